@@ -1,0 +1,36 @@
+# The commands of the project; `make demo` and `make test` are all that a newcomer needs.
+PYTHON ?= python3
+VIDEO ?=
+BIN := .venv/bin
+STARTED := $(shell date +%s)
+
+.PHONY: help setup demo test test-fast lint format clean
+
+help:  ## Show this list
+	@grep -hE '^[a-z-]+:.*##' Makefile | sed -E 's/:.*## /\t/' | expand -t 14
+
+setup:  ## Make or update the virtual environment .venv
+	@$(PYTHON) scripts/setup_env.py
+
+demo: setup  ## Make a head, train its avatar, evaluate, film it (VIDEO=me.mp4 for your own)
+	@PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/rgbavatar demo --started-at $(STARTED) \
+		$(if $(VIDEO),--video "$(VIDEO)")
+
+test: setup lint  ## Linters, type check and the whole test suite
+	@PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m pytest
+
+test-fast: setup  ## The tests that take seconds
+	@PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m pytest -m "not slow and not browser"
+
+lint: setup  ## Format check, lint, import rules, types
+	@$(BIN)/ruff format --check .
+	@$(BIN)/ruff check .
+	@$(BIN)/lint-imports
+	@$(BIN)/basedpyright
+
+format: setup  ## Format the code and mend what the linter can
+	@$(BIN)/ruff check --fix .
+	@$(BIN)/ruff format .
+
+clean:  ## Remove the environment, builds and outputs
+	rm -rf .venv build outputs
