@@ -4,6 +4,7 @@ Conventions: cameras are OpenCV (x right, y down, z forward), lengths are metres
 coordinates are pixels with the centre of the first pixel at (0.5, 0.5).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from jaxtyping import Float
@@ -34,6 +35,17 @@ class PinholeCameras:
     principal_point_px: Float[Tensor, "C 2"]
     width: int
     height: int
+
+    def select(self, positions: Sequence[int]) -> "PinholeCameras":
+        """The cameras at these positions, in this order."""
+        chosen = list(positions)
+        return PinholeCameras(
+            self.world_to_camera[chosen],
+            self.focal_px[chosen],
+            self.principal_point_px[chosen],
+            self.width,
+            self.height,
+        )
 
 
 @dataclass(frozen=True)
