@@ -1,0 +1,188 @@
+"""`rgbavatar demo`: from nothing (or from a video) to a trained avatar, through nerfstudio."""
+
+import json
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from rgbavatar_ns.cli.progress import progress_bar
+from rgbavatar_ns.cli.stages import Result, Stages, write_json
+from rgbavatar_ns.errors import UserError
+
+METHOD = "rgbavatar-tiny"
+
+
+def run(
+    output: Path | None = None,
+    video: tuple[Path, ...] = (),
+    frames: int = 240,
+    image_size: int = 256,
+    steps: int | None = None,
+    seed: int = 0,
+    fresh: bool = False,
+    started_at: float | None = None,
+) -> None:
+    """Make or track a head, train its avatar with ns-train, evaluate it, film it.
+
+    Args:
+        output: where everything is written; outputs/demo, or outputs/NAME for NAME.mp4.
+        video: your own video (several clips of one person may be given) in place of the demo
+            subject.
+        frames: frames of the demo subject; its last quarter is held out.
+        image_size: width and height of the images in pixels.
+        steps: training steps; by default those of the method rgbavatar-tiny.
+        seed: of the demo subject and of the training.
+        fresh: do every stage again, also those that are done.
+        started_at: Unix time from which total_seconds counts; now by default.
+    """
+    started_at = time.time() if started_at is None else started_at
+    for clip in video:
+        if not clip.exists():
+            raise UserError(f"There is no video {clip}.", "Check the path given with --video.")
+    if output is None:
+        output = Path("outputs") / (video[0].stem if video else "demo")
+    output = output.resolve()
+    stages = Stages(output, fresh)
+    if video:
+        settings: dict[str, Any] = {"video": [_fingerprint(clip) for clip in video]}
+        settings["image_size"] = image_size
+        data = stages.run("track", settings, lambda key: _track(video, output / "data", image_size))
+    else:
+        settings = {"frames": frames, "image_size": image_size, "seed": seed}
+        data = stages.run("demo subject", settings, lambda key: _demo(output / "data", settings))
+    folder = Path(data["data"])
+    trained = stages.run(
+        "train",
+        {"steps": steps, "seed": seed},
+        lambda key: _train(folder, output, key, steps, seed),
+    )
+    run_folder = Path(trained["run"])
+    scores = stages.run("evaluate", {}, lambda key: _evaluate(run_folder, output / "eval.json"))
+    shown = stages.run("film", {}, lambda key: _film(run_folder, folder, output))
+    summary = {
+        "psnr": scores["psnr"],
+        "ssim": scores["ssim"],
+        "lpips": scores.get("lpips"),
+        "train_seconds": trained["train_seconds"],
+        "images_per_second": trained["images_per_second"],
+        "total_seconds": time.time() - started_at,
+        "stage_seconds": stages.seconds,
+        "held_out_frames": shown["frames"],
+        "run": str(run_folder),
+        "data": str(folder),
+        "video": shown["video"],
+        "picture": shown["picture"],
+    }
+    write_json(output / "summary.json", summary)
+    _tell(summary, output)
+
+
+def _fingerprint(path: Path) -> tuple[str, int, float]:
+    facts = path.stat()
+    return str(path.resolve()), facts.st_size, facts.st_mtime
+
+
+def _demo(destination: Path, settings: dict[str, Any]) -> Result:
+    from rgbavatar_ns.data.demo import DemoConfig, make_demo_dataset
+
+    shutil.rmtree(destination, ignore_errors=True)
+    config = DemoConfig(
+        num_frames=settings["frames"],
+        num_test_frames=max(1, settings["frames"] // 4),
+        image_size=settings["image_size"],
+        seed=settings["seed"],
+    )
+    with progress_bar("demo subject") as update:
+        make_demo_dataset(destination, config, progress=update)
+    return {"data": str(destination)}
+
+
+def _track(video: tuple[Path, ...], destination: Path, image_size: int) -> Result:
+    from rgbavatar_ns.tracking import TrackConfig, track_video
+
+    shutil.rmtree(destination, ignore_errors=True)
+    with progress_bar("track") as update:
+        track_video(video, destination, TrackConfig(image_size=image_size), progress=update)
+    return {"data": str(destination)}
+
+
+def _call(*command: str | Path) -> None:
+    """Run one of nerfstudio's commands from this environment; its output is shown as it comes.
+
+    On Ctrl-C the command is given the time to save what it has.
+    """
+    program = Path(sys.executable).with_name(str(command[0]))
+    with subprocess.Popen([str(program), *map(str, command[1:])]) as process:
+        try:
+            code = process.wait()
+        except KeyboardInterrupt:
+            process.wait()
+            raise
+    if code == 130:
+        raise KeyboardInterrupt
+    if code != 0:
+        raise UserError(
+            f"{command[0]} ended with exit code {code}; its last lines above say why.",
+            "Once that is mended, run the same command again: finished stages are kept.",
+        )
+
+
+def _train(data: Path, output: Path, key: str, steps: int | None, seed: int) -> Result:
+    run_folder = output / "runs" / "demo" / METHOD / key
+    options: list[str | Path] = ["--data", data, "--output-dir", output / "runs"]
+    options += ["--experiment-name", "demo", "--timestamp", key, "--vis", "tensorboard"]
+    options += ["--machine.seed", str(seed)]
+    if steps is not None:
+        options += ["--max-num-iterations", str(steps)]
+    if any(run_folder.glob("nerfstudio_models/*.ckpt")):
+        options += ["--load-dir", run_folder / "nerfstudio_models"]
+    _call("ns-train", METHOD, *options)
+    facts = json.loads((run_folder / "training.json").read_text())
+    return {
+        "run": str(run_folder),
+        "train_seconds": facts["train_seconds"],
+        "images_per_second": facts["images_per_second"],
+    }
+
+
+def _evaluate(run_folder: Path, destination: Path) -> Result:
+    _call("ns-eval", "--load-config", run_folder / "config.yml", "--output-path", destination)
+    return json.loads(destination.read_text())["results"]
+
+
+def _film(run_folder: Path, data: Path, output: Path) -> Result:
+    from rgbavatar_ns import Avatar
+    from rgbavatar_ns.data import load_dataset
+    from rgbavatar_ns.export import write_comparison
+
+    video, picture = output / "comparison.mp4", output / "comparison.png"
+    count = write_comparison(Avatar.load(run_folder), load_dataset(data), video, picture)
+    return {"video": str(video), "picture": str(picture), "frames": count}
+
+
+def _tell(summary: dict[str, Any], output: Path) -> None:
+    """Print where things are, the metrics and how to open the viewer."""
+    lpips = summary["lpips"]
+    rows = {
+        "held-out PSNR": f"{summary['psnr']:.2f} dB over {summary['held_out_frames']} frames",
+        "held-out SSIM": f"{summary['ssim']:.4f}",
+        "held-out LPIPS": "needs its network, which is not here"
+        if lpips is None
+        else f"{lpips:.4f}",
+        "training": f"{summary['train_seconds']:.0f} s, "
+        f"{summary['images_per_second']:.0f} images/s",
+        "picture": summary["picture"],
+        "film": summary["video"],
+        "figures": str(output / "summary.json"),
+        "viewer": f"{Path(sys.executable).with_name('ns-viewer')} --load-config "
+        f"{Path(summary['run']) / 'config.yml'}",
+    }
+    console = Console(soft_wrap=True, highlight=False)
+    console.rule("done")
+    for name, value in rows.items():
+        console.print(f"{name:<15} {value}")

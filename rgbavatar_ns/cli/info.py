@@ -1,0 +1,27 @@
+"""`rgbavatar info`: the machine and the software, for a bug report or a first look."""
+
+import importlib.metadata
+import os
+import platform
+
+
+def run() -> None:
+    """Print versions, devices and the rasterizer backends that can be used here."""
+    import torch
+
+    import rgbavatar_ns
+    from rgbavatar_ns.kernels import available_backends
+
+    cuda = torch.cuda.get_device_name(0) if torch.cuda.is_available() else "none"
+    rows = {
+        "rgbavatar_ns": rgbavatar_ns.__version__,
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+        "nerfstudio": importlib.metadata.version("nerfstudio"),
+        "cpu": f"{os.cpu_count()} cores, {torch.get_num_threads()} threads used",
+        "cuda": cuda,
+        "rasterizer backends": ", ".join(available_backends()),
+    }
+    width = max(map(len, rows))
+    for name, value in rows.items():
+        print(f"{name:<{width}}  {value}")
