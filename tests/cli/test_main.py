@@ -1,0 +1,46 @@
+import pytest
+
+from rgbavatar_ns.cli import main as cli
+from rgbavatar_ns.errors import UserError
+
+
+def test_help_lists_every_command(capsys):
+    cli.main(["--help"])
+    printed = capsys.readouterr().out
+    assert all(name in printed for name in cli.COMMANDS)
+
+
+def test_an_unknown_command_ends_with_2_and_the_list(capsys):
+    with pytest.raises(SystemExit) as ended:
+        cli.main(["tarck"])
+    assert ended.value.code == 2
+    assert "tarck" in capsys.readouterr().err
+
+
+def test_a_users_mistake_is_told_in_one_line_without_a_traceback(capsys, tmp_path):
+    with pytest.raises(SystemExit) as ended:
+        cli.main(["demo", "--output", str(tmp_path), "--video", str(tmp_path / "none.mp4")])
+    assert ended.value.code == 1
+    told = capsys.readouterr().err
+    assert "none.mp4" in told
+    assert "Traceback" not in told
+    assert len(told.strip().splitlines()) == 1
+
+
+def test_a_failed_nerfstudio_command_says_what_to_do(monkeypatch, tmp_path):
+    from rgbavatar_ns.cli import demo
+
+    program = tmp_path / "ns-train"
+    program.write_text("#!/bin/sh\nexit 3\n")
+    program.chmod(0o755)
+    monkeypatch.setattr("sys.executable", str(tmp_path / "python"))
+    with pytest.raises(UserError, match="exit code 3"):
+        demo._call("ns-train")
+
+
+@pytest.mark.parametrize("name", list(cli.COMMANDS))
+def test_every_command_has_help(name, capsys):
+    with pytest.raises(SystemExit) as ended:
+        cli.main([name, "--help"])
+    assert ended.value.code == 0
+    assert f"rgbavatar {name}" in capsys.readouterr().out
