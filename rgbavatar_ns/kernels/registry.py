@@ -1,0 +1,96 @@
+"""The backends and how one is chosen; another device's backend joins by one entry in `_LOADERS`."""
+
+import functools
+import importlib
+import warnings
+from typing import Protocol
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from rgbavatar_ns.kernels.types import GaussianSet, PinholeCameras, RenderedBatch, WeightedColors
+
+
+class Backend(Protocol):
+    """What a rasterizer offers; shapes have been checked when its methods are called."""
+
+    def refusal(self, device: torch.device, dtype: torch.dtype) -> str | None:
+        """Why tensors of this device and type cannot be taken; None if they can."""
+        ...
+
+    def rasterize(
+        self,
+        gaussians: GaussianSet,
+        cameras: PinholeCameras,
+        background: Float[Tensor, "#B 3"],
+        *,
+        with_depth: bool,
+        with_visibility: bool,
+    ) -> RenderedBatch:
+        """As `functional.rasterize`."""
+        ...
+
+    def weighted_color_average(
+        self, gaussians: GaussianSet, cameras: PinholeCameras, images: Float[Tensor, "#B H W C"]
+    ) -> WeightedColors:
+        """As `functional.weighted_color_average`."""
+        ...
+
+
+# Name -> module with `load() -> Backend`, which raises ImportError with the reason; the order is
+# the order of preference.
+_LOADERS = {
+    "cpu": "rgbavatar_ns.kernels.cpu.backend",
+    "reference": "rgbavatar_ns.kernels.reference_backend",
+}
+
+
+@functools.cache
+def _load(name: str) -> Backend | ImportError:
+    try:
+        return importlib.import_module(_LOADERS[name]).load()
+    except ImportError as error:
+        return error
+
+
+def available_backends() -> tuple[str, ...]:
+    """Names of the backends that can be used in this process, the preferred ones first."""
+    return tuple(name for name in _LOADERS if not isinstance(_load(name), ImportError))
+
+
+def choose(name: str, device: torch.device, dtype: torch.dtype) -> Backend:
+    """The named backend, or for "auto" the first that takes such tensors.
+
+    Raises ValueError when there is none, with every backend's reason.
+    """
+    if name != "auto" and name not in _LOADERS:
+        raise ValueError(
+            f"There is no backend {name!r}. Pass 'auto' or one of {', '.join(_LOADERS)}."
+        )
+    refusals = []
+    for candidate in _LOADERS if name == "auto" else (name,):
+        backend = _load(candidate)
+        if isinstance(backend, ImportError):
+            if name == "auto" and device.type == candidate and dtype == torch.float32:
+                _warn_of_slow_choice(candidate, str(backend))
+            refusals.append(f"{candidate}: {backend}")
+            continue
+        refusal = backend.refusal(device, dtype)
+        if refusal is None:
+            return backend
+        refusals.append(f"{candidate}: {refusal}")
+    raise ValueError(
+        f"No backend for {dtype} tensors on {device} ({'; '.join(refusals)}). "
+        "Move the tensors, convert them, or pass backend='auto'."
+    )
+
+
+@functools.cache
+def _warn_of_slow_choice(name: str, reason: str) -> None:
+    warnings.warn(
+        f"The rasterizer's {name} backend cannot be used ({reason}); rendering falls back to the "
+        "reference, which is many times slower. Reinstall the package with a C++17 compiler.",
+        RuntimeWarning,
+        stacklevel=4,
+    )
