@@ -1,0 +1,255 @@
+"""The avatar: the one composition from a head model's parameters theta to Gaussians and images."""
+
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from rgbavatar_ns.avatar.anchors import GaussianAnchors
+from rgbavatar_ns.avatar.blendshapes import GaussianBlendshapes, feature_from_color
+from rgbavatar_ns.avatar.bundle import load_any, save_bundle
+from rgbavatar_ns.avatar.color_init import estimate_colors
+from rgbavatar_ns.avatar.composition import to_world
+from rgbavatar_ns.avatar.config import AvatarConfig
+from rgbavatar_ns.avatar.weights import WeightNetwork
+from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.head import HeadArrays, HeadModel, ThetaLayout, UVAnchors, uv_anchors
+from rgbavatar_ns.kernels import GaussianSet, PinholeCameras, RenderedBatch, rasterize
+
+LEARNING_RATES: dict[str, float] = {
+    "position": 8e-4,
+    "rotation": 5e-3,
+    "log_scale": 2.5e-2,
+    "opacity": 0.25,
+    "color": 1.25e-2,
+    "basis_position": 8e-4 * 0.05,
+    "basis_rotation": 5e-3 * 0.5,
+    "basis_color": 1.25e-2 * 0.5,
+    "weight_network": 1e-3,
+}
+"""Adam's learning rate for each parameter group (paper, supplement: implementation details)."""
+
+
+class Avatar(nn.Module):
+    """A head avatar of reduced Gaussian blendshapes, animated by theta (RGBAvatar, sec. 3.1).
+
+    Everything that a picture needs is inside: head model, identity, anchors and Gaussians.
+
+    Args:
+        head: the head model, whose layout names what theta holds.
+        identity: the subject's identity coefficients, fixed.
+        config: sizes, variants and initial values.
+        seed: of the weight network's initial values; nothing else is random.
+        anchors: places of the Gaussians; by default every covered texel of the head's UV map.
+    """
+
+    color_initialized: Tensor
+    identity: Tensor
+
+    def __init__(
+        self,
+        head: HeadModel,
+        identity: Float[Tensor, "I"],
+        config: AvatarConfig | None = None,
+        *,
+        seed: int = 0,
+        anchors: UVAnchors | None = None,
+    ) -> None:
+        super().__init__()
+        config = AvatarConfig() if config is None else config
+        self.head = head
+        self.config = config
+        self.register_buffer("identity", identity.detach().clone())
+        with torch.no_grad():
+            rest_vertices = head(identity.new_zeros(self.layout.size), identity)
+        if anchors is None:
+            anchors = uv_anchors(head.uv, head.uv_faces, config.uv_resolution)
+        self.anchors = GaussianAnchors(head, anchors, rest_vertices, config.tangent_variant)
+        scale_m: float | Tensor = config.initial_scale_m
+        if config.scale_from_texel_spacing:
+            scale_m = 0.5 * self.anchors.texel_spacing()
+        self.blendshapes = GaussianBlendshapes(
+            len(self.anchors),
+            config.num_bases,
+            scale_m=scale_m,
+            opacity=config.initial_opacity,
+            color=config.initial_color,
+        )
+        self.weight_network = None
+        if config.num_bases > 0:
+            self.weight_network = WeightNetwork(
+                self.layout.feature_size(config.pose_input, config.translation_input),
+                config.num_bases,
+                kind=config.weight_network,
+                hidden_width=config.hidden_width,
+                generator=torch.Generator().manual_seed(seed),
+            )
+        self.register_buffer("color_initialized", torch.zeros(len(self.anchors), dtype=torch.bool))
+
+    @property
+    def layout(self) -> ThetaLayout:
+        """The names and sizes of theta's parts."""
+        return self.head.layout
+
+    @property
+    def num_gaussians(self) -> int:
+        """The number N of Gaussians."""
+        return len(self.anchors)
+
+    def weights(self, theta: Float[Tensor, "B H"]) -> Float[Tensor, "B K"]:
+        """Return the blendshape weights psi = F(theta); raises UserError on a theta unfit."""
+        theta = self._checked(theta)
+        if self.weight_network is None:
+            return theta.new_zeros(len(theta), 0)
+        features = self.layout.network_features(
+            theta, self.config.pose_input, self.config.translation_input
+        )
+        return self.weight_network(features)
+
+    def gaussians(
+        self, theta: Float[Tensor, "B H"], psi: Float[Tensor, "B K"] | None = None
+    ) -> GaussianSet:
+        """Return the world-space Gaussians of a batch of theta, world as the head model's.
+
+        `psi` replaces the weight network's answer. Differentiable in the parameters, theta and
+        psi. Raises UserError where theta has another size or holds NaN.
+        """
+        theta = self._checked(theta)
+        tangent = self.blendshapes.blend(self.weights(theta) if psi is None else psi)
+        vertices = self.head(theta, self.identity)
+        frames = self.anchors.frames(vertices, with_length_ratio=self.config.scale_with_triangle)
+        return to_world(tangent, frames)
+
+    def render(
+        self,
+        theta: Float[Tensor, "B H"],
+        cameras: PinholeCameras,
+        background: Float[Tensor, "3"] | Float[Tensor, "B 3"] | None = None,
+        **rasterize_options: Any,
+    ) -> RenderedBatch:
+        """Draw a batch of theta; the options are those of `rgbavatar_ns.kernels.rasterize`."""
+        return rasterize(self.gaussians(theta), cameras, background, **rasterize_options)
+
+    def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
+        """Return the parameters by the names in `LEARNING_RATES`; none for bases where K = 0."""
+        shapes = self.blendshapes
+        groups = {
+            "position": [shapes.position],
+            "rotation": [shapes.rotation_wxyz],
+            "log_scale": [shapes.log_scale],
+            "opacity": [shapes.opacity_logit],
+            "color": [shapes.color_feature],
+        }
+        if self.weight_network is not None:
+            groups["basis_position"] = [shapes.basis_position]
+            groups["basis_rotation"] = [shapes.basis_rotation_wxyz]
+            groups["basis_color"] = [shapes.basis_color_feature]
+            groups["weight_network"] = list(self.weight_network.parameters())
+        return groups
+
+    def require_layout(self, layout: ThetaLayout, source: str) -> None:
+        """Raise UserError, naming both layouts, where `source` has another than this avatar."""
+        if layout != self.layout:
+            raise UserError(
+                f"{source} has theta of {describe_layout(layout)}, but this avatar's head "
+                f"'{self.head.arrays.name}' takes {describe_layout(self.layout)}.",
+                "Use data of the same head model, or train an avatar on this data.",
+            )
+
+    @torch.no_grad()
+    def initialize_colors(
+        self,
+        theta: Float[Tensor, "B H"],
+        cameras: PinholeCameras,
+        images_rgba: Float[Tensor, "B H_px W_px 4"],
+    ) -> int:
+        """Give Gaussians seen well for the first time the mean colour under them; return how many.
+
+        Paper, sec. 3.2; see `color_init` for the weights. The images' colour is straight (not
+        multiplied by alpha). Only base colours change, and each Gaussian's only once: bases and
+        optimiser state stay, and `color_initialized` remembers.
+        """
+        estimate = estimate_colors(self.gaussians(theta), cameras, images_rgba)
+        fresh = estimate.reliable & ~self.color_initialized
+        feature = self.blendshapes.color_feature
+        feature[fresh] = feature_from_color(estimate.color[fresh]).to(feature.dtype)
+        self.color_initialized |= fresh
+        return int(fresh.sum())
+
+    def save(self, path: str | Path) -> None:
+        """Write a bundle (a directory of avatar.safetensors and avatar.json), atomically."""
+        save_bundle(self.to_state(), self._own_state_dict(), Path(path))
+
+    @classmethod
+    def load(cls, path: str | Path) -> "Avatar":
+        """Load a bundle, a nerfstudio checkpoint (.ckpt) or the newest one of a run's folder.
+
+        Needs no nerfstudio. Raises UserError where there is none or it cannot be read.
+        """
+        state, tensors = load_any(Path(path))
+        avatar = cls.from_state(state)
+        own = set(avatar._own_state_dict())
+        avatar.load_state_dict({k: v for k, v in tensors.items() if k in own}, strict=False)
+        missing = sorted(own - set(tensors))
+        if missing:
+            raise UserError(
+                f"{path} lacks parts of the avatar: {', '.join(missing)}.",
+                "Use another checkpoint, or save the avatar again.",
+            )
+        return avatar
+
+    def _own_state_dict(self) -> dict[str, Tensor]:
+        """Return the state dict without the head model's part, which `to_state` carries."""
+        return {k: v for k, v in self.state_dict().items() if not k.startswith("head.")}
+
+    def to_state(self) -> dict[str, Any]:
+        """Return what `from_state` needs beside the state dict, safe for `weights_only=True`."""
+        return {
+            "config": self.config.to_json(),
+            "head": self.head.arrays.to_state(),
+            "identity": self.identity.detach().cpu(),
+            "anchors": {
+                name: value.cpu() if isinstance(value, Tensor) else value
+                for name, value in self.anchors.to_state().items()
+            },
+        }
+
+    @classmethod
+    def from_state(cls, state: dict[str, Any]) -> "Avatar":
+        """Build an untrained avatar of the same make; its parameters come by load_state_dict."""
+        saved = state["anchors"]
+        anchors = UVAnchors(
+            triangle_index=saved["triangle_index"].long(),
+            barycentric=saved["barycentric"],
+            texel_row_col=saved["texel_row_col"].long(),
+            resolution=saved["resolution"],
+        )
+        return cls(
+            HeadModel(HeadArrays.from_state(state["head"])),
+            state["identity"],
+            AvatarConfig.from_json(state["config"]),
+            anchors=anchors,
+        )
+
+    def _checked(self, theta: Float[Tensor, "B H"]) -> Float[Tensor, "B H"]:
+        """Return theta in the parameters' dtype, or raise UserError with the reason."""
+        if theta.shape[-1] != self.layout.size:
+            raise UserError(
+                f"theta has {theta.shape[-1]} values, but this avatar's head "
+                f"'{self.head.arrays.name}' takes {describe_layout(self.layout)}.",
+                "Give theta of the head model that the avatar was trained with.",
+            )
+        # On a GPU the check would wait for the device each step; data is checked when loaded.
+        if theta.device.type == "cpu" and not torch.isfinite(theta.detach()).all():
+            raise UserError(
+                "theta holds NaN or infinite values.", "Repair or leave out these frames."
+            )
+        return theta.to(self.blendshapes.position.dtype)
+
+
+def describe_layout(layout: ThetaLayout) -> str:
+    """Say a layout in words: its size, then each part's name and size."""
+    parts = ", ".join(f"{field.name} {field.size}" for field in layout.fields)
+    return f"{layout.size} values ({parts})"

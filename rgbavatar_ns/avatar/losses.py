@@ -1,0 +1,87 @@
+"""Training losses: L1 over per-image random backgrounds, and LPIPS as an option."""
+
+from typing import Any, Literal
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, UInt8
+from torch import Tensor, nn
+
+from rgbavatar_ns.errors import UserError
+
+
+def rgba_to_float(
+    rgba: UInt8[Tensor, "B H W 4"] | Float[Tensor, "B H W 4"], dtype: torch.dtype = torch.float32
+) -> Float[Tensor, "B H W 4"]:
+    """Turn 8-bit RGBA into [0, 1]; floating values pass through."""
+    if rgba.dtype == torch.uint8:
+        return rgba.to(dtype).mul_(1 / 255)
+    return rgba.to(dtype)
+
+
+def composite(
+    rgba: Float[Tensor, "B H W 4"], background: Float[Tensor, "B 3"] | Float[Tensor, "3"]
+) -> Float[Tensor, "B H W 3"]:
+    """Lay straight-alpha images over one background colour each (or one for all)."""
+    colors = background.reshape(-1, 1, 1, 3)
+    return torch.lerp(colors, rgba[..., :3], rgba[..., 3:])
+
+
+def random_backgrounds(step: int, batch: int, seed: int = 0) -> Float[Tensor, "batch 3"]:
+    """Return one uniformly random colour an image (paper, sec. 3.2), float32 on the CPU.
+
+    A pure function of its arguments, drawn from a counter-based generator, so that a resumed run
+    sees the backgrounds of the uninterrupted one without any stored random state.
+    """
+    counter = np.random.Philox(key=np.array([seed, step], dtype=np.uint64))
+    return torch.from_numpy(np.random.Generator(counter).random((batch, 3), dtype=np.float32))
+
+
+def l1_loss(image: Float[Tensor, "B H W 3"], target: Float[Tensor, "B H W 3"]) -> Float[Tensor, ""]:
+    """Return the mean absolute difference (paper, sec. 3.2)."""
+    return F.l1_loss(image, target)
+
+
+class LPIPSLoss:
+    """LPIPS between images in [0, 1], its network built on first use; gradients reach both.
+
+    The network's weights come from the internet once (torchvision's VGG-16). Not a module, so
+    that they never enter a checkpoint. Raises UserError where they cannot be had.
+    """
+
+    def __init__(self, net: Literal["vgg", "alex", "squeeze"] = "vgg") -> None:
+        self.net: Literal["vgg", "alex", "squeeze"] = net
+        self._network: nn.Module | None = None
+
+    def __call__(
+        self, image: Float[Tensor, "B H W 3"], target: Float[Tensor, "B H W 3"]
+    ) -> Float[Tensor, ""]:
+        """Return the mean over the batch."""
+        network = self.network().to(image.device)
+        first, second = (x.movedim(-1, 1).float() for x in (image, target))
+        return network(first, second, normalize=True).mean()
+
+    def network(self) -> nn.Module:
+        """Return the network, building it the first time; raises UserError when it cannot be."""
+        if self._network is None:
+            self._network = _build_lpips_network(self.net)
+        return self._network
+
+
+def _build_lpips_network(net: Literal["vgg", "alex", "squeeze"]) -> Any:
+    """Build torchmetrics' LPIPS network; raises UserError with the reason where that fails."""
+    try:
+        # torchmetrics and torchvision take seconds to import, and are optional to a renderer.
+        from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
+
+        metric = LearnedPerceptualImagePatchSimilarity(net_type=net)
+    # Without a network, a disk or a working torchvision this fails in many ways: URLError,
+    # OSError, RuntimeError (operator torchvision::nms), ModuleNotFoundError.
+    except Exception as error:
+        raise UserError(
+            f"LPIPS ({net}) is unavailable: {type(error).__name__}: {error}.",
+            "Run once with internet access, or put torchvision's weights of the network into "
+            f"{torch.hub.get_dir()}/checkpoints; or go on without LPIPS.",
+        ) from error
+    return metric.net.eval().requires_grad_(False)

@@ -1,0 +1,81 @@
+"""Image metrics under one protocol: full frame, black background, soft alpha, means over images.
+
+The protocol is that of the paper's comparisons: predictions are rendered over black and clamped
+to [0, 1], targets are laid over black by their matte, and no mask or crop is applied.
+"""
+
+from typing import Literal
+
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from rgbavatar_ns.avatar.losses import LPIPSLoss, composite, rgba_to_float
+from rgbavatar_ns.errors import UserError
+
+
+def psnr(image: Float[Tensor, "B H W 3"], target: Float[Tensor, "B H W 3"]) -> Float[Tensor, "B"]:
+    """Return each image's peak signal-to-noise ratio in dB, for a range of 1."""
+    from torchmetrics.functional.image import peak_signal_noise_ratio
+
+    ratio = peak_signal_noise_ratio(image, target, data_range=1.0, reduction="none", dim=(1, 2, 3))
+    return ratio.reshape(len(image))
+
+
+def ssim(image: Float[Tensor, "B H W 3"], target: Float[Tensor, "B H W 3"]) -> Float[Tensor, "B"]:
+    """Return each image's structural similarity: Gaussian window, sigma 1.5, range 1."""
+    from torchmetrics.functional.image import structural_similarity_index_measure
+
+    similarity = structural_similarity_index_measure(
+        image.movedim(-1, 1), target.movedim(-1, 1), data_range=1.0, reduction="none"
+    )
+    if not isinstance(similarity, Tensor):
+        similarity = similarity[0]
+    return similarity.reshape(len(image))
+
+
+class LPIPSMetric:
+    """LPIPS that reports itself unavailable instead of failing, and tries only once."""
+
+    def __init__(self, net: Literal["vgg", "alex", "squeeze"] = "vgg") -> None:
+        self.net: Literal["vgg", "alex", "squeeze"] = net
+        self.unavailable: str | None = None
+        self._loss = LPIPSLoss(net)
+
+    @torch.no_grad()
+    def __call__(
+        self, image: Float[Tensor, "B H W 3"], target: Float[Tensor, "B H W 3"]
+    ) -> Float[Tensor, ""] | None:
+        """Return the mean over the batch, or None once `unavailable` says why."""
+        if self.unavailable is None:
+            try:
+                return self._loss(image, target)
+            except UserError as error:
+                self.unavailable = str(error)
+        return None
+
+
+@torch.no_grad()
+def evaluate_images(
+    image: Float[Tensor, "B H W 3"],
+    target_rgba: Float[Tensor, "B H W 4"] | UInt8[Tensor, "B H W 4"],
+    lpips: LPIPSMetric | None = None,
+) -> dict[str, float | str | None]:
+    """Compare images rendered over black with their targets, under the module's protocol.
+
+    Returns `psnr` (dB), `ssim` and, where `lpips` was given, `lpips_<network>`: None where it is
+    unavailable, with the reason as `lpips_unavailable`. To average over a data set, call it on
+    one image at a time or on equal batches: every number is a mean over the images.
+    """
+    image = image.clamp(0, 1)
+    target = composite(rgba_to_float(target_rgba, image.dtype), image.new_zeros(3))
+    values: dict[str, float | str | None] = {
+        "psnr": float(psnr(image, target).mean()),
+        "ssim": float(ssim(image, target).mean()),
+    }
+    if lpips is not None:
+        perceptual = lpips(image, target)
+        values[f"lpips_{lpips.net}"] = None if perceptual is None else float(perceptual)
+        if lpips.unavailable is not None:
+            values["lpips_unavailable"] = lpips.unavailable
+    return values

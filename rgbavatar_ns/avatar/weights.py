@@ -1,0 +1,52 @@
+"""The weight network F: theta's features to the blendshape weights psi (paper, eq. 2)."""
+
+import math
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+
+class WeightNetwork(nn.Module):
+    """Three linear layers with ReLU between them, or a single one; no output activation.
+
+    Paper, supplement: three layers, 128 wide; "linear" is its ablation. The initial values are
+    those of `torch.nn.Linear`, drawn from `generator`, so that building an avatar neither reads
+    nor moves the global random state.
+    """
+
+    def __init__(
+        self,
+        num_features: int,
+        num_bases: int,
+        *,
+        kind: Literal["mlp", "linear"] = "mlp",
+        hidden_width: int = 128,
+        generator: torch.Generator,
+    ) -> None:
+        super().__init__()
+        if kind == "linear":
+            self.layers = nn.Sequential(_linear(num_features, num_bases, generator))
+        else:
+            self.layers = nn.Sequential(
+                _linear(num_features, hidden_width, generator),
+                nn.ReLU(),
+                _linear(hidden_width, hidden_width, generator),
+                nn.ReLU(),
+                _linear(hidden_width, num_bases, generator),
+            )
+
+    def forward(self, features: Float[Tensor, "B F"]) -> Float[Tensor, "B K"]:
+        """Map features to blendshape weights."""
+        return self.layers(features)
+
+
+def _linear(num_in: int, num_out: int, generator: torch.Generator) -> nn.Linear:
+    """Build a linear layer with torch's default initial values drawn from `generator`."""
+    layer = nn.utils.skip_init(nn.Linear, num_in, num_out)
+    bound = 1 / math.sqrt(num_in) if num_in > 0 else 0.0
+    with torch.no_grad():
+        layer.weight.uniform_(-bound, bound, generator=generator)
+        layer.bias.uniform_(-bound, bound, generator=generator)
+    return layer
