@@ -1,0 +1,98 @@
+"""Least squares with bounds: Levenberg-Marquardt whose steps solve the bounded problem.
+
+Clamping an unbounded step afterwards is not enough: the other unknowns would still count on the
+part that was cut off. Each step here is the minimum of the quadratic model inside the bounds.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from scipy.linalg import LinAlgError, cho_factor, cho_solve
+
+Vector = Float[np.ndarray, "P"]
+Matrix = Float[np.ndarray, "P P"]
+
+
+@dataclass(frozen=True)
+class QuadraticModel:
+    """Cost, gradient and Gauss-Newton Hessian of a least-squares problem at one point."""
+
+    cost: float
+    gradient: Vector
+    hessian: Matrix
+
+
+def minimize_box_quadratic(
+    hessian: Matrix, gradient: Vector, lower: Vector, upper: Vector, max_iterations: int = 50
+) -> Vector:
+    """Minimum of 1/2 d'Hd + g'd over lower <= d <= upper, H positive definite, 0 inside.
+
+    Projected Newton with an active set (Bertsekas 1982): unknowns at a bound whose gradient
+    pushes outwards are held, the rest takes a Newton step with a projected line search.
+    """
+    step = np.zeros_like(gradient)
+    value = 0.0
+    for _ in range(max_iterations):
+        slope = gradient + hessian @ step
+        held = ((step <= lower) & (slope > 0)) | ((step >= upper) & (slope < 0))
+        free = np.flatnonzero(~held)
+        if free.size == 0 or np.abs(slope[free]).max() <= 1e-10 * (1 + np.abs(gradient).max()):
+            break
+        direction = np.zeros_like(step)
+        factor = cho_factor(hessian[np.ix_(free, free)], check_finite=False)
+        direction[free] = -cho_solve(factor, slope[free], check_finite=False)
+        length = 1.0
+        while True:
+            trial = np.clip(step + length * direction, lower, upper)
+            trial_value = float(gradient @ trial + 0.5 * trial @ hessian @ trial)
+            if trial_value <= value + 1e-4 * float(slope @ (trial - step)):
+                break
+            length *= 0.5
+            if length < 1e-8:
+                return step
+        settled = value - trial_value <= 1e-13 * (1 + abs(value))
+        step, value = trial, trial_value
+        if settled:
+            break
+    return step
+
+
+def levenberg_marquardt(
+    model_at: Callable[[Vector], QuadraticModel],
+    start: Vector,
+    lower: Vector,
+    upper: Vector,
+    *,
+    iterations: int,
+    tolerance: float = 1e-4,
+) -> tuple[Vector, QuadraticModel]:
+    """Minimise inside the bounds, from `start`; the damping follows whether steps succeed.
+
+    Returns the best point and its model. Stops when a step lowers the cost by less than
+    `tolerance` of it. Deterministic.
+    """
+    point = np.clip(start, lower, upper)
+    model = model_at(point)
+    damping = 1e-4
+    for _ in range(iterations):
+        diagonal = np.maximum(np.diag(model.hessian), 1e-9)
+        damped = model.hessian + np.diag(damping * diagonal + 1e-12)
+        try:
+            step = minimize_box_quadratic(damped, model.gradient, lower - point, upper - point)
+        except LinAlgError:
+            damping = max(damping, 1e-6) * 10
+            continue
+        trial = np.clip(point + step, lower, upper)
+        trial_model = model_at(trial)
+        if trial_model.cost < model.cost:
+            gained = model.cost - trial_model.cost
+            point, model, damping = trial, trial_model, max(damping / 5, 1e-9)
+            if gained < tolerance * (model.cost + 1e-12):
+                break
+        else:
+            damping = max(damping, 1e-6) * 10
+            if damping > 1e6:
+                break
+    return point, model

@@ -1,0 +1,46 @@
+"""The still camera of a clip: the head near the world's origin, the camera in front of it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+
+@dataclass(frozen=True)
+class StillCamera:
+    """OpenCV pinhole on the world's z axis at `distance_m`, looking back at the origin.
+
+    World: y up, z towards the camera (head convention). Image coordinates in pixels.
+    """
+
+    focal_px: float
+    center_px: tuple[float, float]
+    distance_m: float
+
+    @property
+    def world_to_camera(self) -> Float[np.ndarray, "4 4"]:
+        """OpenCV camera coordinates (x right, y down, z forward) from world coordinates."""
+        matrix = np.diag([1.0, -1.0, -1.0, 1.0])
+        matrix[2, 3] = self.distance_m
+        return matrix
+
+    def project(self, points_m: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 2"]:
+        """Image points in pixels."""
+        depth = self.distance_m - points_m[..., 2]
+        across = points_m[..., :2] * (1.0, -1.0)
+        return self.focal_px * across / depth[..., None] + self.center_px
+
+    def jacobian(self, points_m: Float[np.ndarray, "L 3"]) -> Float[np.ndarray, "L 2 3"]:
+        """Derivative of `project` to the points."""
+        depth = self.distance_m - points_m[:, 2]
+        result = np.zeros((len(points_m), 2, 3))
+        result[:, 0, 0] = self.focal_px / depth
+        result[:, 1, 1] = -self.focal_px / depth
+        result[:, 0, 2] = self.focal_px * points_m[:, 0] / depth**2
+        result[:, 1, 2] = -self.focal_px * points_m[:, 1] / depth**2
+        return result
+
+    def cropped(self, left: float, top: float, scale: float) -> "StillCamera":
+        """The same camera for a crop of the image that starts at (left, top), then scaled."""
+        center = ((self.center_px[0] - left) * scale, (self.center_px[1] - top) * scale)
+        return StillCamera(self.focal_px * scale, center, self.distance_m)

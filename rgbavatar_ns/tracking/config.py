@@ -1,0 +1,29 @@
+"""What a user can choose when a video is tracked."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class TrackConfig:
+    """Options of `track_video`; the defaults suit a webcam or phone clip of one person."""
+
+    size_px: int = 256
+    """Side of the square images of the dataset."""
+    test_frames: int | None = None
+    """Last frames held out for evaluation; None holds out a fifth of the tracked frames."""
+    max_frames: int | None = None
+    """Read at most so many frames in all; None reads everything."""
+    focal_px: float | None = None
+    """Focal length in pixels of the source frame; None estimates it."""
+    identity_components: int = 20
+    """How many identity components of the head model are fitted."""
+    key_frames: int = 12
+    """Frames that identity and focal length are fitted on."""
+    keep_torso: bool = False
+    """Keep neck and shoulders as the matte found them. By default the matte fades out below the
+    neck of the fitted head, because the avatar's Gaussians ride on a mesh that ends there: a
+    torso in the picture would be explained by stretched Gaussians that swing with the head."""
+    temporal_weight: float = 1.0
+    """How strongly each frame is drawn to the mean of its neighbours; 0 switches it off."""
+    overwrite: bool = False
+    """Replace an existing dataset at the destination."""

@@ -1,0 +1,57 @@
+import numpy as np
+import pytest
+from scipy.optimize import lsq_linear
+
+from rgbavatar_ns.tracking.bounded import (
+    QuadraticModel,
+    levenberg_marquardt,
+    minimize_box_quadratic,
+)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_box_quadratic_agrees_with_scipy(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    size = int(random.integers(1, 30))
+    matrix = random.normal(size=(size + 10, size)) * random.uniform(0.1, 3, size)
+    target = random.normal(size=size + 10)
+    lower, upper = -random.uniform(0, 0.3, size), random.uniform(0, 0.3, size)
+    step = minimize_box_quadratic(matrix.T @ matrix, -matrix.T @ target, lower, upper)
+    expected = lsq_linear(matrix, target, (lower, upper + 1e-12), tol=1e-14).x
+    assert (step >= lower).all()
+    assert (step <= upper).all()
+    np.testing.assert_allclose(step, expected, atol=1e-6)
+
+
+def test_correlated_unknowns_do_not_count_on_what_a_bound_cuts_off() -> None:
+    # min (x + y - 1)^2 + .01 (x - y)^2 with x <= .2: y must take up the rest. Clamping the free
+    # minimum (.5, .5) would leave y at .5.
+    rows = np.array([[1.0, 1.0], [0.1, -0.1]])
+    target = np.array([1.0, 0.0])
+    step = minimize_box_quadratic(
+        rows.T @ rows, -rows.T @ target, np.array([-5.0, -5.0]), np.array([0.2, 5.0])
+    )
+    assert step[0] == pytest.approx(0.2)
+    assert step[1] == pytest.approx((0.8 + 0.01 * 0.2) / 1.01)
+
+
+def test_levenberg_marquardt_finds_the_bounded_minimum_of_a_curved_valley() -> None:
+    # Rosenbrock's valley cut at x <= .5: the minimum lies at (.5, .25) by hand.
+    def model_at(point: np.ndarray) -> QuadraticModel:
+        x, y = point
+        residual = np.array([10 * (y - x * x), 1 - x])
+        jacobian = np.array([[-20 * x, 10.0], [-1.0, 0.0]])
+        return QuadraticModel(
+            0.5 * float(residual @ residual), jacobian.T @ residual, jacobian.T @ jacobian
+        )
+
+    best, model = levenberg_marquardt(
+        model_at,
+        np.array([-1.2, 1.0]),
+        np.array([-2.0, -2.0]),
+        np.array([0.5, 2.0]),
+        iterations=200,
+        tolerance=0.0,
+    )
+    np.testing.assert_allclose(best, [0.5, 0.25], atol=1e-5)
+    assert model.cost == pytest.approx(0.125, abs=1e-6)
