@@ -1,0 +1,56 @@
+"""What a checkpoint says about the avatar beside its parameters."""
+
+from typing import Any
+
+from rgbavatar_ns.avatar import Avatar, describe_layout
+from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.head import ThetaLayout
+from rgbavatar_ns.plugin.dataparser import Subject
+
+_EXTRA_STATE = "_extra_state"
+
+
+def model_state(avatar: Avatar, subject: Subject) -> dict[str, Any]:
+    """Tensors and plain values only, so that checkpoints load with `weights_only=True`.
+
+    `avatar` is what `Avatar.from_state` needs; `frames` lets another program play the training
+    performance without the dataset.
+    """
+    return {
+        "avatar": avatar.to_state(),
+        "layout": avatar.layout.to_json(),
+        "frames": {"theta": subject.theta, "index": list(subject.frame_index)},
+    }
+
+
+def require_same_layout(state_dict: dict[str, Any], avatar: Avatar) -> None:
+    """Raise UserError where the checkpoint's theta is not laid out as `avatar` takes it."""
+    extra = state_dict.get(_EXTRA_STATE)
+    if extra is None:
+        raise UserError(
+            "The checkpoint holds no avatar of this method.",
+            "Load a checkpoint that `ns-train rgbavatar` or `ns-train rgbavatar-tiny` wrote.",
+        )
+    saved = ThetaLayout.from_json(extra["layout"])
+    if saved != avatar.layout:
+        raise UserError(
+            f"The checkpoint was trained with theta of {describe_layout(saved)}, but the dataset "
+            f"has theta of {describe_layout(avatar.layout)}.",
+            "Use the dataset that the checkpoint was trained with (--data), or another one "
+            "tracked with the same head model.",
+        )
+    _require_same_make(extra["avatar"]["config"], avatar)
+
+
+def _require_same_make(saved: dict[str, Any], avatar: Avatar) -> None:
+    mine = avatar.config.to_json()
+    shape = ("num_bases", "uv_resolution", "weight_network", "hidden_width", "tangent_variant")
+    shape += ("pose_input", "translation_input", "scale_with_triangle")
+    different = [name for name in shape if saved.get(name) != mine[name]]
+    if different:
+        told = ", ".join(f"{name} {saved.get(name)}, not {mine[name]}" for name in different)
+        flags = " ".join(
+            f"--pipeline.model.avatar.{name.replace('_', '-')} {saved.get(name)}"
+            for name in different
+        )
+        raise UserError(f"The checkpoint's avatar has {told}.", f"Pass {flags}.")

@@ -1,0 +1,136 @@
+"""Checkpoints that survive being killed: written whole or not at all, read from the newest good."""
+
+import os
+import re
+import shutil
+import zipfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from rgbavatar_ns.errors import UserError
+
+_NAME = re.compile(r"step-(\d+)\.ckpt")
+_REQUIRED = frozenset({"step", "pipeline", "optimizers", "schedulers", "scalers"})
+# What a zip file's directory and small values may add to the tensors' bytes.
+_OVERHEAD_BYTES = 4 << 20
+
+
+def list_checkpoints(folder: Path) -> list[tuple[int, Path]]:
+    """Step and path of the checkpoints in `folder`, oldest first; empty if there is no folder."""
+    if not folder.is_dir():
+        return []
+    named = ((_NAME.fullmatch(path.name), path) for path in folder.iterdir())
+    return sorted((int(name.group(1)), path) for name, path in named if name)
+
+
+def save_checkpoint(state: dict[str, Any], folder: Path, step: int, keep: int) -> Path:
+    """Write `folder/step-XXXXXXXXX.ckpt` atomically, then remove all but the newest `keep`.
+
+    The file grows under another name beside the folder (nerfstudio takes every file inside it
+    for a checkpoint), is synced and renamed: at any moment the folder holds only whole files.
+
+    Raises:
+        UserError: there is too little space; older checkpoints are untouched.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"step-{step:09d}.ckpt"
+    partial = folder.parent / f".{folder.name}.partial"
+    _require_space(folder, sum(tensor.nbytes for tensor in _tensors(state)) + _OVERHEAD_BYTES)
+    try:
+        with partial.open("wb") as file:
+            torch.save(state, file)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(partial, path)
+    except (OSError, RuntimeError) as error:
+        partial.unlink(missing_ok=True)
+        raise UserError(
+            f"The checkpoint {path} could not be written: {error}.",
+            f"Free space under {folder} and resume with --load-dir {folder}; "
+            "the checkpoints there are untouched.",
+        ) from error
+    _sync_folder(folder)
+    for _, old in list_checkpoints(folder)[: -max(1, keep)]:
+        old.unlink()
+    return path
+
+
+def load_newest(folder: Path, tell: Callable[[str], None]) -> tuple[dict[str, Any], Path]:
+    """Read the newest checkpoint in `folder` that can be read, telling which were passed over.
+
+    `folder` may be a run's folder too.
+
+    Raises:
+        UserError: there is no readable checkpoint.
+    """
+    inside = folder / "nerfstudio_models"
+    candidates = list_checkpoints(folder) or list_checkpoints(inside)
+    if not candidates:
+        raise UserError(
+            f"There is no checkpoint in {folder}.",
+            "Give the folder that holds step-*.ckpt (a run's nerfstudio_models), or leave out "
+            "--load-dir to train from the start.",
+        )
+    for _, path in reversed(candidates):
+        try:
+            return read_checkpoint(path), path
+        except UserError as error:
+            tell(f"Passing over an unreadable checkpoint: {error.cause}")
+    raise UserError(
+        f"None of the {len(candidates)} checkpoints in {folder} can be read.",
+        "Leave out --load-dir to train from the start.",
+    )
+
+
+def read_checkpoint(path: Path) -> dict[str, Any]:
+    """Read one checkpoint on the CPU with safe loading; raises UserError if that fails."""
+    if not path.is_file():
+        raise UserError(f"There is no checkpoint {path}.", "Check --load-checkpoint/--load-step.")
+    try:
+        with zipfile.ZipFile(path) as archive:
+            damaged = archive.testzip()
+        if damaged is not None:
+            raise ValueError(f"{damaged} is damaged")
+        state = torch.load(path, map_location="cpu", weights_only=True)
+        missing = _REQUIRED - state.keys()
+        if missing:
+            raise ValueError(f"{', '.join(sorted(missing))} missing")
+    except Exception as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise UserError(
+            f"{path} cannot be read ({reason}).", "Resume from an older checkpoint."
+        ) from error
+    return state
+
+
+def _require_space(folder: Path, needed: int) -> None:
+    free = shutil.disk_usage(folder).free
+    if free < needed:
+        raise UserError(
+            f"A checkpoint of {needed / 1e6:.0f} MB does not fit into the {free / 1e6:.0f} MB "
+            f"free under {folder}.",
+            f"Free space and resume with --load-dir {folder}; the checkpoints there are untouched.",
+        )
+
+
+def _sync_folder(folder: Path) -> None:
+    """Make a rename last through a power cut, where the system lets folders be synced."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _tensors(state: Any) -> Iterator[torch.Tensor]:
+    if isinstance(state, torch.Tensor):
+        yield state
+    elif isinstance(state, dict):
+        for value in state.values():
+            yield from _tensors(value)
+    elif isinstance(state, list | tuple):
+        for value in state:
+            yield from _tensors(value)

@@ -1,0 +1,203 @@
+"""Batches of whole frames for nerfstudio's pipeline, decoded in the background."""
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal, Protocol
+
+import torch
+import tyro
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.data.datamanagers.base_datamanager import DataManager
+from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
+from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
+from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader
+from torch.nn import Parameter
+
+from rgbavatar_ns.data import ImageCache, OfflineOrder
+from rgbavatar_ns.plugin.dataparser import (
+    FrameDataset,
+    RGBAvatarDataParser,
+    RGBAvatarDataParserConfig,
+)
+from rgbavatar_ns.plugin.errors import install_user_error_hook
+
+_MIB = 1 << 20
+
+
+class FrameSampler(Protocol):
+    """Which frames a training step sees."""
+
+    def batch(self, step: int) -> list[int]:
+        """Positions in the dataset of the frames of `step`."""
+        ...
+
+
+@dataclass
+class RGBAvatarDataManagerConfig(FullImageDatamanagerConfig):
+    """Batches of different frames of one dataset.
+
+    nerfstudio's `ns-render dataset` insists on a relative of its own full-image config; what
+    that config has and this one does not use is kept off the command line.
+    """
+
+    _target: type = field(default_factory=lambda: RGBAvatarDataManager)
+    data: Path | None = None
+    """Dataset folder; `--data` sets it."""
+    dataparser: RGBAvatarDataParserConfig = field(default_factory=RGBAvatarDataParserConfig)
+    """How the folder is read."""
+    batch_size: int = 10
+    """Frames a step, all different (paper: 10)."""
+    sampling: Literal["offline"] = "offline"
+    """Order of the frames: `offline` draws a fresh permutation of all frames every epoch."""
+    cache_mib: int = 1024
+    """Budget for decoded images in MiB; what does not fit is decoded again when it is needed."""
+    decoding_threads: int = 2
+    """Background threads that decode images."""
+    prefetch_steps: int = 2
+    """Steps whose images are decoded ahead."""
+    seed: int | None = None
+    """Seed of the frame order; by default that of the run, `--machine.seed`."""
+    masks_on_gpu: tyro.conf.Suppress[bool] = False
+    images_on_gpu: tyro.conf.Suppress[bool] = False
+    camera_res_scale_factor: tyro.conf.Suppress[float] = 1.0
+    eval_num_images_to_sample_from: tyro.conf.Suppress[int] = -1
+    eval_num_times_to_repeat_images: tyro.conf.Suppress[int] = -1
+    eval_image_indices: tyro.conf.Suppress[tuple[int, ...] | None] = None
+    cache_images: tyro.conf.Suppress[Literal["cpu", "gpu"]] = "cpu"
+    cache_images_type: tyro.conf.Suppress[Literal["uint8", "float32"]] = "uint8"
+    max_thread_workers: tyro.conf.Suppress[int | None] = None
+    train_cameras_sampling_strategy: tyro.conf.Suppress[Literal["random", "fps"]] = "random"
+    train_cameras_sampling_seed: tyro.conf.Suppress[int] = 0
+    fps_reset_every: tyro.conf.Suppress[int] = 100
+
+
+def frame_sampler(
+    config: RGBAvatarDataManagerConfig, positions: tuple[int, ...], seed: int
+) -> FrameSampler:
+    """The sampling strategy that `config.sampling` names, over the training frames.
+
+    The place for every strategy. `offline` is a pure function of (seed, step), so resuming needs
+    no state; local and global pools (`rgbavatar_ns.data.LocalGlobalPools`) are fed by a stream of
+    frames and keep their own.
+    """
+    return OfflineOrder(positions, min(config.batch_size, len(positions)), seed)
+
+
+class RGBAvatarDataManager(DataManager):
+    """Serves frames as (nerfstudio cameras with theta, uint8 RGBA images).
+
+    Training frames come in batches of different frames through the image cache; held-out frames
+    come in batches for the evaluation loss and singly for metrics.
+    """
+
+    config: RGBAvatarDataManagerConfig
+    train_dataset: FrameDataset
+    eval_dataset: FrameDataset
+    train_dataparser_outputs: DataparserOutputs
+
+    def __init__(
+        self,
+        config: RGBAvatarDataManagerConfig,
+        device: torch.device | str = "cpu",
+        test_mode: Literal["test", "val", "inference", "train"] = "val",
+        world_size: int = 1,
+        local_rank: int = 0,
+        **_: Any,
+    ) -> None:
+        install_user_error_hook()
+        self.config = config
+        self.device = device
+        self.test_mode = test_mode
+        self.test_split = "val" if test_mode == "val" else "test"
+        self.world_size = world_size
+        self.local_rank = local_rank
+        if config.data is not None:
+            config.dataparser.data = Path(config.data)
+        self.dataparser: RGBAvatarDataParser = config.dataparser.setup()
+        self.includes_time = self.dataparser.includes_time
+        self.train_dataparser_outputs = self.dataparser.get_dataparser_outputs("train")
+        self.train_dataset = self._dataset("train", self.train_dataparser_outputs)
+        self.eval_dataset = self._dataset(
+            "test", self.dataparser.get_dataparser_outputs(self.test_split)
+        )
+        super().__init__()
+
+    def _dataset(self, split: str, outputs: DataparserOutputs) -> FrameDataset:
+        return FrameDataset(outputs, self.dataparser.tracked, self.dataparser.positions(split))
+
+    def setup_train(self) -> None:
+        """Put the frame order in place; images are decoded when the first step asks."""
+        tracked, config = self.dataparser.tracked, self.config
+        seed = 0 if config.seed is None else config.seed
+        self._train_order = frame_sampler(config, tuple(tracked.train), seed)
+        self._train_cameras = self.train_dataset.cameras.to(self.device)
+        self._train_row = {position: row for row, position in enumerate(tracked.train)}
+
+    def setup_eval(self) -> None:
+        """Put the order of the held-out frames in place."""
+        tracked, config = self.dataparser.tracked, self.config
+        batch_size = min(config.batch_size, len(tracked.test))
+        self._eval_order = OfflineOrder(tracked.test, batch_size, 0)
+        self._eval_cameras = self.eval_dataset.cameras.to(self.device)
+        self._eval_row = {position: row for row, position in enumerate(tracked.test)}
+
+    @cached_property
+    def image_cache(self) -> ImageCache:
+        """Decoded images of the whole dataset, within the budget."""
+        return ImageCache(
+            self.dataparser.tracked,
+            self.config.cache_mib * _MIB,
+            num_workers=self.config.decoding_threads,
+        )
+
+    def next_train(self, step: int) -> tuple[Cameras, dict[str, Any]]:
+        """Cameras and RGBA images of the training frames of `step`, a function of it alone."""
+        positions = self._train_order.batch(step)
+        images = self.image_cache.get(positions)
+        for ahead in range(1, self.config.prefetch_steps + 1):
+            self.image_cache.prefetch(self._train_order.batch(step + ahead))
+        rows = torch.tensor([self._train_row[position] for position in positions])
+        batch = {"image": images.to(self.device), "position": positions, "step": step}
+        return self._train_cameras[rows.to(self.device)], batch
+
+    def next_eval(self, step: int) -> tuple[Cameras, dict[str, Any]]:
+        """Cameras and RGBA images of some held-out frames, in the same form as a training batch."""
+        positions = self._eval_order.batch(step)
+        rows = torch.tensor([self._eval_row[position] for position in positions])
+        images = self.image_cache.get(positions)
+        batch = {"image": images.to(self.device), "position": positions, "step": step}
+        return self._eval_cameras[rows.to(self.device)], batch
+
+    def next_eval_image(self, step: int) -> tuple[Cameras, dict[str, Any]]:
+        """One held-out frame: its camera, and its picture over black [H, W, 3]."""
+        row = self._eval_row[self._eval_order.batch(step)[0]]
+        return self.eval_dataloader.get_camera(row)
+
+    @cached_property
+    def eval_dataloader(self) -> FixedIndicesEvalDataloader:
+        """Every held-out frame in order."""
+        return FixedIndicesEvalDataloader(self.eval_dataset, device=self.device)
+
+    @property
+    def fixed_indices_eval_dataloader(self) -> FixedIndicesEvalDataloader:
+        """Every held-out frame in order; the name that nerfstudio's evaluation asks for."""
+        return self.eval_dataloader
+
+    def get_train_rays_per_batch(self) -> int:
+        """Pixels of a training batch."""
+        tracked = self.dataparser.tracked
+        return min(self.config.batch_size, len(tracked.train)) * tracked.width * tracked.height
+
+    def get_eval_rays_per_batch(self) -> int:
+        """Pixels of an evaluation batch."""
+        tracked = self.dataparser.tracked
+        return min(self.config.batch_size, len(tracked.test)) * tracked.width * tracked.height
+
+    def get_datapath(self) -> Path:
+        """The dataset's folder, beside which the viewer keeps camera paths."""
+        return self.config.dataparser.data
+
+    def get_param_groups(self) -> dict[str, list[Parameter]]:
+        """Nothing here is learnt."""
+        return {}

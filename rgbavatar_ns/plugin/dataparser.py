@@ -1,0 +1,124 @@
+"""nerfstudio's view of a dataset in the project's own format."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from jaxtyping import Float
+from nerfstudio.data.dataparsers.base_dataparser import (
+    DataParser,
+    DataParserConfig,
+    DataparserOutputs,
+)
+from nerfstudio.data.datasets.base_dataset import InputDataset
+from nerfstudio.data.scene_box import SceneBox
+from torch import Tensor
+
+from rgbavatar_ns.data import TrackedDataset, load_dataset
+from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.head import HeadArrays, ThetaLayout
+from rgbavatar_ns.plugin.cameras import to_nerfstudio
+
+_SCENE_RADIUS_M = 0.5
+
+
+@dataclass(frozen=True)
+class Subject:
+    """What the model needs to know of a dataset: the head and every frame's theta."""
+
+    arrays: HeadArrays
+    identity: Float[Tensor, "I"]
+    layout: ThetaLayout
+    theta: Float[Tensor, "F H"]
+    frame_index: tuple[int, ...]
+    camera_center: Float[Tensor, "3"]
+    """Where the first frame was filmed from, in the head's world."""
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> "Subject":
+        """nerfstudio copies metadata deeply; nothing here is ever changed, so share it."""
+        return self
+
+
+@dataclass
+class RGBAvatarDataParserConfig(DataParserConfig):
+    """Reads a dataset folder made by `rgbavatar track`, `rgbavatar demo-data` or an importer."""
+
+    _target: type = field(default_factory=lambda: RGBAvatarDataParser)
+    data: Path = Path()
+    """Folder that holds dataset.json."""
+
+
+class RGBAvatarDataParser(DataParser):
+    """Splits a tracked dataset into training frames and the held-out last ones.
+
+    `train` are the training frames; `val` and `test` are the held-out ones.
+    """
+
+    config: RGBAvatarDataParserConfig
+    includes_time: bool = True
+
+    def __init__(self, config: RGBAvatarDataParserConfig) -> None:
+        super().__init__(config)
+        self._tracked: TrackedDataset | None = None
+
+    @property
+    def tracked(self) -> TrackedDataset:
+        """The dataset, validated and read on first use; raises UserError on any problem."""
+        if self._tracked is None:
+            if self.config.data == Path():
+                raise UserError(
+                    "No dataset was named.",
+                    "Pass --data FOLDER; `rgbavatar demo-data FOLDER` makes one to try.",
+                )
+            self._tracked = load_dataset(self.config.data)
+        return self._tracked
+
+    def positions(self, split: str) -> tuple[int, ...]:
+        """Positions in the dataset of the frames of nerfstudio's `split`."""
+        return self.tracked.train if split == "train" else self.tracked.test
+
+    def _generate_dataparser_outputs(self, split: str = "train", **_: Any) -> DataparserOutputs:
+        tracked, positions = self.tracked, self.positions(split)
+        chosen = torch.tensor(positions, dtype=torch.long)
+        cameras = tracked.cameras
+        every_frame = to_nerfstudio(
+            cameras,
+            theta=tracked.theta,
+            position=torch.arange(len(tracked), dtype=torch.float32)[:, None],
+            times=torch.linspace(0.0, 1.0, len(tracked)),
+        )
+        radius = _SCENE_RADIUS_M
+        return DataparserOutputs(
+            image_filenames=[tracked.image_paths[position] for position in positions],
+            cameras=every_frame[chosen],
+            alpha_color=torch.zeros(3),
+            scene_box=SceneBox(aabb=torch.tensor([[-radius] * 3, [radius] * 3])),
+            metadata={
+                "subject": Subject(
+                    arrays=tracked.arrays,
+                    identity=tracked.identity,
+                    layout=tracked.layout,
+                    theta=tracked.theta,
+                    frame_index=tuple(tracked.frame_index),
+                    camera_center=torch.linalg.inv(cameras.world_to_camera[0])[:3, 3],
+                )
+            },
+        )
+
+
+class FrameDataset(InputDataset):
+    """Single frames for evaluation, rendering and the viewer: RGB over black, in [0, 1]."""
+
+    def __init__(
+        self, outputs: DataparserOutputs, tracked: TrackedDataset, positions: tuple[int, ...]
+    ) -> None:
+        super().__init__(outputs)
+        self._tracked = tracked
+        self._positions = positions
+
+    def get_numpy_image(self, image_idx: int) -> npt.NDArray[np.uint8]:
+        """RGBA of one frame [H, W, 4]; raises UserError on a broken file or another size."""
+        return np.asarray(self._tracked.read_image(self._positions[image_idx]))

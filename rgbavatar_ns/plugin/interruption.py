@@ -1,0 +1,60 @@
+"""Ctrl-C and SIGTERM as a wish to stop after the present step."""
+
+import signal
+import threading
+from types import FrameType, TracebackType
+
+
+class StopRequest:
+    """While entered, the first SIGINT or SIGTERM is noted instead of breaking the step.
+
+    A second signal acts as usual. Outside the main thread, where Python handles no signals,
+    entering does nothing.
+    """
+
+    def __init__(self) -> None:
+        self.signal_number: int | None = None
+        self._event = threading.Event()
+        self._before: dict[int, object] = {}
+
+    @property
+    def requested(self) -> bool:
+        """Whether a stop was asked for."""
+        return self._event.is_set()
+
+    @property
+    def exit_code(self) -> int:
+        """128 + the signal's number, as shells report it: 130 after Ctrl-C, 143 after SIGTERM."""
+        return 0 if self.signal_number is None else 128 + self.signal_number
+
+    def request(self) -> None:
+        """Ask for a stop from the program itself; the exit code stays 0."""
+        self._event.set()
+
+    def wait(self, seconds: float) -> bool:
+        """Sleep until a stop is asked for, at most `seconds`; True if it was."""
+        return self._event.wait(seconds)
+
+    def __enter__(self) -> "StopRequest":
+        if threading.current_thread() is threading.main_thread():
+            for number in (signal.SIGINT, signal.SIGTERM):
+                self._before[number] = signal.signal(number, self._note)
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._restore()
+
+    def _note(self, number: int, frame: FrameType | None) -> None:
+        self.signal_number = number
+        self._restore()
+        self._event.set()
+
+    def _restore(self) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)  # type: ignore[arg-type]
+        self._before.clear()

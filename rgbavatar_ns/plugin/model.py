@@ -1,0 +1,215 @@
+"""nerfstudio's model around an `Avatar`; everything that is the method happens there."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.engine.callbacks import (
+    TrainingCallback,
+    TrainingCallbackAttributes,
+    TrainingCallbackLocation,
+)
+from nerfstudio.models.base_model import Model, ModelConfig
+from torch import Tensor
+from torch.nn import Parameter
+
+from rgbavatar_ns.avatar import Avatar, AvatarConfig
+from rgbavatar_ns.avatar.color_init import ColorInitSchedule
+from rgbavatar_ns.avatar.losses import (
+    LPIPSLoss,
+    composite,
+    l1_loss,
+    random_backgrounds,
+    rgba_to_float,
+)
+from rgbavatar_ns.avatar.metrics import LPIPSMetric, evaluate_images
+from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.head import HeadModel
+from rgbavatar_ns.plugin.cameras import from_nerfstudio, head_to_nerfstudio
+from rgbavatar_ns.plugin.checkpoint_state import model_state, require_same_layout
+from rgbavatar_ns.plugin.dataparser import Subject
+from rgbavatar_ns.plugin.viewer_panel import ViewerPanel, Viewpoint
+
+Outputs = dict[str, Tensor]
+
+# The viewer starts in front of the training cameras, whose frames it also draws.
+_NEARER = 0.9
+
+
+@dataclass
+class RGBAvatarModelConfig(ModelConfig):
+    """The avatar and how it is trained."""
+
+    _target: type = field(default_factory=lambda: RGBAvatarModel)
+    avatar: AvatarConfig = field(default_factory=AvatarConfig)
+    """Sizes, variants and initial values of the avatar."""
+    initialize_colors: bool = True
+    """Give each Gaussian the mean colour of the pixels it covers when it is first seen."""
+    lpips_weight: float = 0.0
+    """Weight of the LPIPS loss (paper: 0, and 0.05 for its sharper variant)."""
+    lpips_start_step: int = 0
+    """Step from which the LPIPS loss counts."""
+    lpips_metric: bool = True
+    """Whether `ns-eval` computes LPIPS; its network is downloaded once (528 MB)."""
+    rasterizer: str = "auto"
+    """Backend of the rasterizer, one of `rgbavatar_ns.kernels.available_backends()` or auto."""
+    seed: int | None = None
+    """Seed of initial values and backgrounds; by default that of the run, `--machine.seed`."""
+    enable_collider: bool = False
+    """Part of nerfstudio's ray-based models; not used."""
+
+
+class RGBAvatarModel(Model):
+    """Draws the avatar for nerfstudio's cameras, which carry theta as metadata.
+
+    A camera without theta (the viewer's, a camera path's) shows the frame that the viewer panel
+    has chosen.
+    """
+
+    config: RGBAvatarModelConfig
+    frame_theta: Tensor
+
+    def populate_modules(self) -> None:
+        """Build the avatar of the dataset's subject."""
+        super().populate_modules()
+        subject = self.kwargs["metadata"]["subject"]
+        assert isinstance(subject, Subject)
+        self.subject = subject
+        self.seed = 0 if self.config.seed is None else self.config.seed
+        self.avatar = Avatar(
+            HeadModel(subject.arrays), subject.identity, self.config.avatar, seed=self.seed
+        )
+        self.register_buffer("frame_theta", subject.theta, persistent=False)
+        self.viewer_panel = ViewerPanel(len(subject.theta), _viewpoint(self.avatar, subject))
+        self.color_schedule = ColorInitSchedule()
+        self.lpips_loss = LPIPSLoss()
+        self.lpips_metric: LPIPSMetric | None = None
+
+    def get_param_groups(self) -> dict[str, list[Parameter]]:
+        """The avatar's parameters under the names of the paper's learning rates."""
+        return self.avatar.parameter_groups()
+
+    def get_outputs(self, ray_bundle: RayBundle | Cameras) -> Outputs:
+        """Draw B cameras: rgb over black [B H W 3], accumulation and depth in metres [B H W 1].
+
+        Depth is along the camera's z, and only computed outside training. The viewer's cameras
+        are drawn over the viewer panel's background.
+        """
+        if not isinstance(ray_bundle, Cameras):
+            raise UserError(
+                "This method draws whole images and cannot render single rays.",
+                "Leave out options that trace rays, such as --render-nearest-camera.",
+            )
+        cameras = ray_bundle if ray_bundle.shape else ray_bundle.reshape((1,))
+        metadata = cameras.metadata or {}
+        theta, background = metadata.get("theta"), None
+        if theta is None:
+            position = self.viewer_panel.position(cameras.times)
+            theta = self.frame_theta[position].expand(len(cameras), -1)
+            background = theta.new_tensor(self.viewer_panel.background_color())
+        drawn = self.avatar.render(
+            theta,
+            from_nerfstudio(cameras),
+            background,
+            backend=self.config.rasterizer,
+            with_depth=not self.training,
+        )
+        outputs = {"rgb": drawn.image, "accumulation": drawn.alpha}
+        if drawn.depth is not None:
+            outputs["depth"] = _filled_depth(drawn.depth, drawn.alpha)
+        if self.training:
+            self._cameras = cameras
+        return outputs
+
+    @torch.no_grad()
+    def get_outputs_for_camera(self, camera: Cameras, obb_box: Any = None) -> Outputs:
+        """Draw one camera: [H W C] images. nerfstudio's crop box does not apply and is ignored."""
+        outputs = self.get_outputs(camera.to(self.device))
+        return {name: image[0] for name, image in outputs.items()}
+
+    def get_loss_dict(
+        self,
+        outputs: Outputs,
+        batch: dict[str, Any],
+        metrics_dict: dict[str, Tensor] | None = None,
+    ) -> dict[str, Tensor]:
+        """L1 of both images laid over one random background an image, and LPIPS if it is on."""
+        step = batch["step"]
+        target_rgba = rgba_to_float(batch["image"].to(self.device))
+        background = random_backgrounds(step, len(target_rgba), self.seed).to(self.device)
+        seen_through = 1.0 - outputs["accumulation"]
+        image = outputs["rgb"] + seen_through * background[:, None, None]
+        target = composite(target_rgba, background)
+        losses = {"l1": l1_loss(image, target)}
+        if self.config.lpips_weight > 0 and step >= self.config.lpips_start_step:
+            losses["lpips"] = self.config.lpips_weight * self.lpips_loss(image, target)
+        self._target_rgba = target_rgba
+        return losses
+
+    def get_training_callbacks(
+        self, training_callback_attributes: TrainingCallbackAttributes
+    ) -> list[TrainingCallback]:
+        """Colour initialisation after the optimiser's step."""
+        if not self.config.initialize_colors:
+            return []
+        after = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]
+        return [TrainingCallback(where_to_run=after, func=self.initialize_colors)]
+
+    def initialize_colors(self, step: int) -> None:
+        """Initialise the colours of Gaussians that the batch of `step` shows for the first time."""
+        if not self.color_schedule.due(step) or bool(self.avatar.color_initialized.all()):
+            return
+        theta = (self._cameras.metadata or {})["theta"]
+        self.avatar.initialize_colors(theta, from_nerfstudio(self._cameras), self._target_rgba)
+
+    def get_image_metrics_and_images(
+        self, outputs: Outputs, batch: dict[str, Any]
+    ) -> tuple[dict[str, float], dict[str, Tensor]]:
+        """PSNR, SSIM and, if it is there, LPIPS of one image; truth, avatar, error x 4 in a row."""
+        image = outputs["rgb"][None]
+        truth = batch["image"].to(self.device)[None]
+        opaque = torch.cat([truth[..., :3], torch.ones_like(truth[..., :1])], dim=-1)
+        scores = evaluate_images(image, opaque, self.lpips_metric).to_dict()
+        metrics = {name: value for name, value in scores.items() if isinstance(value, float)}
+        error = ((image - truth).abs() * 4).clamp(0, 1)
+        row = torch.cat([truth, image.clamp(0, 1), error], dim=2)[0]
+        return metrics, {"truth_avatar_error": row}
+
+    def get_rgba_image(self, outputs: Outputs, output_name: str = "rgb") -> Tensor:
+        """Straight-alpha RGBA [H W 4] of an image over black."""
+        alpha = outputs["accumulation"]
+        return torch.cat([(outputs[output_name] / alpha.clamp(min=1e-6)).clamp(0, 1), alpha], -1)
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """What rebuilds the avatar without this dataset: its make, and every frame's theta."""
+        return model_state(self.avatar, self.subject)
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Nothing to restore: `load_state_dict` has compared it with this dataset's subject."""
+
+    def load_state_dict(
+        self, state_dict: dict[str, Any], strict: bool = True, assign: bool = False
+    ) -> Any:
+        """Load parameters; raises UserError, naming both, if theta's layout is another one."""
+        require_same_layout(state_dict, self.avatar)
+        return super().load_state_dict(state_dict, strict=strict, assign=assign)
+
+
+def _filled_depth(
+    depth: Float[Tensor, "B H W 1"], alpha: Float[Tensor, "B H W 1"]
+) -> Float[Tensor, "B H W 1"]:
+    """Put what is not covered behind everything else, as the viewer's compositing expects."""
+    return torch.where(alpha > 0.5, depth, depth.amax())
+
+
+@torch.no_grad()
+def _viewpoint(avatar: Avatar, subject: Subject) -> Viewpoint:
+    """From the first frame's camera, a little nearer than it, at the middle of the head."""
+    means = avatar.gaussians(subject.theta[:1]).means[0]
+    middle = (means.amin(0) + means.amax(0)) / 2
+    eye = torch.lerp(middle, subject.camera_center.to(middle), _NEARER)
+    ends = head_to_nerfstudio(torch.stack([eye, middle])).tolist()
+    return Viewpoint(eye=tuple(ends[0]), look_at=tuple(ends[1]))

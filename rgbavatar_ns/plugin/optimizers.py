@@ -1,0 +1,61 @@
+"""Adam and learning-rate schedules whose checkpoints hold nothing but tensors and numbers."""
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from nerfstudio.engine.optimizers import OptimizerConfig
+from nerfstudio.engine.schedulers import Scheduler, SchedulerConfig
+from torch.optim.lr_scheduler import LambdaLR
+
+from rgbavatar_ns.avatar import LEARNING_RATES
+
+
+@dataclass
+class AdamConfig(OptimizerConfig):
+    """Adam with one pass over memory per step."""
+
+    _target: type = torch.optim.Adam
+    lr: float = 1e-3
+    """Learning rate per step."""
+    eps: float = 1e-15
+    """Added to the root of the second moment; tiny, as in Gaussian splatting."""
+    max_norm: float | None = None
+    """Largest norm of a group's gradient; unlimited by default."""
+    fused: bool = True
+    """Use PyTorch's fused kernel, on a CPU too."""
+
+
+@dataclass
+class ExponentialConfig(SchedulerConfig):
+    """From the optimizer's rate to `factor` times it, exponentially, then constant.
+
+    nerfstudio's own schedule computes with numpy, whose scalars end up in the checkpoint and
+    make it unreadable for torch's safe loading.
+    """
+
+    _target: type = field(default_factory=lambda: Exponential)
+    factor: float = 1.0
+    """Final learning rate divided by the first one."""
+    steps: int = 5000
+    """Steps until the final rate is reached."""
+
+
+class Exponential(Scheduler):
+    """The schedule of `ExponentialConfig`."""
+
+    config: ExponentialConfig
+
+    def get_scheduler(self, optimizer: torch.optim.Optimizer, lr_init: float) -> LambdaLR:
+        """Torch's scheduler for `optimizer`; `lr_init` is taken from the optimizer itself."""
+        log_factor, steps = math.log(self.config.factor), max(1, self.config.steps)
+        return LambdaLR(optimizer, lambda step: math.exp(log_factor * min(step / steps, 1.0)))
+
+
+def paper_optimizers() -> dict[str, Any]:
+    """One Adam a parameter group at the paper's constant learning rates (supplement, table)."""
+    return {
+        name: {"optimizer": AdamConfig(lr=rate), "scheduler": None}
+        for name, rate in LEARNING_RATES.items()
+    }

@@ -1,0 +1,49 @@
+"""nerfstudio's pipeline with this method's data and model, and LPIPS at evaluation."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
+
+from rgbavatar_ns.avatar.metrics import LPIPSMetric
+from rgbavatar_ns.plugin.datamanager import RGBAvatarDataManager, RGBAvatarDataManagerConfig
+from rgbavatar_ns.plugin.model import RGBAvatarModel, RGBAvatarModelConfig
+
+
+@dataclass
+class RGBAvatarPipelineConfig(VanillaPipelineConfig):
+    """Where the data comes from and what is trained on it."""
+
+    _target: type = field(default_factory=lambda: RGBAvatarPipeline)
+    datamanager: RGBAvatarDataManagerConfig = field(default_factory=RGBAvatarDataManagerConfig)
+    """The data."""
+    model: RGBAvatarModelConfig = field(default_factory=RGBAvatarModelConfig)
+    """The model."""
+
+
+class RGBAvatarPipeline(VanillaPipeline):
+    """Adds to nerfstudio's pipeline what `ns-eval` reports about LPIPS."""
+
+    config: RGBAvatarPipelineConfig
+    datamanager: RGBAvatarDataManager
+    model: RGBAvatarModel
+
+    def get_average_eval_image_metrics(
+        self, step: int | None = None, output_path: Path | None = None, get_std: bool = False
+    ) -> dict[str, Any]:
+        """Means over the held-out frames.
+
+        Under `ns-eval` these contain LPIPS, or under `lpips_unavailable` the reason why not.
+        """
+        if self.test_mode != "test":
+            return super().get_average_eval_image_metrics(step, output_path, get_std)
+        if self.config.model.lpips_metric:
+            self.model.lpips_metric = LPIPSMetric()
+        metrics = super().get_average_eval_image_metrics(step, output_path, get_std)
+        lpips = self.model.lpips_metric
+        if lpips is None:
+            metrics["lpips_unavailable"] = "switched off with --pipeline.model.lpips-metric False"
+        elif lpips.unavailable is not None:
+            metrics["lpips_unavailable"] = lpips.unavailable
+        return metrics
