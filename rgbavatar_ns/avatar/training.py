@@ -1,7 +1,7 @@
 """The training step and a minimal loop around it: the paper's offline training in one function."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from jaxtyping import Float, UInt8
@@ -38,7 +38,7 @@ class TrainingOptions:
     """Weight of the LPIPS loss (paper's variant: .05); 0 needs no LPIPS network."""
     lpips_start_step: int = 0
     """First step with the LPIPS loss (release: after 20k images)."""
-    color_init: ColorInitSchedule | None = ColorInitSchedule()
+    color_init: ColorInitSchedule | None = field(default_factory=ColorInitSchedule)
     """When colours are initialised; None leaves them grey."""
 
 

@@ -1,0 +1,241 @@
+import dataclasses
+
+import pytest
+import roma
+import torch
+
+from rgbavatar_ns.avatar import LEARNING_RATES, Avatar, AvatarConfig
+from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.head import ThetaField, ThetaLayout
+
+from .small_head import (
+    front_camera,
+    random_theta,
+    small_head,
+    small_identity,
+)
+
+VARIANTS = ("normalized", "raw", "orthonormal")
+
+
+def covariances(gaussians):
+    """R diag(s^2) R^T of every Gaussian, by another library (roma, xyzw)."""
+    quats_xyzw = gaussians.quats_wxyz.roll(-1, -1)
+    rotation = roma.unitquat_to_rotmat(quats_xyzw / quats_xyzw.norm(dim=-1, keepdim=True))
+    return (
+        rotation
+        @ torch.diag_embed(gaussians.scales.expand_as(gaussians.means) ** 2)
+        @ (rotation.transpose(-1, -2))
+    )
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_rigid_head_motion_moves_gaussians_rigidly(make_avatar, variant):
+    avatar = make_avatar(random=True, dtype=torch.float64, tangent_variant=variant)
+    layout = avatar.layout
+    still = random_theta(layout, 2, dtype=torch.float64)
+    still[:, layout.slice("rotation")] = 0
+    still[:, layout.slice("translation")] = 0
+    moved = still.clone()
+    moved[:, layout.slice("rotation")] = torch.tensor([0.3, -0.8, 0.2], dtype=torch.float64)
+    moved[:, layout.slice("translation")] = torch.tensor([0.1, -0.2, 0.3], dtype=torch.float64)
+    psi = torch.randn(2, 3, dtype=torch.float64)
+    before, after = avatar.gaussians(still, psi), avatar.gaussians(moved, psi)
+
+    # The motion as the mesh makes it: rotation about the root joint, then translation.
+    rotation = roma.rotvec_to_rotmat(moved[0, layout.slice("rotation")])
+    vertices = [avatar.head(theta, avatar.identity) for theta in (still, moved)]
+    offset = vertices[1][:, :1] - vertices[0][:, :1] @ rotation.T
+    torch.testing.assert_close(after.means, before.means @ rotation.T + offset)
+    torch.testing.assert_close(
+        covariances(after), rotation @ covariances(before) @ rotation.T, atol=1e-12, rtol=1e-9
+    )
+    torch.testing.assert_close(after.colors, before.colors)
+
+
+def test_untrained_gaussians_lie_on_the_mesh(make_avatar):
+    avatar = make_avatar(dtype=torch.float64)
+    theta = random_theta(avatar.layout, 2, dtype=torch.float64)
+    vertices = avatar.head(theta, avatar.identity)
+    triangle, weights = avatar.anchors.triangle_index, avatar.anchors.barycentric.double()
+    corners = vertices[:, avatar.head.faces[triangle].long()]
+    expected = torch.einsum("bncx,nc->bnx", corners, weights)
+    torch.testing.assert_close(avatar.gaussians(theta).means, expected)
+    # A position residual along the frame's third axis leaves the surface along its normal.
+    with torch.no_grad():
+        avatar.blendshapes.position[:, 2] = 1e-3
+    normal = torch.linalg.cross(
+        corners[:, :, 1] - corners[:, :, 0], corners[:, :, 2] - corners[:, :, 0], dim=-1
+    )
+    normal = normal / normal.norm(dim=-1, keepdim=True)
+    torch.testing.assert_close(avatar.gaussians(theta).means, expected + 1e-3 * normal)
+
+
+def test_quaternions_turn_the_third_axis_onto_the_normal(make_avatar):
+    for variant in VARIANTS:
+        avatar = make_avatar(dtype=torch.float64, tangent_variant=variant)
+        theta = random_theta(avatar.layout, 1, dtype=torch.float64)
+        quats = avatar.gaussians(theta).quats_wxyz
+        third = roma.unitquat_to_rotmat(quats.roll(-1, -1))[..., 2]
+        with torch.no_grad():
+            base = avatar.gaussians(theta).means
+            avatar.blendshapes.position[:, 2] = 1.0
+            normal = avatar.gaussians(theta).means - base
+        torch.testing.assert_close(third, normal)
+
+
+def test_scales_and_opacities_are_shared_by_the_batch(make_avatar):
+    avatar = make_avatar(random=True)
+    gaussians = avatar.gaussians(random_theta(avatar.layout, 3))
+    assert gaussians.means.shape == (3, avatar.num_gaussians, 3)
+    assert gaussians.scales.shape == (1, avatar.num_gaussians, 3)
+    assert gaussians.opacities.shape == (1, avatar.num_gaussians)
+
+
+def test_scale_follows_the_triangle_only_when_asked(make_avatar):
+    fixed = make_avatar(dtype=torch.float64)
+    following = make_avatar(dtype=torch.float64, scale_with_triangle=True)
+    rest = torch.zeros(1, fixed.layout.size, dtype=torch.float64)
+    torch.testing.assert_close(following.gaussians(rest).scales, fixed.gaussians(rest).scales)
+    # Bending the sheet stretches its triangles by the ratio of side lengths at most.
+    bent = random_theta(fixed.layout, 1, dtype=torch.float64)
+    ratio = following.gaussians(bent).scales / fixed.gaussians(bent).scales
+    vertices = [following.head(theta, following.identity)[0] for theta in (rest, bent)]
+    areas = []
+    for posed in vertices:
+        a, b, c = posed[following.head.faces.long()].unbind(1)
+        areas.append(torch.linalg.cross(b - a, c - a, dim=-1).norm(dim=-1))
+    expected = (areas[1] / areas[0]).sqrt()[following.anchors.triangle_index]
+    torch.testing.assert_close(ratio, expected[None, :, None].expand_as(ratio))
+
+
+def test_scale_from_texel_spacing_is_half_the_distance_of_neighbours(make_avatar):
+    avatar = make_avatar(dtype=torch.float32, uv_resolution=40, scale_from_texel_spacing=True)
+    means = avatar.gaussians(torch.zeros(1, avatar.layout.size)).means[0].detach()
+    nearest = (torch.cdist(means, means) + 10 * torch.eye(len(means))).amin(1)
+    ratio = avatar.blendshapes.log_scale.exp()[:, 0].detach() / nearest
+    assert 0.4 < ratio.median() < 0.7
+
+
+def test_batched_render_equals_a_loop(make_avatar):
+    avatar = make_avatar(random=True)
+    theta, camera = random_theta(avatar.layout, 3), front_camera(24)
+    background = torch.rand(3, 3)
+    batch = avatar.render(theta, camera, background)
+    assert batch.alpha.amax() > 0.5
+    for b in range(3):
+        one = avatar.render(theta[b : b + 1], camera, background[b : b + 1])
+        torch.testing.assert_close(batch.image[b], one.image[0], atol=1e-5, rtol=1e-5)
+        torch.testing.assert_close(batch.alpha[b], one.alpha[0], atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize("kind", ["mlp", "linear"])
+def test_every_parameter_gets_a_gradient(make_avatar, kind):
+    avatar = make_avatar(random=True, weight_network=kind)
+    theta = random_theta(avatar.layout, 2)
+    rendered = avatar.render(theta, front_camera(24), torch.rand(2, 3))
+    (rendered.image * torch.rand(rendered.image.shape)).sum().backward()
+    for name, parameters in avatar.parameter_groups().items():
+        for parameter in parameters:
+            assert parameter.grad is not None, name
+            assert torch.isfinite(parameter.grad).all(), name
+            assert parameter.grad.abs().max() > 0, name
+    grouped = {id(p) for group in avatar.parameter_groups().values() for p in group}
+    assert grouped == {id(p) for p in avatar.parameters()}
+
+
+def test_gradients_match_finite_differences(make_avatar):
+    avatar = make_avatar(random=True, dtype=torch.float64, uv_resolution=3, num_bases=2)
+    theta = random_theta(avatar.layout, 1, dtype=torch.float64).requires_grad_()
+    shapes = avatar.blendshapes
+
+    def attributes(theta, *_):
+        gaussians = avatar.gaussians(theta)
+        return gaussians.means, gaussians.quats_wxyz, gaussians.colors, gaussians.scales
+
+    inputs = (theta, shapes.position, shapes.rotation_wxyz, shapes.basis_position)
+    assert torch.autograd.gradcheck(attributes, (*inputs, shapes.log_scale), atol=1e-6)
+
+
+def test_without_bases_there_are_no_basis_groups(make_avatar):
+    avatar = make_avatar(num_bases=0)
+    assert set(avatar.parameter_groups()) == {
+        "position",
+        "rotation",
+        "log_scale",
+        "opacity",
+        "color",
+    }
+    theta = random_theta(avatar.layout, 2)
+    assert avatar.weights(theta).shape == (2, 0)
+    assert avatar.render(theta, front_camera(16)).image.shape == (2, 16, 16, 3)
+
+
+def test_learning_rates_are_the_papers(make_avatar):
+    assert set(make_avatar().parameter_groups()) == set(LEARNING_RATES)
+    assert LEARNING_RATES["opacity"] == 0.25
+    for basis, base, ratio in (
+        ("basis_position", "position", 0.05),
+        ("basis_rotation", "rotation", 0.5),
+        ("basis_color", "color", 0.5),
+    ):
+        assert LEARNING_RATES[basis] == pytest.approx(ratio * LEARNING_RATES[base])
+
+
+def test_building_depends_on_the_seed_alone(make_avatar):
+    first = make_avatar(seed=3)
+    torch.manual_seed(99)
+    same, other = make_avatar(seed=3), make_avatar(seed=4)
+    theta = random_theta(first.layout, 2)
+    assert torch.equal(first.weights(theta), same.weights(theta))
+    assert not torch.equal(first.weights(theta), other.weights(theta))
+
+
+def test_theta_of_another_size_is_refused_with_the_layout(make_avatar):
+    avatar = make_avatar()
+    with pytest.raises(UserError, match=rf"theta has 5 values.*'small'.*{avatar.layout.size}"):
+        avatar.gaussians(torch.zeros(1, 5))
+    with pytest.raises(UserError, match="expression 4"):
+        avatar.weights(torch.zeros(1, 5))
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_theta_that_is_not_finite_is_refused(make_avatar, value):
+    avatar = make_avatar()
+    theta = torch.zeros(2, avatar.layout.size)
+    theta[1, 3] = value
+    with pytest.raises(UserError, match="NaN or infinite"):
+        avatar.render(theta, front_camera(8))
+
+
+def test_another_layout_is_refused_naming_both(make_avatar):
+    avatar = make_avatar()
+    avatar.require_layout(small_head().layout, "This dataset")
+    other = ThetaLayout(
+        (ThetaField("expression", 50, "linear"), ThetaField("jaw", 3, "axis_angle"))
+    )
+    with pytest.raises(UserError, match=r"clip\.json.*53 values.*expression 50.*expression 4"):
+        avatar.require_layout(other, "clip.json")
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"num_bases": -1},
+        {"uv_resolution": 0},
+        {"initial_opacity": 1.0},
+        {"initial_scale_m": 0.0},
+        {"weight_network": "deep"},
+        {"tangent_variant": "flat"},
+    ],
+)
+def test_settings_out_of_range_are_refused(change):
+    with pytest.raises(UserError, match=next(iter(change))):
+        dataclasses.replace(AvatarConfig(), **change)
+
+
+def test_float64_goes_through(make_avatar):
+    avatar = make_avatar(random=True, dtype=torch.float64)
+    theta = random_theta(avatar.layout, 1)
+    assert avatar.gaussians(theta).means.dtype == torch.float64
+    assert Avatar(small_head(), small_identity()).num_gaussians > 10_000

@@ -1,0 +1,91 @@
+import numpy as np
+import pytest
+import torch
+from scipy import stats
+
+from rgbavatar_ns.avatar import losses
+from rgbavatar_ns.avatar.losses import (
+    LPIPSLoss,
+    composite,
+    l1_loss,
+    random_backgrounds,
+    rgba_to_float,
+)
+from rgbavatar_ns.errors import UserError
+
+
+def test_composite_by_hand():
+    rgba = torch.tensor([[[[1.0, 0.0, 0.5, 0.25]]], [[[1.0, 0.0, 0.5, 1.0]]]])
+    background = torch.tensor([[0.2, 0.4, 0.8], [0.9, 0.9, 0.9]])
+    expected = torch.tensor([[[[0.4, 0.3, 0.725]]], [[[1.0, 0.0, 0.5]]]])
+    torch.testing.assert_close(composite(rgba, background), expected)
+
+
+def test_composite_over_one_color_for_all():
+    rgba = torch.rand(3, 4, 5, 4)
+    black = composite(rgba, torch.zeros(3))
+    torch.testing.assert_close(black, rgba[..., :3] * rgba[..., 3:])
+
+
+def test_8_bit_values_become_fractions():
+    rgba = torch.tensor([0, 51, 255, 128], dtype=torch.uint8).reshape(1, 1, 1, 4)
+    expected = torch.tensor([0.0, 0.2, 1.0, 128 / 255]).reshape(1, 1, 1, 4)
+    torch.testing.assert_close(rgba_to_float(rgba), expected)
+
+
+def test_l1_by_hand():
+    image = torch.zeros(1, 1, 2, 3)
+    target = torch.tensor([[[[0.1, -0.2, 0.3], [0.0, 0.0, 0.6]]]])
+    assert l1_loss(image, target).item() == pytest.approx(1.2 / 6)
+
+
+def test_backgrounds_depend_on_step_and_seed_alone():
+    torch.manual_seed(0)
+    first = random_backgrounds(7, 10, seed=3)
+    torch.manual_seed(1)
+    np.random.default_rng(0)
+    assert torch.equal(first, random_backgrounds(7, 10, seed=3))
+    assert not torch.equal(first, random_backgrounds(8, 10, seed=3))
+    assert not torch.equal(first, random_backgrounds(7, 10, seed=4))
+    assert len(first.unique()) == 30
+
+
+def test_backgrounds_are_uniform_over_steps():
+    values = torch.cat([random_backgrounds(step, 4) for step in range(500)]).flatten()
+    assert stats.kstest(values.double().numpy(), "uniform").pvalue > 1e-3
+
+
+def test_lpips_without_its_weights_names_the_remedy(monkeypatch):
+    def offline(*_args, **_options):
+        raise OSError("Name or service not known")
+
+    monkeypatch.setattr("torch.hub.load_state_dict_from_url", offline)
+    monkeypatch.setattr("torchvision.models._api.load_state_dict_from_url", offline)
+    loss = LPIPSLoss()
+    with pytest.raises(UserError, match=r"LPIPS \(vgg\) is unavailable.*internet"):
+        loss(torch.rand(1, 32, 32, 3), torch.rand(1, 32, 32, 3))
+
+
+def test_lpips_uses_its_network_on_unit_range_images(monkeypatch):
+    built = []
+
+    class Squared(torch.nn.Module):
+        def forward(self, first, second, normalize):
+            assert normalize
+            assert first.shape == (2, 3, 4, 5)
+            return ((first - second) ** 2).mean((1, 2, 3))
+
+    def build(net):
+        built.append(net)
+        return Squared()
+
+    monkeypatch.setattr(losses, "_build_lpips_network", build)
+    loss, image = LPIPSLoss(), torch.full((2, 4, 5, 3), 0.5, requires_grad=True)
+    assert built == []
+    value = loss(image, torch.zeros(2, 4, 5, 3))
+    loss(image, torch.zeros(2, 4, 5, 3))
+    assert built == ["vgg"]
+    assert value.item() == pytest.approx(0.25)
+    value.backward()
+    assert image.grad is not None
+    torch.testing.assert_close(image.grad, torch.full_like(image, 1 / image.numel()))

@@ -1,0 +1,97 @@
+import math
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+from skimage.metrics import peak_signal_noise_ratio, structural_similarity
+
+from rgbavatar_ns.avatar import metrics
+from rgbavatar_ns.avatar.losses import LPIPSLoss
+from rgbavatar_ns.avatar.metrics import LPIPSMetric, evaluate_images, psnr, ssim
+from rgbavatar_ns.errors import UserError
+
+
+@pytest.fixture
+def pair():
+    rng = np.random.default_rng(0)
+    image = rng.random((2, 40, 48, 3))
+    return image, np.clip(image + rng.normal(0, 0.1, image.shape), 0, 1)
+
+
+def test_psnr_by_hand():
+    # An error of .1 everywhere is 20 dB, of .01 is 40 dB.
+    image = torch.zeros(2, 4, 4, 3, dtype=torch.float64)
+    target = torch.full_like(image, 0.1)
+    target[1] = 0.01
+    torch.testing.assert_close(psnr(image, target), torch.tensor([20.0, 40.0]).double())
+
+
+def test_psnr_and_ssim_equal_scikit_images(pair):
+    image, target = pair
+    values = psnr(torch.from_numpy(image), torch.from_numpy(target))
+    expected = [peak_signal_noise_ratio(t, i, data_range=1) for i, t in zip(image, target)]
+    np.testing.assert_allclose(values.numpy(), expected, rtol=1e-6)
+    similarity = ssim(torch.from_numpy(image), torch.from_numpy(target))
+    expected = [
+        structural_similarity(
+            t,
+            i,
+            data_range=1,
+            channel_axis=-1,
+            gaussian_weights=True,
+            sigma=1.5,
+            use_sample_covariance=False,
+        )
+        for i, t in zip(image, target)
+    ]
+    np.testing.assert_allclose(similarity.numpy(), expected, rtol=1e-4)
+
+
+def test_targets_are_laid_over_black_and_images_clamped():
+    target = torch.tensor([255, 255, 255, 51], dtype=torch.uint8).expand(1, 16, 16, 4)
+    image = torch.full((1, 16, 16, 3), 0.3)
+    assert evaluate_images(image, target)["psnr"] == pytest.approx(20.0, abs=1e-3)
+    white = torch.full((1, 16, 16, 4), 255, dtype=torch.uint8)
+    assert evaluate_images(torch.full((1, 16, 16, 3), 7.0), white)["psnr"] == math.inf
+    assert evaluate_images(image, target).keys() == {"psnr", "ssim"}
+
+
+def test_lpips_offline_is_reported_and_the_others_go_on(monkeypatch):
+    tries = []
+
+    def offline(self):
+        tries.append(self.net)
+        raise UserError("LPIPS (vgg) is unavailable: offline.", "Go online.")
+
+    monkeypatch.setattr(LPIPSLoss, "network", offline)
+    lpips = LPIPSMetric()
+    target = torch.randint(0, 255, (1, 16, 16, 4), dtype=torch.uint8)
+    for _ in range(2):
+        values = evaluate_images(torch.rand(1, 16, 16, 3), target, lpips)
+        assert values["lpips_vgg"] is None
+        assert "offline" in str(values["lpips_unavailable"])
+        assert isinstance(values["psnr"], float)
+    assert tries == ["vgg"]
+
+
+def test_the_network_is_named_beside_the_number(monkeypatch):
+    monkeypatch.setattr(
+        metrics.LPIPSLoss, "__call__", lambda self, image, target: torch.tensor(0.125)
+    )
+    target = torch.randint(0, 255, (1, 16, 16, 4), dtype=torch.uint8)
+    values = evaluate_images(torch.rand(1, 16, 16, 3), target, LPIPSMetric("alex"))
+    assert values["lpips_alex"] == 0.125
+    assert "lpips_unavailable" not in values
+
+
+def test_importing_the_avatar_loads_neither_torchmetrics_nor_torchvision():
+    code = (
+        "import sys, rgbavatar_ns.avatar.metrics, rgbavatar_ns.avatar.training;"
+        "print([m for m in ('torchmetrics', 'torchvision', 'nerfstudio') if m in sys.modules])"
+    )
+    answer = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    assert answer.stdout.strip() == "[]"
