@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import torch
 import tyro
@@ -25,6 +25,7 @@ from rgbavatar_ns.plugin.errors import install_user_error_hook
 _MIB = 1 << 20
 
 
+@runtime_checkable
 class FrameSampler(Protocol):
     """Which frames a training step sees."""
 
