@@ -15,6 +15,7 @@ from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader
 from torch.nn import Parameter
 
 from rgbavatar_ns.data import ImageCache, OfflineOrder
+from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.plugin.dataparser import (
     FrameDataset,
     RGBAvatarDataParser,
@@ -81,7 +82,15 @@ def frame_sampler(
     The place for every strategy. `offline` is a pure function of (seed, step), so resuming needs
     no state; local and global pools (`rgbavatar_ns.data.LocalGlobalPools`) are fed by a stream of
     frames and keep their own.
+
+    Raises:
+        UserError: the batch size is not positive.
     """
+    if config.batch_size < 1:
+        raise UserError(
+            f"A batch of {config.batch_size} frames is impossible.",
+            "Pass --pipeline.datamanager.batch-size with 1 or more.",
+        )
     return OfflineOrder(positions, min(config.batch_size, len(positions)), seed)
 
 

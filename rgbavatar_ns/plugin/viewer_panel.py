@@ -19,6 +19,7 @@ from torch import Tensor, nn
 _VISER_PER_METRE = 10.0
 _VISIBLE_HEIGHT_M = 0.42
 _PLAYED_FRAMES_PER_SECOND = 12.0
+_PATIENCE_S = 5.0
 
 BY_FRAME = "frame slider"
 BY_TIME = "time slider"
@@ -51,8 +52,15 @@ class ViewerPanel(nn.Module):
             [BY_FRAME, BY_TIME],
             hint="What chooses the frame: the slider below, or the viewer's own time",
         )
+        self._noticed = threading.Event()
         self.frame = ViewerSlider(
-            "Frame", 0, 0, last, 1, hint="Frame of the dataset whose expression and pose are shown"
+            "Frame",
+            0,
+            0,
+            last,
+            1,
+            cb_hook=lambda _: self._noticed.set(),
+            hint="Frame of the dataset whose expression and pose are shown",
         )
         self.play = ViewerCheckbox("Play", False, hint="Move the frame slider on by itself")
         self.shade = ViewerRGB("Backdrop", (255, 255, 255), hint="Colour behind the head")
@@ -84,9 +92,17 @@ class ViewerPanel(nn.Module):
         return red / 255, green / 255, blue / 255
 
     def advance(self) -> None:
-        """Show the next frame if the viewer is playing; after the last comes the first."""
-        if self.play.value:
-            self.frame.value = (int(self.frame.value) + 1) % self.num_frames
+        """Show the next frame if the viewer is playing; after the last comes the first.
+
+        Returns once the viewer has noticed, which it does between two pictures, so that frames
+        do not queue up where drawing is slow.
+        """
+        if not self.play.value:
+            return
+        self._noticed.clear()
+        self.frame.value = (int(self.frame.value) + 1) % self.num_frames
+        if self.is_shown:
+            self._noticed.wait(_PATIENCE_S)
 
 
 class _Start(ViewerControl):

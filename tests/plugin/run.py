@@ -1,0 +1,84 @@
+"""Training runs: in this process through nerfstudio's trainer, or through its commands."""
+
+import copy
+import os
+import subprocess
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from nerfstudio.scripts.train import _set_random_seed
+from nerfstudio.utils import writer
+
+from rgbavatar_ns.avatar import AvatarConfig
+from rgbavatar_ns.plugin.methods import rgbavatar_tiny
+from rgbavatar_ns.plugin.trainer import RGBAvatarTrainer, RGBAvatarTrainerConfig
+
+SMALL = AvatarConfig(uv_resolution=16, num_bases=3, hidden_width=16)
+# Entry points exist only once the package is installed; the variable works without.
+_METHODS = (
+    "rgbavatar=rgbavatar_ns.plugin.methods:rgbavatar,"
+    "rgbavatar-tiny=rgbavatar_ns.plugin.methods:rgbavatar_tiny"
+)
+
+
+def small_config(data: Path, output: Path, **fields: Any) -> RGBAvatarTrainerConfig:
+    """rgbavatar-tiny with fewer Gaussians and steps, writing to `output`."""
+    config = copy.deepcopy(rgbavatar_tiny.config)
+    assert isinstance(config, RGBAvatarTrainerConfig)
+    config.output_dir = output
+    config.experiment_name = "tiny"
+    config.timestamp = "run"
+    config.vis = "tensorboard"
+    config.max_num_iterations = 20
+    config.machine.device_type = "cpu"
+    config.pipeline.datamanager.data = data
+    config.pipeline.datamanager.batch_size = 4
+    config.pipeline.model.avatar = SMALL
+    for name, value in fields.items():
+        assert hasattr(config, name)
+        setattr(config, name, value)
+    return config
+
+
+def make_trainer(config: RGBAvatarTrainerConfig) -> RGBAvatarTrainer:
+    """What `ns-train` does up to the first step."""
+    writer.EVENT_WRITERS.clear()
+    writer.EVENT_STORAGE.clear()
+    _set_random_seed(config.machine.seed)
+    config.save_config()
+    trainer = config.setup(local_rank=0, world_size=1)
+    trainer.setup()
+    return trainer
+
+
+def finished_run(data: Path, output: Path, **fields: Any) -> Path:
+    """Train in this process; the path of the run's config.yml."""
+    trainer = make_trainer(small_config(data, output, **fields))
+    trainer.train()
+    return trainer.base_dir / "config.yml"
+
+
+def program(name: str) -> str:
+    """The path of one of nerfstudio's commands in this environment."""
+    return str(Path(sys.executable).with_name(name))
+
+
+def environment(**changes: str) -> Mapping[str, str]:
+    """For a command: the methods are known, whether the package is installed or not."""
+    return {**os.environ, "NERFSTUDIO_METHOD_CONFIGS": _METHODS, "COLUMNS": "200", **changes}
+
+
+def run_command(
+    *command: str | Path, timeout_s: float = 180, **changes: str
+) -> "subprocess.CompletedProcess[str]":
+    """Run one of nerfstudio's commands to its end."""
+    return subprocess.run(
+        [program(str(command[0])), *map(str, command[1:])],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=timeout_s,
+        env=environment(**changes),
+    )

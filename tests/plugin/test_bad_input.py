@@ -1,0 +1,91 @@
+"""What a user can get wrong is told with cause and remedy, before or during training."""
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from rgbavatar_ns.errors import UserError
+from tests.plugin.run import make_trainer, small_config
+from tests.plugin.tiny import SIZE, tiny_dataset
+
+
+@pytest.fixture
+def data(tiny_data: Path, tmp_path: Path) -> Path:
+    """A copy of the tiny dataset to break."""
+    return Path(shutil.copytree(tiny_data, tmp_path / "data"))
+
+
+def _train(data: Path, output: Path, **fields: Any) -> None:
+    make_trainer(small_config(data, output, max_num_iterations=4, **fields)).train()
+
+
+def _truncate_image(data: Path) -> None:
+    image = data / "images" / "00002.png"
+    image.write_bytes(image.read_bytes()[:60])
+
+
+def _other_size(data: Path) -> None:
+    Image.new("RGBA", (SIZE + 8, SIZE)).save(data / "images" / "00002.png")
+
+
+def _nan_theta(data: Path) -> None:
+    theta = np.load(data / "theta.npy")
+    theta[3, 0] = np.nan
+    np.save(data / "theta.npy", theta)
+
+
+def _short_theta(data: Path) -> None:
+    np.save(data / "theta.npy", np.load(data / "theta.npy")[:, :-1])
+
+
+def _empty(data: Path) -> None:
+    shutil.rmtree(data)
+    data.mkdir()
+
+
+@pytest.mark.parametrize(
+    "damage", [shutil.rmtree, _empty, _truncate_image, _other_size, _nan_theta, _short_theta]
+)
+def test_broken_dataset_is_a_user_error(data: Path, tmp_path: Path, damage: Callable[[Path], None]):
+    damage(data)
+    with pytest.raises(UserError) as told:
+        _train(data, tmp_path / "runs")
+    assert told.value.cause
+    assert told.value.remedy
+    named = "00002.png" if damage in (_truncate_image, _other_size) else str(data)
+    assert named in told.value.cause
+
+
+def test_no_data_at_all_is_a_user_error(tmp_path: Path):
+    config = small_config(Path(), tmp_path)
+    config.pipeline.datamanager.data = None
+    with pytest.raises(UserError, match="No dataset"):
+        make_trainer(config)
+
+
+def test_theta_of_another_layout_than_the_checkpoints_is_refused_by_name(
+    data: Path, tmp_path: Path
+):
+    make_trainer(small_config(data, tmp_path / "runs", max_num_iterations=2)).train()
+    checkpoints = tmp_path / "runs" / "tiny" / "rgbavatar-tiny" / "run" / "nerfstudio_models"
+    size = np.load(data / "theta.npy").shape[1]
+    tiny_dataset(tmp_path / "fewer", fewer_expressions=1)
+    with pytest.raises(UserError) as told:
+        _train(tmp_path / "fewer", tmp_path / "other", load_dir=checkpoints)
+    assert f"{size} values" in told.value.cause
+    assert f"{size - 1} values" in told.value.cause
+
+
+def test_foreign_checkpoint_is_refused(data: Path, tmp_path: Path):
+    state = {"step": 0, "pipeline": {}, "optimizers": {}, "schedulers": {}, "scalers": {}}
+    folder = tmp_path / "foreign"
+    folder.mkdir()
+    torch.save(state, folder / "step-000000000.ckpt")
+    with pytest.raises(UserError, match="no avatar of this method"):
+        _train(data, tmp_path / "runs", load_dir=folder)

@@ -1,0 +1,136 @@
+"""nerfstudio's own commands, as a user types them."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.plugin.run import finished_run, run_command
+from tests.plugin.tiny import NUM_TEST, SIZE
+
+pytestmark = pytest.mark.slow
+
+
+def _has_no_traceback(text: str) -> bool:
+    return "Traceback" not in text and "rgbavatar_ns/" not in text
+
+
+def test_train_takes_its_flags_in_any_order_and_evaluates_offline(tiny_data: Path, tmp_path: Path):
+    trained = run_command(
+        "ns-train",
+        "rgbavatar-tiny",
+        "--pipeline.model.avatar.uv-resolution",
+        "16",
+        "--vis",
+        "tensorboard",
+        "--pipeline.datamanager.dataparser.data",
+        tiny_data,
+        "--max-num-iterations",
+        "6",
+        "--pipeline.model.avatar.num-bases",
+        "2",
+        "--data",
+        tiny_data,
+        "--pipeline.datamanager.batch-size",
+        "3",
+        "--timestamp",
+        "run",
+        "--output-dir",
+        tmp_path,
+        "--optimizers.color.optimizer.lr",
+        "0.01",
+    )
+    assert trained.returncode == 0, trained.stdout + trained.stderr
+    run_folder = tmp_path / "data" / "rgbavatar-tiny" / "run"
+    assert json.loads((run_folder / "training.json").read_text())["steps"] == 6
+
+    scores = tmp_path / "scores.json"
+    # No address can be reached through this proxy: as on a machine without network.
+    offline = {"http_proxy": "http://127.0.0.1:9", "https_proxy": "http://127.0.0.1:9"}
+    command = ["ns-eval", "--load-config", run_folder / "config.yml", "--output-path", scores]
+    evaluated = run_command(*command, **offline)
+    assert evaluated.returncode == 0, evaluated.stdout + evaluated.stderr
+    results = json.loads(scores.read_text())["results"]
+    assert results["psnr"] > 5
+    assert -1 <= results["ssim"] <= 1
+    assert "lpips_vgg" in results or results["lpips_unavailable"]
+
+
+def test_a_users_mistake_is_told_without_a_traceback(tmp_path: Path):
+    ended = run_command(
+        "ns-train", "rgbavatar-tiny", "--data", tmp_path / "absent", "--output-dir", tmp_path
+    )
+    assert ended.returncode == 1
+    assert "Error: " in ended.stderr
+    assert "absent" in ended.stderr
+    assert _has_no_traceback(ended.stdout + ended.stderr)
+
+
+def test_render_dataset_and_camera_path(tiny_data: Path, tmp_path: Path):
+    config = finished_run(tiny_data, tmp_path, max_num_iterations=5)
+    rendered = run_command(
+        "ns-render",
+        "dataset",
+        "--load-config",
+        config,
+        "--output-path",
+        tmp_path / "frames",
+        "--rendered-output-names",
+        "rgb",
+        "gt-rgb",
+        "depth",
+        "rgba",
+        "--image-format",
+        "png",
+    )
+    assert rendered.returncode == 0, rendered.stdout + rendered.stderr
+    for name in ("rgb", "gt-rgb", "depth", "rgba"):
+        images = sorted((tmp_path / "frames" / "test" / name).glob("*.png"))
+        assert len(images) == NUM_TEST
+        assert Image.open(images[0]).size == (SIZE, SIZE)
+
+    # nerfstudio asks for ffmpeg, also where it writes single images.
+    if shutil.which("ffmpeg") is None:
+        pytest.skip("ns-render camera-path needs ffmpeg on the PATH")
+    path = tmp_path / "path.json"
+    path.write_text(json.dumps(_camera_path(times=(0.0, 0.5, 1.0))))
+    rendered = run_command(
+        "ns-render",
+        "camera-path",
+        "--load-config",
+        config,
+        "--camera-path-filename",
+        path,
+        "--output-path",
+        tmp_path / "film.mp4",
+        "--output-format",
+        "images",
+        "--image-format",
+        "png",
+    )
+    assert rendered.returncode == 0, rendered.stdout + rendered.stderr
+    images = [np.asarray(Image.open(p)).astype(int) for p in sorted((tmp_path / "film").iterdir())]
+    assert [image.shape for image in images] == [(48, 64, 3)] * 3
+    # One camera, three frames of the performance.
+    assert all(image.max() > 30 for image in images)
+    assert np.abs(images[0] - images[1]).max() > 10
+
+
+def _camera_path(times: tuple[float, ...]) -> dict[str, object]:
+    """The viewer's export of a camera that looks at the face along +y, z up."""
+    camera_to_world = [1, 0, 0, 0, 0, 0, -1, -0.9, 0, 1, 0, 0, 0, 0, 0, 1]
+    cameras = [
+        {"camera_to_world": camera_to_world, "fov": 40, "aspect": 4 / 3, "render_time": time}
+        for time in times
+    ]
+    return {
+        "camera_type": "perspective",
+        "render_height": 48,
+        "render_width": 64,
+        "camera_path": cameras,
+        "fps": 3,
+        "seconds": 1,
+    }

@@ -1,0 +1,125 @@
+"""ns-viewer in a real browser: the head is seen, and another frame gives another picture."""
+
+import io
+import os
+import re
+import shutil
+import subprocess
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from PIL import Image
+
+from tests.plugin.run import environment, finished_run, program
+
+CHROMIUM = os.environ.get("RGBAVATAR_CHROMIUM") or shutil.which("chromium")
+_FLAGS = [
+    "--no-sandbox",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--ignore-gpu-blocklist",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+]
+_WIDTH, _HEIGHT = 1100, 800
+_SECONDS_UNTIL_DRAWN = 60.0
+
+pytestmark = [
+    pytest.mark.browser,
+    pytest.mark.slow,
+    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium; set RGBAVATAR_CHROMIUM to its path"),
+]
+
+Picture = npt.NDArray[np.uint8]
+
+
+@pytest.fixture
+def viewer_address(tiny_data: Path, tmp_path: Path) -> Iterator[str]:
+    """Where ns-viewer shows a run of a few steps."""
+    config = finished_run(tiny_data, tmp_path)
+    log = tmp_path / "viewer.log"
+    command = [program("ns-viewer"), "--load-config", str(config)]
+    command += ["--viewer.websocket-host", "127.0.0.1"]
+    with log.open("w") as output:
+        process = subprocess.Popen(
+            command, stdout=output, stderr=subprocess.STDOUT, env=environment()
+        )
+        try:
+            yield _address(process, log)
+        finally:
+            process.kill()
+            process.wait()
+
+
+def _address(process: "subprocess.Popen[bytes]", log: Path) -> str:
+    for _ in range(900):
+        found = re.search(r"http://127\.0\.0\.1:\d+", log.read_text())
+        if found:
+            return found.group(0)
+        assert process.poll() is None, log.read_text()
+        time.sleep(0.1)
+    raise AssertionError(log.read_text())
+
+
+@pytest.fixture
+def page(viewer_address: str) -> Iterator[Any]:
+    """The viewer's page in a headless browser."""
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    with playwright.sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=CHROMIUM, args=_FLAGS)
+        page = browser.new_page(viewport={"width": _WIDTH, "height": _HEIGHT})
+        page.goto(viewer_address)
+        yield page
+        browser.close()
+
+
+def _canvas(page: Any) -> Picture:
+    """The middle of the 3D view, left of the control panel."""
+    image = Image.open(io.BytesIO(page.screenshot())).convert("RGB")
+    return np.asarray(image)[100 : _HEIGHT - 100, 150 : _WIDTH - 450]
+
+
+def _colored(picture: Picture) -> float:
+    """The share of pixels that are neither the white backdrop nor grey."""
+    spread = picture.max(-1).astype(int) - picture.min(-1)
+    return float((spread > 25).mean())
+
+
+def _wait_for(page: Any, wanted: Any) -> Picture:
+    """The first settled picture of the 3D view for which `wanted` holds."""
+    deadline = time.monotonic() + _SECONDS_UNTIL_DRAWN
+    picture = _canvas(page)
+    while time.monotonic() < deadline:
+        before, picture = picture, _canvas(page)
+        if wanted(picture) and np.array_equal(before, picture):
+            return picture
+        time.sleep(0.5)
+    Path("viewer-failed.png").write_bytes(page.screenshot())
+    raise AssertionError("the viewer did not show what was awaited; see viewer-failed.png")
+
+
+def test_frame_control_changes_the_picture_of_the_head(page: Any):
+    first = _wait_for(page, lambda picture: _colored(picture) > 0.05)
+    # The head stands in the middle, and the corners show the backdrop.
+    height, width = first.shape[:2]
+    middle = first[height // 3 : -height // 3, width // 3 : -width // 3]
+    assert _colored(middle) > 0.5
+    assert _colored(first[:40, :40]) == 0
+
+    number = page.get_by_label("Frame", exact=True)
+    number.fill("4")
+    number.press("Enter")
+    second = _wait_for(page, lambda picture: _difference(picture, first) > 0.02)
+    assert _colored(second) > 0.05
+
+
+def _difference(picture: Picture, other: Picture) -> float:
+    return float((np.abs(picture.astype(int) - other).max(-1) > 20).mean())
