@@ -1,0 +1,156 @@
+"""The compiled rasterizer behind torch's autograd.
+
+The environment variable RGBAVATAR_INSTRUCTION_SET (generic, avx2, avx512) forces one copy of the
+loops; without it the fastest that the processor runs is taken.
+"""
+
+import os
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from rgbavatar_ns.kernels.cpu import _native
+from rgbavatar_ns.kernels.types import GaussianSet, PinholeCameras, RenderedBatch, WeightedColors
+
+INSTRUCTION_SET_VARIABLE = "RGBAVATAR_INSTRUCTION_SET"
+
+
+@dataclass
+class _Request:
+    """What of a rendering is not differentiated, and the outputs that carry no gradient."""
+
+    cameras: PinholeCameras
+    batch: int
+    depth: Tensor | None
+    visibility: Tensor | None
+
+
+def _session(gaussians: tuple[Tensor, ...], cameras: PinholeCameras, batch: int):
+    return _native.Session(
+        _native.Gaussians(*gaussians),
+        cameras.world_to_camera.detach().contiguous(),
+        cameras.focal_px.detach().contiguous(),
+        cameras.principal_point_px.detach().contiguous(),
+        batch,
+        cameras.width,
+        cameras.height,
+        torch.get_num_threads(),
+        os.environ.get(INSTRUCTION_SET_VARIABLE, ""),
+    )
+
+
+class _Rasterize(torch.autograd.Function):
+    """Image and alpha of (means, quats_wxyz, scales, opacities, colors, background)."""
+
+    @staticmethod
+    def forward(ctx: Any, request: _Request, *inputs: Tensor) -> tuple[Tensor, Tensor]:
+        *gaussians, background = (tensor.detach().contiguous() for tensor in inputs)
+        size = (request.batch, request.cameras.height, request.cameras.width)
+        image, alpha = background.new_empty(*size, 3), background.new_empty(*size, 1)
+        session = _session(tuple(gaussians), request.cameras, request.batch)
+        session.draw(background, image, alpha, request.depth)
+        if request.visibility is not None:
+            session.average(None, None, None, request.visibility)
+        if any(ctx.needs_input_grad):
+            ctx.session = session
+            ctx.save_for_backward(*gaussians, image, alpha)
+            ctx.background_shape = background.shape
+            ctx.set_materialize_grads(False)
+        return image, alpha
+
+    @staticmethod
+    @once_differentiable
+    def backward(
+        ctx: Any, image_grad: Tensor | None, alpha_grad: Tensor | None
+    ) -> tuple[Tensor | None, ...]:
+        *gaussians, image, alpha = ctx.saved_tensors
+        if image_grad is None and alpha_grad is None:
+            return (None,) * 7
+        image_grad = None if image_grad is None else image_grad.contiguous()
+        alpha_grad = None if alpha_grad is None else alpha_grad.contiguous()
+        grads: list[Tensor | None] = [None] * 5
+        if any(ctx.needs_input_grad[1:6]):
+            filled = [torch.empty_like(tensor) for tensor in gaussians]
+            ctx.session.backward(
+                _native.Gaussians(*gaussians),
+                image,
+                alpha,
+                image_grad,
+                alpha_grad,
+                *filled,
+                torch.get_num_threads(),
+            )
+            grads = [
+                grad if needed else None for grad, needed in zip(filled, ctx.needs_input_grad[1:6])
+            ]
+        background_grad = None
+        if ctx.needs_input_grad[6] and image_grad is not None:
+            background_grad = ((1 - alpha) * image_grad).sum((1, 2))
+            background_grad = background_grad.sum_to_size(ctx.background_shape)
+        return (None, *grads, background_grad)
+
+
+class CpuBackend:
+    """Runs float32 tensors in main memory, on as many threads as torch uses."""
+
+    def refusal(self, device: torch.device, dtype: torch.dtype) -> str | None:
+        """The reason, unless it is float32 on a CPU."""
+        if device.type != "cpu" or dtype != torch.float32:
+            return "it takes float32 tensors on the CPU"
+        return None
+
+    def rasterize(
+        self,
+        gaussians: GaussianSet,
+        cameras: PinholeCameras,
+        background: Float[Tensor, "#B 3"],
+        *,
+        with_depth: bool,
+        with_visibility: bool,
+    ) -> RenderedBatch:
+        """As `functional.rasterize`."""
+        inputs = _attributes(gaussians)
+        batch = max(t.shape[0] for t in (*inputs, background, cameras.focal_px))
+        new = inputs[0].new_empty
+        size = (batch, cameras.height, cameras.width, 1)
+        request = _Request(
+            cameras,
+            batch,
+            new(size) if with_depth else None,
+            new(batch, inputs[0].shape[1]) if with_visibility else None,
+        )
+        image, alpha = _Rasterize.apply(request, *inputs, background)
+        return RenderedBatch(image, alpha, request.depth, request.visibility)
+
+    @torch.no_grad()
+    def weighted_color_average(
+        self, gaussians: GaussianSet, cameras: PinholeCameras, images: Float[Tensor, "#B H W C"]
+    ) -> WeightedColors:
+        """As `functional.weighted_color_average`."""
+        inputs = tuple(tensor.detach().contiguous() for tensor in _attributes(gaussians))
+        batch = max(t.shape[0] for t in (*inputs, images, cameras.focal_px))
+        count = inputs[0].shape[1]
+        weighted_sum = images.new_empty(batch, count, images.shape[-1])
+        weight_sum, max_weight = images.new_empty(2, batch, count).unbind(0)
+        session = _session(inputs, cameras, batch)
+        session.average(images.detach().contiguous(), weighted_sum, weight_sum, max_weight)
+        return WeightedColors(weighted_sum, weight_sum, max_weight)
+
+
+def _attributes(gaussians: GaussianSet) -> tuple[Tensor, ...]:
+    return (
+        gaussians.means,
+        gaussians.quats_wxyz,
+        gaussians.scales,
+        gaussians.opacities,
+        gaussians.colors,
+    )
+
+
+def load() -> CpuBackend:
+    """The backend; raises ImportError with the reason when it was not compiled."""
+    return CpuBackend()

@@ -1,0 +1,457 @@
+// The loops over Gaussians and pixels. Compiled once per instruction set with RGBAVATAR_ISA naming
+// it; uses no inline function or template of the standard library, because the linker would merge
+// those of different instruction sets.
+#include "layout.h"
+#include "simd.h"
+
+namespace rgbavatar::RGBAVATAR_ISA {
+
+#include "../../shared/gaussian_math.h"
+
+using C = BlendingConstants;
+
+// ---- Projection -------------------------------------------------------------------------------
+
+static Camera camera_from(const float* c, int width, int height) {
+  Camera out;
+  out.row0 = {c[0], c[1], c[2]};
+  out.row1 = {c[4], c[5], c[6]};
+  out.row2 = {c[8], c[9], c[10]};
+  out.translation = {c[3], c[7], c[11]};
+  out.fx = c[16], out.fy = c[17], out.cx = c[18], out.cy = c[19];
+  const float margin_u = C::kFrustumMargin * 0.5f * width / out.fx;
+  const float margin_v = C::kFrustumMargin * 0.5f * height / out.fy;
+  out.min_u = -out.cx / out.fx - margin_u, out.max_u = (width - out.cx) / out.fx + margin_u;
+  out.min_v = -out.cy / out.fy - margin_v, out.max_v = (height - out.cy) / out.fy + margin_v;
+  return out;
+}
+
+// Columns of rows [first, first + lanes) of a [N, K] array; further lanes are 0.
+template <int K>
+static inline void load_columns(const float* rows, int first, int lanes, Wide out[K]) {
+  float columns[K][kLanes] = {};
+  for (int lane = 0; lane < lanes; ++lane)
+    for (int k = 0; k < K; ++k) columns[k][lane] = rows[int64_t(first + lane) * K + k];
+  for (int k = 0; k < K; ++k) load(out[k], columns[k]);
+}
+
+template <int K>
+static inline void add_columns(float* rows, int first, int lanes, const Wide values[K]) {
+  float columns[K][kLanes];
+  for (int k = 0; k < K; ++k) store(values[k], columns[k]);
+  for (int lane = 0; lane < lanes; ++lane)
+    for (int k = 0; k < K; ++k) rows[int64_t(first + lane) * K + k] += columns[k][lane];
+}
+
+static inline GaussianInput<Wide> load_gaussians(const Scene& scene, int image, int first,
+                                                 int lanes) {
+  GaussianInput<Wide> g;
+  Wide column[3];
+  load_columns<3>(scene.means.of(image), first, lanes, column);
+  g.mean = {column[0], column[1], column[2]};
+  load_columns<4>(scene.quats.of(image), first, lanes, g.quat);
+  load_columns<3>(scene.scales.of(image), first, lanes, column);
+  g.scale = {column[0], column[1], column[2]};
+  load_columns<1>(scene.opacities.of(image), first, lanes, &g.opacity);
+  return g;
+}
+
+static inline int floor_of_positive(float x) { return int(x); }
+static inline int ceil_of_positive(float x) { return int(x) + (float(int(x)) < x); }
+
+// Sets the range of blocks whose pixel centres lie within [low, high]; both are already clamped
+// to [0, side - 1] in units of pixel indices.
+static inline bool block_range(float low, float high, uint16_t& first, uint16_t& last) {
+  if (!(low <= high)) return false;
+  const int first_pixel = ceil_of_positive(low), last_pixel = floor_of_positive(high);
+  first = uint16_t(first_pixel / kBlockSide);
+  last = uint16_t(last_pixel / kBlockSide);
+  return first_pixel <= last_pixel;
+}
+
+static void project_image(const Scene& scene, const float* camera_floats, int image, int begin,
+                          int end, Splat* splats) {
+  const Camera camera = camera_from(camera_floats, scene.width, scene.height);
+  for (int first = begin; first < end; first += kLanes) {
+    const int lanes = end - first < kLanes ? end - first : kLanes;
+    const GaussianInput<Wide> g = load_gaussians(scene, image, first, lanes);
+    Wide rgb[3];
+    load_columns<3>(scene.colors.of(image), first, lanes, rgb);
+    const Projection<Wide> q = project(g, camera);
+    const WideMask drawable = is_drawable(g, Vec3<Wide>{rgb[0], rgb[1], rgb[2]}, q);
+    const Wide log2_opacity = log2_of(select(drawable, g.opacity, Wide(1.0f)));
+    // Where alpha falls to the cut: -k d^T Q d = log2(min alpha / o), an ellipse of half-widths
+    // sqrt(2 ln(o / min alpha) cov).
+    const Wide reach = (log2_opacity - C::kLog2MinAlpha) * (2.0f * C::kLn2);
+    const Wide half_x = square_root(reach * q.cov00), half_y = square_root(reach * q.cov11);
+    const Wide centre_x = q.mean_x - 0.5f, centre_y = q.mean_y - 0.5f;
+    enum { kMeanX, kMeanY, kOpacity, kQa, kQb, kQc, kLowX, kHighX, kLowY, kHighY, kColumns };
+    float column[kColumns][kLanes];
+    store(q.mean_x, column[kMeanX]);
+    store(q.mean_y, column[kMeanY]);
+    store(log2_opacity, column[kOpacity]);
+    store(q.conic00 * -C::kHalfLog2E, column[kQa]);
+    store(q.conic01 * (-2.0f * C::kHalfLog2E), column[kQb]);
+    store(q.conic11 * -C::kHalfLog2E, column[kQc]);
+    // Beyond the image the comparison low <= high fails; so it does for what is not drawable.
+    store(select(drawable, max_of(centre_x - half_x, Wide(0.0f)), Wide(1e9f)), column[kLowX]);
+    store(min_of(centre_x + half_x, Wide(scene.width - 1.0f)), column[kHighX]);
+    store(max_of(centre_y - half_y, Wide(0.0f)), column[kLowY]);
+    store(min_of(centre_y + half_y, Wide(scene.height - 1.0f)), column[kHighY]);
+    float depth[kLanes], color[3][kLanes];
+    store(q.p.z, depth);
+    for (int k = 0; k < 3; ++k) store(rgb[k], color[k]);
+    for (int lane = 0; lane < lanes; ++lane) {
+      Splat& s = splats[first + lane];
+      const bool seen = block_range(column[kLowX][lane], column[kHighX][lane], s.first_block_x,
+                                    s.last_block_x) &&
+                        block_range(column[kLowY][lane], column[kHighY][lane], s.first_block_y,
+                                    s.last_block_y);
+      if (!seen) {
+        s.first_block_x = 1, s.last_block_x = 0;
+        continue;
+      }
+      s.mean_x = column[kMeanX][lane], s.mean_y = column[kMeanY][lane];
+      s.log2_opacity = column[kOpacity][lane];
+      s.qa = column[kQa][lane], s.qb = column[kQb][lane], s.qc = column[kQc][lane];
+      s.red = color[0][lane], s.green = color[1][lane], s.blue = color[2][lane];
+      s.depth = depth[lane];
+    }
+  }
+}
+
+static void project_image_backward(const Scene& scene, const float* camera_floats, int image,
+                                   int begin, int end, const uint32_t* slot_offset,
+                                   const float* slots, const SceneGradient& gradient) {
+  const Camera camera = camera_from(camera_floats, scene.width, scene.height);
+  for (int first = begin; first < end; first += kLanes) {
+    const int lanes = end - first < kLanes ? end - first : kLanes;
+    if (slot_offset[first] == slot_offset[first + lanes]) continue;
+    float sums[kMoments][kLanes] = {};
+    float seen[kLanes] = {};
+    for (int lane = 0; lane < lanes; ++lane) {
+      const uint32_t stop = slot_offset[first + lane + 1];
+      for (uint32_t slot = slot_offset[first + lane]; slot < stop; ++slot) {
+        seen[lane] = 1.0f;
+        for (int k = 0; k < kMoments; ++k) sums[k][lane] += slots[int64_t(slot) * kMoments + k];
+      }
+    }
+    Wide m[kMoments];
+    for (int k = 0; k < kMoments; ++k) load(m[k], sums[k]);
+    const Moments<Wide> moments = {{m[0], m[1], m[2]}, m[3], m[4], m[5], m[6], m[7], m[8]};
+    const GaussianInput<Wide> g = load_gaussians(scene, image, first, lanes);
+    const Projection<Wide> q = project(g, camera);
+    const GaussianGradient<Wide> d = project_backward(g, camera, q, moments);
+    // What was not drawn may hold anything; its gradient is 0.
+    const WideMask drawn = load_wide(seen) > Wide(0.0f);
+    const Wide zero(0.0f);
+    const Wide mean[3] = {select(drawn, d.mean.x, zero), select(drawn, d.mean.y, zero),
+                          select(drawn, d.mean.z, zero)};
+    const Wide quat[4] = {select(drawn, d.quat[0], zero), select(drawn, d.quat[1], zero),
+                          select(drawn, d.quat[2], zero), select(drawn, d.quat[3], zero)};
+    const Wide scale[3] = {select(drawn, d.scale.x, zero), select(drawn, d.scale.y, zero),
+                           select(drawn, d.scale.z, zero)};
+    const Wide opacity[1] = {select(drawn, d.opacity, zero)};
+    add_columns<3>(gradient.means, first, lanes, mean);
+    add_columns<4>(gradient.quats, first, lanes, quat);
+    add_columns<3>(gradient.scales, first, lanes, scale);
+    add_columns<1>(gradient.opacities, first, lanes, opacity);
+    add_columns<3>(gradient.colors, first, lanes, m);
+  }
+}
+
+// ---- Tiles ------------------------------------------------------------------------------------
+
+struct BlockRange {
+  int first_x, last_x, first_y, last_y;  // within the tile, inclusive
+};
+
+static inline BlockRange blocks_in_tile(const Splat& s, int origin_x, int origin_y) {
+  const int x0 = s.first_block_x - origin_x, x1 = s.last_block_x - origin_x;
+  const int y0 = s.first_block_y - origin_y, y1 = s.last_block_y - origin_y;
+  return {x0 > 0 ? x0 : 0, x1 < kTileBlocks ? x1 : kTileBlocks - 1, y0 > 0 ? y0 : 0,
+          y1 < kTileBlocks ? y1 : kTileBlocks - 1};
+}
+
+// Centres of a block's pixels.
+struct PixelCentres {
+  Wide x, y;
+  PixelCentres() {
+    float lane_x[kBlockPixels], lane_y[kBlockPixels];
+    for (int i = 0; i < kBlockPixels; ++i) {
+      lane_x[i] = i % kBlockSide + 0.5f;
+      lane_y[i] = i / kBlockSide + 0.5f;
+    }
+    load(x, lane_x);
+    load(y, lane_y);
+  }
+};
+
+// Calls visit(lane, pixel index) for every pixel of the block that lies in the image.
+template <class Visit>
+static inline void for_pixels(const Tile& tile, int block, Visit visit) {
+  const int left = (tile.tile_x * kTileBlocks + block % kTileBlocks) * kBlockSide;
+  const int top = (tile.tile_y * kTileBlocks + block / kTileBlocks) * kBlockSide;
+  const int rows = tile.height - top < kBlockSide ? tile.height - top : kBlockSide;
+  const int columns = tile.width - left < kBlockSide ? tile.width - left : kBlockSide;
+  for (int y = 0; y < rows; ++y)
+    for (int x = 0; x < columns; ++x)
+      visit(y * kBlockSide + x, int64_t(top + y) * tile.width + left + x);
+}
+
+// T is 1 in the image and 0 outside it, so that pixels outside neither take part in the blending
+// nor keep their block open.
+static void start_transmittance(const Tile& tile, TileScratch& scratch) {
+  for (int block = 0; block < kBlocksPerTile; ++block) {
+    float* t = scratch.transmittance[block];
+    for (int i = 0; i < kBlockPixels; ++i) t[i] = 0.0f;
+    scratch.open[block] = false;
+    for_pixels(tile, block, [&](int lane, int64_t) {
+      t[lane] = 1.0f;
+      scratch.open[block] = true;
+    });
+  }
+}
+
+// Which of the portion's Gaussians touch each open block, as scratch.list.
+static void list_by_block(const Tile& tile, int count, TileScratch& scratch) {
+  const int origin_x = tile.tile_x * kTileBlocks, origin_y = tile.tile_y * kTileBlocks;
+  uint32_t fill[kBlocksPerTile] = {};
+  for (int i = 0; i < count; ++i) {
+    const BlockRange r = blocks_in_tile(scratch.portion[i], origin_x, origin_y);
+    for (int y = r.first_y; y <= r.last_y; ++y)
+      for (int x = r.first_x; x <= r.last_x; ++x) ++fill[y * kTileBlocks + x];
+  }
+  uint32_t total = 0;
+  for (int block = 0; block < kBlocksPerTile; ++block) {
+    scratch.list_start[block] = total;
+    total += fill[block];
+    fill[block] = scratch.list_start[block];
+  }
+  scratch.list_start[kBlocksPerTile] = total;
+  for (int i = 0; i < count; ++i) {
+    const BlockRange r = blocks_in_tile(scratch.portion[i], origin_x, origin_y);
+    for (int y = r.first_y; y <= r.last_y; ++y)
+      for (int x = r.first_x; x <= r.last_x; ++x)
+        scratch.list[fill[y * kTileBlocks + x]++] = uint16_t(i);
+  }
+}
+
+struct Alpha {
+  Wide raw, value;  // before the cap, and as blended; both 0 below the cut
+};
+
+static RGBAVATAR_MEMBER Alpha alpha_at(const Wide& dx, const Wide& dy, const Splat& s) {
+  const Wide p = log2_alpha(dx, dy, s.log2_opacity, s.qa, s.qb, s.qc);
+  const Wide raw = select(p >= Wide(C::kLog2MinAlpha), exp2_of(p), Wide(0.0f));
+  return {raw, min_of(raw, Wide(C::kMaxAlpha))};
+}
+
+static RGBAVATAR_MEMBER bool is_open(const Wide& transmittance) {
+  return any(transmittance >= Wide(C::kMinTransmittance));
+}
+
+// Blends a block's list into its transmittance and channels (red, green, blue, depth).
+template <bool kDepth>
+static inline void blend_block(const Tile& tile, const PixelCentres& centres, int block,
+                               TileScratch& scratch) {
+  const Wide px = centres.x + float((tile.tile_x * kTileBlocks + block % kTileBlocks) * kBlockSide);
+  const Wide py = centres.y + float((tile.tile_y * kTileBlocks + block / kTileBlocks) * kBlockSide);
+  float(*channels)[kBlockPixels] = scratch.channels[block];
+  Wide t = load_wide(scratch.transmittance[block]);
+  Wide red = load_wide(channels[0]), green = load_wide(channels[1]);
+  Wide blue = load_wide(channels[2]), depth = load_wide(channels[3]);
+  const uint32_t stop = scratch.list_start[block + 1];
+  for (uint32_t i = scratch.list_start[block]; i < stop; ++i) {
+    if (!is_open(t)) {
+      scratch.open[block] = false;
+      break;
+    }
+    const Splat& s = scratch.portion[scratch.list[i]];
+    const Wide w = alpha_at(px - s.mean_x, py - s.mean_y, s).value * t;
+    red = red + w * s.red;
+    green = green + w * s.green;
+    blue = blue + w * s.blue;
+    if (kDepth) depth = depth + w * s.depth;
+    t = t - w;
+  }
+  store(t, scratch.transmittance[block]);
+  store(red, channels[0]);
+  store(green, channels[1]);
+  store(blue, channels[2]);
+  if (kDepth) store(depth, channels[3]);
+}
+
+static int load_portion(const Tile& tile, uint32_t first, TileScratch& scratch) {
+  const uint32_t rest = tile.entry_count - first;
+  const int count = rest < uint32_t(kPortion) ? int(rest) : kPortion;
+  for (int i = 0; i < count; ++i) scratch.portion[i] = tile.splats[tile.entries[first + i]];
+  return count;
+}
+
+static void write_block(const Tile& tile, const ForwardOutput& out, int block,
+                        const TileScratch& scratch) {
+  const float* t = scratch.transmittance[block];
+  const float(*channels)[kBlockPixels] = scratch.channels[block];
+  for_pixels(tile, block, [&](int lane, int64_t pixel) {
+    for (int k = 0; k < 3; ++k)
+      out.image[pixel * 3 + k] = channels[k][lane] + t[lane] * out.background[k];
+    out.alpha[pixel] = 1.0f - t[lane];
+    if (out.depth) out.depth[pixel] = t[lane] < 1.0f ? channels[3][lane] / (1.0f - t[lane]) : 0.0f;
+  });
+}
+
+static void forward_tile(const Tile& tile, const ForwardOutput& out, TileScratch& scratch) {
+  const PixelCentres centres;
+  start_transmittance(tile, scratch);
+  for (int block = 0; block < kBlocksPerTile; ++block)
+    for (int k = 0; k < 4; ++k)
+      for (int i = 0; i < kBlockPixels; ++i) scratch.channels[block][k][i] = 0.0f;
+  for (uint32_t first = 0; first < tile.entry_count; first += kPortion) {
+    list_by_block(tile, load_portion(tile, first, scratch), scratch);
+    for (int block = 0; block < kBlocksPerTile; ++block) {
+      if (!scratch.open[block]) continue;
+      if (out.depth)
+        blend_block<true>(tile, centres, block, scratch);
+      else
+        blend_block<false>(tile, centres, block, scratch);
+    }
+  }
+  for (int block = 0; block < kBlocksPerTile; ++block) write_block(tile, out, block, scratch);
+}
+
+// ---- Gaussian-stationary passes ---------------------------------------------------------------
+
+// Calls visit(dx, dy, transmittance, block) for the open blocks that the Gaussian touches, and
+// closes those that have become opaque. The visit updates the transmittance as the forward pass
+// did, so that the same blocks close at the same Gaussian.
+template <class Visit>
+static RGBAVATAR_MEMBER void for_open_blocks(const Tile& tile, const PixelCentres& centres,
+                                             const Splat& s, TileScratch& scratch, Visit visit) {
+  const int origin_x = tile.tile_x * kTileBlocks, origin_y = tile.tile_y * kTileBlocks;
+  const BlockRange r = blocks_in_tile(s, origin_x, origin_y);
+  for (int y = r.first_y; y <= r.last_y; ++y) {
+    const Wide dy = centres.y + float((origin_y + y) * kBlockSide) - Wide(s.mean_y);
+    for (int x = r.first_x; x <= r.last_x; ++x) {
+      const int block = y * kTileBlocks + x;
+      if (!scratch.open[block]) continue;
+      Wide t = load_wide(scratch.transmittance[block]);
+      if (!is_open(t)) {
+        scratch.open[block] = false;
+        continue;
+      }
+      const Wide dx = centres.x + float((origin_x + x) * kBlockSide) - Wide(s.mean_x);
+      visit(dx, dy, t, block);
+      store(t, scratch.transmittance[block]);
+    }
+  }
+}
+
+static void start_remainder(const Tile& tile, const BackwardInput& in, TileScratch& scratch) {
+  for (int block = 0; block < kBlocksPerTile; ++block) {
+    float(*g)[kBlockPixels] = scratch.channels[block];
+    float* remainder = scratch.remainder[block];
+    for (int i = 0; i < kBlockPixels; ++i) g[0][i] = g[1][i] = g[2][i] = remainder[i] = 0.0f;
+    for_pixels(tile, block, [&](int lane, int64_t pixel) {
+      float rest = 0.0f;
+      if (in.image_grad)
+        for (int k = 0; k < 3; ++k) {
+          g[k][lane] = in.image_grad[pixel * 3 + k];
+          rest += g[k][lane] * in.image[pixel * 3 + k];
+        }
+      if (in.alpha_grad) rest -= in.alpha_grad[pixel] * (1.0f - in.alpha[pixel]);
+      remainder[lane] = rest;
+    });
+  }
+}
+
+static void backward_tile(const Tile& tile, const BackwardInput& in, TileScratch& scratch,
+                          float* slots) {
+  const PixelCentres centres;
+  start_transmittance(tile, scratch);
+  start_remainder(tile, in, scratch);
+  for (uint32_t i = 0; i < tile.entry_count; ++i) {
+    const uint32_t gaussian = tile.entries[i];
+    const Splat s = tile.splats[gaussian];
+    Wide sums[kMoments];
+    for (int k = 0; k < kMoments; ++k) sums[k] = Wide(0.0f);
+    for_open_blocks(
+        tile, centres, s, scratch, [&](const Wide& dx, const Wide& dy, Wide& t, int block) {
+          const float(*channels)[kBlockPixels] = scratch.channels[block];
+          const Wide red = load_wide(channels[0]), green = load_wide(channels[1]);
+          const Wide blue = load_wide(channels[2]);
+          const Alpha alpha = alpha_at(dx, dy, s);
+          const Wide w = alpha.value * t;
+          const Wide along = red * s.red + green * s.green + blue * s.blue;
+          const Wide remainder = load_wide(scratch.remainder[block]) - w * along;
+          store(remainder, scratch.remainder[block]);
+          const Wide d_alpha = t * along - remainder * reciprocal_of(1.0f - alpha.value);
+          t = t - w;
+          // The cap has no gradient.
+          const Wide raw = select(alpha.raw <= Wide(C::kMaxAlpha), alpha.raw, Wide(0.0f));
+          const Wide d_p = d_alpha * raw;  // times ln 2, below
+          const Wide d_x = d_p * dx, d_y = d_p * dy;
+          sums[0] = sums[0] + w * red;
+          sums[1] = sums[1] + w * green;
+          sums[2] = sums[2] + w * blue;
+          sums[3] = sums[3] + d_p;
+          sums[4] = sums[4] + d_x;
+          sums[5] = sums[5] + d_y;
+          sums[6] = sums[6] + d_x * dx;
+          sums[7] = sums[7] + d_x * dy;
+          sums[8] = sums[8] + d_y * dy;
+        });
+    float* slot = slots + int64_t(tile.slot(gaussian)) * kMoments;
+    for (int k = 0; k < kMoments; ++k) slot[k] = sum_of(sums[k]) * (k < 3 ? 1.0f : C::kLn2);
+  }
+}
+
+template <int kChannels>
+static void average_channels(const Tile& tile, const float* image, int channels,
+                             TileScratch& scratch, float* slots) {
+  const PixelCentres centres;
+  start_transmittance(tile, scratch);
+  for (int block = 0; block < kBlocksPerTile; ++block) {
+    float(*pixels)[kBlockPixels] = scratch.channels[block];
+    for (int k = 0; k < kChannels; ++k)
+      for (int i = 0; i < kBlockPixels; ++i) pixels[k][i] = 0.0f;
+    for_pixels(tile, block, [&](int lane, int64_t pixel) {
+      for (int k = 0; k < channels; ++k) pixels[k][lane] = image[pixel * channels + k];
+    });
+  }
+  for (uint32_t i = 0; i < tile.entry_count; ++i) {
+    const uint32_t gaussian = tile.entries[i];
+    const Splat s = tile.splats[gaussian];
+    Wide sums[kChannels + 1], largest(0.0f);
+    for (int k = 0; k <= kChannels; ++k) sums[k] = Wide(0.0f);
+    for_open_blocks(tile, centres, s, scratch,
+                    [&](const Wide& dx, const Wide& dy, Wide& t, int block) {
+                      const Wide w = alpha_at(dx, dy, s).value * t;
+                      t = t - w;
+                      largest = max_of(largest, w);
+                      sums[kChannels] = sums[kChannels] + w;
+                      for (int k = 0; k < kChannels; ++k)
+                        sums[k] = sums[k] + w * load_wide(scratch.channels[block][k]);
+                    });
+    float* slot = slots + int64_t(tile.slot(gaussian)) * (channels + 2);
+    for (int k = 0; k < channels; ++k) slot[k] = sum_of(sums[k]);
+    slot[channels] = sum_of(sums[kChannels]);
+    slot[channels + 1] = max_lane(largest);
+  }
+}
+
+static void average_tile(const Tile& tile, const float* image, int channels, TileScratch& scratch,
+                         float* slots) {
+  if (channels == 0)
+    average_channels<0>(tile, image, channels, scratch, slots);
+  else if (channels <= 4)
+    average_channels<4>(tile, image, channels, scratch, slots);
+  else
+    average_channels<kMaxChannels>(tile, image, channels, scratch, slots);
+}
+
+extern const Kernels kernels;
+const Kernels kernels = {project_image, forward_tile, backward_tile, average_tile,
+                         project_image_backward};
+
+}  // namespace rgbavatar::RGBAVATAR_ISA

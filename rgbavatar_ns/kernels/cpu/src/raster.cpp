@@ -1,0 +1,326 @@
+#include "raster.h"
+
+#include <algorithm>
+#include <cstring>
+#include <mutex>
+#include <stdexcept>
+
+#include "team.h"
+
+namespace rgbavatar {
+
+namespace generic {
+extern const Kernels kernels;
+}
+#if defined(RGBAVATAR_X86)
+namespace avx2 {
+extern const Kernels kernels;
+}
+namespace avx512 {
+extern const Kernels kernels;
+}
+#endif
+
+namespace {
+
+struct InstructionSet {
+  const char* name;
+  const Kernels* kernels;
+};
+
+// The sets this processor runs, the fastest first.
+std::vector<InstructionSet> supported() {
+  std::vector<InstructionSet> sets;
+#if defined(RGBAVATAR_X86)
+  __builtin_cpu_init();
+  const bool avx2 = __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma");
+  if (avx2 && __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512dq") &&
+      __builtin_cpu_supports("avx512vl") && __builtin_cpu_supports("avx512bw"))
+    sets.push_back({"avx512", &avx512::kernels});
+  if (avx2) sets.push_back({"avx2", &avx2::kernels});
+#endif
+  sets.push_back({"generic", &generic::kernels});
+  return sets;
+}
+
+// An empty name means the fastest.
+const Kernels* kernels_for(const std::string& name) {
+  std::string known;
+  for (const InstructionSet& set : supported()) {
+    if (name.empty() || name == set.name) return set.kernels;
+    known += known.empty() ? set.name : std::string(", ") + set.name;
+  }
+  throw std::invalid_argument("This processor does not run the instruction set '" + name +
+                              "'. Choose one of: " + known + ".");
+}
+
+constexpr size_t kKeptWorkspaces = 2;
+std::mutex pool_mutex;
+
+std::vector<std::unique_ptr<Workspace>>& pool() {
+  static auto* kept = new std::vector<std::unique_ptr<Workspace>>;  // outlives every Rendering
+  return *kept;
+}
+
+std::unique_ptr<Workspace> take_workspace() {
+  std::lock_guard<std::mutex> lock(pool_mutex);
+  if (pool().empty()) return std::make_unique<Workspace>();
+  std::unique_ptr<Workspace> workspace = std::move(pool().back());
+  pool().pop_back();
+  return workspace;
+}
+
+void give_workspace(std::unique_ptr<Workspace> workspace) {
+  std::lock_guard<std::mutex> lock(pool_mutex);
+  if (pool().size() < kKeptWorkspaces) pool().push_back(std::move(workspace));
+}
+
+// Gaussians that one thread projects at a time; a multiple of the SIMD lanes.
+constexpr int kChunk = 2048;
+int chunks_of(int count) { return (count + kChunk - 1) / kChunk; }
+
+// Sorts keys by their upper half, keeping the order of equal ones; the low half is the Gaussian.
+// Only the bits that differ from the smallest key are sorted: for a head in front of a camera two
+// passes of 11 bits. Returns where the result is: `keys` or `other`.
+uint64_t* radix_sort(uint64_t* keys, uint64_t* other, size_t count) {
+  if (count == 0) return keys;
+  constexpr int kBits = 11, kBuckets = 1 << kBits;
+  uint64_t smallest = ~uint64_t(0), largest = 0;
+  for (size_t i = 0; i < count; ++i) {
+    smallest = std::min(smallest, keys[i] >> 32);
+    largest = std::max(largest, keys[i] >> 32);
+  }
+  for (int shift = 0; (largest - smallest) >> shift; shift += kBits) {
+    uint32_t start[kBuckets] = {};
+    const auto bucket = [&](uint64_t key) {
+      return (((key >> 32) - smallest) >> shift) & (kBuckets - 1);
+    };
+    for (size_t i = 0; i < count; ++i) ++start[bucket(keys[i])];
+    uint32_t total = 0;
+    for (uint32_t& s : start) {
+      const uint32_t here = s;
+      s = total;
+      total += here;
+    }
+    for (size_t i = 0; i < count; ++i) other[start[bucket(keys[i])]++] = keys[i];
+    std::swap(keys, other);
+  }
+  return keys;
+}
+
+template <class Visit>
+void for_tiles(const Splat& s, int tiles_x, Visit visit) {
+  for (int y = s.first_tile_y(); y < s.first_tile_y() + s.tiles_y(); ++y)
+    for (int x = s.first_tile_x(); x < s.first_tile_x() + s.tiles_x(); ++x) visit(y * tiles_x + x);
+}
+
+}  // namespace
+
+std::vector<std::string> instruction_sets() {
+  std::vector<std::string> names;
+  for (const InstructionSet& set : supported()) names.push_back(set.name);
+  return names;
+}
+
+Rendering::Rendering(const Scene& scene, const Cameras& cameras,
+                     const std::string& instruction_set, int threads)
+    : batch_(scene.batch),
+      count_(scene.count),
+      width_(scene.width),
+      height_(scene.height),
+      tiles_x_((scene.width + kTileBlocks * kBlockSide - 1) / (kTileBlocks * kBlockSide)),
+      tiles_y_((scene.height + kTileBlocks * kBlockSide - 1) / (kTileBlocks * kBlockSide)),
+      kernels_(kernels_for(instruction_set)),
+      workspace_(take_workspace()) {
+  Workspace& w = *workspace_;
+  w.cameras.reserve(size_t(batch_) * kCameraFloats);
+  for (int image = 0; image < batch_; ++image) {
+    const int from = cameras.count == 1 ? 0 : image;
+    float* to = &w.cameras[size_t(image) * kCameraFloats];
+    std::memcpy(to, cameras.world_to_camera + from * 16, 16 * sizeof(float));
+    std::memcpy(to + 16, cameras.focal_px + from * 2, 2 * sizeof(float));
+    std::memcpy(to + 18, cameras.principal_point_px + from * 2, 2 * sizeof(float));
+  }
+  Team team(threads);
+  project(scene, team);
+  sort(team);
+}
+
+Rendering::~Rendering() { give_workspace(std::move(workspace_)); }
+
+void Rendering::project(const Scene& scene, Team& team) {
+  Workspace& w = *workspace_;
+  w.splats.reserve(size_t(batch_) * count_);
+  const int chunks = chunks_of(count_);
+  team.run(int64_t(batch_) * chunks, [&](int64_t item, int) {
+    const int image = int(item / chunks), begin = int(item % chunks) * kChunk;
+    kernels_->project(scene, &w.cameras[size_t(image) * kCameraFloats], image, begin,
+                      std::min(begin + kChunk, count_), w.splats.data() + size_t(image) * count_);
+  });
+}
+
+void Rendering::sort(Team& team) {
+  Workspace& w = *workspace_;
+  w.slot_offset.reserve(size_t(batch_) * (count_ + 1));
+  w.tile_start.reserve(size_t(batch_) * (tiles_per_image() + 1));
+  w.entry_offset.reserve(batch_ + 1);
+  team.run(batch_, [&](int64_t image, int) {
+    const Splat* splats = w.splats.data() + size_t(image) * count_;
+    uint32_t* slot_offset = w.slot_offset.data() + size_t(image) * (count_ + 1);
+    size_t total = 0;
+    for (int i = 0; i < count_; ++i) {
+      slot_offset[i] = uint32_t(total);
+      if (splats[i].visible()) total += size_t(splats[i].tiles_x()) * splats[i].tiles_y();
+    }
+    slot_offset[count_] = uint32_t(total);
+    w.entry_offset[image + 1] = total;
+  });
+  w.entry_offset[0] = 0;
+  for (int image = 0; image < batch_; ++image) {
+    if (w.entry_offset[image + 1] > UINT32_MAX)
+      throw std::invalid_argument(
+          "The Gaussians of one image touch more than 2^32 tiles. Render a smaller image or check "
+          "the Gaussians' scales.");
+    w.entry_offset[image + 1] += w.entry_offset[image];
+  }
+  w.entries.reserve(w.entry_offset[batch_]);
+  w.sort_keys.reserve(size_t(team.size()) * 2 * count_);
+  team.run(batch_, [&](int64_t image, int thread) {
+    sort_image(int(image), w.sort_keys.data() + size_t(thread) * 2 * count_);
+  });
+}
+
+// Front to back, then by tile: a counting sort keeps the order within each tile.
+void Rendering::sort_image(int image, uint64_t* keys) {
+  Workspace& w = *workspace_;
+  const Splat* splats = w.splats.data() + size_t(image) * count_;
+  uint32_t* start = w.tile_start.data() + size_t(image) * (tiles_per_image() + 1);
+  std::fill(start, start + tiles_per_image() + 1, 0u);
+  size_t visible = 0;
+  for (int i = 0; i < count_; ++i) {
+    if (!splats[i].visible()) continue;
+    uint32_t depth_bits;  // of a positive float: ordered like the float
+    std::memcpy(&depth_bits, &splats[i].depth, sizeof depth_bits);
+    keys[visible++] = uint64_t(depth_bits) << 32 | uint32_t(i);
+    for_tiles(splats[i], tiles_x_, [&](int tile) { ++start[tile]; });
+  }
+  const uint64_t* sorted = radix_sort(keys, keys + count_, visible);
+  uint32_t total = 0;
+  for (int tile = 0; tile <= tiles_per_image(); ++tile) {
+    const uint32_t here = start[tile];
+    start[tile] = total;
+    total += here;
+  }
+  uint32_t* entries = w.entries.data() + w.entry_offset[image];
+  for (size_t i = 0; i < visible; ++i) {
+    const uint32_t gaussian = uint32_t(sorted[i]);
+    for_tiles(splats[gaussian], tiles_x_, [&](int tile) { entries[start[tile]++] = gaussian; });
+  }
+  // Each start has moved to the next tile's; move them back.
+  for (int tile = tiles_per_image(); tile > 0; --tile) start[tile] = start[tile - 1];
+  start[0] = 0;
+}
+
+Tile Rendering::tile(int image, int index) const {
+  const Workspace& w = *workspace_;
+  const uint32_t* start = w.tile_start.data() + size_t(image) * (tiles_per_image() + 1) + index;
+  Tile tile;
+  tile.splats = w.splats.data() + size_t(image) * count_;
+  tile.entries = w.entries.data() + w.entry_offset[image] + start[0];
+  tile.entry_count = start[1] - start[0];
+  tile.slot_offset = w.slot_offset.data() + size_t(image) * (count_ + 1);
+  tile.tile_x = index % tiles_x_, tile.tile_y = index / tiles_x_;
+  tile.width = width_, tile.height = height_;
+  return tile;
+}
+
+void Rendering::draw(const Attribute& background, float* image, float* alpha, float* depth,
+                     int threads) {
+  Team team(threads);
+  workspace_->scratch.reserve(team.size());
+  const size_t pixels = size_t(width_) * height_;
+  team.run(int64_t(batch_) * tiles_per_image(), [&](int64_t item, int thread) {
+    const int b = int(item / tiles_per_image());
+    const ForwardOutput out = {background.of(b), image + b * pixels * 3, alpha + b * pixels,
+                               depth ? depth + b * pixels : nullptr};
+    kernels_->forward_tile(tile(b, int(item % tiles_per_image())), out,
+                           workspace_->scratch[thread]);
+  });
+}
+
+void Rendering::average(const Attribute& images, int channels, float* weighted_sum,
+                        float* weight_sum, float* max_weight, int threads) {
+  Team team(threads);
+  Workspace& w = *workspace_;
+  const int width = channels + 2;
+  w.scratch.reserve(team.size());
+  w.slots.reserve(w.entry_offset[batch_] * width);
+  team.run(int64_t(batch_) * tiles_per_image(), [&](int64_t item, int thread) {
+    const int b = int(item / tiles_per_image());
+    kernels_->average_tile(tile(b, int(item % tiles_per_image())), images.of(b), channels,
+                           w.scratch[thread], w.slots.data() + w.entry_offset[b] * width);
+  });
+  const int chunks = chunks_of(count_);
+  team.run(int64_t(batch_) * chunks, [&](int64_t item, int) {
+    const int b = int(item / chunks), begin = int(item % chunks) * kChunk;
+    const uint32_t* offset = w.slot_offset.data() + size_t(b) * (count_ + 1);
+    for (int i = begin; i < std::min(begin + kChunk, count_); ++i) {
+      float sums[kMaxChannels + 2] = {};
+      for (uint32_t k = offset[i]; k < offset[i + 1]; ++k) {
+        const float* slot = w.slots.data() + (w.entry_offset[b] + k) * width;
+        for (int c = 0; c <= channels; ++c) sums[c] += slot[c];
+        sums[channels + 1] = std::max(sums[channels + 1], slot[channels + 1]);
+      }
+      const size_t row = size_t(b) * count_ + i;
+      if (weighted_sum) std::copy(sums, sums + channels, weighted_sum + row * channels);
+      if (weight_sum) weight_sum[row] = sums[channels];
+      if (max_weight) max_weight[row] = sums[channels + 1];
+    }
+  });
+}
+
+void Rendering::backward(const Scene& scene, const BackwardInput& input,
+                         const SceneGradient& gradient, int threads) {
+  Team team(threads);
+  Workspace& w = *workspace_;
+  w.scratch.reserve(team.size());
+  w.slots.reserve(w.entry_offset[batch_] * kMoments);
+  const size_t pixels = size_t(width_) * height_;
+  team.run(int64_t(batch_) * tiles_per_image(), [&](int64_t item, int thread) {
+    const int b = int(item / tiles_per_image());
+    const auto of_image = [&](const float* data, int width) {
+      return data ? data + b * pixels * width : nullptr;
+    };
+    const BackwardInput in = {of_image(input.image, 3), of_image(input.alpha, 1),
+                              of_image(input.image_grad, 3), of_image(input.alpha_grad, 1)};
+    kernels_->backward_tile(tile(b, int(item % tiles_per_image())), in, w.scratch[thread],
+                            w.slots.data() + w.entry_offset[b] * kMoments);
+  });
+  // Every chunk of Gaussians takes the images in order, so shared gradients are sums in order.
+  team.run(chunks_of(count_), [&](int64_t chunk, int) {
+    const int begin = int(chunk) * kChunk, end = std::min(begin + kChunk, count_);
+    const auto clear = [&](const Attribute& attribute, float* grad, int width) {
+      for (int b = 0; b < (attribute.batch_stride ? batch_ : 1); ++b)
+        std::fill(grad + (size_t(b) * count_ + begin) * width,
+                  grad + (size_t(b) * count_ + end) * width, 0.0f);
+    };
+    clear(scene.means, gradient.means, 3);
+    clear(scene.quats, gradient.quats, 4);
+    clear(scene.scales, gradient.scales, 3);
+    clear(scene.opacities, gradient.opacities, 1);
+    clear(scene.colors, gradient.colors, 3);
+    for (int b = 0; b < batch_; ++b) {
+      const SceneGradient of_image = {
+          gradient.means + b * scene.means.batch_stride,
+          gradient.quats + b * scene.quats.batch_stride,
+          gradient.scales + b * scene.scales.batch_stride,
+          gradient.opacities + b * scene.opacities.batch_stride,
+          gradient.colors + b * scene.colors.batch_stride};
+      kernels_->project_backward(scene, &w.cameras[size_t(b) * kCameraFloats], b, begin, end,
+                                 w.slot_offset.data() + size_t(b) * (count_ + 1),
+                                 w.slots.data() + w.entry_offset[b] * kMoments, of_image);
+    }
+  });
+}
+
+}  // namespace rgbavatar

@@ -1,0 +1,92 @@
+// The driver: memory, threads and the order of the stages; the loops are in isa_kernels.cpp.
+#pragma once
+
+#include <cstdlib>
+#include <memory>
+#include <new>
+#include <string>
+#include <vector>
+
+#include "layout.h"
+
+namespace rgbavatar {
+
+// Memory that grows and is not initialised.
+template <class T>
+class Buffer {
+ public:
+  void reserve(size_t count) {
+    if (count <= capacity_) return;
+    void* memory = nullptr;
+    if (posix_memalign(&memory, 64, count * sizeof(T)) != 0) throw std::bad_alloc();
+    data_.reset(static_cast<T*>(memory));
+    capacity_ = count;
+  }
+  T* data() { return data_.get(); }
+  const T* data() const { return data_.get(); }
+  T& operator[](size_t i) { return data_.get()[i]; }
+  const T& operator[](size_t i) const { return data_.get()[i]; }
+
+ private:
+  struct Free {
+    void operator()(T* memory) const { std::free(memory); }
+  };
+  std::unique_ptr<T, Free> data_;
+  size_t capacity_ = 0;
+};
+
+// What one rendering needs; returned to a small pool, because fresh pages cost as much as work.
+struct Workspace {
+  Buffer<Splat> splats;          // [B, N]
+  Buffer<uint32_t> slot_offset;  // [B, N + 1]: first (Gaussian, tile) slot of every Gaussian
+  Buffer<uint32_t> tile_start;   // [B, tiles + 1]: into the image's entries
+  Buffer<uint32_t> entries;      // Gaussians by tile, front to back; slots many per image
+  Buffer<size_t> entry_offset;   // [B + 1]: each image's first entry and slot
+  Buffer<float> cameras;         // [B, kCameraFloats]
+  Buffer<float> slots;
+  Buffer<uint64_t> sort_keys;  // [threads, 2, N]
+  Buffer<TileScratch> scratch;   // [threads]
+};
+
+struct Cameras {
+  const float *world_to_camera, *focal_px, *principal_point_px;
+  int count;
+};
+
+// Names of the instruction sets this processor runs, the fastest first.
+std::vector<std::string> instruction_sets();
+
+// Projects and sorts at construction; then draws, averages and differentiates any number of
+// times. The Gaussians' memory is not kept: the caller passes the same scene again.
+class Rendering {
+ public:
+  Rendering(const Scene& scene, const Cameras& cameras, const std::string& instruction_set,
+            int threads);
+  ~Rendering();
+  Rendering(const Rendering&) = delete;
+  Rendering& operator=(const Rendering&) = delete;
+
+  // image [B, H, W, 3], alpha [B, H, W], depth [B, H, W] or null, background [B or 1, 3].
+  void draw(const Attribute& background, float* image, float* alpha, float* depth, int threads);
+
+  // images [B or 1, H, W, C] with C >= 0; outputs [B, N, C], [B, N], [B, N]; each may be null.
+  void average(const Attribute& images, int channels, float* weighted_sum, float* weight_sum,
+               float* max_weight, int threads);
+
+  // Fills `gradient`, whose arrays have the shapes of the scene's attributes.
+  void backward(const Scene& scene, const BackwardInput& input, const SceneGradient& gradient,
+                int threads);
+
+ private:
+  void project(const Scene& scene, class Team& team);
+  void sort(class Team& team);
+  void sort_image(int image, uint64_t* keys);
+  Tile tile(int image, int index) const;
+  int tiles_per_image() const { return tiles_x_ * tiles_y_; }
+
+  int batch_, count_, width_, height_, tiles_x_, tiles_y_;
+  const Kernels* kernels_;
+  std::unique_ptr<Workspace> workspace_;
+};
+
+}  // namespace rgbavatar

@@ -1,0 +1,279 @@
+// Sixteen floats as one value: one AVX-512 register, two AVX registers or four of 128 bits, so
+// that loops read like formulas. Lives in a namespace of its own for every instruction set,
+// because the linker would merge equal names that were compiled with different flags.
+#pragma once
+
+#include <cstdint>
+
+#if defined(__x86_64__)
+#include <immintrin.h>
+#endif
+
+#define RGBAVATAR_FUNCTION static inline __attribute__((always_inline))
+#define RGBAVATAR_MEMBER inline __attribute__((always_inline))
+
+namespace rgbavatar::RGBAVATAR_ISA {
+
+#if defined(__AVX512F__)
+constexpr int kNativeLanes = 16;
+#elif defined(__AVX2__)
+constexpr int kNativeLanes = 8;
+#else
+constexpr int kNativeLanes = 4;
+#endif
+constexpr int kLanes = 16;
+
+typedef float NativeFloat __attribute__((vector_size(4 * kNativeLanes)));
+typedef float UnalignedFloat __attribute__((vector_size(4 * kNativeLanes), aligned(4)));
+typedef int32_t NativeInt __attribute__((vector_size(4 * kNativeLanes)));
+#if defined(__AVX512F__)
+typedef __mmask16 NativeMask;
+#else
+typedef NativeInt NativeMask;
+#endif
+
+template <int Lanes>
+struct Mask {
+  Mask<Lanes / 2> low, high;
+  friend RGBAVATAR_MEMBER Mask operator&(Mask a, Mask b) { return {a.low & b.low, a.high & b.high}; }
+};
+
+template <>
+struct Mask<kNativeLanes> {
+  NativeMask m;
+  friend RGBAVATAR_MEMBER Mask operator&(Mask a, Mask b) { return {NativeMask(a.m & b.m)}; }
+};
+
+template <int Lanes>
+struct Floats {
+  typedef Floats<Lanes / 2> Half;
+  Half low, high;
+  Floats() = default;
+  RGBAVATAR_MEMBER Floats(Half l, Half h) : low(l), high(h) {}
+  RGBAVATAR_MEMBER Floats(float s) : low(s), high(s) {}
+#define RGBAVATAR_PAIRWISE(op) \
+  friend RGBAVATAR_MEMBER Floats operator op(Floats a, Floats b) { \
+    return {a.low op b.low, a.high op b.high}; \
+  }
+#define RGBAVATAR_PAIRWISE_COMPARE(op) \
+  friend RGBAVATAR_MEMBER Mask<Lanes> operator op(Floats a, Floats b) { \
+    return {a.low op b.low, a.high op b.high}; \
+  }
+  RGBAVATAR_PAIRWISE(+)
+  RGBAVATAR_PAIRWISE(-)
+  RGBAVATAR_PAIRWISE(*)
+  RGBAVATAR_PAIRWISE(/)
+  RGBAVATAR_PAIRWISE_COMPARE(>=)
+  RGBAVATAR_PAIRWISE_COMPARE(<=)
+  RGBAVATAR_PAIRWISE_COMPARE(>)
+  RGBAVATAR_PAIRWISE_COMPARE(==)
+#undef RGBAVATAR_PAIRWISE
+#undef RGBAVATAR_PAIRWISE_COMPARE
+};
+
+template <>
+struct Floats<kNativeLanes> {
+  NativeFloat v;
+  Floats() = default;
+  RGBAVATAR_MEMBER explicit Floats(NativeFloat n) : v(n) {}
+  RGBAVATAR_MEMBER Floats(float s) : v(s - NativeFloat{}) {}
+#define RGBAVATAR_NATIVE(op) \
+  friend RGBAVATAR_MEMBER Floats operator op(Floats a, Floats b) { return Floats(a.v op b.v); }
+#if defined(__AVX512F__)
+#define RGBAVATAR_NATIVE_COMPARE(op, code) \
+  friend RGBAVATAR_MEMBER Mask<kNativeLanes> operator op(Floats a, Floats b) { \
+    return {_mm512_cmp_ps_mask(a.v, b.v, code)}; \
+  }
+#else
+#define RGBAVATAR_NATIVE_COMPARE(op, code) \
+  friend RGBAVATAR_MEMBER Mask<kNativeLanes> operator op(Floats a, Floats b) { \
+    return {a.v op b.v}; \
+  }
+#endif
+  RGBAVATAR_NATIVE(+)
+  RGBAVATAR_NATIVE(-)
+  RGBAVATAR_NATIVE(*)
+  RGBAVATAR_NATIVE(/)
+  RGBAVATAR_NATIVE_COMPARE(>=, _CMP_GE_OQ)
+  RGBAVATAR_NATIVE_COMPARE(<=, _CMP_LE_OQ)
+  RGBAVATAR_NATIVE_COMPARE(>, _CMP_GT_OQ)
+  RGBAVATAR_NATIVE_COMPARE(==, _CMP_EQ_OQ)
+#undef RGBAVATAR_NATIVE
+#undef RGBAVATAR_NATIVE_COMPARE
+};
+
+typedef Floats<kLanes> Wide;
+typedef Floats<kNativeLanes> Native;
+typedef Mask<kLanes> WideMask;
+typedef Mask<kNativeLanes> Flags;
+
+// ---- one register -----------------------------------------------------------------------------
+
+RGBAVATAR_FUNCTION Native select(Flags m, Native a, Native b) {
+#if defined(__AVX512F__)
+  return Native(_mm512_mask_blend_ps(m.m, b.v, a.v));
+#else
+  return Native(m.m ? a.v : b.v);
+#endif
+}
+
+RGBAVATAR_FUNCTION Native min_of(Native a, Native b) { return Native(a.v < b.v ? a.v : b.v); }
+RGBAVATAR_FUNCTION Native max_of(Native a, Native b) { return Native(a.v > b.v ? a.v : b.v); }
+
+RGBAVATAR_FUNCTION bool any(Flags m) {
+#if defined(__AVX512F__)
+  return m.m != 0;
+#elif defined(__AVX2__)
+  return _mm256_movemask_ps((__m256)m.m) != 0;
+#elif defined(__x86_64__)
+  return _mm_movemask_ps((__m128)m.m) != 0;
+#else
+  return (m.m[0] | m.m[1] | m.m[2] | m.m[3]) != 0;
+#endif
+}
+
+RGBAVATAR_FUNCTION Native square_root(Native a) {
+#if defined(__AVX512F__)
+  return Native(_mm512_sqrt_ps(a.v));
+#elif defined(__AVX2__)
+  return Native(_mm256_sqrt_ps(a.v));
+#elif defined(__x86_64__)
+  return Native(_mm_sqrt_ps(a.v));
+#else
+  for (int i = 0; i < kNativeLanes; ++i) a.v[i] = __builtin_sqrtf(a.v[i]);
+  return a;
+#endif
+}
+
+// 1 / a to about 23 bits: the hardware's estimate and one Newton step.
+RGBAVATAR_FUNCTION Native reciprocal_of(Native a) {
+#if defined(__AVX512F__)
+  const Native estimate(_mm512_rcp14_ps(a.v));
+#elif defined(__AVX2__)
+  const Native estimate(_mm256_rcp_ps(a.v));
+#elif defined(__x86_64__)
+  const Native estimate(_mm_rcp_ps(a.v));
+#else
+  return Native(1.0f) / a;
+#endif
+#if defined(__x86_64__)
+  return estimate + estimate * (Native(1.0f) - a * estimate);
+#endif
+}
+
+// 2^a for -126 < a < 127, relative error 3e-6; other arguments give any number.
+// Adding 1.5 * 2^23 rounds to the nearest integer n and leaves n in the low bits; 2^(a-n) is the
+// minimax polynomial of degree 4 on [-1/2, 1/2], and n is added to its exponent.
+RGBAVATAR_FUNCTION Native exp2_of(Native a) {
+  const Native shifted = a + Native(12582912.0f);
+  const Native f = a - (shifted - Native(12582912.0f));
+  Native p(0.009570102207362652f);
+  p = p * f + Native(0.05591785907745361f);
+  p = p * f + Native(0.240247443318367f);
+  p = p * f + Native(0.6931217908859253f);
+  p = p * f + Native(0.9999992847442627f);
+  return Native((NativeFloat)((NativeInt)p.v + ((NativeInt)shifted.v << 23)));
+}
+
+// Log2 of a positive, normal number: the mantissa m in [1/sqrt 2, sqrt 2) through the odd series
+// of atanh in (m - 1) / (m + 1).
+RGBAVATAR_FUNCTION Native log2_of(Native a) {
+  const NativeInt bits = (NativeInt)a.v - 0x3f3504f3;
+  const Native exponent(__builtin_convertvector(bits >> 23, NativeFloat));
+  const Native m((NativeFloat)((bits & 0x7fffff) + 0x3f3504f3));
+  const Native s = (m - Native(1.0f)) / (m + Native(1.0f)), s2 = s * s;
+  Native p(0.3205989f);  // (2 / ln 2) / 9, / 7, / 5, / 3, / 1
+  p = p * s2 + Native(0.41219860f);
+  p = p * s2 + Native(0.57707802f);
+  p = p * s2 + Native(0.96179669f);
+  p = p * s2 + Native(2.88539008f);
+  return p * s + exponent;
+}
+
+RGBAVATAR_FUNCTION void load(Native& a, const float* from) {
+  a.v = *reinterpret_cast<const UnalignedFloat*>(from);
+}
+RGBAVATAR_FUNCTION void store(Native a, float* to) {
+  *reinterpret_cast<UnalignedFloat*>(to) = a.v;
+}
+
+// ---- pairs of halves --------------------------------------------------------------------------
+
+#define RGBAVATAR_HALVES1(name) \
+  template <int L> \
+  RGBAVATAR_FUNCTION Floats<L> name(Floats<L> a) { \
+    return {name(a.low), name(a.high)}; \
+  }
+#define RGBAVATAR_HALVES2(name) \
+  template <int L> \
+  RGBAVATAR_FUNCTION Floats<L> name(Floats<L> a, Floats<L> b) { \
+    return {name(a.low, b.low), name(a.high, b.high)}; \
+  }
+RGBAVATAR_HALVES1(square_root)
+RGBAVATAR_HALVES1(reciprocal_of)
+RGBAVATAR_HALVES1(exp2_of)
+RGBAVATAR_HALVES1(log2_of)
+RGBAVATAR_HALVES2(min_of)
+RGBAVATAR_HALVES2(max_of)
+#undef RGBAVATAR_HALVES1
+#undef RGBAVATAR_HALVES2
+
+template <int L>
+RGBAVATAR_FUNCTION Floats<L> select(Mask<L> m, Floats<L> a, Floats<L> b) {
+  return {select(m.low, a.low, b.low), select(m.high, a.high, b.high)};
+}
+template <int L>
+RGBAVATAR_FUNCTION bool any(Mask<L> m) {
+  return any(m.low) || any(m.high);
+}
+template <int L>
+RGBAVATAR_FUNCTION void load(Floats<L>& a, const float* from) {
+  load(a.low, from);
+  load(a.high, from + L / 2);
+}
+template <int L>
+RGBAVATAR_FUNCTION void store(Floats<L> a, float* to) {
+  store(a.low, to);
+  store(a.high, to + L / 2);
+}
+
+RGBAVATAR_FUNCTION Wide load_wide(const float* from) {
+  Wide a;
+  load(a, from);
+  return a;
+}
+
+RGBAVATAR_FUNCTION Native sum_to_register(Native a) { return a; }
+template <int L>
+RGBAVATAR_FUNCTION Native sum_to_register(Floats<L> a) {
+  return sum_to_register(a.low + a.high);
+}
+
+// The sum of the lanes.
+RGBAVATAR_FUNCTION float sum_of(Wide a) {
+  const Native s = sum_to_register(a);
+#if defined(__x86_64__)
+#if defined(__AVX512F__)
+  const __m256 half = _mm512_castps512_ps256(s.v) + _mm512_extractf32x8_ps(s.v, 1);
+  const __m128 q = _mm256_castps256_ps128(half) + _mm256_extractf128_ps(half, 1);
+#elif defined(__AVX2__)
+  const __m128 q = _mm256_castps256_ps128(s.v) + _mm256_extractf128_ps(s.v, 1);
+#else
+  const __m128 q = s.v;
+#endif
+  const __m128 d = q + _mm_movehl_ps(q, q);
+  return d[0] + d[1];
+#else
+  return (s.v[0] + s.v[2]) + (s.v[1] + s.v[3]);
+#endif
+}
+
+// The largest lane; all are at least 0.
+RGBAVATAR_FUNCTION float max_lane(Wide a) {
+  float lanes[kLanes], largest = 0.0f;
+  store(a, lanes);
+  for (int i = 0; i < kLanes; ++i) largest = lanes[i] > largest ? lanes[i] : largest;
+  return largest;
+}
+
+}  // namespace rgbavatar::RGBAVATAR_ISA
