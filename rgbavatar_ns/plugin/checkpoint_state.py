@@ -1,5 +1,6 @@
 """What a checkpoint says about the avatar beside its parameters."""
 
+from collections.abc import Mapping
 from typing import Any
 
 from rgbavatar_ns.avatar import Avatar, describe_layout
@@ -23,7 +24,7 @@ def model_state(avatar: Avatar, subject: Subject) -> dict[str, Any]:
     }
 
 
-def require_same_layout(state_dict: dict[str, Any], avatar: Avatar) -> None:
+def require_same_layout(state_dict: Mapping[str, Any], avatar: Avatar) -> None:
     """Raise UserError where the checkpoint's theta is not laid out as `avatar` takes it."""
     extra = state_dict.get(_EXTRA_STATE)
     if extra is None:

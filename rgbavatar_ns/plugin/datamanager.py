@@ -1,5 +1,8 @@
 """Batches of whole frames for nerfstudio's pipeline, decoded in the background."""
 
+# pyright: reportIncompatibleVariableOverride=false
+# nerfstudio's classes are used by narrowing their fields, which a strict type system forbids.
+
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path

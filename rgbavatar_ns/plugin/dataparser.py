@@ -1,5 +1,8 @@
 """nerfstudio's view of a dataset in the project's own format."""
 
+# pyright: reportIncompatibleVariableOverride=false
+# nerfstudio's classes are used by narrowing their fields, which a strict type system forbids.
+
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any

@@ -1,5 +1,9 @@
 """nerfstudio's model around an `Avatar`; everything that is the method happens there."""
 
+# pyright: reportIncompatibleVariableOverride=false
+# nerfstudio's classes are used by narrowing their fields, which a strict type system forbids.
+
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -92,7 +96,7 @@ class RGBAvatarModel(Model):
         """The avatar's parameters under the names of the paper's learning rates."""
         return self.avatar.parameter_groups()
 
-    def get_outputs(self, ray_bundle: RayBundle | Cameras) -> Outputs:
+    def get_outputs(self, ray_bundle: RayBundle | Cameras) -> dict[str, Tensor | list[Any]]:
         """Draw B cameras: rgb over black [B H W 3], accumulation and depth in metres [B H W 1].
 
         Depth is along the camera's z, and only computed outside training. The viewer's cameras
@@ -103,7 +107,10 @@ class RGBAvatarModel(Model):
                 "This method draws whole images and cannot render single rays.",
                 "Leave out options that trace rays, such as --render-nearest-camera.",
             )
-        cameras = ray_bundle if ray_bundle.shape else ray_bundle.reshape((1,))
+        return {**self._draw(ray_bundle)}
+
+    def _draw(self, cameras: Cameras) -> Outputs:
+        cameras = cameras if cameras.shape else cameras.reshape((1,))
         metadata = cameras.metadata or {}
         theta, background = metadata.get("theta"), None
         if theta is None:
@@ -127,7 +134,7 @@ class RGBAvatarModel(Model):
     @torch.no_grad()
     def get_outputs_for_camera(self, camera: Cameras, obb_box: Any = None) -> Outputs:
         """Draw one camera: [H W C] images. nerfstudio's crop box does not apply and is ignored."""
-        outputs = self.get_outputs(camera.to(self.device))
+        outputs = self._draw(camera.to(self.device))
         return {name: image[0] for name, image in outputs.items()}
 
     def get_loss_dict(
@@ -172,7 +179,7 @@ class RGBAvatarModel(Model):
         image = outputs["rgb"][None]
         truth = batch["image"].to(self.device)[None]
         opaque = torch.cat([truth[..., :3], torch.ones_like(truth[..., :1])], dim=-1)
-        scores = evaluate_images(image, opaque, self.lpips_metric).to_dict()
+        scores = evaluate_images(image, opaque, self.lpips_metric)
         metrics = {name: value for name, value in scores.items() if isinstance(value, float)}
         error = ((image - truth).abs() * 4).clamp(0, 1)
         row = torch.cat([truth, image.clamp(0, 1), error], dim=2)[0]
@@ -191,7 +198,7 @@ class RGBAvatarModel(Model):
         """Nothing to restore: `load_state_dict` has compared it with this dataset's subject."""
 
     def load_state_dict(
-        self, state_dict: dict[str, Any], strict: bool = True, assign: bool = False
+        self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False
     ) -> Any:
         """Load parameters; raises UserError, naming both, if theta's layout is another one."""
         require_same_layout(state_dict, self.avatar)

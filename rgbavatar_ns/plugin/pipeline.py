@@ -1,5 +1,8 @@
 """nerfstudio's pipeline with this method's data and model, and LPIPS at evaluation."""
 
+# pyright: reportIncompatibleVariableOverride=false
+# nerfstudio's classes are used by narrowing their fields, which a strict type system forbids.
+
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -27,7 +30,12 @@ class RGBAvatarPipeline(VanillaPipeline):
 
     config: RGBAvatarPipelineConfig
     datamanager: RGBAvatarDataManager
-    model: RGBAvatarModel
+    _model: RGBAvatarModel
+
+    @property
+    def model(self) -> RGBAvatarModel:
+        """The model; this method trains on one device, so it is never wrapped."""
+        return self._model
 
     def get_average_eval_image_metrics(
         self, step: int | None = None, output_path: Path | None = None, get_std: bool = False

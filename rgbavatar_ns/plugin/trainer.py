@@ -1,5 +1,8 @@
 """nerfstudio's trainer with checkpoints, resuming and interruption that can be relied on."""
 
+# pyright: reportIncompatibleVariableOverride=false
+# nerfstudio's classes are used by narrowing their fields, which a strict type system forbids.
+
 import json
 import time
 from dataclasses import dataclass, field
@@ -14,6 +17,7 @@ from nerfstudio.utils import writer
 from nerfstudio.utils.misc import step_check
 from nerfstudio.utils.rich_utils import CONSOLE
 from nerfstudio.utils.writer import EventName
+from nerfstudio.viewer.viewer import Viewer
 
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.plugin.checkpoints import load_newest, read_checkpoint, save_checkpoint
@@ -77,7 +81,7 @@ class RGBAvatarTrainer(Trainer):
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         """Build pipeline, optimisers, viewer and writers; load a checkpoint if one is named."""
         super().setup(test_mode)
-        if self.viewer_state is not None:
+        if isinstance(self.viewer_state, Viewer):
             for line in self.viewer_state.viewer_info:
                 CONSOLE.print(line, highlight=False)
 
