@@ -1,0 +1,275 @@
+"""A folder of tracked frames, read and checked: every fault is one error with its remedy."""
+
+import json
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from rgbavatar_ns.data.native_format import (
+    FORMAT,
+    HEAD_FILE,
+    INDEX_FILE,
+    THETA_FILE,
+    VERSION,
+    cameras_from_json,
+)
+from rgbavatar_ns.data.png import png_size, read_png_rgba
+from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.head import HeadArrays, HeadModel, ThetaLayout
+from rgbavatar_ns.kernels.types import PinholeCameras
+
+_MAKE_ONE = (
+    "Make a dataset with `rgbavatar demo-data FOLDER` or `rgbavatar track VIDEO FOLDER`, and "
+    "pass that folder."
+)
+_WRITE_AGAIN = "Write the dataset again, or mend this file."
+
+
+@dataclass(frozen=True)
+class TrackedDataset:
+    """Tracked frames of one person; images stay on disk until they are asked for.
+
+    A "position" counts frames in the order of this dataset from 0; `frame_index` says which frame
+    of the source that is. The last positions are held out: `train` and `test` partition them.
+    """
+
+    root: Path
+    arrays: HeadArrays
+    identity: Float[Tensor, "I"]
+    layout: ThetaLayout
+    theta: Float[Tensor, "F H"]
+    cameras: PinholeCameras
+    """One for each frame (C = F), also where all are the same."""
+    image_paths: list[Path]
+    frame_index: tuple[int, ...]
+    width: int
+    height: int
+    num_test_frames: int
+
+    def __len__(self) -> int:
+        return len(self.image_paths)
+
+    @property
+    def train(self) -> tuple[int, ...]:
+        """Positions of the frames to train from."""
+        return tuple(range(len(self) - self.num_test_frames))
+
+    @property
+    def test(self) -> tuple[int, ...]:
+        """Positions of the held-out frames: the last ones, as in the paper."""
+        return tuple(range(len(self) - self.num_test_frames, len(self)))
+
+    def read_image(self, position: int) -> UInt8[np.ndarray, "height width 4"]:
+        """Decode one frame to RGBA with straight alpha.
+
+        Raises UserError naming the file where it is missing, damaged or of another size.
+        """
+        path = self.image_paths[position]
+        image = read_png_rgba(path)
+        height, width = image.shape[:2]
+        _check_size(path, (width, height), (self.width, self.height))
+        return image
+
+
+def load_dataset(path: str | Path) -> TrackedDataset:
+    """Read a dataset folder and check all of it but the pixels, which are checked when decoded.
+
+    Raises UserError for a missing or empty folder, another format or version, theta that holds
+    NaN or does not fit the head, cameras that are none, images that are missing, cut short or
+    of different sizes.
+    """
+    root = Path(path)
+    index = _read_index(root)
+    width, height = _whole(index, "width"), _whole(index, "height")
+    arrays = _read_head(root, str(index.get("head")))
+    layout = _read_layout(root, index, arrays)
+    identity = _read_identity(root, index, arrays)
+    frames = _read_frames(root, index)
+    numbers = tuple(frame["index"] for frame in frames)
+    theta = _read_theta(root, layout, numbers)
+    shared = index.get("camera")
+    cameras = cameras_from_json(
+        [(f"frame {frame['index']}", frame.get("camera", shared)) for frame in frames],
+        width,
+        height,
+    )
+    image_paths = [root / frame["image"] for frame in frames]
+    for image_path in image_paths:
+        _check_size(image_path, png_size(image_path), (width, height))
+    return TrackedDataset(
+        root,
+        arrays,
+        identity,
+        layout,
+        theta,
+        cameras,
+        image_paths,
+        numbers,
+        width,
+        height,
+        _read_test_frames(root, index, len(frames)),
+    )
+
+
+def _read_index(root: Path) -> dict[str, Any]:
+    if not root.exists():
+        raise UserError(f"The dataset folder {root} does not exist.", _MAKE_ONE)
+    if not root.is_dir():
+        raise UserError(f"{root} is a file, not a dataset folder.", _MAKE_ONE)
+    path = root / INDEX_FILE
+    if not path.exists():
+        what = "is empty" if not any(root.iterdir()) else f"has no {INDEX_FILE}"
+        raise UserError(f"The dataset folder {root} {what}.", _MAKE_ONE)
+    try:
+        index = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise UserError(f"{path} cannot be read: {error}.", _WRITE_AGAIN) from None
+    if not isinstance(index, dict) or index.get("format") != FORMAT:
+        raise UserError(f'{path} does not say "format": "{FORMAT}".', _MAKE_ONE)
+    if index.get("version") != VERSION:
+        raise UserError(
+            f"{path} has version {index.get('version')} of the format; version {VERSION} is known.",
+            "Update rgbavatar-ns, or write the dataset again with this version of it.",
+        )
+    missing = [name for name in ("head", "identity", "layout", "frames") if name not in index]
+    if missing:
+        raise UserError(f"{path} lacks {', '.join(missing)}.", _WRITE_AGAIN)
+    return index
+
+
+def _whole(index: dict[str, Any], name: str) -> int:
+    value = index.get(name)
+    if not isinstance(value, int) or value < 1:
+        raise UserError(
+            f"{INDEX_FILE} has {name} = {value!r}; a positive whole number is needed.",
+            _WRITE_AGAIN,
+        )
+    return value
+
+
+def _read_head(root: Path, name: str) -> HeadArrays:
+    path = root / HEAD_FILE
+    if path.exists():
+        try:
+            return HeadArrays.load(path)
+        except (OSError, ValueError, KeyError) as error:
+            raise UserError(f"{path} holds no head model: {error}.", _WRITE_AGAIN) from None
+    embedded = HeadArrays.embedded()
+    if name != embedded.name:
+        raise UserError(
+            f"The dataset {root} was made for the head '{name}', which is not known here.",
+            f"Put its arrays beside it as {HEAD_FILE}, or track the video with the embedded head "
+            f"'{embedded.name}'.",
+        )
+    return embedded
+
+
+def _read_layout(root: Path, index: dict[str, Any], arrays: HeadArrays) -> ThetaLayout:
+    try:
+        layout = ThetaLayout.from_json(index["layout"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise UserError(
+            f"The layout in {root / INDEX_FILE} is not valid: {error}.", _WRITE_AGAIN
+        ) from None
+    expected = HeadModel(arrays).layout
+    if layout != expected:
+        raise UserError(
+            f"The dataset {root} has theta of {_describe(layout)}, but the head '{arrays.name}' "
+            f"takes {_describe(expected)}.",
+            "Track the video again with this head.",
+        )
+    return layout
+
+
+def _describe(layout: ThetaLayout) -> str:
+    parts = ", ".join(f"{field.name} {field.size}" for field in layout.fields)
+    return f"{layout.size} values ({parts})"
+
+
+def _read_identity(root: Path, index: dict[str, Any], arrays: HeadArrays) -> Float[Tensor, "I"]:
+    try:
+        identity = torch.tensor(index["identity"], dtype=torch.float32)
+    except (TypeError, ValueError):
+        identity = torch.full((1,), torch.nan)
+    if identity.shape != (arrays.num_identity,) or not torch.isfinite(identity).all():
+        raise UserError(
+            f"The identity in {root / INDEX_FILE} is not a list of {arrays.num_identity} finite "
+            f"numbers, which the head '{arrays.name}' takes.",
+            _WRITE_AGAIN,
+        )
+    return identity
+
+
+def _read_frames(root: Path, index: dict[str, Any]) -> list[dict[str, Any]]:
+    frames = index["frames"]
+    if not isinstance(frames, list) or not frames:
+        raise UserError(f"The dataset {root} lists no frames.", _MAKE_ONE)
+    for frame in frames:
+        whole = isinstance(frame, dict) and isinstance(frame.get("index"), int)
+        if not whole or not isinstance(frame.get("image"), str):
+            raise UserError(
+                f"{root / INDEX_FILE} has a frame without a number or an image: {frame}.",
+                _WRITE_AGAIN,
+            )
+    counts = Counter(frame["index"] for frame in frames)
+    twice = [number for number, count in counts.items() if count > 1]
+    if twice:
+        raise UserError(
+            f"The dataset {root} has {len(twice)} frame numbers more than once "
+            f"({_first_few(twice)}).",
+            "Give every frame a number of its own.",
+        )
+    return frames
+
+
+def _read_theta(root: Path, layout: ThetaLayout, numbers: tuple[int, ...]) -> Float[Tensor, "F H"]:
+    path = root / THETA_FILE
+    try:
+        theta = np.load(path, allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise UserError(f"{path} cannot be read: {error}.", _WRITE_AGAIN) from None
+    expected = (len(numbers), layout.size)
+    if theta.shape != expected or theta.dtype.kind != "f":
+        raise UserError(
+            f"{path} holds {theta.dtype} of shape {theta.shape}; {len(numbers)} frames of "
+            f"{_describe(layout)} need floats of shape {expected}.",
+            "Write the dataset again with the layout of its head.",
+        )
+    wrong = [number for number, row in zip(numbers, theta) if not np.isfinite(row).all()]
+    if wrong:
+        raise UserError(
+            f"{path} holds NaN or infinite values in {len(wrong)} of {len(numbers)} frames "
+            f"({_first_few(wrong)}).",
+            "Track these frames again, or leave them out of the dataset.",
+        )
+    return torch.from_numpy(theta.astype(np.float32))
+
+
+def _read_test_frames(root: Path, index: dict[str, Any], num_frames: int) -> int:
+    count = index.get("test_frames")
+    if not isinstance(count, int) or not 0 <= count < num_frames:
+        raise UserError(
+            f"The dataset {root} holds out {count!r} of {num_frames} frames.",
+            f"Set test_frames in {INDEX_FILE} to a number from 0 to {num_frames - 1}.",
+        )
+    return count
+
+
+def _check_size(path: Path, size: tuple[int, int], expected: tuple[int, int]) -> None:
+    if size != expected:
+        raise UserError(
+            f"The image {path} is {size[0]} x {size[1]}, but the dataset's images are "
+            f"{expected[0]} x {expected[1]} pixels.",
+            "Bring all images to one size, or leave this frame out.",
+        )
+
+
+def _first_few(numbers: list[int]) -> str:
+    shown = ", ".join(map(str, numbers[:5]))
+    return shown if len(numbers) <= 5 else f"{shown}, ..."

@@ -1,0 +1,25 @@
+"""One tracked frame: what every importer, tracker and stream hands on."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from rgbavatar_ns.kernels.types import PinholeCameras
+
+
+@dataclass(frozen=True)
+class TrackedFrame:
+    """An image, what the head did in it, and the camera that saw it.
+
+    index: number of the frame in its source, unique in a dataset.
+    theta: head parameters in the order of the dataset's layout (radians, metres).
+    camera: exactly one camera (C = 1), of the image's size.
+    image_rgba: straight (not premultiplied) alpha, red first.
+    """
+
+    index: int
+    theta: Float[Tensor, "H"]
+    camera: PinholeCameras
+    image_rgba: UInt8[np.ndarray, "height width 4"]

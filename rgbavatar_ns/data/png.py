@@ -1,0 +1,100 @@
+"""PNG files as they are: RGBA with straight alpha, and every damage is told."""
+
+import struct
+import zlib
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from rgbavatar_ns.errors import UserError
+
+_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+_HEADER_BYTES = 33
+_END_CHUNK = b"\x00\x00\x00\x00IEND\xaeB`\x82"
+_REPAIR = "Copy or export the file again, or leave the frame out of the dataset."
+
+
+def png_size(path: Path) -> tuple[int, int]:
+    """Return (width, height) from a PNG's first bytes, checking its last ones; decodes nothing.
+
+    Raises UserError where the file is missing, empty, not a PNG or cut short.
+    """
+    try:
+        with path.open("rb") as file:
+            head = file.read(_HEADER_BYTES)
+            file.seek(0, 2)
+            size = file.tell()
+            file.seek(max(0, size - len(_END_CHUNK)))
+            tail = file.read()
+    except FileNotFoundError:
+        raise UserError(f"The image {path} is missing.", _REPAIR) from None
+    except OSError as error:
+        raise UserError(f"The image {path} cannot be read: {error.strerror}.", _REPAIR) from None
+    if not head:
+        raise UserError(f"The image {path} is empty.", _REPAIR)
+    if head[:8] != _SIGNATURE[: len(head)] or head[12:16] != b"IHDR"[: max(0, len(head) - 12)]:
+        raise UserError(f"{path} is not a PNG image.", "Store images as PNG files.")
+    if len(head) < _HEADER_BYTES or tail != _END_CHUNK:
+        raise UserError(f"The image {path} is truncated.", _REPAIR)
+    width, height = struct.unpack(">II", head[16:24])
+    return width, height
+
+
+def read_png_rgba(path: Path) -> UInt8[np.ndarray, "height width 4"]:
+    """Decode a PNG to RGBA; grey becomes RGB, a missing alpha becomes opaque.
+
+    Raises UserError where the file is missing, truncated or damaged: OpenCV alone would hand
+    back a partial picture without a word, so the chunks' lengths and checksums are checked.
+    """
+    try:
+        encoded = path.read_bytes()
+    except FileNotFoundError:
+        raise UserError(f"The image {path} is missing.", _REPAIR) from None
+    except OSError as error:
+        raise UserError(f"The image {path} cannot be read: {error.strerror}.", _REPAIR) from None
+    damage = _damage(encoded)
+    if damage is not None:
+        raise UserError(f"The image {path} {damage}.", _REPAIR)
+    decoded = cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_UNCHANGED)
+    if decoded is None:
+        raise UserError(f"The image {path} cannot be decoded.", _REPAIR)
+    if decoded.dtype == np.uint16:
+        decoded = ((decoded.astype(np.uint32) + 128) // 257).astype(np.uint8)
+    if decoded.ndim == 2:
+        return cv2.cvtColor(decoded, cv2.COLOR_GRAY2RGBA)
+    if decoded.shape[2] == 3:
+        return cv2.cvtColor(decoded, cv2.COLOR_BGR2RGBA)
+    return cv2.cvtColor(decoded, cv2.COLOR_BGRA2RGBA)
+
+
+def encode_png_rgba(image_rgba: UInt8[np.ndarray, "height width 4"], compression: int = 3) -> bytes:
+    """Encode straight-alpha RGBA as a PNG; lossless, colour under zero alpha included."""
+    bgra = cv2.cvtColor(np.ascontiguousarray(image_rgba), cv2.COLOR_RGBA2BGRA)
+    ok, encoded = cv2.imencode(".png", bgra, [cv2.IMWRITE_PNG_COMPRESSION, compression])
+    if not ok:
+        raise RuntimeError(f"OpenCV could not encode an image of {image_rgba.shape}.")
+    return encoded.tobytes()
+
+
+def _damage(encoded: bytes) -> str | None:
+    """Say what is wrong with a PNG's chunks, or None where they are whole."""
+    if not encoded:
+        return "is empty"
+    if encoded[:8] != _SIGNATURE[: len(encoded)]:
+        return "is not a PNG"
+    place, size = 8, len(encoded)
+    while place + 12 <= size:
+        (length,) = struct.unpack(">I", encoded[place : place + 4])
+        end = place + 12 + length
+        if end > size:
+            break
+        kind_and_data = memoryview(encoded)[place + 4 : end - 4]
+        (checksum,) = struct.unpack(">I", encoded[end - 4 : end])
+        if zlib.crc32(kind_and_data) != checksum:
+            return "is damaged (a checksum is wrong)"
+        if kind_and_data[:4] == b"IEND":
+            return None
+        place = end
+    return "is truncated"

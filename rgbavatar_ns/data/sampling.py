@@ -1,0 +1,186 @@
+"""Which frames a training step sees: a shuffled order offline, two pools for a stream."""
+
+from collections import deque
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from rgbavatar_ns.errors import UserError
+
+_KEPT_EPOCHS = 4
+
+
+class OfflineOrder:
+    """Endless batches in which every epoch shows every frame once, in an order of its own.
+
+    A batch is a pure function of (seed, step), so that resuming needs no state. Frames of one
+    batch are all different, also where the batch spans two epochs: there the next epoch's order
+    gives way just enough. Ours; the paper only says that batches are drawn from all frames.
+
+    Args:
+        positions: frames to draw from, e.g. `TrackedDataset.train`; not empty.
+        batch_size: frames a batch, at most as many as there are positions.
+        seed: not negative.
+    """
+
+    def __init__(self, positions: Sequence[int], batch_size: int, seed: int) -> None:
+        if len(positions) == 0:
+            raise UserError(
+                "There are no frames to draw from.",
+                "Use a dataset with at least one frame in each of its two parts.",
+            )
+        if not 1 <= batch_size <= len(positions):
+            raise ValueError(
+                f"A batch of {batch_size} different frames out of {len(positions)} is impossible."
+            )
+        self._positions = np.asarray(positions)
+        self._batch_size = batch_size
+        self._seed = seed
+        self._orders: dict[int, npt.NDArray[np.intp]] = {}
+
+    def batch(self, step: int) -> list[int]:
+        """The frames of training step `step` (0, 1, ...)."""
+        count = len(self._positions)
+        epoch, first = divmod(step * self._batch_size, count)
+        chosen = self._order(epoch)[first : first + self._batch_size]
+        missing = self._batch_size - len(chosen)
+        if missing:
+            chosen = np.concatenate([chosen, self._order(epoch + 1)[:missing]])
+        return self._positions[chosen].tolist()
+
+    def _order(self, epoch: int) -> npt.NDArray[np.intp]:
+        """The order of an epoch; each depends on the end of the one before it."""
+        known = max((e for e in self._orders if e <= epoch), default=-1)
+        for missing in range(known + 1, epoch + 1):
+            self._orders[missing] = self._next_order(missing)
+            for old in [e for e in self._orders if e <= missing - _KEPT_EPOCHS]:
+                del self._orders[old]
+        return self._orders[epoch]
+
+    def _next_order(self, epoch: int) -> npt.NDArray[np.intp]:
+        count = len(self._positions)
+        # Raw bits of a bit generator and a stable sort: numpy promises both for ever, while
+        # Generator.permutation may change between versions.
+        bits = np.random.PCG64(np.random.SeedSequence([self._seed, epoch])).random_raw(count)
+        order = np.argsort(bits, kind="stable")
+        begun = (epoch * count) % self._batch_size
+        if epoch == 0 or begun == 0:
+            return order
+        ended_with = self._orders[epoch - 1][count - begun :]
+        free = np.flatnonzero(~np.isin(order, ended_with))[: self._batch_size - begun]
+        return np.concatenate([order[free], np.delete(order, free)])
+
+
+class LocalGlobalPools:
+    """The paper's sampling of a stream: recent frames first, old ones so as not to be forgotten.
+
+    New frames enter a local pool, first in, first out; each frame that leaves it is offered to
+    a global pool by reservoir sampling, which keeps every frame of the past equally likely
+    (RGBAvatar, sec. 3.3 and supplement, algorithm 2). Frames are known by their number; who
+    feeds the pools keeps the images of `frames` and drops what `add` returns.
+
+    Args:
+        local_size: frames in the local pool (paper: 150).
+        global_size: frames in the global pool (paper: 1000); 0 leaves it out.
+        local_share: the paper's eta, the part of a batch from the local pool (paper: .7).
+        seed: of every draw.
+    """
+
+    def __init__(
+        self,
+        local_size: int = 150,
+        global_size: int = 1000,
+        local_share: float = 0.7,
+        seed: int = 0,
+    ) -> None:
+        if local_size < 1 or global_size < 0 or not 0 <= local_share <= 1:
+            raise ValueError(
+                "local_size must be at least 1, global_size at least 0, local_share in [0, 1]; "
+                f"got {local_size}, {global_size}, {local_share}."
+            )
+        self.local_size = local_size
+        self.global_size = global_size
+        self.local_share = local_share
+        self._local: deque[int] = deque()
+        self._global: list[int] = []
+        self._departed = 0
+        self._generator = torch.Generator().manual_seed(seed)
+
+    @property
+    def local_frames(self) -> tuple[int, ...]:
+        """Frames in the local pool, oldest first."""
+        return tuple(self._local)
+
+    @property
+    def global_frames(self) -> tuple[int, ...]:
+        """Frames in the global pool, in no order that means anything."""
+        return tuple(self._global)
+
+    def __len__(self) -> int:
+        return len(self._local) + len(self._global)
+
+    def add(self, frame: int) -> int | None:
+        """Take in the stream's next frame; return the frame that no pool holds any more, if any."""
+        dropped = None
+        if len(self._local) == self.local_size:
+            dropped = self._offer_to_global(self._local.popleft())
+        self._local.append(frame)
+        return dropped
+
+    def _offer_to_global(self, frame: int) -> int | None:
+        """Reservoir sampling: the j-th frame to leave the local pool stays with chance size/j."""
+        self._departed += 1
+        if len(self._global) < self.global_size:
+            self._global.append(frame)
+            return None
+        slot = self._draw_integer(self._departed)
+        if slot >= self.global_size:
+            return frame
+        self._global[slot], dropped = frame, self._global[slot]
+        return dropped
+
+    def batch(self, batch_size: int) -> list[int]:
+        """Draw different frames, a share of `local_share` (rounded) from the local pool.
+
+        Where one pool has too few, the other fills up; the batch is smaller than asked for only
+        while both together hold fewer frames. Raises UserError while there are none.
+        """
+        if not len(self):
+            raise UserError("No frame has arrived yet.", "Add a frame before drawing a batch.")
+        wanted = round(self.local_share * batch_size)
+        from_global = min(batch_size - wanted, len(self._global))
+        from_local = min(batch_size - from_global, len(self._local))
+        from_global = min(batch_size - from_local, len(self._global))
+        return self._draw(list(self._local), from_local) + self._draw(self._global, from_global)
+
+    def _draw(self, pool: list[int], count: int) -> list[int]:
+        order = torch.randperm(len(pool), generator=self._generator)[:count]
+        return [pool[i] for i in order.tolist()]
+
+    def _draw_integer(self, end: int) -> int:
+        return int(torch.randint(end, (), generator=self._generator))
+
+    def state_dict(self) -> dict[str, Any]:
+        """All that the next draws depend on, safe for `torch.load(weights_only=True)`."""
+        return {
+            "local": list(self._local),
+            "global": list(self._global),
+            "departed": self._departed,
+            "generator": self._generator.get_state(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on where `state_dict` was taken; raises UserError where its pools do not fit in."""
+        if len(state["local"]) > self.local_size or len(state["global"]) > self.global_size:
+            raise UserError(
+                f"The saved pools hold {len(state['local'])} and {len(state['global'])} frames, "
+                f"more than {self.local_size} and {self.global_size}.",
+                "Resume with pools of at least the size that the run was started with.",
+            )
+        self._local = deque(state["local"])
+        self._global = list(state["global"])
+        self._departed = state["departed"]
+        self._generator.set_state(state["generator"])

@@ -1,0 +1,8 @@
+import pytest
+
+from rgbavatar_ns.head import HeadModel
+
+
+@pytest.fixture(scope="session")
+def head() -> HeadModel:
+    return HeadModel.embedded()

@@ -1,0 +1,162 @@
+import threading
+import time
+
+import numpy as np
+import pytest
+import torch
+
+from rgbavatar_ns.data import ImageCache
+from rgbavatar_ns.errors import UserError
+from tests.data.small_dataset import HEIGHT, NUM_FRAMES, WIDTH, noise_image, small_dataset
+
+IMAGE_BYTES = WIDTH * HEIGHT * 4
+
+
+class CountingDataset:
+    """Stands in for a dataset: counts what is decoded and can hold the workers up."""
+
+    width, height = WIDTH, HEIGHT
+
+    def __init__(self, failing: int | None = None) -> None:
+        self.reads: list[int] = []
+        self.failing = failing
+        self.may_go_on = threading.Event()
+        self.may_go_on.set()
+
+    def read_image(self, position: int) -> np.ndarray:
+        self.may_go_on.wait(10)
+        self.reads.append(position)
+        if position == self.failing:
+            raise UserError(f"The image {position}.png is truncated.", "Repair it.")
+        return noise_image(position)
+
+
+@pytest.fixture
+def make_cache():
+    caches = []
+
+    def make(dataset, images: float, workers: int = 2) -> ImageCache:
+        cache = ImageCache(dataset, int(images * IMAGE_BYTES), workers)
+        caches.append(cache)
+        return cache
+
+    yield make
+    for cache in caches:
+        cache.close()
+
+
+def eventually(condition) -> None:
+    deadline = time.monotonic() + 5
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.002)
+
+
+def test_images_come_in_the_order_asked_for(tmp_path, head, make_cache):
+    dataset = small_dataset(tmp_path, head)
+    cache = make_cache(dataset, 100)
+    images = cache.get([3, 0, 3])
+    assert images.shape == (3, HEIGHT, WIDTH, 4)
+    assert images.dtype == torch.uint8
+    for image, index in zip(images, (3, 0, 3)):
+        assert np.array_equal(image.numpy(), noise_image(index))
+
+
+def test_what_is_held_is_decoded_once(make_cache):
+    dataset = CountingDataset()
+    cache = make_cache(dataset, 3)
+    for _ in range(4):
+        cache.get([0, 1, 2])
+    assert sorted(dataset.reads) == [0, 1, 2]
+
+
+def test_the_least_recently_used_image_gives_way(make_cache):
+    dataset = CountingDataset()
+    cache = make_cache(dataset, 2)
+    for position in (0, 1, 0, 2, 0):
+        cache.get([position])
+    assert dataset.reads == [0, 1, 2]
+    cache.get([1])
+    assert dataset.reads == [0, 1, 2, 1]
+
+
+@pytest.mark.parametrize("images", [0, 0.9, 1, 2.5, 4])
+def test_the_budget_holds_at_every_moment(make_cache, images):
+    cache = make_cache(CountingDataset(), images)
+    rng = np.random.default_rng(0)
+    for _ in range(60):
+        cache.prefetch(rng.integers(0, 9, 3).tolist())
+        assert cache.held_bytes <= images * IMAGE_BYTES
+        wanted = rng.integers(0, 9, 3).tolist()
+        got = cache.get(wanted)
+        assert cache.held_bytes <= images * IMAGE_BYTES
+        for image, index in zip(got, wanted):
+            assert np.array_equal(image.numpy(), noise_image(index))
+
+
+def test_prefetching_decodes_in_the_background(make_cache):
+    dataset = CountingDataset()
+    dataset.may_go_on.clear()
+    cache = make_cache(dataset, 10)
+    cache.prefetch([4, 5, 6])  # returns although no image can be decoded yet
+    assert dataset.reads == []
+    dataset.may_go_on.set()
+    eventually(lambda: sorted(dataset.reads) == [4, 5, 6])
+    cache.get([4, 5, 6])
+    assert len(dataset.reads) == 3
+
+
+def test_images_asked_for_ahead_do_not_push_each_other_out(make_cache):
+    dataset = CountingDataset()
+    cache = make_cache(dataset, 3)
+    cache.get([0, 1])
+    cache.prefetch([2, 3, 4, 5, 6])
+    eventually(lambda: len(dataset.reads) == 5)
+    cache.get([2, 3, 4])
+    assert sorted(dataset.reads) == [0, 1, 2, 3, 4]
+
+
+def test_a_workers_error_is_raised_by_get_and_tried_again(make_cache):
+    dataset = CountingDataset(failing=2)
+    cache = make_cache(dataset, 10)
+    cache.prefetch([1, 2])
+    for _ in range(2):
+        with pytest.raises(UserError, match=r"2\.png is truncated"):
+            cache.get([1, 2])
+    dataset.failing = None
+    assert np.array_equal(cache.get([2])[0].numpy(), noise_image(2))
+
+
+def test_a_truncated_file_is_named_by_get(tmp_path, head, make_cache):
+    dataset = small_dataset(tmp_path, head)
+    path = dataset.image_paths[NUM_FRAMES - 1]
+    path.write_bytes(path.read_bytes()[:-20])
+    with pytest.raises(UserError, match=path.name) as caught:
+        make_cache(dataset, 10).get(range(NUM_FRAMES))
+    assert caught.value.remedy
+
+
+def test_several_threads_get_the_right_images(make_cache):
+    cache = make_cache(CountingDataset(), 3, workers=3)
+    wrong = []
+
+    def ask(seed: int) -> None:
+        for position in np.random.default_rng(seed).integers(0, 8, 40).tolist():
+            if not np.array_equal(cache.get([position])[0].numpy(), noise_image(position)):
+                wrong.append(position)
+
+    threads = [threading.Thread(target=ask, args=(seed,)) for seed in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert wrong == []
+
+
+def test_threads_end_with_the_cache():
+    before = threading.active_count()
+    cache = ImageCache(CountingDataset(), 100 * IMAGE_BYTES)
+    cache.get([0, 1])
+    assert threading.active_count() > before
+    del cache
+    eventually(lambda: threading.active_count() == before)

@@ -1,0 +1,281 @@
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from rgbavatar_ns.data import DatasetWriter, load_dataset
+from rgbavatar_ns.errors import UserError
+from tests.data.small_dataset import (
+    HEIGHT,
+    NUM_FRAMES,
+    NUM_TEST,
+    WIDTH,
+    frame,
+    odd_camera,
+    small_dataset,
+)
+
+
+@pytest.fixture
+def folder(tmp_path, head) -> Path:
+    small_dataset(tmp_path / "data", head)
+    return tmp_path / "data"
+
+
+def edit_index(folder: Path, **changes) -> None:
+    path = folder / "dataset.json"
+    index = json.loads(path.read_text())
+    index.update(changes)
+    path.write_text(json.dumps(index))
+
+
+def error_of(folder: Path) -> UserError:
+    with pytest.raises(UserError) as caught:
+        load_dataset(folder)
+    assert caught.value.cause
+    assert caught.value.remedy
+    return caught.value
+
+
+def test_what_is_written_is_read_bit_for_bit(tmp_path, head):
+    small_dataset(tmp_path / "data", head, per_frame_camera=True)
+    dataset = load_dataset(tmp_path / "data")
+    assert len(dataset) == NUM_FRAMES
+    assert (dataset.width, dataset.height) == (WIDTH, HEIGHT)
+    assert torch.equal(dataset.identity, torch.linspace(-1, 1, head.num_identity) / 3)
+    assert dataset.layout == head.layout
+    for position in range(NUM_FRAMES):
+        expected = frame(head, position, per_frame_camera=True)
+        assert dataset.frame_index[position] == position
+        assert torch.equal(dataset.theta[position], expected.theta)
+        for part in ("world_to_camera", "focal_px", "principal_point_px"):
+            written, read = getattr(expected.camera, part)[0], getattr(dataset.cameras, part)
+            assert torch.equal(read[position], written)
+        assert np.array_equal(dataset.read_image(position), expected.image_rgba)
+
+
+def test_one_camera_for_all_frames_is_written_once_and_read_for_each(folder):
+    index = json.loads((folder / "dataset.json").read_text())
+    assert "camera" in index
+    assert all("camera" not in record for record in index["frames"])
+    cameras = load_dataset(folder).cameras
+    assert torch.equal(cameras.focal_px, odd_camera().focal_px.expand(NUM_FRAMES, 2))
+
+
+def test_the_last_frames_are_held_out(folder):
+    dataset = load_dataset(folder)
+    assert dataset.train + dataset.test == tuple(range(NUM_FRAMES))
+    assert len(dataset.test) == NUM_TEST
+
+
+def test_images_on_disk_are_straight_alpha_in_rgb_order(tmp_path, head):
+    half_red = np.zeros((HEIGHT, WIDTH, 4), np.uint8)
+    half_red[:] = (200, 10, 0, 128)
+    writer = DatasetWriter(
+        tmp_path, "makehuman", torch.zeros(head.num_identity), head.layout, WIDTH, HEIGHT
+    )
+    writer.add(replace(frame(head, 0), image_rgba=half_red))
+    writer.finish(0)
+    from PIL import Image
+
+    assert Image.open(tmp_path / "images/00000.png").getpixel((3, 3)) == (200, 10, 0, 128)
+
+
+def test_another_head_travels_with_the_dataset(tmp_path, head):
+    other = replace(head.arrays, name="mine", v_template=head.arrays.v_template * np.float32(2))
+    identity = torch.zeros(head.num_identity)
+    writer = DatasetWriter(tmp_path, other, identity, head.layout, WIDTH, HEIGHT)
+    writer.add(frame(head, 0))
+    dataset = writer.finish(0)
+    assert dataset.arrays.name == "mine"
+    assert np.array_equal(dataset.arrays.v_template, other.v_template)
+
+
+def test_an_unfinished_dataset_is_none(tmp_path, head):
+    writer = DatasetWriter(
+        tmp_path, head.arrays, torch.zeros(head.num_identity), head.layout, WIDTH, HEIGHT
+    )
+    writer.add(frame(head, 0))
+    assert "dataset.json" in error_of(tmp_path).cause
+
+
+def test_an_interrupted_overwriting_leaves_no_mixture(folder, head):
+    identity = torch.zeros(head.num_identity)
+    with pytest.raises(UserError, match="not empty"):
+        DatasetWriter(folder, head.arrays, identity, head.layout, WIDTH, HEIGHT)
+    load_dataset(folder)
+    writer = DatasetWriter(
+        folder, head.arrays, identity, head.layout, WIDTH, HEIGHT, overwrite=True
+    )
+    writer.add(frame(head, 0))
+    assert "dataset.json" in error_of(folder).cause
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"theta": torch.zeros(3)}, "3 values"),
+        ({"theta": None}, "NaN"),
+        ({"image_rgba": np.zeros((HEIGHT, WIDTH + 1, 4), np.uint8)}, "not 12 x 8"),
+        ({"index": 0}, "two frames 0"),
+    ],
+)
+def test_a_frame_that_does_not_fit_is_refused(tmp_path, head, change, words):
+    writer = DatasetWriter(
+        tmp_path, head.arrays, torch.zeros(head.num_identity), head.layout, WIDTH, HEIGHT
+    )
+    writer.add(frame(head, 0))
+    if "theta" in change and change["theta"] is None:
+        change = {"theta": torch.full((head.layout.size,), torch.nan)}
+    with pytest.raises(UserError, match=words):
+        writer.add(replace(frame(head, 1), **change))
+
+
+def test_holding_out_every_frame_is_refused(tmp_path, head):
+    writer = DatasetWriter(
+        tmp_path, head.arrays, torch.zeros(head.num_identity), head.layout, WIDTH, HEIGHT
+    )
+    writer.add(frame(head, 0))
+    with pytest.raises(UserError, match="held out"):
+        writer.finish(1)
+
+
+def test_missing_or_empty_folder(tmp_path):
+    assert "does not exist" in error_of(tmp_path / "none").cause
+    assert "is empty" in error_of(tmp_path).cause
+    (tmp_path / "file").write_text("x")
+    assert "is a file" in error_of(tmp_path / "file").cause
+
+
+def test_nan_in_theta(folder):
+    theta = np.load(folder / "theta.npy")
+    theta[4, 3] = np.nan
+    np.save(folder / "theta.npy", theta)
+    error = error_of(folder)
+    assert "1 of 7 frames (4)" in error.cause
+
+
+def test_theta_of_another_size(folder, head):
+    np.save(folder / "theta.npy", np.zeros((NUM_FRAMES, 5), np.float32))
+    error = error_of(folder)
+    assert "(7, 5)" in error.cause
+    assert str(head.layout.size) in error.cause
+
+
+def test_theta_that_needs_pickle_is_not_opened(folder):
+    np.save(folder / "theta.npy", np.array([{"a": 1}], dtype=object), allow_pickle=True)
+    assert "theta.npy" in error_of(folder).cause
+
+
+def test_another_layout_than_the_heads(folder, head):
+    fields = head.layout.to_json()
+    assert isinstance(fields, list)
+    edit_index(folder, layout=fields[1:])
+    error = error_of(folder)
+    assert str(head.layout.size) in error.cause
+
+
+def test_unknown_version_and_format(folder):
+    edit_index(folder, version=99)
+    assert "99" in error_of(folder).cause
+    edit_index(folder, format="other")
+    assert "format" in error_of(folder).cause
+
+
+def test_unknown_head(folder):
+    edit_index(folder, head="flame2020")
+    assert "flame2020" in error_of(folder).cause
+
+
+def test_duplicate_frame_number(folder):
+    frames = json.loads((folder / "dataset.json").read_text())["frames"]
+    frames[3]["index"] = 2
+    edit_index(folder, frames=frames)
+    assert "(2)" in error_of(folder).cause
+
+
+@pytest.mark.parametrize(
+    "camera",
+    [
+        {},
+        {"world_to_camera": [[1, 0], [0, 1]], "focal_px": [9, 9], "principal_point_px": [1, 1]},
+        {
+            "world_to_camera": np.diag([1.0, 1, -1, 1]).tolist(),
+            "focal_px": [9, 9],
+            "principal_point_px": [1, 1],
+        },
+        {
+            "world_to_camera": np.eye(4).tolist(),
+            "focal_px": [9, -9],
+            "principal_point_px": [1, 1],
+        },
+    ],
+    ids=["absent", "shape", "mirrored", "focal"],
+)
+def test_a_camera_that_is_none(folder, camera):
+    edit_index(folder, camera=camera)
+    assert "camera of frame 0" in error_of(folder).cause
+
+
+def test_an_index_that_is_no_json_and_one_that_lacks_parts(folder):
+    edit_index(folder, test_frames=NUM_FRAMES)
+    assert "holds out" in error_of(folder).cause
+    edit_index(folder, frames=[])
+    assert "no frames" in error_of(folder).cause
+    (folder / "dataset.json").write_text("{")
+    assert "cannot be read" in error_of(folder).cause
+
+
+def test_a_missing_image(folder):
+    (folder / "images/00002.png").unlink()
+    assert "00002.png" in error_of(folder).cause
+
+
+def test_a_truncated_image_is_found_when_loading(folder):
+    path = folder / "images/00002.png"
+    whole = path.read_bytes()
+    for kept in (0, 5, 20, len(whole) // 2, len(whole) - 1):
+        path.write_bytes(whole[:kept])
+        assert "00002.png" in error_of(folder).cause
+
+
+def test_a_file_that_is_no_png(folder):
+    (folder / "images/00002.png").write_bytes(b"GIF89a" + bytes(100))
+    assert "not a PNG" in error_of(folder).cause
+
+
+def test_a_damaged_image_is_found_when_it_is_decoded(folder):
+    path = folder / "images/00002.png"
+    damaged = bytearray(path.read_bytes())
+    damaged[len(damaged) // 2] ^= 255
+    path.write_bytes(damaged)
+    dataset = load_dataset(folder)
+    dataset.read_image(1)
+    with pytest.raises(UserError, match=r"00002\.png is damaged"):
+        dataset.read_image(2)
+
+
+def test_an_image_of_another_size(folder):
+    cv2.imwrite(str(folder / "images/00003.png"), np.zeros((HEIGHT, WIDTH * 2, 4), np.uint8))
+    error = error_of(folder)
+    assert "24 x 8" in error.cause
+    assert "12 x 8" in error.cause
+
+
+@pytest.mark.parametrize(
+    ("stored", "expected"),
+    [
+        (np.uint8([30, 20, 10]), (10, 20, 30, 255)),  # BGR without alpha, as OpenCV stores
+        (np.uint16([30 * 257, 20 * 257, 10 * 257, 99 * 257]), (10, 20, 30, 99)),
+        (np.uint8(77), (77, 77, 77, 255)),
+    ],
+    ids=["opaque", "sixteen bits", "grey"],
+)
+def test_other_kinds_of_png_become_rgba(folder, stored, expected):
+    picture = np.broadcast_to(stored, (HEIGHT, WIDTH, *stored.shape)).copy()
+    cv2.imwrite(str(folder / "images/00001.png"), picture)
+    assert tuple(load_dataset(folder).read_image(1)[2, 2]) == expected
