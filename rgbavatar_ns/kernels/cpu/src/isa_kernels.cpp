@@ -70,7 +70,7 @@ static inline bool block_range(float low, float high, uint16_t& first, uint16_t&
 }
 
 static void project_image(const Scene& scene, const float* camera_floats, int image, int begin,
-                          int end, Splat* splats) {
+                          int end, Splat* splats, Bounds* bounds) {
   const Camera camera = camera_from(camera_floats, scene.width, scene.height);
   for (int first = begin; first < end; first += kLanes) {
     const int lanes = end - first < kLanes ? end - first : kLanes;
@@ -102,15 +102,17 @@ static void project_image(const Scene& scene, const float* camera_floats, int im
     store(q.p.z, depth);
     for (int k = 0; k < 3; ++k) store(rgb[k], color[k]);
     for (int lane = 0; lane < lanes; ++lane) {
-      Splat& s = splats[first + lane];
-      const bool seen = block_range(column[kLowX][lane], column[kHighX][lane], s.first_block_x,
-                                    s.last_block_x) &&
-                        block_range(column[kLowY][lane], column[kHighY][lane], s.first_block_y,
-                                    s.last_block_y);
+      Bounds& box = bounds[first + lane];
+      const bool seen = block_range(column[kLowX][lane], column[kHighX][lane], box.first_block_x,
+                                    box.last_block_x) &&
+                        block_range(column[kLowY][lane], column[kHighY][lane], box.first_block_y,
+                                    box.last_block_y);
       if (!seen) {
-        s.first_block_x = 1, s.last_block_x = 0;
+        box.first_block_x = 1, box.last_block_x = 0;
         continue;
       }
+      Splat& s = splats[first + lane];
+      s.bounds = box;
       s.mean_x = column[kMeanX][lane], s.mean_y = column[kMeanY][lane];
       s.log2_opacity = column[kOpacity][lane];
       s.qa = column[kQa][lane], s.qb = column[kQb][lane], s.qc = column[kQc][lane];
@@ -166,7 +168,7 @@ struct BlockRange {
   int first_x, last_x, first_y, last_y;  // within the tile, inclusive
 };
 
-static inline BlockRange blocks_in_tile(const Splat& s, int origin_x, int origin_y) {
+static inline BlockRange blocks_in_tile(const Bounds& s, int origin_x, int origin_y) {
   const int x0 = s.first_block_x - origin_x, x1 = s.last_block_x - origin_x;
   const int y0 = s.first_block_y - origin_y, y1 = s.last_block_y - origin_y;
   return {x0 > 0 ? x0 : 0, x1 < kTileBlocks ? x1 : kTileBlocks - 1, y0 > 0 ? y0 : 0,
@@ -189,11 +191,17 @@ struct PixelCentres {
 
 // Calls visit(lane, pixel index) for every pixel of the block that lies in the image.
 template <class Visit>
-static inline void for_pixels(const Tile& tile, int block, Visit visit) {
+static RGBAVATAR_MEMBER void for_pixels(const Tile& tile, int block, Visit visit) {
   const int left = (tile.tile_x * kTileBlocks + block % kTileBlocks) * kBlockSide;
   const int top = (tile.tile_y * kTileBlocks + block / kTileBlocks) * kBlockSide;
   const int rows = tile.height - top < kBlockSide ? tile.height - top : kBlockSide;
   const int columns = tile.width - left < kBlockSide ? tile.width - left : kBlockSide;
+  if (rows == kBlockSide && columns == kBlockSide) {  // the usual case, unrolled
+    for (int y = 0; y < kBlockSide; ++y)
+      for (int x = 0; x < kBlockSide; ++x)
+        visit(y * kBlockSide + x, int64_t(top + y) * tile.width + left + x);
+    return;
+  }
   for (int y = 0; y < rows; ++y)
     for (int x = 0; x < columns; ++x)
       visit(y * kBlockSide + x, int64_t(top + y) * tile.width + left + x);
@@ -204,36 +212,41 @@ static inline void for_pixels(const Tile& tile, int block, Visit visit) {
 static void start_transmittance(const Tile& tile, TileScratch& scratch) {
   for (int block = 0; block < kBlocksPerTile; ++block) {
     float* t = scratch.transmittance[block];
-    for (int i = 0; i < kBlockPixels; ++i) t[i] = 0.0f;
-    scratch.open[block] = false;
-    for_pixels(tile, block, [&](int lane, int64_t) {
-      t[lane] = 1.0f;
-      scratch.open[block] = true;
-    });
+    store(Wide(0.0f), t);
+    for_pixels(tile, block, [&](int lane, int64_t) { t[lane] = 1.0f; });
   }
 }
 
-// Which of the portion's Gaussians touch each open block, as scratch.list.
+static void clear_channels(TileScratch& scratch, int channels) {
+  for (int block = 0; block < kBlocksPerTile; ++block)
+    for (int k = 0; k < channels; ++k) store(Wide(0.0f), scratch.channels[block][k]);
+}
+
+// Copies the tile's next Gaussians, which lie far apart, to scratch.portion.
+static int load_portion(const Tile& tile, uint32_t first, TileScratch& scratch) {
+  constexpr uint32_t kAhead = 12;
+  const uint32_t rest = tile.entry_count - first;
+  const uint32_t count = rest < uint32_t(kPortion) ? rest : kPortion;
+  const uint32_t* entries = tile.entries + first;
+  for (uint32_t i = 0; i < kAhead && i < count; ++i) __builtin_prefetch(&tile.splats[entries[i]]);
+  for (uint32_t i = 0; i < count; ++i) {
+    if (i + kAhead < count) __builtin_prefetch(&tile.splats[entries[i + kAhead]]);
+    scratch.portion[i] = tile.splats[entries[i]];
+  }
+  return int(count);
+}
+
+// Which of the portion's Gaussians touch each block, as scratch.list.
 static void list_by_block(const Tile& tile, int count, TileScratch& scratch) {
   const int origin_x = tile.tile_x * kTileBlocks, origin_y = tile.tile_y * kTileBlocks;
-  uint32_t fill[kBlocksPerTile] = {};
+  for (int block = 0; block < kBlocksPerTile; ++block) scratch.list_size[block] = 0;
   for (int i = 0; i < count; ++i) {
-    const BlockRange r = blocks_in_tile(scratch.portion[i], origin_x, origin_y);
+    const BlockRange r = blocks_in_tile(scratch.portion[i].bounds, origin_x, origin_y);
     for (int y = r.first_y; y <= r.last_y; ++y)
-      for (int x = r.first_x; x <= r.last_x; ++x) ++fill[y * kTileBlocks + x];
-  }
-  uint32_t total = 0;
-  for (int block = 0; block < kBlocksPerTile; ++block) {
-    scratch.list_start[block] = total;
-    total += fill[block];
-    fill[block] = scratch.list_start[block];
-  }
-  scratch.list_start[kBlocksPerTile] = total;
-  for (int i = 0; i < count; ++i) {
-    const BlockRange r = blocks_in_tile(scratch.portion[i], origin_x, origin_y);
-    for (int y = r.first_y; y <= r.last_y; ++y)
-      for (int x = r.first_x; x <= r.last_x; ++x)
-        scratch.list[fill[y * kTileBlocks + x]++] = uint16_t(i);
+      for (int x = r.first_x; x <= r.last_x; ++x) {
+        const int block = y * kTileBlocks + x;
+        scratch.list[block][scratch.list_size[block]++] = uint16_t(i);
+      }
   }
 }
 
@@ -251,6 +264,12 @@ static RGBAVATAR_MEMBER bool is_open(const Wide& transmittance) {
   return any(transmittance >= Wide(C::kMinTransmittance));
 }
 
+static bool any_open(const TileScratch& scratch) {
+  for (int block = 0; block < kBlocksPerTile; ++block)
+    if (is_open(load_wide(scratch.transmittance[block]))) return true;
+  return false;
+}
+
 // Blends a block's list into its transmittance and channels (red, green, blue, depth).
 template <bool kDepth>
 static inline void blend_block(const Tile& tile, const PixelCentres& centres, int block,
@@ -261,13 +280,9 @@ static inline void blend_block(const Tile& tile, const PixelCentres& centres, in
   Wide t = load_wide(scratch.transmittance[block]);
   Wide red = load_wide(channels[0]), green = load_wide(channels[1]);
   Wide blue = load_wide(channels[2]), depth = load_wide(channels[3]);
-  const uint32_t stop = scratch.list_start[block + 1];
-  for (uint32_t i = scratch.list_start[block]; i < stop; ++i) {
-    if (!is_open(t)) {
-      scratch.open[block] = false;
-      break;
-    }
-    const Splat& s = scratch.portion[scratch.list[i]];
+  const int size = scratch.list_size[block];
+  for (int i = 0; i < size && is_open(t); ++i) {
+    const Splat& s = scratch.portion[scratch.list[block][i]];
     const Wide w = alpha_at(px - s.mean_x, py - s.mean_y, s).value * t;
     red = red + w * s.red;
     green = green + w * s.green;
@@ -280,13 +295,6 @@ static inline void blend_block(const Tile& tile, const PixelCentres& centres, in
   store(green, channels[1]);
   store(blue, channels[2]);
   if (kDepth) store(depth, channels[3]);
-}
-
-static int load_portion(const Tile& tile, uint32_t first, TileScratch& scratch) {
-  const uint32_t rest = tile.entry_count - first;
-  const int count = rest < uint32_t(kPortion) ? int(rest) : kPortion;
-  for (int i = 0; i < count; ++i) scratch.portion[i] = tile.splats[tile.entries[first + i]];
-  return count;
 }
 
 static void write_block(const Tile& tile, const ForwardOutput& out, int block,
@@ -304,13 +312,12 @@ static void write_block(const Tile& tile, const ForwardOutput& out, int block,
 static void forward_tile(const Tile& tile, const ForwardOutput& out, TileScratch& scratch) {
   const PixelCentres centres;
   start_transmittance(tile, scratch);
-  for (int block = 0; block < kBlocksPerTile; ++block)
-    for (int k = 0; k < 4; ++k)
-      for (int i = 0; i < kBlockPixels; ++i) scratch.channels[block][k][i] = 0.0f;
+  clear_channels(scratch, 4);
   for (uint32_t first = 0; first < tile.entry_count; first += kPortion) {
+    if (first && !any_open(scratch)) break;
     list_by_block(tile, load_portion(tile, first, scratch), scratch);
     for (int block = 0; block < kBlocksPerTile; ++block) {
-      if (!scratch.open[block]) continue;
+      if (scratch.list_size[block] == 0) continue;
       if (out.depth)
         blend_block<true>(tile, centres, block, scratch);
       else
@@ -322,24 +329,20 @@ static void forward_tile(const Tile& tile, const ForwardOutput& out, TileScratch
 
 // ---- Gaussian-stationary passes ---------------------------------------------------------------
 
-// Calls visit(dx, dy, transmittance, block) for the open blocks that the Gaussian touches, and
-// closes those that have become opaque. The visit updates the transmittance as the forward pass
-// did, so that the same blocks close at the same Gaussian.
+// Calls visit(dx, dy, transmittance, block) for the open blocks that the Gaussian touches. The
+// visit updates the transmittance as the forward pass did, so that the same blocks close at the
+// same Gaussian.
 template <class Visit>
 static RGBAVATAR_MEMBER void for_open_blocks(const Tile& tile, const PixelCentres& centres,
                                              const Splat& s, TileScratch& scratch, Visit visit) {
   const int origin_x = tile.tile_x * kTileBlocks, origin_y = tile.tile_y * kTileBlocks;
-  const BlockRange r = blocks_in_tile(s, origin_x, origin_y);
+  const BlockRange r = blocks_in_tile(s.bounds, origin_x, origin_y);
   for (int y = r.first_y; y <= r.last_y; ++y) {
     const Wide dy = centres.y + float((origin_y + y) * kBlockSide) - Wide(s.mean_y);
     for (int x = r.first_x; x <= r.last_x; ++x) {
       const int block = y * kTileBlocks + x;
-      if (!scratch.open[block]) continue;
       Wide t = load_wide(scratch.transmittance[block]);
-      if (!is_open(t)) {
-        scratch.open[block] = false;
-        continue;
-      }
+      if (!is_open(t)) continue;
       const Wide dx = centres.x + float((origin_x + x) * kBlockSide) - Wide(s.mean_x);
       visit(dx, dy, t, block);
       store(t, scratch.transmittance[block]);
@@ -347,11 +350,31 @@ static RGBAVATAR_MEMBER void for_open_blocks(const Tile& tile, const PixelCentre
   }
 }
 
+// Calls visit(Gaussian, its slot) front to back, and clears the slots behind an opaque tile.
+template <class Visit>
+static RGBAVATAR_MEMBER void for_gaussians(const Tile& tile, TileScratch& scratch, float* slots,
+                                           int slot_width, Visit visit) {
+  bool open = true;
+  for (uint32_t first = 0; first < tile.entry_count; first += kPortion) {
+    const int count = load_portion(tile, first, scratch);
+    open = open && any_open(scratch);
+    for (int i = 0; i < count; ++i) {
+      const Splat& s = scratch.portion[i];
+      float* slot = slots + int64_t(tile.slot(s)) * slot_width;
+      if (open)
+        visit(s, slot);
+      else
+        for (int k = 0; k < slot_width; ++k) slot[k] = 0.0f;
+    }
+  }
+}
+
 static void start_remainder(const Tile& tile, const BackwardInput& in, TileScratch& scratch) {
+  clear_channels(scratch, 3);
   for (int block = 0; block < kBlocksPerTile; ++block) {
     float(*g)[kBlockPixels] = scratch.channels[block];
     float* remainder = scratch.remainder[block];
-    for (int i = 0; i < kBlockPixels; ++i) g[0][i] = g[1][i] = g[2][i] = remainder[i] = 0.0f;
+    store(Wide(0.0f), remainder);
     for_pixels(tile, block, [&](int lane, int64_t pixel) {
       float rest = 0.0f;
       if (in.image_grad)
@@ -370,9 +393,7 @@ static void backward_tile(const Tile& tile, const BackwardInput& in, TileScratch
   const PixelCentres centres;
   start_transmittance(tile, scratch);
   start_remainder(tile, in, scratch);
-  for (uint32_t i = 0; i < tile.entry_count; ++i) {
-    const uint32_t gaussian = tile.entries[i];
-    const Splat s = tile.splats[gaussian];
+  for_gaussians(tile, scratch, slots, kMoments, [&](const Splat& s, float* slot) {
     Wide sums[kMoments];
     for (int k = 0; k < kMoments; ++k) sums[k] = Wide(0.0f);
     for_open_blocks(
@@ -401,9 +422,8 @@ static void backward_tile(const Tile& tile, const BackwardInput& in, TileScratch
           sums[7] = sums[7] + d_x * dy;
           sums[8] = sums[8] + d_y * dy;
         });
-    float* slot = slots + int64_t(tile.slot(gaussian)) * kMoments;
     for (int k = 0; k < kMoments; ++k) slot[k] = sum_of(sums[k]) * (k < 3 ? 1.0f : C::kLn2);
-  }
+  });
 }
 
 template <int kChannels>
@@ -411,17 +431,14 @@ static void average_channels(const Tile& tile, const float* image, int channels,
                              TileScratch& scratch, float* slots) {
   const PixelCentres centres;
   start_transmittance(tile, scratch);
+  clear_channels(scratch, kChannels);
   for (int block = 0; block < kBlocksPerTile; ++block) {
     float(*pixels)[kBlockPixels] = scratch.channels[block];
-    for (int k = 0; k < kChannels; ++k)
-      for (int i = 0; i < kBlockPixels; ++i) pixels[k][i] = 0.0f;
     for_pixels(tile, block, [&](int lane, int64_t pixel) {
       for (int k = 0; k < channels; ++k) pixels[k][lane] = image[pixel * channels + k];
     });
   }
-  for (uint32_t i = 0; i < tile.entry_count; ++i) {
-    const uint32_t gaussian = tile.entries[i];
-    const Splat s = tile.splats[gaussian];
+  for_gaussians(tile, scratch, slots, channels + 2, [&](const Splat& s, float* slot) {
     Wide sums[kChannels + 1], largest(0.0f);
     for (int k = 0; k <= kChannels; ++k) sums[k] = Wide(0.0f);
     for_open_blocks(tile, centres, s, scratch,
@@ -433,11 +450,10 @@ static void average_channels(const Tile& tile, const float* image, int channels,
                       for (int k = 0; k < kChannels; ++k)
                         sums[k] = sums[k] + w * load_wide(scratch.channels[block][k]);
                     });
-    float* slot = slots + int64_t(tile.slot(gaussian)) * (channels + 2);
     for (int k = 0; k < channels; ++k) slot[k] = sum_of(sums[k]);
     slot[channels] = sum_of(sums[kChannels]);
     slot[channels + 1] = max_lane(largest);
-  }
+  });
 }
 
 static void average_tile(const Tile& tile, const float* image, int channels, TileScratch& scratch,

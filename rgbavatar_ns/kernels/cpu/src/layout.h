@@ -15,10 +15,8 @@ constexpr int kBlockPixels = 16;
 constexpr int kPortion = 512;
 constexpr int kMaxChannels = 8;
 
-// A projected Gaussian; blocks first..last (inclusive) hold every pixel it can reach.
-struct Splat {
-  float mean_x, mean_y, log2_opacity, qa, qb, qc;
-  float red, green, blue, depth;
+// Blocks first..last (inclusive) that hold every pixel a Gaussian can reach.
+struct Bounds {
   uint16_t first_block_x, first_block_y, last_block_x, last_block_y;
 
   bool visible() const { return first_block_x <= last_block_x; }
@@ -26,6 +24,14 @@ struct Splat {
   int first_tile_y() const { return first_block_y >> kTileBlocksShift; }
   int tiles_x() const { return (last_block_x >> kTileBlocksShift) - first_tile_x() + 1; }
   int tiles_y() const { return (last_block_y >> kTileBlocksShift) - first_tile_y() + 1; }
+};
+
+// A projected Gaussian, as the blending wants it: one cache line.
+struct alignas(64) Splat {
+  float mean_x, mean_y, log2_opacity, qa, qb, qc;
+  float red, green, blue, depth;
+  Bounds bounds;
+  uint32_t first_slot;  // of its (Gaussian, tile) slots
 };
 
 // [B or 1, N, width] floats; the stride is 0 when the batch shares them.
@@ -51,15 +57,13 @@ constexpr int kMoments = 9;
 // One tile of one image.
 struct Tile {
   const Splat* splats;
-  const uint32_t* entries;      // Gaussians in the tile, front to back
+  const uint32_t* entries;  // Gaussians in the tile, front to back
   uint32_t entry_count;
-  const uint32_t* slot_offset;  // first (Gaussian, tile) slot of each Gaussian
   int tile_x, tile_y, width, height;
 
-  uint32_t slot(uint32_t gaussian) const {
-    const Splat& s = splats[gaussian];
-    return slot_offset[gaussian] + (tile_y - s.first_tile_y()) * s.tiles_x() + tile_x -
-           s.first_tile_x();
+  uint32_t slot(const Splat& s) const {
+    return s.first_slot + (tile_y - s.bounds.first_tile_y()) * s.bounds.tiles_x() + tile_x -
+           s.bounds.first_tile_x();
   }
 };
 
@@ -79,15 +83,15 @@ struct alignas(64) TileScratch {
   float remainder[kBlocksPerTile][kBlockPixels];
   float channels[kBlocksPerTile][kMaxChannels][kBlockPixels];
   Splat portion[kPortion];
-  uint16_t list[kPortion * kBlocksPerTile];
-  uint32_t list_start[kBlocksPerTile + 1];
-  bool open[kBlocksPerTile];
+  uint16_t list[kBlocksPerTile][kPortion];  // of each block: places in the portion
+  uint16_t list_size[kBlocksPerTile];
 };
 
 // The loops, compiled once per instruction set.
 struct Kernels {
-  // Writes splats[begin, end) of an image; the camera is a Camera of gaussian_math.h (opaque).
-  void (*project)(const Scene&, const float* camera, int image, int begin, int end, Splat* splats);
+  // Writes splats[begin, end), but for their first slot, and bounds[begin, end) of an image.
+  void (*project)(const Scene&, const float* camera, int image, int begin, int end, Splat* splats,
+                  Bounds* bounds);
   void (*forward_tile)(const Tile&, const ForwardOutput&, TileScratch&);
   // Writes slots[slot * kMoments].
   void (*backward_tile)(const Tile&, const BackwardInput&, TileScratch&, float* slots);

@@ -109,7 +109,7 @@ uint64_t* radix_sort(uint64_t* keys, uint64_t* other, size_t count) {
 }
 
 template <class Visit>
-void for_tiles(const Splat& s, int tiles_x, Visit visit) {
+void for_tiles(const Bounds& s, int tiles_x, Visit visit) {
   for (int y = s.first_tile_y(); y < s.first_tile_y() + s.tiles_y(); ++y)
     for (int x = s.first_tile_x(); x < s.first_tile_x() + s.tiles_x(); ++x) visit(y * tiles_x + x);
 }
@@ -151,11 +151,13 @@ Rendering::~Rendering() { give_workspace(std::move(workspace_)); }
 void Rendering::project(const Scene& scene, Team& team) {
   Workspace& w = *workspace_;
   w.splats.reserve(size_t(batch_) * count_);
+  w.bounds.reserve(size_t(batch_) * count_);
   const int chunks = chunks_of(count_);
   team.run(int64_t(batch_) * chunks, [&](int64_t item, int) {
     const int image = int(item / chunks), begin = int(item % chunks) * kChunk;
     kernels_->project(scene, &w.cameras[size_t(image) * kCameraFloats], image, begin,
-                      std::min(begin + kChunk, count_), w.splats.data() + size_t(image) * count_);
+                      std::min(begin + kChunk, count_), w.splats.data() + size_t(image) * count_,
+                      w.bounds.data() + size_t(image) * count_);
   });
 }
 
@@ -165,12 +167,15 @@ void Rendering::sort(Team& team) {
   w.tile_start.reserve(size_t(batch_) * (tiles_per_image() + 1));
   w.entry_offset.reserve(batch_ + 1);
   team.run(batch_, [&](int64_t image, int) {
-    const Splat* splats = w.splats.data() + size_t(image) * count_;
+    Splat* splats = w.splats.data() + size_t(image) * count_;
+    const Bounds* bounds = w.bounds.data() + size_t(image) * count_;
     uint32_t* slot_offset = w.slot_offset.data() + size_t(image) * (count_ + 1);
     size_t total = 0;
     for (int i = 0; i < count_; ++i) {
       slot_offset[i] = uint32_t(total);
-      if (splats[i].visible()) total += size_t(splats[i].tiles_x()) * splats[i].tiles_y();
+      if (!bounds[i].visible()) continue;
+      splats[i].first_slot = uint32_t(total);
+      total += size_t(bounds[i].tiles_x()) * bounds[i].tiles_y();
     }
     slot_offset[count_] = uint32_t(total);
     w.entry_offset[image + 1] = total;
@@ -194,15 +199,16 @@ void Rendering::sort(Team& team) {
 void Rendering::sort_image(int image, uint64_t* keys) {
   Workspace& w = *workspace_;
   const Splat* splats = w.splats.data() + size_t(image) * count_;
+  const Bounds* bounds = w.bounds.data() + size_t(image) * count_;
   uint32_t* start = w.tile_start.data() + size_t(image) * (tiles_per_image() + 1);
   std::fill(start, start + tiles_per_image() + 1, 0u);
   size_t visible = 0;
   for (int i = 0; i < count_; ++i) {
-    if (!splats[i].visible()) continue;
+    if (!bounds[i].visible()) continue;
     uint32_t depth_bits;  // of a positive float: ordered like the float
     std::memcpy(&depth_bits, &splats[i].depth, sizeof depth_bits);
     keys[visible++] = uint64_t(depth_bits) << 32 | uint32_t(i);
-    for_tiles(splats[i], tiles_x_, [&](int tile) { ++start[tile]; });
+    for_tiles(bounds[i], tiles_x_, [&](int tile) { ++start[tile]; });
   }
   const uint64_t* sorted = radix_sort(keys, keys + count_, visible);
   uint32_t total = 0;
@@ -214,7 +220,7 @@ void Rendering::sort_image(int image, uint64_t* keys) {
   uint32_t* entries = w.entries.data() + w.entry_offset[image];
   for (size_t i = 0; i < visible; ++i) {
     const uint32_t gaussian = uint32_t(sorted[i]);
-    for_tiles(splats[gaussian], tiles_x_, [&](int tile) { entries[start[tile]++] = gaussian; });
+    for_tiles(bounds[gaussian], tiles_x_, [&](int tile) { entries[start[tile]++] = gaussian; });
   }
   // Each start has moved to the next tile's; move them back.
   for (int tile = tiles_per_image(); tile > 0; --tile) start[tile] = start[tile - 1];
@@ -228,7 +234,6 @@ Tile Rendering::tile(int image, int index) const {
   tile.splats = w.splats.data() + size_t(image) * count_;
   tile.entries = w.entries.data() + w.entry_offset[image] + start[0];
   tile.entry_count = start[1] - start[0];
-  tile.slot_offset = w.slot_offset.data() + size_t(image) * (count_ + 1);
   tile.tile_x = index % tiles_x_, tile.tile_y = index / tiles_x_;
   tile.width = width_, tile.height = height_;
   return tile;

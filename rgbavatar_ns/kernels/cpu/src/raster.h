@@ -37,7 +37,8 @@ class Buffer {
 
 // What one rendering needs; returned to a small pool, because fresh pages cost as much as work.
 struct Workspace {
-  Buffer<Splat> splats;          // [B, N]
+  Buffer<Splat> splats;          // [B, N]; those out of sight are not set
+  Buffer<Bounds> bounds;         // [B, N]
   Buffer<uint32_t> slot_offset;  // [B, N + 1]: first (Gaussian, tile) slot of every Gaussian
   Buffer<uint32_t> tile_start;   // [B, tiles + 1]: into the image's entries
   Buffer<uint32_t> entries;      // Gaussians by tile, front to back; slots many per image
