@@ -1,0 +1,174 @@
+"""A head model as plain arrays in FLAME's convention, and their file."""
+
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from rgbavatar_ns.errors import UserError
+
+JOINT_NAMES = ("root", "neck", "jaw", "left_eye", "right_eye")
+EMBEDDED_HEAD = Path(__file__).parent / "assets" / "makehuman_head.npz"
+_GROUP = "group_"
+_MAY_BE_HALF = ("shapedirs", "posedirs", "eyelid_dirs")
+
+
+@dataclass(frozen=True)
+class HeadArrays:
+    """FLAME and the embedded head differ only in these; raises UserError where shapes disagree.
+
+    Metres, y up, z forward, +x the subject's left; triangles are wound outward. Source: FLAME's
+    model files; uv has u to the right and v up.
+    """
+
+    name: str
+    v_template: Float[np.ndarray, "V 3"]
+    """The mean head at rest."""
+    shapedirs: Float[np.ndarray, "V 3 C"]
+    """Offsets a unit of coefficient: `num_identity` identity directions, then expressions."""
+    num_identity: int
+    posedirs: Float[np.ndarray, "V 3 36"]
+    """Offsets a unit of (R - I), rows of neck, jaw, left eye, right eye after one another."""
+    joint_regressor: Float[np.ndarray, "5 V"]
+    """Joints from the shaped vertices; rows sum to one."""
+    parents: Int[np.ndarray, "5"]
+    """Parent joint of root, neck, jaw, left eye, right eye; -1 for the root."""
+    skinning_weights: Float[np.ndarray, "V 5"]
+    """Rows sum to one."""
+    faces: Int[np.ndarray, "F 3"]
+    uv: Float[np.ndarray, "VT 2"]
+    uv_faces: Int[np.ndarray, "F 3"]
+    expression_names: tuple[str, ...]
+    """A name for each expression direction."""
+    eyelid_dirs: Float[np.ndarray, "V 3 2"] | None = None
+    """Offsets that close the left and the right eyelid, where the model has them."""
+    vertex_groups: dict[str, Int[np.ndarray, "_"]] = field(default_factory=dict)
+    """Vertices of skin, left_eye, right_eye, upper_teeth, lower_teeth, tongue, if known."""
+
+    def __post_init__(self) -> None:
+        vertices = len(self.v_template)
+        wanted: dict[str, tuple[int, ...]] = {
+            "v_template": (vertices, 3),
+            "shapedirs": (vertices, 3, self.num_identity + self.num_expressions),
+            "posedirs": (vertices, 3, 36),
+            "joint_regressor": (5, vertices),
+            "parents": (5,),
+            "skinning_weights": (vertices, 5),
+            "faces": (len(self.faces), 3),
+            "uv": (len(self.uv), 2),
+            "uv_faces": (len(self.faces), 3),
+        }
+        if self.eyelid_dirs is not None:
+            wanted["eyelid_dirs"] = (vertices, 3, 2)
+        for name, shape in wanted.items():
+            if getattr(self, name).shape != shape:
+                raise self._refuse(f"{name} has shape {getattr(self, name).shape}, not {shape}")
+        for name, index, count in (
+            ("faces", self.faces, vertices),
+            ("uv_faces", self.uv_faces, len(self.uv)),
+            *((name, group, vertices) for name, group in self.vertex_groups.items()),
+        ):
+            if index.size and (index.min() < 0 or index.max() >= count):
+                raise self._refuse(f"{name} points outside of its {count} vertices")
+
+    def _refuse(self, reason: str) -> UserError:
+        return UserError(
+            f"The head model '{self.name}' does not fit together: {reason}.",
+            "Convert it again, or use the embedded head.",
+        )
+
+    @property
+    def num_expressions(self) -> int:
+        """How many expression directions follow the identity directions."""
+        return len(self.expression_names)
+
+    @classmethod
+    def embedded(cls) -> "HeadArrays":
+        """The CC0 MakeHuman head that ships with the package (assets/LICENSE)."""
+        return _load_embedded()
+
+    def save(self, path: Path) -> None:
+        """Write one npz without pickles; offsets go as float16 where that loses nothing."""
+        arrays = {}
+        for name, value in self._items():
+            arrays[name] = np.array(value)
+        with Path(path).open("wb") as file:
+            np.savez_compressed(file, **arrays)
+
+    @classmethod
+    def load(cls, path: Path) -> "HeadArrays":
+        """Read what `save` wrote; raises UserError for a missing or damaged file."""
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                return cls._from_items({name: file[name] for name in file.files})
+        except (OSError, EOFError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
+            raise UserError(
+                f"{path} is no head model of this project: {error}.",
+                "Write it with HeadArrays.save, or use the embedded head.",
+            ) from None
+
+    def to_state(self) -> dict[str, Any]:
+        """The arrays as tensors, text and numbers, safe for `torch.load(weights_only=True)`."""
+        state: dict[str, Any] = {}
+        for name, value in self._items():
+            state[name] = torch.from_numpy(value.copy()) if isinstance(value, np.ndarray) else value
+        return state
+
+    @classmethod
+    def from_state(cls, state: Mapping[str, Any]) -> "HeadArrays":
+        """Inverse of `to_state`; raises UserError where something is missing."""
+        try:
+            return cls._from_items(
+                {
+                    name: value.detach().cpu().numpy() if isinstance(value, Tensor) else value
+                    for name, value in state.items()
+                }
+            )
+        except (KeyError, TypeError, ValueError) as error:
+            raise UserError(
+                f"This state holds no head model: {error}.", "Save the avatar again."
+            ) from None
+
+    def _items(self) -> list[tuple[str, Any]]:
+        """Flat names and values; nothing for absent eyelids."""
+        items = []
+        for entry in fields(self):
+            value = getattr(self, entry.name)
+            if entry.name == "vertex_groups":
+                items += [(_GROUP + name, group) for name, group in value.items()]
+            elif entry.name == "expression_names":
+                items.append((entry.name, list(value)))
+            elif value is not None:
+                if entry.name in _MAY_BE_HALF:
+                    half = value.astype(np.float16)
+                    value = half if np.array_equal(half.astype(value.dtype), value) else value
+                items.append((entry.name, value))
+        return items
+
+    @classmethod
+    def _from_items(cls, items: Mapping[str, Any]) -> "HeadArrays":
+        values = {name: value for name, value in items.items() if not name.startswith(_GROUP)}
+        for name in _MAY_BE_HALF:
+            if name in values and values[name].dtype == np.float16:
+                values[name] = values[name].astype(np.float32)
+        values["name"] = str(values["name"])
+        values["num_identity"] = int(values["num_identity"])
+        values["expression_names"] = tuple(str(name) for name in values["expression_names"])
+        groups = {
+            name.removeprefix(_GROUP): value
+            for name, value in items.items()
+            if name.startswith(_GROUP)
+        }
+        return cls(**values, vertex_groups=groups)
+
+
+@cache
+def _load_embedded() -> HeadArrays:
+    return HeadArrays.load(EMBEDDED_HEAD)

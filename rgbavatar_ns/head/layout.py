@@ -1,0 +1,169 @@
+"""What the numbers of a theta vector mean: named fields with a size and a form."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any, Literal, get_args
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.head.rotations import axis_angle_to_matrix, matrix_to_6d_rows
+
+ThetaForm = Literal["linear", "axis_angle", "translation"]
+"""linear: blend weights; axis_angle: radians times unit axis; translation: metres."""
+
+
+@dataclass(frozen=True)
+class ThetaField:
+    """One named run of theta; rotations and translations have three numbers."""
+
+    name: str
+    size: int
+    form: ThetaForm
+
+    def __post_init__(self) -> None:
+        if self.form not in get_args(ThetaForm):
+            raise UserError(
+                f"The theta field '{self.name}' has the form '{self.form}'.",
+                f"Use one of {', '.join(get_args(ThetaForm))}.",
+            )
+        if self.size < 0 or (self.form != "linear" and self.size != 3):
+            raise UserError(
+                f"The theta field '{self.name}' of form {self.form} has size {self.size}.",
+                "Rotations and translations have size 3, linear fields at least 0.",
+            )
+
+
+@dataclass(frozen=True)
+class ThetaLayout:
+    """The order of fields in theta; saved with every checkpoint and data set."""
+
+    fields: tuple[ThetaField, ...]
+
+    def __post_init__(self) -> None:
+        if len(set(self.names)) != len(self.fields):
+            raise UserError(
+                f"A theta layout names a field twice: {', '.join(self.names)}.",
+                "Give every field its own name.",
+            )
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The fields' names in order."""
+        return tuple(field.name for field in self.fields)
+
+    @property
+    def size(self) -> int:
+        """How many numbers theta has."""
+        return sum(field.size for field in self.fields)
+
+    def __contains__(self, name: object) -> bool:
+        """Whether there is a field of this name."""
+        return name in self.names
+
+    def slice(self, name: str) -> slice:
+        """Where a field lies in theta; raises UserError for an unknown name."""
+        start = 0
+        for field in self.fields:
+            if field.name == name:
+                return slice(start, start + field.size)
+            start += field.size
+        raise self._unknown([name])
+
+    def split(self, theta: Float[Tensor, "*batch H"]) -> dict[str, Float[Tensor, "*batch _"]]:
+        """Theta's fields by name (views); raises UserError where the size differs."""
+        if theta.shape[-1] != self.size:
+            raise UserError(
+                f"theta has {theta.shape[-1]} numbers, but the layout ({self}) has {self.size}.",
+                "Use theta made for this head model, or map it field by field by name.",
+            )
+        parts = torch.split(theta, [field.size for field in self.fields], dim=-1)
+        return dict(zip(self.names, parts))
+
+    def join(self, parts: Mapping[str, Float[Tensor, "*batch _"]]) -> Float[Tensor, "*batch H"]:
+        """Theta from fields by name; batch axes broadcast and a missing field is zero.
+
+        Raises UserError for a name that the layout lacks, for a wrong size, and for no parts.
+        """
+        if not parts:
+            raise UserError("No field of theta is given.", "Give at least one, for its batch axes.")
+        unknown = [name for name in parts if name not in self]
+        if unknown:
+            raise self._unknown(unknown)
+        for field in self.fields:
+            if field.name in parts and parts[field.name].shape[-1] != field.size:
+                raise UserError(
+                    f"The theta field '{field.name}' has {parts[field.name].shape[-1]} numbers.",
+                    f"This layout wants {field.size}.",
+                )
+        batch = torch.broadcast_shapes(*(part.shape[:-1] for part in parts.values()))
+        like = next(iter(parts.values()))
+        pieces = [
+            parts[field.name].expand(*batch, field.size)
+            if field.name in parts
+            else like.new_zeros(*batch, field.size)
+            for field in self.fields
+        ]
+        return torch.cat(pieces, dim=-1)
+
+    def to_json(self) -> list[dict[str, Any]]:
+        """The fields as plain values that JSON can hold."""
+        return [
+            {"name": field.name, "size": field.size, "form": field.form} for field in self.fields
+        ]
+
+    @classmethod
+    def from_json(cls, values: Iterable[Mapping[str, Any]]) -> "ThetaLayout":
+        """Inverse of `to_json`; raises UserError for anything else."""
+        try:
+            fields = [dict(value) for value in values]
+            if any(set(field) != {"name", "size", "form"} for field in fields):
+                raise ValueError("every field needs exactly name, size and form")
+            return cls(tuple(ThetaField(str(f["name"]), int(f["size"]), f["form"]) for f in fields))
+        except (TypeError, ValueError) as error:
+            raise UserError(
+                f"This is not a theta layout: {error}.",
+                "Take the list of fields that ThetaLayout.to_json wrote.",
+            ) from None
+
+    def feature_size(self, include_pose: bool = True, include_translation: bool = False) -> int:
+        """How many numbers `network_features` gives."""
+        sizes = {
+            "linear": lambda field: field.size,
+            "axis_angle": lambda field: 6 if include_pose else 0,
+            "translation": lambda field: field.size if include_translation else 0,
+        }
+        return sum(sizes[field.form](field) for field in self.fields)
+
+    def network_features(
+        self,
+        theta: Float[Tensor, "*batch H"],
+        include_pose: bool = True,
+        include_translation: bool = False,
+    ) -> Float[Tensor, "*batch F"]:
+        """Theta as the weight network reads it (paper, sec. 3.1: expression and joint poses).
+
+        Rotations become the first two rows of their matrix, as in the release, or are left out;
+        the translation is left out by default, ours, because an avatar must not change its look
+        when the head moves sideways.
+        """
+        parts = self.split(theta)
+        features = [theta[..., :0]]
+        for field in self.fields:
+            part = parts[field.name]
+            if field.form == "axis_angle" and include_pose:
+                features.append(matrix_to_6d_rows(axis_angle_to_matrix(part)))
+            elif field.form == "linear" or (field.form == "translation" and include_translation):
+                features.append(part)
+        return torch.cat(features, dim=-1)
+
+    def __str__(self) -> str:
+        """Names and sizes in a line."""
+        return ", ".join(f"{field.name} {field.size}" for field in self.fields)
+
+    def _unknown(self, names: Iterable[str]) -> UserError:
+        return UserError(
+            f"Unknown theta field: {', '.join(names)}.", f"This layout has {', '.join(self.names)}."
+        )

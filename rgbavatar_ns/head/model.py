@@ -1,0 +1,165 @@
+"""The head model: theta and identity to posed vertices, for FLAME and the embedded head alike."""
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.head.arrays import HeadArrays
+from rgbavatar_ns.head.layout import ThetaField, ThetaLayout
+from rgbavatar_ns.head.rotations import axis_angle_to_matrix
+
+_JOINT_FIELDS = ("rotation", "neck", "jaw", "left_eye", "right_eye")
+"""Theta's field that turns each joint, in the order of the joints."""
+
+
+class HeadModel(nn.Module):
+    """A mesh with shape directions and five joints (Li et al. 2017, FLAME, eq. 1-5).
+
+    The arrays are buffers outside of the state dict: `arrays` carries them (`to_state`).
+    """
+
+    faces: Int[Tensor, "F 3"]
+    uv: Float[Tensor, "VT 2"]
+    uv_faces: Int[Tensor, "F 3"]
+    _template: Float[Tensor, "V 3"]
+    _identity_dirs: Float[Tensor, "I V3"]
+    _linear_dirs: Float[Tensor, "E V3"]
+    _eyelid_dirs: Float[Tensor, "L V3"]
+    _pose_dirs: Float[Tensor, "P V3"]
+    _regressor: Float[Tensor, "5 V"]
+    _weights: Float[Tensor, "V 5"]
+
+    def __init__(self, arrays: HeadArrays, dtype: torch.dtype = torch.float32) -> None:
+        super().__init__()
+        self.arrays = arrays
+        self._parents = [int(parent) for parent in arrays.parents]
+        directions = _flat_directions(arrays.shapedirs)
+        eyelids = arrays.eyelid_dirs
+        posedirs = arrays.posedirs if arrays.posedirs.any() else arrays.posedirs[..., :0]
+        eyelid_dirs = arrays.posedirs[..., :0] if eyelids is None else eyelids
+        for name, values in (
+            ("_template", arrays.v_template),
+            ("_identity_dirs", directions[: arrays.num_identity]),
+            ("_linear_dirs", directions[arrays.num_identity :]),
+            ("_eyelid_dirs", _flat_directions(eyelid_dirs)),
+            ("_pose_dirs", _flat_directions(posedirs)),
+            ("_regressor", arrays.joint_regressor),
+            ("_weights", arrays.skinning_weights),
+            ("uv", arrays.uv),
+        ):
+            # Copied, so that no user of the tensors can change the shared arrays.
+            self.register_buffer(name, torch.tensor(values, dtype=dtype), persistent=False)
+        for name, index in (("faces", arrays.faces), ("uv_faces", arrays.uv_faces)):
+            self.register_buffer(name, torch.tensor(index, dtype=torch.int64), persistent=False)
+        self.layout = _layout(arrays)
+
+    @classmethod
+    def embedded(cls, dtype: torch.dtype = torch.float32) -> "HeadModel":
+        """The CC0 MakeHuman head that ships with the package."""
+        return cls(HeadArrays.embedded(), dtype)
+
+    @property
+    def num_identity(self) -> int:
+        """How many identity coefficients there are."""
+        return self.arrays.num_identity
+
+    def forward(
+        self,
+        theta: Float[Tensor, "*batch H"],
+        identity: Float[Tensor, "I"] | Float[Tensor, "*batch I"] | None = None,
+    ) -> Float[Tensor, "*batch V 3"]:
+        """Vertices in world space in metres; all zero gives `v_template` to the bit.
+
+        The global rotation turns about the root joint, then the translation is added. Eyelid
+        offsets are added before skinning and after the joints are found, as in the release, so
+        that a blink turns with the head and shifts no joint; metrical-tracker adds them after
+        skinning, which is the same for its frames, whose root and neck do not turn. Raises
+        UserError where theta or identity have another size.
+        """
+        batch = theta.shape[:-1]
+        parts = self.layout.split(theta.reshape(-1, theta.shape[-1]))
+        flat_identity = self._flat_identity(identity, batch)
+        shaped = self._shaped(parts["expression"], flat_identity)
+        joints = self._regressor @ shaped
+        turns = torch.stack([axis_angle_to_matrix(parts[name]) for name in _JOINT_FIELDS], dim=1)
+        turns = turns - torch.eye(3, dtype=turns.dtype, device=turns.device)
+        if "eyelids" in parts:
+            shaped = shaped + (parts["eyelids"] @ self._eyelid_dirs).unflatten(-1, (-1, 3))
+        if len(self._pose_dirs):
+            correctives = turns[:, 1:].flatten(1) @ self._pose_dirs
+            shaped = shaped + correctives.unflatten(-1, (-1, 3))
+        posed = shaped + self._skinned_offsets(shaped, joints, turns)
+        return (posed + parts["translation"][:, None]).reshape(*batch, -1, 3)
+
+    def joints(self, identity: Float[Tensor, "I"] | None = None) -> Float[Tensor, "5 3"]:
+        """Joints of the neutral head at rest: root, neck, jaw, left eye, right eye, metres."""
+        no_expression = self._template.new_zeros(1, self.arrays.num_expressions)
+        shaped = self._shaped(no_expression, self._flat_identity(identity, torch.Size()))
+        return (self._regressor @ shaped)[0]
+
+    def _flat_identity(
+        self, identity: Float[Tensor, "*_"] | None, batch: torch.Size
+    ) -> Float[Tensor, "#B I"]:
+        if identity is None:
+            return self._template.new_zeros(1, self.num_identity)
+        if identity.shape[-1] != self.num_identity:
+            raise UserError(
+                f"The identity has {identity.shape[-1]} numbers, but the head model "
+                f"'{self.arrays.name}' has {self.num_identity}.",
+                "Use the identity that was fitted with this head model.",
+            )
+        if identity.ndim == 1:
+            return identity[None]
+        return identity.expand(*batch, self.num_identity).reshape(-1, self.num_identity)
+
+    def _shaped(
+        self, expression: Float[Tensor, "B E"], identity: Float[Tensor, "#B I"]
+    ) -> Float[Tensor, "B V 3"]:
+        """Template plus identity and expression."""
+        person = self._template.flatten() + identity @ self._identity_dirs
+        return (person + expression @ self._linear_dirs).unflatten(-1, (-1, 3))
+
+    def _skinned_offsets(
+        self,
+        shaped: Float[Tensor, "B V 3"],
+        joints: Float[Tensor, "B 5 3"],
+        turns: Float[Tensor, "B 5 3 3"],
+    ) -> Float[Tensor, "B V 3"]:
+        """How linear blend skinning moves each vertex; `turns` are R - I.
+
+        Everything is kept as a difference from rest, so that no rotation means exactly no motion.
+        """
+        world_turns: list[Tensor] = []
+        shifts: list[Tensor] = []
+        for joint, parent in enumerate(self._parents):
+            turn = turns[:, joint]
+            if parent < 0:
+                world_turns.append(turn)
+                shifts.append(torch.zeros_like(joints[:, joint]))
+                continue
+            above = world_turns[parent]
+            bone = joints[:, joint] - joints[:, parent]
+            # (I + A)(I + T) - I = A + T + A T
+            world_turns.append(above + turn + above @ turn)
+            shifts.append(shifts[parent] + (above @ bone[..., None])[..., 0])
+        turn = torch.stack(world_turns, 1)
+        shift = torch.stack(shifts, 1) - (turn @ joints[..., None])[..., 0]
+        affine = torch.cat([turn, shift[..., None]], -1).flatten(-2)
+        blended = (self._weights @ affine).unflatten(-1, (3, 4))
+        return (blended[..., :3] * shaped[..., None, :]).sum(-1) + blended[..., 3]
+
+
+def _flat_directions(directions: Float[np.ndarray, "V 3 C"]) -> Float[np.ndarray, "C V3"]:
+    """Directions as rows over all coordinates, contiguous for one matrix product."""
+    return np.ascontiguousarray(directions.reshape(directions.shape[0] * 3, directions.shape[2]).T)
+
+
+def _layout(arrays: HeadArrays) -> ThetaLayout:
+    fields = [ThetaField("expression", arrays.num_expressions, "linear")]
+    fields += [ThetaField(name, 3, "axis_angle") for name in _JOINT_FIELDS]
+    if arrays.eyelid_dirs is not None:
+        fields.append(ThetaField("eyelids", 2, "linear"))
+    fields.append(ThetaField("translation", 3, "translation"))
+    return ThetaLayout(tuple(fields))
