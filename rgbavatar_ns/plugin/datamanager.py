@@ -148,8 +148,10 @@ class RGBAvatarDataManager(DataManager):
         self._train_row = {position: row for row, position in enumerate(tracked.train)}
 
     def setup_eval(self) -> None:
-        """Put the order of the held-out frames in place."""
+        """Put the order of the held-out frames in place, if there are any."""
         tracked, config = self.dataparser.tracked, self.config
+        if not tracked.test:
+            return
         batch_size = min(config.batch_size, len(tracked.test))
         self._eval_order = OfflineOrder(tracked.test, batch_size, 0)
         self._eval_cameras = self.eval_dataset.cameras.to(self.device)

@@ -10,6 +10,7 @@ from typing import Any
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 
 from rgbavatar_ns.avatar.metrics import LPIPSMetric
+from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.plugin.datamanager import RGBAvatarDataManager, RGBAvatarDataManagerConfig
 from rgbavatar_ns.plugin.model import RGBAvatarModel, RGBAvatarModelConfig
 
@@ -43,7 +44,15 @@ class RGBAvatarPipeline(VanillaPipeline):
         """Means over the held-out frames.
 
         Under `ns-eval` these contain LPIPS, or under `lpips_unavailable` the reason why not.
+
+        Raises:
+            UserError: the dataset holds out no frames.
         """
+        if len(self.datamanager.eval_dataset) == 0:
+            raise UserError(
+                f"The dataset {self.datamanager.get_datapath()} holds out no frames.",
+                "Write it again with some held out, so that there is something to evaluate on.",
+            )
         if self.test_mode != "test":
             return super().get_average_eval_image_metrics(step, output_path, get_std)
         if self.config.model.lpips_metric:

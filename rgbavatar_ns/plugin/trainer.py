@@ -137,8 +137,9 @@ class RGBAvatarTrainer(Trainer):
                     value = self._finite(float(loss.detach()), step)
                     self._write_scalars(step, value, parts, seconds, images_per_step, pixels)
                     progress.show(step + 1, value)
-                with self.train_lock:
-                    self.eval_iteration(step)
+                if len(self.pipeline.datamanager.eval_dataset) > 0:
+                    with self.train_lock:
+                        self.eval_iteration(step)
                 if step_check(step, self.config.steps_per_save):
                     self.save_checkpoint(step)
                 writer.write_out_storage()
@@ -188,7 +189,8 @@ class RGBAvatarTrainer(Trainer):
     ) -> None:
         """TensorBoard's curves, and the speeds that the viewer shares the device by."""
         writer.put_scalar(name="Train Loss", scalar=loss, step=step)
-        writer.put_dict(name="Train Loss Dict", scalar_dict=parts, step=step)
+        shares = {name: part.detach() for name, part in parts.items()}
+        writer.put_dict(name="Train Loss Dict", scalar_dict=shares, step=step)
         writer.put_scalar(name="Train Images / Sec", scalar=images_per_step / seconds, step=step)
         writer.put_time(EventName.ITER_TRAIN_TIME, seconds, step, update_eta=True)
         writer.put_time(EventName.TRAIN_RAYS_PER_SEC, pixels / seconds, step)

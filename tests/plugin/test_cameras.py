@@ -80,6 +80,6 @@ def test_theta_and_position_follow_a_choice_of_cameras():
 
 def test_other_lenses_are_refused():
     theirs = _to_nerfstudio(_cameras(2), 2)
-    theirs.camera_type[:] = CameraType.FISHEYE.value
+    theirs.camera_type = torch.full((2, 1), CameraType.FISHEYE.value)
     with pytest.raises(UserError, match="perspective"):
         from_nerfstudio(theirs)

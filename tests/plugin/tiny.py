@@ -1,6 +1,7 @@
 """A dataset of a few small frames: the embedded head's vertices as coloured dots."""
 
 import dataclasses
+import math
 from pathlib import Path
 
 import numpy as np
@@ -29,14 +30,14 @@ def tiny_dataset(
     camera = _front_camera(head, identity, size)
     writer = DatasetWriter(folder, head.arrays, identity, head.layout, size, size, overwrite=True)
     for index in range(frames):
-        phase = 2 * np.pi * index / frames
+        phase = 2 * math.pi * index / frames
         expression = torch.zeros(len(head.arrays.expression_names))
         expression[0] = 0.5
         theta = head.layout.join(
             {
                 "expression": expression,
-                "rotation": torch.tensor([0.0, 0.5 * np.sin(phase), 0.0]),
-                "jaw": torch.tensor([0.1 * (1 + np.cos(phase)), 0.0, 0.0]),
+                "rotation": torch.tensor([0.0, 0.5 * math.sin(phase), 0.0]),
+                "jaw": torch.tensor([0.1 * (1 + math.cos(phase)), 0.0, 0.0]),
             }
         )
         image = _dots(head, identity, theta, camera, index)
