@@ -156,10 +156,7 @@ def _whole(index: dict[str, Any], name: str) -> int:
 def _read_head(root: Path, name: str) -> HeadArrays:
     path = root / HEAD_FILE
     if path.exists():
-        try:
-            return HeadArrays.load(path)
-        except (OSError, ValueError, KeyError) as error:
-            raise UserError(f"{path} holds no head model: {error}.", _WRITE_AGAIN) from None
+        return HeadArrays.load(path)
     embedded = HeadArrays.embedded()
     if name != embedded.name:
         raise UserError(
@@ -171,25 +168,15 @@ def _read_head(root: Path, name: str) -> HeadArrays:
 
 
 def _read_layout(root: Path, index: dict[str, Any], arrays: HeadArrays) -> ThetaLayout:
-    try:
-        layout = ThetaLayout.from_json(index["layout"])
-    except (KeyError, TypeError, ValueError) as error:
-        raise UserError(
-            f"The layout in {root / INDEX_FILE} is not valid: {error}.", _WRITE_AGAIN
-        ) from None
+    layout = ThetaLayout.from_json(index["layout"])
     expected = HeadModel(arrays).layout
     if layout != expected:
         raise UserError(
-            f"The dataset {root} has theta of {_describe(layout)}, but the head '{arrays.name}' "
-            f"takes {_describe(expected)}.",
+            f"The dataset {root} has theta of {layout.size} values ({layout}), but the head "
+            f"'{arrays.name}' takes {expected.size} ({expected}).",
             "Track the video again with this head.",
         )
     return layout
-
-
-def _describe(layout: ThetaLayout) -> str:
-    parts = ", ".join(f"{field.name} {field.size}" for field in layout.fields)
-    return f"{layout.size} values ({parts})"
 
 
 def _read_identity(root: Path, index: dict[str, Any], arrays: HeadArrays) -> Float[Tensor, "I"]:
@@ -238,7 +225,7 @@ def _read_theta(root: Path, layout: ThetaLayout, numbers: tuple[int, ...]) -> Fl
     if theta.shape != expected or theta.dtype.kind != "f":
         raise UserError(
             f"{path} holds {theta.dtype} of shape {theta.shape}; {len(numbers)} frames of "
-            f"{_describe(layout)} need floats of shape {expected}.",
+            f"{layout.size} values ({layout}) need floats of shape {expected}.",
             "Write the dataset again with the layout of its head.",
         )
     wrong = [number for number, row in zip(numbers, theta) if not np.isfinite(row).all()]

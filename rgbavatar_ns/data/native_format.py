@@ -30,9 +30,7 @@ def camera_to_json(cameras: PinholeCameras, position: int) -> dict[str, Any]:
     return {name: getattr(cameras, name)[position].tolist() for name in _CAMERA_SHAPES}
 
 
-def cameras_from_json(
-    records: list[tuple[str, dict[str, Any]]], width: int, height: int
-) -> PinholeCameras:
+def cameras_from_json(records: list[tuple[str, Any]], width: int, height: int) -> PinholeCameras:
     """Cameras of one size from (what to call it in an error, JSON); raises UserError."""
     columns: dict[str, list[Tensor]] = {name: [] for name in _CAMERA_SHAPES}
     for label, record in records:
@@ -49,7 +47,7 @@ def cameras_from_json(
 
 
 def _camera_part(
-    label: str, record: dict[str, Any], name: str, shape: tuple[int, ...]
+    label: str, record: Any, name: str, shape: tuple[int, ...]
 ) -> Float[Tensor, "..."]:
     try:
         value = torch.tensor(record[name], dtype=torch.float32)

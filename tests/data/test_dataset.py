@@ -269,9 +269,12 @@ def test_an_image_of_another_size(folder):
 @pytest.mark.parametrize(
     ("stored", "expected"),
     [
-        (np.uint8([30, 20, 10]), (10, 20, 30, 255)),  # BGR without alpha, as OpenCV stores
-        (np.uint16([30 * 257, 20 * 257, 10 * 257, 99 * 257]), (10, 20, 30, 99)),
-        (np.uint8(77), (77, 77, 77, 255)),
+        (
+            np.array([30, 20, 10], np.uint8),
+            (10, 20, 30, 255),
+        ),  # BGR without alpha, as OpenCV stores
+        (257 * np.array([30, 20, 10, 99], np.uint16), (10, 20, 30, 99)),
+        (np.array(77, np.uint8), (77, 77, 77, 255)),
     ],
     ids=["opaque", "sixteen bits", "grey"],
 )

