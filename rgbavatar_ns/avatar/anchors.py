@@ -34,6 +34,15 @@ class GaussianAnchors(nn.Module):
     triangle_index: Int[Tensor, "N"]
     barycentric: Float[Tensor, "N 3"]
     texel_row_col: Int[Tensor, "N 2"]
+    _faces: Int[Tensor, "F 3"]
+    _uv: Float[Tensor, "VT 2"]
+    _uv_faces: Int[Tensor, "F 3"]
+    _rest_vertices: Float[Tensor, "V 3"]
+    _frame_index: Int[Tensor, "N"]
+    _used_faces: Int[Tensor, "U 3"]
+    _used_uv_faces: Int[Tensor, "U 3"]
+    _anchor_vertices: Int[Tensor, "N 3"]
+    _rest_length: Float[Tensor, "U"]
 
     def __init__(
         self,

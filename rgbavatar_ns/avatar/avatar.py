@@ -251,5 +251,4 @@ class Avatar(nn.Module):
 
 def describe_layout(layout: ThetaLayout) -> str:
     """Say a layout in words: its size, then each part's name and size."""
-    parts = ", ".join(f"{field.name} {field.size}" for field in layout.fields)
-    return f"{layout.size} values ({parts})"
+    return f"{layout.size} values ({layout})"

@@ -1,6 +1,6 @@
 """Training losses: L1 over per-image random backgrounds, and LPIPS as an option."""
 
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import torch
@@ -64,12 +64,13 @@ class LPIPSLoss:
 
     def network(self) -> nn.Module:
         """Return the network, building it the first time; raises UserError when it cannot be."""
-        if self._network is None:
-            self._network = _build_lpips_network(self.net)
-        return self._network
+        network = self._network
+        if network is None:
+            network = self._network = _build_lpips_network(self.net)
+        return network
 
 
-def _build_lpips_network(net: Literal["vgg", "alex", "squeeze"]) -> Any:
+def _build_lpips_network(net: Literal["vgg", "alex", "squeeze"]) -> nn.Module:
     """Build torchmetrics' LPIPS network; raises UserError with the reason where that fails."""
     try:
         # torchmetrics and torchvision take seconds to import, and are optional to a renderer.

@@ -44,7 +44,8 @@ class WeightNetwork(nn.Module):
 
 def _linear(num_in: int, num_out: int, generator: torch.Generator) -> nn.Linear:
     """Build a linear layer with torch's default initial values drawn from `generator`."""
-    layer = nn.utils.skip_init(nn.Linear, num_in, num_out)
+    # On "meta" nothing is drawn; torch's own initialisation would move the global random state.
+    layer = nn.Linear(num_in, num_out, device="meta").to_empty(device="cpu")
     bound = 1 / math.sqrt(num_in) if num_in > 0 else 0.0
     with torch.no_grad():
         layer.weight.uniform_(-bound, bound, generator=generator)

@@ -3,7 +3,7 @@
 import functools
 import importlib
 import warnings
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -12,6 +12,7 @@ from torch import Tensor
 from rgbavatar_ns.kernels.types import GaussianSet, PinholeCameras, RenderedBatch, WeightedColors
 
 
+@runtime_checkable
 class Backend(Protocol):
     """What a rasterizer offers; shapes have been checked when its methods are called."""
 

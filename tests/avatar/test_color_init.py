@@ -70,9 +70,10 @@ def test_the_blending_weight_must_exceed_the_threshold(opacity, seen):
 
 
 def test_the_weight_is_alpha_times_transmittance():
-    # Two equal Gaussians of opacity .9: the hidden one weighs at most .9 * (1 - .9) = .09.
+    # Behind one of opacity .99 and five times its size, a Gaussian of .9 weighs below .04.
     pair = one_gaussian(0.9, count=2)
     pair.means[0, 1, 2] = -0.02
+    pair.scales[0, 0], pair.opacities[0, 0] = 0.05, 0.99
     estimate = estimate_colors(pair, front_camera(100), images([0.5] * 3 + [1.0]))
     assert estimate.reliable.tolist() == [True, False]
 
