@@ -32,6 +32,13 @@ from makehuman_source import (
 
 ASSETS = Path(__file__).resolve().parent.parent / "rgbavatar_ns/head/assets"
 NUM_IDENTITY = 30
+CLOSED_LIPS = {
+    "mouthClose": 0.1,
+    "mouthShrugUpper": -0.2,
+    "mouthUpperUpLeft": -0.05,
+    "mouthUpperUpRight": -0.05,
+}
+"""The average adult's lips stand a millimetre open; so much of these expressions closes them."""
 IDENTITY_FOLDERS = ("head", "nose", "mouth", "chin", "cheek", "eyes", "forehead", "ears", "neck")
 OFFSET_STEP_M = 2.0**-16
 """Offsets are rounded to 15 micrometres: exact in float16 up to 31 mm, and they compress well."""
@@ -100,13 +107,13 @@ def identity_samples(data: Path, base: BaseMesh, adult: Adult, mesh: HeadMesh) -
     for name, offsets in loaded.items():
         if name.startswith("l-"):
             other = loaded["r-" + name[2:]]
-            samples += [0.3 * (offsets + other), 0.1 * (offsets - other)]
+            samples += [0.15 * (offsets + other), 0.05 * (offsets - other)]
         elif not name.startswith("r-"):
-            samples.append(0.3 * offsets)
+            samples.append((0.05 if "neck" in name else 0.15) * offsets)
     skull = mesh.vertices[:, 1] > np.quantile(mesh.vertices[:, 1], 0.6)
     for direction in adult.directions:
         offsets = mesh.gather(direction)
-        samples.append(0.6 * (offsets - offsets[skull].mean(0)))
+        samples.append(0.4 * (offsets - offsets[skull].mean(0)))
     return np.stack(samples)
 
 
@@ -142,6 +149,8 @@ def build() -> dict[str, np.ndarray]:
     for path in sorted((data / "faceunits01/targets/faceunits").glob("*.target")):
         expressions.append(mesh.gather(read_target(path, len(base.vertices))))
         names.append(path.name.removesuffix(".target"))
+    closing = sum(amount * expressions[names.index(n)] for n, amount in CLOSED_LIPS.items())
+    mesh = mesh.moved(np.asarray(closing))
     identity, explained = principal_directions(
         identity_samples(data, base, adult, mesh), NUM_IDENTITY
     )
