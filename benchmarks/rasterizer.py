@@ -125,14 +125,14 @@ def machine() -> dict[str, str]:
         ["git", "rev-parse", "--short", "HEAD"], cwd=here, capture_output=True, text=True
     ).stdout.strip()
     try:
-        from rgbavatar_ns.kernels.cpu import _native
+        from rgbavatar_ns.kernels.cpu.backend import instruction_sets
 
-        instruction_sets = " ".join(_native.instruction_sets())
+        names = " ".join(instruction_sets())
     except ImportError:
-        instruction_sets = "none"
+        names = "none: the extension is not compiled"
     return {
         "processor": model,
-        "instruction_sets": instruction_sets,
+        "instruction_sets": names,
         "python": platform.python_version(),
         "torch": torch.__version__,
         "commit": commit,

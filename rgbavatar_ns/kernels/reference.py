@@ -126,7 +126,7 @@ def _visible(gaussians: GaussianSet, cameras: PinholeCameras) -> Bool[Tensor, "B
     )
     determinant = covariance[..., 0, 0] * covariance[..., 1, 1] - covariance[..., 0, 1] ** 2
     finite = torch.isfinite(mean_px).all(-1) & torch.isfinite(determinant) & (determinant > 0)
-    finite = finite & torch.isfinite(gaussians.colors).all(-1)
+    finite = finite & torch.isfinite(gaussians.colors).all(-1) & torch.isfinite(gaussians.opacities)
     length = gaussians.quats_wxyz.norm(dim=-1)
     oriented = (length >= MIN_QUAT_NORM) & torch.isfinite(length)
     return finite & oriented & (z >= NEAR_PLANE_M) & (gaussians.opacities >= MIN_ALPHA)

@@ -13,10 +13,20 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from rgbavatar_ns.kernels.cpu import _native
+from rgbavatar_ns.kernels.cpu import _native  # pyright: ignore[reportMissingModuleSource]
 from rgbavatar_ns.kernels.types import GaussianSet, PinholeCameras, RenderedBatch, WeightedColors
 
 INSTRUCTION_SET_VARIABLE = "RGBAVATAR_INSTRUCTION_SET"
+
+
+def instruction_sets() -> tuple[str, ...]:
+    """Instruction sets whose loops this processor runs, the fastest first."""
+    return tuple(_native.instruction_sets())
+
+
+def compiled_constants() -> dict[str, float]:
+    """The numbers of `kernels/constants.py` as the compiled loops have them."""
+    return _native.constants()
 
 
 @dataclass
@@ -64,9 +74,8 @@ class _Rasterize(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(
-        ctx: Any, image_grad: Tensor | None, alpha_grad: Tensor | None
-    ) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, *grad_outputs: Tensor | None) -> tuple[Tensor | None, ...]:
+        image_grad, alpha_grad = grad_outputs
         *gaussians, image, alpha = ctx.saved_tensors
         if image_grad is None and alpha_grad is None:
             return (None,) * 7

@@ -1,0 +1,80 @@
+"""Every float32 backend against the float64 reference: values and gradients."""
+
+import functools
+
+import pytest
+import torch
+
+from rgbavatar_ns.kernels import available_backends
+from tests.kernels.scenes import (
+    ATTRIBUTES,
+    random_scene,
+    relative_l2,
+    render_and_differentiate,
+    settled_pixels,
+)
+
+SCENES = {
+    "plain": {"extremes": False},
+    "extremes": {},
+    "cameras": {"num_cameras": 3},
+    "cameras of one set": {"batch": 1, "num_cameras": 2},
+    "shared scales and opacities": {"shared": ("scales", "opacities")},
+    "all shared but means": {"shared": ("quats_wxyz", "scales", "opacities", "colors")},
+    "one pixel": {"width": 1, "height": 1},
+    "several tiles": {"width": 131, "height": 66, "batch": 1, "count": 120},
+    "crowded": {"count": 700, "batch": 1, "width": 16, "height": 12},
+}
+
+
+@functools.cache
+def _expected(name: str):
+    """The scene, the pixels that are compared, and the float64 reference's results."""
+    scene = random_scene(5, **SCENES[name])
+    mask = settled_pixels(scene).double()
+    assert mask.mean() > 0.5
+    return scene, mask, render_and_differentiate(scene, torch.float64, "reference", mask)
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_values_and_gradients_match_reference(fast_backend, name):
+    scene, mask, (expected, expected_grads) = _expected(name)
+    got, grads = render_and_differentiate(scene, torch.float32, fast_backend, mask)
+    assert ((got.image - expected.image) * mask).abs().max() < 1e-4
+    assert ((got.alpha - expected.alpha) * mask).abs().max() < 1e-4
+    seen = mask * (expected.alpha > 0.01)
+    assert ((got.depth - expected.depth) * seen).abs().max() < 1e-3 * expected.depth.max()
+    # A cut pixel can raise the largest weight by the cut itself, no more.
+    assert (got.visibility - expected.visibility).abs().max() < 1 / 255 + 1e-4
+    for attribute in (*ATTRIBUTES, "background"):
+        assert torch.isfinite(grads[attribute]).all()
+        error = relative_l2(grads[attribute], expected_grads[attribute])
+        assert error < 1e-3, f"{attribute}: {error}"
+
+
+def test_extreme_scenes_are_seen_at_all():
+    scene = random_scene(5)
+    rendered, grads = render_and_differentiate(scene, torch.float64, "reference")
+    assert 0.05 < rendered.alpha.mean() < 1
+    assert all(grad.norm() > 0 for grad in grads.values())
+
+
+def test_no_gaussians_show_the_background(fast_backend):
+    scene = random_scene(0, count=0)
+    rendered, grads = render_and_differentiate(scene, torch.float32, fast_backend)
+    expected = scene.background.float().double().expand_as(rendered.image)
+    torch.testing.assert_close(rendered.image, expected)
+    assert rendered.alpha.max() == 0
+    assert grads["means"].shape == (3, 0, 3)
+
+
+@pytest.mark.skipif("cpu" not in available_backends(), reason="the extension is not compiled")
+def test_compiled_constants_are_the_reference_s():
+    from rgbavatar_ns.kernels import constants
+    from rgbavatar_ns.kernels.cpu.backend import compiled_constants
+
+    compiled = compiled_constants()
+    names = {name for name in vars(constants) if name.isupper()}
+    assert names == set(compiled)
+    for name, value in compiled.items():
+        assert value == pytest.approx(getattr(constants, name), rel=1e-6)

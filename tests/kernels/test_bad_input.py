@@ -1,0 +1,176 @@
+"""Gaussians that are not numbers harm nobody else; arguments that do not fit are refused."""
+
+import math
+import warnings
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rgbavatar_ns.kernels import (
+    GaussianSet,
+    PinholeCameras,
+    available_backends,
+    rasterize,
+    registry,
+    weighted_color_average,
+)
+from tests.kernels.scenes import ATTRIBUTES, random_scene, render_and_differentiate, to
+
+DTYPES = {"reference": torch.float64, "cpu": torch.float32}
+COUNT = 60
+BAD = st.tuples(
+    st.sampled_from(ATTRIBUTES),
+    st.integers(0, COUNT - 1),
+    st.sampled_from([math.nan, math.inf, -math.inf]),
+    st.integers(0, 3),
+)
+
+
+def _changed(scene, gaussians):
+    return type(scene)(**{**vars(scene), "gaussians": GaussianSet(**gaussians)})
+
+
+def _without(scene, indices):
+    """The scene with these Gaussians fully transparent and ordinary otherwise."""
+    opacities = scene.gaussians.opacities.clone()
+    opacities[:, indices] = 0
+    return _changed(scene, {**vars(scene.gaussians), "opacities": opacities})
+
+
+def _assert_isolated(scene, broken, indices, backend):
+    rendered, grads = render_and_differentiate(broken, DTYPES[backend], backend)
+    expected, expected_grads = render_and_differentiate(
+        _without(scene, indices), DTYPES[backend], backend
+    )
+    assert torch.equal(rendered.image, expected.image)
+    for name in ATTRIBUTES:
+        assert torch.equal(grads[name], expected_grads[name])
+        assert (grads[name][:, indices] == 0).all()
+
+
+@pytest.mark.parametrize("backend", available_backends())
+@settings(max_examples=12, deadline=None)
+@given(bad=st.lists(BAD, min_size=1, max_size=5), seed=st.integers(0, 3))
+def test_not_finite_gaussians_contribute_nothing(backend, bad, seed):
+    scene = random_scene(seed, count=COUNT, batch=1, width=9, height=10, extremes=False)
+    values = {name: value.clone() for name, value in vars(scene.gaussians).items()}
+    for name, index, value, component in bad:
+        row = values[name][:, index]
+        if row.ndim == 1:
+            values[name][:, index] = value
+        else:
+            row[:, component % row.shape[1]] = value
+    indices = sorted({index for _, index, _, _ in bad})
+    _assert_isolated(scene, _changed(scene, values), indices, backend)
+
+
+@pytest.mark.parametrize("backend", available_backends())
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("quats_wxyz", 0.0), ("quats_wxyz", 1e-20), ("quats_wxyz", 1e200), ("scales", 1e200)],
+)
+def test_degenerate_gaussians_contribute_nothing(backend, name, value):
+    scene = random_scene(0, count=COUNT, batch=1, width=9, height=10, extremes=False)
+    values = {key: tensor.clone() for key, tensor in vars(scene.gaussians).items()}
+    values[name][:, 7] = value
+    _assert_isolated(scene, _changed(scene, values), [7], backend)
+
+
+def _small():
+    scene = random_scene(0, count=4, extremes=False)
+    return to(scene.gaussians, torch.float32), to(scene.cameras, torch.float32)
+
+
+def _replaced(value, **changes):
+    # Without the constructor: run-time shape checks would speak before the code under test.
+    copy = object.__new__(type(value))
+    for name, old in vars(value).items():
+        object.__setattr__(copy, name, changes.get(name, old))
+    return copy
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"means": torch.zeros(4, 3)}, r"means are \[4, 3\]. Pass \[B or 1, N, 3\]"),
+        ({"scales": torch.ones(1, 5, 3)}, r"scales are \[1, 5, 3\]. Pass \[B or 1, 4, 3\]"),
+        ({"colors": torch.ones(2, 4, 3)}, "colors: leading dimension 2 in a batch of 3"),
+        ({"opacities": torch.ones(1, 4).double()}, "opacities: torch.float64"),
+        ({"means": torch.zeros(1, 4, 3, dtype=torch.int64)}, "floating-point"),
+    ],
+)
+def test_gaussians_that_do_not_fit_are_refused(changes, message):
+    gaussians, cameras = _small()
+    with pytest.raises(ValueError, match=message):
+        rasterize(_replaced(gaussians, **changes), cameras)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"focal_px": torch.tensor([[-1.0, 1.0]])}, "must be positive"),
+        ({"focal_px": torch.ones(2, 2)}, r"focal_px is \[2, 2\]"),
+        ({"world_to_camera": torch.full((1, 4, 4), math.nan)}, "NaN or infinity"),
+        ({"width": 0}, "width is 0"),
+    ],
+)
+def test_cameras_that_do_not_fit_are_refused(changes, message):
+    gaussians, cameras = _small()
+    with pytest.raises(ValueError, match=message):
+        rasterize(gaussians, _replaced(cameras, **changes))
+
+
+def test_other_arguments_that_do_not_fit_are_refused():
+    gaussians, cameras = _small()
+    with pytest.raises(ValueError, match="no backend 'quick'"):
+        rasterize(gaussians, cameras, backend="quick")
+    with pytest.raises(ValueError, match="leading dimension 2 in a batch of 3"):
+        rasterize(gaussians, cameras, torch.zeros(2, 3))
+    nine_channels = torch.zeros(3, cameras.height, cameras.width, 9)
+    with pytest.raises(ValueError, match="9 channels"):
+        weighted_color_average(gaussians, cameras, nine_channels)
+    with pytest.raises(ValueError, match=r"Pass \[B, H, W, C\]"):
+        weighted_color_average(gaussians, cameras, torch.zeros(3, 4, 4, 3))
+
+
+@pytest.mark.skipif("cpu" not in available_backends(), reason="the extension is not compiled")
+def test_the_compiled_backend_says_what_it_takes(monkeypatch):
+    gaussians, cameras = _small()
+    with pytest.raises(ValueError, match="float32 tensors on the CPU"):
+        rasterize(to(gaussians, torch.float64), to(cameras, torch.float64), backend="cpu")
+    monkeypatch.setenv("RGBAVATAR_INSTRUCTION_SET", "mmx")
+    with pytest.raises(ValueError, match="'mmx'"):
+        rasterize(gaussians, cameras, backend="cpu")
+
+
+def test_without_the_extension_the_reference_draws_and_the_reason_is_told(monkeypatch):
+    load = registry._load
+
+    def load_without_extension(name):
+        return ImportError("No module named '_native'") if name == "cpu" else load(name)
+
+    monkeypatch.setattr(registry, "_load", load_without_extension)
+    registry._warn_of_slow_choice.cache_clear()
+    gaussians, cameras = _small()
+    with pytest.warns(RuntimeWarning, match="No module named '_native'"):
+        rendered = rasterize(gaussians, cameras)
+    assert torch.equal(rendered.image, rasterize(gaussians, cameras, backend="reference").image)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # it is told once
+        rasterize(gaussians, cameras)
+    with pytest.raises(ValueError, match="No module named '_native'"):
+        rasterize(gaussians, cameras, backend="cpu")
+
+
+def test_cameras_of_one_size_are_shared_or_one_each():
+    gaussians, cameras = _small()
+    many = PinholeCameras(
+        cameras.world_to_camera.repeat(3, 1, 1),
+        cameras.focal_px.repeat(3, 1),
+        cameras.principal_point_px.repeat(3, 1),
+        cameras.width,
+        cameras.height,
+    )
+    assert torch.equal(rasterize(gaussians, many).image, rasterize(gaussians, cameras).image)
