@@ -74,7 +74,9 @@ class _Rasterize(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, *grad_outputs: Tensor | None) -> tuple[Tensor | None, ...]:
+    def backward(  # pyright: ignore[reportIncompatibleMethodOverride]
+        ctx: Any, *grad_outputs: Tensor | None
+    ) -> tuple[Tensor | None, ...]:
         image_grad, alpha_grad = grad_outputs
         *gaussians, image, alpha = ctx.saved_tensors
         if image_grad is None and alpha_grad is None:
