@@ -3,15 +3,19 @@
 from rgbavatar_ns.head.anchors import UVAnchors, uv_anchors
 from rgbavatar_ns.head.arrays import HeadArrays
 from rgbavatar_ns.head.frames import frame_quats_wxyz, tangent_frames
+from rgbavatar_ns.head.landmarks import SPARSE_51, LandmarkMap, facemesh_landmarks
 from rgbavatar_ns.head.layout import ThetaField, ThetaLayout
 from rgbavatar_ns.head.model import HeadModel
 
 __all__ = [
+    "SPARSE_51",
     "HeadArrays",
     "HeadModel",
+    "LandmarkMap",
     "ThetaField",
     "ThetaLayout",
     "UVAnchors",
+    "facemesh_landmarks",
     "frame_quats_wxyz",
     "tangent_frames",
     "uv_anchors",

@@ -1,0 +1,69 @@
+"""Where mediapipe's FaceMesh points lie on the embedded head."""
+
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int
+
+LANDMARK_FILE = Path(__file__).parent / "assets" / "facemesh_landmarks.npz"
+
+SPARSE_51 = (
+    *(70, 63, 105, 66, 107, 336, 296, 334, 293, 300),
+    *(168, 197, 195, 4, 98, 97, 2, 326, 327),
+    *(33, 160, 158, 133, 153, 144, 362, 385, 387, 263, 373, 380),
+    *(61, 39, 37, 0, 267, 269, 291, 405, 314, 17, 84, 181),
+    *(78, 82, 13, 312, 308, 317, 14, 87),
+)
+"""FaceMesh indices of the usual 68 points without the jaw line: brows, nose, eyes, mouth."""
+
+
+@dataclass(frozen=True)
+class LandmarkMap:
+    """L FaceMesh points as places on triangles of the embedded head, by FaceMesh index.
+
+    Made by scripts/build_landmark_map.py, which looks at renders of the head with FaceMesh.
+    """
+
+    facemesh_index: Int[np.ndarray, "L"]
+    triangle: Int[np.ndarray, "L"]
+    barycentric: Float[np.ndarray, "L 3"]
+    mirror: Int[np.ndarray, "L"]
+    """FaceMesh index of the point on the other side of the face; a middle point is its own."""
+    spread_m: Float[np.ndarray, "L"]
+    """How far single renders put the point from this place (median, metres): small is sure."""
+
+    def select(self, facemesh_indices: tuple[int, ...]) -> "LandmarkMap":
+        """These points, in this order; raises KeyError for a point that is not in the map."""
+        places = {int(index): place for place, index in enumerate(self.facemesh_index)}
+        chosen = np.array([places[index] for index in facemesh_indices], dtype=np.int64)
+        return LandmarkMap(
+            self.facemesh_index[chosen],
+            self.triangle[chosen],
+            self.barycentric[chosen],
+            self.mirror[chosen],
+            self.spread_m[chosen],
+        )
+
+    def as_dict(self) -> dict[int, tuple[int, tuple[float, float, float]]]:
+        """FaceMesh index -> (triangle, barycentric coordinates)."""
+        return {
+            int(index): (int(triangle), (float(weights[0]), float(weights[1]), float(weights[2])))
+            for index, triangle, weights in zip(
+                self.facemesh_index, self.triangle, self.barycentric
+            )
+        }
+
+
+@cache
+def facemesh_landmarks() -> LandmarkMap:
+    """All FaceMesh points that have a place on the embedded head, irises (468-477) included."""
+    with np.load(LANDMARK_FILE, allow_pickle=False) as file:
+        return LandmarkMap(
+            file["facemesh_index"].astype(np.int64),
+            file["triangle"].astype(np.int64),
+            file["barycentric"].astype(np.float64),
+            file["mirror"].astype(np.int64),
+            file["spread_m"].astype(np.float64),
+        )
