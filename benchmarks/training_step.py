@@ -157,7 +157,7 @@ def main() -> None:
         for image_px in arguments.image:
             name = f"{avatar.num_gaussians // 1000}k @ {image_px}"
             columns[name] = time_parts(avatar, make_batch(avatar, image_px), arguments.repeats)
-    print(f"backend {available_backends()[-1]}, {torch.get_num_threads()} threads; ms, batch 10")
+    print(f"backend {available_backends()[0]}, {torch.get_num_threads()} threads; ms, batch 10")
     print(f"{'':34}" + "".join(f"{name:>12}" for name in columns))
     for part in next(iter(columns.values())):
         print(f"{part:34}" + "".join(f"{times[part]:12.1f}" for times in columns.values()))

@@ -31,9 +31,10 @@ class ColorEstimate:
 class ColorInitSchedule:
     """After which optimiser steps colours are initialised.
 
-    The estimate costs about as much as a forward pass. Nearly all Gaussians that the data shows
-    are seen in the first steps, so it runs after each of the first `every_step_until` steps and
-    then after every `interval`-th one, which adds 1-2 % to a long run. Ours: the paper is silent.
+    The estimate costs about half a training step. Nearly all Gaussians that the data shows are
+    seen in the first steps, so it runs after each of the first `every_step_until` steps and then
+    after every `interval`-th one, which adds about 2 % to a long run; once every Gaussian has its
+    colour it stops. Ours: the paper does not say how often.
     """
 
     every_step_until: int = 20
