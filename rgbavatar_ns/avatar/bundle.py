@@ -61,6 +61,7 @@ def save_bundle(state: dict[str, Any], parameters: dict[str, Tensor], path: Path
         save_file(dense, scratch / TENSORS_NAME)
         (scratch / MANIFEST_NAME).write_text(json.dumps(manifest, indent=1) + "\n")
         for name in (TENSORS_NAME, MANIFEST_NAME):
+            (scratch / name).chmod(0o644)  # safetensors keeps its files to their owner.
             _sync(scratch / name)
         _replace_directory(scratch, path)
     except (OSError, SafetensorError) as error:
