@@ -20,7 +20,7 @@ import torch
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 from scipy.optimize import linear_sum_assignment
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from trimesh.triangles import closest_point
 
 from rgbavatar_ns.head import HeadModel
@@ -81,7 +81,7 @@ def albedo(head: HeadModel, rest: np.ndarray, part: np.ndarray) -> np.ndarray:
     outer = np.unique(head.arrays.faces[~uv_of])
     rims = np.intersect1d(inner, outer)
     rims = rims[head.arrays.v_template[rims, 1] > 0]
-    lash = cKDTree(head.arrays.v_template[rims]).query(rest)[0] < 0.0013
+    lash = KDTree(head.arrays.v_template[rims]).query(rest)[0] < 0.0013
     color[lash] = [0.12, 0.08, 0.07]
     for name, centre_x in (("left_eye", 1), ("right_eye", -1)):
         eye = part == name
@@ -152,7 +152,7 @@ class Painter:
             visible = (hit >= 0) & (distance > np.linalg.norm(seen, axis=1) - 5e-4)
             seen, rest = seen[visible], rest[visible]
             pixels = seen[:, :2] / -seen[:, 2:] * FOCAL_PX * [1, -1] + SIZE_PX / 2
-            nearest = cKDTree(pixels).query(points_px[chosen], k=3)
+            nearest = KDTree(pixels).query(points_px[chosen], k=3)
             closeness = 1 / (nearest[0] + 0.3)
             closeness /= closeness.sum(1, keepdims=True)
             places[chosen] = (rest[nearest[1]] * closeness[..., None]).sum(1)
@@ -280,7 +280,7 @@ def build(painter: Painter) -> dict[str, np.ndarray]:
     # Only an open mouth tells the lips apart.
     table[np.ix_(~opened, on_mouth(np.median(table, 0)))] = np.nan
     places = np.nanmedian(table, 0)
-    nearest = cKDTree(painter.rest).query(np.nan_to_num(table))[1]
+    nearest = np.asarray(KDTree(painter.rest).query(np.nan_to_num(table))[1])
     jaw = np.median(painter.head.arrays.skinning_weights[nearest[opened], 2], 0)
     mirror = mirror_table(painter)
     print(f"asymmetry: {np.abs(places - places[mirror] * [-1, 1, 1]).max() * 1e3:.1f} mm at most")

@@ -112,7 +112,8 @@ def cut_head(base: BaseMesh, adult: np.ndarray, bones: dict[str, np.ndarray]) ->
     texture_triangles = np.take_along_axis(texture_quads, order, 1).reshape(-1, 3)
     used, faces = _compact(triangles)
     used_uv, guide_faces = _compact(texture_triangles)
-    source = sparse.identity(len(adult), format="csr")[used]
+    ones = np.ones(len(used))
+    source = sparse.csr_matrix((ones, (np.arange(len(used)), used)), (len(used), len(adult)))
     parts = np.array([SOURCE_GROUPS[name] for name in np.repeat(base.groups[keep], 2)])
     guide_uv = base.texture_vertices[used_uv]
     return HeadMesh(adult[used], faces, parts, source, guide_uv, guide_faces)
@@ -156,7 +157,7 @@ def round_eyeballs(mesh: HeadMesh) -> HeadMesh:
         vertices,
         np.concatenate([mesh.faces[~is_eye], split]),
         np.concatenate([mesh.face_parts[~is_eye], np.repeat(mesh.face_parts[is_eye], 4)]),
-        sparse.vstack([mesh.source, halves]).tocsr(),
+        sparse.csr_matrix(sparse.vstack([mesh.source, halves])),
         np.concatenate([mesh.guide_uv, guide_added]),
         np.concatenate([mesh.guide_faces[~is_eye], guide_split]),
     )
@@ -197,7 +198,7 @@ def skinning_weights(
 ) -> np.ndarray:
     """Weights [V, 5] of root, neck, jaw, left eye, right eye; rows sum to one."""
     follow = {"neck01": 0.1, "neck02": 0.45, "neck03": 0.85}
-    head = np.zeros(mesh.source.shape[1])
+    head = np.zeros(len(next(iter(bones.values()))))
     for bone, values in bones.items():
         if bone.startswith(HEAD_BONES):
             head += follow.get(bone, 1.0) * values

@@ -143,6 +143,7 @@ def _flatten_chart(mesh: HeadMesh, name: str, inside: np.ndarray) -> tuple[np.nd
     faces = mesh.faces[inside]
     size = (CELLS[name][2] - 2 * MARGIN, CELLS[name][3] - 2 * MARGIN)
     points, guide = mesh.vertices, mesh.vertices[:, :2]
+    seam, origins = [], np.array([], np.int64)
     if name == "skin":
         seam = _back_seam(mesh, faces)
         faces, origins = _cut_open(faces, seam, len(points))

@@ -1,14 +1,17 @@
 """Tangent frames of triangles (paper, Alg. 1) and the rotations that belong to them."""
 
-from typing import Literal
+from typing import Literal, TypeAlias
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from rgbavatar_ns.head.rotations import matrix_to_quat_wxyz
 
 TangentVariant = Literal["normalized", "raw", "orthonormal"]
+
+_Planes: TypeAlias = tuple[Tensor, ...]
+"""x, y and z of many vectors, each [*batch, F]."""
 
 
 def tangent_frames(
@@ -29,35 +32,64 @@ def tangent_frames(
     Triangles without area in the UV map take their edges for T and B, triangles without area in
     space take the world's axes: always finite, gradients too.
     """
-    corners = vertices.index_select(-2, faces.flatten()).unflatten(-2, (len(faces), 3))
-    first = corners[..., 1, :] - corners[..., 0, :]
-    second = corners[..., 2, :] - corners[..., 0, :]
-    axes = torch.eye(3, dtype=vertices.dtype, device=vertices.device)
-    flat = _without_area(first, second)[..., None]
-    first, second = torch.where(flat, axes[0], first), torch.where(flat, axes[1], second)
-    cross = torch.linalg.cross(first, second, dim=-1)
-    normal = cross / torch.linalg.vector_norm(cross, dim=-1, keepdim=True)
+    first, second = _edges(vertices, faces)
+    keep = _has_area(first, second)
+    # x, y, z lie in planes of their own up to the end: several times faster than rows of three.
+    first = (first[0] * keep + (1 - keep), first[1] * keep, first[2] * keep)
+    second = (second[0] * keep, second[1] * keep + (1 - keep), second[2] * keep)
+    normal = _scaled_to_one(_cross(first, second))
     inverse = _uv_inverses(uv, uv_faces).to(vertices.dtype)
-    tangent = first * inverse[:, 0, 0, None] + second * inverse[:, 0, 1, None]
+
+    def derivative(row: Float[Tensor, "F 2"]) -> _Planes:
+        return tuple(a * row[:, 0] + b * row[:, 1] for a, b in zip(first, second))
+
+    tangent = derivative(inverse[:, 0])
     if variant == "orthonormal":
-        tangent = tangent / torch.linalg.vector_norm(tangent, dim=-1, keepdim=True)
-        bitangent = torch.linalg.cross(normal, tangent, dim=-1)
-        return torch.stack([tangent, bitangent, normal], -1)
-    bitangent = first * inverse[:, 1, 0, None] + second * inverse[:, 1, 1, None]
-    if variant == "normalized":
-        tangent = tangent / torch.linalg.vector_norm(tangent, dim=-1, keepdim=True)
-        bitangent = bitangent / torch.linalg.vector_norm(bitangent, dim=-1, keepdim=True)
-    return torch.stack([tangent, bitangent, normal], -1)
+        tangent = _scaled_to_one(tangent)
+        bitangent = _cross(normal, tangent)
+    else:
+        bitangent = derivative(inverse[:, 1])
+        if variant == "normalized":
+            tangent, bitangent = _scaled_to_one(tangent), _scaled_to_one(bitangent)
+    rows = [entry for row in zip(tangent, bitangent, normal) for entry in row]
+    return torch.stack(rows).movedim(0, -1).contiguous().unflatten(-1, (3, 3))
 
 
-def _without_area(
-    first: Float[Tensor, "*batch F 3"], second: Float[Tensor, "*batch F 3"]
-) -> Bool[Tensor, "*batch F"]:
-    """Whether two edges are (nearly) parallel or have no length."""
-    with torch.no_grad():
-        a, b = (first * first).sum(-1), (second * second).sum(-1)
-        c = (first * second).sum(-1)
-        return ~(a * b - c * c > 1e-10 * a * b + 1e-30)
+def _edges(
+    vertices: Float[Tensor, "*batch V 3"], faces: Int[Tensor, "F 3"]
+) -> tuple[_Planes, _Planes]:
+    """From each triangle's first corner to its second and third, as planes [*batch, F]."""
+    planes = vertices.movedim(-1, 0).contiguous()
+    corners = [
+        planes.gather(-1, faces[:, corner].expand(*planes.shape[:-1], -1)) for corner in range(3)
+    ]
+    first, second = corners[1] - corners[0], corners[2] - corners[0]
+    return tuple(first.unbind(0)), tuple(second.unbind(0))
+
+
+def _dot(a: _Planes, b: _Planes) -> Tensor:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def _cross(a: _Planes, b: _Planes) -> _Planes:
+    return (
+        a[1] * b[2] - a[2] * b[1],
+        a[2] * b[0] - a[0] * b[2],
+        a[0] * b[1] - a[1] * b[0],
+    )
+
+
+def _scaled_to_one(a: _Planes) -> _Planes:
+    factor = torch.rsqrt(_dot(a, a))
+    return tuple(entry * factor for entry in a)
+
+
+@torch.no_grad()
+def _has_area(first: _Planes, second: _Planes) -> Float[Tensor, "*batch F"]:
+    """0 where two edges are (nearly) parallel or have no length, else 1."""
+    cross = _cross(first, second)
+    wide = _dot(cross, cross) > 1e-10 * _dot(first, first) * _dot(second, second) + 1e-30
+    return wide.to(cross[0])
 
 
 def _uv_inverses(uv: Float[Tensor, "VT 2"], uv_faces: Int[Tensor, "F 3"]) -> Float[Tensor, "F 2 2"]:
@@ -85,12 +117,14 @@ def frame_quats_wxyz(frames: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*bat
     an orthonormal frame it is the frame itself. Where the UV map is mirrored, B is negated first.
     Ours; the paper (sec. 3.1) writes q_D = R q_T without saying how R becomes a rotation.
     """
-    tangent, bitangent, normal = frames.unbind(-1)
+    entries = frames.flatten(-2).movedim(-1, 0).contiguous().unbind(0)
+    tangent, bitangent, normal = entries[0::3], entries[1::3], entries[2::3]
     # In the plane: turning B back by 90 degrees (B x N) gives a second wish for T's direction.
-    turned = torch.linalg.cross(bitangent, normal, dim=-1)
-    mirrored = (turned * tangent).sum(-1, keepdim=True) < 0
-    wished = tangent + torch.where(mirrored, -turned, turned)
-    wished = wished - (wished * normal).sum(-1, keepdim=True) * normal
-    along_u = wished / torch.linalg.vector_norm(wished, dim=-1, keepdim=True)
-    along_v = torch.linalg.cross(normal, along_u, dim=-1)
-    return matrix_to_quat_wxyz(torch.stack([along_u, along_v, normal], -1))
+    turned = _cross(bitangent, normal)
+    sign = 1 - 2 * (_dot(turned, tangent) < 0).to(frames)
+    wished = tuple(t + sign * q for t, q in zip(tangent, turned))
+    off_plane = _dot(wished, normal)
+    along_u = _scaled_to_one(tuple(w - off_plane * n for w, n in zip(wished, normal)))
+    along_v = _cross(normal, along_u)
+    rows = [entry for row in zip(along_u, along_v, normal) for entry in row]
+    return matrix_to_quat_wxyz(torch.stack(rows).movedim(0, -1).unflatten(-1, (3, 3)))

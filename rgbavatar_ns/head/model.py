@@ -23,13 +23,13 @@ class HeadModel(nn.Module):
     faces: Int[Tensor, "F 3"]
     uv: Float[Tensor, "VT 2"]
     uv_faces: Int[Tensor, "F 3"]
-    _template: Float[Tensor, "V 3"]
+    _template: Float[Tensor, "3 V"]
     _identity_dirs: Float[Tensor, "I V3"]
     _linear_dirs: Float[Tensor, "E V3"]
     _eyelid_dirs: Float[Tensor, "L V3"]
     _pose_dirs: Float[Tensor, "P V3"]
-    _regressor: Float[Tensor, "5 V"]
-    _weights: Float[Tensor, "V 5"]
+    _regressor: Float[Tensor, "V 5"]
+    _weights: Float[Tensor, "5 V"]
 
     def __init__(self, arrays: HeadArrays, dtype: torch.dtype = torch.float32) -> None:
         super().__init__()
@@ -40,13 +40,13 @@ class HeadModel(nn.Module):
         posedirs = arrays.posedirs if arrays.posedirs.any() else arrays.posedirs[..., :0]
         eyelid_dirs = arrays.posedirs[..., :0] if eyelids is None else eyelids
         for name, values in (
-            ("_template", arrays.v_template),
+            ("_template", arrays.v_template.T),
             ("_identity_dirs", directions[: arrays.num_identity]),
             ("_linear_dirs", directions[arrays.num_identity :]),
             ("_eyelid_dirs", _flat_directions(eyelid_dirs)),
             ("_pose_dirs", _flat_directions(posedirs)),
-            ("_regressor", arrays.joint_regressor),
-            ("_weights", arrays.skinning_weights),
+            ("_regressor", arrays.joint_regressor.T),
+            ("_weights", arrays.skinning_weights.T),
             ("uv", arrays.uv),
         ):
             # Copied, so that no user of the tensors can change the shared arrays.
@@ -82,22 +82,22 @@ class HeadModel(nn.Module):
         parts = self.layout.split(theta.reshape(-1, theta.shape[-1]))
         flat_identity = self._flat_identity(identity, batch)
         shaped = self._shaped(parts["expression"], flat_identity)
-        joints = self._regressor @ shaped
+        joints = (shaped @ self._regressor).mT
         turns = torch.stack([axis_angle_to_matrix(parts[name]) for name in _JOINT_FIELDS], dim=1)
         turns = turns - torch.eye(3, dtype=turns.dtype, device=turns.device)
         if "eyelids" in parts:
-            shaped = shaped + (parts["eyelids"] @ self._eyelid_dirs).unflatten(-1, (-1, 3))
+            shaped = shaped + (parts["eyelids"] @ self._eyelid_dirs).unflatten(-1, (3, -1))
         if len(self._pose_dirs):
             correctives = turns[:, 1:].flatten(1) @ self._pose_dirs
-            shaped = shaped + correctives.unflatten(-1, (-1, 3))
+            shaped = shaped + correctives.unflatten(-1, (3, -1))
         posed = shaped + self._skinned_offsets(shaped, joints, turns)
-        return (posed + parts["translation"][:, None]).reshape(*batch, -1, 3)
+        return (posed + parts["translation"][..., None]).mT.reshape(*batch, -1, 3)
 
     def joints(self, identity: Float[Tensor, "I"] | None = None) -> Float[Tensor, "5 3"]:
         """Joints of the neutral head at rest: root, neck, jaw, left eye, right eye, metres."""
         no_expression = self._template.new_zeros(1, self.arrays.num_expressions)
         shaped = self._shaped(no_expression, self._flat_identity(identity, torch.Size()))
-        return (self._regressor @ shaped)[0]
+        return (shaped @ self._regressor)[0].mT
 
     def _flat_identity(
         self, identity: Float[Tensor, "*_"] | None, batch: torch.Size
@@ -116,17 +116,17 @@ class HeadModel(nn.Module):
 
     def _shaped(
         self, expression: Float[Tensor, "B E"], identity: Float[Tensor, "#B I"]
-    ) -> Float[Tensor, "B V 3"]:
+    ) -> Float[Tensor, "B 3 V"]:
         """Template plus identity and expression."""
         person = self._template.flatten() + identity @ self._identity_dirs
-        return (person + expression @ self._linear_dirs).unflatten(-1, (-1, 3))
+        return (person + expression @ self._linear_dirs).unflatten(-1, (3, -1))
 
     def _skinned_offsets(
         self,
-        shaped: Float[Tensor, "B V 3"],
+        shaped: Float[Tensor, "B 3 V"],
         joints: Float[Tensor, "B 5 3"],
         turns: Float[Tensor, "B 5 3 3"],
-    ) -> Float[Tensor, "B V 3"]:
+    ) -> Float[Tensor, "B 3 V"]:
         """How linear blend skinning moves each vertex; `turns` are R - I.
 
         Everything is kept as a difference from rest, so that no rotation means exactly no motion.
@@ -146,14 +146,16 @@ class HeadModel(nn.Module):
             shifts.append(shifts[parent] + (above @ bone[..., None])[..., 0])
         turn = torch.stack(world_turns, 1)
         shift = torch.stack(shifts, 1) - (turn @ joints[..., None])[..., 0]
-        affine = torch.cat([turn, shift[..., None]], -1).flatten(-2)
-        blended = (self._weights @ affine).unflatten(-1, (3, 4))
-        return (blended[..., :3] * shaped[..., None, :]).sum(-1) + blended[..., 3]
+        affine = torch.cat([turn, shift[..., None]], -1).movedim(1, -1)
+        blended = affine @ self._weights
+        x, y, z, moved = blended.unbind(2)
+        return x * shaped[:, None, 0] + y * shaped[:, None, 1] + z * shaped[:, None, 2] + moved
 
 
 def _flat_directions(directions: Float[np.ndarray, "V 3 C"]) -> Float[np.ndarray, "C V3"]:
-    """Directions as rows over all coordinates, contiguous for one matrix product."""
-    return np.ascontiguousarray(directions.reshape(directions.shape[0] * 3, directions.shape[2]).T)
+    """Directions as rows over all x, then all y, then all z, for one matrix product."""
+    num_vertices, _, count = directions.shape
+    return np.ascontiguousarray(directions.transpose(2, 1, 0)).reshape(count, 3 * num_vertices)
 
 
 def _layout(arrays: HeadArrays) -> ThetaLayout:

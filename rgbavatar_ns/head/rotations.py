@@ -34,8 +34,33 @@ def rows_6d_to_matrix(rows: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch 
 
 
 def matrix_to_quat_wxyz(matrix: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 4"]:
-    """Unit quaternions of proper rotations; the sign is either."""
-    return roma.quat_xyzw_to_wxyz(roma.rotmat_to_unitquat(matrix))
+    """Unit quaternions of proper rotations; the sign is either.
+
+    Written out (Day 2015, "Converting a rotation matrix to a quaternion"), because roma's own
+    takes ten times as long on a head's triangles; the tests compare the two.
+    """
+    m00, m01, m02, m10, m11, m12, m20, m21, m22 = matrix.flatten(-2).unbind(-1)
+    # Which component is surely not small, as factors 0 and 1: cheaper than torch.where here.
+    z_down, x_wins, z_wins = ((m22 < 0).to(matrix), (m00 > m11).to(matrix), (m00 < -m11).to(matrix))
+    is_x, is_y = z_down * x_wins, z_down * (1 - x_wins)
+    is_z, is_w = (1 - z_down) * z_wins, (1 - z_down) * (1 - z_wins)
+    sign_x, sign_y, sign_z = is_w + is_x - is_y - is_z, is_w + is_y - is_x - is_z, 1 - 2 * z_down
+    # Four times the square of that component.
+    square = 1 + sign_x * m00 + sign_y * m11 + sign_z * m22
+    wx, wy, wz = m21 - m12, m02 - m20, m10 - m01
+    xy, xz, yz = m01 + m10, m02 + m20, m12 + m21
+
+    def pick(w: Tensor, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
+        return is_w * w + is_x * x + is_y * y + is_z * z
+
+    factor = 0.5 * torch.rsqrt(square)
+    quat = [
+        pick(square, wx, wy, wz) * factor,
+        pick(wx, square, xy, xz) * factor,
+        pick(wy, xy, square, yz) * factor,
+        pick(wz, xz, yz, square) * factor,
+    ]
+    return torch.stack(quat).movedim(0, -1).contiguous()
 
 
 def quat_wxyz_to_matrix(quat_wxyz: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3 3"]:
