@@ -79,8 +79,9 @@ def from_nerfstudio(cameras: Cameras) -> PinholeCameras:
     last_row = world_to_camera.new_tensor([[[0.0, 0.0, 0.0, 1.0]]]).expand(len(rotation), 1, 4)
     return PinholeCameras(
         world_to_camera=torch.cat([world_to_camera, last_row], dim=1),
-        focal_px=torch.cat([flat.fx, flat.fy], dim=-1),
-        principal_point_px=torch.cat([flat.cx, flat.cy], dim=-1),
+        # A camera path brings poses and focal lengths in different precision.
+        focal_px=torch.cat([flat.fx, flat.fy], dim=-1).to(rotation),
+        principal_point_px=torch.cat([flat.cx, flat.cy], dim=-1).to(rotation),
         width=int(flat.width.reshape(-1)[0]),
         height=int(flat.height.reshape(-1)[0]),
     )

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 # nerfstudio shows its world ten times as large in viser.
 _VISER_PER_METRE = 10.0
-_VISIBLE_HEIGHT_M = 0.42
+_VISIBLE_HEIGHT_M = 0.45
 _PLAYED_FRAMES_PER_SECOND = 12.0
 _PATIENCE_S = 5.0
 

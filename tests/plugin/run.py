@@ -15,7 +15,7 @@ from rgbavatar_ns.avatar import AvatarConfig
 from rgbavatar_ns.plugin.methods import rgbavatar_tiny
 from rgbavatar_ns.plugin.trainer import RGBAvatarTrainer, RGBAvatarTrainerConfig
 
-SMALL = AvatarConfig(uv_resolution=16, num_bases=3, hidden_width=16)
+SMALL = AvatarConfig(uv_resolution=16, num_bases=3, hidden_width=16, scale_from_texel_spacing=True)
 # Entry points exist only once the package is installed; the variable works without.
 _METHODS = (
     "rgbavatar=rgbavatar_ns.plugin.methods:rgbavatar,"
@@ -23,7 +23,9 @@ _METHODS = (
 )
 
 
-def small_config(data: Path, output: Path, **fields: Any) -> RGBAvatarTrainerConfig:
+def small_config(
+    data: Path, output: Path, avatar: AvatarConfig = SMALL, **fields: Any
+) -> RGBAvatarTrainerConfig:
     """rgbavatar-tiny with fewer Gaussians and steps, writing to `output`."""
     config = copy.deepcopy(rgbavatar_tiny.config)
     assert isinstance(config, RGBAvatarTrainerConfig)
@@ -35,7 +37,7 @@ def small_config(data: Path, output: Path, **fields: Any) -> RGBAvatarTrainerCon
     config.machine.device_type = "cpu"
     config.pipeline.datamanager.data = data
     config.pipeline.datamanager.batch_size = 4
-    config.pipeline.model.avatar = SMALL
+    config.pipeline.model.avatar = avatar
     for name, value in fields.items():
         assert hasattr(config, name)
         setattr(config, name, value)
@@ -67,7 +69,13 @@ def program(name: str) -> str:
 
 def environment(**changes: str) -> Mapping[str, str]:
     """For a command: the methods are known, whether the package is installed or not."""
-    return {**os.environ, "NERFSTUDIO_METHOD_CONFIGS": _METHODS, "COLUMNS": "200", **changes}
+    here = str(Path(sys.executable).parent)
+    own = {
+        "NERFSTUDIO_METHOD_CONFIGS": _METHODS,
+        "COLUMNS": "200",
+        "PATH": here + os.pathsep + os.environ.get("PATH", ""),
+    }
+    return {**os.environ, **own, **changes}
 
 
 def run_command(

@@ -1,5 +1,6 @@
 """Training through nerfstudio's trainer: repeatable, resumable bit for bit, interruptible."""
 
+import dataclasses
 import json
 import math
 import shutil
@@ -198,8 +199,8 @@ def test_full_disk_at_a_checkpoint_is_a_user_error_and_the_old_one_survives(
 
 def test_checkpoint_of_another_make_is_refused_with_the_flags(tiny_data: Path, tmp_path: Path):
     first = _train(tiny_data, tmp_path, max_num_iterations=2)
-    config = small_config(tiny_data, tmp_path / "other", load_dir=first.checkpoint_dir)
-    config.pipeline.model.avatar = type(SMALL)(uv_resolution=16, num_bases=5, hidden_width=16)
+    other = dataclasses.replace(SMALL, num_bases=5)
+    config = small_config(tiny_data, tmp_path / "other", other, load_dir=first.checkpoint_dir)
     with pytest.raises(UserError, match="num_bases 3, not 5") as refused:
         make_trainer(config)
     assert "--pipeline.model.avatar.num-bases 3" in refused.value.remedy

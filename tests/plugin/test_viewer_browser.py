@@ -5,6 +5,7 @@ import os
 import re
 import shutil
 import subprocess
+import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,6 +16,7 @@ import numpy.typing as npt
 import pytest
 from PIL import Image
 
+from rgbavatar_ns.avatar import AvatarConfig
 from tests.plugin.run import environment, finished_run, program
 
 CHROMIUM = os.environ.get("RGBAVATAR_CHROMIUM") or shutil.which("chromium")
@@ -29,8 +31,9 @@ _FLAGS = [
     "--disable-component-update",
     "--disable-sync",
 ]
-_WIDTH, _HEIGHT = 1100, 800
-_SECONDS_UNTIL_DRAWN = 60.0
+_WIDTH, _HEIGHT = 1100, 1200
+_PANEL_WIDTH = 330
+_SECONDS_UNTIL_DRAWN = 120.0
 
 pytestmark = [
     pytest.mark.browser,
@@ -44,7 +47,8 @@ Picture = npt.NDArray[np.uint8]
 @pytest.fixture
 def viewer_address(tiny_data: Path, tmp_path: Path) -> Iterator[str]:
     """Where ns-viewer shows a run of a few steps."""
-    config = finished_run(tiny_data, tmp_path)
+    avatar = AvatarConfig(uv_resolution=48, num_bases=3, scale_from_texel_spacing=True)
+    config = finished_run(tiny_data, tmp_path, avatar=avatar)
     log = tmp_path / "viewer.log"
     command = [program("ns-viewer"), "--load-config", str(config)]
     command += ["--viewer.websocket-host", "127.0.0.1"]
@@ -82,9 +86,9 @@ def page(viewer_address: str) -> Iterator[Any]:
 
 
 def _canvas(page: Any) -> Picture:
-    """The middle of the 3D view, left of the control panel."""
+    """The 3D view, left of the control panel, below the title and above the axes."""
     image = Image.open(io.BytesIO(page.screenshot())).convert("RGB")
-    return np.asarray(image)[100 : _HEIGHT - 100, 150 : _WIDTH - 450]
+    return np.asarray(image)[80 : _HEIGHT - 80, : _WIDTH - _PANEL_WIDTH]
 
 
 def _colored(picture: Picture) -> float:
@@ -102,8 +106,8 @@ def _wait_for(page: Any, wanted: Any) -> Picture:
         if wanted(picture) and np.array_equal(before, picture):
             return picture
         time.sleep(0.5)
-    Path("viewer-failed.png").write_bytes(page.screenshot())
-    raise AssertionError("the viewer did not show what was awaited; see viewer-failed.png")
+    Image.fromarray(picture).save(seen := Path(tempfile.gettempdir()) / "rgbavatar-viewer.png")
+    raise AssertionError(f"the viewer did not show what was awaited, but {seen}")
 
 
 def test_frame_control_changes_the_picture_of_the_head(page: Any):
@@ -114,11 +118,22 @@ def test_frame_control_changes_the_picture_of_the_head(page: Any):
     assert _colored(middle) > 0.5
     assert _colored(first[:40, :40]) == 0
 
-    number = page.get_by_label("Frame", exact=True)
+    number = _number_beside(page, "Frame")
     number.fill("4")
     number.press("Enter")
     second = _wait_for(page, lambda picture: _difference(picture, first) > 0.02)
     assert _colored(second) > 0.05
+
+    play = page.get_by_role("checkbox", name="Play")
+    play.check()
+    page.wait_for_timeout(3000)
+    play.uncheck()
+    assert number.input_value() != "4"
+
+
+def _number_beside(page: Any, label: str) -> Any:
+    place = f"//*[normalize-space(text())='{label}']/following::input[@inputmode='numeric'][1]"
+    return page.locator(f"xpath={place}")
 
 
 def _difference(picture: Picture, other: Picture) -> float:
