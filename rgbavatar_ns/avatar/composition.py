@@ -48,10 +48,10 @@ class _BatchedProduct(torch.autograd.Function):
 
     @staticmethod
     def backward(
-        ctx: Any, gradient: Float[Tensor, "B N 4"]
+        ctx: Any, *grad_outputs: Float[Tensor, "B N 4"]
     ) -> tuple[Float[Tensor, "B N 4"] | None, Float[Tensor, "B N 4"] | None]:
         first, second = (_to_complex(quats) for quats in ctx.saved_tensors)
-        outer = _to_complex(gradient)
+        outer = _to_complex(grad_outputs[0])
         need_first, need_second = ctx.needs_input_grad
         return (
             _product(outer, _conjugate(second)) if need_first else None,
