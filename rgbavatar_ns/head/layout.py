@@ -115,7 +115,7 @@ class ThetaLayout:
         ]
 
     @classmethod
-    def from_json(cls, values: Iterable[Mapping[str, Any]]) -> "ThetaLayout":
+    def from_json(cls, values: Any) -> "ThetaLayout":
         """Inverse of `to_json`; raises UserError for anything else."""
         try:
             fields = [dict(value) for value in values]

@@ -91,7 +91,8 @@ class HeadModel(nn.Module):
             correctives = turns[:, 1:].flatten(1) @ self._pose_dirs
             shaped = shaped + correctives.unflatten(-1, (3, -1))
         posed = shaped + self._skinned_offsets(shaped, joints, turns)
-        return (posed + parts["translation"][..., None]).mT.reshape(*batch, -1, 3)
+        vertices = (posed + parts["translation"][..., None]).mT
+        return vertices.reshape(*batch, *vertices.shape[1:])
 
     def joints(self, identity: Float[Tensor, "I"] | None = None) -> Float[Tensor, "5 3"]:
         """Joints of the neutral head at rest: root, neck, jaw, left eye, right eye, metres."""

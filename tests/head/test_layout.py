@@ -1,0 +1,99 @@
+import json
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.head import HeadModel, ThetaField, ThetaLayout
+from rgbavatar_ns.head.rotations import axis_angle_to_matrix
+
+LAYOUT = ThetaLayout(
+    (
+        ThetaField("expression", 4, "linear"),
+        ThetaField("jaw", 3, "axis_angle"),
+        ThetaField("eyelids", 2, "linear"),
+        ThetaField("translation", 3, "translation"),
+    )
+)
+
+
+@given(st.lists(st.integers(1, 4), max_size=3), st.integers(0, 1000))
+def test_join_undoes_split(batch: list[int], seed: int) -> None:
+    theta = torch.randn(*batch, LAYOUT.size, generator=torch.Generator().manual_seed(seed))
+    parts = LAYOUT.split(theta)
+    assert [tuple(part.shape) for part in parts.values()] == [
+        (*batch, size) for size in (4, 3, 2, 3)
+    ]
+    assert torch.equal(LAYOUT.join(parts), theta)
+
+
+def test_a_missing_field_is_zero_and_batch_axes_broadcast() -> None:
+    jaw = torch.tensor([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]])
+    theta = LAYOUT.join({"jaw": jaw, "translation": torch.ones(3)})
+    wanted = [[0, 0, 0, 0, 1, 2, 3, 0, 0, 1, 1, 1], [0, 0, 0, 0, 4, 5, 6, 0, 0, 1, 1, 1]]
+    assert theta.tolist() == wanted
+
+
+def test_slices_follow_one_another() -> None:
+    assert LAYOUT.slice("expression") == slice(0, 4)
+    assert LAYOUT.slice("jaw") == slice(4, 7)
+    assert LAYOUT.slice("translation") == slice(9, 12)
+    assert LAYOUT.size == 12
+    assert "jaw" in LAYOUT
+    assert "neck" not in LAYOUT
+
+
+def test_layout_survives_json() -> None:
+    for layout in (LAYOUT, HeadModel.embedded().layout):
+        assert ThetaLayout.from_json(json.loads(json.dumps(layout.to_json()))) == layout
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        [{"name": "jaw", "size": 3}],
+        [{"name": "jaw", "size": 3, "form": "axis_angle", "unit": "rad"}],
+        [{"name": "jaw", "size": 3, "form": "euler"}],
+        [{"name": "jaw", "size": 4, "form": "axis_angle"}],
+        [{"name": "a", "size": 1, "form": "linear"}, {"name": "a", "size": 1, "form": "linear"}],
+        ["jaw"],
+    ],
+)
+def test_json_of_something_else_is_refused(values: list) -> None:
+    with pytest.raises(UserError):
+        ThetaLayout.from_json(values)
+
+
+def test_unknown_fields_and_wrong_sizes_are_refused_by_name() -> None:
+    with pytest.raises(UserError, match="neck"):
+        LAYOUT.join({"neck": torch.zeros(3)})
+    with pytest.raises(UserError, match="neck"):
+        LAYOUT.slice("neck")
+    with pytest.raises(UserError, match="jaw"):
+        LAYOUT.join({"jaw": torch.zeros(4)})
+    with pytest.raises(UserError, match="13 numbers"):
+        LAYOUT.split(torch.zeros(2, 13))
+    with pytest.raises(UserError):
+        LAYOUT.join({})
+
+
+@pytest.mark.parametrize("include_pose", [True, False])
+@pytest.mark.parametrize("include_translation", [True, False])
+def test_network_features_by_hand(include_pose: bool, include_translation: bool) -> None:
+    theta = torch.randn(2, 3, LAYOUT.size, generator=torch.Generator().manual_seed(0))
+    features = LAYOUT.network_features(theta, include_pose, include_translation)
+    matrix = axis_angle_to_matrix(theta[..., 4:7])
+    wanted = [theta[..., :4]]
+    wanted += [matrix[..., 0, :], matrix[..., 1, :]] if include_pose else []
+    wanted += [theta[..., 7:9]]
+    wanted += [theta[..., 9:]] if include_translation else []
+    assert torch.equal(features, torch.cat(wanted, -1))
+    assert features.shape[-1] == LAYOUT.feature_size(include_pose, include_translation)
+
+
+def test_moving_sideways_leaves_the_default_features_alone() -> None:
+    theta = torch.zeros(1, LAYOUT.size)
+    moved = LAYOUT.join({"translation": torch.tensor([[0.3, 0.0, 0.0]])})
+    assert torch.equal(LAYOUT.network_features(theta), LAYOUT.network_features(moved))

@@ -1,0 +1,166 @@
+import numpy as np
+import pytest
+import torch
+
+from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.head import HeadArrays, HeadModel
+from rgbavatar_ns.head.rotations import axis_angle_to_matrix
+from tests.head.synthetic_head import flame_shaped_arrays
+
+
+@pytest.fixture(scope="module")
+def synthetic() -> HeadModel:
+    return HeadModel(flame_shaped_arrays(), torch.float64)
+
+
+@pytest.fixture(scope="module")
+def embedded() -> HeadModel:
+    return HeadModel.embedded(torch.float64)
+
+
+@pytest.fixture(params=["synthetic", "embedded"])
+def head(request: pytest.FixtureRequest) -> HeadModel:
+    return request.getfixturevalue(request.param)
+
+
+def random_theta(head: HeadModel, *batch: int, seed: int = 0) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    theta = torch.randn(*batch, head.layout.size, generator=generator, dtype=torch.float64)
+    return theta * 0.3
+
+
+def random_identity(head: HeadModel, *batch: int) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(9)
+    return torch.randn(*batch, head.num_identity, generator=generator, dtype=torch.float64)
+
+
+def rodrigues(axis_angle: np.ndarray) -> np.ndarray:
+    angle = np.linalg.norm(axis_angle)
+    if angle == 0:
+        return np.eye(3)
+    x, y, z = axis_angle / angle
+    k = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * (k @ k)
+
+
+def flame_by_hand(arrays: HeadArrays, parts: dict[str, np.ndarray], identity: np.ndarray):
+    """Equations 1 to 5 of the FLAME paper with 4 x 4 matrices, one head, plain loops."""
+    coefficients = np.concatenate([identity, parts["expression"]])
+    shaped = arrays.v_template.astype(np.float64) + arrays.shapedirs @ coefficients
+    joints = arrays.joint_regressor @ shaped
+    fields = ("rotation", "neck", "jaw", "left_eye", "right_eye")
+    turns = [rodrigues(parts[name]) for name in fields]
+    pose_feature = np.concatenate([(turn - np.eye(3)).ravel() for turn in turns[1:]])
+    shaped = shaped + arrays.posedirs @ pose_feature
+    if arrays.eyelid_dirs is not None:
+        shaped = shaped + arrays.eyelid_dirs @ parts["eyelids"]
+    world = []
+    for joint, parent in enumerate(arrays.parents):
+        local = np.eye(4)
+        local[:3, :3] = turns[joint]
+        local[:3, 3] = joints[joint] - (joints[parent] if parent >= 0 else 0)
+        world.append(local if parent < 0 else world[parent] @ local)
+    vertices = np.zeros_like(shaped)
+    for joint in range(5):
+        from_rest = world[joint].copy()
+        from_rest[:3, 3] -= world[joint][:3, :3] @ joints[joint]
+        moved = shaped @ from_rest[:3, :3].T + from_rest[:3, 3]
+        vertices += arrays.skinning_weights[:, joint, None] * moved
+    return vertices + parts["translation"]
+
+
+def test_zero_theta_gives_the_template_to_the_bit(head: HeadModel) -> None:
+    template = torch.tensor(head.arrays.v_template, dtype=torch.float64)
+    theta = torch.zeros(2, head.layout.size, dtype=torch.float64)
+    assert torch.equal(head(theta)[1], template)
+    assert torch.equal(head(theta, torch.zeros(head.num_identity, dtype=torch.float64))[0], template)
+
+
+def test_agrees_with_the_equations_by_hand(head: HeadModel) -> None:
+    theta, identity = random_theta(head, 2), random_identity(head)
+    vertices = head(theta, identity)
+    for row in range(2):
+        parts = {name: part[row].numpy() for name, part in head.layout.split(theta).items()}
+        wanted = flame_by_hand(head.arrays, parts, identity.numpy())
+        np.testing.assert_allclose(vertices[row], wanted, atol=1e-7)
+
+
+def test_global_motion_is_rigid(head: HeadModel) -> None:
+    theta, identity = random_theta(head), random_identity(head)
+    still, moved = theta.clone(), theta.clone()
+    still[head.layout.slice("rotation")] = 0
+    still[head.layout.slice("translation")] = 0
+    # About the root joint of the shaped head: expressions shape it too.
+    arrays = head.arrays
+    coefficients = torch.cat([identity, theta[head.layout.slice("expression")]]).numpy()
+    root = arrays.joint_regressor[0] @ (arrays.v_template + arrays.shapedirs @ coefficients)
+    turn = axis_angle_to_matrix(theta[head.layout.slice("rotation")])
+    about = torch.from_numpy(np.asarray(root, dtype=np.float64))
+    wanted = (head(still, identity) - about) @ turn.T + about
+    wanted = wanted + theta[head.layout.slice("translation")]
+    torch.testing.assert_close(head(moved, identity), wanted, atol=1e-7, rtol=0)
+
+
+@pytest.mark.parametrize("batch", [(), (3,), (2, 2), (0,)])
+def test_batch_equals_loop(synthetic: HeadModel, batch: tuple[int, ...]) -> None:
+    theta, identity = random_theta(synthetic, *batch), random_identity(synthetic, *batch)
+    together = synthetic(theta, identity)
+    assert together.shape == (*batch, 36, 3)
+    for index in np.ndindex(*batch):
+        torch.testing.assert_close(together[index], synthetic(theta[index], identity[index]))
+
+
+@pytest.mark.parametrize("scale", [0.0, 1.0])
+def test_gradients_agree_with_differences_in_every_parameter(
+    synthetic: HeadModel, scale: float
+) -> None:
+    theta = (scale * random_theta(synthetic)).requires_grad_()
+    identity = random_identity(synthetic).requires_grad_()
+    probe = torch.randn(36, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(4))
+    (synthetic(theta, identity) * probe).sum().backward()
+    assert theta.grad is not None
+    assert identity.grad is not None
+    with torch.no_grad():
+        for values, gradient, at in (
+            (theta, theta.grad, lambda moved: synthetic(moved, identity.expand(len(moved), -1))),
+            (identity, identity.grad, lambda moved: synthetic(theta.expand(len(moved), -1), moved)),
+        ):
+            steps = 1e-5 * torch.eye(len(values), dtype=torch.float64)
+            change = at(values + steps) - at(values - steps)
+            differences = (change * probe).sum((1, 2)) / 2e-5
+            torch.testing.assert_close(gradient, differences, atol=1e-8, rtol=1e-7)
+
+
+def test_float32_stays_near_float64() -> None:
+    single, double = HeadModel.embedded(), HeadModel.embedded(torch.float64)
+    theta = random_theta(double, 3)
+    error = single(theta.float()).double() - double(theta)
+    assert single(theta.float()).dtype == torch.float32
+    assert error.abs().max() < 2e-6
+
+
+def test_eyelids_close_before_skinning(synthetic: HeadModel) -> None:
+    layout, arrays = synthetic.layout, synthetic.arrays
+    assert arrays.eyelid_dirs is not None
+    turn = {"rotation": torch.tensor([0.2, -0.4, 0.3], dtype=torch.float64)}
+    closed = layout.join({**turn, "eyelids": torch.tensor([1.0, 0.5], dtype=torch.float64)})
+    offset = synthetic(closed) - synthetic(layout.join(turn))
+    lids = torch.from_numpy(arrays.eyelid_dirs @ np.array([1.0, 0.5]))
+    torch.testing.assert_close(offset, lids @ axis_angle_to_matrix(turn["rotation"]).T)
+
+
+def test_wrong_sizes_are_refused(synthetic: HeadModel) -> None:
+    with pytest.raises(UserError, match="theta has 7"):
+        synthetic(torch.zeros(1, 7, dtype=torch.float64))
+    with pytest.raises(UserError, match="identity has 5"):
+        synthetic(random_theta(synthetic, 1), torch.zeros(5, dtype=torch.float64))
+
+
+def test_users_of_the_tensors_cannot_change_the_shared_arrays() -> None:
+    head = HeadModel.embedded()
+    head.uv.add_(1)
+    head.faces.add_(1)
+    again = HeadArrays.embedded()
+    assert again.uv.max() <= 1
+    assert again.faces.min() == 0
+    assert not list(head.state_dict())

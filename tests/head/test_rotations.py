@@ -1,0 +1,73 @@
+import math
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+
+from rgbavatar_ns.head import rotations
+
+ANGLES = torch.tensor(
+    np.concatenate(
+        [
+            np.random.default_rng(0).normal(size=(200, 3)),
+            math.pi * np.eye(3),
+            -0.999 * math.pi * np.eye(3),
+            np.zeros((1, 3)),
+        ]
+    )
+)
+
+
+def test_conversions_agree_with_scipy() -> None:
+    known = Rotation.from_rotvec(ANGLES.numpy())
+    matrix = rotations.axis_angle_to_matrix(ANGLES)
+    np.testing.assert_allclose(matrix, known.as_matrix(), atol=1e-12)
+    quat_wxyz = rotations.matrix_to_quat_wxyz(matrix).numpy()
+    xyzw = known.as_quat()
+    wanted = np.concatenate([xyzw[:, 3:], xyzw[:, :3]], 1)
+    same_sign = np.sign((quat_wxyz * wanted).sum(1, keepdims=True))
+    np.testing.assert_allclose(quat_wxyz, wanted * same_sign, atol=1e-12)
+    np.testing.assert_allclose(
+        rotations.quat_wxyz_to_matrix(3 * torch.tensor(quat_wxyz)), known.as_matrix(), atol=1e-12
+    )
+    back = rotations.axis_angle_to_matrix(rotations.matrix_to_axis_angle(matrix))
+    np.testing.assert_allclose(back, matrix, atol=1e-9)
+
+
+def test_six_numbers_are_the_first_two_rows() -> None:
+    matrix = rotations.axis_angle_to_matrix(ANGLES)
+    rows = rotations.matrix_to_6d_rows(matrix)
+    assert torch.equal(rows[:, :3], matrix[:, 0])
+    assert torch.equal(rows[:, 3:], matrix[:, 1])
+    assert rotations.matrix_to_6d_rows(torch.eye(3)).tolist() == [1, 0, 0, 0, 1, 0]
+    torch.testing.assert_close(rotations.rows_6d_to_matrix(rows), matrix)
+
+
+def test_quaternion_product_is_the_product_of_matrices() -> None:
+    first, second = ANGLES[:100], ANGLES[100:200]
+    to_matrix = rotations.axis_angle_to_matrix
+    product = rotations.quat_multiply_wxyz(
+        rotations.matrix_to_quat_wxyz(to_matrix(first)),
+        rotations.matrix_to_quat_wxyz(to_matrix(second)),
+    )
+    torch.testing.assert_close(
+        rotations.quat_wxyz_to_matrix(product), to_matrix(first) @ to_matrix(second)
+    )
+
+
+def test_no_rotation_is_exactly_the_identity_with_the_right_gradient() -> None:
+    zero = torch.zeros(3, dtype=torch.float64, requires_grad=True)
+    matrix = rotations.axis_angle_to_matrix(zero)
+    assert torch.equal(matrix, torch.eye(3, dtype=torch.float64))
+    matrix[2, 1].backward()
+    assert zero.grad is not None
+    assert zero.grad.tolist() == [1, 0, 0]
+
+
+def test_quaternion_gradients_agree_with_differences() -> None:
+    angles = ANGLES[:6].clone().requires_grad_()
+
+    def quat(axis_angle: torch.Tensor) -> torch.Tensor:
+        return rotations.matrix_to_quat_wxyz(rotations.axis_angle_to_matrix(axis_angle))
+
+    assert torch.autograd.gradcheck(quat, (angles,))
