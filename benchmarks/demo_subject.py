@@ -118,12 +118,8 @@ def main() -> None:
     rows = []
     for seed in arguments.seeds:
         with tempfile.TemporaryDirectory() as folder, Progress() as progress:
-            task = progress.add_task(f"seed {seed}: subject")
-            dataset = make_demo_dataset(
-                Path(folder) / "subject",
-                DemoConfig(seed=seed),
-                progress=lambda done, total: progress.update(task, completed=done, total=total),
-            )
+            progress.add_task(f"seed {seed}: subject", total=None)
+            dataset = make_demo_dataset(Path(folder) / "subject", DemoConfig(seed=seed))
             bench = Bench(dataset, seed, progress)
             rows.append(measure(bench, arguments.steps, arguments.uv_resolution))
         print("  ".join(f"{k} {v:.2f}" if v is not None else f"{k} -" for k, v in rows[-1].items()))
