@@ -73,7 +73,9 @@ def test_zero_theta_gives_the_template_to_the_bit(head: HeadModel) -> None:
     template = torch.tensor(head.arrays.v_template, dtype=torch.float64)
     theta = torch.zeros(2, head.layout.size, dtype=torch.float64)
     assert torch.equal(head(theta)[1], template)
-    assert torch.equal(head(theta, torch.zeros(head.num_identity, dtype=torch.float64))[0], template)
+    assert torch.equal(
+        head(theta, torch.zeros(head.num_identity, dtype=torch.float64))[0], template
+    )
 
 
 def test_agrees_with_the_equations_by_hand(head: HeadModel) -> None:
