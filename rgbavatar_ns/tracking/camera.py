@@ -40,7 +40,7 @@ class StillCamera:
         result[:, 1, 2] = -self.focal_px * points_m[:, 1] / depth**2
         return result
 
-    def cropped(self, left: float, top: float, scale: float) -> "StillCamera":
+    def cropped(self, left: int, top: int, scale: float) -> "StillCamera":
         """The same camera for a crop of the image that starts at (left, top), then scaled."""
         center = ((self.center_px[0] - left) * scale, (self.center_px[1] - top) * scale)
         return StillCamera(self.focal_px * scale, center, self.distance_m)

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 class TrackConfig:
     """Options of `track_video`; the defaults suit a webcam or phone clip of one person."""
 
-    size_px: int = 256
-    """Side of the square images of the dataset."""
+    image_size: int = 256
+    """Side of the square images of the dataset, pixels."""
     test_frames: int | None = None
     """Last frames held out for evaluation; None holds out a fifth of the tracked frames."""
     max_frames: int | None = None

@@ -57,9 +57,7 @@ class FaceLandmarker:
     ) -> None:
         self._mesh.close()
 
-    def __call__(
-        self, image_rgb: UInt8[np.ndarray, "H W 3"]
-    ) -> Float[np.ndarray, "478 2"] | None:
+    def __call__(self, image_rgb: UInt8[np.ndarray, "H W 3"]) -> Float[np.ndarray, "478 2"] | None:
         """Landmarks in pixels (centre of the first pixel at .5, .5), or None without a face."""
         height, width = image_rgb.shape[:2]
         shrink = _MAX_SIDE_PX / max(height, width)

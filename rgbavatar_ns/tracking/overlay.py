@@ -39,7 +39,7 @@ def _draw(tile: OverlayTile, faces: Int[np.ndarray, "T 3"]) -> UInt8[np.ndarray,
     scale = _TILE_PX / tile.image_rgba.shape[0]
     color = tile.image_rgba[..., 2::-1].astype(np.float32)
     alpha = tile.image_rgba[..., 3:].astype(np.float32) / 255
-    matted = np.uint8(color * alpha + 128 * (1 - alpha) + 0.5)
+    matted = (color * alpha + 128 * (1 - alpha) + 0.5).astype(np.uint8)
     picture = cv2.resize(matted, (_TILE_PX, _TILE_PX), interpolation=cv2.INTER_CUBIC)
     drawn = picture.copy()
     corners = tile.vertices_px[faces]

@@ -7,6 +7,7 @@ from pathlib import Path
 import av
 import cv2
 import numpy as np
+from av.error import FFmpegError
 from jaxtyping import UInt8
 
 from rgbavatar_ns.errors import UserError
@@ -88,7 +89,7 @@ class FrameSource:
                 for frame in container.decode(stream):
                     decoded += 1
                     yield _upright_square_pixels(frame)
-        except (av.error.FFmpegError, OSError) as error:
+        except (FFmpegError, OSError) as error:
             if not decoded:
                 raise UserError(
                     f"{path} cannot be read as a video ({error}).",
@@ -136,5 +137,5 @@ def _declared_frames(path: Path) -> int:
             if stream.average_rate is None or container.duration is None:
                 return 0
             return round(container.duration / av.time_base * float(stream.average_rate))
-    except (av.error.FFmpegError, OSError, IndexError):
+    except (FFmpegError, OSError, IndexError):
         return 0

@@ -72,7 +72,9 @@ def _patch_display_matrix(path: Path, clockwise_degrees: int) -> None:
     cos, sin = {90: (0, 1), 180: (-1, 0), 270: (0, -1)}[clockwise_degrees]
     values = (cos << 16, sin << 16, 0, -sin << 16, cos << 16, 0, 0, 0, 1 << 30)
     for number, value in enumerate(values):
-        data[matrix + 4 * number : matrix + 4 * number + 4] = (value & 0xFFFFFFFF).to_bytes(4, "big")
+        data[matrix + 4 * number : matrix + 4 * number + 4] = (value & 0xFFFFFFFF).to_bytes(
+            4, "big"
+        )
     path.write_bytes(bytes(data))
 
 

@@ -1,0 +1,146 @@
+"""How badly a pose of the head explains one frame's landmarks, with derivatives."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from rgbavatar_ns.tracking.bounded import QuadraticModel
+from rgbavatar_ns.tracking.camera import StillCamera
+from rgbavatar_ns.tracking.landmark_head import LandmarkHead
+from rgbavatar_ns.tracking.parameters import FitParameters
+
+# Pairs of landmarks whose distance says how far lips and lids are open: their difference counts
+# by itself, so that a bias of both points does not hide a closed mouth or eye.
+LIP_PAIRS = ((13, 14), (82, 87), (312, 317), (81, 178), (311, 402), (80, 88), (310, 318))
+LID_PAIRS = ((159, 145), (158, 153), (160, 144), (386, 374), (385, 380), (387, 373))
+# One standard deviation of a landmark is this share of the face's height. Neighbouring landmarks
+# err together: the sum over all counts as about `_INDEPENDENT` independent points.
+_SIGMA_SHARE = 0.01
+_INDEPENDENT = 120.0
+_PAIR_WEIGHT = 3.0
+_HUBER_SIGMAS = 2.5
+
+
+@dataclass(frozen=True)
+class Target:
+    """One frame's landmarks in pixels (those of the landmark head, in its order)."""
+
+    points_px: Float[np.ndarray, "L 2"]
+    face_height_px: float
+
+
+@dataclass(frozen=True)
+class Linearized:
+    """Robust cost with gradient and Gauss-Newton Hessian to frame (P) and identity (I)."""
+
+    cost: float
+    gradient: Float[np.ndarray, "PI"]
+    hessian: Float[np.ndarray, "PI PI"]
+
+
+@dataclass
+class FrameCost:
+    """Reprojection of landmarks and of their pairs, plus priors; shared by all frames."""
+
+    head: LandmarkHead
+    facemesh_index: Int[np.ndarray, "L"]
+    landmark_weight: Float[np.ndarray, "L"]
+    parameters: FitParameters
+
+    def __post_init__(self) -> None:
+        place = {int(index): row for row, index in enumerate(self.facemesh_index)}
+        pairs = [
+            (place[a], place[b]) for a, b in LIP_PAIRS + LID_PAIRS if a in place and b in place
+        ]
+        self._pairs = np.array(pairs, dtype=np.int64).reshape(-1, 2)
+        scale = _INDEPENDENT / max(float((self.landmark_weight**2).sum()), 1e-9)
+        self._weight = self.landmark_weight * np.sqrt(scale)
+        self._pair_weight = _PAIR_WEIGHT * np.sqrt(scale)
+
+    def theta(
+        self, values: Float[np.ndarray, "P"], base: Float[np.ndarray, "H"]
+    ) -> Float[np.ndarray, "H"]:
+        """theta with the fitted entries replaced."""
+        theta = base.copy()
+        theta[self.parameters.columns] = values
+        return theta
+
+    def linearize(
+        self,
+        theta: Float[np.ndarray, "H"],
+        identity: Float[np.ndarray, "I"],
+        camera: StillCamera,
+        target: Target,
+        identity_columns: int = 0,
+    ) -> Linearized:
+        """The data terms at theta; derivatives to identity's first columns come last."""
+        derivatives = self.head.jacobian(theta, identity)
+        to_image = camera.jacobian(derivatives.points)
+        wanted = np.concatenate(
+            [
+                derivatives.to_theta[..., self.parameters.columns],
+                derivatives.to_identity[..., :identity_columns],
+            ],
+            axis=2,
+        )
+        jacobian = to_image @ wanted
+        unit = _SIGMA_SHARE * target.face_height_px
+        residual = (camera.project(derivatives.points) - target.points_px) / unit
+        first, second = self._pairs.T
+        pair_residual = residual[first] - residual[second]
+        pair_jacobian = jacobian[first] - jacobian[second]
+        weight = np.concatenate([self._weight, np.full(len(first), self._pair_weight)])
+        return _robust_normal_equations(
+            np.concatenate([residual, pair_residual]),
+            np.concatenate([jacobian, pair_jacobian]) / unit,
+            weight,
+        )
+
+    def residuals_px(
+        self,
+        theta: Float[np.ndarray, "H"],
+        identity: Float[np.ndarray, "I"],
+        camera: StillCamera,
+        target: Target,
+    ) -> Float[np.ndarray, "L 2"]:
+        """Projected minus observed landmarks."""
+        return camera.project(self.head.points(theta, identity)) - target.points_px
+
+    def add_priors(
+        self,
+        values: Float[np.ndarray, "P"],
+        model: QuadraticModel,
+        neighbours: Float[np.ndarray, "P"] | None,
+        temporal_weight: float,
+    ) -> QuadraticModel:
+        """The frame's own prior to 0 and the temporal one to its neighbours' mean."""
+        precision = self.parameters.prior_width**-2.0
+        pull = precision * values
+        cost = model.cost + 0.5 * float(pull @ values)
+        if neighbours is not None and temporal_weight > 0:
+            closeness = temporal_weight * self.parameters.temporal_width**-2.0
+            away = values - neighbours
+            cost += 0.5 * float(closeness @ away**2)
+            pull = pull + closeness * away
+            precision = precision + closeness
+        return QuadraticModel(cost, model.gradient + pull, model.hessian + np.diag(precision))
+
+
+def _robust_normal_equations(
+    residual: Float[np.ndarray, "R 2"],
+    jacobian: Float[np.ndarray, "R 2 Q"],
+    weight: Float[np.ndarray, "R"],
+) -> Linearized:
+    """Huber on each point's distance: far-off landmarks (a hand, a slip) count linearly."""
+    distance = np.linalg.norm(residual, axis=1)
+    far = distance > _HUBER_SIGMAS
+    huber = np.where(far, _HUBER_SIGMAS * (distance - 0.5 * _HUBER_SIGMAS), 0.5 * distance**2)
+    soften = np.where(far, _HUBER_SIGMAS / np.maximum(distance, 1e-12), 1.0)
+    root = (weight * np.sqrt(soften))[:, None]
+    scaled = (jacobian * root[..., None]).reshape(-1, jacobian.shape[-1])
+    return Linearized(
+        float((weight**2) @ huber),
+        scaled.T @ (residual * root).reshape(-1),
+        scaled.T @ scaled,
+    )

@@ -1,0 +1,145 @@
+"""The head model fitted to one speaker: the landmark map, its weights, the stages of the fit."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from threadpoolctl import threadpool_limits
+
+from rgbavatar_ns.head import HeadModel
+from rgbavatar_ns.head.landmarks import SPARSE_51, LandmarkMap, facemesh_landmarks
+from rgbavatar_ns.tracking.config import TrackConfig
+from rgbavatar_ns.tracking.fit import (
+    ClipFit,
+    fit_clip,
+    fit_subject,
+    key_frame_positions,
+    subject_offsets,
+)
+from rgbavatar_ns.tracking.frame_cost import LID_PAIRS, LIP_PAIRS, FrameCost, Target
+from rgbavatar_ns.tracking.landmark_head import LandmarkHead
+from rgbavatar_ns.tracking.landmarks import FACE_OVAL, IRIS_CENTERS, face_height_px
+from rgbavatar_ns.tracking.parameters import fit_parameters
+
+# Lips, lids, brows, nose and irises are seen; cheeks and forehead are interpolated by FaceMesh,
+# so every second of those points does. The outline slides over the skin as the head turns, but
+# without it the pitch of the head is badly known: on renders the error halves with it.
+_FEATURE_WEIGHT, _IRIS_WEIGHT, _OTHER_WEIGHT, _OVAL_WEIGHT = 1.0, 2.0, 0.7, 1.0
+_FEATURES = frozenset(SPARSE_51) | {index for pair in LIP_PAIRS + LID_PAIRS for index in pair}
+_UNSURE_M = 0.002
+# A frame whose landmarks the head cannot follow to this share of the face's height is left out.
+_REJECT_SHARE = 0.06
+
+
+@dataclass
+class SubjectTracker:
+    """Fits the head to a clip; after `fit` it knows the subject's landmark offsets too."""
+
+    head: HeadModel
+    config: TrackConfig
+
+    def __post_init__(self) -> None:
+        marks = _chosen_landmarks()
+        self.facemesh_index = marks.facemesh_index
+        vertex_ids = self.head.arrays.faces[marks.triangle].astype(np.int64)
+        self.mesh_landmarks = LandmarkHead(self.head, vertex_ids, marks.barycentric)
+        parameters = fit_parameters(
+            self.head.layout,
+            self.head.arrays.expression_names,
+            self.mesh_landmarks.expression_size_m(),
+        )
+        self.cost = FrameCost(
+            self.mesh_landmarks, marks.facemesh_index, _landmark_weights(marks), parameters
+        )
+
+    def targets(self, landmarks_px: Float[np.ndarray, "F 478 2"]) -> list[Target]:
+        """Each frame's landmarks in the order of the landmark head."""
+        heights = face_height_px(landmarks_px)
+        return [
+            Target(points[self.facemesh_index], float(height))
+            for points, height in zip(landmarks_px, heights)
+        ]
+
+    def fit(
+        self,
+        landmarks_px: Float[np.ndarray, "F 478 2"],
+        follows: Sequence[bool],
+        width: int,
+        height: int,
+        advance: Callable[[], None] = lambda: None,
+    ) -> ClipFit:
+        """Identity, camera and offsets from key frames, then every frame."""
+        # The matrices are small: more threads would only wait for each other.
+        with threadpool_limits(1):
+            return self._fit(landmarks_px, follows, width, height, advance)
+
+    def _fit(
+        self,
+        landmarks_px: Float[np.ndarray, "F 478 2"],
+        follows: Sequence[bool],
+        width: int,
+        height: int,
+        advance: Callable[[], None],
+    ) -> ClipFit:
+        targets = self.targets(landmarks_px)
+        picked = key_frame_positions(landmarks_px, self.config.key_frames)
+        keys = [targets[position] for position in picked]
+        subject = fit_subject(
+            self.cost, keys, width, height, self.config.identity_components, self.config.focal_px
+        )
+        offsets = subject_offsets(self.cost, subject, keys)
+        self.cost = replace(self.cost, head=self.cost.head.with_offsets(offsets))
+        return fit_clip(self.cost, subject, targets, follows, self.config.temporal_weight, advance)
+
+    def thetas(self, fit: ClipFit) -> Float[np.ndarray, "F H"]:
+        """theta of every frame."""
+        return np.array([self._theta(fit, position) for position in range(len(fit.values))])
+
+    def _theta(self, fit: ClipFit, position: int) -> Float[np.ndarray, "H"]:
+        return self.cost.theta(fit.values[position], np.zeros(self.head.layout.size))
+
+    def fitted_px(self, fit: ClipFit, *, with_offsets: bool = True) -> Float[np.ndarray, "F L 2"]:
+        """Projected landmarks in source pixels, as fitted or as the bare mesh has them."""
+        head = self.cost.head if with_offsets else self.mesh_landmarks
+        identity = fit.subject.identity
+        return np.array(
+            [fit.subject.camera.project(head.points(theta, identity)) for theta in self.thetas(fit)]
+        )
+
+    def frame_px(self, fit: ClipFit, position: int) -> Float[np.ndarray, "L 2"]:
+        """Projected landmarks of the bare mesh in one frame, source pixels."""
+        theta = self._theta(fit, position)
+        return fit.subject.camera.project(self.mesh_landmarks.points(theta, fit.subject.identity))
+
+    def rejected(self, fit: ClipFit, landmarks_px: Float[np.ndarray, "F 478 2"]) -> list[int]:
+        """Positions whose landmarks no pose of the head explains."""
+        away = self.fitted_px(fit) - landmarks_px[:, self.facemesh_index]
+        share = np.linalg.norm(away, axis=-1).mean(1) / face_height_px(landmarks_px)
+        return [int(position) for position in np.flatnonzero(share > _REJECT_SHARE)]
+
+    def vertices_px(self, fit: ClipFit, position: int) -> Float[np.ndarray, "V 2"]:
+        """The full mesh of one frame in source pixels."""
+        theta = torch.from_numpy(self._theta(fit, position))
+        with torch.no_grad():
+            vertices = self.head(theta, torch.from_numpy(fit.subject.identity))
+        return fit.subject.camera.project(vertices.numpy())
+
+
+def _chosen_landmarks() -> LandmarkMap:
+    marks = facemesh_landmarks()
+    kept = []
+    for index in map(int, marks.facemesh_index):
+        wanted = index in _FEATURES or index in IRIS_CENTERS or index in FACE_OVAL
+        if wanted or (index < IRIS_CENTERS[0] and index % 2 == 0):
+            kept.append(index)
+    return marks.select(tuple(kept))
+
+
+def _landmark_weights(marks: LandmarkMap) -> Float[np.ndarray, "L"]:
+    weights = np.full(len(marks.facemesh_index), _OTHER_WEIGHT)
+    weights[np.isin(marks.facemesh_index, sorted(_FEATURES))] = _FEATURE_WEIGHT
+    weights[np.isin(marks.facemesh_index, FACE_OVAL)] = _OVAL_WEIGHT
+    weights[np.isin(marks.facemesh_index, IRIS_CENTERS)] = _IRIS_WEIGHT
+    return weights / np.sqrt(1 + (marks.spread_m / _UNSURE_M) ** 2)
