@@ -22,8 +22,8 @@ class DemoConfig:
     theta_noise: float = 1.0
     """Strength of the tracker's noise: 1 is a good tracker (.01 on expression coefficients, .1
     degrees on rotations, .1 mm on translations), 0 none. Images are never noisy."""
-    supersampling: int = 4
-    """Rays per pixel along each axis where something begins or ends; 2 elsewhere."""
+    supersampling: int = 3
+    """Rays per pixel along each axis where something begins or ends; elsewhere two rays."""
     wrinkles: float = 1.0
     """Depth of the wrinkles that come with expressions; 0 leaves them out."""
     glasses: bool = True

@@ -13,7 +13,7 @@ Values = Float[np.ndarray, "N"]
 
 KEY_DIRECTION = unit(np.array([-0.55, 0.55, 0.65])).astype(np.float32)
 """Towards the large lamp at the upper left of the picture, the only one that casts shadows."""
-KEY_SPREAD = 0.09
+KEY_SPREAD = 0.035
 """Radius of the lamp as seen from the head, in radians."""
 _KEY = np.array([1.62, 1.52, 1.38], np.float32)
 _FILL_DIRECTION = unit(np.array([0.75, 0.10, 0.55])).astype(np.float32)

@@ -31,9 +31,9 @@ Progress = Callable[[int, int], None]
 
 WIDE_OPEN_RAD = 0.33
 _THREADS = 2
-_CAMERA_HEIGHT_M = -0.002
+_CAMERA_HEIGHT_M = 0.007
 _CAMERA_DISTANCE_M = 1.1
-_HALF_VIEW_M = 0.158
+_HALF_VIEW_M = 0.153
 
 
 def demo_camera(size: int) -> StillCamera:

@@ -1,25 +1,38 @@
 """Smooth noise in space, the same on every machine."""
 
+from functools import cache
+
 import numpy as np
 from jaxtyping import Float
 
-_PRIMES = np.array([0x9E3779B1, 0x85EBCA77, 0xC2B2AE3D], np.uint32)
+_PERIOD = 64
 
 
 def value_noise(points: Float[np.ndarray, "N 3"], seed: int) -> Float[np.ndarray, "N"]:
     """Noise in [-1, 1] that varies over a unit of length: random values on the integer lattice.
 
-    Ours: hashed lattice, blended by smoothstep.
+    Ours: the lattice repeats after 64 units, each seed starts at another place in it, and values
+    between are blended by smoothstep.
     """
-    cell = np.floor(points).astype(np.int64)
+    start = np.random.PCG64(seed).random_raw(3) % _PERIOD
+    cell = np.floor(points)
     part = (points - cell).astype(np.float32)
     blend = part * part * (3 - 2 * part)
-    total = np.zeros(len(points), np.float32)
-    for corner in range(8):
-        offset = np.array([corner & 1, corner >> 1 & 1, corner >> 2 & 1])
-        weight = np.where(offset, blend, 1 - blend).prod(1)
-        total += weight * _lattice_value(cell + offset, seed)
-    return total
+    lower = (cell.astype(np.int32) + start.astype(np.int32)) & (_PERIOD - 1)
+    upper = (lower + 1) & (_PERIOD - 1)
+    lattice = _lattice()
+    x, y, z = blend.T
+    columns = [lower[:, 0] * _PERIOD**2, upper[:, 0] * _PERIOD**2]
+    rows = [lower[:, 1] * _PERIOD, upper[:, 1] * _PERIOD]
+    planes = []
+    for depth in (lower[:, 2], upper[:, 2]):
+        lines = []
+        for row in rows:
+            place = row + depth
+            first, second = lattice[columns[0] + place], lattice[columns[1] + place]
+            lines.append(first + (second - first) * x)
+        planes.append(lines[0] + (lines[1] - lines[0]) * y)
+    return planes[0] + (planes[1] - planes[0]) * z
 
 
 def fractal_noise(
@@ -32,10 +45,8 @@ def fractal_noise(
     return total / (2 - 0.5 ** (octaves - 1))
 
 
-def _lattice_value(cell: np.ndarray, seed: int) -> np.ndarray:
-    mixed = (cell & 0xFFFFFFFF).astype(np.uint32) * _PRIMES
-    value = mixed[:, 0] ^ mixed[:, 1] ^ mixed[:, 2] ^ np.uint32(seed * 0x27D4EB2F & 0xFFFFFFFF)
-    for shift, factor in ((15, 0x2C1B3C6D), (12, 0x297A2D39)):
-        value = (value ^ (value >> np.uint32(shift))) * np.uint32(factor)
-    value = value ^ (value >> np.uint32(15))
-    return value.astype(np.float32) * np.float32(2 / 0xFFFFFFFF) - 1
+@cache
+def _lattice() -> Float[np.ndarray, "_"]:
+    """Values in [-1, 1]; raw bits, since numpy promises that these never change."""
+    bits = np.random.PCG64(20251).random_raw(_PERIOD**3) >> np.uint64(40)
+    return (bits.astype(np.float32) * np.float32(2 / (2**24 - 1)) - 1).astype(np.float32)

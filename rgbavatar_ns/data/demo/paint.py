@@ -14,7 +14,7 @@ from rgbavatar_ns.data.demo.regions import Points, bump, smooth
 from rgbavatar_ns.data.demo.wrinkles import wrinkle_depths
 from rgbavatar_ns.head import HeadArrays, uv_anchors
 
-_SKIN = np.array([0.56, 0.335, 0.235])
+_SKIN = np.array([0.545, 0.345, 0.255])
 _HAIR = np.array([0.060, 0.034, 0.020])
 _SHIRT = np.array([0.055, 0.105, 0.165])
 _WRINKLE_DEPTH_M = np.array([0.85, 0.55, 1.25, 0.75, 0.45, 0.5]) * 1e-3
@@ -48,7 +48,7 @@ class Paint:
         shade = 1 - 0.55 * np.clip(-wrinkles / 8e-4, 0, 1) + 0.10 * np.clip(wrinkles / 8e-4, 0, 1)
         color = np.empty((*shade.shape, 4), np.float32)
         flush = np.float32(blush) * self.cheeks
-        for channel, (redness, glow) in enumerate(((0.65, 0.12), (1.1, -0.22), (1.1, -0.20))):
+        for channel, (redness, glow) in enumerate(((0.75, 0.06), (1.05, -0.15), (1.05, -0.13))):
             color[..., channel] = self.albedo[..., channel] * shade**redness * (1 + glow * flush)
         color[..., 3] = self.gloss
         height = self.relief_m + wrinkles
@@ -125,7 +125,7 @@ def _skin(p: Points, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     freckles = smooth(value_noise(p * 420, seed + 3), 0.45, 0.75) * smooth(x, 0.062, 0.04)
     freckles *= bump(y, 0.002, 0.016) * (z > 0.02) * 0.28
     color = color * (1 - freckles[:, None] * np.array([0.7, 0.95, 1.0]))
-    hairs = smooth(value_noise(p * 1100, seed + 4), 0.05, 0.6)
+    hairs = smooth(value_noise(p * 1900, seed + 4), 0.05, 0.6)
     beard = regions.stubble(p) * (0.30 + 0.45 * hairs)
     color = _mix(color, np.array([0.12, 0.085, 0.07]), beard * 0.75)
     for spot, radius in (((0.031, -0.021), 0.0014), ((-0.043, 0.001), 0.0011)):
@@ -177,11 +177,13 @@ def _inside_mouth(p: Points) -> np.ndarray:
 def _hair(
     p: Points, seed: int, color: np.ndarray, gloss: np.ndarray, relief: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    frayed = regions.above_hairline_m(p) + 0.004 * value_noise(p * 300, seed + 7)
+    frayed = regions.above_hairline_m(p) + 0.006 * value_noise(
+        p * np.array([420, 110, 260]), seed + 7
+    )
     hair = smooth(frayed, -0.002, 0.005)
     # Combed back on top, down on the sides.
     side = smooth(np.abs(p[:, 0]), 0.035, 0.060)[:, None]
-    top_way, side_way = np.array([520, 520, 60]), np.array([520, 60, 520])
+    top_way, side_way = np.array([520, 140, 60]), np.array([520, 60, 520])
     curl = 0.004 * fractal_noise(p * 60, seed + 8, 2)[:, None]
     strands = (1 - side) * value_noise((p + curl) * top_way, seed + 9)[:, None]
     strands = strands + side * value_noise((p + curl) * side_way, seed + 10)[:, None]

@@ -14,7 +14,7 @@ Shapes = Mapping[str, float]
 
 MOUTH_MOODS: dict[str, Shapes] = {
     "smile": {"mouthSmile*": 0.80, "cheekSquint*": 0.45, "eyeSquint*": 0.30, "mouthDimple*": 0.2},
-    "grin": {"mouthSmile*": 0.85, "cheekSquint*": 0.6, "mouthUpperUp*": 0.35, "jaw": 0.11,
+    "grin": {"mouthSmile*": 0.80, "cheekSquint*": 0.6, "mouthUpperUp*": 0.65, "jaw": 0.08,
              "mouthLowerDown*": 0.4, "eyeSquint*": 0.4},
     "sad": {"mouthFrown*": 0.85, "mouthShrugLower": 0.6, "mouthStretch*": 0.2},
     "gape": {"jaw": 0.30, "mouthFunnel": 0.25},

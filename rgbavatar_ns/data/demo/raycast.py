@@ -2,13 +2,14 @@
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore import EmbreeDevice
 from embreex.rtcore_scene import EmbreeScene
 from jaxtyping import Bool, Float, Int
 
-_EDGE_DEPTH_M = 0.006
+_EDGE_DEPTH_M = 0.015
 
 
 @dataclass(frozen=True)
@@ -22,23 +23,32 @@ class Hits:
 
 
 class RayScene:
-    """Triangles that rays can be cast at; one Embree device serves all scenes."""
+    """Triangles that rays can be cast at; one Embree device serves all scenes.
+
+    `kept` names the triangles that are there at all; hits count in the numbers of `faces`.
+    """
 
     def __init__(
         self,
         device: EmbreeDevice,
         vertices: Float[np.ndarray, "V 3"],
         faces: Int[np.ndarray, "F 3"],
+        kept: Int[np.ndarray, "_"] | None = None,
     ) -> None:
         self._scene = EmbreeScene(device)
-        self._mesh = TriangleMesh(self._scene, vertices.astype(np.float32), faces.astype(np.int32))
+        there = faces if kept is None else faces[kept]
+        self._mesh = TriangleMesh(self._scene, vertices.astype(np.float32), there.astype(np.int32))
+        self._kept = None if kept is None else np.append(kept, -1).astype(np.int32)
 
     def cast(self, origins: Float[np.ndarray, "N 3"], directions: Float[np.ndarray, "N 3"]) -> Hits:
         """First hit of each ray; distances in lengths of `directions`."""
         found = self._scene.run(origins, directions, query="INTERSECT", output=True)
         second, third = found["u"], found["v"]
         weights = np.stack([1 - second - third, second, third], 1)
-        return Hits(found["primID"], weights, found["tfar"])
+        triangle = found["primID"]
+        if self._kept is not None:
+            triangle = self._kept[triangle]
+        return Hits(triangle, weights, found["tfar"])
 
     def is_free(
         self,
@@ -106,55 +116,62 @@ def cast_pixels(
     material: Int[np.ndarray, "F"],
     supersampling: int,
 ) -> PixelRays:
-    """Cast 2 x 2 rays a pixel, and `supersampling` squared where materials or depths part."""
+    """Cast two rays a pixel, and `supersampling` squared where materials or depths part."""
     left, right, top, bottom = camera.window(points)
     columns, rows = np.meshgrid(np.arange(left, right), np.arange(top, bottom))
     pixel = (rows * camera.size + columns).ravel()
-    rays_per_pixel = np.full(camera.size**2, 4)
-    parts = [_cast_grid(scene, camera, pixel, 2)]
-    if supersampling != 2:
-        edge = _has_edge(parts[0][3], material, len(pixel))
-        rays_per_pixel[pixel[edge]] = supersampling**2
-        kept = np.repeat(~edge, 4)
-        parts = [_chosen(parts[0], kept), _cast_grid(scene, camera, pixel[edge], supersampling)]
-    met = [_chosen(part, part[3].triangle >= 0) for part in parts]
+    diagonal = np.array([0.25, 0.75])
+    coarse = _cast_pattern(scene, camera, pixel, diagonal, diagonal)
+    edge = _has_edge(coarse[3], material, columns.shape)
+    places = (np.arange(supersampling) + 0.5) / supersampling
+    across, down = np.meshgrid(places, places)
+    fine = _cast_pattern(scene, camera, pixel[edge], across.ravel(), down.ravel())
+    rays_per_pixel = np.full(camera.size**2, len(diagonal))
+    rays_per_pixel[pixel[edge]] = supersampling**2
+    coarse = _chosen(coarse, np.repeat(~edge, len(diagonal)) & (coarse[3].triangle >= 0))
+    fine = _chosen(fine, fine[3].triangle >= 0)
+    hits = [coarse[3], fine[3]]
     return PixelRays(
-        np.concatenate([part[0] for part in met]),
-        np.concatenate([part[1] for part in met]),
-        np.concatenate([part[2] for part in met]),
+        *(np.concatenate([coarse[k], fine[k]]) for k in range(3)),
         Hits(
-            np.concatenate([part[3].triangle for part in met]),
-            np.concatenate([part[3].weights for part in met]),
-            np.concatenate([part[3].distance for part in met]),
+            np.concatenate([part.triangle for part in hits]),
+            np.concatenate([part.weights for part in hits]),
+            np.concatenate([part.distance for part in hits]),
         ),
         rays_per_pixel,
     )
 
 
-_Grid = tuple[np.ndarray, np.ndarray, np.ndarray, Hits]
+_Pattern = tuple[np.ndarray, np.ndarray, np.ndarray, Hits]
 
 
-def _cast_grid(scene: RayScene, camera: StillCamera, pixel: np.ndarray, count: int) -> _Grid:
-    """Pixel, place in the pattern, direction and hit of count x count rays for each pixel."""
-    places = (np.arange(count) + 0.5) / count
-    across, down = np.meshgrid(places, places)
-    column = (pixel[:, None] % camera.size + across.ravel()).ravel()
-    row = (pixel[:, None] // camera.size + down.ravel()).ravel()
+def _cast_pattern(
+    scene: RayScene, camera: StillCamera, pixel: np.ndarray, across: np.ndarray, down: np.ndarray
+) -> _Pattern:
+    """Pixel, place in the pattern, direction and hit of rays at the same places of each pixel."""
+    column = (pixel[:, None] % camera.size + across).ravel()
+    row = (pixel[:, None] // camera.size + down).ravel()
     directions = camera.directions(column, row)
     origins = np.broadcast_to(camera.centre, directions.shape).copy()
-    pattern = np.tile(np.arange(count * count), len(pixel))
-    return np.repeat(pixel, count * count), pattern, directions, scene.cast(origins, directions)
+    number = np.tile(np.arange(len(across)), len(pixel))
+    return np.repeat(pixel, len(across)), number, directions, scene.cast(origins, directions)
 
 
-def _chosen(part: _Grid, mask: np.ndarray) -> _Grid:
-    pixel, pattern, directions, hits = part
+def _chosen(part: _Pattern, mask: np.ndarray) -> _Pattern:
+    pixel, number, directions, hits = part
     chosen = Hits(hits.triangle[mask], hits.weights[mask], hits.distance[mask])
-    return pixel[mask], pattern[mask], directions[mask], chosen
+    return pixel[mask], number[mask], directions[mask], chosen
 
 
-def _has_edge(hits: Hits, material: np.ndarray, count: int) -> np.ndarray:
-    """Pixels whose rays met different materials or depths."""
+def _has_edge(hits: Hits, material: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """Pixels whose rays, or those of their four neighbours, met other materials or depths."""
     met = hits.triangle >= 0
-    kind = np.where(met, material[hits.triangle], -1).reshape(count, -1)
-    depth = np.where(met, hits.distance, 0).reshape(count, -1)
-    return (np.ptp(kind, 1) > 0) | (np.ptp(depth, 1) > _EDGE_DEPTH_M)
+    cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
+
+    def spread(values: np.ndarray) -> np.ndarray:
+        pairs = values.reshape(*shape, -1).astype(np.float32)
+        return cv2.dilate(pairs.max(-1), cross) - cv2.erode(pairs.min(-1), cross)
+
+    kind = spread(np.where(met, material[hits.triangle], -1))
+    depth = spread(np.where(met, hits.distance, 0))
+    return ((kind > 0) | (depth > _EDGE_DEPTH_M)).ravel()

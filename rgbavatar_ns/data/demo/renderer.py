@@ -18,6 +18,7 @@ from rgbavatar_ns.data.demo.lighting import (
 )
 from rgbavatar_ns.data.demo.paint import Paint, paint_eye
 from rgbavatar_ns.data.demo.raycast import PixelRays, RayScene, StillCamera, cast_pixels
+from rgbavatar_ns.data.demo.regions import smooth
 from rgbavatar_ns.data.demo.surface import PARTS, PosedSurface, TrueSurface, unit
 
 _FRAME_MATERIAL = len(PARTS)
@@ -25,6 +26,7 @@ _AMBIENT_RAYS = 48
 _AMBIENT_REACH_M = 0.12
 _SHARPNESS = np.array([16.0, 260.0, 260.0, 70.0, 70.0, 40.0, 60.0], np.float32)
 _TRANSLUCENCY = np.array([1.0, 0.3, 0.3, 0.4, 0.4, 1.0, 0.0], np.float32)
+_FRAME_SHADOW = 0.3
 _FRAME_COLOR = np.array([0.020, 0.013, 0.010], np.float32)
 
 
@@ -105,13 +107,22 @@ class DemoRenderer:
             frame = self._glasses.frame.moved(moment.head_rotation, moment.head_shift_m)
             vertices = np.concatenate([vertices, frame.vertices])
             normals = np.concatenate([normals, frame.normals])
-        scene = RayScene(self._device, vertices, self._faces)
+        kept = self._may_matter(vertices, normals)
+        scene = RayScene(self._device, vertices, self._faces, kept)
         rays = cast_pixels(scene, self._camera, vertices, self._material, self._supersampling)
         light = shade(self._samples(moment, scene, vertices, normals, rays))
         if self._glasses is not None:
             lenses = self._glasses.lenses.moved(moment.head_rotation, moment.head_shift_m)
             light = self._through_lenses(lenses, rays, light)
         return self._develop(rays, to_srgb(light))
+
+    def _may_matter(self, vertices: np.ndarray, normals: np.ndarray) -> np.ndarray:
+        """Triangles that face the camera or the key lamp, or are no skin; the rest of the head is
+        hidden behind these and throws no shadow that they do not throw.
+        """
+        to_eye = unit(self._camera.centre - vertices)
+        facing = np.maximum((normals * to_eye).sum(1), normals @ KEY_DIRECTION) > -0.35
+        return np.flatnonzero(facing[self._faces].any(1) | (self._material != 0))
 
     def _samples(
         self,
@@ -133,6 +144,7 @@ class DemoRenderer:
         share = np.float32(moment.jaw_open)
         seen = (1 - share) * self._openness[0] + share * self._openness[1]
         openness[body] = _interpolate(seen[:, None], corners, weights)[:, 0]
+        openness[body] = self._brighten_teeth(openness[body], material[body], corners)
         color, tilted = self._textured(moment, hits.triangle[body], weights, n[body])
         n[body] = tilted
         albedo[body], gloss[body] = color[:, :3], color[:, 3]
@@ -156,6 +168,16 @@ class DemoRenderer:
             lit=self._lit(scene, at, n, rays.pattern),
         )
 
+    def _brighten_teeth(
+        self, openness: np.ndarray, material: np.ndarray, corners: np.ndarray
+    ) -> np.ndarray:
+        """Light bounces within the mouth: front teeth and tongue are never as dark as its depth."""
+        inner = material >= 3
+        depth = self._surface.template[corners[inner, 0], 2]
+        result = openness.copy()
+        result[inner] = np.maximum(result[inner], 0.75 * smooth(depth, 0.018, 0.046))
+        return result
+
     def _textured(
         self, moment: Moment, triangle: np.ndarray, weights: np.ndarray, n: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
@@ -172,7 +194,10 @@ class DemoRenderer:
     def _lit(
         self, scene: RayScene, at: np.ndarray, n: np.ndarray, pattern: np.ndarray
     ) -> Float[np.ndarray, "N"]:
-        """Whether the key lamp is seen, each ray towards another place on it."""
+        """How far the key lamp is seen, each ray towards another place on it.
+
+        The thin frame of the glasses hides only a part of a lamp as large as this one.
+        """
         turn = 2.4 * pattern + 0.7
         radius = KEY_SPREAD * np.sqrt((0.37 + 0.618034 * pattern) % 1)
         across = unit(np.cross(KEY_DIRECTION, [0.0, 1.0, 0.0]))
@@ -183,7 +208,9 @@ class DemoRenderer:
         lit = np.zeros(len(n), np.float32)
         facing = np.flatnonzero(n @ KEY_DIRECTION > -0.25)
         start = at[facing] + 6e-4 * n[facing] + 6e-4 * KEY_DIRECTION
-        lit[facing] = scene.is_free(start.astype(np.float32), direction[facing])
+        blocked_by = scene.cast(start.astype(np.float32), direction[facing]).triangle
+        shadow = np.where(self._material[blocked_by] == _FRAME_MATERIAL, _FRAME_SHADOW, 1.0)
+        lit[facing] = np.where(blocked_by < 0, 1.0, 1.0 - shadow)
         return lit
 
     def _through_lenses(self, lenses: Mesh, rays: PixelRays, light: np.ndarray) -> np.ndarray:

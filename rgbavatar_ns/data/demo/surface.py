@@ -76,6 +76,9 @@ class TrueSurface:
         self.template = (self._split @ arrays.v_template).astype(np.float32)
         corners = arrays.uv[arrays.uv_faces].astype(np.float64)
         self._uv_inverse = np.linalg.inv(corners[:, 1:] - corners[:, :1]).astype(np.float32)
+        self._edge_ends = self._split.indices[count:].reshape(-1, 2)
+        depth = self.template[count:, 2]
+        self._roundness = (0.8 * smooth(depth, 0.03, 0.0)).astype(np.float32)
         self._coarse_incidence = incidence(arrays.faces, count)
         self._incidence = incidence(self.faces, len(self.template))
         part_of_vertex = np.zeros(count, np.int8)
@@ -88,6 +91,20 @@ class TrueSurface:
         full = 0.0055 + 0.0085 * smooth(self.template[:, 1], 0.05, 0.12)
         self._hair_m = (full * locks * smooth(above, -0.001, 0.022) * skin).astype(np.float32)
         self._folds_m = wrinkle_heights_m(self.template) * (skin * np.float32(wrinkles))[:, None]
+
+    def _rounded(self, tracked: Vertices, normals: Vertices) -> Vertices:
+        """Vertices after splitting; skull and neck, coarse in the head model, are rounded.
+
+        Phong tessellation (Boubekeur and Alexa 2008): an edge's middle moves towards the planes
+        that touch the surface at its ends.
+        """
+        fine = (self._split @ tracked).astype(np.float32)
+        middle = fine[len(tracked) :].copy()
+        for end in self._edge_ends.T:
+            n = normals[end]
+            height = ((middle - tracked[end]) * n).sum(1)
+            fine[len(tracked) :] -= (0.5 * self._roundness * height)[:, None] * n
+        return fine
 
     def tangents(
         self, tracked: Vertices
@@ -102,9 +119,9 @@ class TrueSurface:
         self, tracked: Vertices, activations: Float[np.ndarray, "W"], tilt: float = 0.0
     ) -> PosedSurface:
         """The surface over the tracked mesh's vertices; `tilt` is how far hair hangs to +x."""
-        fine = (self._split @ tracked).astype(np.float32)
-        coarse_normals = self._coarse_incidence @ face_normals(tracked, self._coarse_faces)
-        out = unit(self._split @ unit(coarse_normals)).astype(np.float32)
+        coarse_normals = unit(self._coarse_incidence @ face_normals(tracked, self._coarse_faces))
+        fine = self._rounded(tracked, coarse_normals)
+        out = unit(self._split @ coarse_normals).astype(np.float32)
         hair = self._hair_m * (1 + np.float32(tilt) * out[:, 0])
         haired = fine + out * hair[:, None]
         normals = unit(self._incidence @ face_normals(haired, self.faces))
