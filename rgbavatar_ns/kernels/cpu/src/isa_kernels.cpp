@@ -189,37 +189,49 @@ struct PixelCentres {
   }
 };
 
-// Calls visit(lane, pixel index) for every pixel of the block that lies in the image.
-template <class Visit>
-static RGBAVATAR_MEMBER void for_pixels(const Tile& tile, int block, Visit visit) {
-  const int left = (tile.tile_x * kTileBlocks + block % kTileBlocks) * kBlockSide;
-  const int top = (tile.tile_y * kTileBlocks + block / kTileBlocks) * kBlockSide;
-  const int rows = tile.height - top < kBlockSide ? tile.height - top : kBlockSide;
-  const int columns = tile.width - left < kBlockSide ? tile.width - left : kBlockSide;
-  if (rows == kBlockSide && columns == kBlockSide) {  // the usual case, unrolled
-    for (int y = 0; y < kBlockSide; ++y)
-      for (int x = 0; x < kBlockSide; ++x)
-        visit(y * kBlockSide + x, int64_t(top + y) * tile.width + left + x);
-    return;
+// The part of a block that lies in the image.
+struct BlockPixels {
+  int64_t first;  // index of its first pixel in the image
+  int rows, columns;
+
+  BlockPixels(const Tile& tile, int block) {
+    const int left = (tile.tile_x * kTileBlocks + block % kTileBlocks) * kBlockSide;
+    const int top = (tile.tile_y * kTileBlocks + block / kTileBlocks) * kBlockSide;
+    first = int64_t(top) * tile.width + left;
+    rows = tile.height - top < kBlockSide ? tile.height - top : kBlockSide;
+    columns = tile.width - left < kBlockSide ? tile.width - left : kBlockSide;
   }
-  for (int y = 0; y < rows; ++y)
-    for (int x = 0; x < columns; ++x)
-      visit(y * kBlockSide + x, int64_t(top + y) * tile.width + left + x);
+  bool whole() const { return rows == kBlockSide && columns == kBlockSide; }
+
+  // Calls visit(lane, pixel index) for each of them.
+  template <class Visit>
+  void for_each(const Tile& tile, Visit visit) const {
+    for (int y = 0; y < rows; ++y)
+      for (int x = 0; x < columns; ++x) visit(y * kBlockSide + x, first + y * tile.width + x);
+  }
+};
+
+// Rows of a block in the scratch memory: transmittance, red, green and blue (or other channels),
+// then depth (forward) or remainder (backward).
+enum { kTransmittance = 0, kColor = 1, kDepth = 4, kRemainder = 4, kBlendRows = 5 };
+
+template <int kRows>
+static RGBAVATAR_MEMBER float (*block_rows(TileScratch& scratch, int block))[kBlockPixels] {
+  return scratch.rows + block * kRows;
 }
 
 // T is 1 in the image and 0 outside it, so that pixels outside neither take part in the blending
-// nor keep their block open.
-static void start_transmittance(const Tile& tile, TileScratch& scratch) {
+// nor keep their block open. The other rows are 0.
+template <int kRows>
+static void start_rows(const Tile& tile, TileScratch& scratch) {
   for (int block = 0; block < kBlocksPerTile; ++block) {
-    float* t = scratch.transmittance[block];
-    store(Wide(0.0f), t);
-    for_pixels(tile, block, [&](int lane, int64_t) { t[lane] = 1.0f; });
+    float(*rows)[kBlockPixels] = block_rows<kRows>(scratch, block);
+    const BlockPixels pixels(tile, block);
+    store(Wide(pixels.whole() ? 1.0f : 0.0f), rows[kTransmittance]);
+    if (!pixels.whole())
+      pixels.for_each(tile, [&](int lane, int64_t) { rows[kTransmittance][lane] = 1.0f; });
+    for (int k = 1; k < kRows; ++k) store(Wide(0.0f), rows[k]);
   }
-}
-
-static void clear_channels(TileScratch& scratch, int channels) {
-  for (int block = 0; block < kBlocksPerTile; ++block)
-    for (int k = 0; k < channels; ++k) store(Wide(0.0f), scratch.channels[block][k]);
 }
 
 // Copies the tile's next Gaussians, which lie far apart, to scratch.portion.
@@ -264,22 +276,23 @@ static RGBAVATAR_MEMBER bool is_open(const Wide& transmittance) {
   return any(transmittance >= Wide(C::kMinTransmittance));
 }
 
-static bool any_open(const TileScratch& scratch) {
+template <int kRows>
+static bool any_open(TileScratch& scratch) {
   for (int block = 0; block < kBlocksPerTile; ++block)
-    if (is_open(load_wide(scratch.transmittance[block]))) return true;
+    if (is_open(load_wide(block_rows<kRows>(scratch, block)[kTransmittance]))) return true;
   return false;
 }
 
-// Blends a block's list into its transmittance and channels (red, green, blue, depth).
-template <bool kDepth>
+// Blends a block's list into its rows.
+template <bool kWithDepth>
 static inline void blend_block(const Tile& tile, const PixelCentres& centres, int block,
                                TileScratch& scratch) {
   const Wide px = centres.x + float((tile.tile_x * kTileBlocks + block % kTileBlocks) * kBlockSide);
   const Wide py = centres.y + float((tile.tile_y * kTileBlocks + block / kTileBlocks) * kBlockSide);
-  float(*channels)[kBlockPixels] = scratch.channels[block];
-  Wide t = load_wide(scratch.transmittance[block]);
-  Wide red = load_wide(channels[0]), green = load_wide(channels[1]);
-  Wide blue = load_wide(channels[2]), depth = load_wide(channels[3]);
+  float(*rows)[kBlockPixels] = block_rows<kBlendRows>(scratch, block);
+  Wide t = load_wide(rows[kTransmittance]), red = load_wide(rows[kColor]);
+  Wide green = load_wide(rows[kColor + 1]), blue = load_wide(rows[kColor + 2]);
+  Wide depth = load_wide(rows[kDepth]);
   const int size = scratch.list_size[block];
   for (int i = 0; i < size && is_open(t); ++i) {
     const Splat& s = scratch.portion[scratch.list[block][i]];
@@ -287,34 +300,52 @@ static inline void blend_block(const Tile& tile, const PixelCentres& centres, in
     red = red + w * s.red;
     green = green + w * s.green;
     blue = blue + w * s.blue;
-    if (kDepth) depth = depth + w * s.depth;
+    if (kWithDepth) depth = depth + w * s.depth;
     t = t - w;
   }
-  store(t, scratch.transmittance[block]);
-  store(red, channels[0]);
-  store(green, channels[1]);
-  store(blue, channels[2]);
-  if (kDepth) store(depth, channels[3]);
+  store(t, rows[kTransmittance]);
+  store(red, rows[kColor]);
+  store(green, rows[kColor + 1]);
+  store(blue, rows[kColor + 2]);
+  if (kWithDepth) store(depth, rows[kDepth]);
 }
 
+// Puts the background behind the block and writes it to the image.
 static void write_block(const Tile& tile, const ForwardOutput& out, int block,
-                        const TileScratch& scratch) {
-  const float* t = scratch.transmittance[block];
-  const float(*channels)[kBlockPixels] = scratch.channels[block];
-  for_pixels(tile, block, [&](int lane, int64_t pixel) {
-    for (int k = 0; k < 3; ++k)
-      out.image[pixel * 3 + k] = channels[k][lane] + t[lane] * out.background[k];
-    out.alpha[pixel] = 1.0f - t[lane];
-    if (out.depth) out.depth[pixel] = t[lane] < 1.0f ? channels[3][lane] / (1.0f - t[lane]) : 0.0f;
+                        TileScratch& scratch) {
+  float(*rows)[kBlockPixels] = block_rows<kBlendRows>(scratch, block);
+  const float* transmittance = rows[kTransmittance];
+  float(*channels)[kBlockPixels] = rows + kColor;
+  const Wide t = load_wide(transmittance);
+  for (int k = 0; k < 3; ++k)
+    store(load_wide(channels[k]) + t * out.background[k], channels[k]);
+  const BlockPixels pixels(tile, block);
+  if (pixels.whole()) {
+    for (int y = 0; y < kBlockSide; ++y) {
+      const int lane = y * kBlockSide;
+      const int64_t pixel = pixels.first + y * tile.width;
+      store_interleaved(load_quad(channels[0] + lane), load_quad(channels[1] + lane),
+                        load_quad(channels[2] + lane), out.image + pixel * 3);
+      store_quad(1.0f - load_quad(transmittance + lane), out.alpha + pixel);
+    }
+  } else {
+    pixels.for_each(tile, [&](int lane, int64_t pixel) {
+      for (int k = 0; k < 3; ++k) out.image[pixel * 3 + k] = channels[k][lane];
+      out.alpha[pixel] = 1.0f - transmittance[lane];
+    });
+  }
+  if (!out.depth) return;
+  pixels.for_each(tile, [&](int lane, int64_t pixel) {
+    const float alpha = 1.0f - transmittance[lane];
+    out.depth[pixel] = alpha > 0.0f ? rows[kDepth][lane] / alpha : 0.0f;
   });
 }
 
 static void forward_tile(const Tile& tile, const ForwardOutput& out, TileScratch& scratch) {
   const PixelCentres centres;
-  start_transmittance(tile, scratch);
-  clear_channels(scratch, 4);
+  start_rows<kBlendRows>(tile, scratch);
   for (uint32_t first = 0; first < tile.entry_count; first += kPortion) {
-    if (first && !any_open(scratch)) break;
+    if (first && !any_open<kBlendRows>(scratch)) break;
     list_by_block(tile, load_portion(tile, first, scratch), scratch);
     for (int block = 0; block < kBlocksPerTile; ++block) {
       if (scratch.list_size[block] == 0) continue;
@@ -329,10 +360,10 @@ static void forward_tile(const Tile& tile, const ForwardOutput& out, TileScratch
 
 // ---- Gaussian-stationary passes ---------------------------------------------------------------
 
-// Calls visit(dx, dy, transmittance, block) for the open blocks that the Gaussian touches. The
-// visit updates the transmittance as the forward pass did, so that the same blocks close at the
+// Calls visit(dx, dy, transmittance, rows) for the open blocks that the Gaussian touches. The visit
+// updates the transmittance as the forward pass did, so that the same blocks close at the
 // same Gaussian.
-template <class Visit>
+template <int kRows, class Visit>
 static RGBAVATAR_MEMBER void for_open_blocks(const Tile& tile, const PixelCentres& centres,
                                              const Splat& s, TileScratch& scratch, Visit visit) {
   const int origin_x = tile.tile_x * kTileBlocks, origin_y = tile.tile_y * kTileBlocks;
@@ -340,24 +371,24 @@ static RGBAVATAR_MEMBER void for_open_blocks(const Tile& tile, const PixelCentre
   for (int y = r.first_y; y <= r.last_y; ++y) {
     const Wide dy = centres.y + float((origin_y + y) * kBlockSide) - Wide(s.mean_y);
     for (int x = r.first_x; x <= r.last_x; ++x) {
-      const int block = y * kTileBlocks + x;
-      Wide t = load_wide(scratch.transmittance[block]);
+      float(*rows)[kBlockPixels] = block_rows<kRows>(scratch, y * kTileBlocks + x);
+      Wide t = load_wide(rows[kTransmittance]);
       if (!is_open(t)) continue;
       const Wide dx = centres.x + float((origin_x + x) * kBlockSide) - Wide(s.mean_x);
-      visit(dx, dy, t, block);
-      store(t, scratch.transmittance[block]);
+      visit(dx, dy, t, rows);
+      store(t, rows[kTransmittance]);
     }
   }
 }
 
 // Calls visit(Gaussian, its slot) front to back, and clears the slots behind an opaque tile.
-template <class Visit>
+template <int kRows, class Visit>
 static RGBAVATAR_MEMBER void for_gaussians(const Tile& tile, TileScratch& scratch, float* slots,
                                            int slot_width, Visit visit) {
   bool open = true;
   for (uint32_t first = 0; first < tile.entry_count; first += kPortion) {
     const int count = load_portion(tile, first, scratch);
-    open = open && any_open(scratch);
+    open = open && any_open<kRows>(scratch);
     for (int i = 0; i < count; ++i) {
       const Splat& s = scratch.portion[i];
       float* slot = slots + int64_t(tile.slot(s)) * slot_width;
@@ -369,43 +400,65 @@ static RGBAVATAR_MEMBER void for_gaussians(const Tile& tile, TileScratch& scratc
   }
 }
 
-static void start_remainder(const Tile& tile, const BackwardInput& in, TileScratch& scratch) {
-  clear_channels(scratch, 3);
-  for (int block = 0; block < kBlocksPerTile; ++block) {
-    float(*g)[kBlockPixels] = scratch.channels[block];
-    float* remainder = scratch.remainder[block];
-    store(Wide(0.0f), remainder);
-    for_pixels(tile, block, [&](int lane, int64_t pixel) {
-      float rest = 0.0f;
-      if (in.image_grad)
-        for (int k = 0; k < 3; ++k) {
-          g[k][lane] = in.image_grad[pixel * 3 + k];
-          rest += g[k][lane] * in.image[pixel * 3 + k];
-        }
-      if (in.alpha_grad) rest -= in.alpha_grad[pixel] * (1.0f - in.alpha[pixel]);
-      remainder[lane] = rest;
+static void load_color_block(const Tile& tile, const float* image, const BlockPixels& pixels,
+                             float channels[3][kBlockPixels]) {
+  if (pixels.whole()) {
+    for (int y = 0; y < kBlockSide; ++y) {
+      Quad r, g, b;
+      load_interleaved(image + (pixels.first + y * tile.width) * 3, r, g, b);
+      store_quad(r, channels[0] + y * kBlockSide);
+      store_quad(g, channels[1] + y * kBlockSide);
+      store_quad(b, channels[2] + y * kBlockSide);
+    }
+  } else {
+    for (int k = 0; k < 3; ++k) store(Wide(0.0f), channels[k]);
+    pixels.for_each(tile, [&](int lane, int64_t pixel) {
+      for (int k = 0; k < 3; ++k) channels[k][lane] = image[pixel * 3 + k];
     });
+  }
+}
+
+// Sets the remainder to g . image - h (1 - alpha) and the channels to g; both are 0 outside the
+// image.
+static void start_remainder(const Tile& tile, const BackwardInput& in, TileScratch& scratch) {
+  for (int block = 0; block < kBlocksPerTile; ++block) {
+    float(*rows)[kBlockPixels] = block_rows<kBlendRows>(scratch, block);
+    float(*g)[kBlockPixels] = rows + kColor;
+    float* remainder = rows[kRemainder];
+    const BlockPixels pixels(tile, block);
+    Wide rest(0.0f);
+    if (in.image_grad) {
+      float image[3][kBlockPixels];
+      load_color_block(tile, in.image, pixels, image);
+      load_color_block(tile, in.image_grad, pixels, g);
+      for (int k = 0; k < 3; ++k) rest = rest + load_wide(g[k]) * load_wide(image[k]);
+    }
+    store(rest, remainder);
+    if (in.alpha_grad)
+      pixels.for_each(tile, [&](int lane, int64_t pixel) {
+        remainder[lane] -= in.alpha_grad[pixel] * (1.0f - in.alpha[pixel]);
+      });
   }
 }
 
 static void backward_tile(const Tile& tile, const BackwardInput& in, TileScratch& scratch,
                           float* slots) {
   const PixelCentres centres;
-  start_transmittance(tile, scratch);
+  start_rows<kBlendRows>(tile, scratch);
   start_remainder(tile, in, scratch);
-  for_gaussians(tile, scratch, slots, kMoments, [&](const Splat& s, float* slot) {
+  for_gaussians<kBlendRows>(tile, scratch, slots, kMoments, [&](const Splat& s, float* slot) {
     Wide sums[kMoments];
     for (int k = 0; k < kMoments; ++k) sums[k] = Wide(0.0f);
-    for_open_blocks(
-        tile, centres, s, scratch, [&](const Wide& dx, const Wide& dy, Wide& t, int block) {
-          const float(*channels)[kBlockPixels] = scratch.channels[block];
-          const Wide red = load_wide(channels[0]), green = load_wide(channels[1]);
-          const Wide blue = load_wide(channels[2]);
+    for_open_blocks<kBlendRows>(
+        tile, centres, s, scratch,
+        [&](const Wide& dx, const Wide& dy, Wide& t, float(*rows)[kBlockPixels]) {
+          const Wide red = load_wide(rows[kColor]), green = load_wide(rows[kColor + 1]);
+          const Wide blue = load_wide(rows[kColor + 2]);
           const Alpha alpha = alpha_at(dx, dy, s);
           const Wide w = alpha.value * t;
           const Wide along = red * s.red + green * s.green + blue * s.blue;
-          const Wide remainder = load_wide(scratch.remainder[block]) - w * along;
-          store(remainder, scratch.remainder[block]);
+          const Wide remainder = load_wide(rows[kRemainder]) - w * along;
+          store(remainder, rows[kRemainder]);
           const Wide d_alpha = t * along - remainder * reciprocal_of(1.0f - alpha.value);
           t = t - w;
           // The cap has no gradient.
@@ -422,7 +475,9 @@ static void backward_tile(const Tile& tile, const BackwardInput& in, TileScratch
           sums[7] = sums[7] + d_x * dy;
           sums[8] = sums[8] + d_y * dy;
         });
-    for (int k = 0; k < kMoments; ++k) slot[k] = sum_of(sums[k]) * (k < 3 ? 1.0f : C::kLn2);
+    store_quad(sums_of(sums[0], sums[1], sums[2], sums[3]) * Quad{1.0f, 1.0f, 1.0f, C::kLn2}, slot);
+    store_quad(sums_of(sums[4], sums[5], sums[6], sums[7]) * C::kLn2, slot + 4);
+    slot[8] = sum_of(sums[8]) * C::kLn2;
   });
 }
 
@@ -430,26 +485,26 @@ template <int kChannels>
 static void average_channels(const Tile& tile, const float* image, int channels,
                              TileScratch& scratch, float* slots) {
   const PixelCentres centres;
-  start_transmittance(tile, scratch);
-  clear_channels(scratch, kChannels);
+  constexpr int kRows = 1 + kChannels;
+  start_rows<kRows>(tile, scratch);
   for (int block = 0; block < kBlocksPerTile; ++block) {
-    float(*pixels)[kBlockPixels] = scratch.channels[block];
-    for_pixels(tile, block, [&](int lane, int64_t pixel) {
-      for (int k = 0; k < channels; ++k) pixels[k][lane] = image[pixel * channels + k];
+    float(*values)[kBlockPixels] = block_rows<kRows>(scratch, block) + 1;
+    BlockPixels(tile, block).for_each(tile, [&](int lane, int64_t pixel) {
+      for (int k = 0; k < channels; ++k) values[k][lane] = image[pixel * channels + k];
     });
   }
-  for_gaussians(tile, scratch, slots, channels + 2, [&](const Splat& s, float* slot) {
+  for_gaussians<kRows>(tile, scratch, slots, channels + 2, [&](const Splat& s, float* slot) {
     Wide sums[kChannels + 1], largest(0.0f);
     for (int k = 0; k <= kChannels; ++k) sums[k] = Wide(0.0f);
-    for_open_blocks(tile, centres, s, scratch,
-                    [&](const Wide& dx, const Wide& dy, Wide& t, int block) {
-                      const Wide w = alpha_at(dx, dy, s).value * t;
-                      t = t - w;
-                      largest = max_of(largest, w);
-                      sums[kChannels] = sums[kChannels] + w;
-                      for (int k = 0; k < kChannels; ++k)
-                        sums[k] = sums[k] + w * load_wide(scratch.channels[block][k]);
-                    });
+    for_open_blocks<kRows>(
+        tile, centres, s, scratch,
+        [&](const Wide& dx, const Wide& dy, Wide& t, const float(*rows)[kBlockPixels]) {
+          const Wide w = alpha_at(dx, dy, s).value * t;
+          t = t - w;
+          largest = max_of(largest, w);
+          sums[kChannels] = sums[kChannels] + w;
+          for (int k = 0; k < kChannels; ++k) sums[k] = sums[k] + w * load_wide(rows[1 + k]);
+        });
     for (int k = 0; k < channels; ++k) slot[k] = sum_of(sums[k]);
     slot[channels] = sum_of(sums[kChannels]);
     slot[channels + 1] = max_lane(largest);

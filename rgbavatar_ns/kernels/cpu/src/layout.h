@@ -79,9 +79,8 @@ struct BackwardInput {
 
 // Scratch memory of one thread.
 struct alignas(64) TileScratch {
-  float transmittance[kBlocksPerTile][kBlockPixels];
-  float remainder[kBlocksPerTile][kBlockPixels];
-  float channels[kBlocksPerTile][kMaxChannels][kBlockPixels];
+  // What a pass keeps for every block, a few rows each, the transmittance first.
+  float rows[kBlocksPerTile * (1 + kMaxChannels)][kBlockPixels];
   Splat portion[kPortion];
   uint16_t list[kBlocksPerTile][kPortion];  // of each block: places in the portion
   uint16_t list_size[kBlocksPerTile];

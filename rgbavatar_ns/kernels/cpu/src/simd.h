@@ -117,8 +117,20 @@ RGBAVATAR_FUNCTION Native select(Flags m, Native a, Native b) {
 #endif
 }
 
-RGBAVATAR_FUNCTION Native min_of(Native a, Native b) { return Native(a.v < b.v ? a.v : b.v); }
-RGBAVATAR_FUNCTION Native max_of(Native a, Native b) { return Native(a.v > b.v ? a.v : b.v); }
+RGBAVATAR_FUNCTION Native min_of(Native a, Native b) {
+#if defined(__AVX512F__)
+  return Native(_mm512_min_ps(a.v, b.v));
+#else
+  return Native(a.v < b.v ? a.v : b.v);
+#endif
+}
+RGBAVATAR_FUNCTION Native max_of(Native a, Native b) {
+#if defined(__AVX512F__)
+  return Native(_mm512_max_ps(a.v, b.v));
+#else
+  return Native(a.v > b.v ? a.v : b.v);
+#endif
+}
 
 RGBAVATAR_FUNCTION bool any(Flags m) {
 #if defined(__AVX512F__)
@@ -167,11 +179,10 @@ RGBAVATAR_FUNCTION Native reciprocal_of(Native a) {
 RGBAVATAR_FUNCTION Native exp2_of(Native a) {
   const Native shifted = a + Native(12582912.0f);
   const Native f = a - (shifted - Native(12582912.0f));
-  Native p(0.009570102207362652f);
-  p = p * f + Native(0.05591785907745361f);
-  p = p * f + Native(0.240247443318367f);
-  p = p * f + Native(0.6931217908859253f);
-  p = p * f + Native(0.9999992847442627f);
+  const Native f2 = f * f;  // Estrin's order: short chains, because latency is what counts here
+  const Native low = Native(0.6931217908859253f) * f + Native(0.9999992847442627f);
+  const Native middle = Native(0.05591785907745361f) * f + Native(0.240247443318367f);
+  const Native p = (Native(0.009570102207362652f) * f2 + middle) * f2 + low;
   return Native((NativeFloat)((NativeInt)p.v + ((NativeInt)shifted.v << 23)));
 }
 
@@ -249,30 +260,92 @@ RGBAVATAR_FUNCTION Native sum_to_register(Floats<L> a) {
   return sum_to_register(a.low + a.high);
 }
 
-// The sum of the lanes.
-RGBAVATAR_FUNCTION float sum_of(Wide a) {
+typedef float Quad __attribute__((vector_size(16)));
+typedef float UnalignedQuad __attribute__((vector_size(16), aligned(4)));
+
+// The four sums of every fourth lane.
+RGBAVATAR_FUNCTION Quad sum_to_quad(Wide a) {
   const Native s = sum_to_register(a);
-#if defined(__x86_64__)
 #if defined(__AVX512F__)
   const __m256 half = _mm512_castps512_ps256(s.v) + _mm512_extractf32x8_ps(s.v, 1);
-  const __m128 q = _mm256_castps256_ps128(half) + _mm256_extractf128_ps(half, 1);
+  return _mm256_castps256_ps128(half) + _mm256_extractf128_ps(half, 1);
 #elif defined(__AVX2__)
-  const __m128 q = _mm256_castps256_ps128(s.v) + _mm256_extractf128_ps(s.v, 1);
+  return _mm256_castps256_ps128(s.v) + _mm256_extractf128_ps(s.v, 1);
 #else
-  const __m128 q = s.v;
+  return s.v;
 #endif
-  const __m128 d = q + _mm_movehl_ps(q, q);
-  return d[0] + d[1];
+}
+
+// The sum of the lanes of each of four quads.
+RGBAVATAR_FUNCTION Quad sums_of_quads(Quad a, Quad b, Quad c, Quad d) {
+  const Quad ab = __builtin_shufflevector(a, b, 0, 4, 1, 5) +
+                  __builtin_shufflevector(a, b, 2, 6, 3, 7);
+  const Quad cd = __builtin_shufflevector(c, d, 0, 4, 1, 5) +
+                  __builtin_shufflevector(c, d, 2, 6, 3, 7);
+  return __builtin_shufflevector(ab, cd, 0, 1, 4, 5) + __builtin_shufflevector(ab, cd, 2, 3, 6, 7);
+}
+
+// Four sums of lanes at a time.
+RGBAVATAR_FUNCTION Quad sums_of(Wide a, Wide b, Wide c, Wide d) {
+#if defined(__AVX512F__)
+  const auto fold = [](__m512 x, __m512 y) __attribute__((always_inline)) {
+    return _mm512_shuffle_f32x4(x, y, 0x44) + _mm512_shuffle_f32x4(x, y, 0xee);
+  };
+  const __m512 ab = fold(a.v, b.v), cd = fold(c.v, d.v);
+  // Quads: [a, b, c, d], each with the lanes' sums modulo four.
+  const __m512 quads =
+      _mm512_shuffle_f32x4(ab, cd, 0x88) + _mm512_shuffle_f32x4(ab, cd, 0xdd);
+  const __m512 pairs = quads + _mm512_shuffle_ps(quads, quads, 0x4e);
+  const __m512 sums = pairs + _mm512_shuffle_ps(pairs, pairs, 0xb1);
+  const __m512i every_fourth = _mm512_setr_epi32(0, 4, 8, 12, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0);
+  return _mm512_castps512_ps128(_mm512_permutexvar_ps(every_fourth, sums));
 #else
-  return (s.v[0] + s.v[2]) + (s.v[1] + s.v[3]);
+  return sums_of_quads(sum_to_quad(a), sum_to_quad(b), sum_to_quad(c), sum_to_quad(d));
 #endif
+}
+
+// The sum of the lanes.
+RGBAVATAR_FUNCTION float sum_of(Wide a) {
+  const Quad q = sum_to_quad(a);
+  return (q[0] + q[2]) + (q[1] + q[3]);
+}
+
+RGBAVATAR_FUNCTION Quad load_quad(const float* from) {
+  return *reinterpret_cast<const UnalignedQuad*>(from);
+}
+RGBAVATAR_FUNCTION void store_quad(Quad a, float* to) {
+  *reinterpret_cast<UnalignedQuad*>(to) = a;
+}
+
+// Four pixels' r, g, b as r0 g0 b0 r1 ..., and back.
+RGBAVATAR_FUNCTION void store_interleaved(Quad r, Quad g, Quad b, float* to) {
+  const Quad rg = __builtin_shufflevector(r, g, 0, 4, 1, 5);   // r0 g0 r1 g1
+  const Quad rg2 = __builtin_shufflevector(r, g, 2, 6, 3, 7);  // r2 g2 r3 g3
+  const Quad br = __builtin_shufflevector(b, r, 0, 5, 1, 0);   // b0 r1 b1 .
+  const Quad gb = __builtin_shufflevector(g, b, 1, 5, 3, 7);   // g1 b1 g3 b3
+  const Quad b2 = __builtin_shufflevector(b, r, 2, 7, 2, 7);   // b2 r3 . .
+  store_quad(__builtin_shufflevector(rg, br, 0, 1, 4, 5), to);
+  store_quad(__builtin_shufflevector(gb, rg2, 0, 1, 4, 5), to + 4);
+  store_quad(__builtin_shufflevector(b2, gb, 0, 1, 6, 7), to + 8);
+}
+RGBAVATAR_FUNCTION void load_interleaved(const float* from, Quad& r, Quad& g, Quad& b) {
+  const Quad x = load_quad(from);      // r0 g0 b0 r1
+  const Quad y = load_quad(from + 4);  // g1 b1 r2 g2
+  const Quad z = load_quad(from + 8);  // b2 r3 g3 b3
+  const Quad r23 = __builtin_shufflevector(y, z, 2, 2, 5, 5);
+  const Quad g01 = __builtin_shufflevector(x, y, 1, 1, 4, 4);
+  const Quad g23 = __builtin_shufflevector(y, z, 3, 3, 6, 6);
+  const Quad b01 = __builtin_shufflevector(x, y, 2, 2, 5, 5);
+  r = __builtin_shufflevector(x, r23, 0, 3, 4, 6);
+  g = __builtin_shufflevector(g01, g23, 0, 2, 4, 6);
+  b = __builtin_shufflevector(b01, z, 0, 2, 4, 7);
 }
 
 // The largest lane; all are at least 0.
 RGBAVATAR_FUNCTION float max_lane(Wide a) {
   float lanes[kLanes], largest = 0.0f;
   store(a, lanes);
-  for (int i = 0; i < kLanes; ++i) largest = lanes[i] > largest ? lanes[i] : largest;
+  for (int i = 0; i < kLanes; ++i) largest = largest < lanes[i] ? lanes[i] : largest;
   return largest;
 }
 
