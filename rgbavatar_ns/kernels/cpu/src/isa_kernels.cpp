@@ -368,16 +368,23 @@ static RGBAVATAR_MEMBER void for_open_blocks(const Tile& tile, const PixelCentre
                                              const Splat& s, TileScratch& scratch, Visit visit) {
   const int origin_x = tile.tile_x * kTileBlocks, origin_y = tile.tile_y * kTileBlocks;
   const BlockRange r = blocks_in_tile(s.bounds, origin_x, origin_y);
-  for (int y = r.first_y; y <= r.last_y; ++y) {
-    const Wide dy = centres.y + float((origin_y + y) * kBlockSide) - Wide(s.mean_y);
-    for (int x = r.first_x; x <= r.last_x; ++x) {
-      float(*rows)[kBlockPixels] = block_rows<kRows>(scratch, y * kTileBlocks + x);
-      Wide t = load_wide(rows[kTransmittance]);
-      if (!is_open(t)) continue;
-      const Wide dx = centres.x + float((origin_x + x) * kBlockSide) - Wide(s.mean_x);
-      visit(dx, dy, t, rows);
+  const int width = r.last_x - r.first_x + 1, height = r.last_y - r.first_y + 1;
+  const float left_px = float((origin_x + r.first_x) * kBlockSide);
+  int x = 0, block = r.first_y * kTileBlocks + r.first_x;
+  float right_px = left_px, down_px = float((origin_y + r.first_y) * kBlockSide);
+  // One loop over rows and columns: the processor guesses its end better than that of each row.
+  for (int rest = width * height; rest > 0; --rest) {
+    float(*rows)[kBlockPixels] = block_rows<kRows>(scratch, block);
+    Wide t = load_wide(rows[kTransmittance]);
+    if (is_open(t)) {
+      visit(centres.x + right_px - Wide(s.mean_x), centres.y + down_px - Wide(s.mean_y), t, rows);
       store(t, rows[kTransmittance]);
     }
+    const bool wrap = ++x == width;
+    block += wrap ? kTileBlocks + 1 - width : 1;
+    right_px = wrap ? left_px : right_px + kBlockSide;
+    down_px += wrap ? float(kBlockSide) : 0.0f;
+    x = wrap ? 0 : x;
   }
 }
 
