@@ -52,7 +52,10 @@ rgbavatar_tiny = MethodSpecification(
     config=RGBAvatarTrainerConfig(
         method_name="rgbavatar-tiny",
         pipeline=RGBAvatarPipelineConfig(
-            model=RGBAvatarModelConfig(avatar=AvatarConfig(uv_resolution=128), lpips_metric=False)
+            model=RGBAvatarModelConfig(
+                avatar=AvatarConfig(uv_resolution=128, scale_from_texel_spacing=True),
+                lpips_metric=False,
+            )
         ),
         max_num_iterations=1500,
         steps_per_save=250,
