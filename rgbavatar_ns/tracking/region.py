@@ -60,7 +60,7 @@ class HeadRegion:
         narrow = cv2.GaussianBlur(_grown(silhouette, _MARGIN * face), (0, 0), 0.02 * face)
         rows, columns = np.mgrid[0:size, 0:size] + 0.5
         height = (columns - chin_px[0]) * up[0] + (rows - chin_px[1]) * up[1]
-        skull = _smooth_step(height / face, 0.0, 0.3)
+        skull = _smooth_step(height / face, 0.12, 0.4)
         if len(self._ring):
             ends = float(np.percentile((vertices_px[self._ring] - chin_px) @ up, 10)) / face
             # A ring that slants or a chin on the chest must not cut the face itself.

@@ -38,6 +38,7 @@ def track_video(
     """
     config = config or TrackConfig()
     source = FrameSource.open(videos, config.max_frames)
+    _refuse_used_folder(Path(dst), config.overwrite)
     work = _Work(progress, source.count_hint() or 0)
     seconds = _Stopwatch()
     seen = find_landmarks(source, work.advance)
@@ -81,6 +82,15 @@ def track_video(
     write_report(Path(dst) / "tracking.json", report)
     test_frames = len(found) // 5 if config.test_frames is None else config.test_frames
     return writer.finish(test_frames)
+
+
+def _refuse_used_folder(dst: Path, overwrite: bool) -> None:
+    """Say at once what the writer would say after all the work."""
+    if not overwrite and dst.is_dir() and any(dst.iterdir()):
+        raise UserError(
+            f"The folder {dst} is not empty.",
+            "Name a new folder, or allow to overwrite the dataset in it.",
+        )
 
 
 class _Work:

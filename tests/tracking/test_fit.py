@@ -1,0 +1,155 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from rgbavatar_ns.head import HeadModel
+from rgbavatar_ns.head.rotations import axis_angle_to_matrix
+from rgbavatar_ns.tracking.camera import StillCamera
+from rgbavatar_ns.tracking.config import TrackConfig
+from rgbavatar_ns.tracking.fit import fit_clip, key_frame_positions
+from rgbavatar_ns.tracking.report import fit_quality
+from rgbavatar_ns.tracking.subject import SubjectTracker
+
+CAMERA = StillCamera(700.0, (160.0, 120.0), 0.8)
+ACTIVE = ("mouthSmileLeft", "mouthPucker", "browInnerUp", "eyeBlinkLeft", "eyeBlinkRight")
+
+
+@pytest.fixture(scope="module")
+def head() -> HeadModel:
+    return HeadModel.embedded(dtype=torch.float64)
+
+
+def _performance(head: HeadModel, frames: int) -> tuple[np.ndarray, np.ndarray]:
+    """Smooth theta [F, H] with turns, jaw, gaze, blinks and expressions, and an identity."""
+    random = np.random.default_rng(11)
+    layout, names = head.layout, list(head.arrays.expression_names)
+    theta = np.zeros((frames, layout.size))
+    time = np.linspace(0, 2 * np.pi, frames)
+    turns = [0.12 * np.sin(time), 0.25 * np.sin(2 * time + 1), 0.08 * np.cos(time)]
+    theta[:, layout.slice("rotation")] = np.stack(turns, axis=1)
+    theta[:, layout.slice("translation")] = 0.015 * np.stack(
+        [np.sin(time + k) for k in range(3)], 1
+    )
+    theta[:, layout.slice("jaw").start] = 0.12 * (1 - np.cos(2 * time))
+    for eye in ("left_eye", "right_eye"):
+        theta[:, layout.slice(eye).start + 1] = 0.2 * np.sin(time + 2)
+    for number, name in enumerate(ACTIVE):
+        wave = 0.5 + 0.5 * np.sin((1 + number % 3) * time + number)
+        theta[:, layout.slice("expression").start + names.index(name)] = 0.8 * wave
+    identity = np.zeros(head.num_identity)
+    identity[:10] = 0.5 * random.normal(size=10)
+    return theta, identity
+
+
+def _observed(tracker: SubjectTracker, theta: np.ndarray, identity: np.ndarray) -> np.ndarray:
+    points = np.zeros((len(theta), 478, 2))
+    for frame, row in enumerate(theta):
+        projected = CAMERA.project(tracker.mesh_landmarks.points(row, identity))
+        points[frame, tracker.facemesh_index] = projected
+    return points
+
+
+def _angles_deg(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    a, b = (axis_angle_to_matrix(torch.from_numpy(part)) for part in (first, second))
+    trace = (a * b).sum((-1, -2)).numpy()
+    return np.degrees(np.arccos(np.clip((trace - 1) / 2, -1, 1)))
+
+
+def test_known_performance_is_recovered_from_its_own_landmarks(head: HeadModel) -> None:
+    tracker = SubjectTracker(head, TrackConfig(focal_px=CAMERA.focal_px, key_frames=6))
+    theta, identity = _performance(head, 16)
+    observed = _observed(tracker, theta, identity)
+    noisy = observed + np.random.default_rng(0).normal(size=observed.shape) * 0.3
+    fit = tracker.fit(noisy, [False] + [True] * 15, 320, 240)
+    found = tracker.thetas(fit)
+    layout = head.layout
+
+    rotation = layout.slice("rotation")
+    assert _angles_deg(found[:, rotation], theta[:, rotation]).mean() < 1.5
+    jaw = layout.slice("jaw").start
+    assert np.corrcoef(found[:, jaw], theta[:, jaw])[0, 1] > 0.9
+    gaze = layout.slice("left_eye").start + 1
+    assert np.corrcoef(found[:, gaze], theta[:, gaze])[0, 1] > 0.9
+    names, first = list(head.arrays.expression_names), layout.slice("expression").start
+    active = [first + names.index(name) for name in ACTIVE]
+    assert np.corrcoef(found[:, active].ravel(), theta[:, active].ravel())[0, 1] > 0.8
+
+    skin = head.arrays.v_template[:, 2] > 0.02
+    with torch.no_grad():
+        true = head(torch.from_numpy(theta), torch.from_numpy(identity)).numpy()[:, skin]
+        ours = head(torch.from_numpy(found), torch.from_numpy(fit.subject.identity)).numpy()
+    shift = CAMERA.distance_m - fit.subject.camera.distance_m
+    ours = ours[:, skin] + np.array([0, 0, shift])
+    away = np.linalg.norm((ours - true)[..., :2], axis=-1)
+    assert away.mean() < 0.002, "metres across the image, face"
+
+    quality = fit_quality(tracker, fit, noisy)
+    assert quality["reprojection_error_share"] < 0.01
+    assert quality["mouth_opening_correlation"] > 0.95
+    assert quality["eyelid_opening_correlation"] > 0.95
+    assert tracker.rejected(fit, noisy) == []
+    lower, upper = tracker.cost.parameters.lower, tracker.cost.parameters.upper
+    assert (fit.values >= lower).all()
+    assert (fit.values <= upper).all()
+
+
+def test_the_same_landmarks_give_the_same_fit_and_a_gap_is_not_bridged(head: HeadModel) -> None:
+    config = TrackConfig(focal_px=CAMERA.focal_px, key_frames=3, identity_components=5)
+    theta, identity = _performance(head, 6)
+    observed = _observed(SubjectTracker(head, config), theta, identity)
+    follows = [False, True, True, False, True, True]
+    trackers = [SubjectTracker(head, config) for _ in range(2)]
+    runs = [tracker.fit(observed, follows, 320, 240) for tracker in trackers]
+    np.testing.assert_array_equal(runs[0].values, runs[1].values)
+    # What comes after the gap changes nothing before it.
+    tracker, subject = trackers[0], runs[0].subject
+    targets = tracker.targets(observed)
+    whole = fit_clip(tracker.cost, subject, targets, follows, 1.0).values
+    alone = fit_clip(tracker.cost, subject, targets[:3], follows[:3], 1.0).values
+    np.testing.assert_array_equal(whole[:3], alone)
+
+
+def test_smoothing_lowers_jitter_without_lag(head: HeadModel) -> None:
+    config = TrackConfig(focal_px=CAMERA.focal_px, key_frames=3, identity_components=3)
+    theta, identity = _performance(head, 12)
+    tracker = SubjectTracker(head, config)
+    noisy = _observed(tracker, theta, identity)
+    noisy = noisy + np.random.default_rng(3).normal(size=noisy.shape) * 1.0
+    follows = [False] + [True] * 11
+    smooth = tracker.fit(noisy, follows, 320, 240)
+    rough = SubjectTracker(head, replace(config, temporal_weight=0.0)).fit(noisy, follows, 320, 240)
+    yaw = tracker.cost.parameters.columns.tolist().index(head.layout.slice("rotation").start + 1)
+    true = theta[:, head.layout.slice("rotation").start + 1]
+
+    def jitter(values: np.ndarray) -> float:
+        return float(np.square(np.diff(values, 2)).mean())
+
+    assert jitter(smooth.values[:, yaw]) < jitter(rough.values[:, yaw])
+    shifted = [
+        np.abs(np.roll(smooth.values[:, yaw], -lag) - true)[2:-2].std() for lag in (-1, 0, 1)
+    ]
+    assert np.argmin(shifted) == 1
+
+
+def test_landmarks_that_no_head_explains_are_rejected(head: HeadModel) -> None:
+    config = TrackConfig(focal_px=CAMERA.focal_px, key_frames=3, identity_components=3)
+    theta, identity = _performance(head, 4)
+    tracker = SubjectTracker(head, config)
+    observed = _observed(tracker, theta, identity)
+    fit = tracker.fit(observed, [False, True, True, True], 320, 240)
+    broken = observed.copy()
+    random = np.random.default_rng(1)
+    broken[2, 30:] += random.normal(size=(448, 2)) * 15
+    assert tracker.rejected(fit, broken) == [2]
+
+
+def test_key_frames_differ_and_are_the_same_each_time() -> None:
+    random = np.random.default_rng(2)
+    still, moved = random.normal(size=(478, 2)), random.normal(size=(478, 2))
+    clip = np.stack([still, still, moved * 3, still + 5, still])
+    chosen = key_frame_positions(clip, 2)
+    assert len(chosen) == 2
+    assert 2 in chosen, "a translation alone is no new shape"
+    assert key_frame_positions(clip, 99) == key_frame_positions(clip, 5)

@@ -1,0 +1,140 @@
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rgbavatar_ns.data import load_dataset
+from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.tracking import TrackConfig, track_video
+
+from .clips import REAL_CLIPS, gradient_images, write_clip
+
+pytest.importorskip("mediapipe", reason="the tracker's optional extra is not installed")
+CLIP = REAL_CLIPS / "grid_id2.mpg"
+needs_clip = pytest.mark.skipif(not CLIP.exists(), reason=f"the clip {CLIP.name} is not here")
+
+
+def _astronaut() -> np.ndarray:
+    """A public-domain portrait that scikit-image carries, cut to head and shoulders."""
+    skimage = pytest.importorskip("skimage.data", reason="scikit-image is not installed")
+    return skimage.astronaut()[:400, 30:430]
+
+
+@pytest.fixture(scope="module")
+def portrait(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[int]]:
+    """A written clip: the portrait drifts, two frames in the middle show no face."""
+    image, frames = _astronaut(), []
+    blank = [3, 4]
+    for number in range(9):
+        shifted = np.roll(image, 2 * number, axis=1)
+        frames.append(np.full_like(image, 90) if number in blank else shifted)
+    path = tmp_path_factory.mktemp("portrait") / "portrait.mp4"
+    return write_clip(path, frames), blank
+
+
+def test_a_written_clip_becomes_a_dataset_without_its_faceless_frames(
+    portrait: tuple[Path, list[int]], tmp_path: Path
+) -> None:
+    clip, blank = portrait
+    calls: list[tuple[int, int]] = []
+    config = TrackConfig(image_size=128, key_frames=3, focal_px=500.0)
+    dataset = track_video(clip, tmp_path / "set", config, lambda *done: calls.append(done))
+
+    report = json.loads((tmp_path / "set" / "tracking.json").read_text())
+    assert report["frames_read"] == 9
+    assert set(blank) <= set(report["rejected"]["no face"])
+    assert not set(dataset.frame_index) & set(report["rejected"]["no face"])
+    assert report["frames_tracked"] == len(dataset) >= 5
+    assert report["reprojection_error_share"] < 0.015
+    assert (tmp_path / "set" / "overlay.png").stat().st_size > 10_000
+    assert len(dataset.test) == len(dataset) // 5
+    done = [call[0] for call in calls]
+    assert done == sorted(done)
+    assert calls[-1][0] == calls[-1][1]
+
+    image = dataset.read_image(0)
+    assert image.shape == (128, 128, 4)
+    assert image[64, 64, 3] == 255, "the face is solid"
+    assert image[2, 2, 3] == 0, "the background is gone"
+    assert (image[..., 3] > 0).mean() < 0.7
+
+
+def test_tracking_twice_gives_the_same_dataset(
+    portrait: tuple[Path, list[int]], tmp_path: Path
+) -> None:
+    config = TrackConfig(image_size=64, key_frames=2, max_frames=3, focal_px=500.0)
+    first, second = (track_video(portrait[0], tmp_path / name, config) for name in "ab")
+    np.testing.assert_array_equal(first.theta.numpy(), second.theta.numpy())
+    np.testing.assert_array_equal(first.read_image(1), second.read_image(1))
+
+
+def test_torso_is_kept_only_when_asked_for(
+    portrait: tuple[Path, list[int]], tmp_path: Path
+) -> None:
+    shares = []
+    for keep in (False, True):
+        config = TrackConfig(
+            image_size=96, key_frames=1, max_frames=1, focal_px=500.0, keep_torso=keep
+        )
+        dataset = track_video(portrait[0], tmp_path / str(keep), config)
+        shares.append(dataset.read_image(0)[-8:, :, 3].mean() / 255)
+    assert shares[0] < 0.05
+    assert shares[1] > 0.3
+
+
+def test_no_face_anywhere_is_told_and_leaves_no_dataset(tmp_path: Path) -> None:
+    clip = write_clip(tmp_path / "grey.mp4", gradient_images(3, 96, 96))
+    with pytest.raises(UserError, match="No face"):
+        track_video(clip, tmp_path / "set")
+    assert not (tmp_path / "set" / "dataset.json").exists()
+
+
+def test_missing_mediapipe_is_told_with_the_command_that_installs_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import importlib
+
+    real = importlib.import_module
+
+    def refuse(name: str, *rest: Any) -> Any:
+        if name == "mediapipe":
+            raise ModuleNotFoundError("No module named 'mediapipe'")
+        return real(name, *rest)
+
+    monkeypatch.setattr(importlib, "import_module", refuse)
+    clip = write_clip(tmp_path / "grey.mp4", gradient_images(2, 96, 96))
+    with pytest.raises(UserError, match=r"--no-deps mediapipe==0\.10\.9"):
+        track_video(clip, tmp_path / "set")
+
+
+def test_an_existing_dataset_is_not_overwritten_unasked(
+    portrait: tuple[Path, list[int]], tmp_path: Path
+) -> None:
+    (tmp_path / "note.txt").write_text("mine")
+    with pytest.raises(UserError, match="not empty"):
+        track_video(portrait[0], tmp_path, TrackConfig(max_frames=2))
+
+
+def test_interruption_leaves_no_dataset(portrait: tuple[Path, list[int]], tmp_path: Path) -> None:
+    def interrupt(done: int, total: int) -> None:
+        if done > total - 2:
+            raise KeyboardInterrupt
+
+    config = TrackConfig(max_frames=2, key_frames=1, image_size=64, focal_px=500.0)
+    with pytest.raises(KeyboardInterrupt):
+        track_video(portrait[0], tmp_path / "set", config, interrupt)
+    with pytest.raises(UserError):
+        load_dataset(tmp_path / "set")
+
+
+@needs_clip
+def test_ten_frames_of_the_real_clip_are_tracked_closely(tmp_path: Path) -> None:
+    config = TrackConfig(max_frames=10, key_frames=4)
+    dataset = track_video(CLIP, tmp_path / "set", config)
+    report = json.loads((tmp_path / "set" / "tracking.json").read_text())
+    assert len(dataset) == 10
+    assert report["reprojection_error_share"] < 0.01
+    assert report["mesh_reprojection_error_share"] < 0.015
+    assert dataset.theta[:, dataset.layout.slice("rotation")].abs().max() < 0.4
