@@ -35,7 +35,9 @@ typedef NativeInt NativeMask;
 template <int Lanes>
 struct Mask {
   Mask<Lanes / 2> low, high;
-  friend RGBAVATAR_MEMBER Mask operator&(Mask a, Mask b) { return {a.low & b.low, a.high & b.high}; }
+  friend RGBAVATAR_MEMBER Mask operator&(Mask a, Mask b) {
+    return {a.low & b.low, a.high & b.high};
+  }
 };
 
 template <>

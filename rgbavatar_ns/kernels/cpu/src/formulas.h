@@ -1,0 +1,13 @@
+// The shared formulas for this instruction set.
+#pragma once
+
+#include "layout.h"
+#include "simd.h"
+
+namespace rgbavatar::RGBAVATAR_ISA {
+
+#include "../../shared/gaussian_math.h"
+
+using C = BlendingConstants;
+
+}  // namespace rgbavatar::RGBAVATAR_ISA
