@@ -1,0 +1,40 @@
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import av
+import cv2
+import pytest
+
+RGBAVATAR = Path(sys.executable).with_name("rgbavatar")
+
+
+def demo(output: Path) -> subprocess.CompletedProcess[str]:
+    options = ["--frames", "12", "--image-size", "48", "--steps", "12"]
+    command = [str(RGBAVATAR), "demo", "--output", str(output), *options]
+    return subprocess.run(command, capture_output=True, text=True, timeout=400)
+
+
+@pytest.mark.slow
+def test_demo_goes_from_nothing_to_a_film_and_the_second_time_only_tells(tmp_path):
+    first = demo(tmp_path)
+    assert first.returncode == 0, first.stdout + first.stderr
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    for name in ("psnr", "ssim", "train_seconds", "images_per_second", "total_seconds"):
+        assert summary[name] > 0, name
+    assert summary["held_out_frames"] == 3
+    assert summary["total_seconds"] >= summary["train_seconds"]
+    with av.open(summary["video"]) as film:
+        frames = [frame for frame in film.decode(video=0)]
+    assert [(f.width, f.height) for f in frames] == [(3 * 48, 48)] * 3
+    assert cv2.imread(summary["picture"]).shape[0] == 3 * 48
+    assert "ns-viewer" in first.stdout
+    assert str(summary["picture"]) in first.stdout.replace("\n", "")
+
+    second = demo(tmp_path)
+    assert second.returncode == 0
+    assert second.stdout.count("done before") == 4
+    again = json.loads((tmp_path / "summary.json").read_text())
+    assert again["psnr"] == summary["psnr"]
+    assert again["total_seconds"] < summary["total_seconds"]
