@@ -17,6 +17,7 @@ from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader
 from torch.nn import Parameter
 
+from rgbavatar_ns.avatar.losses import random_backgrounds
 from rgbavatar_ns.data import ImageCache, OfflineOrder
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.plugin.dataparser import (
@@ -62,7 +63,7 @@ class RGBAvatarDataManagerConfig(FullImageDatamanagerConfig):
     prefetch_steps: int = 2
     """Steps whose images are decoded ahead."""
     seed: int | None = None
-    """Seed of the frame order; by default that of the run, `--machine.seed`."""
+    """Seed of frame order and backgrounds; by default that of the run, `--machine.seed`."""
     masks_on_gpu: tyro.conf.Suppress[bool] = False
     images_on_gpu: tyro.conf.Suppress[bool] = False
     camera_res_scale_factor: tyro.conf.Suppress[float] = 1.0
@@ -120,6 +121,7 @@ class RGBAvatarDataManager(DataManager):
     ) -> None:
         install_user_error_hook()
         self.config = config
+        self.seed = 0 if config.seed is None else config.seed
         self.device = device
         self.test_mode = test_mode
         self.test_split = "val" if test_mode == "val" else "test"
@@ -141,11 +143,9 @@ class RGBAvatarDataManager(DataManager):
 
     def setup_train(self) -> None:
         """Put the frame order in place; images are decoded when the first step asks."""
-        tracked, config = self.dataparser.tracked, self.config
-        seed = 0 if config.seed is None else config.seed
-        self._train_order = frame_sampler(config, tuple(tracked.train), seed)
+        positions = tuple(self.dataparser.tracked.train)
+        self._train_order = frame_sampler(self.config, positions, self.seed)
         self._train_cameras = self.train_dataset.cameras.to(self.device)
-        self._train_row = {position: row for row, position in enumerate(tracked.train)}
 
     def setup_eval(self) -> None:
         """Put the order of the held-out frames in place, if there are any."""
@@ -155,7 +155,6 @@ class RGBAvatarDataManager(DataManager):
         batch_size = min(config.batch_size, len(tracked.test))
         self._eval_order = OfflineOrder(tracked.test, batch_size, 0)
         self._eval_cameras = self.eval_dataset.cameras.to(self.device)
-        self._eval_row = {position: row for row, position in enumerate(tracked.test)}
 
     @cached_property
     def image_cache(self) -> ImageCache:
@@ -167,26 +166,41 @@ class RGBAvatarDataManager(DataManager):
         )
 
     def next_train(self, step: int) -> tuple[Cameras, dict[str, Any]]:
-        """Cameras and RGBA images of the training frames of `step`, a function of it alone."""
-        positions = self._train_order.batch(step)
-        images = self.image_cache.get(positions)
+        """Cameras, images and backgrounds of the training frames of `step`, a function of it."""
+        batch = self._batch(self._train_order.batch(step), self._train_cameras, 0, step)
         for ahead in range(1, self.config.prefetch_steps + 1):
             self.image_cache.prefetch(self._train_order.batch(step + ahead))
-        rows = torch.tensor([self._train_row[position] for position in positions])
-        batch = {"image": images.to(self.device), "position": positions, "step": step}
-        return self._train_cameras[rows.to(self.device)], batch
+        return batch
 
     def next_eval(self, step: int) -> tuple[Cameras, dict[str, Any]]:
-        """Cameras and RGBA images of some held-out frames, in the same form as a training batch."""
-        positions = self._eval_order.batch(step)
-        rows = torch.tensor([self._eval_row[position] for position in positions])
-        images = self.image_cache.get(positions)
-        batch = {"image": images.to(self.device), "position": positions, "step": step}
-        return self._eval_cameras[rows.to(self.device)], batch
+        """Some held-out frames, in the same form as a training batch."""
+        first = len(self.train_dataset)
+        return self._batch(self._eval_order.batch(step), self._eval_cameras, first, step)
+
+    def _batch(
+        self, positions: list[int], cameras: Cameras, first: int, step: int
+    ) -> tuple[Cameras, dict[str, Any]]:
+        """Frames at `positions`, whose cameras begin with that of position `first`.
+
+        Every image has a background colour of its own (paper, sec. 3.2), which its camera brings
+        to the model.
+        """
+        images = self.image_cache.get(positions).to(self.device)
+        rows = torch.tensor(positions, device=self.device) - first
+        chosen = cameras[rows]
+        background = random_backgrounds(step, len(positions), self.seed).to(self.device)
+        chosen.metadata = {**(chosen.metadata or {}), "background": background}
+        batch = {
+            "image": images,
+            "background": background,
+            "position": positions,
+            "step": step,
+        }
+        return chosen, batch
 
     def next_eval_image(self, step: int) -> tuple[Cameras, dict[str, Any]]:
         """One held-out frame: its camera, and its picture over black [H, W, 3]."""
-        row = self._eval_row[self._eval_order.batch(step)[0]]
+        row = self._eval_order.batch(step)[0] - len(self.train_dataset)
         return self.eval_dataloader.get_camera(row)
 
     @cached_property

@@ -26,7 +26,6 @@ from rgbavatar_ns.avatar.losses import (
     LPIPSLoss,
     composite,
     l1_loss,
-    random_backgrounds,
     rgba_to_float,
 )
 from rgbavatar_ns.avatar.metrics import LPIPSMetric, evaluate_images
@@ -61,7 +60,7 @@ class RGBAvatarModelConfig(ModelConfig):
     rasterizer: str = "auto"
     """Backend of the rasterizer, one of `rgbavatar_ns.kernels.available_backends()` or auto."""
     seed: int | None = None
-    """Seed of initial values and backgrounds; by default that of the run, `--machine.seed`."""
+    """Seed of the weight network's initial values; by default that of the run, `--machine.seed`."""
     enable_collider: bool = False
     """Part of nerfstudio's ray-based models; not used."""
 
@@ -82,9 +81,9 @@ class RGBAvatarModel(Model):
         subject = self.kwargs["metadata"]["subject"]
         assert isinstance(subject, Subject)
         self.subject = subject
-        self.seed = 0 if self.config.seed is None else self.config.seed
+        seed = 0 if self.config.seed is None else self.config.seed
         self.avatar = Avatar(
-            HeadModel(subject.arrays), subject.identity, self.config.avatar, seed=self.seed
+            HeadModel(subject.arrays), subject.identity, self.config.avatar, seed=seed
         )
         self.register_buffer("frame_theta", subject.theta, persistent=False)
         self.viewer_panel = ViewerPanel(len(subject.theta), _viewpoint(self.avatar, subject))
@@ -97,10 +96,10 @@ class RGBAvatarModel(Model):
         return self.avatar.parameter_groups()
 
     def get_outputs(self, ray_bundle: RayBundle | Cameras) -> dict[str, Tensor | list[Any]]:
-        """Draw B cameras: rgb over black [B H W 3], accumulation and depth in metres [B H W 1].
+        """Draw B cameras: rgb [B H W 3], accumulation and depth in metres [B H W 1].
 
-        Depth is along the camera's z, and only computed outside training. The viewer's cameras
-        are drawn over the viewer panel's background.
+        The background is what the cameras' metadata brings, else black; for the viewer's cameras
+        it is the panel's. Depth is along the camera's z, and only computed outside training.
         """
         if not isinstance(ray_bundle, Cameras):
             raise UserError(
@@ -112,7 +111,7 @@ class RGBAvatarModel(Model):
     def _draw(self, cameras: Cameras) -> Outputs:
         cameras = cameras if cameras.shape else cameras.reshape((1,))
         metadata = cameras.metadata or {}
-        theta, background = metadata.get("theta"), None
+        theta, background = metadata.get("theta"), metadata.get("background")
         if theta is None:
             position = self.viewer_panel.position(cameras.times)
             theta = self.frame_theta[position].expand(len(cameras), -1)
@@ -143,15 +142,12 @@ class RGBAvatarModel(Model):
         batch: dict[str, Any],
         metrics_dict: dict[str, Tensor] | None = None,
     ) -> dict[str, Tensor]:
-        """L1 of both images laid over one random background an image, and LPIPS if it is on."""
-        step = batch["step"]
-        target_rgba = rgba_to_float(batch["image"].to(self.device))
-        background = random_backgrounds(step, len(target_rgba), self.seed).to(self.device)
-        seen_through = 1.0 - outputs["accumulation"]
-        image = outputs["rgb"] + seen_through * background[:, None, None]
-        target = composite(target_rgba, background)
+        """L1 of both images over the batch's backgrounds, and LPIPS if it is on."""
+        image = outputs["rgb"]
+        target_rgba = rgba_to_float(batch["image"])
+        target = composite(target_rgba, batch["background"])
         losses = {"l1": l1_loss(image, target)}
-        if self.config.lpips_weight > 0 and step >= self.config.lpips_start_step:
+        if self.config.lpips_weight > 0 and batch["step"] >= self.config.lpips_start_step:
             losses["lpips"] = self.config.lpips_weight * self.lpips_loss(image, target)
         self._target_rgba = target_rgba
         return losses

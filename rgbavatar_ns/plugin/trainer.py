@@ -225,7 +225,7 @@ class RGBAvatarTrainer(Trainer):
         CONSOLE.print(f"Config: {self.base_dir / 'config.yml'}", highlight=False, soft_wrap=True)
         CONSOLE.print(f"Checkpoints: {self.checkpoint_dir}", highlight=False, soft_wrap=True)
 
-    def _write_summary(self) -> dict[str, float]:
+    def _write_summary(self) -> dict[str, int | float]:
         """The run's length and speed over all its sessions, as training.json."""
         steps = self.step + 1
         datamanager = self.pipeline.datamanager

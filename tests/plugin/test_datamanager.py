@@ -39,6 +39,8 @@ def test_a_batch_is_different_frames_with_their_own_images_cameras_and_theta(
             assert np.array_equal(batch["image"][i].numpy(), tracked.read_image(position))
         assert cameras.metadata is not None
         assert torch.equal(cameras.metadata["theta"], tracked.theta[positions])
+        assert torch.equal(cameras.metadata["background"], batch["background"])
+        assert len(torch.unique(batch["background"], dim=0)) == 4
         seen = from_nerfstudio(cameras).world_to_camera
         expected = tracked.cameras.world_to_camera.expand(len(tracked), 4, 4)[positions]
         torch.testing.assert_close(seen, expected, atol=1e-6, rtol=0)
@@ -62,6 +64,7 @@ def test_a_step_is_the_same_whenever_it_is_asked_for(
         there, here = other.next_train(step)[1], datamanager.next_train(step)[1]
         assert there["position"] == here["position"]
         assert torch.equal(there["image"], here["image"])
+        assert torch.equal(there["background"], here["background"])
 
 
 def test_batches_larger_than_the_dataset_are_the_dataset(tiny_data: Path):
@@ -92,3 +95,13 @@ def test_single_evaluation_frame_belongs_to_its_camera(
     tracked = datamanager.dataparser.tracked
     assert position in tracked.test
     assert tracked.test[int(batch["image_idx"])] == position
+
+
+def test_held_out_batches_belong_to_their_cameras(datamanager: RGBAvatarDataManager):
+    cameras, batch = datamanager.next_eval(0)
+    tracked = datamanager.dataparser.tracked
+    assert sorted(batch["position"]) == list(tracked.test)
+    assert cameras.metadata is not None
+    assert cameras.metadata["position"].flatten().tolist() == batch["position"]
+    for image, position in zip(batch["image"], batch["position"]):
+        assert np.array_equal(image.numpy(), tracked.read_image(position))

@@ -18,7 +18,7 @@ from rgbavatar_ns.plugin.checkpoints import list_checkpoints, read_checkpoint
 from rgbavatar_ns.plugin.trainer import RGBAvatarTrainer
 from tests.plugin.run import SMALL, make_trainer, small_config
 
-STEPS = 20
+STEPS = 12
 
 
 def _train(data: Path, output: Path, **fields: Any) -> RGBAvatarTrainer:
@@ -99,7 +99,7 @@ def test_interrupted_run_saves_and_goes_on_as_if_nothing_had_been(
     trainer = make_trainer(small_config(tiny_data, tmp_path, **_FALLING))
 
     def interrupt(step: int) -> None:
-        if step == 6:
+        if step == 4:
             signal.raise_signal(number)
 
     where = [TrainingCallbackLocation.BEFORE_TRAIN_ITERATION]
@@ -108,7 +108,7 @@ def test_interrupted_run_saves_and_goes_on_as_if_nothing_had_been(
         trainer.train()
     assert ended.value.code == 128 + number
     # The step in which the signal came is finished, saved, and not done again.
-    assert [step for step, _ in list_checkpoints(trainer.checkpoint_dir)] == [6]
+    assert [step for step, _ in list_checkpoints(trainer.checkpoint_dir)] == [4]
     resumed = _train(tiny_data, tmp_path, load_dir=trainer.checkpoint_dir, **_FALLING)
     _assert_equal_runs(_newest(resumed), uninterrupted)
 

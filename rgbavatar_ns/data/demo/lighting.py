@@ -58,7 +58,8 @@ def shade(samples: Samples) -> Vectors:
     rim = np.clip((n @ _RIM_DIRECTION)[:, None], 0, 1) * openness
     up = 0.5 + 0.5 * n[:, 1:2]
     # Light that has bounced in a cavity of flesh is redder.
-    ambient = (_FLOOR + (_SKY - _FLOOR) * up) * openness ** np.array([0.8, 1.1, 1.15], np.float32)
+    bounced = openness * (1 + (1 - openness) * np.array([0.20, -0.09, -0.13], np.float32))
+    ambient = (_FLOOR + (_SKY - _FLOOR) * up) * bounced
     diffuse = samples.albedo * (_KEY * key + _FILL * fill + _RIM * rim + ambient)
     shine = _highlight(samples, KEY_DIRECTION)[:, None] * samples.lit[:, None] * _KEY
     shine = shine + _highlight(samples, _FILL_DIRECTION)[:, None] * _FILL * openness

@@ -31,6 +31,7 @@ Progress = Callable[[int, int], None]
 
 WIDE_OPEN_RAD = 0.33
 _THREADS = 2
+_CHUNK = 16
 _CAMERA_HEIGHT_M = 0.007
 _CAMERA_DISTANCE_M = 1.1
 _HALF_VIEW_M = 0.153
@@ -89,6 +90,7 @@ class DemoPerson:
         layout = self.head.layout
         expression = theta[:, layout.slice("expression")].double().numpy()
         names = self.head.arrays.expression_names
+        vertices = np.zeros((0, 0, 3), np.float32)
         activations = wrinkle_activations(expression, names)
         jaw = theta[:, layout.slice("jaw").start].double().numpy() / WIDE_OPEN_RAD
         smile = 0.5 * (
@@ -96,9 +98,11 @@ class DemoPerson:
             + expression[:, names.index("mouthSmileRight")]
         )
         for k in range(len(theta)):
+            if k % _CHUNK == 0:
+                vertices = self.head(theta[k : k + _CHUNK], self.identity).numpy()
             rotation, shift = self._skull(theta[k])
             yield Moment(
-                tracked=self.head(theta[k], self.identity).numpy(),
+                tracked=vertices[k % _CHUNK],
                 activations=activations[k],
                 blush=float(smile[k]),
                 jaw_open=float(np.clip(jaw[k], 0, 1)),

@@ -1,7 +1,5 @@
 """The person's colours: textures painted once as functions of the place on the template head."""
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 import torch
@@ -25,37 +23,63 @@ def wrinkle_heights_m(p: Points) -> Float[np.ndarray, "N W"]:
     return wrinkle_depths(p) * _WRINKLE_DEPTH_M.astype(np.float32)
 
 
-@dataclass(frozen=True)
 class Paint:
-    """Textures over the head's UV map (row 0 at v = 1); colours are linear, heights metres."""
+    """Textures over the head's UV map (row 0 at v = 1): colour, gloss, and how the surface tilts.
 
-    albedo: Float[np.ndarray, "R R 3"]
-    gloss: Float[np.ndarray, "R R"]
-    relief_m: Float[np.ndarray, "R R"]
-    """Fixed relief: pores and strands of hair."""
-    wrinkles_m: Float[np.ndarray, "W R R"]
-    cheeks: Float[np.ndarray, "R R"]
-    """Where blood shows."""
-    metres_per_texel: Float[np.ndarray, "R R 2"]
-    """Length of one texel to the right and upwards."""
+    Args:
+        color: linear colour and gloss.
+        relief_m: fixed heights: pores and strands of hair.
+        wrinkles_m: heights of each fully folded group of wrinkles.
+        cheeks: where blood shows, in [0, 1].
+        metres_per_texel: length of one texel to the right and upwards.
+    """
+
+    def __init__(
+        self,
+        color: Float[np.ndarray, "R R 4"],
+        relief_m: Float[np.ndarray, "R R"],
+        wrinkles_m: Float[np.ndarray, "R R W"],
+        cheeks: Float[np.ndarray, "R R"],
+        metres_per_texel: Float[np.ndarray, "R R 2"],
+    ) -> None:
+        self._color = color
+        self._slope = _slopes(relief_m, metres_per_texel)
+        groups = [_slopes(height, metres_per_texel) for height in np.moveaxis(wrinkles_m, -1, 0)]
+        slopes = np.stack(groups, -1)
+        changing = (np.abs(wrinkles_m).max(-1) > 1e-6) | (cheeks > 0.01)
+        changing |= np.abs(slopes).max((-1, -2)) > 1e-3
+        self._changing = np.flatnonzero(changing)
+        self._wrinkles_m = wrinkles_m[changing]
+        self._slopes = slopes[changing]
+        self._cheeks = cheeks[changing]
 
     def folded(
         self, activations: Float[np.ndarray, "W"], blush: float
     ) -> tuple[Float[np.ndarray, "R R 4"], Float[np.ndarray, "R R 2"]]:
         """Colour and gloss, and the surface's slope to the right and upwards, of one frame."""
-        wrinkles = np.tensordot(activations.astype(np.float32), self.wrinkles_m, 1)
+        folds = activations.astype(np.float32)
+        heights = self._wrinkles_m @ folds * np.float32(1 / 8e-4)
         # Valleys see less of the sky and gather blood; rolls are stretched and pale.
-        shade = 1 - 0.55 * np.clip(-wrinkles / 8e-4, 0, 1) + 0.10 * np.clip(wrinkles / 8e-4, 0, 1)
-        color = np.empty((*shade.shape, 4), np.float32)
-        flush = np.float32(blush) * self.cheeks
-        for channel, (redness, glow) in enumerate(((0.75, 0.06), (1.05, -0.15), (1.05, -0.13))):
-            color[..., channel] = self.albedo[..., channel] * shade**redness * (1 + glow * flush)
-        color[..., 3] = self.gloss
-        height = self.relief_m + wrinkles
-        slope = np.empty((*shade.shape, 2), np.float32)
-        slope[..., 0] = cv2.Sobel(height, -1, 1, 0, ksize=3, scale=0.125)
-        slope[..., 1] = cv2.Sobel(height, -1, 0, 1, ksize=3, scale=-0.125)
-        return color, slope / self.metres_per_texel
+        valley, roll = np.clip(-heights, 0, 1), np.clip(heights, 0, 1)
+        flush = np.float32(blush) * self._cheeks
+        color, slope = self._color.copy(), self._slope.copy()
+        flat = color.reshape(-1, 4)
+        factor = np.ones((len(flush), 4), np.float32)
+        for channel, (dark, glow) in enumerate(((0.45, 0.06), (0.57, -0.15), (0.57, -0.13))):
+            factor[:, channel] = (1 - dark * valley + 0.1 * roll) * (1 + glow * flush)
+        flat[self._changing] *= factor
+        slope.reshape(-1, 2)[self._changing] += self._slopes @ folds
+        return color, slope
+
+
+def _slopes(
+    height_m: Float[np.ndarray, "R R"], metres_per_texel: Float[np.ndarray, "R R 2"]
+) -> Float[np.ndarray, "R R 2"]:
+    """Slope of a height map to the right and upwards."""
+    height_m = np.ascontiguousarray(height_m)
+    right = cv2.Sobel(height_m, -1, 1, 0, ksize=3, scale=0.125)
+    up = cv2.Sobel(height_m, -1, 0, 1, ksize=3, scale=-0.125)
+    return np.stack([right, up], -1) / metres_per_texel
 
 
 def paint_head(arrays: HeadArrays, resolution: int, seed: int, wrinkles: float) -> Paint:
@@ -79,11 +103,10 @@ def paint_head(arrays: HeadArrays, resolution: int, seed: int, wrinkles: float) 
     columns.append(_texel_lengths(arrays, triangle, resolution))
     maps = _spread(np.concatenate(columns, 1), anchors.texel_row_col.numpy(), resolution)
     return Paint(
-        albedo=maps[..., :3],
-        gloss=maps[..., 3],
-        relief_m=np.ascontiguousarray(maps[..., 4]),
+        color=np.ascontiguousarray(maps[..., :4]),
+        relief_m=maps[..., 4],
         cheeks=maps[..., 5],
-        wrinkles_m=np.ascontiguousarray(np.moveaxis(maps[..., 6:-2], -1, 0)),
+        wrinkles_m=maps[..., 6:-2],
         metres_per_texel=np.maximum(maps[..., -2:], 1e-5),
     )
 

@@ -69,15 +69,20 @@ def perform(
     expression = _Expression(expression_names, seconds)
     talk = _talking(rng, seconds)
     common = [name for name in MOUTH_MOODS if name not in EARLY_ONLY]
-    decks = ((early_end, [*EARLY_ONLY, *common[:2]]), (train_end, common), (np.inf, [*MOUTH_MOODS]))
-    for start, length, name in _dealt(rng, seconds[-1], decks, 1.5):
+    # Every mood is to come back however short the end is.
+    hurried = float(np.clip((seconds[-1] - train_end) / (1.1 * len(MOUTH_MOODS)), 0.3, 1.5))
+    moods = (
+        _Deck(early_end, [*EARLY_ONLY, *common[:2]], 1.4),
+        _Deck(train_end, common, 1.5),
+        _Deck(np.inf, [*MOUTH_MOODS], hurried),
+    )
+    for start, length, name in _dealt(rng, seconds[-1], moods):
         level = rng.uniform(0.7, 1.0)
         expression.add(MOUTH_MOODS[name], level * _hump(seconds, start, length, 0.35))
-    brows = ((np.inf, list(BROW_MOODS)),)
-    for start, length, name in _dealt(rng, seconds[-1], brows, 1.3):
+    for start, length, name in _dealt(rng, seconds[-1], [_Deck(np.inf, [*BROW_MOODS], 1.3)]):
         level = rng.uniform(0.65, 1.0)
         expression.add(BROW_MOODS[name], level * _hump(seconds, start, length, 0.3))
-    for start, length, name in _dealt(rng, seconds[-1], ((np.inf, list(VISEMES)),), 0.24):
+    for start, length, name in _dealt(rng, seconds[-1], [_Deck(np.inf, [*VISEMES], 0.24)]):
         level = talk * rng.uniform(0.6, 1.0)
         expression.add(VISEMES[name], level * _hump(seconds, start, 1.7 * length, 0.12))
     gaze = _gaze(rng, seconds)
@@ -138,20 +143,27 @@ def _hump(seconds: np.ndarray, start: float, length: float, ramp: float) -> np.n
     return rise * rise * (3 - 2 * rise)
 
 
+@dataclass(frozen=True)
+class _Deck:
+    """Cards in force until a time; each lasts some `length` seconds."""
+
+    until: float
+    cards: list[str]
+    length: float
+
+
 def _dealt(
-    rng: np.random.Generator,
-    end: float,
-    decks: Sequence[tuple[float, list[str]]],
-    mean_length: float,
+    rng: np.random.Generator, end: float, decks: Sequence[_Deck]
 ) -> list[tuple[float, float, str]]:
-    """(start, length, card) one after another: cards of the deck in force, dealt without
-    repeats until it is used up and shuffled again."""
-    dealt, now, hand, in_force = [], 0.1 * mean_length, [], -1
+    """Deal (start, length, card) one after another until `end`: cards of the deck in force,
+    without repeats until it is used up and shuffled again."""
+    now = 0.1 * decks[0].length
+    dealt, hand, in_force = [], [], None
     while now < end:
-        deck = next(k for k, (until, _) in enumerate(decks) if now < until)
-        if deck != in_force or not hand:
-            in_force, hand = deck, list(rng.permutation(decks[deck][1]))
-        length = mean_length * rng.uniform(0.75, 1.3)
+        deck = next(deck for deck in decks if now < deck.until)
+        if deck is not in_force or not hand:
+            in_force, hand = deck, list(rng.permutation(deck.cards))
+        length = deck.length * rng.uniform(0.75, 1.3)
         dealt.append((now, length, str(hand.pop())))
         now += length
     return dealt

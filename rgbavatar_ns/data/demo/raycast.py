@@ -169,8 +169,9 @@ def _has_edge(hits: Hits, material: np.ndarray, shape: tuple[int, int]) -> np.nd
     cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
 
     def spread(values: np.ndarray) -> np.ndarray:
-        pairs = values.reshape(*shape, -1).astype(np.float32)
-        return cv2.dilate(pairs.max(-1), cross) - cv2.erode(pairs.min(-1), cross)
+        first, second = (values[k::2].reshape(shape).astype(np.float32) for k in (0, 1))
+        highest, lowest = np.maximum(first, second), np.minimum(first, second)
+        return cv2.dilate(highest, cross) - cv2.erode(lowest, cross)
 
     kind = spread(np.where(met, material[hits.triangle], -1))
     depth = spread(np.where(met, hits.distance, 0))

@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 Points = Float[np.ndarray, "N 3"]
 Values = Float[np.ndarray, "N"]
+Level = float | int | np.ndarray
 
 EYE_CENTRE_M = np.array([0.0289, 0.0300, 0.0300])
 """Of the left eyeball; the right one is its mirror image."""
@@ -21,13 +22,13 @@ _HAIRLINE_Z = np.array(
 _HAIRLINE_Y = np.array([-0.050, -0.048, -0.020, 0.043, 0.043, -0.004, 0.000, 0.036, 0.060, 0.076])
 
 
-def smooth(value: np.ndarray, start: float, end: float) -> np.ndarray:
+def smooth(value: np.ndarray, start: Level, end: Level) -> np.ndarray:
     """Smoothstep from 0 at `start` to 1 at `end`; `end` may be the smaller one."""
     t = np.clip((value - start) / (end - start), 0, 1)
     return t * t * (3 - 2 * t)
 
 
-def bump(value: np.ndarray, centre: float, width: float) -> np.ndarray:
+def bump(value: np.ndarray, centre: Level, width: float) -> np.ndarray:
     """A Gaussian bell of height 1."""
     return np.exp(-0.5 * ((value - centre) / width) ** 2)
 

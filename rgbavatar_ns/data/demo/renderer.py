@@ -20,6 +20,7 @@ from rgbavatar_ns.data.demo.paint import Paint, paint_eye
 from rgbavatar_ns.data.demo.raycast import PixelRays, RayScene, StillCamera, cast_pixels
 from rgbavatar_ns.data.demo.regions import smooth
 from rgbavatar_ns.data.demo.surface import PARTS, PosedSurface, TrueSurface, unit
+from rgbavatar_ns.data.demo.wrinkles import WRINKLES
 
 _FRAME_MATERIAL = len(PARTS)
 _AMBIENT_RAYS = 48
@@ -69,7 +70,7 @@ class DemoRenderer:
         self._device = EmbreeDevice()
         self._surface, self._paint, self._glasses = surface, paint, glasses
         self._camera, self._supersampling = camera, supersampling
-        still = np.zeros(len(paint.wrinkles_m))
+        still = np.zeros(len(WRINKLES))
         self._openness = [
             self._ambient(surface.pose(vertices, still)) for vertices in (at_rest, jaw_open)
         ]

@@ -92,7 +92,9 @@ class TrueSurface:
         self._hair_m = (full * locks * smooth(above, -0.001, 0.022) * skin).astype(np.float32)
         self._folds_m = wrinkle_heights_m(self.template) * (skin * np.float32(wrinkles))[:, None]
 
-    def _rounded(self, tracked: Vertices, normals: Vertices) -> Vertices:
+    def _rounded(
+        self, tracked: Float[np.ndarray, "C 3"], normals: Float[np.ndarray, "C 3"]
+    ) -> Float[np.ndarray, "V 3"]:
         """Vertices after splitting; skull and neck, coarse in the head model, are rounded.
 
         Phong tessellation (Boubekeur and Alexa 2008): an edge's middle moves towards the planes
