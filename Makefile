@@ -2,6 +2,8 @@
 PYTHON ?= python3
 VIDEO ?=
 BIN := .venv/bin
+# OpenMP's threads spin while they wait, which stalls everything where other programs run too.
+export OMP_WAIT_POLICY ?= PASSIVE
 STARTED := $(shell date +%s)
 
 .PHONY: help setup demo test test-fast lint format clean

@@ -1,6 +1,7 @@
 """`rgbavatar demo`: from nothing (or from a video) to a trained avatar, through nerfstudio."""
 
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -15,6 +16,12 @@ from rgbavatar_ns.cli.stages import Result, Stages, write_json
 from rgbavatar_ns.errors import UserError
 
 METHOD = "rgbavatar-tiny"
+_QUIET = {
+    # OpenMP's threads spin while they wait, which stalls training where other programs run too.
+    "OMP_WAIT_POLICY": "PASSIVE",
+    # torchvision's file decoders, which nothing here uses, may not match the build of torch.
+    "PYTHONWARNINGS": "ignore::UserWarning:torchvision.io.image,ignore::FutureWarning",
+}
 
 
 def run(
@@ -117,7 +124,8 @@ def _call(*command: str | Path) -> None:
     On Ctrl-C the command is given the time to save what it has.
     """
     program = Path(sys.executable).with_name(str(command[0]))
-    with subprocess.Popen([str(program), *map(str, command[1:])]) as process:
+    environment = _QUIET | os.environ
+    with subprocess.Popen([program, *map(str, command[1:])], env=environment) as process:
         try:
             code = process.wait()
         except KeyboardInterrupt:
