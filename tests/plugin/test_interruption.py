@@ -33,7 +33,7 @@ def test_second_interrupt_breaks():
 def test_stop_by_the_program_is_no_failure():
     with StopRequest() as stop:
         stop.request()
-        assert stop.wait(10)
+        assert stop.wait(10.0)
         assert stop.exit_code == 0
 
 
