@@ -122,9 +122,12 @@ def fit(
     options = TrainingOptions() if options is None else options
     optimizer = make_optimizer(avatar) if optimizer is None else optimizer
     lpips = LPIPSLoss() if options.lpips_weight > 0 else None
-    losses = []
+    # One tensor for all: a small one kept from each step would split the allocator's large free
+    # blocks, and the process would grow by about an image batch a step.
+    losses = torch.zeros(steps)
     for step in range(first_step, first_step + steps):
-        losses.append(training_step(avatar, optimizer, batch_at(step), step, options, lpips))
+        loss = training_step(avatar, optimizer, batch_at(step), step, options, lpips)
+        losses[step - first_step] = loss
         if on_step is not None:
-            on_step(step, losses[-1])
-    return torch.stack(losses) if losses else torch.zeros(0)
+            on_step(step, loss)
+    return losses
