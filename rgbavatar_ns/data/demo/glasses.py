@@ -57,18 +57,18 @@ def make_glasses(
     tubes, lenses = [], []
     for side in (1.0, -1.0):
         outline = _outline(side, half_gap) + centre
-        tubes.append(_tube(outline, 0.00135, closed=True))
+        tubes.append(_tube(outline, 0.00115, closed=True))
         lenses.append(_lens(outline, centre + np.array([side * half_gap, 0, 0])))
         hinge = np.array([side * (half_gap + 0.0265), 0.0075, -0.0075]) + centre
         ear = np.array([side * 0.0745, middle[1] + 0.0060, -0.030])
         bend = np.array([side * 0.0755, middle[1] - 0.014, -0.052])
         corner = np.array([side * (half_gap + 0.0225), 0.0085, -0.0020]) + centre
         arm = np.stack([corner, hinge, 0.5 * (hinge + ear) + [side * 0.003, 0, 0], ear, bend])
-        tubes.append(_tube(_refine(arm), 0.0014, closed=False))
+        tubes.append(_tube(_refine(arm), 0.0012, closed=False))
     arc = np.linspace(-1, 1, 9)
     inner = half_gap - 0.0215
     bridge = np.stack([arc * inner, 0.0055 + 0.0035 * (1 - arc**2), 0.0022 * (1 - arc**2)], 1)
-    tubes.append(_tube(bridge + centre, 0.0013, closed=False))
+    tubes.append(_tube(bridge + centre, 0.00115, closed=False))
     return Glasses(joined(tubes), joined(lenses))
 
 

@@ -15,13 +15,13 @@ KEY_DIRECTION = unit(np.array([-0.55, 0.55, 0.65])).astype(np.float32)
 """Towards the large lamp at the upper left of the picture, the only one that casts shadows."""
 KEY_SPREAD = 0.035
 """Radius of the lamp as seen from the head, in radians."""
-_KEY = np.array([1.62, 1.52, 1.38], np.float32)
+_KEY = np.array([1.42, 1.34, 1.22], np.float32)
 _FILL_DIRECTION = unit(np.array([0.75, 0.10, 0.55])).astype(np.float32)
 _FILL = np.array([0.30, 0.34, 0.42], np.float32)
 _RIM_DIRECTION = unit(np.array([0.70, 0.35, -0.62])).astype(np.float32)
 _RIM = np.array([0.95, 0.90, 0.85], np.float32)
-_SKY = np.array([0.30, 0.31, 0.34], np.float32)
-_FLOOR = np.array([0.16, 0.13, 0.11], np.float32)
+_SKY = np.array([0.38, 0.39, 0.42], np.float32)
+_FLOOR = np.array([0.21, 0.18, 0.16], np.float32)
 _WRAP = np.array([0.26, 0.12, 0.08], np.float32)
 
 

@@ -28,7 +28,7 @@ _AMBIENT_REACH_M = 0.12
 _SHARPNESS = np.array([16.0, 260.0, 260.0, 70.0, 70.0, 40.0, 60.0], np.float32)
 _TRANSLUCENCY = np.array([1.0, 0.3, 0.3, 0.4, 0.4, 1.0, 0.0], np.float32)
 _FRAME_SHADOW = 0.3
-_FRAME_COLOR = np.array([0.020, 0.013, 0.010], np.float32)
+_FRAME_COLOR = np.array([0.190, 0.095, 0.055], np.float32)
 
 
 @dataclass(frozen=True)

@@ -32,8 +32,8 @@ _DRIVERS: dict[str, dict[str, float]] = {
 
 
 def wrinkle_activations(
-    expression: Float[np.ndarray, "*batch E"], names: Sequence[str]
-) -> Float[np.ndarray, "*batch W"]:
+    expression: Float[np.ndarray, "F E"], names: Sequence[str]
+) -> Float[np.ndarray, "F W"]:
     """How far each group of wrinkles is folded, in [0, 1]; nothing below a slight expression.
 
     Not linear in the coefficients: skin resists at first, then folds, then can fold no more.

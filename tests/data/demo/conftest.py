@@ -19,6 +19,11 @@ def person_without_glasses() -> DemoPerson:
 
 
 @pytest.fixture(scope="session")
+def person_without_wrinkles() -> DemoPerson:
+    return DemoPerson.of(DemoConfig(image_size=SIZE, wrinkles=0.0))
+
+
+@pytest.fixture(scope="session")
 def theta_of(person):
     return partial(_theta, person)
 
