@@ -24,7 +24,11 @@ _METHODS = (
 
 
 def small_config(
-    data: Path, output: Path, avatar: AvatarConfig = SMALL, **fields: Any
+    data: Path,
+    output: Path,
+    avatar: AvatarConfig = SMALL,
+    lpips_metric: bool = False,
+    **fields: Any,
 ) -> RGBAvatarTrainerConfig:
     """rgbavatar-tiny with fewer Gaussians and steps, writing to `output`."""
     config = copy.deepcopy(rgbavatar_tiny.config)
@@ -38,6 +42,7 @@ def small_config(
     config.pipeline.datamanager.data = data
     config.pipeline.datamanager.batch_size = 4
     config.pipeline.model.avatar = avatar
+    config.pipeline.model.lpips_metric = lpips_metric
     for name, value in fields.items():
         assert hasattr(config, name)
         setattr(config, name, value)
