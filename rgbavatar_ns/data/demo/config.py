@@ -17,7 +17,7 @@ class DemoConfig:
     """Held-out frames at the end; they combine expressions and poses as no other frame does."""
     seed: int = 0
     """Seed of the person's looks, the performance and the tracker's noise."""
-    frames_per_second: float = 10.0
+    frames_per_second: float = 8.0
     """Frames per second of the performance; a second has some four syllables."""
     theta_noise: float = 1.0
     """Strength of the tracker's noise: 1 is a good tracker (.01 on expression coefficients, .1

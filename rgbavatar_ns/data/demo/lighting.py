@@ -11,17 +11,17 @@ from rgbavatar_ns.data.demo.surface import unit
 Vectors = Float[np.ndarray, "N 3"]
 Values = Float[np.ndarray, "N"]
 
-KEY_DIRECTION = unit(np.array([-0.55, 0.55, 0.65])).astype(np.float32)
+KEY_DIRECTION = unit(np.array([-0.68, 0.48, 0.58])).astype(np.float32)
 """Towards the large lamp at the upper left of the picture, the only one that casts shadows."""
 KEY_SPREAD = 0.035
 """Radius of the lamp as seen from the head, in radians."""
-_KEY = np.array([1.42, 1.34, 1.22], np.float32)
+_KEY = np.array([1.62, 1.47, 1.26], np.float32)
 _FILL_DIRECTION = unit(np.array([0.75, 0.10, 0.55])).astype(np.float32)
-_FILL = np.array([0.30, 0.34, 0.42], np.float32)
+_FILL = np.array([0.36, 0.47, 0.66], np.float32)
 _RIM_DIRECTION = unit(np.array([0.70, 0.35, -0.62])).astype(np.float32)
-_RIM = np.array([0.95, 0.90, 0.85], np.float32)
-_SKY = np.array([0.38, 0.39, 0.42], np.float32)
-_FLOOR = np.array([0.21, 0.18, 0.16], np.float32)
+_RIM = np.array([1.25, 1.18, 1.10], np.float32)
+_SKY = np.array([0.27, 0.28, 0.31], np.float32)
+_FLOOR = np.array([0.15, 0.13, 0.12], np.float32)
 _WRAP = np.array([0.26, 0.12, 0.08], np.float32)
 
 
@@ -76,19 +76,20 @@ def _highlight(samples: Samples, towards: np.ndarray) -> Values:
 
 
 def room(direction: Vectors) -> Values:
-    """How bright the room is in each direction: two windows and a strip on the ceiling."""
+    """How bright the room is in each direction: two windows with curtains, and a bright ceiling.
+
+    Their soft edges make a glare that wanders over the lenses rather than a sharp picture.
+    """
     azimuth = np.arctan2(direction[:, 0], direction[:, 2])
     elevation = np.arcsin(np.clip(direction[:, 1], -1, 1))
 
     def window(left: float, right: float, low: float, high: float) -> np.ndarray:
-        edge = 0.05
+        edge = 0.22
         across = smooth(azimuth, left, left + edge) * smooth(azimuth, right + edge, right)
         return across * smooth(elevation, low, low + edge) * smooth(elevation, high + edge, high)
 
-    light = 3.0 * window(-0.78, -0.46, -0.10, 0.62) + 2.2 * window(0.30, 0.48, -0.20, 0.50)
-    light = light + 1.4 * window(-1.5, 1.5, 0.70, 0.86)
-    bars = smooth(np.abs(elevation - 0.24), 0.015, 0.035)
-    return 0.12 + 0.10 * np.clip(direction[:, 1], 0, 1) + light * bars
+    light = 2.9 * window(-1.05, -0.45, -0.35, 0.60) + 2.3 * window(0.42, 0.85, -0.40, 0.45)
+    return 0.12 + 0.10 * np.clip(direction[:, 1], 0, 1) + light + window(-1.5, 1.5, 0.62, 1.0)
 
 
 def reflection(normals: Vectors, to_eye: Vectors) -> Values:

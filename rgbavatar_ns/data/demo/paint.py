@@ -65,7 +65,7 @@ class Paint:
         color, slope = self._color.copy(), self._slope.copy()
         flat = color.reshape(-1, 4)
         factor = np.ones((len(flush), 4), np.float32)
-        for channel, (dark, glow) in enumerate(((0.45, 0.06), (0.57, -0.15), (0.57, -0.13))):
+        for channel, (dark, glow) in enumerate(((0.45, 0.06), (0.57, -0.19), (0.57, -0.17))):
             factor[:, channel] = (1 - dark * valley + 0.1 * roll) * (1 + glow * flush)
         flat[self._changing] *= factor
         slope.reshape(-1, 2)[self._changing] += self._slopes @ folds
@@ -115,7 +115,10 @@ def _spread(values: np.ndarray, row_col: np.ndarray, resolution: int) -> np.ndar
     """Values of covered texels as a map; the others take those of the nearest covered texel."""
     covered = np.zeros((resolution, resolution), bool)
     covered[row_col[:, 0], row_col[:, 1]] = True
-    nearest = ndimage.distance_transform_edt(~covered, return_distances=False, return_indices=True)
+    nearest = np.zeros((2, *covered.shape), np.int32)
+    ndimage.distance_transform_edt(
+        ~covered, return_distances=False, return_indices=True, indices=nearest
+    )
     filled = np.zeros((resolution, resolution, values.shape[1]), np.float32)
     filled[row_col[:, 0], row_col[:, 1]] = values
     return filled[nearest[0], nearest[1]]
@@ -203,7 +206,7 @@ def _hair(
     frayed = regions.above_hairline_m(p) + 0.006 * value_noise(
         p * np.array([420, 110, 260]), seed + 7
     )
-    hair = smooth(frayed, -0.002, 0.005)
+    hair = smooth(frayed, -0.004, 0.008)
     # Combed back on top, down on the sides.
     side = smooth(np.abs(p[:, 0]), 0.035, 0.060)[:, None]
     top_way, side_way = np.array([520, 140, 60]), np.array([520, 60, 520])
@@ -211,7 +214,7 @@ def _hair(
     strands = (1 - side) * value_noise((p + curl) * top_way, seed + 9)[:, None]
     strands = strands + side * value_noise((p + curl) * side_way, seed + 10)[:, None]
     locks = fractal_noise((p + curl) * np.array([130, 60, 40]), seed + 11, 2)[:, None]
-    shade = np.clip(1 + 0.45 * strands + 0.35 * locks, 0.25, 2.2)
+    shade = np.clip(1 + 0.38 * strands + 0.32 * locks, 0.25, 2.2)
     color = _mix(color, _HAIR * shade, hair)
     strand_gloss = 0.30 + 0.25 * strands[:, 0]
     relief = _mix1(relief, 2.2e-4 * (strands + 0.8 * locks)[:, 0], hair)

@@ -70,16 +70,16 @@ def perform(
     talk = _talking(rng, seconds)
     common = [name for name in MOUTH_MOODS if name not in EARLY_ONLY]
     # Every mood is to come back however short the end is.
-    hurried = float(np.clip((seconds[-1] - train_end) / (1.1 * len(MOUTH_MOODS)), 0.3, 1.5))
+    hurried = float(np.clip((seconds[-1] - train_end) / (1.1 * len(MOUTH_MOODS)), 0.3, 1.3))
     moods = (
-        _Deck(early_end, [*EARLY_ONLY, *common[:2]], 1.4),
-        _Deck(train_end, common, 1.5),
+        _Deck(early_end, [*EARLY_ONLY, *common[:2]], 1.2),
+        _Deck(train_end, common, 1.25),
         _Deck(np.inf, [*MOUTH_MOODS], hurried),
     )
     for start, length, name in _dealt(rng, seconds[-1], moods):
         level = rng.uniform(0.7, 1.0)
         expression.add(MOUTH_MOODS[name], level * _hump(seconds, start, length, 0.35))
-    for start, length, name in _dealt(rng, seconds[-1], [_Deck(np.inf, [*BROW_MOODS], 1.3)]):
+    for start, length, name in _dealt(rng, seconds[-1], [_Deck(np.inf, [*BROW_MOODS], 1.05)]):
         level = rng.uniform(0.65, 1.0)
         expression.add(BROW_MOODS[name], level * _hump(seconds, start, length, 0.3))
     for start, length, name in _dealt(rng, seconds[-1], [_Deck(np.inf, [*VISEMES], 0.24)]):
@@ -218,11 +218,11 @@ def _head_turns(
     degree = np.pi / 180
     times = [0.0, early_end, early_end + 1.0, train_end, train_end + 0.5]
     middle = np.interp(seconds, times, [12.0, 12.0, -9.0, -9.0, 0.0])
-    reach = np.interp(seconds, times, [13.0, 13.0, 16.0, 16.0, 23.0])
-    yaw = (middle + reach * np.sin(1.35 * _waves(rng, seconds, (3.1, 5.3)))) * degree
+    reach = np.interp(seconds, times, [13.0, 13.0, 16.0, 16.0, 21.0])
+    yaw = (middle + reach * np.sin(1.35 * _waves(rng, seconds, (2.7, 4.6)))) * degree
     nod = _waves(rng, seconds, (1.3, 0.9)) * np.clip(_waves(rng, seconds, (4.0, 7.0)), 0, 1)
-    pitch = (9.0 * _waves(rng, seconds, (3.7, 6.1)) + 5.0 * nod) * degree
-    roll = 7.0 * degree * _waves(rng, seconds, (4.3, 7.9))
+    pitch = (9.0 * _waves(rng, seconds, (3.1, 5.2)) + 5.0 * nod) * degree
+    roll = 7.0 * degree * _waves(rng, seconds, (3.6, 6.4))
     sway = [3.0 * degree * _waves(rng, seconds, (6.7, 9.1)) for _ in range(3)]
     drift = [size * _waves(rng, seconds, (5.9, 8.3)) for size in (0.004, 0.003, 0.006)]
     return {

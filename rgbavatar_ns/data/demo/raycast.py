@@ -122,7 +122,7 @@ def cast_pixels(
     pixel = (rows * camera.size + columns).ravel()
     diagonal = np.array([0.25, 0.75])
     coarse = _cast_pattern(scene, camera, pixel, diagonal, diagonal)
-    edge = _has_edge(coarse[3], material, columns.shape)
+    edge = _has_edge(coarse[3], material, (bottom - top, right - left))
     places = (np.arange(supersampling) + 0.5) / supersampling
     across, down = np.meshgrid(places, places)
     fine = _cast_pattern(scene, camera, pixel[edge], across.ravel(), down.ravel())
@@ -132,13 +132,15 @@ def cast_pixels(
     fine = _chosen(fine, fine[3].triangle >= 0)
     hits = [coarse[3], fine[3]]
     return PixelRays(
-        *(np.concatenate([coarse[k], fine[k]]) for k in range(3)),
-        Hits(
+        pixel=np.concatenate([coarse[0], fine[0]]),
+        pattern=np.concatenate([coarse[1], fine[1]]),
+        directions=np.concatenate([coarse[2], fine[2]]),
+        hits=Hits(
             np.concatenate([part.triangle for part in hits]),
             np.concatenate([part.weights for part in hits]),
             np.concatenate([part.distance for part in hits]),
         ),
-        rays_per_pixel,
+        rays_per_pixel=rays_per_pixel,
     )
 
 

@@ -27,7 +27,8 @@ _AMBIENT_RAYS = 48
 _AMBIENT_REACH_M = 0.12
 _SHARPNESS = np.array([16.0, 260.0, 260.0, 70.0, 70.0, 40.0, 60.0], np.float32)
 _TRANSLUCENCY = np.array([1.0, 0.3, 0.3, 0.4, 0.4, 1.0, 0.0], np.float32)
-_FRAME_SHADOW = 0.3
+_SHADOW = 0.6
+_FRAME_SHADOW = 0.25
 _FRAME_COLOR = np.array([0.190, 0.095, 0.055], np.float32)
 
 
@@ -210,7 +211,7 @@ class DemoRenderer:
         facing = np.flatnonzero(n @ KEY_DIRECTION > -0.25)
         start = at[facing] + 6e-4 * n[facing] + 6e-4 * KEY_DIRECTION
         blocked_by = scene.cast(start.astype(np.float32), direction[facing]).triangle
-        shadow = np.where(self._material[blocked_by] == _FRAME_MATERIAL, _FRAME_SHADOW, 1.0)
+        shadow = np.where(self._material[blocked_by] == _FRAME_MATERIAL, _FRAME_SHADOW, _SHADOW)
         lit[facing] = np.where(blocked_by < 0, 1.0, 1.0 - shadow)
         return lit
 

@@ -29,7 +29,8 @@ def split_in_four(faces: Faces, count: int) -> tuple[Int[np.ndarray, "F4 3"], sp
     halves = sparse.csr_matrix(
         (np.full(ends.size, 0.5, np.float32), (rows, ends.ravel())), (len(ends), count)
     )
-    return split, sparse.vstack([sparse.identity(count, np.float32), halves]).tocsr()
+    same = sparse.csr_matrix((np.ones(count, np.float32), (range(count), range(count))))
+    return split, sparse.csr_matrix(sparse.vstack([same, halves]))
 
 
 def incidence(faces: Faces, count: int) -> sparse.csr_matrix:

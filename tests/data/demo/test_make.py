@@ -48,6 +48,10 @@ def test_noise_is_on_theta_and_not_on_the_images(tmp_path):
 
 
 def test_impossible_configs_are_refused():
-    for wrong in ({"num_test_frames": 240}, {"image_size": 0}, {"supersampling": 0}):
+    for impossible in (
+        lambda: DemoConfig(num_test_frames=240),
+        lambda: DemoConfig(image_size=0),
+        lambda: DemoConfig(supersampling=0),
+    ):
         with pytest.raises(UserError):
-            DemoConfig(**wrong)
+            impossible()

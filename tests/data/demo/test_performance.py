@@ -17,7 +17,7 @@ LAYOUT = HEAD.layout
 
 @pytest.fixture(scope="module", params=[0, 5])
 def theta(request) -> np.ndarray:
-    return perform(LAYOUT, NAMES, 240, 60, 10.0, request.param).theta
+    return perform(LAYOUT, NAMES, 240, 60, 8.0, request.param).theta
 
 
 def field(theta: np.ndarray, name: str) -> np.ndarray:
@@ -42,7 +42,7 @@ def test_everything_moves_within_its_range(theta):
 
 def test_the_head_moves_smoothly(theta):
     degrees_a_frame = np.abs(np.diff(np.degrees(field(theta, "neck")), axis=0)).max()
-    assert degrees_a_frame < 8  # at ten frames a second
+    assert degrees_a_frame < 11  # at eight frames a second
 
 
 def test_every_wrinkle_is_seen_folded_and_flat_in_training(theta):

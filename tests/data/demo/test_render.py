@@ -34,7 +34,7 @@ def silhouette(person, theta) -> np.ndarray:
     corners = (project(person, vertices) * scale - 0.5)[person.head.arrays.faces]
     mask = np.zeros((person.camera.size * scale,) * 2, np.uint8)
     for triangle in corners.round().astype(np.int32):
-        cv2.fillConvexPoly(mask, triangle, 1)
+        cv2.fillConvexPoly(mask, triangle, (1,))
     return cv2.resize(
         mask.astype(np.float32), (person.camera.size,) * 2, interpolation=cv2.INTER_AREA
     )
