@@ -58,6 +58,8 @@ rgbavatar_tiny = MethodSpecification(
             )
         ),
         max_num_iterations=1500,
+        position_lr_final=8e-5,
+        learning_rate_factor=0.1,
         steps_per_save=250,
         steps_per_eval_batch=500,
         steps_per_eval_image=500,

@@ -19,9 +19,10 @@ class DemoConfig:
     """Seed of the person's looks, the performance and the tracker's noise."""
     frames_per_second: float = 8.0
     """Frames per second of the performance; a second has some four syllables."""
-    theta_noise: float = 1.0
-    """Strength of the tracker's noise: 1 is a good tracker (.01 on expression coefficients, .1
-    degrees on rotations, .1 mm on translations), 0 none. Images are never noisy."""
+    theta_noise: float = 0.3
+    """Strength of the tracker's noise: 1 is .01 on expression coefficients, .1 degrees on
+    rotations (a third of a pixel at the crown of the default size) and .1 mm on translations; 0 is
+    none. Images are never noisy."""
     supersampling: int = 3
     """Rays per pixel along each axis where something begins or ends; elsewhere two rays."""
     wrinkles: float = 1.0
