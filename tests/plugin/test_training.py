@@ -15,7 +15,8 @@ from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocati
 from rgbavatar_ns import Avatar
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.plugin.checkpoints import list_checkpoints, read_checkpoint
-from rgbavatar_ns.plugin.trainer import RGBAvatarTrainer
+from rgbavatar_ns.plugin.methods import rgbavatar
+from rgbavatar_ns.plugin.trainer import RGBAvatarTrainer, RGBAvatarTrainerConfig
 from tests.plugin.run import SMALL, make_trainer, small_config
 
 STEPS = 12
@@ -151,13 +152,35 @@ def test_learning_rates_fall_as_asked(uninterrupted: dict[str, Any]):
     assert all(type(rate(group)) is float for group in uninterrupted["optimizers"])
 
 
-def test_constant_rates_are_the_default(tiny_data: Path, tmp_path: Path):
-    trainer = make_trainer(small_config(tiny_data, tmp_path))
+def test_the_papers_method_has_its_constant_rates(tiny_data: Path, tmp_path: Path):
+    constant = rgbavatar.config
+    assert isinstance(constant, RGBAvatarTrainerConfig)
+    fields = ("position_lr_final", "learning_rate_factor", "learning_rate_steps")
+    trainer = make_trainer(
+        small_config(tiny_data, tmp_path, **{name: getattr(constant, name) for name in fields})
+    )
     assert trainer.optimizers.schedulers == {}
+    rates = {}
     for group, optimizer in trainer.optimizers.optimizers.items():
         (settings,) = optimizer.param_groups
         assert settings["eps"] == 1e-15
-        assert settings["lr"] == trainer.config.optimizers[group]["optimizer"].lr
+        rates[group] = settings["lr"]
+    # The paper's supplement.
+    assert rates == {
+        "position": 0.0008,
+        "opacity": 0.25,
+        "log_scale": 0.025,
+        "rotation": 0.005,
+        "color": 0.0125,
+        "basis_position": pytest.approx(0.00004),
+        "basis_rotation": pytest.approx(0.0025),
+        "basis_color": pytest.approx(0.00625),
+        "weight_network": 0.001,
+    }
+    assert constant.max_num_iterations == 5000
+    assert constant.pipeline.datamanager.batch_size == 10
+    assert constant.pipeline.model.avatar.num_bases == 20
+    assert constant.pipeline.model.avatar.uv_resolution == 256
 
 
 def test_training_lowers_the_loss_and_colors_gaussians(tiny_data: Path, tmp_path: Path):
