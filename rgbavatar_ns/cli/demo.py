@@ -74,7 +74,7 @@ def run(
     summary = {
         "psnr": scores["psnr"],
         "ssim": scores["ssim"],
-        "lpips": scores.get("lpips"),
+        "lpips_vgg": scores.get("lpips_vgg"),
         "train_seconds": trained["train_seconds"],
         "images_per_second": trained["images_per_second"],
         "total_seconds": time.time() - started_at,
@@ -175,7 +175,7 @@ def _film(run_folder: Path, data: Path, output: Path) -> Result:
 
 def _tell(summary: dict[str, Any], output: Path) -> None:
     """Print where things are, the metrics and how to open the viewer."""
-    lpips = summary["lpips"]
+    lpips = summary["lpips_vgg"]
     rows = {
         "held-out PSNR": f"{summary['psnr']:.2f} dB over {summary['held_out_frames']} frames",
         "held-out SSIM": f"{summary['ssim']:.4f}",
@@ -188,8 +188,10 @@ def _tell(summary: dict[str, Any], output: Path) -> None:
         "film": summary["video"],
         "figures": str(output / "summary.json"),
         "viewer": f"{Path(sys.executable).with_name('ns-viewer')} --load-config "
-        f"{Path(summary['run']) / 'config.yml'}",
+        f"{Path(summary['run']) / 'config.yml'} --viewer.websocket-host 127.0.0.1",
     }
+    if lpips is not None:
+        rows["held-out LPIPS"] = f"{lpips:.4f} (VGG)"
     console = Console(soft_wrap=True, highlight=False)
     console.rule("done")
     for name, value in rows.items():
