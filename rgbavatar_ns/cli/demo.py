@@ -179,9 +179,6 @@ def _tell(summary: dict[str, Any], output: Path) -> None:
     rows = {
         "held-out PSNR": f"{summary['psnr']:.2f} dB over {summary['held_out_frames']} frames",
         "held-out SSIM": f"{summary['ssim']:.4f}",
-        "held-out LPIPS": "needs its network, which is not here"
-        if lpips is None
-        else f"{lpips:.4f}",
         "training": f"{summary['train_seconds']:.0f} s, "
         f"{summary['images_per_second']:.0f} images/s",
         "picture": summary["picture"],
