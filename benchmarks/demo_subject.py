@@ -89,7 +89,7 @@ def steps_to_reach(losses: torch.Tensor, level: float) -> int | None:
 
 def measure(bench: Bench, steps: int, uv_resolution: int) -> dict[str, Any]:
     """Train the variants of one seed and return its figures."""
-    config = AvatarConfig(uv_resolution=uv_resolution)
+    config = AvatarConfig(uv_resolution=uv_resolution, scale_from_texel_spacing=True)
     options = TrainingOptions(seed=bench.seed)
     grey = replace(options, color_init=None)
     full, losses, seconds = bench.train("K = 20", config, steps, options)

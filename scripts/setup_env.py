@@ -185,6 +185,12 @@ def digest(*patterns: str) -> str:
     return total.hexdigest()[:16]
 
 
+def module_names() -> str:
+    """A hash of the package's folders: the installed import hook lists them once."""
+    folders = {str(path.parent.relative_to(ROOT)) for path in ROOT.glob("rgbavatar_ns/**/*.py")}
+    return hashlib.sha256("\n".join(sorted(folders)).encode()).hexdigest()[:16]
+
+
 def read_stamp() -> dict[str, str]:
     """What earlier calls finished."""
     try:
@@ -207,9 +213,8 @@ def main() -> None:
     started = time.monotonic()
     wanted = {
         "packages": digest("pyproject.toml", "requirements/*.txt", "scripts/setup_env.py"),
-        "project": digest(
-            "pyproject.toml", "CMakeLists.txt", "rgbavatar_ns/kernels/cpu/**/*.[ch]*"
-        ),
+        "project": digest("pyproject.toml", "CMakeLists.txt", "rgbavatar_ns/kernels/**/*.[ch]*")
+        + module_names(),
     }
     done = read_stamp()
     if VENV.exists() and done == wanted:
