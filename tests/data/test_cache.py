@@ -154,9 +154,11 @@ def test_several_threads_get_the_right_images(make_cache):
 
 
 def test_threads_end_with_the_cache():
-    before = threading.active_count()
+    before = set(threading.enumerate())
     cache = ImageCache(CountingDataset(), 100 * IMAGE_BYTES)
     cache.get([0, 1])
-    assert threading.active_count() > before
+    # Threads of other tests may end meanwhile: only this cache's own are looked at.
+    started = set(threading.enumerate()) - before
+    assert started
     del cache
-    eventually(lambda: threading.active_count() == before)
+    eventually(lambda: not any(thread.is_alive() for thread in started))
