@@ -14,7 +14,6 @@ from torch import Tensor
 
 from rgbavatar_ns.errors import UserError
 
-JOINT_NAMES = ("root", "neck", "jaw", "left_eye", "right_eye")
 EMBEDDED_HEAD = Path(__file__).parent / "assets" / "makehuman_head.npz"
 _GROUP = "group_"
 _MAY_BE_HALF = ("shapedirs", "posedirs", "eyelid_dirs")

@@ -54,8 +54,6 @@ class RGBAvatarDataManagerConfig(FullImageDatamanagerConfig):
     """How the folder is read."""
     batch_size: int = 10
     """Frames a step, all different (paper: 10)."""
-    sampling: Literal["offline"] = "offline"
-    """Order of the frames: `offline` draws a fresh permutation of all frames every epoch."""
     cache_mib: int = 1024
     """Budget for decoded images in MiB; what does not fit is decoded again when it is needed."""
     decoding_threads: int = 2
@@ -81,9 +79,9 @@ class RGBAvatarDataManagerConfig(FullImageDatamanagerConfig):
 def frame_sampler(
     config: RGBAvatarDataManagerConfig, positions: tuple[int, ...], seed: int
 ) -> FrameSampler:
-    """The sampling strategy that `config.sampling` names, over the training frames.
+    """The order of the training frames: a fresh permutation of all of them every epoch.
 
-    The place for every strategy. `offline` is a pure function of (seed, step), so resuming needs
+    The place for every strategy. This one is a pure function of (seed, step), so resuming needs
     no state; local and global pools (`rgbavatar_ns.data.LocalGlobalPools`) are fed by a stream of
     frames and keep their own.
 

@@ -97,16 +97,6 @@ class FrameCost:
             weight,
         )
 
-    def residuals_px(
-        self,
-        theta: Float[np.ndarray, "H"],
-        identity: Float[np.ndarray, "I"],
-        camera: StillCamera,
-        target: Target,
-    ) -> Float[np.ndarray, "L 2"]:
-        """Projected minus observed landmarks."""
-        return camera.project(self.head.points(theta, identity)) - target.points_px
-
     def add_priors(
         self,
         values: Float[np.ndarray, "P"],

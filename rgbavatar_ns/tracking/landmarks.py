@@ -10,10 +10,7 @@ from jaxtyping import Float, UInt8
 
 from rgbavatar_ns.errors import UserError
 
-NUM_LANDMARKS = 478
 FOREHEAD, CHIN = 10, 152
-UPPER_LIP, LOWER_LIP = 13, 14
-UPPER_LIDS, LOWER_LIDS = (159, 386), (145, 374)
 IRIS_CENTERS = (468, 473)
 """FaceMesh's iris centres; 468 is the subject's right eye, 473 the left one."""
 FACE_OVAL = (
