@@ -1,0 +1,137 @@
+"""What of the benchmarks can be chosen; no heavy imports, so that help is shown at once."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from rgbavatar_ns.errors import UserError
+
+
+@dataclass(frozen=True)
+class CommonOptions:
+    """Choices of every benchmark."""
+
+    json: Path | None = None
+    """Also write the figures here."""
+    avatar: Path | None = None
+    """Measure a trained avatar: a run's folder, a checkpoint or a bundle."""
+    data: Path | None = None
+    """Dataset whose theta and camera drive the avatar; without it small random theta."""
+    size: int | None = None
+    """Side of the images in pixels: 512, or the dataset's."""
+    threads: int | None = None
+    """Threads to use; as many as torch takes by default."""
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be measured."""
+        for name in ("size", "threads"):
+            value = getattr(self, name)
+            if value is not None:
+                require_positive(name, value)
+
+
+@dataclass(frozen=True)
+class RasterizerOptions(CommonOptions):
+    """The rasterizer alone, forward and backward, beside its peers.
+
+    The workload: Gaussians on an ellipsoid that fills about 60 % of the image, anisotropic, mean
+    3-sigma radii of 5.4 and 3.0 pixels at 512 x 512, opacity U(.1, .95), another set for every
+    image, one camera, gradients to all attributes; or a trained avatar's Gaussians (--avatar).
+    """
+
+    count: int | None = None
+    """Gaussians in a set of the synthetic workload: 60,000."""
+    batch: int = 10
+    """Sets, and images, at a time."""
+    shared: bool = False
+    """Share opacities and scales within the batch, as an avatar does."""
+    backend: str = "auto"
+    """Backend of the rasterizer."""
+    repetitions: int = 15
+    """Timings of each kind, after a warm-up."""
+    peers: bool = True
+    """Also measure the peers, on one image of the workload."""
+    peer_repetitions: int = 2
+    """Timings of each peer, after a warm-up; they take seconds each."""
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be measured or would be ignored."""
+        super().__post_init__()
+        for name in ("batch", "repetitions", "peer_repetitions"):
+            require_positive(name, getattr(self, name))
+        if self.count is not None:
+            require_positive("count", self.count)
+        if self.avatar is None and self.data is not None:
+            raise UserError(
+                "--data drives an avatar, but none is named.", "Pass --avatar too, or neither."
+            )
+        if self.avatar is not None and (self.count is not None or self.shared):
+            raise UserError(
+                "--count and --shared belong to the synthetic workload, not to an avatar.",
+                "Leave them out, or leave out --avatar.",
+            )
+
+
+@dataclass(frozen=True)
+class AvatarOptions(CommonOptions):
+    """Choices of the benchmarks that need a whole avatar."""
+
+    uv: int | None = None
+    """Side of the UV map of the avatar that is made for the benchmark: 256."""
+    bases: int | None = None
+    """Its number of blendshapes: 20."""
+
+    def __post_init__(self) -> None:
+        """Refuse what would be ignored."""
+        super().__post_init__()
+        if self.avatar is not None and (self.uv is not None or self.bases is not None):
+            raise UserError(
+                "--uv and --bases belong to the avatar that is made for the benchmark.",
+                "Leave them out: the one given with --avatar has its own.",
+            )
+
+
+@dataclass(frozen=True)
+class StepOptions(AvatarOptions):
+    """A whole training step: theta and uint8 pictures in, changed parameters out.
+
+    The workload: the embedded head with one Gaussian a texel and random pictures; or a trained
+    avatar (--avatar) and the pictures of its dataset (--data).
+    """
+
+    batch: int = 10
+    """Images a step."""
+    repetitions: int = 15
+    """Timings of each kind, after a warm-up."""
+    trainer: bool = False
+    """Also train with nerfstudio's trainer, and say what share of the bare step's speed it has."""
+    trainer_steps: int = 100
+    """Steps of that training."""
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be measured."""
+        super().__post_init__()
+        for name in ("batch", "repetitions", "trainer_steps"):
+            require_positive(name, getattr(self, name))
+
+
+@dataclass(frozen=True)
+class RenderOptions(AvatarOptions):
+    """From theta to the image, one image at a time, without gradients."""
+
+    frames: int = 10
+    """Different theta that are drawn in turn."""
+    repetitions: int = 50
+    """Timings of each kind, after a warm-up."""
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be measured."""
+        super().__post_init__()
+        for name in ("frames", "repetitions"):
+            require_positive(name, getattr(self, name))
+
+
+def require_positive(name: str, value: int) -> None:
+    """Raise UserError where an option is below 1."""
+    if value < 1:
+        flag = name.replace("_", "-")
+        raise UserError(f"--{flag} is {value}.", "Give 1 or more.")

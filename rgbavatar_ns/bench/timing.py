@@ -1,0 +1,121 @@
+"""Repeated timings, and how much memory a call needs."""
+
+import ctypes
+import re
+import statistics
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+Progress = Callable[[str, int, int], None]
+"""Called with (what is timed, timings done, timings in all), never while the clock runs."""
+
+Lap = Callable[[str], None]
+"""Called by what is timed, at the end of a part, with the part's name."""
+
+WHOLE = "whole"
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Median and quartiles of repeated timings, in milliseconds."""
+
+    median_ms: float
+    lower_ms: float
+    upper_ms: float
+    repetitions: int
+
+    @classmethod
+    def of(cls, seconds: Sequence[float]) -> "Spread":
+        """The spread of one or more timings in seconds."""
+        times_ms = [1e3 * value for value in seconds]
+        if len(times_ms) == 1:
+            return cls(times_ms[0], times_ms[0], times_ms[0], 1)
+        lower, median, upper = statistics.quantiles(times_ms, n=4, method="inclusive")
+        return cls(median, lower, upper, len(times_ms))
+
+
+class Stopwatch:
+    """Times calls `repetitions` times after one warm-up, and says how far it is."""
+
+    def __init__(self, repetitions: int, progress: Progress | None = None) -> None:
+        self.repetitions = repetitions
+        self._progress = progress or (lambda what, done, total: None)
+
+    def time(
+        self, what: str, call: Callable[[], Any], prepare: Callable[[], Any] | None = None
+    ) -> Spread:
+        """Time a call; `prepare` runs before each one, outside of the time."""
+        return self.laps(what, lambda lap: call(), prepare)[WHOLE]
+
+    def laps(
+        self, what: str, call: Callable[[Lap], Any], prepare: Callable[[], Any] | None = None
+    ) -> dict[str, Spread]:
+        """Time a call and the parts that it marks; the call itself is under "whole"."""
+        seconds: dict[str, list[float]] = {}
+        for repetition in range(-1, self.repetitions):
+            self._progress(what, repetition + 1, self.repetitions + 1)
+            if prepare is not None:
+                prepare()
+            marks: list[tuple[str, float]] = []
+            start = time.perf_counter()
+            call(lambda name, marks=marks: marks.append((name, time.perf_counter())))
+            end = time.perf_counter()
+            if repetition < 0:
+                continue
+            last = start
+            for name, mark in marks:
+                seconds.setdefault(name, []).append(mark - last)
+                last = mark
+            seconds.setdefault(WHOLE, []).append(end - start)
+        self._progress(what, self.repetitions + 1, self.repetitions + 1)
+        return {name: Spread.of(values) for name, values in seconds.items()}
+
+
+@contextmanager
+def using_threads(count: int | None) -> Iterator[int]:
+    """Let torch use this many threads within; gives the number used."""
+    before = torch.get_num_threads()
+    if count is not None:
+        torch.set_num_threads(count)
+    try:
+        yield torch.get_num_threads()
+    finally:
+        torch.set_num_threads(before)
+
+
+PEAK_MEMORY_METHOD = (
+    "peak resident memory of the process during one call (VmHWM, reset before it) less the "
+    "resident memory before it, freed memory handed back first; outputs, gradients and buffers "
+    "that are kept for later calls are in it, inputs and what earlier calls kept are not"
+)
+
+
+def peak_growth_bytes(call: Callable[[], Any]) -> int | None:
+    """How far the process's resident memory rose above its level before the call.
+
+    See PEAK_MEMORY_METHOD. None where the system does not tell (it needs Linux's /proc).
+    """
+    try:
+        ctypes.CDLL("libc.so.6").malloc_trim(0)
+    except (OSError, AttributeError):
+        pass  # Another C library: what it has freed but kept makes the growth look smaller.
+    try:
+        Path("/proc/self/clear_refs").write_text("5")
+        before = _status_bytes("VmRSS")
+    except (OSError, LookupError):
+        return None
+    call()
+    return max(_status_bytes("VmHWM") - before, 0)
+
+
+def _status_bytes(field: str) -> int:
+    found = re.search(rf"^{field}:\s*(\d+) kB", Path("/proc/self/status").read_text(), re.M)
+    if found is None:
+        raise LookupError(field)
+    return 1024 * int(found[1])
