@@ -35,9 +35,9 @@ class MachineSpeed:
 def measure_speed(
     matrix_side: int = 2048, copy_mib: int = 256, repetitions: int = 5
 ) -> MachineSpeed:
-    """Arithmetic from a large float32 matrix product, bandwidth from a large copy; the best of each.
+    """Arithmetic from a large float32 matrix product, bandwidth from a large copy.
 
-    A copy counts its bytes twice, read and written.
+    The best of the repetitions each. A copy counts its bytes twice, read and written.
     """
     factor = torch.randn(matrix_side, matrix_side)
     product = torch.empty_like(factor)

@@ -24,16 +24,14 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from rgbavatar_ns.bench.dense_torch import dense_torch
+from rgbavatar_ns.bench.drawing import Draw, DrawTimes, time_draw
 from rgbavatar_ns.bench.gsplat_torch import gsplat_torch
 from rgbavatar_ns.bench.projection import one_camera, one_image
-from rgbavatar_ns.bench.timing import WHOLE, Lap, Stopwatch, peak_growth_bytes
+from rgbavatar_ns.bench.timing import Stopwatch
 from rgbavatar_ns.kernels import GaussianSet, PinholeCameras
 
-Draw = Callable[[GaussianSet], Float[Tensor, "1 H W 3"]]
 Adapter = Callable[[GaussianSet, PinholeCameras], Draw]
 
 
@@ -45,7 +43,7 @@ PEERS: dict[str, Adapter] = {"dense torch": _dense_torch, "gsplat torch": gsplat
 
 
 def time_peers(
-    ours: Draw,
+    ours: Adapter,
     gaussians: GaussianSet,
     cameras: PinholeCameras,
     ours_ms_per_image: float,
@@ -58,26 +56,26 @@ def time_peers(
     `ratio_one_image` is over ours given the same single image.
     """
     single, camera = one_image(gaussians, 0), one_camera(cameras, 0)
+    shape = (1, camera.height, camera.width, 3)
+    own_draw = ours(single, camera)
     with torch.no_grad():
-        image = ours(single)
-    own = time_draw("ours, one image", ours, single, stopwatch)
+        own_image = own_draw(single)
+    own = time_draw("ours, one image", own_draw, single, shape, stopwatch)
     results: dict[str, Any] = {}
     for name, adapter in (PEERS if peers is None else peers).items():
         try:
             draw = adapter(single, camera)
             with torch.no_grad():
-                difference = (draw(single) - image).abs()
-            figures = time_draw(f"peer: {name}", draw, single, stopwatch)
+                difference = (draw(single) - own_image).abs()
+            times = time_draw(f"peer: {name}", draw, single, shape, stopwatch)
         except (ImportError, RuntimeError, AttributeError, OSError) as error:
             reason = (str(error).splitlines() or [""])[0]
             results[name] = {"unavailable": f"{type(error).__name__}: {reason}"}
             continue
-        whole = figures["forward_ms_per_image"] + figures["backward_ms_per_image"]
-        own_whole = own["forward_ms_per_image"] + own["backward_ms_per_image"]
         results[name] = {
-            **figures,
-            "ratio": whole / ours_ms_per_image,
-            "ratio_one_image": whole / own_whole,
+            **_figures(times),
+            "ratio": times.whole.median_ms / ours_ms_per_image,
+            "ratio_one_image": times.whole.median_ms / own.whole.median_ms,
             "mean_difference": float(difference.mean()),
             "largest_difference": float(difference.max()),
             "images": 1,
@@ -90,34 +88,11 @@ def time_peers(
     return results
 
 
-def time_draw(
-    what: str, draw: Draw, gaussians: GaussianSet, stopwatch: Stopwatch
-) -> dict[str, float | int | None]:
-    """Forward and backward in milliseconds an image, and the memory that both need."""
-    leaves = leaf_gaussians(gaussians)
-    with torch.no_grad():
-        image_grad = torch.randn_like(draw(leaves)) / draw(leaves)[0].numel()
-
-    def once(lap: Lap) -> None:
-        for leaf in vars(leaves).values():
-            leaf.grad = None
-        image = draw(leaves)
-        lap("forward")
-        image.backward(image_grad)
-        lap("backward")
-
-    memory = peak_growth_bytes(lambda: once(lambda name: None))
-    spread = stopwatch.laps(what, once)
+def _figures(times: DrawTimes) -> dict[str, float | int | None]:
+    """One image's."""
     return {
-        "forward_ms_per_image": spread["forward"].median_ms / len(image_grad),
-        "backward_ms_per_image": spread["backward"].median_ms / len(image_grad),
-        "forward_backward_ms_per_image": spread[WHOLE].median_ms / len(image_grad),
-        "bytes_per_image": None if memory is None else memory // len(image_grad),
+        "forward_ms_per_image": times.forward.median_ms,
+        "backward_ms_per_image": times.backward.median_ms,
+        "whole_ms_per_image": times.whole.median_ms,
+        "bytes_per_image": times.growth_bytes,
     }
-
-
-def leaf_gaussians(gaussians: GaussianSet) -> GaussianSet:
-    """The same Gaussians as leaves that ask for gradients."""
-    return GaussianSet(
-        **{name: value.detach().requires_grad_() for name, value in vars(gaussians).items()}
-    )

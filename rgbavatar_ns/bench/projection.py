@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from rgbavatar_ns.kernels import GaussianSet, PinholeCameras
@@ -147,5 +147,5 @@ def _spans(
     middle = projected.mean_px[index, 0] - xy * dy / xx - 0.5
     first = torch.ceil(middle - half_width).clamp(0, width).long()
     last = torch.floor(middle + half_width).clamp(-1, width - 1).long()
-    touched: Bool[Tensor, "s"] = (root >= 0) & (last >= first)
+    touched = (root >= 0) & (last >= first)
     return RowSpans(index[touched], row[touched], first[touched], last[touched])

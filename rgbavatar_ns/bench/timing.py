@@ -5,7 +5,7 @@ import re
 import statistics
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -41,10 +41,13 @@ class Spread:
 
 
 class Stopwatch:
-    """Times calls `repetitions` times after one warm-up, and says how far it is."""
+    """Times calls `repetitions` times after a warm-up, and says how far it is."""
 
-    def __init__(self, repetitions: int, progress: Progress | None = None) -> None:
+    def __init__(
+        self, repetitions: int, progress: Progress | None = None, *, warm_up: bool = True
+    ) -> None:
         self.repetitions = repetitions
+        self._warm_up = warm_up
         self._progress = progress or (lambda what, done, total: None)
 
     def time(
@@ -58,8 +61,8 @@ class Stopwatch:
     ) -> dict[str, Spread]:
         """Time a call and the parts that it marks; the call itself is under "whole"."""
         seconds: dict[str, list[float]] = {}
-        for repetition in range(-1, self.repetitions):
-            self._progress(what, repetition + 1, self.repetitions + 1)
+        for repetition in range(-int(self._warm_up), self.repetitions):
+            self._progress(what, max(repetition, 0), self.repetitions)
             if prepare is not None:
                 prepare()
             marks: list[tuple[str, float]] = []
@@ -73,7 +76,7 @@ class Stopwatch:
                 seconds.setdefault(name, []).append(mark - last)
                 last = mark
             seconds.setdefault(WHOLE, []).append(end - start)
-        self._progress(what, self.repetitions + 1, self.repetitions + 1)
+        self._progress(what, self.repetitions, self.repetitions)
         return {name: Spread.of(values) for name, values in seconds.items()}
 
 
@@ -101,10 +104,9 @@ def peak_growth_bytes(call: Callable[[], Any]) -> int | None:
 
     See PEAK_MEMORY_METHOD. None where the system does not tell (it needs Linux's /proc).
     """
-    try:
+    # With another C library, what it has freed but kept makes the growth look smaller.
+    with suppress(OSError, AttributeError):
         ctypes.CDLL("libc.so.6").malloc_trim(0)
-    except (OSError, AttributeError):
-        pass  # Another C library: what it has freed but kept makes the growth look smaller.
     try:
         Path("/proc/self/clear_refs").write_text("5")
         before = _status_bytes("VmRSS")

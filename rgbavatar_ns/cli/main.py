@@ -11,6 +11,7 @@ COMMANDS = {
     "demo-data": "render the procedural demo subject as a dataset",
     "track": "turn a video of a head into a dataset",
     "render": "film and picture of a trained avatar beside the held-out frames",
+    "bench": "how fast the rasterizer, a training step and rendering are on this machine",
     "info": "what is installed here and which rasterizer backends can be used",
 }
 

@@ -1,0 +1,118 @@
+"""nerfstudio's trainer against the bare step: the same frames in the same order, from one start."""
+
+import copy
+import json
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from rgbavatar_ns.avatar import Avatar
+from rgbavatar_ns.avatar.training import (
+    TrainingBatch,
+    TrainingOptions,
+    make_optimizer,
+    training_step,
+)
+from rgbavatar_ns.bench.options import StepOptions
+from rgbavatar_ns.bench.timing import Progress
+from rgbavatar_ns.bench.workloads import DEFAULT_SIZE_PX, read_images
+from rgbavatar_ns.data import OfflineOrder, TrackedDataset, load_dataset
+from rgbavatar_ns.data.demo import DemoConfig, make_demo_dataset
+from rgbavatar_ns.head import HeadModel
+
+_NUM_FRAMES = 22
+_NUM_TEST_FRAMES = 2
+_SEED = 0
+
+
+def bench_trainer(options: StepOptions, progress: Progress | None = None) -> dict[str, Any]:
+    """Train an avatar twice, by nerfstudio's trainer and by bare steps, and compare their speeds.
+
+    On --data or on a small demo subject, without colour initialisation. The trainer's speed is
+    what it writes to training.json, its wait for the first pictures included.
+    """
+    with tempfile.TemporaryDirectory(prefix="rgbavatar-bench-") as folder:
+        if options.data is None:
+            size_px = options.size or DEFAULT_SIZE_PX
+            dataset = _demo(Path(folder) / "data", size_px, progress)
+        else:
+            dataset = load_dataset(options.data)
+        config = _trainer_config(options, dataset, Path(folder))
+        summary = _train(config)
+        model, datamanager = config.pipeline.model, config.pipeline.datamanager
+        batch = min(datamanager.batch_size, len(dataset.train))
+        avatar = Avatar(HeadModel(dataset.arrays), dataset.identity, model.avatar, seed=_SEED)
+        bare = _bare_images_per_second(avatar, dataset, batch, options.trainer_steps, progress)
+    return {
+        "images_per_second": summary["images_per_second"],
+        "bare_images_per_second": bare,
+        "share_of_bare_step": summary["images_per_second"] / bare,
+        "steps": summary["steps"],
+        "batch": batch,
+        "frames": len(dataset.train),
+        "width_px": dataset.width,
+        "height_px": dataset.height,
+        "gaussians": avatar.num_gaussians,
+    }
+
+
+def _demo(folder: Path, size_px: int, progress: Progress | None) -> TrackedDataset:
+    config = DemoConfig(
+        image_size=size_px, num_frames=_NUM_FRAMES, num_test_frames=_NUM_TEST_FRAMES, seed=_SEED
+    )
+
+    def told(done: int, total: int) -> None:
+        if progress is not None:
+            progress("demo subject", done, total)
+
+    return make_demo_dataset(folder, config, told)
+
+
+def _trainer_config(options: StepOptions, dataset: TrackedDataset, folder: Path) -> Any:
+    """The method `rgbavatar` for a short run that leaves nothing behind."""
+    from rgbavatar_ns.plugin.methods import rgbavatar
+
+    config: Any = copy.deepcopy(rgbavatar.config)
+    config.data = config.pipeline.datamanager.data = dataset.root
+    config.pipeline.datamanager.batch_size = options.batch
+    avatar = config.pipeline.model.avatar
+    avatar = avatar if options.uv is None else replace(avatar, uv_resolution=options.uv)
+    avatar = avatar if options.bases is None else replace(avatar, num_bases=options.bases)
+    config.pipeline.model.avatar = avatar
+    config.pipeline.model.initialize_colors = False
+    config.output_dir, config.experiment_name, config.timestamp = folder / "runs", "bench", "run"
+    config.vis, config.max_num_iterations = "tensorboard", options.trainer_steps
+    config.machine.seed = _SEED
+    return config
+
+
+def _train(config: Any) -> dict[str, Any]:
+    from rgbavatar_ns.plugin.trainer import SUMMARY_NAME
+
+    trainer = config.setup()
+    trainer.setup()
+    trainer.train()
+    return json.loads((trainer.base_dir / SUMMARY_NAME).read_text())
+
+
+def _bare_images_per_second(
+    avatar: Avatar, dataset: TrackedDataset, batch: int, steps: int, progress: Progress | None
+) -> float:
+    """The speed of as many bare steps over the same batches, pictures at hand."""
+    order = OfflineOrder(dataset.train, batch, _SEED)
+    images = read_images(dataset, dataset.train)
+    options, optimizer = TrainingOptions(seed=_SEED, color_init=None), make_optimizer(avatar)
+    seconds = 0.0
+    for step in range(steps):
+        positions = order.batch(step)
+        start = time.perf_counter()
+        training = TrainingBatch(
+            dataset.theta[positions], dataset.cameras.select(positions), images[positions]
+        )
+        training_step(avatar, optimizer, training, step, options)
+        seconds += time.perf_counter() - start
+        if progress is not None:
+            progress("bare steps beside the trainer", step + 1, steps)
+    return steps * batch / seconds

@@ -1,0 +1,169 @@
+"""What is measured: the synthetic common workload, and avatars with theta, camera and pictures."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from rgbavatar_ns.avatar import Avatar, AvatarConfig
+from rgbavatar_ns.avatar.training import TrainingBatch
+from rgbavatar_ns.bench.options import AvatarOptions
+from rgbavatar_ns.data import TrackedDataset, load_dataset
+from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.head import HeadModel
+from rgbavatar_ns.kernels import GaussianSet, PinholeCameras
+
+DEFAULT_COUNT = 60_000
+DEFAULT_SIZE_PX = 512
+_THETA_DEVIATION = 0.05
+_HEAD_SHARE = 0.8
+"""Share of the image's height that the head takes without a dataset's camera."""
+
+
+def ellipsoid_scene(
+    count: int = DEFAULT_COUNT,
+    size_px: int = DEFAULT_SIZE_PX,
+    batch: int = 10,
+    *,
+    shared: bool = False,
+    seed: int = 0,
+) -> tuple[GaussianSet, PinholeCameras]:
+    """The common workload: Gaussians on a head-sized ellipsoid, and one camera for all images.
+
+    `shared` gives opacities and scales a leading dimension of 1. Everything in pixels grows with
+    the image, so that the number of pairs is proportional to its pixels.
+    """
+    generator = torch.Generator().manual_seed(seed)
+
+    def uniform(low: float, high: float, *size: int) -> Tensor:
+        return low + (high - low) * torch.rand(*size, generator=generator)
+
+    direction = torch.randn(batch, count, 3, generator=generator)
+    direction = direction / direction.norm(dim=-1, keepdim=True)
+    leading = 1 if shared else batch
+    # One pixel at 512 x 512 is 0.44 mm at the head's distance.
+    ranges_m = ((0.5e-3, 1.3e-3), (0.3e-3, 0.8e-3), (0.1e-3, 0.25e-3))
+    gaussians = GaussianSet(
+        means=direction * torch.tensor([0.085, 0.115, 0.1]),
+        quats_wxyz=torch.randn(batch, count, 4, generator=generator),
+        scales=torch.stack([uniform(*ends, leading, count) for ends in ranges_m], -1),
+        opacities=uniform(0.1, 0.95, leading, count),
+        colors=uniform(0.0, 1.0, batch, count, 3),
+    )
+    world_to_camera = torch.eye(4)[None].clone()
+    world_to_camera[0, 2, 3] = 1.0
+    cameras = PinholeCameras(
+        world_to_camera,
+        torch.full((1, 2), 4.4 * size_px),
+        torch.full((1, 2), size_px / 2),
+        size_px,
+        size_px,
+    )
+    return gaussians, cameras
+
+
+@dataclass(frozen=True)
+class AvatarWorkload:
+    """An avatar and a batch to draw or to train it with."""
+
+    avatar: Avatar
+    batch: TrainingBatch
+    facts: dict[str, Any]
+    """What it is, for the report."""
+
+
+def avatar_workload(
+    options: AvatarOptions, batch: int, *, with_images: bool = True
+) -> AvatarWorkload:
+    """The avatar that the options name, or a fresh one; driven by their dataset or at random.
+
+    Without `with_images` the batch's pictures are empty. Raises UserError where avatar or
+    dataset cannot be read or do not fit one another or the size asked for.
+    """
+    config = AvatarConfig(
+        num_bases=20 if options.bases is None else options.bases,
+        uv_resolution=256 if options.uv is None else options.uv,
+    )
+    dataset = None if options.data is None else _dataset(options.data, options.size)
+    avatar = load_or_make(options.avatar, dataset, config)
+    training = _batch(avatar, dataset, options.size or DEFAULT_SIZE_PX, batch, with_images)
+    facts = {
+        "avatar": "fresh" if options.avatar is None else str(options.avatar),
+        "head": avatar.head.arrays.name,
+        "theta": "random" if options.data is None else str(options.data),
+        "gaussians": avatar.num_gaussians,
+        "bases": avatar.config.num_bases,
+        "uv_resolution": avatar.config.uv_resolution,
+        "width_px": training.cameras.width,
+        "height_px": training.cameras.height,
+        "batch": batch,
+    }
+    return AvatarWorkload(avatar, training, facts)
+
+
+def load_or_make(path: Path | None, dataset: TrackedDataset | None, config: AvatarConfig) -> Avatar:
+    """The avatar at `path`, else a fresh one of the dataset's subject or the embedded head."""
+    if path is not None:
+        avatar = Avatar.load(path)
+        if dataset is not None:
+            avatar.require_layout(dataset.layout, str(dataset.root))
+        return avatar
+    if dataset is not None:
+        return Avatar(HeadModel(dataset.arrays), dataset.identity, config)
+    head = HeadModel.embedded()
+    return Avatar(head, torch.zeros(head.num_identity), config)
+
+
+def _dataset(path: Path, size_px: int | None) -> TrackedDataset:
+    dataset = load_dataset(path)
+    if size_px is not None and (dataset.width, dataset.height) != (size_px, size_px):
+        raise UserError(
+            f"The pictures of {path} are {dataset.width} x {dataset.height}, not "
+            f"{size_px} x {size_px}.",
+            "Leave out --size, or pass another dataset.",
+        )
+    return dataset
+
+
+def _batch(
+    avatar: Avatar, dataset: TrackedDataset | None, size_px: int, count: int, with_images: bool
+) -> TrainingBatch:
+    generator = torch.Generator().manual_seed(0)
+    if dataset is None:
+        theta = _THETA_DEVIATION * torch.randn(count, avatar.layout.size, generator=generator)
+        cameras = front_camera(avatar, size_px)
+        shape = (count, size_px, size_px, 4) if with_images else (count, 0, 0, 4)
+        images = torch.randint(0, 256, shape, generator=generator, dtype=torch.uint8)
+        return TrainingBatch(theta, cameras, images)
+    # Spread over all frames; a dataset of fewer frames gives some of them twice.
+    positions = [index * len(dataset) // count for index in range(count)]
+    images = torch.zeros(count, 0, 0, 4, dtype=torch.uint8)
+    if with_images:
+        images = read_images(dataset, positions)
+    return TrainingBatch(dataset.theta[positions], dataset.cameras.select(positions), images)
+
+
+def read_images(dataset: TrackedDataset, positions: Sequence[int]) -> UInt8[Tensor, "B H W 4"]:
+    """Decode these frames."""
+    return torch.stack([torch.as_tensor(dataset.read_image(position)) for position in positions])
+
+
+def front_camera(avatar: Avatar, size_px: int) -> PinholeCameras:
+    """A camera a metre in front of the head, which takes most of the image's height."""
+    vertices: Float[Tensor, "V 3"] = torch.as_tensor(avatar.head.arrays.v_template).float()
+    low, high = vertices.amin(0), vertices.amax(0)
+    world_to_camera = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
+    shift = -world_to_camera[:3, :3] @ ((low + high) / 2)
+    world_to_camera[:3, 3] = shift + torch.tensor([0.0, 0.0, 1.0])
+    focal_px = _HEAD_SHARE * size_px / float(high[1] - low[1])
+    return PinholeCameras(
+        world_to_camera=world_to_camera[None],
+        focal_px=torch.full((1, 2), focal_px),
+        principal_point_px=torch.full((1, 2), size_px / 2),
+        width=size_px,
+        height=size_px,
+    )
