@@ -61,8 +61,8 @@ def measure_speed(
 class Work:
     """What must be done for a batch: lane operations and bytes between memory and processor."""
 
-    operations: float
-    moved_bytes: float
+    operations: int
+    moved_bytes: int
 
     def seconds(self, speed: MachineSpeed) -> float:
         """The longer of the two, since they can overlap."""
@@ -96,12 +96,12 @@ def update_work(parameters: list[nn.Parameter], targets: Tensor) -> Work:
     The blend's multiply-adds, three a basis value and image, hide under these 24 bytes a value.
     """
     values = sum(parameter.numel() for parameter in parameters)
-    return Work(0.0, 6 * _FLOAT_BYTES * values + targets.numel() * targets.element_size())
+    return Work(0, 6 * _FLOAT_BYTES * values + targets.numel() * targets.element_size())
 
 
 def parameter_work(parameters: list[nn.Parameter]) -> Work:
     """Drawing from theta, beside the rasterizer: every parameter is read once."""
-    return Work(0.0, _FLOAT_BYTES * sum(parameter.numel() for parameter in parameters))
+    return Work(0, _FLOAT_BYTES * sum(parameter.numel() for parameter in parameters))
 
 
 def floor_figures(

@@ -74,9 +74,10 @@ def _variants() -> dict[str, TrainingOptions]:
     if "fast" not in {field.name for field in fields(TrainingOptions)}:
         return {WHOLE_STEP: TrainingOptions(color_init=None)}
     fast: dict[str, Any] = {"color_init": None, "fast": True}
+    eager: dict[str, Any] = {**fast, "fast": False}
     return {
         WHOLE_STEP: TrainingOptions(**fast),
-        "whole step, eager": TrainingOptions(**(fast | {"fast": False})),
+        "whole step, eager": TrainingOptions(**eager),
     }
 
 

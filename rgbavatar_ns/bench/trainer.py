@@ -4,6 +4,7 @@ import copy
 import json
 import tempfile
 import time
+import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -89,11 +90,14 @@ def _trainer_config(options: StepOptions, dataset: TrackedDataset, folder: Path)
 
 
 def _train(config: Any) -> dict[str, Any]:
-    from rgbavatar_ns.plugin.trainer import SUMMARY_NAME
+    with warnings.catch_warnings():
+        # nerfstudio's and torchvision's, about parts that are not used here.
+        warnings.simplefilter("ignore")
+        from rgbavatar_ns.plugin.trainer import SUMMARY_NAME
 
-    trainer = config.setup()
-    trainer.setup()
-    trainer.train()
+        trainer = config.setup()
+        trainer.setup()
+        trainer.train()
     return json.loads((trainer.base_dir / SUMMARY_NAME).read_text())
 
 

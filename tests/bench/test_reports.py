@@ -1,0 +1,215 @@
+import dataclasses
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+from rgbavatar_ns.avatar import Avatar, AvatarConfig
+from rgbavatar_ns.avatar.training import TrainingOptions
+from rgbavatar_ns.bench import machine, step
+from rgbavatar_ns.bench.floor import measure_speed
+from rgbavatar_ns.bench.options import RasterizerOptions, RenderOptions, StepOptions
+from rgbavatar_ns.bench.rasterizer import bench_rasterizer
+from rgbavatar_ns.bench.render import bench_render
+from rgbavatar_ns.bench.step import WholeStep, bench_step, parameters_of
+from rgbavatar_ns.bench.trainer import bench_trainer
+from rgbavatar_ns.bench.workloads import avatar_workload, ellipsoid_scene
+from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.head import HeadModel
+from rgbavatar_ns.kernels import rasterize
+from tests.plugin.tiny import SIZE, tiny_dataset
+
+KEYS = {
+    "forward_ms_per_image",
+    "backward_ms_per_image",
+    "images_per_second",
+    "frames_per_second",
+    "parts",
+    "peers",
+    "machine",
+    "workload",
+    "spread",
+    "floor",
+    "pairs",
+    "memory",
+}
+SOMEWHERE = Path("somewhere")
+TINY = {"uv": 32, "bases": 3, "size": 64}
+
+
+@pytest.fixture(autouse=True)
+def small_probes(monkeypatch):
+    """Measure the machine on small matrices: these tests ask for shapes, not for its speed."""
+    speed = measure_speed(matrix_side=64, copy_mib=1, repetitions=1)
+    for name in ("rasterizer", "step", "render"):
+        monkeypatch.setattr(f"rgbavatar_ns.bench.{name}.measure_speed", lambda: speed)
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    return tiny_dataset(tmp_path_factory.mktemp("data") / "subject")
+
+
+@pytest.fixture(scope="module")
+def bundle(tmp_path_factory):
+    head = HeadModel.embedded()
+    config = AvatarConfig(num_bases=2, uv_resolution=24)
+    avatar = Avatar(head, torch.zeros(head.num_identity), config)
+    path = tmp_path_factory.mktemp("avatar") / "bundle"
+    avatar.save(path)
+    return path
+
+
+def checked_json(report):
+    figures = json.loads(json.dumps(report.to_json()))
+    assert set(figures) >= KEYS
+    assert figures["parts"]
+    assert all(value > 0 for value in figures["parts"].values())
+    assert set(figures["spread"]) == set(figures["parts"])
+    assert figures["floor"]["reached"] == pytest.approx(
+        figures["floor"]["ms_per_image"] * figures["images_per_second"] / 1e3
+    )
+    for fact in ("processor", "cores", "threads", "instruction_set", "python", "torch", "date"):
+        assert fact in figures["machine"]
+    return figures
+
+
+def test_rasterizer_report():
+    options = RasterizerOptions(count=300, size=64, batch=2, repetitions=2, peers=False)
+    figures = checked_json(bench_rasterizer(options))
+    whole_ms = figures["parts"]["forward and backward"]
+    assert figures["images_per_second"] == pytest.approx(2e3 / whole_ms)
+    assert figures["pairs"]["per_second"] == pytest.approx(
+        2 * figures["pairs"]["per_image"] * 1e3 / whole_ms
+    )
+    assert figures["frames_per_second"] is None
+    assert figures["peers"] == {}
+    assert figures["workload"]["gaussians"] == 300
+
+
+def test_rasterizer_of_an_avatar(bundle, dataset):
+    options = RasterizerOptions(
+        avatar=bundle, data=dataset.root, batch=3, repetitions=1, peers=False
+    )
+    figures = checked_json(bench_rasterizer(options))
+    assert figures["workload"]["name"] == "avatar"
+    assert figures["workload"]["width_px"] == SIZE
+
+
+def test_step_report():
+    figures = checked_json(bench_step(StepOptions(**TINY, batch=2, repetitions=1)))
+    assert figures["images_per_second"] == pytest.approx(2e3 / figures["parts"]["whole step"])
+    assert figures["backward_ms_per_image"] > 0
+    assert figures["trainer"] is None
+
+
+def test_step_of_a_trained_avatar_on_its_pictures(bundle, dataset):
+    options = StepOptions(avatar=bundle, data=dataset.root, batch=2, repetitions=1)
+    figures = checked_json(bench_step(options))
+    assert figures["workload"]["uv_resolution"] == 24
+    assert figures["workload"]["height_px"] == SIZE
+
+
+def test_a_step_with_two_paths_is_compared_with_its_eager_one(monkeypatch):
+    both = TrainingOptions(color_init=None)
+    monkeypatch.setattr(step, "_variants", lambda: {"whole step": both, "eager": both})
+    report = bench_step(StepOptions(**TINY, batch=2, repetitions=1))
+    eager = report.peers["eager"]
+    assert eager["ratio"] == pytest.approx(report.parts["eager"] / report.parts["whole step"])
+
+
+def test_every_repetition_of_a_step_starts_from_the_same_parameters():
+    workload = avatar_workload(StepOptions(**TINY), 2)
+    parameters = parameters_of(workload.avatar)
+    before = [parameter.detach().clone() for parameter in parameters]
+    again = WholeStep(workload.avatar, workload.batch, TrainingOptions(color_init=None))
+    again.run()
+    assert any(not torch.equal(a, b) for a, b in zip(before, parameters))
+    again.restore()
+    assert all(torch.equal(a, b) for a, b in zip(before, parameters))
+
+
+def test_render_report(bundle):
+    figures = checked_json(bench_render(RenderOptions(avatar=bundle, size=64, repetitions=2)))
+    assert figures["frames_per_second"] == pytest.approx(1e3 / figures["parts"]["whole frame"])
+    parts = {"head", "network", "blend", "frames", "transform", "rasterize"}
+    assert parts < set(figures["parts"])
+    assert figures["backward_ms_per_image"] is None
+
+
+@pytest.mark.slow
+def test_the_trainer_is_compared_with_the_bare_step(dataset):
+    found = bench_trainer(StepOptions(data=dataset.root, uv=24, bases=2, batch=4, trainer_steps=6))
+    assert found["steps"] == 6
+    assert found["share_of_bare_step"] == pytest.approx(
+        found["images_per_second"] / found["bare_images_per_second"]
+    )
+
+
+def test_the_ellipsoid_fills_three_fifths_of_the_image():
+    gaussians, cameras = ellipsoid_scene(20_000, 256, 1)
+    alpha = rasterize(gaussians, cameras).alpha
+    assert float((alpha > 0.5).float().mean()) == pytest.approx(0.6, abs=0.03)
+
+
+@pytest.mark.parametrize(
+    ("make", "cause"),
+    [
+        (lambda: RasterizerOptions(batch=0), "--batch is 0"),
+        (lambda: RasterizerOptions(count=0), "--count is 0"),
+        (lambda: RasterizerOptions(repetitions=0), "--repetitions is 0"),
+        (lambda: RasterizerOptions(peer_repetitions=0), "--peer-repetitions is 0"),
+        (lambda: StepOptions(trainer_steps=0), "--trainer-steps is 0"),
+        (lambda: StepOptions(threads=0), "--threads is 0"),
+        (lambda: StepOptions(size=-1), "--size is -1"),
+        (lambda: RenderOptions(frames=0), "--frames is 0"),
+        (lambda: RasterizerOptions(data=SOMEWHERE), "--data drives an avatar"),
+        (lambda: RasterizerOptions(avatar=SOMEWHERE, count=5), "synthetic workload"),
+        (lambda: RasterizerOptions(avatar=SOMEWHERE, shared=True), "synthetic workload"),
+        (lambda: RenderOptions(avatar=SOMEWHERE, uv=64), "made for the benchmark"),
+    ],
+)
+def test_options_that_cannot_be_measured_are_refused(make, cause):
+    with pytest.raises(UserError, match=cause):
+        make()
+
+
+def test_an_avatar_or_dataset_that_is_not_there_is_named(tmp_path, bundle):
+    with pytest.raises(UserError, match="missing"):
+        bench_render(RenderOptions(avatar=tmp_path / "missing", repetitions=1))
+    with pytest.raises(UserError, match="missing"):
+        bench_step(StepOptions(avatar=bundle, data=tmp_path / "missing", repetitions=1))
+
+
+def test_another_size_or_head_than_the_datasets_is_refused(tmp_path, bundle, dataset):
+    with pytest.raises(UserError, match="not 64 x 64"):
+        bench_render(RenderOptions(avatar=bundle, data=dataset.root, size=64, repetitions=1))
+    other = tiny_dataset(tmp_path / "other", frames=4, test=1, fewer_expressions=2)
+    with pytest.raises(UserError, match="has theta of"):
+        bench_render(RenderOptions(avatar=bundle, data=other.root, repetitions=1))
+
+
+def test_without_a_compiled_backend_the_remedy_is_told(monkeypatch):
+    monkeypatch.setattr(machine, "available_backends", lambda: ("reference",))
+    for run in (
+        lambda: bench_rasterizer(RasterizerOptions(count=10, size=8)),
+        lambda: bench_step(StepOptions(**TINY)),
+        lambda: bench_render(RenderOptions(**TINY)),
+    ):
+        with pytest.raises(UserError, match=r"'cpu' cannot be used here.*C\+\+17"):
+            run()
+    small = RasterizerOptions(
+        count=50, size=16, batch=1, repetitions=1, backend="reference", peers=False
+    )
+    assert bench_rasterizer(small).workload["backend"] == "reference"
+
+
+def test_an_unknown_backend_is_refused():
+    with pytest.raises(UserError, match="'tpu'"):
+        bench_rasterizer(RasterizerOptions(backend="tpu"))
+
+
+def test_reports_hold_no_field_that_json_would_lose():
+    report = bench_render(RenderOptions(**TINY, repetitions=1))
+    assert set(report.to_json()) == {field.name for field in dataclasses.fields(report)}

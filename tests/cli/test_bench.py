@@ -1,0 +1,55 @@
+import json
+
+import pytest
+
+from rgbavatar_ns.cli import main as cli
+
+TINY = ["--size", "64", "--repetitions", "1"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["rasterizer", "--count", "300", "--batch", "2", "--peer-repetitions", "1"], "images/s"),
+        (["step", "--uv", "24", "--bases", "2", "--batch", "2"], "whole step"),
+        (["render", "--uv", "24", "--bases", "2"], "frames/s"),
+    ],
+)
+def test_figures_are_printed_and_written(arguments, told, tmp_path, capsys):
+    path = tmp_path / "new folder" / "out.json"
+    cli.main(["bench", *arguments, *TINY, "--json", str(path)])
+    printed = capsys.readouterr().out
+    assert told in printed
+    assert "floor" in printed
+    assert "reached" in printed
+    figures = json.loads(path.read_text())
+    assert figures["benchmark"] == arguments[0]
+    assert figures["images_per_second"] > 0
+    if arguments[0] == "rasterizer":
+        assert set(figures["peers"]) == {"dense torch", "gsplat torch"}
+        assert "dense torch" in printed
+
+
+@pytest.mark.parametrize(
+    ("arguments", "cause"),
+    [
+        (["rasterizer", "--repetitions", "0"], "--repetitions is 0"),
+        (["step", "--avatar", "/no/such/avatar"], "/no/such/avatar"),
+        (["render", "--json", "/proc/none/out.json"], "/proc/none/out.json"),
+    ],
+)
+def test_a_mistake_is_told_in_one_line(arguments, cause, capsys):
+    with pytest.raises(SystemExit) as ended:
+        cli.main(["bench", *arguments])
+    assert ended.value.code == 1
+    told = capsys.readouterr().err
+    assert cause in told
+    assert len(told.strip().splitlines()) == 1
+
+
+def test_each_benchmark_has_help(capsys):
+    for name in ("rasterizer", "step", "render"):
+        with pytest.raises(SystemExit) as ended:
+            cli.main(["bench", name, "--help"])
+        assert ended.value.code == 0
+        assert "--json" in capsys.readouterr().out
