@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from rgbavatar_ns.kernels import GaussianSet, PinholeCameras, rasterize
-from rgbavatar_ns.kernels.constants import MIN_ALPHA
+from rgbavatar_ns.kernels.constants import MAX_ALPHA, MIN_ALPHA
 from rgbavatar_ns.kernels.reference import project
 
 ATTRIBUTES = ("means", "quats_wxyz", "scales", "opacities", "colors")
@@ -103,7 +103,7 @@ def random_scene(
 
 
 def settled_pixels(scene: Scene, margin: float = 1e-4) -> Tensor:
-    """Pixels [B, H, W, 1] where no alpha is so near the cut that rounding decides about it."""
+    """Pixels [B, H, W, 1] where no alpha is so near the cut or cap that rounding decides."""
     projected = project(scene.gaussians, scene.cameras)
     y, x = torch.meshgrid(
         torch.arange(scene.cameras.height), torch.arange(scene.cameras.width), indexing="ij"
@@ -114,6 +114,7 @@ def settled_pixels(scene: Scene, margin: float = 1e-4) -> Tensor:
     distance = (offset[..., None, :] @ conic @ offset[..., None])[..., 0, 0]
     alpha = projected.opacities[:, None, None] * torch.exp(-0.5 * distance)
     near = (alpha / MIN_ALPHA - 1).abs() < margin
+    near = near | ((alpha / MAX_ALPHA - 1).abs() < 1e-5)
     return ~near.any(-1, keepdim=True)
 
 

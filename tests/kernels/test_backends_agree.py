@@ -6,13 +6,8 @@ import pytest
 import torch
 
 from rgbavatar_ns.kernels import available_backends
-from tests.kernels.scenes import (
-    ATTRIBUTES,
-    random_scene,
-    relative_l2,
-    render_and_differentiate,
-    settled_pixels,
-)
+from tests.kernels.agreement import assert_agrees, expect
+from tests.kernels.scenes import random_scene, render_and_differentiate
 
 SCENES = {
     "plain": {"extremes": False},
@@ -29,27 +24,12 @@ SCENES = {
 
 @functools.cache
 def _expected(name: str):
-    """The scene, the pixels that are compared, and the float64 reference's results."""
-    scene = random_scene(5, **SCENES[name])
-    mask = settled_pixels(scene).double()
-    assert mask.mean() > 0.5
-    return scene, mask, render_and_differentiate(scene, torch.float64, "reference", mask)
+    return expect(random_scene(5, **SCENES[name]))
 
 
 @pytest.mark.parametrize("name", SCENES)
 def test_values_and_gradients_match_reference(fast_backend, name):
-    scene, mask, (expected, expected_grads) = _expected(name)
-    got, grads = render_and_differentiate(scene, torch.float32, fast_backend, mask)
-    assert ((got.image - expected.image) * mask).abs().max() < 1e-4
-    assert ((got.alpha - expected.alpha) * mask).abs().max() < 1e-4
-    seen = mask * (expected.alpha > 0.01)
-    assert ((got.depth - expected.depth) * seen).abs().max() < 1e-3 * expected.depth.max()
-    # A cut pixel can raise the largest weight by the cut itself, no more.
-    assert (got.visibility - expected.visibility).abs().max() < 1 / 255 + 1e-4
-    for attribute in (*ATTRIBUTES, "background"):
-        assert torch.isfinite(grads[attribute]).all()
-        error = relative_l2(grads[attribute], expected_grads[attribute])
-        assert error < 1e-3, f"{attribute}: {error}"
+    assert_agrees(_expected(name), fast_backend)
 
 
 def test_extreme_scenes_are_seen_at_all():
