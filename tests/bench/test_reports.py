@@ -150,7 +150,7 @@ def test_the_trainer_is_compared_with_the_bare_step(dataset):
 def test_the_ellipsoid_fills_three_fifths_of_the_image():
     gaussians, cameras = ellipsoid_scene(20_000, 256, 1)
     alpha = rasterize(gaussians, cameras).alpha
-    assert float((alpha > 0.5).float().mean()) == pytest.approx(0.6, abs=0.03)
+    assert float((alpha > 0.1).float().mean()) == pytest.approx(0.6, abs=0.02)
 
 
 @pytest.mark.parametrize(
