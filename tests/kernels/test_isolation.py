@@ -1,0 +1,238 @@
+"""What is broken in one Gaussian, one image or one pixel stays there: drawn by hypothesis."""
+
+import math
+
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from rgbavatar_ns.kernels import GaussianSet, PinholeCameras, available_backends, rasterize
+from tests.kernels.scenes import ATTRIBUTES, random_scene, to
+
+pytestmark = [
+    pytest.mark.usefixtures("instruction_set"),
+    pytest.mark.skipif("cpu" not in available_backends(), reason="the extension is not compiled"),
+]
+BATCH, COUNT, WIDTH, HEIGHT = 3, 37, 19, 14
+NOT_FINITE = [math.nan, math.inf, -math.inf]
+EXTREME = [0.0, -0.0, 1e-40, -1e-40, 1e-30, 1e-20, 1e20, -1e20, 1e30, 3.4e38, -3.4e38, -1.0]
+# The instruction set is a fixture of a function that hypothesis calls many times; it is constant.
+drawn = settings(
+    max_examples=25,
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+)
+
+
+def _scene(seed: int, shared: tuple[str, ...] = ()):
+    return random_scene(
+        seed,
+        batch=BATCH,
+        count=COUNT,
+        width=WIDTH,
+        height=HEIGHT,
+        num_cameras=BATCH,
+        extremes=False,
+        shared=shared,
+    )
+
+
+def _rows(scene) -> dict[str, Tensor]:
+    return {name: value.float() for name, value in vars(scene.gaussians).items()}
+
+
+def _draw(rows, scene, background=None, image_grad=None, cameras=None):
+    """Image, alpha and the gradients of all attributes."""
+    leaves = {name: value.clone().requires_grad_() for name, value in rows.items()}
+    background = scene.background.float() if background is None else background
+    rendered = rasterize(
+        GaussianSet(**leaves),
+        cameras or to(scene.cameras, torch.float32),
+        background,
+        backend="cpu",
+        with_depth=True,
+        with_visibility=True,
+    )
+    image_grad = scene.image_grad.float() if image_grad is None else image_grad
+    torch.autograd.backward(
+        [rendered.image, rendered.alpha], [image_grad, scene.alpha_grad.float()]
+    )
+    return rendered, {name: torch.as_tensor(leaf.grad) for name, leaf in leaves.items()}
+
+
+def _with(rows, changes):
+    """A copy in which `name`'s row of one image and Gaussian holds `value` (at one component)."""
+    changed = {name: value.clone() for name, value in rows.items()}
+    for name, index, component, value in changes:
+        tensor = changed[name]
+        row = tensor[component % len(tensor), index]
+        if row.ndim:
+            row[component % len(row)] = value
+        else:
+            tensor[component % len(tensor), index] = value
+    return changed
+
+
+def _changes(values) -> st.SearchStrategy:
+    change = st.tuples(
+        st.sampled_from(ATTRIBUTES),
+        st.integers(0, COUNT - 1),
+        st.integers(0, 11),
+        st.sampled_from(values),
+    )
+    return st.lists(change, min_size=1, max_size=6)
+
+
+@drawn
+@given(changes=_changes(NOT_FINITE), seed=st.integers(0, 3), shared=st.sampled_from(ATTRIBUTES))
+def test_gaussians_that_are_not_finite_might_as_well_be_absent(changes, seed, shared):
+    scene = _scene(seed, (shared,))
+    # Broken in every image, so that it can be left out of the batch.
+    indices = sorted({index for _, index, _, _ in changes})
+    everywhere = [
+        (name, index, BATCH * component + image, value)
+        for name, index, component, value in changes
+        for image in range(BATCH)
+    ]
+    keep = [index for index in range(COUNT) if index not in indices]
+    rows = _rows(scene)
+    rendered, grads = _draw(_with(rows, everywhere), scene)
+    alone, alone_grads = _draw({name: row[:, keep] for name, row in rows.items()}, scene)
+    assert torch.equal(rendered.image, alone.image)
+    assert torch.equal(rendered.alpha, alone.alpha)
+    assert torch.equal(torch.as_tensor(rendered.depth), torch.as_tensor(alone.depth))
+    assert (torch.as_tensor(rendered.visibility)[:, indices] == 0).all()
+    for name in ATTRIBUTES:
+        assert torch.equal(grads[name][:, keep], alone_grads[name]), name
+        assert (grads[name][:, indices] == 0).all()
+
+
+@drawn
+@given(change=_changes(NOT_FINITE + EXTREME), seed=st.integers(0, 3))
+def test_what_is_broken_in_one_image_is_not_seen_in_another(change, seed):
+    scene = _scene(seed)
+    rows = _rows(scene)
+    # The middle image's rows are 1 modulo the batch's size.
+    middle = [(name, index, 3 * component + 1, value) for name, index, component, value in change]
+    rendered, grads = _draw(_with(rows, middle), scene)
+    expected, expected_grads = _draw(rows, scene)
+    for image in (0, 2):
+        assert torch.equal(rendered.image[image], expected.image[image])
+        for name in ATTRIBUTES:
+            assert torch.equal(grads[name][image], expected_grads[name][image])
+
+
+@drawn
+@given(changes=_changes(EXTREME), seed=st.integers(0, 3))
+def test_extreme_shapes_and_opacities_leave_images_in_range(changes, seed):
+    scene = _scene(seed)
+    changes = [change for change in changes if change[0] != "colors"]
+    rendered, grads = _draw(_with(_rows(scene), changes), scene)
+    touched = {index for _, index, _, _ in changes}
+    others = [index for index in range(COUNT) if index not in touched]
+    assert 0 <= rendered.alpha.min() <= rendered.alpha.max() <= 1
+    assert -1e-6 <= rendered.image.min() <= rendered.image.max() <= 1 + 1e-5
+    for name in ATTRIBUTES:
+        assert torch.isfinite(grads[name][:, others]).all(), name
+
+
+@drawn
+@given(
+    name=st.sampled_from(["world_to_camera", "focal_px", "principal_point_px"]),
+    position=st.integers(0, 100),
+    value=st.sampled_from(NOT_FINITE),
+)
+def test_cameras_that_are_not_finite_are_refused(name, position, value):
+    scene = _scene(0)
+    cameras = to(scene.cameras, torch.float32)
+    flat = getattr(cameras, name).view(-1)
+    flat[position % len(flat)] = value
+    with pytest.raises(ValueError, match=f"{name} holds NaN or infinity"):
+        _draw(_rows(scene), scene, cameras=cameras)
+
+
+@drawn
+@given(
+    name=st.sampled_from(["world_to_camera", "focal_px", "principal_point_px"]),
+    position=st.integers(0, 100),
+    value=st.sampled_from(EXTREME),
+)
+def test_extreme_cameras_are_refused_or_leave_images_in_range(name, position, value):
+    scene = _scene(1)
+    cameras = to(scene.cameras, torch.float32)
+    values = getattr(cameras, name)
+    values[1].view(-1)[position % values[1].numel()] = value
+    if name == "focal_px" and value <= 0:
+        with pytest.raises(ValueError, match="focal_px must be positive"):
+            _draw(_rows(scene), scene, cameras=cameras)
+        return
+    rendered, grads = _draw(_rows(scene), scene, cameras=cameras)
+    expected, expected_grads = _draw(_rows(scene), scene)
+    assert 0 <= rendered.alpha.min() <= rendered.alpha.max() <= 1
+    assert -1e-6 <= rendered.image.min() <= rendered.image.max() <= 1 + 1e-5
+    for image in (0, 2):
+        assert torch.equal(rendered.image[image], expected.image[image])
+        for attribute in ATTRIBUTES:
+            assert torch.equal(grads[attribute][image], expected_grads[attribute][image])
+
+
+@drawn
+@given(channel=st.integers(0, 2), value=st.sampled_from(NOT_FINITE + EXTREME))
+def test_a_broken_background_stays_in_its_image_and_channel(channel, value):
+    scene = _scene(2)
+    plain = scene.background.float().repeat(BATCH, 1)
+    broken = plain.clone()
+    broken[1, channel] = value
+    rendered, grads = _draw(_rows(scene), scene, broken)
+    expected, expected_grads = _draw(_rows(scene), scene, plain)
+    assert torch.equal(rendered.alpha, expected.alpha)
+    others = [k for k in range(3) if k != channel]
+    assert torch.equal(rendered.image[..., others], expected.image[..., others])
+    for image in (0, 2):
+        assert torch.equal(rendered.image[image], expected.image[image])
+        for name in ATTRIBUTES:
+            assert torch.equal(grads[name][image], expected_grads[name][image])
+    assert torch.equal(grads["colors"], expected_grads["colors"])
+
+
+@drawn
+@given(
+    row=st.integers(0, HEIGHT - 1),
+    column=st.integers(0, WIDTH - 1),
+    value=st.sampled_from(NOT_FINITE),
+)
+def test_a_broken_gradient_of_a_pixel_stays_with_the_gaussians_of_its_image(row, column, value):
+    scene = _scene(3)
+    image_grad = scene.image_grad.float()
+    image_grad[1, row, column, 1] = value
+    _, grads = _draw(_rows(scene), scene, image_grad=image_grad)
+    _, expected = _draw(_rows(scene), scene)
+    for image in (0, 2):
+        for name in ATTRIBUTES:
+            assert torch.equal(grads[name][image], expected[name][image])
+
+
+@pytest.mark.parametrize("value", [1e3, -1e3])
+def test_a_glaring_gaussian_leaves_its_neighbours_gradients(value):
+    """What lies behind it has a gradient in which its colour does not occur."""
+    scene = _scene(0)
+    nearest = (scene.gaussians.means[0] @ scene.cameras.world_to_camera[0, 2, :3]).argmin()
+    rows = {name: row[:1] for name, row in _rows(scene).items()}
+    camera = PinholeCameras(
+        **{
+            name: item[:1].float() if isinstance(item, Tensor) else item
+            for name, item in vars(scene.cameras).items()
+        }
+    )
+    one = type(scene)(
+        scene.gaussians, camera, scene.background, scene.image_grad[:1], scene.alpha_grad[:1]
+    )
+    glaring = _with(rows, [("colors", int(nearest), k, value) for k in range(3)])
+    _, grads = _draw(glaring, one, cameras=camera)
+    _, expected = _draw(rows, one, cameras=camera)
+    others = torch.arange(COUNT) != nearest
+    for name in ATTRIBUTES:
+        error = (grads[name] - expected[name])[:, others].norm()
+        assert error < 1e-3 * expected[name].norm(), f"{name}: {error}"

@@ -1,0 +1,136 @@
+"""The C++ loops under the address and undefined-behaviour sanitizers, on the kernel tests."""
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from rgbavatar_ns.kernels import available_backends
+
+ROOT = Path(__file__).parents[2]
+SANITIZERS = "address,undefined,float-cast-overflow"
+# libstdc++ as well: the address sanitizer looks for its exceptions when the process starts.
+PRELOADED = ("libasan.so", "libubsan.so", "libstdc++.so.6")
+TESTS = (
+    "test_backends_agree.py",
+    "test_bad_input.py",
+    "test_extremes.py",
+    "test_isolation.py",
+    "test_laws.py",
+    "test_sizes.py",
+    "test_weighted_colors.py",
+)
+# A pytest plugin that puts the module built here where the package looks for its own.
+PLUGIN = """
+import importlib.util
+import sys
+
+NAME, PATH = "rgbavatar_ns.kernels.cpu._native", {path!r}
+spec = importlib.util.spec_from_file_location(NAME, PATH)
+sys.modules[NAME] = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(sys.modules[NAME])
+
+
+def pytest_report_header():
+    from rgbavatar_ns.kernels.cpu import backend
+
+    return "rasterizer: " + backend._native.__file__
+"""
+
+
+def _program(name: str) -> str:
+    beside_python = shutil.which(name, path=str(Path(sys.executable).parent))
+    found = beside_python or shutil.which(name)
+    return found or pytest.skip(f"{name} is not installed")
+
+
+def _preloaded() -> str:
+    compiler = os.environ.get("CXX", "c++")
+    if sys.platform != "linux" or not shutil.which(compiler):
+        pytest.skip("needs Linux and a C++ compiler")
+    paths = []
+    for library in PRELOADED:
+        command = [compiler, f"-print-file-name={library}"]
+        path = subprocess.run(command, capture_output=True, text=True).stdout.strip()
+        if not Path(path).is_absolute():
+            pytest.skip(f"{compiler} has no {library}")
+        paths.append(path)
+    return ":".join(paths)
+
+
+def _run(command: list[str], **options) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        command,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        errors="replace",
+        timeout=600,
+        **options,
+    )
+
+
+@pytest.fixture(scope="module")
+def sanitized(tmp_path_factory) -> dict[str, str]:
+    """The environment of a process in which the package uses a sanitized build."""
+    if "cpu" not in available_backends():
+        pytest.skip("the extension is not compiled")
+    pytest.importorskip("nanobind")
+    preloaded, cmake, ninja = _preloaded(), _program("cmake"), _program("ninja")
+    build = tmp_path_factory.mktemp("sanitized")
+    nanobind = subprocess.check_output(
+        [sys.executable, "-m", "nanobind", "--cmake_dir"], text=True
+    ).strip()
+    options = {
+        "CMAKE_MAKE_PROGRAM": ninja,
+        "CMAKE_BUILD_TYPE": "RelWithDebInfo",
+        "CMAKE_CXX_FLAGS_RELWITHDEBINFO": "-O1 -g1",
+        "Python_EXECUTABLE": sys.executable,
+        "nanobind_DIR": nanobind,
+        "RGBAVATAR_SANITIZE": SANITIZERS,
+    }
+    definitions = [f"-D{name}={value}" for name, value in options.items()]
+    configured = _run([cmake, "-G", "Ninja", "-S", str(ROOT), "-B", str(build), *definitions])
+    assert configured.returncode == 0, configured.stdout[-4000:]
+    built = _run([cmake, "--build", str(build), "--parallel", str(os.cpu_count() or 1)])
+    assert built.returncode == 0, built.stdout[-4000:]
+    (module,) = build.glob("_native*.so")
+    (build / "sanitized_native.py").write_text(PLUGIN.format(path=str(module)))
+    return {
+        **os.environ,
+        "PYTHONPATH": str(build),
+        "LD_PRELOAD": preloaded,
+        "ASAN_OPTIONS": "detect_leaks=0",
+        "UBSAN_OPTIONS": "halt_on_error=1:print_stacktrace=1",
+        "OMP_NUM_THREADS": "2",
+    }
+
+
+def _summary(output: str) -> str:
+    """The sanitizer's finding and where it is, or what pytest says at last."""
+    lines = output.splitlines()
+    for number, line in enumerate(lines):
+        if re.search(r"runtime error:|ERROR: \w+Sanitizer", line):
+            return "\n".join(each[:300] for each in lines[number : number + 12])
+    return output[-4000:]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("which", ["fastest", "generic"])
+def test_kernel_tests_are_clean(sanitized, which):
+    from rgbavatar_ns.kernels.cpu.backend import instruction_sets
+
+    chosen = instruction_sets()[0] if which == "fastest" else which
+    others = [name for name in (*instruction_sets(), "reference") if name != chosen]
+    command = [sys.executable, "-m", "pytest", "-x", "-v", "--capture=sys", "-m", "not slow"]
+    command += ["-p", "sanitized_native", "-p", "no:cacheprovider", "-o", "addopts="]
+    command += ["-k", " and ".join(f"not [{name}" for name in others)]
+    command += [str(ROOT / "tests" / "kernels" / name) for name in TESTS]
+    environment = {**sanitized, "RGBAVATAR_INSTRUCTION_SET": chosen}
+    result = _run(command, cwd=ROOT, env=environment)
+    assert f"rasterizer: {sanitized['PYTHONPATH']}" in result.stdout, result.stdout[-4000:]
+    assert result.returncode == 0, _summary(result.stdout)
