@@ -41,6 +41,7 @@ struct BlendingConstants {
   static constexpr float kMaxAlpha = 0.999f;
   static constexpr float kMinAlpha = 1.0f / 255.0f;
   static constexpr float kLog2MinAlpha = -7.994353436858858f;
+  static constexpr float kLog2MaxAlpha = -0.0014434168696687186f;
   static constexpr float kMinTransmittance = 1e-4f;
   static constexpr float kFrustumMargin = 0.3f;
   static constexpr float kMinQuatNorm = 1e-12f;
@@ -176,8 +177,8 @@ RGBAVATAR_FUNCTION auto is_drawable(const GaussianInput<F>& g, const Vec3<F>& co
 
 // Log2 of the alpha at offset (dx, dy) from the mean, before cut and cap.
 template <class F>
-RGBAVATAR_FUNCTION F log2_alpha(const F& dx, const F& dy, float log2_opacity, float qa, float qb,
-                                float qc) {
+RGBAVATAR_FUNCTION F log2_alpha(const F& dx, const F& dy, const F& log2_opacity, const F& qa,
+                                const F& qb, const F& qc) {
   return dx * (dx * qa + dy * qb) + (dy * (dy * qc) + log2_opacity);
 }
 

@@ -5,53 +5,6 @@
 
 namespace rgbavatar::RGBAVATAR_ISA {
 
-// Calls visit(dx, dy, transmittance, rows) for the open blocks that the Gaussian touches. The visit
-// updates the transmittance as the forward pass did, so that the same blocks close at the
-// same Gaussian.
-template <int kRows, class Visit>
-static RGBAVATAR_MEMBER void for_open_blocks(const Tile& tile, const PixelCentres& centres,
-                                             const Splat& s, TileScratch& scratch, Visit visit) {
-  const int origin_x = tile.tile_x * kTileBlocks, origin_y = tile.tile_y * kTileBlocks;
-  const BlockRange r = blocks_in_tile(s.bounds, origin_x, origin_y);
-  const int width = r.last_x - r.first_x + 1, height = r.last_y - r.first_y + 1;
-  const float left_px = float((origin_x + r.first_x) * kBlockSide);
-  int x = 0, block = r.first_y * kTileBlocks + r.first_x;
-  float right_px = left_px, down_px = float((origin_y + r.first_y) * kBlockSide);
-  // One loop over rows and columns: the processor guesses its end better than that of each row.
-  for (int rest = width * height; rest > 0; --rest) {
-    float(*rows)[kBlockPixels] = block_rows<kRows>(scratch, block);
-    Wide t = load_wide(rows[kTransmittance]);
-    if (is_open(t)) {
-      visit(centres.x + right_px - Wide(s.mean_x), centres.y + down_px - Wide(s.mean_y), t, rows);
-      store(t, rows[kTransmittance]);
-    }
-    const bool wrap = ++x == width;
-    block += wrap ? kTileBlocks + 1 - width : 1;
-    right_px = wrap ? left_px : right_px + kBlockSide;
-    down_px += wrap ? float(kBlockSide) : 0.0f;
-    x = wrap ? 0 : x;
-  }
-}
-
-// Calls visit(Gaussian, its slot) front to back, and clears the slots behind an opaque tile.
-template <int kRows, class Visit>
-static RGBAVATAR_MEMBER void for_gaussians(const Tile& tile, TileScratch& scratch, float* slots,
-                                           int slot_width, Visit visit) {
-  bool open = true;
-  for (uint32_t first = 0; first < tile.entry_count; first += kPortion) {
-    const int count = load_portion(tile, first, scratch);
-    open = open && any_open<kRows>(scratch);
-    for (int i = 0; i < count; ++i) {
-      const Splat& s = scratch.portion[i];
-      float* slot = slots + int64_t(tile.slot(s)) * slot_width;
-      if (open)
-        visit(s, slot);
-      else
-        for (int k = 0; k < slot_width; ++k) slot[k] = 0.0f;
-    }
-  }
-}
-
 static void load_color_block(const Tile& tile, const float* image, const BlockPixels& pixels,
                              float channels[3][kBlockPixels]) {
   if (pixels.whole()) {
@@ -70,6 +23,13 @@ static void load_color_block(const Tile& tile, const float* image, const BlockPi
   }
 }
 
+// Begins to fetch the block two below, whose rows lie too far apart for the processor to guess.
+static void prefetch_block(const Tile& tile, const float* image, const BlockPixels& pixels) {
+  if (!image) return;
+  for (int y = 0; y < kBlockSide; ++y)
+    __builtin_prefetch(image + (pixels.first + (2 * kBlockSide + y) * int64_t(tile.width)) * 3);
+}
+
 // Sets the remainder to g . image - h (1 - alpha) and the channels to g; both are 0 outside the
 // image.
 static void start_remainder(const Tile& tile, const BackwardInput& in, TileScratch& scratch) {
@@ -78,6 +38,8 @@ static void start_remainder(const Tile& tile, const BackwardInput& in, TileScrat
     float(*g)[kBlockPixels] = rows + kColor;
     float* remainder = rows[kRemainder];
     const BlockPixels pixels(tile, block);
+    prefetch_block(tile, in.image, pixels);
+    prefetch_block(tile, in.image_grad, pixels);
     Wide rest(0.0f);
     if (in.image_grad) {
       float image[3][kBlockPixels];
@@ -93,50 +55,107 @@ static void start_remainder(const Tile& tile, const BackwardInput& in, TileScrat
   }
 }
 
+// The sums over the jobs of one Gaussian of the group, which are written to its slot.
+static RGBAVATAR_MEMBER void sum_moments(const BlockGrid& grid, int place, TileScratch& scratch,
+                                         float* slots) {
+  const Group& group = scratch.group;
+  const Splat& s = group.splats[place];
+  const Wide color_red(s.red), color_green(s.green), color_blue(s.blue);
+  const Wide zero(0.0f);
+  Wide sum_red = zero, sum_green = zero, sum_blue = zero;
+  Wide sum_one = zero, sum_x = zero, sum_y = zero, sum_xx = zero, sum_xy = zero, sum_yy = zero;
+  const int stop = int(group.first_job[place + 1]);
+  for (int i = int(group.first_job[place]); i < stop; ++i) {
+    const unsigned block = Job(group, i).block;
+    float* row = block_rows<kBlendRows>(scratch, block)[0];
+    const Wide t = load_wide(row);
+    if (!is_open(t)) continue;
+    const Wide red = load_wide(row + kColor * kBlockPixels);
+    const Wide green = load_wide(row + (kColor + 1) * kBlockPixels);
+    const Wide blue = load_wide(row + (kColor + 2) * kBlockPixels);
+    const Wide alpha = load_wide(group.alpha[i]);
+    const Wide w = alpha * t;
+    const Wide along = w * (red * color_red + green * color_green + blue * color_blue);
+    const Wide remainder = load_wide(row + kRemainder * kBlockPixels) - along;
+    store(t - w, row);
+    store(remainder, row + kRemainder * kBlockPixels);
+    // alpha dL/dalpha, whose ln 2 follows below; the cap has no gradient.
+    const Wide d_p = select(Wide(C::kMaxAlpha) > alpha,
+                            along - remainder * load_wide(group.odds[i]), zero);
+    const Wide dx = grid.from_mean_x(s, block), dy = grid.from_mean_y(s, block);
+    const Wide d_x = d_p * dx, d_y = d_p * dy;
+    sum_red = sum_red + w * red;
+    sum_green = sum_green + w * green;
+    sum_blue = sum_blue + w * blue;
+    sum_one = sum_one + d_p;
+    sum_x = sum_x + d_x;
+    sum_y = sum_y + d_y;
+    sum_xx = sum_xx + d_x * dx;
+    sum_xy = sum_xy + d_x * dy;
+    sum_yy = sum_yy + d_y * dy;
+  }
+  Quad first = sums_of(sum_red, sum_green, sum_blue, sum_one) * Quad{1.0f, 1.0f, 1.0f, C::kLn2};
+  Quad second = sums_of(sum_x, sum_y, sum_xx, sum_xy) * C::kLn2;
+  float last = sum_of(sum_yy) * C::kLn2;
+  float* slot = slots + int64_t(group.slot[place]) * kMoments;
+  if (group.continued[place]) {
+    first = first + load_quad(slot);
+    second = second + load_quad(slot + 4);
+    last += slot[8];
+  }
+  store_quad(first, slot);
+  store_quad(second, slot + 4);
+  slot[8] = last;
+}
+
+static void clear_slot(float* slots, uint32_t slot, int width) {
+  for (int k = 0; k < width; ++k) slots[int64_t(slot) * width + k] = 0.0f;
+}
+
 static void backward_tile(const Tile& tile, const BackwardInput& in, TileScratch& scratch,
                           float* slots) {
-  const PixelCentres centres;
+  const BlockGrid grid(tile);
   start_rows<kBlendRows>(tile, scratch);
   start_remainder(tile, in, scratch);
-  for_gaussians<kBlendRows>(tile, scratch, slots, kMoments, [&](const Splat& s, float* slot) {
-    Wide sums[kMoments];
-    for (int k = 0; k < kMoments; ++k) sums[k] = Wide(0.0f);
-    for_open_blocks<kBlendRows>(
-        tile, centres, s, scratch,
-        [&](const Wide& dx, const Wide& dy, Wide& t, float(*rows)[kBlockPixels]) {
-          const Wide red = load_wide(rows[kColor]), green = load_wide(rows[kColor + 1]);
-          const Wide blue = load_wide(rows[kColor + 2]);
-          const Alpha alpha = alpha_at(dx, dy, s);
-          const Wide w = alpha.value * t;
-          const Wide along = red * s.red + green * s.green + blue * s.blue;
-          const Wide remainder = load_wide(rows[kRemainder]) - w * along;
-          store(remainder, rows[kRemainder]);
-          const Wide d_alpha = t * along - remainder * reciprocal_of(1.0f - alpha.value);
-          t = t - w;
-          // The cap has no gradient.
-          const Wide raw = select(alpha.raw <= Wide(C::kMaxAlpha), alpha.raw, Wide(0.0f));
-          const Wide d_p = d_alpha * raw;  // times ln 2, below
-          const Wide d_x = d_p * dx, d_y = d_p * dy;
-          sums[0] = sums[0] + w * red;
-          sums[1] = sums[1] + w * green;
-          sums[2] = sums[2] + w * blue;
-          sums[3] = sums[3] + d_p;
-          sums[4] = sums[4] + d_x;
-          sums[5] = sums[5] + d_y;
-          sums[6] = sums[6] + d_x * dx;
-          sums[7] = sums[7] + d_x * dy;
-          sums[8] = sums[8] + d_y * dy;
-        });
-    store_quad(sums_of(sums[0], sums[1], sums[2], sums[3]) * Quad{1.0f, 1.0f, 1.0f, C::kLn2}, slot);
-    store_quad(sums_of(sums[4], sums[5], sums[6], sums[7]) * C::kLn2, slot + 4);
-    slot[8] = sum_of(sums[8]) * C::kLn2;
-  });
+  for_groups<kBlendRows>(
+      tile, scratch,
+      [&] {
+        fill_alphas<true>(grid, scratch.group);
+        for (int i = 0; i < scratch.group.splat_count; ++i) sum_moments(grid, i, scratch, slots);
+      },
+      [&](uint32_t slot) { clear_slot(slots, slot, kMoments); });
+}
+
+template <int kChannels>
+static RGBAVATAR_MEMBER void sum_channels(int place, int channels, TileScratch& scratch,
+                                          float* slots) {
+  const Group& group = scratch.group;
+  Wide sums[kChannels + 1], largest(0.0f);
+  for (int k = 0; k <= kChannels; ++k) sums[k] = Wide(0.0f);
+  const int stop = int(group.first_job[place + 1]);
+  for (int i = int(group.first_job[place]); i < stop; ++i) {
+    float* row = block_rows<1 + kChannels>(scratch, Job(group, i).block)[0];
+    const Wide t = load_wide(row);
+    if (!is_open(t)) continue;
+    const Wide w = load_wide(group.alpha[i]) * t;
+    store(t - w, row);
+    largest = max_of(largest, w);
+    sums[kChannels] = sums[kChannels] + w;
+    for (int k = 0; k < kChannels; ++k)
+      sums[k] = sums[k] + w * load_wide(row + (1 + k) * kBlockPixels);
+  }
+  float* slot = slots + int64_t(group.slot[place]) * (channels + 2);
+  if (!group.continued[place]) clear_slot(slots, group.slot[place], channels + 2);
+  for (int k = 0; k < channels; ++k) slot[k] += sum_of(sums[k]);
+  slot[channels] += sum_of(sums[kChannels]);
+  const float lane = max_lane(largest);
+  slot[channels + 1] = lane > slot[channels + 1] ? lane : slot[channels + 1];
 }
 
 template <int kChannels>
 static void average_channels(const Tile& tile, const float* image, int channels,
                              TileScratch& scratch, float* slots) {
-  const PixelCentres centres;
+  const BlockGrid grid(tile);
   constexpr int kRows = 1 + kChannels;
   start_rows<kRows>(tile, scratch);
   for (int block = 0; block < kBlocksPerTile; ++block) {
@@ -145,22 +164,14 @@ static void average_channels(const Tile& tile, const float* image, int channels,
       for (int k = 0; k < channels; ++k) values[k][lane] = image[pixel * channels + k];
     });
   }
-  for_gaussians<kRows>(tile, scratch, slots, channels + 2, [&](const Splat& s, float* slot) {
-    Wide sums[kChannels + 1], largest(0.0f);
-    for (int k = 0; k <= kChannels; ++k) sums[k] = Wide(0.0f);
-    for_open_blocks<kRows>(
-        tile, centres, s, scratch,
-        [&](const Wide& dx, const Wide& dy, Wide& t, const float(*rows)[kBlockPixels]) {
-          const Wide w = alpha_at(dx, dy, s).value * t;
-          t = t - w;
-          largest = max_of(largest, w);
-          sums[kChannels] = sums[kChannels] + w;
-          for (int k = 0; k < kChannels; ++k) sums[k] = sums[k] + w * load_wide(rows[1 + k]);
-        });
-    for (int k = 0; k < channels; ++k) slot[k] = sum_of(sums[k]);
-    slot[channels] = sum_of(sums[kChannels]);
-    slot[channels + 1] = max_lane(largest);
-  });
+  for_groups<kRows>(
+      tile, scratch,
+      [&] {
+        fill_alphas<false>(grid, scratch.group);
+        for (int i = 0; i < scratch.group.splat_count; ++i)
+          sum_channels<kChannels>(i, channels, scratch, slots);
+      },
+      [&](uint32_t slot) { clear_slot(slots, slot, channels + 2); });
 }
 
 static void average_tile(const Tile& tile, const float* image, int channels, TileScratch& scratch,

@@ -1,32 +1,27 @@
-// Blending of one tile: block by block, every block through its list of Gaussians.
+// Blending of one tile: Gaussian by Gaussian, each over the blocks that it touches.
 #pragma once
 
 #include "formulas.h"
 
 namespace rgbavatar::RGBAVATAR_ISA {
 
-struct BlockRange {
-  int first_x, last_x, first_y, last_y;  // within the tile, inclusive
-};
+// The pixel centres of a tile's blocks.
+struct alignas(64) BlockGrid {
+  float x[kTileBlocks][kBlockPixels], y[kTileBlocks][kBlockPixels];
 
-static inline BlockRange blocks_in_tile(const Bounds& s, int origin_x, int origin_y) {
-  const int x0 = s.first_block_x - origin_x, x1 = s.last_block_x - origin_x;
-  const int y0 = s.first_block_y - origin_y, y1 = s.last_block_y - origin_y;
-  return {x0 > 0 ? x0 : 0, x1 < kTileBlocks ? x1 : kTileBlocks - 1, y0 > 0 ? y0 : 0,
-          y1 < kTileBlocks ? y1 : kTileBlocks - 1};
-}
-
-// Centres of a block's pixels.
-struct PixelCentres {
-  Wide x, y;
-  PixelCentres() {
-    float lane_x[kBlockPixels], lane_y[kBlockPixels];
-    for (int i = 0; i < kBlockPixels; ++i) {
-      lane_x[i] = i % kBlockSide + 0.5f;
-      lane_y[i] = i / kBlockSide + 0.5f;
-    }
-    load(x, lane_x);
-    load(y, lane_y);
+  explicit BlockGrid(const Tile& tile) {
+    for (int block = 0; block < kTileBlocks; ++block)
+      for (int i = 0; i < kBlockPixels; ++i) {
+        x[block][i] = float((tile.tile_x * kTileBlocks + block) * kBlockSide + i % kBlockSide) + 0.5f;
+        y[block][i] = float((tile.tile_y * kTileBlocks + block) * kBlockSide + i / kBlockSide) + 0.5f;
+      }
+  }
+  // Pixels from a Gaussian's mean.
+  RGBAVATAR_MEMBER Wide from_mean_x(const Splat& s, unsigned block) const {
+    return load_wide(x[block % kTileBlocks]) - s.mean_x;
+  }
+  RGBAVATAR_MEMBER Wide from_mean_y(const Splat& s, unsigned block) const {
+    return load_wide(y[block / kTileBlocks]) - s.mean_y;
   }
 };
 
@@ -75,42 +70,8 @@ static void start_rows(const Tile& tile, TileScratch& scratch) {
   }
 }
 
-// Copies the tile's next Gaussians, which lie far apart, to scratch.portion.
-static int load_portion(const Tile& tile, uint32_t first, TileScratch& scratch) {
-  constexpr uint32_t kAhead = 12;
-  const uint32_t rest = tile.entry_count - first;
-  const uint32_t count = rest < uint32_t(kPortion) ? rest : kPortion;
-  const uint32_t* entries = tile.entries + first;
-  for (uint32_t i = 0; i < kAhead && i < count; ++i) __builtin_prefetch(&tile.splats[entries[i]]);
-  for (uint32_t i = 0; i < count; ++i) {
-    if (i + kAhead < count) __builtin_prefetch(&tile.splats[entries[i + kAhead]]);
-    scratch.portion[i] = tile.splats[entries[i]];
-  }
-  return int(count);
-}
-
-// Which of the portion's Gaussians touch each block, as scratch.list.
-static void list_by_block(const Tile& tile, int count, TileScratch& scratch) {
-  const int origin_x = tile.tile_x * kTileBlocks, origin_y = tile.tile_y * kTileBlocks;
-  for (int block = 0; block < kBlocksPerTile; ++block) scratch.list_size[block] = 0;
-  for (int i = 0; i < count; ++i) {
-    const BlockRange r = blocks_in_tile(scratch.portion[i].bounds, origin_x, origin_y);
-    for (int y = r.first_y; y <= r.last_y; ++y)
-      for (int x = r.first_x; x <= r.last_x; ++x) {
-        const int block = y * kTileBlocks + x;
-        scratch.list[block][scratch.list_size[block]++] = uint16_t(i);
-      }
-  }
-}
-
-struct Alpha {
-  Wide raw, value;  // before the cap, and as blended; both 0 below the cut
-};
-
-static RGBAVATAR_MEMBER Alpha alpha_at(const Wide& dx, const Wide& dy, const Splat& s) {
-  const Wide p = log2_alpha(dx, dy, s.log2_opacity, s.qa, s.qb, s.qc);
-  const Wide raw = select(p >= Wide(C::kLog2MinAlpha), exp2_of(p), Wide(0.0f));
-  return {raw, min_of(raw, Wide(C::kMaxAlpha))};
+static RGBAVATAR_MEMBER void add_to(float* row, const Wide& value) {
+  store(load_wide(row) + value, row);
 }
 
 static RGBAVATAR_MEMBER bool is_open(const Wide& transmittance) {
@@ -124,37 +85,200 @@ static bool any_open(TileScratch& scratch) {
   return false;
 }
 
-// Blends a block's list into its rows.
-template <bool kWithDepth>
-static inline void blend_block(const Tile& tile, const PixelCentres& centres, int block,
-                               TileScratch& scratch) {
-  const Wide px = centres.x + float((tile.tile_x * kTileBlocks + block % kTileBlocks) * kBlockSide);
-  const Wide py = centres.y + float((tile.tile_y * kTileBlocks + block / kTileBlocks) * kBlockSide);
-  float(*rows)[kBlockPixels] = block_rows<kBlendRows>(scratch, block);
-  Wide t = load_wide(rows[kTransmittance]), red = load_wide(rows[kColor]);
-  Wide green = load_wide(rows[kColor + 1]), blue = load_wide(rows[kColor + 2]);
-  Wide depth = load_wide(rows[kDepth]);
-  const int size = scratch.list_size[block];
-  for (int i = 0; i < size && is_open(t); ++i) {
-    const Splat& s = scratch.portion[scratch.list[block][i]];
-    const Wide w = alpha_at(px - s.mean_x, py - s.mean_y, s).value * t;
-    red = red + w * s.red;
-    green = green + w * s.green;
-    blue = blue + w * s.blue;
-    if (kWithDepth) depth = depth + w * s.depth;
-    t = t - w;
+// Gaussians between two looks at whether any block of the tile is still open.
+constexpr uint32_t kPortion = 256;
+
+// ---- Jobs: a Gaussian over a block of pixels ----------------------------------------------------
+// A tile's Gaussians are taken in groups, whose jobs stand in one list. A loop over the list has no
+// inner loops that end after a few blocks, at places that no processor guesses.
+
+struct Job {
+  const Splat* splat;
+  unsigned block;
+
+  Job(const Group& group, int i)
+      : splat(group.splats + (group.jobs[i] >> 16)), block(group.jobs[i] & 0xffff) {}
+};
+
+// Four jobs at a time: a processor does not look far enough ahead to overlap chains of operations as
+// long as these by itself.
+typedef Floats<4 * kLanes> FourJobs;
+template <class Value>
+static RGBAVATAR_MEMBER FourJobs of_four(const Job jobs[4], const Value& value) {
+  return {{value(jobs[0]), value(jobs[1])}, {value(jobs[2]), value(jobs[3])}};
+}
+static RGBAVATAR_MEMBER void store_four(const FourJobs& a, float to[4][kBlockPixels]) {
+  store(a.low.low, to[0]);
+  store(a.low.high, to[1]);
+  store(a.high.low, to[2]);
+  store(a.high.high, to[3]);
+}
+
+// Fills the group's alphas, after cut and cap, and alpha / (1 - alpha) where asked for.
+template <bool kWithOdds>
+static void fill_alphas(const BlockGrid& grid, Group& group) {
+  for (int i = 0; i < 4; ++i) group.jobs[group.job_count + i] = 0;
+  for (int i = 0; i < group.job_count; i += 4) {
+    const Job jobs[4] = {{group, i}, {group, i + 1}, {group, i + 2}, {group, i + 3}};
+    const auto of = [&](auto value) __attribute__((always_inline)) {
+      return of_four(jobs, value);
+    };
+    const FourJobs dx = of([&](const Job& j) { return grid.from_mean_x(*j.splat, j.block); });
+    const FourJobs dy = of([&](const Job& j) { return grid.from_mean_y(*j.splat, j.block); });
+    const FourJobs p = log2_alpha(dx, dy, of([](const Job& j) { return Wide(j.splat->log2_opacity); }),
+                                  of([](const Job& j) { return Wide(j.splat->qa); }),
+                                  of([](const Job& j) { return Wide(j.splat->qb); }),
+                                  of([](const Job& j) { return Wide(j.splat->qc); }));
+    const FourJobs alpha =
+        min_of(exp2_where(p >= FourJobs(C::kLog2MinAlpha), p), FourJobs(C::kMaxAlpha));
+    store_four(alpha, group.alpha + i);
+    if (kWithOdds) store_four(alpha * reciprocal_of(FourJobs(1.0f) - alpha), group.odds + i);
   }
-  store(t, rows[kTransmittance]);
-  store(red, rows[kColor]);
-  store(green, rows[kColor + 1]);
-  store(blue, rows[kColor + 2]);
-  if (kWithDepth) store(depth, rows[kDepth]);
+}
+
+// Appends jobs for the blocks of an 8 x 8 window, whose first one is `first` of the tile.
+static RGBAVATAR_MEMBER void add_jobs(uint64_t blocks, int first, Group& group) {
+  const int code = group.splat_count << 16;
+  uint32_t* to = group.jobs + group.job_count;
+#if defined(__AVX512F__)
+  // Two rows of the window at a time.
+  const __m512i pair = _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, kTileBlocks, kTileBlocks + 1,
+                                         kTileBlocks + 2, kTileBlocks + 3, kTileBlocks + 4,
+                                         kTileBlocks + 5, kTileBlocks + 6, kTileBlocks + 7);
+  for (int row = 0; row < kWindow; row += 2) {
+    const __mmask16 mask = __mmask16(blocks >> (8 * row));
+    const __m512i codes =
+        _mm512_add_epi32(pair, _mm512_set1_epi32(code + first + row * kTileBlocks));
+    _mm512_storeu_si512(to, _mm512_maskz_compress_epi32(mask, codes));
+    to += __builtin_popcount(mask);
+  }
+#else
+  for (; blocks; blocks &= blocks - 1) {
+    const int bit = __builtin_ctzll(blocks);
+    *to++ = uint32_t(code + first + bit / kWindow * kTileBlocks + bit % kWindow);
+  }
+#endif
+  group.job_count = int(to - group.jobs);
+}
+
+static RGBAVATAR_MEMBER void add_splat(const Splat& s, uint32_t slot, bool continued,
+                                       Group& group) {
+  const int place = group.splat_count;
+  group.splats[place] = s;
+  group.slot[place] = slot;
+  group.continued[place] = continued;
+  group.first_job[place] = uint32_t(group.job_count);
+}
+
+// Closes the list of the last Gaussian.
+static RGBAVATAR_MEMBER void end_splat(Group& group) {
+  group.first_job[++group.splat_count] = uint32_t(group.job_count);
+}
+
+static RGBAVATAR_MEMBER bool is_full(const Group& group) {
+  return group.splat_count == kGroupSplats || group.job_count > kGroupJobs - kWindow * kWindow;
+}
+
+// Bits low..high of eight.
+static inline unsigned bit_span(int low, int high) {
+  const int from = low > 0 ? low : 0, to = high < kWindow - 1 ? high : kWindow - 1;
+  return from > to ? 0u : (2u << to) - (1u << from);
+}
+
+// The blocks (x, y) of a window with 0 <= left + x < side_x and 0 <= top + y < side_y.
+static inline uint64_t blocks_within(int left, int top, int side_x, int side_y) {
+  const uint64_t columns = bit_span(-left, side_x - 1 - left) * 0x0101010101010101ull;
+  const int first = top < 0 ? -top : 0, rest = side_y - top;  // rows first..rest - 1
+  if (first >= kWindow || rest <= 0) return 0;
+  const uint64_t above = rest < kWindow ? (1ull << (8 * rest)) - 1 : kAllBlocks;
+  return columns & above & (kAllBlocks << (8 * first));
+}
+
+// A Gaussian that needs several windows; (x, y) is the first block of its bounds in the tile.
+template <class Empty>
+static __attribute__((noinline)) void add_large_splat(const Tile& tile, const Splat& s, int x,
+                                                      int y, uint32_t slot, Group& group,
+                                                      const Empty& empty) {
+  const int last_x = s.bounds.last_block_x - tile.tile_x * kTileBlocks;
+  const int last_y = s.bounds.last_block_y - tile.tile_y * kTileBlocks;
+  const int side_x = last_x < kTileBlocks ? last_x + 1 : kTileBlocks;
+  const int side_y = last_y < kTileBlocks ? last_y + 1 : kTileBlocks;
+  bool continued = false;
+  for (int top = y > 0 ? y : 0; top < side_y; top += kWindow)
+    for (int left = x > 0 ? x : 0; left < side_x; left += kWindow) {
+      add_splat(s, slot, continued, group);
+      add_jobs(blocks_within(left, top, side_x, side_y), top * kTileBlocks + left, group);
+      end_splat(group);
+      if (is_full(group)) empty();
+      continued = true;
+    }
+}
+
+// Calls flush() whenever the group is full and at the end, and skip(slot) for Gaussians behind an
+// opaque tile.
+template <int kRows, class Flush, class Skip>
+static RGBAVATAR_MEMBER void for_groups(const Tile& tile, TileScratch& scratch, const Flush& flush,
+                                        const Skip& skip) {
+  Group& group = scratch.group;
+  const auto empty = [&] {
+    flush();
+    group.splat_count = group.job_count = 0;
+  };
+  const int origin_x = tile.tile_x * kTileBlocks, origin_y = tile.tile_y * kTileBlocks;
+  group.splat_count = group.job_count = 0;
+  constexpr uint32_t kAhead = 16;
+  for (uint32_t i = 0; i < tile.entry_count; ++i) {
+    if (i % kPortion == 0 && i) {
+      empty();
+      if (!any_open<kRows>(scratch)) {
+        for (; i < tile.entry_count; ++i) skip(tile.entries[i].slot);
+        return;
+      }
+    }
+    if (i + kAhead < tile.entry_count)
+      __builtin_prefetch(tile.splats + tile.entries[i + kAhead].gaussian);
+    const Entry entry = tile.entries[i];
+    const Splat& s = tile.splats[entry.gaussian];
+    const int x = s.bounds.first_block_x - origin_x, y = s.bounds.first_block_y - origin_y;
+    if (s.blocks == kAllBlocks) {
+      add_large_splat(tile, s, x, y, entry.slot, group, empty);
+      continue;
+    }
+    uint64_t blocks = s.blocks;
+    constexpr int kInside = kTileBlocks - kWindow;
+    if (unsigned(x) > unsigned(kInside) || unsigned(y) > unsigned(kInside))
+      blocks &= blocks_within(x, y, kTileBlocks, kTileBlocks);
+    add_splat(s, entry.slot, false, group);
+    add_jobs(blocks, y * kTileBlocks + x, group);
+    end_splat(group);
+    if (is_full(group)) empty();
+  }
+  empty();
+}
+
+template <int kRows>
+static void blend_group(TileScratch& scratch) {
+  const Group& group = scratch.group;
+  for (int i = 0; i < group.job_count; ++i) {
+    const Job job(group, i);
+    float* row = block_rows<kRows>(scratch, job.block)[0];
+    const Wide t = load_wide(row);
+    if (!is_open(t)) continue;
+    const Splat& s = *job.splat;
+    const Wide w = load_wide(group.alpha[i]) * t;
+    store(t - w, row);
+    add_to(row + kColor * kBlockPixels, w * s.red);
+    add_to(row + (kColor + 1) * kBlockPixels, w * s.green);
+    add_to(row + (kColor + 2) * kBlockPixels, w * s.blue);
+    if (kRows > kDepth) add_to(row + kDepth * kBlockPixels, w * s.depth);
+  }
 }
 
 // Puts the background behind the block and writes it to the image.
+template <int kRows>
 static void write_block(const Tile& tile, const ForwardOutput& out, int block,
                         TileScratch& scratch) {
-  float(*rows)[kBlockPixels] = block_rows<kBlendRows>(scratch, block);
+  float(*rows)[kBlockPixels] = block_rows<kRows>(scratch, block);
   const float* transmittance = rows[kTransmittance];
   float(*channels)[kBlockPixels] = rows + kColor;
   const Wide t = load_wide(transmittance);
@@ -175,28 +299,31 @@ static void write_block(const Tile& tile, const ForwardOutput& out, int block,
       out.alpha[pixel] = 1.0f - transmittance[lane];
     });
   }
-  if (!out.depth) return;
+  if (kRows <= kDepth) return;
   pixels.for_each(tile, [&](int lane, int64_t pixel) {
     const float alpha = 1.0f - transmittance[lane];
     out.depth[pixel] = alpha > 0.0f ? rows[kDepth][lane] / alpha : 0.0f;
   });
 }
 
+template <int kRows>
+static void forward_rows(const Tile& tile, const ForwardOutput& out, TileScratch& scratch) {
+  const BlockGrid grid(tile);
+  start_rows<kRows>(tile, scratch);
+  for_groups<kRows>(
+      tile, scratch, [&] {
+        fill_alphas<false>(grid, scratch.group);
+        blend_group<kRows>(scratch);
+      }, [](uint32_t) {});
+  for (int block = 0; block < kBlocksPerTile; ++block)
+    write_block<kRows>(tile, out, block, scratch);
+}
+
 static void forward_tile(const Tile& tile, const ForwardOutput& out, TileScratch& scratch) {
-  const PixelCentres centres;
-  start_rows<kBlendRows>(tile, scratch);
-  for (uint32_t first = 0; first < tile.entry_count; first += kPortion) {
-    if (first && !any_open<kBlendRows>(scratch)) break;
-    list_by_block(tile, load_portion(tile, first, scratch), scratch);
-    for (int block = 0; block < kBlocksPerTile; ++block) {
-      if (scratch.list_size[block] == 0) continue;
-      if (out.depth)
-        blend_block<true>(tile, centres, block, scratch);
-      else
-        blend_block<false>(tile, centres, block, scratch);
-    }
-  }
-  for (int block = 0; block < kBlocksPerTile; ++block) write_block(tile, out, block, scratch);
+  if (out.depth)
+    forward_rows<kDepth + 1>(tile, out, scratch);
+  else
+    forward_rows<kDepth>(tile, out, scratch);
 }
 
 }  // namespace rgbavatar::RGBAVATAR_ISA

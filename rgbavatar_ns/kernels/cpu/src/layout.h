@@ -5,15 +5,15 @@
 
 namespace rgbavatar {
 
-// Pixels are taken in blocks of 4 x 4, one SIMD vector, and blocks in tiles of 16 x 16.
+// Pixels are taken in blocks of 4 x 4, one SIMD vector, and blocks in tiles.
 constexpr int kBlockSide = 4;
+constexpr int kBlockPixels = 16;
 constexpr int kTileBlocksShift = 4;
 constexpr int kTileBlocks = 1 << kTileBlocksShift;
 constexpr int kBlocksPerTile = kTileBlocks * kTileBlocks;
-constexpr int kBlockPixels = 16;
-// Gaussians of a tile are taken in portions, so that the block lists have a fixed size.
-constexpr int kPortion = 512;
 constexpr int kMaxChannels = 8;
+// A Gaussian whose blocks fit this window knows which of them its ellipse touches.
+constexpr int kWindow = 8;
 
 // Blocks first..last (inclusive) that hold every pixel a Gaussian can reach.
 struct Bounds {
@@ -31,7 +31,15 @@ struct alignas(64) Splat {
   float mean_x, mean_y, log2_opacity, qa, qb, qc;
   float red, green, blue, depth;
   Bounds bounds;
-  uint32_t first_slot;  // of its (Gaussian, tile) slots
+  uint64_t blocks;  // bit 8 y + x: it touches the block (x, y) counted from the first one of the
+                    // bounds; kAllBlocks where the bounds do not fit the window
+  uint64_t unused;
+};
+constexpr uint64_t kAllBlocks = ~uint64_t(0);
+
+// A Gaussian in a tile, and where its gradient's sums over the tile's pixels go.
+struct Entry {
+  uint32_t gaussian, slot;
 };
 
 // [B or 1, N, width] floats; the stride is 0 when the batch shares them.
@@ -46,25 +54,33 @@ struct Scene {
   Attribute means, quats, scales, opacities, colors;
 };
 
-// Gradients like the attributes; a null pointer means not wanted.
+// Gradients like the attributes.
 struct SceneGradient {
   float *means, *quats, *scales, *opacities, *colors;
+};
+
+// Where the projection of one image goes.
+struct Projected {
+  Splat* splats;    // those out of sight hold anything
+  float* depth;     // the same again in arrays, for the sorting
+  Bounds* bounds;
 };
 
 // The nine sums of the blending's backward pass, in the order of Moments.
 constexpr int kMoments = 9;
 
+// What one image left behind for its Gaussians' gradients.
+struct ImageSlots {
+  const uint32_t* offset;  // [N + 1]: first slot of every Gaussian
+  const float* slots;      // [slots, kMoments], and room for three floats more
+};
+
 // One tile of one image.
 struct Tile {
   const Splat* splats;
-  const uint32_t* entries;  // Gaussians in the tile, front to back
+  const Entry* entries;  // front to back
   uint32_t entry_count;
   int tile_x, tile_y, width, height;
-
-  uint32_t slot(const Splat& s) const {
-    return s.first_slot + (tile_y - s.bounds.first_tile_y()) * s.bounds.tiles_x() + tile_x -
-           s.bounds.first_tile_x();
-  }
 };
 
 struct ForwardOutput {
@@ -77,29 +93,39 @@ struct BackwardInput {
   const float *image_grad, *alpha_grad;  // each may be null
 };
 
-// Scratch memory of one thread.
+// Gaussians of a tile that are taken together. Each has some jobs: blocks of pixels.
+constexpr int kGroupSplats = 64, kGroupJobs = 192;
+struct alignas(64) Group {
+  Splat splats[kGroupSplats];
+  float alpha[kGroupJobs + 4][kBlockPixels], odds[kGroupJobs + 4][kBlockPixels];
+  uint32_t jobs[kGroupJobs + kBlockPixels];  // place of the Gaussian << 16 | block of the tile
+  uint32_t first_job[kGroupSplats + 1];
+  uint32_t slot[kGroupSplats];
+  bool continued[kGroupSplats];  // it had jobs in earlier groups
+  int splat_count, job_count;
+};
+
+// Scratch memory of one thread: what a pass keeps for every block, a few rows each, the
+// transmittance first.
 struct alignas(64) TileScratch {
-  // What a pass keeps for every block, a few rows each, the transmittance first.
   float rows[kBlocksPerTile * (1 + kMaxChannels)][kBlockPixels];
-  Splat portion[kPortion];
-  uint16_t list[kBlocksPerTile][kPortion];  // of each block: places in the portion
-  uint16_t list_size[kBlocksPerTile];
+  Group group;
 };
 
 // The loops, compiled once per instruction set.
 struct Kernels {
-  // Writes splats[begin, end), but for their first slot, and bounds[begin, end) of an image.
-  void (*project)(const Scene&, const float* camera, int image, int begin, int end, Splat* splats,
-                  Bounds* bounds);
+  // Projects Gaussians [begin, end) of an image.
+  void (*project)(const Scene&, const float* camera, int image, int begin, int end,
+                  const Projected&);
   void (*forward_tile)(const Tile&, const ForwardOutput&, TileScratch&);
   // Writes slots[slot * kMoments].
   void (*backward_tile)(const Tile&, const BackwardInput&, TileScratch&, float* slots);
   // Writes slots[slot * (channels + 2)]: sums of w I, sum of w, largest w. `image` is [H, W, C].
   void (*average_tile)(const Tile&, const float* image, int channels, TileScratch&, float* slots);
-  // Adds the gradient of image `image` for Gaussians [begin, end) to `gradient`.
+  // Writes the gradient of image `image` for Gaussians [begin, end); adds to that of the images
+  // before where the batch shares an attribute.
   void (*project_backward)(const Scene&, const float* camera, int image, int begin, int end,
-                           const uint32_t* slot_offset, const float* slots,
-                           const SceneGradient& gradient);
+                           const ImageSlots&, const SceneGradient&);
 };
 
 // world_to_camera [4, 4], focal [2] and principal point [2] in one row of floats.

@@ -19,139 +19,346 @@ static Camera camera_from(const float* c, int width, int height) {
   return out;
 }
 
-// Columns of rows [first, first + lanes) of a [N, K] array; further lanes are 0.
+// Sixteen rows of a [N, K] array: in place, or a copy padded with zeros at the array's end.
 template <int K>
-static inline void load_columns(const float* rows, int first, int lanes, Wide out[K]) {
-  float columns[K][kLanes] = {};
-  for (int lane = 0; lane < lanes; ++lane)
-    for (int k = 0; k < K; ++k) columns[k][lane] = rows[int64_t(first + lane) * K + k];
-  for (int k = 0; k < K; ++k) load(out[k], columns[k]);
+struct Rows {
+  float padded[kLanes * K];
+  const float* data;
+
+  Rows(const float* rows, int first, int lanes) : data(rows + int64_t(first) * K) {
+    if (lanes == kLanes) return;
+    for (int i = 0; i < kLanes * K; ++i) padded[i] = i < lanes * K ? data[i] : 0.0f;
+    data = padded;
+  }
+};
+
+// The same for writing: what lies behind the array's end is dropped.
+template <int K>
+struct OutputRows {
+  float padded[kLanes * K];
+  float *target, *data;
+  int floats;
+
+  OutputRows(float* rows, int first, int lanes)
+      : target(rows + int64_t(first) * K),
+        data(lanes == kLanes ? target : padded),
+        floats(lanes * K) {}
+  ~OutputRows() {
+    if (data == padded)
+      for (int i = 0; i < floats; ++i) target[i] = padded[i];
+  }
+};
+
+static RGBAVATAR_MEMBER Vec3<Wide> load_vec3(const float* rows, int first, int lanes) {
+  const Rows<3> in(rows, first, lanes);
+  Quad x[4], y[4], z[4];
+  for (int i = 0; i < 4; ++i) load_interleaved(in.data + 12 * i, x[i], y[i], z[i]);
+  return {wide_of(x[0], x[1], x[2], x[3]), wide_of(y[0], y[1], y[2], y[3]),
+          wide_of(z[0], z[1], z[2], z[3])};
 }
 
-template <int K>
-static inline void add_columns(float* rows, int first, int lanes, const Wide values[K]) {
-  float columns[K][kLanes];
-  for (int k = 0; k < K; ++k) store(values[k], columns[k]);
-  for (int lane = 0; lane < lanes; ++lane)
-    for (int k = 0; k < K; ++k) rows[int64_t(first + lane) * K + k] += columns[k][lane];
+static RGBAVATAR_MEMBER void load_quats(const float* rows, int first, int lanes, Wide out[4]) {
+  const Rows<4> in(rows, first, lanes);
+  Quad q[4][4];
+  for (int i = 0; i < 4; ++i) {
+    for (int k = 0; k < 4; ++k) q[i][k] = load_quad(in.data + 16 * i + 4 * k);
+    transpose(q[i][0], q[i][1], q[i][2], q[i][3]);
+  }
+  for (int k = 0; k < 4; ++k) out[k] = wide_of(q[0][k], q[1][k], q[2][k], q[3][k]);
 }
 
-static inline GaussianInput<Wide> load_gaussians(const Scene& scene, int image, int first,
+template <int i>
+static RGBAVATAR_MEMBER void store_quarter(const Vec3<Wide>& v, float* to) {
+  store_interleaved(quad_of<i>(v.x), quad_of<i>(v.y), quad_of<i>(v.z), to + 12 * i);
+}
+
+static RGBAVATAR_MEMBER void store_vec3(const Vec3<Wide>& v, float* rows, int first, int lanes) {
+  const OutputRows<3> out(rows, first, lanes);
+  store_quarter<0>(v, out.data);
+  store_quarter<1>(v, out.data);
+  store_quarter<2>(v, out.data);
+  store_quarter<3>(v, out.data);
+}
+
+// Four columns of rows [4i, 4i + 4) of an array whose rows are `stride` floats apart.
+template <int i>
+static RGBAVATAR_MEMBER void store_columns(const Wide& a, const Wide& b, const Wide& c,
+                                           const Wide& d, float* to, int stride) {
+  Quad rows[4] = {quad_of<i>(a), quad_of<i>(b), quad_of<i>(c), quad_of<i>(d)};
+  transpose(rows[0], rows[1], rows[2], rows[3]);
+  for (int k = 0; k < 4; ++k) store_quad(rows[k], to + (4 * i + k) * stride);
+}
+
+static RGBAVATAR_MEMBER void store_four_columns(const Wide v[4], float* to, int stride) {
+  store_columns<0>(v[0], v[1], v[2], v[3], to, stride);
+  store_columns<1>(v[0], v[1], v[2], v[3], to, stride);
+  store_columns<2>(v[0], v[1], v[2], v[3], to, stride);
+  store_columns<3>(v[0], v[1], v[2], v[3], to, stride);
+}
+
+static RGBAVATAR_MEMBER void store_quats(const Wide v[4], float* rows, int first, int lanes) {
+  const OutputRows<4> out(rows, first, lanes);
+  store_four_columns(v, out.data, 4);
+}
+
+static RGBAVATAR_MEMBER Wide load_column(const float* rows, int first, int lanes) {
+  return load_wide(Rows<1>(rows, first, lanes).data);
+}
+
+static RGBAVATAR_MEMBER GaussianInput<Wide> load_gaussians(const Scene& scene, int image, int first,
                                                  int lanes) {
   GaussianInput<Wide> g;
-  Wide column[3];
-  load_columns<3>(scene.means.of(image), first, lanes, column);
-  g.mean = {column[0], column[1], column[2]};
-  load_columns<4>(scene.quats.of(image), first, lanes, g.quat);
-  load_columns<3>(scene.scales.of(image), first, lanes, column);
-  g.scale = {column[0], column[1], column[2]};
-  load_columns<1>(scene.opacities.of(image), first, lanes, &g.opacity);
+  g.mean = load_vec3(scene.means.of(image), first, lanes);
+  load_quats(scene.quats.of(image), first, lanes, g.quat);
+  g.scale = load_vec3(scene.scales.of(image), first, lanes);
+  g.opacity = load_column(scene.opacities.of(image), first, lanes);
   return g;
 }
 
-static inline int floor_of_positive(float x) { return int(x); }
-static inline int ceil_of_positive(float x) { return int(x) + (float(int(x)) < x); }
-
-// Sets the range of blocks whose pixel centres lie within [low, high]; both are already clamped
-// to [0, side - 1] in units of pixel indices.
-static inline bool block_range(float low, float high, uint16_t& first, uint16_t& last) {
-  if (!(low <= high)) return false;
-  const int first_pixel = ceil_of_positive(low), last_pixel = floor_of_positive(high);
-  first = uint16_t(first_pixel / kBlockSide);
-  last = uint16_t(last_pixel / kBlockSide);
-  return first_pixel <= last_pixel;
+// Floor and ceiling of numbers from 0 to 2^24.
+static RGBAVATAR_MEMBER WideInt floor_of(const Wide& x) { return to_ints(x); }
+static RGBAVATAR_MEMBER WideInt ceil_of(const Wide& x) {
+  const Wide below = to_floats(to_ints(x));
+  return to_ints(select(x > below, below + 1.0f, below));
 }
 
-static void project_image(const Scene& scene, const float* camera_floats, int image, int begin,
-                          int end, Splat* splats, Bounds* bounds) {
-  const Camera camera = camera_from(camera_floats, scene.width, scene.height);
-  for (int first = begin; first < end; first += kLanes) {
-    const int lanes = end - first < kLanes ? end - first : kLanes;
-    const GaussianInput<Wide> g = load_gaussians(scene, image, first, lanes);
-    Wide rgb[3];
-    load_columns<3>(scene.colors.of(image), first, lanes, rgb);
-    const Projection<Wide> q = project(g, camera);
-    const WideMask drawable = is_drawable(g, Vec3<Wide>{rgb[0], rgb[1], rgb[2]}, q);
-    const Wide log2_opacity = log2_of(select(drawable, g.opacity, Wide(1.0f)));
-    // Where alpha falls to the cut: -k d^T Q d = log2(min alpha / o), an ellipse of half-widths
-    // sqrt(2 ln(o / min alpha) cov).
-    const Wide reach = (log2_opacity - C::kLog2MinAlpha) * (2.0f * C::kLn2);
-    const Wide half_x = square_root(reach * q.cov00), half_y = square_root(reach * q.cov11);
-    const Wide centre_x = q.mean_x - 0.5f, centre_y = q.mean_y - 0.5f;
-    enum { kMeanX, kMeanY, kOpacity, kQa, kQb, kQc, kLowX, kHighX, kLowY, kHighY, kColumns };
-    float column[kColumns][kLanes];
-    store(q.mean_x, column[kMeanX]);
-    store(q.mean_y, column[kMeanY]);
-    store(log2_opacity, column[kOpacity]);
-    store(q.conic00 * -C::kHalfLog2E, column[kQa]);
-    store(q.conic01 * (-2.0f * C::kHalfLog2E), column[kQb]);
-    store(q.conic11 * -C::kHalfLog2E, column[kQc]);
-    // Beyond the image the comparison low <= high fails; so it does for what is not drawable.
-    store(select(drawable, max_of(centre_x - half_x, Wide(0.0f)), Wide(1e9f)), column[kLowX]);
-    store(min_of(centre_x + half_x, Wide(scene.width - 1.0f)), column[kHighX]);
-    store(max_of(centre_y - half_y, Wide(0.0f)), column[kLowY]);
-    store(min_of(centre_y + half_y, Wide(scene.height - 1.0f)), column[kHighY]);
-    float depth[kLanes], color[3][kLanes];
-    store(q.p.z, depth);
-    for (int k = 0; k < 3; ++k) store(rgb[k], color[k]);
-    for (int lane = 0; lane < lanes; ++lane) {
-      Bounds& box = bounds[first + lane];
-      const bool seen = block_range(column[kLowX][lane], column[kHighX][lane], box.first_block_x,
-                                    box.last_block_x) &&
-                        block_range(column[kLowY][lane], column[kHighY][lane], box.first_block_y,
-                                    box.last_block_y);
-      if (!seen) {
-        box.first_block_x = 1, box.last_block_x = 0;
-        continue;
-      }
-      Splat& s = splats[first + lane];
-      s.bounds = box;
-      s.mean_x = column[kMeanX][lane], s.mean_y = column[kMeanY][lane];
-      s.log2_opacity = column[kOpacity][lane];
-      s.qa = column[kQa][lane], s.qb = column[kQb][lane], s.qc = column[kQc][lane];
-      s.red = color[0][lane], s.green = color[1][lane], s.blue = color[2][lane];
-      s.depth = depth[lane];
-    }
+// Blocks first..last that hold the pixel indices low..high; both are within the image.
+struct BlockSpan {
+  WideInt first, last;
+};
+static RGBAVATAR_MEMBER BlockSpan span_of(const Wide& low, const Wide& high) {
+  return {ceil_of(low) >> 2, floor_of(high) >> 2};
+}
+
+// Which blocks the ellipses touch, as words of four rows of eight bits, for those whose bounds fit
+// the window. An ellipse d^T cov^-1 d = reach ends, along the row dy, at
+//   dx = (cov01 dy +- sqrt(det (cov11 reach - dy^2))) / cov11,
+// and is widest where dy = +-cov01 sqrt(reach / cov00): the block row's dy nearest to that.
+struct TouchedBlocks {
+  WideInt upper, lower;
+};
+static inline TouchedBlocks touched_blocks(const Scene& scene, const Projection<Wide>& q,
+                                           const Wide& cov01, const Wide& reach,
+                                           const Wide& half_x, const Wide& half_y,
+                                           const BlockSpan& x, const BlockSpan& y,
+                                           const WideMask& fits) {
+  constexpr float kSlackPx = 0.02f;  // more than rounding makes of a bound within the window
+  const Wide inverse_cov11 = 1.0f / q.cov11;
+  const Wide slope = cov01 * inverse_cov11;
+  const Wide spread = q.determinant * inverse_cov11 * inverse_cov11;
+  const Wide widest = cov01 * half_x * (1.0f / q.cov00);
+  const Wide rows = to_floats(y.last - y.first);
+  const Wide left = to_floats(x.first);
+  TouchedBlocks touched = {0, 0};
+  Wide first_dy = to_floats(y.first) * float(kBlockSide) + 0.5f - q.mean_y;
+  for (int row = 0; row < kWindow && any((rows >= Wide(float(row))) & fits); ++row) {
+    const Wide low = max_of(first_dy, Wide(0.0f) - half_y);
+    const Wide high = min_of(first_dy + (kBlockSide - 1.0f), half_y);
+    const Wide dy_right = min_of(max_of(widest, low), high);
+    const Wide dy_left = min_of(max_of(Wide(0.0f) - widest, low), high);
+    const Wide square = q.cov11 * reach;
+    const Wide right = square_root(max_of(square - dy_right * dy_right, Wide(0.0f)) * spread);
+    const Wide to_left = square_root(max_of(square - dy_left * dy_left, Wide(0.0f)) * spread);
+    const Wide centre = q.mean_x - 0.5f;
+    const Wide start = max_of(centre + slope * dy_left - to_left - kSlackPx, Wide(0.0f));
+    const Wide stop = min_of(centre + slope * dy_right + right + kSlackPx,
+                             Wide(scene.width - 1.0f));
+    const WideMask some = (rows >= Wide(float(row))) & fits & (stop >= start);
+    // From the first bit to the last, within the eight of this row; none where start > stop.
+    const BlockSpan span = span_of(select(some, start, Wide(4.0f)), select(some, stop, Wide(0.0f)));
+    const Wide first_bit = max_of(select(some, to_floats(span.first) - left, Wide(1.0f)), Wide(0.0f));
+    const Wide last_bit = min_of(select(some, to_floats(span.last) - left, Wide(0.0f)), Wide(7.0f));
+    const WideMask touches = last_bit >= first_bit;
+    const WideInt from = to_ints(select(touches, first_bit, Wide(0.0f)));
+    const WideInt past = to_ints(select(touches, last_bit + 1.0f, Wide(0.0f)));
+    const WideInt bits = (WideInt(1) << past) - (WideInt(1) << from);
+    if (row < kWindow / 2)
+      touched.upper = touched.upper | (bits << WideInt(8 * row));
+    else
+      touched.lower = touched.lower | (bits << WideInt(8 * row - 32));
+    first_dy = first_dy + float(kBlockSide);
+  }
+  return touched;
+}
+
+template <int i>
+static RGBAVATAR_MEMBER void store_splats(const Wide columns[16], Splat* to) {
+  float* rows = &to->mean_x;
+  for (int k = 0; k < 16; k += 4)
+    store_columns<i>(columns[k], columns[k + 1], columns[k + 2], columns[k + 3], rows + k, 16);
+}
+
+// Projects sixteen Gaussians and writes their splats.
+static inline void project_lanes(const Scene& scene, const Camera& camera,
+                                 const GaussianInput<Wide>& g, const Vec3<Wide>& color, int first,
+                                 int lanes, const Projected& out) {
+  static_assert(sizeof(Splat) == 16 * sizeof(float), "a splat is sixteen columns");
+  const Projection<Wide> q = project(g, camera);
+  const WideMask drawable = is_drawable(g, color, q);
+  const Wide log2_opacity = log2_of(select(drawable, g.opacity, Wide(1.0f)));
+  // Where alpha falls to the cut: -k d^T Q d = log2(min alpha / o), an ellipse of half-widths
+  // sqrt(2 ln(o / min alpha) cov).
+  const Wide reach = (log2_opacity - C::kLog2MinAlpha) * (2.0f * C::kLn2);
+  const Wide half_x = square_root(reach * q.cov00), half_y = square_root(reach * q.cov11);
+  const Wide centre_x = q.mean_x - 0.5f, centre_y = q.mean_y - 0.5f;
+  const Wide low_x = max_of(centre_x - half_x, Wide(0.0f));
+  const Wide low_y = max_of(centre_y - half_y, Wide(0.0f));
+  const Wide high_x = min_of(centre_x + half_x, Wide(scene.width - 1.0f));
+  const Wide high_y = min_of(centre_y + half_y, Wide(scene.height - 1.0f));
+  // The first comparisons keep what is far outside, or not drawable, from the conversion to
+  // integers; the second ones ask for a pixel centre.
+  const WideMask near = drawable & (high_x >= low_x) & (high_y >= low_y);
+  const Wide zero(0.0f), left = select(near, low_x, zero), right = select(near, high_x, zero);
+  const Wide top = select(near, low_y, zero), bottom = select(near, high_y, zero);
+  const WideMask seen = near & (to_floats(floor_of(right)) >= left) &
+                        (to_floats(floor_of(bottom)) >= top);
+  const BlockSpan x = span_of(left, right), y = span_of(top, bottom);
+  const WideMask fits = seen & (Wide(kWindow - 1.0f) >= to_floats(x.last - x.first)) &
+                        (Wide(kWindow - 1.0f) >= to_floats(y.last - y.first));
+  const TouchedBlocks touched = touched_blocks(
+      scene, q, zero - q.conic01 * q.determinant, reach, half_x, half_y, x, y, fits);
+  const Wide first_block = select(seen, bits_as_floats(x.first | (y.first << 16)),
+                                  bits_as_floats(WideInt(1)));
+  const Wide last_block = select(seen, bits_as_floats(x.last | (y.last << 16)), zero);
+  const WideInt all(-1);
+  const Wide columns[16] = {q.mean_x,
+                            q.mean_y,
+                            log2_opacity,
+                            q.conic00 * -C::kHalfLog2E,
+                            q.conic01 * (-2.0f * C::kHalfLog2E),
+                            q.conic11 * -C::kHalfLog2E,
+                            color.x,
+                            color.y,
+                            color.z,
+                            q.p.z,
+                            first_block,
+                            last_block,
+                            select(fits, bits_as_floats(touched.upper), bits_as_floats(all)),
+                            select(fits, bits_as_floats(touched.lower), bits_as_floats(all)),
+                            zero,
+                            zero};
+  float depths[kLanes], firsts[kLanes], lasts[kLanes];
+  Splat padded[kLanes];
+  Splat* splats = lanes == kLanes ? out.splats + first : padded;
+  store_splats<0>(columns, splats);
+  store_splats<1>(columns, splats);
+  store_splats<2>(columns, splats);
+  store_splats<3>(columns, splats);
+  if (lanes < kLanes)
+    for (int lane = 0; lane < lanes; ++lane) out.splats[first + lane] = padded[lane];
+  store(q.p.z, depths);
+  store(first_block, firsts);
+  store(last_block, lasts);
+  for (int lane = 0; lane < lanes; ++lane) {
+    out.depth[first + lane] = depths[lane];
+    __builtin_memcpy(&out.bounds[first + lane], &firsts[lane], 4);
+    __builtin_memcpy(&out.bounds[first + lane].last_block_x, &lasts[lane], 4);
   }
 }
 
-static void project_image_backward(const Scene& scene, const float* camera_floats, int image,
-                                   int begin, int end, const uint32_t* slot_offset,
-                                   const float* slots, const SceneGradient& gradient) {
+static void project_image(const Scene& scene, const float* camera_floats, int image, int begin,
+                          int end, const Projected& out) {
   const Camera camera = camera_from(camera_floats, scene.width, scene.height);
   for (int first = begin; first < end; first += kLanes) {
     const int lanes = end - first < kLanes ? end - first : kLanes;
-    if (slot_offset[first] == slot_offset[first + lanes]) continue;
-    float sums[kMoments][kLanes] = {};
-    float seen[kLanes] = {};
-    for (int lane = 0; lane < lanes; ++lane) {
-      const uint32_t stop = slot_offset[first + lane + 1];
-      for (uint32_t slot = slot_offset[first + lane]; slot < stop; ++slot) {
-        seen[lane] = 1.0f;
-        for (int k = 0; k < kMoments; ++k) sums[k][lane] += slots[int64_t(slot) * kMoments + k];
+    project_lanes(scene, camera, load_gaussians(scene, image, first, lanes),
+                  load_vec3(scene.colors.of(image), first, lanes), first, lanes, out);
+  }
+}
+
+// The sums over the slots of sixteen Gaussians, and which of them have any.
+struct LaneMoments {
+  Moments<Wide> sums;
+  WideMask drawn;
+};
+
+static RGBAVATAR_MEMBER LaneMoments sum_slots(const ImageSlots& image, int first, int lanes) {
+  alignas(64) float sums[kLanes][12];
+  float seen[kLanes] = {};
+  for (int lane = 0; lane < kLanes; ++lane) {
+    Quad a = {}, b = {}, c = {};
+    if (lane < lanes) {
+      const uint32_t start = image.offset[first + lane], stop = image.offset[first + lane + 1];
+      seen[lane] = float(stop - start);
+      for (uint32_t slot = start; slot < stop; ++slot) {
+        const float* from = image.slots + int64_t(slot) * kMoments;
+        a = a + load_quad(from);
+        b = b + load_quad(from + 4);
+        c = c + load_quad(from + 8);
       }
     }
-    Wide m[kMoments];
-    for (int k = 0; k < kMoments; ++k) load(m[k], sums[k]);
-    const Moments<Wide> moments = {{m[0], m[1], m[2]}, m[3], m[4], m[5], m[6], m[7], m[8]};
-    const GaussianInput<Wide> g = load_gaussians(scene, image, first, lanes);
-    const Projection<Wide> q = project(g, camera);
-    const GaussianGradient<Wide> d = project_backward(g, camera, q, moments);
-    // What was not drawn may hold anything; its gradient is 0.
-    const WideMask drawn = load_wide(seen) > Wide(0.0f);
-    const Wide zero(0.0f);
-    const Wide mean[3] = {select(drawn, d.mean.x, zero), select(drawn, d.mean.y, zero),
-                          select(drawn, d.mean.z, zero)};
-    const Wide quat[4] = {select(drawn, d.quat[0], zero), select(drawn, d.quat[1], zero),
-                          select(drawn, d.quat[2], zero), select(drawn, d.quat[3], zero)};
-    const Wide scale[3] = {select(drawn, d.scale.x, zero), select(drawn, d.scale.y, zero),
-                           select(drawn, d.scale.z, zero)};
-    const Wide opacity[1] = {select(drawn, d.opacity, zero)};
-    add_columns<3>(gradient.means, first, lanes, mean);
-    add_columns<4>(gradient.quats, first, lanes, quat);
-    add_columns<3>(gradient.scales, first, lanes, scale);
-    add_columns<1>(gradient.opacities, first, lanes, opacity);
-    add_columns<3>(gradient.colors, first, lanes, m);
+    store_quad(a, sums[lane]);
+    store_quad(b, sums[lane] + 4);
+    store_quad(c, sums[lane] + 8);
+  }
+  Quad t[4][12];
+  for (int i = 0; i < 4; ++i)
+    for (int k = 0; k < 12; k += 4) {
+      for (int j = 0; j < 4; ++j) t[i][k + j] = load_quad(sums[4 * i + j] + k);
+      transpose(t[i][k], t[i][k + 1], t[i][k + 2], t[i][k + 3]);
+    }
+  Wide m[kMoments];
+  for (int k = 0; k < kMoments; ++k) m[k] = wide_of(t[0][k], t[1][k], t[2][k], t[3][k]);
+  return {{{m[0], m[1], m[2]}, m[3], m[4], m[5], m[6], m[7], m[8]},
+          load_wide(seen) > Wide(0.0f)};
+}
+
+// The gradient of sixteen Gaussians of one image; 0 for what was not drawn, which may hold
+// anything.
+static RGBAVATAR_MEMBER GaussianGradient<Wide> gradient_lanes(const GaussianInput<Wide>& g,
+                                                              const Camera& camera,
+                                                              const LaneMoments& moments) {
+  const GaussianGradient<Wide> d = project_backward(g, camera, project(g, camera), moments.sums);
+  const Wide zero(0.0f);
+  const auto keep = [&](const Wide& x) __attribute__((always_inline)) {
+    return select(moments.drawn, x, zero);
+  };
+  return {{keep(d.mean.x), keep(d.mean.y), keep(d.mean.z)},
+          {keep(d.quat[0]), keep(d.quat[1]), keep(d.quat[2]), keep(d.quat[3])},
+          {keep(d.scale.x), keep(d.scale.y), keep(d.scale.z)},
+          keep(d.opacity)};
+}
+
+// Writes, or adds to what is there.
+static RGBAVATAR_MEMBER void put_vec3(Vec3<Wide> v, bool add, float* rows, int first, int lanes) {
+  if (add) {
+    const Vec3<Wide> old = load_vec3(rows, first, lanes);
+    v = {v.x + old.x, v.y + old.y, v.z + old.z};
+  }
+  store_vec3(v, rows, first, lanes);
+}
+
+static void project_image_backward(const Scene& scene, const float* camera_floats, int image,
+                                   int begin, int end, const ImageSlots& slots,
+                                   const SceneGradient& gradient) {
+  const Camera camera = camera_from(camera_floats, scene.width, scene.height);
+  // What the batch shares is a sum over the images.
+  const auto adds = [&](const Attribute& attribute) {
+    return image > 0 && attribute.batch_stride == 0;
+  };
+  const auto of_image = [&](const Attribute& attribute, float* grads) {
+    return grads + image * attribute.batch_stride;
+  };
+  for (int first = begin; first < end; first += kLanes) {
+    const int lanes = end - first < kLanes ? end - first : kLanes;
+    const LaneMoments moments = sum_slots(slots, first, lanes);
+    GaussianGradient<Wide> d =
+        gradient_lanes(load_gaussians(scene, image, first, lanes), camera, moments);
+    put_vec3(d.mean, adds(scene.means), of_image(scene.means, gradient.means), first, lanes);
+    put_vec3(d.scale, adds(scene.scales), of_image(scene.scales, gradient.scales), first, lanes);
+    put_vec3(moments.sums.color, adds(scene.colors), of_image(scene.colors, gradient.colors), first,
+             lanes);
+    float* quats = of_image(scene.quats, gradient.quats);
+    if (adds(scene.quats)) {
+      Wide old[4];
+      load_quats(quats, first, lanes, old);
+      for (int k = 0; k < 4; ++k) d.quat[k] = d.quat[k] + old[k];
+    }
+    store_quats(d.quat, quats, first, lanes);
+    float* opacities = of_image(scene.opacities, gradient.opacities);
+    if (adds(scene.opacities)) d.opacity = d.opacity + load_column(opacities, first, lanes);
+    const OutputRows<1> out(opacities, first, lanes);
+    store(d.opacity, out.data);
   }
 }
 

@@ -110,8 +110,10 @@ uint64_t* radix_sort(uint64_t* keys, uint64_t* other, size_t count) {
 
 template <class Visit>
 void for_tiles(const Bounds& s, int tiles_x, Visit visit) {
-  for (int y = s.first_tile_y(); y < s.first_tile_y() + s.tiles_y(); ++y)
-    for (int x = s.first_tile_x(); x < s.first_tile_x() + s.tiles_x(); ++x) visit(y * tiles_x + x);
+  const int first_x = s.first_tile_x(), last_x = s.last_block_x >> kTileBlocksShift;
+  const int last_y = s.last_block_y >> kTileBlocksShift;
+  for (int y = s.first_tile_y(); y <= last_y; ++y)
+    for (int x = first_x; x <= last_x; ++x) visit(y * tiles_x + x);
 }
 
 }  // namespace
@@ -142,74 +144,68 @@ Rendering::Rendering(const Scene& scene, const Cameras& cameras,
     std::memcpy(to + 18, cameras.principal_point_px + from * 2, 2 * sizeof(float));
   }
   Team team(threads);
-  project(scene, team);
-  sort(team);
+  prepare(scene, team);
 }
 
 Rendering::~Rendering() { give_workspace(std::move(workspace_)); }
 
-void Rendering::project(const Scene& scene, Team& team) {
+// As many images at a time as there are threads: what the projection writes, the sorting finds in
+// the caches.
+void Rendering::prepare(const Scene& scene, Team& team) {
   Workspace& w = *workspace_;
-  w.splats.reserve(size_t(batch_) * count_);
-  w.bounds.reserve(size_t(batch_) * count_);
-  const int chunks = chunks_of(count_);
-  team.run(int64_t(batch_) * chunks, [&](int64_t item, int) {
-    const int image = int(item / chunks), begin = int(item % chunks) * kChunk;
-    kernels_->project(scene, &w.cameras[size_t(image) * kCameraFloats], image, begin,
-                      std::min(begin + kChunk, count_), w.splats.data() + size_t(image) * count_,
-                      w.bounds.data() + size_t(image) * count_);
-  });
-}
-
-void Rendering::sort(Team& team) {
-  Workspace& w = *workspace_;
+  const int group = std::min(batch_, team.size()), chunks = chunks_of(count_);
   w.slot_offset.reserve(size_t(batch_) * (count_ + 1));
   w.tile_start.reserve(size_t(batch_) * (tiles_per_image() + 1));
-  w.entry_offset.reserve(batch_ + 1);
-  team.run(batch_, [&](int64_t image, int) {
-    Splat* splats = w.splats.data() + size_t(image) * count_;
-    const Bounds* bounds = w.bounds.data() + size_t(image) * count_;
-    uint32_t* slot_offset = w.slot_offset.data() + size_t(image) * (count_ + 1);
-    size_t total = 0;
-    for (int i = 0; i < count_; ++i) {
-      slot_offset[i] = uint32_t(total);
-      if (!bounds[i].visible()) continue;
-      splats[i].first_slot = uint32_t(total);
-      total += size_t(bounds[i].tiles_x()) * bounds[i].tiles_y();
-    }
-    slot_offset[count_] = uint32_t(total);
-    w.entry_offset[image + 1] = total;
-  });
-  w.entry_offset[0] = 0;
-  for (int image = 0; image < batch_; ++image) {
-    if (w.entry_offset[image + 1] > UINT32_MAX)
-      throw std::invalid_argument(
-          "The Gaussians of one image touch more than 2^32 tiles. Render a smaller image or check "
-          "the Gaussians' scales.");
-    w.entry_offset[image + 1] += w.entry_offset[image];
+  w.slot_start.reserve(batch_ + 1);
+  w.slot_count.reserve(batch_);
+  if (int(w.entries.size()) < batch_) w.entries.resize(batch_);
+  w.splats.reserve(size_t(batch_) * count_);
+  w.depth.reserve(size_t(group) * count_);
+  w.bounds.reserve(size_t(group) * count_);
+  w.sort_keys.reserve(size_t(group) * 2 * count_);
+  for (int image = 0; image < batch_; image += group) {
+    const int images = std::min(group, batch_ - image);
+    team.run(int64_t(images) * chunks, [&](int64_t item, int) {
+      const int place = int(item / chunks), begin = int(item % chunks) * kChunk;
+      kernels_->project(scene, &w.cameras[size_t(image + place) * kCameraFloats], image + place,
+                        begin, std::min(begin + kChunk, count_),
+                        {w.splats.data() + size_t(image + place) * count_,
+                         w.depth.data() + size_t(place) * count_,
+                         w.bounds.data() + size_t(place) * count_});
+    });
+    team.run(images, [&](int64_t place, int) { sort_image(image + int(place), int(place)); });
+    for (int place = 0; place < images; ++place)
+      if (w.slot_count[image + place] > UINT32_MAX)
+        throw std::invalid_argument(
+            "The Gaussians of one image touch more than 2^32 tiles. Render a smaller image or check "
+            "the Gaussians' scales.");
   }
-  w.entries.reserve(w.entry_offset[batch_]);
-  w.sort_keys.reserve(size_t(team.size()) * 2 * count_);
-  team.run(batch_, [&](int64_t image, int thread) {
-    sort_image(int(image), w.sort_keys.data() + size_t(thread) * 2 * count_);
-  });
+  w.slot_start[0] = 0;
+  for (int image = 0; image < batch_; ++image)
+    w.slot_start[image + 1] = w.slot_start[image] + w.slot_count[image];
 }
 
 // Front to back, then by tile: a counting sort keeps the order within each tile.
-void Rendering::sort_image(int image, uint64_t* keys) {
+void Rendering::sort_image(int image, int place) {
   Workspace& w = *workspace_;
-  const Splat* splats = w.splats.data() + size_t(image) * count_;
-  const Bounds* bounds = w.bounds.data() + size_t(image) * count_;
+  const float* depth = w.depth.data() + size_t(place) * count_;
+  const Bounds* bounds = w.bounds.data() + size_t(place) * count_;
+  uint64_t* keys = w.sort_keys.data() + size_t(place) * 2 * count_;
   uint32_t* start = w.tile_start.data() + size_t(image) * (tiles_per_image() + 1);
+  uint32_t* slot_offset = w.slot_offset.data() + size_t(image) * (count_ + 1);
   std::fill(start, start + tiles_per_image() + 1, 0u);
-  size_t visible = 0;
+  size_t visible = 0, slots = 0;
   for (int i = 0; i < count_; ++i) {
+    slot_offset[i] = uint32_t(slots);
     if (!bounds[i].visible()) continue;
     uint32_t depth_bits;  // of a positive float: ordered like the float
-    std::memcpy(&depth_bits, &splats[i].depth, sizeof depth_bits);
+    std::memcpy(&depth_bits, &depth[i], sizeof depth_bits);
     keys[visible++] = uint64_t(depth_bits) << 32 | uint32_t(i);
-    for_tiles(bounds[i], tiles_x_, [&](int tile) { ++start[tile]; });
+    for_tiles(bounds[i], tiles_x_, [&](int tile) { ++start[tile], ++slots; });
   }
+  slot_offset[count_] = uint32_t(slots);
+  w.slot_count[image] = slots;
+  if (slots > UINT32_MAX) return;
   const uint64_t* sorted = radix_sort(keys, keys + count_, visible);
   uint32_t total = 0;
   for (int tile = 0; tile <= tiles_per_image(); ++tile) {
@@ -217,10 +213,13 @@ void Rendering::sort_image(int image, uint64_t* keys) {
     start[tile] = total;
     total += here;
   }
-  uint32_t* entries = w.entries.data() + w.entry_offset[image];
+  Buffer<Entry>& entries = w.entries[image];
+  entries.reserve(slots);
   for (size_t i = 0; i < visible; ++i) {
     const uint32_t gaussian = uint32_t(sorted[i]);
-    for_tiles(bounds[gaussian], tiles_x_, [&](int tile) { entries[start[tile]++] = gaussian; });
+    uint32_t slot = slot_offset[gaussian];
+    for_tiles(bounds[gaussian], tiles_x_,
+              [&](int tile) { entries[start[tile]++] = {gaussian, slot++}; });
   }
   // Each start has moved to the next tile's; move them back.
   for (int tile = tiles_per_image(); tile > 0; --tile) start[tile] = start[tile - 1];
@@ -230,13 +229,23 @@ void Rendering::sort_image(int image, uint64_t* keys) {
 Tile Rendering::tile(int image, int index) const {
   const Workspace& w = *workspace_;
   const uint32_t* start = w.tile_start.data() + size_t(image) * (tiles_per_image() + 1) + index;
-  Tile tile;
-  tile.splats = w.splats.data() + size_t(image) * count_;
-  tile.entries = w.entries.data() + w.entry_offset[image] + start[0];
-  tile.entry_count = start[1] - start[0];
-  tile.tile_x = index % tiles_x_, tile.tile_y = index / tiles_x_;
-  tile.width = width_, tile.height = height_;
-  return tile;
+  return {w.splats.data() + size_t(image) * count_,
+          w.entries[image].data() + start[0],
+          start[1] - start[0],
+          index % tiles_x_,
+          index / tiles_x_,
+          width_,
+          height_};
+}
+
+// `width` floats a slot.
+void Rendering::lay_out_slots(int width) {
+  Workspace& w = *workspace_;
+  w.slots.reserve(w.slot_start[batch_] * width + 3);
+  w.image_slots.reserve(batch_);
+  for (int image = 0; image < batch_; ++image)
+    w.image_slots[image] = {w.slot_offset.data() + size_t(image) * (count_ + 1),
+                            w.slots.data() + w.slot_start[image] * width};
 }
 
 void Rendering::draw(const Attribute& background, float* image, float* alpha, float* depth,
@@ -259,20 +268,20 @@ void Rendering::average(const Attribute& images, int channels, float* weighted_s
   Workspace& w = *workspace_;
   const int width = channels + 2;
   w.scratch.reserve(team.size());
-  w.slots.reserve(w.entry_offset[batch_] * width);
+  lay_out_slots(width);
   team.run(int64_t(batch_) * tiles_per_image(), [&](int64_t item, int thread) {
     const int b = int(item / tiles_per_image());
     kernels_->average_tile(tile(b, int(item % tiles_per_image())), images.of(b), channels,
-                           w.scratch[thread], w.slots.data() + w.entry_offset[b] * width);
+                           w.scratch[thread], w.slots.data() + w.slot_start[b] * width);
   });
   const int chunks = chunks_of(count_);
   team.run(int64_t(batch_) * chunks, [&](int64_t item, int) {
     const int b = int(item / chunks), begin = int(item % chunks) * kChunk;
-    const uint32_t* offset = w.slot_offset.data() + size_t(b) * (count_ + 1);
+    const ImageSlots& image = w.image_slots[b];
     for (int i = begin; i < std::min(begin + kChunk, count_); ++i) {
       float sums[kMaxChannels + 2] = {};
-      for (uint32_t k = offset[i]; k < offset[i + 1]; ++k) {
-        const float* slot = w.slots.data() + (w.entry_offset[b] + k) * width;
+      for (uint32_t k = image.offset[i]; k < image.offset[i + 1]; ++k) {
+        const float* slot = image.slots + size_t(k) * width;
         for (int c = 0; c <= channels; ++c) sums[c] += slot[c];
         sums[channels + 1] = std::max(sums[channels + 1], slot[channels + 1]);
       }
@@ -289,7 +298,7 @@ void Rendering::backward(const Scene& scene, const BackwardInput& input,
   Team team(threads);
   Workspace& w = *workspace_;
   w.scratch.reserve(team.size());
-  w.slots.reserve(w.entry_offset[batch_] * kMoments);
+  lay_out_slots(kMoments);
   const size_t pixels = size_t(width_) * height_;
   team.run(int64_t(batch_) * tiles_per_image(), [&](int64_t item, int thread) {
     const int b = int(item / tiles_per_image());
@@ -299,32 +308,14 @@ void Rendering::backward(const Scene& scene, const BackwardInput& input,
     const BackwardInput in = {of_image(input.image, 3), of_image(input.alpha, 1),
                               of_image(input.image_grad, 3), of_image(input.alpha_grad, 1)};
     kernels_->backward_tile(tile(b, int(item % tiles_per_image())), in, w.scratch[thread],
-                            w.slots.data() + w.entry_offset[b] * kMoments);
+                            w.slots.data() + w.slot_start[b] * kMoments);
   });
-  // Every chunk of Gaussians takes the images in order, so shared gradients are sums in order.
   team.run(chunks_of(count_), [&](int64_t chunk, int) {
+    // Every chunk takes the images in order, so that sums over them have one order.
     const int begin = int(chunk) * kChunk, end = std::min(begin + kChunk, count_);
-    const auto clear = [&](const Attribute& attribute, float* grad, int width) {
-      for (int b = 0; b < (attribute.batch_stride ? batch_ : 1); ++b)
-        std::fill(grad + (size_t(b) * count_ + begin) * width,
-                  grad + (size_t(b) * count_ + end) * width, 0.0f);
-    };
-    clear(scene.means, gradient.means, 3);
-    clear(scene.quats, gradient.quats, 4);
-    clear(scene.scales, gradient.scales, 3);
-    clear(scene.opacities, gradient.opacities, 1);
-    clear(scene.colors, gradient.colors, 3);
-    for (int b = 0; b < batch_; ++b) {
-      const SceneGradient of_image = {
-          gradient.means + b * scene.means.batch_stride,
-          gradient.quats + b * scene.quats.batch_stride,
-          gradient.scales + b * scene.scales.batch_stride,
-          gradient.opacities + b * scene.opacities.batch_stride,
-          gradient.colors + b * scene.colors.batch_stride};
+    for (int b = 0; b < batch_; ++b)
       kernels_->project_backward(scene, &w.cameras[size_t(b) * kCameraFloats], b, begin, end,
-                                 w.slot_offset.data() + size_t(b) * (count_ + 1),
-                                 w.slots.data() + w.entry_offset[b] * kMoments, of_image);
-    }
+                                 w.image_slots[b], gradient);
   });
 }
 

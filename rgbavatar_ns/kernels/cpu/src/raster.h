@@ -1,6 +1,10 @@
 // The driver: memory, threads and the order of the stages; the loops are in isa_kernels.cpp.
 #pragma once
 
+#if defined(__linux__)
+#include <sys/mman.h>
+#endif
+
 #include <cstdlib>
 #include <memory>
 #include <new>
@@ -17,8 +21,15 @@ class Buffer {
  public:
   void reserve(size_t count) {
     if (count <= capacity_) return;
+    constexpr size_t kHugePage = size_t(2) << 20;
+    const size_t bytes = count * sizeof(T);
     void* memory = nullptr;
-    if (posix_memalign(&memory, 64, count * sizeof(T)) != 0) throw std::bad_alloc();
+    if (posix_memalign(&memory, bytes < kHugePage ? 64 : kHugePage, bytes) != 0)
+      throw std::bad_alloc();
+#if defined(__linux__)
+    // Gaussians are met in any order: with small pages, half of the time goes to finding pages.
+    if (bytes >= kHugePage) madvise(memory, bytes, MADV_HUGEPAGE);
+#endif
     data_.reset(static_cast<T*>(memory));
     capacity_ = count;
   }
@@ -37,16 +48,20 @@ class Buffer {
 
 // What one rendering needs; returned to a small pool, because fresh pages cost as much as work.
 struct Workspace {
-  Buffer<Splat> splats;          // [B, N]; those out of sight are not set
-  Buffer<Bounds> bounds;         // [B, N]
+  Buffer<float> cameras;         // [B, kCameraFloats]
   Buffer<uint32_t> slot_offset;  // [B, N + 1]: first (Gaussian, tile) slot of every Gaussian
   Buffer<uint32_t> tile_start;   // [B, tiles + 1]: into the image's entries
-  Buffer<uint32_t> entries;      // Gaussians by tile, front to back; slots many per image
-  Buffer<size_t> entry_offset;   // [B + 1]: each image's first entry and slot
-  Buffer<float> cameras;         // [B, kCameraFloats]
+  Buffer<Splat> splats;                // [B, N]; those out of sight hold anything
+  std::vector<Buffer<Entry>> entries;  // of each image: its Gaussians by tile, front to back
+  Buffer<size_t> slot_count;           // [B]: (Gaussian, tile) pairs of each image
+  Buffer<size_t> slot_start;           // [B + 1]: their sums, each image's first slot
   Buffer<float> slots;
-  Buffer<uint64_t> sort_keys;  // [threads, 2, N]
-  Buffer<TileScratch> scratch;   // [threads]
+  Buffer<ImageSlots> image_slots;  // [B]
+  Buffer<TileScratch> scratch;     // [threads]
+  // Of the images that are being projected.
+  Buffer<float> depth;         // [group, N]
+  Buffer<Bounds> bounds;       // [group, N]
+  Buffer<uint64_t> sort_keys;  // [group, 2, N]
 };
 
 struct Cameras {
@@ -79,9 +94,9 @@ class Rendering {
                 int threads);
 
  private:
-  void project(const Scene& scene, class Team& team);
-  void sort(class Team& team);
-  void sort_image(int image, uint64_t* keys);
+  void prepare(const Scene& scene, class Team& team);
+  void sort_image(int image, int place);
+  void lay_out_slots(int width);
   Tile tile(int image, int index) const;
   int tiles_per_image() const { return tiles_x_ * tiles_y_; }
 

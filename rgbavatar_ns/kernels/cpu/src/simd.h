@@ -104,8 +104,46 @@ struct Floats<kNativeLanes> {
 #undef RGBAVATAR_NATIVE_COMPARE
 };
 
+// Sixteen 32-bit integers, for bounds and masks.
+template <int Lanes>
+struct Ints {
+  typedef Ints<Lanes / 2> Half;
+  Half low, high;
+  Ints() = default;
+  RGBAVATAR_MEMBER Ints(Half l, Half h) : low(l), high(h) {}
+  RGBAVATAR_MEMBER Ints(int32_t s) : low(s), high(s) {}
+#define RGBAVATAR_PAIRWISE(op) \
+  friend RGBAVATAR_MEMBER Ints operator op(Ints a, Ints b) { \
+    return {a.low op b.low, a.high op b.high}; \
+  }
+  RGBAVATAR_PAIRWISE(+)
+  RGBAVATAR_PAIRWISE(-)
+  RGBAVATAR_PAIRWISE(|)
+  RGBAVATAR_PAIRWISE(<<)
+  RGBAVATAR_PAIRWISE(>>)
+#undef RGBAVATAR_PAIRWISE
+};
+
+template <>
+struct Ints<kNativeLanes> {
+  NativeInt v;
+  Ints() = default;
+  RGBAVATAR_MEMBER explicit Ints(NativeInt n) : v(n) {}
+  RGBAVATAR_MEMBER Ints(int32_t s) : v(s - NativeInt{}) {}
+#define RGBAVATAR_NATIVE(op) \
+  friend RGBAVATAR_MEMBER Ints operator op(Ints a, Ints b) { return Ints(a.v op b.v); }
+  RGBAVATAR_NATIVE(+)
+  RGBAVATAR_NATIVE(-)
+  RGBAVATAR_NATIVE(|)
+  RGBAVATAR_NATIVE(<<)
+  RGBAVATAR_NATIVE(>>)
+#undef RGBAVATAR_NATIVE
+};
+
 typedef Floats<kLanes> Wide;
 typedef Floats<kNativeLanes> Native;
+typedef Ints<kLanes> WideInt;
+typedef Ints<kNativeLanes> NativeInts;
 typedef Mask<kLanes> WideMask;
 typedef Mask<kNativeLanes> Flags;
 
@@ -118,6 +156,24 @@ RGBAVATAR_FUNCTION Native select(Flags m, Native a, Native b) {
   return Native(m.m ? a.v : b.v);
 #endif
 }
+
+// a b where the mask is set, 0 elsewhere.
+RGBAVATAR_FUNCTION Native product_where(Flags m, Native a, Native b) {
+#if defined(__AVX512F__)
+  return Native(_mm512_maskz_mul_ps(m.m, a.v, b.v));
+#else
+  return select(m, a * b, Native(0.0f));
+#endif
+}
+
+// Towards zero.
+RGBAVATAR_FUNCTION NativeInts to_ints(Native a) {
+  return NativeInts(__builtin_convertvector(a.v, NativeInt));
+}
+RGBAVATAR_FUNCTION Native to_floats(NativeInts a) {
+  return Native(__builtin_convertvector(a.v, NativeFloat));
+}
+RGBAVATAR_FUNCTION Native bits_as_floats(NativeInts a) { return Native((NativeFloat)a.v); }
 
 RGBAVATAR_FUNCTION Native min_of(Native a, Native b) {
 #if defined(__AVX512F__)
@@ -175,17 +231,26 @@ RGBAVATAR_FUNCTION Native reciprocal_of(Native a) {
 #endif
 }
 
-// 2^a for -126 < a < 127, relative error 3e-6; other arguments give any number.
-// Adding 1.5 * 2^23 rounds to the nearest integer n and leaves n in the low bits; 2^(a-n) is the
-// minimax polynomial of degree 4 on [-1/2, 1/2], and n is added to its exponent.
-RGBAVATAR_FUNCTION Native exp2_of(Native a) {
-  const Native shifted = a + Native(12582912.0f);
+// 2^a where the mask is set and 0 elsewhere, relative error 3e-6; -126 < a < 127 where it is set.
+// The minimax polynomial of degree 4 on [0, 1) for the fraction, and the floor for the exponent.
+RGBAVATAR_FUNCTION Native exp2_where(Flags m, Native a) {
+#if defined(__AVX512F__)
+  const Native f(_mm512_reduce_ps(a.v, _MM_FROUND_TO_NEG_INF));
+#else
+  // Adding 1.5 * 2^23 rounds to the nearest integer and leaves it in the low bits.
+  const Native shifted = (a - Native(0.5f)) + Native(12582912.0f);
   const Native f = a - (shifted - Native(12582912.0f));
+#endif
   const Native f2 = f * f;  // Estrin's order: short chains, because latency is what counts here
-  const Native low = Native(0.6931217908859253f) * f + Native(0.9999992847442627f);
-  const Native middle = Native(0.05591785907745361f) * f + Native(0.240247443318367f);
-  const Native p = (Native(0.009570102207362652f) * f2 + middle) * f2 + low;
-  return Native((NativeFloat)((NativeInt)p.v + ((NativeInt)shifted.v << 23)));
+  const Native low = Native(0.69300383329391479f) * f + Native(1.0000026226043701f);
+  const Native middle = Native(0.052011460065841675f) * f + Native(0.24144275486469269f);
+  const Native p = (Native(0.013534167781472206f) * f2 + middle) * f2 + low;
+#if defined(__AVX512F__)
+  return Native(_mm512_maskz_scalef_ps(m.m, p.v, a.v));
+#else
+  const Native scaled((NativeFloat)((NativeInt)p.v + ((NativeInt)shifted.v << 23)));
+  return select(m, scaled, Native(0.0f));
+#endif
 }
 
 // Log2 of a positive, normal number: the mantissa m in [1/sqrt 2, sqrt 2) through the odd series
@@ -217,6 +282,11 @@ RGBAVATAR_FUNCTION void store(Native a, float* to) {
   RGBAVATAR_FUNCTION Floats<L> name(Floats<L> a) { \
     return {name(a.low), name(a.high)}; \
   }
+#define RGBAVATAR_HALVES1_OF(name, To, From) \
+  template <int L> \
+  RGBAVATAR_FUNCTION To<L> name(From<L> a) { \
+    return {name(a.low), name(a.high)}; \
+  }
 #define RGBAVATAR_HALVES2(name) \
   template <int L> \
   RGBAVATAR_FUNCTION Floats<L> name(Floats<L> a, Floats<L> b) { \
@@ -224,16 +294,27 @@ RGBAVATAR_FUNCTION void store(Native a, float* to) {
   }
 RGBAVATAR_HALVES1(square_root)
 RGBAVATAR_HALVES1(reciprocal_of)
-RGBAVATAR_HALVES1(exp2_of)
 RGBAVATAR_HALVES1(log2_of)
 RGBAVATAR_HALVES2(min_of)
 RGBAVATAR_HALVES2(max_of)
+RGBAVATAR_HALVES1_OF(to_ints, Ints, Floats)
+RGBAVATAR_HALVES1_OF(to_floats, Floats, Ints)
+RGBAVATAR_HALVES1_OF(bits_as_floats, Floats, Ints)
 #undef RGBAVATAR_HALVES1
+#undef RGBAVATAR_HALVES1_OF
 #undef RGBAVATAR_HALVES2
 
 template <int L>
 RGBAVATAR_FUNCTION Floats<L> select(Mask<L> m, Floats<L> a, Floats<L> b) {
   return {select(m.low, a.low, b.low), select(m.high, a.high, b.high)};
+}
+template <int L>
+RGBAVATAR_FUNCTION Floats<L> exp2_where(Mask<L> m, Floats<L> a) {
+  return {exp2_where(m.low, a.low), exp2_where(m.high, a.high)};
+}
+template <int L>
+RGBAVATAR_FUNCTION Floats<L> product_where(Mask<L> m, Floats<L> a, Floats<L> b) {
+  return {product_where(m.low, a.low, b.low), product_where(m.high, a.high, b.high)};
 }
 template <int L>
 RGBAVATAR_FUNCTION bool any(Mask<L> m) {
@@ -310,6 +391,50 @@ RGBAVATAR_FUNCTION Quad sums_of(Wide a, Wide b, Wide c, Wide d) {
 RGBAVATAR_FUNCTION float sum_of(Wide a) {
   const Quad q = sum_to_quad(a);
   return (q[0] + q[2]) + (q[1] + q[3]);
+}
+
+// Lanes 4i ... 4i + 3.
+template <int i>
+RGBAVATAR_FUNCTION Quad quad_of(Native a) {
+#if defined(__AVX512F__)
+  return _mm512_extractf32x4_ps(a.v, i);
+#elif defined(__AVX2__)
+  return _mm256_extractf128_ps(a.v, i);
+#else
+  return a.v;
+#endif
+}
+template <int i, int L>
+RGBAVATAR_FUNCTION Quad quad_of(Floats<L> a) {
+  if constexpr (i < L / 8)
+    return quad_of<i>(a.low);
+  else
+    return quad_of<i - L / 8>(a.high);
+}
+
+RGBAVATAR_FUNCTION Wide wide_of(Quad a, Quad b, Quad c, Quad d) {
+#if defined(__AVX512F__)
+  const __m512 ab = _mm512_insertf32x4(_mm512_castps128_ps512(a), b, 1);
+  const __m256 cd = _mm256_insertf128_ps(_mm256_castps128_ps256(c), d, 1);
+  return Wide(_mm512_insertf32x8(ab, cd, 1));
+#elif defined(__AVX2__)
+  return Wide(Native(_mm256_insertf128_ps(_mm256_castps128_ps256(a), b, 1)),
+              Native(_mm256_insertf128_ps(_mm256_castps128_ps256(c), d, 1)));
+#else
+  return Wide({Native(a), Native(b)}, {Native(c), Native(d)});
+#endif
+}
+
+// Rows become columns.
+RGBAVATAR_FUNCTION void transpose(Quad& a, Quad& b, Quad& c, Quad& d) {
+  const Quad ab = __builtin_shufflevector(a, b, 0, 4, 1, 5);
+  const Quad ab2 = __builtin_shufflevector(a, b, 2, 6, 3, 7);
+  const Quad cd = __builtin_shufflevector(c, d, 0, 4, 1, 5);
+  const Quad cd2 = __builtin_shufflevector(c, d, 2, 6, 3, 7);
+  a = __builtin_shufflevector(ab, cd, 0, 1, 4, 5);
+  b = __builtin_shufflevector(ab, cd, 2, 3, 6, 7);
+  c = __builtin_shufflevector(ab2, cd2, 0, 1, 4, 5);
+  d = __builtin_shufflevector(ab2, cd2, 2, 3, 6, 7);
 }
 
 RGBAVATAR_FUNCTION Quad load_quad(const float* from) {
