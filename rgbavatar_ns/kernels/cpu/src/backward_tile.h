@@ -112,11 +112,9 @@ static void clear_slot(float* slots, uint32_t slot, int width) {
   for (int k = 0; k < width; ++k) slots[int64_t(slot) * width + k] = 0.0f;
 }
 
-static void backward_tile(const Tile& tile, const BackwardInput& in, TileScratch& scratch,
-                          float* slots) {
+// From rows that hold dL/dimage and the remainder to the slots.
+static void backward_rows(const Tile& tile, TileScratch& scratch, float* slots) {
   const BlockGrid grid(tile);
-  start_rows<kBlendRows>(tile, scratch);
-  start_remainder(tile, in, scratch);
   for_groups<kBlendRows>(
       tile, scratch,
       [&] {
@@ -124,6 +122,13 @@ static void backward_tile(const Tile& tile, const BackwardInput& in, TileScratch
         for (int i = 0; i < scratch.group.splat_count; ++i) sum_moments(grid, i, scratch, slots);
       },
       [&](uint32_t slot) { clear_slot(slots, slot, kMoments); });
+}
+
+static void backward_tile(const Tile& tile, const BackwardInput& in, TileScratch& scratch,
+                          float* slots) {
+  start_rows<kBlendRows>(tile, scratch);
+  start_remainder(tile, in, scratch);
+  backward_rows(tile, scratch, slots);
 }
 
 template <int kChannels>

@@ -7,6 +7,7 @@
 namespace rgbavatar::RGBAVATAR_ISA {
 
 #include "../../shared/gaussian_math.h"
+#include "../../shared/tangent_math.h"
 
 using C = BlendingConstants;
 

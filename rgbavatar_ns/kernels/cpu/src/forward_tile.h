@@ -256,7 +256,7 @@ static RGBAVATAR_MEMBER void for_groups(const Tile& tile, TileScratch& scratch, 
   empty();
 }
 
-template <int kRows>
+template <int kRows, bool kWithDepth>
 static void blend_group(TileScratch& scratch) {
   const Group& group = scratch.group;
   for (int i = 0; i < group.job_count; ++i) {
@@ -270,7 +270,7 @@ static void blend_group(TileScratch& scratch) {
     add_to(row + kColor * kBlockPixels, w * s.red);
     add_to(row + (kColor + 1) * kBlockPixels, w * s.green);
     add_to(row + (kColor + 2) * kBlockPixels, w * s.blue);
-    if (kRows > kDepth) add_to(row + kDepth * kBlockPixels, w * s.depth);
+    if (kWithDepth) add_to(row + kDepth * kBlockPixels, w * s.depth);
   }
 }
 
@@ -306,24 +306,33 @@ static void write_block(const Tile& tile, const ForwardOutput& out, int block,
   });
 }
 
-template <int kRows>
-static void forward_rows(const Tile& tile, const ForwardOutput& out, TileScratch& scratch) {
+// Blends the tile into its rows, over nothing.
+template <int kRows, bool kWithDepth>
+static void draw_rows(const Tile& tile, TileScratch& scratch) {
   const BlockGrid grid(tile);
   start_rows<kRows>(tile, scratch);
   for_groups<kRows>(
-      tile, scratch, [&] {
+      tile, scratch,
+      [&] {
         fill_alphas<false>(grid, scratch.group);
-        blend_group<kRows>(scratch);
-      }, [](uint32_t) {});
+        blend_group<kRows, kWithDepth>(scratch);
+      },
+      [](uint32_t) {});
+}
+
+template <bool kWithDepth>
+static void forward_rows(const Tile& tile, const ForwardOutput& out, TileScratch& scratch) {
+  constexpr int kRows = kWithDepth ? kDepth + 1 : kDepth;
+  draw_rows<kRows, kWithDepth>(tile, scratch);
   for (int block = 0; block < kBlocksPerTile; ++block)
     write_block<kRows>(tile, out, block, scratch);
 }
 
 static void forward_tile(const Tile& tile, const ForwardOutput& out, TileScratch& scratch) {
   if (out.depth)
-    forward_rows<kDepth + 1>(tile, out, scratch);
+    forward_rows<true>(tile, out, scratch);
   else
-    forward_rows<kDepth>(tile, out, scratch);
+    forward_rows<false>(tile, out, scratch);
 }
 
 }  // namespace rgbavatar::RGBAVATAR_ISA

@@ -1,13 +1,14 @@
 // The loops over Gaussians and pixels. Compiled once per instruction set with RGBAVATAR_ISA naming
 // it; uses no inline function or template of the standard library, because the linker would merge
 // those of different instruction sets.
-#include "backward_tile.h"
-#include "projection.h"
+#include "blended.h"
+#include "train_tile.h"
 
 namespace rgbavatar::RGBAVATAR_ISA {
 
 extern const Kernels kernels;
 const Kernels kernels = {project_image, forward_tile, backward_tile, average_tile,
-                         project_image_backward};
+                         project_image_backward, fill_frames, project_blended, train_tile,
+                         update_blended};
 
 }  // namespace rgbavatar::RGBAVATAR_ISA

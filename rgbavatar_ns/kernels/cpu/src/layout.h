@@ -112,6 +112,59 @@ struct alignas(64) TileScratch {
   Group group;
 };
 
+// ---- Blended Gaussians ------------------------------------------------------------------------
+
+// Position, rotation and colour: what the bases change.
+constexpr int kBlendedKinds = 3;
+constexpr int kBlendedWidth[kBlendedKinds] = {3, 4, 3};
+// Gaussians that are blended at a time; the columns of a few images then fit the nearest cache.
+constexpr int kBlendChunk = 128;
+constexpr int kBlendColumns = kBlendChunk * 4;
+
+// A triangle's frame, corner, edges and length ratio in an image: 23 numbers, and one unused.
+constexpr int kFrameFloats = 24;
+
+// Gaussians in the tangent frames of a mesh, as base plus weighted bases (paper, eq. 1), for a
+// batch of meshes.
+struct BlendedScene {
+  int batch, count, bases, width, height;
+  int vertices, triangles, variant;  // variant: TangentVariant
+  const float* weights;              // [B, K]
+  const float* base[kBlendedKinds];   // [N, 3 or 4]
+  const float* basis[kBlendedKinds];  // [K, N, 3 or 4]
+  const float *log_scale, *opacity_logit;  // [N, 3], [N]
+  const float *vertex, *barycentric;       // [B, V, 3], [N, 3]
+  const int64_t *triangle_vertices, *triangle_of;  // [U, 3], [N]
+  const float *edges_to_frame, *rest_length;       // [U, 4], [U]; no rest length: fixed scales
+  float* frames;                                   // [B, U, kFrameFloats]
+};
+
+// Parameters with Adam's moments, and the numbers of this step.
+struct AdamGroup {
+  float *value, *first, *second;
+  float rate, inverse_root, beta1, beta2, epsilon;
+};
+
+struct BlendedOptimizer {
+  AdamGroup base[kBlendedKinds], basis[kBlendedKinds], log_scale, opacity_logit;
+};
+
+// Scratch memory of one thread for a chunk of Gaussians.
+struct BlendScratch {
+  float* tangent[kBlendedKinds];   // [B, kBlendChunk * width]: blended, or the gradient of that
+  float* weight_sums;              // [B, K, 16]
+  float gradient[kBlendColumns];
+  float scale[3][kBlendChunk], opacity[kBlendChunk];
+  float scale_gradient[kBlendChunk * 3], opacity_gradient[kBlendChunk];
+};
+
+// A tile's target for training: straight-alpha RGBA of 8 bits over the background.
+struct TrainingTarget {
+  const uint8_t* rgba;
+  const float* background;
+  float gradient;  // of the loss by each absolute difference
+};
+
 // The loops, compiled once per instruction set.
 struct Kernels {
   // Projects Gaussians [begin, end) of an image.
@@ -126,6 +179,20 @@ struct Kernels {
   // before where the batch shares an attribute.
   void (*project_backward)(const Scene&, const float* camera, int image, int begin, int end,
                            const ImageSlots&, const SceneGradient&);
+  // Fills the frames [begin, end) of an image.
+  void (*fill_frames)(const BlendedScene&, int image, int begin, int end);
+  // Blends and projects Gaussians [begin, end), at most kBlendChunk, of all images. `cameras` and
+  // `images` hold one entry an image.
+  void (*project_blended)(const BlendedScene&, const float* cameras, int begin, int end,
+                          BlendScratch&, const Projected* images);
+  // Draws the tile, compares it with the target and writes its slots; returns the sum of absolute
+  // differences.
+  double (*train_tile)(const Tile&, const TrainingTarget&, TileScratch&, float* slots);
+  // Updates the parameters of Gaussians [begin, end) and writes the gradient of the weights that
+  // comes from them, [B, K].
+  void (*update_blended)(const BlendedScene&, const float* cameras, int begin, int end,
+                         BlendScratch&, const ImageSlots* images, const BlendedOptimizer&,
+                         float* weight_gradient);
 };
 
 // world_to_camera [4, 4], focal [2] and principal point [2] in one row of floats.

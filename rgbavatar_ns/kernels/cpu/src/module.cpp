@@ -1,11 +1,15 @@
 // The Python module. Arrays arrive through DLPack; shapes have been checked by functional.py.
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
+#include <nanobind/stl/array.h>
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/string.h>
+#include <nanobind/stl/tuple.h>
 #include <nanobind/stl/vector.h>
 
+#include <array>
 #include <optional>
+#include <tuple>
 
 #include "raster.h"
 
@@ -19,6 +23,8 @@ namespace {
 
 using Input = nb::ndarray<const float, nb::c_contig, nb::device::cpu>;
 using Output = nb::ndarray<float, nb::c_contig, nb::device::cpu>;
+using Indices = nb::ndarray<const int64_t, nb::c_contig, nb::device::cpu>;
+using Pixels = nb::ndarray<const uint8_t, nb::c_contig, nb::device::cpu>;
 
 template <class Array>
 auto pointer(const std::optional<Array>& array) {
@@ -90,6 +96,101 @@ struct Session {
   }
 };
 
+// Blended Gaussians with the mesh that carries them; keeps the tensors alive.
+struct Blended {
+  Input position, rotation, color, log_scale, opacity_logit;
+  std::optional<Input> basis_position, basis_rotation, basis_color;
+  Input barycentric, edges_to_frame;
+  std::optional<Input> rest_length;
+  Indices triangle_vertices, triangle_of;
+  int variant;
+
+  rgbavatar::BlendedScene scene(const Input& weights, const Input& vertices, int width,
+                                int height) const {
+    return {int(weights.shape(0)),
+            int(position.shape(0)),
+            int(weights.shape(1)),
+            width,
+            height,
+            int(vertices.shape(1)),
+            int(triangle_vertices.shape(0)),
+            variant,
+            weights.data(),
+            {position.data(), rotation.data(), color.data()},
+            {pointer(basis_position), pointer(basis_rotation), pointer(basis_color)},
+            log_scale.data(),
+            opacity_logit.data(),
+            vertices.data(),
+            barycentric.data(),
+            triangle_vertices.data(),
+            triangle_of.data(),
+            edges_to_frame.data(),
+            pointer(rest_length),
+            nullptr};
+  }
+};
+
+// A parameter's value, Adam's two moments, and (rate, inverse_root, beta1, beta2, epsilon).
+using AdamArrays = std::tuple<Output, Output, Output, std::array<float, 5>>;
+
+rgbavatar::AdamGroup adam_group(const AdamArrays& arrays) {
+  const auto& [value, first, second, n] = arrays;
+  return {value.data(), first.data(), second.data(), n[0], n[1], n[2], n[3], n[4]};
+}
+
+// A BlendedRendering with the tensors that its later calls need.
+struct BlendedSession {
+  Blended blended;
+  Input weights, vertices;
+  int width, height, threads;
+  rgbavatar::BlendedRendering rendering;
+
+  BlendedSession(const Blended& blended, const Input& weights, const Input& vertices,
+                 const Input& world_to_camera, const Input& focal_px,
+                 const Input& principal_point_px, int width, int height, int threads,
+                 const std::string& instruction_set)
+      : blended(blended),
+        weights(weights),
+        vertices(vertices),
+        width(width),
+        height(height),
+        threads(threads),
+        rendering(blended.scene(weights, vertices, width, height),
+                  {world_to_camera.data(), focal_px.data(), principal_point_px.data(),
+                   int(focal_px.shape(0))},
+                  instruction_set, threads) {}
+
+  void draw(const Input& background, const Output& image, const Output& alpha,
+            const std::optional<Output>& depth) {
+    rendering.draw(attribute(background), image.data(), alpha.data(), pointer(depth), threads);
+  }
+
+  void average(const std::optional<Input>& images, const std::optional<Output>& weighted_sum,
+               const std::optional<Output>& weight_sum, const Output& max_weight) {
+    const rgbavatar::Attribute pixels =
+        images ? attribute(*images) : rgbavatar::Attribute{nullptr, 0};
+    rendering.average(pixels, images ? int(images->shape(3)) : 0, pointer(weighted_sum),
+                      pointer(weight_sum), max_weight.data(), threads);
+  }
+
+  double compare(const Pixels& images, const Input& background) {
+    return rendering.compare(images.data(), attribute(background), threads);
+  }
+
+  void update(const std::vector<AdamArrays>& groups, const Output& weight_gradient) {
+    rgbavatar::BlendedOptimizer optimizer = {};
+    for (int kind = 0; kind < rgbavatar::kBlendedKinds; ++kind) {
+      optimizer.base[kind] = adam_group(groups[kind]);
+      if (weights.shape(1) > 0)
+        optimizer.basis[kind] = adam_group(groups[5 + kind]);
+    }
+    optimizer.log_scale = adam_group(groups[3]);
+    optimizer.opacity_logit = adam_group(groups[4]);
+    rendering.update(blended.scene(weights, vertices, width, height), optimizer,
+                     weight_gradient.data(), threads);
+  }
+};
+
 nb::dict constants() {
   using C = BlendingConstants;
   nb::dict out;
@@ -131,5 +232,39 @@ NB_MODULE(_native, m) {
            "alpha"_a.noconvert(), "image_grad"_a.noconvert().none(),
            "alpha_grad"_a.noconvert().none(), "means"_a.noconvert(), "quats_wxyz"_a.noconvert(),
            "scales"_a.noconvert(), "opacities"_a.noconvert(), "colors"_a.noconvert(), "threads"_a,
+           Release());
+  nb::class_<Blended>(m, "Blended")
+      .def("__init__",
+           [](Blended* self, Input position, Input rotation, Input color, Input log_scale,
+              Input opacity_logit, std::optional<Input> basis_position,
+              std::optional<Input> basis_rotation, std::optional<Input> basis_color,
+              Input barycentric, Input edges_to_frame, std::optional<Input> rest_length,
+              Indices triangle_vertices, Indices triangle_of, int variant) {
+             new (self) Blended{position,       rotation,    color,          log_scale,
+                                opacity_logit,  basis_position, basis_rotation, basis_color,
+                                barycentric,    edges_to_frame, rest_length,
+                                triangle_vertices, triangle_of, variant};
+           },
+           "position"_a.noconvert(), "rotation_wxyz"_a.noconvert(), "color_feature"_a.noconvert(),
+           "log_scale"_a.noconvert(), "opacity_logit"_a.noconvert(),
+           "basis_position"_a.noconvert().none(), "basis_rotation_wxyz"_a.noconvert().none(),
+           "basis_color_feature"_a.noconvert().none(), "barycentric"_a.noconvert(),
+           "edges_to_frame"_a.noconvert(), "rest_length"_a.noconvert().none(),
+           "triangle_vertices"_a.noconvert(), "triangle_of"_a.noconvert(), "variant"_a);
+  nb::class_<BlendedSession>(m, "BlendedSession")
+      .def(nb::init<const Blended&, const Input&, const Input&, const Input&, const Input&,
+                    const Input&, int, int, int, const std::string&>(),
+           "blended"_a, "weights"_a.noconvert(), "vertices"_a.noconvert(),
+           "world_to_camera"_a.noconvert(), "focal_px"_a.noconvert(),
+           "principal_point_px"_a.noconvert(), "width"_a, "height"_a, "threads"_a,
+           "instruction_set"_a, Release())
+      .def("draw", &BlendedSession::draw, "background"_a.noconvert(), "image"_a.noconvert(),
+           "alpha"_a.noconvert(), "depth"_a.noconvert().none(), Release())
+      .def("average", &BlendedSession::average, "images"_a.noconvert().none(),
+           "weighted_sum"_a.noconvert().none(), "weight_sum"_a.noconvert().none(),
+           "max_weight"_a.noconvert(), Release())
+      .def("compare", &BlendedSession::compare, "images_rgba"_a.noconvert(),
+           "background"_a.noconvert(), Release())
+      .def("update", &BlendedSession::update, "groups"_a, "weight_gradient"_a.noconvert(),
            Release());
 }

@@ -137,7 +137,7 @@ static RGBAVATAR_MEMBER BlockSpan span_of(const Wide& low, const Wide& high) {
 struct TouchedBlocks {
   WideInt upper, lower;
 };
-static inline TouchedBlocks touched_blocks(const Scene& scene, const Projection<Wide>& q,
+static inline TouchedBlocks touched_blocks(int width, const Projection<Wide>& q,
                                            const Wide& cov01, const Wide& reach,
                                            const Wide& half_x, const Wide& half_y,
                                            const BlockSpan& x, const BlockSpan& y,
@@ -162,7 +162,7 @@ static inline TouchedBlocks touched_blocks(const Scene& scene, const Projection<
     const Wide centre = q.mean_x - 0.5f;
     const Wide start = max_of(centre + slope * dy_left - to_left - kSlackPx, Wide(0.0f));
     const Wide stop = min_of(centre + slope * dy_right + right + kSlackPx,
-                             Wide(scene.width - 1.0f));
+                             Wide(width - 1.0f));
     const WideMask some = (rows >= Wide(float(row))) & fits & (stop >= start);
     // From the first bit to the last, within the eight of this row; none where start > stop.
     const BlockSpan span = span_of(select(some, start, Wide(4.0f)), select(some, stop, Wide(0.0f)));
@@ -189,7 +189,7 @@ static RGBAVATAR_MEMBER void store_splats(const Wide columns[16], Splat* to) {
 }
 
 // Projects sixteen Gaussians and writes their splats.
-static inline void project_lanes(const Scene& scene, const Camera& camera,
+static inline void project_lanes(int width, int height, const Camera& camera,
                                  const GaussianInput<Wide>& g, const Vec3<Wide>& color, int first,
                                  int lanes, const Projected& out) {
   static_assert(sizeof(Splat) == 16 * sizeof(float), "a splat is sixteen columns");
@@ -203,8 +203,8 @@ static inline void project_lanes(const Scene& scene, const Camera& camera,
   const Wide centre_x = q.mean_x - 0.5f, centre_y = q.mean_y - 0.5f;
   const Wide low_x = max_of(centre_x - half_x, Wide(0.0f));
   const Wide low_y = max_of(centre_y - half_y, Wide(0.0f));
-  const Wide high_x = min_of(centre_x + half_x, Wide(scene.width - 1.0f));
-  const Wide high_y = min_of(centre_y + half_y, Wide(scene.height - 1.0f));
+  const Wide high_x = min_of(centre_x + half_x, Wide(width - 1.0f));
+  const Wide high_y = min_of(centre_y + half_y, Wide(height - 1.0f));
   // The first comparisons keep what is far outside, or not drawable, from the conversion to
   // integers; the second ones ask for a pixel centre.
   const WideMask near = drawable & (high_x >= low_x) & (high_y >= low_y);
@@ -216,7 +216,7 @@ static inline void project_lanes(const Scene& scene, const Camera& camera,
   const WideMask fits = seen & (Wide(kWindow - 1.0f) >= to_floats(x.last - x.first)) &
                         (Wide(kWindow - 1.0f) >= to_floats(y.last - y.first));
   const TouchedBlocks touched = touched_blocks(
-      scene, q, zero - q.conic01 * q.determinant, reach, half_x, half_y, x, y, fits);
+      width, q, zero - q.conic01 * q.determinant, reach, half_x, half_y, x, y, fits);
   const Wide first_block = select(seen, bits_as_floats(x.first | (y.first << 16)),
                                   bits_as_floats(WideInt(1)));
   const Wide last_block = select(seen, bits_as_floats(x.last | (y.last << 16)), zero);
@@ -261,7 +261,7 @@ static void project_image(const Scene& scene, const float* camera_floats, int im
   const Camera camera = camera_from(camera_floats, scene.width, scene.height);
   for (int first = begin; first < end; first += kLanes) {
     const int lanes = end - first < kLanes ? end - first : kLanes;
-    project_lanes(scene, camera, load_gaussians(scene, image, first, lanes),
+    project_lanes(scene.width, scene.height, camera, load_gaussians(scene, image, first, lanes),
                   load_vec3(scene.colors.of(image), first, lanes), first, lanes, out);
   }
 }

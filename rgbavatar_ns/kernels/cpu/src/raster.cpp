@@ -9,50 +9,7 @@
 
 namespace rgbavatar {
 
-namespace generic {
-extern const Kernels kernels;
-}
-#if defined(RGBAVATAR_X86)
-namespace avx2 {
-extern const Kernels kernels;
-}
-namespace avx512 {
-extern const Kernels kernels;
-}
-#endif
-
 namespace {
-
-struct InstructionSet {
-  const char* name;
-  const Kernels* kernels;
-};
-
-// The sets this processor runs, the fastest first.
-std::vector<InstructionSet> supported() {
-  std::vector<InstructionSet> sets;
-#if defined(RGBAVATAR_X86)
-  __builtin_cpu_init();
-  const bool avx2 = __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma");
-  if (avx2 && __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512dq") &&
-      __builtin_cpu_supports("avx512vl") && __builtin_cpu_supports("avx512bw"))
-    sets.push_back({"avx512", &avx512::kernels});
-  if (avx2) sets.push_back({"avx2", &avx2::kernels});
-#endif
-  sets.push_back({"generic", &generic::kernels});
-  return sets;
-}
-
-// An empty name means the fastest.
-const Kernels* kernels_for(const std::string& name) {
-  std::string known;
-  for (const InstructionSet& set : supported()) {
-    if (name.empty() || name == set.name) return set.kernels;
-    known += known.empty() ? set.name : std::string(", ") + set.name;
-  }
-  throw std::invalid_argument("This processor does not run the instruction set '" + name +
-                              "'. Choose one of: " + known + ".");
-}
 
 constexpr size_t kKeptWorkspaces = 2;
 std::mutex pool_mutex;
@@ -118,79 +75,76 @@ void for_tiles(const Bounds& s, int tiles_x, Visit visit) {
 
 }  // namespace
 
-std::vector<std::string> instruction_sets() {
-  std::vector<std::string> names;
-  for (const InstructionSet& set : supported()) names.push_back(set.name);
-  return names;
-}
-
-Rendering::Rendering(const Scene& scene, const Cameras& cameras,
-                     const std::string& instruction_set, int threads)
-    : batch_(scene.batch),
-      count_(scene.count),
-      width_(scene.width),
-      height_(scene.height),
-      tiles_x_((scene.width + kTileBlocks * kBlockSide - 1) / (kTileBlocks * kBlockSide)),
-      tiles_y_((scene.height + kTileBlocks * kBlockSide - 1) / (kTileBlocks * kBlockSide)),
+Rendering::Rendering(int batch, int count, int width, int height, const Cameras& cameras,
+                     const std::string& instruction_set)
+    : batch_(batch),
+      count_(count),
+      width_(width),
+      height_(height),
+      tiles_x_((width + kTileBlocks * kBlockSide - 1) / (kTileBlocks * kBlockSide)),
+      tiles_y_((height + kTileBlocks * kBlockSide - 1) / (kTileBlocks * kBlockSide)),
       kernels_(kernels_for(instruction_set)),
       workspace_(take_workspace()) {
   Workspace& w = *workspace_;
   w.cameras.reserve(size_t(batch_) * kCameraFloats);
+  w.splats.reserve(size_t(batch_) * count_);
+  w.depth.reserve(size_t(batch_) * count_);
+  w.bounds.reserve(size_t(batch_) * count_);
+  w.projected.reserve(batch_);
   for (int image = 0; image < batch_; ++image) {
     const int from = cameras.count == 1 ? 0 : image;
     float* to = &w.cameras[size_t(image) * kCameraFloats];
     std::memcpy(to, cameras.world_to_camera + from * 16, 16 * sizeof(float));
     std::memcpy(to + 16, cameras.focal_px + from * 2, 2 * sizeof(float));
     std::memcpy(to + 18, cameras.principal_point_px + from * 2, 2 * sizeof(float));
+    const size_t first = size_t(image) * count_;
+    w.projected[image] = {w.splats.data() + first, w.depth.data() + first,
+                          w.bounds.data() + first};
   }
+}
+
+Rendering::Rendering(const Scene& scene, const Cameras& cameras,
+                     const std::string& instruction_set, int threads)
+    : Rendering(scene.batch, scene.count, scene.width, scene.height, cameras, instruction_set) {
   Team team(threads);
-  prepare(scene, team);
+  Workspace& w = *workspace_;
+  const int chunks = chunks_of(count_);
+  team.run(int64_t(batch_) * chunks, [&](int64_t item, int) {
+    const int image = int(item / chunks), begin = int(item % chunks) * kChunk;
+    kernels_->project(scene, &w.cameras[size_t(image) * kCameraFloats], image, begin,
+                      std::min(begin + kChunk, count_), w.projected[image]);
+  });
+  sort(team);
 }
 
 Rendering::~Rendering() { give_workspace(std::move(workspace_)); }
 
-// As many images at a time as there are threads: what the projection writes, the sorting finds in
-// the caches.
-void Rendering::prepare(const Scene& scene, Team& team) {
+void Rendering::sort(Team& team) {
   Workspace& w = *workspace_;
-  const int group = std::min(batch_, team.size()), chunks = chunks_of(count_);
   w.slot_offset.reserve(size_t(batch_) * (count_ + 1));
   w.tile_start.reserve(size_t(batch_) * (tiles_per_image() + 1));
   w.slot_start.reserve(batch_ + 1);
   w.slot_count.reserve(batch_);
+  w.sort_keys.reserve(size_t(team.size()) * 2 * count_);
   if (int(w.entries.size()) < batch_) w.entries.resize(batch_);
-  w.splats.reserve(size_t(batch_) * count_);
-  w.depth.reserve(size_t(group) * count_);
-  w.bounds.reserve(size_t(group) * count_);
-  w.sort_keys.reserve(size_t(group) * 2 * count_);
-  for (int image = 0; image < batch_; image += group) {
-    const int images = std::min(group, batch_ - image);
-    team.run(int64_t(images) * chunks, [&](int64_t item, int) {
-      const int place = int(item / chunks), begin = int(item % chunks) * kChunk;
-      kernels_->project(scene, &w.cameras[size_t(image + place) * kCameraFloats], image + place,
-                        begin, std::min(begin + kChunk, count_),
-                        {w.splats.data() + size_t(image + place) * count_,
-                         w.depth.data() + size_t(place) * count_,
-                         w.bounds.data() + size_t(place) * count_});
-    });
-    team.run(images, [&](int64_t place, int) { sort_image(image + int(place), int(place)); });
-    for (int place = 0; place < images; ++place)
-      if (w.slot_count[image + place] > UINT32_MAX)
-        throw std::invalid_argument(
-            "The Gaussians of one image touch more than 2^32 tiles. Render a smaller image or check "
-            "the Gaussians' scales.");
-  }
+  team.run(batch_, [&](int64_t image, int thread) {
+    sort_image(int(image), w.sort_keys.data() + size_t(thread) * 2 * count_);
+  });
   w.slot_start[0] = 0;
-  for (int image = 0; image < batch_; ++image)
+  for (int image = 0; image < batch_; ++image) {
+    if (w.slot_count[image] > UINT32_MAX)
+      throw std::invalid_argument(
+          "The Gaussians of one image touch more than 2^32 tiles. Render a smaller image or check "
+          "the Gaussians' scales.");
     w.slot_start[image + 1] = w.slot_start[image] + w.slot_count[image];
+  }
 }
 
 // Front to back, then by tile: a counting sort keeps the order within each tile.
-void Rendering::sort_image(int image, int place) {
+void Rendering::sort_image(int image, uint64_t* keys) {
   Workspace& w = *workspace_;
-  const float* depth = w.depth.data() + size_t(place) * count_;
-  const Bounds* bounds = w.bounds.data() + size_t(place) * count_;
-  uint64_t* keys = w.sort_keys.data() + size_t(place) * 2 * count_;
+  const float* depth = w.projected[image].depth;
+  const Bounds* bounds = w.projected[image].bounds;
   uint32_t* start = w.tile_start.data() + size_t(image) * (tiles_per_image() + 1);
   uint32_t* slot_offset = w.slot_offset.data() + size_t(image) * (count_ + 1);
   std::fill(start, start + tiles_per_image() + 1, 0u);
@@ -229,7 +183,7 @@ void Rendering::sort_image(int image, int place) {
 Tile Rendering::tile(int image, int index) const {
   const Workspace& w = *workspace_;
   const uint32_t* start = w.tile_start.data() + size_t(image) * (tiles_per_image() + 1) + index;
-  return {w.splats.data() + size_t(image) * count_,
+  return {w.projected[image].splats,
           w.entries[image].data() + start[0],
           start[1] - start[0],
           index % tiles_x_,

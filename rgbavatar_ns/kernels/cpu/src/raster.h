@@ -58,10 +58,17 @@ struct Workspace {
   Buffer<float> slots;
   Buffer<ImageSlots> image_slots;  // [B]
   Buffer<TileScratch> scratch;     // [threads]
-  // Of the images that are being projected.
-  Buffer<float> depth;         // [group, N]
-  Buffer<Bounds> bounds;       // [group, N]
-  Buffer<uint64_t> sort_keys;  // [group, 2, N]
+  // Of the projection.
+  Buffer<float> depth;             // [B, N]
+  Buffer<Bounds> bounds;           // [B, N]
+  Buffer<Projected> projected;     // [B]
+  Buffer<uint64_t> sort_keys;      // [threads, 2, N]
+  // Of blended Gaussians.
+  Buffer<float> frames;            // [B, U, kFrameFloats]
+  Buffer<BlendScratch> blending;   // [threads]
+  Buffer<float> blending_columns;  // [threads, ...]: what the scratch memory points to
+  Buffer<float> weight_gradient;   // [chunks, B, K]
+  Buffer<double> loss;             // [B, tiles]
 };
 
 struct Cameras {
@@ -71,6 +78,9 @@ struct Cameras {
 
 // Names of the instruction sets this processor runs, the fastest first.
 std::vector<std::string> instruction_sets();
+
+// The loops of one of them; an empty name means the fastest. Throws std::invalid_argument.
+const Kernels* kernels_for(const std::string& name);
 
 // Projects and sorts at construction; then draws, averages and differentiates any number of
 // times. The Gaussians' memory is not kept: the caller passes the same scene again.
@@ -93,9 +103,10 @@ class Rendering {
   void backward(const Scene& scene, const BackwardInput& input, const SceneGradient& gradient,
                 int threads);
 
- private:
-  void prepare(const Scene& scene, class Team& team);
-  void sort_image(int image, int place);
+ protected:
+  Rendering(int batch, int count, int width, int height, const Cameras& cameras,
+            const std::string& instruction_set);
+  void sort(class Team& team);
   void lay_out_slots(int width);
   Tile tile(int image, int index) const;
   int tiles_per_image() const { return tiles_x_ * tiles_y_; }
@@ -103,6 +114,27 @@ class Rendering {
   int batch_, count_, width_, height_, tiles_x_, tiles_y_;
   const Kernels* kernels_;
   std::unique_ptr<Workspace> workspace_;
+
+ private:
+  void sort_image(int image, uint64_t* keys);
+};
+
+// A Rendering of blended Gaussians, which can train them. The scene's memory is not kept.
+class BlendedRendering : public Rendering {
+ public:
+  BlendedRendering(BlendedScene scene, const Cameras& cameras, const std::string& instruction_set,
+                   int threads);
+
+  // The mean absolute difference to images [B, H, W, 4] of 8 bits over backgrounds [B or 1, 3];
+  // keeps what `update` needs.
+  double compare(const uint8_t* images, const Attribute& background, int threads);
+
+  // One step of Adam by the gradient of the last comparison; writes that of the weights, [B, K].
+  void update(BlendedScene scene, const BlendedOptimizer& optimizer, float* weight_gradient,
+              int threads);
+
+ private:
+  void lay_out_blending(const BlendedScene& scene, const class Team& team);
 };
 
 }  // namespace rgbavatar

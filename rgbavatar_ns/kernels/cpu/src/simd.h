@@ -119,6 +119,7 @@ struct Ints {
   RGBAVATAR_PAIRWISE(+)
   RGBAVATAR_PAIRWISE(-)
   RGBAVATAR_PAIRWISE(|)
+  RGBAVATAR_PAIRWISE(&)
   RGBAVATAR_PAIRWISE(<<)
   RGBAVATAR_PAIRWISE(>>)
 #undef RGBAVATAR_PAIRWISE
@@ -135,6 +136,7 @@ struct Ints<kNativeLanes> {
   RGBAVATAR_NATIVE(+)
   RGBAVATAR_NATIVE(-)
   RGBAVATAR_NATIVE(|)
+  RGBAVATAR_NATIVE(&)
   RGBAVATAR_NATIVE(<<)
   RGBAVATAR_NATIVE(>>)
 #undef RGBAVATAR_NATIVE
@@ -231,6 +233,22 @@ RGBAVATAR_FUNCTION Native reciprocal_of(Native a) {
 #endif
 }
 
+// 1 / sqrt(a) of a positive, normal number, to about 23 bits, in the same way.
+RGBAVATAR_FUNCTION Native inverse_root_of(Native a) {
+#if defined(__AVX512F__)
+  const Native estimate(_mm512_rsqrt14_ps(a.v));
+#elif defined(__AVX2__)
+  const Native estimate(_mm256_rsqrt_ps(a.v));
+#elif defined(__x86_64__)
+  const Native estimate(_mm_rsqrt_ps(a.v));
+#else
+  return Native(1.0f) / square_root(a);
+#endif
+#if defined(__x86_64__)
+  return estimate * (Native(1.5f) - Native(0.5f) * a * estimate * estimate);
+#endif
+}
+
 // 2^a where the mask is set and 0 elsewhere, relative error 3e-6; -126 < a < 127 where it is set.
 // The minimax polynomial of degree 4 on [0, 1) for the fraction, and the floor for the exponent.
 RGBAVATAR_FUNCTION Native exp2_where(Flags m, Native a) {
@@ -294,6 +312,7 @@ RGBAVATAR_FUNCTION void store(Native a, float* to) {
   }
 RGBAVATAR_HALVES1(square_root)
 RGBAVATAR_HALVES1(reciprocal_of)
+RGBAVATAR_HALVES1(inverse_root_of)
 RGBAVATAR_HALVES1(log2_of)
 RGBAVATAR_HALVES2(min_of)
 RGBAVATAR_HALVES2(max_of)
@@ -333,6 +352,20 @@ RGBAVATAR_FUNCTION void store(Floats<L> a, float* to) {
 
 RGBAVATAR_FUNCTION Wide load_wide(const float* from) {
   Wide a;
+  load(a, from);
+  return a;
+}
+
+RGBAVATAR_FUNCTION void load(NativeInts& a, const int32_t* from) {
+  __builtin_memcpy(&a.v, from, sizeof a.v);
+}
+template <int L>
+RGBAVATAR_FUNCTION void load(Ints<L>& a, const int32_t* from) {
+  load(a.low, from);
+  load(a.high, from + L / 2);
+}
+RGBAVATAR_FUNCTION WideInt load_ints(const int32_t* from) {
+  WideInt a;
   load(a, from);
   return a;
 }

@@ -1,0 +1,62 @@
+// Forward pass, loss and backward pass of one tile in one go: no image is written.
+#pragma once
+
+#include "backward_tile.h"
+
+namespace rgbavatar::RGBAVATAR_ISA {
+
+// A block's RGBA pixels, one a lane; 0 outside the image.
+static RGBAVATAR_MEMBER WideInt load_rgba(const Tile& tile, const BlockPixels& pixels,
+                                          const uint8_t* rgba) {
+  int32_t lanes[kBlockPixels] = {};
+  if (pixels.whole())
+    for (int y = 0; y < kBlockSide; ++y)
+      __builtin_memcpy(lanes + y * kBlockSide, rgba + (pixels.first + int64_t(y) * tile.width) * 4,
+                       4 * kBlockSide);
+  else
+    pixels.for_each(tile, [&](int lane, int64_t pixel) {
+      __builtin_memcpy(lanes + lane, rgba + pixel * 4, 4);
+    });
+  return load_ints(lanes);
+}
+
+// From the drawn rows to those of the backward pass: T starts again, the channels become dL/dimage
+// of the mean absolute difference, and the remainder g . image. Returns the differences' sums.
+static Wide compare_block(const Tile& tile, const TrainingTarget& target, int block,
+                          TileScratch& scratch) {
+  float(*rows)[kBlockPixels] = block_rows<kBlendRows>(scratch, block);
+  const BlockPixels pixels(tile, block);
+  const WideInt rgba = load_rgba(tile, pixels, target.rgba);
+  const Wide zero(0.0f), one(1.0f), t = load_wide(rows[kTransmittance]);
+  float within[kBlockPixels] = {};
+  pixels.for_each(tile, [&](int lane, int64_t) { within[lane] = 1.0f; });
+  const Wide inside = load_wide(within);
+  const Wide matte = to_floats((rgba >> 24) & 255) * (1.0f / 255.0f);
+  Wide remainder = zero, sum = zero;
+  for (int k = 0; k < 3; ++k) {
+    const Wide background(target.background[k]);
+    const Wide color = to_floats((rgba >> (8 * k)) & 255) * (1.0f / 255.0f);
+    const Wide image = load_wide(rows[kColor + k]) + t * background;
+    const Wide difference = (image - (background + matte * (color - background))) * inside;
+    const Wide sign = select(difference > zero, one, zero) - select(zero > difference, one, zero);
+    const Wide g = sign * target.gradient;
+    sum = sum + sign * difference;
+    remainder = remainder + g * image;
+    store(g, rows[kColor + k]);
+  }
+  store(inside, rows[kTransmittance]);
+  store(remainder, rows[kRemainder]);
+  return sum;
+}
+
+static double train_tile(const Tile& tile, const TrainingTarget& target, TileScratch& scratch,
+                         float* slots) {
+  draw_rows<kBlendRows, false>(tile, scratch);
+  Wide sum(0.0f);
+  for (int block = 0; block < kBlocksPerTile; ++block)
+    sum = sum + compare_block(tile, target, block, scratch);
+  backward_rows(tile, scratch, slots);
+  return double(sum_of(sum));
+}
+
+}  // namespace rgbavatar::RGBAVATAR_ISA
