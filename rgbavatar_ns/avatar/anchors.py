@@ -8,7 +8,13 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from rgbavatar_ns.head import HeadModel, UVAnchors, frame_quats_wxyz, tangent_frames
+from rgbavatar_ns.head import (
+    HeadModel,
+    UVAnchors,
+    edges_to_frame,
+    frame_quats_wxyz,
+    tangent_frames,
+)
 
 
 @dataclass(frozen=True)
@@ -43,6 +49,7 @@ class GaussianAnchors(nn.Module):
     _used_uv_faces: Int[Tensor, "U 3"]
     _anchor_vertices: Int[Tensor, "N 3"]
     _rest_length: Float[Tensor, "U"]
+    _edges_to_frame: Float[Tensor, "U 2 2"]
 
     def __init__(
         self,
@@ -79,6 +86,8 @@ class GaussianAnchors(nn.Module):
         self.register_buffer("_anchor_vertices", self._faces[self.triangle_index], persistent=False)
         rest_length = self._side_lengths(self._rest_vertices[None])[0]
         self.register_buffer("_rest_length", rest_length, persistent=False)
+        inverse = edges_to_frame(self._uv, self._used_uv_faces).to(rest_length.dtype)
+        self.register_buffer("_edges_to_frame", inverse, persistent=False)
 
     def __len__(self) -> int:
         """Return the number N of Gaussians."""
@@ -102,6 +111,17 @@ class GaussianAnchors(nn.Module):
             origin=self.origins(vertices),
             length_ratio=ratio,
         )
+
+    def triangles(self, *, with_rest_length: bool) -> dict[str, Any]:
+        """Return what `kernels.BlendedGaussians` holds of the mesh, by its fields' names."""
+        return {
+            "barycentric": self.barycentric,
+            "triangle_of": self._frame_index,
+            "triangle_vertices": self._used_faces,
+            "edges_to_frame": self._edges_to_frame,
+            "rest_length": self._rest_length if with_rest_length else None,
+            "variant": self.variant,
+        }
 
     def origins(self, vertices: Float[Tensor, "B V 3"]) -> Float[Tensor, "B N 3"]:
         """Return the anchors' world positions by barycentric interpolation (paper, supplement)."""

@@ -1,5 +1,6 @@
 """The avatar: the one composition from a head model's parameters theta to Gaussians and images."""
 
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,15 @@ from rgbavatar_ns.avatar.config import AvatarConfig
 from rgbavatar_ns.avatar.weights import WeightNetwork
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadArrays, HeadModel, ThetaLayout, UVAnchors, uv_anchors
-from rgbavatar_ns.kernels import GaussianSet, PinholeCameras, RenderedBatch, rasterize
+from rgbavatar_ns.kernels import (
+    BlendedGaussians,
+    BlendedRenderer,
+    GaussianSet,
+    PinholeCameras,
+    RenderedBatch,
+    blended_renderer,
+    rasterize,
+)
 
 LEARNING_RATES: dict[str, float] = {
     "position": 8e-4,
@@ -127,10 +136,47 @@ class Avatar(nn.Module):
         theta: Float[Tensor, "B H"],
         cameras: PinholeCameras,
         background: Float[Tensor, "3"] | Float[Tensor, "B 3"] | None = None,
-        **rasterize_options: Any,
+        *,
+        backend: str = "auto",
+        with_depth: bool = False,
+        with_visibility: bool = False,
     ) -> RenderedBatch:
-        """Draw a batch of theta; the options are those of `rgbavatar_ns.kernels.rasterize`."""
-        return rasterize(self.gaussians(theta), cameras, background, **rasterize_options)
+        """Draw a batch of theta; the options are those of `rgbavatar_ns.kernels.rasterize`.
+
+        Without gradients (`torch.no_grad`) a backend may draw the blended Gaussians directly,
+        several times faster, to the same numbers.
+        """
+        options = {"with_depth": with_depth, "with_visibility": with_visibility}
+        if not torch.is_grad_enabled():
+            renderer = self.renderer(theta, cameras, backend=backend)
+            if renderer is not None:
+                color = self.identity.new_zeros(3) if background is None else background
+                return renderer.draw(color.reshape(-1, 3), **options)
+        return rasterize(self.gaussians(theta), cameras, background, backend=backend, **options)
+
+    def renderer(
+        self,
+        theta: Float[Tensor, "B H"],
+        cameras: PinholeCameras,
+        psi: Float[Tensor, "B K"] | None = None,
+        *,
+        backend: str = "auto",
+    ) -> BlendedRenderer | None:
+        """Return the backend's way to draw and train without `gaussians`, if it has one.
+
+        `psi` replaces the weight network's answer. Raises UserError where theta is unfit.
+        """
+        theta = self._checked(theta)
+        with torch.no_grad():
+            psi = self.weights(theta) if psi is None else psi
+            vertices = self.head(theta, self.identity)
+        return blended_renderer(self._blended_gaussians(), psi, vertices, cameras, backend)
+
+    def _blended_gaussians(self) -> BlendedGaussians:
+        names = [field.name for field in fields(BlendedGaussians)]
+        tensors = {n: getattr(self.blendshapes, n, None) for n in names}
+        follows = self.config.scale_with_triangle
+        return BlendedGaussians(**tensors | self.anchors.triangles(with_rest_length=follows))
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         """Return the parameters by the names in `LEARNING_RATES`; none for bases where K = 0."""

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from rgbavatar_ns.avatar.avatar import LEARNING_RATES, Avatar
 from rgbavatar_ns.avatar.color_init import ColorInitSchedule
+from rgbavatar_ns.avatar.fused_step import FusedStep, refusal
 from rgbavatar_ns.avatar.losses import (
     LPIPSLoss,
     composite,
@@ -40,6 +41,8 @@ class TrainingOptions:
     """First step with the LPIPS loss (release: after 20k images)."""
     color_init: ColorInitSchedule | None = field(default_factory=ColorInitSchedule)
     """When colours are initialised; None leaves them grey."""
+    fast: bool = True
+    """Use the fused step where it can be; False keeps to the readable path through autograd."""
 
 
 def make_optimizer(
@@ -95,12 +98,33 @@ def training_step(
     lpips: LPIPSLoss | None = None,
 ) -> Float[Tensor, ""]:
     """Take one optimiser step, then initialise colours where due; return the detached loss."""
-    optimizer.zero_grad(set_to_none=True)
-    loss = training_loss(avatar, batch, step, options, lpips)
-    loss.backward()
-    optimizer.step()
+    loss = _fused_loss(avatar, optimizer, batch, step, options) if options.fast else None
+    if loss is None:
+        optimizer.zero_grad(set_to_none=True)
+        loss = training_loss(avatar, batch, step, options, lpips)
+        loss.backward()
+        optimizer.step()
     initialize_colors_if_due(avatar, batch, step, options.color_init)
     return loss.detach()
+
+
+def _fused_loss(
+    avatar: Avatar,
+    optimizer: torch.optim.Optimizer,
+    batch: TrainingBatch,
+    step: int,
+    options: TrainingOptions,
+) -> Float[Tensor, ""] | None:
+    """The loss of a fused step; None where it has not been taken."""
+    if options.lpips_weight > 0 or batch.images_rgba.dtype != torch.uint8:
+        return None
+    if refusal(avatar, [optimizer]) is not None:
+        return None
+    background = random_backgrounds(step, len(batch.theta), options.seed)
+    background = background.to(batch.theta.device, avatar.blendshapes.position.dtype)
+    return FusedStep(avatar, [optimizer])(
+        batch.theta, batch.cameras, batch.images_rgba, background
+    )
 
 
 def fit(

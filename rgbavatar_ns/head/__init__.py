@@ -2,7 +2,7 @@
 
 from rgbavatar_ns.head.anchors import UVAnchors, uv_anchors
 from rgbavatar_ns.head.arrays import HeadArrays
-from rgbavatar_ns.head.frames import frame_quats_wxyz, tangent_frames
+from rgbavatar_ns.head.frames import edges_to_frame, frame_quats_wxyz, tangent_frames
 from rgbavatar_ns.head.landmarks import SPARSE_51, LandmarkMap, facemesh_landmarks
 from rgbavatar_ns.head.layout import ThetaField, ThetaLayout
 from rgbavatar_ns.head.model import HeadModel
@@ -16,6 +16,7 @@ __all__ = [
     "ThetaLayout",
     "UVAnchors",
     "facemesh_landmarks",
+    "edges_to_frame",
     "frame_quats_wxyz",
     "tangent_frames",
     "uv_anchors",

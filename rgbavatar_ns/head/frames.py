@@ -38,7 +38,7 @@ def tangent_frames(
     first = (first[0] * keep + (1 - keep), first[1] * keep, first[2] * keep)
     second = (second[0] * keep, second[1] * keep + (1 - keep), second[2] * keep)
     normal = _scaled_to_one(_cross(first, second))
-    inverse = _uv_inverses(uv, uv_faces).to(vertices.dtype)
+    inverse = edges_to_frame(uv, uv_faces).to(vertices.dtype)
 
     def derivative(row: Float[Tensor, "F 2"]) -> _Planes:
         return tuple(a * row[:, 0] + b * row[:, 1] for a, b in zip(first, second))
@@ -92,8 +92,11 @@ def _has_area(first: _Planes, second: _Planes) -> Float[Tensor, "*batch F"]:
     return wide.to(cross[0])
 
 
-def _uv_inverses(uv: Float[Tensor, "VT 2"], uv_faces: Int[Tensor, "F 3"]) -> Float[Tensor, "F 2 2"]:
-    """Rows give T and B from the two edges, in float64; the identity where there is no area."""
+def edges_to_frame(uv: Float[Tensor, "VT 2"], uv_faces: Int[Tensor, "F 3"]) -> Float[Tensor, "F 2 2"]:
+    """Each triangle's matrix whose rows give T and B from its two edges, in float64.
+
+    The identity where there is no area.
+    """
     corners = uv.double()[uv_faces]
     du, dv = (corners[:, 1:] - corners[:, :1]).unbind(-1)
     det = du[:, 0] * dv[:, 1] - du[:, 1] * dv[:, 0]

@@ -1,18 +1,31 @@
 """Batch rasterizer of Gaussians: one specification, several backends, one entrance."""
 
+from rgbavatar_ns.kernels.blended import blended_renderer
 from rgbavatar_ns.kernels.functional import (
     available_backends,
     rasterize,
     weighted_color_average,
 )
-from rgbavatar_ns.kernels.types import GaussianSet, PinholeCameras, RenderedBatch, WeightedColors
+from rgbavatar_ns.kernels.registry import BlendedRenderer
+from rgbavatar_ns.kernels.types import (
+    AdamParameter,
+    BlendedGaussians,
+    GaussianSet,
+    PinholeCameras,
+    RenderedBatch,
+    WeightedColors,
+)
 
 __all__ = [
+    "AdamParameter",
+    "BlendedGaussians",
+    "BlendedRenderer",
     "GaussianSet",
     "PinholeCameras",
     "RenderedBatch",
     "WeightedColors",
     "available_backends",
+    "blended_renderer",
     "rasterize",
     "weighted_color_average",
 ]

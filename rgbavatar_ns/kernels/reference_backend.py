@@ -8,7 +8,13 @@ from rgbavatar_ns.kernels.reference import (
     rasterize_reference,
     weighted_color_average_reference,
 )
-from rgbavatar_ns.kernels.types import GaussianSet, PinholeCameras, RenderedBatch, WeightedColors
+from rgbavatar_ns.kernels.types import (
+    BlendedGaussians,
+    GaussianSet,
+    PinholeCameras,
+    RenderedBatch,
+    WeightedColors,
+)
 
 
 class ReferenceBackend:
@@ -41,6 +47,16 @@ class ReferenceBackend:
     ) -> WeightedColors:
         """As `functional.weighted_color_average`."""
         return weighted_color_average_reference(gaussians, cameras, images)
+
+    def blended_renderer(
+        self,
+        gaussians: BlendedGaussians,
+        weights: Float[Tensor, "B K"],
+        vertices: Float[Tensor, "B V 3"],
+        cameras: PinholeCameras,
+    ) -> None:
+        """None: blending in torch and `rasterize` are the specification."""
+        return None
 
 
 def load() -> ReferenceBackend:

@@ -3,13 +3,52 @@
 import functools
 import importlib
 import warnings
+from collections.abc import Mapping
 from typing import Protocol, runtime_checkable
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from rgbavatar_ns.kernels.types import GaussianSet, PinholeCameras, RenderedBatch, WeightedColors
+from rgbavatar_ns.kernels.types import (
+    AdamParameter,
+    BlendedGaussians,
+    GaussianSet,
+    PinholeCameras,
+    RenderedBatch,
+    WeightedColors,
+)
+
+
+class BlendedRenderer(Protocol):
+    """B posed sets of the same blended Gaussians, projected and sorted; carries no autograd graph.
+
+    Neither Gaussians, weights nor vertices may change before `update`.
+    """
+
+    def draw(
+        self, background: Float[Tensor, "#B 3"], *, with_depth: bool, with_visibility: bool
+    ) -> RenderedBatch:
+        """As `rasterize`, without gradients."""
+        ...
+
+    def weighted_color_average(self, images: Float[Tensor, "#B H W C"]) -> WeightedColors:
+        """As `weighted_color_average`."""
+        ...
+
+    def compare(
+        self, images_rgba: UInt8[Tensor, "B H W 4"], background: Float[Tensor, "#B 3"]
+    ) -> float:
+        """The mean absolute difference to straight-alpha images over the background."""
+        ...
+
+    def update(self, parameters: Mapping[str, AdamParameter]) -> Float[Tensor, "B K"]:
+        """Take one step of Adam by the gradient of the last comparison, in place.
+
+        `parameters` holds one entry for each of the Gaussians' tensors, by its name. Returns the
+        gradient of the weights.
+        """
+        ...
 
 
 @runtime_checkable
@@ -36,6 +75,16 @@ class Backend(Protocol):
         self, gaussians: GaussianSet, cameras: PinholeCameras, images: Float[Tensor, "#B H W C"]
     ) -> WeightedColors:
         """As `functional.weighted_color_average`."""
+        ...
+
+    def blended_renderer(
+        self,
+        gaussians: BlendedGaussians,
+        weights: Float[Tensor, "B K"],
+        vertices: Float[Tensor, "B V 3"],
+        cameras: PinholeCameras,
+    ) -> BlendedRenderer | None:
+        """As `blended.blended_renderer`; None where this backend has none."""
         ...
 
 

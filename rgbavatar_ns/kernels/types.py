@@ -6,8 +6,9 @@ coordinates are pixels with the centre of the first pixel at (0.5, 0.5).
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 
@@ -73,3 +74,46 @@ class WeightedColors:
     weighted_sum: Float[Tensor, "B N C"]
     weight_sum: Float[Tensor, "B N"]
     max_weight: Float[Tensor, "B N"]
+
+
+TANGENT_VARIANTS = ("normalized", "raw", "orthonormal")
+"""The forms of a triangle's tangent frame, in the order of their numbers in compiled code."""
+
+
+@dataclass(frozen=True)
+class BlendedGaussians:
+    """N Gaussians in the tangent frames of a mesh's triangles, with K bases (RGBAvatar, eq. 1).
+
+    `basis_*` are None where K = 0. Scales are activated by exp, opacities by the sigmoid, colours
+    are .5 + .282 f. `edges_to_frame` gives each triangle's T and B (rows) from its two edges;
+    `triangle_of` names each Gaussian's triangle. With `rest_length` (the root of each triangle's
+    area at rest) scales follow the triangles.
+    """
+
+    position: Float[Tensor, "N 3"]
+    rotation_wxyz: Float[Tensor, "N 4"]
+    color_feature: Float[Tensor, "N 3"]
+    log_scale: Float[Tensor, "N 3"]
+    opacity_logit: Float[Tensor, "N"]
+    basis_position: Float[Tensor, "K N 3"] | None
+    basis_rotation_wxyz: Float[Tensor, "K N 4"] | None
+    basis_color_feature: Float[Tensor, "K N 3"] | None
+    barycentric: Float[Tensor, "N 3"]
+    triangle_of: Int[Tensor, "N"]
+    triangle_vertices: Int[Tensor, "U 3"]
+    edges_to_frame: Float[Tensor, "U 2 2"]
+    rest_length: Float[Tensor, "U"] | None
+    variant: Literal["normalized", "raw", "orthonormal"]
+
+
+@dataclass(frozen=True)
+class AdamParameter:
+    """A parameter with Adam's state, to be updated in place; `step` counts the coming one from 1."""
+
+    value: Float[Tensor, "*shape"]
+    first_moment: Float[Tensor, "*shape"]
+    second_moment: Float[Tensor, "*shape"]
+    learning_rate: float
+    betas: tuple[float, float]
+    epsilon: float
+    step: int

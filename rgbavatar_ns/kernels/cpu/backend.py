@@ -13,11 +13,16 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from rgbavatar_ns.kernels.constants import INSTRUCTION_SET_VARIABLE
 from rgbavatar_ns.kernels.cpu import _native  # pyright: ignore[reportMissingModuleSource]
-from rgbavatar_ns.kernels.types import GaussianSet, PinholeCameras, RenderedBatch, WeightedColors
-
-INSTRUCTION_SET_VARIABLE = "RGBAVATAR_INSTRUCTION_SET"
-
+from rgbavatar_ns.kernels.cpu.blended import CpuBlendedRenderer
+from rgbavatar_ns.kernels.types import (
+    BlendedGaussians,
+    GaussianSet,
+    PinholeCameras,
+    RenderedBatch,
+    WeightedColors,
+)
 
 def instruction_sets() -> tuple[str, ...]:
     """Instruction sets whose loops this processor runs, the fastest first."""
@@ -150,6 +155,16 @@ class CpuBackend:
         session = _session(inputs, cameras, batch)
         session.average(images.detach().contiguous(), weighted_sum, weight_sum, max_weight)
         return WeightedColors(weighted_sum, weight_sum, max_weight)
+
+    def blended_renderer(
+        self,
+        gaussians: BlendedGaussians,
+        weights: Float[Tensor, "B K"],
+        vertices: Float[Tensor, "B V 3"],
+        cameras: PinholeCameras,
+    ) -> CpuBlendedRenderer:
+        """As `blended.blended_renderer`."""
+        return CpuBlendedRenderer(gaussians, weights, vertices, cameras)
 
 
 def _attributes(gaussians: GaussianSet) -> tuple[Tensor, ...]:

@@ -1,0 +1,121 @@
+"""The optimiser step without autograd, for what the eager step spends its time on.
+
+Blending, tangent frames, rasterisation, L1 and Adam of all Gaussian parameters run in the backend's
+own loops; torch keeps the weight network. Agrees with `training_step`'s eager path up to rounding.
+"""
+
+from collections.abc import Iterable
+
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from rgbavatar_ns.avatar.avatar import Avatar
+from rgbavatar_ns.kernels import AdamParameter, PinholeCameras
+
+_GROUPS = {
+    "position": "position",
+    "rotation_wxyz": "rotation",
+    "color_feature": "color",
+    "log_scale": "log_scale",
+    "opacity_logit": "opacity",
+    "basis_position": "basis_position",
+    "basis_rotation_wxyz": "basis_rotation",
+    "basis_color_feature": "basis_color",
+}
+"""The parameter group of each of the Gaussians' tensors."""
+
+_PLAIN_ADAM = {"weight_decay": 0, "amsgrad": False, "maximize": False, "differentiable": False}
+
+
+class FusedStep:
+    """Trains an avatar with torch's Adam optimisers, whose state and learning rates it uses.
+
+    The optimisers' checkpoints are those of the eager path: a run can change between the two.
+
+    Raises:
+        ValueError: `refusal` gives a reason for these optimisers.
+    """
+
+    def __init__(self, avatar: Avatar, optimizers: Iterable[torch.optim.Optimizer]) -> None:
+        self._avatar, self._optimizers = avatar, list(optimizers)
+        reason = refusal(avatar, self._optimizers)
+        if reason is not None:
+            raise ValueError(f"The fused step cannot be used: {reason}. Use the eager one.")
+        homes = _homes(self._optimizers)
+        groups = avatar.parameter_groups()
+        self._parameters = {
+            name: (groups[group][0], *homes[groups[group][0]])
+            for name, group in _GROUPS.items()
+            if group in groups
+        }
+        self._network = groups.get("weight_network", [])
+        self._network_optimizers = {id(o): o for o, _ in map(homes.get, self._network)}.values()
+
+    def __call__(
+        self,
+        theta: Float[Tensor, "B H"],
+        cameras: PinholeCameras,
+        images_rgba: UInt8[Tensor, "B H_px W_px 4"],
+        background: Float[Tensor, "B 3"],
+        backend: str = "auto",
+    ) -> Float[Tensor, ""] | None:
+        """Take one step and return the loss; None, and no step, where the backend cannot."""
+        psi = self._avatar.weights(theta)
+        renderer = self._avatar.renderer(theta, cameras, psi.detach(), backend=backend)
+        if renderer is None:
+            return None
+        loss = renderer.compare(images_rgba, background)
+        weight_gradient = renderer.update({n: self._adam(n) for n in self._parameters})
+        if self._network:
+            psi.backward(weight_gradient)
+            for optimizer in self._network_optimizers:
+                optimizer.step()
+            for parameter in self._network:
+                parameter.grad = None
+        return psi.new_tensor(loss)
+
+    def _adam(self, name: str) -> AdamParameter:
+        """The parameter's next update; counts it."""
+        value, optimizer, group = self._parameters[name]
+        state = optimizer.state[value]
+        if not state:
+            # As torch.optim.Adam begins, so that either path can go on from the other's state.
+            state["step"] = torch.zeros((), dtype=torch.float32)
+            state["exp_avg"] = torch.zeros_like(value)
+            state["exp_avg_sq"] = torch.zeros_like(value)
+        state["step"] += 1
+        return AdamParameter(
+            value=value,
+            first_moment=state["exp_avg"],
+            second_moment=state["exp_avg_sq"],
+            learning_rate=float(group["lr"]),
+            betas=(float(group["betas"][0]), float(group["betas"][1])),
+            epsilon=float(group["eps"]),
+            step=int(state["step"]),
+        )
+
+
+def refusal(avatar: Avatar, optimizers: Iterable[torch.optim.Optimizer]) -> str | None:
+    """Return why the fused step cannot train this avatar with these optimisers; None if it can."""
+    homes = _homes(optimizers)
+    for name, parameters in avatar.parameter_groups().items():
+        for parameter in parameters:
+            if parameter not in homes:
+                return f"no optimiser holds the parameters of {name}"
+            optimizer, group = homes[parameter]
+            if type(optimizer) is not torch.optim.Adam:
+                return f"the optimiser of {name} is {type(optimizer).__name__}, not Adam"
+            for option, plain in _PLAIN_ADAM.items():
+                if group[option] != plain:
+                    return f"the optimiser of {name} has {option}={group[option]}"
+            if not parameter.is_contiguous():
+                return f"the parameters of {name} are not contiguous"
+    return None
+
+
+def _homes(
+    optimizers: Iterable[torch.optim.Optimizer],
+) -> dict[Tensor, tuple[torch.optim.Optimizer, dict]]:
+    """Each parameter's optimiser and group."""
+    return {p: (o, g) for o in optimizers for g in o.param_groups for p in g["params"]}

@@ -1,0 +1,107 @@
+"""The compiled loops for blended Gaussians."""
+
+import os
+from collections.abc import Mapping
+
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from rgbavatar_ns.kernels.constants import INSTRUCTION_SET_VARIABLE
+from rgbavatar_ns.kernels.cpu import _native  # pyright: ignore[reportMissingModuleSource]
+from rgbavatar_ns.kernels.types import (
+    TANGENT_VARIANTS,
+    AdamParameter,
+    BlendedGaussians,
+    PinholeCameras,
+    RenderedBatch,
+    WeightedColors,
+)
+
+_BASE = ("position", "rotation_wxyz", "color_feature", "log_scale", "opacity_logit")
+_BASES = ("basis_position", "basis_rotation_wxyz", "basis_color_feature")
+
+
+class CpuBlendedRenderer:
+    """See `kernels.blended.BlendedRenderer`."""
+
+    def __init__(
+        self,
+        gaussians: BlendedGaussians,
+        weights: Float[Tensor, "B K"],
+        vertices: Float[Tensor, "B V 3"],
+        cameras: PinholeCameras,
+    ) -> None:
+        self._cameras, self._count = cameras, len(gaussians.position)
+        self._weights = weights.detach().contiguous()
+        tensors = {
+            name: None if value is None else value.detach().contiguous()
+            for name, value in vars(gaussians).items()
+            if name != "variant"
+        }
+        self._session = _native.BlendedSession(
+            _native.Blended(**tensors, variant=TANGENT_VARIANTS.index(gaussians.variant)),
+            self._weights,
+            vertices.detach().contiguous(),
+            cameras.world_to_camera.detach().contiguous(),
+            cameras.focal_px.detach().contiguous(),
+            cameras.principal_point_px.detach().contiguous(),
+            cameras.width,
+            cameras.height,
+            torch.get_num_threads(),
+            os.environ.get(INSTRUCTION_SET_VARIABLE, ""),
+        )
+
+    def draw(
+        self, background: Float[Tensor, "#B 3"], *, with_depth: bool, with_visibility: bool
+    ) -> RenderedBatch:
+        """As `rasterize`, without gradients."""
+        batch, new = len(self._weights), self._weights.new_empty
+        size = (batch, self._cameras.height, self._cameras.width)
+        image, alpha = new(*size, 3), new(*size, 1)
+        depth = new(*size, 1) if with_depth else None
+        self._session.draw(background.detach().contiguous(), image, alpha, depth)
+        visibility = None
+        if with_visibility:
+            visibility = new(batch, self._count)
+            self._session.average(None, None, None, visibility)
+        return RenderedBatch(image, alpha, depth, visibility)
+
+    def weighted_color_average(self, images: Float[Tensor, "#B H W C"]) -> WeightedColors:
+        """As `weighted_color_average`."""
+        new = self._weights.new_empty
+        size = (len(self._weights), self._count)
+        weighted_sum, weight_sum, max_weight = new(*size, images.shape[-1]), new(size), new(size)
+        self._session.average(images.contiguous(), weighted_sum, weight_sum, max_weight)
+        return WeightedColors(weighted_sum, weight_sum, max_weight)
+
+    def compare(
+        self, images_rgba: UInt8[Tensor, "B H W 4"], background: Float[Tensor, "#B 3"]
+    ) -> float:
+        """The mean absolute difference to straight-alpha images over the background."""
+        return self._session.compare(images_rgba.contiguous(), background.detach().contiguous())
+
+    def update(self, parameters: Mapping[str, AdamParameter]) -> Float[Tensor, "B K"]:
+        """Take one step of Adam by the gradient of the last comparison, in place."""
+        names = _BASE + (_BASES if self._weights.shape[1] else ())
+        weight_gradient = torch.empty_like(self._weights)
+        self._session.update([_arrays(parameters[name]) for name in names], weight_gradient)
+        return weight_gradient
+
+
+def _arrays(parameter: AdamParameter) -> tuple[Tensor, Tensor, Tensor, tuple[float, ...]]:
+    """A parameter as compiled code takes it, with the bias corrections folded into the numbers."""
+    beta1, beta2 = parameter.betas
+    numbers = (
+        parameter.learning_rate / (1 - beta1**parameter.step),
+        (1 - beta2**parameter.step) ** -0.5,
+        beta1,
+        beta2,
+        parameter.epsilon,
+    )
+    return (
+        parameter.value.detach(),
+        parameter.first_moment.detach(),
+        parameter.second_moment.detach(),
+        numbers,
+    )
