@@ -5,13 +5,13 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 
 from rgbavatar_ns.avatar.anchors import GaussianAnchors
 from rgbavatar_ns.avatar.blendshapes import GaussianBlendshapes, feature_from_color
 from rgbavatar_ns.avatar.bundle import load_any, save_bundle
-from rgbavatar_ns.avatar.color_init import estimate_colors
+from rgbavatar_ns.avatar.color_init import color_estimate, premultiplied
 from rgbavatar_ns.avatar.composition import to_world
 from rgbavatar_ns.avatar.config import AvatarConfig
 from rgbavatar_ns.avatar.weights import WeightNetwork
@@ -25,6 +25,7 @@ from rgbavatar_ns.kernels import (
     RenderedBatch,
     blended_renderer,
     rasterize,
+    weighted_color_average,
 )
 
 LEARNING_RATES: dict[str, float] = {
@@ -174,7 +175,7 @@ class Avatar(nn.Module):
 
     def _blended_gaussians(self) -> BlendedGaussians:
         names = [field.name for field in fields(BlendedGaussians)]
-        tensors = {n: getattr(self.blendshapes, n, None) for n in names}
+        tensors: dict[str, Any] = {n: getattr(self.blendshapes, n, None) for n in names}
         follows = self.config.scale_with_triangle
         return BlendedGaussians(**tensors | self.anchors.triangles(with_rest_length=follows))
 
@@ -209,7 +210,9 @@ class Avatar(nn.Module):
         self,
         theta: Float[Tensor, "B H"],
         cameras: PinholeCameras,
-        images_rgba: Float[Tensor, "B H_px W_px 4"],
+        images_rgba: UInt8[Tensor, "B H_px W_px 4"] | Float[Tensor, "B H_px W_px 4"],
+        *,
+        backend: str = "auto",
     ) -> int:
         """Give Gaussians seen well for the first time the mean colour under them; return how many.
 
@@ -217,7 +220,14 @@ class Avatar(nn.Module):
         multiplied by alpha). Only base colours change, and each Gaussian's only once: bases and
         optimiser state stay, and `color_initialized` remembers.
         """
-        estimate = estimate_colors(self.gaussians(theta), cameras, images_rgba)
+        images = premultiplied(images_rgba, self.blendshapes.position.dtype)
+        renderer = self.renderer(theta, cameras, backend=backend)
+        if renderer is not None:
+            sums = renderer.weighted_color_average(images)
+        else:
+            gaussians = self.gaussians(theta)
+            sums = weighted_color_average(gaussians, cameras, images, backend=backend)
+        estimate = color_estimate(sums)
         fresh = estimate.reliable & ~self.color_initialized
         feature = self.blendshapes.color_feature
         feature[fresh] = feature_from_color(estimate.color[fresh]).to(feature.dtype)

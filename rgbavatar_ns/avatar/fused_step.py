@@ -49,8 +49,6 @@ class FusedStep:
             for name, group in _GROUPS.items()
             if group in groups
         }
-        self._network = groups.get("weight_network", [])
-        self._network_optimizers = {id(o): o for o, _ in map(homes.get, self._network)}.values()
 
     def __call__(
         self,
@@ -61,18 +59,19 @@ class FusedStep:
         backend: str = "auto",
     ) -> Float[Tensor, ""] | None:
         """Take one step and return the loss; None, and no step, where the backend cannot."""
+        for optimizer in self._optimizers:
+            optimizer.zero_grad(set_to_none=True)
         psi = self._avatar.weights(theta)
         renderer = self._avatar.renderer(theta, cameras, psi.detach(), backend=backend)
         if renderer is None:
             return None
         loss = renderer.compare(images_rgba, background)
         weight_gradient = renderer.update({n: self._adam(n) for n in self._parameters})
-        if self._network:
+        if psi.requires_grad:
             psi.backward(weight_gradient)
-            for optimizer in self._network_optimizers:
-                optimizer.step()
-            for parameter in self._network:
-                parameter.grad = None
+        # Of the Gaussians they find no gradient; hooks and schedules still see each take its step.
+        for optimizer in self._optimizers:
+            optimizer.step()
         return psi.new_tensor(loss)
 
     def _adam(self, name: str) -> AdamParameter:

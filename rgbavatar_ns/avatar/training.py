@@ -85,8 +85,7 @@ def initialize_colors_if_due(
     """After an optimiser step, initialise colours when the schedule says so; return how many."""
     if schedule is None or not schedule.due(step) or bool(avatar.color_initialized.all()):
         return 0
-    images = rgba_to_float(batch.images_rgba, avatar.blendshapes.position.dtype)
-    return avatar.initialize_colors(batch.theta, batch.cameras, images)
+    return avatar.initialize_colors(batch.theta, batch.cameras, batch.images_rgba)
 
 
 def training_step(
@@ -122,9 +121,7 @@ def _fused_loss(
         return None
     background = random_backgrounds(step, len(batch.theta), options.seed)
     background = background.to(batch.theta.device, avatar.blendshapes.position.dtype)
-    return FusedStep(avatar, [optimizer])(
-        batch.theta, batch.cameras, batch.images_rgba, background
-    )
+    return FusedStep(avatar, [optimizer])(batch.theta, batch.cameras, batch.images_rgba, background)
 
 
 def fit(

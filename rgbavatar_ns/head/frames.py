@@ -92,7 +92,9 @@ def _has_area(first: _Planes, second: _Planes) -> Float[Tensor, "*batch F"]:
     return wide.to(cross[0])
 
 
-def edges_to_frame(uv: Float[Tensor, "VT 2"], uv_faces: Int[Tensor, "F 3"]) -> Float[Tensor, "F 2 2"]:
+def edges_to_frame(
+    uv: Float[Tensor, "VT 2"], uv_faces: Int[Tensor, "F 3"]
+) -> Float[Tensor, "F 2 2"]:
     """Each triangle's matrix whose rows give T and B from its two edges, in float64.
 
     The identity where there is no area.

@@ -3,7 +3,7 @@
 # pyright: reportIncompatibleVariableOverride=false
 # nerfstudio's classes are used by narrowing their fields, which a strict type system forbids.
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -22,6 +22,7 @@ from torch.nn import Parameter
 
 from rgbavatar_ns.avatar import Avatar, AvatarConfig
 from rgbavatar_ns.avatar.color_init import ColorInitSchedule
+from rgbavatar_ns.avatar.fused_step import FusedStep, refusal
 from rgbavatar_ns.avatar.losses import (
     LPIPSLoss,
     composite,
@@ -59,6 +60,11 @@ class RGBAvatarModelConfig(ModelConfig):
     """Whether `ns-eval` computes LPIPS; its network is downloaded once (528 MB)."""
     rasterizer: str = "auto"
     """Backend of the rasterizer, one of `rgbavatar_ns.kernels.available_backends()` or auto."""
+    fast: bool = True
+    """Take training steps without autograd where that can be done, several times faster. It needs
+    the method's own loss (no LPIPS) and optimizers (plain Adam, no max_norm) and the compiled
+    rasterizer. False keeps to the readable path. Both give the same up to rounding, and a run can
+    be resumed with the other."""
     seed: int | None = None
     """Seed of the weight network's initial values; by default that of the run, `--machine.seed`."""
     enable_collider: bool = False
@@ -144,13 +150,42 @@ class RGBAvatarModel(Model):
     ) -> dict[str, Tensor]:
         """L1 of both images over the batch's backgrounds, and LPIPS if it is on."""
         image = outputs["rgb"]
-        target_rgba = rgba_to_float(batch["image"])
-        target = composite(target_rgba, batch["background"])
+        target = composite(rgba_to_float(batch["image"]), batch["background"])
         losses = {"l1": l1_loss(image, target)}
-        if self.config.lpips_weight > 0 and batch["step"] >= self.config.lpips_start_step:
+        if self._lpips_counts(batch["step"]):
             losses["lpips"] = self.config.lpips_weight * self.lpips_loss(image, target)
-        self._target_rgba = target_rgba
+        self._images_rgba = batch["image"]
         return losses
+
+    def can_fuse(self, step: int, optimizers: Iterable[torch.optim.Optimizer]) -> bool:
+        """Say whether `fused_losses` may be asked for this step."""
+        wanted = self.config.fast and not self._lpips_counts(step)
+        return wanted and refusal(self.avatar, optimizers) is None
+
+    def fused_losses(
+        self,
+        cameras: Cameras,
+        batch: dict[str, Any],
+        optimizers: Iterable[torch.optim.Optimizer],
+    ) -> dict[str, Tensor] | None:
+        """Take the optimizers' step on a batch without autograd and return its losses.
+
+        None, and no step, where the rasterizer's backend cannot. As drawing the batch,
+        `get_loss_dict`, its gradients and the optimizers' steps, up to rounding.
+        """
+        theta = (cameras.metadata or {})["theta"]
+        loss = FusedStep(self.avatar, optimizers)(
+            theta,
+            from_nerfstudio(cameras),
+            batch["image"],
+            batch["background"],
+            backend=self.config.rasterizer,
+        )
+        self._cameras, self._images_rgba = cameras, batch["image"]
+        return None if loss is None else {"l1": loss}
+
+    def _lpips_counts(self, step: int) -> bool:
+        return self.config.lpips_weight > 0 and step >= self.config.lpips_start_step
 
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes
@@ -166,7 +201,10 @@ class RGBAvatarModel(Model):
         if not self.color_schedule.due(step) or bool(self.avatar.color_initialized.all()):
             return
         theta = (self._cameras.metadata or {})["theta"]
-        self.avatar.initialize_colors(theta, from_nerfstudio(self._cameras), self._target_rgba)
+        cameras = from_nerfstudio(self._cameras)
+        self.avatar.initialize_colors(
+            theta, cameras, self._images_rgba, backend=self.config.rasterizer
+        )
 
     def get_image_metrics_and_images(
         self, outputs: Outputs, batch: dict[str, Any]

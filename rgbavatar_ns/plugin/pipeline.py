@@ -7,7 +7,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
+from torch import Tensor
 
 from rgbavatar_ns.avatar.metrics import LPIPSMetric
 from rgbavatar_ns.errors import UserError
@@ -37,6 +39,20 @@ class RGBAvatarPipeline(VanillaPipeline):
     def model(self) -> RGBAvatarModel:
         """The model; this method trains on one device, so it is never wrapped."""
         return self._model
+
+    def fused_train_step(self, step: int, optimizers: Optimizers) -> dict[str, Tensor] | None:
+        """Take a training step without autograd and return its losses.
+
+        None, and no step, where `get_train_loss_dict`, its gradients and the optimizers are needed.
+        """
+        groups = optimizers.config.values()
+        if any(group["optimizer"].max_norm is not None for group in groups):
+            return None
+        plain = optimizers.optimizers.values()
+        if not self.model.can_fuse(step, plain):
+            return None
+        cameras, batch = self.datamanager.next_train(step)
+        return self.model.fused_losses(cameras, batch, plain)
 
     def get_average_eval_image_metrics(
         self, step: int | None = None, output_path: Path | None = None, get_std: bool = False

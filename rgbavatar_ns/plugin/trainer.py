@@ -127,14 +127,14 @@ class RGBAvatarTrainer(Trainer):
                 if self._wait_while_paused():
                     break
                 began = time.monotonic()
-                loss, parts = self._train_one(step)
+                parts = self._train_one(step)
                 self.step = step
                 seconds = time.monotonic() - began
                 self._train_seconds += seconds
                 self._update_viewer_state(step)
                 last = step == total - 1
                 if last or step_check(step, self.config.logging.steps_per_log, run_at_zero=True):
-                    value = self._finite(float(loss.detach()), step)
+                    value = self._finite(sum(map(float, parts.values())), step)
                     self._write_scalars(step, value, parts, seconds, images_per_step, pixels)
                     progress.show(step + 1, value)
                 if len(self.pipeline.datamanager.eval_dataset) > 0:
@@ -150,20 +150,31 @@ class RGBAvatarTrainer(Trainer):
             self.stop.wait(0.01)
         return self.stop.requested or self.stop_training
 
-    def _train_one(self, step: int) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-        """One step: loss, gradients, optimisers, callbacks. Under the viewer's lock."""
+    def _train_one(self, step: int) -> dict[str, torch.Tensor]:
+        """One step: loss, gradients, optimisers, callbacks. Under the viewer's lock.
+
+        Returns the parts of the loss, detached.
+        """
         with self.train_lock:
             self.pipeline.train()
             self._run_callbacks(step, TrainingCallbackLocation.BEFORE_TRAIN_ITERATION)
-            self.optimizers.zero_grad_all()
-            _, parts, _ = self.pipeline.get_train_loss_dict(step=step)
-            loss = torch.stack(list(parts.values())).sum()
-            loss.backward()
-            self.optimizers.optimizer_scaler_step_all(self.grad_scaler)
+            parts = None
+            if not self.grad_scaler.is_enabled():
+                parts = self.pipeline.fused_train_step(step, self.optimizers)
+            if parts is None:
+                parts = self._eager_step(step)
             for scheduler in self.optimizers.schedulers.values():
                 scheduler.step()
             self._run_callbacks(step, TrainingCallbackLocation.AFTER_TRAIN_ITERATION)
-        return loss, parts
+        return parts
+
+    def _eager_step(self, step: int) -> dict[str, torch.Tensor]:
+        """Loss, gradients by autograd, optimisers; the parts of the loss."""
+        self.optimizers.zero_grad_all()
+        _, parts, _ = self.pipeline.get_train_loss_dict(step=step)
+        torch.stack(list(parts.values())).sum().backward()
+        self.optimizers.optimizer_scaler_step_all(self.grad_scaler)
+        return {name: part.detach() for name, part in parts.items()}
 
     def _run_callbacks(self, step: int, location: TrainingCallbackLocation) -> None:
         for callback in self.callbacks:
@@ -189,8 +200,7 @@ class RGBAvatarTrainer(Trainer):
     ) -> None:
         """TensorBoard's curves, and the speeds that the viewer shares the device by."""
         writer.put_scalar(name="Train Loss", scalar=loss, step=step)
-        shares = {name: part.detach() for name, part in parts.items()}
-        writer.put_dict(name="Train Loss Dict", scalar_dict=shares, step=step)
+        writer.put_dict(name="Train Loss Dict", scalar_dict={**parts}, step=step)
         writer.put_scalar(name="Train Images / Sec", scalar=images_per_step / seconds, step=step)
         writer.put_time(EventName.ITER_TRAIN_TIME, seconds, step, update_eta=True)
         writer.put_time(EventName.TRAIN_RAYS_PER_SEC, pixels / seconds, step)

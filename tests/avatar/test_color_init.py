@@ -125,5 +125,28 @@ def test_gaussians_seen_later_are_initialised_later(make_avatar):
 
 
 def test_the_schedule_is_dense_first_and_sparse_later():
-    schedule = ColorInitSchedule(every_step_until=3, interval=10)
-    assert [step for step in range(31) if schedule.due(step)] == [0, 1, 2, 10, 20, 30]
+    schedule = ColorInitSchedule(every_step_until=3, interval=10, regular_until=40)
+    due = [step for step in range(400) if schedule.due(step)]
+    assert due == [0, 1, 2, 10, 20, 30, 40, 80, 160, 320]
+    # As every second per cent of a long run would be.
+    assert sum(map(ColorInitSchedule().due, range(5000))) < 0.01 * 5000
+
+
+@pytest.mark.parametrize("scale_with_triangle", [False, True])
+def test_the_compiled_way_gives_the_same_colors(make_avatar, scale_with_triangle):
+    """Sums of the blended renderer against those over the world-space Gaussians, 8 bit and float."""
+    camera, size = front_camera(48), 48
+    pictures = torch.randint(
+        0, 256, (3, size, size, 4), generator=torch.Generator().manual_seed(3), dtype=torch.uint8
+    )
+    features = []
+    for backend, rgba in (("auto", pictures), ("reference", pictures / 255)):
+        avatar = make_avatar(random=True, scale_with_triangle=scale_with_triangle)
+        theta = random_theta(avatar.layout, 3)
+        before = rgba.clone()
+        assert avatar.initialize_colors(theta, camera, rgba, backend=backend) > 0
+        assert torch.equal(before, rgba)
+        features.append((avatar.color_initialized, avatar.blendshapes.color_feature.detach()))
+    (seen, colors), (expected_seen, expected_colors) = features
+    assert torch.equal(seen, expected_seen)
+    torch.testing.assert_close(colors, expected_colors, atol=2e-4, rtol=0)

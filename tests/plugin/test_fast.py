@@ -1,0 +1,119 @@
+"""Steps without autograd through nerfstudio's trainer: when they are taken, and what they give."""
+
+import warnings
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from rgbavatar_ns.avatar.fused_step import FusedStep
+from rgbavatar_ns.kernels import available_backends
+from rgbavatar_ns.plugin.checkpoints import list_checkpoints, read_checkpoint
+from rgbavatar_ns.plugin.trainer import RGBAvatarTrainer, RGBAvatarTrainerConfig
+from tests.plugin.run import make_trainer, small_config
+
+pytestmark = pytest.mark.skipif("cpu" not in available_backends(), reason="not compiled")
+
+
+@pytest.fixture
+def fused_steps(monkeypatch: pytest.MonkeyPatch) -> list[bool]:
+    """For each fused step that was asked for, whether it was taken."""
+    seen: list[bool] = []
+    original = FusedStep.__call__
+
+    def counted(self: FusedStep, *arguments: Any, **options: Any) -> Any:
+        loss = original(self, *arguments, **options)
+        seen.append(loss is not None)
+        return loss
+
+    monkeypatch.setattr(FusedStep, "__call__", counted)
+    return seen
+
+
+def _config(data: Path, output: Path, *, fast: bool = True, steps: int = 4):
+    config = small_config(data, output, max_num_iterations=steps)
+    config.pipeline.model.fast = fast
+    return config
+
+
+def _train(config: RGBAvatarTrainerConfig) -> RGBAvatarTrainer:
+    trainer = make_trainer(config)
+    trainer.train()
+    return trainer
+
+
+def _parameters(trainer: RGBAvatarTrainer) -> torch.Tensor:
+    values = [p.detach().flatten() for p in trainer.pipeline.model.avatar.parameters()]
+    return torch.cat(values)
+
+
+def test_training_is_fused_and_can_be_told_not_to_be(
+    tiny_data: Path, tmp_path: Path, fused_steps: list[bool]
+):
+    _train(_config(tiny_data, tmp_path / "fast"))
+    assert fused_steps == [True] * 4
+    _train(_config(tiny_data, tmp_path / "eager", fast=False))
+    assert len(fused_steps) == 4
+
+
+def test_both_ways_begin_alike(tiny_data: Path, tmp_path: Path):
+    """After one step, colour initialisation included; later steps part by rounding."""
+    fast = _train(_config(tiny_data, tmp_path / "fast", steps=1))
+    eager = _train(_config(tiny_data, tmp_path / "eager", fast=False, steps=1))
+    first, second = _parameters(fast), _parameters(eager)
+    # Adam's first step is the sign of the gradient: where that is zero up to rounding it may
+    # differ by two learning rates, which is why the norm is compared.
+    assert (first - second).norm() < 1e-2 * second.norm()
+    seen = [t.pipeline.model.avatar.color_initialized for t in (fast, eager)]
+    assert bool(seen[0].any())
+    assert (seen[0] == seen[1]).float().mean() > 0.98
+
+
+@pytest.mark.parametrize("reason", ["max_norm", "weight decay", "reference", "lpips"])
+def test_what_cannot_be_fused_goes_through_autograd(
+    reason: str,
+    tiny_data: Path,
+    tmp_path: Path,
+    fused_steps: list[bool],
+    monkeypatch: pytest.MonkeyPatch,
+):
+    config = _config(tiny_data, tmp_path, steps=3)
+    if reason == "max_norm":
+        config.optimizers["color"]["optimizer"].max_norm = 1.0
+    elif reason == "reference":
+        config.pipeline.model.rasterizer = "reference"
+    elif reason == "lpips":
+        config.pipeline.model.lpips_weight = 0.05
+        config.pipeline.model.lpips_start_step = 2
+    trainer = make_trainer(config)
+    if reason == "weight decay":
+        trainer.optimizers.optimizers["color"].param_groups[0]["weight_decay"] = 0.01
+    monkeypatch.setattr(
+        trainer.pipeline.model, "lpips_loss", lambda image, target: (image - target).square().mean()
+    )
+    before = _parameters(trainer)
+    trainer.train()
+    expected = {"reference": [False] * 3, "lpips": [True] * 2}.get(reason, [])
+    assert fused_steps == expected
+    assert not torch.equal(_parameters(trainer), before)
+
+
+def test_a_run_changes_its_way_on_resume(tiny_data: Path, tmp_path: Path):
+    """Fused, eager, fused: every optimiser's count and the schedules go on."""
+    folder: Path | None = None
+    for steps, fast in ((2, True), (4, False), (6, True)):
+        config = _config(tiny_data, tmp_path, fast=fast, steps=steps)
+        config.load_dir, config.learning_rate_factor = folder, 0.1
+        config.learning_rate_steps = 6
+        with warnings.catch_warnings():
+            # torch warns where a schedule's step comes before its optimiser's.
+            warnings.filterwarnings("error", message=".*lr_scheduler.step.*")
+            trainer = _train(config)
+        folder = trainer.checkpoint_dir
+    state = read_checkpoint(list_checkpoints(trainer.checkpoint_dir)[-1][1])
+    for name, saved in state["optimizers"].items():
+        assert {float(each["step"]) for each in saved["state"].values()} == {6.0}, name
+        assert saved["param_groups"][0]["lr"] == pytest.approx(
+            0.1 * config.optimizers[name]["optimizer"].lr
+        )
