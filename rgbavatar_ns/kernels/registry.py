@@ -20,6 +20,7 @@ from rgbavatar_ns.kernels.types import (
 )
 
 
+@runtime_checkable
 class BlendedRenderer(Protocol):
     """B posed sets of the same blended Gaussians, projected and sorted; carries no autograd graph.
 

@@ -167,7 +167,7 @@ RGBAVATAR_FUNCTION auto is_drawable(const GaussianInput<F>& g, const Vec3<F>& co
                                     const Projection<F>& q) {
   using C = BlendingConstants;
   // x * 0 is NaN for every x that is not finite.
-  const F zero = (g.opacity + color.x + color.y + color.z + q.p.z) * 0.0f +
+  const F zero = (g.opacity + q.p.z) * 0.0f + color.x * 0.0f + color.y * 0.0f + color.z * 0.0f +
                  (q.mean_x + q.mean_y) * 0.0f + q.determinant * 0.0f +
                  (q.conic00 + q.conic01 + q.conic11) * 0.0f;
   const F limit = F(1.0f / C::kMinQuatNorm);

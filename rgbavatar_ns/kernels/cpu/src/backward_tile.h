@@ -55,10 +55,13 @@ static void start_remainder(const Tile& tile, const BackwardInput& in, TileScrat
   }
 }
 
+static void clear_slot(float* slots, uint32_t slot, int width) {
+  for (int k = 0; k < width; ++k) slots[int64_t(slot) * width + k] = 0.0f;
+}
+
 // The sums over the jobs of one Gaussian of the group, which are written to its slot.
-static RGBAVATAR_MEMBER void sum_moments(const BlockGrid& grid, int place, TileScratch& scratch,
-                                         float* slots) {
-  const Group& group = scratch.group;
+static RGBAVATAR_MEMBER void sum_moments(const BlockGrid& grid, const Group& group, int place,
+                                         TileScratch& scratch, float* slots) {
   const Splat& s = group.splats[place];
   const Wide color_red(s.red), color_green(s.green), color_blue(s.blue);
   const Wide zero(0.0f);
@@ -108,33 +111,33 @@ static RGBAVATAR_MEMBER void sum_moments(const BlockGrid& grid, int place, TileS
   slot[8] = last;
 }
 
-static void clear_slot(float* slots, uint32_t slot, int width) {
-  for (int k = 0; k < width; ++k) slots[int64_t(slot) * width + k] = 0.0f;
+static void sum_group(const BlockGrid& grid, const Group& group, TileScratch& scratch,
+                      float* slots) {
+  for (int i = 0; i < group.splat_count; ++i) sum_moments(grid, group, i, scratch, slots);
 }
 
-// From rows that hold dL/dimage and the remainder to the slots.
-static void backward_rows(const Tile& tile, TileScratch& scratch, float* slots) {
-  const BlockGrid grid(tile);
-  for_groups<kBlendRows>(
-      tile, scratch,
-      [&] {
-        fill_alphas<true>(grid, scratch.group);
-        for (int i = 0; i < scratch.group.splat_count; ++i) sum_moments(grid, i, scratch, slots);
-      },
-      [&](uint32_t slot) { clear_slot(slots, slot, kMoments); });
+// Reads on to the end, from rows that hold dL/dimage and the remainder.
+static void sum_rest(const BlockGrid& grid, GroupReader& reader, TileScratch& scratch,
+                     float* slots) {
+  Group& group = scratch.groups[0];
+  while (any_open<kBlendRows>(scratch) && reader.next(group)) {
+    fill_alphas<true>(grid, group);
+    sum_group(grid, group, scratch, slots);
+  }
+  reader.rest([&](uint32_t slot) { clear_slot(slots, slot, kMoments); });
 }
 
 static void backward_tile(const Tile& tile, const BackwardInput& in, TileScratch& scratch,
                           float* slots) {
   start_rows<kBlendRows>(tile, scratch);
   start_remainder(tile, in, scratch);
-  backward_rows(tile, scratch, slots);
+  GroupReader reader(tile);
+  sum_rest(BlockGrid(tile), reader, scratch, slots);
 }
 
 template <int kChannels>
-static RGBAVATAR_MEMBER void sum_channels(int place, int channels, TileScratch& scratch,
-                                          float* slots) {
-  const Group& group = scratch.group;
+static RGBAVATAR_MEMBER void sum_channels(const Group& group, int place, int channels,
+                                          TileScratch& scratch, float* slots) {
   Wide sums[kChannels + 1], largest(0.0f);
   for (int k = 0; k <= kChannels; ++k) sums[k] = Wide(0.0f);
   const int stop = int(group.first_job[place + 1]);
@@ -169,14 +172,14 @@ static void average_channels(const Tile& tile, const float* image, int channels,
       for (int k = 0; k < channels; ++k) values[k][lane] = image[pixel * channels + k];
     });
   }
-  for_groups<kRows>(
-      tile, scratch,
-      [&] {
-        fill_alphas<false>(grid, scratch.group);
-        for (int i = 0; i < scratch.group.splat_count; ++i)
-          sum_channels<kChannels>(i, channels, scratch, slots);
-      },
-      [&](uint32_t slot) { clear_slot(slots, slot, channels + 2); });
+  GroupReader reader(tile);
+  Group& group = scratch.groups[0];
+  while (any_open<kRows>(scratch) && reader.next(group)) {
+    fill_alphas<false>(grid, group);
+    for (int i = 0; i < group.splat_count; ++i)
+      sum_channels<kChannels>(group, i, channels, scratch, slots);
+  }
+  reader.rest([&](uint32_t slot) { clear_slot(slots, slot, channels + 2); });
 }
 
 static void average_tile(const Tile& tile, const float* image, int channels, TileScratch& scratch,

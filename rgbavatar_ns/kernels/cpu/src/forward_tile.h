@@ -85,9 +85,6 @@ static bool any_open(TileScratch& scratch) {
   return false;
 }
 
-// Gaussians between two looks at whether any block of the tile is still open.
-constexpr uint32_t kPortion = 256;
-
 // ---- Jobs: a Gaussian over a block of pixels ----------------------------------------------------
 // A tile's Gaussians are taken in groups, whose jobs stand in one list. A loop over the list has no
 // inner loops that end after a few blocks, at places that no processor guesses.
@@ -161,24 +158,6 @@ static RGBAVATAR_MEMBER void add_jobs(uint64_t blocks, int first, Group& group) 
   group.job_count = int(to - group.jobs);
 }
 
-static RGBAVATAR_MEMBER void add_splat(const Splat& s, uint32_t slot, bool continued,
-                                       Group& group) {
-  const int place = group.splat_count;
-  group.splats[place] = s;
-  group.slot[place] = slot;
-  group.continued[place] = continued;
-  group.first_job[place] = uint32_t(group.job_count);
-}
-
-// Closes the list of the last Gaussian.
-static RGBAVATAR_MEMBER void end_splat(Group& group) {
-  group.first_job[++group.splat_count] = uint32_t(group.job_count);
-}
-
-static RGBAVATAR_MEMBER bool is_full(const Group& group) {
-  return group.splat_count == kGroupSplats || group.job_count > kGroupJobs - kWindow * kWindow;
-}
-
 // Bits low..high of eight.
 static inline unsigned bit_span(int low, int high) {
   const int from = low > 0 ? low : 0, to = high < kWindow - 1 ? high : kWindow - 1;
@@ -194,71 +173,83 @@ static inline uint64_t blocks_within(int left, int top, int side_x, int side_y) 
   return columns & above & (kAllBlocks << (8 * first));
 }
 
-// A Gaussian that needs several windows; (x, y) is the first block of its bounds in the tile.
-template <class Empty>
-static __attribute__((noinline)) void add_large_splat(const Tile& tile, const Splat& s, int x,
-                                                      int y, uint32_t slot, Group& group,
-                                                      const Empty& empty) {
-  const int last_x = s.bounds.last_block_x - tile.tile_x * kTileBlocks;
-  const int last_y = s.bounds.last_block_y - tile.tile_y * kTileBlocks;
-  const int side_x = last_x < kTileBlocks ? last_x + 1 : kTileBlocks;
-  const int side_y = last_y < kTileBlocks ? last_y + 1 : kTileBlocks;
-  bool continued = false;
-  for (int top = y > 0 ? y : 0; top < side_y; top += kWindow)
-    for (int left = x > 0 ? x : 0; left < side_x; left += kWindow) {
-      add_splat(s, slot, continued, group);
-      add_jobs(blocks_within(left, top, side_x, side_y), top * kTileBlocks + left, group);
-      end_splat(group);
-      if (is_full(group)) empty();
-      continued = true;
-    }
-}
+// Reads a tile's Gaussians front to back, in groups.
+class GroupReader {
+ public:
+  explicit GroupReader(const Tile& tile)
+      : tile_(tile),
+        origin_x_(tile.tile_x * kTileBlocks),
+        origin_y_(tile.tile_y * kTileBlocks) {}
 
-// Calls flush() whenever the group is full and at the end, and skip(slot) for Gaussians behind an
-// opaque tile.
-template <int kRows, class Flush, class Skip>
-static RGBAVATAR_MEMBER void for_groups(const Tile& tile, TileScratch& scratch, const Flush& flush,
-                                        const Skip& skip) {
-  Group& group = scratch.group;
-  const auto empty = [&] {
-    flush();
+  // Fills the group with the next Gaussians; false when there are none left.
+  bool next(Group& group) {
+    constexpr uint32_t kAhead = 16;
     group.splat_count = group.job_count = 0;
-  };
-  const int origin_x = tile.tile_x * kTileBlocks, origin_y = tile.tile_y * kTileBlocks;
-  group.splat_count = group.job_count = 0;
-  constexpr uint32_t kAhead = 16;
-  for (uint32_t i = 0; i < tile.entry_count; ++i) {
-    if (i % kPortion == 0 && i) {
-      empty();
-      if (!any_open<kRows>(scratch)) {
-        for (; i < tile.entry_count; ++i) skip(tile.entries[i].slot);
-        return;
+    while (entry_ < tile_.entry_count && group.splat_count < kGroupSplats &&
+           group.job_count <= kGroupJobs - kWindow * kWindow) {
+      if (entry_ + kAhead < tile_.entry_count)
+        __builtin_prefetch(tile_.splats + tile_.entries[entry_ + kAhead].gaussian);
+      const Entry entry = tile_.entries[entry_];
+      const Splat& s = tile_.splats[entry.gaussian];
+      if (s.blocks == kAllBlocks) {
+        add_window(s, entry.slot, group);
+        continue;
       }
+      const int x = s.bounds.first_block_x - origin_x_, y = s.bounds.first_block_y - origin_y_;
+      uint64_t blocks = s.blocks;
+      constexpr unsigned kInside = kTileBlocks - kWindow;
+      if (unsigned(x) > kInside || unsigned(y) > kInside)
+        blocks &= blocks_within(x, y, kTileBlocks, kTileBlocks);
+      add(s, entry.slot, false, blocks, y * kTileBlocks + x, group);
+      ++entry_;
     }
-    if (i + kAhead < tile.entry_count)
-      __builtin_prefetch(tile.splats + tile.entries[i + kAhead].gaussian);
-    const Entry entry = tile.entries[i];
-    const Splat& s = tile.splats[entry.gaussian];
-    const int x = s.bounds.first_block_x - origin_x, y = s.bounds.first_block_y - origin_y;
-    if (s.blocks == kAllBlocks) {
-      add_large_splat(tile, s, x, y, entry.slot, group, empty);
-      continue;
-    }
-    uint64_t blocks = s.blocks;
-    constexpr int kInside = kTileBlocks - kWindow;
-    if (unsigned(x) > unsigned(kInside) || unsigned(y) > unsigned(kInside))
-      blocks &= blocks_within(x, y, kTileBlocks, kTileBlocks);
-    add_splat(s, entry.slot, false, group);
-    add_jobs(blocks, y * kTileBlocks + x, group);
-    end_splat(group);
-    if (is_full(group)) empty();
+    return group.splat_count > 0;
   }
-  empty();
-}
+
+  // Calls visit(slot) for the Gaussians that no group has begun with.
+  template <class Visit>
+  void rest(const Visit& visit) const {
+    for (uint32_t i = entry_ + (window_ > 0); i < tile_.entry_count; ++i)
+      visit(tile_.entries[i].slot);
+  }
+
+ private:
+  static RGBAVATAR_MEMBER void add(const Splat& s, uint32_t slot, bool continued, uint64_t blocks,
+                                   int first_block, Group& group) {
+    const int place = group.splat_count;
+    group.splats[place] = s;
+    group.slot[place] = slot;
+    group.continued[place] = continued;
+    group.first_job[place] = uint32_t(group.job_count);
+    add_jobs(blocks, first_block, group);
+    group.first_job[++group.splat_count] = uint32_t(group.job_count);
+  }
+
+  // One window of a Gaussian that needs several.
+  __attribute__((noinline)) void add_window(const Splat& s, uint32_t slot, Group& group) {
+    const int last_x = s.bounds.last_block_x - origin_x_;
+    const int last_y = s.bounds.last_block_y - origin_y_;
+    const int side_x = last_x < kTileBlocks ? last_x + 1 : kTileBlocks;
+    const int side_y = last_y < kTileBlocks ? last_y + 1 : kTileBlocks;
+    const int first_x = s.bounds.first_block_x > origin_x_ ? s.bounds.first_block_x - origin_x_ : 0;
+    const int first_y = s.bounds.first_block_y > origin_y_ ? s.bounds.first_block_y - origin_y_ : 0;
+    const int across = (side_x - first_x + kWindow - 1) / kWindow;
+    const int down = (side_y - first_y + kWindow - 1) / kWindow;
+    const int x = first_x + window_ % across * kWindow, y = first_y + window_ / across * kWindow;
+    add(s, slot, window_ > 0, blocks_within(x, y, side_x, side_y), y * kTileBlocks + x, group);
+    if (++window_ < across * down) return;
+    window_ = 0;
+    ++entry_;
+  }
+
+  const Tile& tile_;
+  int origin_x_, origin_y_;
+  uint32_t entry_ = 0;
+  int window_ = 0;  // the next one of the present Gaussian, where it needs several
+};
 
 template <int kRows, bool kWithDepth>
-static void blend_group(TileScratch& scratch) {
-  const Group& group = scratch.group;
+static void blend_group(const Group& group, TileScratch& scratch) {
   for (int i = 0; i < group.job_count; ++i) {
     const Job job(group, i);
     float* row = block_rows<kRows>(scratch, job.block)[0];
@@ -306,24 +297,17 @@ static void write_block(const Tile& tile, const ForwardOutput& out, int block,
   });
 }
 
-// Blends the tile into its rows, over nothing.
-template <int kRows, bool kWithDepth>
-static void draw_rows(const Tile& tile, TileScratch& scratch) {
-  const BlockGrid grid(tile);
-  start_rows<kRows>(tile, scratch);
-  for_groups<kRows>(
-      tile, scratch,
-      [&] {
-        fill_alphas<false>(grid, scratch.group);
-        blend_group<kRows, kWithDepth>(scratch);
-      },
-      [](uint32_t) {});
-}
-
 template <bool kWithDepth>
 static void forward_rows(const Tile& tile, const ForwardOutput& out, TileScratch& scratch) {
   constexpr int kRows = kWithDepth ? kDepth + 1 : kDepth;
-  draw_rows<kRows, kWithDepth>(tile, scratch);
+  const BlockGrid grid(tile);
+  GroupReader reader(tile);
+  Group& group = scratch.groups[0];
+  start_rows<kRows>(tile, scratch);
+  while (any_open<kRows>(scratch) && reader.next(group)) {
+    fill_alphas<false>(grid, group);
+    blend_group<kRows, kWithDepth>(group, scratch);
+  }
   for (int block = 0; block < kBlocksPerTile; ++block)
     write_block<kRows>(tile, out, block, scratch);
 }

@@ -8,7 +8,7 @@ namespace rgbavatar {
 // Pixels are taken in blocks of 4 x 4, one SIMD vector, and blocks in tiles.
 constexpr int kBlockSide = 4;
 constexpr int kBlockPixels = 16;
-constexpr int kTileBlocksShift = 4;
+constexpr int kTileBlocksShift = 3;
 constexpr int kTileBlocks = 1 << kTileBlocksShift;
 constexpr int kBlocksPerTile = kTileBlocks * kTileBlocks;
 constexpr int kMaxChannels = 8;
@@ -61,9 +61,9 @@ struct SceneGradient {
 
 // Where the projection of one image goes.
 struct Projected {
-  Splat* splats;    // those out of sight hold anything
-  float* depth;     // the same again in arrays, for the sorting
-  Bounds* bounds;
+  Splat* splats;  // those out of sight hold anything
+  float* depth;   // the same again in arrays, for the sorting
+  uint32_t *first_block, *last_block;  // x | y << 16; first x > last x where out of sight
 };
 
 // The nine sums of the blending's backward pass, in the order of Moments.
@@ -107,9 +107,10 @@ struct alignas(64) Group {
 
 // Scratch memory of one thread: what a pass keeps for every block, a few rows each, the
 // transmittance first.
+constexpr int kKeptGroups = 96;
 struct alignas(64) TileScratch {
   float rows[kBlocksPerTile * (1 + kMaxChannels)][kBlockPixels];
-  Group group;
+  Group groups[kKeptGroups + 1];
 };
 
 // ---- Blended Gaussians ------------------------------------------------------------------------
@@ -118,7 +119,7 @@ struct alignas(64) TileScratch {
 constexpr int kBlendedKinds = 3;
 constexpr int kBlendedWidth[kBlendedKinds] = {3, 4, 3};
 // Gaussians that are blended at a time; the columns of a few images then fit the nearest cache.
-constexpr int kBlendChunk = 128;
+constexpr int kBlendChunk = 256;
 constexpr int kBlendColumns = kBlendChunk * 4;
 
 // A triangle's frame, corner, edges and length ratio in an image: 23 numbers, and one unused.

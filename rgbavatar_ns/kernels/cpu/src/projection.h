@@ -134,6 +134,11 @@ static RGBAVATAR_MEMBER BlockSpan span_of(const Wide& low, const Wide& high) {
 // the window. An ellipse d^T cov^-1 d = reach ends, along the row dy, at
 //   dx = (cov01 dy +- sqrt(det (cov11 reach - dy^2))) / cov11,
 // and is widest where dy = +-cov01 sqrt(reach / cov00): the block row's dy nearest to that.
+static RGBAVATAR_MEMBER Wide quick_root(const Wide& a) {
+  const Wide positive = max_of(a, Wide(1e-20f));
+  return positive * inverse_root_of(positive);
+}
+
 struct TouchedBlocks {
   WideInt upper, lower;
 };
@@ -157,8 +162,8 @@ static inline TouchedBlocks touched_blocks(int width, const Projection<Wide>& q,
     const Wide dy_right = min_of(max_of(widest, low), high);
     const Wide dy_left = min_of(max_of(Wide(0.0f) - widest, low), high);
     const Wide square = q.cov11 * reach;
-    const Wide right = square_root(max_of(square - dy_right * dy_right, Wide(0.0f)) * spread);
-    const Wide to_left = square_root(max_of(square - dy_left * dy_left, Wide(0.0f)) * spread);
+    const Wide right = quick_root((square - dy_right * dy_right) * spread);
+    const Wide to_left = quick_root((square - dy_left * dy_left) * spread);
     const Wide centre = q.mean_x - 0.5f;
     const Wide start = max_of(centre + slope * dy_left - to_left - kSlackPx, Wide(0.0f));
     const Wide stop = min_of(centre + slope * dy_right + right + kSlackPx,
@@ -237,7 +242,6 @@ static inline void project_lanes(int width, int height, const Camera& camera,
                             select(fits, bits_as_floats(touched.lower), bits_as_floats(all)),
                             zero,
                             zero};
-  float depths[kLanes], firsts[kLanes], lasts[kLanes];
   Splat padded[kLanes];
   Splat* splats = lanes == kLanes ? out.splats + first : padded;
   store_splats<0>(columns, splats);
@@ -246,14 +250,9 @@ static inline void project_lanes(int width, int height, const Camera& camera,
   store_splats<3>(columns, splats);
   if (lanes < kLanes)
     for (int lane = 0; lane < lanes; ++lane) out.splats[first + lane] = padded[lane];
-  store(q.p.z, depths);
-  store(first_block, firsts);
-  store(last_block, lasts);
-  for (int lane = 0; lane < lanes; ++lane) {
-    out.depth[first + lane] = depths[lane];
-    __builtin_memcpy(&out.bounds[first + lane], &firsts[lane], 4);
-    __builtin_memcpy(&out.bounds[first + lane].last_block_x, &lasts[lane], 4);
-  }
+  store(q.p.z, OutputRows<1>(out.depth, first, lanes).data);
+  store(first_block, OutputRows<1>(reinterpret_cast<float*>(out.first_block), first, lanes).data);
+  store(last_block, OutputRows<1>(reinterpret_cast<float*>(out.last_block), first, lanes).data);
 }
 
 static void project_image(const Scene& scene, const float* camera_floats, int image, int begin,

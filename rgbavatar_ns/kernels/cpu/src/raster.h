@@ -46,13 +46,19 @@ class Buffer {
   size_t capacity_ = 0;
 };
 
+// An image's Gaussians by tile: as they stand in memory, and front to back.
+struct ImageEntries {
+  Buffer<Entry> binned, sorted;
+  Buffer<uint32_t> depth_bits;  // of the binned ones
+};
+
 // What one rendering needs; returned to a small pool, because fresh pages cost as much as work.
 struct Workspace {
   Buffer<float> cameras;         // [B, kCameraFloats]
   Buffer<uint32_t> slot_offset;  // [B, N + 1]: first (Gaussian, tile) slot of every Gaussian
   Buffer<uint32_t> tile_start;   // [B, tiles + 1]: into the image's entries
   Buffer<Splat> splats;                // [B, N]; those out of sight hold anything
-  std::vector<Buffer<Entry>> entries;  // of each image: its Gaussians by tile, front to back
+  std::vector<ImageEntries> images;    // [B]
   Buffer<size_t> slot_count;           // [B]: (Gaussian, tile) pairs of each image
   Buffer<size_t> slot_start;           // [B + 1]: their sums, each image's first slot
   Buffer<float> slots;
@@ -60,9 +66,9 @@ struct Workspace {
   Buffer<TileScratch> scratch;     // [threads]
   // Of the projection.
   Buffer<float> depth;             // [B, N]
-  Buffer<Bounds> bounds;           // [B, N]
+  Buffer<uint32_t> bounds;         // [2, B, N]: first blocks, last blocks
   Buffer<Projected> projected;     // [B]
-  Buffer<uint64_t> sort_keys;      // [threads, 2, N]
+  Buffer<uint64_t> sort_keys;      // [threads, 2, most entries of a tile]
   // Of blended Gaussians.
   Buffer<float> frames;            // [B, U, kFrameFloats]
   Buffer<BlendScratch> blending;   // [threads]
@@ -116,7 +122,8 @@ class Rendering {
   std::unique_ptr<Workspace> workspace_;
 
  private:
-  void sort_image(int image, uint64_t* keys);
+  void bin_image(int image);
+  void sort_tile(int image, int index, uint64_t* keys, uint32_t most);
 };
 
 // A Rendering of blended Gaussians, which can train them. The scene's memory is not kept.

@@ -26,6 +26,7 @@ constexpr int kLanes = 16;
 typedef float NativeFloat __attribute__((vector_size(4 * kNativeLanes)));
 typedef float UnalignedFloat __attribute__((vector_size(4 * kNativeLanes), aligned(4)));
 typedef int32_t NativeInt __attribute__((vector_size(4 * kNativeLanes)));
+typedef uint32_t NativeUnsigned __attribute__((vector_size(4 * kNativeLanes)));
 #if defined(__AVX512F__)
 typedef __mmask16 NativeMask;
 #else
@@ -266,7 +267,8 @@ RGBAVATAR_FUNCTION Native exp2_where(Flags m, Native a) {
 #if defined(__AVX512F__)
   return Native(_mm512_maskz_scalef_ps(m.m, p.v, a.v));
 #else
-  const Native scaled((NativeFloat)((NativeInt)p.v + ((NativeInt)shifted.v << 23)));
+  // Unsigned, because lanes that the mask drops may overflow.
+  const Native scaled((NativeFloat)((NativeUnsigned)p.v + ((NativeUnsigned)shifted.v << 23)));
   return select(m, scaled, Native(0.0f));
 #endif
 }

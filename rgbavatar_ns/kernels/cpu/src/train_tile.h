@@ -51,11 +51,26 @@ static Wide compare_block(const Tile& tile, const TrainingTarget& target, int bl
 
 static double train_tile(const Tile& tile, const TrainingTarget& target, TileScratch& scratch,
                          float* slots) {
-  draw_rows<kBlendRows, false>(tile, scratch);
+  const BlockGrid grid(tile);
+  start_rows<kBlendRows>(tile, scratch);
+  // Groups stay in memory for the backward pass; those beyond the room are made again.
+  GroupReader reader(tile);
+  int kept = 0;
+  while (kept < kKeptGroups && any_open<kBlendRows>(scratch) && reader.next(scratch.groups[kept])) {
+    fill_alphas<true>(grid, scratch.groups[kept]);
+    blend_group<kBlendRows, false>(scratch.groups[kept++], scratch);
+  }
+  GroupReader ahead = reader;
+  Group& last = scratch.groups[kKeptGroups];
+  while (any_open<kBlendRows>(scratch) && ahead.next(last)) {
+    fill_alphas<false>(grid, last);
+    blend_group<kBlendRows, false>(last, scratch);
+  }
   Wide sum(0.0f);
   for (int block = 0; block < kBlocksPerTile; ++block)
     sum = sum + compare_block(tile, target, block, scratch);
-  backward_rows(tile, scratch, slots);
+  for (int i = 0; i < kept; ++i) sum_group(grid, scratch.groups[i], scratch, slots);
+  sum_rest(grid, reader, scratch, slots);
   return double(sum_of(sum));
 }
 
