@@ -29,6 +29,3 @@ MIN_QUAT_NORM = 1e-12
 
 MAX_AVERAGE_CHANNELS = 8
 """Most channels `weighted_color_average` takes."""
-
-INSTRUCTION_SET_VARIABLE = "RGBAVATAR_INSTRUCTION_SET"
-"""Environment variable that forces one copy of the compiled loops: generic, avx2 or avx512."""

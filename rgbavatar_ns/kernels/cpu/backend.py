@@ -13,8 +13,10 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from rgbavatar_ns.kernels.constants import INSTRUCTION_SET_VARIABLE
-from rgbavatar_ns.kernels.cpu import _native  # pyright: ignore[reportMissingModuleSource]
+from rgbavatar_ns.kernels.cpu import (
+    INSTRUCTION_SET_VARIABLE,
+    _native,  # pyright: ignore[reportMissingModuleSource]
+)
 from rgbavatar_ns.kernels.cpu.blended import CpuBlendedRenderer
 from rgbavatar_ns.kernels.types import (
     BlendedGaussians,

@@ -7,8 +7,10 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from rgbavatar_ns.kernels.constants import INSTRUCTION_SET_VARIABLE
-from rgbavatar_ns.kernels.cpu import _native  # pyright: ignore[reportMissingModuleSource]
+from rgbavatar_ns.kernels.cpu import (
+    INSTRUCTION_SET_VARIABLE,
+    _native,  # pyright: ignore[reportMissingModuleSource]
+)
 from rgbavatar_ns.kernels.types import (
     TANGENT_VARIANTS,
     AdamParameter,

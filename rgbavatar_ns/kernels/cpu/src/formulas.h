@@ -2,7 +2,7 @@
 #pragma once
 
 #include "layout.h"
-#include "simd.h"
+#include "quads.h"
 
 namespace rgbavatar::RGBAVATAR_ISA {
 

@@ -143,6 +143,7 @@ static RGBAVATAR_MEMBER void add_jobs(uint64_t blocks, int first, Group& group) 
                                          kTileBlocks + 2, kTileBlocks + 3, kTileBlocks + 4,
                                          kTileBlocks + 5, kTileBlocks + 6, kTileBlocks + 7);
   for (int row = 0; row < kWindow; row += 2) {
+    if (row == kWindow / 2 && blocks >> (8 * row) == 0) break;  // most end here
     const __mmask16 mask = __mmask16(blocks >> (8 * row));
     const __m512i codes =
         _mm512_add_epi32(pair, _mm512_set1_epi32(code + first + row * kTileBlocks));

@@ -55,22 +55,11 @@ struct Gaussians {
   }
 };
 
-// A Rendering with the sizes that its later calls need.
-struct Session {
-  int batch, width, height, threads;
-  rgbavatar::Rendering rendering;
-
-  Session(const Gaussians& gaussians, const Input& world_to_camera, const Input& focal_px,
-          const Input& principal_point_px, int batch, int width, int height, int threads,
-          const std::string& instruction_set)
-      : batch(batch),
-        width(width),
-        height(height),
-        threads(threads),
-        rendering(gaussians.scene(batch, width, height),
-                  {world_to_camera.data(), focal_px.data(), principal_point_px.data(),
-                   int(focal_px.shape(0))},
-                  instruction_set, threads) {}
+// What both kinds of rendering offer to Python.
+template <class Rendering>
+struct Drawing {
+  int threads;
+  Rendering rendering;
 
   void draw(const Input& background, const Output& image, const Output& alpha,
             const std::optional<Output>& depth) {
@@ -84,6 +73,36 @@ struct Session {
     rendering.average(pixels, images ? int(images->shape(3)) : 0, pointer(weighted_sum),
                       pointer(weight_sum), max_weight.data(), threads);
   }
+
+  static void bind(nb::class_<Drawing>& type) {
+    using Release = nb::call_guard<nb::gil_scoped_release>;
+    type.def("draw", &Drawing::draw, "background"_a.noconvert(), "image"_a.noconvert(),
+             "alpha"_a.noconvert(), "depth"_a.noconvert().none(), Release())
+        .def("average", &Drawing::average, "images"_a.noconvert().none(),
+             "weighted_sum"_a.noconvert().none(), "weight_sum"_a.noconvert().none(),
+             "max_weight"_a.noconvert(), Release());
+  }
+};
+
+rgbavatar::Cameras cameras(const Input& world_to_camera, const Input& focal_px,
+                           const Input& principal_point_px) {
+  return {world_to_camera.data(), focal_px.data(), principal_point_px.data(),
+          int(focal_px.shape(0))};
+}
+
+// A Rendering with the sizes that its later calls need.
+struct Session : Drawing<rgbavatar::Rendering> {
+  int batch, width, height;
+
+  Session(const Gaussians& gaussians, const Input& world_to_camera, const Input& focal_px,
+          const Input& principal_point_px, int batch, int width, int height, int threads,
+          const std::string& instruction_set)
+      : Drawing{threads,
+                {gaussians.scene(batch, width, height),
+                 cameras(world_to_camera, focal_px, principal_point_px), instruction_set, threads}},
+        batch(batch),
+        width(width),
+        height(height) {}
 
   void backward(const Gaussians& gaussians, const Input& image, const Input& alpha,
                 const std::optional<Input>& image_grad, const std::optional<Input>& alpha_grad,
@@ -139,39 +158,23 @@ rgbavatar::AdamGroup adam_group(const AdamArrays& arrays) {
 }
 
 // A BlendedRendering with the tensors that its later calls need.
-struct BlendedSession {
+struct BlendedSession : Drawing<rgbavatar::BlendedRendering> {
   Blended blended;
   Input weights, vertices;
-  int width, height, threads;
-  rgbavatar::BlendedRendering rendering;
+  int width, height;
 
   BlendedSession(const Blended& blended, const Input& weights, const Input& vertices,
                  const Input& world_to_camera, const Input& focal_px,
                  const Input& principal_point_px, int width, int height, int threads,
                  const std::string& instruction_set)
-      : blended(blended),
+      : Drawing{threads,
+                {blended.scene(weights, vertices, width, height),
+                 cameras(world_to_camera, focal_px, principal_point_px), instruction_set, threads}},
+        blended(blended),
         weights(weights),
         vertices(vertices),
         width(width),
-        height(height),
-        threads(threads),
-        rendering(blended.scene(weights, vertices, width, height),
-                  {world_to_camera.data(), focal_px.data(), principal_point_px.data(),
-                   int(focal_px.shape(0))},
-                  instruction_set, threads) {}
-
-  void draw(const Input& background, const Output& image, const Output& alpha,
-            const std::optional<Output>& depth) {
-    rendering.draw(attribute(background), image.data(), alpha.data(), pointer(depth), threads);
-  }
-
-  void average(const std::optional<Input>& images, const std::optional<Output>& weighted_sum,
-               const std::optional<Output>& weight_sum, const Output& max_weight) {
-    const rgbavatar::Attribute pixels =
-        images ? attribute(*images) : rgbavatar::Attribute{nullptr, 0};
-    rendering.average(pixels, images ? int(images->shape(3)) : 0, pointer(weighted_sum),
-                      pointer(weight_sum), max_weight.data(), threads);
-  }
+        height(height) {}
 
   double compare(const Pixels& images, const Input& background) {
     return rendering.compare(images.data(), attribute(background), threads);
@@ -217,17 +220,16 @@ NB_MODULE(_native, m) {
            "quats_wxyz"_a.noconvert(), "scales"_a.noconvert(), "opacities"_a.noconvert(),
            "colors"_a.noconvert());
   using Release = nb::call_guard<nb::gil_scoped_release>;
-  nb::class_<Session>(m, "Session")
+  nb::class_<Drawing<rgbavatar::Rendering>> drawing(m, "Drawing");
+  Drawing<rgbavatar::Rendering>::bind(drawing);
+  nb::class_<Drawing<rgbavatar::BlendedRendering>> blended_drawing(m, "BlendedDrawing");
+  Drawing<rgbavatar::BlendedRendering>::bind(blended_drawing);
+  nb::class_<Session, Drawing<rgbavatar::Rendering>>(m, "Session")
       .def(nb::init<const Gaussians&, const Input&, const Input&, const Input&, int, int, int, int,
                     const std::string&>(),
            "gaussians"_a, "world_to_camera"_a.noconvert(), "focal_px"_a.noconvert(),
            "principal_point_px"_a.noconvert(), "batch"_a, "width"_a, "height"_a, "threads"_a,
            "instruction_set"_a, Release())
-      .def("draw", &Session::draw, "background"_a.noconvert(), "image"_a.noconvert(),
-           "alpha"_a.noconvert(), "depth"_a.noconvert().none(), Release())
-      .def("average", &Session::average, "images"_a.noconvert().none(),
-           "weighted_sum"_a.noconvert().none(), "weight_sum"_a.noconvert().none(),
-           "max_weight"_a.noconvert(), Release())
       .def("backward", &Session::backward, "gaussians"_a, "image"_a.noconvert(),
            "alpha"_a.noconvert(), "image_grad"_a.noconvert().none(),
            "alpha_grad"_a.noconvert().none(), "means"_a.noconvert(), "quats_wxyz"_a.noconvert(),
@@ -251,18 +253,13 @@ NB_MODULE(_native, m) {
            "basis_color_feature"_a.noconvert().none(), "barycentric"_a.noconvert(),
            "edges_to_frame"_a.noconvert(), "rest_length"_a.noconvert().none(),
            "triangle_vertices"_a.noconvert(), "triangle_of"_a.noconvert(), "variant"_a);
-  nb::class_<BlendedSession>(m, "BlendedSession")
+  nb::class_<BlendedSession, Drawing<rgbavatar::BlendedRendering>>(m, "BlendedSession")
       .def(nb::init<const Blended&, const Input&, const Input&, const Input&, const Input&,
                     const Input&, int, int, int, const std::string&>(),
            "blended"_a, "weights"_a.noconvert(), "vertices"_a.noconvert(),
            "world_to_camera"_a.noconvert(), "focal_px"_a.noconvert(),
            "principal_point_px"_a.noconvert(), "width"_a, "height"_a, "threads"_a,
            "instruction_set"_a, Release())
-      .def("draw", &BlendedSession::draw, "background"_a.noconvert(), "image"_a.noconvert(),
-           "alpha"_a.noconvert(), "depth"_a.noconvert().none(), Release())
-      .def("average", &BlendedSession::average, "images"_a.noconvert().none(),
-           "weighted_sum"_a.noconvert().none(), "weight_sum"_a.noconvert().none(),
-           "max_weight"_a.noconvert(), Release())
       .def("compare", &BlendedSession::compare, "images_rgba"_a.noconvert(),
            "background"_a.noconvert(), Release())
       .def("update", &BlendedSession::update, "groups"_a, "weight_gradient"_a.noconvert(),

@@ -1,0 +1,141 @@
+// Four floats of a vector as one value: sums of lanes, and rows that become columns.
+#pragma once
+
+#include "simd.h"
+
+namespace rgbavatar::RGBAVATAR_ISA {
+
+typedef float Quad __attribute__((vector_size(16)));
+typedef float UnalignedQuad __attribute__((vector_size(16), aligned(4)));
+
+// The four sums of every fourth lane.
+RGBAVATAR_FUNCTION Quad sum_to_quad(Wide a) {
+  const Native s = sum_to_register(a);
+#if defined(__AVX512F__)
+  const __m256 half = _mm512_castps512_ps256(s.v) + _mm512_extractf32x8_ps(s.v, 1);
+  return _mm256_castps256_ps128(half) + _mm256_extractf128_ps(half, 1);
+#elif defined(__AVX2__)
+  return _mm256_castps256_ps128(s.v) + _mm256_extractf128_ps(s.v, 1);
+#else
+  return s.v;
+#endif
+}
+
+// The sum of the lanes of each of four quads.
+RGBAVATAR_FUNCTION Quad sums_of_quads(Quad a, Quad b, Quad c, Quad d) {
+  const Quad ab = __builtin_shufflevector(a, b, 0, 4, 1, 5) +
+                  __builtin_shufflevector(a, b, 2, 6, 3, 7);
+  const Quad cd = __builtin_shufflevector(c, d, 0, 4, 1, 5) +
+                  __builtin_shufflevector(c, d, 2, 6, 3, 7);
+  return __builtin_shufflevector(ab, cd, 0, 1, 4, 5) + __builtin_shufflevector(ab, cd, 2, 3, 6, 7);
+}
+
+// Four sums of lanes at a time.
+RGBAVATAR_FUNCTION Quad sums_of(Wide a, Wide b, Wide c, Wide d) {
+#if defined(__AVX512F__)
+  const auto fold = [](__m512 x, __m512 y) __attribute__((always_inline)) {
+    return _mm512_shuffle_f32x4(x, y, 0x44) + _mm512_shuffle_f32x4(x, y, 0xee);
+  };
+  const __m512 ab = fold(a.v, b.v), cd = fold(c.v, d.v);
+  // Quads: [a, b, c, d], each with the lanes' sums modulo four.
+  const __m512 quads =
+      _mm512_shuffle_f32x4(ab, cd, 0x88) + _mm512_shuffle_f32x4(ab, cd, 0xdd);
+  const __m512 pairs = quads + _mm512_shuffle_ps(quads, quads, 0x4e);
+  const __m512 sums = pairs + _mm512_shuffle_ps(pairs, pairs, 0xb1);
+  const __m512i every_fourth = _mm512_setr_epi32(0, 4, 8, 12, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0);
+  return _mm512_castps512_ps128(_mm512_permutexvar_ps(every_fourth, sums));
+#else
+  return sums_of_quads(sum_to_quad(a), sum_to_quad(b), sum_to_quad(c), sum_to_quad(d));
+#endif
+}
+
+// The sum of the lanes.
+RGBAVATAR_FUNCTION float sum_of(Wide a) {
+  const Quad q = sum_to_quad(a);
+  return (q[0] + q[2]) + (q[1] + q[3]);
+}
+
+// Lanes 4i ... 4i + 3.
+template <int i>
+RGBAVATAR_FUNCTION Quad quad_of(Native a) {
+#if defined(__AVX512F__)
+  return _mm512_extractf32x4_ps(a.v, i);
+#elif defined(__AVX2__)
+  return _mm256_extractf128_ps(a.v, i);
+#else
+  return a.v;
+#endif
+}
+template <int i, int L>
+RGBAVATAR_FUNCTION Quad quad_of(Floats<L> a) {
+  if constexpr (i < L / 8)
+    return quad_of<i>(a.low);
+  else
+    return quad_of<i - L / 8>(a.high);
+}
+
+RGBAVATAR_FUNCTION Wide wide_of(Quad a, Quad b, Quad c, Quad d) {
+#if defined(__AVX512F__)
+  const __m512 ab = _mm512_insertf32x4(_mm512_castps128_ps512(a), b, 1);
+  const __m256 cd = _mm256_insertf128_ps(_mm256_castps128_ps256(c), d, 1);
+  return Wide(_mm512_insertf32x8(ab, cd, 1));
+#elif defined(__AVX2__)
+  return Wide(Native(_mm256_insertf128_ps(_mm256_castps128_ps256(a), b, 1)),
+              Native(_mm256_insertf128_ps(_mm256_castps128_ps256(c), d, 1)));
+#else
+  return Wide({Native(a), Native(b)}, {Native(c), Native(d)});
+#endif
+}
+
+// Rows become columns.
+RGBAVATAR_FUNCTION void transpose(Quad& a, Quad& b, Quad& c, Quad& d) {
+  const Quad ab = __builtin_shufflevector(a, b, 0, 4, 1, 5);
+  const Quad ab2 = __builtin_shufflevector(a, b, 2, 6, 3, 7);
+  const Quad cd = __builtin_shufflevector(c, d, 0, 4, 1, 5);
+  const Quad cd2 = __builtin_shufflevector(c, d, 2, 6, 3, 7);
+  a = __builtin_shufflevector(ab, cd, 0, 1, 4, 5);
+  b = __builtin_shufflevector(ab, cd, 2, 3, 6, 7);
+  c = __builtin_shufflevector(ab2, cd2, 0, 1, 4, 5);
+  d = __builtin_shufflevector(ab2, cd2, 2, 3, 6, 7);
+}
+
+RGBAVATAR_FUNCTION Quad load_quad(const float* from) {
+  return *reinterpret_cast<const UnalignedQuad*>(from);
+}
+RGBAVATAR_FUNCTION void store_quad(Quad a, float* to) {
+  *reinterpret_cast<UnalignedQuad*>(to) = a;
+}
+
+// Four pixels' r, g, b as r0 g0 b0 r1 ..., and back.
+RGBAVATAR_FUNCTION void store_interleaved(Quad r, Quad g, Quad b, float* to) {
+  const Quad rg = __builtin_shufflevector(r, g, 0, 4, 1, 5);   // r0 g0 r1 g1
+  const Quad rg2 = __builtin_shufflevector(r, g, 2, 6, 3, 7);  // r2 g2 r3 g3
+  const Quad br = __builtin_shufflevector(b, r, 0, 5, 1, 0);   // b0 r1 b1 .
+  const Quad gb = __builtin_shufflevector(g, b, 1, 5, 3, 7);   // g1 b1 g3 b3
+  const Quad b2 = __builtin_shufflevector(b, r, 2, 7, 2, 7);   // b2 r3 . .
+  store_quad(__builtin_shufflevector(rg, br, 0, 1, 4, 5), to);
+  store_quad(__builtin_shufflevector(gb, rg2, 0, 1, 4, 5), to + 4);
+  store_quad(__builtin_shufflevector(b2, gb, 0, 1, 6, 7), to + 8);
+}
+RGBAVATAR_FUNCTION void load_interleaved(const float* from, Quad& r, Quad& g, Quad& b) {
+  const Quad x = load_quad(from);      // r0 g0 b0 r1
+  const Quad y = load_quad(from + 4);  // g1 b1 r2 g2
+  const Quad z = load_quad(from + 8);  // b2 r3 g3 b3
+  const Quad r23 = __builtin_shufflevector(y, z, 2, 2, 5, 5);
+  const Quad g01 = __builtin_shufflevector(x, y, 1, 1, 4, 4);
+  const Quad g23 = __builtin_shufflevector(y, z, 3, 3, 6, 6);
+  const Quad b01 = __builtin_shufflevector(x, y, 2, 2, 5, 5);
+  r = __builtin_shufflevector(x, r23, 0, 3, 4, 6);
+  g = __builtin_shufflevector(g01, g23, 0, 2, 4, 6);
+  b = __builtin_shufflevector(b01, z, 0, 2, 4, 7);
+}
+
+// The largest lane; all are at least 0.
+RGBAVATAR_FUNCTION float max_lane(Wide a) {
+  float lanes[kLanes], largest = 0.0f;
+  store(a, lanes);
+  for (int i = 0; i < kLanes; ++i) largest = largest < lanes[i] ? lanes[i] : largest;
+  return largest;
+}
+
+}  // namespace rgbavatar::RGBAVATAR_ISA
