@@ -14,6 +14,7 @@ from rgbavatar_ns.avatar.bundle import load_any, save_bundle
 from rgbavatar_ns.avatar.color_init import color_estimate, premultiplied
 from rgbavatar_ns.avatar.composition import to_world
 from rgbavatar_ns.avatar.config import AvatarConfig
+from rgbavatar_ns.avatar.losses import require_images_of
 from rgbavatar_ns.avatar.weights import WeightNetwork
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadArrays, HeadModel, ThetaLayout, UVAnchors, uv_anchors
@@ -151,8 +152,8 @@ class Avatar(nn.Module):
         if not torch.is_grad_enabled():
             renderer = self.renderer(theta, cameras, backend=backend)
             if renderer is not None:
-                color = self.identity.new_zeros(3) if background is None else background
-                return renderer.draw(color.reshape(-1, 3), **options)
+                color = theta.new_zeros(3) if background is None else background
+                return renderer.draw(color.expand(len(theta), 3).to(self.identity), **options)
         return rasterize(self.gaussians(theta), cameras, background, backend=backend, **options)
 
     def renderer(
@@ -220,6 +221,7 @@ class Avatar(nn.Module):
         multiplied by alpha). Only base colours change, and each Gaussian's only once: bases and
         optimiser state stay, and `color_initialized` remembers.
         """
+        require_images_of(images_rgba, len(theta), cameras)
         images = premultiplied(images_rgba, self.blendshapes.position.dtype)
         renderer = self.renderer(theta, cameras, backend=backend)
         if renderer is not None:

@@ -11,6 +11,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from rgbavatar_ns.avatar.avatar import Avatar
+from rgbavatar_ns.avatar.losses import require_images_of
 from rgbavatar_ns.kernels import AdamParameter, PinholeCameras
 
 _GROUPS = {
@@ -58,7 +59,13 @@ class FusedStep:
         background: Float[Tensor, "B 3"],
         backend: str = "auto",
     ) -> Float[Tensor, ""] | None:
-        """Take one step and return the loss; None, and no step, where the backend cannot."""
+        """Take one step and return the loss; None, and no step, where the backend cannot.
+
+        Raises ValueError where the images are not of the cameras' size, or not as many as theta.
+        """
+        # Compiled code reads what it is promised.
+        require_images_of(images_rgba, len(theta), cameras)
+        background = background.expand(len(theta), 3)
         for optimizer in self._optimizers:
             optimizer.zero_grad(set_to_none=True)
         psi = self._avatar.weights(theta)

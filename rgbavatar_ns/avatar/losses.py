@@ -9,6 +9,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.kernels import PinholeCameras
 
 
 def rgba_to_float(
@@ -18,6 +19,13 @@ def rgba_to_float(
     if rgba.dtype == torch.uint8:
         return rgba.to(dtype).mul_(1 / 255)
     return rgba.to(dtype)
+
+
+def require_images_of(images_rgba: Tensor, count: int, cameras: PinholeCameras) -> None:
+    """Raise ValueError unless these are `count` RGBA images of the cameras' size."""
+    wanted = (count, cameras.height, cameras.width, 4)
+    if tuple(images_rgba.shape) != wanted:
+        raise ValueError(f"The images are {tuple(images_rgba.shape)}. Pass {wanted}.")
 
 
 def composite(

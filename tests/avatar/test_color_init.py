@@ -134,7 +134,7 @@ def test_the_schedule_is_dense_first_and_sparse_later():
 
 @pytest.mark.parametrize("scale_with_triangle", [False, True])
 def test_the_compiled_way_gives_the_same_colors(make_avatar, scale_with_triangle):
-    """Sums of the blended renderer against those over the world-space Gaussians, 8 bit and float."""
+    """The blended renderer's sums against those over world-space Gaussians, 8 bit and float."""
     camera, size = front_camera(48), 48
     pictures = torch.randint(
         0, 256, (3, size, size, 4), generator=torch.Generator().manual_seed(3), dtype=torch.uint8

@@ -16,13 +16,14 @@ SANITIZERS = "address,undefined,float-cast-overflow"
 # libstdc++ as well: the address sanitizer looks for its exceptions when the process starts.
 PRELOADED = ("libasan.so", "libubsan.so", "libstdc++.so.6")
 TESTS = (
-    "test_backends_agree.py",
-    "test_bad_input.py",
-    "test_extremes.py",
-    "test_isolation.py",
-    "test_laws.py",
-    "test_sizes.py",
-    "test_weighted_colors.py",
+    "kernels/test_backends_agree.py",
+    "kernels/test_bad_input.py",
+    "kernels/test_extremes.py",
+    "kernels/test_isolation.py",
+    "kernels/test_laws.py",
+    "kernels/test_sizes.py",
+    "kernels/test_weighted_colors.py",
+    "avatar/test_fused_step.py",
 )
 # A pytest plugin that puts the module built here where the package looks for its own.
 PLUGIN = """
@@ -128,7 +129,7 @@ def test_kernel_tests_are_clean(sanitized, which):
     command = [sys.executable, "-m", "pytest", "-x", "-v", "--capture=sys", "-m", "not slow"]
     command += ["-p", "sanitized_native", "-p", "no:cacheprovider", "-o", "addopts="]
     command += ["-k", " and ".join(f"not [{name}" for name in others)]
-    command += [str(ROOT / "tests" / "kernels" / name) for name in TESTS]
+    command += [str(ROOT / "tests" / name) for name in TESTS]
     environment = {**os.environ, **sanitized, "RGBAVATAR_INSTRUCTION_SET": chosen}
     result = _run(command, cwd=ROOT, env=environment)
     assert f"rasterizer: {sanitized['PYTHONPATH']}" in result.stdout, result.stdout[-4000:]

@@ -1,0 +1,150 @@
+"""Steps to compare: avatars whose every gradient lives, and targets far from what they show."""
+
+import dataclasses
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from rgbavatar_ns.avatar import Avatar
+from rgbavatar_ns.avatar.fused_step import FusedStep
+from rgbavatar_ns.avatar.losses import composite, l1_loss, rgba_to_float
+from rgbavatar_ns.avatar.training import TrainingBatch
+from rgbavatar_ns.kernels import PinholeCameras
+
+from .small_head import front_camera, random_theta
+
+AMOUNTS = {
+    "position": 2e-3,
+    "rotation": 0.4,
+    "log_scale": 0.2,
+    "opacity": 0.7,
+    "color": 0.15,
+    "basis_position": 1e-3,
+    "basis_rotation": 0.2,
+    "basis_color": 0.1,
+    "weight_network": 0.02,
+}
+
+
+def stir(avatar: Avatar, seed: int = 0) -> Avatar:
+    """Move every parameter a little; colours stay between .3 and .7."""
+    generator = torch.Generator().manual_seed(seed)
+    with torch.no_grad():
+        for name, parameters in avatar.parameter_groups().items():
+            for parameter in parameters:
+                noise = torch.randn(parameter.shape, generator=generator, dtype=torch.float64)
+                parameter.add_(AMOUNTS[name] * noise.clamp(-2, 2).to(parameter.dtype))
+    return avatar
+
+
+def far_batch(
+    avatar: Avatar,
+    count: int,
+    width: int = 40,
+    height: int = 40,
+    cameras: int = 1,
+    dtype: torch.dtype = torch.float32,
+) -> tuple[TrainingBatch, Tensor]:
+    """Frames whose pixels are much darker or much brighter than the avatar, and backgrounds.
+
+    The L1 loss has a kink where image and target meet: there the gradient's sign is decided by
+    rounding. Here all differences are above .1, so that two ways to compute must agree.
+    """
+    generator = torch.Generator().manual_seed(5)
+    theta = random_theta(avatar.layout, count, dtype=dtype)
+    rows, columns = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    bright = (torch.sin(0.7 * rows + 0.3 * columns) > 0)[None, :, :, None]
+    images = torch.full((count, height, width, 4), 210, dtype=torch.uint8)
+    images[..., :3] = 255 * bright.to(torch.uint8)
+    images[..., 3] += (20 * torch.rand(count, height, width, generator=generator)).to(torch.uint8)
+    background = 0.4 + 0.2 * torch.rand(count, 3, generator=generator)
+    camera = _cameras(cameras, width, height, generator, dtype)
+    return TrainingBatch(theta, camera, images), background.to(dtype)
+
+
+def _cameras(
+    count: int, width: int, height: int, generator: torch.Generator, dtype: torch.dtype
+) -> PinholeCameras:
+    """The front camera, for more than one each moved a little."""
+    one = front_camera(max(width, height), dtype)
+    world_to_camera = one.world_to_camera.repeat(count, 1, 1)
+    if count > 1:
+        shift = 0.01 * torch.randn(count, 3, generator=generator)
+        world_to_camera[:, :3, 3] += shift.to(dtype)
+    return PinholeCameras(
+        world_to_camera,
+        one.focal_px.repeat(count, 1),
+        torch.tensor([[width / 2, height / 2]], dtype=dtype).repeat(count, 1),
+        width,
+        height,
+    )
+
+
+def reordered(
+    batch: TrainingBatch, background: Tensor, order: list[int]
+) -> tuple[TrainingBatch, Tensor]:
+    """The same images in another order: the same step but for the order of summation."""
+    cameras = batch.cameras
+    if len(cameras.focal_px) > 1:
+        cameras = cameras.select(order)
+    mixed = TrainingBatch(batch.theta[order], cameras, batch.images_rgba[order])
+    return mixed, background[order]
+
+
+def fused_step(
+    avatar: Avatar, optimizer: torch.optim.Optimizer, batch: TrainingBatch, background: Tensor
+) -> Tensor | None:
+    """Without autograd."""
+    images = batch.images_rgba
+    return FusedStep(avatar, [optimizer])(batch.theta, batch.cameras, images, background)
+
+
+def eager_step(
+    avatar: Avatar,
+    optimizer: torch.optim.Optimizer,
+    batch: TrainingBatch,
+    background: Tensor,
+    backend: str = "auto",
+) -> Tensor:
+    """The readable way, through autograd."""
+    optimizer.zero_grad(set_to_none=True)
+    dtype = background.dtype
+    image = avatar.render(batch.theta, batch.cameras, background, backend=backend).image
+    loss = l1_loss(image, composite(rgba_to_float(batch.images_rgba, dtype), background))
+    loss.backward()
+    optimizer.step()
+    return loss.detach()
+
+
+def first_moments(avatar: Avatar, optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
+    """Adam's first moment of each group as one vector: the gradient, but for a factor."""
+    return {
+        name: torch.cat([optimizer.state[p]["exp_avg"].flatten() for p in parameters])
+        for name, parameters in avatar.parameter_groups().items()
+    }
+
+
+def relative_differences(first: dict[str, Tensor], second: dict[str, Tensor]) -> dict[str, float]:
+    """Each group's relative L2 difference; the second is the right one."""
+    assert first.keys() == second.keys()
+    return {
+        name: float((first[name].double() - value.double()).norm() / value.double().norm())
+        for name, value in second.items()
+    }
+
+
+def double(avatar: Avatar) -> Avatar:
+    """A copy in float64, for the reference."""
+    copy = Avatar.from_state(avatar.to_state())
+    copy.load_state_dict(avatar.state_dict())
+    return copy.to(torch.float64)
+
+
+def in_double(batch: TrainingBatch) -> TrainingBatch:
+    """The batch for it."""
+    values: dict[str, Any] = {
+        name: value.double() if isinstance(value, Tensor) else value
+        for name, value in vars(batch.cameras).items()
+    }
+    return dataclasses.replace(batch, theta=batch.theta.double(), cameras=PinholeCameras(**values))
