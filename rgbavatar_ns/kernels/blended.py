@@ -7,6 +7,7 @@ same numbers and is only faster.
 from jaxtyping import Float
 from torch import Tensor
 
+from rgbavatar_ns.kernels.functional import check_cameras
 from rgbavatar_ns.kernels.registry import BlendedRenderer, choose
 from rgbavatar_ns.kernels.types import BlendedGaussians, PinholeCameras
 
@@ -20,11 +21,11 @@ def blended_renderer(
 ) -> BlendedRenderer | None:
     """The chosen backend's renderer for one batch; None where it has none or cannot take this.
 
-    Raises ValueError where there is no such backend.
+    Raises ValueError where there is no such backend, and for cameras as `rasterize`.
     """
-    if len(cameras.focal_px) not in (1, len(weights)):
-        return None
     tensor = gaussians.position
+    if check_cameras(tensor, cameras) not in (1, len(weights)):
+        return None
     return choose(backend, tensor.device, tensor.dtype).blended_renderer(
         gaussians, weights, vertices, cameras
     )

@@ -34,13 +34,7 @@ def rasterize(
     Source: 3D Gaussian splatting (Kerbl et al. 2023); exact rule in `kernels/reference.py`.
     """
     batch = _check(gaussians, cameras)
-    if background is None:
-        background = gaussians.colors.new_zeros(3)
-    background = background.reshape(-1, background.shape[-1]) if background.ndim else background
-    _check_like(gaussians.means, background, "background")
-    if background.ndim != 2 or background.shape[1] != 3:
-        raise ValueError(f"background is {_shape(background)}. Pass [3] or [B, 3].")
-    _join(batch, "background", background.shape[0])
+    background = checked_background(gaussians.means, background, batch)
     chosen = choose(backend, gaussians.means.device, gaussians.means.dtype)
     return chosen.rasterize(
         gaussians,
@@ -79,6 +73,22 @@ def weighted_color_average(
     return chosen.weighted_color_average(gaussians, cameras, images)
 
 
+def checked_background(
+    like: Tensor, background: Tensor | None, batch: int
+) -> Float[Tensor, "#B 3"]:
+    """Return the background of a batch of B images; None is black. Raises as `rasterize`."""
+    if background is None:
+        return like.new_zeros(1, 3)
+    background = background.reshape(-1, background.shape[-1]) if background.ndim else background
+    _check_like(like, background, "background")
+    if background.ndim != 2 or background.shape[1] != 3:
+        raise ValueError(f"background is {_shape(background)}. Pass [3] or [B, 3].")
+    if background.device.type == "cpu" and not torch.isfinite(background).all():
+        raise ValueError("background holds NaN or infinity. Pass a colour.")
+    _join(batch, "background", background.shape[0])
+    return background
+
+
 def _shape(tensor: Tensor) -> str:
     return str(list(tensor.shape))
 
@@ -114,11 +124,11 @@ def _check(gaussians: GaussianSet, cameras: PinholeCameras) -> int:
             expected = ", ".join(["B or 1", "N" if count < 0 else str(count), *map(str, width)])
             raise ValueError(f"{name} are {_shape(tensor)}. Pass [{expected}].")
         batch = _join(batch, name, tensor.shape[0])
-    return _join(batch, "cameras", _check_cameras(means, cameras))
+    return _join(batch, "cameras", check_cameras(means, cameras))
 
 
-def _check_cameras(means: Tensor, cameras: PinholeCameras) -> int:
-    """The number of cameras."""
+def check_cameras(means: Tensor, cameras: PinholeCameras) -> int:
+    """Return the number of cameras. Raises as `rasterize`."""
     count = cameras.world_to_camera.shape[0]
     for name, shape in (
         ("world_to_camera", (count, 4, 4)),

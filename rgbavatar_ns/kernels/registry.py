@@ -28,7 +28,11 @@ class BlendedRenderer(Protocol):
     """
 
     def draw(
-        self, background: Float[Tensor, "#B 3"], *, with_depth: bool, with_visibility: bool
+        self,
+        background: Float[Tensor, "3"] | Float[Tensor, "#B 3"] | None = None,
+        *,
+        with_depth: bool = False,
+        with_visibility: bool = False,
     ) -> RenderedBatch:
         """As `rasterize`, without gradients."""
         ...

@@ -17,7 +17,8 @@ class GaussianSet:
     """B sets of N world-space Gaussians; a leading 1 stands for all B sets.
 
     `quats_wxyz` need not be normalised; `scales` are standard deviations in metres;
-    `opacities` lie in [0, 1]; `colors` are linear blending colours, usually in [0, 1].
+    `opacities` lie in [0, 1]; `colors` are linear blending colours, usually in [0, 1]: beyond
+    about a thousand they cost the gradients of Gaussians behind them their last digits.
     """
 
     means: Float[Tensor, "#B N 3"]

@@ -11,6 +11,7 @@ from rgbavatar_ns.kernels.cpu import (
     INSTRUCTION_SET_VARIABLE,
     _native,  # pyright: ignore[reportMissingModuleSource]
 )
+from rgbavatar_ns.kernels.functional import checked_background
 from rgbavatar_ns.kernels.types import (
     TANGENT_VARIANTS,
     AdamParameter,
@@ -55,9 +56,14 @@ class CpuBlendedRenderer:
         )
 
     def draw(
-        self, background: Float[Tensor, "#B 3"], *, with_depth: bool, with_visibility: bool
+        self,
+        background: Float[Tensor, "3"] | Float[Tensor, "#B 3"] | None = None,
+        *,
+        with_depth: bool = False,
+        with_visibility: bool = False,
     ) -> RenderedBatch:
         """As `rasterize`, without gradients."""
+        background = checked_background(self._weights, background, len(self._weights))
         batch, new = len(self._weights), self._weights.new_empty
         size = (batch, self._cameras.height, self._cameras.width)
         image, alpha = new(*size, 3), new(*size, 1)
