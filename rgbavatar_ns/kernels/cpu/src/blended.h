@@ -113,6 +113,8 @@ static void blend_images(const float* base, const float* basis, int64_t stride, 
     }
     for (int k = 0; k < bases; ++k) {
       const float* row = basis + k * stride + first;
+      __builtin_prefetch(row + 128);
+      __builtin_prefetch(row + 144);
       const Wide basis_low = load_some(row, low);
       const Wide basis_high = high > 0 ? load_some(row + kLanes, high) : Wide(0.0f);
       for (int b = 0; b < kImages; ++b) {

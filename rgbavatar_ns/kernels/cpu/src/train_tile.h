@@ -20,6 +20,13 @@ static RGBAVATAR_MEMBER WideInt load_rgba(const Tile& tile, const BlockPixels& p
   return load_ints(lanes);
 }
 
+// 1 in the image, 0 outside.
+static Wide lanes_inside(const Tile& tile, const BlockPixels& pixels) {
+  float within[kBlockPixels] = {};
+  pixels.for_each(tile, [&](int lane, int64_t) { within[lane] = 1.0f; });
+  return load_wide(within);
+}
+
 // From the drawn rows to those of the backward pass: T starts again, the channels become dL/dimage
 // of the mean absolute difference, and the remainder g . image. Returns the differences' sums.
 static Wide compare_block(const Tile& tile, const TrainingTarget& target, int block,
@@ -28,9 +35,7 @@ static Wide compare_block(const Tile& tile, const TrainingTarget& target, int bl
   const BlockPixels pixels(tile, block);
   const WideInt rgba = load_rgba(tile, pixels, target.rgba);
   const Wide zero(0.0f), one(1.0f), t = load_wide(rows[kTransmittance]);
-  float within[kBlockPixels] = {};
-  pixels.for_each(tile, [&](int lane, int64_t) { within[lane] = 1.0f; });
-  const Wide inside = load_wide(within);
+  const Wide inside = pixels.whole() ? one : lanes_inside(tile, pixels);
   const Wide matte = to_floats((rgba >> 24) & 255) * (1.0f / 255.0f);
   Wide remainder = zero, sum = zero;
   for (int k = 0; k < 3; ++k) {
