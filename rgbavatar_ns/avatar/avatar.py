@@ -161,18 +161,20 @@ class Avatar(nn.Module):
         theta: Float[Tensor, "B H"],
         cameras: PinholeCameras,
         psi: Float[Tensor, "B K"] | None = None,
+        vertices: Float[Tensor, "B V 3"] | None = None,
         *,
         backend: str = "auto",
     ) -> BlendedRenderer | None:
         """Return the backend's way to draw and train without `gaussians`, if it has one.
 
-        `psi` replaces the weight network's answer. Raises UserError where theta is unfit.
+        `psi` and `vertices` replace the answers of weight network and head model. Raises UserError
+        where theta is unfit.
         """
         theta = self._checked(theta)
         with torch.no_grad():
-            psi = self.weights(theta) if psi is None else psi
-            vertices = self.head(theta, self.identity)
-        return blended_renderer(self._blended_gaussians(), psi, vertices, cameras, backend)
+            weights = self.weights(theta) if psi is None else psi
+            posed = self.head(theta, self.identity) if vertices is None else vertices
+        return blended_renderer(self._blended_gaussians(), weights, posed, cameras, backend)
 
     def _blended_gaussians(self) -> BlendedGaussians:
         names = [field.name for field in fields(BlendedGaussians)]

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from rgbavatar_ns.avatar.avatar import Avatar
 from rgbavatar_ns.avatar.losses import require_images_of
-from rgbavatar_ns.kernels import AdamParameter, PinholeCameras
+from rgbavatar_ns.kernels import AdamParameter, BlendedRenderer, PinholeCameras
 
 _GROUPS = {
     "position": "position",
@@ -66,20 +66,29 @@ class FusedStep:
         # Compiled code reads what it is promised.
         require_images_of(images_rgba, len(theta), cameras)
         background = background.expand(len(theta), 3)
-        for optimizer in self._optimizers:
-            optimizer.zero_grad(set_to_none=True)
         psi = self._avatar.weights(theta)
         renderer = self._avatar.renderer(theta, cameras, psi.detach(), backend=backend)
         if renderer is None:
             return None
         loss = renderer.compare(images_rgba, background)
-        weight_gradient = renderer.update({n: self._adam(n) for n in self._parameters})
+        self.update_network(psi, self.update_gaussians(renderer))
+        return psi.new_tensor(loss)
+
+    def update_gaussians(self, renderer: BlendedRenderer) -> Float[Tensor, "B K"]:
+        """Step by the renderer's last comparison and return the gradient of the weights."""
+        return renderer.update({name: self._adam(name) for name in self._parameters})
+
+    def update_network(
+        self, psi: Float[Tensor, "B K"], weight_gradient: Float[Tensor, "B K"]
+    ) -> None:
+        """Step with the weight network that gave psi."""
+        for optimizer in self._optimizers:
+            optimizer.zero_grad(set_to_none=True)
         if psi.requires_grad:
             psi.backward(weight_gradient)
         # Of the Gaussians they find no gradient; hooks and schedules still see each take its step.
         for optimizer in self._optimizers:
             optimizer.step()
-        return psi.new_tensor(loss)
 
     def _adam(self, name: str) -> AdamParameter:
         """The parameter's next update; counts it."""

@@ -7,7 +7,6 @@ from typing import Any
 import torch
 
 from rgbavatar_ns.avatar import Avatar
-from rgbavatar_ns.avatar.composition import to_world
 from rgbavatar_ns.avatar.training import TrainingBatch
 from rgbavatar_ns.bench.floor import floor_figures, measure_speed, parameter_work, rasterizer_work
 from rgbavatar_ns.bench.machine import machine_facts, require_backend
@@ -17,6 +16,8 @@ from rgbavatar_ns.bench.projection import one_camera
 from rgbavatar_ns.bench.report import Report
 from rgbavatar_ns.bench.timing import (
     PEAK_MEMORY_METHOD,
+    WHOLE,
+    Lap,
     Progress,
     Spread,
     Stopwatch,
@@ -24,9 +25,10 @@ from rgbavatar_ns.bench.timing import (
     using_threads,
 )
 from rgbavatar_ns.bench.workloads import AvatarWorkload, avatar_workload
-from rgbavatar_ns.kernels import PinholeCameras, rasterize
+from rgbavatar_ns.kernels import rasterize
 
 WHOLE_FRAME = "whole frame"
+EAGER_FRAME = "whole frame, eager"
 
 
 @torch.no_grad()
@@ -42,6 +44,7 @@ def bench_render(options: RenderOptions, progress: Progress | None = None) -> Re
         growth_bytes = peak_growth_bytes(frame)
         whole = stopwatch.time(WHOLE_FRAME, frame)
         spread = {WHOLE_FRAME: whole} | _time_parts(workload, stopwatch)
+        spread[EAGER_FRAME] = _time_eager(workload, stopwatch)
         return _report(workload, facts, spread, growth_bytes)
 
 
@@ -56,24 +59,30 @@ def _frames_in_turn(avatar: Avatar, batch: TrainingBatch) -> Callable[[], Any]:
 
 
 def _time_parts(workload: AvatarWorkload, stopwatch: Stopwatch) -> dict[str, Spread]:
-    """Times of one frame's parts by the readable path, one after another."""
+    """Times of one frame's parts as they follow one another."""
     avatar, theta = workload.avatar, workload.batch.theta[:1]
-    camera: PinholeCameras = one_camera(workload.batch.cameras, 0)
-    ratio = avatar.config.scale_with_triangle
-    vertices = avatar.head(theta, avatar.identity)
-    psi = avatar.weights(theta)
-    tangent = avatar.blendshapes.blend(psi)
-    frames = avatar.anchors.frames(vertices, with_length_ratio=ratio)
-    gaussians = to_world(tangent, frames)
-    parts: dict[str, Callable[[], Any]] = {
-        "head": lambda: avatar.head(theta, avatar.identity),
-        "network": lambda: avatar.weights(theta),
-        "blend": lambda: avatar.blendshapes.blend(psi),
-        "frames": lambda: avatar.anchors.frames(vertices, with_length_ratio=ratio),
-        "transform": lambda: to_world(tangent, frames),
-        "rasterize": lambda: rasterize(gaussians, camera),
-    }
-    return {name: stopwatch.time(name, part) for name, part in parts.items()}
+    camera, background = one_camera(workload.batch.cameras, 0), torch.zeros(1, 3)
+
+    def once(lap: Lap) -> None:
+        vertices = avatar.head(theta, avatar.identity)
+        lap("head")
+        psi = avatar.weights(theta)
+        lap("network")
+        renderer = avatar.renderer(theta, camera, psi, vertices)
+        lap("prepare")
+        assert renderer is not None
+        renderer.draw(background, with_depth=False, with_visibility=False)
+        lap("draw")
+
+    parts = stopwatch.laps("parts", once)
+    return {name: part for name, part in parts.items() if name != WHOLE}
+
+
+def _time_eager(workload: AvatarWorkload, stopwatch: Stopwatch) -> Spread:
+    """The readable path, frame after frame as the whole one."""
+    avatar, theta = workload.avatar, workload.batch.theta[:1]
+    camera = one_camera(workload.batch.cameras, 0)
+    return stopwatch.time(EAGER_FRAME, lambda: rasterize(avatar.gaussians(theta), camera))
 
 
 def _report(
@@ -103,6 +112,13 @@ def _report(
         pairs={"per_image": pairs, "per_second": 1e3 * pairs / whole_ms},
         memory={"bytes_per_image": growth_bytes, "method": PEAK_MEMORY_METHOD},
         floor=floor_figures(works, measure_speed(), 1, whole_ms),
-        peers={},
+        peers={
+            EAGER_FRAME: {
+                "whole_ms_per_image": spread[EAGER_FRAME].median_ms,
+                "ratio": spread[EAGER_FRAME].median_ms / whole_ms,
+                "threads": facts["threads"],
+                "repetitions": spread[EAGER_FRAME].repetitions,
+            }
+        },
         machine=machine_facts(),
     )

@@ -13,8 +13,9 @@ from rgbavatar_ns.bench.timing import Spread
 class Report:
     """What a benchmark found; None where a figure does not apply.
 
-    `forward_ms_per_image` and `backward_ms_per_image` are the rasterizer's, also within a step;
-    of a rendering they are the whole way from theta to the image, which has no backward.
+    `forward_ms_per_image` and `backward_ms_per_image` are the rasterizer's alone, also beside a
+    step, whose own loops do both at once; of a rendering they are the whole way from theta to the
+    image, which has no backward.
     `parts` are milliseconds a batch; `spread` has median and quartiles in milliseconds a batch.
     """
 

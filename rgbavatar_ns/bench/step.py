@@ -1,7 +1,6 @@
 """`rgbavatar bench step`: a whole training step, its parts, and nerfstudio's trainer beside it."""
 
 from collections.abc import Callable
-from dataclasses import fields
 from typing import Any
 
 import torch
@@ -9,6 +8,7 @@ from torch import Tensor, nn
 
 from rgbavatar_ns.avatar import Avatar
 from rgbavatar_ns.avatar.composition import to_world
+from rgbavatar_ns.avatar.fused_step import FusedStep
 from rgbavatar_ns.avatar.losses import composite, l1_loss, random_backgrounds, rgba_to_float
 from rgbavatar_ns.avatar.training import (
     TrainingBatch,
@@ -24,6 +24,8 @@ from rgbavatar_ns.bench.pairs import count_pairs
 from rgbavatar_ns.bench.report import Report
 from rgbavatar_ns.bench.timing import (
     PEAK_MEMORY_METHOD,
+    WHOLE,
+    Lap,
     Progress,
     Spread,
     Stopwatch,
@@ -35,6 +37,8 @@ from rgbavatar_ns.bench.workloads import AvatarWorkload, avatar_workload
 from rgbavatar_ns.kernels import rasterize
 
 WHOLE_STEP = "whole step"
+EAGER_STEP = "whole step, eager"
+COLOR_INITIALISATION = "(colour initialisation, when due)"
 
 
 def bench_step(options: StepOptions, progress: Progress | None = None) -> Report:
@@ -46,14 +50,15 @@ def bench_step(options: StepOptions, progress: Progress | None = None) -> Report
         stopwatch = Stopwatch(options.repetitions, progress)
         whole, growth_bytes = time_step(workload, stopwatch)
         parts = time_parts(workload, stopwatch)
+        eager_parts = time_eager_parts(workload, stopwatch)
         trainer = bench_trainer(options, progress) if options.trainer else None
-        return _report(workload, facts, whole, parts, growth_bytes, trainer)
+        return _report(workload, facts, whole, parts, eager_parts, growth_bytes, trainer)
 
 
 def time_step(
     workload: AvatarWorkload, stopwatch: Stopwatch
 ) -> tuple[dict[str, Spread], int | None]:
-    """Times of `training_step` and its memory; also of the eager path where there is a faster one.
+    """Times of `training_step` and its memory, and times of its eager path.
 
     Every repetition starts from the same parameters, so that all of them do the same work.
     """
@@ -70,14 +75,10 @@ def time_step(
 
 
 def _variants() -> dict[str, TrainingOptions]:
-    """Options of the step as training takes it, and of the eager one if that is another."""
-    if "fast" not in {field.name for field in fields(TrainingOptions)}:
-        return {WHOLE_STEP: TrainingOptions(color_init=None)}
-    fast: dict[str, Any] = {"color_init": None, "fast": True}
-    eager: dict[str, Any] = {**fast, "fast": False}
+    """Options of the step as training takes it, and of the eager one."""
     return {
-        WHOLE_STEP: TrainingOptions(**fast),
-        "whole step, eager": TrainingOptions(**eager),
+        WHOLE_STEP: TrainingOptions(color_init=None),
+        EAGER_STEP: TrainingOptions(color_init=None, fast=False),
     }
 
 
@@ -86,13 +87,13 @@ class WholeStep:
 
     def __init__(self, avatar: Avatar, batch: TrainingBatch, options: TrainingOptions) -> None:
         self._avatar, self._batch, self._options = avatar, batch, options
-        self._optimizer = make_optimizer(avatar)
+        self.optimizer = make_optimizer(avatar)
         self._parameters = parameters_of(avatar)
         self._before = [parameter.detach().clone() for parameter in self._parameters]
 
     def run(self) -> None:
         """Take the step."""
-        training_step(self._avatar, self._optimizer, self._batch, 0, self._options)
+        training_step(self._avatar, self.optimizer, self._batch, 0, self._options)
 
     @torch.no_grad()
     def restore(self) -> None:
@@ -111,9 +112,44 @@ def _backward(tensors: tuple[Tensor, ...], gradients: tuple[Tensor, ...], inputs
 
 
 def time_parts(workload: AvatarWorkload, stopwatch: Stopwatch) -> dict[str, Spread]:
+    """Times of the fused step's parts as they follow one another, and of what is due at times."""
+    avatar, batch = workload.avatar, workload.batch
+    whole = WholeStep(avatar, batch, TrainingOptions(color_init=None))
+    background, images = random_backgrounds(0, len(batch.theta)), torch.as_tensor(batch.images_rgba)
+
+    def once(lap: Lap) -> None:
+        step = FusedStep(avatar, [whole.optimizer])
+        psi = avatar.weights(batch.theta)
+        lap("network")
+        with torch.no_grad():
+            vertices = avatar.head(batch.theta, avatar.identity)
+        lap("head")
+        renderer = avatar.renderer(batch.theta, batch.cameras, psi.detach(), vertices)
+        lap("prepare")
+        assert renderer is not None
+        renderer.compare(images, background)
+        lap("compare")
+        weight_gradient = step.update_gaussians(renderer)
+        lap("update")
+        step.update_network(psi, weight_gradient)
+        lap("network, backward and Adam")
+
+    parts = stopwatch.laps("parts", once, whole.restore)
+    whole.restore()
+    parts = {name: part for name, part in parts.items() if name != WHOLE}
+    initialized = avatar.color_initialized.clone()
+    parts[COLOR_INITIALISATION] = stopwatch.time(
+        COLOR_INITIALISATION, lambda: avatar.initialize_colors(batch.theta, batch.cameras, images)
+    )
+    whole.restore()
+    avatar.color_initialized.copy_(initialized)
+    return parts
+
+
+def time_eager_parts(workload: AvatarWorkload, stopwatch: Stopwatch) -> dict[str, Spread]:
     """Times of the eager step's parts, one after another on the tensors of a real step.
 
-    Their sum can differ a little from the whole, and a lot where the whole is fused.
+    Their sum can differ a little from the whole.
     """
     avatar, batch = workload.avatar, workload.batch
     optimizer = make_optimizer(avatar)
@@ -138,7 +174,6 @@ def time_parts(workload: AvatarWorkload, stopwatch: Stopwatch) -> dict[str, Spre
     shared = (tangent.log_scale, tangent.opacity_logit)
     for parameter in parameters:
         parameter.grad = torch.zeros_like(parameter)
-    images = rgba_to_float(batch.images_rgba)
     no_grad: Callable[[Callable[[], Any]], Callable[[], Any]] = torch.no_grad()
     parts: dict[str, Callable[[], Any]] = {
         "weights": lambda: avatar.weights(batch.theta),
@@ -154,11 +189,8 @@ def time_parts(workload: AvatarWorkload, stopwatch: Stopwatch) -> dict[str, Spre
         "to world, backward": lambda: _backward(outputs, outer, (*blended, *shared)),
         "blend and weights, backward": lambda: _backward(blended, inner, parameters),
         "Adam": optimizer.step,
-        "(colour initialisation, when due)": lambda: avatar.initialize_colors(
-            batch.theta, batch.cameras, images
-        ),
     }
-    spreads = {name: stopwatch.time(name, part) for name, part in parts.items()}
+    spreads = {name: stopwatch.time(f"eager: {name}", part) for name, part in parts.items()}
     for parameter in parameters:
         parameter.grad = None
     return spreads
@@ -169,6 +201,7 @@ def _report(
     facts: dict[str, Any],
     whole: dict[str, Spread],
     parts: dict[str, Spread],
+    eager_parts: dict[str, Spread],
     growth_bytes: int | None,
     trainer: dict[str, Any] | None,
 ) -> Report:
@@ -181,6 +214,7 @@ def _report(
             "ratio": spread.median_ms / whole_ms,
             "threads": facts["threads"],
             "repetitions": spread.repetitions,
+            "parts": {part: times.median_ms for part, times in eager_parts.items()},
         }
         for name, spread in whole.items()
         if name != WHOLE_STEP
@@ -193,12 +227,12 @@ def _report(
         rasterizer_work(pairs, gaussians, cameras, backward=True),
         update_work(parameters_of(workload.avatar), torch.as_tensor(workload.batch.images_rgba)),
     ]
-    spread = whole | parts
+    spread = whole | parts | {f"eager: {name}": part for name, part in eager_parts.items()}
     return Report(
         benchmark="step",
         workload=facts,
-        forward_ms_per_image=parts["rasterize"].median_ms / batch,
-        backward_ms_per_image=parts["rasterize, backward"].median_ms / batch,
+        forward_ms_per_image=eager_parts["rasterize"].median_ms / batch,
+        backward_ms_per_image=eager_parts["rasterize, backward"].median_ms / batch,
         images_per_second=1e3 * batch / whole_ms,
         frames_per_second=None,
         parts={name: part.median_ms for name, part in spread.items()},

@@ -13,6 +13,7 @@ from rgbavatar_ns.bench.options import RasterizerOptions, RenderOptions, StepOpt
 from rgbavatar_ns.bench.rasterizer import bench_rasterizer
 from rgbavatar_ns.bench.render import bench_render
 from rgbavatar_ns.bench.step import WholeStep, bench_step, parameters_of
+from rgbavatar_ns.bench.timing import Stopwatch
 from rgbavatar_ns.bench.trainer import bench_trainer
 from rgbavatar_ns.bench.workloads import avatar_workload, ellipsoid_scene
 from rgbavatar_ns.errors import UserError
@@ -111,12 +112,21 @@ def test_step_of_a_trained_avatar_on_its_pictures(bundle, dataset):
     assert figures["workload"]["height_px"] == SIZE
 
 
-def test_a_step_with_two_paths_is_compared_with_its_eager_one(monkeypatch):
-    both = TrainingOptions(color_init=None)
-    monkeypatch.setattr(step, "_variants", lambda: {"whole step": both, "eager": both})
+def test_a_step_has_its_parts_and_is_compared_with_the_eager_one():
     report = bench_step(StepOptions(**TINY, batch=2, repetitions=1))
-    eager = report.peers["eager"]
-    assert eager["ratio"] == pytest.approx(report.parts["eager"] / report.parts["whole step"])
+    eager, parts = report.peers["whole step, eager"], report.parts
+    assert eager["ratio"] == pytest.approx(parts["whole step, eager"] / parts["whole step"])
+    assert {"network", "head", "prepare", "compare", "update"} < set(parts)
+    assert {"blend", "frames", "rasterize", "rasterize, backward", "Adam"} < set(eager["parts"])
+    assert parts["eager: blend"] == eager["parts"]["blend"]
+
+
+def test_timing_parts_leaves_the_avatar_as_it_was():
+    workload = avatar_workload(StepOptions(**TINY), 2)
+    before = {name: value.clone() for name, value in workload.avatar.state_dict().items()}
+    step.time_parts(workload, Stopwatch(1))
+    after = workload.avatar.state_dict()
+    assert all(torch.equal(value, after[name]) for name, value in before.items())
 
 
 def test_every_repetition_of_a_step_starts_from_the_same_parameters():
@@ -133,8 +143,11 @@ def test_every_repetition_of_a_step_starts_from_the_same_parameters():
 def test_render_report(bundle):
     figures = checked_json(bench_render(RenderOptions(avatar=bundle, size=64, repetitions=2)))
     assert figures["frames_per_second"] == pytest.approx(1e3 / figures["parts"]["whole frame"])
-    parts = {"head", "network", "blend", "frames", "transform", "rasterize"}
-    assert parts < set(figures["parts"])
+    assert {"head", "network", "prepare", "draw"} < set(figures["parts"])
+    eager = figures["peers"]["whole frame, eager"]
+    assert eager["ratio"] == pytest.approx(
+        figures["parts"]["whole frame, eager"] / figures["parts"]["whole frame"]
+    )
     assert figures["backward_ms_per_image"] is None
 
 
