@@ -151,10 +151,16 @@ class ThetaLayout:
         """
         parts = self.split(theta)
         features = [theta[..., :0]]
+        # All rotations at once: single ones are too small for a tensor operation each.
+        turning = [f.name for f in self.fields if f.form == "axis_angle"] if include_pose else []
+        rows_6d = {}
+        if turning:
+            matrices = axis_angle_to_matrix(torch.stack([parts[name] for name in turning], -2))
+            rows_6d = dict(zip(turning, matrix_to_6d_rows(matrices).unbind(-2)))
         for field in self.fields:
             part = parts[field.name]
-            if field.form == "axis_angle" and include_pose:
-                features.append(matrix_to_6d_rows(axis_angle_to_matrix(part)))
+            if field.name in rows_6d:
+                features.append(rows_6d[field.name])
             elif field.form == "linear" or (field.form == "translation" and include_translation):
                 features.append(part)
         return torch.cat(features, dim=-1)

@@ -1,5 +1,7 @@
 """The head model: theta and identity to posed vertices, for FLAME and the embedded head alike."""
 
+from dataclasses import dataclass
+
 import numpy as np
 import torch
 from jaxtyping import Float, Int
@@ -28,6 +30,7 @@ class HeadModel(nn.Module):
     _linear_dirs: Float[Tensor, "E V3"]
     _eyelid_dirs: Float[Tensor, "L V3"]
     _pose_dirs: Float[Tensor, "P V3"]
+    _linear_joint_dirs: Float[Tensor, "E 15"]
     _regressor: Float[Tensor, "V 5"]
     _weights: Float[Tensor, "5 V"]
 
@@ -45,6 +48,7 @@ class HeadModel(nn.Module):
             ("_linear_dirs", directions[arrays.num_identity :]),
             ("_eyelid_dirs", _flat_directions(eyelid_dirs)),
             ("_pose_dirs", _flat_directions(posedirs)),
+            ("_linear_joint_dirs", _joint_directions(arrays)),
             ("_regressor", arrays.joint_regressor.T),
             ("_weights", arrays.skinning_weights.T),
             ("uv", arrays.uv),
@@ -54,6 +58,7 @@ class HeadModel(nn.Module):
         for name, index in (("faces", arrays.faces), ("uv_faces", arrays.uv_faces)):
             self.register_buffer(name, torch.tensor(index, dtype=torch.int64), persistent=False)
         self.layout = _layout(arrays)
+        self._remembered: _Person | None = None
 
     @classmethod
     def embedded(cls, dtype: torch.dtype = torch.float32) -> "HeadModel":
@@ -80,25 +85,48 @@ class HeadModel(nn.Module):
         """
         batch = theta.shape[:-1]
         parts = self.layout.split(theta.reshape(-1, theta.shape[-1]))
-        flat_identity = self._flat_identity(identity, batch)
-        shaped = self._shaped(parts["expression"], flat_identity)
-        joints = (shaped @ self._regressor).mT
-        turns = torch.stack([axis_angle_to_matrix(parts[name]) for name in _JOINT_FIELDS], dim=1)
+        person, person_joints = self._person(identity, batch)
+        expression = parts["expression"]
+        shaped = torch.addmm(person, expression, self._linear_dirs).unflatten(-1, (3, -1))
+        joints = torch.addmm(person_joints, expression, self._linear_joint_dirs)
+        joints = joints.unflatten(-1, (3, 5)).mT
+        turns = axis_angle_to_matrix(torch.stack([parts[name] for name in _JOINT_FIELDS], dim=1))
         turns = turns - torch.eye(3, dtype=turns.dtype, device=turns.device)
         if "eyelids" in parts:
             shaped = shaped + (parts["eyelids"] @ self._eyelid_dirs).unflatten(-1, (3, -1))
         if len(self._pose_dirs):
             correctives = turns[:, 1:].flatten(1) @ self._pose_dirs
             shaped = shaped + correctives.unflatten(-1, (3, -1))
-        posed = shaped + self._skinned_offsets(shaped, joints, turns)
-        vertices = (posed + parts["translation"][..., None]).mT
+        x, y, z, moved = self._skinned_offsets(joints, turns).unbind(2)
+        posed = shaped + parts["translation"][..., None] + moved
+        for row, along in zip((x, y, z), shaped[:, None].unbind(2)):
+            posed = torch.addcmul(posed, row, along)
+        vertices = posed.mT
         return vertices.reshape(*batch, *vertices.shape[1:])
 
     def joints(self, identity: Float[Tensor, "I"] | None = None) -> Float[Tensor, "5 3"]:
         """Joints of the neutral head at rest: root, neck, jaw, left eye, right eye, metres."""
-        no_expression = self._template.new_zeros(1, self.arrays.num_expressions)
-        shaped = self._shaped(no_expression, self._flat_identity(identity, torch.Size()))
-        return (shaped @ self._regressor)[0].mT
+        _, joints = self._person(identity, torch.Size())
+        return joints.reshape(3, 5).mT
+
+    def _person(
+        self, identity: Float[Tensor, "*_"] | None, batch: torch.Size
+    ) -> tuple[Float[Tensor, "#B V3"], Float[Tensor, "#B 15"]]:
+        """Vertices and joints of the neutral head of an identity.
+
+        One that needs no gradient is remembered, since nearly all calls are about one subject.
+        """
+        steady = identity if _is_steady(identity) else None
+        known = self._remembered
+        if steady is not None and known is not None and known.is_of(steady, self._template):
+            return known.vertices, known.joints
+        flat = self._flat_identity(identity, batch)
+        vertices = self._template.flatten() + flat @ self._identity_dirs
+        joints = (vertices.unflatten(-1, (3, -1)) @ self._regressor).flatten(1)
+        if steady is not None:
+            version = steady._version
+            self._remembered = _Person(steady, version, self._template, vertices, joints)
+        return vertices, joints
 
     def _flat_identity(
         self, identity: Float[Tensor, "*_"] | None, batch: torch.Size
@@ -115,42 +143,54 @@ class HeadModel(nn.Module):
             return identity[None]
         return identity.expand(*batch, self.num_identity).reshape(-1, self.num_identity)
 
-    def _shaped(
-        self, expression: Float[Tensor, "B E"], identity: Float[Tensor, "#B I"]
-    ) -> Float[Tensor, "B 3 V"]:
-        """Template plus identity and expression."""
-        person = self._template.flatten() + identity @ self._identity_dirs
-        return (person + expression @ self._linear_dirs).unflatten(-1, (3, -1))
-
     def _skinned_offsets(
-        self,
-        shaped: Float[Tensor, "B 3 V"],
-        joints: Float[Tensor, "B 5 3"],
-        turns: Float[Tensor, "B 5 3 3"],
-    ) -> Float[Tensor, "B 3 V"]:
-        """How linear blend skinning moves each vertex; `turns` are R - I.
+        self, joints: Float[Tensor, "B 5 3"], turns: Float[Tensor, "B 5 3 3"]
+    ) -> Float[Tensor, "B 3 4 V"]:
+        """How linear blend skinning moves each vertex: by A x + s; `turns` are R - I.
 
         Everything is kept as a difference from rest, so that no rotation means exactly no motion.
         """
-        world_turns: list[Tensor] = []
-        shifts: list[Tensor] = []
-        for joint, parent in enumerate(self._parents):
-            turn = turns[:, joint]
+        # About its joint j alone, a bone moves x by T (x - j).
+        alone = torch.cat([turns, -(turns @ joints[..., None])], -1).unbind(1)
+        moves: list[Tensor] = []
+        for local, parent in zip(alone, self._parents):
             if parent < 0:
-                world_turns.append(turn)
-                shifts.append(torch.zeros_like(joints[:, joint]))
+                moves.append(local)
                 continue
-            above = world_turns[parent]
-            bone = joints[:, joint] - joints[:, parent]
-            # (I + A)(I + T) - I = A + T + A T
-            world_turns.append(above + turn + above @ turn)
-            shifts.append(shifts[parent] + (above @ bone[..., None])[..., 0])
-        turn = torch.stack(world_turns, 1)
-        shift = torch.stack(shifts, 1) - (turn @ joints[..., None])[..., 0]
-        affine = torch.cat([turn, shift[..., None]], -1).movedim(1, -1)
-        blended = affine @ self._weights
-        x, y, z, moved = blended.unbind(2)
-        return x * shaped[:, None, 0] + y * shaped[:, None, 1] + z * shaped[:, None, 2] + moved
+            above = moves[parent]
+            # First the bone, then all above it: m + M(x + m) = M(x) + m + A m.
+            moves.append(torch.baddbmm(above + local, above[..., :3], local))
+        return torch.stack(moves, -1) @ self._weights
+
+
+@dataclass(frozen=True)
+class _Person:
+    """A neutral head, and of which identity and template it is."""
+
+    identity: Tensor
+    version: int
+    template: Tensor
+    vertices: Float[Tensor, "1 V3"]
+    joints: Float[Tensor, "1 15"]
+
+    def is_of(self, identity: Tensor, template: Tensor) -> bool:
+        """Whether this is the very tensor, unchanged since, of the head where it is now."""
+        same = identity is self.identity and identity._version == self.version
+        return same and template is self.template
+
+
+def _is_steady(identity: Tensor | None) -> bool:
+    """Whether what follows from one identity can be used again, in any mode of autograd."""
+    if identity is None or identity.ndim != 1 or identity.requires_grad:
+        return False
+    return not (identity.is_inference() or torch.is_inference_mode_enabled())
+
+
+def _joint_directions(arrays: HeadArrays) -> Float[np.ndarray, "E 15"]:
+    """How each expression moves the joints: all x, then all y, then all z."""
+    expressions = arrays.shapedirs[..., arrays.num_identity :].astype(np.float64)
+    moved = np.einsum("jv,vcx->xcj", arrays.joint_regressor.astype(np.float64), expressions)
+    return moved.reshape(len(moved), 15)
 
 
 def _flat_directions(directions: Float[np.ndarray, "V 3 C"]) -> Float[np.ndarray, "C V3"]:

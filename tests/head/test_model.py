@@ -166,3 +166,25 @@ def test_users_of_the_tensors_cannot_change_the_shared_arrays() -> None:
     assert again.uv.max() <= 1
     assert again.faces.min() == 0
     assert not list(head.state_dict())
+
+
+def test_a_remembered_identity_is_not_mistaken_for_another(synthetic: HeadModel) -> None:
+    theta, identity = random_theta(synthetic), random_identity(synthetic)
+    fresh = HeadModel(synthetic.arrays, torch.float64)
+    first = synthetic(theta, identity)
+    assert torch.equal(synthetic(theta, identity), first)
+    assert torch.equal(synthetic(theta, identity.clone()), first)
+    identity[0] += 1  # In place: the same tensor, another person.
+    second = synthetic(theta, identity)
+    torch.testing.assert_close(second, fresh(theta, identity), atol=0, rtol=0)
+    assert not torch.equal(first, second)
+    assert not torch.equal(synthetic.joints(identity), synthetic.joints())
+    # The head in another type, and gradients after a call without them.
+    moved = HeadModel(synthetic.arrays, torch.float64)
+    moved(theta, identity)
+    assert moved.float()(theta.float(), identity.float()).dtype == torch.float32
+    with torch.inference_mode():
+        synthetic(theta, identity)
+    theta.requires_grad_()
+    synthetic(theta, identity).sum().backward()
+    assert theta.grad is not None

@@ -1,6 +1,7 @@
 import math
 
 import numpy as np
+import roma
 import torch
 from scipy.spatial.transform import Rotation
 
@@ -71,3 +72,24 @@ def test_quaternion_gradients_agree_with_differences() -> None:
         return rotations.matrix_to_quat_wxyz(rotations.axis_angle_to_matrix(axis_angle))
 
     assert torch.autograd.gradcheck(quat, (angles,))
+
+
+def test_axis_angle_agrees_with_roma_at_small_and_large_angles() -> None:
+    """Also in float32, and its gradient, where the angle is zero or nearly so."""
+    for factor in (1.0, 1e-2, 1e-4, 1e-8):
+        angles = (factor * ANGLES).requires_grad_()
+        expected = roma.rotvec_to_rotmat(angles)
+        np.testing.assert_allclose(
+            rotations.axis_angle_to_matrix(angles).detach(), expected.detach(), atol=1e-13
+        )
+        single = rotations.axis_angle_to_matrix(angles.detach().float())
+        np.testing.assert_allclose(single, expected.detach(), atol=1e-6)
+        probe = torch.randn(expected.shape, generator=torch.Generator().manual_seed(1)).double()
+        gradients = [
+            torch.autograd.grad((matrix * probe).sum(), angles)[0]
+            for matrix in (expected, rotations.axis_angle_to_matrix(angles))
+        ]
+        np.testing.assert_allclose(gradients[1], gradients[0], atol=1e-7)
+    assert torch.equal(
+        rotations.axis_angle_to_matrix(torch.zeros(2, 3)), torch.eye(3).expand(2, 3, 3)
+    )
