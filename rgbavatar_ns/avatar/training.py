@@ -115,7 +115,8 @@ def _fused_loss(
     options: TrainingOptions,
 ) -> Float[Tensor, ""] | None:
     """The loss of a fused step; None where it has not been taken."""
-    if options.lpips_weight > 0 or batch.images_rgba.dtype != torch.uint8:
+    with_lpips = options.lpips_weight > 0 and step >= options.lpips_start_step
+    if with_lpips or batch.images_rgba.dtype != torch.uint8:
         return None
     if refusal(avatar, [optimizer]) is not None:
         return None

@@ -3,6 +3,7 @@
 import copy
 import dataclasses
 import statistics
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
@@ -353,6 +354,32 @@ def test_rendering_without_gradients_is_rendering(stirred, variant, count):
         bare = avatar.render(batch.theta, batch.cameras)
     assert bare.depth is None
     assert bare.visibility is None
+
+
+def test_renderers_do_not_disturb_one_another(stirred):
+    """Several alive at once, used in turn and by threads at the same time."""
+    avatars = [stirred(), stirred(num_bases=0), stirred(uv_resolution=23)]
+    batches = [
+        far_batch(avatar, 1 + i, 40 - 9 * i, 31 + 8 * i)[0] for i, avatar in enumerate(avatars)
+    ]
+    black = torch.zeros(1, 3)
+
+    def draw(renderer):
+        image = renderer.draw(black, with_depth=True, with_visibility=True)
+        sums = renderer.weighted_color_average(image.image)
+        return [*vars(image).values(), *vars(sums).values()]
+
+    def renderers():
+        pairs = zip(avatars, batches, strict=True)
+        return [avatar.renderer(batch.theta, batch.cameras) for avatar, batch in pairs]
+
+    alone = [draw(renderers()[i]) for i in range(3)]
+    with ThreadPoolExecutor(3) as workers:
+        ways = [map(draw, renderers()), workers.map(draw, renderers())]
+        ways.append(workers.map(lambda i: draw(renderers()[i]), range(3)))
+        for way in ways:
+            for found, expected in zip(way, alone, strict=True):
+                assert all(torch.equal(a, b) for a, b in zip(found, expected, strict=True))
 
 
 def test_rendering_without_gradients_refuses_what_rendering_refuses(stirred):
