@@ -109,7 +109,7 @@ class BlendedGaussians:
 
 @dataclass(frozen=True)
 class AdamParameter:
-    """A parameter with Adam's state, to be updated in place; `step` counts the coming one from 1."""
+    """A parameter with Adam's state, to be updated in place; `step` counts from 1, this one too."""
 
     value: Float[Tensor, "*shape"]
     first_moment: Float[Tensor, "*shape"]

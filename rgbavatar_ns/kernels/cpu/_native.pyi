@@ -8,7 +8,19 @@ class Gaussians:
         self, means: Tensor, quats_wxyz: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor
     ) -> None: ...
 
-class Session:
+class _Drawing:
+    def draw(
+        self, background: Tensor, image: Tensor, alpha: Tensor, depth: Tensor | None
+    ) -> None: ...
+    def average(
+        self,
+        images: Tensor | None,
+        weighted_sum: Tensor | None,
+        weight_sum: Tensor | None,
+        max_weight: Tensor,
+    ) -> None: ...
+
+class Session(_Drawing):
     def __init__(
         self,
         gaussians: Gaussians,
@@ -20,16 +32,6 @@ class Session:
         height: int,
         threads: int,
         instruction_set: str,
-    ) -> None: ...
-    def draw(
-        self, background: Tensor, image: Tensor, alpha: Tensor, depth: Tensor | None
-    ) -> None: ...
-    def average(
-        self,
-        images: Tensor | None,
-        weighted_sum: Tensor | None,
-        weight_sum: Tensor | None,
-        max_weight: Tensor,
     ) -> None: ...
     def backward(
         self,
@@ -44,4 +46,44 @@ class Session:
         opacities: Tensor,
         colors: Tensor,
         threads: int,
+    ) -> None: ...
+
+class Blended:
+    def __init__(
+        self,
+        position: Tensor,
+        rotation_wxyz: Tensor,
+        color_feature: Tensor,
+        log_scale: Tensor,
+        opacity_logit: Tensor,
+        basis_position: Tensor | None,
+        basis_rotation_wxyz: Tensor | None,
+        basis_color_feature: Tensor | None,
+        barycentric: Tensor,
+        edges_to_frame: Tensor,
+        rest_length: Tensor | None,
+        triangle_vertices: Tensor,
+        triangle_of: Tensor,
+        variant: int,
+    ) -> None: ...
+
+class BlendedSession(_Drawing):
+    def __init__(
+        self,
+        blended: Blended,
+        weights: Tensor,
+        vertices: Tensor,
+        world_to_camera: Tensor,
+        focal_px: Tensor,
+        principal_point_px: Tensor,
+        width: int,
+        height: int,
+        threads: int,
+        instruction_set: str,
+    ) -> None: ...
+    def compare(self, images_rgba: Tensor, background: Tensor) -> float: ...
+    def update(
+        self,
+        groups: list[tuple[Tensor, Tensor, Tensor, tuple[float, ...]]],
+        weight_gradient: Tensor,
     ) -> None: ...

@@ -26,6 +26,7 @@ from rgbavatar_ns.kernels.types import (
     WeightedColors,
 )
 
+
 def instruction_sets() -> tuple[str, ...]:
     """Instruction sets whose loops this processor runs, the fastest first."""
     return tuple(_native.instruction_sets())

@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Mapping
+from typing import Any
 
 import torch
 from jaxtyping import Float, UInt8
@@ -37,7 +38,7 @@ class CpuBlendedRenderer:
     ) -> None:
         self._cameras, self._count = cameras, len(gaussians.position)
         self._weights = weights.detach().contiguous()
-        tensors = {
+        tensors: dict[str, Any] = {
             name: None if value is None else value.detach().contiguous()
             for name, value in vars(gaussians).items()
             if name != "variant"
