@@ -6,7 +6,9 @@ from typing import Any
 
 import pytest
 import torch
+from nerfstudio.cameras.cameras import Cameras
 
+from rgbavatar_ns import Avatar
 from rgbavatar_ns.plugin.cameras import from_nerfstudio
 from rgbavatar_ns.plugin.viewer_panel import BY_TIME, ViewerPanel, Viewpoint
 from tests.plugin.run import make_trainer, small_config
@@ -65,21 +67,25 @@ def test_backdrop_is_black_without_a_viewer(panel: ViewerPanel):
     assert panel.background_color() == pytest.approx((1.0, 0.2, 0.0))
 
 
+@torch.no_grad()
+def _rendered(avatar: Avatar, theta: torch.Tensor, camera: Cameras) -> torch.Tensor:
+    return avatar.render(theta, from_nerfstudio(camera)).image[0]
+
+
 def test_model_draws_metadata_before_the_panel(tiny_data: Path, tmp_path: Path):
     pipeline = make_trainer(small_config(tiny_data, tmp_path)).pipeline
     model = pipeline.model.eval()
     camera, _ = next(iter(pipeline.datamanager.fixed_indices_eval_dataloader))
     model.viewer_panel.frame.value = 3
     with_theta = model.get_outputs_for_camera(camera)["rgb"]
-    theta = camera.metadata["theta"]
-    expected = model.avatar.render(theta, from_nerfstudio(camera)).image[0]
+    expected = _rendered(model.avatar, camera.metadata["theta"], camera)
     assert torch.equal(with_theta, expected)
     camera.metadata = {"cam_idx": 0}
     for place, time in ((3, 3 / (NUM_FRAMES - 1)), (0, 0.0)):
         camera.times = torch.tensor([[time]])
         drawn = model.get_outputs_for_camera(camera)
         theta = model.frame_theta[place : place + 1]
-        expected = model.avatar.render(theta, from_nerfstudio(camera)).image[0]
+        expected = _rendered(model.avatar, theta, camera)
         assert torch.equal(drawn["rgb"], expected)
         assert drawn["depth"].shape == drawn["accumulation"].shape == (*expected.shape[:2], 1)
         assert not torch.equal(drawn["rgb"], with_theta)
