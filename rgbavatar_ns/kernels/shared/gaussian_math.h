@@ -2,7 +2,7 @@
 //
 // F is a floating-point type: float, or a vector of lanes that each hold another Gaussian
 // (projection) or another pixel (blending). It needs + - * /, comparisons that give a mask, and
-// select(mask, a, b), min_of, max_of, square_root, log2_of, exp2_of and reciprocal_of.
+// select(mask, a, b), min_of, max_of, square_root, inverse_root_of, log2_of and reciprocal_of.
 // Define RGBAVATAR_FUNCTION before including, e.g. as "__device__ __forceinline__", and include
 // inside a namespace of its own for every instruction set.
 //
@@ -121,7 +121,7 @@ RGBAVATAR_FUNCTION F transform_row(const Vec3<float>& row, float offset, const V
 template <class F>
 RGBAVATAR_FUNCTION void rotate(const F quat[4], Projection<F>& q) {
   const F norm2 = quat[0] * quat[0] + quat[1] * quat[1] + quat[2] * quat[2] + quat[3] * quat[3];
-  q.inverse_norm = F(1.0f) / square_root(norm2);
+  q.inverse_norm = inverse_root_of(norm2);
   const F w = quat[0] * q.inverse_norm, x = quat[1] * q.inverse_norm;
   const F y = quat[2] * q.inverse_norm, z = quat[3] * q.inverse_norm;
   q.w = w, q.x = x, q.y = y, q.z = z;
@@ -136,7 +136,7 @@ RGBAVATAR_FUNCTION Projection<F> project(const GaussianInput<F>& g, const Camera
   q.p = {transform_row(c.row0, c.translation.x, g.mean),
          transform_row(c.row1, c.translation.y, g.mean),
          transform_row(c.row2, c.translation.z, g.mean)};
-  q.inverse_z = F(1.0f) / q.p.z;
+  q.inverse_z = reciprocal_of(q.p.z);
   q.slope_x = q.p.x * q.inverse_z;
   q.slope_y = q.p.y * q.inverse_z;
   q.mean_x = q.slope_x * c.fx + c.cx;
@@ -154,7 +154,7 @@ RGBAVATAR_FUNCTION Projection<F> project(const GaussianInput<F>& g, const Camera
   const Vec3<F> n = cross(q.u0, q.u1);
   q.cov00 = s00 + d, q.cov11 = s11 + d;
   q.determinant = dot(n, n) + d * (s00 + s11) + d * d;
-  const F inverse = F(1.0f) / q.determinant;
+  const F inverse = reciprocal_of(q.determinant);
   q.conic00 = q.cov11 * inverse;
   q.conic01 = F(0.0f) - s01 * inverse;
   q.conic11 = q.cov00 * inverse;

@@ -17,7 +17,7 @@ struct TangentFrame {
 
 template <class F>
 RGBAVATAR_FUNCTION Vec3<F> scaled_to_one(const Vec3<F>& a) {
-  return scaled(a, F(1.0f) / square_root(dot(a, a)));
+  return scaled(a, inverse_root_of(dot(a, a)));
 }
 
 // Unit quaternion (w x y z) of the rotation with columns u, v, n. Of the four components the one
@@ -32,7 +32,7 @@ RGBAVATAR_FUNCTION void quat_of_columns(const Vec3<F>& u, const Vec3<F>& v, cons
   const F sign_y = select(z_up, select(not_z, one, zero - one), select(x_wins, zero - one, one));
   const F sign_z = select(z_up, one, zero - one);
   const F square = one + sign_x * u.x + sign_y * v.y + sign_z * n.z;
-  const F factor = 0.5f / square_root(square);
+  const F factor = 0.5f * inverse_root_of(square);
   const F wx = v.z - n.y, wy = n.x - u.z, wz = u.y - v.x;
   const F xy = v.x + u.y, xz = n.x + u.z, yz = n.y + v.z;
   const auto pick = [&](const F& w, const F& x, const F& y, const F& z) {

@@ -45,7 +45,7 @@ static void fill_frames(const BlendedScene& scene, int image, int begin, int end
         e1.z,        e2.x,          e2.y,       e2.z,        ratio,         Wide(0.0f)};
     const OutputRows<kFrameFloats> out(frames, first, lanes);
     for (int k = 0; k < kFrameFloats; k += 4)
-      store_four_columns(columns + k, out.data + k, kFrameFloats);
+      store_columns(columns + k, [&](int i) { return out.data + i * kFrameFloats + k; });
   }
 }
 
@@ -64,14 +64,8 @@ static RGBAVATAR_MEMBER FrameLanes load_frames(const BlendedScene& scene, int im
   for (int lane = 0; lane < kLanes; ++lane)
     rows[lane] = frames + scene.triangle_of[first + (lane < lanes ? lane : 0)] * kFrameFloats;
   Wide c[kFrameFloats];
-  for (int k = 0; k < kFrameFloats; k += 4) {
-    Quad q[4][4];
-    for (int i = 0; i < 4; ++i) {
-      for (int j = 0; j < 4; ++j) q[i][j] = load_quad(rows[4 * i + j] + k);
-      transpose(q[i][0], q[i][1], q[i][2], q[i][3]);
-    }
-    for (int j = 0; j < 4; ++j) c[k + j] = wide_of(q[0][j], q[1][j], q[2][j], q[3][j]);
-  }
+  for (int k = 0; k < kFrameFloats; k += 4)
+    load_columns([&](int i) { return rows[i] + k; }, c + k);
   const Vec3<Wide> corner = {c[13], c[14], c[15]}, e1 = {c[16], c[17], c[18]};
   const Vec3<Wide> e2 = {c[19], c[20], c[21]};
   return {{c[0], c[1], c[2]},

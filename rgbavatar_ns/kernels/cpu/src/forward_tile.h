@@ -160,19 +160,36 @@ static RGBAVATAR_MEMBER void add_jobs(uint64_t blocks, int first, Group& group) 
 }
 
 // Bits low..high of eight.
-static inline unsigned bit_span(int low, int high) {
+static constexpr uint64_t bit_span(int low, int high) {
   const int from = low > 0 ? low : 0, to = high < kWindow - 1 ? high : kWindow - 1;
-  return from > to ? 0u : (2u << to) - (1u << from);
+  return from > to ? 0 : (uint64_t(2) << to) - (uint64_t(1) << from);
 }
 
 // The blocks (x, y) of a window with 0 <= left + x < side_x and 0 <= top + y < side_y.
-static inline uint64_t blocks_within(int left, int top, int side_x, int side_y) {
-  const uint64_t columns = bit_span(-left, side_x - 1 - left) * 0x0101010101010101ull;
-  const int first = top < 0 ? -top : 0, rest = side_y - top;  // rows first..rest - 1
-  if (first >= kWindow || rest <= 0) return 0;
-  const uint64_t above = rest < kWindow ? (1ull << (8 * rest)) - 1 : kAllBlocks;
-  return columns & above & (kAllBlocks << (8 * first));
+static constexpr uint64_t blocks_within(int left, int top, int side_x, int side_y) {
+  const uint64_t rows = bit_span(-top, side_y - 1 - top);
+  uint64_t blocks = 0;
+  for (int row = 0; row < kWindow; ++row)
+    if (rows >> row & 1) blocks |= bit_span(-left, side_x - 1 - left) << (kWindow * row);
+  return blocks;
 }
+
+// A window's blocks within the tile, by where the window begins.
+struct TileClips {
+  uint64_t x[kWindow - 1 + kTileBlocks], y[kWindow - 1 + kTileBlocks];
+
+  constexpr TileClips() : x(), y() {
+    for (int i = 0; i < kWindow - 1 + kTileBlocks; ++i) {
+      const int first = i - (kWindow - 1);
+      x[i] = blocks_within(first, 0, kTileBlocks, kWindow);
+      y[i] = blocks_within(0, first, kWindow, kTileBlocks);
+    }
+  }
+  uint64_t of(int first_x, int first_y) const {
+    return x[first_x + kWindow - 1] & y[first_y + kWindow - 1];
+  }
+};
+static constexpr TileClips kTileClips = {};
 
 // Reads a tile's Gaussians front to back, in groups.
 class GroupReader {
@@ -197,11 +214,7 @@ class GroupReader {
         continue;
       }
       const int x = s.bounds.first_block_x - origin_x_, y = s.bounds.first_block_y - origin_y_;
-      uint64_t blocks = s.blocks;
-      constexpr unsigned kInside = kTileBlocks - kWindow;
-      if (unsigned(x) > kInside || unsigned(y) > kInside)
-        blocks &= blocks_within(x, y, kTileBlocks, kTileBlocks);
-      add(s, entry.slot, false, blocks, y * kTileBlocks + x, group);
+      add(s, entry.slot, false, s.blocks & kTileClips.of(x, y), y * kTileBlocks + x, group);
       ++entry_;
     }
     return group.splat_count > 0;

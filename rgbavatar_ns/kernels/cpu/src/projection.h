@@ -59,12 +59,7 @@ static RGBAVATAR_MEMBER Vec3<Wide> load_vec3(const float* rows, int first, int l
 
 static RGBAVATAR_MEMBER void load_quats(const float* rows, int first, int lanes, Wide out[4]) {
   const Rows<4> in(rows, first, lanes);
-  Quad q[4][4];
-  for (int i = 0; i < 4; ++i) {
-    for (int k = 0; k < 4; ++k) q[i][k] = load_quad(in.data + 16 * i + 4 * k);
-    transpose(q[i][0], q[i][1], q[i][2], q[i][3]);
-  }
-  for (int k = 0; k < 4; ++k) out[k] = wide_of(q[0][k], q[1][k], q[2][k], q[3][k]);
+  load_columns([&](int i) { return in.data + 4 * i; }, out);
 }
 
 template <int i>
@@ -80,25 +75,9 @@ static RGBAVATAR_MEMBER void store_vec3(const Vec3<Wide>& v, float* rows, int fi
   store_quarter<3>(v, out.data);
 }
 
-// Four columns of rows [4i, 4i + 4) of an array whose rows are `stride` floats apart.
-template <int i>
-static RGBAVATAR_MEMBER void store_columns(const Wide& a, const Wide& b, const Wide& c,
-                                           const Wide& d, float* to, int stride) {
-  Quad rows[4] = {quad_of<i>(a), quad_of<i>(b), quad_of<i>(c), quad_of<i>(d)};
-  transpose(rows[0], rows[1], rows[2], rows[3]);
-  for (int k = 0; k < 4; ++k) store_quad(rows[k], to + (4 * i + k) * stride);
-}
-
-static RGBAVATAR_MEMBER void store_four_columns(const Wide v[4], float* to, int stride) {
-  store_columns<0>(v[0], v[1], v[2], v[3], to, stride);
-  store_columns<1>(v[0], v[1], v[2], v[3], to, stride);
-  store_columns<2>(v[0], v[1], v[2], v[3], to, stride);
-  store_columns<3>(v[0], v[1], v[2], v[3], to, stride);
-}
-
 static RGBAVATAR_MEMBER void store_quats(const Wide v[4], float* rows, int first, int lanes) {
   const OutputRows<4> out(rows, first, lanes);
-  store_four_columns(v, out.data, 4);
+  store_columns(v, [&](int i) { return out.data + 4 * i; });
 }
 
 static RGBAVATAR_MEMBER Wide load_column(const float* rows, int first, int lanes) {
@@ -148,10 +127,10 @@ static inline TouchedBlocks touched_blocks(int width, const Projection<Wide>& q,
                                            const BlockSpan& x, const BlockSpan& y,
                                            const WideMask& fits) {
   constexpr float kSlackPx = 0.02f;  // more than rounding makes of a bound within the window
-  const Wide inverse_cov11 = 1.0f / q.cov11;
+  const Wide inverse_cov11 = reciprocal_of(q.cov11);
   const Wide slope = cov01 * inverse_cov11;
   const Wide spread = q.determinant * inverse_cov11 * inverse_cov11;
-  const Wide widest = cov01 * half_x * (1.0f / q.cov00);
+  const Wide widest = cov01 * half_x * reciprocal_of(q.cov00);
   const Wide rows = to_floats(y.last - y.first);
   const Wide left = to_floats(x.first);
   TouchedBlocks touched = {0, 0};
@@ -184,13 +163,6 @@ static inline TouchedBlocks touched_blocks(int width, const Projection<Wide>& q,
     first_dy = first_dy + float(kBlockSide);
   }
   return touched;
-}
-
-template <int i>
-static RGBAVATAR_MEMBER void store_splats(const Wide columns[16], Splat* to) {
-  float* rows = &to->mean_x;
-  for (int k = 0; k < 16; k += 4)
-    store_columns<i>(columns[k], columns[k + 1], columns[k + 2], columns[k + 3], rows + k, 16);
 }
 
 // Projects sixteen Gaussians and writes their splats.
@@ -244,10 +216,8 @@ static inline void project_lanes(int width, int height, const Camera& camera,
                             zero};
   Splat padded[kLanes];
   Splat* splats = lanes == kLanes ? out.splats + first : padded;
-  store_splats<0>(columns, splats);
-  store_splats<1>(columns, splats);
-  store_splats<2>(columns, splats);
-  store_splats<3>(columns, splats);
+  for (int k = 0; k < 16; k += 4)
+    store_columns(columns + k, [&](int i) { return &splats[i].mean_x + k; });
   if (lanes < kLanes)
     for (int lane = 0; lane < lanes; ++lane) out.splats[first + lane] = padded[lane];
   store(q.p.z, OutputRows<1>(out.depth, first, lanes).data);
@@ -290,14 +260,9 @@ static RGBAVATAR_MEMBER LaneMoments sum_slots(const ImageSlots& image, int first
     store_quad(b, sums[lane] + 4);
     store_quad(c, sums[lane] + 8);
   }
-  Quad t[4][12];
-  for (int i = 0; i < 4; ++i)
-    for (int k = 0; k < 12; k += 4) {
-      for (int j = 0; j < 4; ++j) t[i][k + j] = load_quad(sums[4 * i + j] + k);
-      transpose(t[i][k], t[i][k + 1], t[i][k + 2], t[i][k + 3]);
-    }
-  Wide m[kMoments];
-  for (int k = 0; k < kMoments; ++k) m[k] = wide_of(t[0][k], t[1][k], t[2][k], t[3][k]);
+  Wide m[12];
+  for (int k = 0; k < 12; k += 4)
+    load_columns([&](int i) { return sums[i] + k; }, m + k);
   return {{{m[0], m[1], m[2]}, m[3], m[4], m[5], m[6], m[7], m[8]},
           load_wide(seen) > Wide(0.0f)};
 }

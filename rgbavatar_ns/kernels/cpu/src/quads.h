@@ -138,4 +138,56 @@ RGBAVATAR_FUNCTION float max_lane(Wide a) {
   return largest;
 }
 
+// Of the four 4 x 4 matrices whose rows are the quarters of a, b, c, d.
+RGBAVATAR_FUNCTION void transpose_quarters(Native& a, Native& b, Native& c, Native& d) {
+#if defined(__AVX512F__)
+  const __m512 ab = _mm512_unpacklo_ps(a.v, b.v), ab2 = _mm512_unpackhi_ps(a.v, b.v);
+  const __m512 cd = _mm512_unpacklo_ps(c.v, d.v), cd2 = _mm512_unpackhi_ps(c.v, d.v);
+  a.v = _mm512_shuffle_ps(ab, cd, 0x44);
+  b.v = _mm512_shuffle_ps(ab, cd, 0xee);
+  c.v = _mm512_shuffle_ps(ab2, cd2, 0x44);
+  d.v = _mm512_shuffle_ps(ab2, cd2, 0xee);
+#elif defined(__AVX2__)
+  const __m256 ab = _mm256_unpacklo_ps(a.v, b.v), ab2 = _mm256_unpackhi_ps(a.v, b.v);
+  const __m256 cd = _mm256_unpacklo_ps(c.v, d.v), cd2 = _mm256_unpackhi_ps(c.v, d.v);
+  a.v = _mm256_shuffle_ps(ab, cd, 0x44);
+  b.v = _mm256_shuffle_ps(ab, cd, 0xee);
+  c.v = _mm256_shuffle_ps(ab2, cd2, 0x44);
+  d.v = _mm256_shuffle_ps(ab2, cd2, 0xee);
+#else
+  transpose(a.v, b.v, c.v, d.v);
+#endif
+}
+template <int L>
+RGBAVATAR_FUNCTION void transpose_quarters(Floats<L>& a, Floats<L>& b, Floats<L>& c,
+                                           Floats<L>& d) {
+  transpose_quarters(a.low, b.low, c.low, d.low);
+  transpose_quarters(a.high, b.high, c.high, d.high);
+}
+
+// Four columns of sixteen rows of floats; `row(i)` is where the four numbers of row i begin.
+template <class Row>
+RGBAVATAR_FUNCTION void load_columns(const Row& row, Wide out[4]) {
+  // Rows four apart share a register, so that the columns come out in order.
+  for (int i = 0; i < 4; ++i)
+    out[i] = wide_of(load_quad(row(i)), load_quad(row(4 + i)), load_quad(row(8 + i)),
+                     load_quad(row(12 + i)));
+  transpose_quarters(out[0], out[1], out[2], out[3]);
+}
+
+// The other way.
+template <int i, class Row>
+RGBAVATAR_FUNCTION void store_quarters(const Wide v[4], const Row& row) {
+  for (int k = 0; k < 4; ++k) store_quad(quad_of<i>(v[k]), row(4 * i + k));
+}
+template <class Row>
+RGBAVATAR_FUNCTION void store_columns(const Wide in[4], const Row& row) {
+  Wide v[4] = {in[0], in[1], in[2], in[3]};
+  transpose_quarters(v[0], v[1], v[2], v[3]);
+  store_quarters<0>(v, row);
+  store_quarters<1>(v, row);
+  store_quarters<2>(v, row);
+  store_quarters<3>(v, row);
+}
+
 }  // namespace rgbavatar::RGBAVATAR_ISA
