@@ -21,9 +21,16 @@ def blended_renderer(
 ) -> BlendedRenderer | None:
     """The chosen backend's renderer for one batch; None where it has none or cannot take this.
 
-    Raises ValueError where there is no such backend, and for cameras as `rasterize`.
+    Raises ValueError where there is no such backend, for weights and vertices that do not fit, and
+    for cameras as `rasterize`.
     """
-    tensor = gaussians.position
+    tensor, bases = gaussians.position, gaussians.basis_position
+    num_bases = 0 if bases is None else len(bases)
+    if weights.shape[1] != num_bases or len(vertices) != len(weights):
+        raise ValueError(
+            f"weights are {list(weights.shape)} and vertices {list(vertices.shape)}. Pass "
+            f"[B, {num_bases}] and [B, V, 3]."
+        )
     if check_cameras(tensor, cameras) not in (1, len(weights)):
         return None
     return choose(backend, tensor.device, tensor.dtype).blended_renderer(

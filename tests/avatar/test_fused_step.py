@@ -406,6 +406,24 @@ def test_images_of_another_size_are_refused():
             require_images_of(torch.zeros(shape), 3, camera)
 
 
+def test_a_renderer_refuses_what_its_loops_would_read_wrongly(stirred):
+    avatar = stirred()
+    batch, background = far_batch(avatar, 2)
+    renderer = avatar.renderer(batch.theta, batch.cameras)
+    assert renderer is not None
+    height, width = batch.cameras.height, batch.cameras.width
+    with pytest.raises(ValueError, match="the cameras' size"):
+        renderer.weighted_color_average(torch.zeros(2, height, width + 1, 4))
+    with pytest.raises(ValueError, match="9 channels"):
+        renderer.weighted_color_average(torch.zeros(2, height, width, 9))
+    with pytest.raises(ValueError, match="one RGBA image for each of the 2 sets"):
+        renderer.compare(batch.images_rgba[:1], background)
+    with pytest.raises(ValueError, match="before update"):
+        renderer.update({})
+    with pytest.raises(ValueError, match=r"weights are \[2, 1\]"):
+        avatar.renderer(batch.theta, batch.cameras, torch.zeros(2, 1))
+
+
 @pytest.mark.slow
 def test_held_out_psnr_is_that_of_the_eager_path(tmp_path):
     """Means over held-out frames of a small demo subject, two seeds, within a tenth of a dB."""

@@ -12,6 +12,7 @@ from rgbavatar_ns.kernels.cpu import (
     INSTRUCTION_SET_VARIABLE,
     _native,  # pyright: ignore[reportMissingModuleSource]
 )
+from rgbavatar_ns.kernels.constants import MAX_AVERAGE_CHANNELS
 from rgbavatar_ns.kernels.functional import checked_background
 from rgbavatar_ns.kernels.types import (
     TANGENT_VARIANTS,
@@ -38,6 +39,7 @@ class CpuBlendedRenderer:
     ) -> None:
         self._cameras, self._count = cameras, len(gaussians.position)
         self._weights = weights.detach().contiguous()
+        self._compared = False
         tensors: dict[str, Any] = {
             name: None if value is None else value.detach().contiguous()
             for name, value in vars(gaussians).items()
@@ -78,6 +80,11 @@ class CpuBlendedRenderer:
 
     def weighted_color_average(self, images: Float[Tensor, "#B H W C"]) -> WeightedColors:
         """As `weighted_color_average`."""
+        self._check_images(images, self._weights.dtype)
+        if not 1 <= images.shape[-1] <= MAX_AVERAGE_CHANNELS:
+            raise ValueError(
+                f"images have {images.shape[-1]} channels. Pass 1 to {MAX_AVERAGE_CHANNELS}."
+            )
         new = self._weights.new_empty
         size = (len(self._weights), self._count)
         weighted_sum, weight_sum, max_weight = new(*size, images.shape[-1]), new(size), new(size)
@@ -88,14 +95,36 @@ class CpuBlendedRenderer:
         self, images_rgba: UInt8[Tensor, "B H W 4"], background: Float[Tensor, "#B 3"]
     ) -> float:
         """The mean absolute difference to straight-alpha images over the background."""
+        self._check_images(images_rgba, torch.uint8)
+        if len(images_rgba) != len(self._weights) or images_rgba.shape[-1] != 4:
+            raise ValueError(
+                f"images are {list(images_rgba.shape)}. Pass one RGBA image for each of the "
+                f"{len(self._weights)} sets."
+            )
+        background = checked_background(self._weights, background, len(self._weights))
+        self._compared = True
         return self._session.compare(images_rgba.contiguous(), background.detach().contiguous())
 
     def update(self, parameters: Mapping[str, AdamParameter]) -> Float[Tensor, "B K"]:
         """Take one step of Adam by the gradient of the last comparison, in place."""
+        if not self._compared:
+            raise ValueError("There is no gradient yet. Call compare() before update().")
+        self._compared = False  # the parameters are others now
         names = _BASE + (_BASES if self._weights.shape[1] else ())
         weight_gradient = torch.empty_like(self._weights)
         self._session.update([_arrays(parameters[name]) for name in names], weight_gradient)
         return weight_gradient
+
+    def _check_images(self, images: Tensor, dtype: torch.dtype) -> None:
+        """Compiled code reads what it is promised."""
+        size = (self._cameras.height, self._cameras.width)
+        if images.dtype != dtype or images.ndim != 4 or tuple(images.shape[1:3]) != size:
+            raise ValueError(
+                f"images are {images.dtype} {list(images.shape)}. Pass {dtype} "
+                f"[B, {size[0]}, {size[1]}, C]: the cameras' size."
+            )
+        if len(images) not in (1, len(self._weights)):
+            raise ValueError(f"There are {len(images)} images for {len(self._weights)} sets.")
 
 
 def _arrays(parameter: AdamParameter) -> tuple[Tensor, Tensor, Tensor, tuple[float, ...]]:
