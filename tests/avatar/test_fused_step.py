@@ -417,7 +417,7 @@ def test_a_renderer_refuses_what_its_loops_would_read_wrongly(stirred):
     with pytest.raises(ValueError, match="9 channels"):
         renderer.weighted_color_average(torch.zeros(2, height, width, 9))
     with pytest.raises(ValueError, match="one RGBA image for each of the 2 sets"):
-        renderer.compare(batch.images_rgba[:1], background)
+        renderer.compare(batch.images_rgba[:1], background[:1])
     with pytest.raises(ValueError, match="before update"):
         renderer.update({})
     with pytest.raises(ValueError, match=r"weights are \[2, 1\]"):

@@ -8,11 +8,11 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from rgbavatar_ns.kernels.constants import MAX_AVERAGE_CHANNELS
 from rgbavatar_ns.kernels.cpu import (
     INSTRUCTION_SET_VARIABLE,
     _native,  # pyright: ignore[reportMissingModuleSource]
 )
-from rgbavatar_ns.kernels.constants import MAX_AVERAGE_CHANNELS
 from rgbavatar_ns.kernels.functional import checked_background
 from rgbavatar_ns.kernels.types import (
     TANGENT_VARIANTS,
