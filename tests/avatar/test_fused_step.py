@@ -426,7 +426,10 @@ def test_a_renderer_refuses_what_its_loops_would_read_wrongly(stirred):
 
 @pytest.mark.slow
 def test_held_out_psnr_is_that_of_the_eager_path(tmp_path):
-    """Means over held-out frames of a small demo subject, two seeds, within a tenth of a dB."""
+    """Means over held-out frames of a small demo subject, five seeds, within a tenth of a dB.
+
+    Two runs of one seed part by about .1 dB either way, as two eager runs do.
+    """
     config = DemoConfig(image_size=64, num_frames=32, num_test_frames=8)
     dataset = make_demo_dataset(tmp_path / "subject", config)
     images = torch.stack([torch.as_tensor(dataset.read_image(i)) for i in range(len(dataset))])
@@ -447,7 +450,7 @@ def test_held_out_psnr_is_that_of_the_eager_path(tmp_path):
         pairs = zip(drawn.clamp(0, 1).split(1), truth.split(1), strict=True)
         return statistics.fmean(float(psnr(*pair)) for pair in pairs)
 
-    scores = {fast: [score(fast, seed) for seed in range(2)] for fast in (True, False)}
+    scores = {fast: [score(fast, seed) for seed in range(5)] for fast in (True, False)}
     assert min(scores[False]) > 20
     assert statistics.fmean(scores[True]) == pytest.approx(statistics.fmean(scores[False]), abs=0.1)
 
