@@ -18,12 +18,6 @@ constexpr int kWindow = 8;
 // Blocks first..last (inclusive) that hold every pixel a Gaussian can reach.
 struct Bounds {
   uint16_t first_block_x, first_block_y, last_block_x, last_block_y;
-
-  bool visible() const { return first_block_x <= last_block_x; }
-  int first_tile_x() const { return first_block_x >> kTileBlocksShift; }
-  int first_tile_y() const { return first_block_y >> kTileBlocksShift; }
-  int tiles_x() const { return (last_block_x >> kTileBlocksShift) - first_tile_x() + 1; }
-  int tiles_y() const { return (last_block_y >> kTileBlocksShift) - first_tile_y() + 1; }
 };
 
 // A projected Gaussian, as the blending wants it: one cache line.

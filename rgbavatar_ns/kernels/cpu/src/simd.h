@@ -160,15 +160,6 @@ RGBAVATAR_FUNCTION Native select(Flags m, Native a, Native b) {
 #endif
 }
 
-// a b where the mask is set, 0 elsewhere.
-RGBAVATAR_FUNCTION Native product_where(Flags m, Native a, Native b) {
-#if defined(__AVX512F__)
-  return Native(_mm512_maskz_mul_ps(m.m, a.v, b.v));
-#else
-  return select(m, a * b, Native(0.0f));
-#endif
-}
-
 // Towards zero.
 RGBAVATAR_FUNCTION NativeInts to_ints(Native a) {
   return NativeInts(__builtin_convertvector(a.v, NativeInt));
@@ -332,10 +323,6 @@ RGBAVATAR_FUNCTION Floats<L> select(Mask<L> m, Floats<L> a, Floats<L> b) {
 template <int L>
 RGBAVATAR_FUNCTION Floats<L> exp2_where(Mask<L> m, Floats<L> a) {
   return {exp2_where(m.low, a.low), exp2_where(m.high, a.high)};
-}
-template <int L>
-RGBAVATAR_FUNCTION Floats<L> product_where(Mask<L> m, Floats<L> a, Floats<L> b) {
-  return {product_where(m.low, a.low, b.low), product_where(m.high, a.high, b.high)};
 }
 template <int L>
 RGBAVATAR_FUNCTION bool any(Mask<L> m) {
