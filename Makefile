@@ -1,6 +1,8 @@
 # The commands of the project; `make demo` and `make test` are all that a newcomer needs.
 PYTHON ?= python3
 VIDEO ?=
+# Test processes at a time; each takes about a gigabyte.
+WORKERS ?= 2
 BIN := .venv/bin
 # OpenMP's threads spin while they wait, which stalls everything where other programs run too.
 export OMP_WAIT_POLICY ?= PASSIVE
@@ -19,10 +21,11 @@ demo: setup  ## Make a head, train its avatar, evaluate, film it (VIDEO=me.mp4 f
 		$(if $(VIDEO),--video "$(VIDEO)")
 
 test: setup lint  ## Linters, type check and the whole test suite
-	@PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m pytest
+	@PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
 
 test-fast: setup  ## The tests that take seconds
-	@PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m pytest -m "not slow and not browser"
+	@PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal \
+		-m "not slow and not browser"
 
 lint: setup  ## Format check, lint, import rules, types
 	@$(BIN)/ruff format --check .

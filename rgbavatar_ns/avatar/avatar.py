@@ -11,6 +11,8 @@ from torch import Tensor, nn
 from rgbavatar_ns.avatar.anchors import GaussianAnchors
 from rgbavatar_ns.avatar.blendshapes import GaussianBlendshapes, feature_from_color
 from rgbavatar_ns.avatar.bundle import load_any, save_bundle
+from rgbavatar_ns.avatar.bundle_head import reference_to
+from rgbavatar_ns.avatar.bundle_statistics import TrainingStatistics
 from rgbavatar_ns.avatar.color_init import color_estimate, premultiplied
 from rgbavatar_ns.avatar.composition import to_world
 from rgbavatar_ns.avatar.config import AvatarConfig
@@ -89,7 +91,9 @@ class Avatar(nn.Module):
             color=config.initial_color,
         )
         self.weight_network = None
-        if config.num_bases > 0:
+        if config.weight_network == "none":
+            self._require_expressions(config.num_bases)
+        elif config.num_bases > 0:
             self.weight_network = WeightNetwork(
                 self.layout.feature_size(config.pose_input, config.translation_input),
                 config.num_bases,
@@ -113,11 +117,21 @@ class Avatar(nn.Module):
         """Return the blendshape weights psi = F(theta); raises UserError on a theta unfit."""
         theta = self._checked(theta)
         if self.weight_network is None:
-            return theta.new_zeros(len(theta), 0)
+            return theta[:, self.layout.slice("expression")][:, : self.config.num_bases]
         features = self.layout.network_features(
             theta, self.config.pose_input, self.config.translation_input
         )
         return self.weight_network(features)
+
+    def carrier_vertices(self, theta: Float[Tensor, "B H"]) -> Float[Tensor, "B V 3"]:
+        """Return the posed mesh whose tangent frames carry the Gaussians, as `carrier` says."""
+        if self.config.carrier == "joints":
+            moves = theta.new_ones(self.layout.size)
+            for part in self.layout.fields:
+                if part.form == "linear":
+                    moves[self.layout.slice(part.name)] = 0
+            theta = theta * moves
+        return self.head(theta, self.identity)
 
     def gaussians(
         self, theta: Float[Tensor, "B H"], psi: Float[Tensor, "B K"] | None = None
@@ -129,7 +143,7 @@ class Avatar(nn.Module):
         """
         theta = self._checked(theta)
         tangent = self.blendshapes.blend(self.weights(theta) if psi is None else psi)
-        vertices = self.head(theta, self.identity)
+        vertices = self.carrier_vertices(theta)
         frames = self.anchors.frames(vertices, with_length_ratio=self.config.scale_with_triangle)
         return to_world(tangent, frames)
 
@@ -173,7 +187,7 @@ class Avatar(nn.Module):
         theta = self._checked(theta)
         with torch.no_grad():
             weights = self.weights(theta) if psi is None else psi
-            posed = self.head(theta, self.identity) if vertices is None else vertices
+            posed = self.carrier_vertices(theta) if vertices is None else vertices
         return blended_renderer(self._blended_gaussians(), weights, posed, cameras, backend)
 
     def _blended_gaussians(self) -> BlendedGaussians:
@@ -192,10 +206,11 @@ class Avatar(nn.Module):
             "opacity": [shapes.opacity_logit],
             "color": [shapes.color_feature],
         }
-        if self.weight_network is not None:
+        if self.config.num_bases > 0:
             groups["basis_position"] = [shapes.basis_position]
             groups["basis_rotation"] = [shapes.basis_rotation_wxyz]
             groups["basis_color"] = [shapes.basis_color_feature]
+        if self.weight_network is not None:
             groups["weight_network"] = list(self.weight_network.parameters())
         return groups
 
@@ -238,9 +253,22 @@ class Avatar(nn.Module):
         self.color_initialized |= fresh
         return int(fresh.sum())
 
-    def save(self, path: str | Path) -> None:
-        """Write a bundle (a directory of avatar.safetensors and avatar.json), atomically."""
-        save_bundle(self.to_state(), self._own_state_dict(), Path(path))
+    def save(
+        self,
+        path: str | Path,
+        *,
+        statistics: TrainingStatistics | None = None,
+        with_head: bool = True,
+    ) -> None:
+        """Write a bundle (a directory of avatar.safetensors and avatar.json), atomically.
+
+        Without `with_head` it only names its head model, as the licence of FLAME asks where the
+        bundle is passed on; `load` then wants the file (RGBAVATAR_HEAD).
+        """
+        state = self.to_state()
+        if not with_head:
+            state["head"] = reference_to(self.head.arrays)
+        save_bundle(state, self._own_state_dict(), Path(path), self.layout, statistics)
 
     @classmethod
     def load(cls, path: str | Path) -> "Avatar":
@@ -292,6 +320,15 @@ class Avatar(nn.Module):
             AvatarConfig.from_json(state["config"]),
             anchors=anchors,
         )
+
+    def _require_expressions(self, num_bases: int) -> None:
+        known = self.layout.slice("expression")
+        if num_bases > known.stop - known.start:
+            raise UserError(
+                f"{num_bases} bases without a weight network need as many expression "
+                f"coefficients; the head '{self.head.arrays.name}' has {known.stop - known.start}.",
+                "Use fewer bases, or the weight network mlp or linear.",
+            )
 
     def _checked(self, theta: Float[Tensor, "B H"]) -> Float[Tensor, "B H"]:
         """Return theta in the parameters' dtype, or raise UserError with the reason."""

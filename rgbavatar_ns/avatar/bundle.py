@@ -14,7 +14,10 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
+from rgbavatar_ns.avatar.bundle_head import is_reference, resolve
+from rgbavatar_ns.avatar.bundle_statistics import TrainingStatistics
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.head import ThetaLayout
 
 BUNDLE_FORMAT = "rgbavatar-bundle"
 BUNDLE_VERSION = 1
@@ -27,16 +30,24 @@ CHECKPOINT_EXTRA_STATE = "_model._extra_state"
 """Where it keeps the model's extra state, whose `avatar` is `Avatar.to_state()`."""
 
 _TENSOR_MARK = "$tensor"
+_STATE_PARTS = ("config", "head", "identity", "anchors")
 _log = logging.getLogger(__name__)
 
 AvatarState = tuple[dict[str, Any], dict[str, Tensor]]
 """`Avatar.to_state()` and the avatar's state dict."""
 
 
-def save_bundle(state: dict[str, Any], parameters: dict[str, Tensor], path: Path) -> None:
+def save_bundle(
+    state: dict[str, Any],
+    parameters: dict[str, Tensor],
+    path: Path,
+    layout: ThetaLayout,
+    statistics: TrainingStatistics | None = None,
+) -> None:
     """Write a bundle directory: complete or not at all; an older bundle there is replaced.
 
-    Raises UserError where `path` is something else than a bundle or an empty directory.
+    The layout says to other programs what theta holds. Raises UserError where `path` is something
+    else than a bundle or an empty directory.
     """
     path = path.absolute()
     if path.exists() and not _replaceable(path):
@@ -47,8 +58,12 @@ def save_bundle(state: dict[str, Any], parameters: dict[str, Tensor], path: Path
     manifest = {
         "format": BUNDLE_FORMAT,
         "version": BUNDLE_VERSION,
+        "layout": layout.to_json(),
         "state": _split_off_tensors(state, "state", tensors),
     }
+    if statistics is not None:
+        seen = statistics.to_state()
+        manifest["statistics"] = _split_off_tensors(seen, "statistics", tensors)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         scratch = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
@@ -99,7 +114,33 @@ def load_any(path: Path) -> AvatarState:
     )
 
 
+def load_statistics(path: Path) -> TrainingStatistics | None:
+    """What the avatar of a bundle saw in training; None where that is not kept.
+
+    Raises UserError where a bundle is damaged or of another version.
+    """
+    if not (path / MANIFEST_NAME).exists():
+        return None
+    manifest, tensors = _read_bundle(path)
+    if "statistics" not in manifest:
+        return None
+    return TrainingStatistics.from_state(_join_tensors(manifest["statistics"], tensors))
+
+
 def _load_bundle(path: Path) -> AvatarState:
+    manifest, tensors = _read_bundle(path)
+    state = _join_tensors(manifest["state"], tensors)
+    if is_reference(state["head"]):
+        state["head"] = resolve(state["head"], path)
+    prefix = "parameters/"
+    parameters = {
+        name[len(prefix) :]: value for name, value in tensors.items() if name.startswith(prefix)
+    }
+    return state, parameters
+
+
+def _read_bundle(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """Manifest and tensors, checked; raises UserError as `load_any`."""
     damaged = f"The avatar bundle {path} is damaged"
     remedy = "Save the avatar again, or use another copy."
     try:
@@ -117,17 +158,16 @@ def _load_bundle(path: Path) -> AvatarState:
             f"version {BUNDLE_VERSION}.",
             "Install the version of rgbavatar_ns that wrote it.",
         )
+    missing = [name for name in _STATE_PARTS if name not in manifest.get("state", {})]
+    if missing:
+        raise UserError(f"{damaged}: {MANIFEST_NAME} lacks {', '.join(missing)}.", remedy)
     try:
         with safe_open(path / TENSORS_NAME, framework="pt") as file:
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-        state = _join_tensors(manifest["state"], tensors)
+        _join_tensors(manifest, tensors)
     except (OSError, SafetensorError, KeyError) as error:
         raise UserError(f"{damaged}: {TENSORS_NAME}: {error}.", remedy) from error
-    prefix = "parameters/"
-    parameters = {
-        name[len(prefix) :]: value for name, value in tensors.items() if name.startswith(prefix)
-    }
-    return state, parameters
+    return manifest, tensors
 
 
 def _load_newest(checkpoints: list[Path]) -> AvatarState:

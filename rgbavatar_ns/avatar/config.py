@@ -14,8 +14,9 @@ class AvatarConfig:
     """Number K of Gaussian blendshapes (paper: 20); 0 leaves the base model alone."""
     uv_resolution: int = 256
     """Side of the UV map whose covered texels carry one Gaussian each (paper: 256)."""
-    weight_network: Literal["mlp", "linear"] = "mlp"
-    """Map from theta to the blendshape weights (paper: mlp; linear is its ablation)."""
+    weight_network: Literal["mlp", "linear", "none"] = "mlp"
+    """Map from theta to the blendshape weights (paper: mlp; linear is an ablation of it). With none
+    the first num_bases expression coefficients are the weights (its "w/o reducing")."""
     hidden_width: int = 128
     """Width of the weight network's two hidden layers."""
     tangent_variant: Literal["normalized", "raw", "orthonormal"] = "normalized"
@@ -24,6 +25,9 @@ class AvatarConfig:
     """Whether the weight network sees joint and head rotations (paper: yes)."""
     translation_input: bool = False
     """Whether it sees the head's translation; off, so that moving sideways changes nothing."""
+    carrier: Literal["mesh", "joints"] = "mesh"
+    """What carries the Gaussians: tangent frames of the mesh that theta deforms, or of a mesh that
+    only its joints move, not its expressions (the paper's ablation "w/o tangent space")."""
     scale_with_triangle: bool = False
     """Whether Gaussians grow and shrink with their triangle (paper: no)."""
     initial_scale_m: float = 8e-4
@@ -42,9 +46,14 @@ class AvatarConfig:
             (self.uv_resolution < 1, f"uv_resolution is {self.uv_resolution}", "1 or more"),
             (self.hidden_width < 1, f"hidden_width is {self.hidden_width}", "1 or more"),
             (
-                self.weight_network not in ("mlp", "linear"),
+                self.weight_network not in ("mlp", "linear", "none"),
                 f"weight_network is {self.weight_network!r}",
-                "'mlp' or 'linear'",
+                "'mlp', 'linear' or 'none'",
+            ),
+            (
+                self.carrier not in ("mesh", "joints"),
+                f"carrier is {self.carrier!r}",
+                "'mesh' or 'joints'",
             ),
             (
                 self.tangent_variant not in ("normalized", "raw", "orthonormal"),

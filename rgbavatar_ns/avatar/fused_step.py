@@ -12,7 +12,12 @@ from torch import Tensor
 
 from rgbavatar_ns.avatar.avatar import Avatar
 from rgbavatar_ns.avatar.losses import require_images_of
-from rgbavatar_ns.kernels import AdamParameter, BlendedRenderer, PinholeCameras
+from rgbavatar_ns.kernels import (
+    AdamParameter,
+    BlendedGradient,
+    BlendedRenderer,
+    PinholeCameras,
+)
 
 _GROUPS = {
     "position": "position",
@@ -61,22 +66,32 @@ class FusedStep:
     ) -> Float[Tensor, ""] | None:
         """Take one step and return the loss; None, and no step, where the backend cannot.
 
-        Raises ValueError where the images are not of the cameras' size, or not as many as theta.
+        Where theta requires a gradient, `theta.grad` gets that of the loss before the step, as
+        from `backward`. Raises ValueError where the images are not of the cameras' size, or not as
+        many as theta.
         """
         # Compiled code reads what it is promised.
         require_images_of(images_rgba, len(theta), cameras)
         background = background.expand(len(theta), 3)
         psi = self._avatar.weights(theta)
-        renderer = self._avatar.renderer(theta, cameras, psi.detach(), backend=backend)
+        with torch.set_grad_enabled(theta.requires_grad):
+            vertices = self._avatar.carrier_vertices(theta.to(psi))
+        renderer = self._avatar.renderer(theta, cameras, psi.detach(), vertices, backend=backend)
         if renderer is None:
             return None
         loss = renderer.compare(images_rgba, background)
-        self.update_network(psi, self.update_gaussians(renderer))
+        gradient = self.update_gaussians(renderer, with_vertices=theta.requires_grad)
+        self.update_network(psi, gradient.weights)
+        if gradient.vertices is not None:
+            vertices.backward(gradient.vertices)
         return psi.new_tensor(loss)
 
-    def update_gaussians(self, renderer: BlendedRenderer) -> Float[Tensor, "B K"]:
-        """Step by the renderer's last comparison and return the gradient of the weights."""
-        return renderer.update({name: self._adam(name) for name in self._parameters})
+    def update_gaussians(
+        self, renderer: BlendedRenderer, *, with_vertices: bool = False
+    ) -> BlendedGradient:
+        """Step by the renderer's last comparison and return the gradient of what posed it."""
+        parameters = {name: self._adam(name) for name in self._parameters}
+        return renderer.update(parameters, with_vertices=with_vertices)
 
     def update_network(
         self, psi: Float[Tensor, "B K"], weight_gradient: Float[Tensor, "B K"]

@@ -1,7 +1,8 @@
 """Image metrics under one protocol: full frame, black background, soft alpha, means over images.
 
 The protocol is that of the paper's comparisons: predictions are rendered over black and clamped
-to [0, 1], targets are laid over black by their matte, and no mask or crop is applied.
+to [0, 1], targets are laid over black by their matte, and no mask or crop is applied. One more
+number, `psnr_head`, takes only the pixels that the target's matte gives to the person.
 """
 
 from typing import Literal
@@ -20,6 +21,21 @@ def psnr(image: Float[Tensor, "B H W 3"], target: Float[Tensor, "B H W 3"]) -> F
 
     ratio = peak_signal_noise_ratio(image, target, data_range=1.0, reduction="none", dim=(1, 2, 3))
     return ratio.reshape(len(image))
+
+
+def head_psnr(
+    image: Float[Tensor, "B H W 3"],
+    target: Float[Tensor, "B H W 3"],
+    alpha: Float[Tensor, "B H W"],
+) -> Float[Tensor, "B"]:
+    """Return each image's PSNR in dB over the pixels where the target's alpha is above .5.
+
+    NaN where there are none. Ours: black surroundings, which every avatar gets right, raise the
+    full frame's PSNR by as much as the person is small in it.
+    """
+    inside = (alpha > 0.5).to(image)
+    error = ((image - target).square().mean(-1) * inside).sum((1, 2)) / inside.sum((1, 2))
+    return -10 * error.log10()
 
 
 def ssim(image: Float[Tensor, "B H W 3"], target: Float[Tensor, "B H W 3"]) -> Float[Tensor, "B"]:
@@ -63,14 +79,16 @@ def evaluate_images(
 ) -> dict[str, float | str | None]:
     """Compare images rendered over black with their targets, under the module's protocol.
 
-    Returns `psnr` (dB), `ssim` and, where `lpips` was given, `lpips_<network>`: None where it is
-    unavailable, with the reason as `lpips_unavailable`. To average over a data set, call it on
-    one image at a time or on equal batches: every number is a mean over the images.
+    Returns `psnr` and `psnr_head` (dB), `ssim` and, where `lpips` was given, `lpips_<network>`:
+    None where it is unavailable, with the reason as `lpips_unavailable`. To average over a data
+    set, call it on one image at a time or on equal batches: every number is a mean over the images.
     """
     image = image.clamp(0, 1)
-    target = composite(rgba_to_float(target_rgba, image.dtype), image.new_zeros(3))
+    rgba = rgba_to_float(target_rgba, image.dtype)
+    target = composite(rgba, image.new_zeros(3))
     values: dict[str, float | str | None] = {
         "psnr": float(psnr(image, target).mean()),
+        "psnr_head": float(head_psnr(image, target, rgba[..., 3]).mean()),
         "ssim": float(ssim(image, target).mean()),
     }
     if lpips is not None:

@@ -129,7 +129,7 @@ def time_parts(workload: AvatarWorkload, stopwatch: Stopwatch) -> dict[str, Spre
         assert renderer is not None
         renderer.compare(images, background)
         lap("compare")
-        weight_gradient = step.update_gaussians(renderer)
+        weight_gradient = step.update_gaussians(renderer).weights
         lap("update")
         step.update_network(psi, weight_gradient)
         lap("network, backward and Adam")

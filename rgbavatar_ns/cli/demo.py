@@ -1,27 +1,24 @@
 """`rgbavatar demo`: from nothing (or from a video) to a trained avatar, through nerfstudio."""
 
 import json
-import os
 import shutil
-import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 
-from rgbavatar_ns.cli.progress import progress_bar
-from rgbavatar_ns.cli.stages import Result, Stages, write_json
+from rgbavatar_ns.cli.progress import progress_bar, stage_bars
+from rgbavatar_ns.cli.stages import Result, Stages
+from rgbavatar_ns.data.json_file import write_json
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.plugin.commands import run_nerfstudio
 
 METHOD = "rgbavatar-tiny"
-_QUIET = {
-    # OpenMP's threads spin while they wait, which stalls training where other programs run too.
-    "OMP_WAIT_POLICY": "PASSIVE",
-    # torchvision's file decoders, which nothing here uses, may not match the build of torch.
-    "PYTHONWARNINGS": "ignore::UserWarning:torchvision.io.image,ignore::FutureWarning",
-}
+HELD_OUT_STEPS = 40
+"""Steps of fitting a video's held-out frames, for the score that looks at their images."""
 
 
 def run(
@@ -65,14 +62,16 @@ def run(
     folder = Path(data["data"])
     trained = stages.run(
         "train",
-        {"steps": steps, "seed": seed},
-        lambda key: _train(folder, output, key, steps, seed),
+        {"steps": steps, "seed": seed, "refine_tracking": bool(video)},
+        lambda key: _train(folder, output, key, steps, seed, refine_tracking=bool(video)),
     )
     run_folder = Path(trained["run"])
     scores = stages.run("evaluate", {}, lambda key: _evaluate(run_folder, output / "eval.json"))
     shown = stages.run("film", {}, lambda key: _film(run_folder, folder, output))
     summary = {
         "psnr": scores["psnr"],
+        "psnr_head": scores["psnr_head"],
+        "psnr_head_refined": scores.get("psnr_head_refined"),
         "ssim": scores["ssim"],
         "lpips_vgg": scores.get("lpips_vgg"),
         "train_seconds": trained["train_seconds"],
@@ -112,44 +111,28 @@ def _demo(destination: Path, settings: dict[str, Any]) -> Result:
 def _track(video: tuple[Path, ...], destination: Path, image_size: int) -> Result:
     from rgbavatar_ns.tracking import TrackConfig, track_video
 
-    shutil.rmtree(destination, ignore_errors=True)
-    with progress_bar("track") as update:
-        track_video(video, destination, TrackConfig(image_size=image_size), progress=update)
+    # What an interrupted run has done is gone on with.
+    config = TrackConfig(image_size=image_size, overwrite=True)
+    with stage_bars("frames") as update:
+        track_video(video, destination, config, progress=update)
     return {"data": str(destination)}
 
 
-def _call(*command: str | Path) -> None:
-    """Run one of nerfstudio's commands from this environment; its output is shown as it comes.
-
-    On Ctrl-C the command is given the time to save what it has.
-    """
-    program = Path(sys.executable).with_name(str(command[0]))
-    environment = _QUIET | os.environ
-    with subprocess.Popen([program, *map(str, command[1:])], env=environment) as process:
-        try:
-            code = process.wait()
-        except KeyboardInterrupt:
-            process.wait()
-            raise
-    if code == 130:
-        raise KeyboardInterrupt
-    if code != 0:
-        raise UserError(
-            f"{command[0]} ended with exit code {code}; its last lines above say why.",
-            "Once that is mended, run the same command again: finished stages are kept.",
-        )
-
-
-def _train(data: Path, output: Path, key: str, steps: int | None, seed: int) -> Result:
+def _train(
+    data: Path, output: Path, key: str, steps: int | None, seed: int, *, refine_tracking: bool
+) -> Result:
     run_folder = output / "runs" / "demo" / METHOD / key
     options: list[str | Path] = ["--data", data, "--output-dir", output / "runs"]
     options += ["--experiment-name", "demo", "--timestamp", key, "--vis", "tensorboard"]
     options += ["--machine.seed", str(seed)]
+    if refine_tracking:
+        options += ["--pipeline.model.refine-tracking", "True"]
+        options += ["--pipeline.model.refine-held-out", str(HELD_OUT_STEPS)]
     if steps is not None:
         options += ["--max-num-iterations", str(steps)]
     if any(run_folder.glob("nerfstudio_models/*.ckpt")):
         options += ["--load-dir", run_folder / "nerfstudio_models"]
-    _call("ns-train", METHOD, *options)
+    run_nerfstudio("ns-train", METHOD, *options)
     facts = json.loads((run_folder / "training.json").read_text())
     return {
         "run": str(run_folder),
@@ -159,17 +142,27 @@ def _train(data: Path, output: Path, key: str, steps: int | None, seed: int) -> 
 
 
 def _evaluate(run_folder: Path, destination: Path) -> Result:
-    _call("ns-eval", "--load-config", run_folder / "config.yml", "--output-path", destination)
+    run_nerfstudio(
+        "ns-eval", "--load-config", run_folder / "config.yml", "--output-path", destination
+    )
     return json.loads(destination.read_text())["results"]
 
 
 def _film(run_folder: Path, data: Path, output: Path) -> Result:
+    import numpy as np
+    import torch
+
     from rgbavatar_ns import Avatar
     from rgbavatar_ns.data import load_dataset
     from rgbavatar_ns.export import write_comparison
+    from rgbavatar_ns.plugin.refinement import REFINED_NAME
 
     video, picture = output / "comparison.mp4", output / "comparison.png"
-    count = write_comparison(Avatar.load(run_folder), load_dataset(data), video, picture)
+    dataset, refined = load_dataset(data), run_folder / REFINED_NAME
+    if refined.exists():
+        theta = torch.from_numpy(np.load(refined, allow_pickle=False))
+        dataset = replace(dataset, theta=theta)
+    count = write_comparison(Avatar.load(run_folder), dataset, video, picture)
     return {"video": str(video), "picture": str(picture), "frames": count}
 
 
@@ -178,6 +171,7 @@ def _tell(summary: dict[str, Any], output: Path) -> None:
     lpips = summary["lpips_vgg"]
     rows = {
         "held-out PSNR": f"{summary['psnr']:.2f} dB over {summary['held_out_frames']} frames",
+        "of the head": f"{summary['psnr_head']:.2f} dB",
         "held-out SSIM": f"{summary['ssim']:.4f}",
         "training": f"{summary['train_seconds']:.0f} s, "
         f"{summary['images_per_second']:.0f} images/s",
@@ -187,6 +181,8 @@ def _tell(summary: dict[str, Any], output: Path) -> None:
         "viewer": f"{Path(sys.executable).with_name('ns-viewer')} --load-config "
         f"{Path(summary['run']) / 'config.yml'} --viewer.websocket-host 127.0.0.1",
     }
+    if summary["psnr_head_refined"] is not None:
+        rows["head, fitted"] = f"{summary['psnr_head_refined']:.2f} dB, pose fitted to each image"
     if lpips is not None:
         rows["held-out LPIPS"] = f"{lpips:.4f} (VGG)"
     console = Console(soft_wrap=True, highlight=False)

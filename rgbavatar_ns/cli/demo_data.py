@@ -1,25 +1,37 @@
 """`rgbavatar demo-data`: the procedural demo subject as a dataset."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
 from rgbavatar_ns.cli.progress import progress_bar
 from rgbavatar_ns.data.demo import DemoConfig, make_demo_dataset
+from rgbavatar_ns.data.exporters import write_demo
+
+DataFormat = Literal["native", "insta", "metrical", "vhap", "flashavatar", "imavatar"]
 
 
 def run(
     dst: Annotated[Path, tyro.conf.Positional],
     config: Annotated[DemoConfig, tyro.conf.arg(name="")] = DemoConfig(),
+    format: DataFormat = "native",
 ) -> None:
     """Render a procedural person, by ray casting, into a dataset with known truth.
 
     Args:
         dst: the dataset's folder; it must be empty or not exist.
         config: size, length and difficulty.
+        format: as which system the data is written; all but native come with a FLAME-shaped model
+            that holds nothing of FLAME.
     """
+    if format == "native":
+        with progress_bar("demo subject") as update:
+            dataset = make_demo_dataset(dst, config, progress=update)
+        print(f"{len(dataset.train)} frames to train on, {len(dataset.test)} held out, in {dst}")
+        print(f"Then: ns-train rgbavatar-tiny --data {dst}")
+        return
     with progress_bar("demo subject") as update:
-        dataset = make_demo_dataset(dst, config, progress=update)
-    print(f"{len(dataset.train)} frames to train on, {len(dataset.test)} held out, in {dst}")
-    print(f"Then: ns-train rgbavatar-tiny --data {dst}")
+        flame = write_demo(dst, format, config, progress=update)
+    print(f"{config.num_frames} frames as {format} data, in {dst}")
+    print(f"Then: RGBAVATAR_FLAME={flame} ns-train rgbavatar-tiny --data {dst}")

@@ -10,10 +10,17 @@ COMMANDS = {
     "demo": "demo subject (or your video) to a trained avatar, its metrics, a film and a picture",
     "demo-data": "render the procedural demo subject as a dataset",
     "track": "turn a video of a head into a dataset",
-    "render": "film and picture of a trained avatar beside the held-out frames",
+    "import": "turn other systems' data (INSTA, VHAP, metrical-tracker, ...) into a dataset",
+    "check": "look at data before training: what it is, what is odd, and a picture of the fit",
+    "render": "films and pictures: held-out frames, another's performance, views, learned bases",
+    "export": "the avatar as a bundle, as PLY files of Gaussians or as a web page",
+    "sweep": "train and evaluate every cell of an experiment, configs/*.yaml or your own",
+    "report": "tables and plots of a sweep",
     "bench": "how fast the rasterizer, a training step and rendering are on this machine",
     "info": "what is installed here and which rasterizer backends can be used",
 }
+_MODULES = {"import": "import_data"}
+"""Of commands whose name cannot be a module's."""
 
 
 def _help() -> str:
@@ -36,10 +43,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if name not in COMMANDS:
         print(f"There is no command {name!r}.\n\n{_help()}", file=sys.stderr)
         sys.exit(2)
-    import tyro
-
-    module = importlib.import_module(f"rgbavatar_ns.cli.{name.replace('-', '_')}")
+    module_name = _MODULES.get(name, name.replace("-", "_"))
     try:
+        import tyro
+
+        module = importlib.import_module(f"rgbavatar_ns.cli.{module_name}")
         tyro.cli(module.run, prog=f"rgbavatar {name}", args=arguments[1:])
     except UserError as error:
         print(f"rgbavatar {name}: {error}", file=sys.stderr)

@@ -1,35 +1,272 @@
-"""`rgbavatar render`: a trained avatar beside the frames it was not trained on."""
+"""`rgbavatar render`: films and pictures of a trained avatar."""
 
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
+
+from rgbavatar_ns.cli.progress import progress_bar
+from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.export.driving import DrivingOptions
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from rgbavatar_ns.avatar import Avatar
+    from rgbavatar_ns.avatar.bundle_statistics import TrainingStatistics
+    from rgbavatar_ns.data import TrackedDataset
+    from rgbavatar_ns.export.scenes import Scene
+    from rgbavatar_ns.kernels import PinholeCameras
+
+Show = Literal["comparison", "performance", "views", "orbit", "camera-path", "turntable", "bases"]
+Kind = Literal["mp4", "png", "gif"]
+
+
+@dataclass(frozen=True)
+class PictureOptions:
+    """Size, background and kind of what is written."""
+
+    kind: Kind | None = None
+    """mp4, png (numbered pictures) or gif; mp4 by default, gif for the turntable."""
+    width: int | None = None
+    """Width of the avatar's picture in pixels; the dataset's by default."""
+    height: int | None = None
+    """Height of the avatar's picture in pixels; the dataset's by default."""
+    background: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    """Colour behind the head, red, green and blue in [0, 1]."""
+    transparent: bool = False
+    """No background: PNG files keep the alpha."""
+    frames_per_second: float = 25.0
+    """Of the film, and of the performance for smoothing."""
+
+    def __post_init__(self) -> None:
+        """Refuse sizes and colours that are none."""
+        if any(side is not None and side < 1 for side in (self.width, self.height)):
+            raise UserError("The picture's width and height must be positive.", "Give pixels.")
+        if not all(0 <= channel <= 1 for channel in self.background):
+            raise UserError("The background's channels lie in [0, 1].", "Give three such numbers.")
+        if self.frames_per_second <= 0:
+            raise UserError("There must be more than 0 frames per second.", "Give a rate above 0.")
+
+    def kind_for(self, show: Show) -> Kind:
+        """What is written; raises UserError for a film that would lose its alpha."""
+        kind = self.kind or ("gif" if show == "turntable" else "mp4")
+        if self.transparent and kind != "png":
+            raise UserError(f"A transparent {kind} cannot be written.", "Add --kind png.")
+        return kind
+
+
+_PICTURE, _DRIVING = PictureOptions(), DrivingOptions()
 
 
 def run(
     run_folder: Annotated[Path, tyro.conf.Positional],
     output: Annotated[Path, tyro.conf.Positional],
-    data: Path,
-    frames_per_second: float = 25.0,
+    data: Path | None = None,
+    show: Show = "comparison",
+    driver: Path | None = None,
+    frames: tuple[int, int] | None = None,
+    hold: int | None = None,
+    camera_path: Path | None = None,
+    gain: float = 1.5,
+    arc: float = 360.0,
+    picture: Annotated[PictureOptions, tyro.conf.arg(name="")] = _PICTURE,
+    driving: Annotated[DrivingOptions, tyro.conf.arg(name="")] = _DRIVING,
 ) -> None:
-    """Write OUTPUT/comparison.mp4 and OUTPUT/comparison.png: truth, avatar, error times 4.
+    """Write films and pictures of an avatar to the folder OUTPUT.
+
+    comparison: held-out frames, avatar and error (times 4) side by side. performance: the avatar
+    alone, or with --driver beside the other person who drives it. views: four fixed views in a
+    row. orbit: the camera swings around the head. camera-path: the cameras of nerfstudio's viewer.
+    turntable: once around the head. bases: the grid of learned bases, each alone.
 
     Args:
         run_folder: a run of ns-train, a checkpoint or an avatar bundle.
         output: the folder to write to.
-        data: the dataset whose held-out frames are shown.
-        frames_per_second: of the film.
+        data: the avatar's own dataset; by default the one that the run names. A bundle that holds
+            training statistics needs none: it is seen at rest from the front, or driven.
+        show: what to show.
+        driver: another dataset, or a run that names its dataset, whose performance drives the
+            avatar.
+        frames: the first frame of the performance and the one after the last; by default all of
+            the driver's frames, or the held-out ones of the avatar's own dataset.
+        hold: show the expression of this one of the chosen frames, instead of playing them.
+        camera_path: for camera-path, the JSON file saved in the viewer's render panel.
+        arc: for the turntable, how far around the head in degrees; less than 360 goes to and fro.
+        gain: for bases, by how much each basis's largest weight in training is exaggerated.
+        picture: how pictures are written.
+        driving: how the driver's performance becomes the avatar's.
     """
-    from rgbavatar_ns import Avatar
-    from rgbavatar_ns.data import load_dataset
-    from rgbavatar_ns.export import write_comparison
+    if driver is not None and show == "comparison":
+        show = "performance"
+    subject = _subject(run_folder, data, picture)
+    if show == "comparison":
+        _compare(subject, output, frames, picture)
+    elif show == "bases":
+        _write_bases(subject, output, gain, picture)
+    else:
+        kind = picture.kind_for(show)
+        scene, beside = _scene(subject, driver, frames, picture, driving)
+        total, drawn = _drawn(subject.avatar, scene, beside, show, hold, arc, camera_path, picture)
+        _write(drawn, total, output, show, kind, picture.frames_per_second)
 
-    video, picture = output / "comparison.mp4", output / "comparison.png"
-    count = write_comparison(
-        Avatar.load(run_folder),
-        load_dataset(data),
-        video,
-        picture,
-        frames_per_second=frames_per_second,
-    )
-    print(f"{count} held-out frames: {video} and {picture}")
+
+@dataclass(frozen=True)
+class _Subject:
+    """An avatar and what is known about its training."""
+
+    avatar: "Avatar"
+    dataset: "TrackedDataset | None"
+    seen: "TrainingStatistics"
+    camera: "PinholeCameras"
+    """The dataset's first camera, or one before the face, for pictures of the size asked for."""
+
+
+def _subject(run_folder: Path, data: Path | None, picture: PictureOptions) -> _Subject:
+    from rgbavatar_ns import Avatar
+    from rgbavatar_ns.avatar.bundle import load_statistics
+    from rgbavatar_ns.data import load_dataset
+    from rgbavatar_ns.export import dataset_folder, front_camera, resized, statistics_of
+
+    avatar, seen = Avatar.load(run_folder), load_statistics(run_folder)
+    folder = dataset_folder(run_folder) if data is None else data
+    if data is None and folder == run_folder:
+        if seen is None:
+            raise UserError(f"{run_folder} does not name its dataset.", "Name it with --data.")
+        camera = front_camera(avatar, picture.width or 512, picture.height or 512)
+        return _Subject(avatar, None, seen, camera)
+    dataset = load_dataset(folder)
+    avatar.require_layout(dataset.layout, f"The dataset {folder}")
+    size = picture.width or dataset.width, picture.height or dataset.height
+    camera = resized(dataset.cameras.select([0]), *size)
+    return _Subject(avatar, dataset, seen or statistics_of(avatar, dataset), camera)
+
+
+def _compare(
+    subject: _Subject, output: Path, frames: tuple[int, int] | None, picture: PictureOptions
+) -> None:
+    from rgbavatar_ns.export import write_comparison
+    from rgbavatar_ns.export.scenes import chosen_frames
+
+    dataset = subject.dataset
+    if dataset is None:
+        raise UserError("A comparison needs the avatar's own dataset.", "Name it with --data.")
+    chosen = None if frames is None else chosen_frames(len(dataset), frames, dataset.test)
+    video, still = output / "comparison.mp4", output / "comparison.png"
+    with progress_bar("comparison") as update:
+        count = write_comparison(
+            subject.avatar,
+            dataset,
+            video,
+            still,
+            chosen,
+            frames_per_second=picture.frames_per_second,
+            background=picture.background,
+            progress=update,
+        )
+    print(f"{count} frames: {video} and {still}")
+
+
+def _write_bases(subject: _Subject, output: Path, gain: float, picture: PictureOptions) -> None:
+    from rgbavatar_ns.export import basis_grid, write_png
+
+    background = None if picture.transparent else picture.background
+    grid = basis_grid(subject.avatar, subject.seen, subject.camera, background, gain)
+    write_png(output / "bases.png", grid)
+    print(f"base and {subject.avatar.config.num_bases} bases: {output / 'bases.png'}")
+
+
+def _scene(
+    subject: _Subject,
+    driver: Path | None,
+    frames: tuple[int, int] | None,
+    picture: PictureOptions,
+    driving: DrivingOptions,
+) -> "tuple[Scene, tuple[TrackedDataset, tuple[int, ...]] | None]":
+    """The performance seen by the avatar's own camera, and the driver's frames if there is one."""
+    from rgbavatar_ns.data import load_dataset
+    from rgbavatar_ns.export import dataset_folder, resized
+    from rgbavatar_ns.export.scenes import Scene, chosen_frames, driven_by
+
+    rate, camera, dataset = picture.frames_per_second, subject.camera, subject.dataset
+    if driver is None:
+        if dataset is None:
+            return Scene(subject.seen.theta_neutral[None], camera, rate), None
+        chosen = chosen_frames(len(dataset), frames, dataset.test or dataset.train)
+        cameras = resized(dataset.cameras.select(chosen), camera.width, camera.height)
+        return Scene(dataset.theta[list(chosen)], cameras, rate), None
+    other = load_dataset(dataset_folder(driver))
+    chosen = chosen_frames(len(other), frames, range(len(other)))
+    mapped = driven_by(subject.avatar, other, chosen, subject.seen, rate, driving)
+    if mapped.unmapped:
+        print(f"not known to the avatar, left out: {', '.join(mapped.unmapped)}")
+    if mapped.missing:
+        print(f"not known to the driver, left at rest: {', '.join(mapped.missing)}")
+    return Scene(mapped.theta, camera, rate), (other, chosen)
+
+
+def _drawn(
+    avatar: "Avatar",
+    scene: "Scene",
+    beside: "tuple[TrackedDataset, tuple[int, ...]] | None",
+    show: Show,
+    hold: int | None,
+    arc: float,
+    camera_path: Path | None,
+    picture: PictureOptions,
+) -> "tuple[int, Iterator[np.ndarray]]":
+    """How many pictures there will be, and the pictures."""
+    from rgbavatar_ns.export import pictures, scenes
+
+    background = None if picture.transparent else picture.background
+    if hold is not None or show == "turntable":
+        moving = show in ("orbit", "turntable")
+        scene = scene.held(hold or 0, scenes.TURNTABLE_FRAMES if moving else 1)
+        beside = None
+    if show == "views":
+        return len(scene), scenes.side_by_side(avatar, scene, background)
+    if show == "orbit":
+        scene = scenes.orbiting(avatar, scene)
+    elif show == "turntable":
+        scene = scenes.turntable(avatar, scene, arc)
+    elif show == "camera-path":
+        if camera_path is None:
+            raise UserError("There is no camera path.", "Name its file with --camera-path.")
+        scene = scenes.along_path(camera_path, scene)
+    elif beside is not None and background is not None:
+        return len(scene), scenes.beside_driver(avatar, scene, *beside, background)
+    return len(scene), pictures(avatar, scene.theta, scene.cameras, background)
+
+
+def _write(
+    drawn: "Iterator[np.ndarray]",
+    total: int,
+    output: Path,
+    show: Show,
+    kind: Kind,
+    frames_per_second: float,
+) -> None:
+    from rgbavatar_ns.export import write_gif, write_pngs, write_video
+
+    with progress_bar(show) as update:
+        counted = _counted(drawn, total, update)
+        if kind == "png":
+            place = output / show
+            count = write_pngs(place, counted)
+        elif kind == "gif":
+            place = output / f"{show}.gif"
+            count = write_gif(place, counted, frames_per_second)
+        else:
+            place = output / f"{show}.mp4"
+            count = write_video(place, counted, frames_per_second)
+    print(f"{count} pictures: {place}")
+
+
+def _counted(
+    frames: "Iterable[np.ndarray]", total: int, update: Callable[[int, int], None]
+) -> "Iterator[np.ndarray]":
+    for done, frame in enumerate(frames, start=1):
+        yield frame
+        update(done, total)

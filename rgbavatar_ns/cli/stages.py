@@ -2,13 +2,14 @@
 
 import hashlib
 import json
-import os
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
+
+from rgbavatar_ns.data.json_file import write_json
 
 Result = dict[str, Any]
 
@@ -60,11 +61,3 @@ class Stages:
             write_json(self._path, self._done)
         self.seconds[name] = known["seconds"]
         return known["result"]
-
-
-def write_json(path: Path, content: Any) -> None:
-    """Write JSON so that a reader sees the old file or the whole new one."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.partial")
-    partial.write_text(json.dumps(content, indent=2) + "\n")
-    os.replace(partial, path)

@@ -1,11 +1,16 @@
 """`rgbavatar track`: a video of a head becomes a dataset."""
 
+import json
+import sys
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
+from rich.console import Console
+from rich.table import Table
 
-from rgbavatar_ns.cli.progress import progress_bar
+from rgbavatar_ns.cli.progress import stage_bars
 from rgbavatar_ns.tracking import TrackConfig, track_video
 
 
@@ -16,13 +21,75 @@ def run(
 ) -> None:
     """Find the face, cut out the person, fit the head model and write a dataset.
 
+    An interrupted command goes on where it was when it is given again.
+
     Args:
         videos: one file, a folder of images, or several clips of one person.
         dst: the dataset's folder.
         config: options of the tracker.
     """
-    with progress_bar("track") as update:
-        dataset = track_video(videos, dst, config, progress=update)
+    try:
+        with stage_bars("frames") as update:
+            dataset = track_video(videos, dst, config, progress=update)
+    except KeyboardInterrupt:
+        print(
+            f"rgbavatar track: interrupted; what is done is kept in {dst}, and the same command "
+            "goes on from there.",
+            file=sys.stderr,
+        )
+        sys.exit(130)
+    report = json.loads((dst / "tracking.json").read_text())
+    console = Console(soft_wrap=True, highlight=False)
+    console.print(summary_table(report))
+    console.print(f"{report['verdict']}", style="bold")
+    for note in report["notes"]:
+        console.print(f"note: {note}")
     print(f"{len(dataset.train)} frames to train on, {len(dataset.test)} held out, in {dst}")
     print(f"Look at {dst / 'overlay.png'}: the mesh should lie on the face.")
     print(f"Then: ns-train rgbavatar-tiny --data {dst}")
+
+
+def summary_table(report: Mapping[str, Any]) -> Table:
+    """The figures of `tracking.json` that tell whether the clip was tracked well."""
+    table = Table(show_header=False, box=None)
+    rejected = {why: len(frames) for why, frames in report["rejected"].items() if frames}
+    without = ", ".join(f"{count} {why}" for why, count in rejected.items()) or "none"
+    rows = {
+        "frames": f"{report['frames_tracked']} of {report['frames_read']} tracked, "
+        f"in {_counted(len(report['segments']), 'stretch', 'stretches')}",
+        "left out": without,
+        "reprojection error": f"{_percent(report['mesh_reprojection_error_share'])} of the face's "
+        f"height, {_percent(report['reprojection_error_share'])} with landmark offsets; "
+        f"worst frame {_percent(report['worst_frame_error_share'])}",
+        "silhouette": f"matte holds {_percent(report['silhouette_coverage'])} of the head; "
+        f"IoU between chin and eyes {_share(report['face_silhouette_iou'])}",
+        "mouth, eyelids": f"correlation of fitted and measured opening "
+        f"{_share(report['mouth_opening_correlation'])}, "
+        f"{_share(report['eyelid_opening_correlation'])}",
+        "blinks": f"{report['blinks_fitted']} fitted, {report['blinks_measured']} measured",
+        "face": f"{report['face_height_px']:.0f} pixels high; "
+        f"{_counted(len(report['blurred']), 'blurred frame', 'blurred frames')}, "
+        f"another face in {_counted(len(report['other_faces']), 'frame', 'frames')}",
+        "speed": ", ".join(
+            f"{name} {stage['frames_per_second']:.0f} frames/s"
+            for name, stage in report["stages"].items()
+            if stage["frames"]
+        ),
+    }
+    if report["frames_per_second"] is not None:
+        rows["speed"] += f"; together {report['frames_per_second']:.1f} frames/s"
+    for name, value in rows.items():
+        table.add_row(name, value)
+    return table
+
+
+def _percent(share: float | None) -> str:
+    return "unknown" if share is None else f"{100 * share:.2f} %"
+
+
+def _share(value: float | None) -> str:
+    return "unknown" if value is None else f"{value:.3f}"
+
+
+def _counted(count: int, one: str, many: str) -> str:
+    return f"{count} {one if count == 1 else many}"

@@ -2,8 +2,9 @@
 
 import json
 from collections import Counter
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ from rgbavatar_ns.data.native_format import (
     HEAD_FILE,
     INDEX_FILE,
     THETA_FILE,
-    VERSION,
+    VERSIONS,
     cameras_from_json,
 )
 from rgbavatar_ns.data.png import png_size, read_png_rgba
@@ -25,8 +26,8 @@ from rgbavatar_ns.head import HeadArrays, HeadModel, ThetaLayout
 from rgbavatar_ns.kernels.types import PinholeCameras
 
 _MAKE_ONE = (
-    "Make a dataset with `rgbavatar demo-data FOLDER` or `rgbavatar track VIDEO FOLDER`, and "
-    "pass that folder."
+    "Make a dataset with `rgbavatar demo-data FOLDER` or `rgbavatar track VIDEO FOLDER` and pass "
+    "that folder, or pass another system's output as docs/dataset_format.md lists them."
 )
 _WRITE_AGAIN = "Write the dataset again, or mend this file."
 
@@ -36,7 +37,7 @@ class TrackedDataset:
     """Tracked frames of one person; images stay on disk until they are asked for.
 
     A "position" counts frames in the order of this dataset from 0; `frame_index` says which frame
-    of the source that is. The last positions are held out: `train` and `test` partition them.
+    of the source that is. `train` and `test` partition the positions.
     """
 
     root: Path
@@ -50,7 +51,15 @@ class TrackedDataset:
     frame_index: tuple[int, ...]
     width: int
     height: int
-    num_test_frames: int
+    test: tuple[int, ...]
+    """Positions of the held-out frames: the last ones as in the paper, or those of held-out
+    cameras and moments, as the source has it."""
+    camera_names: tuple[str, ...] = ()
+    """Which of several cameras saw each frame; empty where there is one camera."""
+    timesteps: tuple[int, ...] = ()
+    """The moment of each frame, the same for all cameras; empty where each frame has its own."""
+    source: Mapping[str, Any] = field(default_factory=dict)
+    """Where an imported dataset came from: `format`, `path`, `notes`."""
 
     def __len__(self) -> int:
         return len(self.image_paths)
@@ -58,12 +67,8 @@ class TrackedDataset:
     @property
     def train(self) -> tuple[int, ...]:
         """Positions of the frames to train from."""
-        return tuple(range(len(self) - self.num_test_frames))
-
-    @property
-    def test(self) -> tuple[int, ...]:
-        """Positions of the held-out frames: the last ones, as in the paper."""
-        return tuple(range(len(self) - self.num_test_frames, len(self)))
+        held_out = set(self.test)
+        return tuple(position for position in range(len(self)) if position not in held_out)
 
     def read_image(self, position: int) -> UInt8[np.ndarray, "height width 4"]:
         """Decode one frame to RGBA with straight alpha.
@@ -77,8 +82,8 @@ class TrackedDataset:
         return image
 
 
-def load_dataset(path: str | Path) -> TrackedDataset:
-    """Read a dataset folder and check all of it but the pixels, which are checked when decoded.
+def load_native(path: str | Path) -> TrackedDataset:
+    """Read a folder in the project's own format; pixels are read and checked when decoded.
 
     Raises UserError for a missing or empty folder, another format or version, theta that holds
     NaN or does not fit the head, cameras that are none, images that are missing, cut short or
@@ -93,15 +98,11 @@ def load_dataset(path: str | Path) -> TrackedDataset:
     frames = _read_frames(root, index)
     numbers = tuple(frame["index"] for frame in frames)
     theta = _read_theta(root, layout, numbers)
-    shared = index.get("camera")
-    cameras = cameras_from_json(
-        [(f"frame {frame['index']}", frame.get("camera", shared)) for frame in frames],
-        width,
-        height,
-    )
+    cameras = cameras_from_json(_camera_records(root, index, frames), width, height)
     image_paths = [root / frame["image"] for frame in frames]
     for image_path in image_paths:
         _check_size(image_path, png_size(image_path), (width, height))
+    source = index.get("source", {})
     return TrackedDataset(
         root,
         arrays,
@@ -113,7 +114,10 @@ def load_dataset(path: str | Path) -> TrackedDataset:
         numbers,
         width,
         height,
-        _read_test_frames(root, index, len(frames)),
+        _read_test(root, index, numbers),
+        _column(root, frames, "camera_name", str),
+        _column(root, frames, "timestep", int),
+        source if isinstance(source, dict) else {},
     )
 
 
@@ -132,9 +136,10 @@ def _read_index(root: Path) -> dict[str, Any]:
         raise UserError(f"{path} cannot be read: {error}.", _WRITE_AGAIN) from None
     if not isinstance(index, dict) or index.get("format") != FORMAT:
         raise UserError(f'{path} does not say "format": "{FORMAT}".', _MAKE_ONE)
-    if index.get("version") != VERSION:
+    if index.get("version") not in VERSIONS:
         raise UserError(
-            f"{path} has version {index.get('version')} of the format; version {VERSION} is known.",
+            f"{path} has version {index.get('version')} of the format; versions "
+            f"{', '.join(map(str, VERSIONS))} are known.",
             "Update rgbavatar-ns, or write the dataset again with this version of it.",
         )
     missing = [name for name in ("head", "identity", "layout", "frames") if name not in index]
@@ -204,6 +209,12 @@ def _read_frames(root: Path, index: dict[str, Any]) -> list[dict[str, Any]]:
                 f"{root / INDEX_FILE} has a frame without a number or an image: {frame}.",
                 _WRITE_AGAIN,
             )
+        relative = PurePosixPath(frame["image"])
+        if relative.is_absolute() or ".." in relative.parts:
+            raise UserError(
+                f"{root / INDEX_FILE} names the image {relative}, which is not in its folder.",
+                _WRITE_AGAIN,
+            )
     counts = Counter(frame["index"] for frame in frames)
     twice = [number for number, count in counts.items() if count > 1]
     if twice:
@@ -238,6 +249,47 @@ def _read_theta(root: Path, layout: ThetaLayout, numbers: tuple[int, ...]) -> Fl
     return torch.from_numpy(theta.astype(np.float32))
 
 
+def _camera_records(
+    root: Path, index: dict[str, Any], frames: list[dict[str, Any]]
+) -> list[tuple[str, Any]]:
+    """Each frame's label and camera: its own, one of a name, or the one for all."""
+    shared, named = index.get("camera"), index.get("cameras", {})
+    records = []
+    for frame in frames:
+        camera = frame.get("camera", shared)
+        if isinstance(camera, str):
+            if not isinstance(named, dict) or camera not in named:
+                raise UserError(
+                    f"{root / INDEX_FILE} names the camera '{camera}' in frame {frame['index']}, "
+                    "but does not describe it.",
+                    _WRITE_AGAIN,
+                )
+            camera = named[camera]
+        records.append((f"frame {frame['index']}", camera))
+    return records
+
+
+def _read_test(root: Path, index: dict[str, Any], numbers: tuple[int, ...]) -> tuple[int, ...]:
+    """Positions of held-out frames: `test` names them, `test_frames` counts them from the end."""
+    if "test" not in index:
+        count = _read_test_frames(root, index, len(numbers))
+        return tuple(range(len(numbers) - count, len(numbers)))
+    listed = index["test"]
+    if not isinstance(listed, list) or not {type(number) for number in listed} <= {int}:
+        raise UserError(
+            f"{root / INDEX_FILE} has a `test` that is no list of frame numbers.", _WRITE_AGAIN
+        )
+    held_out = set(listed)
+    unknown = sorted(held_out - set(numbers))
+    if unknown or len(held_out) >= len(numbers):
+        what = f"{len(unknown)} that are not there ({_first_few(unknown)})" if unknown else "all"
+        raise UserError(
+            f"The dataset {root} holds out {what} of its {len(numbers)} frames.",
+            f"Mend the list `test` in {INDEX_FILE}: numbers of frames, but not of all.",
+        )
+    return tuple(place for place, number in enumerate(numbers) if number in held_out)
+
+
 def _read_test_frames(root: Path, index: dict[str, Any], num_frames: int) -> int:
     count = index.get("test_frames")
     if not isinstance(count, int) or not 0 <= count < num_frames:
@@ -246,6 +298,20 @@ def _read_test_frames(root: Path, index: dict[str, Any], num_frames: int) -> int
             f"Set test_frames in {INDEX_FILE} to a number from 0 to {num_frames - 1}.",
         )
     return count
+
+
+def _column(root: Path, frames: list[dict[str, Any]], name: str, kind: type) -> tuple[Any, ...]:
+    """An optional entry of all frames, or nothing where none has it."""
+    values = tuple(frame.get(name) for frame in frames)
+    if all(value is None for value in values):
+        return ()
+    if not all(isinstance(value, kind) for value in values):
+        raise UserError(
+            f"{root / INDEX_FILE} has a {name} for some frames only, or one that is no "
+            f"{kind.__name__}.",
+            _WRITE_AGAIN,
+        )
+    return values
 
 
 def _check_size(path: Path, size: tuple[int, int], expected: tuple[int, int]) -> None:

@@ -17,9 +17,12 @@ class TrackedFrame:
     theta: head parameters in the order of the dataset's layout (radians, metres).
     camera: exactly one camera (C = 1), of the image's size.
     image_rgba: straight (not premultiplied) alpha, red first.
+    camera_name, timestep: which of several cameras saw it, and the moment that they share.
     """
 
     index: int
     theta: Float[Tensor, "H"]
     camera: PinholeCameras
     image_rgba: UInt8[np.ndarray, "height width 4"]
+    camera_name: str | None = None
+    timestep: int | None = None

@@ -42,24 +42,38 @@ def png_size(path: Path) -> tuple[int, int]:
     return width, height
 
 
-def read_png_rgba(path: Path) -> UInt8[np.ndarray, "height width 4"]:
-    """Decode a PNG to RGBA; grey becomes RGB, a missing alpha becomes opaque.
+def png_header_size(encoded: bytes) -> tuple[int, int] | None:
+    """(width, height) that a PNG's first bytes promise; None where they are none of a PNG."""
+    if len(encoded) < _HEADER_BYTES or encoded[:8] != _SIGNATURE or encoded[12:16] != b"IHDR":
+        return None
+    width, height = struct.unpack(">II", encoded[16:24])
+    return width, height
 
-    Raises UserError where the file is missing, truncated or damaged: OpenCV alone would hand
-    back a partial picture without a word, so the chunks' lengths and checksums are checked.
-    """
+
+def read_png_rgba(path: Path) -> UInt8[np.ndarray, "height width 4"]:
+    """Decode a PNG file to RGBA, see `decode_png_rgba`; raises UserError naming the file."""
     try:
         encoded = path.read_bytes()
     except FileNotFoundError:
         raise UserError(f"The image {path} is missing.", _REPAIR) from None
     except OSError as error:
         raise UserError(f"The image {path} cannot be read: {error.strerror}.", _REPAIR) from None
-    damage = _damage(encoded)
+    return decode_png_rgba(encoded, str(path))
+
+
+def decode_png_rgba(encoded: bytes, name: str) -> UInt8[np.ndarray, "height width 4"]:
+    """Decode a PNG to RGBA; grey becomes RGB, a missing alpha becomes opaque.
+
+    Raises UserError, calling the image `name`, where it is truncated or damaged: OpenCV alone
+    would hand back a partial picture without a word, so the chunks' lengths and checksums are
+    checked.
+    """
+    damage = png_damage(encoded)
     if damage is not None:
-        raise UserError(f"The image {path} {damage}.", _REPAIR)
+        raise UserError(f"The image {name} {damage}.", _REPAIR)
     decoded = cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_UNCHANGED)
     if decoded is None:
-        raise UserError(f"The image {path} cannot be decoded.", _REPAIR)
+        raise UserError(f"The image {name} cannot be decoded.", _REPAIR)
     if decoded.dtype == np.uint16:
         decoded = ((decoded.astype(np.uint32) + 128) // 257).astype(np.uint8)
     if decoded.ndim == 2:
@@ -78,7 +92,7 @@ def encode_png_rgba(image_rgba: UInt8[np.ndarray, "height width 4"], compression
     return encoded.tobytes()
 
 
-def _damage(encoded: bytes) -> str | None:
+def png_damage(encoded: bytes) -> str | None:
     """Say what is wrong with a PNG's chunks, or None where they are whole."""
     if not encoded:
         return "is empty"

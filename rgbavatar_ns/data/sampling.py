@@ -1,8 +1,9 @@
 """Which frames a training step sees: a shuffled order offline, two pools for a stream."""
 
+import math
 from collections import deque
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -11,6 +12,16 @@ import torch
 from rgbavatar_ns.errors import UserError
 
 _KEPT_EPOCHS = 4
+_RAMP_FRAMES = 600
+_NEWEST_FRAMES = 150.0
+
+PoolStrategy = Literal["paper", "release"]
+"""paper: a fixed share of each batch from the local pool, all of its frames equally likely.
+release: as the authors' program is said to do, the global pool's share grows over the first 600
+frames and local draws favour the newest, exp(i / 150) for the i-th oldest."""
+
+DEFAULT_LOCAL_SHARE: dict[PoolStrategy, float] = {"paper": 0.7, "release": 0.3}
+"""The local pool's share of a batch; for "release" that which it falls to, from 1."""
 
 
 class OfflineOrder:
@@ -85,17 +96,24 @@ class LocalGlobalPools:
     Args:
         local_size: frames in the local pool (paper: 150).
         global_size: frames in the global pool (paper: 1000); 0 leaves it out.
-        local_share: the paper's eta, the part of a batch from the local pool (paper: .7).
+        local_share: the paper's eta, the part of a batch from the local pool (paper: .7; see
+            `DEFAULT_LOCAL_SHARE`).
         seed: of every draw.
+        strategy: how a batch is divided and drawn, see `PoolStrategy`.
+        new_first: let local frames that no batch has held yet fill up to half of the local part,
+            the newest first. Ours: by chance alone a frame may wait for seconds.
     """
 
     def __init__(
         self,
         local_size: int = 150,
         global_size: int = 1000,
-        local_share: float = 0.7,
+        local_share: float | None = None,
         seed: int = 0,
+        strategy: PoolStrategy = "paper",
+        new_first: bool = False,
     ) -> None:
+        local_share = DEFAULT_LOCAL_SHARE[strategy] if local_share is None else local_share
         if local_size < 1 or global_size < 0 or not 0 <= local_share <= 1:
             raise ValueError(
                 "local_size must be at least 1, global_size at least 0, local_share in [0, 1]; "
@@ -104,8 +122,12 @@ class LocalGlobalPools:
         self.local_size = local_size
         self.global_size = global_size
         self.local_share = local_share
+        self.strategy: PoolStrategy = strategy
+        self.new_first = new_first
         self._local: deque[int] = deque()
         self._global: list[int] = []
+        self._undrawn: dict[int, None] = {}  # of the local pool, oldest first
+        self._arrived = 0
         self._departed = 0
         self._generator = torch.Generator().manual_seed(seed)
 
@@ -126,8 +148,12 @@ class LocalGlobalPools:
         """Take in the stream's next frame; return the frame that no pool holds any more, if any."""
         dropped = None
         if len(self._local) == self.local_size:
-            dropped = self._offer_to_global(self._local.popleft())
+            oldest = self._local.popleft()
+            self._undrawn.pop(oldest, None)
+            dropped = self._offer_to_global(oldest)
         self._local.append(frame)
+        self._undrawn[frame] = None
+        self._arrived += 1
         return dropped
 
     def _offer_to_global(self, frame: int) -> int | None:
@@ -143,21 +169,44 @@ class LocalGlobalPools:
         return dropped
 
     def batch(self, batch_size: int) -> list[int]:
-        """Draw different frames, a share of `local_share` (rounded) from the local pool.
+        """Draw different frames, the local pool's share of them (rounded) from the local pool.
 
         Where one pool has too few, the other fills up; the batch is smaller than asked for only
         while both together hold fewer frames. Raises UserError while there are none.
         """
         if not len(self):
             raise UserError("No frame has arrived yet.", "Add a frame before drawing a batch.")
-        wanted = round(self.local_share * batch_size)
+        wanted = round(self._present_local_share() * batch_size)
         from_global = min(batch_size - wanted, len(self._global))
         from_local = min(batch_size - from_global, len(self._local))
         from_global = min(batch_size - from_local, len(self._global))
-        return self._draw(list(self._local), from_local) + self._draw(self._global, from_global)
+        return self._draw_local(from_local) + self._draw(self._global, from_global)
 
-    def _draw(self, pool: list[int], count: int) -> list[int]:
-        order = torch.randperm(len(pool), generator=self._generator)[:count]
+    def _present_local_share(self) -> float:
+        if self.strategy == "paper":
+            return self.local_share
+        return 1.0 - (1.0 - self.local_share) * min(1.0, self._arrived / _RAMP_FRAMES)
+
+    def _draw_local(self, count: int) -> list[int]:
+        new: list[int] = []
+        if self.new_first:
+            new = list(self._undrawn)[::-1][: math.ceil(count / 2)]
+        others = list(self._local)
+        if new:
+            taken = set(new)
+            others = [frame for frame in others if frame not in taken]
+        drawn = new + self._draw(others, count - len(new), self.strategy == "release")
+        for frame in drawn:
+            self._undrawn.pop(frame, None)
+        return drawn
+
+    def _draw(self, pool: list[int], count: int, favour_newest: bool = False) -> list[int]:
+        if favour_newest and count:
+            age = torch.arange(len(pool), dtype=torch.float64)
+            weight = torch.exp(age / _NEWEST_FRAMES)
+            order = torch.multinomial(weight, count, generator=self._generator)
+        else:
+            order = torch.randperm(len(pool), generator=self._generator)[:count]
         return [pool[i] for i in order.tolist()]
 
     def _draw_integer(self, end: int) -> int:
@@ -168,6 +217,8 @@ class LocalGlobalPools:
         return {
             "local": list(self._local),
             "global": list(self._global),
+            "undrawn": list(self._undrawn),
+            "arrived": self._arrived,
             "departed": self._departed,
             "generator": self._generator.get_state(),
         }
@@ -182,5 +233,8 @@ class LocalGlobalPools:
             )
         self._local = deque(state["local"])
         self._global = list(state["global"])
+        self._undrawn = dict.fromkeys(state["undrawn"])
+        self._arrived = state["arrived"]
         self._departed = state["departed"]
-        self._generator.set_state(state["generator"])
+        # A copy: loading moves state to the run's device and may share its memory.
+        self._generator.set_state(state["generator"].cpu().clone())

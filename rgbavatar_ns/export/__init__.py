@@ -1,6 +1,53 @@
-"""Taking the avatar away: pictures and videos of it."""
+"""Taking the avatar away: pictures and films of it, PLY files, a web page."""
 
+from rgbavatar_ns.export.bases import basis_grid
 from rgbavatar_ns.export.comparison import comparison_frames, write_comparison
-from rgbavatar_ns.export.video import write_video
+from rgbavatar_ns.export.drawing import Color, Picture, draw, pictures
+from rgbavatar_ns.export.driving import DrivingOptions, MappedTheta, ThetaNames, drive
+from rgbavatar_ns.export.one_euro import OneEuroOptions, one_euro
+from rgbavatar_ns.export.ply import write_ply
+from rgbavatar_ns.export.run_data import dataset_folder
+from rgbavatar_ns.export.statistics import statistics_of
+from rgbavatar_ns.export.video import write_gif, write_png, write_pngs, write_video
+from rgbavatar_ns.export.views import (
+    four_views,
+    front_camera,
+    head_centre,
+    orbit,
+    read_camera_path,
+    resized,
+    swing,
+)
+from rgbavatar_ns.export.web_page import PageOptions, write_web_page
 
-__all__ = ["comparison_frames", "write_comparison", "write_video"]
+__all__ = [
+    "Color",
+    "DrivingOptions",
+    "MappedTheta",
+    "OneEuroOptions",
+    "PageOptions",
+    "Picture",
+    "ThetaNames",
+    "basis_grid",
+    "comparison_frames",
+    "dataset_folder",
+    "draw",
+    "drive",
+    "four_views",
+    "front_camera",
+    "head_centre",
+    "one_euro",
+    "orbit",
+    "pictures",
+    "read_camera_path",
+    "resized",
+    "statistics_of",
+    "swing",
+    "write_comparison",
+    "write_gif",
+    "write_ply",
+    "write_png",
+    "write_pngs",
+    "write_video",
+    "write_web_page",
+]

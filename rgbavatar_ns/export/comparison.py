@@ -1,25 +1,20 @@
 """The avatar beside the frames that it was not trained on: a film and a picture."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-import cv2
 import numpy as np
 import torch
 
 from rgbavatar_ns.avatar.avatar import Avatar
 from rgbavatar_ns.data.dataset import TrackedDataset
-from rgbavatar_ns.export.video import write_video
+from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.export.drawing import draw, to_uint8
+from rgbavatar_ns.export.video import write_png, write_video
 
 ERROR_GAIN = 4.0
 
 
-def _to_uint8(image: torch.Tensor) -> np.ndarray:
-    """[H, W, 3] in [0, 1] to uint8, rounded."""
-    return (image.clamp(0, 1) * 255 + 0.5).to(torch.uint8).cpu().numpy()
-
-
-@torch.no_grad()
 def comparison_frames(
     avatar: Avatar,
     dataset: TrackedDataset,
@@ -35,10 +30,10 @@ def comparison_frames(
     for position in positions:
         rgba = torch.from_numpy(dataset.read_image(position)).to(device).float() / 255
         truth = rgba[..., :3] * rgba[..., 3:] + ground * (1 - rgba[..., 3:])
-        theta = dataset.theta[position : position + 1].to(device)
-        image = avatar.render(theta, dataset.cameras.select([position]), ground).image[0]
+        theta = dataset.theta[position : position + 1]
+        image = draw(avatar, theta, dataset.cameras.select([position]), background).image[0]
         error = (image - truth).abs() * ERROR_GAIN
-        yield _to_uint8(truth), _to_uint8(image), _to_uint8(error)
+        yield to_uint8(truth), to_uint8(image), to_uint8(error)
 
 
 def write_comparison(
@@ -49,28 +44,32 @@ def write_comparison(
     positions: Sequence[int] | None = None,
     columns: int = 5,
     frames_per_second: float = 25.0,
+    background: tuple[float, float, float] = (1.0, 1.0, 1.0),
+    progress: Callable[[int, int], None] | None = None,
 ) -> int:
     """Write the film (truth, avatar, error side by side) and a picture of a few frames.
 
     positions: the held-out frames by default. The picture has one column for each of `columns`
     evenly spread frames: truth above, avatar in the middle, error (times 4) below. Returns the
-    number of frames.
+    number of frames. Raises UserError where no frames are held out.
     """
     chosen = tuple(dataset.test if positions is None else positions)
+    if not chosen:
+        raise UserError(
+            f"The dataset {dataset.root} holds out no frames.", "Name the frames to compare."
+        )
     shown = {chosen[i] for i in np.linspace(0, len(chosen) - 1, columns).round().astype(int)}
     kept: list[np.ndarray] = []
 
     def film() -> Iterator[np.ndarray]:
-        for position, row in zip(chosen, comparison_frames(avatar, dataset, chosen)):
+        compared = comparison_frames(avatar, dataset, chosen, background)
+        for done, (position, row) in enumerate(zip(chosen, compared), start=1):
             if position in shown:
                 kept.append(np.concatenate(row, axis=0))
             yield np.concatenate(row, axis=1)
+            if progress is not None:
+                progress(done, len(chosen))
 
     count = write_video(video, film(), frames_per_second)
-    picture.parent.mkdir(parents=True, exist_ok=True)
-    grid = np.concatenate(kept, axis=1)
-    ok, encoded = cv2.imencode(".png", grid[..., ::-1])
-    if not ok:
-        raise RuntimeError(f"OpenCV could not encode {picture}.")
-    picture.write_bytes(encoded.tobytes())
+    write_png(picture, np.concatenate(kept, axis=1))
     return count

@@ -52,6 +52,11 @@ class HeadArrays:
     """Vertices of skin, left_eye, right_eye, upper_teeth, lower_teeth, tongue, if known."""
 
     def __post_init__(self) -> None:
+        # Sums round by the order in memory: a head is the same before and after it was stored.
+        for item in fields(self):
+            value = getattr(self, item.name)
+            if isinstance(value, np.ndarray):
+                object.__setattr__(self, item.name, np.ascontiguousarray(value))
         vertices = len(self.v_template)
         wanted: dict[str, tuple[int, ...]] = {
             "v_template": (vertices, 3),

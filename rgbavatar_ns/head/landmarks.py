@@ -1,6 +1,6 @@
 """Where mediapipe's FaceMesh points lie on the embedded head."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cache
 from pathlib import Path
 
@@ -17,6 +17,28 @@ SPARSE_51 = (
     *(78, 82, 13, 312, 308, 317, 14, 87),
 )
 """FaceMesh indices of the usual 68 points without the jaw line: brows, nose, eyes, mouth."""
+
+
+@dataclass(frozen=True)
+class LandmarkResponse:
+    """Where a detector puts L points apart from the skin they lie on, in the skull's frame, metres.
+
+    Detectors follow faces incompletely: they round off expressions, and points of the outline
+    slide over the skin as the head turns. Offsets are `rest`, plus the others times: the head's
+    direction to the camera (x, y, x^2, y^2, xy), expression coefficients, the sine of the jaw's
+    angle, the sines of the eyes' pitch and yaw, identity coefficients.
+    """
+
+    rest: Float[np.ndarray, "L 3"]
+    view: Float[np.ndarray, "L 3 5"]
+    expression: Float[np.ndarray, "L 3 E"]
+    jaw_open: Float[np.ndarray, "L 3"]
+    gaze: Float[np.ndarray, "L 3 2"]
+    identity: Float[np.ndarray, "L 3 I"]
+
+    def select(self, rows: Int[np.ndarray, "K"]) -> "LandmarkResponse":
+        """The same of these rows."""
+        return LandmarkResponse(*(getattr(self, field.name)[rows] for field in fields(self)))
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ from rgbavatar_ns.kernels.registry import BlendedRenderer
 from rgbavatar_ns.kernels.types import (
     AdamParameter,
     BlendedGaussians,
+    BlendedGradient,
     GaussianSet,
     PinholeCameras,
     RenderedBatch,
@@ -19,6 +20,7 @@ from rgbavatar_ns.kernels.types import (
 __all__ = [
     "AdamParameter",
     "BlendedGaussians",
+    "BlendedGradient",
     "BlendedRenderer",
     "GaussianSet",
     "PinholeCameras",

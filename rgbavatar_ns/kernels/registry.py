@@ -13,6 +13,7 @@ from torch import Tensor
 from rgbavatar_ns.kernels.types import (
     AdamParameter,
     BlendedGaussians,
+    BlendedGradient,
     GaussianSet,
     PinholeCameras,
     RenderedBatch,
@@ -47,11 +48,13 @@ class BlendedRenderer(Protocol):
         """The mean absolute difference to straight-alpha images over the background."""
         ...
 
-    def update(self, parameters: Mapping[str, AdamParameter]) -> Float[Tensor, "B K"]:
+    def update(
+        self, parameters: Mapping[str, AdamParameter] | None, *, with_vertices: bool = False
+    ) -> BlendedGradient:
         """Take one step of Adam by the gradient of the last comparison, in place.
 
-        `parameters` holds one entry for each of the Gaussians' tensors, by its name. Returns the
-        gradient of the weights.
+        `parameters` holds one entry for each of the Gaussians' tensors, by its name; None leaves
+        them all as they are. Returns the gradient of the weights and, if asked, of the vertices.
         """
         ...
 

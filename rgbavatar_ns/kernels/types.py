@@ -108,6 +108,14 @@ class BlendedGaussians:
 
 
 @dataclass(frozen=True)
+class BlendedGradient:
+    """The gradient of what poses blended Gaussians: `vertices` only when it was asked for."""
+
+    weights: Float[Tensor, "B K"]
+    vertices: Float[Tensor, "B V 3"] | None = None
+
+
+@dataclass(frozen=True)
 class AdamParameter:
     """A parameter with Adam's state, to be updated in place; `step` counts from 1, this one too."""
 

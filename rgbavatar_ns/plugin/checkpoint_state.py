@@ -46,7 +46,7 @@ def require_same_layout(state_dict: Mapping[str, Any], avatar: Avatar) -> None:
 def _require_same_make(saved: dict[str, Any], avatar: Avatar) -> None:
     mine = avatar.config.to_json()
     shape = ("num_bases", "uv_resolution", "weight_network", "hidden_width", "tangent_variant")
-    shape += ("pose_input", "translation_input", "scale_with_triangle")
+    shape += ("pose_input", "translation_input", "scale_with_triangle", "carrier")
     different = [name for name in shape if saved.get(name) != mine[name]]
     if different:
         told = ", ".join(f"{name} {saved.get(name)}, not {mine[name]}" for name in different)

@@ -3,6 +3,7 @@
 # pyright: reportIncompatibleVariableOverride=false
 # nerfstudio's classes are used by narrowing their fields, which a strict type system forbids.
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -19,6 +20,7 @@ from torch.nn import Parameter
 
 from rgbavatar_ns.avatar.losses import random_backgrounds
 from rgbavatar_ns.data import ImageCache, OfflineOrder
+from rgbavatar_ns.data.check import quick_check
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.plugin.dataparser import (
     FrameDataset,
@@ -35,7 +37,7 @@ class FrameSampler(Protocol):
     """Which frames a training step sees."""
 
     def batch(self, step: int) -> list[int]:
-        """Positions in the dataset of the frames of `step`."""
+        """The frames of `step`, counted among the training frames."""
         ...
 
 
@@ -60,6 +62,9 @@ class RGBAvatarDataManagerConfig(FullImageDatamanagerConfig):
     """Background threads that decode images."""
     prefetch_steps: int = 2
     """Steps whose images are decoded ahead."""
+    check_data: bool = True
+    """Refuse data whose head is not where its images show it (`rgbavatar check`), before the first
+    step."""
     seed: int | None = None
     """Seed of frame order and backgrounds; by default that of the run, `--machine.seed`."""
     masks_on_gpu: tyro.conf.Suppress[bool] = False
@@ -77,7 +82,7 @@ class RGBAvatarDataManagerConfig(FullImageDatamanagerConfig):
 
 
 def frame_sampler(
-    config: RGBAvatarDataManagerConfig, positions: tuple[int, ...], seed: int
+    config: RGBAvatarDataManagerConfig, rows: tuple[int, ...], seed: int
 ) -> FrameSampler:
     """The order of the training frames: a fresh permutation of all of them every epoch.
 
@@ -93,7 +98,7 @@ def frame_sampler(
             f"A batch of {config.batch_size} frames is impossible.",
             "Pass --pipeline.datamanager.batch-size with 1 or more.",
         )
-    return OfflineOrder(positions, min(config.batch_size, len(positions)), seed)
+    return OfflineOrder(rows, min(config.batch_size, len(rows)), seed)
 
 
 class RGBAvatarDataManager(DataManager):
@@ -129,6 +134,9 @@ class RGBAvatarDataManager(DataManager):
             config.dataparser.data = Path(config.data)
         self.dataparser: RGBAvatarDataParser = config.dataparser.setup()
         self.includes_time = self.dataparser.includes_time
+        if config.check_data and test_mode == "val":
+            for problem in quick_check(self.dataparser.tracked):
+                raise problem.as_error()
         self.train_dataparser_outputs = self.dataparser.get_dataparser_outputs("train")
         self.train_dataset = self._dataset("train", self.train_dataparser_outputs)
         self.eval_dataset = self._dataset(
@@ -141,17 +149,16 @@ class RGBAvatarDataManager(DataManager):
 
     def setup_train(self) -> None:
         """Put the frame order in place; images are decoded when the first step asks."""
-        positions = tuple(self.dataparser.tracked.train)
-        self._train_order = frame_sampler(self.config, positions, self.seed)
+        rows = tuple(range(len(self.train_dataset)))
+        self._train_order = frame_sampler(self.config, rows, self.seed)
         self._train_cameras = self.train_dataset.cameras.to(self.device)
 
     def setup_eval(self) -> None:
         """Put the order of the held-out frames in place, if there are any."""
-        tracked, config = self.dataparser.tracked, self.config
-        if not tracked.test:
+        rows = range(len(self.eval_dataset))
+        if not rows:
             return
-        batch_size = min(config.batch_size, len(tracked.test))
-        self._eval_order = OfflineOrder(tracked.test, batch_size, 0)
+        self._eval_order = OfflineOrder(rows, min(self.config.batch_size, len(rows)), 0)
         self._eval_cameras = self.eval_dataset.cameras.to(self.device)
 
     @cached_property
@@ -165,28 +172,30 @@ class RGBAvatarDataManager(DataManager):
 
     def next_train(self, step: int) -> tuple[Cameras, dict[str, Any]]:
         """Cameras, images and backgrounds of the training frames of `step`, a function of it."""
-        batch = self._batch(self._train_order.batch(step), self._train_cameras, 0, step)
+        positions = self.dataparser.positions("train")
+        batch = self._batch(self._train_order.batch(step), self._train_cameras, positions, step)
         for ahead in range(1, self.config.prefetch_steps + 1):
-            self.image_cache.prefetch(self._train_order.batch(step + ahead))
+            rows = self._train_order.batch(step + ahead)
+            self.image_cache.prefetch([positions[row] for row in rows])
         return batch
 
     def next_eval(self, step: int) -> tuple[Cameras, dict[str, Any]]:
         """Some held-out frames, in the same form as a training batch."""
-        first = len(self.train_dataset)
-        return self._batch(self._eval_order.batch(step), self._eval_cameras, first, step)
+        positions = self.dataparser.positions(self.test_split)
+        return self._batch(self._eval_order.batch(step), self._eval_cameras, positions, step)
 
     def _batch(
-        self, positions: list[int], cameras: Cameras, first: int, step: int
+        self, rows: list[int], cameras: Cameras, places: Sequence[int], step: int
     ) -> tuple[Cameras, dict[str, Any]]:
-        """Frames at `positions`, whose cameras begin with that of position `first`.
+        """A split's frames, by rows of its cameras; `places` are its positions in the dataset.
 
         Every image has a background colour of its own (paper, sec. 3.2), which its camera brings
         to the model.
         """
+        positions = [places[row] for row in rows]
         images = self.image_cache.get(positions).to(self.device)
-        rows = torch.tensor(positions, device=self.device) - first
-        chosen = cameras[rows]
-        background = random_backgrounds(step, len(positions), self.seed).to(self.device)
+        chosen = cameras[torch.tensor(rows, device=self.device)]
+        background = random_backgrounds(step, len(rows), self.seed).to(self.device)
         chosen.metadata = {**(chosen.metadata or {}), "background": background}
         batch = {
             "image": images,
@@ -198,8 +207,7 @@ class RGBAvatarDataManager(DataManager):
 
     def next_eval_image(self, step: int) -> tuple[Cameras, dict[str, Any]]:
         """One held-out frame: its camera, and its picture over black [H, W, 3]."""
-        row = self._eval_order.batch(step)[0] - len(self.train_dataset)
-        return self.eval_dataloader.get_camera(row)
+        return self.eval_dataloader.get_camera(self._eval_order.batch(step)[0])
 
     @cached_property
     def eval_dataloader(self) -> FixedIndicesEvalDataloader:

@@ -1,4 +1,4 @@
-"""nerfstudio's view of a dataset in the project's own format."""
+"""nerfstudio's view of a dataset: the project's own, or another system's."""
 
 # pyright: reportIncompatibleVariableOverride=false
 # nerfstudio's classes are used by narrowing their fields, which a strict type system forbids.
@@ -21,6 +21,7 @@ from nerfstudio.data.scene_box import SceneBox
 from torch import Tensor
 
 from rgbavatar_ns.data import TrackedDataset, load_dataset
+from rgbavatar_ns.data.importers import ImportOptions
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadArrays, ThetaLayout
 from rgbavatar_ns.plugin.cameras import to_nerfstudio
@@ -37,6 +38,8 @@ class Subject:
     layout: ThetaLayout
     theta: Float[Tensor, "F H"]
     frame_index: tuple[int, ...]
+    train: tuple[int, ...]
+    """Positions of the training frames."""
     camera_center: Float[Tensor, "3"]
     """Where the first frame was filmed from, in the head's world."""
 
@@ -47,15 +50,17 @@ class Subject:
 
 @dataclass
 class RGBAvatarDataParserConfig(DataParserConfig):
-    """Reads a dataset folder made by `rgbavatar track`, `rgbavatar demo-data` or an importer."""
+    """Reads a dataset folder of `rgbavatar track`, `rgbavatar demo-data` or another system."""
 
     _target: type = field(default_factory=lambda: RGBAvatarDataParser)
     data: Path = Path()
-    """Folder that holds dataset.json."""
+    """Folder that holds dataset.json, or another system's data."""
+    importing: ImportOptions = field(default_factory=ImportOptions)
+    """How another system's data is read."""
 
 
 class RGBAvatarDataParser(DataParser):
-    """Splits a tracked dataset into training frames and the held-out last ones.
+    """Splits a tracked dataset into training frames and the held-out ones.
 
     `train` are the training frames; `val` and `test` are the held-out ones.
     """
@@ -76,7 +81,7 @@ class RGBAvatarDataParser(DataParser):
                     "No dataset was named.",
                     "Pass --data FOLDER; `rgbavatar demo-data FOLDER` makes one to try.",
                 )
-            self._tracked = load_dataset(self.config.data)
+            self._tracked = load_dataset(self.config.data, self.config.importing)
         return self._tracked
 
     def positions(self, split: str) -> tuple[int, ...]:
@@ -106,6 +111,7 @@ class RGBAvatarDataParser(DataParser):
                     layout=tracked.layout,
                     theta=tracked.theta,
                     frame_index=tuple(tracked.frame_index),
+                    train=tuple(tracked.train),
                     camera_center=torch.linalg.inv(cameras.world_to_camera[0])[:3, 3],
                 )
             },
@@ -125,3 +131,7 @@ class FrameDataset(InputDataset):
     def get_numpy_image(self, image_idx: int) -> npt.NDArray[np.uint8]:
         """RGBA of one frame [H, W, 4]; raises UserError on a broken file or another size."""
         return np.asarray(self._tracked.read_image(self._positions[image_idx]))
+
+    def get_metadata(self, data: dict[str, Any]) -> dict[str, Any]:
+        """The frame as it was read, uint8 RGBA [H, W, 4], beside nerfstudio's over black."""
+        return {"image_rgba": torch.from_numpy(self.get_numpy_image(data["image_idx"]))}

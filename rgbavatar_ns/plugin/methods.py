@@ -1,6 +1,6 @@
 """The methods that nerfstudio's commands list: `rgbavatar` and `rgbavatar-tiny`."""
 
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from nerfstudio.configs.base_config import (
@@ -18,12 +18,14 @@ from rgbavatar_ns.plugin.optimizers import paper_optimizers
 from rgbavatar_ns.plugin.pipeline import RGBAvatarPipelineConfig
 from rgbavatar_ns.plugin.trainer import RGBAvatarTrainerConfig
 
+TrainerKind = TypeVar("TrainerKind", bound=RGBAvatarTrainerConfig)
 
-def _preset(method_name: str, **settings: Any) -> RGBAvatarTrainerConfig:
-    """A trainer's config with what all presets share."""
+
+def preset(kind: type[TrainerKind], method_name: str, **settings: Any) -> TrainerKind:
+    """A trainer's config with what all methods share."""
     # A GPU is used once the rasterizer has a backend for it.
     gpu = torch.cuda.is_available() and "cuda" in available_backends()
-    return RGBAvatarTrainerConfig(
+    return kind(
         method_name=method_name,
         steps_per_eval_batch=500,
         steps_per_eval_image=500,
@@ -41,20 +43,22 @@ def _preset(method_name: str, **settings: Any) -> RGBAvatarTrainerConfig:
     )
 
 
+def tiny_model() -> RGBAvatarModelConfig:
+    """An avatar of fewer Gaussians."""
+    avatar = AvatarConfig(uv_resolution=128, scale_from_texel_spacing=True)
+    return RGBAvatarModelConfig(avatar=avatar, lpips_metric=False)
+
+
 rgbavatar = MethodSpecification(
-    config=_preset("rgbavatar", max_num_iterations=5000, steps_per_save=500),
+    config=preset(RGBAvatarTrainerConfig, "rgbavatar", max_num_iterations=5000, steps_per_save=500),
     description="RGBAvatar: head avatars of reduced Gaussian blendshapes, as in the paper.",
 )
 
 rgbavatar_tiny = MethodSpecification(
-    config=_preset(
+    config=preset(
+        RGBAvatarTrainerConfig,
         "rgbavatar-tiny",
-        pipeline=RGBAvatarPipelineConfig(
-            model=RGBAvatarModelConfig(
-                avatar=AvatarConfig(uv_resolution=128, scale_from_texel_spacing=True),
-                lpips_metric=False,
-            )
-        ),
+        pipeline=RGBAvatarPipelineConfig(model=tiny_model()),
         max_num_iterations=1500,
         # Falling rates bring .2 to .3 dB on held-out frames of the demo subject. Their length is
         # named, so that a run resumed with more steps equals one that had them from the start.

@@ -4,8 +4,8 @@
 # nerfstudio's classes are used by narrowing their fields, which a strict type system forbids.
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Float
@@ -30,17 +30,21 @@ from rgbavatar_ns.avatar.losses import (
     rgba_to_float,
 )
 from rgbavatar_ns.avatar.metrics import LPIPSMetric, evaluate_images
+from rgbavatar_ns.avatar.orthogonality import orthogonality_loss, orthogonalize
+from rgbavatar_ns.avatar.refinement import RefinementConfig
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.plugin.cameras import from_nerfstudio, head_to_nerfstudio
 from rgbavatar_ns.plugin.checkpoint_state import model_state, require_same_layout
 from rgbavatar_ns.plugin.dataparser import Subject
+from rgbavatar_ns.plugin.refinement import FrameRefinement, require_same_refinement
 from rgbavatar_ns.plugin.viewer_panel import ViewerPanel, Viewpoint
 
 Outputs = dict[str, Tensor]
 
 # The viewer starts in front of the training cameras, whose frames it also draws.
 _NEARER = 0.9
+_ORTHOGONALITY_WEIGHT, _ORTHOGONALIZE_EVERY = 10.0, 1000
 
 
 @dataclass
@@ -58,6 +62,18 @@ class RGBAvatarModelConfig(ModelConfig):
     """Step from which the LPIPS loss counts."""
     lpips_metric: bool = True
     """Whether `ns-eval` computes LPIPS; its network is downloaded once (528 MB)."""
+    orthogonality: Literal["free", "loss", "qr", "gram_schmidt"] = "free"
+    """Keep the bases orthogonal, by a loss of weight 10 or every 1,000 steps by QR decomposition or
+    Gram-Schmidt (paper, supplement, where none of them helps)."""
+    refine_tracking: bool = False
+    """Correct each training frame's tracked pose, expression and translation a little, together
+    with the avatar. Held-out frames take what a linear map learns from these corrections; their
+    images are not looked at."""
+    refine_held_out: int = 0
+    """Steps of fitting held-out frames to their images with the avatar frozen; `ns-eval` then
+    reports psnr_refined and others beside the plain ones. 0 leaves it out."""
+    refinement: RefinementConfig = field(default_factory=RefinementConfig)
+    """How far and how quickly tracking is corrected."""
     rasterizer: str = "auto"
     """Backend of the rasterizer, one of `rgbavatar_ns.kernels.available_backends()` or auto."""
     fast: bool = True
@@ -92,6 +108,9 @@ class RGBAvatarModel(Model):
             HeadModel(subject.arrays), subject.identity, self.config.avatar, seed=seed
         )
         self.register_buffer("frame_theta", subject.theta, persistent=False)
+        self.refinement = None
+        if self.config.refine_tracking:
+            self.refinement = FrameRefinement(subject, self.config.refinement)
         self.viewer_panel = ViewerPanel(len(subject.theta), _viewpoint(self.avatar, subject))
         self.color_schedule = ColorInitSchedule()
         self.lpips_loss = LPIPSLoss()
@@ -120,8 +139,13 @@ class RGBAvatarModel(Model):
         theta, background = metadata.get("theta"), metadata.get("background")
         if theta is None:
             position = self.viewer_panel.position(cameras.times)
-            theta = self.frame_theta[position].expand(len(cameras), -1)
+            theta = self.frame_theta[position][None]
+            if self.refinement is not None:
+                theta = self.refinement.corrected(theta, theta.new_full((1, 1), position))
+            theta = theta.expand(len(cameras), -1)
             background = theta.new_tensor(self.viewer_panel.background_color())
+        else:
+            theta = self._frames_theta(cameras)
         drawn = self.avatar.render(
             theta,
             from_nerfstudio(cameras),
@@ -154,12 +178,16 @@ class RGBAvatarModel(Model):
         losses = {"l1": l1_loss(image, target)}
         if self._lpips_counts(batch["step"]):
             losses["lpips"] = self.config.lpips_weight * self.lpips_loss(image, target)
+        if self._orthogonality() == "loss":
+            error = orthogonality_loss(self.avatar.blendshapes)
+            losses["orthogonality"] = _ORTHOGONALITY_WEIGHT * error
         self._images_rgba = batch["image"]
         return losses
 
     def can_fuse(self, step: int, optimizers: Iterable[torch.optim.Optimizer]) -> bool:
         """Say whether `fused_losses` may be asked for this step."""
-        wanted = self.config.fast and not self._lpips_counts(step)
+        own_loss = not self._lpips_counts(step) and self._orthogonality() != "loss"
+        wanted = self.config.fast and own_loss
         return wanted and refusal(self.avatar, optimizers) is None
 
     def fused_losses(
@@ -173,9 +201,8 @@ class RGBAvatarModel(Model):
         None, and no step, where the rasterizer's backend cannot. As drawing the batch,
         `get_loss_dict`, its gradients and the optimizers' steps, up to rounding.
         """
-        theta = (cameras.metadata or {})["theta"]
         loss = FusedStep(self.avatar, optimizers)(
-            theta,
+            self._frames_theta(cameras),
             from_nerfstudio(cameras),
             batch["image"],
             batch["background"],
@@ -184,26 +211,67 @@ class RGBAvatarModel(Model):
         self._cameras, self._images_rgba = cameras, batch["image"]
         return None if loss is None else {"l1": loss}
 
+    def held_out_theta(self, positions: list[int]) -> Tensor:
+        """What drives the avatar in these held-out frames: tracked theta, perhaps calibrated."""
+        theta = self.frame_theta[positions]
+        if self.refinement is None:
+            return theta
+        return self.refinement.corrected(theta, theta.new_tensor(positions)[:, None])
+
+    def _frames_theta(self, cameras: Cameras) -> Tensor:
+        """What the cameras bring, corrected where it belongs to a training frame.
+
+        In training it is kept, and takes the loss's gradient if it is to be corrected further.
+        """
+        metadata = cameras.metadata or {}
+        theta = metadata["theta"]
+        if self.refinement is not None:
+            theta = self.refinement.corrected(theta, metadata["position"])
+        if self.training:
+            theta.requires_grad_(self.refinement is not None)
+            self._theta = theta
+        return theta
+
+    def orthogonalize(self, step: int) -> None:
+        """Make the bases orthogonal after every 1,000th step."""
+        method = self.config.orthogonality
+        if (step + 1) % _ORTHOGONALIZE_EVERY == 0 and method in ("qr", "gram_schmidt"):
+            orthogonalize(self.avatar.blendshapes, method)
+
+    def _orthogonality(self) -> str:
+        return self.config.orthogonality if self.config.avatar.num_bases > 0 else "free"
+
     def _lpips_counts(self, step: int) -> bool:
         return self.config.lpips_weight > 0 and step >= self.config.lpips_start_step
 
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes
     ) -> list[TrainingCallback]:
-        """Colour initialisation after the optimiser's step."""
-        if not self.config.initialize_colors:
-            return []
+        """After the optimiser's step: corrected tracking, orthogonal bases, colours."""
         after = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]
-        return [TrainingCallback(where_to_run=after, func=self.initialize_colors)]
+        wanted = []
+        if self.refinement is not None:
+            wanted.append(self.refine_tracking)
+        if self._orthogonality() in ("qr", "gram_schmidt"):
+            wanted.append(self.orthogonalize)
+        if self.config.initialize_colors:
+            wanted.append(self.initialize_colors)
+        return [TrainingCallback(where_to_run=after, func=function) for function in wanted]
+
+    def refine_tracking(self, step: int) -> None:
+        """Correct the theta of the frames of `step` by the gradient that it has left there."""
+        gradient = self._theta.grad
+        if self.refinement is not None and gradient is not None:
+            position = (self._cameras.metadata or {})["position"]
+            self.refinement.step(step, position, gradient)
 
     def initialize_colors(self, step: int) -> None:
         """Initialise the colours of Gaussians that the batch of `step` shows for the first time."""
         if not self.color_schedule.due(step) or bool(self.avatar.color_initialized.all()):
             return
-        theta = (self._cameras.metadata or {})["theta"]
         cameras = from_nerfstudio(self._cameras)
         self.avatar.initialize_colors(
-            theta, cameras, self._images_rgba, backend=self.config.rasterizer
+            self._theta.detach(), cameras, self._images_rgba, backend=self.config.rasterizer
         )
 
     def get_image_metrics_and_images(
@@ -212,8 +280,8 @@ class RGBAvatarModel(Model):
         """PSNR, SSIM and, if it is there, LPIPS of one image; truth, avatar, error x 4 in a row."""
         image = outputs["rgb"][None]
         truth = batch["image"].to(self.device)[None]
-        opaque = torch.cat([truth[..., :3], torch.ones_like(truth[..., :1])], dim=-1)
-        scores = evaluate_images(image, opaque, self.lpips_metric)
+        rgba = batch["image_rgba"].to(self.device)[None]
+        scores = evaluate_images(image, rgba, self.lpips_metric)
         metrics = {name: value for name, value in scores.items() if isinstance(value, float)}
         error = ((image - truth).abs() * 4).clamp(0, 1)
         row = torch.cat([truth, image.clamp(0, 1), error], dim=2)[0]
@@ -226,7 +294,10 @@ class RGBAvatarModel(Model):
 
     def get_extra_state(self) -> dict[str, Any]:
         """What rebuilds the avatar without this dataset: its make, and every frame's theta."""
-        return model_state(self.avatar, self.subject)
+        subject = self.subject
+        if self.refinement is not None:
+            subject = replace(subject, theta=self.refinement.all_frames(subject.theta))
+        return model_state(self.avatar, subject)
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Nothing to restore: `load_state_dict` has compared it with this dataset's subject."""
@@ -234,8 +305,9 @@ class RGBAvatarModel(Model):
     def load_state_dict(
         self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False
     ) -> Any:
-        """Load parameters; raises UserError, naming both, if theta's layout is another one."""
+        """Load parameters; raises UserError if theta's layout or the refinement is another one."""
         require_same_layout(state_dict, self.avatar)
+        require_same_refinement(state_dict, self.refinement)
         return super().load_state_dict(state_dict, strict=strict, assign=assign)
 
 

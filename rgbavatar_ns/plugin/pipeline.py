@@ -3,16 +3,23 @@
 # pyright: reportIncompatibleVariableOverride=false
 # nerfstudio's classes are used by narrowing their fields, which a strict type system forbids.
 
+import statistics
+from collections import defaultdict
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import torch
 from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
+from rich.progress import track
 from torch import Tensor
 
-from rgbavatar_ns.avatar.metrics import LPIPSMetric
+from rgbavatar_ns.avatar.metrics import LPIPSMetric, evaluate_images
+from rgbavatar_ns.avatar.orthogonality import orthogonality_error
+from rgbavatar_ns.avatar.refinement import fit_theta
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.plugin.cameras import from_nerfstudio
 from rgbavatar_ns.plugin.datamanager import RGBAvatarDataManager, RGBAvatarDataManagerConfig
 from rgbavatar_ns.plugin.model import RGBAvatarModel, RGBAvatarModelConfig
 
@@ -59,7 +66,9 @@ class RGBAvatarPipeline(VanillaPipeline):
     ) -> dict[str, Any]:
         """Means over the held-out frames.
 
-        Under `ns-eval` these contain LPIPS, or under `lpips_unavailable` the reason why not.
+        Under `ns-eval` these contain LPIPS, or under `lpips_unavailable` the reason why not, and
+        with `refine_held_out` the scores of frames fitted to their images, named `..._refined`;
+        `e_orth` is how far the bases are from orthogonal.
 
         Raises:
             UserError: the dataset holds out no frames.
@@ -74,9 +83,41 @@ class RGBAvatarPipeline(VanillaPipeline):
         if self.config.model.lpips_metric:
             self.model.lpips_metric = LPIPSMetric()
         metrics = super().get_average_eval_image_metrics(step, output_path, get_std)
+        if self.config.model.refine_held_out > 0:
+            metrics |= self._refined_metrics()
+        metrics["e_orth"] = orthogonality_error(self.model.avatar.blendshapes).item()
         lpips = self.model.lpips_metric
         if lpips is None:
             metrics["lpips_unavailable"] = "switched off with --pipeline.model.lpips-metric False"
         elif lpips.unavailable is not None:
             metrics["lpips_unavailable"] = lpips.unavailable
         return metrics
+
+    @torch.no_grad()
+    def _refined_metrics(self) -> dict[str, float]:
+        """Means over held-out frames whose theta was fitted to the image, the avatar frozen."""
+        tracked, model = self.datamanager.dataparser.tracked, self.config.model
+        size, scores = self.datamanager.config.batch_size, defaultdict[str, list[float]](list)
+        positions = list(tracked.test)
+        for first in track(range(0, len(positions), size), "Fitting held-out frames..."):
+            chosen = positions[first : first + size]
+            rows = torch.arange(first, first + len(chosen))
+            cameras = self.datamanager.eval_dataset.cameras[rows].to(self.device)
+            pinhole = from_nerfstudio(cameras)
+            images = self.datamanager.image_cache.get(chosen).to(self.device)
+            theta = fit_theta(
+                self.model.avatar,
+                self.model.held_out_theta(chosen),
+                pinhole,
+                images,
+                model.refine_held_out,
+                config=model.refinement,
+                reference=self.model.frame_theta[list(tracked.train)],
+                backend=model.rasterizer,
+            )
+            drawn = self.model.avatar.render(theta, pinhole, backend=model.rasterizer).image
+            for image, target in zip(drawn, images):
+                for name, value in evaluate_images(image[None], target[None]).items():
+                    if isinstance(value, float):
+                        scores[f"{name}_refined"].append(value)
+        return {name: statistics.fmean(values) for name, values in scores.items()}

@@ -26,6 +26,7 @@ from rgbavatar_ns.plugin.interruption import StopRequest
 from rgbavatar_ns.plugin.optimizers import ExponentialConfig
 from rgbavatar_ns.plugin.pipeline import RGBAvatarPipeline, RGBAvatarPipelineConfig
 from rgbavatar_ns.plugin.progress import TrainingProgress
+from rgbavatar_ns.plugin.refinement import REFINED_NAME
 
 SUMMARY_NAME = "training.json"
 
@@ -208,13 +209,19 @@ class RGBAvatarTrainer(Trainer):
             rate = scheduler.get_last_lr()[0]
             writer.put_scalar(name=f"learning_rate/{name}", scalar=rate, step=step)
 
+    @property
+    def completed(self) -> bool:
+        """Whether all steps are done."""
+        return self.step >= self.config.max_num_iterations - 1
+
     def _after_train(self) -> None:
         """Save, say how it went, and keep the viewer open if it is to stay."""
-        completed = self.step >= self.config.max_num_iterations - 1
+        completed = self.completed
         self.training_state = "completed" if completed else "paused"
         if self.step >= 0 and self.step != self._saved_step:
             self.save_checkpoint(self.step)
         writer.write_out_storage()
+        self._save_refined()
         self._tell_end(completed)
         self._run_callbacks(self.step, TrainingCallbackLocation.AFTER_TRAIN)
         if completed and not self.config.viewer.quit_on_train_completion:
@@ -234,6 +241,12 @@ class RGBAvatarTrainer(Trainer):
             )
         CONSOLE.print(f"Config: {self.base_dir / 'config.yml'}", highlight=False, soft_wrap=True)
         CONSOLE.print(f"Checkpoints: {self.checkpoint_dir}", highlight=False, soft_wrap=True)
+
+    def _save_refined(self) -> None:
+        """Write what refinement made of the frames' theta beside the config."""
+        model = self.pipeline.model
+        if model.refinement is not None:
+            model.refinement.save(self.base_dir / REFINED_NAME, model.frame_theta)
 
     def _write_summary(self) -> dict[str, int | float]:
         """The run's length and speed over all its sessions, as training.json."""

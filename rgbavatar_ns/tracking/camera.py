@@ -30,14 +30,16 @@ class StillCamera:
         across = points_m[..., :2] * (1.0, -1.0)
         return self.focal_px * across / depth[..., None] + self.center_px
 
-    def jacobian(self, points_m: Float[np.ndarray, "L 3"]) -> Float[np.ndarray, "L 2 3"]:
-        """Derivative of `project` to the points."""
+    def image_derivative(
+        self, points_m: Float[np.ndarray, "L 3"], derivative: Float[np.ndarray, "3 L Q"]
+    ) -> Float[np.ndarray, "L 2 Q"]:
+        """Derivative of `project` where the points' own derivative is given."""
         depth = self.distance_m - points_m[:, 2]
-        result = np.zeros((len(points_m), 2, 3))
-        result[:, 0, 0] = self.focal_px / depth
-        result[:, 1, 1] = -self.focal_px / depth
-        result[:, 0, 2] = self.focal_px * points_m[:, 0] / depth**2
-        result[:, 1, 2] = -self.focal_px * points_m[:, 1] / depth**2
+        across = self.focal_px / depth
+        towards = across[:, None] * points_m[:, :2] / depth[:, None]
+        result = np.empty((len(points_m), 2, derivative.shape[-1]))
+        result[:, 0] = across[:, None] * derivative[0] + towards[:, :1] * derivative[2]
+        result[:, 1] = -across[:, None] * derivative[1] - towards[:, 1:] * derivative[2]
         return result
 
     def cropped(self, left: int, top: int, scale: float) -> "StillCamera":

@@ -1,6 +1,7 @@
 """What a user can choose when a video is tracked."""
 
 from dataclasses import dataclass
+from pathlib import Path
 
 
 @dataclass(frozen=True)
@@ -23,7 +24,11 @@ class TrackConfig:
     """Keep neck and shoulders as the matte found them. By default the matte fades out below the
     neck of the fitted head, because the avatar's Gaussians ride on a mesh that ends there: a
     torso in the picture would be explained by stretched Gaussians that swing with the head."""
+    mattes: Path | None = None
+    """Your own mattes, in place of those that are found: a folder with one image a frame (named
+    like the frames, or in the order of their numbers; white or opaque is the person), or a mask
+    video. The alpha channel of a folder of images is used by itself."""
     temporal_weight: float = 1.0
     """How strongly each frame is drawn to the mean of its neighbours; 0 switches it off."""
     overwrite: bool = False
-    """Replace an existing dataset at the destination."""
+    """Replace an existing dataset, or an unfinished run of other options, at the destination."""

@@ -28,14 +28,20 @@ class SquareCrop:
         """Output pixels per source pixel."""
         return self.size / self.side
 
-    def apply(self, image: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "size size 3"]:
-        """The square part of the frame at the output size."""
+    def apply(
+        self, image: UInt8[np.ndarray, "H W *channels"]
+    ) -> UInt8[np.ndarray, "size size *channels"]:
+        """The square part of the frame (of a picture or a mask) at the output size."""
         height, width = image.shape[:2]
-        rows = np.clip(np.arange(self.top, self.top + self.side), 0, height - 1)
-        columns = np.clip(np.arange(self.left, self.left + self.side), 0, width - 1)
-        square = np.ascontiguousarray(image[rows[:, None], columns[None]])
+        top, bottom = _within(self.top, self.side, height)
+        left, right = _within(self.left, self.side, width)
+        part = image[top:bottom, left:right]
+        beyond = (top - self.top, self.top + self.side - bottom)
+        beside = (left - self.left, self.left + self.side - right)
+        if any(beyond + beside):
+            part = cv2.copyMakeBorder(part, *beyond, *beside, cv2.BORDER_REPLICATE)
         method = cv2.INTER_AREA if self.size <= self.side else cv2.INTER_CUBIC
-        return cv2.resize(square, (self.size, self.size), interpolation=method)
+        return cv2.resize(part, (self.size, self.size), interpolation=method)
 
     def inside(self, width: int, height: int) -> Float[np.ndarray, "size size"]:
         """1 where the square shows the frame, 0 where it reaches beyond."""
@@ -49,6 +55,12 @@ class SquareCrop:
     def points(self, points_px: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
         """Points of the source frame in pixels of the crop."""
         return (points_px - (self.left, self.top)) * self.scale
+
+
+def _within(start: int, side: int, span: int) -> tuple[int, int]:
+    """The part of start .. start + side that lies in 0 .. span, at least one pixel of it."""
+    first = min(max(start, 0), span - 1)
+    return first, max(min(start + side, span), first + 1)
 
 
 def steady_crop(

@@ -18,6 +18,7 @@ _IDENTITY_WIDTH = 2.5
 _SCAN_KEYS = 4
 _HEAD_HEIGHT_M = 0.19
 _OFFSET_SHRINK = 0.8
+_ROBUST_STEPS = 2
 
 
 @dataclass(frozen=True)
@@ -110,22 +111,30 @@ def fit_frame(
     temporal_weight: float,
     iterations: int,
 ) -> Float[np.ndarray, "P"]:
-    """One frame's bounded fit from `start`, drawn towards `neighbours` if given."""
+    """One frame's bounded fit from `start`, drawn towards `neighbours` if given.
+
+    The last `_ROBUST_STEPS` of at most `iterations` steps let go of landmarks that are far off.
+    """
     base, identity = blank(cost)
+    values = start
+    for steps, redescending in ((iterations - _ROBUST_STEPS, False), (_ROBUST_STEPS, True)):
 
-    def model_at(values: Float[np.ndarray, "P"]) -> QuadraticModel:
-        data = cost.linearize(cost.theta(values, base), identity, camera, target)
-        model = QuadraticModel(data.cost, data.gradient, data.hessian)
-        return cost.add_priors(values, model, neighbours, temporal_weight)
+        def model_at(
+            values: Float[np.ndarray, "P"], redescending: bool = redescending
+        ) -> QuadraticModel:
+            theta = cost.theta(values, base)
+            data = cost.linearize(theta, identity, camera, target, redescending=redescending)
+            model = QuadraticModel(data.cost, data.gradient, data.hessian)
+            return cost.add_priors(values, model, neighbours, temporal_weight)
 
-    values, _ = levenberg_marquardt(
-        model_at,
-        start,
-        cost.parameters.lower,
-        cost.parameters.upper,
-        iterations=iterations,
-        tolerance=1e-3,
-    )
+        values, _ = levenberg_marquardt(
+            model_at,
+            values,
+            cost.parameters.lower,
+            cost.parameters.upper,
+            iterations=steps,
+            tolerance=1e-3,
+        )
     return values
 
 
@@ -200,6 +209,7 @@ def _fit_keys(
     ]
     frames, size = len(keys), len(cost.parameters.columns)
     shared = min(identity_components, len(identity))
+    joint = replace(cost, identity_columns=shared)
     # All key frames share FaceMesh's bias, so they count as one observation of the identity.
     precision = frames / _IDENTITY_WIDTH**2
     lower = np.concatenate([np.tile(cost.parameters.lower, frames), np.full(shared, -3.0)])
@@ -217,7 +227,7 @@ def _fit_keys(
         for number, key in enumerate(keys):
             own = slice(number * size, (number + 1) * size)
             values = packed[own]
-            data = cost.linearize(cost.theta(values, base), person, camera, key, shared)
+            data = joint.linearize(cost.theta(values, base), person, camera, key)
             frame = cost.add_priors(
                 values,
                 QuadraticModel(data.cost, data.gradient[:size], data.hessian[:size, :size]),

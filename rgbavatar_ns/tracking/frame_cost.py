@@ -1,5 +1,6 @@
 """How badly a pose of the head explains one frame's landmarks, with derivatives."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,7 +20,15 @@ LID_PAIRS = ((159, 145), (158, 153), (160, 144), (386, 374), (385, 380), (387, 3
 _SIGMA_SHARE = 0.01
 _INDEPENDENT = 120.0
 _PAIR_WEIGHT = 3.0
+# Huber's loss finds the head from afar; then points beyond `_REDESCENDING_SIGMAS` (a hand, a slip)
+# count ever less: Geman and McClure's loss.
 _HUBER_SIGMAS = 2.5
+_REDESCENDING_SIGMAS = 3.0
+
+
+RobustLoss = Callable[
+    [Float[np.ndarray, "R"]], tuple[Float[np.ndarray, "R"], Float[np.ndarray, "R"]]
+]
 
 
 @dataclass(frozen=True)
@@ -47,8 +56,11 @@ class FrameCost:
     facemesh_index: Int[np.ndarray, "L"]
     landmark_weight: Float[np.ndarray, "L"]
     parameters: FitParameters
+    identity_columns: int = 0
+    """How many identity coefficients are unknown too."""
 
     def __post_init__(self) -> None:
+        self._unknowns = self.head.unknowns(self.parameters.columns, self.identity_columns)
         place = {int(index): row for row, index in enumerate(self.facemesh_index)}
         pairs = [
             (place[a], place[b]) for a, b in LIP_PAIRS + LID_PAIRS if a in place and b in place
@@ -72,19 +84,15 @@ class FrameCost:
         identity: Float[np.ndarray, "I"],
         camera: StillCamera,
         target: Target,
-        identity_columns: int = 0,
+        *,
+        redescending: bool = False,
     ) -> Linearized:
-        """The data terms at theta; derivatives to identity's first columns come last."""
-        derivatives = self.head.jacobian(theta, identity)
-        to_image = camera.jacobian(derivatives.points)
-        wanted = np.concatenate(
-            [
-                derivatives.to_theta[..., self.parameters.columns],
-                derivatives.to_identity[..., :identity_columns],
-            ],
-            axis=2,
-        )
-        jacobian = to_image @ wanted
+        """The data terms at theta; derivatives to identity's first columns come last.
+
+        With `redescending` far-off landmarks lose their pull; otherwise they keep an even one.
+        """
+        derivatives = self.head.jacobian(theta, identity, self._unknowns)
+        jacobian = camera.image_derivative(derivatives.points, derivatives.derivative)
         unit = _SIGMA_SHARE * target.face_height_px
         residual = (camera.project(derivatives.points) - target.points_px) / unit
         first, second = self._pairs.T
@@ -95,6 +103,7 @@ class FrameCost:
             np.concatenate([residual, pair_residual]),
             np.concatenate([jacobian, pair_jacobian]) / unit,
             weight,
+            _geman_mcclure if redescending else _huber,
         )
 
     def add_priors(
@@ -117,20 +126,34 @@ class FrameCost:
         return QuadraticModel(cost, model.gradient + pull, model.hessian + np.diag(precision))
 
 
+def _huber(
+    distance: Float[np.ndarray, "R"],
+) -> tuple[Float[np.ndarray, "R"], Float[np.ndarray, "R"]]:
+    """Loss and weight (its derivative by distance^2 / 2): far-off points pull evenly."""
+    far = distance > _HUBER_SIGMAS
+    loss = np.where(far, _HUBER_SIGMAS * (distance - 0.5 * _HUBER_SIGMAS), 0.5 * distance**2)
+    return loss, np.where(far, _HUBER_SIGMAS / np.maximum(distance, 1e-12), 1.0)
+
+
+def _geman_mcclure(
+    distance: Float[np.ndarray, "R"],
+) -> tuple[Float[np.ndarray, "R"], Float[np.ndarray, "R"]]:
+    """Loss and weight: far-off points cost a constant and hardly pull."""
+    share = 1 / (1 + (distance / _REDESCENDING_SIGMAS) ** 2)
+    return 0.5 * distance**2 * share, share**2
+
+
 def _robust_normal_equations(
     residual: Float[np.ndarray, "R 2"],
     jacobian: Float[np.ndarray, "R 2 Q"],
     weight: Float[np.ndarray, "R"],
+    robust: RobustLoss,
 ) -> Linearized:
-    """Huber on each point's distance: far-off landmarks (a hand, a slip) count linearly."""
-    distance = np.linalg.norm(residual, axis=1)
-    far = distance > _HUBER_SIGMAS
-    huber = np.where(far, _HUBER_SIGMAS * (distance - 0.5 * _HUBER_SIGMAS), 0.5 * distance**2)
-    soften = np.where(far, _HUBER_SIGMAS / np.maximum(distance, 1e-12), 1.0)
+    loss, soften = robust(np.linalg.norm(residual, axis=1))
     root = (weight * np.sqrt(soften))[:, None]
     scaled = (jacobian * root[..., None]).reshape(-1, jacobian.shape[-1])
     return Linearized(
-        float((weight**2) @ huber),
+        float((weight**2) @ loss),
         scaled.T @ (residual * root).reshape(-1),
         scaled.T @ scaled,
     )

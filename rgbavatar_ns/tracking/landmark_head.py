@@ -11,28 +11,36 @@ from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.head.rotations import axis_angle_to_matrix
 
 POSE_FIELDS = ("rotation", "neck", "jaw", "left_eye", "right_eye")
-_DIFFERENCE = 1e-5
+_SKULL = 1
+_NO_ANGLE_RAD = 1e-7
 
 
 @dataclass(frozen=True)
 class LandmarkJacobian:
-    """Landmarks [L, 3] in metres with their derivatives to theta [L, 3, H] and identity."""
+    """Landmarks [L, 3] in metres with their derivatives [3, L, Q] to the unknowns asked for."""
 
     points: Float[np.ndarray, "L 3"]
-    to_theta: Float[np.ndarray, "L 3 H"]
-    to_identity: Float[np.ndarray, "L 3 I"]
+    derivative: Float[np.ndarray, "3 L Q"]
 
 
 @dataclass(frozen=True)
 class _Chain:
-    """Joints of B poses: a point at rest x on joint j goes to turned_j x + sum_k carried_jk J_k.
+    """Joints of a pose: what rests at x on joint j goes to turned_j (x - at_rest_j) + placed_j.
 
-    J are the joints at rest; `features` are R - I of all joints but the root, FLAME's order.
+    `local` are the joints' own rotations; column k of `spin` is the angular velocity in the world
+    as entry k of the joint's axis angle grows.
     """
 
-    turned: Float[np.ndarray, "B 5 3 3"]
-    carried: Float[np.ndarray, "B 5 5 3 3"]
-    features: Float[np.ndarray, "B 36"]
+    local: Float[np.ndarray, "5 3 3"]
+    turned: Float[np.ndarray, "5 3 3"]
+    spin: Float[np.ndarray, "5 3 3"]
+    at_rest: Float[np.ndarray, "5 3"]
+    placed: Float[np.ndarray, "5 3"]
+
+    @property
+    def features(self) -> Float[np.ndarray, "36"]:
+        """R - I of all joints but the root, FLAME's order."""
+        return (self.local[1:] - np.eye(3)).reshape(36)
 
 
 @dataclass(frozen=True)
@@ -49,6 +57,22 @@ class _JointMoments:
     rest: Float[np.ndarray, "3 R"]
     dirs: Float[np.ndarray, "3 R C"]
     pose_dirs: Float[np.ndarray, "3 R 36"] | None
+
+
+@dataclass(frozen=True)
+class Unknowns:
+    """What a fit asks derivatives for, in this order: places in the derivative's last axis.
+
+    angles: (joint, axis, place); shifts: (axis, place); coefficients: their places, and each
+    joint's `dirs` and joint directions for them alone.
+    """
+
+    size: int
+    angles: tuple[tuple[int, int, int], ...]
+    shifts: tuple[tuple[int, int], ...]
+    coefficients: Int[np.ndarray, "K"]
+    dirs: tuple[Float[np.ndarray, "3 _"], ...]
+    joint_dirs: Float[np.ndarray, "5 3 K"]
 
 
 def _joint_moments(
@@ -142,47 +166,61 @@ class LandmarkHead:
             moved[:, part.rows] += part.dirs[..., first : first + count]
         return np.linalg.norm(moved, axis=0).max(0)
 
+    def unknowns(self, theta_columns: Int[np.ndarray, "P"], identity_columns: int = 0) -> Unknowns:
+        """Entries of theta, then the identity's first coefficients, as unknowns of a fit."""
+        kinds: dict[int, tuple[str, int]] = {}
+        for joint, name in enumerate(POSE_FIELDS):
+            if name in self.layout:
+                first = self.layout.slice(name).start
+                kinds |= {first + axis: ("angle", 3 * joint + axis) for axis in range(3)}
+        first = self.layout.slice("translation").start
+        kinds |= {first + axis: ("shift", axis) for axis in range(3)}
+        place = self.num_identity
+        for name in ("expression", "eyelids"):
+            if name in self.layout:
+                part = self.layout.slice(name)
+                for column in range(part.start, part.stop):
+                    kinds[column] = ("coefficient", place)
+                    place += 1
+        asked = [kinds[int(column)] for column in theta_columns]
+        asked += [("coefficient", number) for number in range(identity_columns)]
+        rows = [(number, kind[1]) for number, kind in enumerate(asked) if kind[0] == "coefficient"]
+        sources = [source for _, source in rows]
+        return Unknowns(
+            len(asked),
+            tuple((s // 3, s % 3, n) for n, (kind, s) in enumerate(asked) if kind == "angle"),
+            tuple((s, n) for n, (kind, s) in enumerate(asked) if kind == "shift"),
+            np.array([number for number, _ in rows], dtype=np.int64),
+            tuple(part.dirs[..., sources].reshape(3, -1) for part in self._moments),
+            self._joint_dirs[..., sources],
+        )
+
     def points(
         self, theta: Float[np.ndarray, "H"], identity: Float[np.ndarray, "I"]
     ) -> Float[np.ndarray, "L 3"]:
         """Landmarks in world space, metres."""
         coefficients = self._coefficients(theta, identity)
-        chain = self._chain(self._poses(theta)[None])
-        return self._pose(chain, coefficients)[0] + self._translation(theta)
+        chain = self._chain(theta, coefficients)
+        return sum(self._carried(chain, coefficients), np.zeros((3, self.num_landmarks))).T
 
     def head_rotation(self, theta: Float[np.ndarray, "H"]) -> Float[np.ndarray, "3 3"]:
         """World rotation of the skull: global rotation, then neck."""
-        return self._chain(self._poses(theta)[None]).turned[0, 1]
+        return self._chain(theta, np.zeros(self._joint_dirs.shape[-1])).turned[_SKULL]
 
     def jacobian(
-        self, theta: Float[np.ndarray, "H"], identity: Float[np.ndarray, "I"]
+        self, theta: Float[np.ndarray, "H"], identity: Float[np.ndarray, "I"], unknowns: Unknowns
     ) -> LandmarkJacobian:
-        """Landmarks with derivatives: exact for coefficients, central differences for angles.
-
-        The differences are taken in float64 with a step of 1e-5 rad: right to about 1e-10.
-        """
+        """Landmarks with their exact derivatives to `unknowns` of this head."""
         coefficients = self._coefficients(theta, identity)
-        poses = self._poses(theta)
-        shifts = np.eye(15).reshape(15, 5, 3) * _DIFFERENCE
-        chain = self._chain(np.concatenate([poses[None], poses + shifts, poses - shifts]))
-        posed = self._pose(chain, coefficients)
-        to_angles = ((posed[1:16] - posed[16:]) / (2 * _DIFFERENCE)).transpose(1, 2, 0)
-        to_coefficients = self._coefficient_jacobian(chain)
-        to_theta = np.zeros((self.num_landmarks, 3, self.layout.size))
-        for number, name in enumerate(POSE_FIELDS):
-            if name in self.layout:
-                to_theta[..., self.layout.slice(name)] = to_angles[..., 3 * number : 3 * number + 3]
-        to_theta[..., self.layout.slice("translation")] = np.eye(3)
-        expression = self.layout.slice("expression")
-        count = self.num_identity + (expression.stop - expression.start)
-        to_theta[..., expression] = to_coefficients[..., self.num_identity : count]
-        if "eyelids" in self.layout:
-            to_theta[..., self.layout.slice("eyelids")] = to_coefficients[..., count:]
-        return LandmarkJacobian(
-            posed[0] + self._translation(theta),
-            to_theta,
-            to_coefficients[..., : self.num_identity],
-        )
+        chain = self._chain(theta, coefficients)
+        carried = self._carried(chain, coefficients)
+        derivative = np.zeros((3, self.num_landmarks, unknowns.size))
+        derivative[..., unknowns.coefficients] = self._coefficient_jacobian(chain, unknowns)
+        for axis, place in unknowns.shifts:
+            derivative[axis, :, place] = 1.0
+        for joint, axis, place in unknowns.angles:
+            derivative[..., place] = self._turning(chain, carried, joint, axis)
+        return LandmarkJacobian(sum(carried, np.zeros((3, self.num_landmarks))).T, derivative)
 
     def _coefficients(
         self, theta: Float[np.ndarray, "H"], identity: Float[np.ndarray, "I"]
@@ -192,56 +230,98 @@ class LandmarkHead:
             parts.append(theta[self.layout.slice("eyelids")])
         return np.concatenate(parts)
 
-    def _poses(self, theta: Float[np.ndarray, "H"]) -> Float[np.ndarray, "5 3"]:
-        return np.stack(
-            [
-                theta[self.layout.slice(name)] if name in self.layout else np.zeros(3)
-                for name in POSE_FIELDS
-            ]
-        )
-
-    def _translation(self, theta: Float[np.ndarray, "H"]) -> Float[np.ndarray, "3"]:
-        return theta[self.layout.slice("translation")]
-
-    def _pose(
+    def _carried(
         self, chain: _Chain, coefficients: Float[np.ndarray, "C"]
-    ) -> Float[np.ndarray, "B L 3"]:
-        joints = self._joint_rest + self._joint_dirs @ coefficients
-        offsets = np.tensordot(chain.carried, joints, axes=((2, 4), (0, 1)))
-        posed = np.zeros((len(offsets), 3, self.num_landmarks))
+    ) -> list[Float[np.ndarray, "3 L"]]:
+        """What each part of `_moments` adds to the landmarks in the world."""
+        found = []
         for part in self._moments:
             rest = part.rest + part.dirs @ coefficients
             if part.pose_dirs is not None:
-                rest = rest + np.moveaxis(part.pose_dirs @ chain.features.T, -1, 0)
-            posed[..., part.rows] += chain.turned[:, part.joint] @ rest
-            posed[..., part.rows] += offsets[:, part.joint, :, None] * part.share
-        return posed.transpose(0, 2, 1)
+                rest = rest + part.pose_dirs @ chain.features
+            rest -= part.share * chain.at_rest[part.joint][:, None]
+            carried = np.zeros((3, self.num_landmarks))
+            placed = chain.placed[part.joint][:, None] * part.share
+            carried[:, part.rows] = chain.turned[part.joint] @ rest + placed
+            found.append(carried)
+        return found
 
-    def _coefficient_jacobian(self, chain: _Chain) -> Float[np.ndarray, "L 3 C"]:
-        """Of the chain's first pose."""
-        offsets = np.einsum("jkxy,kyc->jxc", chain.carried[0], self._joint_dirs)
-        moved = np.zeros((3, self.num_landmarks, self._joint_dirs.shape[-1]))
-        for part in self._moments:
-            turned = chain.turned[0, part.joint] @ part.dirs.reshape(3, -1)
-            moved[:, part.rows] += turned.reshape(part.dirs.shape)
-            moved[:, part.rows] += part.share[:, None] * offsets[part.joint][:, None]
-        return moved.transpose(1, 0, 2)
-
-    def _chain(self, poses: Float[np.ndarray, "B 5 3"]) -> _Chain:
-        rotations = axis_angle_to_matrix(torch.from_numpy(poses)).numpy()
-        turned = np.zeros_like(rotations)
-        carried = np.zeros((len(rotations), 5, 5, 3, 3))
+    def _coefficient_jacobian(
+        self, chain: _Chain, unknowns: Unknowns
+    ) -> Float[np.ndarray, "3 L K"]:
+        placed = np.zeros_like(unknowns.joint_dirs)
         for joint, parent in enumerate(self._parents):
+            placed[joint] = unknowns.joint_dirs[joint]
+            if parent >= 0:
+                apart = unknowns.joint_dirs[joint] - unknowns.joint_dirs[parent]
+                placed[joint] = placed[parent] + chain.turned[parent] @ apart
+        moved = np.zeros((3, self.num_landmarks, unknowns.joint_dirs.shape[-1]))
+        for part, dirs in zip(self._moments, unknowns.dirs):
+            turned = chain.turned[part.joint]
+            shift = placed[part.joint] - turned @ unknowns.joint_dirs[part.joint]
+            own = (turned @ dirs).reshape(3, len(part.rows), -1)
+            moved[:, part.rows] += own + part.share[:, None] * shift[:, None]
+        return moved
+
+    def _turning(
+        self,
+        chain: _Chain,
+        carried: list[Float[np.ndarray, "3 L"]],
+        joint: int,
+        axis: int,
+    ) -> Float[np.ndarray, "3 L"]:
+        """Derivative of the landmarks to one entry of a joint's axis angle."""
+        spin = chain.spin[joint, :, axis]
+        lever = np.zeros((3, self.num_landmarks))
+        for part, own in zip(self._moments, carried):
+            if self._hangs_on(part.joint, joint):
+                lever += own
+                lever[:, part.rows] -= chain.placed[joint][:, None] * part.share
+        moved = _cross_matrix(spin) @ lever
+        if joint == 0:
+            return moved
+        local = _cross_matrix(chain.turned[self._parents[joint]].T @ spin) @ chain.local[joint]
+        for part in self._moments:
+            if part.pose_dirs is not None:
+                corrected = part.pose_dirs[..., 9 * joint - 9 : 9 * joint] @ local.reshape(9)
+                moved[:, part.rows] += chain.turned[part.joint] @ corrected
+        return moved
+
+    def _hangs_on(self, joint: int, ancestor: int) -> bool:
+        while joint != ancestor and joint >= 0:
+            joint = self._parents[joint]
+        return joint == ancestor
+
+    def _chain(self, theta: Float[np.ndarray, "H"], coefficients: Float[np.ndarray, "C"]) -> _Chain:
+        poses = np.zeros((5, 3))
+        for joint, name in enumerate(POSE_FIELDS):
+            if name in self.layout:
+                poses[joint] = theta[self.layout.slice(name)]
+        local = axis_angle_to_matrix(torch.from_numpy(poses)).numpy()
+        at_rest = self._joint_rest + self._joint_dirs @ coefficients
+        turned, placed, spin = local.copy(), at_rest.copy(), np.zeros((5, 3, 3))
+        for joint, parent in enumerate(self._parents):
+            above = turned[parent] if parent >= 0 else np.eye(3)
+            spin[joint] = above @ _spin(poses[joint], local[joint])
             if parent < 0:
-                turned[:, joint] = rotations[:, joint]
-                carried[:, joint, joint] = np.eye(3)
+                placed[joint] += theta[self.layout.slice("translation")]
                 continue
-            turned[:, joint] = turned[:, parent] @ rotations[:, joint]
-            carried[:, joint] = carried[:, parent]
-            carried[:, joint, joint] += turned[:, parent]
-            carried[:, joint, parent] -= turned[:, parent]
-        # Up to here where each joint goes; minus where its rotation alone would take it.
-        for joint in range(5):
-            carried[:, joint, joint] -= turned[:, joint]
-        features = (rotations[:, 1:] - np.eye(3)).reshape(len(poses), 36)
-        return _Chain(turned, carried, features)
+            turned[joint] = above @ local[joint]
+            placed[joint] = placed[parent] + above @ (at_rest[joint] - at_rest[parent])
+        return _Chain(local, turned, spin, at_rest, placed)
+
+
+def _cross_matrix(vector: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+    x, y, z = vector
+    return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+
+
+def _spin(
+    axis_angle: Float[np.ndarray, "3"], rotation: Float[np.ndarray, "3 3"]
+) -> Float[np.ndarray, "3 3"]:
+    """Column k: angular velocity of exp(v) as v's entry k grows (Gallego and Yezzi 2015)."""
+    squared = float(axis_angle @ axis_angle)
+    if squared < _NO_ANGLE_RAD**2:
+        return np.eye(3)
+    across = _cross_matrix(axis_angle) @ (np.eye(3) - rotation)
+    return (np.outer(axis_angle, axis_angle) + across) / squared

@@ -9,6 +9,8 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.tracking.follow import FaceFollower
+from rgbavatar_ns.tracking.image_files import fitted_size
 
 FOREHEAD, CHIN = 10, 152
 IRIS_CENTERS = (468, 473)
@@ -18,7 +20,9 @@ FACE_OVAL = (
     *(152, 148, 176, 149, 150, 136, 172, 58, 132, 93, 234, 127, 162, 21, 54, 103, 67, 109),
 )
 """Where FaceMesh puts the outline of the face as seen: these points slide over the skin."""
-_MAX_SIDE_PX = 1280
+MAX_SIDE_PX = 1280
+"""Pictures that are larger are made smaller before faces are looked for."""
+_MOST_FACES = 3
 
 
 def load_mediapipe() -> ModuleType:
@@ -35,13 +39,17 @@ def load_mediapipe() -> ModuleType:
 
 
 class FaceLandmarker:
-    """FaceMesh over the frames of a video in order; it follows one face, so order matters."""
+    """FaceMesh over the frames of a video in order; order matters, it goes on from each frame.
+
+    Called, it keeps to one face (`FaceFollower`); `faces` gives all it sees, up to `_MOST_FACES`.
+    """
 
     def __init__(self) -> None:
         face_mesh = load_mediapipe().solutions.face_mesh
         self._mesh = face_mesh.FaceMesh(
-            static_image_mode=False, max_num_faces=1, refine_landmarks=True
+            static_image_mode=False, max_num_faces=_MOST_FACES, refine_landmarks=True
         )
+        self._follower = FaceFollower()
 
     def __enter__(self) -> "FaceLandmarker":
         return self
@@ -55,17 +63,21 @@ class FaceLandmarker:
         self._mesh.close()
 
     def __call__(self, image_rgb: UInt8[np.ndarray, "H W 3"]) -> Float[np.ndarray, "478 2"] | None:
-        """Landmarks in pixels (centre of the first pixel at .5, .5), or None without a face."""
+        """The followed face's landmarks in pixels (first pixel's centre at .5, .5), or None."""
         height, width = image_rgb.shape[:2]
-        shrink = _MAX_SIDE_PX / max(height, width)
-        if shrink < 1:
-            small = (max(1, round(width * shrink)), max(1, round(height * shrink)))
+        faces = self.faces(image_rgb) * (width, height)
+        followed = self._follower(faces, width, height).position
+        return None if followed is None else faces[followed]
+
+    def faces(self, image_rgb: UInt8[np.ndarray, "H W 3"]) -> Float[np.ndarray, "N 478 2"]:
+        """Every face's landmarks as shares of the picture's width and height."""
+        height, width = image_rgb.shape[:2]
+        small = fitted_size(width, height, MAX_SIDE_PX)
+        if small != (width, height):
             image_rgb = cv2.resize(image_rgb, small, interpolation=cv2.INTER_AREA)
-        found = self._mesh.process(np.ascontiguousarray(image_rgb)).multi_face_landmarks
-        if not found:
-            return None
-        relative = np.array([[point.x, point.y] for point in found[0].landmark])
-        return relative * (width, height)
+        found = self._mesh.process(np.ascontiguousarray(image_rgb)).multi_face_landmarks or []
+        points = [[(point.x, point.y) for point in face.landmark] for face in found]
+        return np.array(points, dtype=np.float64).reshape(-1, 478, 2)
 
 
 def face_height_px(landmarks_px: Float[np.ndarray, "*batch 478 2"]) -> Float[np.ndarray, "*batch"]:

@@ -12,7 +12,10 @@ _GUIDE_EPSILON = 1e-4 * 255**2
 
 
 class PersonMatte:
-    """mediapipe's selfie segmentation, refined by a guided filter; each frame by itself."""
+    """mediapipe's selfie segmentation, refined by a guided filter.
+
+    Each frame by itself: the result depends on one picture alone.
+    """
 
     def __init__(self) -> None:
         selfie = load_mediapipe().solutions.selfie_segmentation
@@ -31,13 +34,30 @@ class PersonMatte:
 
     def __call__(self, image_rgb: UInt8[np.ndarray, "H W 3"]) -> Float[np.ndarray, "H W"]:
         """Alpha in [0, 1], float32: 1 on the person, soft at hair."""
-        coarse = self._segmenter.process(np.ascontiguousarray(image_rgb)).segmentation_mask
-        radius = max(2, round(max(image_rgb.shape[:2]) / 45))
-        fine = cv2.ximgproc.guidedFilter(
-            image_rgb, coarse.astype(np.float32), radius, _GUIDE_EPSILON
-        )
-        # The segmentation hovers a little off 0 and 1; an avatar would learn that as haze.
-        return np.clip((fine - 0.06) / 0.88, 0, 1).astype(np.float32)
+        return refined_matte(image_rgb, self.coarse(image_rgb))
+
+    def coarse(self, image_rgb: UInt8[np.ndarray, "H W 3"]) -> Float[np.ndarray, "H W"]:
+        """The segmentation alone, which knows no more than about 256 x 256 pixels."""
+        found = self._segmenter.process(np.ascontiguousarray(image_rgb)).segmentation_mask
+        return found.astype(np.float32)
+
+
+def refined_matte(
+    image_rgb: UInt8[np.ndarray, "H W 3"], coarse: Float[np.ndarray, "H W"]
+) -> Float[np.ndarray, "H W"]:
+    """The coarse matte drawn to the picture's own edges by a guided filter (He 2010)."""
+    radius = max(2, round(max(image_rgb.shape[:2]) / 45))
+    fine = cv2.ximgproc.guidedFilter(image_rgb, coarse, radius, _GUIDE_EPSILON)
+    # The segmentation hovers a little off 0 and 1; an avatar would learn that as haze.
+    return np.clip((fine - 0.06) / 0.88, 0, 1).astype(np.float32)
+
+
+def straight_rgba(
+    color: UInt8[np.ndarray, "H W 3"], alpha: Float[np.ndarray, "H W"]
+) -> UInt8[np.ndarray, "H W 4"]:
+    """Colour and alpha as a picture; colour under zero alpha is black, which compresses well."""
+    levels = np.round(alpha * 255).astype(np.uint8)
+    return np.dstack([color * (levels > 0)[..., None].astype(np.uint8), levels])
 
 
 def foreground_color(
@@ -45,30 +65,56 @@ def foreground_color(
 ) -> UInt8[np.ndarray, "H W 3"]:
     """Straight-alpha colour: what the person's own colour is where the background shines through.
 
-    Blurred-fusion estimate (Forte 2021, "Approximate fast foreground colour estimation"), two
-    passes from coarse to fine; without it hair edges keep a fringe of the background's colour.
+    Blurred-fusion estimate (Forte 2021, "Approximate fast foreground colour estimation") from
+    coarse to fine: at a quarter of the size, at half of it, and the last correction at full size;
+    without it hair edges keep a fringe of the background's colour.
     """
-    image = image_rgb.astype(np.float32)
-    weight = np.repeat(alpha[..., None].astype(np.float32), 3, axis=2)
-    foreground, background = image, image
-    for radius in (max(image.shape[:2]) // 6 | 1, max(image.shape[:2]) // 40 | 1):
-        foreground, background = _fuse(image, foreground, background, weight, radius)
-    return np.clip(foreground + 0.5, 0, 255).astype(np.uint8)
+    height, width = alpha.shape
+    longer = max(height, width)
+    image, weight = image_rgb.astype(np.float32), alpha.astype(np.float32)
+    near, far = image, image
+    for coarser, diameter in ((4, longer // 6), (2, longer // 40)):
+        few = (max(1, width // coarser), max(1, height // coarser))
+        small, before, behind, small_weight = (
+            cv2.resize(part, few, interpolation=cv2.INTER_AREA)
+            for part in (image, near, far, weight)
+        )
+        near, far = _fuse(small, before, behind, small_weight, diameter // coarser | 1)
+    near, far = cv2.resize(near, (width, height)), cv2.resize(far, (width, height))
+    return (_explained(image, near, far, weight) + 0.5).astype(np.uint8)
 
 
 def _fuse(
     image: Float[np.ndarray, "H W 3"],
     foreground: Float[np.ndarray, "H W 3"],
     background: Float[np.ndarray, "H W 3"],
-    alpha: Float[np.ndarray, "H W 3"],
-    radius: int,
+    alpha: Float[np.ndarray, "H W"],
+    diameter: int,
 ) -> tuple[Float[np.ndarray, "H W 3"], Float[np.ndarray, "H W 3"]]:
-    def blur(values: Float[np.ndarray, "H W 3"]) -> Float[np.ndarray, "H W 3"]:
-        return cv2.blur(values, (radius, radius))
-
+    beyond = 1 - alpha
     # Cubed weights trust the solid parts: the mixed ones are what is to be explained.
-    solid, empty = alpha**3 + 1e-4 * alpha, (1 - alpha) ** 3 + 1e-4 * (1 - alpha)
-    near = blur(foreground * solid) / (blur(solid) + 1e-7)
-    far = blur(background * empty) / (blur(empty) + 1e-7)
-    near = near + alpha * (image - alpha * near - (1 - alpha) * far)
-    return np.clip(near, 0, 255), np.clip(far, 0, 255)
+    solid = alpha * alpha * alpha + 1e-4 * alpha
+    empty = beyond * beyond * beyond + 1e-4 * beyond
+    near = _weighted_blur(foreground, solid, diameter)
+    far = _weighted_blur(background, empty, diameter)
+    return _explained(image, near, far, alpha), far
+
+
+def _explained(
+    image: Float[np.ndarray, "H W 3"],
+    foreground: Float[np.ndarray, "H W 3"],
+    background: Float[np.ndarray, "H W 3"],
+    alpha: Float[np.ndarray, "H W"],
+) -> Float[np.ndarray, "H W 3"]:
+    """The foreground, changed as far as alpha goes so that both together give the picture."""
+    mixed = alpha[..., None]
+    changed = image - background - mixed * (foreground - background)
+    return np.clip(foreground + mixed * changed, 0, 255)
+
+
+def _weighted_blur(
+    values: Float[np.ndarray, "H W 3"], weight: Float[np.ndarray, "H W"], diameter: int
+) -> Float[np.ndarray, "H W 3"]:
+    box = (diameter, diameter)
+    total = cv2.blur(weight, box) + 1e-7
+    return cv2.blur(values * weight[..., None], box) / total[..., None]

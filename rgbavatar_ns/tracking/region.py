@@ -2,12 +2,16 @@
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
+
+from rgbavatar_ns.data.mesh_drawing import mesh_silhouette
 
 # Shares of the face's height (forehead to chin): how far hair may stand off the skull, how far
 # skin may lie beside the fitted mesh, over what length the neck fades out, and how far below the
 # chin nothing is cut.
 _HAIR, _MARGIN, _FADE, _BELOW_CHIN = 0.4, 0.05, 0.12, 0.08
+REGION_PX = 128
+"""Size at which the region is made: all its edges are soft."""
 
 
 def neck_ring(faces: Int[np.ndarray, "T 3"]) -> Int[np.ndarray, "R"]:
@@ -52,46 +56,65 @@ class HeadRegion:
         chin_px: Float[np.ndarray, "2"],
         size: int,
     ) -> Float[np.ndarray, "size size"]:
-        """1 on head and neck, 0 below, for a square image of `size` pixels."""
+        """1 on head and neck, 0 below, for a square image of `size` pixels.
+
+        Made at `REGION_PX` at most, then enlarged.
+        """
+        few = min(size, REGION_PX)
+        shrink = few / size
+        region = self.of_silhouette(
+            self.silhouette(vertices_px * shrink, few),
+            vertices_px * shrink,
+            forehead_px * shrink,
+            chin_px * shrink,
+        )
+        return cv2.resize(region, (size, size)) if few < size else region
+
+    def silhouette(
+        self, vertices_px: Float[np.ndarray, "V 2"], size: int
+    ) -> Float[np.ndarray, "size size"]:
+        """Where the head and its neck are, without shoulders: 1, elsewhere 0."""
+        return mesh_silhouette(vertices_px, self._faces, size)
+
+    def of_silhouette(
+        self,
+        silhouette: Float[np.ndarray, "size size"],
+        vertices_px: Float[np.ndarray, "V 2"],
+        forehead_px: Float[np.ndarray, "2"],
+        chin_px: Float[np.ndarray, "2"],
+    ) -> Float[np.ndarray, "size size"]:
+        """The region around a silhouette that was drawn before."""
+        size = len(silhouette)
         face = float(np.linalg.norm(forehead_px - chin_px))
-        up = (forehead_px - chin_px) / face
-        silhouette = mesh_silhouette(vertices_px, self._faces, size)
-        wide = cv2.GaussianBlur(_grown(silhouette, _HAIR * face), (0, 0), 0.04 * face)
-        narrow = cv2.GaussianBlur(_grown(silhouette, _MARGIN * face), (0, 0), 0.02 * face)
-        rows, columns = np.mgrid[0:size, 0:size] + 0.5
-        height = (columns - chin_px[0]) * up[0] + (rows - chin_px[1]) * up[1]
-        skull = _smooth_step(height / face, 0.12, 0.4)
+        distance = cv2.distanceTransform(
+            (silhouette < 0.5).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5
+        )
+        wide = cv2.GaussianBlur(_grown(distance, _HAIR * face), (0, 0), 0.04 * face)
+        narrow = cv2.GaussianBlur(_grown(distance, _MARGIN * face), (0, 0), 0.02 * face)
+        height = height_above_chin(forehead_px, chin_px, size)
+        skull = _smooth_step(height, 0.12, 0.4)
         if len(self._ring):
+            up = (forehead_px - chin_px) / face
             ends = float(np.percentile((vertices_px[self._ring] - chin_px) @ up, 10)) / face
             # A ring that slants or a chin on the chest must not cut the face itself.
             low = min(ends, -_BELOW_CHIN - _FADE)
-            narrow = narrow * _smooth_step(height / face, low, low + _FADE)
+            narrow = narrow * _smooth_step(height, low, low + _FADE)
         return (skull * wide + (1 - skull) * narrow).astype(np.float32)
 
 
-def mesh_silhouette(
-    vertices_px: Float[np.ndarray, "V 2"], faces: Int[np.ndarray, "T 3"], size: int
+def height_above_chin(
+    forehead_px: Float[np.ndarray, "2"], chin_px: Float[np.ndarray, "2"], size: int
 ) -> Float[np.ndarray, "size size"]:
-    """1 where any triangle covers the pixel, 0 elsewhere."""
-    mask = np.zeros((size, size), np.uint8)
-    fixed = np.round((vertices_px - 0.5) * 16).astype(np.int32)
-    for triangle in fixed[faces[_facing(vertices_px, faces)]]:
-        cv2.fillConvexPoly(mask, triangle, (1,), shift=4)
-    return mask.astype(np.float32)
+    """How far up the face each pixel lies: 0 at the chin, 1 at the forehead."""
+    along = (forehead_px - chin_px) / float(np.sum((forehead_px - chin_px) ** 2))
+    places = np.arange(size, dtype=np.float32) + np.float32(0.5)
+    columns = ((places - chin_px[0]) * along[0]).astype(np.float32)
+    rows = ((places - chin_px[1]) * along[1]).astype(np.float32)
+    return rows[:, None] + columns
 
 
-def _facing(
-    vertices_px: Float[np.ndarray, "V 2"], faces: Int[np.ndarray, "T 3"]
-) -> Bool[np.ndarray, "T"]:
-    """Triangles seen from outside: wound counterclockwise as seen, with y down."""
-    a, b, c = (vertices_px[faces[:, corner]] for corner in range(3))
-    return (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) < (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
-
-
-def _grown(mask: Float[np.ndarray, "H W"], radius_px: float) -> Float[np.ndarray, "H W"]:
-    outside = (mask < 0.5).astype(np.uint8)
-    distance = cv2.distanceTransform(outside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    return np.clip(radius_px - distance + 0.5, 0, 1).astype(np.float32)
+def _grown(distance_px: Float[np.ndarray, "H W"], radius_px: float) -> Float[np.ndarray, "H W"]:
+    return np.clip(radius_px - distance_px + 0.5, 0, 1)
 
 
 def _smooth_step(

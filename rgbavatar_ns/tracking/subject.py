@@ -1,7 +1,7 @@
 """The head model fitted to one speaker: the landmark map, its weights, the stages of the fit."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -13,6 +13,7 @@ from rgbavatar_ns.head.landmarks import SPARSE_51, LandmarkMap, facemesh_landmar
 from rgbavatar_ns.tracking.config import TrackConfig
 from rgbavatar_ns.tracking.fit import (
     ClipFit,
+    SubjectFit,
     fit_clip,
     fit_subject,
     key_frame_positions,
@@ -24,7 +25,7 @@ from rgbavatar_ns.tracking.landmarks import FACE_OVAL, IRIS_CENTERS, face_height
 from rgbavatar_ns.tracking.parameters import fit_parameters
 
 # Lips, lids, brows, nose and irises are seen; cheeks and forehead are interpolated by FaceMesh,
-# so every second of those points does. The outline slides over the skin as the head turns, but
+# so every fourth of those points does. The outline slides over the skin as the head turns, but
 # without it the pitch of the head is badly known: on renders the error halves with it.
 _FEATURE_WEIGHT, _IRIS_WEIGHT, _OTHER_WEIGHT, _OVAL_WEIGHT = 1.0, 2.0, 0.7, 1.0
 _FEATURES = frozenset(SPARSE_51) | {index for pair in LIP_PAIRS + LID_PAIRS for index in pair}
@@ -39,9 +40,11 @@ class SubjectTracker:
 
     head: HeadModel
     config: TrackConfig
+    landmarks: LandmarkMap = field(default_factory=facemesh_landmarks)
+    """Where FaceMesh's points lie on this head; by default on the embedded one."""
 
     def __post_init__(self) -> None:
-        marks = _chosen_landmarks()
+        marks = _chosen_landmarks(self.landmarks)
         self.facemesh_index = marks.facemesh_index
         vertex_ids = self.head.arrays.faces[marks.triangle].astype(np.int64)
         self.mesh_landmarks = LandmarkHead(self.head, vertex_ids, marks.barycentric)
@@ -73,16 +76,15 @@ class SubjectTracker:
         """Identity, camera and offsets from key frames, then every frame."""
         # The matrices are small: more threads would only wait for each other.
         with threadpool_limits(1):
-            return self._fit(landmarks_px, follows, width, height, advance)
+            subject = self.meet(landmarks_px, width, height)
+            targets = self.targets(landmarks_px)
+            weight = self.config.temporal_weight
+            return fit_clip(self.cost, subject, targets, follows, weight, advance)
 
-    def _fit(
-        self,
-        landmarks_px: Float[np.ndarray, "F 478 2"],
-        follows: Sequence[bool],
-        width: int,
-        height: int,
-        advance: Callable[[], None],
-    ) -> ClipFit:
+    def meet(
+        self, landmarks_px: Float[np.ndarray, "F 478 2"], width: int, height: int
+    ) -> SubjectFit:
+        """Identity, camera and landmark offsets from the frames that differ most."""
         targets = self.targets(landmarks_px)
         picked = key_frame_positions(landmarks_px, self.config.key_frames)
         keys = [targets[position] for position in picked]
@@ -91,7 +93,7 @@ class SubjectTracker:
         )
         offsets = subject_offsets(self.cost, subject, keys)
         self.cost = replace(self.cost, head=self.cost.head.with_offsets(offsets))
-        return fit_clip(self.cost, subject, targets, follows, self.config.temporal_weight, advance)
+        return subject
 
     def thetas(self, fit: ClipFit) -> Float[np.ndarray, "F H"]:
         """theta of every frame."""
@@ -127,12 +129,11 @@ class SubjectTracker:
         return fit.subject.camera.project(vertices.numpy())
 
 
-def _chosen_landmarks() -> LandmarkMap:
-    marks = facemesh_landmarks()
+def _chosen_landmarks(marks: LandmarkMap) -> LandmarkMap:
     kept = []
     for index in map(int, marks.facemesh_index):
         wanted = index in _FEATURES or index in IRIS_CENTERS or index in FACE_OVAL
-        if wanted or (index < IRIS_CENTERS[0] and index % 2 == 0):
+        if wanted or (index < IRIS_CENTERS[0] and index % 4 == 0):
             kept.append(index)
     return marks.select(tuple(kept))
 

@@ -60,7 +60,18 @@ def test_targets_are_laid_over_black_and_images_clamped():
     assert evaluate_images(image, target)["psnr"] == pytest.approx(20.0, abs=1e-3)
     white = torch.full((1, 16, 16, 4), 255, dtype=torch.uint8)
     assert evaluate_images(torch.full((1, 16, 16, 3), 7.0), white)["psnr"] == math.inf
-    assert evaluate_images(image, target).keys() == {"psnr", "ssim"}
+    assert evaluate_images(image, target).keys() == {"psnr", "psnr_head", "ssim"}
+
+
+def test_psnr_of_the_head_counts_its_pixels_alone():
+    """An error of .1 on a quarter of the frame, the person: 20 dB, of the whole frame 6 dB more."""
+    image = torch.zeros(1, 20, 20, 3)
+    target = torch.zeros(1, 20, 20, 4)
+    target[:, :10, :10] = torch.tensor([0.1, 0.1, 0.1, 1.0])
+    target[:, 10:, :10] = torch.tensor([0.9, 0.9, 0.9, 0.0])
+    values = evaluate_images(image, target)
+    assert values["psnr_head"] == pytest.approx(20.0, abs=1e-4)
+    assert values["psnr"] == pytest.approx(20.0 + 10 * math.log10(4), abs=1e-4)
 
 
 def test_lpips_offline_is_reported_and_the_others_go_on(monkeypatch):

@@ -28,14 +28,14 @@ def test_a_users_mistake_is_told_in_one_line_without_a_traceback(capsys, tmp_pat
 
 
 def test_a_failed_nerfstudio_command_says_what_to_do(monkeypatch, tmp_path):
-    from rgbavatar_ns.cli import demo
+    from rgbavatar_ns.plugin.commands import run_nerfstudio
 
     program = tmp_path / "ns-train"
     program.write_text("#!/bin/sh\nexit 3\n")
     program.chmod(0o755)
     monkeypatch.setattr("sys.executable", str(tmp_path / "python"))
     with pytest.raises(UserError, match="exit code 3"):
-        demo._call("ns-train")
+        run_nerfstudio("ns-train")
 
 
 @pytest.mark.parametrize("name", list(cli.COMMANDS))

@@ -2,7 +2,8 @@ import json
 
 import pytest
 
-from rgbavatar_ns.cli.stages import Stages, write_json
+from rgbavatar_ns.cli.stages import Stages
+from rgbavatar_ns.data.json_file import write_json
 
 
 def run_two(folder, calls, settings="a", fresh=False, fail=False):

@@ -1,5 +1,4 @@
 import io
-from collections import Counter
 
 import numpy as np
 import pytest
@@ -92,21 +91,78 @@ def test_pools_never_grow_beyond_their_sizes_and_tell_what_they_drop():
 
 
 def test_every_streamed_frame_is_equally_likely_in_the_global_pool():
-    local_size, global_size, stream, runs = 3, 5, 23, 1600
-    seen = Counter()
+    local_size, global_size, stream, runs = 3, 8, 43, 2000
+    seen = np.zeros(stream)
     for seed in range(runs):
         pools = LocalGlobalPools(local_size, global_size, seed=seed)
         for frame in range(stream):
             pools.add(frame)
-        seen.update(pools.global_frames)
+        seen[list(pools.global_frames)] += 1
     departed = stream - local_size
-    chance = global_size / departed
-    # Hoeffding: all of the 20 frequencies lie within this of the truth with probability .999.
-    tolerance = np.sqrt(np.log(2 * departed / 1e-3) / (2 * runs))
-    assert tolerance < chance / 4
-    assert set(seen) == set(range(departed))
-    for frame in range(departed):
-        assert abs(seen[frame] / runs - chance) < tolerance
+    assert seen[departed:].sum() == 0
+    # Each is kept with probability |M_g| / n. Frames of one pool exclude each other: compared with
+    # independent draws the statistic is smaller by (1 - |M_g| / n) n / (n - 1).
+    expected = runs * global_size / departed
+    statistic = ((seen[:departed] - expected) ** 2 / expected).sum()
+    statistic /= (1 - global_size / departed) * departed / (departed - 1)
+    # Chi-square of 39 degrees of freedom: outside with probability .002.
+    assert 17.26 < statistic < 72.05
+
+
+def test_local_pool_of_the_papers_size_holds_exactly_the_last_150():
+    pools = LocalGlobalPools()
+    for frame in range(1400):
+        pools.add(frame)
+    assert pools.local_frames == tuple(range(1250, 1400))
+    assert len(pools.global_frames) == len(set(pools.global_frames)) == 1000
+    assert max(pools.global_frames) < 1250
+
+
+def test_release_strategy_ramps_the_global_share_up_to_seven_tenths():
+    pools = LocalGlobalPools(150, 1000, strategy="release")
+    shares = {}
+    for frame in range(900):
+        pools.add(frame)
+        if frame + 1 in (151, 300, 450, 600, 900):
+            batch = pools.batch(100)
+            shares[frame + 1] = sum(drawn <= frame - 150 for drawn in batch)
+    # 70 of 100 after 600 frames, in proportion before; only one frame is there at 151.
+    assert shares == {151: 1, 300: 35, 450: 52, 600: 70, 900: 70}
+
+
+def test_release_strategy_favours_the_newest_as_exp_i_over_150():
+    pools = LocalGlobalPools(150, 0, strategy="release", seed=1)
+    for frame in range(150):
+        pools.add(frame)
+    draws = 20_000
+    counts = np.bincount([pools.batch(1)[0] for _ in range(draws)], minlength=150)
+    weight = np.exp(np.arange(150) / 150)
+    expected = draws * weight / weight.sum()
+    # Chi-square of 149 degrees of freedom: exceeded with probability .001.
+    assert ((counts - expected) ** 2 / expected).sum() < 208.1
+
+
+def test_new_frames_come_first_newest_first_and_take_half_of_the_local_part():
+    pools = LocalGlobalPools(100, 50, new_first=True)
+    for frame in range(120):
+        pools.add(frame)
+    drawn = pools.batch(10)  # seven local ones: four new first, the rest by chance
+    assert drawn[:4] == [119, 118, 117, 116]
+    assert len(set(drawn)) == 10
+    assert sum(frame >= 20 for frame in drawn) == 7
+    # Each new frame is in the very next batch, without being drawn twice in it.
+    for frame in range(120, 160):
+        pools.add(frame)
+        drawn = pools.batch(10)
+        assert drawn[0] == frame
+        assert len(set(drawn)) == 10
+
+
+def test_without_new_first_a_frame_waits_for_chance():
+    pools = LocalGlobalPools(100, 50)
+    for frame in range(120):
+        pools.add(frame)
+    assert sum(119 in pools.batch(10) for _ in range(200)) < 60  # expected: 14
 
 
 @pytest.mark.parametrize(
@@ -147,7 +203,9 @@ def test_without_a_global_pool_old_frames_are_gone():
     assert set(pools.batch(10)) == {3, 4, 5, 6, 7}
 
 
-def test_pools_go_on_from_their_state_as_if_uninterrupted():
+@pytest.mark.parametrize("strategy", ["paper", "release"])
+@pytest.mark.parametrize("new_first", [False, True])
+def test_pools_go_on_from_their_state_as_if_uninterrupted(strategy, new_first):
     def stream(pools: LocalGlobalPools, frames: range) -> list[list[int]]:
         batches = []
         for frame in frames:
@@ -155,12 +213,12 @@ def test_pools_go_on_from_their_state_as_if_uninterrupted():
             batches.append(pools.batch(6))
         return batches
 
-    whole = LocalGlobalPools(5, 7, seed=4)
+    whole = LocalGlobalPools(5, 7, seed=4, strategy=strategy, new_first=new_first)
     stream(whole, range(30))
     file = io.BytesIO()
     torch.save(whole.state_dict(), file)
     file.seek(0)
-    resumed = LocalGlobalPools(5, 7, seed=99)
+    resumed = LocalGlobalPools(5, 7, seed=99, strategy=strategy, new_first=new_first)
     resumed.load_state_dict(torch.load(file, weights_only=True))
     assert stream(resumed, range(30, 60)) == stream(whole, range(30, 60))
     assert resumed.global_frames == whole.global_frames

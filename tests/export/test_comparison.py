@@ -34,7 +34,7 @@ def dataset(avatar, tmp_path_factory):
     writer = DatasetWriter(folder, "makehuman", avatar.identity, head.layout, SIZE, SIZE)
     for index in range(3):
         writer.add(TrackedFrame(index, torch.zeros(head.layout.size), camera, image))
-    return writer.finish(test_frames=2)
+    return writer.finish(2)
 
 
 def test_truth_is_laid_over_the_background_and_error_is_four_times_the_difference(avatar, dataset):

@@ -1,5 +1,6 @@
 """Batches of different training frames with their own theta and camera; held-out ones apart."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ import torch
 from rgbavatar_ns.data import load_dataset
 from rgbavatar_ns.plugin.cameras import from_nerfstudio
 from rgbavatar_ns.plugin.datamanager import RGBAvatarDataManager, RGBAvatarDataManagerConfig
-from tests.plugin.tiny import NUM_FRAMES, NUM_TEST, SIZE
+from tests.plugin.tiny import NUM_FRAMES, NUM_TEST, SIZE, tiny_dataset
 
 
 @pytest.fixture(scope="module")
@@ -105,3 +106,25 @@ def test_held_out_batches_belong_to_their_cameras(datamanager: RGBAvatarDataMana
     assert cameras.metadata["position"].flatten().tolist() == batch["position"]
     for image, position in zip(batch["image"], batch["position"]):
         assert np.array_equal(image.numpy(), tracked.read_image(position))
+
+
+def test_held_out_frames_among_the_others_keep_their_own_cameras(tmp_path: Path):
+    tiny_dataset(tmp_path / "data")
+    index = tmp_path / "data" / "dataset.json"
+    content = json.loads(index.read_text())
+    del content["test_frames"]
+    content |= {"version": 2, "test": [content["frames"][k]["index"] for k in (0, 5, 6)]}
+    index.write_text(json.dumps(content))
+    config = RGBAvatarDataManagerConfig(data=tmp_path / "data", batch_size=11, seed=2)
+    datamanager = config.setup(device="cpu")
+    tracked = datamanager.dataparser.tracked
+    assert tracked.test == (0, 5, 6)
+    train, held_out = datamanager.next_train(0), datamanager.next_eval(0)
+    for (cameras, batch), among in ((train, tracked.train), (held_out, tracked.test)):
+        assert sorted(batch["position"]) == list(among)
+        assert cameras.metadata is not None
+        assert torch.equal(cameras.metadata["theta"], tracked.theta[batch["position"]])
+        for image, position in zip(batch["image"], batch["position"]):
+            assert np.array_equal(image.numpy(), tracked.read_image(position))
+    camera, _ = datamanager.next_eval_image(1)
+    assert int(camera.metadata["position"][0]) in tracked.test

@@ -1,10 +1,11 @@
 import numpy as np
 import pytest
 
+from rgbavatar_ns.data.mesh_drawing import mesh_silhouette
 from rgbavatar_ns.tracking.camera import StillCamera
 from rgbavatar_ns.tracking.crop import SquareCrop, steady_crop
 from rgbavatar_ns.tracking.matting import foreground_color
-from rgbavatar_ns.tracking.region import HeadRegion, mesh_silhouette, neck_ring
+from rgbavatar_ns.tracking.region import HeadRegion, neck_ring
 
 
 def test_projection_worked_by_hand() -> None:
@@ -19,7 +20,8 @@ def test_projection_worked_by_hand() -> None:
 def test_projection_derivative_equals_central_differences() -> None:
     camera = StillCamera(300.0, (50.0, 60.0), 1.5)
     points = np.random.default_rng(0).normal(size=(7, 3)) * 0.1
-    derivative = camera.jacobian(points)
+    along_axes = np.broadcast_to(np.eye(3)[:, None], (3, 7, 3))
+    derivative = camera.image_derivative(points, along_axes)
     for axis in range(3):
         shift = np.eye(3)[axis] * 1e-6
         slope = (camera.project(points + shift) - camera.project(points - shift)) / 2e-6

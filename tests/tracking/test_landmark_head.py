@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -38,11 +40,24 @@ def test_reduced_head_equals_the_full_head_at_its_landmarks(head: HeadModel, see
     np.testing.assert_allclose(person.points(theta, np.zeros(0)), expected, atol=1e-9)
 
 
+def _with_pose_correctives(head: HeadModel) -> HeadModel:
+    """The same head with correctives as FLAME has them."""
+    random = np.random.default_rng(8)
+    pose_dirs = 0.01 * random.normal(size=head.arrays.posedirs.shape)
+    arrays = replace(head.arrays, posedirs=pose_dirs.astype(np.float16))
+    return HeadModel(arrays, dtype=torch.float64)
+
+
+@pytest.mark.parametrize("correctives", [False, True])
+@pytest.mark.parametrize("still", [False, True])
 def test_derivatives_equal_those_of_the_full_head_by_automatic_differentiation(
-    head: HeadModel,
+    head: HeadModel, correctives: bool, still: bool
 ) -> None:
+    head = _with_pose_correctives(head) if correctives else head
     vertex_ids, barycentric = _landmarks(head, 20)
     theta, identity = _theta(head, 9)
+    if still:
+        theta[:] = 0
 
     def points(theta: torch.Tensor, identity: torch.Tensor) -> torch.Tensor:
         corners = head(theta, identity)[torch.from_numpy(vertex_ids)]
@@ -51,9 +66,17 @@ def test_derivatives_equal_those_of_the_full_head_by_automatic_differentiation(
     expected = torch.autograd.functional.jacobian(
         points, (torch.from_numpy(theta), torch.from_numpy(identity)), vectorize=True
     )
-    found = LandmarkHead(head, vertex_ids, barycentric).jacobian(theta, identity)
-    np.testing.assert_allclose(found.to_theta, expected[0].numpy(), atol=1e-7)
-    np.testing.assert_allclose(found.to_identity, expected[1].numpy(), atol=1e-7)
+    reduced = LandmarkHead(head, vertex_ids, barycentric)
+    columns = np.random.default_rng(2).permutation(head.layout.size)
+    found = reduced.jacobian(theta, identity, reduced.unknowns(columns, 7))
+    derivative = found.derivative.transpose(1, 0, 2)
+    np.testing.assert_allclose(found.points, reduced.points(theta, identity), atol=1e-14)
+    np.testing.assert_allclose(
+        derivative[..., : len(columns)], expected[0].numpy()[..., columns], atol=1e-9
+    )
+    np.testing.assert_allclose(
+        derivative[..., len(columns) :], expected[1].numpy()[..., :7], atol=1e-9
+    )
 
 
 def test_offsets_ride_with_the_head(head: HeadModel) -> None:

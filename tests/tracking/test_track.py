@@ -9,23 +9,17 @@ from rgbavatar_ns.data import load_dataset
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.tracking import TrackConfig, track_video
 
-from .clips import REAL_CLIPS, gradient_images, write_clip
+from .clips import REAL_CLIPS, astronaut, gradient_images, write_clip
 
 pytest.importorskip("mediapipe", reason="the tracker's optional extra is not installed")
 CLIP = REAL_CLIPS / "grid_id2.mpg"
 needs_clip = pytest.mark.skipif(not CLIP.exists(), reason=f"the clip {CLIP.name} is not here")
 
 
-def _astronaut() -> np.ndarray:
-    """A public-domain portrait that scikit-image carries, cut to head and shoulders."""
-    skimage = pytest.importorskip("skimage.data", reason="scikit-image is not installed")
-    return skimage.astronaut()[:400, 30:430]
-
-
 @pytest.fixture(scope="module")
 def portrait(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[int]]:
     """A written clip: the portrait drifts, two frames in the middle show no face."""
-    image, frames = _astronaut(), []
+    image, frames = astronaut(), []
     blank = [3, 4]
     for number in range(9):
         shifted = np.roll(image, 2 * number, axis=1)
@@ -38,7 +32,7 @@ def test_a_written_clip_becomes_a_dataset_without_its_faceless_frames(
     portrait: tuple[Path, list[int]], tmp_path: Path
 ) -> None:
     clip, blank = portrait
-    calls: list[tuple[int, int]] = []
+    calls: list[tuple[str, int, int | None]] = []
     config = TrackConfig(image_size=128, key_frames=3, focal_px=500.0)
     dataset = track_video(clip, tmp_path / "set", config, lambda *done: calls.append(done))
 
@@ -50,9 +44,12 @@ def test_a_written_clip_becomes_a_dataset_without_its_faceless_frames(
     assert report["reprojection_error_share"] < 0.015
     assert (tmp_path / "set" / "overlay.png").stat().st_size > 10_000
     assert len(dataset.test) == len(dataset) // 5
-    done = [call[0] for call in calls]
-    assert done == sorted(done)
-    assert calls[-1][0] == calls[-1][1]
+    stages = list(dict.fromkeys(call[0] for call in calls))
+    assert stages == ["faces", "fit", "pictures"]
+    for stage in stages:
+        done = [call[1] for call in calls if call[0] == stage]
+        assert done == sorted(done)
+        assert done[-1] == [call[2] for call in calls if call[0] == stage][-1]
 
     image = dataset.read_image(0)
     assert image.shape == (128, 128, 4)
@@ -118,8 +115,8 @@ def test_an_existing_dataset_is_not_overwritten_unasked(
 
 
 def test_interruption_leaves_no_dataset(portrait: tuple[Path, list[int]], tmp_path: Path) -> None:
-    def interrupt(done: int, total: int) -> None:
-        if done > total - 2:
+    def interrupt(stage: str, done: int, total: int | None) -> None:
+        if stage == "pictures" and done == 1:
             raise KeyboardInterrupt
 
     config = TrackConfig(max_frames=2, key_frames=1, image_size=64, focal_px=500.0)
@@ -127,6 +124,37 @@ def test_interruption_leaves_no_dataset(portrait: tuple[Path, list[int]], tmp_pa
         track_video(portrait[0], tmp_path / "set", config, interrupt)
     with pytest.raises(UserError):
         load_dataset(tmp_path / "set")
+
+
+def test_a_face_in_one_frame_only_gives_one_frame_and_a_warning(tmp_path: Path) -> None:
+    image = astronaut()
+    frames = [np.full_like(image, 90) for _ in range(4)]
+    frames[2] = image
+    clip = write_clip(tmp_path / "once.mp4", frames)
+    dataset = track_video(clip, tmp_path / "set", TrackConfig(image_size=64, focal_px=500.0))
+    assert dataset.frame_index == (2,)
+    assert (len(dataset.train), len(dataset.test)) == (1, 0)
+    report = json.loads((tmp_path / "set" / "tracking.json").read_text())
+    assert report["rejected"]["no face"] == [0, 1, 3]
+    assert report["verdict"].startswith("look at it")
+    assert report["segments"] == [{"first_frame": 2, "last_frame": 2, "clip": 0}]
+
+
+def test_another_face_beside_the_followed_one_is_reported(tmp_path: Path) -> None:
+    portrait = astronaut()[::2, ::2]
+    alone = np.full((200, 400, 3), 128, np.uint8)
+    alone[:, :200] = portrait
+    both = alone.copy()
+    both[:, 200:] = portrait[:, ::-1]
+    clip = write_clip(tmp_path / "two.mp4", [alone, alone, both, both])
+    config = TrackConfig(image_size=64, key_frames=1, focal_px=500.0)
+    dataset = track_video(clip, tmp_path / "set", config)
+    report = json.loads((tmp_path / "set" / "tracking.json").read_text())
+    assert report["other_faces"] == [2, 3]
+    assert "another face is seen in 2 frames" in report["verdict"]
+    assert len(report["segments"]) == 1
+    across = dataset.theta[:, dataset.layout.slice("translation").start]
+    assert across.std() < 0.02
 
 
 @needs_clip

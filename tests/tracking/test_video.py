@@ -89,9 +89,11 @@ def test_what_cannot_be_read_is_the_users_error_with_a_remedy(tmp_path: Path) ->
     empty.mkdir()
     with pytest.raises(UserError, match="holds no images"):
         list(FrameSource.open(empty))
-    (empty / "a.png").write_bytes(b"no picture")
-    with pytest.raises(UserError, match="cannot be decoded"):
-        list(FrameSource.open(empty))
+    for name, told in (("a.png", "is not a PNG"), ("a.jpg", "cannot be decoded")):
+        (empty / name).write_bytes(b"no picture")
+        with pytest.raises(UserError, match=told):
+            list(FrameSource.open(empty))
+        (empty / name).unlink()
 
 
 def test_clips_of_two_sizes_are_refused(tmp_path: Path) -> None:

@@ -23,7 +23,7 @@ from rgbavatar_ns.data.demo.wrinkles import wrinkle_activations
 from rgbavatar_ns.data.frame import TrackedFrame
 from rgbavatar_ns.data.writer import DatasetWriter
 from rgbavatar_ns.head import HeadModel
-from rgbavatar_ns.head.rotations import axis_angle_to_matrix
+from rgbavatar_ns.head.rotations import axis_angle_to_matrix, matrix_to_axis_angle
 from rgbavatar_ns.kernels.types import PinholeCameras
 
 Progress = Callable[[int, int], None]
@@ -121,6 +121,19 @@ class DemoPerson:
         shift = body @ (neck - turn @ neck - root) + root + parts["translation"]
         return (body @ turn).numpy(), shift.numpy()
 
+    def with_stiff_neck(self, theta: Float[Tensor, "F H"]) -> Float[Tensor, "F H"]:
+        """Theta that moves the skull likewise, and everything else with it."""
+        parts = self.head.layout.split(theta)
+        root = self.head.joints(self.identity)[0]
+        turns, shifts = zip(*(self._skull(row) for row in theta))
+        turn, shift = (torch.from_numpy(np.stack(values)) for values in (turns, shifts))
+        moved = {
+            "rotation": matrix_to_axis_angle(turn),
+            "translation": shift - root + turn @ root,
+            "neck": torch.zeros_like(parts["neck"]),
+        }
+        return self.head.layout.join({**parts, **moved})
+
     def draw(self, theta: Float[Tensor, "F H"]) -> Iterator[UInt8[np.ndarray, "S S 4"]]:
         """Images of each theta in order, a few frames at work at a time."""
         waiting: deque[Future[np.ndarray]] = deque()
@@ -133,15 +146,27 @@ class DemoPerson:
                 yield waiting.popleft().result()
 
 
-def make_demo_dataset(
-    dst: str | Path, config: DemoConfig | None = None, progress: Progress | None = None
-) -> TrackedDataset:
-    """Render the demo subject and write it to `dst`, replacing a dataset that is there.
+@dataclass(frozen=True)
+class DemoFilm:
+    """The demo subject's performance: theta as a tracker finds it, and images when asked for."""
 
-    The same config gives the same person, performance, noise and images on every run. Calls
-    `progress(frames done, frames in all)` after each frame.
+    person: DemoPerson
+    tracked: Float[Tensor, "F H"]
+    true: Float[Tensor, "F H"]
+    camera: PinholeCameras
+
+    def frames(self) -> Iterator[TrackedFrame]:
+        """Render frame after frame."""
+        for index, image in enumerate(self.person.draw(self.true)):
+            yield TrackedFrame(index, self.tracked[index], self.camera, image)
+
+
+def film_demo(config: DemoConfig, stiff_neck: bool = False) -> DemoFilm:
+    """Cast, script and track the demo subject; the same config gives the same film on every run.
+
+    stiff_neck: the body turns in the neck's stead, so that the head moves as one piece, as
+    trackers assume that put all of its motion into the camera.
     """
-    config = config or DemoConfig()
     person = DemoPerson.of(config)
     layout = person.head.layout
     performance = perform(
@@ -153,17 +178,30 @@ def make_demo_dataset(
         config.seed,
     )
     tracked = with_tracker_noise(performance.theta, layout, config.theta_noise, config.seed)
-    size = config.image_size
+    found, true = (torch.from_numpy(theta).float() for theta in (tracked, performance.theta))
+    if stiff_neck:
+        found, true = person.with_stiff_neck(found), person.with_stiff_neck(true)
+    return DemoFilm(person, found, true, as_pinhole(person.camera))
+
+
+def make_demo_dataset(
+    dst: str | Path, config: DemoConfig | None = None, progress: Progress | None = None
+) -> TrackedDataset:
+    """Render the demo subject and write it to `dst`, replacing a dataset that is there.
+
+    The same config gives the same person, performance, noise and images on every run. Calls
+    `progress(frames done, frames in all)` after each frame.
+    """
+    config = config or DemoConfig()
+    film = film_demo(config)
+    head, size = film.person.head, config.image_size
     writer = DatasetWriter(
-        dst, person.head.arrays, person.identity, layout, size, size, overwrite=True
+        dst, head.arrays, film.person.identity, head.layout, size, size, overwrite=True
     )
-    camera = as_pinhole(person.camera)
-    images = person.draw(torch.from_numpy(performance.theta).float())
-    for index, image in enumerate(images):
-        theta = torch.from_numpy(tracked[index]).float()
-        writer.add(TrackedFrame(index, theta, camera, image))
+    for frame in film.frames():
+        writer.add(frame)
         if progress is not None:
-            progress(index + 1, config.num_frames)
+            progress(frame.index + 1, config.num_frames)
     return writer.finish(config.num_test_frames)
 
 

@@ -86,4 +86,5 @@ class BlendedSession(_Drawing):
         self,
         groups: list[tuple[Tensor, Tensor, Tensor, tuple[float, ...]]],
         weight_gradient: Tensor,
+        vertex_gradient: Tensor | None = None,
     ) -> None: ...

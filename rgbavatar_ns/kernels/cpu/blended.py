@@ -18,6 +18,7 @@ from rgbavatar_ns.kernels.types import (
     TANGENT_VARIANTS,
     AdamParameter,
     BlendedGaussians,
+    BlendedGradient,
     PinholeCameras,
     RenderedBatch,
     WeightedColors,
@@ -39,6 +40,7 @@ class CpuBlendedRenderer:
     ) -> None:
         self._cameras, self._count = cameras, len(gaussians.position)
         self._weights = weights.detach().contiguous()
+        self._vertices = vertices.detach().contiguous()
         self._compared = False
         tensors: dict[str, Any] = {
             name: None if value is None else value.detach().contiguous()
@@ -48,7 +50,7 @@ class CpuBlendedRenderer:
         self._session = _native.BlendedSession(
             _native.Blended(**tensors, variant=TANGENT_VARIANTS.index(gaussians.variant)),
             self._weights,
-            vertices.detach().contiguous(),
+            self._vertices,
             cameras.world_to_camera.detach().contiguous(),
             cameras.focal_px.detach().contiguous(),
             cameras.principal_point_px.detach().contiguous(),
@@ -105,15 +107,19 @@ class CpuBlendedRenderer:
         self._compared = True
         return self._session.compare(images_rgba.contiguous(), background.detach().contiguous())
 
-    def update(self, parameters: Mapping[str, AdamParameter]) -> Float[Tensor, "B K"]:
-        """Take one step of Adam by the gradient of the last comparison, in place."""
+    def update(
+        self, parameters: Mapping[str, AdamParameter] | None, *, with_vertices: bool = False
+    ) -> BlendedGradient:
+        """Take one step of Adam, or none, by the gradient of the last comparison."""
         if not self._compared:
             raise ValueError("There is no gradient yet. Call compare() before update().")
         self._compared = False  # the parameters are others now
         names = _BASE + (_BASES if self._weights.shape[1] else ())
-        weight_gradient = torch.empty_like(self._weights)
-        self._session.update([_arrays(parameters[name]) for name in names], weight_gradient)
-        return weight_gradient
+        groups = [] if parameters is None else [_arrays(parameters[name]) for name in names]
+        weights = torch.empty_like(self._weights)
+        vertices = torch.empty_like(self._vertices) if with_vertices else None
+        self._session.update(groups, weights, vertices)
+        return BlendedGradient(weights, vertices)
 
     def _check_images(self, images: Tensor, dtype: torch.dtype) -> None:
         """Compiled code reads what it is promised."""

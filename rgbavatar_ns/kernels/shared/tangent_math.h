@@ -6,6 +6,7 @@
 // coordinates (1 - b1 - b2, b1, b2) with tangent position x and rotation q has, in the world,
 //   mean = M x + c + b1 e1 + b2 e2,   rotation = q_f q,
 // and so dL/dx = M^T dL/dmean and dL/dq = conj(q_f) dL/drotation, because q_f has unit length.
+// The frame's own gradient is dL/dM = dL/dmean x^T and dL/dq_f = dL/drotation conj(q).
 
 enum TangentVariant { kNormalizedFrame = 0, kRawFrame = 1, kOrthonormalFrame = 2 };
 
@@ -88,6 +89,76 @@ RGBAVATAR_FUNCTION void conjugate_product(const F a[4], const F b[4], F out[4]) 
   const F zero(0.0f);
   const F conjugate[4] = {a[0], zero - a[1], zero - a[2], zero - a[3]};
   quat_product(conjugate, b, out);
+}
+
+// a conj(b).
+template <class F>
+RGBAVATAR_FUNCTION void product_conjugate(const F a[4], const F b[4], F out[4]) {
+  const F zero(0.0f);
+  const F conjugate[4] = {b[0], zero - b[1], zero - b[2], zero - b[3]};
+  quat_product(a, conjugate, out);
+}
+
+// The gradient of a by that of a / |a|; `unit` is the latter.
+template <class F>
+RGBAVATAR_FUNCTION Vec3<F> scaled_to_one_backward(const Vec3<F>& a, const Vec3<F>& unit,
+                                                  const Vec3<F>& gradient) {
+  const Vec3<F> across = add_scaled(gradient, unit, F(0.0f) - dot(unit, gradient));
+  return scaled(across, inverse_root_of(dot(a, a)));
+}
+
+// Adds to the gradients of the edges what comes from that of `tangent_frame`; nothing from a
+// triangle without area, whose frame does not hang on them.
+template <class F>
+RGBAVATAR_FUNCTION void tangent_frame_backward(const Vec3<F>& first, const Vec3<F>& second,
+                                               const F inverse[4], int variant,
+                                               const TangentFrame<F>& frame,
+                                               const TangentFrame<F>& gradient, Vec3<F>& d_first,
+                                               Vec3<F>& d_second) {
+  const F zero(0.0f), one(1.0f);
+  const Vec3<F> area = cross(first, second);
+  const auto wide = dot(area, area) > 1e-10f * dot(first, first) * dot(second, second) + 1e-30f;
+  const Vec3<F>&t = frame.tangent, &b = frame.bitangent, &n = frame.normal;
+  Vec3<F> d_t = gradient.tangent, d_b = gradient.bitangent, d_n = gradient.normal;
+  // The rotation with columns u, v, n turns by w: dL/dw = Im(dL/dq conj(q)) / 2, and
+  // w = (du . v) n - (dn . v) u + (dn . u) v.
+  const Vec3<F> turned = cross(b, n);
+  const F sign = select(dot(turned, t) >= zero, one, zero - one);
+  const Vec3<F> wished = add_scaled(t, turned, sign);
+  const F off_plane = dot(wished, n);
+  const Vec3<F> along = add_scaled(wished, n, zero - off_plane);
+  const F inverse_length = inverse_root_of(dot(along, along));
+  const Vec3<F> u = scaled(along, inverse_length), v = cross(n, u);
+  F doubled[4];
+  product_conjugate(gradient.quat, frame.quat, doubled);
+  const Vec3<F> turn = scaled(Vec3<F>{doubled[1], doubled[2], doubled[3]}, 0.5f);
+  const F about_n = dot(turn, n) * inverse_length;
+  d_n = add_scaled(d_n, v, zero - dot(turn, u) - off_plane * about_n);
+  d_n = add_scaled(d_n, u, dot(turn, v));
+  const Vec3<F> d_wished = scaled(v, about_n), d_turned = scaled(d_wished, sign);
+  d_t = add_scaled(d_t, d_wished, one);
+  d_b = add_scaled(d_b, cross(n, d_turned), one);
+  d_n = add_scaled(d_n, cross(d_turned, b), one);
+  if (variant == kOrthonormalFrame) {  // b = n x t
+    d_n = add_scaled(d_n, cross(t, d_b), one);
+    d_t = add_scaled(d_t, cross(d_b, n), one);
+    d_b = {zero, zero, zero};
+  }
+  if (variant != kRawFrame) {
+    const Vec3<F> along_u = add_scaled(scaled(first, inverse[0]), second, inverse[1]);
+    d_t = scaled_to_one_backward(along_u, t, d_t);
+  }
+  if (variant == kNormalizedFrame) {
+    const Vec3<F> along_v = add_scaled(scaled(first, inverse[2]), second, inverse[3]);
+    d_b = scaled_to_one_backward(along_v, b, d_b);
+  }
+  const Vec3<F> d_area = scaled_to_one_backward(area, n, d_n);
+  const auto add = [&](Vec3<F>& sum, const Vec3<F>& part) {
+    sum = {sum.x + select(wide, part.x, zero), sum.y + select(wide, part.y, zero),
+           sum.z + select(wide, part.z, zero)};
+  };
+  add(d_first, add_scaled(add_scaled(cross(second, d_area), d_t, inverse[0]), d_b, inverse[2]));
+  add(d_second, add_scaled(add_scaled(cross(d_area, first), d_t, inverse[1]), d_b, inverse[3]));
 }
 
 // Adam (Kingma and Ba 2015) with both bias corrections folded into the numbers of a step:

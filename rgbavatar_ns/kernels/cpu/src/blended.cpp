@@ -72,25 +72,38 @@ double BlendedRendering::compare(const uint8_t* images, const Attribute& backgro
   return sum * weight;
 }
 
-void BlendedRendering::update(BlendedScene scene, const BlendedOptimizer& optimizer,
-                              float* weight_gradient, int threads) {
+void BlendedRendering::update(BlendedScene scene, const BlendedOptimizer* optimizer,
+                              float* weight_gradient, float* vertex_gradient, int threads) {
   Team team(threads);
   Workspace& w = *workspace_;
   scene.frames = w.frames.data();
   lay_out_blending(scene, team);
   const int chunks = blend_chunks_of(count_), weights = batch_ * scene.bases;
   w.weight_gradient.reserve(size_t(chunks) * weights);
+  float* carried = nullptr;
+  if (vertex_gradient) {
+    w.carried.reserve(size_t(batch_) * count_ * kCarriedFloats);
+    carried = w.carried.data();
+  }
   team.run(chunks, [&](int64_t chunk, int thread) {
     const int begin = int(chunk) * kBlendChunk;
     kernels_->update_blended(scene, w.cameras.data(), begin,
                              std::min(begin + kBlendChunk, count_), w.blending[thread],
                              w.image_slots.data(), optimizer,
-                             w.weight_gradient.data() + chunk * weights);
+                             w.weight_gradient.data() + chunk * weights, carried);
   });
   std::fill(weight_gradient, weight_gradient + weights, 0.0f);
   for (int chunk = 0; chunk < chunks; ++chunk)
     for (int i = 0; i < weights; ++i)
       weight_gradient[i] += w.weight_gradient[size_t(chunk) * weights + i];
+  if (!vertex_gradient) return;
+  const size_t frame_floats = size_t(scene.triangles) * kFrameFloats;
+  w.frame_gradient.reserve(frame_floats * team.size());
+  team.run(batch_, [&](int64_t image, int thread) {
+    kernels_->mesh_gradient(scene, int(image), carried,
+                            w.frame_gradient.data() + frame_floats * thread,
+                            vertex_gradient + image * scene.vertices * 3);
+  });
 }
 
 }  // namespace rgbavatar

@@ -165,6 +165,8 @@ static void activate_chunk(const BlendedScene& scene, int begin, int count,
 constexpr float kColorScale = 0.28209479177387814f;  // of the zeroth spherical harmonic
 
 struct WorldLanes {
+  Vec3<Wide> position;  // in the tangent frame, like the rotation
+  Wide rotation[4];
   GaussianInput<Wide> gaussian;
   Vec3<Wide> color;
   FrameLanes frame;
@@ -180,13 +182,13 @@ static RGBAVATAR_MEMBER WorldLanes world_lanes(const BlendedScene& scene, int im
   const Vec3<Wide> barycentric = load_vec3(scene.barycentric, begin + first, lanes);
   out.frame = load_frames(scene, image, begin + first, lanes, barycentric);
   const FrameLanes& f = out.frame;
-  const Vec3<Wide> x = load_vec3(tangent(0), first, kLanes);
-  Wide q[4];
-  load_quats(tangent(1), first, kLanes, q);
+  out.position = load_vec3(tangent(0), first, kLanes);
+  load_quats(tangent(1), first, kLanes, out.rotation);
+  const Vec3<Wide>& x = out.position;
   const Vec3<Wide> feature = load_vec3(tangent(2), first, kLanes);
   out.gaussian.mean = {dot(f.row0, x) + f.origin.x, dot(f.row1, x) + f.origin.y,
                        dot(f.row2, x) + f.origin.z};
-  quat_product(f.quat, q, out.gaussian.quat);
+  quat_product(f.quat, out.rotation, out.gaussian.quat);
   out.gaussian.scale = {load_wide(scratch.scale[0] + first) * f.ratio,
                         load_wide(scratch.scale[1] + first) * f.ratio,
                         load_wide(scratch.scale[2] + first) * f.ratio};
@@ -214,10 +216,32 @@ static void project_blended(const BlendedScene& scene, const float* cameras, int
 
 // ---- Gradients and Adam -------------------------------------------------------------------------
 
+// Keeps what the gradient of the frames is made of; 0 for what was not drawn.
+static void carry(const WorldLanes& world, const GaussianGradient<Wide>& d, const WideMask& drawn,
+                  float* rows, int first, int lanes) {
+  const Wide zero(0.0f);
+  const GaussianInput<Wide>& g = world.gaussian;
+  Wide quat[4];
+  product_conjugate(d.quat, world.rotation, quat);
+  const Vec3<Wide>& x = world.position;
+  const Wide ratio = dot(d.scale, g.scale) / world.frame.ratio;
+  const Wide columns[kCarriedFloats] = {
+      d.mean.x, d.mean.y,
+      d.mean.z, select(drawn, quat[0], zero),
+      select(drawn, quat[1], zero), select(drawn, quat[2], zero),
+      select(drawn, quat[3], zero), select(drawn, ratio, zero),
+      select(drawn, x.x, zero), select(drawn, x.y, zero),
+      select(drawn, x.z, zero), zero};
+  const OutputRows<kCarriedFloats> out(rows, first, lanes);
+  for (int k = 0; k < kCarriedFloats; k += 4)
+    store_columns(columns + k, [&](int i) { return out.data + i * kCarriedFloats + k; });
+}
+
 // Turns the chunk's blended numbers into their gradients, of all images, and sums those of scales
 // and opacities.
 static void differentiate_chunk(const BlendedScene& scene, const float* cameras, int begin,
-                                int count, BlendScratch& scratch, const ImageSlots* images) {
+                                int count, BlendScratch& scratch, const ImageSlots* images,
+                                float* carried) {
   const Wide zero(0.0f);
   for (int image = 0; image < scene.batch; ++image) {
     const Camera camera = camera_from(cameras + image * kCameraFloats, scene.width, scene.height);
@@ -227,6 +251,9 @@ static void differentiate_chunk(const BlendedScene& scene, const float* cameras,
       const WorldLanes world = world_lanes(scene, image, begin, first, lanes, scratch);
       const GaussianGradient<Wide> d = gradient_lanes(world.gaussian, camera, moments);
       const FrameLanes& f = world.frame;
+      if (carried)
+        carry(world, d, moments.drawn, carried + int64_t(image) * scene.count * kCarriedFloats,
+              begin + first, lanes);
       const auto of = [&](int kind) __attribute__((always_inline)) {
         return scratch.tangent[kind] + image * kBlendChunk * kBlendedWidth[kind];
       };
@@ -295,7 +322,7 @@ static void basis_images(const float* basis, const float* d, int d_stride, const
 
 // The gradient of each basis, which goes into Adam at once, and of the weights.
 static void update_bases(const BlendedScene& scene, int kind, int begin, int count,
-                         BlendScratch& scratch, const AdamGroup& group) {
+                         BlendScratch& scratch, const AdamGroup* group) {
   const int width = kBlendedWidth[kind], columns = count * width, d_stride = kBlendChunk * width;
   for (int k = 0; k < scene.bases; ++k) {
     const int64_t start = (int64_t(k) * scene.count + begin) * width;
@@ -312,7 +339,7 @@ static void update_bases(const BlendedScene& scene, int kind, int begin, int cou
             scene.bases * kLanes);
       image += rest < kBlendImages ? rest : kBlendImages;
     }
-    adam_columns(group, start, columns, scratch.gradient);
+    if (group) adam_columns(*group, start, columns, scratch.gradient);
   }
 }
 
@@ -330,20 +357,22 @@ static void update_base(const BlendedScene& scene, int kind, int begin, int coun
 
 static void update_blended(const BlendedScene& scene, const float* cameras, int begin, int end,
                            BlendScratch& scratch, const ImageSlots* images,
-                           const BlendedOptimizer& optimizer, float* weight_gradient) {
+                           const BlendedOptimizer* optimizer, float* weight_gradient,
+                           float* carried) {
   const int count = end - begin, weights = scene.batch * scene.bases;
   blend_chunk(scene, begin, count, scratch);
   activate_chunk(scene, begin, count, scratch);
-  differentiate_chunk(scene, cameras, begin, count, scratch, images);
+  differentiate_chunk(scene, cameras, begin, count, scratch, images, carried);
   for (int i = 0; i < weights; ++i) store(Wide(0.0f), scratch.weight_sums + i * kLanes);
   for (int kind = 0; kind < kBlendedKinds; ++kind) {
-    update_bases(scene, kind, begin, count, scratch, optimizer.basis[kind]);
-    update_base(scene, kind, begin, count, scratch, optimizer.base[kind]);
+    update_bases(scene, kind, begin, count, scratch, optimizer ? &optimizer->basis[kind] : nullptr);
+    if (optimizer) update_base(scene, kind, begin, count, scratch, optimizer->base[kind]);
   }
   for (int i = 0; i < weights; ++i)
     weight_gradient[i] = sum_of(load_wide(scratch.weight_sums + i * kLanes));
-  adam_columns(optimizer.log_scale, int64_t(begin) * 3, count * 3, scratch.scale_gradient);
-  adam_columns(optimizer.opacity_logit, begin, count, scratch.opacity_gradient);
+  if (!optimizer) return;
+  adam_columns(optimizer->log_scale, int64_t(begin) * 3, count * 3, scratch.scale_gradient);
+  adam_columns(optimizer->opacity_logit, begin, count, scratch.opacity_gradient);
 }
 
 }  // namespace rgbavatar::RGBAVATAR_ISA

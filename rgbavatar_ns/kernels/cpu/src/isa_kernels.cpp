@@ -2,6 +2,7 @@
 // it; uses no inline function or template of the standard library, because the linker would merge
 // those of different instruction sets.
 #include "blended.h"
+#include "mesh_gradient.h"
 #include "train_tile.h"
 
 namespace rgbavatar::RGBAVATAR_ISA {
@@ -9,6 +10,6 @@ namespace rgbavatar::RGBAVATAR_ISA {
 extern const Kernels kernels;
 const Kernels kernels = {project_image, forward_tile, backward_tile, average_tile,
                          project_image_backward, fill_frames, project_blended, train_tile,
-                         update_blended};
+                         update_blended, mesh_gradient};
 
 }  // namespace rgbavatar::RGBAVATAR_ISA

@@ -119,6 +119,10 @@ constexpr int kBlendColumns = kBlendChunk * 4;
 // A triangle's frame, corner, edges and length ratio in an image: 23 numbers, and one unused.
 constexpr int kFrameFloats = 24;
 
+// What the gradient of a Gaussian's frame is made of, in an image: the gradients of its mean, of
+// the frame's rotation and of the length ratio, and its tangent position; one number is unused.
+constexpr int kCarriedFloats = 12;
+
 // Gaussians in the tangent frames of a mesh, as base plus weighted bases (paper, eq. 1), for a
 // batch of meshes.
 struct BlendedScene {
@@ -183,11 +187,16 @@ struct Kernels {
   // Draws the tile, compares it with the target and writes its slots; returns the sum of absolute
   // differences.
   double (*train_tile)(const Tile&, const TrainingTarget&, TileScratch&, float* slots);
-  // Updates the parameters of Gaussians [begin, end) and writes the gradient of the weights that
-  // comes from them, [B, K].
+  // Updates the parameters of Gaussians [begin, end), where there is an optimizer, and writes the
+  // gradient of the weights that comes from them, [B, K], and, where it is asked for, what
+  // `mesh_gradient` needs of them, [B, N, kCarriedFloats].
   void (*update_blended)(const BlendedScene&, const float* cameras, int begin, int end,
-                         BlendScratch&, const ImageSlots* images, const BlendedOptimizer&,
-                         float* weight_gradient);
+                         BlendScratch&, const ImageSlots* images, const BlendedOptimizer*,
+                         float* weight_gradient, float* carried);
+  // Writes the gradient of an image's vertices, [V, 3]; `frame_gradient` is scratch memory for
+  // [U, kFrameFloats].
+  void (*mesh_gradient)(const BlendedScene&, int image, const float* carried,
+                        float* frame_gradient, float* vertex_gradient);
 };
 
 // world_to_camera [4, 4], focal [2] and principal point [2] in one row of floats.

@@ -180,7 +180,12 @@ struct BlendedSession : Drawing<rgbavatar::BlendedRendering> {
     return rendering.compare(images.data(), attribute(background), threads);
   }
 
-  void update(const std::vector<AdamArrays>& groups, const Output& weight_gradient) {
+  void update(const std::vector<AdamArrays>& groups, const Output& weight_gradient,
+              const std::optional<Output>& vertex_gradient) {
+    const rgbavatar::BlendedScene scene = blended.scene(weights, vertices, width, height);
+    if (groups.empty())
+      return rendering.update(scene, nullptr, weight_gradient.data(), pointer(vertex_gradient),
+                              threads);
     rgbavatar::BlendedOptimizer optimizer = {};
     for (int kind = 0; kind < rgbavatar::kBlendedKinds; ++kind) {
       optimizer.base[kind] = adam_group(groups[kind]);
@@ -189,8 +194,7 @@ struct BlendedSession : Drawing<rgbavatar::BlendedRendering> {
     }
     optimizer.log_scale = adam_group(groups[3]);
     optimizer.opacity_logit = adam_group(groups[4]);
-    rendering.update(blended.scene(weights, vertices, width, height), optimizer,
-                     weight_gradient.data(), threads);
+    rendering.update(scene, &optimizer, weight_gradient.data(), pointer(vertex_gradient), threads);
   }
 };
 
@@ -263,5 +267,5 @@ NB_MODULE(_native, m) {
       .def("compare", &BlendedSession::compare, "images_rgba"_a.noconvert(),
            "background"_a.noconvert(), Release())
       .def("update", &BlendedSession::update, "groups"_a, "weight_gradient"_a.noconvert(),
-           Release());
+           "vertex_gradient"_a.noconvert().none() = nb::none(), Release());
 }

@@ -74,6 +74,8 @@ struct Workspace {
   Buffer<BlendScratch> blending;   // [threads]
   Buffer<float> blending_columns;  // [threads, ...]: what the scratch memory points to
   Buffer<float> weight_gradient;   // [chunks, B, K]
+  Buffer<float> carried;           // [B, N, kCarriedFloats]
+  Buffer<float> frame_gradient;    // [threads, U, kFrameFloats]
   Buffer<double> loss;             // [B, tiles]
 };
 
@@ -136,9 +138,10 @@ class BlendedRendering : public Rendering {
   // keeps what `update` needs.
   double compare(const uint8_t* images, const Attribute& background, int threads);
 
-  // One step of Adam by the gradient of the last comparison; writes that of the weights, [B, K].
-  void update(BlendedScene scene, const BlendedOptimizer& optimizer, float* weight_gradient,
-              int threads);
+  // One step of Adam by the gradient of the last comparison, or none without an optimizer; writes
+  // the gradients of the weights, [B, K], and, unless it is null, of the vertices, [B, V, 3].
+  void update(BlendedScene scene, const BlendedOptimizer* optimizer, float* weight_gradient,
+              float* vertex_gradient, int threads);
 
  private:
   void lay_out_blending(const BlendedScene& scene, const class Team& team);

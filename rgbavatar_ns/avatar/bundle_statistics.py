@@ -1,0 +1,112 @@
+"""What an avatar has seen in training: ranges of theta and psi, and its space of expressions."""
+
+from dataclasses import dataclass, fields
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.head import ThetaLayout
+
+_RIGID = ("rotation", "neck", "translation")
+"""Fields that move the head as a whole; the others make the expression."""
+_EXPLAINED = 0.999
+_NOTHING = 1e-8
+
+
+@dataclass(frozen=True)
+class TrainingStatistics:
+    """Of F training frames. Source: ours, after complaints of drivers that leave what was seen."""
+
+    num_frames: int
+    theta_mean: Float[Tensor, "H"]
+    theta_std: Float[Tensor, "H"]
+    theta_min: Float[Tensor, "H"]
+    theta_max: Float[Tensor, "H"]
+    theta_neutral: Float[Tensor, "H"]
+    """The frame whose expression is nearest to rest."""
+    psi_mean: Float[Tensor, "K"]
+    psi_std: Float[Tensor, "K"]
+    psi_min: Float[Tensor, "K"]
+    psi_max: Float[Tensor, "K"]
+    expressive: Bool[Tensor, "H"]
+    """Which numbers of theta make the expression (all but the head's rigid motion)."""
+    components: Float[Tensor, "C H"]
+    """Orthonormal principal components of the expression that hold .999 of its variance."""
+    component_min: Float[Tensor, "C"]
+    component_max: Float[Tensor, "C"]
+
+    @classmethod
+    @torch.no_grad()
+    def of(
+        cls, theta: Float[Tensor, "F H"], psi: Float[Tensor, "F K"], layout: ThetaLayout
+    ) -> "TrainingStatistics":
+        """Statistics of training frames; raises UserError where there are none."""
+        if len(theta) == 0:
+            raise UserError("There are no training frames.", "Give a dataset with frames.")
+        expressive = expressive_numbers(layout)
+        mean = theta.mean(0)
+        centred = (theta - mean) * expressive
+        _, strengths, directions = torch.linalg.svd(centred.double(), full_matrices=False)
+        share = strengths.square().cumsum(0) / strengths.square().sum().clamp(min=_NOTHING**2)
+        count = int((share < _EXPLAINED).sum()) + 1 if strengths.max() > _NOTHING else 0
+        components = directions[:count].to(theta.dtype)
+        along = centred @ components.T
+        return cls(
+            num_frames=len(theta),
+            theta_mean=mean,
+            theta_std=theta.std(0, unbiased=False),
+            theta_min=theta.amin(0),
+            theta_max=theta.amax(0),
+            theta_neutral=neutral_frame(theta, layout),
+            psi_mean=psi.mean(0),
+            psi_std=psi.std(0, unbiased=False),
+            psi_min=psi.amin(0),
+            psi_max=psi.amax(0),
+            expressive=expressive,
+            components=components,
+            component_min=along.amin(0),
+            component_max=along.amax(0),
+        )
+
+    def project(self, theta: Float[Tensor, "F H"]) -> Float[Tensor, "F H"]:
+        """The nearest expression in the span and range of those seen; rigid motion stays.
+
+        Ranges are those along each principal component.
+        """
+        along = (theta - self.theta_mean) @ self.components.T
+        held = torch.minimum(torch.maximum(along, self.component_min), self.component_max)
+        return torch.where(self.expressive, self.theta_mean + held @ self.components, theta)
+
+    def to_state(self) -> dict[str, Any]:
+        """Tensors and numbers by field."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+    @classmethod
+    def from_state(cls, state: dict[str, Any]) -> "TrainingStatistics":
+        """Inverse of `to_state`; raises UserError where a field is missing."""
+        missing = [field.name for field in fields(cls) if field.name not in state]
+        if missing:
+            raise UserError(
+                f"The training statistics lack {', '.join(missing)}.", "Export the avatar again."
+            )
+        return cls(**{field.name: state[field.name] for field in fields(cls)})
+
+
+def expressive_numbers(layout: ThetaLayout) -> Bool[Tensor, "H"]:
+    """Which numbers of theta make the expression: all but rotation, neck and translation."""
+    mask = torch.ones(layout.size, dtype=torch.bool)
+    for name in _RIGID:
+        if name in layout:
+            mask[layout.slice(name)] = False
+    return mask
+
+
+def neutral_frame(theta: Float[Tensor, "F H"], layout: ThetaLayout) -> Float[Tensor, "H"]:
+    """The frame whose expression is nearest to rest: the smallest sum of absolute values.
+
+    Without names that say more: at rest, blend weights and joint angles of the face are zero.
+    """
+    return theta[theta[:, expressive_numbers(layout)].abs().sum(1).argmin()]

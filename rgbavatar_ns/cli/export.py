@@ -1,0 +1,140 @@
+"""`rgbavatar export`: the avatar for other programs and other people."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+
+from rgbavatar_ns.cli.progress import progress_bar
+from rgbavatar_ns.errors import UserError
+
+if TYPE_CHECKING:
+    from rgbavatar_ns.avatar import Avatar
+    from rgbavatar_ns.data import TrackedDataset
+
+Format = Literal["bundle", "ply", "ply-sequence", "web"]
+
+
+def run(
+    run_folder: Annotated[Path, tyro.conf.Positional],
+    destination: Annotated[Path, tyro.conf.Positional],
+    format: Format = "bundle",
+    data: Path | None = None,
+    frame: int | None = None,
+    frames: tuple[int, int] | None = None,
+    head_inside: bool = True,
+    frames_per_second: float = 25.0,
+    title: str = "Avatar",
+) -> None:
+    """Write an avatar as a bundle, as Gaussians in PLY files or as a web page.
+
+    bundle: a folder that `Avatar.load` opens without nerfstudio; with --data it holds what the
+    avatar saw in training. ply: the Gaussians of one frame, as viewers of 3D Gaussian splatting
+    open them. ply-sequence: a folder of them. web: one HTML file that plays and drives the avatar
+    in a browser, without a server or a network.
+
+    Args:
+        run_folder: a run of ns-train, a checkpoint or an avatar bundle.
+        destination: the folder (bundle, ply-sequence) or file (ply, web) to write.
+        format: what to write.
+        data: the dataset whose frames are meant: the avatar's own.
+        frame: for ply, the frame's place in the dataset; without it the head is at rest.
+        frames: for ply-sequence and web, first frame and the frame after the last one.
+        head_inside: for bundle, put the head model inside. Without it the bundle only names its
+            head model, as the licence of FLAME asks where it is passed on.
+        frames_per_second: for web, of the performance.
+        title: for web, the page's title.
+    """
+    from rgbavatar_ns import Avatar
+
+    avatar = Avatar.load(run_folder)
+    dataset = _dataset(avatar, data)
+    if format == "bundle":
+        from rgbavatar_ns.avatar.bundle import load_statistics
+        from rgbavatar_ns.export import statistics_of
+
+        seen = load_statistics(run_folder) if dataset is None else statistics_of(avatar, dataset)
+        avatar.save(destination, statistics=seen, with_head=head_inside)
+        print(f"Avatar.load({str(destination)!r}) opens it.")
+    elif format == "ply":
+        _write_frame(avatar, dataset, frame, destination)
+    elif format == "ply-sequence":
+        _write_sequence(avatar, dataset, frames, destination)
+    else:
+        _write_page(avatar, dataset, frames, destination, frames_per_second, title)
+
+
+def _dataset(avatar: "Avatar", data: Path | None) -> "TrackedDataset | None":
+    from rgbavatar_ns.data import load_dataset
+
+    if data is None:
+        return None
+    dataset = load_dataset(data)
+    avatar.require_layout(dataset.layout, f"The dataset {data}")
+    return dataset
+
+
+def _write_frame(
+    avatar: "Avatar", dataset: "TrackedDataset | None", frame: int | None, destination: Path
+) -> None:
+    import torch
+
+    from rgbavatar_ns.export import write_ply
+    from rgbavatar_ns.export.scenes import chosen_frames
+
+    theta = torch.zeros(1, avatar.layout.size)
+    if frame is not None:
+        if dataset is None:
+            raise UserError("--frame needs a dataset.", "Name it with --data.")
+        theta = dataset.theta[list(chosen_frames(len(dataset), (frame, frame + 1), ()))]
+    with torch.no_grad():
+        count = write_ply(destination, avatar.gaussians(theta))
+    print(f"{count} Gaussians in {destination}")
+
+
+def _write_sequence(
+    avatar: "Avatar",
+    dataset: "TrackedDataset | None",
+    frames: tuple[int, int] | None,
+    destination: Path,
+) -> None:
+    import torch
+
+    from rgbavatar_ns.export import write_ply
+    from rgbavatar_ns.export.scenes import chosen_frames
+
+    if dataset is None:
+        raise UserError("A sequence needs a dataset.", "Name it with --data.")
+    chosen = chosen_frames(len(dataset), frames, range(len(dataset)))
+    with progress_bar("PLY files") as update, torch.no_grad():
+        for done, place in enumerate(chosen, start=1):
+            gaussians = avatar.gaussians(dataset.theta[place : place + 1])
+            write_ply(destination / f"{place:05d}.ply", gaussians)
+            update(done, len(chosen))
+    print(f"{len(chosen)} PLY files in {destination}")
+
+
+def _write_page(
+    avatar: "Avatar",
+    dataset: "TrackedDataset | None",
+    frames: tuple[int, int] | None,
+    destination: Path,
+    frames_per_second: float,
+    title: str,
+) -> None:
+    import torch
+
+    from rgbavatar_ns.export import PageOptions, front_camera, write_web_page
+    from rgbavatar_ns.export.scenes import chosen_frames
+
+    if dataset is None:
+        camera, theta = front_camera(avatar, 512, 512), torch.zeros(0, avatar.layout.size)
+    else:
+        chosen = chosen_frames(len(dataset), frames, range(len(dataset)))
+        camera, theta = (
+            dataset.cameras.select([chosen[0]]),
+            dataset.theta[chosen[0] : chosen[-1] + 1],
+        )
+    options = PageOptions(title, frames_per_second)
+    size = write_web_page(avatar, destination, camera, theta, options)
+    print(f"{destination}: {size / 1e6:.1f} MB; open it in a browser")

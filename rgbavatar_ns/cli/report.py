@@ -1,0 +1,32 @@
+"""`rgbavatar report`: tables and plots of what a sweep has done so far."""
+
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+from rich.markdown import Markdown
+
+from rgbavatar_ns.experiments import read_experiment
+from rgbavatar_ns.experiments.report import write_report
+
+
+def run(
+    folder: Annotated[Path, tyro.conf.Positional],
+    file: Path,
+    tiny: bool = False,
+    plots: bool = True,
+) -> None:
+    """Write the experiment's table as Markdown, CSV and LaTeX, its plot, and a page with all.
+
+    Args:
+        folder: where `rgbavatar sweep` wrote.
+        file: the experiment that was swept.
+        tiny: it was swept with --tiny.
+        plots: draw them too (needs matplotlib).
+    """
+    report = write_report(read_experiment(file, tiny=tiny), folder, plots=plots)
+    console = Console()
+    console.print(Markdown(report.table.to_markdown()))
+    for path in report.paths:
+        console.print(str(path), soft_wrap=True, highlight=False)

@@ -1,0 +1,78 @@
+"""`rgbavatar sweep`: every cell of an experiment that is not done yet."""
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+from rich.console import Console
+from rich.live import Live
+from rich.table import Table
+
+from rgbavatar_ns.experiments import read_experiment
+from rgbavatar_ns.experiments.engines import Engine, LocalEngine, RayEngine
+from rgbavatar_ns.experiments.sweep import CellStatus, sweep
+
+_STYLE = {"waiting": "dim", "running": "cyan", "done": "green", "failed": "bold red"}
+
+
+def run(
+    file: Annotated[Path, tyro.conf.Positional],
+    output: Path | None = None,
+    tiny: bool = False,
+    engine: Literal["local", "ray"] = "local",
+    at_once: int = 1,
+    address: str | None = None,
+    cpus: float = 2.0,
+    gpus: float = 0.0,
+) -> None:
+    """Train and evaluate each variant on each subject with each seed; finished cells are kept.
+
+    Interrupted or failed, call it again: it goes on. `rgbavatar report` makes the tables.
+
+    Args:
+        file: the experiment, one of configs/*.yaml or your own.
+        output: where everything is written; outputs/sweeps/NAME by default (NAME-tiny with --tiny).
+        tiny: take the file's `tiny` section: minutes on two cores.
+        engine: processes of this machine, or a Ray cluster.
+        at_once: cells at a time of the local engine.
+        address: of the Ray cluster; without it one is started here.
+        cpus: CPU cores that a cell asks Ray for.
+        gpus: GPUs, or a share of one, that a cell asks Ray for.
+    """
+    experiment = read_experiment(file, tiny=tiny)
+    name = f"{experiment.name}-tiny" if tiny else experiment.name
+    folder = (output or Path("outputs") / "sweeps" / name).resolve()
+    console = Console()
+    chosen: Engine = LocalEngine(at_once) if engine == "local" else RayEngine(address, cpus, gpus)
+    with Live(console=console, refresh_per_second=1) as live:
+        statuses = sweep(experiment, folder, chosen, lambda statuses: live.update(_table(statuses)))
+    console.print()
+    failed = {status.folder: status for status in statuses if status.state != "done"}
+    for status in failed.values():
+        console.print(f"[red]failed:[/red] {status.cell.variant}, {status.folder}", soft_wrap=True)
+        console.print("\n".join(f"    {line}" for line in status.why), markup=False, soft_wrap=True)
+    report = f"rgbavatar report {folder} --file {file}" + (" --tiny" if tiny else "")
+    console.print(
+        f"{len(statuses) - len(failed)} of {len(statuses)} cells done; {report}",
+        soft_wrap=True,
+        highlight=False,
+    )
+    if failed:
+        sys.exit(1)
+
+
+def _table(statuses: Sequence[CellStatus]) -> Table:
+    table = Table("variant", "subject", "seed", "state", "PSNR")
+    for status in statuses:
+        score = (status.result or {}).get("metrics", {}).get("psnr")
+        style = _STYLE[status.state]
+        table.add_row(
+            status.cell.variant,
+            Path(status.cell.subject).name,
+            str(status.cell.seed),
+            f"[{style}]{status.state}[/{style}]",
+            "" if score is None else f"{score:.2f}",
+        )
+    return table

@@ -1,0 +1,150 @@
+"""Parameters and cameras in numbers, and which of them are odd."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from rgbavatar_ns.data.check.problems import Problem, first_few
+from rgbavatar_ns.data.dataset import TrackedDataset
+
+_LARGEST_COEFFICIENT, _LARGEST_TURN_RAD = 12.0, np.pi + 0.01
+_NARROWEST_DEGREES, _WIDEST_DEGREES = 3.0, 120.0
+_NEAREST_M, _FARTHEST_M = 0.1, 20.0
+_USUAL_FLAME = {
+    "VHAP": "2023",
+    "raw VHAP": "2023",
+    "IMAvatar": "2020",
+    "INSTA": "2020",
+    "FlashAvatar": "2020",
+    "NeRFBlendShape": "2020",
+    "GaussianBlendshapes": "2020",
+    "RGBAvatar": "2020",
+    "metrical-tracker": "2020",
+}
+"""The version of FLAME that each system's data is tracked with."""
+_ALSO_OTHERS = ("VHAP", "raw VHAP")
+"""Systems that can be told to use another version."""
+
+
+@dataclass(frozen=True)
+class FieldRange:
+    """One field of theta over all frames."""
+
+    name: str
+    size: int
+    smallest: float
+    largest: float
+    changes: bool
+
+    def __str__(self) -> str:
+        """A line of the report."""
+        still = "" if self.changes else ", the same in all frames"
+        return f"{self.name} ({self.size}): {self.smallest:.3g} to {self.largest:.3g}{still}"
+
+
+def field_ranges(dataset: TrackedDataset) -> tuple[FieldRange, ...]:
+    """The range of each field of theta."""
+    parts = dataset.layout.split(dataset.theta)
+    return tuple(
+        FieldRange(
+            name,
+            part.shape[1],
+            float(part.min()),
+            float(part.max()),
+            bool((part != part[:1]).any()),
+        )
+        for name, part in parts.items()
+        if part.numel()
+    )
+
+
+def parameter_problems(dataset: TrackedDataset) -> list[Problem]:
+    """Coefficients and turns that no head makes, a theta that never changes."""
+    problems = []
+    parts = dataset.layout.split(dataset.theta)
+    for field in dataset.layout.fields:
+        part = parts[field.name]
+        if field.form == "axis_angle":
+            odd, what = part.norm(dim=1) > _LARGEST_TURN_RAD, "turns of more than half a circle"
+        elif field.form == "linear":
+            odd = part.abs().amax(1) > _LARGEST_COEFFICIENT if part.numel() else torch.zeros(0)
+            what = f"coefficients beyond {_LARGEST_COEFFICIENT:.0f}"
+        else:
+            continue
+        frames = tuple(n for n, is_odd in zip(dataset.frame_index, odd.tolist()) if is_odd)
+        if frames:
+            problems.append(
+                Problem(
+                    "parameters",
+                    "warning",
+                    f"{field.name} has {what} in {len(frames)} of {len(dataset)} frames "
+                    f"({first_few(frames)}).",
+                    "Look at these frames in the tracker; leave them out if it lost the face.",
+                    frames,
+                )
+            )
+    if len(dataset) > 1 and not (dataset.theta != dataset.theta[:1]).any():
+        moving = bool((dataset.cameras.world_to_camera != dataset.cameras.world_to_camera[0]).any())
+        problems.append(
+            Problem(
+                "parameters",
+                "warning" if moving else "error",
+                f"theta is the same in all {len(dataset)} frames.",
+                "An avatar learns from changing expressions: check how the parameters were read.",
+            )
+        )
+    return problems
+
+
+def camera_problems(dataset: TrackedDataset) -> list[Problem]:
+    """Angles of view, principal points and distances that are not those of a portrait."""
+    cameras = dataset.cameras
+    focal = cameras.focal_px.numpy()
+    size = np.array([dataset.width, dataset.height])
+    angles = np.degrees(2 * np.arctan(size / (2 * focal)))
+    center = cameras.principal_point_px.numpy()
+    eye = torch.linalg.inv(cameras.world_to_camera.double())[:, :3, 3].numpy()
+    head = dataset.arrays.v_template.mean(0)
+    if "translation" in dataset.layout:
+        head = head + dataset.layout.split(dataset.theta)["translation"].numpy()
+    distance = np.linalg.norm(eye - head, axis=1)
+    found = []
+    for odd, what, remedy in (
+        (
+            (angles < _NARROWEST_DEGREES) | (angles > _WIDEST_DEGREES),
+            f"an angle of view of {angles.min():.1f} to {angles.max():.1f} degrees",
+            "Check the focal length in pixels, for images of this size.",
+        ),
+        (
+            (center < 0) | (center > size),
+            "a principal point outside of the image",
+            "Check that it is in pixels, for images of this size.",
+        ),
+        (
+            ((distance < _NEAREST_M) | (distance > _FARTHEST_M))[:, None],
+            f"a distance of {distance.min():.2g} to {distance.max():.2g} m from the head",
+            "Check the unit of translations: metres are meant.",
+        ),
+    ):
+        frames = tuple(n for n, bad in zip(dataset.frame_index, odd.any(1).tolist()) if bad)
+        if frames:
+            cause = f"{len(frames)} of {len(dataset)} cameras have {what} ({first_few(frames)})."
+            found.append(Problem("cameras", "warning", cause, remedy, frames))
+    return found
+
+
+def version_problem(dataset: TrackedDataset) -> Problem | None:
+    """Whether the head is another FLAME than that which the data's system tracks with."""
+    told = str(dataset.source.get("format", ""))
+    usual, name = _USUAL_FLAME.get(told), dataset.arrays.name
+    version = name.removeprefix("FLAME ").removesuffix(" female").removesuffix(" male")
+    if usual is None or version == usual:
+        return None
+    return Problem(
+        "FLAME version",
+        "warning" if told in _ALSO_OTHERS and name.startswith("FLAME") else "error",
+        f"The data comes from {told}, which tracks with FLAME {usual}, but its head is '{name}': "
+        "coefficients of one version give another face in the other.",
+        f"Import it again with the pickle of FLAME {usual}.",
+    )

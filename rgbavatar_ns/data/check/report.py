@@ -1,0 +1,238 @@
+"""The check of a dataset: what is in it, what is odd, and whether it can be trained."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rgbavatar_ns.data.check.parameters import (
+    FieldRange,
+    camera_problems,
+    field_ranges,
+    parameter_problems,
+    version_problem,
+)
+from rgbavatar_ns.data.check.placement import mirrored_problem, placement_problem
+from rgbavatar_ns.data.check.problems import Problem, first_few
+from rgbavatar_ns.data.check.sample import (
+    Agreement,
+    Sample,
+    agreement,
+    inside_share,
+    projected,
+    silhouettes,
+    take_sample,
+)
+from rgbavatar_ns.data.check.sheet import MAX_TILES, spread, write_sheet
+from rgbavatar_ns.data.check.timing import frame_offset_problem, longest_run
+from rgbavatar_ns.data.dataset import TrackedDataset
+from rgbavatar_ns.data.importers import find_format
+from rgbavatar_ns.data.native_format import FORMAT, INDEX_FILE
+from rgbavatar_ns.errors import UserError
+
+_FEW_SPREAD = 4
+"""Frames that are enough to see whether the head is where the images show it."""
+_FEW_FRAMES, _LOW_OF_MEDIAN, _HALF = 30, 0.75, 0.5
+
+
+@dataclass(frozen=True)
+class CheckReport:
+    """What `rgbavatar check` tells; `usable` where no problem is an error."""
+
+    path: Path
+    format: str
+    frames: int
+    problems: tuple[Problem, ...]
+    train: int = 0
+    test: int = 0
+    head: str = ""
+    size: tuple[int, int] = (0, 0)
+    num_cameras: int = 0
+    focal_px: tuple[float, float] = (0.0, 0.0)
+    ranges: tuple[FieldRange, ...] = ()
+    notes: tuple[str, ...] = ()
+    iou: dict[int, float] = field(default_factory=dict)
+    """Overlap of head mesh and matte by frame number, of the frames that were looked at."""
+    sheet: Path | None = None
+
+    @property
+    def usable(self) -> bool:
+        """Whether training can go on."""
+        return not any(problem.severity == "error" for problem in self.problems)
+
+    def to_json(self) -> dict[str, Any]:
+        """For programs: `format`, `frames`, `usable`, `problems`, and the figures behind them."""
+        return {
+            "format": self.format,
+            "frames": self.frames,
+            "usable": self.usable,
+            "problems": [problem.to_json() for problem in self.problems],
+            "train": self.train,
+            "test": self.test,
+            "head": self.head,
+            "size": list(self.size),
+            "cameras": self.num_cameras,
+            "focal_px": list(self.focal_px),
+            "parameters": {r.name: [r.smallest, r.largest] for r in self.ranges},
+            "notes": list(self.notes),
+            "iou": {str(number): round(value, 4) for number, value in self.iou.items()},
+            "sheet": None if self.sheet is None else str(self.sheet),
+        }
+
+
+def unreadable_report(path: Path, error: UserError) -> CheckReport:
+    """The report on data that its reader refused; its format is told where it can be."""
+    foreign = find_format(path) if path.is_dir() else None
+    told = "unknown" if foreign is None else foreign.name
+    if (path / INDEX_FILE).is_file():
+        told = FORMAT
+    return CheckReport(path, told, 0, (Problem.of_error(error),))
+
+
+def quick_check(dataset: TrackedDataset) -> list[Problem]:
+    """What can be told from a few frames in a second: errors only, for use before training.
+
+    Raises UserError naming an image that cannot be decoded.
+    """
+    train = dataset.train
+    positions = [train[place] for place in spread(len(train), _FEW_SPREAD)]
+    problem = placement_problem(take_sample(dataset, positions), only_hopeless=True)
+    found = [problem, version_problem(dataset)]
+    return [one for one in found if one is not None and one.severity == "error"]
+
+
+def check_dataset(
+    dataset: TrackedDataset,
+    max_frames: int = 200,
+    sheet: Path | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> CheckReport:
+    """Look at up to `max_frames` frames, evenly spread, and at a run of frames one after another.
+
+    sheet: where the contact sheet goes (PNG); None writes none. Images that cannot be decoded
+    become problems of the report.
+    """
+    positions = spread(len(dataset), max_frames).tolist()
+    problems = [*parameter_problems(dataset), *camera_problems(dataset)]
+    problems += [one for one in [version_problem(dataset)] if one is not None]
+    agreements: list[Agreement] = []
+    try:
+        sample = take_sample(dataset, positions, progress)
+        agreements = _agreements(sample)
+        found = _picture_problems(dataset, sample, agreements)
+        if sheet is not None:
+            sheet.parent.mkdir(parents=True, exist_ok=True)
+            write_sheet(sheet, dataset, sample, agreements, spread(len(sample), MAX_TILES).tolist())
+    except UserError as error:
+        found, sheet = [Problem.of_error(error)], None
+    problems = sorted([*found, *problems], key=lambda problem: problem.severity)
+    focal = dataset.cameras.focal_px
+    views = np.concatenate(
+        [dataset.cameras.world_to_camera.flatten(1), focal, dataset.cameras.principal_point_px], 1
+    )
+    return CheckReport(
+        dataset.root,
+        str(dataset.source.get("format") or FORMAT),
+        len(dataset),
+        tuple(problems),
+        len(dataset.train),
+        len(dataset.test),
+        dataset.arrays.name,
+        (dataset.width, dataset.height),
+        len(np.unique(views, axis=0)),
+        (float(focal.min()), float(focal.max())),
+        field_ranges(dataset),
+        tuple(map(str, dataset.source.get("notes", ()))),
+        {dataset.frame_index[p]: a.iou for p, a in zip(positions, agreements)},
+        sheet,
+    )
+
+
+def _agreements(sample: Sample) -> list[Agreement]:
+    """Of every frame; none where the images have no mattes."""
+    if not sample.has_mattes:
+        return []
+    drawn = silhouettes(sample, projected(sample))
+    return [agreement(mesh, matte) for mesh, matte in zip(drawn, sample.alpha)]
+
+
+def _picture_problems(
+    dataset: TrackedDataset, sample: Sample, agreements: list[Agreement]
+) -> list[Problem]:
+    problems: list[Problem | None] = []
+    few = sample.select(spread(len(sample), _FEW_SPREAD).tolist())
+    placement = placement_problem(few)
+    problems.append(placement)
+    if placement is None or placement.severity == "warning":
+        problems.append(mirrored_problem(sample))
+        problems.append(frame_offset_problem(take_sample(dataset, longest_run(dataset))))
+        problems += [_outside(dataset, sample), _worse_than_others(dataset, sample, agreements)]
+    problems.append(_mattes(sample))
+    if len(dataset.train) < _FEW_FRAMES:
+        problems.append(
+            Problem(
+                "parameters",
+                "warning",
+                f"There are only {len(dataset.train)} frames to train from.",
+                "Expect a poor avatar; some hundred frames with speech and head turns are usual.",
+            )
+        )
+    return [problem for problem in problems if problem is not None]
+
+
+def _outside(dataset: TrackedDataset, sample: Sample) -> Problem | None:
+    """Single frames whose head is not in the image, where most are."""
+    odd = inside_share(sample, projected(sample)) < _HALF
+    frames = tuple(dataset.frame_index[p] for p, bad in zip(sample.positions, odd) if bad)
+    if not frames:
+        return None
+    return Problem(
+        "outside",
+        "warning",
+        f"In {len(frames)} of {len(sample)} frames the projected head lies outside of the image "
+        f"({first_few(frames)}).",
+        "Leave these frames out: the tracker lost the face there.",
+        frames,
+    )
+
+
+def _worse_than_others(
+    dataset: TrackedDataset, sample: Sample, agreements: list[Agreement]
+) -> Problem | None:
+    """Frames whose mesh leaves the matte far more than the others do."""
+    if not agreements:
+        return None
+    covered = np.array([one.covered for one in agreements])
+    odd = covered < _LOW_OF_MEDIAN * np.median(covered)
+    frames = tuple(dataset.frame_index[p] for p, bad in zip(sample.positions, odd) if bad)
+    if not frames:
+        return None
+    return Problem(
+        "misfit",
+        "warning",
+        f"In {len(frames)} of {len(sample)} frames the mesh leaves the person far more than in "
+        f"the others ({first_few(frames)}).",
+        "Look at these frames; leave them out if the tracker lost the face.",
+        frames,
+    )
+
+
+def _mattes(sample: Sample) -> Problem | None:
+    if sample.has_mattes:
+        empty = (sample.alpha > _HALF).mean() < 0.005
+        if not empty:
+            return None
+        return Problem(
+            "mattes",
+            "error",
+            "The images are empty: their alpha is zero nearly everywhere.",
+            "Check the mattes; alpha 255 is the person, 0 the background.",
+        )
+    return Problem(
+        "mattes",
+        "warning",
+        "The images are opaque: the person is not cut out, so that no silhouette can be compared.",
+        "Cut the person out (alpha 255 is the person), or the background is learned too.",
+    )

@@ -1,0 +1,192 @@
+"""Frames of a dataset made small, with the head as the dataset says it should appear in them."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+
+from rgbavatar_ns.data.dataset import TrackedDataset
+from rgbavatar_ns.data.mesh_drawing import mesh_silhouette
+from rgbavatar_ns.head import HeadModel
+
+SMALL_PX = 96
+"""Longer side of the pictures that silhouettes are compared in."""
+_CHUNK = 16
+_NEAREST_M = 1e-3
+_OPAQUE, _MATTED_SHARE = 0.5, 0.98
+
+
+@dataclass(frozen=True)
+class Sample:
+    """F small frames: what the images show, and where theta and the cameras put the head.
+
+    The mesh is the part of the head that follows the neck more than the root, without shoulders.
+    """
+
+    positions: tuple[int, ...]
+    alpha: Float[np.ndarray, "F h w"]
+    gray: Float[np.ndarray, "F h w"]
+    """Luminance times alpha, in [0, 1]."""
+    vertices: Float[np.ndarray, "F V 3"]
+    """In the head's world, metres."""
+    faces: Int[np.ndarray, "T 3"]
+    world_to_camera: Float[np.ndarray, "F 4 4"]
+    focal_px: Float[np.ndarray, "F 2"]
+    principal_point_px: Float[np.ndarray, "F 2"]
+    rest: Float[np.ndarray, "V 3"]
+    """The same vertices at rest."""
+    scale: float
+    """Size of the small frames by that of the images."""
+
+    @property
+    def has_mattes(self) -> bool:
+        """Whether the images are cut out at all: opaque ones have no silhouette."""
+        return bool((self.alpha > _OPAQUE).mean() < _MATTED_SHARE)
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+    def select(self, places: Sequence[int]) -> "Sample":
+        """Some of the frames, by their place in this sample."""
+        chosen = list(places)
+        return replace(
+            self,
+            positions=tuple(self.positions[place] for place in chosen),
+            alpha=self.alpha[chosen],
+            gray=self.gray[chosen],
+            vertices=self.vertices[chosen],
+            world_to_camera=self.world_to_camera[chosen],
+            focal_px=self.focal_px[chosen],
+            principal_point_px=self.principal_point_px[chosen],
+        )
+
+
+@dataclass(frozen=True)
+class Projection:
+    """V vertices in F small frames, in pixels; those behind the camera are not seen."""
+
+    points_px: Float[np.ndarray, "F V 2"]
+    seen: Bool[np.ndarray, "F V"]
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """How one frame's head mesh and matte fit, in shares of pixels."""
+
+    iou: float
+    """Of mesh and matte, without the matte below the mesh (the shoulders)."""
+    covered: float
+    """Share of the mesh that lies on the matte."""
+
+
+def take_sample(
+    dataset: TrackedDataset,
+    positions: Sequence[int],
+    progress: Callable[[int, int], None] | None = None,
+) -> Sample:
+    """Decode these frames and pose the head for them; one full image in memory at a time.
+
+    Raises UserError naming an image that cannot be decoded.
+    """
+    scale = SMALL_PX / max(dataset.width, dataset.height)
+    size = (max(1, round(dataset.width * scale)), max(1, round(dataset.height * scale)))
+    alphas, grays = [], []
+    for done, position in enumerate(positions):
+        image = dataset.read_image(position)
+        small = cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32) / 255
+        alphas.append(small[..., 3])
+        grays.append(small[..., :3].mean(-1) * small[..., 3])
+        if progress is not None:
+            progress(done + 1, len(positions))
+    vertices, faces, rest = _posed(dataset, positions)
+    chosen = dataset.cameras.select(positions)
+    by_axis = np.array(size) / np.array([dataset.width, dataset.height])
+    return Sample(
+        tuple(positions),
+        np.stack(alphas),
+        np.stack(grays),
+        vertices,
+        faces,
+        chosen.world_to_camera.double().numpy(),
+        chosen.focal_px.double().numpy() * by_axis,
+        chosen.principal_point_px.double().numpy() * by_axis,
+        rest,
+        scale,
+    )
+
+
+def _posed(
+    dataset: TrackedDataset, positions: Sequence[int]
+) -> tuple[Float[np.ndarray, "F V 3"], Int[np.ndarray, "T 3"], Float[np.ndarray, "V 3"]]:
+    arrays = dataset.arrays
+    head = HeadModel(arrays)
+    with_head = arrays.skinning_weights[:, 0] < 0.5
+    faces = arrays.faces[with_head[arrays.faces].all(1)]
+    kept = np.unique(faces)
+    theta = dataset.theta[list(positions)]
+    with torch.no_grad():
+        vertices = [
+            head(theta[start : start + _CHUNK], dataset.identity)[:, kept].numpy()
+            for start in range(0, len(theta), _CHUNK)
+        ]
+    numbered = np.searchsorted(kept, faces).astype(np.int64)
+    return np.concatenate(vertices), numbered, arrays.v_template[kept]
+
+
+def project(
+    vertices: Float[np.ndarray, "F V 3"],
+    world_to_camera: Float[np.ndarray, "F 4 4"],
+    focal_px: Float[np.ndarray, "F 2"],
+    principal_point_px: Float[np.ndarray, "F 2"],
+) -> Projection:
+    """Vertices in pixels (OpenCV axes)."""
+    rotation, shift = world_to_camera[:, :3, :3], world_to_camera[:, None, :3, 3]
+    in_camera = vertices @ rotation.transpose(0, 2, 1) + shift
+    depth = in_camera[..., 2:]
+    seen = depth[..., 0] > _NEAREST_M
+    flat = in_camera[..., :2] / np.where(seen[..., None], depth, 1)
+    points = flat * focal_px[:, None] + principal_point_px[:, None]
+    # Far outside is outside; float32 in the drawing has no room for more.
+    return Projection(np.clip(points, -1e5, 1e5), seen)
+
+
+def projected(sample: Sample) -> Projection:
+    """The sample's head in its frames."""
+    return project(
+        sample.vertices, sample.world_to_camera, sample.focal_px, sample.principal_point_px
+    )
+
+
+def inside_share(sample: Sample, projection: Projection) -> Float[np.ndarray, "F"]:
+    """Of each frame's vertices the share that the image shows."""
+    height, width = sample.alpha.shape[1:]
+    points = projection.points_px
+    inside = (points >= 0).all(-1) & (points[..., 0] <= width) & (points[..., 1] <= height)
+    return (inside & projection.seen).mean(1)
+
+
+def silhouettes(
+    sample: Sample, projection: Projection, frames: Sequence[int] | None = None
+) -> Float[np.ndarray, "N h w"]:
+    """The mesh's silhouette in these of the sample's frames (all by default)."""
+    height, width = sample.alpha.shape[1:]
+    drawn = []
+    for frame in range(len(projection.points_px)) if frames is None else frames:
+        faces = sample.faces[projection.seen[frame][sample.faces].all(1)]
+        mask = mesh_silhouette(projection.points_px[frame], faces, max(height, width))
+        drawn.append(mask[:height, :width])
+    return np.stack(drawn)
+
+
+def agreement(silhouette: Float[np.ndarray, "h w"], alpha: Float[np.ndarray, "h w"]) -> Agreement:
+    """Compare a silhouette with a matte, down to the silhouette's lowest row."""
+    mesh, matte = silhouette > 0.5, alpha > _OPAQUE
+    rows = np.flatnonzero(mesh.any(1))
+    if not len(rows):
+        return Agreement(0.0, 0.0)
+    both = int((mesh & matte).sum())
+    either = int((mesh | matte)[: rows[-1] + 1].sum())
+    return Agreement(both / either, both / int(mesh.sum()))

@@ -1,0 +1,91 @@
+"""Folders of other systems, imported once behind the scenes and then opened as our own."""
+
+import fcntl
+import glob
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from rgbavatar_ns.data.dataset import TrackedDataset, load_native
+from rgbavatar_ns.data.importers.convert import (
+    CACHE_FOLDER,
+    fingerprint,
+    flame_fingerprint,
+    import_dataset,
+    source_fingerprint,
+)
+from rgbavatar_ns.data.importers.formats import find_format
+from rgbavatar_ns.data.importers.frame_files import Progress
+from rgbavatar_ns.data.importers.options import ImportOptions
+from rgbavatar_ns.data.native_format import INDEX_FILE
+from rgbavatar_ns.errors import UserError
+
+_NO_BACKUP = "Signature: 8a477f597d28d172789f06886806bc55\n# Made by rgbavatar; may be deleted.\n"
+
+
+def open_foreign(
+    src: Path, options: ImportOptions, progress: Progress | None = None
+) -> TrackedDataset:
+    """Open a folder of another system through its import, made now if need be.
+
+    The import lies in the folder itself (`.rgbavatar/`) where that may be written to, else in the
+    user's cache directory; its name is a hash of the files and options that it depends on. One
+    line on stderr says what happens.
+    """
+    name = fingerprint(src, options)
+    places = _places(src, name)
+    if flame_fingerprint(options) is None:
+        # Once imported, FLAME itself is not needed: any import of the same data will do.
+        made = [
+            place
+            for pattern in _places(src, f"{source_fingerprint(src, options)}-*")
+            for place in pattern.parent.glob(pattern.name)
+        ]
+    else:
+        made = places
+    for place in made:
+        if (place / INDEX_FILE).exists():
+            return load_native(place)
+    place = next((place for place in places if _can_be_made(place)), None)
+    if place is None:
+        raise UserError(
+            f"The import of {src} can be written neither to {places[0]} nor to {places[1]}.",
+            "Free some space or name a folder: rgbavatar import SRC DST.",
+        )
+    found = find_format(src, options)
+    with _alone(place):
+        if not (place / INDEX_FILE).exists():
+            recognised = "" if found is None else f"{found.name} data in "
+            print(f"{recognised}{src}: imported once into {place}", file=sys.stderr)
+        return import_dataset(src, place, options, link=True, progress=progress)
+
+
+def _places(src: Path, name: str) -> list[Path]:
+    """Where an import of this name may lie: in the data, or in the user's cache."""
+    subject = glob.escape(src.resolve().name) if name.endswith("*") else src.resolve().name
+    return [src / CACHE_FOLDER / name, _user_cache() / f"{subject}-{name}"]
+
+
+def _user_cache() -> Path:
+    base = os.environ.get("XDG_CACHE_HOME")
+    return (Path(base) if base else Path.home() / ".cache") / "rgbavatar" / "imports"
+
+
+def _can_be_made(place: Path) -> bool:
+    try:
+        place.mkdir(parents=True, exist_ok=True)
+        # Backup programs pass over a folder with such a file.
+        (place.parent / "CACHEDIR.TAG").write_text(_NO_BACKUP)
+    except OSError:
+        return False
+    return os.access(place, os.W_OK)
+
+
+@contextmanager
+def _alone(place: Path) -> Iterator[None]:
+    """Two programs that open the same data import it one after the other."""
+    with place.with_name(f"{place.name}.lock").open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield

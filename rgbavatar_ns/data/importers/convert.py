@@ -1,0 +1,210 @@
+"""From a source's records to a folder in the project's own format, on all cores, resumable."""
+
+import hashlib
+import json
+import os
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+from rgbavatar_ns.data.dataset import TrackedDataset, load_native
+from rgbavatar_ns.data.importers.findings import Findings, UnusableFrameError
+from rgbavatar_ns.data.importers.flashavatar import tracker_folder
+from rgbavatar_ns.data.importers.folder import Folder
+from rgbavatar_ns.data.importers.formats import find_format, read_source
+from rgbavatar_ns.data.importers.frame_files import Progress
+from rgbavatar_ns.data.importers.options import ImportOptions
+from rgbavatar_ns.data.importers.pictures import make_png
+from rgbavatar_ns.data.importers.source import Source
+from rgbavatar_ns.data.json_file import write_json
+from rgbavatar_ns.data.native_format import INDEX_FILE
+from rgbavatar_ns.data.writer import DatasetWriter
+from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.head.flame import FLAME_VARIABLE
+
+CACHE_FOLDER = ".rgbavatar"
+"""In the source; nothing in it belongs to the source."""
+_STATE_FILE = ".import.json"
+_IMPORTER_VERSION = 1
+"""To be raised where the same files give another dataset."""
+
+
+def import_dataset(
+    src: str | Path,
+    dst: str | Path,
+    options: ImportOptions | None = None,
+    *,
+    overwrite: bool = False,
+    link: bool = False,
+    progress: Progress | None = None,
+) -> TrackedDataset:
+    """Write a folder of another system to `dst` in the project's own format.
+
+    An interrupted import goes on where it was when the same is asked for again; a finished one is
+    opened. `link` shares the bytes of images that need no change where the disk allows it.
+    `progress` is called with (stage, done, in all). Raises UserError where something cannot be
+    used, or where `dst` holds something else and `overwrite` is not given.
+    """
+    src, dst, options = Path(src), Path(dst), options or ImportOptions()
+    key = fingerprint(src, options)
+    state = _state(dst)
+    resumed = state is not None and state.get("key") == key
+    if resumed and (dst / INDEX_FILE).exists():
+        return load_native(dst)
+    _refuse_nested(src, dst)
+    source = read_source(src, options, progress)
+    unfinished = state is not None and not (dst / INDEX_FILE).exists()
+    writer = DatasetWriter(
+        dst,
+        source.arrays,
+        source.identity,
+        source.layout,
+        source.cameras.width,
+        source.cameras.height,
+        overwrite=overwrite or unfinished,
+        keep_images=resumed,
+        source={
+            "format": source.format,
+            "path": str(src.resolve()),
+            "notes": list(source.notes),
+            "options": {name: str(value) for name, value in asdict(options).items() if value},
+        },
+    )
+    write_json(dst / _STATE_FILE, {"key": key, "source": str(src.resolve())})
+    unusable = _write_images(source, writer, link, progress)
+    _settle(source, unusable, options.allow_partial)
+    for position, index in enumerate(source.index):
+        if position not in unusable:
+            writer.add_encoded(
+                index,
+                source.theta[position],
+                source.cameras.select([position]),
+                None,
+                source.camera_names[position],
+                source.timesteps[position],
+            )
+    return writer.finish(source.test - {source.index[position] for position in unusable})
+
+
+def _refuse_nested(src: Path, dst: Path) -> None:
+    if src.resolve() == dst.resolve():
+        raise UserError(f"{dst} is the data itself.", "Name another folder to write to.")
+
+
+def _state(dst: Path) -> dict[str, Any] | None:
+    """What an earlier import into this folder noted; None where there was none."""
+    try:
+        state = json.loads((dst / _STATE_FILE).read_text())
+    except (OSError, ValueError):
+        return None
+    return state if isinstance(state, dict) else None
+
+
+def _write_images(
+    source: Source, writer: DatasetWriter, link: bool, progress: Progress | None
+) -> dict[int, str]:
+    """Put every image into its place; positions of those that cannot be used, and why."""
+    unusable: dict[int, str] = {}
+    # OpenCV and zlib let other threads run while they work.
+    pool = ThreadPoolExecutor(os.cpu_count() or 1, "import")
+    try:
+        jobs = {
+            pool.submit(_write_image, source, writer, position, link): position
+            for position in range(len(source))
+        }
+        for done, job in enumerate(as_completed(jobs), 1):
+            try:
+                job.result()
+            except UnusableFrameError as error:
+                unusable[jobs[job]] = str(error)
+            if progress is not None:
+                progress("converting images", done, len(jobs))
+    finally:
+        pool.shutdown(cancel_futures=True)
+    return unusable
+
+
+def _write_image(source: Source, writer: DatasetWriter, position: int, link: bool) -> None:
+    picture, index = source.pictures[position], source.index[position]
+    place = writer.image_path(index)
+    if place.exists():
+        return
+    png = make_png(picture, (source.cameras.width, source.cameras.height))
+    if link and png.is_original:
+        try:
+            os.link(picture.color.resolve(), place)
+        except OSError:  # another disk, or one without links
+            pass
+        else:
+            return
+    writer.write_image(index, png.encoded)
+
+
+def _settle(source: Source, unusable: dict[int, str], allow_partial: bool) -> None:
+    findings = Findings()
+    for position, reason in sorted(unusable.items()):
+        findings.leave_out(reason, [source.pictures[position].color.name])
+    findings.settle(f"The {source.format} data in {source.root}", allow_partial)
+    if len(unusable) == len(source):
+        raise UserError(f"No image of {source.root} can be used.", "Look at its files.")
+
+
+def fingerprint(src: Path, options: ImportOptions) -> str:
+    """What an import depends on, hashed: see `source_fingerprint` and `flame_fingerprint`."""
+    return f"{source_fingerprint(src, options)}-{flame_fingerprint(options) or 'none'}"
+
+
+def source_fingerprint(src: Path, options: ImportOptions) -> str:
+    """Names, sizes and times of all files of the data, and all options but FLAME's place."""
+    others = replace(options, flame=None, flame_uv=None, flame_eyelids=None)
+    digest = hashlib.sha256(f"{_IMPORTER_VERSION} {others}".encode())
+    found = find_format(src, options) if src.is_dir() else None
+    extra = tracker_folder(Folder(src)) if found and found.key == "flashavatar" else None
+    return _hashed(digest, [src, extra, options.images, options.masks])
+
+
+def flame_fingerprint(options: ImportOptions) -> str | None:
+    """Names, sizes and times of FLAME's files; None where no FLAME is named."""
+    flame = options.flame or os.environ.get(FLAME_VARIABLE)
+    if not flame:
+        return None
+    return _hashed(hashlib.sha256(), [flame, options.flame_uv, options.flame_eyelids])[:8]
+
+
+def _hashed(digest: "hashlib._Hash", places: Sequence[str | Path | None]) -> str:
+    for place in places:
+        for line in _listing(place) if place is not None else ():
+            digest.update(line.encode("utf-8", "surrogateescape"))
+    return digest.hexdigest()[:16]
+
+
+def _listing(place: str | Path) -> Iterator[str]:
+    top = os.path.realpath(os.path.expanduser(place))
+    if os.path.isfile(top):
+        yield _line(os.path.dirname(top), os.path.basename(top))
+    seen: set[str] = set()
+    for folder, names, files in os.walk(top, followlinks=True):
+        real = os.path.realpath(folder)
+        names[:] = sorted(name for name in names if _is_data(name))
+        if real in seen:
+            names.clear()
+            continue
+        seen.add(real)
+        yield f"{os.path.relpath(folder, top)}\n"
+        for name in sorted(filter(_is_data, files)):
+            yield _line(folder, name)
+
+
+def _is_data(name: str) -> bool:
+    """Not hidden, as our own imports are, and not where ns-train writes by default."""
+    return not name.startswith(".") and name != "outputs"
+
+
+def _line(folder: str, name: str) -> str:
+    try:
+        facts = os.stat(os.path.join(folder, name))
+    except OSError:
+        return f"{name} missing\n"
+    return f"{name} {facts.st_size} {facts.st_mtime_ns}\n"

@@ -1,0 +1,78 @@
+"""FlashAvatar: JPEG images, mattes and parsing masks, numbered one higher than their frames."""
+
+from dataclasses import replace
+from pathlib import Path
+
+from rgbavatar_ns.data.importers.folder import PICTURES, Folder
+from rgbavatar_ns.data.importers.frame_files import Progress, read_frame_files
+from rgbavatar_ns.data.importers.frame_folders import CHECKPOINTS, pair, require_one
+from rgbavatar_ns.data.importers.source import Reading, Source, Split, assemble
+from rgbavatar_ns.errors import UserError
+
+IMAGE_MINUS_FRAME = 1
+_HELD_OUT = 500
+_REGIONS = ("_neckhead", "_mouth")
+
+
+def is_flashavatar(folder: Folder) -> bool:
+    """`imgs` and `alpha`, or the folder above that holds such data and the tracker's."""
+    if folder.has("imgs", "alpha"):
+        return True
+    return folder.has("dataset", "metrical-tracker/output")
+
+
+def read_flashavatar(reading: Reading, progress: Progress | None = None) -> Source:
+    """Image n belongs to frame n - 1; the last 500 frames are held out.
+
+    With the option `region` = head the matte ends where the parsing masks end.
+    """
+    subject = _subject(reading.folder)
+    frames = replace(subject, root=tracker_folder(reading.folder))
+    files = frames.numbered(CHECKPOINTS, (".frame",))
+    images = _of_frames(subject.numbered("imgs", PICTURES))
+    masks = _of_frames(subject.numbered("alpha", PICTURES))
+    regions = None
+    if reading.options.region == "head":
+        neckhead, mouth = (
+            _of_frames(subject.numbered("parsing", PICTURES, ending)) for ending in _REGIONS
+        )
+        regions = {n: (neckhead[n], mouth[n]) for n in neckhead.keys() & mouth.keys()}
+    tracked = read_frame_files(reading, files, progress)
+    records = pair(reading, tracked, images, masks, regions)
+    return assemble(reading, records, tracked.arrays, tracked.identity, Split(_HELD_OUT))
+
+
+def _of_frames(pictures: dict[int, Path]) -> dict[int, Path]:
+    return {number - IMAGE_MINUS_FRAME: path for number, path in pictures.items()}
+
+
+def _subject(folder: Folder) -> Folder:
+    """The folder of the subject's pictures."""
+    if folder.has("imgs"):
+        return folder
+    named = sorted(path.parent for path in (folder.root / "dataset").glob("*/imgs"))
+    return replace(folder, root=require_one(named, "subjects", folder.root))
+
+
+def tracker_folder(folder: Folder) -> Path:
+    """The tracker's output that belongs to the subject's pictures.
+
+    FlashAvatar keeps it beside its folder of subjects, so it may lie outside of the folder given.
+    Raises UserError where there is none.
+    """
+    subject = _subject(folder).root
+    name = subject.resolve().name
+    output = Path("metrical-tracker") / "output"
+    places = [
+        subject,
+        subject / output / name,
+        *sorted((subject / output).glob("*")),
+        subject.resolve().parent.parent / output / name,
+    ]
+    for place in places:
+        if (place / CHECKPOINTS).is_dir():
+            return place
+    raise UserError(
+        f"The FlashAvatar data in {subject} has no {CHECKPOINTS} folder of the tracker.",
+        f"Put metrical-tracker's output for it to {subject / output / name}.",
+    )

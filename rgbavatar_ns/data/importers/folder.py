@@ -1,0 +1,159 @@
+"""A folder of somebody else's files: nothing outside of it is read, and every file is checked."""
+
+import json
+import os
+import re
+import zipfile
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from rgbavatar_ns.data.importers.findings import UnusableFrameError, first_few
+from rgbavatar_ns.errors import UserError
+
+PICTURES = (".png", ".jpg", ".jpeg")
+_NUMBER = re.compile(r"(?:.*\D)?(\d{1,15})")
+_MAX_BYTES = 1 << 30
+
+
+@dataclass(frozen=True)
+class Folder:
+    """`allow_outside`: whether links and relative paths may lead out of `root`."""
+
+    root: Path
+    allow_outside: bool = False
+
+    def path(self, relative: str | Path) -> Path:
+        """A path in the folder; raises UserError where it leads out, through a link or `..`."""
+        text = os.fspath(relative)
+        if "\0" in text:
+            raise UserError(f"A path in {self.root} holds a zero byte.", "Mend the data.")
+        path = self.root / text
+        if not self.allow_outside and not _is_within(path, self.root):
+            raise UserError(
+                f"'{text}' leads out of the folder {self.root}.",
+                "Put the files into the folder, or consent with --allow-outside.",
+            )
+        return path
+
+    def has(self, *relative: str) -> bool:
+        """Whether all of these exist, wherever links lead."""
+        return all((self.root / name).exists() for name in relative)
+
+    def names(self, subfolder: str, suffixes: tuple[str, ...]) -> list[str]:
+        """Files of these suffixes in a subfolder, in order; hidden ones are passed over."""
+        folder = self.path(subfolder)
+        return [
+            name
+            for name in (sorted(os.listdir(folder)) if folder.is_dir() else ())
+            if not name.startswith(".") and os.path.splitext(name)[1].lower() in suffixes
+        ]
+
+    def numbered(
+        self, subfolder: str, suffixes: tuple[str, ...], ending: str = ""
+    ) -> dict[int, Path]:
+        """Files of a subfolder by the number at the end of their name, in its order.
+
+        `ending` is what follows the number: "_mouth" finds 00001_mouth.png. Hidden files and
+        those without a number are passed over. Raises UserError where two have one number.
+        """
+        found: dict[int, Path] = {}
+        twice: list[str] = []
+        for name in self.names(subfolder, suffixes):
+            stem = os.path.splitext(name)[0]
+            match = _NUMBER.fullmatch(stem.removesuffix(ending))
+            if match is None or not stem.endswith(ending):
+                continue
+            if int(match[1]) in found:
+                twice.append(name)
+            found[int(match[1])] = self.path(Path(subfolder) / name)
+        if twice:
+            raise UserError(
+                f"{self.root / subfolder} holds several files of one number: {first_few(twice)}.",
+                "Keep one of each, or put the others elsewhere.",
+            )
+        return dict(sorted(found.items()))
+
+
+def _is_within(path: Path, root: Path) -> bool:
+    real, top = os.path.realpath(path), os.path.realpath(root)
+    return real == top or real.startswith(top.rstrip(os.sep) + os.sep)
+
+
+def number_of(path: str) -> int | None:
+    """The number at the end of a file's name, its suffix left out."""
+    match = _NUMBER.fullmatch(Path(path).stem)
+    return int(match[1]) if match else None
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """A JSON object; raises UserError for anything else."""
+    try:
+        if path.stat().st_size > _MAX_BYTES:
+            raise ValueError("it is larger than any index of frames")
+        content = json.loads(path.read_text(encoding="utf-8-sig"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise UserError(f"{path} cannot be read: {error}.", "Copy or export it again.") from None
+    if not isinstance(content, dict):
+        raise UserError(f"{path} holds no JSON object.", "Copy or export it again.")
+    return content
+
+
+def read_npz(path: Path) -> dict[str, np.ndarray]:
+    """The arrays of an npz file; raises UnusableFrameError where it is missing or damaged."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            if isinstance(file, np.ndarray):
+                raise ValueError("a single array")
+            promised = sum(entry.file_size for entry in file.zip.infolist())
+            if promised > _MAX_BYTES:
+                raise ValueError("arrays too large")
+            return {name: file[name] for name in file.files}
+    except FileNotFoundError:
+        raise UnusableFrameError("parameters that are missing") from None
+    except (
+        OSError, ValueError, EOFError, KeyError, SyntaxError, TypeError, RuntimeError, MemoryError,
+        NotImplementedError, OverflowError, zipfile.BadZipFile, zlib.error,
+    ):  # fmt: skip
+        raise UnusableFrameError("parameters that cannot be read") from None
+
+
+def numbers(value: Any, count: int, what: str) -> Float[np.ndarray, "_"]:
+    """`count` finite numbers, whatever batch axes of 1 they have; raises UnusableFrameError."""
+    if value is None:
+        raise UnusableFrameError(f"no {what}")
+    try:
+        array = np.asarray(value)
+    except (TypeError, ValueError, OverflowError):
+        array = np.empty(0, object)
+    if array.dtype.kind not in "iuf" or array.size != count or count not in (1, *array.shape):
+        raise UnusableFrameError(f"{what} that is not {count} numbers")
+    return finite(array.reshape(count), what)
+
+
+def finite(array: np.ndarray, what: str) -> Float[np.ndarray, "*shape"]:
+    """The array as float64; raises UnusableFrameError where a number is NaN or infinite."""
+    array = array.astype(np.float64)
+    # Anything beyond float32's reach would become infinite on the way.
+    if not (np.abs(array) < 1e30).all():
+        raise UnusableFrameError(f"NaN or infinity in {what}")
+    return array
+
+
+def matrix(value: Any, rows: int, columns: int, what: str) -> Float[np.ndarray, "R C"]:
+    """A matrix of finite numbers, one batch axis of 1 allowed; raises UnusableFrameError."""
+    if value is None:
+        raise UnusableFrameError(f"no {what}")
+    try:
+        array = np.asarray(value)
+    except (TypeError, ValueError, OverflowError):
+        array = np.empty(0, object)
+    if array.ndim == 3 and len(array) == 1:
+        array = array[0]
+    if array.dtype.kind not in "iuf" or array.shape != (rows, columns):
+        raise UnusableFrameError(f"{what} that is not {rows} x {columns} numbers")
+    return finite(array, what)

@@ -1,0 +1,138 @@
+"""metrical-tracker's `.frame` files, which five systems share."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from rgbavatar_ns.data.importers.findings import UnusableFrameError
+from rgbavatar_ns.data.importers.flame_parameters import flame_for, from_6d_rows, padded
+from rgbavatar_ns.data.importers.folder import matrix, numbers
+from rgbavatar_ns.data.importers.frame_record import CameraRecord
+from rgbavatar_ns.data.importers.source import Reading
+from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.head import HeadArrays
+from rgbavatar_ns.head.safe_pickle import read_torch_file
+
+FLAME_VERSION = "2020"
+_SHAPE_TOLERANCE = 1e-3
+_SKEW_TOLERANCE = 1e-3
+
+Progress = Callable[[str, int, int], None]
+"""Called with (stage, done, in all)."""
+
+
+@dataclass(frozen=True)
+class TrackedHead:
+    """One `.frame` file: the head stands still, the camera moves about it.
+
+    theta: expression, jaw, eyes and eyelids by field; `shape` is the identity.
+    """
+
+    shape: Float[np.ndarray, "_"]
+    theta: dict[str, Float[np.ndarray, "_"]]
+    camera: CameraRecord
+    size: tuple[int, int] | None
+
+
+@dataclass(frozen=True)
+class TrackedHeads:
+    """All `.frame` files of a folder by number, and the head model that they move."""
+
+    arrays: HeadArrays
+    identity: Float[np.ndarray, "_"]
+    frames: dict[int, TrackedHead]
+    unreadable: frozenset[int]
+
+
+def read_frame_files(
+    reading: Reading, files: dict[int, Path], progress: Progress | None = None
+) -> TrackedHeads:
+    """Read all `.frame` files; a broken one is a finding. Raises UserError where all are."""
+    arrays = flame_for(reading, FLAME_VERSION)
+    if arrays.eyelid_dirs is None:
+        reading.findings.note(
+            "the FLAME model has no eyelid offsets (l_eyelid.npy, r_eyelid.npy): the tracked "
+            "eyelids are left out"
+        )
+    frames: dict[int, TrackedHead] = {}
+    for done, (number, path) in enumerate(files.items(), 1):
+        with reading.findings.frame(path.name):
+            frames[number] = parse_frame(_read(path), arrays)
+        if progress is not None:
+            progress("reading frames", done, len(files))
+    unreadable = frozenset(files.keys() - frames.keys())
+    if not frames:
+        reading.findings.settle(str(reading), False)
+        raise UserError(f"{reading} has no .frame files.", "Name the tracker's output folder.")
+    identity = next(iter(frames.values())).shape
+    other = [n for n, f in frames.items() if np.abs(f.shape - identity).max() > _SHAPE_TOLERANCE]
+    reading.findings.leave_out(
+        "records of another head shape than the first", [files[number].name for number in other]
+    )
+    for number in other:
+        del frames[number]
+    return TrackedHeads(arrays, identity, frames, unreadable | frozenset(other))
+
+
+def _read(path: Path) -> Any:
+    try:
+        return read_torch_file(path)
+    except UserError as error:
+        raise UnusableFrameError(f"records that cannot be read ({_cause(error, path)})") from None
+
+
+def _cause(error: UserError, path: Path) -> str:
+    """What is wrong, without the file's name, so that equal faults are counted together."""
+    return error.cause.replace(str(path), "the file").rstrip(".")
+
+
+def parse_frame(content: Any, arrays: HeadArrays) -> TrackedHead:
+    """One file's dict; raises UnusableFrameError where it lacks something or is not finite."""
+    if not isinstance(content, dict):
+        raise UnusableFrameError("records that are no dict")
+    flame, opencv = content.get("flame"), content.get("opencv")
+    if not isinstance(flame, dict) or not isinstance(opencv, dict):
+        raise UnusableFrameError("records without 'flame' and 'opencv'")
+    eyes = numbers(flame.get("eyes"), 12, "eyes").reshape(2, 6)
+    jaw = numbers(flame.get("jaw"), 6, "jaw")
+    jaw, left_eye, right_eye = from_6d_rows(np.stack([jaw, *eyes]), "jaw or eyes")
+    expression, shape = flame.get("exp"), flame.get("shape")
+    if expression is None or shape is None:
+        raise UnusableFrameError("records without 'exp' or 'shape'")
+    theta = {
+        "expression": padded(expression, arrays.num_expressions, "exp", arrays),
+        "jaw": jaw,
+        "left_eye": left_eye,
+        "right_eye": right_eye,
+    }
+    if arrays.eyelid_dirs is not None and "eyelids" in flame:
+        theta["eyelids"] = numbers(flame["eyelids"], 2, "eyelids")
+    return TrackedHead(
+        shape=padded(shape, arrays.num_identity, "shape", arrays),
+        theta=theta,
+        camera=_camera(opencv),
+        size=_size(content.get("img_size")),
+    )
+
+
+def _camera(opencv: dict[str, Any]) -> CameraRecord:
+    world_to_camera = np.eye(4)
+    world_to_camera[:3, :3] = matrix(opencv.get("R"), 3, 3, "R")
+    world_to_camera[:3, 3] = numbers(opencv.get("t"), 3, "t")
+    intrinsics = matrix(opencv.get("K"), 3, 3, "K")
+    last_row = np.abs(intrinsics[2] - [0, 0, 1]).max()
+    if max(abs(intrinsics[0, 1]), abs(intrinsics[1, 0]), last_row) > _SKEW_TOLERANCE:
+        raise UnusableFrameError("cameras whose K is no pinhole in pixels")
+    return CameraRecord(world_to_camera, np.diag(intrinsics)[:2].copy(), intrinsics[:2, 2].copy())
+
+
+def _size(img_size: Any) -> tuple[int, int] | None:
+    """(width, height) of (h, w)."""
+    if img_size is None:
+        return None
+    height, width = numbers(img_size, 2, "img_size")
+    return int(width), int(height)

@@ -1,0 +1,139 @@
+"""Folders of metrical-tracker's `.frame` files beside images, as four systems lay them out."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from rgbavatar_ns.data.importers.findings import first_few
+from rgbavatar_ns.data.importers.folder import PICTURES, Folder
+from rgbavatar_ns.data.importers.frame_files import Progress, TrackedHeads, read_frame_files
+from rgbavatar_ns.data.importers.frame_record import FrameRecord
+from rgbavatar_ns.data.importers.pictures import Picture
+from rgbavatar_ns.data.importers.source import Reading, Source, Split, assemble
+from rgbavatar_ns.errors import UserError
+
+CHECKPOINTS = "checkpoint"
+_MATTES = ("alpha", "matted", "mask", "masks", "matte", "seg_mask", "image_mask")
+_IMAGES = ("images", "input", "imgs", "image")
+
+
+@dataclass(frozen=True)
+class Layout:
+    """How a system lays out its folder.
+
+    images, masks: subfolders (no masks: the images' own alpha).
+    last: how many frames it holds out.
+    by_order: frames and images belong together by their order, not by their numbers.
+    """
+
+    images: str
+    masks: str | None
+    last: int
+    by_order: bool = False
+
+
+def is_metrical(folder: Folder) -> bool:
+    """metrical-tracker's own output: `.frame` files and the pictures that it read."""
+    return folder.has(CHECKPOINTS, "input") and not folder.has("images")
+
+
+def is_gaussian_blendshapes(folder: Folder) -> bool:
+    """GaussianBlendshapes: images with alpha, and the mesh of the subject at rest."""
+    return folder.has(CHECKPOINTS, "images", "canonical.obj") and not _has_background(folder)
+
+
+def is_nerf_blend_shape(folder: Folder) -> bool:
+    """NeRFBlendShape: a picture of the background, masks beside the images."""
+    return folder.has(CHECKPOINTS, "images") and _has_background(folder)
+
+
+def is_rgbavatar(folder: Folder) -> bool:
+    """RGBAvatar's own: `.frame` files and images, nothing else."""
+    return folder.has(CHECKPOINTS, "images")
+
+
+def _has_background(folder: Folder) -> bool:
+    return folder.has("bc.jpg") or folder.has("image_mask")
+
+
+def read_metrical(reading: Reading, progress: Progress | None = None) -> Source:
+    """metrical-tracker's output; it has no mattes of its own, so they are looked for."""
+    options, folder = reading.options, reading.folder
+    images = next(name for name in ("input", *_IMAGES) if folder.has(name))
+    masks = next((name for name in _MATTES if folder.has(name)), None)
+    if options.images is not None or options.masks is not None:
+        images = str(options.images or images)
+        masks = None if options.masks is None else str(options.masks)
+    return _read(reading, Layout(images, masks, last=350), progress)
+
+
+def read_gaussian_blendshapes(reading: Reading, progress: Progress | None = None) -> Source:
+    """GaussianBlendshapes: the last 350 frames are held out."""
+    return _read(reading, Layout("images", None, last=350), progress)
+
+
+def read_nerf_blend_shape(reading: Reading, progress: Progress | None = None) -> Source:
+    """NeRFBlendShape: mattes in image_mask, the last 500 frames are held out."""
+    masks = "image_mask" if reading.folder.has("image_mask") else None
+    return _read(reading, Layout("images", masks, last=500), progress)
+
+
+def read_rgbavatar(reading: Reading, progress: Progress | None = None) -> Source:
+    """RGBAvatar's own: frames and images belong together in the order of their names."""
+    return _read(reading, Layout("images", None, last=350, by_order=True), progress)
+
+
+def _read(reading: Reading, layout: Layout, progress: Progress | None) -> Source:
+    folder = reading.folder
+    files = folder.numbered(CHECKPOINTS, (".frame",))
+    images = folder.numbered(layout.images, PICTURES)
+    if layout.by_order and len(files) == len(images) and list(files) != list(images):
+        reading.findings.note("frames and images have other numbers: paired in order")
+        images = dict(zip(files, images.values()))
+    masks = None if layout.masks is None else folder.numbered(layout.masks, PICTURES)
+    tracked = read_frame_files(reading, files, progress)
+    records = pair(reading, tracked, images, masks)
+    return assemble(reading, records, tracked.arrays, tracked.identity, Split(layout.last))
+
+
+def pair(
+    reading: Reading,
+    tracked: TrackedHeads,
+    images: Mapping[int, Path],
+    masks: Mapping[int, Path] | None,
+    regions: Mapping[int, tuple[Path, ...]] | None = None,
+) -> list[FrameRecord]:
+    """Records of the frames that have all their files; what lacks one is a finding."""
+    findings = reading.findings
+    known = tracked.frames.keys() | tracked.unreadable
+    findings.leave_out(
+        "images without a record", [images[n].name for n in images if n not in known]
+    )
+    findings.leave_out(
+        "records without an image", [f"frame {n}" for n in tracked.frames if n not in images]
+    )
+    records = []
+    for number, head in tracked.frames.items():
+        if number not in images:
+            continue
+        picture = Picture(images[number])
+        if masks is not None:
+            if number not in masks:
+                findings.leave_out("images without a matte", [images[number].name])
+                continue
+            picture = replace(picture, alpha=masks[number])
+        if regions is not None:
+            if number not in regions:
+                findings.leave_out("images without parsing masks", [images[number].name])
+                continue
+            picture = replace(picture, regions=regions[number])
+        records.append(FrameRecord(number, picture, head.theta, head.camera, head.size))
+    return records
+
+
+def require_one(found: list[Path], what: str, root: Path) -> Path:
+    """The only one of several candidates; raises UserError naming them."""
+    if len(found) == 1:
+        return found[0]
+    names = first_few([str(path) for path in found]) if found else "none"
+    raise UserError(f"{root} holds {len(found)} {what}: {names}.", "Name the one that is meant.")

@@ -1,0 +1,142 @@
+"""IMAvatar's flame_params.json, which SplattingAvatar, PointAvatar and MonoGaussianAvatar share."""
+
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+
+from rgbavatar_ns.data.importers.findings import UnusableFrameError
+from rgbavatar_ns.data.importers.flame_parameters import flame_for, padded
+from rgbavatar_ns.data.importers.folder import (
+    PICTURES,
+    Folder,
+    matrix,
+    number_of,
+    numbers,
+    read_json,
+)
+from rgbavatar_ns.data.importers.frame_files import Progress
+from rgbavatar_ns.data.importers.frame_record import CameraRecord, FrameRecord
+from rgbavatar_ns.data.importers.pictures import Picture, picture_header
+from rgbavatar_ns.data.importers.source import Reading, Source, Split, assemble
+from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.head import HeadArrays
+
+INDEX_FILE = "flame_params.json"
+FLAME_VERSION = "2020"
+SCALE = 4.0
+"""IMAvatar's world is FLAME's times this."""
+_HELD_OUT = 350
+_IMAGES = ("image", "images")
+_POSE = ("rotation", "neck", "jaw", "left_eye", "right_eye")
+
+
+def is_imavatar(folder: Folder) -> bool:
+    """A `flame_params.json`."""
+    return folder.has(INDEX_FILE)
+
+
+def read_imavatar(reading: Reading, progress: Progress | None = None) -> Source:
+    """Metres instead of quarters of them, OpenCV instead of OpenGL cameras.
+
+    Mattes are in `mask`, where there is one. The last 350 frames are held out.
+    """
+    path = reading.folder.path(INDEX_FILE)
+    content = read_json(path)
+    frames = content.get("frames")
+    if not isinstance(frames, list) or not frames:
+        raise UserError(f"{path} has no list of frames.", "Export the data again.")
+    arrays = flame_for(reading, FLAME_VERSION)
+    try:
+        identity = padded(
+            np.asarray(content.get("shape_params", ())), arrays.num_identity, "shape", arrays
+        )
+        intrinsics = numbers(content.get("intrinsics"), 4, "intrinsics")
+    except (UnusableFrameError, ValueError, OverflowError) as error:
+        raise UserError(f"{path} has {error}.", "Export the data again.") from None
+    masks = "mask" if reading.folder.has("mask") else None
+    records, named, lengths = [], set(), set()
+    for place, frame in enumerate(frames):
+        name = str(frame.get("file_path")) if isinstance(frame, dict) else f"frame {place}"
+        with reading.findings.frame(name):
+            if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
+                raise UnusableFrameError("frames without file_path")
+            image = _image(reading.folder, name)
+            named.add(image.name)
+            if isinstance(frame.get("expression"), list):
+                lengths.add(len(frame["expression"]))
+            records.append(_record(reading.folder, frame, image, masks, intrinsics, arrays))
+        if progress is not None:
+            progress("reading frames", place + 1, len(frames))
+    _tell_unnamed(reading, named)
+    if len(lengths) > 1:
+        raise UserError(
+            f"{reading} has expressions of {', '.join(map(str, sorted(lengths)))} numbers.",
+            "All frames need the same coefficients: export the data again.",
+        )
+    return assemble(reading, records, arrays, identity, Split(_HELD_OUT))
+
+
+def _record(
+    folder: Folder,
+    frame: dict[str, Any],
+    image: Path,
+    masks: str | None,
+    intrinsics: np.ndarray,
+    arrays: HeadArrays,
+) -> FrameRecord:
+    number = number_of(image.name)
+    if number is None:
+        raise UnusableFrameError("images without a number")
+    header = picture_header(image)
+    world_to_camera = np.eye(4)
+    world_to_camera[:3] = matrix(_three_rows(frame.get("world_mat")), 3, 4, "world_mat")
+    # OpenGL looks along -z with y up, and the world is scaled.
+    world_to_camera[1:3] *= -1
+    world_to_camera[:3, 3] /= SCALE
+    size = np.array([header.width, header.height])
+    # Some exporters write the first focal length with the wrong sign.
+    camera = CameraRecord(world_to_camera, np.abs(intrinsics[:2]) * size, intrinsics[2:] * size)
+    pose = numbers(frame.get("pose"), 15, "pose").reshape(5, 3)
+    try:
+        expression = np.asarray(frame.get("expression", ()))
+    except (TypeError, ValueError, OverflowError):
+        raise UnusableFrameError("expression that is no list of numbers") from None
+    theta = {"expression": padded(expression, arrays.num_expressions, "expression", arrays)}
+    return FrameRecord(
+        number, _picture(folder, image, masks), theta | dict(zip(_POSE, pose)), camera
+    )
+
+
+def _three_rows(world_mat: Any) -> Any:
+    """Some write the last row 0 0 0 1 too."""
+    four = isinstance(world_mat, list) and len(world_mat) == 4
+    return world_mat[:3] if four and world_mat[3] == [0, 0, 0, 1] else world_mat
+
+
+def _image(folder: Folder, file_path: str) -> Path:
+    """The file that a path without suffix means; the folder is called image or images."""
+    named = PurePosixPath(file_path)
+    parents = [named.parent, *(named.parent.parent / name for name in _IMAGES)]
+    for parent in parents:
+        for suffix in ("", *PICTURES):
+            candidate = folder.path(f"{parent / named.name}{suffix}")
+            if candidate.is_file():
+                return candidate
+    raise UnusableFrameError("records without an image")
+
+
+def _picture(folder: Folder, image: Path, masks: str | None) -> Picture:
+    if masks is None:
+        return Picture(image)
+    for suffix in PICTURES:
+        candidate = folder.path(f"{masks}/{image.stem}{suffix}")
+        if candidate.is_file():
+            return Picture(image, alpha=candidate)
+    raise UnusableFrameError("images without a matte")
+
+
+def _tell_unnamed(reading: Reading, named: set[str]) -> None:
+    for name in _IMAGES:
+        left = [image for image in reading.folder.names(name, PICTURES) if image not in named]
+        reading.findings.leave_out("images without a record", left)

@@ -1,0 +1,153 @@
+"""INSTA: transforms.json with OpenCV cameras, and what metrical-tracker knew or its meshes tell."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from rgbavatar_ns.data.importers.findings import UnusableFrameError
+from rgbavatar_ns.data.importers.flame_parameters import flame_for, padded
+from rgbavatar_ns.data.importers.folder import Folder, number_of
+from rgbavatar_ns.data.importers.frame_files import FLAME_VERSION, Progress, read_frame_files
+from rgbavatar_ns.data.importers.frame_folders import CHECKPOINTS
+from rgbavatar_ns.data.importers.frame_record import FrameRecord
+from rgbavatar_ns.data.importers.mesh_fit import fit_meshes
+from rgbavatar_ns.data.importers.pictures import Picture
+from rgbavatar_ns.data.importers.source import Reading, Source, Split, assemble
+from rgbavatar_ns.data.importers.transforms import (
+    INDEX_FILE,
+    Entry,
+    camera_of,
+    first_frame,
+    has_transforms,
+    read_transforms,
+    size_of,
+)
+from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.head import HeadArrays
+from rgbavatar_ns.head.flame import EXPRESSIONS
+
+_HELD_OUT = 350
+_CAMERA_TOLERANCE = 1e-3
+_EXPRESSION_BYTES = 1 << 20
+
+
+@dataclass(frozen=True)
+class _Parameters:
+    """Head parameters by frame number."""
+
+    arrays: HeadArrays
+    identity: Float[np.ndarray, "_"]
+    theta: dict[int, dict[str, Float[np.ndarray, "_"]]]
+
+
+def is_insta(folder: Folder) -> bool:
+    """A transforms.json whose frames name no VHAP parameters, beside meshes or `.frame` files."""
+    if not has_transforms(folder.has):
+        return False
+    name = INDEX_FILE if folder.has(INDEX_FILE) else "transforms_train.json"
+    frame = first_frame(folder.root / name)
+    if "flame_param_path" in frame:
+        return False
+    return bool({"exp_path", "mesh_path"} & frame.keys()) or folder.has(CHECKPOINTS)
+
+
+def read_insta(reading: Reading, progress: Progress | None = None) -> Source:
+    """INSTA data with `.frame` files, or without: then jaw, eyes and eyelids are fitted to meshes.
+
+    Images are RGBA with soft alpha. The last 350 frames are held out where no file tells.
+    """
+    transforms = read_transforms(reading)
+    entries: dict[int, Entry] = {}
+    for entry in transforms.entries:
+        with reading.findings.frame(entry.name):
+            number = number_of(entry.name)
+            if number is None:
+                raise UnusableFrameError("images without a number")
+            if number in entries:
+                raise UnusableFrameError("images of the same number")
+            entries[number] = entry
+    files = reading.folder.numbered(CHECKPOINTS, (".frame",))
+    if files:
+        parameters = _from_frames(reading, entries, files, progress)
+    else:
+        parameters = _from_meshes(reading, entries, progress)
+    records = []
+    for number, entry in entries.items():
+        with reading.findings.frame(entry.name):
+            if number in parameters.theta:
+                records.append(_record(reading, number, entry, parameters.theta[number]))
+    split = Split(last=_HELD_OUT)
+    if transforms.has_split:
+        split = Split(numbers=frozenset(n for n, entry in entries.items() if entry.held_out))
+    return assemble(reading, records, parameters.arrays, parameters.identity, split)
+
+
+def _record(
+    reading: Reading, number: int, entry: Entry, theta: dict[str, Float[np.ndarray, "_"]]
+) -> FrameRecord:
+    picture = Picture(reading.folder.path(entry.name))
+    camera = camera_of(entry.values, opengl=False)
+    return FrameRecord(number, picture, theta, camera, size_of(entry.values))
+
+
+def _from_frames(
+    reading: Reading, entries: dict[int, Entry], files: dict[int, Path], progress: Progress | None
+) -> _Parameters:
+    findings = reading.findings
+    missing = [entry.name for number, entry in entries.items() if number not in files]
+    findings.leave_out("images without a .frame file", missing)
+    wanted = {number: path for number, path in files.items() if number in entries}
+    tracked = read_frame_files(reading, wanted, progress)
+    other = []
+    for number, head in tracked.frames.items():
+        with findings.frame(entries[number].name):
+            camera = camera_of(entries[number].values, opengl=False)
+            off = np.abs(camera.world_to_camera - head.camera.world_to_camera).max()
+            if off > _CAMERA_TOLERANCE:
+                other.append(entries[number].name)
+    findings.leave_out(f"cameras of {INDEX_FILE} that differ from their .frame file's", other)
+    theta = {number: head.theta for number, head in tracked.frames.items()}
+    return _Parameters(tracked.arrays, tracked.identity, theta)
+
+
+def _from_meshes(
+    reading: Reading, entries: dict[int, Entry], progress: Progress | None
+) -> _Parameters:
+    findings, folder = reading.findings, reading.folder
+    arrays = flame_for(reading, FLAME_VERSION)
+    expressions = {}
+    meshes = {}
+    for number, entry in entries.items():
+        with findings.frame(entry.name):
+            expressions[number] = _expression(folder, entry, arrays)
+            mesh = entry.values.get("mesh_path", f"meshes/{number:05d}.obj")
+            if not isinstance(mesh, str) or not folder.path(mesh).is_file():
+                raise UnusableFrameError("frames with neither a .frame file nor a mesh")
+            meshes[number] = folder.path(mesh)
+    if not meshes:
+        findings.settle(str(reading), False)
+        raise UserError(f"{reading} has no frames.", "Name the folder that holds the data.")
+    findings.note(
+        f"there are no .frame files: head shape, jaw, eyes and eyelids are fitted to "
+        f"{len(meshes)} meshes"
+    )
+    fitted = fit_meshes(reading, arrays, {n: expressions[n] for n in meshes}, meshes, progress)
+    return _Parameters(arrays, fitted.identity, fitted.theta)
+
+
+def _expression(folder: Folder, entry: Entry, arrays: HeadArrays) -> Float[np.ndarray, "_"]:
+    name = entry.values.get("exp_path")
+    if not isinstance(name, str):
+        raise UnusableFrameError("frames without exp_path")
+    path = folder.path(name)
+    try:
+        if path.stat().st_size > _EXPRESSION_BYTES:
+            raise ValueError
+        values = np.array([float(word) for word in path.read_text(encoding="utf-8").split()])
+    except (OSError, ValueError):
+        raise UnusableFrameError("expressions that cannot be read") from None
+    if len(values) != EXPRESSIONS:
+        raise UnusableFrameError(f"expressions that are not {EXPRESSIONS} numbers")
+    return padded(values, arrays.num_expressions, "expression", arrays)

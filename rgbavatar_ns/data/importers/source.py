@@ -1,0 +1,207 @@
+"""The source that a format's records make up, checked and in one form."""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from rgbavatar_ns.data.importers.findings import Findings, UnusableFrameError
+from rgbavatar_ns.data.importers.folder import Folder
+from rgbavatar_ns.data.importers.frame_record import FrameRecord
+from rgbavatar_ns.data.importers.head_pose import place_head_pose
+from rgbavatar_ns.data.importers.options import ImportOptions
+from rgbavatar_ns.data.importers.pictures import Picture, PictureHeader, picture_header
+from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.head import HeadArrays, HeadModel, ThetaLayout
+from rgbavatar_ns.kernels.types import PinholeCameras
+
+_LARGEST_SIZE = 16384
+
+
+@dataclass(frozen=True)
+class Split:
+    """Which frames a format holds out: the last ones, those of some numbers, or both None: none."""
+
+    last: int = 0
+    numbers: frozenset[int] | None = None
+
+
+@dataclass
+class Reading:
+    """A folder being read: where, with which options, and what was found odd."""
+
+    format: str
+    folder: Folder
+    options: ImportOptions
+    findings: Findings = field(default_factory=Findings)
+
+    def __str__(self) -> str:
+        return f"The {self.format} data in {self.folder.root}"
+
+
+@dataclass(frozen=True)
+class Source:
+    """A format's frames in order of their numbers, checked as far as pixels are not needed."""
+
+    format: str
+    root: Path
+    arrays: HeadArrays
+    layout: ThetaLayout
+    identity: Float[Tensor, "I"]
+    index: tuple[int, ...]
+    pictures: tuple[Picture, ...]
+    theta: Float[Tensor, "F H"]
+    cameras: PinholeCameras
+    test: frozenset[int]
+    camera_names: tuple[str | None, ...]
+    timesteps: tuple[int | None, ...]
+    notes: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+
+def assemble(
+    reading: Reading,
+    records: Sequence[FrameRecord],
+    arrays: HeadArrays,
+    identity: Float[np.ndarray, "_"],
+    split: Split,
+) -> Source:
+    """Check records together and bring them into one form; raises UserError about what is odd."""
+    records = _unique(reading, sorted(records, key=lambda record: record.index))
+    size, records = _one_size(reading, records)
+    reading.findings.settle(str(reading), reading.options.allow_partial)
+    if not records:
+        raise UserError(f"{reading} has no frame that can be used.", "Look at its files.")
+    records = place_head_pose(records, arrays, identity, reading.options.head_pose)
+    layout = HeadModel(arrays).layout
+    theta = layout.join({f.name: _column(records, f.name, f.size) for f in layout.fields})
+    width, height = size
+    cameras = PinholeCameras(
+        _stack([record.camera.world_to_camera for record in records]),
+        _stack([record.camera.focal_px for record in records]),
+        _stack([record.camera.principal_point_px for record in records]),
+        width,
+        height,
+    )
+    test = _held_out(reading, records, split)
+    return Source(
+        format=reading.format,
+        root=reading.folder.root,
+        arrays=arrays,
+        layout=layout,
+        identity=torch.from_numpy(identity).float(),
+        index=tuple(record.index for record in records),
+        pictures=tuple(record.picture for record in records),
+        theta=theta.float(),
+        cameras=cameras,
+        test=test,
+        camera_names=tuple(record.camera_name for record in records),
+        timesteps=tuple(record.timestep for record in records),
+        notes=tuple(reading.findings.notes),
+    )
+
+
+def _stack(values: Sequence[np.ndarray]) -> Float[Tensor, "F *shape"]:
+    return torch.from_numpy(np.stack(values)).float()
+
+
+def _column(records: Sequence[FrameRecord], name: str, size: int) -> Float[Tensor, "F _"]:
+    zero = np.zeros(size)
+    return torch.from_numpy(np.stack([record.theta.get(name, zero) for record in records]))
+
+
+def _unique(reading: Reading, records: list[FrameRecord]) -> list[FrameRecord]:
+    counts = Counter(record.index for record in records)
+    twice = [str(number) for number, count in counts.items() if count > 1]
+    reading.findings.leave_out("frame numbers that occur more than once", twice)
+    return [record for record in records if counts[record.index] == 1]
+
+
+def _one_size(
+    reading: Reading, records: list[FrameRecord]
+) -> tuple[tuple[int, int], list[FrameRecord]]:
+    """The size that most images have, and the records of that size that camera and image share."""
+    headers: dict[int, PictureHeader] = {}
+    for record in records:
+        with reading.findings.frame(record.picture.color.name):
+            headers[record.index] = picture_header(record.picture.color)
+    if not headers:
+        reading.findings.settle(str(reading), False)
+        raise UserError(f"{reading} has no frames.", "Name the folder that holds the data.")
+    sizes = Counter((header.width, header.height) for header in headers.values())
+    size = sizes.most_common(1)[0][0]
+    if max(size) > _LARGEST_SIZE:
+        raise UserError(f"{reading} has images of {size[0]} x {size[1]}.", "Make them smaller.")
+    kept = []
+    for record in records:
+        if record.index in headers:
+            with reading.findings.frame(record.picture.color.name):
+                _check_header(record, headers[record.index], size, reading.options.allow_opaque)
+                kept.append(record)
+    return size, kept
+
+
+def _check_header(
+    record: FrameRecord, header: PictureHeader, size: tuple[int, int], allow_opaque: bool
+) -> None:
+    found = f"{header.width} x {header.height}"
+    if (header.width, header.height) != size:
+        raise UnusableFrameError(f"images of {found} pixels among ones of {size[0]} x {size[1]}")
+    if record.size is not None and record.size != size:
+        raise UnusableFrameError(
+            f"cameras for images of {record.size[0]} x {record.size[1]} pixels, where the images "
+            f"have {found}"
+        )
+    if record.picture.alpha is None and not header.has_alpha and not allow_opaque:
+        raise UnusableFrameError(
+            "images without a matte (--allow-opaque takes them with their background)"
+        )
+
+
+def _held_out(reading: Reading, records: Sequence[FrameRecord], split: Split) -> frozenset[int]:
+    """Numbers of the frames to hold out, after the options and the format's own rule."""
+    options, numbers = reading.options, [record.index for record in records]
+    if options.test_cameras:
+        return _of_cameras(reading, records)
+    last = options.test_frames
+    if last is not None:
+        if last >= len(numbers):
+            raise UserError(
+                f"{reading} has {len(numbers)} frames, of which {last} cannot be held out.",
+                "Name a smaller --test-frames.",
+            )
+    elif split.numbers is not None:
+        held_out = split.numbers & set(numbers)
+        if len(held_out) == len(numbers):
+            raise UserError(
+                f"{reading} holds out all of its frames.", "Name another count by --test-frames."
+            )
+        return frozenset(held_out)
+    else:
+        last = split.last
+        if last >= len(numbers):
+            last = len(numbers) // 4
+            reading.findings.note(
+                f"the format holds out the last {split.last} frames, but there are only "
+                f"{len(numbers)}: the last {last} are held out"
+            )
+    return frozenset(numbers[len(numbers) - last :])
+
+
+def _of_cameras(reading: Reading, records: Sequence[FrameRecord]) -> frozenset[int]:
+    wanted = set(reading.options.test_cameras)
+    known = {record.camera_name for record in records if record.camera_name is not None}
+    if not wanted <= known or wanted == known:
+        names = ", ".join(sorted(known)) or "one without a name"
+        raise UserError(
+            f"{reading} has the cameras {names}; {', '.join(sorted(wanted))} cannot be held out.",
+            "Name some of its cameras, but not all.",
+        )
+    return frozenset(record.index for record in records if record.camera_name in wanted)

@@ -1,0 +1,169 @@
+"""NeRF-style transforms.json files, as INSTA and VHAP write them: frames, splits, intrinsics."""
+
+import math
+import os
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from rgbavatar_ns.data.importers.findings import UnusableFrameError
+from rgbavatar_ns.data.importers.folder import PICTURES, matrix, numbers, read_json
+from rgbavatar_ns.data.importers.frame_record import CameraRecord
+from rgbavatar_ns.data.importers.source import Reading
+from rgbavatar_ns.errors import UserError
+
+INDEX_FILE = "transforms.json"
+_OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def _file_of(split: str) -> str:
+    return f"transforms_{split}.json"
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One frame of the files with what stands above all frames; the frame's own wins."""
+
+    values: dict[str, Any]
+    held_out: bool
+
+    @property
+    def name(self) -> str:
+        """What to call it in a report."""
+        return str(self.values.get("file_path", "a frame without file_path"))
+
+
+@dataclass(frozen=True)
+class Transforms:
+    """All frames of a folder; `has_split` says whether files tell which are held out."""
+
+    entries: list[Entry]
+    has_split: bool
+
+
+def has_transforms(root_has: Any) -> bool:
+    """Whether there is an index of all frames, or one of training frames. Takes `Folder.has`."""
+    return root_has(INDEX_FILE) or root_has(_file_of("train"))
+
+
+def first_frame(reading_path: Any) -> Mapping[str, Any]:
+    """The first frame of the index, to tell formats apart; empty where there is none."""
+    try:
+        frames = read_json(reading_path).get("frames")
+    except UserError:
+        return {}
+    first = frames[0] if isinstance(frames, list) and frames else None
+    return first if isinstance(first, dict) else {}
+
+
+def read_transforms(reading: Reading) -> Transforms:
+    """Every frame that the files name, once.
+
+    Held out are frames of transforms_test.json and transforms_val.json that are not in
+    transforms_train.json: INSTA's val is the end of train, VHAP's is the held-out camera. A frame
+    of transforms.json that no split names is a finding.
+    """
+    splits = {
+        split: _frames(reading, _file_of(split))
+        for split in ("train", "val", "test")
+        if reading.folder.has(_file_of(split))
+    }
+    every = dict(_frames(reading, INDEX_FILE)) if reading.folder.has(INDEX_FILE) else {}
+    has_split = "train" in splits and "test" in splits
+    if splits and not has_split:
+        there = ", ".join(map(_file_of, splits))
+        raise UserError(
+            f"{reading} has {there}, but not both {_file_of('train')} and {_file_of('test')}.",
+            "Add the missing one, or remove all of them to hold out the last frames.",
+        )
+    for frames in splits.values():
+        every = {**frames, **every}
+    train = splits.get("train", {})
+    held_out = {key for split in ("val", "test") for key in splits.get(split, ())} - train.keys()
+    both = splits.get("test", {}).keys() & train.keys()
+    if both:
+        reading.findings.note(
+            f"{len(both)} frames stand both in {_file_of('train')} and {_file_of('test')}: they "
+            "are trained on"
+        )
+    _tell_unnamed(reading, every.keys())
+    if has_split:
+        idle = every.keys() - train.keys() - held_out
+        reading.findings.leave_out("frames that no split names", sorted(idle))
+        every = {key: values for key, values in every.items() if key not in idle}
+    entries = [Entry(values, key in held_out) for key, values in every.items()]
+    return Transforms(entries, has_split)
+
+
+def _tell_unnamed(reading: Reading, named: Iterable[str]) -> None:
+    """Images that lie beside named ones, but that no entry names."""
+    named = {os.path.normpath(name) for name in named}
+    for parent in {os.path.dirname(name) for name in named} - {""}:
+        files = reading.folder.names(parent, PICTURES)
+        left = [name for name in files if os.path.join(parent, name) not in named]
+        reading.findings.leave_out("images without a record", left)
+
+
+def _frames(reading: Reading, name: str) -> dict[str, dict[str, Any]]:
+    """A file's frames by their image, each with the file's common values."""
+    path = reading.folder.path(name)
+    content = read_json(path)
+    frames = content.get("frames")
+    if not isinstance(frames, list):
+        raise UserError(f"{path} has no list of frames.", "Export the data again.")
+    shared = {key: value for key, value in content.items() if key != "frames"}
+    found: dict[str, dict[str, Any]] = {}
+    for place, frame in enumerate(frames):
+        label = f"frame {place} of {name}"
+        if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
+            reading.findings.leave_out("entries without file_path", [label])
+        elif frame["file_path"] in found:
+            reading.findings.leave_out("images named more than once", [frame["file_path"]])
+        else:
+            found[frame["file_path"]] = {**shared, **frame}
+    return found
+
+
+def camera_of(values: Mapping[str, Any], opengl: bool) -> CameraRecord:
+    """The camera of a frame: `transform_matrix` is camera-to-world, in OpenGL or OpenCV axes."""
+    camera_to_world = matrix(values.get("transform_matrix"), 4, 4, "transform_matrix")
+    if not np.array_equal(camera_to_world[3], [0, 0, 0, 1]):
+        raise UnusableFrameError("cameras whose matrix is no rotation and shift")
+    if opengl:
+        camera_to_world = camera_to_world @ _OPENGL_TO_OPENCV
+    width, height = size_of(values)
+    focal = [_focal(values, "x", width), _focal(values, "y", height)]
+    centre = [numbers(values.get(name), 1, name)[0] for name in ("cx", "cy")]
+    return CameraRecord(inverse(camera_to_world), np.array(focal), np.array(centre))
+
+
+def inverse(rigid: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
+    """Inverse of a rotation and shift; raises UnusableFrameError where it is singular."""
+    try:
+        return np.linalg.inv(rigid)
+    except np.linalg.LinAlgError:
+        raise UnusableFrameError("cameras whose matrix is no rotation and shift") from None
+
+
+def size_of(values: Mapping[str, Any]) -> tuple[int, int]:
+    """(width, height) of the frame's image."""
+    width, height = numbers([values.get("w"), values.get("h")], 2, "w and h")
+    if width < 1 or height < 1:
+        raise UnusableFrameError("w and h that are not positive")
+    return int(width), int(height)
+
+
+def _focal(values: Mapping[str, Any], axis: str, pixels: int) -> float:
+    """In pixels: as it is written, else from the angle of view."""
+    if f"fl_{axis}" in values:
+        return float(numbers(values[f"fl_{axis}"], 1, f"fl_{axis}")[0])
+    if f"camera_angle_{axis}" in values:
+        angle = float(numbers(values[f"camera_angle_{axis}"], 1, f"camera_angle_{axis}")[0])
+        if 0 < angle < math.pi:
+            return 0.5 * pixels / math.tan(0.5 * angle)
+    if axis == "y":
+        return _focal(values, "x", int(values["w"]))
+    raise UnusableFrameError("cameras without a focal length")

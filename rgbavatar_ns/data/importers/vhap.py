@@ -1,0 +1,174 @@
+"""VHAP's export, as GaussianAvatars reads it: OpenGL cameras, axis-angle FLAME 2023 parameters."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from rgbavatar_ns.data.importers.findings import UnusableFrameError
+from rgbavatar_ns.data.importers.flame_parameters import flame_for, padded
+from rgbavatar_ns.data.importers.folder import Folder, finite, numbers, read_npz
+from rgbavatar_ns.data.importers.frame_files import Progress
+from rgbavatar_ns.data.importers.frame_record import FrameRecord
+from rgbavatar_ns.data.importers.pictures import Picture
+from rgbavatar_ns.data.importers.source import Reading, Source, Split, assemble
+from rgbavatar_ns.data.importers.transforms import (
+    INDEX_FILE,
+    Entry,
+    camera_of,
+    first_frame,
+    has_transforms,
+    read_transforms,
+    size_of,
+)
+from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.head import HeadArrays
+from rgbavatar_ns.head.flame import FLAME_VERTICES
+
+FLAME_VERSION = "2023"
+TEETH_VERTICES = 120
+_OFFSET_TOLERANCE_M = 1e-6
+_SHAPE_TOLERANCE = 1e-5
+_MAX_INDEX = 10**7
+
+
+def is_vhap(folder: Folder) -> bool:
+    """A transforms.json whose frames name FLAME parameters."""
+    if not has_transforms(folder.has):
+        return False
+    name = INDEX_FILE if folder.has(INDEX_FILE) else "transforms_train.json"
+    return "flame_param_path" in first_frame(folder.root / name)
+
+
+def read_vhap(reading: Reading, progress: Progress | None = None) -> Source:
+    """VHAP's export of one camera or many; held out is what transforms_val and _test hold.
+
+    With several cameras a frame's number is timestep x cameras + place of the camera.
+    """
+    transforms = read_transforms(reading)
+    frames: list[tuple[Entry, tuple[int, int]]] = []
+    for entry in transforms.entries:
+        with reading.findings.frame(entry.name):
+            place = (_index(entry.values, "timestep_index"), _index(entry.values, "camera_index"))
+            frames.append((entry, place))
+    cameras = sorted({camera for _, (_, camera) in frames})
+    subject = VhapSubject(reading)
+    records: list[FrameRecord] = []
+    held_out = set()
+    for done, (entry, (timestep, camera)) in enumerate(frames, 1):
+        with reading.findings.frame(entry.name):
+            number = timestep * len(cameras) + cameras.index(camera)
+            name = None
+            if len(cameras) > 1:
+                name = str(entry.values.get("camera_id", camera))
+            path = entry.values.get("flame_param_path")
+            if not isinstance(path, str):
+                raise UnusableFrameError("frames without flame_param_path")
+            records.append(
+                FrameRecord(
+                    number,
+                    _picture(reading.folder, entry),
+                    subject.theta(reading.folder.path(path)),
+                    camera_of(entry.values, opengl=True),
+                    size_of(entry.values),
+                    name,
+                    timestep if name is not None else None,
+                )
+            )
+            if entry.held_out:
+                held_out.add(number)
+        if progress is not None:
+            progress("reading frames", done, len(frames))
+    split = Split(numbers=frozenset(held_out)) if transforms.has_split else Split(0)
+    return assemble(reading, records, subject.arrays, subject.identity, split)
+
+
+def _index(values: dict[str, Any], name: str) -> int:
+    value = values.get(name, 0 if name == "camera_index" else None)
+    if type(value) is not int or not 0 <= value < _MAX_INDEX:
+        raise UnusableFrameError(f"frames without a valid {name}")
+    return value
+
+
+def _picture(folder: Folder, entry: Entry) -> Picture:
+    mask = entry.values.get("fg_mask_path")
+    if mask is None:
+        return Picture(folder.path(entry.name))
+    if not isinstance(mask, str) or not folder.path(mask).is_file():
+        raise UnusableFrameError("frames whose mask is missing")
+    return Picture(folder.path(entry.name), alpha=folder.path(mask))
+
+
+@dataclass
+class VhapSubject:
+    """The head model with the subject's own offsets, made of the first parameters that are read."""
+
+    reading: Reading
+    _arrays: HeadArrays | None = None
+    _shape: Float[np.ndarray, "_"] = field(default_factory=lambda: np.zeros(0))
+    _offset: Float[np.ndarray, "_ 3"] | None = None
+    _known: dict[Path, dict[str, Float[np.ndarray, "_"]]] = field(default_factory=dict)
+
+    @property
+    def arrays(self) -> HeadArrays:
+        """FLAME with the subject's offsets; raises UserError where no frame could be read."""
+        if self._arrays is None:
+            self.reading.findings.settle(str(self.reading), False)
+            raise UserError(f"{self.reading} has no frames.", "Name the folder of the export.")
+        return self._arrays
+
+    @property
+    def identity(self) -> Float[np.ndarray, "_"]:
+        """The subject's shape."""
+        return self._shape
+
+    def theta(self, path: Path) -> dict[str, Float[np.ndarray, "_"]]:
+        """Head parameters of a file, which several cameras may share."""
+        if path not in self._known:
+            self._known[path] = self.parse(read_npz(path))
+        return self._known[path]
+
+    def parse(self, values: dict[str, np.ndarray]) -> dict[str, Float[np.ndarray, "_"]]:
+        """Head parameters of one moment; raises UnusableFrameError where some are missing."""
+        offset = static_offset(values.get("static_offset"))
+        if "shape" not in values or "expr" not in values:
+            raise UnusableFrameError("parameters without 'shape' or 'expr'")
+        eyes = numbers(values.get("eyes_pose"), 6, "eyes_pose")
+        theta = {
+            "translation": numbers(values.get("translation"), 3, "translation"),
+            "rotation": numbers(values.get("rotation"), 3, "rotation"),
+            "neck": numbers(values.get("neck_pose"), 3, "neck_pose"),
+            "jaw": numbers(values.get("jaw_pose"), 3, "jaw_pose"),
+            "left_eye": eyes[:3],
+            "right_eye": eyes[3:],
+        }
+        if self._arrays is None:
+            self._arrays = flame_for(self.reading, FLAME_VERSION, offset)
+            self._shape = padded(values["shape"], self._arrays.num_identity, "shape", self._arrays)
+            self._offset = offset
+        shape = padded(values["shape"], self._arrays.num_identity, "shape", self._arrays)
+        if np.abs(shape - self._shape).max() > _SHAPE_TOLERANCE or not self._same_offset(offset):
+            raise UnusableFrameError("records of another head shape than the first")
+        expression = padded(values["expr"], self._arrays.num_expressions, "expr", self._arrays)
+        return {"expression": expression, **theta}
+
+    def _same_offset(self, offset: Float[np.ndarray, "_ 3"] | None) -> bool:
+        if offset is None or self._offset is None:
+            return offset is self._offset
+        same_size = offset.shape == self._offset.shape
+        return same_size and bool(np.abs(offset - self._offset).max() < _OFFSET_TOLERANCE_M)
+
+
+def static_offset(value: np.ndarray | None) -> Float[np.ndarray, "_ 3"] | None:
+    """The subject's own offsets of FLAME's vertices, those of VHAP's teeth after them."""
+    if value is None:
+        return None
+    offset = value[0] if value.ndim == 3 and len(value) == 1 else value
+    known = (FLAME_VERTICES, FLAME_VERTICES + TEETH_VERTICES)
+    if offset.ndim != 2 or offset.shape[1] != 3 or len(offset) not in known:
+        raise UnusableFrameError("a static_offset that is not of FLAME's vertices")
+    if offset.dtype.kind != "f":
+        raise UnusableFrameError("a static_offset that is no numbers")
+    return finite(offset, "static_offset")

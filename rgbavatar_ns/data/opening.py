@@ -1,0 +1,50 @@
+"""The one entrance to datasets: the project's own folders, and those of other systems."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import Progress as Bars
+from rich.progress import TaskID
+
+from rgbavatar_ns.data.dataset import TrackedDataset, load_native
+from rgbavatar_ns.data.importers import ImportOptions, find_format, open_foreign
+from rgbavatar_ns.data.importers.frame_files import Progress
+from rgbavatar_ns.data.native_format import INDEX_FILE
+
+
+def load_dataset(
+    path: str | Path, options: ImportOptions | None = None, progress: Progress | None = None
+) -> TrackedDataset:
+    """Read a dataset folder and check all of it but the pixels, which are checked when decoded.
+
+    A folder of another system is imported once, into a cache, and opened from there; `options`
+    say how, and `progress` is called with (stage, done, in all) instead of bars being shown.
+
+    Raises UserError for a missing or empty folder, another format or version, theta that holds
+    NaN or does not fit the head, cameras that are none, images that are missing, cut short or
+    of different sizes.
+    """
+    root, options = Path(path), options or ImportOptions()
+    own = (root / INDEX_FILE).exists() and options.format is None
+    if own or not root.is_dir() or find_format(root, options) is None:
+        return load_native(root)
+    if progress is not None:
+        return open_foreign(root, options, progress)
+    with _bars() as shown:
+        return open_foreign(root, options, shown)
+
+
+@contextmanager
+def _bars() -> Iterator[Progress]:
+    """A bar for each stage on stderr."""
+    tasks: dict[str, TaskID] = {}
+    with Bars(console=Console(stderr=True), transient=True) as bars:
+
+        def show(stage: str, done: int, total: int) -> None:
+            if stage not in tasks:
+                tasks[stage] = bars.add_task(stage)
+            bars.update(tasks[stage], completed=done, total=total)
+
+        yield show

@@ -1,0 +1,219 @@
+"""From a stream to the pools, beside the training and never in its way."""
+
+import threading
+from collections import Counter, deque
+from collections.abc import Callable
+from typing import Any
+
+import torch
+
+from rgbavatar_ns.data.png import png_header_size
+from rgbavatar_ns.data.streams.numbering import SeenNumbers
+from rgbavatar_ns.data.streams.pooled import FramePools
+from rgbavatar_ns.data.streams.protocol import FrameStream, Rewindable, StreamedFrame, StreamSubject
+from rgbavatar_ns.errors import UserError
+
+_PATIENCE_S = 0.1
+
+
+class FrameQueue:
+    """Frames between the source and the decoder, at most `capacity` of them.
+
+    When it is full, `put` drops the oldest frame, for a stream is about now; or it waits, where
+    the source keeps what is not taken.
+    """
+
+    def __init__(self, capacity: int) -> None:
+        self.capacity = capacity
+        self.dropped = 0
+        self._frames: deque[StreamedFrame] = deque()
+        self._closed = False
+        self._changed = threading.Condition()
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+    def put(self, frame: StreamedFrame, wait: bool) -> None:
+        """Append a frame; does nothing once the queue is closed."""
+        with self._changed:
+            if wait:
+                self._changed.wait_for(lambda: self._closed or len(self._frames) < self.capacity)
+            if self._closed:
+                return
+            if len(self._frames) >= self.capacity:
+                self._frames.popleft()
+                self.dropped += 1
+            self._frames.append(frame)
+            self._changed.notify_all()
+
+    def get(self) -> StreamedFrame | None:
+        """Take the oldest frame, waiting for one; None once the queue is closed and empty."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._closed or self._frames)
+            frame = self._frames.popleft() if self._frames else None
+            self._changed.notify_all()
+            return frame
+
+    def close(self) -> None:
+        """Let nothing more in; what is there can still be taken."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+
+
+class Ingest:
+    """Two threads: one listens to the stream, one checks and decodes frames and fills the pools.
+
+    Listening begins with `listen`, so that nothing is lost while an avatar is being built, the
+    pools are filled from `start` on. Frames that cannot be used are left out and counted.
+
+    Args:
+        stream: closed by `close`.
+        subject: the stream's.
+        pools: where the frames go.
+        queue_frames: most frames that wait to be decoded.
+        tell: called, from the threads, with what a user should read at once.
+    """
+
+    def __init__(
+        self,
+        stream: FrameStream,
+        subject: StreamSubject,
+        pools: FramePools,
+        queue_frames: int = 256,
+        tell: Callable[[str], None] = lambda line: None,
+    ) -> None:
+        self._stream, self._subject, self._pools, self._tell = stream, subject, pools, tell
+        self._queue = FrameQueue(queue_frames)
+        self._counts: Counter[str] = Counter()
+        self._seen = SeenNumbers()
+        self._session = subject.session
+        self._between_frames = threading.Lock()
+        self._stopped = threading.Event()
+        self._threads: list[threading.Thread] = []
+        self._finished = threading.Event()
+        self.failure: Exception | None = None
+        """What ended the stream against its will; to be raised by who looks after the threads."""
+
+    @property
+    def finished(self) -> bool:
+        """Whether the stream has ended and all its frames have been dealt with."""
+        return self._finished.is_set()
+
+    def counts(self) -> Counter[str]:
+        """Frames "arrived" and "taken in", and what went wrong, by name."""
+        counts = self._counts + self._stream.counts
+        counts["arrived"] += 0
+        counts["taken in"] += 0
+        counts["dropped"] = self._queue.dropped
+        return counts
+
+    def listen(self) -> None:
+        """Begin to take frames from the stream, as far as the queue goes."""
+        self._begin("rgbavatar stream", self._listen)
+
+    def give(self, frame: StreamedFrame) -> None:
+        """Take a frame as if the stream had just given it."""
+        self._counts["arrived"] += 1
+        self._queue.put(frame, wait=self._stream.keeps_frames)
+
+    def start(self) -> None:
+        """Begin to fill the pools, and to listen where that has not begun."""
+        if not self._threads:
+            self.listen()
+        self._begin("rgbavatar ingest", self._fill)
+
+    def close(self) -> None:
+        """Stop both threads and close the stream."""
+        self._stopped.set()
+        self._queue.close()
+        self._stream.close()
+        for thread in self._threads:
+            thread.join(timeout=5.0)
+
+    def _begin(self, name: str, work: Callable[[], None]) -> None:
+        def guarded() -> None:
+            try:
+                work()
+            except Exception as error:
+                if not self._stopped.is_set():
+                    self.failure = error
+            finally:
+                self._queue.close()
+
+        thread = threading.Thread(target=guarded, name=name, daemon=True)
+        self._threads.append(thread)
+        thread.start()
+
+    def _listen(self) -> None:
+        while not self._stopped.is_set():
+            frame = self._stream.next(_PATIENCE_S)
+            if frame is not None:
+                self.give(frame)
+            elif self._stream.ended:
+                return
+
+    def _fill(self) -> None:
+        while not self._stopped.is_set():
+            frame = self._queue.get()
+            if frame is None:
+                self._finished.set()
+                return
+            with self._between_frames:
+                fault = self._fault(frame)
+                if fault is None:
+                    fault = self._take_in(frame)
+                self._counts[fault or "taken in"] += 1
+
+    def _fault(self, frame: StreamedFrame) -> str | None:
+        """Why a frame is left out, found without decoding it; None if it is not."""
+        if frame.session != self._session:
+            self._session, self._seen = frame.session, SeenNumbers()
+        verdict = self._seen.add(frame.index)
+        if verdict in ("duplicate", "too late"):
+            return verdict
+        if verdict == "late":
+            self._counts["out of order"] += 1
+        if frame.theta.shape != (self._subject.layout.size,):
+            return "theta of another size"
+        if not bool(torch.isfinite(frame.theta).all()):
+            return "theta not finite"
+        size, wanted = png_header_size(frame.png), (self._subject.width, self._subject.height)
+        if size is not None and size != wanted:
+            if not self._counts["another resolution"]:
+                self._tell(
+                    f"Frame {frame.index} has {size[0]} x {size[1]} pixels; the stream began with "
+                    f"{wanted[0]} x {wanted[1]}, and frames of another resolution are left out."
+                )
+            return "another resolution"
+        return None
+
+    def _take_in(self, frame: StreamedFrame) -> str | None:
+        try:
+            decoded = frame.decode()
+        except UserError:
+            return "unreadable"
+        self._pools.add(decoded, frame)
+        return None
+
+    def state_dict(self) -> dict[str, Any]:
+        """Counters, frame numbers and pools, safe for `torch.load(weights_only=True)`."""
+        with self._between_frames:
+            counts = self.counts()
+            counts["arrived"] -= len(self._queue)
+            return {
+                "frames": self._pools.state_dict(),
+                "counts": dict(counts),
+                "numbers": self._seen.state_dict(),
+                "session": self._session,
+            }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on where `state_dict` was taken; before `start`, and before `listen` if it can be."""
+        self._pools.load_state_dict(state["frames"], self._stream)
+        self._counts = Counter(state["counts"])
+        self._queue.dropped = self._counts.pop("dropped", 0)
+        self._session = state["session"]
+        self._seen.load_state_dict(state["numbers"])
+        if isinstance(self._stream, Rewindable):
+            self._stream.go_on_after(self._seen.newest)

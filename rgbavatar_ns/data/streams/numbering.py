@@ -1,0 +1,59 @@
+"""Which frames have been there already, by their numbers, in bounded memory."""
+
+from typing import Any, Literal
+
+_REMEMBERED = 4096
+
+Verdict = Literal["new", "late", "duplicate", "too late"]
+
+
+class SeenNumbers:
+    """Tells new frames from those that come late or twice.
+
+    "late": new, but a frame with a higher number came before it. "too late": so far behind the
+    highest number (4,096) that it is not known any more whether it came before.
+    """
+
+    def __init__(self) -> None:
+        self._newest = -1
+        self._seen: set[int] = set()
+
+    def add(self, number: int) -> Verdict:
+        """Note a frame's number (not negative) and judge it."""
+        if number > self._newest:
+            oldest_before = self._newest - _REMEMBERED
+            self._newest = number
+            self._seen.add(number)
+            self._forget(oldest_before)
+            return "new"
+        if number <= self._newest - _REMEMBERED:
+            return "too late"
+        if number in self._seen:
+            return "duplicate"
+        self._seen.add(number)
+        return "late"
+
+    @property
+    def newest(self) -> int:
+        """The highest number so far; -1 before the first."""
+        return self._newest
+
+    def pass_over(self, number: int) -> None:
+        """Take every number up to this one for one that has been there."""
+        self._newest = max(self._newest, number)
+        self._seen = set(range(max(0, self._newest - _REMEMBERED), self._newest + 1))
+
+    def _forget(self, oldest_before: int) -> None:
+        oldest = self._newest - _REMEMBERED
+        if oldest - oldest_before <= _REMEMBERED:
+            self._seen.difference_update(range(oldest_before, oldest + 1))
+        else:
+            self._seen = {number for number in self._seen if number > oldest}
+
+    def state_dict(self) -> dict[str, Any]:
+        """Plain values that `load_state_dict` goes on from."""
+        return {"newest": self._newest, "seen": sorted(self._seen)}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on where `state_dict` was taken."""
+        self._newest, self._seen = state["newest"], set(state["seen"])

@@ -1,0 +1,132 @@
+"""What a stream of tracked frames is, wherever it comes from."""
+
+from collections import Counter
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from rgbavatar_ns.data.frame import TrackedFrame
+from rgbavatar_ns.data.png import decode_png_rgba
+from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.head import HeadArrays, HeadModel, ThetaLayout
+from rgbavatar_ns.kernels.types import PinholeCameras
+
+
+@dataclass(frozen=True)
+class StreamSubject:
+    """Who is filmed: known before the first frame, the same for all of them.
+
+    Raises UserError where layout or identity do not fit the head.
+    """
+
+    arrays: HeadArrays
+    identity: Float[Tensor, "I"]
+    layout: ThetaLayout
+    width: int
+    height: int
+    session: str = ""
+    """Numbering of frames begins anew where a source comes back with another session."""
+
+    def __post_init__(self) -> None:
+        expected = HeadModel(self.arrays).layout
+        if self.layout != expected:
+            raise UserError(
+                f"The stream has theta of {self.layout.size} values ({self.layout}), but the "
+                f"head '{self.arrays.name}' takes {expected.size} ({expected}).",
+                "Send theta in the layout of the head that the stream names.",
+            )
+        fits = self.identity.shape == (self.arrays.num_identity,)
+        if not fits or not bool(torch.isfinite(self.identity).all()):
+            raise UserError(
+                f"The stream's identity is not {self.arrays.num_identity} finite numbers, which "
+                f"the head '{self.arrays.name}' takes.",
+                "Send the identity coefficients of that head.",
+            )
+        if self.width < 1 or self.height < 1:
+            raise UserError(
+                f"The stream's images are said to be {self.width} x {self.height} pixels.",
+                "Send the size of the images.",
+            )
+
+
+@dataclass(frozen=True)
+class StreamedFrame:
+    """A tracked frame with its image still encoded, as it came in.
+
+    index: number of the frame in its source.
+    theta: head parameters in the order of the subject's layout; not checked yet.
+    camera: exactly one camera (C = 1), of the subject's image size.
+    png: the image, RGBA with straight alpha.
+    arrived_s: when it arrived, by time.monotonic().
+    """
+
+    index: int
+    theta: Float[Tensor, "_"]
+    camera: PinholeCameras
+    png: bytes
+    arrived_s: float
+    session: str = ""
+
+    def decode(self) -> TrackedFrame:
+        """The frame with its picture; raises UserError where that is damaged or no PNG."""
+        image = decode_png_rgba(self.png, f"frame {self.index}")
+        return TrackedFrame(self.index, self.theta, self.camera, image)
+
+
+@runtime_checkable
+class FrameStream(Protocol):
+    """Gives the frames of one subject in the order of their arrival, each once.
+
+    Called from one thread at a time; `close` from any.
+    """
+
+    @property
+    def counts(self) -> Counter[str]:
+        """What went wrong, by name: "garbage bytes", "reconnects", "no face" ..."""
+        ...
+
+    @property
+    def keeps_frames(self) -> bool:
+        """Whether frames that are not taken yet stay at the source.
+
+        Else they are dropped when the queue behind it is full.
+        """
+        ...
+
+    def subject(self, timeout_s: float) -> StreamSubject | None:
+        """Who is filmed; None if that is not known after `timeout_s`."""
+        ...
+
+    def next(self, timeout_s: float) -> StreamedFrame | None:
+        """The next frame; None if none has come after `timeout_s`, or the stream has ended."""
+        ...
+
+    @property
+    def ended(self) -> bool:
+        """Whether no frame will come any more."""
+        ...
+
+    def close(self) -> None:
+        """Let go of files, sockets and devices; `next` returns None from now on."""
+        ...
+
+
+@runtime_checkable
+class Rewindable(Protocol):
+    """A stream that can begin in its middle, for a run that is resumed."""
+
+    def go_on_after(self, index: int) -> None:
+        """Begin behind the frame with this number; before the first `next`."""
+        ...
+
+
+@runtime_checkable
+class Rereadable(Protocol):
+    """A stream whose frames can be had again, so that checkpoints need not hold their images."""
+
+    def again(self, index: int) -> StreamedFrame:
+        """The frame with this number, without the stream going on."""
+        ...

@@ -1,0 +1,78 @@
+"""Overrides of a preset, checked against its typed config before anything runs."""
+
+import dataclasses
+import types
+import typing
+from collections.abc import Mapping
+from typing import Any
+
+from typeguard import TypeCheckError, check_type
+
+from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.experiments.spec import Overrides, nearest
+
+
+def check_overrides(config: Any, overrides: Overrides, where: str) -> None:
+    """Raise UserError unless every key is a field of `config` and takes the value given.
+
+    `config` is a preset's dataclass; keys are dotted as in `pipeline.model.avatar.num_bases`.
+    An unknown key is told with the nearest right one.
+    """
+    for key, value in overrides.items():
+        _check(config, key, value, where)
+
+
+def _check(config: Any, key: str, value: Any, where: str) -> None:
+    *path, last = key.split(".")
+    part, walked = config, []
+    for name in path:
+        part = getattr(_require_field(part, name, key, walked, where), name)
+        walked.append(name)
+    _require_field(part, last, key, walked, where)
+    hint = typing.get_type_hints(type(part))[last]
+    try:
+        check_type(_as_config(value, hint), hint)
+    except TypeCheckError:
+        raise UserError(
+            f"{where} sets {key} to {value!r}, which does not fit its type {_told(hint)}.",
+            "Give a value of that type.",
+        ) from None
+
+
+def _require_field(part: Any, name: str, key: str, walked: list[str], where: str) -> Any:
+    names = [f.name for f in dataclasses.fields(part)] if dataclasses.is_dataclass(part) else []
+    if name not in names:
+        known = [".".join([*walked, field]) for field in names if not field.startswith("_")]
+        raise UserError(
+            f"{where} sets {key}, and {'.'.join([*walked, name])} is no field of the preset.",
+            nearest(".".join([*walked, name]), known or [".".join(walked)]),
+        )
+    return part
+
+
+def _as_config(value: Any, hint: Any) -> Any:
+    """YAML's lists where the config has tuples, its whole numbers where that has floats."""
+    options = typing.get_args(hint) if _is_union(hint) else (hint,)
+    if isinstance(value, list) and any(typing.get_origin(option) is tuple for option in options):
+        return tuple(value)
+    if isinstance(value, int) and not isinstance(value, bool) and float in options:
+        return value if int in options else float(value)
+    return value
+
+
+def _is_union(hint: Any) -> bool:
+    return typing.get_origin(hint) in (typing.Union, types.UnionType)
+
+
+def _told(hint: Any) -> str:
+    return hint.__name__ if isinstance(hint, type) else str(hint).replace("typing.", "")
+
+
+def as_flags(overrides: Mapping[str, Any]) -> list[str]:
+    """The overrides as ns-train's command line takes them."""
+    flags: list[str] = []
+    for key, value in overrides.items():
+        flags.append(f"--{key.replace('_', '-')}")
+        values = value if isinstance(value, list | tuple) else [value]
+        flags += [str(one) for one in values]
+    return flags

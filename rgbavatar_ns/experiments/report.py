@@ -1,0 +1,81 @@
+"""The report of sweeps: tables as Markdown, CSV and LaTeX, plots, and a page that shows all."""
+
+import html
+from dataclasses import dataclass
+from pathlib import Path
+
+from rgbavatar_ns.experiments.plots import write_plots
+from rgbavatar_ns.experiments.spec import Experiment
+from rgbavatar_ns.experiments.sweep import CellStatus, read_statuses
+from rgbavatar_ns.experiments.tables import HEADINGS, ResultTable, result_table
+
+_STYLE = (
+    "body{font:15px/1.5 system-ui,sans-serif;max-width:70em;margin:2em auto;padding:0 1em}"
+    "table{border-collapse:collapse;margin:1em 0}td,th{padding:.25em .8em;text-align:right;"
+    "border-bottom:1px solid #ddd}td:first-child,th:first-child{text-align:left}"
+    "img{max-width:100%}code{font-size:85%}.note{color:#666}"
+)
+
+
+@dataclass(frozen=True)
+class Report:
+    """What was written, and the table itself."""
+
+    table: ResultTable
+    statuses: list[CellStatus]
+    paths: list[Path]
+
+
+def write_report(experiment: Experiment, folder: Path, *, plots: bool = True) -> Report:
+    """Write NAME.md, .csv, .tex, .png, .svg and index.html into `folder/report`.
+
+    Every row of the CSV and of the page names its cells; `folder/cells/HASH` holds the run, its
+    config and its log. Raises UserError where the sweep was never begun.
+    """
+    statuses = read_statuses(folder, experiment.name)
+    table = result_table(experiment, statuses)
+    out = folder / "report"
+    out.mkdir(parents=True, exist_ok=True)
+    paths = []
+    for suffix, text in (
+        (".md", table.to_markdown()),
+        (".csv", table.to_csv()),
+        (".tex", table.to_latex()),
+    ):
+        path = out / f"{experiment.name}{suffix}"
+        path.write_text(text, encoding="utf-8")
+        paths.append(path)
+    drawn = write_plots(experiment, table, out, experiment.name) if plots else []
+    page = out / "index.html"
+    page.write_text(_page(experiment, table, statuses, drawn), encoding="utf-8")
+    return Report(table, statuses, [*paths, *drawn, page])
+
+
+def _page(
+    experiment: Experiment, table: ResultTable, statuses: list[CellStatus], drawn: list[Path]
+) -> str:
+    heading = ["Method", *(HEADINGS[metric] for metric in table.metrics), "cells"]
+    rows = []
+    for row in table.rows:
+        cells = [row.name]
+        for metric in table.metrics:
+            entry = row.entries.get(metric)
+            cells.append("-" if entry is None else f"{entry.mean:.4g} ± {entry.spread:.2g}")
+        links = " ".join(f'<a href="../cells/{key}/">{key[:6]}</a>' for key in row.cells)
+        text = "".join(f"<td>{html.escape(cell)}</td>" for cell in cells)
+        rows.append(f"<tr>{text}<td><code>{links}</code></td></tr>")
+    pictures = "".join(f'<p><img src="{path.name}" alt="plot"></p>' for path in drawn)
+    notes = "".join(f'<p class="note">{html.escape(note)}</p>' for note in table.notes)
+    failed = "".join(
+        f"<h3>failed: {html.escape(status.cell.variant)}, seed {status.cell.seed}</h3>"
+        f"<pre>{html.escape(chr(10).join(status.why))}</pre>"
+        for status in statuses
+        if status.state == "failed"
+    )
+    head = "".join(f"<th>{html.escape(cell)}</th>" for cell in heading)
+    return (
+        f'<!doctype html><html lang="en"><meta charset="utf-8"><title>'
+        f"{html.escape(experiment.title)}</title><style>{_STYLE}</style>"
+        f"<h1>{html.escape(experiment.title)}</h1><table><tr>{head}</tr>{''.join(rows)}</table>"
+        f"{notes}{pictures}{failed}</html>\n"
+    )

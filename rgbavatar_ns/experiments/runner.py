@@ -1,0 +1,83 @@
+"""One cell in a process of its own: `python -m rgbavatar_ns.experiments.runner FOLDER`.
+
+The folder holds cell.json (what to run, and on which data). ns-train and ns-eval write beside it;
+result.json comes last, so that its presence says that the cell is done. A cell that was
+interrupted resumes its training.
+"""
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+from rgbavatar_ns.data.json_file import write_json
+from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.experiments.cells import Cell
+from rgbavatar_ns.experiments.overrides import as_flags
+from rgbavatar_ns.plugin.commands import run_nerfstudio
+
+CELL_FILE, RESULT_FILE, LOG_FILE = "cell.json", "result.json", "log.txt"
+_EVALUATION = "eval.json"
+_RUN = "run"
+
+
+def write_cell(folder: Path, cell: Cell, data: Path) -> None:
+    """Leave in `folder` what `run_cell` needs."""
+    write_json(folder / CELL_FILE, {**cell.to_json(), "data": str(data)})
+
+
+def read_result(folder: Path) -> dict[str, Any] | None:
+    """The metrics of a finished cell; None where it is not done."""
+    try:
+        return json.loads((folder / RESULT_FILE).read_text())
+    except (OSError, ValueError):
+        return None
+
+
+def run_cell(folder: Path) -> dict[str, Any]:
+    """Train and evaluate; returns what result.json then holds."""
+    described = json.loads((folder / CELL_FILE).read_text())
+    data = Path(described.pop("data"))
+    cell = Cell.from_json(described)
+    run_folder = folder / _RUN / "cell" / cell.preset / "run"
+    run_nerfstudio("ns-train", cell.preset, *_training_flags(cell, data, folder, run_folder))
+    evaluation = folder / _EVALUATION
+    run_nerfstudio(
+        "ns-eval", "--load-config", run_folder / "config.yml", "--output-path", evaluation
+    )
+    scores = json.loads(evaluation.read_text())["results"]
+    training = json.loads((run_folder / "training.json").read_text())
+    numbers = {
+        name: value
+        for name, value in {**training, **scores}.items()
+        if isinstance(value, int | float)
+    }
+    result = {"key": cell.key, "metrics": numbers, "run": str(run_folder)}
+    if "lpips_unavailable" in scores:
+        result["unavailable"] = {"lpips_vgg": scores["lpips_unavailable"]}
+    write_json(folder / RESULT_FILE, result)
+    return result
+
+
+def _training_flags(cell: Cell, data: Path, folder: Path, run_folder: Path) -> list[str | Path]:
+    flags: list[str | Path] = ["--data", data, "--output-dir", folder / _RUN]
+    flags += ["--experiment-name", "cell", "--timestamp", "run", "--vis", "tensorboard"]
+    flags += ["--machine.seed", str(cell.seed), *as_flags(cell.overrides)]
+    if any(run_folder.glob("nerfstudio_models/*.ckpt")):
+        flags += ["--load-dir", run_folder / "nerfstudio_models"]
+    return flags
+
+
+def main() -> None:
+    """Run the cell in the folder that is the only argument; exit code 1 tells of a failure."""
+    try:
+        run_cell(Path(sys.argv[1]))
+    except UserError as error:
+        print(error, file=sys.stderr)
+        sys.exit(1)
+    except KeyboardInterrupt:
+        sys.exit(130)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,137 @@
+"""Run what is missing of an experiment; what is there already is kept."""
+
+import json
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from rgbavatar_ns.data.demo import make_demo_dataset
+from rgbavatar_ns.data.json_file import write_json
+from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.experiments.cells import Cell, cells_of, demo_config
+from rgbavatar_ns.experiments.engines import Engine
+from rgbavatar_ns.experiments.overrides import check_overrides
+from rgbavatar_ns.experiments.runner import LOG_FILE, read_result, write_cell
+from rgbavatar_ns.experiments.spec import Experiment, nearest
+
+State = Literal["waiting", "running", "done", "failed"]
+_ATTEMPTS = 2
+_LAST_LINES = 8
+
+
+@dataclass
+class CellStatus:
+    """Where a cell stands; `why` is the end of a failed one's log."""
+
+    cell: Cell
+    folder: Path
+    state: State
+    result: dict[str, Any] | None = None
+    why: list[str] = field(default_factory=list)
+
+
+def check_experiment(experiment: Experiment) -> None:
+    """Raise UserError where the preset or an override does not exist or does not fit."""
+    # Loads nerfstudio, which takes seconds.
+    from rgbavatar_ns.plugin import methods
+
+    configs = [getattr(found, "config", None) for found in vars(methods).values()]
+    presets = {c.method_name: c for c in configs if c is not None and hasattr(c, "method_name")}
+    if experiment.preset not in presets:
+        raise UserError(
+            f"The experiment {experiment.name} names the preset {experiment.preset!r}.",
+            nearest(experiment.preset, list(presets)),
+        )
+    config = presets[experiment.preset]
+    check_overrides(config, experiment.base, f"The experiment {experiment.name}, base,")
+    for variant in experiment.variants:
+        where = f"The experiment {experiment.name}, variant {variant.name!r},"
+        check_overrides(config, variant.overrides, where)
+
+
+def sweep(
+    experiment: Experiment,
+    folder: Path,
+    engine: Engine,
+    progress: Callable[[Sequence[CellStatus]], None] = lambda statuses: None,
+) -> list[CellStatus]:
+    """Train and evaluate every cell that has no result yet, and return where all stand.
+
+    A cell lives in `folder/cells/HASH`; a second call does only what is missing and resumes what
+    was interrupted. A failed cell is tried once more, then left with the last lines of its log;
+    the others go on. Raises UserError, before anything runs, for what `check_experiment` finds.
+    """
+    check_experiment(experiment)
+    cells = cells_of(experiment)
+    statuses = [_status(cell, folder) for cell in cells]
+    write_json(folder / f"{experiment.name}.json", [cell.to_json() for cell in cells])
+    progress(statuses)
+    missing = {status.folder: status for status in statuses if status.state != "done"}
+    data = {cell.subject: _dataset(cell.subject, folder) for cell in cells if missing}
+    for status in missing.values():
+        status.folder.mkdir(parents=True, exist_ok=True)
+        (status.folder / LOG_FILE).unlink(missing_ok=True)
+        write_cell(status.folder, status.cell, data[status.cell.subject])
+
+    def finished(cell_folder: Path, code: int) -> None:
+        for status in statuses:  # variants may share a cell
+            if status.folder == cell_folder:
+                status.result = read_result(cell_folder)
+                done = code == 0 and status.result is not None
+                status.state = "done" if done else "failed"
+                status.why = [] if done else last_lines(cell_folder / LOG_FILE, _LAST_LINES)
+        progress(statuses)
+
+    for _ in range(_ATTEMPTS):
+        left = [path for path, status in missing.items() if status.state != "done"]
+        for status in statuses:
+            status.state = "running" if status.folder in left else status.state
+        progress(statuses)
+        if left:
+            engine.run(left, finished)
+    return statuses
+
+
+def last_lines(path: Path, count: int) -> list[str]:
+    """The end of a log, without blank lines; reads at most its last 64 KiB."""
+    try:
+        with path.open("rb") as log:
+            log.seek(max(0, path.stat().st_size - (1 << 16)))
+            text = log.read().decode(errors="replace")
+    except OSError as error:
+        return [f"(no log: {error})"]
+    return [line.rstrip() for line in text.splitlines() if line.strip()][-count:]
+
+
+def read_statuses(folder: Path, name: str) -> list[CellStatus]:
+    """Where the cells of an experiment stand in `folder`; UserError if it never ran there."""
+    try:
+        listed = json.loads((folder / f"{name}.json").read_text())
+    except (OSError, ValueError) as error:
+        raise UserError(
+            f"The sweep of {name} was not begun in {folder} ({error}).",
+            "Run `rgbavatar sweep FILE` with this folder first.",
+        ) from None
+    return [_status(Cell.from_json(values), folder) for values in listed]
+
+
+def _status(cell: Cell, folder: Path) -> CellStatus:
+    cell_folder = folder / "cells" / cell.key
+    result = read_result(cell_folder)
+    return CellStatus(cell, cell_folder, "waiting" if result is None else "done", result)
+
+
+def _dataset(subject: str, folder: Path) -> Path:
+    """The subject's dataset; a procedural one is made once, whole or not at all."""
+    config = demo_config(subject)
+    if config is None:
+        return Path(subject)
+    name = f"demo-{config.seed}-{config.num_frames}-{config.image_size}"
+    path, partial = folder / "data" / name, folder / "data" / f".{name}"
+    if not path.exists():
+        shutil.rmtree(partial, ignore_errors=True)
+        make_demo_dataset(partial, config)
+        partial.rename(path)
+    return path

@@ -1,0 +1,71 @@
+"""Performances to pictures: any background, or none with the alpha kept."""
+
+from collections.abc import Iterator
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from rgbavatar_ns.avatar.avatar import Avatar
+from rgbavatar_ns.kernels import PinholeCameras, RenderedBatch, rasterize
+
+Picture = UInt8[np.ndarray, "height width channels"]
+"""RGB, or RGBA with straight alpha."""
+Color = tuple[float, float, float]
+
+_BATCH = 8
+
+
+@torch.no_grad()
+def draw(
+    avatar: Avatar,
+    theta: Float[Tensor, "B H"],
+    cameras: PinholeCameras,
+    background: Color | None = None,
+    psi: Float[Tensor, "B K"] | None = None,
+) -> RenderedBatch:
+    """Draw a batch, without gradients; `psi` replaces the weight network's answer."""
+    like = avatar.identity
+    theta = theta.to(like)
+    ground = like.new_tensor((0.0, 0.0, 0.0) if background is None else background)
+    if psi is None:
+        return avatar.render(theta, cameras, ground)
+    renderer = avatar.renderer(theta, cameras, psi.to(like))
+    if renderer is not None:
+        return renderer.draw(ground.expand(len(theta), 3))
+    return rasterize(avatar.gaussians(theta, psi.to(like)), cameras, ground)
+
+
+def pictures(
+    avatar: Avatar,
+    theta: Float[Tensor, "F H"],
+    cameras: PinholeCameras,
+    background: Color | None,
+    psi: Float[Tensor, "F K"] | None = None,
+) -> Iterator[Picture]:
+    """A picture for each frame: RGB over the background, or RGBA where there is none.
+
+    cameras: one for all frames, or one for each.
+    """
+    for start in range(0, len(theta), _BATCH):
+        places = list(range(start, min(start + _BATCH, len(theta))))
+        several = len(cameras.world_to_camera) > 1
+        seen_by = cameras.select(places) if several else cameras
+        weights = None if psi is None else psi[places]
+        rendered = draw(avatar, theta[places], seen_by, background, weights)
+        for image, alpha in zip(rendered.image, rendered.alpha):
+            yield to_uint8(image if background is not None else with_straight_alpha(image, alpha))
+
+
+def with_straight_alpha(
+    image: Float[Tensor, "H W 3"], alpha: Float[Tensor, "H W 1"]
+) -> Float[Tensor, "H W 4"]:
+    """RGBA of a picture over black: colour divided by alpha, black where nothing is seen."""
+    color = torch.where(alpha > 0, image / alpha.clamp(min=1e-6), 0.0)
+    return torch.cat([color, alpha], -1)
+
+
+def to_uint8(image: Float[Tensor, "H W C"]) -> UInt8[np.ndarray, "height width channels"]:
+    """Values in [0, 1] as bytes, rounded; what lies outside is cut."""
+    return (image.clamp(0, 1) * 255 + 0.5).to(torch.uint8).cpu().numpy()

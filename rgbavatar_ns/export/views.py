@@ -1,0 +1,147 @@
+"""Cameras to look at an avatar with: fixed views, orbits, nerfstudio's camera paths."""
+
+import json
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from rgbavatar_ns.avatar.avatar import Avatar
+from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.head.rotations import axis_angle_to_matrix
+from rgbavatar_ns.kernels import PinholeCameras
+
+FOUR_VIEWS_DEGREES = ((-40.0, 0.0), (40.0, 0.0), (0.0, -20.0), (0.0, 20.0))
+"""(yaw, pitch) of the novel views: the head seen from its right, its left, above and below. The
+paper shows four without saying which."""
+
+# nerfstudio's world has z up: (x, y, z) of the head's world is (x, -z, y) there.
+_HEAD_TO_NERFSTUDIO = ((1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0))
+_DISTANCE_M = 1.1
+_SEEN_M = 0.34
+
+
+@torch.no_grad()
+def head_centre(avatar: Avatar) -> Float[Tensor, "3"]:
+    """The middle of the avatar's head at rest, in metres."""
+    rest = avatar.identity.new_zeros(1, avatar.layout.size)
+    return avatar.head(rest, avatar.identity)[0].mean(0).cpu()
+
+
+def front_camera(avatar: Avatar, width: int, height: int) -> PinholeCameras:
+    """A camera 1.1 m in front of the face that sees the whole head."""
+    x, y, z = head_centre(avatar).tolist()
+    world_to_camera = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))[None]
+    world_to_camera[0, :3, 3] = torch.tensor([-x, y, z + _DISTANCE_M])
+    focal_px = min(width, height) * _DISTANCE_M / _SEEN_M
+    return PinholeCameras(
+        world_to_camera,
+        torch.full((1, 2), focal_px),
+        torch.tensor([[width / 2, height / 2]]),
+        width,
+        height,
+    )
+
+
+def orbit(
+    camera: PinholeCameras,
+    centre: Float[Tensor, "3"],
+    yaw_degrees: Sequence[float],
+    pitch_degrees: Sequence[float],
+) -> PinholeCameras:
+    """One camera (C = 1) carried around a point, at the same distance: a view for each angle.
+
+    Positive yaw shows the head's left side, positive pitch looks from below. Angles of zero give
+    the camera itself.
+    """
+    yaw, pitch = (torch.tensor(a).deg2rad() for a in (yaw_degrees, pitch_degrees))
+    zero = torch.zeros_like(yaw)
+    about_x = axis_angle_to_matrix(torch.stack([-pitch, zero, zero], -1))
+    about_y = axis_angle_to_matrix(torch.stack([zero, -yaw, zero], -1))
+    world_to_camera = camera.world_to_camera[0].expand(len(yaw), 4, 4).clone()
+    rotation, translation = world_to_camera[:, :3, :3], world_to_camera[:, :3, 3]
+    turned = rotation @ about_x @ about_y
+    world_to_camera[:, :3, 3] = translation + (rotation - turned) @ centre
+    world_to_camera[:, :3, :3] = turned
+    return PinholeCameras(
+        world_to_camera,
+        camera.focal_px[:1].expand(len(yaw), 2),
+        camera.principal_point_px[:1].expand(len(yaw), 2),
+        camera.width,
+        camera.height,
+    )
+
+
+def four_views(camera: PinholeCameras, centre: Float[Tensor, "3"]) -> PinholeCameras:
+    """The four fixed views around a camera (C = 1)."""
+    yaw, pitch = zip(*FOUR_VIEWS_DEGREES)
+    return orbit(camera, centre, yaw, pitch)
+
+
+def resized(cameras: PinholeCameras, width: int, height: int) -> PinholeCameras:
+    """The same cameras for pictures of another size; what they saw fits into its middle."""
+    zoom = min(width / cameras.width, height / cameras.height)
+    old = torch.tensor([cameras.width, cameras.height]).to(cameras.focal_px)
+    new = torch.tensor([width, height]).to(cameras.focal_px)
+    return PinholeCameras(
+        cameras.world_to_camera,
+        cameras.focal_px * zoom,
+        new / 2 + (cameras.principal_point_px - old / 2) * zoom,
+        width,
+        height,
+    )
+
+
+def read_camera_path(path: Path) -> tuple[PinholeCameras, float]:
+    """Cameras and frames per second of a camera path written by nerfstudio's viewer.
+
+    Raises UserError where the file is none, or not of perspective cameras.
+    """
+    try:
+        described = json.loads(path.read_text(encoding="utf-8"))
+        width, height = int(described["render_width"]), int(described["render_height"])
+        kind = described.get("camera_type", "perspective")
+        poses = [entry["camera_to_world"] for entry in described["camera_path"]]
+        opengl = torch.tensor(poses, dtype=torch.float32).reshape(-1, 4, 4)
+        fov = torch.tensor([float(entry["fov"]) for entry in described["camera_path"]]).deg2rad()
+        frames_per_second = _rate(described, len(fov))
+    except (OSError, ValueError, KeyError, TypeError, RuntimeError) as error:
+        raise UserError(
+            f"{path} is no camera path of nerfstudio's viewer: {error!r}.",
+            "Save one with 'Generate Command' in the viewer's render panel.",
+        ) from None
+    if kind != "perspective" or len(fov) == 0:
+        raise UserError(
+            f"The camera path {path} has {len(fov)} cameras of the type '{kind}'.",
+            "Choose the type 'perspective' in the viewer's render panel and add cameras.",
+        )
+    # The field of view is the vertical one.
+    focal_px = 0.5 * height / torch.tan(0.5 * fov)
+    to_head = torch.tensor(_HEAD_TO_NERFSTUDIO).T
+    axes = to_head @ opengl[:, :3, :3] * torch.tensor([1.0, -1.0, -1.0])
+    centre = to_head @ opengl[:, :3, 3:]
+    world_to_camera = torch.eye(4).repeat(len(fov), 1, 1)
+    world_to_camera[:, :3, :3] = axes.mT
+    world_to_camera[:, :3, 3:] = -(axes.mT @ centre)
+    principal = torch.tensor([width / 2, height / 2]).expand(len(fov), 2)
+    cameras = PinholeCameras(
+        world_to_camera, focal_px[:, None].expand(-1, 2), principal, width, height
+    )
+    return cameras, frames_per_second
+
+
+def _rate(described: dict[str, Any], count: int) -> float:
+    """Frames per second, from the path's length where it is not written."""
+    if "fps" in described:
+        return float(described["fps"])
+    return count / max(float(described["seconds"]), 1e-3)
+
+
+def swing(num_frames: int, reach_degrees: float) -> list[float]:
+    """Angles of a calm swing to both sides that ends where it began."""
+    turn = [2 * math.pi * frame / num_frames for frame in range(num_frames)]
+    return [reach_degrees * math.sin(angle) for angle in turn]

@@ -1,0 +1,186 @@
+"use strict";
+/* The head model: theta to posed vertices and to the tangent frames of its triangles. */
+
+const JOINT_FIELDS = ["rotation", "neck", "jaw", "left_eye", "right_eye"];
+
+class Head {
+  /** data: the manifest with arrays; theta's layout, the person's neutral head, its offsets. */
+  constructor(data) {
+    const a = data.arrays;
+    this.parents = data.parents;
+    this.variant = data.variant;
+    this.neutral = a.neutral_vertices;
+    this.skinning = a.skinning_weights;
+    this.joints = a.joints;
+    this.jointDirections = a.joint_directions;
+    this.columns = {
+      start: a.offset_start, vertex: a.offset_vertex, value: a.offset_value, unit: a.offset_unit,
+    };
+    this.triangles = a.triangle_vertices;
+    this.edgesToFrame = a.edges_to_frame;
+    this.restLength = data.scale_with_triangle ? a.rest_length : null;
+    this.numTriangles = this.triangles.length / 3;
+    this.movedByJointsOnly = data.carrier === "joints";
+    this.slices = {};
+    this.linear = [];
+    let start = 0;
+    for (const { name, size, form } of data.layout) {
+      this.slices[name] = [start, size];
+      if (form === "linear") this.linear.push([start, size]);
+      start += size;
+    }
+    this.numExpressions = this.slices.expression[1];
+    this.numEyelids = this.slices.eyelids ? this.slices.eyelids[1] : 0;
+    this.shaped = new Float32Array(this.neutral.length);
+    this.vertices = new Float32Array(this.neutral.length);
+    // T, B, N of each triangle that carries Gaussians, and the rotation that belongs to it.
+    this.frames = new Float32Array(9 * this.numTriangles);
+    this.quaternions = new Float32Array(4 * 1024 * Math.ceil(this.numTriangles / 1024));
+    this.lengthRatio = new Float32Array(this.numTriangles).fill(1);
+  }
+
+  /** Pose the head: fills `vertices`, `frames`, `quaternions` and `lengthRatio`. */
+  pose(theta) {
+    const turns = JOINT_FIELDS.map((name) => {
+      const [start] = this.slices[name];
+      return axisAngleToMatrix(theta[start], theta[start + 1], theta[start + 2]);
+    });
+    const moved = this.movedByJointsOnly ? this._withoutLinear(theta) : theta;
+    this._shape(moved, turns);
+    this._skin(moved, turns);
+    this._frame();
+  }
+
+  /** theta with its expressions and eyelids at rest. */
+  _withoutLinear(theta) {
+    const moved = theta.slice();
+    for (const [start, size] of this.linear) moved.fill(0, start, start + size);
+    return moved;
+  }
+
+  /** Neutral head plus expressions, eyelids and pose correctives, each a sparse column. */
+  _shape(theta, turns) {
+    this.shaped.set(this.neutral);
+    let column = 0;
+    const [expression] = this.slices.expression;
+    for (let i = 0; i < this.numExpressions; i++) this._add(column++, theta[expression + i]);
+    for (let i = 0; i < this.numEyelids; i++) this._add(column++, theta[this.slices.eyelids[0] + i]);
+    if (column === this.columns.start.length - 1) return; // this head has no correctives
+    for (let joint = 1; joint < 5; joint++) {
+      for (let entry = 0; entry < 9; entry++) {
+        this._add(column++, turns[joint][entry] - (entry % 4 === 0 ? 1 : 0));
+      }
+    }
+  }
+
+  _add(column, amount) {
+    if (amount === 0) return;
+    const { start, vertex, value, unit } = this.columns;
+    const factor = amount * unit[column];
+    for (let i = start[column]; i < start[column + 1]; i++) {
+      const place = 3 * vertex[i];
+      this.shaped[place] += factor * value[3 * i];
+      this.shaped[place + 1] += factor * value[3 * i + 1];
+      this.shaped[place + 2] += factor * value[3 * i + 2];
+    }
+  }
+
+  /** Linear blend skinning with five joints that expressions may move. */
+  _skin(theta, turns) {
+    const [expression] = this.slices.expression;
+    const joints = Array.from(this.joints);
+    for (let i = 0; i < this.numExpressions; i++) {
+      const amount = theta[expression + i];
+      for (let j = 0; amount !== 0 && j < 15; j++) {
+        joints[j] += amount * this.jointDirections[15 * i + j];
+      }
+    }
+    // A bone turns about its joint, and then does what its parent does.
+    const rotation = [], shift = [];
+    for (let j = 0; j < 5; j++) {
+      const at = joints.slice(3 * j, 3 * j + 3);
+      const turned = apply3(turns[j], at);
+      const local = [at[0] - turned[0], at[1] - turned[1], at[2] - turned[2]];
+      const parent = this.parents[j];
+      if (parent < 0) {
+        rotation.push(turns[j]);
+        shift.push(local);
+      } else {
+        const above = apply3(rotation[parent], local);
+        rotation.push(multiply3(rotation[parent], turns[j]));
+        shift.push(above.map((value, i) => value + shift[parent][i]));
+      }
+    }
+    const [moved] = this.slices.translation;
+    const m = new Float64Array(12);
+    for (let v = 0; v < this.vertices.length / 3; v++) {
+      m.fill(0);
+      for (let j = 0; j < 5; j++) {
+        const weight = this.skinning[5 * v + j];
+        if (weight === 0) continue;
+        for (let i = 0; i < 9; i++) m[i] += weight * rotation[j][i];
+        for (let i = 0; i < 3; i++) m[9 + i] += weight * shift[j][i];
+      }
+      const x = this.shaped[3 * v], y = this.shaped[3 * v + 1], z = this.shaped[3 * v + 2];
+      for (let i = 0; i < 3; i++) {
+        this.vertices[3 * v + i] = m[3 * i] * x + m[3 * i + 1] * y + m[3 * i + 2] * z + m[9 + i]
+          + theta[moved + i];
+      }
+    }
+  }
+
+  /** Tangent frames: T and B along u and v of the texture map, N the outward normal. */
+  _frame() {
+    const p = this.vertices, frames = this.frames, edges = this.edgesToFrame;
+    for (let f = 0; f < this.numTriangles; f++) {
+      const a = 3 * this.triangles[3 * f];
+      const b = 3 * this.triangles[3 * f + 1];
+      const c = 3 * this.triangles[3 * f + 2];
+      let ux = p[b] - p[a], uy = p[b + 1] - p[a + 1], uz = p[b + 2] - p[a + 2];
+      let vx = p[c] - p[a], vy = p[c + 1] - p[a + 1], vz = p[c + 2] - p[a + 2];
+      let nx = uy * vz - uz * vy, ny = uz * vx - ux * vz, nz = ux * vy - uy * vx;
+      const doubled = Math.sqrt(nx * nx + ny * ny + nz * nz);
+      const squares = (ux * ux + uy * uy + uz * uz) * (vx * vx + vy * vy + vz * vz);
+      if (!(doubled * doubled > 1e-10 * squares + 1e-30)) {
+        // Without area: the world's axes.
+        ux = 1; uy = 0; uz = 0; vx = 0; vy = 1; vz = 0; nx = 0; ny = 0; nz = 1;
+      } else {
+        nx /= doubled; ny /= doubled; nz /= doubled;
+      }
+      if (this.restLength) {
+        this.lengthRatio[f] = Math.sqrt(Math.max(doubled / 2, 1e-16)) / this.restLength[f];
+      }
+      const e0 = edges[4 * f], e1 = edges[4 * f + 1], e2 = edges[4 * f + 2], e3 = edges[4 * f + 3];
+      let tx = e0 * ux + e1 * vx, ty = e0 * uy + e1 * vy, tz = e0 * uz + e1 * vz;
+      let bx = e2 * ux + e3 * vx, by = e2 * uy + e3 * vy, bz = e2 * uz + e3 * vz;
+      if (this.variant !== "raw") {
+        const length = Math.sqrt(tx * tx + ty * ty + tz * tz);
+        tx /= length; ty /= length; tz /= length;
+      }
+      if (this.variant === "orthonormal") {
+        bx = ny * tz - nz * ty; by = nz * tx - nx * tz; bz = nx * ty - ny * tx;
+      } else if (this.variant === "normalized") {
+        const length = Math.sqrt(bx * bx + by * by + bz * bz);
+        bx /= length; by /= length; bz /= length;
+      }
+      const place = 9 * f;
+      frames[place] = tx; frames[place + 1] = ty; frames[place + 2] = tz;
+      frames[place + 3] = bx; frames[place + 4] = by; frames[place + 5] = bz;
+      frames[place + 6] = nx; frames[place + 7] = ny; frames[place + 8] = nz;
+      this._rotation(f, tx, ty, tz, bx, by, bz, nx, ny, nz);
+    }
+  }
+
+  /** The rotation nearest to a frame that keeps N: T and B turned back by 90 degrees, averaged. */
+  _rotation(f, tx, ty, tz, bx, by, bz, nx, ny, nz) {
+    const qx = by * nz - bz * ny, qy = bz * nx - bx * nz, qz = bx * ny - by * nx;
+    const sign = qx * tx + qy * ty + qz * tz < 0 ? -1 : 1;
+    let wx = tx + sign * qx, wy = ty + sign * qy, wz = tz + sign * qz;
+    const off = wx * nx + wy * ny + wz * nz;
+    wx -= off * nx; wy -= off * ny; wz -= off * nz;
+    const length = Math.sqrt(wx * wx + wy * wy + wz * wz);
+    wx /= length; wy /= length; wz /= length;
+    writeQuaternion(this.quaternions, 4 * f, wx, wy, wz,
+      ny * wz - nz * wy, nz * wx - nx * wz, nx * wy - ny * wx, nx, ny, nz);
+  }
+}

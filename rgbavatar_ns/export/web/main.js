@@ -1,0 +1,148 @@
+"use strict";
+/* Glue: state of the page, one picture for each change, `window.rgbavatar` for scripts. */
+
+class App {
+  constructor(data, canvas, message) {
+    this.data = data;
+    this.canvas = canvas;
+    this.message = message;
+    this.head = new Head(data);
+    this.network = new WeightNetwork(data);
+    this.positions = new GaussianPositions(data);
+    this.renderer = new Renderer(canvas, data);
+    this.performance = new RecordedPerformance(data);
+    this.orbit = new OrbitCamera(data.camera, data.centre);
+    this.background = data.background;
+    this.heldWeights = new Map(); // psi that a slider holds, by number
+    this.size = null; // of the picture in pixels, where a script has set it
+    this.theta = this.performance.length ? this.performance.current()
+      : new Array(this.performance.size).fill(0);
+    this.psi = [];
+    this.pictures = 0; // drawn so far
+    this.due = true;
+    this.panel = new Panel(document.getElementById("panel"), this);
+    this.orbit.listen(canvas, () => this.changed());
+    new ResizeObserver(() => this.changed()).observe(canvas);
+    this._last = null;
+    requestAnimationFrame((now) => this._tick(now));
+  }
+
+  /** Have a new picture drawn. */
+  changed() {
+    this.due = true;
+  }
+
+  play(on) {
+    this.performance.playing = on;
+    if (on) this.showFrame(this.performance.place);
+  }
+
+  showFrame(place) {
+    this.performance.place = place;
+    this.theta = this.performance.current();
+  }
+
+  /** Set one number of theta by hand, which stops the performance. */
+  setParameter(place, value) {
+    this.performance.playing = false;
+    this.theta[place] = value;
+    this.changed();
+  }
+
+  setTheta(theta) {
+    this.performance.playing = false;
+    this.theta = Array.from(theta);
+    this.changed();
+  }
+
+  /** Hold a basis weight against the network. */
+  setWeight(k, value) {
+    this.heldWeights.set(k, value);
+    this.changed();
+  }
+
+  releaseWeights() {
+    this.heldWeights.clear();
+    this.changed();
+  }
+
+  /** Fix the picture's size in pixels, whatever the window's. */
+  setSize(width, height) {
+    this.size = [width, height];
+    this.changed();
+  }
+
+  /** Draw now. */
+  draw() {
+    const pixels = window.devicePixelRatio || 1;
+    const [width, height] = this.size || [
+      Math.max(1, Math.round(this.canvas.clientWidth * pixels)),
+      Math.max(1, Math.round(this.canvas.clientHeight * pixels)),
+    ];
+    if (this.canvas.width !== width) this.canvas.width = width;
+    if (this.canvas.height !== height) this.canvas.height = height;
+    const camera = this.orbit.at(width, height);
+    this.psi = this.network.evaluate(this.theta);
+    for (const [k, value] of this.heldWeights) this.psi[k] = value;
+    this.head.pose(this.theta);
+    this.positions.blend(this.psi);
+    this.positions.place(this.head);
+    this.positions.sort(camera);
+    this.renderer.draw(this.positions, this.head, this.psi, camera, this.background);
+    this.panel.show();
+    this.due = false;
+    this.pictures++;
+  }
+
+  savePicture() {
+    this.draw();
+    const link = document.createElement("a");
+    link.download = "avatar.png";
+    link.href = this.canvas.toDataURL("image/png");
+    link.click();
+  }
+
+  _tick(now) {
+    const seconds = this._last === null ? 0 : Math.min((now - this._last) / 1000, 0.25);
+    this._last = now;
+    if (this.performance.playing) {
+      this.performance.advance(seconds);
+      this.theta = this.performance.current();
+      this.due = true;
+    }
+    if (this.due) {
+      this.draw();
+      this._tellRate(now);
+    }
+    requestAnimationFrame((next) => this._tick(next));
+  }
+
+  /** Pictures a second while the performance plays, told twice a second. */
+  _tellRate(now) {
+    if (!this._rateFrom || !this.performance.playing) {
+      this._rateFrom = { now, pictures: this.pictures };
+      if (!this.performance.playing) this.message.textContent = "";
+    } else if (now - this._rateFrom.now > 500) {
+      const rate = (1000 * (this.pictures - this._rateFrom.pictures)) / (now - this._rateFrom.now);
+      this.message.textContent = `${rate.toFixed(0)} pictures/s, `
+        + `${this.data.num_gaussians.toLocaleString("en")} Gaussians`;
+      this._rateFrom = { now, pictures: this.pictures };
+    }
+  }
+}
+
+/** Resolves to the app when the first picture is there. */
+window.rgbavatar = (async () => {
+  const message = document.getElementById("message");
+  try {
+    const data = await loadAvatarData();
+    const app = new App(data, document.getElementById("view"), message);
+    app.draw();
+    message.textContent = "";
+    return app;
+  } catch (error) {
+    message.className = "error";
+    message.textContent = error.message;
+    throw error;
+  }
+})();

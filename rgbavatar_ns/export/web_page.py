@@ -1,0 +1,143 @@
+"""The avatar as one HTML file that plays and drives it in any browser, without a server."""
+
+import base64
+import gzip
+import html
+import json
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from rgbavatar_ns.avatar.avatar import Avatar
+from rgbavatar_ns.export.web_arrays import gaussian_arrays, head_arrays, network_arrays, pack
+from rgbavatar_ns.export.whole_file import whole_file
+from rgbavatar_ns.kernels import PinholeCameras
+
+SCRIPTS = (
+    "data.js",
+    "rotations.js",
+    "head.js",
+    "weights.js",
+    "gaussians.js",
+    "shaders.js",
+    "renderer.js",
+    "camera.js",
+    "performance.js",
+    "panel.js",
+    "main.js",
+)
+"""The page's programs in the order in which they build on one another."""
+
+_LINEAR_RANGE = (-3.0, 3.0)
+_NAMED_RANGE = (0.0, 1.0)
+
+
+@dataclass(frozen=True)
+class PageOptions:
+    """How the page begins."""
+
+    title: str = "Avatar"
+    frames_per_second: float = 25.0
+    """Of the performance."""
+    background: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    """Colour behind the head, each channel in [0, 1]."""
+
+
+def write_web_page(
+    avatar: Avatar,
+    path: Path,
+    camera: PinholeCameras,
+    theta: Float[Tensor, "F H"],
+    options: PageOptions | None = None,
+) -> int:
+    """Write the page and return its size in bytes; nothing in it is loaded from elsewhere.
+
+    camera: where the page's view starts (its first camera). theta: the performance, which may
+    have no frames. The bases are kept in 8 bits with a unit for each component. Raises UserError
+    where the file cannot be written.
+    """
+    options = PageOptions() if options is None else options
+    layers, network = network_arrays(avatar)
+    frames = {"theta": theta.detach().cpu().numpy().astype(np.float32)}
+    directory, block = pack(head_arrays(avatar) | gaussian_arrays(avatar) | network | frames)
+    manifest = _manifest(avatar, camera, theta, options) | {"network": layers, "arrays": directory}
+    text = _assemble(manifest, block, options.title)
+    with whole_file(path) as partial:
+        partial.write_text(text, encoding="utf-8")
+    return len(text)
+
+
+@torch.no_grad()
+def _manifest(
+    avatar: Avatar, camera: PinholeCameras, theta: Float[Tensor, "F H"], options: PageOptions
+) -> dict[str, Any]:
+    config, layout = avatar.config, avatar.layout
+    rest = theta.new_zeros(1, layout.size)
+    vertices = avatar.head(rest.to(avatar.identity), avatar.identity)[0]
+    seen = torch.cat([rest, theta]).to(avatar.identity)
+    expression = seen[:, layout.slice("expression")]
+    names = avatar.head.arrays.expression_names
+    # Blend shapes named after what they do run from 0 to 1; numbered components to both sides.
+    numbered = bool((expression < -0.05).any()) or all(n[-1:].isdigit() for n in names)
+    low, high = _LINEAR_RANGE if numbered else _NAMED_RANGE
+    strength = expression.std(0, unbiased=False)
+    psi = avatar.weights(seen).abs().amax(0)
+    return {
+        "format": "rgbavatar-web",
+        "version": 1,
+        "num_gaussians": avatar.num_gaussians,
+        "num_bases": config.num_bases,
+        "variant": config.tangent_variant,
+        "carrier": config.carrier,
+        "scale_with_triangle": config.scale_with_triangle,
+        "pose_input": config.pose_input,
+        "translation_input": config.translation_input,
+        "layout": layout.to_json(),
+        "parents": [int(parent) for parent in avatar.head.arrays.parents],
+        "expression_names": list(names),
+        "expression_range": [
+            expression.amin(0).clamp(max=low).tolist(),
+            expression.amax(0).clamp(min=high).tolist(),
+        ],
+        "expression_order": torch.argsort(strength, descending=True, stable=True).tolist(),
+        "psi_range": (1.5 * psi).clamp(min=0.1).tolist(),
+        "camera": {
+            "rotation": camera.world_to_camera[0, :3, :3].flatten().tolist(),
+            "translation": camera.world_to_camera[0, :3, 3].tolist(),
+            "focal": camera.focal_px[0].tolist(),
+            "principal": camera.principal_point_px[0].tolist(),
+            "width": camera.width,
+            "height": camera.height,
+        },
+        "centre": vertices.mean(0).tolist(),
+        "background": list(options.background),
+        "frames_per_second": options.frames_per_second,
+    }
+
+
+def _assemble(manifest: dict[str, Any], block: bytes, title: str) -> str:
+    """Fill the page's template; data comes last, so that it cannot be taken for a placeholder."""
+    folder = resources.files("rgbavatar_ns.export") / "web"
+    scripts = "\n".join(
+        f"<script>\n{(folder / name).read_text(encoding='utf-8')}</script>" for name in SCRIPTS
+    )
+    packed = base64.b64encode(gzip.compress(block, compresslevel=6, mtime=0)).decode("ascii")
+    # Within a script element only "</" could end it.
+    described = json.dumps(manifest, allow_nan=False).replace("</", "<\\/")
+    page = (folder / "page.html").read_text(encoding="utf-8")
+    for name, text in {
+        "title": html.escape(title),
+        "style": (folder / "style.css").read_text(encoding="utf-8"),
+        "scripts": scripts,
+        "manifest": described,
+        "payload": packed,
+    }.items():
+        before, after = page.split("{{" + name + "}}")
+        page = before + text + after
+    return page

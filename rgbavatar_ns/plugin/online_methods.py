@@ -1,0 +1,22 @@
+"""The methods that train while the frames arrive: `rgbavatar-online`, `rgbavatar-online-tiny`."""
+
+from nerfstudio.plugins.types import MethodSpecification
+
+from rgbavatar_ns.plugin.methods import preset, tiny_model
+from rgbavatar_ns.plugin.online_pipeline import OnlinePipelineConfig
+from rgbavatar_ns.plugin.online_trainer import OnlineTrainerConfig
+
+rgbavatar_online = MethodSpecification(
+    config=preset(OnlineTrainerConfig, "rgbavatar-online", steps_per_save=500),
+    description="RGBAvatar from a stream: an avatar that grows while the frames arrive.",
+)
+
+rgbavatar_online_tiny = MethodSpecification(
+    config=preset(
+        OnlineTrainerConfig,
+        "rgbavatar-online-tiny",
+        pipeline=OnlinePipelineConfig(model=tiny_model()),
+        steps_per_save=500,
+    ),
+    description="RGBAvatar from a stream with fewer Gaussians: real time on a CPU.",
+)

@@ -1,0 +1,84 @@
+"""Pictures of a folder, in the order of their numbers, whatever depth and channels they have."""
+
+import re
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from rgbavatar_ns.data.png import read_png_rgba
+from rgbavatar_ns.errors import UserError
+
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff")
+_NEVER_ALPHA = (".jpg", ".jpeg", ".bmp")
+
+
+def image_files(folder: Path) -> list[Path]:
+    """The folder's pictures, 2 before 10; other files and hidden ones are passed over."""
+    return sorted(
+        (
+            path
+            for path in folder.iterdir()
+            if path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".")
+        ),
+        key=lambda path: (_natural(path.stem), path.name),
+    )
+
+
+def require_image_files(folder: Path) -> list[Path]:
+    """As `image_files`; UserError where there are none."""
+    files = image_files(folder)
+    if not files:
+        raise UserError(
+            f"{folder} holds no images.", f"Put files ending in {', '.join(IMAGE_SUFFIXES)} there."
+        )
+    return files
+
+
+def read_image_rgba(path: Path) -> UInt8[np.ndarray, "H W 4"]:
+    """Decode a picture, turned as its EXIF data asks; opaque where it has no alpha.
+
+    Grey becomes RGB, 16 bit become 8. Raises UserError for what is damaged or floating point.
+    """
+    if path.suffix.lower() == ".png":
+        return read_png_rgba(path)
+    try:
+        encoded = np.fromfile(path, np.uint8)
+    except OSError as error:
+        raise UserError(f"{path} cannot be read: {error.strerror}.", "Check the file.") from None
+    decoded = None
+    if encoded.size and path.suffix.lower() not in _NEVER_ALPHA:
+        decoded = cv2.imdecode(encoded, cv2.IMREAD_UNCHANGED)
+    if encoded.size and (decoded is None or decoded.ndim == 2 or decoded.shape[2] != 4):
+        # This way of reading drops alpha, but heeds the orientation that cameras note down.
+        decoded = cv2.imdecode(encoded, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
+    if decoded is None:
+        raise UserError(f"{path} cannot be decoded as an image.", "Remove or replace it.")
+    if decoded.dtype not in (np.uint8, np.uint16):
+        raise UserError(
+            f"{path} holds {decoded.dtype} values.", "Store pictures with 8 or 16 bits a channel."
+        )
+    turn = cv2.COLOR_BGRA2RGBA if decoded.shape[2] == 4 else cv2.COLOR_BGR2RGBA
+    rgba = cv2.cvtColor(decoded, turn)
+    if rgba.dtype == np.uint16:
+        rgba = (rgba.astype(np.uint32) + 128) // 257
+    return rgba.astype(np.uint8)
+
+
+def fitted_size(width: int, height: int, max_side: int | None) -> tuple[int, int]:
+    """The same shape with its longer side at most `max_side` pixels."""
+    shrink = 1.0 if max_side is None else min(1.0, max_side / max(width, height))
+    return max(1, round(width * shrink)), max(1, round(height * shrink))
+
+
+def last_number(path: Path) -> int | None:
+    """The last number in a file's name: 12 for cam1_frame_0012.png."""
+    numbers = re.findall(r"\d+", path.stem)
+    return int(numbers[-1]) if numbers else None
+
+
+def _natural(text: str) -> list[tuple[int, str]]:
+    return [
+        (int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"([0-9]+)", text)
+    ]

@@ -1,0 +1,208 @@
+"""The tracker for a stream: one frame in, one tracked frame out."""
+
+from collections import Counter
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from types import TracebackType
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from threadpoolctl import threadpool_limits
+from torch import Tensor
+
+from rgbavatar_ns.data import TrackedFrame
+from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.head import HeadModel
+from rgbavatar_ns.tracking.config import TrackConfig
+from rgbavatar_ns.tracking.fit import ClipFit, SubjectFit, fit_frame, rigid_start
+from rgbavatar_ns.tracking.following_crop import FollowingCrop
+from rgbavatar_ns.tracking.head_picture import HeadPicture, MattedCrop
+from rgbavatar_ns.tracking.landmarks import FaceLandmarker
+from rgbavatar_ns.tracking.pictures import pinhole
+from rgbavatar_ns.tracking.subject import SubjectTracker
+
+# Share of a clip's pull to both neighbours: a stream has only the past, and must not lag.
+_CAUSAL_SHARE = 0.25
+_ITERATIONS, _ITERATIONS_ANEW = 4, 25
+
+_Values = Float[np.ndarray, "P"]
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """A frame of the warm-up, kept until the subject is known."""
+
+    index: int
+    image_rgb: UInt8[np.ndarray, "H W 3"]
+    landmarks_px: Float[np.ndarray, "478 2"]
+
+
+class LiveTracker:
+    """Follows one person in a stream, with the models and the fit of `track_video`.
+
+    The first `config.key_frames` frames that show the face give identity, focal length and crop:
+    until then `ready` is False and calls return None. `backlog` hands these frames out afterwards,
+    tracked, so that none is lost. Every later call fits one frame, starting from the one before
+    and drawn a little towards it. The square that is cut out stays where it is until the head
+    leaves it; each frame carries its own camera. The result depends on the frames alone.
+
+    Use as a context manager, or call `close`. `counts` says how many frames were "tracked", had
+    "no face", or a head that "does not fit".
+    """
+
+    def __init__(self, config: TrackConfig | None = None) -> None:
+        self._config = config or TrackConfig(image_size=512)
+        self.head = HeadModel.embedded(dtype=torch.float64)
+        self._tracker = SubjectTracker(self.head, self._config)
+        self._landmarker = FaceLandmarker()
+        self._picture = HeadPicture(self.head.arrays, self._config.keep_torso)
+        self._worker = ThreadPoolExecutor(1, "rgbavatar-matte")
+        self._warm_up: list[_Seen] = []
+        self._backlog: list[TrackedFrame] = []
+        self._fit: _CausalFit | None = None
+        self._crop: FollowingCrop | None = None
+        self._size: tuple[int, int] | None = None
+        self._next_index = 0
+        self.counts: Counter[str] = Counter()
+
+    def __enter__(self) -> "LiveTracker":
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        value: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Free mediapipe's graphs and the worker thread."""
+        self._worker.shutdown()
+        self._landmarker.__exit__(None, None, None)
+        self._picture.__exit__(None, None, None)
+
+    @property
+    def ready(self) -> bool:
+        """Whether the subject is known and frames are tracked."""
+        return self._fit is not None
+
+    @property
+    def identity(self) -> Float[Tensor, "I"]:
+        """The subject's identity coefficients; RuntimeError before `ready`."""
+        if self._fit is None:
+            raise RuntimeError("The subject is not known before the warm-up's end (`ready`).")
+        return torch.from_numpy(self._fit.subject.identity).float()
+
+    def backlog(self) -> list[TrackedFrame]:
+        """The tracked frames of the warm-up, once: a second call gives an empty list."""
+        taken, self._backlog = self._backlog, []
+        return taken
+
+    def __call__(
+        self, image_rgb: UInt8[np.ndarray, "H W 3"], index: int | None = None
+    ) -> TrackedFrame | None:
+        """Track one frame; None without a usable face, and during the warm-up.
+
+        `index` numbers the frame; without it frames are counted from 0. Raises UserError when the
+        frames' size changes: they share a camera.
+        """
+        index = self._next_index if index is None else index
+        self._next_index = index + 1
+        self._require_size(image_rgb.shape[1], image_rgb.shape[0])
+        # Small matrices: more threads would only wait for each other.
+        with threadpool_limits(1, user_api="blas"):
+            if self._fit is None or self._crop is None:
+                self._collect(index, image_rgb)
+                return None
+            square = self._crop.square
+            matted = self._worker.submit(self._picture.matted, image_rgb, square)
+            landmarks = self._landmarker(image_rgb)
+            if landmarks is None:
+                self._fit.forget()
+                self.counts["no face"] += 1
+                return None
+            frame = self._tracked(self._fit, index, landmarks, matted.result)
+            self._crop.follow(landmarks)
+            return frame
+
+    def _require_size(self, width: int, height: int) -> None:
+        if self._size is not None and self._size != (width, height):
+            raise UserError(
+                f"The stream's frames changed from {self._size[0]} x {self._size[1]} "
+                f"to {width} x {height} pixels.",
+                "Keep one size, or start a new tracker: all frames share a camera.",
+            )
+        self._size = (width, height)
+
+    def _collect(self, index: int, image_rgb: UInt8[np.ndarray, "H W 3"]) -> None:
+        landmarks = self._landmarker(image_rgb)
+        if landmarks is None:
+            self.counts["no face"] += 1
+            return
+        self._warm_up.append(_Seen(index, image_rgb.copy(), landmarks))
+        if len(self._warm_up) >= self._config.key_frames:
+            self._meet()
+
+    def _meet(self) -> None:
+        """Fit the subject to the warm-up's frames, then track these."""
+        seen, self._warm_up = self._warm_up, []
+        landmarks = np.stack([one.landmarks_px for one in seen])
+        height, width = seen[0].image_rgb.shape[:2]
+        self._fit = _CausalFit(self._tracker, self._tracker.meet(landmarks, width, height))
+        self._crop = FollowingCrop.around(landmarks, width, height, self._config.image_size)
+        for one in seen:
+            matted = self._picture.matted(one.image_rgb, self._crop.square)
+            frame = self._tracked(self._fit, one.index, one.landmarks_px, lambda m=matted: m)
+            if frame is not None:
+                self._backlog.append(frame)
+
+    def _tracked(
+        self,
+        fit: "_CausalFit",
+        index: int,
+        landmarks_px: Float[np.ndarray, "478 2"],
+        matted: Callable[[], MattedCrop],
+    ) -> TrackedFrame | None:
+        """Fit the head, then cut it out of what `matted` waits for."""
+        values = fit(landmarks_px)
+        cut = matted()
+        if values is None:
+            self.counts["does not fit"] += 1
+            return None
+        one = ClipFit(fit.subject, values[None])
+        rgba = self._picture.rgba(cut, self._tracker.vertices_px(one, 0), landmarks_px)
+        crop = cut.crop
+        camera = fit.subject.camera.cropped(crop.left, crop.top, crop.scale)
+        theta = torch.from_numpy(self._tracker.thetas(one)[0]).float()
+        self.counts["tracked"] += 1
+        return TrackedFrame(index, theta, pinhole(camera, crop.size), rgba)
+
+
+class _CausalFit:
+    """Fits one frame after the other for a known subject."""
+
+    def __init__(self, tracker: SubjectTracker, subject: SubjectFit) -> None:
+        self.subject = subject
+        self._tracker = tracker
+        head = tracker.cost.head.of_person(subject.identity)
+        self._cost = replace(tracker.cost, head=head)
+        self._weight = _CAUSAL_SHARE * tracker.config.temporal_weight
+        self._previous: _Values | None = None
+
+    def forget(self) -> None:
+        """A gap: the next frame starts anew."""
+        self._previous = None
+
+    def __call__(self, landmarks_px: Float[np.ndarray, "478 2"]) -> Float[np.ndarray, "P"] | None:
+        """The frame's fitted entries of theta; None where no pose of the head explains it."""
+        camera, before = self.subject.camera, self._previous
+        target = self._tracker.targets(landmarks_px[None])[0]
+        start = rigid_start(self._cost, camera, target) if before is None else before
+        iterations = _ITERATIONS_ANEW if before is None else _ITERATIONS
+        values = fit_frame(self._cost, camera, target, start, before, self._weight, iterations)
+        lost = self._tracker.rejected(ClipFit(self.subject, values[None]), landmarks_px[None])
+        self._previous = None if lost else values
+        return self._previous

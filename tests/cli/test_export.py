@@ -1,0 +1,90 @@
+"""`rgbavatar export`: each format opens elsewhere, mistakes are told."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from plyfile import PlyData
+
+from rgbavatar_ns import Avatar
+from rgbavatar_ns.avatar.bundle import load_statistics
+from rgbavatar_ns.cli import main as cli
+from rgbavatar_ns.data import load_dataset
+from tests.data.small_dataset import NUM_FRAMES, NUM_TEST, small_dataset
+from tests.export.subject import avatar_of
+
+
+@pytest.fixture(scope="module")
+def bundle(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("avatar") / "me"
+    avatar_of().save(folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("data") / "own"
+    small_dataset(folder, avatar_of().head)
+    return folder
+
+
+def _export(*words: object) -> None:
+    cli.main(["export", *map(str, words)])
+
+
+def test_a_bundle_gets_statistics_of_the_training_frames_and_passes_them_on(bundle, data, tmp_path):
+    _export(bundle, tmp_path / "first", "--data", data)
+    _export(tmp_path / "first", tmp_path / "second", "--no-head-inside")
+    seen = load_statistics(tmp_path / "second")
+    assert seen is not None
+    dataset = load_dataset(data)
+    theta = dataset.theta[list(dataset.train)]
+    assert seen.num_frames == NUM_FRAMES - NUM_TEST
+    assert torch.allclose(seen.theta_max, theta.amax(0))
+    first, second = (Avatar.load(place) for place in (bundle, tmp_path / "second"))
+    with torch.no_grad():
+        assert torch.allclose(seen.psi_mean, first.weights(theta).mean(0))
+        one, other = first.gaussians(theta[:1]), second.gaussians(theta[:1])
+    assert torch.equal(one.means, other.means)
+
+
+def test_a_ply_of_a_frame_and_of_the_head_at_rest(bundle, data, tmp_path):
+    _export(bundle, tmp_path / "rest.ply", "--format", "ply")
+    _export(bundle, tmp_path / "frame.ply", "--format", "ply", "--data", data, "--frame", 2)
+    avatar, dataset = Avatar.load(bundle), load_dataset(data)
+    for name, theta in (
+        ("rest", torch.zeros(1, avatar.layout.size)),
+        ("frame", dataset.theta[2:3]),
+    ):
+        vertex = PlyData.read(str(tmp_path / f"{name}.ply"))["vertex"]
+        with torch.no_grad():
+            expected = avatar.gaussians(theta).means[0].numpy()
+        np.testing.assert_allclose(np.stack([vertex[a] for a in "xyz"], 1), expected)
+
+
+def test_a_sequence_has_a_file_for_each_frame(bundle, data, tmp_path):
+    words = ["--format", "ply-sequence", "--data", data, "--frames", 2, 4]
+    _export(bundle, tmp_path / "film", *words)
+    assert sorted(p.name for p in (tmp_path / "film").iterdir()) == ["00002.ply", "00003.ply"]
+
+
+def test_a_page_with_and_without_a_performance(bundle, data, tmp_path):
+    _export(bundle, tmp_path / "still.html", "--format", "web")
+    _export(bundle, tmp_path / "film.html", "--format", "web", "--data", data, "--title", "Me")
+    assert "<title>Me</title>" in (tmp_path / "film.html").read_text()
+    assert '"theta": {"dtype": "float32"' in (tmp_path / "still.html").read_text()
+
+
+def test_mistakes_are_told(bundle, data, tmp_path, capsys):
+    for words, told in (
+        ([tmp_path / "none", tmp_path / "out"], "There is no"),
+        ([bundle, tmp_path / "a.ply", "--format", "ply", "--frame", 1], "--data"),
+        ([bundle, tmp_path / "out", "--format", "ply-sequence"], "--data"),
+        ([bundle, tmp_path / "a", "--format", "ply", "--data", data, "--frame", 99], "no frames"),
+        ([bundle, data], "not an avatar bundle"),
+    ):
+        with pytest.raises(SystemExit) as ended:
+            _export(*words)
+        assert ended.value.code == 1
+        assert told in capsys.readouterr().err

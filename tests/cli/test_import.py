@@ -1,0 +1,98 @@
+"""`rgbavatar import` and `demo-data --format` as commands."""
+
+import json
+import os
+from pathlib import Path
+
+import pytest
+
+from rgbavatar_ns.cli import main as cli
+from rgbavatar_ns.data import load_dataset
+from rgbavatar_ns.data.exporters.folders import VhapWriter
+from rgbavatar_ns.head.synthetic_flame import write_synthetic_flame
+from tests.data.importers.takes import NUM_FRAMES, NUM_TEST, make_take
+
+
+@pytest.fixture(scope="module")
+def vhap(tmp_path_factory) -> tuple[Path, Path]:
+    """A folder as VHAP exports it, and its FLAME."""
+    folder = tmp_path_factory.mktemp("vhap")
+    write_synthetic_flame(folder / "flame", "2023")
+    take, frames = make_take(folder / "flame", "2023", False)
+    writer = VhapWriter(folder / "data", take)
+    for frame in frames:
+        writer.add(frame)
+    writer.finish()
+    return folder / "data", folder / "flame"
+
+
+def test_import_tells_what_it_found_and_goes_on_after_an_interruption(
+    vhap, tmp_path, capsys, monkeypatch
+):
+    data, flame = vhap
+    arguments = ["import", str(data), str(tmp_path / "set"), "--flame", str(flame)]
+    from rgbavatar_ns.data.importers import convert
+
+    make_png, calls = convert.make_png, []
+
+    def interrupted(picture, size):
+        calls.append(picture)
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        return make_png(picture, size)
+
+    monkeypatch.setattr(convert, "make_png", interrupted)
+    monkeypatch.setattr(os, "cpu_count", lambda: 1)
+    with pytest.raises(SystemExit) as ended:
+        cli.main(arguments)
+    assert ended.value.code == 130
+    assert not (tmp_path / "set/dataset.json").exists()
+    done = {path.name: path.stat().st_mtime_ns for path in (tmp_path / "set/images").iterdir()}
+    assert 2 <= len(done) < NUM_FRAMES  # the next one may have begun already
+    calls.clear()
+    monkeypatch.setattr(
+        convert, "make_png", lambda picture, size: calls.append(picture) or make_png(picture, size)
+    )
+    capsys.readouterr()
+    cli.main(arguments)
+    told = capsys.readouterr().out
+    assert len(calls) == NUM_FRAMES - len(done)
+    assert "recognised: VHAP, head FLAME 2023" in told
+    assert f"{NUM_FRAMES - NUM_TEST} frames to train on, {NUM_TEST} held out" in told
+    for name, time in done.items():
+        assert (tmp_path / "set/images" / name).stat().st_mtime_ns == time
+    assert json.loads((tmp_path / "set/dataset.json").read_text())["version"] == 2
+    assert len(load_dataset(tmp_path / "set").arrays.v_template) == 5023 + 120
+
+
+def test_another_source_does_not_go_into_a_full_folder(vhap, tmp_path, capsys):
+    data, flame = vhap
+    (tmp_path / "something").write_text("else")
+    with pytest.raises(SystemExit) as ended:
+        cli.main(["import", str(data), str(tmp_path), "--flame", str(flame)])
+    assert ended.value.code == 1
+    assert "not empty" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        cli.main(["import", str(tmp_path), str(tmp_path / "set")])
+    assert "in none of the formats" in capsys.readouterr().err
+
+
+def test_without_flame_it_says_where_to_get_it(vhap, tmp_path, capsys, monkeypatch):
+    monkeypatch.delenv("RGBAVATAR_FLAME", raising=False)
+    with pytest.raises(SystemExit):
+        cli.main(["import", str(vhap[0]), str(tmp_path / "set")])
+    told = capsys.readouterr().err
+    assert "--flame" in told
+    assert "RGBAVATAR_FLAME" in told
+
+
+@pytest.mark.slow
+def test_demo_data_of_another_format_says_how_to_train(tmp_path, capsys):
+    options = ["--image-size", "24", "--num-frames", "2", "--num-test-frames", "1"]
+    folder = tmp_path / "data"
+    cli.main(["demo-data", str(folder), "--format", "vhap", "--supersampling", "1", *options])
+    told = capsys.readouterr().out
+    assert f"ns-train rgbavatar-tiny --data {folder}" in told
+    flame = next((folder / "flame_model").rglob("*.pkl"))
+    assert f"RGBAVATAR_FLAME={flame}" in told
+    assert len(list((folder / "images").iterdir())) == 2

@@ -1,0 +1,179 @@
+"""`rgbavatar render` on a small avatar: what is asked for is written, mistakes are told."""
+
+import json
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from rgbavatar_ns.cli import main as cli
+from rgbavatar_ns.data import DatasetWriter, TrackedFrame
+from rgbavatar_ns.data.png import read_png_rgba
+from rgbavatar_ns.export import front_camera, pictures
+from rgbavatar_ns.head.synthetic_flame import write_synthetic_flame
+from tests.export.subject import avatar_of, lively_theta
+
+_SIZE, _FRAMES, _HELD_OUT = 32, 7, 3
+
+
+@pytest.fixture(scope="module")
+def bundle(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("avatar") / "me"
+    avatar_of().save(folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory) -> Path:
+    """The avatar's own dataset: pictures of itself."""
+    return _write_dataset(tmp_path_factory.mktemp("data") / "own", seed=0)
+
+
+def _write_dataset(folder: Path, seed: int) -> Path:
+    avatar = avatar_of(seed)
+    theta, camera = lively_theta(avatar, _FRAMES, seed), front_camera(avatar, _SIZE, _SIZE)
+    layout = avatar.layout
+    writer = DatasetWriter(folder, "makehuman", avatar.identity, layout, _SIZE, _SIZE)
+    for index, image in enumerate(pictures(avatar, theta, camera, None)):
+        writer.add(TrackedFrame(index, theta[index], camera, image))
+    writer.finish(_HELD_OUT)
+    return folder
+
+
+def _render(*words: object) -> None:
+    cli.main(["render", *map(str, words)])
+
+
+def _told(capsys, *words: object) -> str:
+    with pytest.raises(SystemExit) as ended:
+        _render(*words)
+    assert ended.value.code == 1
+    told = capsys.readouterr().err
+    assert "Traceback" not in told
+    return told
+
+
+def _film(path: Path) -> list[np.ndarray]:
+    with av.open(str(path)) as container:
+        return [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+
+
+def test_held_out_frames_beside_truth_and_error(bundle, data, tmp_path, capsys):
+    _render(bundle, tmp_path, "--data", data)
+    film = _film(tmp_path / "comparison.mp4")
+    assert len(film) == _HELD_OUT
+    truth, avatar, error = np.split(film[0].astype(int), 3, axis=1)
+    # The dataset shows the avatar itself, so that there is no error but the codec's.
+    assert np.abs(truth - avatar).mean() < 6
+    assert error.mean() < 24
+    assert cv2.imread(str(tmp_path / "comparison.png")).shape == (3 * _SIZE, 3 * _SIZE, 3)
+    assert "3 frames" in capsys.readouterr().out
+
+
+def test_pngs_of_any_size_keep_the_alpha(bundle, data, tmp_path):
+    words = ["--show", "performance", "--transparent", "--kind", "png", "--frames", 1, 3]
+    _render(bundle, tmp_path, "--data", data, *words, "--width", 50, "--height", 40)
+    files = sorted(tmp_path.rglob("*.png"))
+    assert [str(f.relative_to(tmp_path)) for f in files] == [
+        "performance/00000.png",
+        "performance/00001.png",
+    ]
+    picture = read_png_rgba(files[0])
+    assert picture.shape == (40, 50, 4)
+    assert (picture[0, 0, 3], picture[..., 3].max()) == (0, 255)
+
+
+def test_views_orbit_and_turntable(bundle, data, tmp_path):
+    common = ["--data", data, "--width", 24, "--height", 24]
+    _render(bundle, tmp_path, *common, "--show", "views", "--hold", 1, "--kind", "png")
+    views = read_png_rgba(tmp_path / "views" / "00000.png")
+    assert views.shape == (24, 4 * 24, 4)
+    _render(bundle, tmp_path, *common, "--show", "orbit")
+    assert len(_film(tmp_path / "orbit.mp4")) == _HELD_OUT
+    _render(bundle, tmp_path, *common, "--show", "turntable")
+    turn = _film(tmp_path / "turntable.gif")
+    assert len(turn) == 72
+    assert np.abs(turn[0].astype(int) - turn[36]).max() > 100, "front and back differ"
+    assert np.abs(turn[0].astype(int) - turn[71]).mean() < 12, "the circle closes"
+    _render(bundle, tmp_path, *common, "--show", "turntable", "--arc", 60)
+    swing = _film(tmp_path / "turntable.gif")
+    assert np.abs(swing[0].astype(int) - swing[36]).max() < 40, "to and fro passes the middle"
+    assert np.abs(swing[18].astype(int) - swing[54]).max() > 60
+
+
+def test_a_camera_path_sets_size_rate_and_length(bundle, data, tmp_path):
+    pose = torch.eye(4)
+    pose[:3, 3] = torch.tensor([0.0, 0.0, 1.0])
+    poses = [{"camera_to_world": pose.flatten().tolist(), "fov": 30, "aspect": 1}] * 5
+    described = {"render_height": 20, "render_width": 30, "fps": 12, "seconds": 1}
+    path = tmp_path / "path.json"
+    path.write_text(json.dumps(described | {"camera_path": poses}))
+    words = ["--data", data, "--show", "camera-path", "--camera-path", path]
+    _render(bundle, tmp_path, *words)
+    film = _film(tmp_path / "camera-path.mp4")
+    assert len(film) == 5
+    assert film[0].shape == (20, 30, 3)
+
+
+def test_the_grid_of_bases(bundle, data, tmp_path):
+    _render(bundle, tmp_path, "--data", data, "--show", "bases")
+    assert cv2.imread(str(tmp_path / "bases.png")).shape == (_SIZE, 5 * _SIZE, 3)
+
+
+def test_another_person_drives_the_avatar_and_is_shown_beside(bundle, data, tmp_path, capsys):
+    driver = _write_dataset(tmp_path / "driver", seed=1)
+    words = ["--data", data, "--show", "performance", "--driver", driver, "--smooth", "--project"]
+    _render(bundle, tmp_path, *words)
+    film = _film(tmp_path / "performance.mp4")
+    assert len(film) == _FRAMES
+    assert film[0].shape == (_SIZE, 2 * _SIZE, 3)
+    assert "left out" not in capsys.readouterr().out
+
+
+def test_a_bundle_with_statistics_needs_no_dataset(bundle, data, tmp_path, capsys):
+    cli.main(["export", str(bundle), str(tmp_path / "me"), "--data", str(data)])
+    words = ["--show", "views", "--kind", "png", "--width", 20, "--height", 20]
+    _render(tmp_path / "me", tmp_path, *words)
+    views = read_png_rgba(tmp_path / "views" / "00000.png")
+    assert views.shape == (20, 80, 4)
+    assert views[..., :3].std() > 20
+    _render(tmp_path / "me", tmp_path, "--driver", data, "--frames", 0, 2)
+    assert len(_film(tmp_path / "performance.mp4")) == 2
+    assert "own dataset" in _told(capsys, tmp_path / "me", tmp_path)
+
+
+def test_mistakes_are_told(bundle, data, tmp_path, capsys):
+    assert "does not name its dataset" in _told(capsys, bundle, tmp_path)
+    transparent = [bundle, tmp_path, "--data", data, "--show", "orbit", "--transparent"]
+    assert "--kind png" in _told(capsys, *transparent)
+    frames = [bundle, tmp_path, "--data", data, "--frames", 5, 9]
+    assert "no frames 5 to 9" in _told(capsys, *frames)
+    hold = [bundle, tmp_path, "--data", data, "--show", "views", "--hold", 7]
+    assert "no frame 7 to hold" in _told(capsys, *hold)
+    path = [bundle, tmp_path, "--data", data, "--show", "camera-path"]
+    assert "--camera-path" in _told(capsys, *path)
+    size = [bundle, tmp_path, "--data", data, "--width", 0]
+    assert "must be positive" in _told(capsys, *size)
+
+
+def test_a_driver_of_another_head_without_a_common_expression_is_refused(
+    bundle, data, tmp_path, capsys
+):
+    from rgbavatar_ns.head import HeadModel
+    from rgbavatar_ns.head.flame import load_flame
+
+    pickle = write_synthetic_flame(tmp_path / "models")
+    head = HeadModel(load_flame(pickle, num_identity=2, num_expressions=4, teeth=False))
+    camera = front_camera(avatar_of(), _SIZE, _SIZE)
+    driver = tmp_path / "driver"
+    writer = DatasetWriter(driver, head.arrays, torch.zeros(2), head.layout, _SIZE, _SIZE)
+    image = np.zeros((_SIZE, _SIZE, 4), np.uint8)
+    writer.add(TrackedFrame(0, torch.zeros(head.layout.size), camera, image))
+    writer.finish(0)
+    words = ["--data", data, "--show", "performance", "--driver", driver]
+    told = _told(capsys, bundle, tmp_path / "out", *words)
+    assert "expression_0" in told
+    assert "browDownLeft" in told

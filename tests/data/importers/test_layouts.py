@@ -1,0 +1,193 @@
+"""The folders of systems that share `.frame` files, FlashAvatar's places, VHAP's raw output."""
+
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from rgbavatar_ns.data.importers import ImportOptions, find_format, read_source
+from rgbavatar_ns.data.importers.pictures import make_png
+from rgbavatar_ns.data.png import decode_png_rgba
+from rgbavatar_ns.errors import UserError
+from tests.data.importers.takes import FIRST, HEIGHT, NUM_FRAMES, WIDTH
+from tests.data.importers.test_round_trips import assert_same_views, write
+
+
+@pytest.fixture
+def options(flame_folder) -> ImportOptions:
+    return ImportOptions(flame=flame_folder, teeth=False)
+
+
+@pytest.fixture
+def frame_folder(tmp_path, takes) -> Path:
+    """`checkpoint` and `images` alone."""
+    folder = tmp_path / "subject"
+    write(folder, "insta", takes)
+    for path in folder.glob("transforms*.json"):
+        path.unlink()
+    for name in ("meshes", "flame"):
+        shutil.rmtree(folder / name)
+    return folder
+
+
+def image(source, position: int) -> np.ndarray:
+    png = make_png(source.pictures[position], (WIDTH, HEIGHT)).encoded
+    return decode_png_rgba(png, "")
+
+
+def test_rgbavatars_own_folder_is_paired_in_order(frame_folder, options, takes):
+    take, frames = takes("2020", True)
+    source = read_source(frame_folder, options)
+    assert source.format == "RGBAvatar"
+    assert_same_views(take, frames, source)
+    third = image(source, 2)
+    for path in sorted((frame_folder / "images").iterdir()):
+        path.rename(path.with_name(f"shot{int(path.stem) + 100}.png"))
+    moved = read_source(frame_folder, options)
+    assert torch.equal(moved.theta, source.theta)
+    assert np.array_equal(image(moved, 2), third)
+    assert any("paired in order" in note for note in moved.notes)
+    (frame_folder / "images/shot103.png").unlink()
+    with pytest.raises(UserError, match="without a record"):
+        read_source(frame_folder, options)
+
+
+def test_gaussian_blendshapes_and_nerf_blend_shape(frame_folder, options, takes):
+    take, frames = takes("2020", True)
+    (frame_folder / "canonical.obj").write_text("v 0 0 0\n")
+    source = read_source(frame_folder, options)
+    assert source.format == "GaussianBlendshapes"
+    assert_same_views(take, frames, source)
+    assert "last 350" in source.notes[-1]
+    masks = frame_folder / "image_mask"
+    masks.mkdir()
+    (frame_folder / "bc.jpg").write_bytes(b"")
+    for frame in frames:
+        mask = np.full((HEIGHT, WIDTH), 10 * frame.index, np.uint8)
+        cv2.imwrite(str(masks / f"mask_{frame.index:05d}.png"), mask)
+    source = read_source(frame_folder, options)
+    assert source.format == "NeRFBlendShape"
+    assert "last 500" in source.notes[-1]
+    assert (image(source, 1)[..., 3] == 10 * (FIRST + 1)).all()
+
+
+def test_held_out_frames_can_be_counted(frame_folder, options):
+    source = read_source(frame_folder, ImportOptions(flame=options.flame, test_frames=4))
+    assert source.test == frozenset(range(FIRST + NUM_FRAMES - 4, FIRST + NUM_FRAMES))
+    with pytest.raises(UserError, match="6 cannot be held out"):
+        read_source(frame_folder, ImportOptions(flame=options.flame, test_frames=6))
+
+
+def test_flashavatar_beside_its_tracker_and_from_above(tmp_path, options, takes):
+    take, frames = write(tmp_path / "dataset" / "obama", "flashavatar", takes)
+    output = tmp_path / "metrical-tracker/output"
+    output.mkdir(parents=True)
+    shutil.move(tmp_path / "dataset/obama/metrical-tracker/output/obama", output / "obama")
+    for folder in (tmp_path, tmp_path / "dataset/obama"):
+        source = read_source(folder, options)
+        assert source.format == "FlashAvatar"
+        assert_same_views(take, frames, source)
+        assert source.pictures[0].color.name == f"{FIRST + 1:05d}.jpg"
+    (tmp_path / "dataset/other/imgs").mkdir(parents=True)
+    with pytest.raises(UserError, match="2 subjects"):
+        read_source(tmp_path, options)
+
+
+def test_flashavatars_parsing_masks_cut_the_matte(tmp_path, options, takes):
+    write(tmp_path / "data", "flashavatar", takes)
+    mask = np.zeros((HEIGHT, WIDTH), np.uint8)
+    for number in range(FIRST + 1, FIRST + 1 + NUM_FRAMES):
+        mask[:, : WIDTH // 2] = 255
+        cv2.imwrite(str(tmp_path / f"data/parsing/{number:05d}_neckhead.png"), mask)
+        cv2.imwrite(str(tmp_path / f"data/parsing/{number:05d}_mouth.png"), np.zeros_like(mask))
+    whole = read_source(tmp_path / "data", options)
+    head = read_source(
+        tmp_path / "data", ImportOptions(options.format, options.flame, region="head")
+    )
+    alpha, cut = image(whole, 0)[..., 3], image(head, 0)[..., 3]
+    assert np.array_equal(cut[:, : WIDTH // 2], alpha[:, : WIDTH // 2])
+    assert not cut[:, WIDTH // 2 :].any()
+    assert alpha[:, WIDTH // 2 :].any()
+
+
+def test_vhaps_raw_output(tmp_path, options, takes):
+    _, frames = write(tmp_path / "export", "vhap", takes)
+    raw = tmp_path / "raw"
+    (raw / "images").mkdir(parents=True)
+    (raw / "fg_masks").mkdir()
+    columns: dict[str, list[np.ndarray]] = {}
+    for frame in frames:
+        name = f"{frame.index:05d}"
+        for kind in ("images", "fg_masks"):
+            shutil.copy(tmp_path / f"export/{kind}/{name}_00.png", raw / f"{kind}/{name}.png")
+        with np.load(tmp_path / f"export/flame_param/{name}.npz") as values:
+            for key in values.files:
+                columns.setdefault(key, []).append(values[key])
+    stacked = {
+        key: column[0] if key in ("shape", "static_offset") else np.concatenate(column)
+        for key, column in columns.items()
+    }
+    stacked["timestep_id"] = np.array([f"{frame.index:05d}" for frame in frames])
+    stacked["focal_length"] = np.array([1.5])
+    np.savez(raw / "tracked_flame_params_0.npz", **{**stacked, "expr": stacked["expr"] * 0})
+    np.savez(raw / "tracked_flame_params_30.npz", **stacked)
+    source = read_source(raw, options)
+    exported = read_source(tmp_path / "export", options)
+    assert torch.equal(source.theta, exported.theta)
+    assert np.array_equal(image(source, 3), image(exported, 3))
+    assert torch.equal(source.cameras.focal_px, torch.full((NUM_FRAMES, 2), 1.5 * WIDTH))
+    # A point .1 m to the right of and .2 m above the head's origin, which is 1 m ahead.
+    seen = source.cameras.world_to_camera[0] @ torch.tensor([0.1, 0.2, 0.0, 1.0])
+    assert torch.allclose(seen, torch.tensor([0.1, -0.2, 1.0, 1.0]))
+    del stacked["focal_length"]
+    np.savez(raw / "tracked_flame_params_30.npz", **stacked)
+    with pytest.raises(UserError, match="calibrated"):
+        read_source(raw, options)
+
+
+def test_vhaps_static_offset_is_the_subjects_head_at_rest(tmp_path, options, takes):
+    take, _ = write(tmp_path / "export", "vhap", takes)
+    offset = np.random.default_rng(3).normal(0, 1e-3, (1, 5143, 3)).astype(np.float32)
+    changed: dict[str, np.ndarray] = {}
+    for path in (tmp_path / "export/flame_param").iterdir():
+        with np.load(path) as values:
+            changed = {**values, "static_offset": offset}
+        np.savez(path, **changed)
+    source = read_source(tmp_path / "export", options)
+    assert np.allclose(source.arrays.v_template, take.arrays.v_template + offset[0, :5023])
+    with_teeth = read_source(tmp_path / "export", ImportOptions(flame=options.flame))
+    assert len(with_teeth.arrays.v_template) == 5143
+    path = tmp_path / f"export/flame_param/{FIRST + 1:05d}.npz"
+    np.savez(path, **{**changed, "static_offset": offset * 2})
+    with pytest.raises(UserError, match=r"another head shape than the first: 1"):
+        read_source(tmp_path / "export", options)
+
+
+def test_images_without_a_matte_need_consent(frame_folder, options):
+    for path in (frame_folder / "images").iterdir():
+        cv2.imwrite(str(path), cv2.imread(str(path)))
+    with pytest.raises(UserError, match="without a matte") as caught:
+        read_source(frame_folder, options)
+    assert "--allow-opaque" in caught.value.cause
+    opaque = ImportOptions(flame=options.flame, allow_opaque=True)
+    assert (image(read_source(frame_folder, opaque), 0)[..., 3] == 255).all()
+
+
+def test_a_camera_that_contradicts_the_trackers_is_told(tmp_path, options, takes):
+    import json
+
+    write(tmp_path, "insta", takes)
+    for path in tmp_path.glob("transforms*.json"):
+        content = json.loads(path.read_text())
+        for frame in content["frames"]:
+            frame["transform_matrix"][0][3] += 0.01
+        path.write_text(json.dumps(content))
+    with pytest.raises(UserError, match=f"differ from their .frame file's: {NUM_FRAMES}"):
+        read_source(tmp_path, options)
+
+
+def test_an_unknown_folder_is_none(tmp_path):
+    assert find_format(tmp_path) is None

@@ -1,0 +1,94 @@
+"""Streams of small frames for tests: the frames say who they are by their pixels."""
+
+import time
+from collections import Counter, deque
+from collections.abc import Iterable
+
+import numpy as np
+import torch
+
+from rgbavatar_ns.data import TrackedFrame
+from rgbavatar_ns.data.png import encode_png_rgba
+from rgbavatar_ns.data.streams import StreamedFrame, StreamSubject
+from rgbavatar_ns.head import HeadModel
+from tests.data.small_dataset import HEIGHT, WIDTH, frame, odd_camera
+
+HEAD = HeadModel.embedded()
+DEADLINE_S = 30.0
+
+
+def subject(session: str = "", width: int = WIDTH, height: int = HEIGHT) -> StreamSubject:
+    identity = torch.linspace(-1, 1, HEAD.num_identity) / 3
+    return StreamSubject(HEAD.arrays, identity, HEAD.layout, width, height, session)
+
+
+def tracked(index: int) -> TrackedFrame:
+    return frame(HEAD, index, per_frame_camera=True)
+
+
+def streamed(index: int, session: str = "", image: np.ndarray | None = None) -> StreamedFrame:
+    one = tracked(index)
+    png = encode_png_rgba(one.image_rgba if image is None else image)
+    return StreamedFrame(index, one.theta, one.camera, png, time.monotonic(), session)
+
+
+def cheap(index: int) -> tuple[TrackedFrame, StreamedFrame]:
+    """A frame whose making costs next to nothing."""
+    theta = torch.full((HEAD.layout.size,), float(index))
+    image = np.full((HEIGHT, WIDTH, 4), index % 251, np.uint8)
+    camera, now = odd_camera(), time.monotonic()
+    return TrackedFrame(index, theta, camera, image), StreamedFrame(index, theta, camera, b"", now)
+
+
+class GivenStream:
+    """Gives what it was made with, then ends."""
+
+    def __init__(self, frames: Iterable[StreamedFrame], keeps_frames: bool = False) -> None:
+        self.counts: Counter[str] = Counter()
+        self.keeps_frames = keeps_frames
+        self._frames = deque(frames)
+        self.closed = False
+
+    def subject(self, timeout_s: float) -> StreamSubject:
+        return subject()
+
+    @property
+    def ended(self) -> bool:
+        return not self._frames
+
+    def next(self, timeout_s: float) -> StreamedFrame | None:
+        return self._frames.popleft() if self._frames else None
+
+    def close(self) -> None:
+        self.closed = True
+
+
+def take(stream, count: int) -> list[StreamedFrame]:
+    """The next `count` frames of a stream, or fewer if it ends before."""
+    frames, deadline = [], time.monotonic() + DEADLINE_S
+    while len(frames) < count and not stream.ended:
+        assert time.monotonic() < deadline, f"only {len(frames)} of {count} frames came"
+        one = stream.next(0.05)
+        if one is not None:
+            frames.append(one)
+    return frames
+
+
+def until(condition) -> None:
+    deadline = time.monotonic() + DEADLINE_S
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
+
+
+def same(sent: TrackedFrame, got: StreamedFrame) -> bool:
+    """Whether a frame came through bit for bit."""
+    image = got.decode().image_rgba
+    return (
+        sent.index == got.index
+        and torch.equal(sent.theta, got.theta)
+        and torch.equal(sent.camera.world_to_camera, got.camera.world_to_camera)
+        and torch.equal(sent.camera.focal_px, got.camera.focal_px)
+        and torch.equal(sent.camera.principal_point_px, got.camera.principal_point_px)
+        and np.array_equal(sent.image_rgba, image)
+    )

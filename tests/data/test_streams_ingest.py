@@ -1,0 +1,198 @@
+"""The worker between stream and pools: nothing lost in silence, nobody made to wait."""
+
+import threading
+import time
+
+import numpy as np
+import pytest
+import torch
+
+from rgbavatar_ns.data import LocalGlobalPools
+from rgbavatar_ns.data.streams import FramePools, FrameStream, Ingest, StreamedFrame
+from rgbavatar_ns.data.streams.ingest import FrameQueue
+from rgbavatar_ns.data.streams.numbering import SeenNumbers
+from tests.data.streaming import GivenStream, streamed, subject, until
+
+
+def ingest_of(stream: FrameStream, queue_frames: int = 256, **more) -> tuple[Ingest, FramePools]:
+    frames = FramePools(subject(), LocalGlobalPools(150, 1000))
+    return Ingest(stream, subject(), frames, queue_frames, **more), frames
+
+
+def taken_in(given: list[StreamedFrame]) -> tuple[Ingest, FramePools]:
+    ingest, frames = ingest_of(GivenStream(given))
+    ingest.start()
+    until(lambda: ingest.finished)
+    ingest.close()
+    assert ingest.failure is None
+    return ingest, frames
+
+
+def broken(frame: StreamedFrame, **fields) -> StreamedFrame:
+    return StreamedFrame(**{**vars(frame), **fields})
+
+
+def test_a_burst_of_200_frames_is_taken_in_whole():
+    ingest, frames = taken_in([streamed(index) for index in range(200)])
+    assert frames.num_added == 200
+    assert frames.fill == (150, 50)
+    assert ingest.counts() == {"arrived": 200, "taken in": 200, "dropped": 0}
+
+
+def test_what_cannot_be_used_is_left_out_and_counted_by_name():
+    nan = streamed(3).theta.clone()
+    nan[5] = torch.nan
+    large = np.zeros((16, 24, 4), np.uint8)
+    given = [
+        streamed(0),
+        streamed(2),
+        streamed(1),  # late, but new
+        streamed(2),
+        broken(streamed(3), theta=nan),
+        broken(streamed(4), theta=torch.zeros(3)),
+        streamed(5, image=large),
+        streamed(6, image=large),
+        broken(streamed(7), png=streamed(7).png[:-20]),
+        broken(streamed(8), png=b"no picture"),
+        streamed(10_000),
+        streamed(9),
+        streamed(0, session="again"),
+    ]
+    told: list[str] = []
+    ingest, frames = ingest_of(GivenStream(given), tell=told.append)
+    ingest.start()
+    until(lambda: ingest.finished)
+    assert ingest.counts() == {
+        "arrived": 13,
+        "taken in": 5,
+        "out of order": 1,
+        "duplicate": 1,
+        "theta not finite": 1,
+        "theta of another size": 1,
+        "another resolution": 2,
+        "unreadable": 2,
+        "too late": 1,
+        "dropped": 0,
+    }
+    assert frames.num_added == 5
+    assert len(told) == 1
+    assert "24 x 16" in told[0]
+    assert "12 x 8" in told[0]
+
+
+def test_pools_see_every_frame_while_the_trainer_does_nothing():
+    stream = GivenStream([streamed(index) for index in range(20)])
+    ingest, frames = ingest_of(stream)
+    ingest.start()
+    # Nobody draws a batch.
+    until(lambda: frames.num_added == 20)
+    ingest.close()
+    assert stream.closed
+
+
+def test_full_queue_drops_the_oldest_and_counts():
+    stream = GivenStream([streamed(index) for index in range(30)])
+    ingest, frames = ingest_of(stream, queue_frames=8)
+    ingest.listen()
+    until(lambda: ingest.counts()["arrived"] == 30)
+    ingest.start()
+    until(lambda: ingest.finished)
+    assert ingest.counts()["dropped"] == 22
+    assert frames.num_added == 8
+    newest = frames.newest()
+    assert newest is not None
+    assert torch.equal(newest.theta[0], streamed(29).theta)
+
+
+def test_a_source_that_keeps_its_frames_waits_instead():
+    stream = GivenStream([streamed(index) for index in range(30)], keeps_frames=True)
+    ingest, frames = ingest_of(stream, queue_frames=8)
+    ingest.listen()
+    until(lambda: ingest.counts()["arrived"] == 9)
+    time.sleep(0.05)
+    assert ingest.counts()["arrived"] == 9
+    ingest.start()
+    until(lambda: ingest.finished)
+    assert frames.num_added == 30
+    assert ingest.counts()["dropped"] == 0
+
+
+def test_training_goes_on_while_the_stream_stalls():
+    stalled = threading.Event()
+
+    class Stalling(GivenStream):
+        @property
+        def ended(self) -> bool:
+            return False
+
+        def next(self, timeout_s: float) -> StreamedFrame | None:
+            frame = super().next(timeout_s)
+            if frame is None:
+                stalled.set()
+                time.sleep(timeout_s)
+            return frame
+
+    ingest, frames = ingest_of(Stalling([streamed(index) for index in range(3)]))
+    ingest.start()
+    assert stalled.wait(10)
+    until(lambda: frames.num_added == 3)
+    began = time.monotonic()
+    for _ in range(5):
+        assert len(frames.batch(10).serial) == 3
+    assert time.monotonic() - began < 5.0
+    assert not ingest.finished
+    ingest.close()
+
+
+def test_a_fault_of_the_source_is_kept_for_who_asks():
+    class Failing(GivenStream):
+        def next(self, timeout_s: float) -> StreamedFrame | None:
+            raise OSError("the disk is gone")
+
+    ingest, _ = ingest_of(Failing([streamed(0)]))
+    ingest.start()
+    until(lambda: ingest.failure is not None)
+    assert "disk is gone" in str(ingest.failure)
+
+
+def test_ingest_goes_on_from_its_state():
+    first, frames = taken_in([streamed(0), streamed(1), streamed(1)])
+    state = first.state_dict()
+    second, resumed = ingest_of(GivenStream([streamed(1), streamed(2)]))
+    second.load_state_dict(state)
+    second.start()
+    until(lambda: second.finished)
+    assert resumed.num_added == 3
+    # The frame that had been there before is known again.
+    assert second.counts() == {"arrived": 5, "taken in": 3, "duplicate": 2, "dropped": 0}
+    assert frames.num_added == 2
+
+
+def test_queue_lets_nothing_in_once_closed():
+    queue = FrameQueue(2)
+    queue.put(streamed(0), wait=False)
+    queue.close()
+    queue.put(streamed(1), wait=True)
+    got = queue.get()
+    assert got is not None
+    assert got.index == 0
+    assert queue.get() is None
+
+
+@pytest.mark.parametrize("last", [50, 20_000])
+def test_numbers_are_judged_within_bounded_memory(last: int):
+    seen = SeenNumbers()
+    for number in range(last + 1):
+        assert seen.add(number) == "new"
+    assert seen.add(last) == "duplicate"
+    assert seen.add(last - 5) == "duplicate"
+    assert seen.add(last + 10) == "new"
+    assert seen.add(last + 5) == "late"
+    assert seen.add(last + 5) == "duplicate"
+    assert len(seen.state_dict()["seen"]) <= 4100
+    assert seen.add(last + 1_000_000) == "new"
+    assert seen.add(last + 5) == "too late"
+    assert len(seen.state_dict()["seen"]) == 1
+    again = SeenNumbers()
+    again.load_state_dict(seen.state_dict())
+    assert again.add(last + 1_000_000) == "duplicate"

@@ -1,0 +1,133 @@
+"""What is wrong with an experiment's file is told before anything runs."""
+
+from pathlib import Path
+
+import pytest
+
+from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.experiments import cells_of, read_experiment
+from rgbavatar_ns.experiments.sweep import check_experiment
+
+CONFIGS = sorted((Path(__file__).parents[2] / "configs").glob("*.yaml"))
+
+GOOD = """
+title: Two widths
+preset: rgbavatar-tiny
+base: {max_num_iterations: 10}
+variants:
+  - name: narrow
+    set: {pipeline.model.avatar.hidden_width: 16}
+    paper: {psnr: 30.5}
+  - name: wide
+seeds: [0, 1]
+subjects: [demo, "demo:3:20:64"]
+tiny:
+  seeds: [7]
+  base: {max_num_iterations: 2}
+"""
+
+
+def _read(tmp_path, text, **options):
+    path = tmp_path / "widths.yaml"
+    path.write_text(text)
+    return read_experiment(path, **options)
+
+
+def test_cells_are_variants_by_subjects_by_seeds(tmp_path):
+    experiment = _read(tmp_path, GOOD)
+    check_experiment(experiment)
+    cells = cells_of(experiment)
+    assert experiment.name == "widths"
+    assert [(c.variant, c.subject, c.seed) for c in cells[:4]] == [
+        ("narrow", "demo", 0),
+        ("narrow", "demo", 1),
+        ("narrow", "demo:3:20:64", 0),
+        ("narrow", "demo:3:20:64", 1),
+    ]
+    assert len(cells) == 8
+    assert cells[0].overrides == {
+        "max_num_iterations": 10,
+        "pipeline.model.avatar.hidden_width": 16,
+    }
+    assert len({cell.key for cell in cells}) == 8
+
+
+def test_tiny_replaces_and_adds_to_the_base(tmp_path):
+    experiment = _read(tmp_path, GOOD, tiny=True)
+    assert experiment.seeds == (7,)
+    assert experiment.base == {"max_num_iterations": 2}
+    assert experiment.subjects == ("demo", "demo:3:20:64")
+
+
+def test_a_cell_is_known_by_what_decides_its_result(tmp_path):
+    first, other = cells_of(_read(tmp_path, GOOD)), cells_of(_read(tmp_path, GOOD))
+    assert [cell.key for cell in first] == [cell.key for cell in other]
+    renamed = cells_of(_read(tmp_path, GOOD.replace("name: wide", "name: broad")))
+    assert [cell.key for cell in renamed] == [cell.key for cell in first]
+    longer = cells_of(_read(tmp_path, GOOD.replace("iterations: 10", "iterations: 11")))
+    assert not {cell.key for cell in longer} & {cell.key for cell in first}
+
+
+def test_a_grid_multiplies_the_variants(tmp_path):
+    text = """
+title: Grid
+preset: rgbavatar
+variants: [{name: a}, {name: b, set: {max_num_iterations: 7}}]
+grid: {pipeline.model.avatar.num_bases: [5, 10], machine.seed: [1]}
+"""
+    experiment = _read(tmp_path, text)
+    assert [variant.name for variant in experiment.variants] == [
+        "a, num_bases 5, seed 1",
+        "a, num_bases 10, seed 1",
+        "b, num_bases 5, seed 1",
+        "b, num_bases 10, seed 1",
+    ]
+    assert [variant.family for variant in experiment.variants] == ["a", "a", "b", "b"]
+    assert experiment.variants[3].overrides["max_num_iterations"] == 7
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "told"),
+    [
+        ("hidden_width", "hiden_width", "Did you mean 'pipeline.model.avatar.hidden_width'"),
+        ("pipeline.model", "pipeline.modle", "Did you mean 'pipeline.model'"),
+        ("width: 16", "width: broad", "does not fit its type int"),
+        ("width: 16", "width: 1.5", "does not fit its type int"),
+        ("rgbavatar-tiny", "rgbavatar-tine", "Did you mean 'rgbavatar-tiny'"),
+        ("seeds:", "seads:", "Did you mean 'seeds'"),
+        ("seeds: [0, 1]", "seeds: []", "no seeds"),
+        ("seeds: [0, 1]", "seeds: [-1]", "0 or more"),
+        ("seeds: [0, 1]", "seeds: 3", "Give a list"),
+        ("psnr: 30.5", "psnrr: 30.5", "Did you mean 'psnr'"),
+        ("name: wide", "name: narrow", "two variants named"),
+        ("title: Two widths", "", "lacks `title`"),
+        ("title: Two widths", "title: [", "cannot be read"),
+        ('"demo:3:20:64"', "no/such/folder", "does not exist"),
+    ],
+)
+def test_each_mistake_is_named_with_its_remedy(tmp_path, old, new, told):
+    assert old in GOOD
+
+    def read_and_check():
+        experiment = _read(tmp_path, GOOD.replace(old, new))
+        check_experiment(experiment)
+        cells_of(experiment)
+
+    with pytest.raises(UserError) as refused:
+        read_and_check()
+    assert told in str(refused.value)
+
+
+def test_an_empty_grid_is_refused(tmp_path):
+    with pytest.raises(UserError, match="Give a list of values"):
+        _read(tmp_path, "title: t\npreset: rgbavatar\ngrid: {max_num_iterations: []}\n")
+    with pytest.raises(UserError, match="varies nothing"):
+        _read(tmp_path, "title: t\npreset: rgbavatar\n")
+
+
+@pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
+@pytest.mark.parametrize("tiny", [False, True])
+def test_the_experiments_that_ship_fit_the_presets(path, tiny):
+    experiment = read_experiment(path, tiny=tiny)
+    check_experiment(experiment)
+    assert cells_of(experiment)

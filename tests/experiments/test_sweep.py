@@ -1,0 +1,150 @@
+"""A sweep does what is missing, survives failures, and its report traces every figure."""
+
+import csv
+import sys
+from pathlib import Path
+
+import pytest
+
+from rgbavatar_ns.cli import main as cli
+from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.experiments import engines, read_experiment
+from rgbavatar_ns.experiments.engines import LocalEngine, RayEngine
+from rgbavatar_ns.experiments.report import write_report
+from rgbavatar_ns.experiments.sweep import sweep
+
+FAKE_RUNNER = """
+import json, pathlib, sys, time
+folder = pathlib.Path(sys.argv[1])
+cell = json.loads((folder / "cell.json").read_text())
+with (folder / "calls.txt").open("a") as calls:
+    calls.write("x")
+print("training", cell["variant"], flush=True)
+if cell["variant"] == "broken":
+    sys.exit("CUDA out of memory, so to speak")
+if cell["variant"] == "shaky" and (folder / "calls.txt").read_text() == "x":
+    sys.exit("once only")
+if cell["variant"] == "slow":
+    time.sleep(60)
+psnr = 30 + cell["overrides"]["pipeline.model.avatar.num_bases"] / 10 + cell["seed"]
+result = {"metrics": {"psnr": psnr, "ssim": 0.9}, "unavailable": {"lpips_vgg": "no weights"}}
+(folder / "result.json").write_text(json.dumps(result))
+"""
+
+TEXT = """
+title: Bases & more
+preset: rgbavatar-tiny
+paper_data: INSTA
+subjects: [{data}]
+seeds: [0, 2]
+variants:
+{variants}
+"""
+
+
+@pytest.fixture
+def experiment_of(tmp_path, monkeypatch):
+    runner = tmp_path / "fake_runner.py"
+    runner.write_text(FAKE_RUNNER)
+    monkeypatch.setattr(engines, "_RUNNER", (sys.executable, str(runner)))
+    (tmp_path / "data").mkdir()
+
+    def build(*names: str, paper: str = ""):
+        rows = [
+            f"  - name: {name}\n    set: {{pipeline.model.avatar.num_bases: {count}}}\n{paper}"
+            for name, count in zip(names, range(10, 100, 10))
+        ]
+        path = tmp_path / "bases.yaml"
+        path.write_text(TEXT.format(data="data", variants="".join(rows)))
+        return read_experiment(path)
+
+    return build
+
+
+def _calls(statuses):
+    return [(status.folder / "calls.txt").read_text() for status in statuses]
+
+
+def test_a_second_call_does_only_what_is_missing(experiment_of, tmp_path):
+    experiment = experiment_of("a", "b")
+    folder = tmp_path / "out"
+    first = sweep(experiment, folder, LocalEngine(2))
+    assert [status.state for status in first] == ["done"] * 4
+    (first[1].folder / "result.json").unlink()
+    again = sweep(experiment, folder, LocalEngine(1))
+    assert [status.state for status in again] == ["done"] * 4
+    assert _calls(again) == ["x", "xx", "x", "x"]
+    wider = sweep(experiment_of("a", "b", "c"), folder, LocalEngine(2))
+    assert _calls(wider) == ["x", "xx", "x", "x", "x", "x"]
+
+
+def test_a_failed_cell_is_tried_once_more_and_stops_nobody(experiment_of, tmp_path):
+    statuses = sweep(experiment_of("broken", "shaky", "fine"), tmp_path / "out", LocalEngine(2))
+    assert [status.state for status in statuses] == ["failed"] * 2 + ["done"] * 4
+    assert _calls(statuses) == ["xx", "xx", "xx", "xx", "x", "x"]
+    assert statuses[0].why[-1] == "CUDA out of memory, so to speak"
+
+
+def test_an_interruption_ends_the_cells_and_is_gone_on_from(experiment_of, tmp_path):
+    experiment = experiment_of("fine", "slow")
+
+    def stop(statuses):
+        if sum(status.state == "done" for status in statuses) == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        sweep(experiment, tmp_path / "out", LocalEngine(1), stop)
+    runner = Path(engines._RUNNER[1])
+    runner.write_text(FAKE_RUNNER.replace("time.sleep(60)", "pass"))
+    statuses = sweep(experiment, tmp_path / "out", LocalEngine(2))
+    assert [status.state for status in statuses] == ["done"] * 4
+    assert _calls(statuses)[:2] == ["x", "x"]
+
+
+def test_the_report_has_means_spreads_and_the_papers_figures(experiment_of, tmp_path):
+    paper = "    paper: {psnr: 31.5}\n"
+    experiment = experiment_of("a", "b", "broken", paper=paper)
+    statuses = sweep(experiment, tmp_path / "out", LocalEngine(2))
+    report = write_report(experiment, tmp_path / "out")
+    # K = 10 and 20 give 31 and 32; seeds 0 and 2 add 0 and 2: mean + 1, deviation sqrt(2).
+    markdown = report.table.to_markdown()
+    assert "| a | 32.00 ± 1.41 | 0.9000 ± 0.0000 | - | 31.50 | - | - |" in markdown
+    assert "PSNR, paper (INSTA)" in markdown
+    assert "LPIPS (VGG) is not available: no weights" in markdown
+    assert "4 of 6 cells done" in markdown
+    rows = list(csv.DictReader((tmp_path / "out/report/bases.csv").open()))
+    assert float(rows[1]["psnr_mean"]) == 33.0
+    assert rows[1]["cells"].split() == [status.cell.key for status in statuses[2:4]]
+    assert rows[2]["psnr_mean"] == ""
+    latex = (tmp_path / "out/report/bases.tex").read_text()
+    assert r"32.00 $\pm$ 1.41" in latex
+    page = (tmp_path / "out/report/index.html").read_text()
+    assert f'href="../cells/{statuses[0].cell.key}/"' in page
+    assert "Bases &amp; more" in page
+    assert (tmp_path / "out/report/bases.png").stat().st_size > 1000
+    assert (tmp_path / "out/report/bases.svg").exists()
+
+
+def test_the_command_says_what_failed_and_ends_with_1(experiment_of, tmp_path, capsys):
+    experiment_of("broken")
+    arguments = ["sweep", str(tmp_path / "bases.yaml"), "--output", str(tmp_path / "out")]
+    with pytest.raises(SystemExit) as ended:
+        cli.main(arguments)
+    assert ended.value.code == 1
+    told = capsys.readouterr().out
+    assert "0 of 2 cells done" in told
+    assert "CUDA out of memory, so to speak" in told
+    assert "rgbavatar report" in told
+    cli.main(["report", str(tmp_path / "out"), "--file", str(tmp_path / "bases.yaml")])
+    assert "index.html" in capsys.readouterr().out
+
+
+def test_a_report_before_the_sweep_is_refused(experiment_of, tmp_path):
+    with pytest.raises(UserError, match="was not begun"):
+        write_report(experiment_of("a"), tmp_path / "none")
+
+
+def test_without_ray_its_engine_says_what_to_do(monkeypatch):
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(UserError, match="pip install 'ray"):
+        RayEngine(None, 1.0, 0.0)

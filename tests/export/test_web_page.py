@@ -1,0 +1,98 @@
+"""What is inside the exported page, without a browser."""
+
+import base64
+import gzip
+import json
+import re
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.export import PageOptions, front_camera, write_web_page
+from rgbavatar_ns.export.web_arrays import head_arrays, pack, quantize
+
+from .subject import avatar_of
+
+
+@settings(max_examples=12, deadline=None)
+@given(st.integers(0, 10_000), st.sampled_from([np.int8, np.int16]), st.floats(1e-6, 1e3))
+def test_a_rounded_value_is_off_by_half_a_unit_at_most(seed, dtype, size):
+    values = size * np.random.default_rng(seed).standard_normal((3, 2, 40))
+    values[1, 0] = 0
+    rounded = quantize(values, dtype)
+    back = rounded.values * rounded.unit[..., None].astype(np.float64)
+    assert (np.abs(back - values) <= 0.501 * rounded.unit[..., None]).all()
+    assert rounded.values.dtype == dtype
+    np.testing.assert_allclose(
+        rounded.unit * np.iinfo(dtype).max, np.abs(values).max(-1), rtol=1e-6
+    )
+
+
+def test_arrays_come_back_from_the_block():
+    arrays = {
+        "bytes": np.arange(-3, 4, dtype=np.int8),
+        "none": np.zeros((0, 3), np.float32),
+        "table": np.random.default_rng(0).random((5, 3), dtype=np.float32).T,
+        "count": np.array([7, 8], np.uint32),
+    }
+    directory, block = pack(arrays)
+    for name, values in arrays.items():
+        entry = directory[name]
+        assert entry["offset"] % values.itemsize == 0, "typed arrays want aligned places"
+        read = np.frombuffer(block, entry["dtype"], entry["length"], entry["offset"])
+        assert np.array_equal(read.reshape(values.shape), values)
+
+
+def test_sparse_columns_hold_every_offset_of_the_head():
+    avatar = avatar_of()
+    arrays = head_arrays(avatar)
+    head = avatar.head.arrays
+    full = head.shapedirs[..., head.num_identity :]
+    start, vertex = arrays["offset_start"], arrays["offset_vertex"]
+    assert len(start) == full.shape[-1] + 1
+    for column in (0, 24, full.shape[-1] - 1):
+        rebuilt = np.zeros_like(full[..., 0])
+        places = slice(start[column], start[column + 1])
+        rebuilt[vertex[places]] = arrays["offset_value"][places] * arrays["offset_unit"][column]
+        # A micrometre is far below what is seen.
+        assert np.abs(rebuilt - full[..., column]).max() < 1e-6
+    with torch.no_grad():
+        rest = avatar.head(torch.zeros(1, avatar.layout.size), avatar.identity)[0]
+    np.testing.assert_allclose(arrays["neutral_vertices"], rest.numpy(), atol=1e-6)
+
+
+def test_the_page_is_one_file_that_names_no_other_place(tmp_path):
+    avatar = avatar_of()
+    path = tmp_path / "page.html"
+    theta = torch.zeros(3, avatar.layout.size)
+    title = "</title><script>alert(1)</script>"
+    size = write_web_page(avatar, path, front_camera(avatar, 64, 48), theta, PageOptions(title))
+    page = path.read_text()
+    assert path.stat().st_size == size
+    assert [p.name for p in tmp_path.iterdir()] == ["page.html"]
+    assert title not in page
+    assert "{{" not in page
+    payload = re.search(r'id="payload">([^<]*)</script>', page)
+    manifest = re.search(r'id="manifest">(.*?)</script>', page, re.DOTALL)
+    assert payload
+    assert manifest
+    rest = page.replace(payload[1], "")
+    assert not re.search(r"https?://|//cdn|src=|import\s*\(|fetch\s*\(|<link", rest)
+    assert "default-src 'none'" in rest
+    described = json.loads(manifest[1])
+    block = gzip.decompress(base64.b64decode(payload[1]))
+    entry = described["arrays"]["theta"]
+    assert entry["length"] == theta.numel()
+    assert max(e["offset"] for e in described["arrays"].values()) <= len(block)
+
+
+def test_a_page_that_cannot_be_written_is_told(tmp_path):
+    avatar = avatar_of()
+    (tmp_path / "file").write_text("")
+    theta = torch.zeros(0, avatar.layout.size)
+    with pytest.raises(UserError, match="Cannot write"):
+        write_web_page(avatar, tmp_path / "file" / "page.html", front_camera(avatar, 8, 8), theta)

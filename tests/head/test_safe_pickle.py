@@ -1,0 +1,386 @@
+"""Pickles of others: what Python itself would give, or an error; never a call of theirs."""
+
+import contextlib
+import io
+import os
+import pickle
+import struct
+import tracemalloc
+import zipfile
+from collections import OrderedDict
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.sparse
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
+
+from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.head.safe_pickle import read_pickle, read_torch_file
+
+_MB = 2**20
+
+
+@pytest.fixture
+def write(tmp_path: Path):
+    def write(data: bytes) -> Path:
+        path = tmp_path / "file.pkl"
+        path.write_bytes(data)
+        return path
+
+    return write
+
+
+def same(a, b) -> bool:
+    if scipy.sparse.issparse(a):
+        return bool((a.toarray() == b.toarray()).all()) and a.dtype == b.dtype
+    if isinstance(a, np.ndarray):
+        return a.dtype == b.dtype and np.array_equal(a, b, equal_nan=a.dtype.kind == "f")
+    if isinstance(a, dict):
+        return list(a) == list(b) and all(same(a[key], b[key]) for key in a)
+    if isinstance(a, list | tuple):
+        return type(a) is type(b) and len(a) == len(b) and all(map(same, a, b))
+    return type(a) is type(b) and a == b
+
+
+VALUES = {
+    "floats": np.arange(12.0).reshape(3, 4),
+    "columns first": np.asfortranarray(np.arange(12, dtype=np.uint32).reshape(3, 4)),
+    "big endian": np.arange(3, dtype=">i4"),
+    "no dimension": np.array(3.0),
+    "empty": np.zeros((0, 3)),
+    "texts": np.array(["ab", "c"]),
+    "scalar": np.float32(3.5),
+    "csc": scipy.sparse.csc_matrix(np.eye(4)),
+    "csr": scipy.sparse.csr_array(np.eye(4)),
+    "coo": scipy.sparse.coo_matrix(np.eye(3)),
+    "plain": (1, 2.5, None, True, False, "xyä", b"ab\xff", -3, 2**40, [1, [{3}]], {}),
+    "ordered": OrderedDict(a=1),
+    "frozen": frozenset([1]),
+}
+
+
+@pytest.mark.parametrize("protocol", range(pickle.HIGHEST_PROTOCOL + 1))
+def test_plain_values_come_back_as_python_reads_them(write, protocol):
+    assert same(VALUES, read_pickle(write(pickle.dumps(VALUES, protocol))))
+
+
+_PLAIN = st.recursive(
+    st.none()
+    | st.booleans()
+    | st.integers(-(2**70), 2**70)
+    | st.floats(allow_nan=False)
+    | st.text()
+    | st.binary()
+    | arrays.arrays(
+        arrays.integer_dtypes() | arrays.floating_dtypes(sizes=(32, 64)),
+        arrays.array_shapes(min_side=0),
+    ),
+    lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner) | st.tuples(inner, inner),
+    max_leaves=6,
+)
+
+
+@settings(
+    max_examples=60,
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
+)
+@given(_PLAIN, st.integers(0, pickle.HIGHEST_PROTOCOL))
+def test_any_plain_value_comes_back(write, value, protocol):
+    assert same(value, read_pickle(write(pickle.dumps(value, protocol))))
+
+
+def test_shared_arrays_stay_shared_and_are_writable(write):
+    array = np.zeros(3)
+    first, second = read_pickle(write(pickle.dumps([array, array])))
+    first[0] = 1
+    assert second[0] == 1
+
+
+def test_a_list_that_contains_itself_is_read(write):
+    loop: list = [np.ones(2)]
+    loop.append(loop)
+    read = read_pickle(write(pickle.dumps(loop)))
+    assert read[1] is read
+    assert np.array_equal(read[0], np.ones(2))
+
+
+PYTHON_2_ARRAY = (
+    b"cnumpy.core.multiarray\n_reconstruct\n(cnumpy\nndarray\n(K\x00tU\x01btR"
+    b"(K\x01(K\x02tcnumpy\ndtype\n(U\x02f8K\x00K\x01tR(K\x03U\x01<NNNJ\xff\xff\xff\xff"
+    b"J\xff\xff\xff\xffK\x00tb\x89U\x10" + struct.pack("<2d", -1.5, 2.25) + b"tb"
+)
+
+
+def test_python_2_text_is_latin_1_and_holds_array_bytes(write):
+    data = b"\x80\x02" + PYTHON_2_ARRAY + b"."
+    assert np.array_equal(pickle.loads(data, encoding="latin1"), [-1.5, 2.25])
+    assert np.array_equal(read_pickle(write(data)), [-1.5, 2.25])
+    assert read_pickle(write(b"S'a\\xe9\\'b'\np0\n.")) == "aé'b"
+
+
+def _chumpy(name: bytes, state: bytes) -> bytes:
+    return b"ccopy_reg\n_reconstructor\n(" + name + b"c__builtin__\nobject\nNtR}(" + state + b"ub"
+
+
+CHUMPY_ARRAY = _chumpy(b"cchumpy.ch\nCh\n", b"U\x01x" + PYTHON_2_ARRAY)
+
+
+def test_chumpy_arrays_are_read_without_chumpy(write):
+    assert np.array_equal(read_pickle(write(b"\x80\x02" + CHUMPY_ARRAY + b".")), [-1.5, 2.25])
+    chosen = pickle.dumps(np.array([1, 1, 0]), 2)[2:-1]
+    selected = _chumpy(
+        b"cchumpy.reordering\nSelect\n", b"U\x01a" + CHUMPY_ARRAY + b"U\x04idxs" + chosen
+    )
+    assert np.array_equal(read_pickle(write(b"\x80\x02" + selected + b".")), [2.25, 2.25, -1.5])
+
+
+def test_a_computed_chumpy_array_is_refused_by_name(write):
+    data = b"\x80\x02" + _chumpy(b"cchumpy.ch\nCh\n", b"U\x01bK\x01") + b"."
+    with pytest.raises(UserError, match=r"chumpy\.ch\.Ch is computed"):
+        read_pickle(write(data))
+
+
+class Calls:
+    """A pickle that calls something when it is read."""
+
+    def __init__(self, function, *arguments):
+        self.call = function, arguments
+
+    def __reduce__(self):
+        return self.call
+
+
+CALLED = []
+
+
+def tell(text):
+    CALLED.append(text)
+
+
+HOSTILE = {
+    "os.system": (Calls(os.system, "false"), r"(posix|nt)\.system"),
+    "eval": (Calls(eval, "tell('x')"), r"builtins\.eval|__builtin__\.eval"),
+    "exec": (Calls(exec, "tell('x')"), r"exec"),
+    "own function": (Calls(tell, "x"), r"test_safe_pickle\.tell"),
+    "nested": ({"a": [Calls(list, [Calls(os.getcwd)])]}, r"getcwd"),
+    "getattr": (Calls(getattr, [], "append"), r"getattr"),
+    "another class": (Path("x"), r"[Pp]ath"),
+    "array of objects": (np.array([{}, None], dtype=object), "are no numbers"),
+    "array of records": (np.zeros(2, [("a", "f4")]), "are no numbers|records"),
+    "bytearray by number": (Calls(bytearray, 2**40), "bytes from something"),
+    "tuples as keys": ({((1,), 2): 3}, "tuple as a key"),
+    "numpy.load": (Calls(np.load, "x.npy"), "numpy.*load"),
+}
+
+
+@pytest.mark.parametrize("protocol", [0, 2, 4])
+@pytest.mark.parametrize("name", HOSTILE)
+@pytest.mark.parametrize("in_torch_file", [False, True])
+def test_what_is_not_on_the_list_is_refused_by_name(write, name, protocol, in_torch_file):
+    value, told = HOSTILE[name]
+    if in_torch_file:
+        path = write(zipped({"a/data.pkl": pickle.dumps(value, protocol)}))
+    else:
+        path = write(pickle.dumps(value, protocol))
+    with pytest.raises(UserError, match=told) as refused:
+        (read_torch_file if in_torch_file else read_pickle)(path)
+    assert "Nothing in it was run" in refused.value.remedy
+    assert not CALLED
+
+
+def _dtype() -> bytes:
+    return pickle.dumps(np.dtype("f8"), 2)[2:-1]
+
+
+BOMBS = {
+    "array header": (
+        b"cnumpy.core.multiarray\n_reconstruct\n(cnumpy\nndarray\n(K\x00tU\x01btR(K\x01(\x8a\x06"
+        + (2**40 - 1).to_bytes(6, "little")
+        + b"t"
+        + _dtype()
+        + b"\x89C\x08"
+        + bytes(8)
+        + b"tb."
+    ),
+    "text length": b"\x8d" + struct.pack("<Q", 2**62) + b"x.",
+    "bytes length": b"\x8e" + struct.pack("<Q", 2**40) + b"x.",
+    "bytearray length": b"\x96" + struct.pack("<Q", 2**40) + b"x.",
+    "negative text length": b"T\xff\xff\xff\xffx.",
+    "long number": b"\x8b" + struct.pack("<i", 2**30) + b"x.",
+    "many digits": b"L" + b"9" * 10**6 + b"L\n.",
+    "memo number": b"]r\xff\xff\xff\xff0j\xff\xff\xff\xfe.",
+    "deep nesting": b"]" * 5_000 + b"a" * 4_999 + b".",
+    "endless hash": b")" + b"q\x000h\x00h\x00\x86" * 60 + b"}q\x01N" + b"h\x00Ns.",
+    "missing mark": b"NNu.",
+    "empty": b"",
+    "no end": b"]",
+}
+
+
+@pytest.mark.parametrize("name", BOMBS)
+def test_bombs_are_refused_in_bounded_memory(write, name):
+    path = write(BOMBS[name])
+    tracemalloc.start()
+    with pytest.raises(UserError):
+        read_pickle(path)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 100 * _MB
+
+
+def test_more_steps_than_a_model_file_needs_are_refused(write, monkeypatch):
+    monkeypatch.setattr("rgbavatar_ns.head.pickle_machine.MAX_OPCODES", 1000)
+    assert read_pickle(write(b"N0" * 499 + b"N.")) is None
+    with pytest.raises(UserError, match="more than 1000 steps"):
+        read_pickle(write(b"N0" * 500 + b"N."))
+
+
+def test_shared_bytes_do_not_multiply(write):
+    """A hundred arrays over the same megabyte are a hundred megabytes when they are made."""
+    raw = pickle.dumps(b"x" * _MB, 3)[2:-1]
+    array = (
+        b"cnumpy.core.multiarray\n_reconstruct\n(cnumpy\nndarray\n(K\x00tU\x01btR(K\x01("
+        + pickle.dumps(_MB, 3)[2:-1]
+        + b"t"
+        + b"cnumpy\ndtype\n(U\x02u1K\x00K\x01tR\x89j\x00\x01\x00\x00tb"
+    )
+    path = write(b"\x80\x03" + raw + b"r\x00\x01\x00\x000](" + array * 100 + b"e.")
+    tracemalloc.start()
+    with pytest.raises(UserError, match="more memory"):
+        read_pickle(path, max_bytes=50 * _MB)
+    assert tracemalloc.get_traced_memory()[1] < 100 * _MB
+    tracemalloc.stop()
+
+
+def test_a_long_or_missing_file_is_refused(write, tmp_path):
+    with pytest.raises(UserError, match="longer than 10 bytes"):
+        read_pickle(write(pickle.dumps("x" * 20)), max_bytes=10)
+    with pytest.raises(UserError, match="no file"):
+        read_pickle(tmp_path / "nowhere")
+    with pytest.raises(UserError, match="no file"):
+        read_torch_file(tmp_path)
+
+
+SEED = pickle.dumps({"v": np.arange(6.0), "s": scipy.sparse.csc_matrix(np.eye(2)), "t": "x"}, 2)
+
+
+@settings(
+    max_examples=120,
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+)
+@given(
+    st.lists(st.tuples(st.integers(0, len(SEED) - 1), st.integers(0, 255)), max_size=4),
+    st.integers(0, len(SEED)),
+    st.binary(max_size=12),
+)
+def test_mutated_bytes_end_in_a_value_or_an_error(write, changes, end, tail):
+    data = bytearray(SEED)
+    for place, value in changes:
+        data[place] = value
+    with contextlib.suppress(UserError):
+        read_pickle(write(bytes(data[:end]) + tail), max_bytes=_MB)
+
+
+# torch files
+
+
+FRAME = {
+    "flame": {"exp": np.linspace(0, 1, 100, dtype=np.float32)[None], "jaw": np.eye(2, 3)[None]},
+    "img_size": np.array([512, 512]),
+    "frame_id": "00001",
+    "tensor": torch.arange(6.0).reshape(2, 3).T,
+    "parameter": torch.nn.Parameter(torch.ones(2)),
+    "expanded": torch.ones(2, dtype=torch.int64).expand(5, 2),
+    "part": torch.arange(10, dtype=torch.uint8)[3:8:2],
+    "empty": torch.zeros(0, 3),
+    "size": torch.Size([2, 3]),
+}
+
+
+@pytest.mark.parametrize("as_zip", [True, False])
+def test_torch_files_give_what_torch_gives(tmp_path, as_zip):
+    path = tmp_path / "00001.frame"
+    torch.save(FRAME, path, _use_new_zipfile_serialization=as_zip)
+    assert zipfile.is_zipfile(path) == as_zip
+    read = read_torch_file(path)
+    assert list(read) == list(FRAME)
+    for name, value in FRAME.items():
+        wanted = value.detach().numpy() if isinstance(value, torch.Tensor) else value
+        wanted = tuple(wanted) if name == "size" else wanted
+        assert same(wanted, read[name]), name
+
+
+def zipped(members: dict[str, bytes], compression: int = zipfile.ZIP_STORED) -> bytes:
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w", compression) as archive:
+        for name, data in members.items():
+            archive.writestr(name, data)
+    return file.getvalue()
+
+
+def test_a_zip_bomb_is_refused_unopened(write):
+    bomb = zipped({"a/data.pkl": b"N." + bytes(40 * _MB)}, zipfile.ZIP_DEFLATED)
+    assert len(bomb) < _MB / 10
+    path = write(bomb)
+    tracemalloc.start()
+    with pytest.raises(UserError, match="is compressed"):
+        read_torch_file(path)
+    assert tracemalloc.get_traced_memory()[1] < 10 * _MB
+    tracemalloc.stop()
+
+
+def _rebuild(tensor: torch.Tensor, **changes: int) -> bytes:
+    """torch's own file, with numbers of the tensor's description replaced."""
+    file = io.BytesIO()
+    torch.save(tensor, file)
+    with zipfile.ZipFile(file) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    name = next(name for name in members if name.endswith("data.pkl"))
+    for old, new in changes.items():
+        old_code = b"K" + bytes([int(old.removeprefix("n"))])
+        assert old_code in members[name]
+        members[name] = members[name].replace(old_code, b"K" + bytes([new]))
+    return zipped(members)
+
+
+def test_tensors_cannot_reach_beyond_their_storage(write):
+    tensor = torch.arange(77.0)
+    assert np.array_equal(read_torch_file(write(_rebuild(tensor))), tensor.numpy())
+    with pytest.raises(UserError, match="not as long as it claims"):
+        read_torch_file(write(_rebuild(tensor, n77=99)))
+    with pytest.raises(UserError, match="reaches beyond"):
+        read_torch_file(write(_rebuild(tensor.reshape(7, 11), n7=8)))
+
+
+def test_other_zips_and_other_bytes_are_no_torch_files(write):
+    for data in (zipped({"x.txt": b"x"}), b"PK\x03\x04", b"", b"\x80\x02N.", os.urandom(50)):
+        with pytest.raises(UserError):
+            read_torch_file(write(data))
+
+
+def _frame_bytes(as_zip: bool) -> bytes:
+    file = io.BytesIO()
+    frame = {"exp": np.arange(3.0), "t": torch.ones(2, 2)}
+    torch.save(frame, file, _use_new_zipfile_serialization=as_zip)
+    return file.getvalue()
+
+
+@settings(
+    max_examples=120,
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+)
+@given(st.booleans(), st.data())
+def test_mutated_torch_files_end_in_a_value_or_an_error(write, as_zip, data):
+    mutated = bytearray(_frame_bytes(as_zip))
+    for _ in range(data.draw(st.integers(0, 4))):
+        mutated[data.draw(st.integers(0, len(mutated) - 1))] = data.draw(st.integers(0, 255))
+    end = data.draw(st.just(len(mutated)) | st.integers(0, len(mutated)))
+    with contextlib.suppress(UserError):
+        read_torch_file(write(bytes(mutated[:end])), max_bytes=_MB)

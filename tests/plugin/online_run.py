@@ -1,0 +1,41 @@
+"""Online runs in this process, small enough for a test."""
+
+import copy
+from pathlib import Path
+from typing import Any
+
+from rgbavatar_ns.plugin.online_methods import rgbavatar_online_tiny
+from rgbavatar_ns.plugin.online_trainer import OnlineTrainer, OnlineTrainerConfig
+from tests.plugin.run import SMALL, make_trainer
+
+
+def online_config(output: Path, data: Path | None = None, **fields: Any) -> OnlineTrainerConfig:
+    """rgbavatar-online-tiny with fewer Gaussians; replays `data` at 200 frames/s.
+
+    `fields` are the trainer's, or where it has none the data manager's.
+    """
+    config = copy.deepcopy(rgbavatar_online_tiny.config)
+    assert isinstance(config, OnlineTrainerConfig)
+    config.output_dir = output
+    config.experiment_name = "tiny"
+    config.timestamp = "run"
+    config.vis = "tensorboard"
+    config.machine.device_type = "cpu"
+    config.steps_after_stream = 3
+    config.pipeline.model.avatar = SMALL
+    manager = config.pipeline.datamanager
+    manager.data = data
+    manager.batch_size = 4
+    manager.source.frames_per_second = 200.0
+    for name, value in fields.items():
+        owner = config if hasattr(config, name) else manager
+        assert hasattr(owner, name)
+        setattr(owner, name, value)
+    return config
+
+
+def online_trainer(config: OnlineTrainerConfig) -> OnlineTrainer:
+    """What `ns-train` does up to the first step."""
+    trainer = make_trainer(config)
+    assert isinstance(trainer, OnlineTrainer)
+    return trainer

@@ -1,0 +1,78 @@
+"""What happens before the first step: sources by their flags, and waiting for a subject."""
+
+import dataclasses
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from rgbavatar_ns.data.streams import (
+    FolderStream,
+    PushedStream,
+    ReplayStream,
+    StreamSubject,
+)
+from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.plugin.online_sources import SourceConfig, await_subject, open_source
+from tests.data.streaming import GivenStream, streamed, subject
+from tests.plugin.online_run import online_config, online_trainer
+
+
+def test_flags_name_the_source(tiny_data: Path, tmp_path: Path):
+    replay = open_source(SourceConfig(), tiny_data)
+    assert isinstance(replay, ReplayStream)
+    assert isinstance(open_source(SourceConfig("folder"), tmp_path), FolderStream)
+    pushed = open_source(SourceConfig("socket", listen="127.0.0.1:0"), None)
+    assert isinstance(pushed, PushedStream)
+    pushed.close()
+    with pytest.raises(UserError, match="Other machines"):
+        open_source(SourceConfig("socket", listen="0.0.0.0:0"), None)
+
+
+def test_the_first_usable_frame_is_waited_for():
+    nan = dataclasses.replace(streamed(0), theta=torch.full_like(streamed(0).theta, torch.nan))
+    broken = dataclasses.replace(streamed(1), png=b"no picture")
+    who, first = await_subject(GivenStream([nan, broken, streamed(2), streamed(3)]), print)
+    assert who.width == subject().width
+    assert first.index == 2
+
+
+def test_a_stream_without_a_usable_frame_is_an_error():
+    broken = dataclasses.replace(streamed(1), png=b"no picture")
+    large = np.zeros((16, 24, 4), np.uint8)
+    with pytest.raises(UserError, match="ended before a frame"):
+        await_subject(GivenStream([broken, streamed(2, image=large)]), print)
+
+
+def test_what_is_waited_for_is_told_once_with_what_went_wrong():
+    class Slow(GivenStream):
+        began = time.monotonic()
+
+        def subject(self, timeout_s: float) -> StreamSubject | None:
+            time.sleep(0.05)
+            return subject() if time.monotonic() - self.began > 1.3 else None
+
+    stream = Slow([streamed(0)])
+    stream.counts["failed openings"] = 2
+    told: list[str] = []
+    await_subject(stream, told.append)
+    assert len(told) == 1
+    assert "Waiting for frames" in told[0]
+    assert "failed openings: 2" in told[0]
+
+
+def test_ctrl_c_while_waiting_ends_with_exit_code_0(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("rgbavatar_ns.plugin.online_datamanager.await_subject", interrupted)
+    config = online_config(tmp_path / "out", tmp_path / "live")
+    config.pipeline.datamanager.source.kind = "folder"
+    with pytest.raises(SystemExit) as ended:
+        online_trainer(config)
+    assert ended.value.code == 0
+    assert "nothing to save" in capsys.readouterr().out

@@ -1,0 +1,165 @@
+"""Which face is followed: laws over drawn boxes, and real faces that cross in one picture."""
+
+import cv2
+import numpy as np
+import pytest
+
+from rgbavatar_ns.tracking.clip import SeenFaces, followed_face
+from rgbavatar_ns.tracking.follow import FaceFollower
+
+from .clips import astronaut
+
+WIDTH, HEIGHT = 640, 480
+SHAPE = np.random.default_rng(0).uniform(-0.5, 0.5, (478, 2)) * (0.8, 1.0)
+SHAPE[10], SHAPE[152] = (0, -0.5), (0, 0.5)
+
+
+def _face(x: float, y: float, height: float = 100) -> np.ndarray:
+    return SHAPE * height + (x, y)
+
+
+def _follow(frames: list[list[np.ndarray]]) -> list[tuple[int | None, int]]:
+    follower = FaceFollower()
+    seen = [follower(np.array(faces).reshape(-1, 478, 2), WIDTH, HEIGHT) for faces in frames]
+    return [(one.position, one.others) for one in seen]
+
+
+def test_the_largest_and_most_central_face_is_chosen_first() -> None:
+    small, large, far = _face(450, 240, 60), _face(300, 240, 130), _face(60, 60, 135)
+    for order in ([small, large, far], [far, small, large], [large, far, small]):
+        ((position, others),) = _follow([order])
+        assert position is not None
+        assert order[position] is large
+        assert others == 2
+
+
+def test_a_larger_face_that_enters_is_not_followed() -> None:
+    frames = [[_face(320, 240)] for _ in range(5)]
+    frames += [[_face(640 - 20 * k, 240, 180), _face(320, 240)] for k in range(7)]
+    assert _follow(frames) == [(0, 0)] * 5 + [(1, 1)] * 7
+
+
+def test_crossing_faces_keep_their_names_whatever_order_they_come_in() -> None:
+    random = np.random.default_rng(3)
+    for _ in range(8):
+        follower = FaceFollower()
+        for frame in range(60):
+            # The followed one stands, another of the same size walks by; hidden, neither is seen.
+            standing = _face(320 + random.normal(), 240 + random.normal())
+            walking = _face(60 + 9 * frame, 250)
+            faces = [standing, walking]
+            if np.abs(walking - standing).max() < 45:
+                faces = [walking]
+            random.shuffle(faces)
+            sighting = follower(np.array(faces), WIDTH, HEIGHT)
+            if len(faces) == 2:
+                assert sighting.position is not None
+                assert faces[sighting.position] is standing, frame
+            assert not sighting.jumped
+
+
+def test_a_lost_face_leaves_a_gap_that_another_one_never_fills() -> None:
+    frames = [[_face(320, 240), _face(100, 200)] for _ in range(20)]
+    frames += [[_face(100 + k, 200)] for k in range(80)]
+    frames += [[_face(180, 200), _face(330, 240)]]
+    assert _follow(frames) == [(0, 1)] * 20 + [(None, 1)] * 80 + [(1, 1)]
+
+
+def test_after_a_cut_the_face_is_found_again_elsewhere() -> None:
+    follower = FaceFollower()
+    for _ in range(30):
+        assert follower(_face(200, 200)[None], WIDTH, HEIGHT).position == 0
+    after = [follower(_face(480, 300, 160)[None], WIDTH, HEIGHT) for _ in range(12)]
+    found = [one.position is not None for one in after]
+    assert not found[0], "it may come back where it was"
+    assert found[6:] == [True] * 6
+    assert [one.jumped for one in after].count(True) == 1
+
+
+def test_a_mistaken_first_choice_gives_way() -> None:
+    # A picture on the wall is seen for three frames; the person is there all the time.
+    frames = [[_face(320, 240, 140), _face(200, 260, 90)] for _ in range(3)]
+    frames += [[_face(200, 260, 90)] for _ in range(40)]
+    positions = [position for position, _ in _follow(frames)]
+    assert positions[:3] == [0, 0, 0]
+    assert positions[-20:] == [0] * 20
+
+
+def test_two_sets_of_landmarks_on_one_face_are_one_face() -> None:
+    assert _follow([[_face(320, 240), _face(322, 238, 104)]]) == [(0, 0)]
+
+
+def test_frames_without_a_face_and_with_several() -> None:
+    assert _follow([[], [_face(320, 240)], [], [_face(325, 240)]]) == [
+        (None, 0),
+        (0, 0),
+        (None, 0),
+        (0, 0),
+    ]
+
+
+def _seen(faces: list[np.ndarray | None], **changes: np.ndarray) -> SeenFaces:
+    there = [face for face in faces if face is not None]
+    count = np.array([face is not None for face in faces], dtype=np.int64)
+    plain = {
+        "count": count,
+        "clip": np.zeros(len(faces), dtype=np.int64),
+        "time_s": np.arange(len(faces)) * 0.04,
+        "has_alpha": np.zeros(len(faces), dtype=bool),
+        "points": np.array(there) / (WIDTH, HEIGHT),
+        "sharpness": np.ones(len(there)),
+    }
+    return SeenFaces(**(plain | changes))
+
+
+def test_gaps_jumps_pauses_and_new_clips_begin_segments() -> None:
+    faces: list[np.ndarray | None] = [_face(300 + 3 * k, 240) for k in range(10)]
+    plain = followed_face(_seen(faces), WIDTH, HEIGHT)
+    assert plain.follows() == [False] + [True] * 9
+    assert plain.segments() == [{"first_frame": 0, "last_frame": 9, "clip": 0}]
+
+    gap = followed_face(_seen([*faces[:4], None, *faces[5:]]), WIDTH, HEIGHT)
+    assert gap.follows() == [False, True, True, True, False, True, True, True, True]
+    assert [part["first_frame"] for part in gap.segments()] == [0, 5]
+
+    moved = [*faces[:6], *(face + 30 for face in faces[6:] if face is not None)]
+    jump = followed_face(_seen(moved), WIDTH, HEIGHT)
+    assert jump.follows().index(False, 1) == 6
+
+    times = np.arange(10) * 0.04
+    times[3:] += 1.0
+    assert followed_face(_seen(faces, time_s=times), WIDTH, HEIGHT).follows().index(False, 1) == 3
+
+    clips = np.repeat([0, 1], 5)
+    assert followed_face(_seen(faces, clip=clips), WIDTH, HEIGHT).follows().index(False, 1) == 5
+
+
+def test_blurred_frames_are_noted_and_kept() -> None:
+    faces: list[np.ndarray | None] = [_face(320, 240)] * 9
+    sharpness = np.ones(9)
+    sharpness[4] = 0.1
+    found = followed_face(_seen(faces, sharpness=sharpness), WIDTH, HEIGHT)
+    assert found.blurred == (4,)
+    assert len(found) == 9
+
+
+def test_real_faces_that_cross_in_a_picture() -> None:
+    pytest.importorskip("mediapipe", reason="the tracker's optional extra is not installed")
+    from rgbavatar_ns.tracking.landmarks import FaceLandmarker
+
+    portrait = cv2.resize(astronaut()[:290, 40:330], (200, 200))
+    other = np.clip(portrait[:, ::-1].astype(int)[..., ::-1] * 0.9, 0, 255).astype(np.uint8)
+    alone = np.full((240, 640, 3), 128, np.uint8)
+    alone[20:220, 220:420] = portrait
+    with FaceLandmarker() as landmarker:
+        truth = landmarker(alone)
+        assert truth is not None
+        assert landmarker(alone) is not None
+        for left in range(0, 441, 22):
+            picture = alone.copy()
+            picture[30:230, left : left + 200] = other
+            found = landmarker(picture)
+            if abs(left - 220) > 190:
+                assert found is not None, left
+            if found is not None and abs(left - 220) > 150:
+                assert np.linalg.norm(found - truth, axis=1).mean() < 8, left

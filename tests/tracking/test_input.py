@@ -1,0 +1,240 @@
+"""Every kind of file that a user may bring: read rightly, or refused in words."""
+
+import subprocess
+import sys
+import wave
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+import pytest
+
+from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.tracking.image_files import image_files, read_image_rgba
+from rgbavatar_ns.tracking.video import FrameSource
+
+from .clips import gradient_images, write_clip
+
+
+@pytest.mark.parametrize(
+    ("codec", "pixel_format", "suffix"),
+    [
+        ("ffv1", "yuv420p10le", "mkv"),
+        ("ffv1", "yuv444p", "mkv"),
+        ("ffv1", "gray", "mkv"),
+        ("mjpeg", "yuvj420p", "avi"),
+        ("libx264", "yuv420p", "mp4"),
+    ],
+)
+def test_codecs_depths_and_ranges_give_the_same_pictures(
+    tmp_path: Path, codec: str, pixel_format: str, suffix: str
+) -> None:
+    images = gradient_images(4)
+    clip = write_clip(tmp_path / f"clip.{suffix}", images, codec, pixel_format)
+    for frame, image in zip(FrameSource.open(clip), images, strict=True):
+        assert frame.image_rgb.dtype == np.uint8
+        assert np.abs(frame.image_rgb[:, 8:24].astype(int) - image[:, 8:24]).max() <= 4
+
+
+def test_odd_sizes_keep_every_pixel(tmp_path: Path) -> None:
+    images = gradient_images(2, 47, 61)
+    clip = write_clip(tmp_path / "odd.mkv", images, "ffv1", "yuv444p")
+    frames = list(FrameSource.open(clip))
+    assert frames[0].image_rgb.shape == (47, 61, 3)
+    assert (frames[0].width, frames[0].height) == (61, 47)
+    assert np.abs(frames[1].image_rgb.astype(int) - images[1])[:, 40:].max() <= 4
+
+
+def test_a_variable_frame_rate_neither_doubles_nor_drops_frames(tmp_path: Path) -> None:
+    times = [0, 40, 80, 400, 410, 900]
+    clip = write_clip(tmp_path / "vfr.mkv", gradient_images(6), "ffv1", times_ms=times)
+    frames = list(FrameSource.open(clip))
+    assert [frame.time_s for frame in frames] == pytest.approx([t / 1000 for t in times], abs=2e-3)
+    levels = [int(frame.image_rgb[..., 0].max()) for frame in frames]
+    assert levels == sorted(set(levels))
+
+
+def test_pixels_that_are_not_square_become_square(tmp_path: Path) -> None:
+    clip = write_clip(tmp_path / "wide.mp4", gradient_images(2), pixel_aspect=Fraction(3, 2))
+    frame = next(iter(FrameSource.open(clip)))
+    assert frame.image_rgb.shape == (48, 96, 3)
+    assert (frame.width, frame.height) == (96, 48)
+    # The dark half still ends in the middle.
+    assert frame.image_rgb[:, 44].mean() < 30 < 35 < frame.image_rgb[:, 52].mean()
+
+
+def test_a_smaller_reading_knows_the_whole_size(tmp_path: Path) -> None:
+    clip = write_clip(tmp_path / "clip.mkv", gradient_images(3, 96, 128), "ffv1")
+    frame = next(FrameSource.open(clip).read(max_side=64))
+    assert frame.image_rgb.shape == (48, 64, 3)
+    assert (frame.width, frame.height) == (128, 96)
+
+
+def test_only_wanted_frames_are_given_and_keep_their_numbers(tmp_path: Path) -> None:
+    clip = write_clip(tmp_path / "clip.mkv", gradient_images(5), "ffv1")
+    whole = list(FrameSource.open(clip))
+    some = list(FrameSource.open(clip).read(lambda index: index in (1, 4)))
+    assert [frame.index for frame in some] == [1, 4]
+    np.testing.assert_array_equal(some[1].image_rgb, whole[4].image_rgb)
+
+
+def test_folders_of_grey_sixteen_bit_and_alpha_images(tmp_path: Path) -> None:
+    grey = np.arange(48 * 64, dtype=np.uint16).reshape(48, 64) * 20
+    rgba = np.zeros((48, 64, 4), np.uint8)
+    rgba[..., :3] = (10, 20, 200)
+    rgba[:, 32:, 3] = 255
+    cv2.imwrite(str(tmp_path / "1.png"), (grey >> 8).astype(np.uint8))
+    cv2.imwrite(str(tmp_path / "2.png"), grey)
+    cv2.imwrite(str(tmp_path / "3.tiff"), grey)
+    cv2.imwrite(str(tmp_path / "4.png"), rgba)
+    cv2.imwrite(str(tmp_path / "5.webp"), rgba, [cv2.IMWRITE_WEBP_QUALITY, 101])
+    first, second, third, fourth, fifth = FrameSource.open(tmp_path)
+    np.testing.assert_array_equal(first.image_rgb[..., 1], grey >> 8)
+    for deep in (second, third):
+        assert np.abs(deep.image_rgb[..., 2] - grey / 257).max() <= 0.5
+        assert deep.alpha is None
+    for clear in (fourth, fifth):
+        assert tuple(clear.image_rgb[0, -1]) == (200, 20, 10)
+        assert clear.alpha is not None
+        np.testing.assert_array_equal(clear.alpha, rgba[..., 3])
+
+
+def test_a_videos_alpha_channel_is_read(tmp_path: Path) -> None:
+    rgba = np.full((48, 64, 4), 120, np.uint8)
+    rgba[:, :20, 3] = 0
+    clip = write_clip(tmp_path / "clear.mov", [rgba] * 2, "png", "rgba")
+    for frame in FrameSource.open(clip):
+        assert frame.alpha is not None
+        np.testing.assert_array_equal(frame.alpha, rgba[..., 3])
+
+
+def test_floating_point_images_are_refused(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "a.tiff"), np.zeros((8, 8, 3), np.float32))
+    with pytest.raises(UserError, match="float32"):
+        read_image_rgba(tmp_path / "a.tiff")
+
+
+def test_photographs_are_turned_as_their_exif_data_asks(tmp_path: Path) -> None:
+    image = gradient_images(1)[0]
+    encoded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 100])[1].tobytes()
+    # An EXIF block with nothing but orientation 6: turn clockwise by 90 degrees.
+    tiff = b"MM\0*\0\0\0\x08" + b"\0\x01" + b"\x01\x12\0\x03\0\0\0\x01\0\x06\0\0" + b"\0\0\0\0"
+    block = b"Exif\0\0" + tiff
+    marker = b"\xff\xe1" + (len(block) + 2).to_bytes(2, "big") + block
+    path = tmp_path / "phone.jpg"
+    path.write_bytes(encoded[:2] + marker + encoded[2:])
+    turned = read_image_rgba(path)[..., :3]
+    assert turned.shape == (64, 48, 3)
+    assert np.abs(turned.astype(int) - np.rot90(image, -1)).max() <= 4
+
+
+def test_a_folders_other_files_are_passed_over_and_numbers_are_counted_as_numbers(
+    tmp_path: Path,
+) -> None:
+    folder = tmp_path / "Büro — кадры 影"
+    folder.mkdir()
+    for number in (10, 9, 2, 1):
+        cv2.imencode(".png", np.full((4, 4, 3), number, np.uint8))[1].tofile(
+            folder / f"Bild_ü{number}.png"
+        )
+    for name in ("notes.txt", ".hidden.png", "Thumbs.db"):
+        (folder / name).write_bytes(b"else")
+    (folder / "deeper").mkdir()
+    assert [path.name for path in image_files(folder)] == [
+        f"Bild_ü{number}.png" for number in (1, 2, 9, 10)
+    ]
+    assert [int(frame.image_rgb.max()) for frame in FrameSource.open(folder)] == [1, 2, 9, 10]
+
+
+def test_unicode_names_of_videos(tmp_path: Path) -> None:
+    clip = write_clip(tmp_path / "Größe — 影.mkv", gradient_images(2), "ffv1")
+    assert len(list(FrameSource.open(clip))) == 2
+
+
+def test_images_of_two_sizes_are_refused_by_name(tmp_path: Path) -> None:
+    for number, size in enumerate((8, 8, 9)):
+        cv2.imwrite(str(tmp_path / f"{number}.png"), np.zeros((size, 8, 3), np.uint8))
+    with pytest.raises(UserError, match=r"2\.png has 8 x 9 pixels"):
+        list(FrameSource.open(tmp_path))
+
+
+def test_an_empty_file_is_told_at_once(tmp_path: Path) -> None:
+    (tmp_path / "empty.mp4").write_bytes(b"")
+    with pytest.raises(UserError, match="0 bytes"):
+        FrameSource.open(tmp_path / "empty.mp4")
+
+
+def test_a_sound_file_with_a_cover_picture_has_no_video(tmp_path: Path) -> None:
+    sound = tmp_path / "sound.wav"
+    with wave.open(str(sound), "wb") as file:
+        file.setnchannels(1)
+        file.setsampwidth(2)
+        file.setframerate(8000)
+        file.writeframes(b"\0\0" * 8000)
+    song = tmp_path / "song.m4a"
+    cover = cv2.imencode(".png", np.zeros((16, 16, 3), np.uint8))[1].tobytes()
+    with av.open(str(sound)) as source, av.open(str(song), "w", format="mp4") as sink:
+        out = sink.add_stream("aac", rate=8000)
+        picture = sink.add_stream("png", rate=1)
+        picture.width = picture.height = 16
+        picture.pix_fmt = "rgb24"
+        picture.disposition = av.stream.Disposition.attached_pic
+        packet = av.Packet(cover)
+        packet.stream = picture
+        packet.pts = packet.dts = 0
+        sink.mux(packet)
+        for frame in source.decode(audio=0):
+            for packet in out.encode(frame):
+                sink.mux(packet)
+        for packet in out.encode():
+            sink.mux(packet)
+    with pytest.raises(UserError, match="no video stream"):
+        list(FrameSource.open(song))
+
+
+def test_a_truncated_mp4_is_refused_or_its_readable_part_is_noted(tmp_path: Path) -> None:
+    whole = write_clip(tmp_path / "whole.mp4", gradient_images(12, 96, 128))
+    data = whole.read_bytes()
+    headless = tmp_path / "headless.mp4"
+    headless.write_bytes(data[: len(data) // 2])
+    with pytest.raises(UserError, match="cannot be read as a video"):
+        list(FrameSource.open(headless))
+
+
+def test_damage_in_the_middle_costs_those_frames_and_is_noted(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    images = [rng.integers(0, 255, (48, 64, 3)).astype(np.uint8) for _ in range(8)]
+    clip = write_clip(tmp_path / "clip.avi", images, "png", "rgb24")
+    data = bytearray(clip.read_bytes())
+    places = [k for k in range(len(data) - 8) if data[k : k + 4] == b"\x89PNG"]
+    data[places[3] : places[3] + 64] = bytes(64)
+    clip.write_bytes(bytes(data))
+    source = FrameSource.open(clip)
+    frames = list(source)
+    # A decoder with several threads may lose the frame that it worked on beside the damaged one.
+    assert 6 <= len(frames) <= 7
+    sent = [next(k for k in range(8) if (images[k] == one.image_rgb).all()) for one in frames]
+    assert sent == sorted(set(sent) - {3})
+    assert any("damaged" in note for note in source.notes)
+
+
+_MEMORY = """
+import resource, sys
+from rgbavatar_ns.tracking.threads import in_background
+from rgbavatar_ns.tracking.video import FrameSource
+peak = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+for frame in in_background(FrameSource.open(sys.argv[1]), 2):
+    early = peak() if frame.index <= 8 else early
+print(frame.index, *frame.image_rgb.shape, peak() - early)
+"""
+
+
+def test_memory_does_not_grow_with_the_length_of_a_4k_clip(tmp_path: Path) -> None:
+    image = cv2.resize(gradient_images(1)[0], (3840, 2160))
+    clip = write_clip(tmp_path / "large.mp4", [image] * 21)
+    command = [sys.executable, "-c", _MEMORY, str(clip)]
+    told = subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()
+    assert told[:4] == ["20", "2160", "3840", "3"]
+    assert float(told[4]) < 60, "12 frames more would take 285 MiB"

@@ -1,0 +1,173 @@
+"""The user's own mattes are taken as they are; ours do not flicker and drag nothing along."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.tracking import TrackConfig, track_video
+from rgbavatar_ns.tracking.mattes import UserMattes
+from rgbavatar_ns.tracking.steady_matte import CoarseMatte, head_motion, steadied
+from rgbavatar_ns.tracking.video import FrameSource
+
+from .clips import astronaut, gradient_images, write_clip
+
+CONFIG = TrackConfig(image_size=96, key_frames=1, focal_px=500.0, keep_torso=True)
+
+
+def _folder(path: Path, images: dict[str, np.ndarray]) -> Path:
+    path.mkdir()
+    for name, image in images.items():
+        cv2.imwrite(str(path / name), image)
+    return path
+
+
+def _levels(mattes: UserMattes, frames: set[int], width: int, height: int) -> dict[int, int]:
+    return {
+        index: int(matte.max()) for index, matte in mattes.levels(frozenset(frames), width, height)
+    }
+
+
+def test_mattes_go_to_images_by_name(tmp_path: Path) -> None:
+    names = ("b", "a", "c")
+    frames = _folder(tmp_path / "f", {f"{n}.png": np.zeros((4, 6, 3), np.uint8) for n in names})
+    masks = {f"{n}.png": np.full((4, 6), 50 * k, np.uint8) for k, n in enumerate(names)}
+    mattes = UserMattes.open(_folder(tmp_path / "m", masks), FrameSource.open(frames))
+    assert _levels(mattes, {0, 1, 2}, 6, 4) == {0: 50, 1: 0, 2: 100}
+
+
+def test_mattes_go_to_videos_by_number(tmp_path: Path) -> None:
+    clip = write_clip(tmp_path / "clip.mkv", gradient_images(11, 4, 6), "ffv1", "yuv444p")
+    masks = {f"matte_{k + 1}.png": np.full((4, 6), 20 * k, np.uint8) for k in range(11)}
+    mattes = UserMattes.open(_folder(tmp_path / "m", masks), FrameSource.open(clip))
+    mattes.require_count(11, limited=False)
+    assert _levels(mattes, {1, 10}, 6, 4) == {1: 20, 10: 200}
+
+
+def test_a_mattes_alpha_counts_before_its_grey(tmp_path: Path) -> None:
+    clip = write_clip(tmp_path / "clip.mkv", gradient_images(1, 4, 6), "ffv1", "yuv444p")
+    rgba = np.zeros((4, 6, 4), np.uint8)
+    rgba[:2, :, 3] = 90
+    mattes = UserMattes.open(_folder(tmp_path / "m", {"0.png": rgba}), FrameSource.open(clip))
+    ((_, matte),) = mattes.levels(frozenset({0}), 6, 4)
+    np.testing.assert_array_equal(matte, rgba[..., 3])
+
+
+def test_a_mask_video_is_read_in_step(tmp_path: Path) -> None:
+    masks = [np.full((16, 16, 3), 30 * k, np.uint8) for k in range(6)]
+    clip = write_clip(tmp_path / "clip.mkv", gradient_images(6, 16, 16), "ffv1")
+    mask = write_clip(tmp_path / "mask.mkv", masks, "ffv1", "yuv444p")
+    mattes = UserMattes.open(mask, FrameSource.open(clip))
+    levels = _levels(mattes, {2, 5}, 16, 16)
+    assert levels == pytest.approx({2: 60, 5: 150}, abs=2)
+
+
+def test_missing_surplus_and_misfitting_mattes_are_told(tmp_path: Path) -> None:
+    clip = FrameSource.open(write_clip(tmp_path / "clip.mkv", gradient_images(4), "ffv1"))
+    with pytest.raises(UserError, match="no mattes at"):
+        UserMattes.open(tmp_path / "absent", clip)
+    small = {f"{k}.png": np.zeros((8, 8), np.uint8) for k in range(3)}
+    mattes = UserMattes.open(_folder(tmp_path / "small", small), clip)
+    with pytest.raises(UserError, match="holds 3 mattes, the video has 4 frames"):
+        mattes.require_count(4, limited=False)
+    with pytest.raises(UserError, match="holds 3 mattes, the video has 2 frames"):
+        mattes.require_count(2, limited=False)
+    mattes.require_count(2, limited=True)
+    with pytest.raises(UserError, match="8 x 8 pixels, the video 64 x 48"):
+        list(mattes.levels(frozenset({0}), 64, 48))
+    video = UserMattes.open(write_clip(tmp_path / "mask.mkv", gradient_images(2), "ffv1"), clip)
+    with pytest.raises(UserError, match="ends before frame 3"):
+        list(video.levels(frozenset({1, 3}), 64, 48))
+    images = {f"{k}.png": np.zeros((8, 8, 3), np.uint8) for k in range(3)}
+    folder = FrameSource.open(_folder(tmp_path / "images", images))
+    with pytest.raises(UserError, match="no matte named 2"):
+        UserMattes.open(_folder(tmp_path / "two", dict(list(small.items())[:2])), folder)
+
+
+def _disc(size: int, x: float) -> np.ndarray:
+    rows, columns = np.mgrid[0:size, 0:size] + 0.5
+    return np.clip(30 - np.hypot(rows - 64, columns - x) + 0.5, 0, 1).astype(np.float32)
+
+
+def _picture(mask: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    stripes = 110 + 40 * np.sin(np.arange(128) / 3)[None, :, None]
+    picture = mask[..., None] * (200, 150, 120) + (1 - mask[..., None]) * stripes
+    return np.clip(picture + noise, 0, 255).astype(np.uint8)
+
+
+def test_flicker_sinks_where_the_picture_does_not_change() -> None:
+    random = np.random.default_rng(0)
+    disc = _disc(128, 64)
+    coarse, seen = [], []
+    for _ in range(9):
+        flicker = cv2.GaussianBlur(random.normal(size=(128, 128)), (0, 0), 3) * 2
+        coarse.append(np.clip(disc + flicker * (disc > 0.01), 0, 1).astype(np.float32))
+        picture = _picture(disc, random.normal(size=(128, 128, 1)) * 2)
+        seen.append(CoarseMatte.of(picture, coarse[-1]))
+    still = np.eye(2, 3)
+    steady = [
+        steadied(coarse[k], seen[k], [(seen[n], still) for n in range(k - 2, k + 3) if n != k])
+        for k in range(2, 7)
+    ]
+    before = np.abs(np.diff(coarse[2:7], axis=0)).mean()
+    after = np.abs(np.diff(steady, axis=0)).mean()
+    assert after < 0.5 * before
+
+
+def test_what_moves_against_the_head_leaves_no_ghost() -> None:
+    # The disc jumps by its own width between frames while the head is said to stand still.
+    coarse = [_disc(128, x) for x in (30, 64, 98)]
+    seen = [CoarseMatte.of(_picture(mask, np.zeros(1)), mask) for mask in coarse]
+    still = np.eye(2, 3)
+    steady = steadied(coarse[1], seen[1], [(seen[0], still), (seen[2], still)])
+    gone = (coarse[0] > 0.9) & (coarse[1] < 0.1)
+    assert steady[gone].mean() < 0.03
+    assert steady[coarse[1] > 0.9].min() > 0.9
+
+
+def test_a_matte_that_moves_with_the_head_stays_sharp() -> None:
+    coarse = [_disc(128, x) for x in (56, 64, 72)]
+    pictures = [(60 + 140 * mask)[..., None].repeat(3, 2).astype(np.uint8) for mask in coarse]
+    seen = [CoarseMatte.of(picture, mask) for picture, mask in zip(pictures, coarse)]
+    points = np.random.default_rng(1).uniform(40, 90, (20, 2))
+    moves = [head_motion(points + np.array([8 * (k - 1), 0]), points) for k in (0, 2)]
+    # Its own matte is wrong at the top; both neighbours, moved along, know better.
+    wrong = coarse[1].copy()
+    wrong[:44] = 0
+    now = CoarseMatte(wrong, seen[1].thumbnail)
+    steady = steadied(wrong, now, [(seen[0], moves[0]), (seen[2], moves[1])])
+    # The mean of all three; in the open and inside the disc that is two thirds.
+    np.testing.assert_allclose(steady[40, 58:70], 2 / 3, atol=0.02)
+    np.testing.assert_allclose(steady[46:], coarse[1][46:], atol=0.1)
+
+
+def test_head_motion_recovers_a_similarity() -> None:
+    points = np.random.default_rng(2).normal(size=(30, 2))
+    turn = 1.1 * np.array([[np.cos(0.3), -np.sin(0.3)], [np.sin(0.3), np.cos(0.3)]])
+    motion = head_motion(points, points @ turn.T + np.array([5, -2]))
+    np.testing.assert_allclose(motion, np.concatenate([turn, [[5], [-2]]], axis=1), atol=1e-12)
+
+
+def test_a_users_matte_and_an_alpha_channel_end_up_in_the_dataset(tmp_path: Path) -> None:
+    pytest.importorskip("mediapipe", reason="the tracker's optional extra is not installed")
+    image = astronaut()[::2, ::2]
+    own = np.zeros(image.shape[:2], np.uint8)
+    own[:, :100] = 255
+    clear = np.dstack([image[..., ::-1], own])
+    frames = _folder(tmp_path / "f", {f"{k}.png": image[..., ::-1] for k in range(2)})
+    masks = _folder(tmp_path / "m", {f"{k}.png": own for k in range(2)})
+    alphas = _folder(tmp_path / "a", {f"{k}.png": clear for k in range(2)})
+    by_mask = track_video(frames, tmp_path / "x", TrackConfig(**{**vars(CONFIG), "mattes": masks}))
+    by_alpha = track_video(alphas, tmp_path / "y", CONFIG)
+    for dataset in (by_mask, by_alpha):
+        alpha = dataset.read_image(1)[..., 3]
+        assert alpha[48, :20].min() == 255
+        assert alpha[:, -20:].max() == 0
+    np.testing.assert_array_equal(
+        by_mask.read_image(0)[..., 3] > 127, by_alpha.read_image(0)[..., 3] > 127
+    )
+    short = _folder(tmp_path / "s", {"0.png": own})
+    with pytest.raises(UserError, match="no matte named 1"):
+        track_video(frames, tmp_path / "z", TrackConfig(**{**vars(CONFIG), "mattes": short}))

@@ -1,0 +1,59 @@
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+
+from rgbavatar_ns.head import HeadModel
+from rgbavatar_ns.tracking.camera import StillCamera
+from rgbavatar_ns.tracking.config import TrackConfig
+from rgbavatar_ns.tracking.fit import fit_frame
+from rgbavatar_ns.tracking.frame_cost import Target
+from rgbavatar_ns.tracking.landmarks import face_height_px
+from rgbavatar_ns.tracking.subject import SubjectTracker
+
+CAMERA = StillCamera(700.0, (160.0, 120.0), 0.8)
+Spoil = Callable[[np.ndarray, float, np.random.Generator], np.ndarray]
+
+
+def _hand_over_mouth(points: np.ndarray, face_px: float, random: np.random.Generator) -> np.ndarray:
+    """The points of the lower face slip onto a hand: to one side and apart."""
+    spoiled = points.copy()
+    below = points[:, 1] > np.quantile(points[:, 1], 0.7)
+    spoiled[below] += [0.14 * face_px, -0.06 * face_px]
+    spoiled[below] += random.normal(size=(below.sum(), 2)) * 0.05 * face_px
+    return spoiled
+
+
+def _single_slips(points: np.ndarray, face_px: float, random: np.random.Generator) -> np.ndarray:
+    """Every eighth point is anywhere on the face, to one side of where it should be."""
+    spoiled = points.copy()
+    spoiled[::8] += np.abs(random.normal(size=(len(points[::8]), 2))) * 0.3 * face_px
+    return spoiled
+
+
+@pytest.mark.parametrize("spoil", [_hand_over_mouth, _single_slips])
+@pytest.mark.parametrize("seed", range(2))
+def test_a_pose_stays_right_when_landmarks_go_wrong(spoil: Spoil, seed: int) -> None:
+    tracker = SubjectTracker(HeadModel.embedded(dtype=torch.float64), TrackConfig())
+    random = np.random.default_rng(seed)
+    layout = tracker.head.layout
+    theta = np.zeros(layout.size)
+    theta[layout.slice("rotation")] = random.uniform(-0.25, 0.25, 3)
+    theta[layout.slice("translation")] = random.uniform(-0.02, 0.02, 3)
+    identity = np.zeros(tracker.head.num_identity)
+    points = CAMERA.project(tracker.mesh_landmarks.points(theta, identity))
+    whole = np.zeros((478, 2))
+    whole[tracker.facemesh_index] = points
+    face_px = float(face_height_px(whole[None])[0])
+    start = np.zeros(len(tracker.cost.parameters.columns))
+    target = Target(spoil(points, face_px, random), face_px)
+    values = fit_frame(tracker.cost, CAMERA, target, start, None, 0.0, 12)
+    found = tracker.cost.theta(values, np.zeros(layout.size))
+
+    turned = tracker.mesh_landmarks.head_rotation(found)
+    turned = turned @ tracker.mesh_landmarks.head_rotation(theta).T
+    angle = np.degrees(np.arccos(np.clip((np.trace(turned) - 1) / 2, -1, 1)))
+    assert angle < 1.5
+    shift = found[layout.slice("translation")] - theta[layout.slice("translation")]
+    assert np.linalg.norm(shift[:2]) < 0.01 * CAMERA.distance_m

@@ -1,0 +1,175 @@
+"""The figures and words of the report, worked by hand."""
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from rich.console import Console
+
+from rgbavatar_ns.cli.track import summary_table
+from rgbavatar_ns.tracking.overlay import OverlayTile, write_contact_sheet
+from rgbavatar_ns.tracking.region import height_above_chin, mesh_silhouette
+from rgbavatar_ns.tracking.report import (
+    closed_eyes,
+    count_blinks,
+    gap_correlation,
+    silhouette_summary,
+    verdict,
+)
+from rgbavatar_ns.tracking.sheet import sheet_frames
+from rgbavatar_ns.tracking.silhouette import silhouette_agreement
+
+GOOD: dict[str, Any] = {
+    "frames_read": 200,
+    "frames_tracked": 200,
+    "rejected": {"no face": []},
+    "segments": [{}],
+    "other_faces": [],
+    "blurred": [],
+    "notes": [],
+    "reprojection_error_share": 0.004,
+    "worst_frame_error_share": 0.01,
+    "mesh_reprojection_error_share": 0.009,
+    "mouth_opening_correlation": 0.98,
+    "eyelid_opening_correlation": 0.95,
+    "blinks_fitted": 3,
+    "blinks_measured": 3,
+    "silhouette_coverage": 0.99,
+    "face_silhouette_iou": 0.92,
+    "face_height_px": 180.0,
+    "stages": {"faces": {"frames": 200, "seconds": 8.0, "frames_per_second": 25.0}},
+    "frames_per_second": 12.0,
+}
+
+
+def test_blinks_are_counted_once_each() -> None:
+    gap = np.array([10, 10, 3, 2, 9, 10, 1, 10, 6, 10, 10, 2.0])
+    assert closed_eyes(gap).tolist() == [k in (2, 3, 6, 11) for k in range(12)]
+    assert count_blinks(gap) == 3
+    assert count_blinks(np.full(5, 7.0)) == 0
+
+
+def test_correlation_of_openings() -> None:
+    opening = np.array([1.0, 2, 3, 2])
+    assert gap_correlation(2 * opening + 1, opening) == pytest.approx(1)
+    assert gap_correlation(-opening, opening) == pytest.approx(-1)
+    assert gap_correlation(np.ones(4), opening) is None
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({}, "good"),
+        ({"mouth_opening_correlation": None, "eyelid_opening_correlation": None}, "good"),
+        ({"mesh_reprojection_error_share": 0.02}, "usable: the mesh lies off the face"),
+        ({"mesh_reprojection_error_share": 0.05}, "look at it: the mesh lies off the face"),
+        ({"frames_tracked": 180}, "usable: 20 of 200 frames are left out"),
+        ({"frames_tracked": 100}, "look at it: 100 of 200 frames are left out"),
+        ({"eyelid_opening_correlation": 0.7}, "usable: the eyelids are not followed"),
+        ({"silhouette_coverage": 0.5}, "look at it: the matte misses part of the head"),
+        ({"other_faces": [4, 5]}, "look at it: another face is seen in 2 frames"),
+        ({"face_height_px": 40.0}, "look at it: the face is only 40 pixels high"),
+        ({"blurred": list(range(30))}, "usable: 30 frames are blurred"),
+    ],
+)
+def test_the_verdict_says_what_is_amiss(changes: dict[str, Any], words: str) -> None:
+    assert verdict(GOOD | changes) == words
+
+
+def test_grave_words_come_before_mild_ones() -> None:
+    both = GOOD | {"mesh_reprojection_error_share": 0.02, "silhouette_coverage": 0.5}
+    assert verdict(both) == (
+        "look at it: the matte misses part of the head; the mesh lies off the face"
+    )
+
+
+def test_the_table_names_every_figure() -> None:
+    console = Console(width=200, record=True)
+    console.print(summary_table(GOOD | {"verdict": "good", "frames_per_second": None}))
+    text = console.export_text()
+    for part in ("200 of 200", "0.90 %", "0.40 %", "0.980", "0.950", "99.00 %", "25 frames/s"):
+        assert part in text
+    assert "None" not in text
+
+
+def test_silhouettes_compared_by_hand() -> None:
+    # Rows 0 to 99, chin at row 80, forehead at row 0: above_chin falls from 1 to -.25.
+    above = height_above_chin(np.array([50.0, 0.0]), np.array([50.0, 80.0]), 100)
+    assert above[0, 0] == pytest.approx(1 - 0.5 / 80)
+    mesh = np.zeros((100, 100), np.float32)
+    mesh[10:95, 30:70] = 1
+    hair = mesh.copy()
+    hair[:30, 20:80] = 1
+    seen = np.ones_like(mesh)
+    with_hair = silhouette_agreement(mesh, hair, seen, above, 80.0)
+    assert (with_hair.coverage, with_hair.face_iou) == (1, 1), "hair on top costs nothing"
+    wider = mesh.copy()
+    wider[:, 65:75] = 1
+    assert silhouette_agreement(mesh, wider, seen, above, 80.0).face_iou == pytest.approx(40 / 45)
+    half = mesh.copy()
+    half[:, :50] = 0
+    agreement = silhouette_agreement(mesh, half, seen, above, 80.0)
+    assert agreement.coverage == pytest.approx(0.5)
+    assert agreement.face_iou == pytest.approx(0.5)
+    outside = silhouette_agreement(mesh, half, np.zeros_like(mesh), above, 80.0)
+    assert (outside.coverage, outside.face_iou) == (None, None)
+    summary = silhouette_summary([agreement.to_json(), outside.to_json(), with_hair.to_json()])
+    assert summary["silhouette_coverage"] == pytest.approx(0.75)
+    assert summary["worst_silhouette_coverage"] == pytest.approx(0.5)
+
+
+def test_a_silhouette_is_the_pixels_whose_centres_lie_inside() -> None:
+    random = np.random.default_rng(4)
+    points = random.uniform(-8, 72, (30, 2))
+    faces = np.array([random.choice(30, 3, replace=False) for _ in range(25)])
+    mask = mesh_silhouette(points, faces, 64)
+    expected = np.zeros((64, 64))
+    for a, b, c in points[faces]:
+        if (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]) >= 0:
+            continue
+        contour = np.array([a, b, c], np.float32)
+        for row in range(64):
+            for column in range(64):
+                if not expected[row, column]:
+                    center = (column + 0.5, row + 0.5)
+                    expected[row, column] = cv2.pointPolygonTest(contour, center, False) >= 0
+    assert np.abs(mask - expected).sum() <= 2, "but for centres on an edge"
+    assert expected.sum() > 300
+
+
+def _landmarks(frames: int) -> np.ndarray:
+    points = np.random.default_rng(5).uniform(100, 200, (478, 2))
+    points[10], points[152], points[234], points[454], points[4] = (
+        *((150, 50), (150, 250), (80, 150), (220, 150), (150, 150)),
+    )
+    return np.repeat(points[None], frames, axis=0)
+
+
+def test_the_sheet_shows_the_frames_that_are_most_likely_wrong() -> None:
+    points = _landmarks(200)
+    points[37, 14] = points[37, 13] + (0, 900)
+    points[61, 4] += (30, 0)
+    error = np.ones(200)
+    error[113] = 9
+    shown = sheet_frames(points, error)
+    assert list(shown) == sorted(shown)
+    assert len(shown) == 12
+    assert "widest mouth" in shown[37]
+    assert "worst fit" in shown[113]
+    assert "turned left" in shown[61]
+    assert max(np.diff(list(shown))) < 45, "the rest lies evenly between"
+
+
+def test_a_sheet_of_one_frame(tmp_path: Path) -> None:
+    shown = sheet_frames(_landmarks(1), np.ones(1))
+    assert list(shown) == [0]
+    image = np.full((64, 64, 4), 255, np.uint8)
+    corners = np.array([[10.0, 10], [50, 10], [30, 50]])
+    tile = OverlayTile(shown[0], image, corners, corners, corners + 3)
+    write_contact_sheet(tmp_path / "sheet.png", [tile], np.array([[0, 2, 1]]))
+    sheet = cv2.imread(str(tmp_path / "sheet.png"))
+    assert sheet.shape[1] == 2 * sheet.shape[0]
+    assert sheet[:, : sheet.shape[0]][40:].min() == 255, "left: the picture as it is"
+    assert sheet[:, sheet.shape[0] :].min() < 200, "right: with the mesh"

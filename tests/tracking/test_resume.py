@@ -1,0 +1,237 @@
+"""Interrupted runs: what is done is kept, and the end is the same."""
+
+import errno
+import json
+import os
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from rgbavatar_ns.cli import track as command
+from rgbavatar_ns.data import load_dataset
+from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.tracking import TrackConfig, track_video
+from rgbavatar_ns.tracking import track as track_module
+from rgbavatar_ns.tracking.find_faces import find_faces
+from rgbavatar_ns.tracking.unfinished import WORK_FOLDER, UnfinishedRun, fingerprint
+
+from .clips import astronaut, gradient_images, write_clip
+
+pytest.importorskip("mediapipe", reason="the tracker's optional extra is not installed")
+CONFIG = TrackConfig(image_size=64, key_frames=2, focal_px=500.0)
+FRAMES, BLOCK = 22, 10
+Progress = Callable[[str, int, int | None], None]
+
+
+@pytest.fixture(scope="module")
+def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The portrait drifts, and is gone for two frames."""
+    image = astronaut()[::2, ::2]
+    frames = [np.roll(image, k // 2, axis=1) for k in range(FRAMES)]
+    frames[14] = frames[15] = np.full_like(image, 90)
+    return write_clip(tmp_path_factory.mktemp("clip") / "clip.mp4", frames)
+
+
+@pytest.fixture(autouse=True)
+def short_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(track_module, "find_faces", partial(find_faces, block_frames=BLOCK))
+
+
+@pytest.fixture(scope="module")
+def uninterrupted(clip: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    dst = tmp_path_factory.mktemp("whole") / "set"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(track_module, "find_faces", partial(find_faces, block_frames=BLOCK))
+        track_video(clip, dst, CONFIG)
+    return dst
+
+
+def _interrupting(stage: str, frames: int) -> Progress:
+    def progress(now: str, done: int, total: int | None) -> None:
+        if now == stage and done >= frames:
+            raise KeyboardInterrupt
+
+    return progress
+
+
+def _files(dst: Path) -> dict[str, bytes]:
+    """Everything but the report, which holds times."""
+    return {
+        str(path.relative_to(dst)): path.read_bytes()
+        for path in sorted(dst.rglob("*"))
+        if path.is_file() and path.name != "tracking.json"
+    }
+
+
+def test_a_run_interrupted_in_every_stage_ends_with_the_same_files(
+    clip: Path, uninterrupted: Path, tmp_path: Path
+) -> None:
+    dst = tmp_path / "set"
+    counted: list[tuple[str, int]] = []
+    for stage, frames in (("faces", 13), ("pictures", 3), ("pictures", 9)):
+        with pytest.raises(KeyboardInterrupt):
+            track_video(clip, dst, CONFIG, _interrupting(stage, frames))
+        with pytest.raises(UserError):
+            load_dataset(dst)
+        assert (dst / WORK_FOLDER).is_dir()
+
+    def count(stage: str, done: int, total: int | None) -> None:
+        counted.append((stage, done))
+
+    track_video(clip, dst, CONFIG, count)
+    # No face was looked for again, and of the pictures those that were missing.
+    assert counted[0] == ("faces", FRAMES)
+    assert min(done for stage, done in counted if stage == "pictures") >= 8
+    assert _files(dst) == _files(uninterrupted)
+    assert not (dst / WORK_FOLDER).exists()
+    reports = [json.loads((one / "tracking.json").read_text()) for one in (dst, uninterrupted)]
+    for report in reports:
+        del report["stages"], report["frames_per_second"]
+    assert reports[0] == reports[1]
+
+
+def test_only_the_block_that_was_begun_is_read_again(clip: Path, tmp_path: Path) -> None:
+    dst = tmp_path / "set"
+    with pytest.raises(KeyboardInterrupt):
+        track_video(clip, dst, CONFIG, _interrupting("faces", BLOCK + 3))
+    seen: list[int] = []
+
+    def watch(stage: str, done: int, total: int | None) -> None:
+        seen.append(done)
+        if stage == "fit":
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        track_video(clip, dst, CONFIG, watch)
+    assert seen[:2] == [BLOCK, BLOCK + 1]
+
+
+def test_other_options_or_another_video_are_refused_in_words_or_start_anew(
+    clip: Path, tmp_path: Path
+) -> None:
+    dst = tmp_path / "set"
+    with pytest.raises(KeyboardInterrupt):
+        track_video(clip, dst, CONFIG, _interrupting("faces", 3))
+    other = TrackConfig(image_size=96, key_frames=2, focal_px=500.0)
+    with pytest.raises(UserError, match="differs in: image_size"):
+        track_video(clip, dst, other)
+    changed = write_clip(tmp_path / "other.mp4", [astronaut()[::4, ::4]] * 2)
+    with pytest.raises(UserError, match="differs in: the video"):
+        track_video(changed, dst, CONFIG)
+    small = TrackConfig(image_size=48, key_frames=1, focal_px=500.0, overwrite=True)
+    assert track_video(changed, dst, small).width == 48
+
+
+def test_a_finished_dataset_stands_until_the_new_ones_pictures_begin(
+    clip: Path, tmp_path: Path
+) -> None:
+    dst = tmp_path / "set"
+    small = TrackConfig(image_size=48, key_frames=1, focal_px=500.0, max_frames=2)
+    first = track_video(clip, dst, small)
+    again = TrackConfig(image_size=32, key_frames=1, max_frames=2, focal_px=500.0, overwrite=True)
+    with pytest.raises(KeyboardInterrupt):
+        track_video(clip, dst, again, _interrupting("fit", 0))
+    assert load_dataset(dst).width == first.width
+    with pytest.raises(UserError, match="not empty"):
+        track_video(clip, dst, TrackConfig(image_size=32, max_frames=2))
+    assert track_video(clip, dst, again).width == 32
+
+
+def test_a_torn_line_and_a_torn_picture_are_made_again(tmp_path: Path) -> None:
+    run = UnfinishedRun.open(tmp_path / "set", {"a": 1}, overwrite=False)
+    images = tmp_path / "set" / "images"
+    images.mkdir()
+    assert run.pictures("fit") == {}
+    for frame in range(3):
+        cv2.imwrite(str(images / f"{frame:05d}.png"), np.zeros((4, 4, 4), np.uint8))
+        run.note_picture(frame, {"coverage": None})
+    whole = (images / "00001.png").read_bytes()
+    (images / "00001.png").write_bytes(whole[:-6])
+    with (tmp_path / "set" / WORK_FOLDER / "pictures.jsonl").open("a") as file:
+        file.write('{"frame": 2, "cov')
+    assert sorted(run.pictures("fit")) == [0, 2]
+    run.note_picture(7, {})
+    cv2.imwrite(str(images / "00007.png"), np.zeros((4, 4, 4), np.uint8))
+    assert sorted(run.pictures("fit")) == [0, 2, 7]
+    assert run.pictures("another fit") == {}
+
+
+def test_ctrl_c_ends_with_one_line_and_code_130(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted(*given: object, **named: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(command, "track_video", interrupted)
+    with pytest.raises(SystemExit) as told:
+        command.run((tmp_path / "clip.mp4",), tmp_path / "set")
+    assert told.value.code == 130
+    assert "the same command goes on from there" in capsys.readouterr().err
+
+
+def test_a_failure_that_repeats_leaves_nothing_behind(tmp_path: Path) -> None:
+    grey = write_clip(tmp_path / "grey.mp4", gradient_images(3, 96, 96))
+    with pytest.raises(UserError, match="No face"):
+        track_video(grey, tmp_path / "set")
+    (tmp_path / "noise.mp4").write_bytes(b"no video" * 99)
+    with pytest.raises(UserError, match="cannot be read"):
+        track_video(tmp_path / "noise.mp4", tmp_path / "set")
+    assert not (tmp_path / "set").exists()
+
+
+def test_a_destination_that_is_a_file_is_refused(clip: Path, tmp_path: Path) -> None:
+    (tmp_path / "set").write_text("mine")
+    with pytest.raises(UserError, match="is a file"):
+        track_video(clip, tmp_path / "set")
+    assert (tmp_path / "set").read_text() == "mine"
+
+
+def _failing(code: int, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let every file whose name holds `name` fail to be moved into its place."""
+    real = os.replace
+
+    def replace(source: str | Path, target: str | Path) -> None:
+        if name in str(target):
+            raise OSError(code, os.strerror(code))
+        real(source, target)
+
+    monkeypatch.setattr(os, "replace", replace)
+
+
+@pytest.mark.parametrize(
+    ("code", "told"), [(errno.EROFS, "cannot be written"), (errno.EACCES, "cannot be written")]
+)
+def test_a_destination_that_cannot_be_written_is_told_before_the_work(
+    clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int, told: str
+) -> None:
+    _failing(code, "run.json", monkeypatch)
+    with pytest.raises(UserError, match=told):
+        track_video(clip, tmp_path / "set", CONFIG, _interrupting("faces", 0))
+
+
+@pytest.mark.parametrize("place", ["faces_", "00005.png"])
+def test_after_a_full_disk_the_same_command_goes_on(
+    clip: Path, tmp_path: Path, uninterrupted: Path, place: str
+) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(track_module, "find_faces", partial(find_faces, block_frames=BLOCK))
+        _failing(errno.ENOSPC, place, patch)
+        with pytest.raises(UserError, match="no space left"):
+            track_video(clip, tmp_path / "set", CONFIG)
+    assert (tmp_path / "set" / WORK_FOLDER).is_dir()
+    if place == "00005.png":
+        track_video(clip, tmp_path / "set", CONFIG)
+        assert _files(tmp_path / "set") == _files(uninterrupted)
+
+
+def test_a_source_is_known_by_its_content(tmp_path: Path) -> None:
+    first, second = tmp_path / "a", tmp_path / "b"
+    first.write_bytes(b"x" * 9_000_000)
+    second.write_bytes(b"x" * 9_000_000)
+    assert fingerprint(first) == fingerprint(second)
+    second.write_bytes(b"x" * 8_999_999 + b"y")
+    assert fingerprint(first) != fingerprint(second)

@@ -1,0 +1,188 @@
+"""Videos and cameras as streams, with a tracker that only counts, and with the real one."""
+
+import time
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from rgbavatar_ns.data import TrackedFrame
+from rgbavatar_ns.data.streams import Backoff, StreamedFrame
+from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.head import HeadModel
+from rgbavatar_ns.kernels import PinholeCameras
+from rgbavatar_ns.tracking.live_pictures import FilePictures, NewestPictures
+from rgbavatar_ns.tracking.video_stream import VideoStream
+
+from .clips import REAL_CLIPS, gradient_images, write_clip
+
+DEADLINE_S = 30.0
+SIZE = 8
+
+
+class CountingTracker:
+    """Meets the subject at the third picture; sees no face in dark ones."""
+
+    def __init__(self) -> None:
+        self.head = HeadModel.embedded()
+        self.counts: Counter[str] = Counter()
+        self.identity = torch.zeros(self.head.num_identity)
+        self.ready = self.closed = False
+        self._warm_up: list[TrackedFrame] = []
+        self._shape: tuple[int, ...] | None = None
+
+    def backlog(self) -> list[TrackedFrame]:
+        taken, self._warm_up = self._warm_up, []
+        return taken
+
+    def __call__(self, image_rgb: np.ndarray, index: int | None = None) -> TrackedFrame | None:
+        if self._shape not in (None, image_rgb.shape):
+            raise UserError("Another size.", "Keep one.")
+        self._shape = image_rgb.shape
+        if image_rgb.mean() < 1:
+            self.counts["no face"] += 1
+            return None
+        assert index is not None
+        frame = TrackedFrame(
+            index,
+            torch.full((self.head.layout.size,), float(index)),
+            PinholeCameras(torch.eye(4)[None], torch.ones(1, 2), torch.zeros(1, 2), SIZE, SIZE),
+            np.full((SIZE, SIZE, 4), index, np.uint8),
+        )
+        if self.ready:
+            return frame
+        self._warm_up.append(frame)
+        self.ready = len(self._warm_up) == 3
+        return None
+
+    def close(self) -> None:
+        self.closed = True
+
+
+def take(stream: VideoStream, count: int) -> list[StreamedFrame]:
+    frames, deadline = [], time.monotonic() + DEADLINE_S
+    while len(frames) < count and not stream.ended:
+        assert time.monotonic() < deadline
+        one = stream.next(0.05)
+        if one is not None:
+            frames.append(one)
+    return frames
+
+
+@pytest.fixture
+def clip(tmp_path: Path) -> Path:
+    return write_clip(tmp_path / "clip.mp4", gradient_images(8))
+
+
+def test_a_file_is_tracked_frame_by_frame_in_its_own_time(clip: Path):
+    tracker = CountingTracker()
+    stream = VideoStream(str(clip), tracker=tracker)
+    began = time.monotonic()
+    who = stream.subject(DEADLINE_S)
+    assert who is not None
+    assert (who.width, who.height) == (SIZE, SIZE)
+    frames = take(stream, 100)
+    # The last of eight frames at 25 a second is due after 7 / 25 s.
+    assert time.monotonic() - began >= 0.27
+    assert [frame.index for frame in frames] == list(range(8))
+    assert all(int(f.decode().image_rgba[0, 0, 0]) == f.index for f in frames)
+    assert stream.ended
+    assert stream.keeps_frames
+    stream.close()
+    assert tracker.closed
+
+
+def test_a_file_goes_on_in_its_middle_with_the_same_subject(clip: Path):
+    stream = VideoStream(str(clip), tracker=CountingTracker())
+    stream.go_on_after(5)
+    assert [frame.index for frame in take(stream, 100)] == [6, 7]
+    late = VideoStream(str(clip), tracker=CountingTracker())
+    assert late.subject(DEADLINE_S) is not None
+    late.go_on_after(1)
+    assert [frame.index for frame in take(late, 100)] == [2, 3, 4, 5, 6, 7]
+
+
+def test_a_missing_file_is_refused(tmp_path: Path):
+    with pytest.raises(UserError, match="no video"):
+        FilePictures(tmp_path / "absent.mp4")
+
+
+class FakeCamera:
+    """Gives some pictures, then nothing; None stands for a picture that did not come."""
+
+    def __init__(self, pictures: list[np.ndarray | None], opened: bool = True) -> None:
+        self._pictures, self._opened, self.released = pictures, opened, False
+
+    def isOpened(self) -> bool:
+        return self._opened
+
+    def read(self) -> tuple[bool, np.ndarray | None]:
+        time.sleep(0.02)
+        picture = self._pictures.pop(0) if self._pictures else None
+        return picture is not None, picture
+
+    def release(self) -> None:
+        self.released = True
+
+
+def lit(level: int, side: int = 4) -> np.ndarray:
+    return np.full((side, side, 3), level, np.uint8)
+
+
+def test_a_lost_camera_is_opened_again_and_faceless_pictures_are_counted():
+    cameras = [
+        FakeCamera([lit(50), lit(60), lit(70), lit(0)]),
+        FakeCamera([], opened=False),
+        FakeCamera([lit(80), lit(90, side=6), lit(100), *[lit(110)] * 1000]),
+    ]
+    opened = iter(cameras)
+    pictures = NewestPictures("0", lambda _: next(opened), Backoff(0.01, 0.02))
+    stream = VideoStream("0", tracker=CountingTracker(), pictures=pictures)
+    frames = take(stream, 6)
+    indices = [frame.index for frame in frames]
+    assert indices == sorted(set(indices))
+    assert indices[0] == 0
+    assert indices[-1] >= 7
+    counts = stream.counts
+    assert counts["source lost"] == counts["reconnects"] == counts["failed openings"] == 1
+    assert counts["no face"] + counts["another resolution"] + counts["skipped"] >= 2
+    assert not stream.keeps_frames
+    assert len({frame.session for frame in frames}) == 1
+    assert frames[0].session
+    stream.close()
+    assert stream.ended
+    assert all(camera.released for camera in cameras)
+
+
+def test_a_slow_tracker_gets_the_newest_picture():
+    camera = FakeCamera([lit(10 + i) for i in range(200)])
+    pictures = NewestPictures("0", lambda _: camera)
+    time.sleep(0.3)
+    first = pictures.next(1.0)
+    time.sleep(0.3)
+    second = pictures.next(1.0)
+    pictures.close()
+    assert first is not None
+    assert second is not None
+    assert second.index > first.index + 1
+    assert pictures.counts["skipped"] >= second.index - 2
+    assert int(second.image_rgb[0, 0, 0]) == 10 + second.index
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not REAL_CLIPS.exists(), reason=f"no clips at {REAL_CLIPS}")
+def test_a_real_clip_becomes_a_stream_of_frames_with_a_face():
+    pytest.importorskip("mediapipe", reason="mediapipe is not installed")
+    stream = VideoStream(str(REAL_CLIPS / "grid_id2.mpg"), image_size=128)
+    who = stream.subject(120.0)
+    assert who is not None
+    assert (who.width, who.height) == (128, 128)
+    frames = take(stream, 16)
+    stream.close()
+    assert [frame.index for frame in frames] == list(range(16))
+    for frame in frames:
+        alpha = frame.decode().image_rgba[..., 3]
+        assert 0.05 < (alpha > 128).mean() < 0.95
+        assert bool(frame.theta.isfinite().all())
