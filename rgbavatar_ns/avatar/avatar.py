@@ -153,22 +153,25 @@ class Avatar(nn.Module):
         cameras: PinholeCameras,
         background: Float[Tensor, "3"] | Float[Tensor, "B 3"] | None = None,
         *,
+        psi: Float[Tensor, "B K"] | None = None,
         backend: str = "auto",
         with_depth: bool = False,
         with_visibility: bool = False,
     ) -> RenderedBatch:
-        """Draw a batch of theta; the options are those of `rgbavatar_ns.kernels.rasterize`.
+        """Draw a batch of theta; `psi` replaces the weight network's answer.
 
-        Without gradients (`torch.no_grad`) a backend may draw the blended Gaussians directly,
-        several times faster, to the same numbers.
+        The options are those of `rgbavatar_ns.kernels.rasterize`. Without gradients
+        (`torch.no_grad`) a backend may draw the blended Gaussians directly, several times faster,
+        to the same numbers.
         """
         options = {"with_depth": with_depth, "with_visibility": with_visibility}
         if not torch.is_grad_enabled():
-            renderer = self.renderer(theta, cameras, backend=backend)
+            renderer = self.renderer(theta, cameras, psi, backend=backend)
             if renderer is not None:
                 color = theta.new_zeros(3) if background is None else background
                 return renderer.draw(color.expand(len(theta), 3).to(self.identity), **options)
-        return rasterize(self.gaussians(theta), cameras, background, backend=backend, **options)
+        gaussians = self.gaussians(theta, psi)
+        return rasterize(gaussians, cameras, background, backend=backend, **options)
 
     def renderer(
         self,

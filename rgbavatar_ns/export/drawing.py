@@ -8,7 +8,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from rgbavatar_ns.avatar.avatar import Avatar
-from rgbavatar_ns.kernels import PinholeCameras, RenderedBatch, rasterize
+from rgbavatar_ns.kernels import PinholeCameras, RenderedBatch
 
 Picture = UInt8[np.ndarray, "height width channels"]
 """RGB, or RGBA with straight alpha."""
@@ -29,12 +29,7 @@ def draw(
     like = avatar.identity
     theta = theta.to(like)
     ground = like.new_tensor((0.0, 0.0, 0.0) if background is None else background)
-    if psi is None:
-        return avatar.render(theta, cameras, ground)
-    renderer = avatar.renderer(theta, cameras, psi.to(like))
-    if renderer is not None:
-        return renderer.draw(ground.expand(len(theta), 3))
-    return rasterize(avatar.gaussians(theta, psi.to(like)), cameras, ground)
+    return avatar.render(theta, cameras, ground, psi=None if psi is None else psi.to(like))
 
 
 def pictures(

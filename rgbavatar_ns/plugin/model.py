@@ -8,7 +8,6 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import torch
-from jaxtyping import Float
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.engine.callbacks import (
@@ -38,7 +37,9 @@ from rgbavatar_ns.plugin.cameras import from_nerfstudio, head_to_nerfstudio
 from rgbavatar_ns.plugin.checkpoint_state import model_state, require_same_layout
 from rgbavatar_ns.plugin.dataparser import Subject
 from rgbavatar_ns.plugin.refinement import FrameRefinement, require_same_refinement
-from rgbavatar_ns.plugin.viewer_panel import ViewerPanel, Viewpoint
+from rgbavatar_ns.plugin.viewer.panel import ViewerPanel, Viewpoint
+from rgbavatar_ns.plugin.viewer.picture import filled_depth
+from rgbavatar_ns.plugin.viewer.wishes import Stage
 
 Outputs = dict[str, Tensor]
 
@@ -111,7 +112,14 @@ class RGBAvatarModel(Model):
         self.refinement = None
         if self.config.refine_tracking:
             self.refinement = FrameRefinement(subject, self.config.refinement)
-        self.viewer_panel = ViewerPanel(len(subject.theta), _viewpoint(self.avatar, subject))
+        trained_on = list(subject.train) or [0]
+        stage = Stage(
+            self.avatar,
+            len(subject.theta),
+            theta_of=lambda position: self.driving_theta([position]),
+            training_theta=lambda: self.driving_theta(trained_on),
+        )
+        self.viewer_panel = ViewerPanel(stage, _viewpoint(self.avatar, subject))
         self.color_schedule = ColorInitSchedule()
         self.lpips_loss = LPIPSLoss()
         self.lpips_metric: LPIPSMetric | None = None
@@ -121,10 +129,10 @@ class RGBAvatarModel(Model):
         return self.avatar.parameter_groups()
 
     def get_outputs(self, ray_bundle: RayBundle | Cameras) -> dict[str, Tensor | list[Any]]:
-        """Draw B cameras: rgb [B H W 3], accumulation and depth in metres [B H W 1].
+        """Draw B cameras that bring theta: rgb [B H W 3], accumulation and depth [B H W 1].
 
-        The background is what the cameras' metadata brings, else black; for the viewer's cameras
-        it is the panel's. Depth is along the camera's z, and only computed outside training.
+        The background is what the cameras' metadata brings, else black. Depth is in metres along
+        the camera's z, and only computed outside training.
         """
         if not isinstance(ray_bundle, Cameras):
             raise UserError(
@@ -135,17 +143,8 @@ class RGBAvatarModel(Model):
 
     def _draw(self, cameras: Cameras) -> Outputs:
         cameras = cameras if cameras.shape else cameras.reshape((1,))
-        metadata = cameras.metadata or {}
-        theta, background = metadata.get("theta"), metadata.get("background")
-        if theta is None:
-            position = self.viewer_panel.position(cameras.times)
-            theta = self.frame_theta[position][None]
-            if self.refinement is not None:
-                theta = self.refinement.corrected(theta, theta.new_full((1, 1), position))
-            theta = theta.expand(len(cameras), -1)
-            background = theta.new_tensor(self.viewer_panel.background_color())
-        else:
-            theta = self._frames_theta(cameras)
+        background = (cameras.metadata or {}).get("background")
+        theta = self._frames_theta(cameras)
         drawn = self.avatar.render(
             theta,
             from_nerfstudio(cameras),
@@ -155,16 +154,22 @@ class RGBAvatarModel(Model):
         )
         outputs = {"rgb": drawn.image, "accumulation": drawn.alpha}
         if drawn.depth is not None:
-            outputs["depth"] = _filled_depth(drawn.depth, drawn.alpha)
+            outputs["depth"] = filled_depth(drawn.depth, drawn.alpha)
         if self.training:
             self._cameras = cameras
         return outputs
 
     @torch.no_grad()
     def get_outputs_for_camera(self, camera: Cameras, obb_box: Any = None) -> Outputs:
-        """Draw one camera: [H W C] images. nerfstudio's crop box does not apply and is ignored."""
-        outputs = self._draw(camera.to(self.device))
-        return {name: image[0] for name, image in outputs.items()}
+        """Draw one camera: [H W C] images. nerfstudio's crop box does not apply and is ignored.
+
+        A camera without theta shows what the viewer's panel asks for.
+        """
+        camera = camera.to(self.device)
+        if (camera.metadata or {}).get("theta") is None:
+            time = None if camera.times is None else float(camera.times.reshape(-1)[0])
+            return self.viewer_panel.draw(from_nerfstudio(camera), time, self.config.rasterizer)
+        return {name: image[0] for name, image in self._draw(camera).items()}
 
     def get_loss_dict(
         self,
@@ -211,8 +216,8 @@ class RGBAvatarModel(Model):
         self._cameras, self._images_rgba = cameras, batch["image"]
         return None if loss is None else {"l1": loss}
 
-    def held_out_theta(self, positions: list[int]) -> Tensor:
-        """What drives the avatar in these held-out frames: tracked theta, perhaps calibrated."""
+    def driving_theta(self, positions: list[int]) -> Tensor:
+        """What drives the avatar in these frames: [F H], tracked, and corrected or calibrated."""
         theta = self.frame_theta[positions]
         if self.refinement is None:
             return theta
@@ -309,13 +314,6 @@ class RGBAvatarModel(Model):
         require_same_layout(state_dict, self.avatar)
         require_same_refinement(state_dict, self.refinement)
         return super().load_state_dict(state_dict, strict=strict, assign=assign)
-
-
-def _filled_depth(
-    depth: Float[Tensor, "B H W 1"], alpha: Float[Tensor, "B H W 1"]
-) -> Float[Tensor, "B H W 1"]:
-    """Put what is not covered behind everything else, as the viewer's compositing expects."""
-    return torch.where(alpha > 0.5, depth, depth.amax())
 
 
 @torch.no_grad()

@@ -14,7 +14,7 @@ from rgbavatar_ns.avatar.losses import composite, rgba_to_float
 from rgbavatar_ns.data.streams import PooledBatch
 from rgbavatar_ns.plugin.online_datamanager import OnlineDataManager, OnlineDataManagerConfig
 from rgbavatar_ns.plugin.pipeline import RGBAvatarPipeline, RGBAvatarPipelineConfig
-from rgbavatar_ns.plugin.viewer_panel import PanelNote
+from rgbavatar_ns.plugin.viewer.note import PanelNote
 
 _SMALLEST_ERROR = 1e-10
 
@@ -39,6 +39,7 @@ class OnlinePipeline(RGBAvatarPipeline):
     ) -> None:
         super().__init__(config, str(device), **more)
         self.stream_note = PanelNote("Stream")
+        self.model.viewer_panel.stage.film = None  # Of a stream only the newest frame is shown.
 
     @torch.no_grad()
     def look_at(self, newest_first: PooledBatch) -> tuple[float, UInt8[Tensor, "H W 3"]]:

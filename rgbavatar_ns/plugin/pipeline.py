@@ -42,6 +42,10 @@ class RGBAvatarPipeline(VanillaPipeline):
     datamanager: RGBAvatarDataManager
     _model: RGBAvatarModel
 
+    def __init__(self, config: RGBAvatarPipelineConfig, device: str, **more: Any) -> None:
+        super().__init__(config, device, **more)
+        self.model.viewer_panel.stage.film = self.datamanager.dataparser.tracked
+
     @property
     def model(self) -> RGBAvatarModel:
         """The model; this method trains on one device, so it is never wrapped."""
@@ -107,7 +111,7 @@ class RGBAvatarPipeline(VanillaPipeline):
             images = self.datamanager.image_cache.get(chosen).to(self.device)
             theta = fit_theta(
                 self.model.avatar,
-                self.model.held_out_theta(chosen),
+                self.model.driving_theta(chosen),
                 pinhole,
                 images,
                 model.refine_held_out,

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from rgbavatar_ns.plugin.online_progress import OnlineProgress, StreamReport
-from rgbavatar_ns.plugin.viewer_panel import PanelNote
+from rgbavatar_ns.plugin.viewer.note import PanelNote
 
 REPORT = StreamReport(
     step=40,

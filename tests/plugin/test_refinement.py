@@ -55,7 +55,7 @@ def test_training_frames_are_corrected_and_held_out_ones_calibrated(tiny_data, t
     moved = refined != tracked
     assert moved[:TRAINED].any(1).all()
     model.eval()
-    drawn = model.held_out_theta(list(range(TRAINED, NUM_FRAMES)))
+    drawn = model.driving_theta(list(range(TRAINED, NUM_FRAMES)))
     assert refinement_of(trainer).frames.calibrated(model.frame_theta[TRAINED:]).equal(drawn)
     np.testing.assert_array_equal(refined[TRAINED:], drawn.numpy())
     # Of this subject only the head's turn about y and the jaw's opening move.

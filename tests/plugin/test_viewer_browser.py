@@ -1,4 +1,4 @@
-"""ns-viewer in a real browser: the head is seen, and another frame gives another picture."""
+"""ns-viewer in a real browser: the head is seen, and each control changes it and back."""
 
 import io
 import os
@@ -110,7 +110,7 @@ def _wait_for(page: Any, wanted: Any) -> Picture:
     raise AssertionError(f"the viewer did not show what was awaited, but {seen}")
 
 
-def test_frame_control_changes_the_picture_of_the_head(page: Any):
+def test_controls_change_the_picture_of_the_head_and_back(page: Any):
     first = _wait_for(page, lambda picture: _colored(picture) > 0.05)
     # The head stands in the middle, and the corners show the backdrop.
     height, width = first.shape[:2]
@@ -118,17 +118,54 @@ def test_frame_control_changes_the_picture_of_the_head(page: Any):
     assert _colored(middle) > 0.5
     assert _colored(first[:40, :40]) == 0
 
-    number = _number_beside(page, "Frame")
-    number.fill("4")
-    number.press("Enter")
+    _set_number(page, "Frame", "4")
     second = _wait_for(page, lambda picture: _difference(picture, first) > 0.02)
     assert _colored(second) > 0.05
+    _set_number(page, "Frame", "0")
+    _wait_for(page, lambda picture: _difference(picture, first) == 0)
 
+    _tab(page, "Face")
+    _set_number(page, "jaw x (deg)", "-15")
+    _wait_for(page, lambda picture: _difference(picture, first) > 0.005)
+    _tab(page, "Drive")
+    _choose(page, "Driven by", "dataset frame")
+    _wait_for(page, lambda picture: _difference(picture, first) == 0)
+
+    _tab(page, "Bases")
+    _set_number(page, "psi 0", "1")
+    _wait_for(page, lambda picture: _difference(picture, first) > 0.002)
+    page.get_by_role("checkbox", name="Weights by hand").uncheck()
+    _wait_for(page, lambda picture: _difference(picture, first) == 0)
+
+    _tab(page, "Look")
+    _choose(page, "Picture", "beside the film")
+    _wait_for(page, lambda picture: _difference(picture, first) > 0.05)
+    _choose(page, "Picture", "avatar")
+    _wait_for(page, lambda picture: _difference(picture, first) == 0)
+
+    _tab(page, "Drive")
+    number = _number_beside(page, "Frame")
     page.get_by_role("checkbox", name="Play").check()
     deadline = time.monotonic() + _SECONDS_UNTIL_DRAWN
-    while number.input_value() == "4":
+    while number.input_value() == "0":
         assert time.monotonic() < deadline, "playing does not move the frame on"
         page.wait_for_timeout(50)
+
+
+def _tab(page: Any, name: str) -> None:
+    page.get_by_role("tab", name=name, exact=True).click()
+
+
+def _choose(page: Any, label: str, option: str) -> None:
+    place = f"//*[normalize-space(text())='{label}']/following::input[1]"
+    page.locator(f"xpath={place}").click()
+    page.get_by_role("option", name=option, exact=True).click()
+
+
+def _set_number(page: Any, label: str, value: str) -> None:
+    number = _number_beside(page, label)
+    number.fill(value)
+    number.press("Enter")
 
 
 def _number_beside(page: Any, label: str) -> Any:

@@ -1,99 +1,331 @@
-"""Which frame drives the avatar: metadata, then the panel, then the camera's time."""
+"""The panel: what its controls do to the picture, on a real viser server without a browser."""
 
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
+import viser
 from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.viewer_legacy.server.viewer_utils import IOChangeException
 
 from rgbavatar_ns import Avatar
 from rgbavatar_ns.plugin.cameras import from_nerfstudio
-from rgbavatar_ns.plugin.viewer_panel import BY_TIME, ViewerPanel, Viewpoint
+from rgbavatar_ns.plugin.model import RGBAvatarModel
+from rgbavatar_ns.plugin.pipeline import RGBAvatarPipeline
+from rgbavatar_ns.plugin.viewer.panel import ViewerPanel
+from rgbavatar_ns.plugin.viewer.widgets import Widgets
 from tests.plugin.run import make_trainer, small_config
-from tests.plugin.tiny import NUM_FRAMES
+from tests.plugin.tiny import NUM_FRAMES, SIZE, tiny_dataset
+
+
+@pytest.fixture(scope="module")
+def pipeline(tiny_data: Path, tmp_path_factory: pytest.TempPathFactory) -> RGBAvatarPipeline:
+    trainer = make_trainer(
+        small_config(tiny_data, tmp_path_factory.mktemp("run"), max_num_iterations=30)
+    )
+    trainer.train()
+    trainer.pipeline.eval()
+    return trainer.pipeline
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[viser.ViserServer]:
+    server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+    yield server
+    server.stop()
+
+
+class Desk:
+    """A panel with its widgets; `do` waits until what follows from it has been done."""
+
+    def __init__(self, model: RGBAvatarModel, server: viser.ViserServer) -> None:
+        server.gui.reset()
+        self.model = model
+        self.panel = ViewerPanel(model.viewer_panel.stage, model.viewer_panel._viewpoint)
+        self.rerenders = 0
+        self.viewer = SimpleNamespace(
+            viser_server=server,
+            render_tab_state=SimpleNamespace(preview_render=False),
+            include_time=True,
+            control_panel=SimpleNamespace(time=0.0),
+            _trigger_rerender=self._count,
+        )
+        self.panel._setup(self.viewer)
+        assert self.panel._widgets is not None
+        self.widgets: Widgets = self.panel._widgets
+
+    def _count(self) -> None:
+        self.rerenders += 1
+
+    def control(self, label: str) -> Any:
+        handles = self.viewer.viser_server.gui._gui_input_handle_from_id.values()
+        return [handle for handle in handles if handle._impl.label == label][-1]
+
+    def set(self, label: str, value: Any, until: Callable[[], bool]) -> None:
+        """Do what a user does: the value comes from outside, then callbacks run in threads."""
+        self.control(label).value = value
+        self.wait(until)
+
+    def wait(self, until: Callable[[], bool]) -> None:
+        deadline = time.monotonic() + 20
+        while not until():
+            assert time.monotonic() < deadline, self.panel.wishes
+            time.sleep(0.01)
+
+    def picture(self, camera: Cameras | None = None) -> torch.Tensor:
+        camera = self.camera() if camera is None else camera
+        return self.panel.draw(from_nerfstudio(camera), None)["rgb"]
+
+    def camera(self) -> Cameras:
+        camera = self.model.kwargs["camera"][0:1]
+        camera.metadata = {}
+        return camera
 
 
 @pytest.fixture
-def panel() -> ViewerPanel:
-    return ViewerPanel(11, Viewpoint(eye=(0.0, -1.0, 0.0), look_at=(0.0, 0.0, 0.0)))
-
-
-def _show(panel: ViewerPanel, **values: Any) -> None:
-    """Stand in for the viewer's installed controls."""
-    for name in ("driven_by", "frame", "play", "shade"):
-        element = getattr(panel, name)
-        element.gui_handle = SimpleNamespace(value=values.get(name, element.default_value))
-
-
-def test_without_a_viewer_the_cameras_time_chooses(panel: ViewerPanel):
-    times = [0.0, 0.49, 0.51, 1.0, 1.5, -1.0]
-    chosen = [panel.position(torch.tensor([[t]])) for t in times]
-    assert chosen == [0, 5, 5, 10, 10, 0]
-    assert panel.position(None) == 0
-
-
-def test_in_the_viewer_the_slider_chooses(panel: ViewerPanel):
-    _show(panel, frame=7)
-    assert panel.position(torch.tensor([[0.2]])) == 7
-    panel.driven_by.gui_handle.value = BY_TIME
-    assert panel.position(torch.tensor([[0.2]])) == 2
-
-
-def test_previewing_a_camera_path_follows_its_time(panel: ViewerPanel):
-    _show(panel, frame=7)
-    panel.start._viewer = SimpleNamespace(render_tab_state=SimpleNamespace(preview_render=True))
-    assert panel.position(torch.tensor([[0.9]])) == 9
-
-
-def test_playing_goes_round(panel: ViewerPanel):
-    seen = []
-    for _ in range(4):
-        panel.advance()
-        seen.append(panel.frame.value)
-    assert seen == [0, 0, 0, 0]
-    panel.play.value = True
-    panel.frame.value = 9
-    for _ in range(3):
-        panel.advance()
-        seen.append(panel.frame.value)
-    assert seen[4:] == [10, 0, 1]
-
-
-def test_backdrop_is_black_without_a_viewer(panel: ViewerPanel):
-    assert panel.background_color() == (0.0, 0.0, 0.0)
-    _show(panel, shade=(255, 51, 0))
-    assert panel.background_color() == pytest.approx((1.0, 0.2, 0.0))
+def desk(pipeline: RGBAvatarPipeline, server: viser.ViserServer) -> Desk:
+    pipeline.model.kwargs["camera"] = pipeline.datamanager.train_dataset.cameras
+    return Desk(pipeline.model, server)
 
 
 @torch.no_grad()
-def _rendered(avatar: Avatar, theta: torch.Tensor, camera: Cameras) -> torch.Tensor:
-    return avatar.render(theta, from_nerfstudio(camera)).image[0]
+def _rendered(avatar: Avatar, theta: torch.Tensor, camera: Cameras, white: bool = False):
+    ground = torch.ones(3) if white else torch.zeros(3)
+    return avatar.render(theta, from_nerfstudio(camera), ground).image[0]
 
 
-def test_model_draws_metadata_before_the_panel(tiny_data: Path, tmp_path: Path):
-    pipeline = make_trainer(small_config(tiny_data, tmp_path)).pipeline
-    model = pipeline.model.eval()
-    camera, _ = next(iter(pipeline.datamanager.fixed_indices_eval_dataloader))
-    model.viewer_panel.frame.value = 3
-    with_theta = model.get_outputs_for_camera(camera)["rgb"]
-    expected = _rendered(model.avatar, camera.metadata["theta"], camera)
-    assert torch.equal(with_theta, expected)
+def test_without_a_viewer_the_cameras_time_chooses_and_the_ground_is_black(
+    pipeline: RGBAvatarPipeline,
+):
+    model = pipeline.model
+    camera = pipeline.datamanager.train_dataset.cameras[0:1]
     camera.metadata = {"cam_idx": 0}
-    for place, time in ((3, 3 / (NUM_FRAMES - 1)), (0, 0.0)):
-        camera.times = torch.tensor([[time]])
+    for share, position in ((0.0, 0), (0.51, 7), (1.0, 13), (1.5, 13), (-1.0, 0)):
+        camera.times = torch.tensor([[share]])
         drawn = model.get_outputs_for_camera(camera)
-        theta = model.frame_theta[place : place + 1]
-        expected = _rendered(model.avatar, theta, camera)
+        expected = _rendered(model.avatar, model.frame_theta[position : position + 1], camera)
         assert torch.equal(drawn["rgb"], expected)
         assert drawn["depth"].shape == drawn["accumulation"].shape == (*expected.shape[:2], 1)
-        assert not torch.equal(drawn["rgb"], with_theta)
 
 
-def test_viewer_starts_before_the_face_and_nearer_than_the_camera(tiny_data: Path, tmp_path: Path):
-    model = make_trainer(small_config(tiny_data, tmp_path)).pipeline.model
-    start = model.viewer_panel.start._viewpoint
+def test_a_cameras_own_theta_comes_before_the_panel(pipeline: RGBAvatarPipeline):
+    camera, _ = next(iter(pipeline.datamanager.fixed_indices_eval_dataloader))
+    drawn = pipeline.model.get_outputs_for_camera(camera)["rgb"]
+    expected = _rendered(pipeline.model.avatar, camera.metadata["theta"], camera)
+    assert torch.equal(drawn, expected)
+
+
+def test_frame_slider_shows_that_frame_over_the_backdrop(desk: Desk):
+    desk.set("Frame", 7, lambda: desk.panel.wishes.frame == 7)
+    theta = desk.model.frame_theta[7:8]
+    assert torch.equal(
+        desk.picture(), _rendered(desk.model.avatar, theta, desk.camera(), white=True)
+    )
+    assert desk.rerenders == 1
+    desk.set("Backdrop", (255, 51, 0), lambda: desk.panel.wishes.backdrop == (1.0, 0.2, 0.0))
+    assert torch.allclose(desk.picture()[0, 0], torch.tensor([1.0, 0.2, 0.0]), atol=1e-6)
+
+
+def test_moving_a_face_slider_drives_by_hand_from_what_is_shown_and_back(desk: Desk):
+    desk.set("Frame", 5, lambda: desk.panel.wishes.frame == 5)
+    before = desk.picture()
+    desk.set("jaw x (deg)", 20.0, lambda: desk.panel.wishes.driven_by == "by hand")
+    expected = desk.model.frame_theta[5].clone()
+    expected[desk.model.avatar.layout.slice("jaw").start] = torch.pi / 9
+    assert torch.allclose(desk.panel.wishes.theta_by_hand, expected, atol=1e-6)
+    assert (desk.picture() - before).abs().max() > 0.01
+    # The other sliders now stand where the frame has its numbers.
+    turned = desk.model.frame_theta[5, desk.model.avatar.layout.slice("rotation")][1]
+    desk.wait(lambda: desk.control("rotation y (deg)").value == pytest.approx(turned.rad2deg()))
+    desk.set("Driven by", "dataset frame", lambda: desk.panel.wishes.driven_by == "dataset frame")
+    assert torch.equal(desk.picture(), before)
+
+
+def test_echoes_of_moved_sliders_change_nothing(desk: Desk):
+    desk.panel.rest()
+    time.sleep(0.3)  # All echoes have come.
+    assert torch.equal(desk.panel.wishes.theta_by_hand, desk.panel.stage.statistics().theta_neutral)
+    assert desk.rerenders == 1
+
+
+def test_random_expressions_stay_within_what_was_seen(desk: Desk):
+    seen, layout = desk.panel.stage.statistics(), desk.model.avatar.layout
+    pose = desk.panel._theta_now()[layout.slice("rotation")]
+    drawn = []
+    for _ in range(20):
+        desk.panel.surprise()
+        drawn.append(desk.panel.wishes.theta_by_hand)
+    angles = torch.stack(drawn)[:, layout.slice("jaw").start]
+    # Only the jaw moves in this film, so its range is the whole of it.
+    low, high = seen.theta_min, seen.theta_max
+    numbers = layout.slice("jaw").start
+    assert low[numbers] - 1e-5 <= angles.min() < angles.max() <= high[numbers] + 1e-5
+    assert angles.max() - angles.min() > 0.3 * (high[numbers] - low[numbers])
+    assert all(torch.equal(theta[layout.slice("rotation")], pose) for theta in drawn)
+
+
+def test_a_weight_slider_overrides_the_network_until_it_is_given_back(desk: Desk):
+    before = desk.picture()
+    theta = desk.model.frame_theta[0:1]
+    psi = desk.model.avatar.weights(theta).detach()
+    desk.set("psi 1", 0.9, lambda: desk.panel.wishes.psi_by_hand is not None)
+    psi[0, 1] = 0.9
+    assert torch.allclose(desk.panel.wishes.psi_by_hand, psi[0])
+    expected = desk.model.avatar.render(
+        theta, from_nerfstudio(desk.camera()), torch.ones(3), psi=psi
+    )
+    assert torch.allclose(desk.picture(), expected.image[0], atol=1e-5)
+    assert (desk.picture() - before).abs().max() > 0.005
+    desk.set("Weights by hand", False, lambda: desk.panel.wishes.psi_by_hand is None)
+    assert torch.equal(desk.picture(), before)
+
+
+def test_bases_used_counts_the_first_ones(desk: Desk):
+    avatar = desk.model.avatar
+    theta = desk.model.frame_theta[0:1]
+    psi = avatar.weights(theta).detach()
+    desk.set("Bases used", 1, lambda: desk.panel.wishes.bases_used == 1)
+    psi[:, 1:] = 0
+    expected = avatar.render(theta, from_nerfstudio(desk.camera()), torch.ones(3), psi=psi)
+    assert torch.allclose(desk.picture(), expected.image[0], atol=1e-5)
+
+
+def test_one_basis_alone_is_base_and_basis_on_the_neutral_frame(desk: Desk):
+    avatar, seen = desk.model.avatar, desk.panel.stage.statistics()
+    extreme = torch.where(seen.psi_max >= -seen.psi_min, seen.psi_max, seen.psi_min)
+    desk.set("One basis alone", "2", lambda: desk.panel.wishes.basis_alone == 2)
+    psi = torch.zeros(1, avatar.config.num_bases)
+    psi[0, 2] = 1.5 * extreme[2]
+    camera = from_nerfstudio(desk.camera())
+    expected = avatar.render(seen.theta_neutral[None], camera, torch.ones(3), psi=psi)
+    assert torch.allclose(desk.picture(), expected.image[0], atol=1e-5)
+    desk.set("One basis alone", "none", lambda: desk.panel.wishes.basis_alone is None)
+    theta = desk.model.frame_theta[0:1]
+    assert torch.equal(desk.picture(), _rendered(avatar, theta, desk.camera(), white=True))
+
+
+def test_film_avatar_and_error_stand_in_a_row(desk: Desk, pipeline: RGBAvatarPipeline):
+    desk.panel.change(frame=4, picture="beside the film", backdrop=(0.0, 0.0, 0.0))
+    wide = desk.camera()
+    wide.width, wide.height = (torch.full_like(wide.width, s * SIZE) for s in (3, 1))
+    row = desk.picture(wide)
+    rgba = torch.from_numpy(pipeline.datamanager.dataparser.tracked.read_image(4)).float() / 255
+    truth = rgba[..., :3] * rgba[..., 3:]
+    assert torch.allclose(row[:, :SIZE], truth, atol=1e-6)
+    camera = pipeline.datamanager.dataparser.tracked.cameras.select([4])
+    avatar = desk.model.avatar.render(desk.model.frame_theta[4:5], camera).image[0]
+    assert torch.allclose(row[:, SIZE : 2 * SIZE], avatar.clamp(0, 1), atol=1e-5)
+    # The error is bright where the two differ most.
+    error, difference = row[:, 2 * SIZE :].sum(-1), (avatar - truth).abs().mean(-1)
+    assert error[difference > 0.2].min() > error[difference < 0.01].max()
+    psnr = -10 * (avatar.clamp(0, 1) - truth).square().mean().log10()
+    assert f"PSNR of this frame {psnr:.2f} dB" in desk.widgets._report.content
+
+
+@pytest.mark.parametrize("picture", ["alpha", "depth", "error"])
+def test_other_pictures_are_drawn(desk: Desk, picture: str):
+    plain = desk.picture()
+    desk.set("Picture", picture, lambda: desk.panel.wishes.picture == picture)
+    image = desk.picture()
+    assert image.shape == plain.shape
+    assert (image - plain).abs().max() > 0.1
+    assert image.std() > 0.01
+
+
+@pytest.mark.parametrize("label", ["Mesh", "Gaussian centres"])
+def test_overlays_lie_on_the_head(desk: Desk, label: str):
+    plain = desk.picture()
+    desk.control(label).value = True
+    desk.wait(lambda: desk.panel.wishes.mesh or desk.panel.wishes.centres)
+    alpha = desk.panel.draw(from_nerfstudio(desk.camera()), None)["accumulation"]
+    changed = (desk.picture() - plain).abs().amax(-1) > 0.05
+    assert 0.02 < changed.float().mean() < 0.95
+    assert alpha[..., 0][changed].mean() > alpha[..., 0][~changed].mean() + 0.2
+
+
+def test_a_driver_plays_on_this_avatar(desk: Desk, tmp_path: Path):
+    other = tiny_dataset(tmp_path / "other", frames=6, test=1)
+    desk.panel.load_driver(str(tmp_path / "other"), "off")
+    wishes = desk.panel.wishes
+    assert (wishes.driven_by, len(wishes.sequence)) == ("driving sequence", 6)
+    jaw = desk.model.avatar.layout.slice("jaw")
+    assert torch.allclose(wishes.sequence[:, jaw], other.theta[:, jaw])
+    first = desk.picture()
+    desk.set("Driver's frame", 3, lambda: desk.panel.wishes.sequence_frame == 3)
+    assert (desk.picture() - first).abs().max() > 0.01
+    assert desk.panel.advance()
+    assert desk.panel.wishes.sequence_frame == 4
+    # Its pictures are another person's: there is nothing to compare with.
+    desk.panel.change(picture="error")
+    assert desk.picture().shape == first.shape
+    assert "no film to compare" in desk.widgets._said.content
+
+
+@pytest.mark.parametrize("folder", ["", "/nowhere/at/all"])
+def test_a_driver_that_is_none_is_told_in_the_panel(desk: Desk, folder: str):
+    desk.panel.load_driver(folder, "neutral")
+    assert desk.panel.wishes.driven_by == "dataset frame"
+    assert "Cannot be shown" in desk.widgets._said.content
+    assert desk.widgets._said.visible
+
+
+def test_the_sequence_cannot_be_chosen_before_it_is_there(desk: Desk):
+    desk.control("Driven by").value = "driving sequence"
+    desk.wait(lambda: "Load a driver" in desk.widgets._said.content)
+    desk.wait(lambda: desk.control("Driven by").value == "dataset frame")
+
+
+def test_trouble_is_told_and_the_plain_avatar_drawn(desk: Desk, monkeypatch: pytest.MonkeyPatch):
+    plain = desk.picture()
+    desk.panel.change(psi_by_hand=torch.zeros(99))
+    assert torch.equal(desk.picture(), plain)
+    assert "Cannot be shown" in desk.widgets._said.content
+
+
+def test_the_viewers_own_interruption_passes(desk: Desk, monkeypatch: pytest.MonkeyPatch):
+    def interrupted(*_: Any, **__: Any) -> None:
+        raise IOChangeException
+
+    monkeypatch.setattr(desk.panel.stage.avatar, "renderer", interrupted)
+    with pytest.raises(IOChangeException):
+        desk.picture()
+
+
+def test_playing_goes_round(desk: Desk):
+    desk.panel.change(frame=NUM_FRAMES - 2)
+    seen = []
+    for _ in range(3):
+        assert desk.panel.advance()
+        seen.append(desk.panel.wishes.frame)
+    assert seen == [NUM_FRAMES - 1, 0, 1]
+    desk.panel.rest()
+    assert not desk.panel.advance()
+
+
+def test_play_moves_on_once_a_picture_was_drawn(desk: Desk):
+    desk.set("Frames a second", 60, lambda: desk.panel.frames_per_second == 60)
+    desk.set("Play", True, lambda: desk.panel.wishes.frame == 1)
+    time.sleep(0.2)
+    assert desk.panel.wishes.frame == 1
+    desk.picture()
+    desk.wait(lambda: desk.panel.wishes.frame == 2)
+    desk.set("Play", False, lambda: not desk.panel.playing)
+
+
+def test_previewing_a_camera_path_follows_its_time(desk: Desk):
+    desk.panel.change(frame=7, mesh=True)
+    desk.viewer.render_tab_state.preview_render = True
+    drawn = desk.panel.draw(from_nerfstudio(desk.camera()), 0.9)["rgb"]
+    theta = desk.model.frame_theta[12:13]
+    assert torch.equal(drawn, _rendered(desk.model.avatar, theta, desk.camera(), white=True))
+
+
+def test_viewer_starts_before_the_face_and_nearer_than_the_camera(pipeline: RGBAvatarPipeline):
+    start = pipeline.model.viewer_panel._viewpoint
     eye, look_at = torch.tensor(start.eye), torch.tensor(start.look_at)
     # The tiny dataset's camera stands one metre before the head, on the face's side: -y.
     offset = eye - look_at

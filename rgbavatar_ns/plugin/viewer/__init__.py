@@ -1,0 +1,1 @@
+"""nerfstudio's viewer: the avatar's controls, and the pictures that it shows."""
