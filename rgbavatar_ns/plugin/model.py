@@ -5,6 +5,7 @@
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, Literal
 
 import torch
@@ -33,6 +34,7 @@ from rgbavatar_ns.avatar.orthogonality import orthogonality_loss, orthogonalize
 from rgbavatar_ns.avatar.refinement import RefinementConfig
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadModel
+from rgbavatar_ns.kernels import PinholeCameras, RenderedBatch
 from rgbavatar_ns.plugin.cameras import from_nerfstudio, head_to_nerfstudio
 from rgbavatar_ns.plugin.checkpoint_state import model_state, require_same_layout
 from rgbavatar_ns.plugin.dataparser import Subject
@@ -82,6 +84,9 @@ class RGBAvatarModelConfig(ModelConfig):
     the method's own loss (no LPIPS) and optimizers (plain Adam, no max_norm) and the compiled
     rasterizer. False keeps to the readable path. Both give the same up to rounding, and a run can
     be resumed with the other."""
+    batch_parallel: bool = True
+    """Draw the images of a training batch together. False draws one after another and sums their
+    gradients (the paper's "naive batch", to measure against), without `fast`."""
     seed: int | None = None
     """Seed of the weight network's initial values; by default that of the run, `--machine.seed`."""
     enable_collider: bool = False
@@ -144,20 +149,31 @@ class RGBAvatarModel(Model):
     def _draw(self, cameras: Cameras) -> Outputs:
         cameras = cameras if cameras.shape else cameras.reshape((1,))
         background = (cameras.metadata or {}).get("background")
-        theta = self._frames_theta(cameras)
-        drawn = self.avatar.render(
-            theta,
-            from_nerfstudio(cameras),
-            background,
-            backend=self.config.rasterizer,
-            with_depth=not self.training,
-        )
+        drawn = self._rendered(self._frames_theta(cameras), from_nerfstudio(cameras), background)
         outputs = {"rgb": drawn.image, "accumulation": drawn.alpha}
         if drawn.depth is not None:
             outputs["depth"] = filled_depth(drawn.depth, drawn.alpha)
         if self.training:
             self._cameras = cameras
         return outputs
+
+    def _rendered(
+        self, theta: Tensor, cameras: PinholeCameras, background: Tensor | None
+    ) -> RenderedBatch:
+        """The batch together, or in training without `batch_parallel` one image after another."""
+        draw = partial(
+            self.avatar.render, backend=self.config.rasterizer, with_depth=not self.training
+        )
+        if self.config.batch_parallel or not self.training:
+            return draw(theta, cameras, background)
+        backgrounds = [None] * len(theta) if background is None else background.split(1)
+        drawn = [
+            draw(one, cameras.select([k]), behind)
+            for k, (one, behind) in enumerate(zip(theta.split(1), backgrounds))
+        ]
+        return RenderedBatch(
+            torch.cat([one.image for one in drawn]), torch.cat([one.alpha for one in drawn])
+        )
 
     @torch.no_grad()
     def get_outputs_for_camera(self, camera: Cameras, obb_box: Any = None) -> Outputs:
@@ -192,7 +208,7 @@ class RGBAvatarModel(Model):
     def can_fuse(self, step: int, optimizers: Iterable[torch.optim.Optimizer]) -> bool:
         """Say whether `fused_losses` may be asked for this step."""
         own_loss = not self._lpips_counts(step) and self._orthogonality() != "loss"
-        wanted = self.config.fast and own_loss
+        wanted = self.config.fast and self.config.batch_parallel and own_loss
         return wanted and refusal(self.avatar, optimizers) is None
 
     def fused_losses(
