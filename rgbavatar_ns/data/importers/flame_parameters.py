@@ -71,9 +71,9 @@ def _moved(arrays: HeadArrays, offset: Float[np.ndarray, "V 3"]) -> HeadArrays:
 
 
 def padded(
-    coefficients: np.ndarray, count: int, what: str, arrays: HeadArrays
+    coefficients: np.ndarray, count: int, what: str, head_name: str
 ) -> Float[np.ndarray, "_"]:
-    """Coefficients brought to the model's number: zeros are added, or taken away.
+    """Coefficients brought to the head model's number: zeros are added, or taken away.
 
     Raises UnusableFrameError where there are none, or where others than zeros would go.
     """
@@ -85,14 +85,18 @@ def padded(
         raise UnusableFrameError(f"no {what}")
     if values[count:].any():
         raise UnusableFrameError(
-            f"{what} of {len(values)} coefficients, of which {arrays.name} keeps {count}"
+            f"{what} of {len(values)} coefficients, of which {head_name} keeps {count}"
         )
     return np.pad(values[:count], (0, max(0, count - len(values))))
 
 
-def from_6d_rows(rows: Float[np.ndarray, "N 6"], what: str) -> Float[np.ndarray, "N 3"]:
-    """Axis-angle of rotations given by their first two rows; raises UnusableFrameError."""
+def require_rotations(rows: Float[np.ndarray, "N 6"], what: str) -> None:
+    """Raise UnusableFrameError where some two rows of a matrix give no rotation."""
     first, second = rows[:, :3], rows[:, 3:]
     if np.linalg.norm(np.cross(first, second), axis=1).min() < _SMALLEST_ROW:
         raise UnusableFrameError(f"{what} that is no rotation")
+
+
+def from_6d_rows(rows: Float[np.ndarray, "*batch 6"]) -> Float[np.ndarray, "*batch 3"]:
+    """Axis-angle of rotations given by their first two rows."""
     return matrix_to_axis_angle(rows_6d_to_matrix(torch.from_numpy(rows))).numpy()

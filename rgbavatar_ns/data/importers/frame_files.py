@@ -1,7 +1,13 @@
 """metrical-tracker's `.frame` files, which five systems share."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
+import multiprocessing
+import os
+import signal
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +15,12 @@ import numpy as np
 from jaxtyping import Float
 
 from rgbavatar_ns.data.importers.findings import UnusableFrameError
-from rgbavatar_ns.data.importers.flame_parameters import flame_for, from_6d_rows, padded
+from rgbavatar_ns.data.importers.flame_parameters import (
+    flame_for,
+    from_6d_rows,
+    padded,
+    require_rotations,
+)
 from rgbavatar_ns.data.importers.folder import matrix, numbers
 from rgbavatar_ns.data.importers.frame_record import CameraRecord
 from rgbavatar_ns.data.importers.source import Reading
@@ -18,8 +29,12 @@ from rgbavatar_ns.head import HeadArrays
 from rgbavatar_ns.head.safe_pickle import read_torch_file
 
 FLAME_VERSION = "2020"
+MANY_FILES = 400
+"""From here on a process for each core pays."""
+_FILES_AT_ONCE = 32
 _SHAPE_TOLERANCE = 1e-3
 _SKEW_TOLERANCE = 1e-3
+_TURNS = ("jaw", "left_eye", "right_eye")
 
 Progress = Callable[[str, int, int], None]
 """Called with (stage, done, in all)."""
@@ -48,6 +63,16 @@ class TrackedHeads:
     unreadable: frozenset[int]
 
 
+@dataclass(frozen=True)
+class HeadSizes:
+    """What of the head model a file is checked against; small enough to be sent to a process."""
+
+    name: str
+    num_identity: int
+    num_expressions: int
+    has_eyelids: bool
+
+
 def read_frame_files(
     reading: Reading, files: dict[int, Path], progress: Progress | None = None
 ) -> TrackedHeads:
@@ -59,11 +84,18 @@ def read_frame_files(
             "eyelids are left out"
         )
     frames: dict[int, TrackedHead] = {}
-    for done, (number, path) in enumerate(files.items(), 1):
-        with reading.findings.frame(path.name):
-            frames[number] = parse_frame(_read(path), arrays)
-        if progress is not None:
-            progress("reading frames", done, len(files))
+    sizes = HeadSizes(
+        arrays.name, arrays.num_identity, arrays.num_expressions, arrays.eyelid_dirs is not None
+    )
+    with _on_all_cores(len(files)) as each:
+        found = each(partial(_read_file, sizes), list(files.values()))
+        for done, (number, head) in enumerate(zip(files, found), 1):
+            with reading.findings.frame(files[number].name):
+                if isinstance(head, UnusableFrameError):
+                    raise head
+                frames[number] = head
+            if progress is not None:
+                progress("reading frames", done, len(files))
     unreadable = frozenset(files.keys() - frames.keys())
     if not frames:
         reading.findings.settle(str(reading), False)
@@ -75,7 +107,56 @@ def read_frame_files(
     )
     for number in other:
         del frames[number]
-    return TrackedHeads(arrays, identity, frames, unreadable | frozenset(other))
+    return TrackedHeads(arrays, identity, _turned(frames), unreadable | frozenset(other))
+
+
+_Each = Callable[
+    [Callable[[Path], "TrackedHead | UnusableFrameError"], list[Path]],
+    "Iterator[TrackedHead | UnusableFrameError]",
+]
+
+
+@contextmanager
+def _on_all_cores(count: int) -> Iterator[_Each]:
+    """`map`, for many files in a process for each core: Python holds all threads but one.
+
+    The processes are forked, since starting Python and this package anew takes seconds; they use
+    numpy alone, whose state is safe to fork, and no torch.
+    """
+    cores = os.cpu_count() or 1
+    if count < MANY_FILES or cores < 2 or "fork" not in multiprocessing.get_all_start_methods():
+        yield map
+        return
+    # Ctrl-C is the parent's to handle: it ends the others.
+    pool = ProcessPoolExecutor(
+        cores,
+        multiprocessing.get_context("fork"),
+        initializer=signal.signal,
+        initargs=(signal.SIGINT, signal.SIG_IGN),
+    )
+    try:
+        yield partial(pool.map, chunksize=_FILES_AT_ONCE)
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _read_file(sizes: HeadSizes, path: Path) -> TrackedHead | UnusableFrameError:
+    """The file's content with turns still as rows of matrices, or why it has none."""
+    try:
+        return parse_frame(_read(path), sizes)
+    except UnusableFrameError as error:
+        return error
+
+
+def _turned(frames: dict[int, TrackedHead]) -> dict[int, TrackedHead]:
+    """The frames with their turns as axis-angle; all at once, since one takes as long as many."""
+    if not frames:
+        return {}
+    rows = np.stack([[frame.theta[name] for name in _TURNS] for frame in frames.values()])
+    return {
+        number: replace(frame, theta={**frame.theta, **dict(zip(_TURNS, turns))})
+        for (number, frame), turns in zip(frames.items(), from_6d_rows(rows))
+    }
 
 
 def _read(path: Path) -> Any:
@@ -90,29 +171,30 @@ def _cause(error: UserError, path: Path) -> str:
     return error.cause.replace(str(path), "the file").rstrip(".")
 
 
-def parse_frame(content: Any, arrays: HeadArrays) -> TrackedHead:
-    """One file's dict; raises UnusableFrameError where it lacks something or is not finite."""
+def parse_frame(content: Any, sizes: HeadSizes) -> TrackedHead:
+    """One file's dict, its turns as the first two rows of matrices.
+
+    Raises UnusableFrameError where it lacks something or is not finite.
+    """
     if not isinstance(content, dict):
         raise UnusableFrameError("records that are no dict")
     flame, opencv = content.get("flame"), content.get("opencv")
     if not isinstance(flame, dict) or not isinstance(opencv, dict):
         raise UnusableFrameError("records without 'flame' and 'opencv'")
     eyes = numbers(flame.get("eyes"), 12, "eyes").reshape(2, 6)
-    jaw = numbers(flame.get("jaw"), 6, "jaw")
-    jaw, left_eye, right_eye = from_6d_rows(np.stack([jaw, *eyes]), "jaw or eyes")
+    turns = np.stack([numbers(flame.get("jaw"), 6, "jaw"), *eyes])
+    require_rotations(turns, "jaw or eyes")
     expression, shape = flame.get("exp"), flame.get("shape")
     if expression is None or shape is None:
         raise UnusableFrameError("records without 'exp' or 'shape'")
     theta = {
-        "expression": padded(expression, arrays.num_expressions, "exp", arrays),
-        "jaw": jaw,
-        "left_eye": left_eye,
-        "right_eye": right_eye,
+        "expression": padded(expression, sizes.num_expressions, "exp", sizes.name),
+        **dict(zip(_TURNS, turns)),
     }
-    if arrays.eyelid_dirs is not None and "eyelids" in flame:
+    if sizes.has_eyelids and "eyelids" in flame:
         theta["eyelids"] = numbers(flame["eyelids"], 2, "eyelids")
     return TrackedHead(
-        shape=padded(shape, arrays.num_identity, "shape", arrays),
+        shape=padded(shape, sizes.num_identity, "shape", sizes.name),
         theta=theta,
         camera=_camera(opencv),
         size=_size(content.get("img_size")),

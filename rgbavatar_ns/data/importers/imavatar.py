@@ -49,7 +49,7 @@ def read_imavatar(reading: Reading, progress: Progress | None = None) -> Source:
     arrays = flame_for(reading, FLAME_VERSION)
     try:
         identity = padded(
-            np.asarray(content.get("shape_params", ())), arrays.num_identity, "shape", arrays
+            np.asarray(content.get("shape_params", ())), arrays.num_identity, "shape", arrays.name
         )
         intrinsics = numbers(content.get("intrinsics"), 4, "intrinsics")
     except (UnusableFrameError, ValueError, OverflowError) as error:
@@ -102,7 +102,8 @@ def _record(
         expression = np.asarray(frame.get("expression", ()))
     except (TypeError, ValueError, OverflowError):
         raise UnusableFrameError("expression that is no list of numbers") from None
-    theta = {"expression": padded(expression, arrays.num_expressions, "expression", arrays)}
+    count = arrays.num_expressions
+    theta = {"expression": padded(expression, count, "expression", arrays.name)}
     return FrameRecord(
         number, _picture(folder, image, masks), theta | dict(zip(_POSE, pose)), camera
     )

@@ -150,4 +150,4 @@ def _expression(folder: Folder, entry: Entry, arrays: HeadArrays) -> Float[np.nd
         raise UnusableFrameError("expressions that cannot be read") from None
     if len(values) != EXPRESSIONS:
         raise UnusableFrameError(f"expressions that are not {EXPRESSIONS} numbers")
-    return padded(values, arrays.num_expressions, "expression", arrays)
+    return padded(values, arrays.num_expressions, "expression", arrays.name)

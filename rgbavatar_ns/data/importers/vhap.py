@@ -146,13 +146,18 @@ class VhapSubject:
         }
         if self._arrays is None:
             self._arrays = flame_for(self.reading, FLAME_VERSION, offset)
-            self._shape = padded(values["shape"], self._arrays.num_identity, "shape", self._arrays)
+            self._shape = self._identity_of(values, self._arrays)
             self._offset = offset
-        shape = padded(values["shape"], self._arrays.num_identity, "shape", self._arrays)
+        shape = self._identity_of(values, self._arrays)
         if np.abs(shape - self._shape).max() > _SHAPE_TOLERANCE or not self._same_offset(offset):
             raise UnusableFrameError("records of another head shape than the first")
-        expression = padded(values["expr"], self._arrays.num_expressions, "expr", self._arrays)
-        return {"expression": expression, **theta}
+        count, name = self._arrays.num_expressions, self._arrays.name
+        return {"expression": padded(values["expr"], count, "expr", name), **theta}
+
+    def _identity_of(
+        self, values: dict[str, np.ndarray], arrays: HeadArrays
+    ) -> Float[np.ndarray, "_"]:
+        return padded(values["shape"], arrays.num_identity, "shape", arrays.name)
 
     def _same_offset(self, offset: Float[np.ndarray, "_ 3"] | None) -> bool:
         if offset is None or self._offset is None:

@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from rgbavatar_ns.data.importers import ImportOptions, Source, read_source
+from rgbavatar_ns.data.importers import ImportOptions, Source, frame_files, read_source
 from rgbavatar_ns.data.importers.findings import UnusableFrameError
 from rgbavatar_ns.data.importers.pictures import Picture, make_png, picture_header
 from rgbavatar_ns.data.png import decode_png_rgba
@@ -292,3 +292,30 @@ def test_nothing_known_says_what_lies_below(folders, tmp_path):
         read_source(tmp_path, ImportOptions())
     with pytest.raises(UserError, match="no format 'x'"):
         read_source(tmp_path, ImportOptions(format="x"))
+
+
+def test_many_processes_read_what_one_does(
+    folders, references, flame_folder, tmp_path, monkeypatch
+):
+    folder = shutil.copytree(folders["metrical"], tmp_path / "data")
+    monkeypatch.setattr(frame_files, "MANY_FILES", 1)
+    monkeypatch.setattr(frame_files, "_FILES_AT_ONCE", 2)
+    monkeypatch.setattr("os.cpu_count", lambda: 3)
+    own = frame_files._read
+
+    def tell_process(path: Path):
+        (tmp_path / f"process-{os.getpid()}").touch()
+        return own(path)
+
+    monkeypatch.setattr(frame_files, "_read", tell_process)
+    assert_same(read(folder, flame_folder), references["metrical"])
+    processes = {path.name for path in tmp_path.glob("process-*")}
+    assert processes
+    assert f"process-{os.getpid()}" not in processes
+    second, third = sorted((folder / "checkpoint").iterdir())[1:3]
+    second.write_bytes(second.read_bytes()[:500])
+    third.write_bytes(b"")
+    with pytest.raises(
+        UserError, match=rf"{second.name}, {third.name}|{second.name}.*{third.name}"
+    ):
+        read(folder, flame_folder)
