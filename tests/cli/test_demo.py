@@ -13,7 +13,7 @@ RGBAVATAR = Path(sys.executable).with_name("rgbavatar")
 def demo(output: Path) -> subprocess.CompletedProcess[str]:
     options = ["--frames", "12", "--image-size", "48", "--steps", "12"]
     command = [str(RGBAVATAR), "demo", "--output", str(output), *options]
-    return subprocess.run(command, capture_output=True, text=True, timeout=400)
+    return subprocess.run(command, capture_output=True, text=True, timeout=800)
 
 
 @pytest.mark.slow

@@ -84,7 +84,7 @@ def environment(**changes: str) -> Mapping[str, str]:
 
 
 def run_command(
-    *command: str | Path, timeout_s: float = 180, **changes: str
+    *command: str | Path, timeout_s: float = 600, **changes: str
 ) -> "subprocess.CompletedProcess[str]":
     """Run one of nerfstudio's commands to its end."""
     return subprocess.run(

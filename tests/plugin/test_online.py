@@ -340,7 +340,7 @@ def test_a_killed_run_goes_on_from_its_last_checkpoint(tiny_data: Path, tmp_path
     log = tmp_path / "log.txt"
     with log.open("w") as output:
         process = subprocess.Popen(command, env=own, stdout=output, stderr=subprocess.STDOUT)
-    deadline = time.monotonic() + 120
+    deadline = time.monotonic() + 300
     while not list_checkpoints(run / "nerfstudio_models"):
         assert process.poll() is None, log.read_text()
         assert time.monotonic() < deadline, log.read_text()

@@ -64,7 +64,7 @@ def viewer_address(tiny_data: Path, tmp_path: Path) -> Iterator[str]:
 
 
 def _address(process: "subprocess.Popen[bytes]", log: Path) -> str:
-    for _ in range(900):
+    for _ in range(3000):
         found = re.search(r"http://127\.0\.0\.1:\d+", log.read_text())
         if found:
             return found.group(0)
