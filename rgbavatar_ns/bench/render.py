@@ -1,9 +1,11 @@
-"""`rgbavatar bench render`: from theta to the image, one image at a time."""
+"""`rgbavatar bench render`: from theta to the image and to the viewer, one image at a time."""
 
+import io
 from collections.abc import Callable
 from itertools import cycle
 from typing import Any
 
+import imageio.v3 as imageio
 import torch
 
 from rgbavatar_ns.avatar import Avatar
@@ -26,9 +28,13 @@ from rgbavatar_ns.bench.timing import (
 )
 from rgbavatar_ns.bench.workloads import AvatarWorkload, avatar_workload
 from rgbavatar_ns.kernels import rasterize
+from rgbavatar_ns.plugin.viewer.picture import viewer_picture
+from rgbavatar_ns.plugin.viewer.wishes import Stage, Wishes
 
 WHOLE_FRAME = "whole frame"
 EAGER_FRAME = "whole frame, eager"
+VIEWER_FRAME = "viewer's picture"
+_JPEG_QUALITY = 75
 
 
 @torch.no_grad()
@@ -44,6 +50,7 @@ def bench_render(options: RenderOptions, progress: Progress | None = None) -> Re
         growth_bytes = peak_growth_bytes(frame)
         whole = stopwatch.time(WHOLE_FRAME, frame)
         spread = {WHOLE_FRAME: whole} | _time_parts(workload, stopwatch)
+        spread[VIEWER_FRAME] = _time_viewer(workload, stopwatch)
         spread[EAGER_FRAME] = _time_eager(workload, stopwatch)
         return _report(workload, facts, spread, growth_bytes)
 
@@ -76,6 +83,23 @@ def _time_parts(workload: AvatarWorkload, stopwatch: Stopwatch) -> dict[str, Spr
 
     parts = stopwatch.laps("parts", once)
     return {name: part for name, part in parts.items() if name != WHOLE}
+
+
+def _time_viewer(workload: AvatarWorkload, stopwatch: Stopwatch) -> Spread:
+    """A frame as nerfstudio's viewer shows it: drawn with depth, to bytes, to JPEG, to be sent."""
+    theta, camera = workload.batch.theta, one_camera(workload.batch.cameras, 0)
+    stage = Stage(
+        workload.avatar, len(theta), lambda position: theta[position : position + 1], lambda: theta
+    )
+    frames = cycle(range(len(theta)))
+
+    def once() -> None:
+        wishes = Wishes(frame=next(frames), backdrop=(1.0, 1.0, 1.0))
+        image = viewer_picture(stage, wishes, camera).image
+        coded = (image * 255).type(torch.uint8).numpy()
+        imageio.imwrite(io.BytesIO(), coded, extension=".jpeg", quality=_JPEG_QUALITY)
+
+    return stopwatch.time(VIEWER_FRAME, once)
 
 
 def _time_eager(workload: AvatarWorkload, stopwatch: Stopwatch) -> Spread:

@@ -144,6 +144,7 @@ def test_render_report(bundle):
     figures = checked_json(bench_render(RenderOptions(avatar=bundle, size=64, repetitions=2)))
     assert figures["frames_per_second"] == pytest.approx(1e3 / figures["parts"]["whole frame"])
     assert {"head", "network", "prepare", "draw"} < set(figures["parts"])
+    assert figures["parts"]["viewer's picture"] > figures["parts"]["draw"]
     eager = figures["peers"]["whole frame, eager"]
     assert eager["ratio"] == pytest.approx(
         figures["parts"]["whole frame, eager"] / figures["parts"]["whole frame"]
