@@ -47,7 +47,7 @@ def run(
     if as_json:
         print(json.dumps(report.to_json(), indent=1, allow_nan=False))
     else:
-        print(_in_words(report))
+        print(_in_words(data, report))
     if not report.usable:
         sys.exit(1)
 
@@ -62,11 +62,12 @@ def _sheet_path(data: Path, root: Path, sheet: Path | None) -> Path:
     return sheet
 
 
-def _in_words(report: CheckReport) -> str:
-    lines = [f"{report.path}: {report.format}"]
+def _in_words(data: Path, report: CheckReport) -> str:
+    lines = [f"{data}: {report.format}"]
     if report.frames:
         width, height = report.size
         shared = "one camera" if report.num_cameras == 1 else f"{report.num_cameras} cameras"
+        shared += " that moves" if report.moving and report.num_cameras == 1 else ""
         low, high = report.focal_px
         focal = f"{low:.0f}" if high - low < 1 else f"{low:.0f} to {high:.0f}"
         lines += [

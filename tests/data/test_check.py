@@ -47,7 +47,7 @@ def test_good_data_has_no_problem(good, tmp_path):
     assert (report.format, report.frames, report.train, report.test) == (
         "rgbavatar native", NUM_FRAMES, NUM_FRAMES - 4, 4,
     )  # fmt: skip
-    assert (report.num_cameras, report.size) == (1, (SIZE, SIZE))
+    assert (report.num_cameras, report.moving, report.size) == (1, False, (SIZE, SIZE))
     assert report.focal_px == (FOCAL_PX, FOCAL_PX)
     assert list(report.iou) == list(range(NUM_FRAMES))
     assert min(report.iou.values()) > 0.75
@@ -82,6 +82,24 @@ def test_a_wrong_focal_length_is_named_with_the_one_that_fits(good, factor):
     # A coarse row of zooms is tried, and hair makes the person larger than the mesh.
     assert told == pytest.approx(FOCAL_PX, rel=0.2)
     assert kinds(quick_check(data)) == (["focal length"] if factor in (0.4, 3.0) else [])
+
+
+def test_a_focal_length_that_hair_could_explain_is_asked_about(good):
+    data = with_cameras(good, focal_px=good.cameras.focal_px * 0.85)
+    report = check_dataset(data, max_frames=8)
+    assert report.usable
+    assert kinds(report.problems, "warning") == ["focal length"]
+    told = float(report.problems[0].cause.split("about ")[-1].split(" ")[0])
+    # Zooms of 1.2 and 1.3 are tried.
+    assert told == pytest.approx(FOCAL_PX, rel=0.12)
+    assert quick_check(data) == []
+
+
+def test_a_camera_that_moves_is_one_camera(good):
+    moved = good.cameras.world_to_camera.clone()
+    moved[:, 0, 3] += torch.linspace(0, 0.01, NUM_FRAMES)
+    report = check_dataset(with_cameras(good, world_to_camera=moved), max_frames=4)
+    assert (report.num_cameras, report.moving) == (1, True)
 
 
 @pytest.mark.parametrize("shift", [(0.3, 0.0), (-0.2, 0.2)])

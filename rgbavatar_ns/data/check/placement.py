@@ -28,6 +28,8 @@ _ZOOMS = (
 )
 _TOO_SHORT, _TOO_LONG = 1.35, 0.87
 """Zooms that hair, which no mesh has, cannot explain: it makes heads larger, never smaller."""
+_MAYBE_SHORT, _GAIN_MAYBE = 1.15, 0.15
+"""From here on hair or the focal length: asked about, not refused. Good data gains .08 at most."""
 _GAIN_SHORT, _GAIN_LONG, _GAIN_SHIFT, _GAIN_AXES = 0.2, 0.08, 0.2, 0.3
 _SHIFT_SHARE = 0.08
 _EQUAL_AXES = 0.1
@@ -141,7 +143,7 @@ def placement_problem(sample: Sample, only_hopeless: bool = False) -> Problem | 
             pair for pair in _tried(_axes_trials(sample)) if pair[1].score > fit.score + _GAIN_AXES
         ]
         found = _likeliest(tried) or _misfit(fit, "warning")
-    return found
+    return found or _perhaps_too_small(sample, fit)
 
 
 def _tried(trials: Iterable[_Trial]) -> list[tuple[_Trial, Fit]]:
@@ -207,8 +209,10 @@ def _axes_trials(sample: Sample) -> Iterator[_Trial]:
         yield _Trial(
             "axes",
             f"The cameras' axes are wrong: the matrices seem to {cause}.",
-            "Give world-to-camera matrices in OpenCV axes (x right, y down, z forward) in the "
-            "head's world (x to the subject's left, y up, z forward).",
+            "Datasets of the project's own have world-to-camera matrices in OpenCV axes (x right, "
+            "y down, z forward) of a world with x to the subject's left, y up, z forward; another "
+            "system's data needs that system's own axes (docs/dataset_format.md): mend what wrote "
+            "the matrices.",
             replace(sample, world_to_camera=matrices),
         )
 
@@ -227,6 +231,27 @@ def _zoom_trials(sample: Sample) -> Iterator[_Trial]:
             replace(sample, focal_px=sample.focal_px * zoom),
             _GAIN_LONG if zoom < 1 else _GAIN_SHORT,
         )
+
+
+def _perhaps_too_small(sample: Sample, fit: Fit) -> Problem | None:
+    """A mesh so much smaller than the person that only an eye can tell whether it is hair."""
+    zooms = [zoom for zoom in _ZOOMS if _MAYBE_SHORT <= zoom < _TOO_SHORT]
+    scores = {
+        zoom: measure_fit(replace(sample, focal_px=sample.focal_px * zoom)).score for zoom in zooms
+    }
+    best = max(zooms, key=lambda zoom: scores[zoom])
+    if scores[best] < fit.score + _GAIN_MAYBE:
+        return None
+    focal = float(np.median(sample.focal_px)) / sample.scale
+    return Problem(
+        "focal length",
+        "warning",
+        f"The person's outline is about {best:.1f} times as large as the head mesh's: either there "
+        f"is much hair, or the focal length of {focal:.0f} pixels is too short (about "
+        f"{best * focal:.0f} would fit).",
+        "Look at the contact sheet of `rgbavatar check DATA`: where the mesh's eyes and mouth lie "
+        "on the person's, it is the hair, and all is well.",
+    )
 
 
 def _telling_zooms(sample: Sample) -> Iterator[_Trial]:

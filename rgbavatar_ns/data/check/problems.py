@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from rgbavatar_ns.data.importers.flame_parameters import FlameVersionError
 from rgbavatar_ns.errors import UserError
 
 Severity = Literal["error", "warning"]
@@ -28,7 +29,8 @@ class Problem:
     @classmethod
     def of_error(cls, error: UserError) -> "Problem":
         """What a reader of the dataset refused."""
-        return cls("unreadable", "error", error.cause, error.remedy)
+        kind = "FLAME version" if isinstance(error, FlameVersionError) else "unreadable"
+        return cls(kind, "error", error.cause, error.remedy)
 
     def as_error(self) -> UserError:
         """For those who cannot go on."""

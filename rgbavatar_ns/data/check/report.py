@@ -50,6 +50,8 @@ class CheckReport:
     head: str = ""
     size: tuple[int, int] = (0, 0)
     num_cameras: int = 0
+    moving: bool = False
+    """Whether a camera stands in several places or has several focal lengths."""
     focal_px: tuple[float, float] = (0.0, 0.0)
     ranges: tuple[FieldRange, ...] = ()
     notes: tuple[str, ...] = ()
@@ -74,6 +76,7 @@ class CheckReport:
             "head": self.head,
             "size": list(self.size),
             "cameras": self.num_cameras,
+            "moving": self.moving,
             "focal_px": list(self.focal_px),
             "parameters": {r.name: [r.smallest, r.largest] for r in self.ranges},
             "notes": list(self.notes),
@@ -132,6 +135,7 @@ def check_dataset(
     views = np.concatenate(
         [dataset.cameras.world_to_camera.flatten(1), focal, dataset.cameras.principal_point_px], 1
     )
+    num_cameras = len(set(dataset.camera_names)) or 1
     return CheckReport(
         dataset.root,
         str(dataset.source.get("format") or FORMAT),
@@ -141,7 +145,8 @@ def check_dataset(
         len(dataset.test),
         dataset.arrays.name,
         (dataset.width, dataset.height),
-        len(np.unique(views, axis=0)),
+        num_cameras,
+        len(np.unique(views, axis=0)) > num_cameras,
         (float(focal.min()), float(focal.max())),
         field_ranges(dataset),
         tuple(map(str, dataset.source.get("notes", ()))),

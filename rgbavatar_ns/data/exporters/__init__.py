@@ -1,6 +1,15 @@
 """The demo subject as other systems' data, so that importers can be tried and tested."""
 
 from rgbavatar_ns.data.exporters.demo import DEMO_FORMATS, write_demo
+from rgbavatar_ns.data.exporters.native import NativeWriter
 from rgbavatar_ns.data.exporters.take import FLAME_FOLDER, FlameFilm, Take, TakeFrame
 
-__all__ = ["DEMO_FORMATS", "FLAME_FOLDER", "FlameFilm", "Take", "TakeFrame", "write_demo"]
+__all__ = [
+    "DEMO_FORMATS",
+    "FLAME_FOLDER",
+    "FlameFilm",
+    "NativeWriter",
+    "Take",
+    "TakeFrame",
+    "write_demo",
+]

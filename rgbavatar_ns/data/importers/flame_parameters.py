@@ -20,6 +20,10 @@ from rgbavatar_ns.head.teeth import with_teeth
 _SMALLEST_ROW = 1e-3
 
 
+class FlameVersionError(UserError):
+    """The FLAME model at hand is of another version than the data's."""
+
+
 def flame_for(
     reading: Reading,
     usual_version: str,
@@ -28,7 +32,7 @@ def flame_for(
     """The user's FLAME of the version that the data was tracked with, with teeth if wanted.
 
     static_offset: what is added to the subject's vertices at rest: FLAME's 5,023, or with the 120
-    of VHAP's teeth after them. Raises UserError where the version is another one: expression and
+    of VHAP's teeth after them. Raises FlameVersionError where the version is another one: expression and
     identity coefficients of one version say nothing in another.
     """
     options = reading.options
@@ -44,7 +48,7 @@ def flame_for(
     )
     version = arrays.name.removeprefix("FLAME ").removesuffix(" female").removesuffix(" male")
     if version != wanted:
-        raise UserError(
+        raise FlameVersionError(
             f"{reading} is tracked with FLAME {wanted}, but {named} is {arrays.name}. Each "
             "version has expressions and identities of its own, so that coefficients of one, "
             "padded or not, give another face in the other.",

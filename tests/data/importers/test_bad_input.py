@@ -13,6 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
+from rgbavatar_ns.data.check import unreadable_report
 from rgbavatar_ns.data.importers import ImportOptions, Source, frame_files, read_source
 from rgbavatar_ns.data.importers.findings import UnusableFrameError
 from rgbavatar_ns.data.importers.pictures import Picture, make_png, picture_header
@@ -181,6 +182,8 @@ def test_another_version_of_flame_is_refused_with_the_reason(folders, flame_fold
         with pytest.raises(UserError, match=f"but .* is FLAME {other}") as caught:
             read(folders[name], pickle)
         assert "--flame-version" in caught.value.remedy
+        report = unreadable_report(folders[name], caught.value)
+        assert [problem.kind for problem in report.problems] == ["FLAME version"]
 
 
 def test_fifty_expressions_are_padded_within_a_version(folders, references, flame_folder, tmp_path):
