@@ -59,6 +59,10 @@ CAMERA_MISTAKES = {
     "x and z": (lambda m: flip(-1, 1, -1) @ m, "x and z flipped"),
     "camera to world, OpenGL": (lambda m: torch.linalg.inv(m) @ flip(1, -1, -1), "flipped"),
     "world": (lambda m: m @ flip(1, -1, -1), "flipped"),
+    "world to camera as camera to world, OpenGL": (
+        lambda m: flip(1, -1, -1) @ torch.linalg.inv(m) @ flip(1, -1, -1),
+        "world to camera where camera to world is meant",
+    ),
 }
 
 
@@ -195,6 +199,15 @@ def test_another_version_of_flame_than_the_systems_is_named(good, told, head, se
     assert [problem.severity for problem in found] == ([severity] if severity else [])
     assert kinds(quick_check(data)) == (["FLAME version"] if severity == "error" else [])
     assert report.format == told
+
+
+def test_a_version_that_the_user_names_is_only_a_warning(good):
+    arrays = replace(good.arrays, name="FLAME 2023")
+    source = {"format": "IMAvatar", "options": {"flame_version": "2023"}}
+    found = quick_check(replace(good, source=source, arrays=arrays))
+    report = check_dataset(replace(good, source=source, arrays=arrays), max_frames=2)
+    assert found == []
+    assert "FLAME version" in kinds(report.problems, "warning")
 
 
 def test_odd_parameters_are_named_by_field_and_frame(good):

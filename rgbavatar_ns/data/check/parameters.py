@@ -135,16 +135,23 @@ def camera_problems(dataset: TrackedDataset) -> list[Problem]:
 
 
 def version_problem(dataset: TrackedDataset) -> Problem | None:
-    """Whether the head is another FLAME than that which the data's system tracks with."""
+    """Whether the head is another FLAME than that which the data's system tracks with.
+
+    A warning where the system can be told so, or the user has said so (`--flame-version`).
+    """
     told = str(dataset.source.get("format", ""))
     usual, name = _USUAL_FLAME.get(told), dataset.arrays.name
     version = name.removeprefix("FLAME ").removesuffix(" female").removesuffix(" male")
     if usual is None or version == usual:
         return None
+    options = dataset.source.get("options")
+    said = isinstance(options, dict) and options.get("flame_version") == version
+    possible = name.startswith("FLAME") and (said or told in _ALSO_OTHERS)
     return Problem(
         "FLAME version",
-        "warning" if told in _ALSO_OTHERS and name.startswith("FLAME") else "error",
+        "warning" if possible else "error",
         f"The data comes from {told}, which tracks with FLAME {usual}, but its head is '{name}': "
         "coefficients of one version give another face in the other.",
-        f"Import it again with the pickle of FLAME {usual}.",
+        f"Import it again with the pickle of FLAME {usual}"
+        + (", unless it was tracked with this one." if possible else "."),
     )

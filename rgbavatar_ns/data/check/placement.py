@@ -205,6 +205,9 @@ def _axes_trials(sample: Sample) -> Iterator[_Trial]:
     causes |= {
         f"go from camera to world and have {name}": flip @ inverse for name, flip in flips.items()
     }
+    # Where a reader has taken such a matrix for one from camera to world.
+    opengl = flips["y and z flipped, as in OpenGL"]
+    causes["go from world to camera where camera to world is meant"] = opengl @ inverse @ opengl
     for cause, matrices in causes.items():
         yield _Trial(
             "axes",

@@ -29,7 +29,15 @@ def read_flashavatar(reading: Reading, progress: Progress | None = None) -> Sour
     subject = _subject(reading.folder)
     frames = replace(subject, root=tracker_folder(reading.folder))
     files = frames.numbered(CHECKPOINTS, (".frame",))
-    images = _of_frames(subject.numbered("imgs", PICTURES))
+    pictures = subject.numbered("imgs", PICTURES)
+    if pictures and pictures.keys() == files.keys():
+        raise UserError(
+            f"{reading} counts images and frames alike, from {min(files)} to {max(files)}, but "
+            f"image n of FlashAvatar belongs to frame n - {IMAGE_MINUS_FRAME}.",
+            "If image n shows frame n, number all pictures one higher; if not, the first image and "
+            "the last frame belong to nothing: remove them.",
+        )
+    images = _of_frames(pictures)
     masks = _of_frames(subject.numbered("alpha", PICTURES))
     regions = None
     if reading.options.region == "head":

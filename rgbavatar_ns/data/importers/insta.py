@@ -100,16 +100,25 @@ def _from_frames(
     findings.leave_out("images without a .frame file", missing)
     wanted = {number: path for number, path in files.items() if number in entries}
     tracked = read_frame_files(reading, wanted, progress)
-    other = []
     for number, head in tracked.frames.items():
         with findings.frame(entries[number].name):
-            camera = camera_of(entries[number].values, opengl=False)
-            off = np.abs(camera.world_to_camera - head.camera.world_to_camera).max()
-            if off > _CAMERA_TOLERANCE:
-                other.append(entries[number].name)
-    findings.leave_out(f"cameras of {INDEX_FILE} that differ from their .frame file's", other)
+            _require_same(entries[number], head.camera.world_to_camera)
     theta = {number: head.theta for number, head in tracked.frames.items()}
     return _Parameters(tracked.arrays, tracked.identity, theta)
+
+
+def _require_same(entry: Entry, tracked: Float[np.ndarray, "4 4"]) -> None:
+    """Raise UnusableFrameError where the entry's camera is not the tracker's."""
+    apart = {
+        opengl: np.abs(camera_of(entry.values, opengl).world_to_camera - tracked).max()
+        for opengl in (False, True)
+    }
+    if apart[False] <= _CAMERA_TOLERANCE:
+        return
+    told = f"cameras of {INDEX_FILE} that differ from their .frame file's"
+    if apart[True] <= _CAMERA_TOLERANCE:
+        told += ", since their axes are OpenGL's, not OpenCV's as INSTA's are"
+    raise UnusableFrameError(told)
 
 
 def _from_meshes(

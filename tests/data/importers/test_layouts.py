@@ -1,5 +1,6 @@
 """The folders of systems that share `.frame` files, FlashAvatar's places, VHAP's raw output."""
 
+import json
 import shutil
 from pathlib import Path
 
@@ -96,6 +97,15 @@ def test_flashavatar_beside_its_tracker_and_from_above(tmp_path, options, takes)
         read_source(tmp_path, options)
 
 
+def test_flashavatar_images_that_are_counted_as_frames_are_refused(tmp_path, options, takes):
+    write(tmp_path / "data", "flashavatar", takes)
+    for path in sorted((tmp_path / "data/imgs").iterdir()):
+        path.rename(path.with_name(f"{int(path.stem) - 1:05d}.jpg"))
+    with pytest.raises(UserError, match="image n of FlashAvatar belongs to frame n - 1") as caught:
+        read_source(tmp_path / "data", options)
+    assert "one higher" in caught.value.remedy
+
+
 def test_flashavatars_parsing_masks_cut_the_matte(tmp_path, options, takes):
     write(tmp_path / "data", "flashavatar", takes)
     mask = np.zeros((HEIGHT, WIDTH), np.uint8)
@@ -177,8 +187,6 @@ def test_images_without_a_matte_need_consent(frame_folder, options):
 
 
 def test_a_camera_that_contradicts_the_trackers_is_told(tmp_path, options, takes):
-    import json
-
     write(tmp_path, "insta", takes)
     for path in tmp_path.glob("transforms*.json"):
         content = json.loads(path.read_text())
@@ -186,6 +194,18 @@ def test_a_camera_that_contradicts_the_trackers_is_told(tmp_path, options, takes
             frame["transform_matrix"][0][3] += 0.01
         path.write_text(json.dumps(content))
     with pytest.raises(UserError, match=f"differ from their .frame file's: {NUM_FRAMES}"):
+        read_source(tmp_path, options)
+
+
+def test_insta_cameras_in_opengl_axes_are_named(tmp_path, options, takes):
+    write(tmp_path, "insta", takes)
+    for path in tmp_path.glob("transforms*.json"):
+        content = json.loads(path.read_text())
+        for frame in content["frames"]:
+            matrix = np.array(frame["transform_matrix"]) @ np.diag([1, -1, -1, 1])
+            frame["transform_matrix"] = matrix.tolist()
+        path.write_text(json.dumps(content))
+    with pytest.raises(UserError, match=f"axes are OpenGL's, .*: {NUM_FRAMES}"):
         read_source(tmp_path, options)
 
 
