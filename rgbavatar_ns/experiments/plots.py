@@ -4,8 +4,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.experiments.spec import Experiment
+from rgbavatar_ns.experiments.streamed import read_streamed
+from rgbavatar_ns.experiments.sweep import CellStatus
 from rgbavatar_ns.experiments.tables import HEADINGS, ResultTable, Row
 
 _COLOR = "tab:blue"
@@ -18,17 +22,10 @@ def write_plots(experiment: Experiment, table: ResultTable, folder: Path, stem: 
 
     Raises UserError where matplotlib is missing.
     """
-    try:
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise UserError(
-            f"Plots need matplotlib, which cannot be imported ({error}).",
-            "Install it (pip install matplotlib), or pass --no-plots.",
-        ) from error
     metrics = [m for m in table.metrics if any(m in row.entries for row in table.rows)]
     if not metrics:
         return []
-    figure = Figure(figsize=(4.2 * len(metrics), 3.2), layout="constrained")
+    figure = _figure(4.2 * len(metrics), 3.2)
     for place, metric in enumerate(metrics, 1):
         axes = figure.add_subplot(1, len(metrics), place)
         axes.spines[["top", "right"]].set_visible(False)
@@ -44,12 +41,57 @@ def write_plots(experiment: Experiment, table: ResultTable, folder: Path, stem: 
         low, high = min(means), max(means)
         margin = max(high - low, 1e-3 * abs(high), 1e-9)
         axes.set_xlim(low - 0.6 * margin, high + 0.3 * margin)
-    paths = []
-    for suffix in (".png", ".svg"):
-        path = folder / f"{stem}{suffix}"
-        figure.savefig(path, dpi=130)
-        paths.append(path)
-    return paths[:1]
+    return [_saved(figure, folder, stem)]
+
+
+def write_forgetting_curves(statuses: Sequence[CellStatus], folder: Path, stem: str) -> list[Path]:
+    """Draw the loss of each streamed frame after the stream's end, a line for each variant.
+
+    Of the first cell of each that has such a curve; returns the PNG's path, or nothing where no
+    cell has one. Raises UserError where matplotlib is missing.
+    """
+    curves: dict[str, tuple[list[int], list[float]]] = {}
+    for status in statuses:
+        curve = read_streamed(status.folder) if status.result is not None else None
+        if curve is not None:
+            curves.setdefault(status.cell.variant, curve)
+    if not curves:
+        return []
+    figure = _figure(8.4, 3.6)
+    axes = figure.add_subplot()
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.set_xlabel("frame of the stream")
+    axes.set_ylabel("L1 after the stream's end")
+    for name, (frames, losses) in curves.items():
+        axes.plot(frames, _smooth(losses), linewidth=1, label=name)
+    axes.legend(frameon=False, fontsize=7)
+    return [_saved(figure, folder, f"{stem}_forgetting")]
+
+
+def _smooth(values: Sequence[float]) -> np.ndarray:
+    """Means over a fortieth of the frames: single expressions would hide the slope."""
+    width = max(1, len(values) // 40)
+    counts = np.convolve(np.ones(len(values)), np.ones(width), "same")
+    return np.convolve(values, np.ones(width), "same") / counts
+
+
+def _figure(width: float, height: float) -> Any:
+    try:
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise UserError(
+            f"Plots need matplotlib, which cannot be imported ({error}).",
+            "Install it (pip install matplotlib), or pass --no-plots.",
+        ) from error
+    return Figure(figsize=(width, height), layout="constrained")
+
+
+def _saved(figure: Any, folder: Path, stem: str) -> Path:
+    """Write PNG and SVG; returns the PNG's path."""
+    path = folder / f"{stem}.png"
+    figure.savefig(path, dpi=130)
+    figure.savefig(path.with_suffix(".svg"))
+    return path
 
 
 def _against(axes: Any, experiment: Experiment, rows: Sequence[Row], metric: str) -> None:

@@ -4,7 +4,7 @@ import html
 from dataclasses import dataclass
 from pathlib import Path
 
-from rgbavatar_ns.experiments.plots import write_plots
+from rgbavatar_ns.experiments.plots import write_forgetting_curves, write_plots
 from rgbavatar_ns.experiments.spec import Experiment
 from rgbavatar_ns.experiments.sweep import CellStatus, read_statuses
 from rgbavatar_ns.experiments.tables import HEADINGS, ResultTable, result_table
@@ -45,7 +45,10 @@ def write_report(experiment: Experiment, folder: Path, *, plots: bool = True) ->
         path = out / f"{experiment.name}{suffix}"
         path.write_text(text, encoding="utf-8")
         paths.append(path)
-    drawn = write_plots(experiment, table, out, experiment.name) if plots else []
+    drawn = []
+    if plots:
+        drawn = write_plots(experiment, table, out, experiment.name)
+        drawn += write_forgetting_curves(statuses, out, experiment.name)
     page = out / "index.html"
     page.write_text(_page(experiment, table, statuses, drawn), encoding="utf-8")
     return Report(table, statuses, [*paths, *drawn, page])

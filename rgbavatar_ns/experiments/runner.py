@@ -10,10 +10,14 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from rgbavatar_ns.avatar import Avatar
+from rgbavatar_ns.data import load_dataset
 from rgbavatar_ns.data.json_file import write_json
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.experiments.cells import Cell
+from rgbavatar_ns.experiments.guard import alone_in, end_with_parent
 from rgbavatar_ns.experiments.overrides import as_flags
+from rgbavatar_ns.experiments.streamed import write_streamed
 from rgbavatar_ns.plugin.commands import run_nerfstudio
 
 CELL_FILE, RESULT_FILE, LOG_FILE = "cell.json", "result.json", "log.txt"
@@ -52,6 +56,9 @@ def run_cell(folder: Path) -> dict[str, Any]:
         for name, value in {**training, **scores}.items()
         if isinstance(value, int | float)
     }
+    if "stream" in training:
+        avatar, dataset = Avatar.load(run_folder), load_dataset(data)
+        numbers["l1_streamed"] = write_streamed(avatar, dataset, folder)
     result = {"key": cell.key, "metrics": numbers, "run": str(run_folder)}
     if "lpips_unavailable" in scores:
         result["unavailable"] = {"lpips_vgg": scores["lpips_unavailable"]}
@@ -69,11 +76,22 @@ def _training_flags(cell: Cell, data: Path, folder: Path, run_folder: Path) -> l
 
 
 def main() -> None:
-    """Run the cell in the folder that is the only argument; exit code 1 tells of a failure."""
+    """Run the cell in the folder that is the only argument; exit code 1 tells of a failure.
+
+    Ends when the process that started it does, and waits for another one in the same folder, so
+    that a cluster may start a lost cell anew.
+    """
+    folder = Path(sys.argv[1])
+    end_with_parent()
     try:
-        run_cell(Path(sys.argv[1]))
+        with alone_in(folder):
+            if read_result(folder) is None:
+                run_cell(folder)
     except UserError as error:
         print(error, file=sys.stderr)
+        sys.exit(1)
+    except OSError as error:
+        print(f"The cell cannot be read or written: {error}.", file=sys.stderr)
         sys.exit(1)
     except KeyboardInterrupt:
         sys.exit(130)

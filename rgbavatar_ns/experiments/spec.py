@@ -11,8 +11,17 @@ import yaml
 
 from rgbavatar_ns.errors import UserError
 
-METRICS = ("psnr", "ssim", "lpips_vgg", "e_orth", "images_per_second", "train_seconds")
-"""What a table may show; the first three are of the held-out frames."""
+METRICS = (
+    "psnr",
+    "ssim",
+    "lpips_vgg",
+    "l1_streamed",
+    "e_orth",
+    "images_per_second",
+    "train_seconds",
+)
+"""What a table may show; the first three are of the held-out frames, `l1_streamed` is of the frames
+that a stream brought, after its end."""
 
 Overrides = dict[str, Any]
 """Dotted fields of a preset's config, as on ns-train's command line, with their values."""

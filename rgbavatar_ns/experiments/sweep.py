@@ -15,6 +15,7 @@ from rgbavatar_ns.experiments.engines import Engine
 from rgbavatar_ns.experiments.overrides import check_overrides
 from rgbavatar_ns.experiments.runner import LOG_FILE, read_result, write_cell
 from rgbavatar_ns.experiments.spec import Experiment, nearest
+from rgbavatar_ns.plugin.commands import killed_by
 
 State = Literal["waiting", "running", "done", "failed"]
 _ATTEMPTS = 2
@@ -35,9 +36,10 @@ class CellStatus:
 def check_experiment(experiment: Experiment) -> None:
     """Raise UserError where the preset or an override does not exist or does not fit."""
     # Loads nerfstudio, which takes seconds.
-    from rgbavatar_ns.plugin import methods
+    from rgbavatar_ns.plugin import methods, online_methods
 
-    configs = [getattr(found, "config", None) for found in vars(methods).values()]
+    found = [*vars(methods).values(), *vars(online_methods).values()]
+    configs = [getattr(one, "config", None) for one in found]
     presets = {c.method_name: c for c in configs if c is not None and hasattr(c, "method_name")}
     if experiment.preset not in presets:
         raise UserError(
@@ -61,10 +63,26 @@ def sweep(
 
     A cell lives in `folder/cells/HASH`; a second call does only what is missing and resumes what
     was interrupted. A failed cell is tried once more, then left with the last lines of its log;
-    the others go on. Raises UserError, before anything runs, for what `check_experiment` finds.
+    the others go on. Raises UserError, before anything runs, for what `check_experiment` finds,
+    and where `folder` cannot be written, such as on a full disk.
     """
     check_experiment(experiment)
-    cells = cells_of(experiment)
+    try:
+        return _sweep(experiment, cells_of(experiment), folder, engine, progress)
+    except OSError as error:
+        raise UserError(
+            f"The sweep of {experiment.name} cannot go on in {folder}: {error}.",
+            "Make room or mend the permissions, then call it again: finished cells are kept.",
+        ) from error
+
+
+def _sweep(
+    experiment: Experiment,
+    cells: Sequence[Cell],
+    folder: Path,
+    engine: Engine,
+    progress: Callable[[Sequence[CellStatus]], None],
+) -> list[CellStatus]:
     statuses = [_status(cell, folder) for cell in cells]
     write_json(folder / f"{experiment.name}.json", [cell.to_json() for cell in cells])
     progress(statuses)
@@ -81,7 +99,7 @@ def sweep(
                 status.result = read_result(cell_folder)
                 done = code == 0 and status.result is not None
                 status.state = "done" if done else "failed"
-                status.why = [] if done else last_lines(cell_folder / LOG_FILE, _LAST_LINES)
+                status.why = [] if done else _why(code, cell_folder)
         progress(statuses)
 
     for _ in range(_ATTEMPTS):
@@ -92,6 +110,12 @@ def sweep(
         if left:
             engine.run(left, finished)
     return statuses
+
+
+def _why(code: int, cell_folder: Path) -> list[str]:
+    """The end of a failed cell's log, and what killed it, if anything did."""
+    lines = last_lines(cell_folder / LOG_FILE, _LAST_LINES)
+    return lines if code >= 0 else [*lines, f"The cell was {killed_by(code)}."]
 
 
 def last_lines(path: Path, count: int) -> list[str]:

@@ -1,6 +1,7 @@
 """nerfstudio's commands as child processes of this environment."""
 
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -31,8 +32,26 @@ def run_nerfstudio(*command: str | Path) -> None:
             raise
     if code == 130:
         raise KeyboardInterrupt
+    if code < 0:
+        raise UserError(
+            f"{command[0]} was {killed_by(code)}.",
+            "Run the same command again: finished stages are kept. For less memory, lower "
+            "--pipeline.datamanager.batch-size, --pipeline.datamanager.cache-mib or the number of "
+            "Gaussians, --pipeline.model.avatar.uv-resolution.",
+        )
     if code != 0:
         raise UserError(
             f"{command[0]} ended with exit code {code}; its last lines above say why.",
             "Once that is mended, run the same command again: finished stages are kept.",
         )
+
+
+def killed_by(code: int) -> str:
+    """What a process's negative exit code says: "killed by SIGKILL, probably out of memory"."""
+    try:
+        name = signal.Signals(-code).name
+    except ValueError:
+        name = f"signal {-code}"
+    # Nobody else sends it uncalled: the system does, to whom takes more memory than there is.
+    guess = ", probably out of memory" if name == "SIGKILL" else ""
+    return f"killed by {name}{guess}"

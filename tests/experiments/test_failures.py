@@ -1,0 +1,193 @@
+"""What can go wrong while cells run: each is named, ends in an exit code, and loses nothing."""
+
+import errno
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from rgbavatar_ns.cli import main as cli
+from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.experiments import engines, read_experiment, runner
+from rgbavatar_ns.experiments import sweep as sweep_module
+from rgbavatar_ns.experiments.engines import LocalEngine
+from rgbavatar_ns.experiments.guard import alone_in
+from rgbavatar_ns.experiments.runner import run_cell, write_cell
+from rgbavatar_ns.experiments.sweep import cells_of, sweep
+from rgbavatar_ns.plugin import commands
+
+TEXT = """
+title: Failures
+preset: rgbavatar-tiny
+subjects: [data]
+metrics: [psnr]
+variants: [{name: first}, {name: second, set: {max_num_iterations: 3}}]
+"""
+
+FAKE = """
+import json, os, pathlib, resource, signal, sys
+folder = pathlib.Path(sys.argv[1])
+cell = json.loads((folder / "cell.json").read_text())
+with (folder / "calls.txt").open("a") as calls:
+    calls.write("x")
+if cell["variant"] == "second":
+    BREAK
+(folder / "result.json").write_text(json.dumps({"metrics": {"psnr": 30.0}}))
+"""
+
+
+@pytest.fixture
+def sweep_of(tmp_path, monkeypatch):
+    """Reads an experiment of two cells, the second of which runs `break_` first."""
+    (tmp_path / "data").mkdir()
+    (tmp_path / "failures.yaml").write_text(TEXT)
+
+    def build(break_: str = "pass"):
+        path = tmp_path / "fake_runner.py"
+        path.write_text(FAKE.replace("BREAK", break_))
+        monkeypatch.setattr(engines, "_RUNNER", (sys.executable, str(path)))
+        return read_experiment(tmp_path / "failures.yaml")
+
+    return build
+
+
+def _no_space(*arguments, **options):
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "somewhere")
+
+
+def test_a_cell_killed_by_the_system_is_named(sweep_of, tmp_path):
+    experiment = sweep_of("os.kill(os.getpid(), signal.SIGKILL)")
+    first, second = sweep(experiment, tmp_path / "out", LocalEngine())
+    assert (first.state, second.state) == ("done", "failed")
+    assert second.why[-1] == "The cell was killed by SIGKILL, probably out of memory."
+    assert (second.folder / "calls.txt").read_text() == "xx"
+
+
+def test_a_cell_without_memory_says_so_and_the_command_ends_with_1(sweep_of, tmp_path, capsys):
+    limit = "resource.setrlimit(resource.RLIMIT_AS, (2**28, 2**28)); bytearray(2**30)"
+    sweep_of(limit)
+    arguments = ["sweep", str(tmp_path / "failures.yaml"), "--output", str(tmp_path / "out")]
+    with pytest.raises(SystemExit) as ended:
+        cli.main(arguments)
+    assert ended.value.code == 1
+    told = capsys.readouterr().out
+    assert "MemoryError" in told
+    assert "1 of 2 cells done" in told
+
+
+def test_a_command_killed_by_the_system_is_named(tmp_path, monkeypatch):
+    program = tmp_path / "ns-train"
+    program.write_text("#!/bin/sh\nkill -KILL $$\n")
+    program.chmod(0o755)
+    monkeypatch.setattr(commands.sys, "executable", str(tmp_path / "python"))
+    with pytest.raises(UserError, match="ns-train was killed by SIGKILL, probably out of memory"):
+        commands.run_nerfstudio("ns-train")
+
+
+@pytest.mark.parametrize("full", ["write_json", "write_cell", "make_demo_dataset"])
+def test_a_full_disk_is_named_and_finished_cells_are_kept(sweep_of, tmp_path, monkeypatch, full):
+    experiment = sweep_of()
+    done = sweep(experiment, tmp_path / "out", LocalEngine())
+    (done[1].folder / "result.json").unlink()
+    if full == "make_demo_dataset":
+        text = TEXT.replace("[data]", "[data, 'demo:0:8:16']")
+        (tmp_path / "failures.yaml").write_text(text)
+        experiment = read_experiment(tmp_path / "failures.yaml")
+    with monkeypatch.context() as patched:
+        patched.setattr(sweep_module, full, _no_space)
+        with pytest.raises(UserError, match="No space left on device") as refused:
+            sweep(experiment, tmp_path / "out", LocalEngine())
+    assert "finished cells are kept" in refused.value.remedy
+    assert not list((tmp_path / "out").glob("data/demo*"))
+    after = sweep(read_experiment(tmp_path / "failures.yaml"), tmp_path / "out", LocalEngine())
+    assert {status.state for status in after} == {"done"}
+    assert (done[0].folder / "calls.txt").read_text() == "x"
+
+
+def test_a_full_disk_leaves_no_half_written_result(tmp_path, monkeypatch, sweep_of, capsys):
+    cell = cells_of(sweep_of())[0]
+    write_cell(tmp_path, cell, tmp_path / "data")
+    monkeypatch.setattr(runner, "run_cell", _no_space)
+    monkeypatch.setattr(sys, "argv", ["runner", str(tmp_path)])
+    with pytest.raises(SystemExit) as ended:
+        runner.main()
+    assert ended.value.code == 1
+    assert "No space left on device" in capsys.readouterr().err
+    assert not (tmp_path / "result.json").exists()
+
+
+def test_a_lost_data_set_is_named_by_the_cell(tmp_path, monkeypatch, sweep_of):
+    """The folder went after the sweep had begun."""
+    cell = cells_of(sweep_of())[0]
+    write_cell(tmp_path, cell, tmp_path / "gone")
+    told = []
+
+    def refuse(*command):
+        told.append(command)
+        raise UserError("There is no dataset.", "")
+
+    monkeypatch.setattr(runner, "run_nerfstudio", refuse)
+    with pytest.raises(UserError):
+        run_cell(tmp_path)
+    assert told[0][:4] == ("ns-train", "rgbavatar-tiny", "--data", tmp_path / "gone")
+
+
+def test_a_finished_cell_is_not_run_again_by_a_second_process(tmp_path, monkeypatch):
+    """A cluster that lost sight of a cell starts it anew; the first may have ended well."""
+    (tmp_path / "result.json").write_text('{"metrics": {}}')
+    monkeypatch.setattr(runner, "run_cell", _no_space)
+    monkeypatch.setattr(sys, "argv", ["runner", str(tmp_path)])
+    runner.main()
+
+
+_HOLD = """
+import pathlib, sys, time
+from rgbavatar_ns.experiments.guard import alone_in
+folder = pathlib.Path(sys.argv[1])
+with alone_in(folder):
+    (folder / "held").touch()
+    time.sleep(3)
+    (folder / "ended").touch()
+"""
+
+_ORPHAN = """
+import pathlib, subprocess, sys
+child = '''
+import pathlib, sys, time
+from rgbavatar_ns.experiments.guard import end_with_parent
+end_with_parent()
+folder = pathlib.Path(sys.argv[1])
+(folder / "begun").touch()
+try:
+    time.sleep(120)
+except KeyboardInterrupt:
+    (folder / "interrupted").touch()
+'''
+subprocess.Popen([sys.executable, "-c", child, sys.argv[1]], start_new_session=True).wait()
+"""
+
+
+def _await(path, seconds=60.0):
+    end = time.monotonic() + seconds
+    while not path.exists():
+        assert time.monotonic() < end, f"{path} never came"
+        time.sleep(0.05)
+
+
+def test_one_process_at_a_time_works_in_a_folder(tmp_path, capsys):
+    with subprocess.Popen([sys.executable, "-c", _HOLD, str(tmp_path)]):
+        _await(tmp_path / "held")
+        assert not (tmp_path / "ended").exists()
+        with alone_in(tmp_path):
+            assert (tmp_path / "ended").exists()
+    assert "still works on this cell" in capsys.readouterr().out
+
+
+def test_a_cell_ends_with_the_worker_that_started_it(tmp_path):
+    with subprocess.Popen([sys.executable, "-c", _ORPHAN, str(tmp_path)]) as worker:
+        _await(tmp_path / "begun")
+        worker.send_signal(signal.SIGKILL)
+    _await(tmp_path / "interrupted")
