@@ -48,9 +48,9 @@ Picture = npt.NDArray[np.uint8]
 
 @pytest.fixture
 def viewer_address(tiny_data: Path, tmp_path: Path) -> Iterator[str]:
-    """Where ns-viewer shows a run of a few steps."""
+    """Where ns-viewer shows a run whose bases have learned something."""
     avatar = AvatarConfig(uv_resolution=48, num_bases=3, scale_from_texel_spacing=True)
-    config = finished_run(tiny_data, tmp_path, avatar=avatar)
+    config = finished_run(tiny_data, tmp_path, avatar=avatar, max_num_iterations=150)
     log = tmp_path / "viewer.log"
     command = [program("ns-viewer"), "--load-config", str(config)]
     command += ["--viewer.websocket-host", "127.0.0.1"]
