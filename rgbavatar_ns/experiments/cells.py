@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,11 +24,15 @@ class Cell:
     subject: str
     seed: int
     overrides: Overrides
+    cross_identity: Mapping[str, str] | None = None
 
     @property
     def key(self) -> str:
         """Of preset, subject, seed and overrides: cells that agree in these are one training."""
-        decides = [self.preset, self.subject, self.seed, sorted(self.overrides.items())]
+        decides: list[Any] = [self.preset, self.subject, self.seed]
+        decides.append(sorted(self.overrides.items()))
+        if self.cross_identity is not None:
+            decides.append(sorted(self.cross_identity.items()))
         return hashlib.sha256(json.dumps(decides).encode()).hexdigest()[:12]
 
     def to_json(self) -> dict[str, Any]:
@@ -43,9 +48,10 @@ class Cell:
 def cells_of(experiment: Experiment) -> list[Cell]:
     """All cells, in the order of the table; subjects that are folders as absolute paths.
 
-    Raises UserError for a dataset folder that does not exist.
+    Raises UserError for a dataset folder or a face-recognition file that does not exist.
     """
     subjects = [_resolved(experiment, subject) for subject in experiment.subjects]
+    cross_identity = _resolved_cross_identity(experiment)
     return [
         Cell(
             experiment.name,
@@ -54,6 +60,7 @@ def cells_of(experiment: Experiment) -> list[Cell]:
             subject,
             seed,
             {**experiment.base, **variant.overrides},
+            cross_identity,
         )
         for variant in experiment.variants
         for subject in subjects
@@ -73,6 +80,23 @@ def demo_config(subject: str) -> DemoConfig | None:
     return DemoConfig(
         seed=seed, num_frames=frames, image_size=size, num_test_frames=max(1, frames // 4)
     )
+
+
+def _resolved_cross_identity(experiment: Experiment) -> dict[str, str] | None:
+    if experiment.cross_identity is None:
+        return None
+    named = dict(experiment.cross_identity)
+    named["driver"] = _resolved(experiment, named["driver"])
+    if "face_recognition" in named:
+        path = (experiment.folder / Path(named["face_recognition"]).expanduser()).resolve()
+        if not path.is_file():
+            raise UserError(
+                f"The experiment {experiment.name} names the face-recognition file {path}, which "
+                "does not exist.",
+                "Correct `face_recognition`; without it CSIM is told to be not available.",
+            )
+        named["face_recognition"] = str(path)
+    return named
 
 
 def _resolved(experiment: Experiment, subject: str) -> str:

@@ -7,6 +7,7 @@ interrupted resumes its training.
 
 import json
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,11 @@ from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.experiments.cells import Cell
 from rgbavatar_ns.experiments.guard import alone_in, end_with_parent
 from rgbavatar_ns.experiments.overrides import as_flags
+from rgbavatar_ns.experiments.reenactment import (
+    OnnxFaceRecognition,
+    load_tracker,
+    reenactment_scores,
+)
 from rgbavatar_ns.experiments.streamed import write_streamed
 from rgbavatar_ns.plugin.commands import run_nerfstudio
 
@@ -25,9 +31,10 @@ _EVALUATION = "eval.json"
 _RUN = "run"
 
 
-def write_cell(folder: Path, cell: Cell, data: Path) -> None:
-    """Leave in `folder` what `run_cell` needs."""
-    write_json(folder / CELL_FILE, {**cell.to_json(), "data": str(data)})
+def write_cell(folder: Path, cell: Cell, data: Path, driver: Path | None = None) -> None:
+    """Leave in `folder` what `run_cell` needs: the cell, its dataset and its driver's."""
+    places = {"data": str(data), "driver_data": None if driver is None else str(driver)}
+    write_json(folder / CELL_FILE, {**cell.to_json(), **places})
 
 
 def read_result(folder: Path) -> dict[str, Any] | None:
@@ -41,7 +48,7 @@ def read_result(folder: Path) -> dict[str, Any] | None:
 def run_cell(folder: Path) -> dict[str, Any]:
     """Train and evaluate; returns what result.json then holds."""
     described = json.loads((folder / CELL_FILE).read_text())
-    data = Path(described.pop("data"))
+    data, driver = Path(described.pop("data")), described.pop("driver_data")
     cell = Cell.from_json(described)
     run_folder = folder / _RUN / "cell" / cell.preset / "run"
     run_nerfstudio("ns-train", cell.preset, *_training_flags(cell, data, folder, run_folder))
@@ -60,10 +67,29 @@ def run_cell(folder: Path) -> dict[str, Any]:
         avatar, dataset = Avatar.load(run_folder), load_dataset(data)
         numbers["l1_streamed"] = write_streamed(avatar, dataset, folder)
     result = {"key": cell.key, "metrics": numbers, "run": str(run_folder)}
+    unavailable = {}
     if "lpips_unavailable" in scores:
-        result["unavailable"] = {"lpips_vgg": scores["lpips_unavailable"]}
+        unavailable["lpips_vgg"] = scores["lpips_unavailable"]
+    if cell.cross_identity is not None and driver is not None:
+        values, missing = _reenact(run_folder, data, Path(driver), cell.cross_identity)
+        numbers |= values
+        unavailable |= missing
+    if unavailable:
+        result["unavailable"] = unavailable
     write_json(folder / RESULT_FILE, result)
     return result
+
+
+def _reenact(
+    run_folder: Path, data: Path, driver: Path, named: Mapping[str, str]
+) -> tuple[dict[str, float], dict[str, str]]:
+    tracker = load_tracker(named["tracker"]) if "tracker" in named else None
+    file = named.get("face_recognition")
+    recognition = None if file is None else OnnxFaceRecognition(Path(file))
+    avatar = Avatar.load(run_folder)
+    return reenactment_scores(
+        avatar, load_dataset(data), load_dataset(driver), tracker, recognition
+    )
 
 
 def _training_flags(cell: Cell, data: Path, folder: Path, run_folder: Path) -> list[str | Path]:

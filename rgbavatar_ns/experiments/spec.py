@@ -19,9 +19,14 @@ METRICS = (
     "e_orth",
     "images_per_second",
     "train_seconds",
+    "aed",
+    "apd",
+    "csim",
 )
 """What a table may show; the first three are of the held-out frames, `l1_streamed` is of the frames
-that a stream brought, after its end."""
+that a stream brought, after its end; the last three need `cross_identity`."""
+
+_CROSS_IDENTITY = ("driver", "tracker", "face_recognition")
 
 Overrides = dict[str, Any]
 """Dotted fields of a preset's config, as on ns-train's command line, with their values."""
@@ -60,6 +65,9 @@ class Experiment:
     paper_data: str | None = None
     """The data set that the paper's figures are of: they stand beside ours, not against them,
     unless it is the one named here."""
+    cross_identity: Mapping[str, str] | None = None
+    """A `driver` (a subject) whose held-out frames drive every avatar, a `tracker`
+    (module:function) for AED and APD, and a `face_recognition` ONNX file for CSIM."""
     folder: Path = Path()
 
     def __post_init__(self) -> None:
@@ -118,6 +126,7 @@ _KINDS: dict[str, tuple[type, ...]] = {
     "metrics": (list,),
     "plot": (str,),
     "paper_data": (str,),
+    "cross_identity": (dict,),
 }
 _SAID = {str: "text", list: "a list", dict: "a mapping"}
 
@@ -146,8 +155,25 @@ def _experiment(path: Path, content: Mapping[str, Any]) -> Experiment:
     if any(not isinstance(seed, int) or seed < 0 for seed in given.get("seeds", ())):
         raise _refusal(where, f"has seeds: {given['seeds']!r}", "Give whole numbers, 0 or more.")
     _require_known(f"{where}, metrics", dict.fromkeys(given.get("metrics", ())), METRICS)
+    _check_cross_identity(where, given.get("cross_identity"), given.get("metrics", ()))
     lists = {key: tuple(value) for key, value in given.items() if isinstance(value, list)}
     return replace(experiment, **{**given, **lists})
+
+
+def _check_cross_identity(
+    where: str, named: Mapping[Any, Any] | None, metrics: Sequence[str]
+) -> None:
+    if named is None:
+        if {"aed", "apd", "csim"} & set(metrics):
+            raise _refusal(
+                where, "lists cross-identity metrics", "Name a driver: `cross_identity: {driver:`."
+            )
+        return
+    _require_known(f"{where}, cross_identity", named, _CROSS_IDENTITY)
+    if "driver" not in named or not all(isinstance(value, str) for value in named.values()):
+        raise _refusal(
+            where, f"has cross_identity: {dict(named)!r}", "Give texts, with a `driver`."
+        )
 
 
 def _variants(

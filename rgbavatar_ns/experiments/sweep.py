@@ -13,6 +13,7 @@ from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.experiments.cells import Cell, cells_of, demo_config
 from rgbavatar_ns.experiments.engines import Engine
 from rgbavatar_ns.experiments.overrides import check_overrides
+from rgbavatar_ns.experiments.reenactment import load_tracker
 from rgbavatar_ns.experiments.runner import LOG_FILE, read_result, write_cell
 from rgbavatar_ns.experiments.spec import Experiment, nearest
 from rgbavatar_ns.plugin.commands import killed_by
@@ -46,6 +47,9 @@ def check_experiment(experiment: Experiment) -> None:
             f"The experiment {experiment.name} names the preset {experiment.preset!r}.",
             nearest(experiment.preset, list(presets)),
         )
+    tracker = (experiment.cross_identity or {}).get("tracker")
+    if tracker is not None:
+        load_tracker(tracker)
     config = presets[experiment.preset]
     check_overrides(config, experiment.base, f"The experiment {experiment.name}, base,")
     for variant in experiment.variants:
@@ -87,11 +91,13 @@ def _sweep(
     write_json(folder / f"{experiment.name}.json", [cell.to_json() for cell in cells])
     progress(statuses)
     missing = {status.folder: status for status in statuses if status.state != "done"}
-    data = {cell.subject: _dataset(cell.subject, folder) for cell in cells if missing}
+    subjects = {cell.subject for cell in cells} | {_driver(cell) for cell in cells}
+    data = {name: _dataset(name, folder) for name in sorted(subjects - {""}) if missing}
     for status in missing.values():
         status.folder.mkdir(parents=True, exist_ok=True)
         (status.folder / LOG_FILE).unlink(missing_ok=True)
-        write_cell(status.folder, status.cell, data[status.cell.subject])
+        cell = status.cell
+        write_cell(status.folder, cell, data[cell.subject], data.get(_driver(cell)))
 
     def finished(cell_folder: Path, code: int) -> None:
         for status in statuses:  # variants may share a cell
@@ -145,6 +151,10 @@ def _status(cell: Cell, folder: Path) -> CellStatus:
     cell_folder = folder / "cells" / cell.key
     result = read_result(cell_folder)
     return CellStatus(cell, cell_folder, "waiting" if result is None else "done", result)
+
+
+def _driver(cell: Cell) -> str:
+    return "" if cell.cross_identity is None else cell.cross_identity["driver"]
 
 
 def _dataset(subject: str, folder: Path) -> Path:

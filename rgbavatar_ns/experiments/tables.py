@@ -18,6 +18,9 @@ HEADINGS = {
     "e_orth": "e_orth",
     "images_per_second": "images/s",
     "train_seconds": "training, s",
+    "aed": "AED",
+    "apd": "APD",
+    "csim": "CSIM",
 }
 _DIGITS = {
     "psnr": 2,
@@ -27,6 +30,9 @@ _DIGITS = {
     "e_orth": 4,
     "images_per_second": 1,
     "train_seconds": 0,
+    "aed": 4,
+    "apd": 4,
+    "csim": 4,
 }
 _MISSING = "-"
 
