@@ -27,7 +27,7 @@ from rgbavatar_ns.head.flame import FLAME_VARIABLE
 CACHE_FOLDER = ".rgbavatar"
 """In the source; nothing in it belongs to the source."""
 _STATE_FILE = ".import.json"
-_IMPORTER_VERSION = 1
+_IMPORTER_VERSION = 2
 """To be raised where the same files give another dataset."""
 
 

@@ -18,6 +18,20 @@ _ROOT, _NECK = 0, 1
 _STILL = 1e-5
 
 
+def all_is_the_cameras(records: Sequence[FrameRecord]) -> bool:
+    """Whether one camera moves about a head that never turns or moves."""
+    first = records[0].camera.world_to_camera
+    still = not any(
+        record.theta[name].any()
+        for record in records
+        for name in ("rotation", "neck", "translation")
+        if name in record.theta
+    )
+    one = len({record.camera_name for record in records}) == 1
+    moves = any(np.abs(record.camera.world_to_camera - first).max() > _STILL for record in records)
+    return still and one and moves
+
+
 def place_head_pose(
     records: Sequence[FrameRecord],
     arrays: HeadArrays,

@@ -27,10 +27,12 @@ class ImportOptions:
     """Folder of l_eyelid.npy and r_eyelid.npy; by default beside the pickle."""
     teeth: bool = True
     """Whether FLAME gets teeth."""
-    head_pose: HeadPose = "source"
-    """Where the head's motion goes. source: as the format has it (metrical-tracker and its kin
-    move the camera); camera: all of it into the camera; head: one still camera, and the head turns
-    and moves; neck: the same, but the rotation is the neck's, so that the collar stays upright."""
+    head_pose: HeadPose | Literal["auto"] = "auto"
+    """Where the head's motion goes. source: as the format has it; camera: all of it into the
+    camera; head: one still camera, and the head turns and moves; neck: the same, but the rotation
+    is the neck's, so that the collar stays upright; auto: head where the format has it all in one
+    camera (metrical-tracker and its kin), else source. What an avatar looks like may depend on how
+    the head is turned, but not on where the camera is."""
     region: Region = "person"
     """person: the format's own mattes; head: of FlashAvatar data only what its parsing masks call
     head, neck and mouth."""

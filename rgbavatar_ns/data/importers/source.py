@@ -13,8 +13,8 @@ from torch import Tensor
 from rgbavatar_ns.data.importers.findings import Findings, UnusableFrameError
 from rgbavatar_ns.data.importers.folder import Folder
 from rgbavatar_ns.data.importers.frame_record import FrameRecord
-from rgbavatar_ns.data.importers.head_pose import place_head_pose
-from rgbavatar_ns.data.importers.options import ImportOptions
+from rgbavatar_ns.data.importers.head_pose import all_is_the_cameras, place_head_pose
+from rgbavatar_ns.data.importers.options import HeadPose, ImportOptions
 from rgbavatar_ns.data.importers.pictures import Picture, PictureHeader, picture_header
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadArrays, HeadModel, ThetaLayout
@@ -79,7 +79,7 @@ def assemble(
     reading.findings.settle(str(reading), reading.options.allow_partial)
     if not records:
         raise UserError(f"{reading} has no frame that can be used.", "Look at its files.")
-    records = place_head_pose(records, arrays, identity, reading.options.head_pose)
+    records = place_head_pose(records, arrays, identity, _head_pose(reading, records))
     layout = HeadModel(arrays).layout
     theta = layout.join({f.name: _column(records, f.name, f.size) for f in layout.fields})
     width, height = size
@@ -106,6 +106,18 @@ def assemble(
         timesteps=tuple(record.timestep for record in records),
         notes=tuple(reading.findings.notes),
     )
+
+
+def _head_pose(reading: Reading, records: Sequence[FrameRecord]) -> HeadPose:
+    chosen = reading.options.head_pose
+    if chosen != "auto":
+        return chosen
+    if not all_is_the_cameras(records):
+        return "source"
+    reading.findings.note(
+        "the format moves the camera about a still head; here the head moves before a still camera"
+    )
+    return "head"
 
 
 def _stack(values: Sequence[np.ndarray]) -> Float[Tensor, "F *shape"]:

@@ -23,6 +23,7 @@ from rgbavatar_ns.data.importers.frame_record import CameraRecord, FrameRecord
 from rgbavatar_ns.data.importers.head_pose import place_head_pose
 from rgbavatar_ns.data.importers.pictures import Picture
 from rgbavatar_ns.head import HeadModel
+from rgbavatar_ns.head.rotations import axis_angle_to_matrix
 from tests.data.importers.takes import FIRST, NUM_FRAMES, NUM_TEST
 
 FORMATS = {
@@ -122,6 +123,27 @@ def test_the_heads_motion_may_be_the_cameras_or_the_heads(
         assert not parts["translation"].any()
     else:
         assert (dataset.cameras.world_to_camera == dataset.cameras.world_to_camera[:1]).all()
+
+
+@pytest.mark.parametrize(
+    ("name", "moved"), [("insta-meshes", True), ("metrical", True), ("vhap", False)]
+)
+def test_by_default_a_head_that_the_camera_moves_about_moves_itself(
+    name, moved, tmp_path, takes, flame_folder
+):
+    take, frames = write(tmp_path / "data", name, takes)
+    dataset = read_source(tmp_path / "data", ImportOptions(flame=flame_folder, teeth=False))
+    assert_same_views(take, frames, dataset)
+    assert any("still head" in note for note in dataset.notes) == moved
+    assert (dataset.cameras.world_to_camera == dataset.cameras.world_to_camera[:1]).all()
+    rotation = dataset.layout.split(dataset.theta)["rotation"]
+    wanted = np.stack([frame.theta["rotation"] for frame in frames])
+    if moved:
+        turns = [axis_angle_to_matrix(torch.from_numpy(turn)) for turn in wanted]
+        relative = torch.stack([turns[0].T @ turn for turn in turns])
+        assert torch.allclose(axis_angle_to_matrix(rotation.double()), relative, atol=1e-5)
+    else:
+        assert np.allclose(rotation, wanted, atol=1e-6)
 
 
 def test_on_the_neck_the_head_stays_and_the_collar_does_not_turn(takes):
