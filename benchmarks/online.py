@@ -5,9 +5,12 @@
 
 The frames of a performance at 25 frames/s are streamed in order; between two of them as many steps
 are taken as a trainer of `--images-per-second` manages, so that the figures do not depend on how
-busy the machine is. Variants: the paper's pools (eta = .7), eta = 0 and 1, without the global and
-without the local pool, the release's strategy, new frames first (the default of `ns-train
-rgbavatar-online`), and offline training with the same number of images.
+busy the machine is; then follow `--steps-after-stream` steps on all that the pools hold, while the
+rates fall to a tenth, as in `ns-train rgbavatar-online`. Variants: the paper's pools (eta = .7),
+eta = .3 (the tiny preset's), 0 and 1, without the global and without the local pool, the release's
+strategy, new frames first (the default of `ns-train rgbavatar-online`), the paper's without those
+last steps, and offline training with the same number of images, with rates that fall in the same
+way at its end and with constant ones.
 
 Printed for each, as means over the seeds: held-out PSNR after the stream, PSNR over the streamed
 frames, and how much of each frame was forgotten (its L1 after the stream minus the lowest that it
@@ -47,8 +50,11 @@ from rgbavatar_ns.head import HeadModel
 BATCH_SIZE = 10
 FRAMES_PER_SECOND = 25.0
 PAPER_STREAM_FRAMES = 3000
+PRESET_STEPS_AFTER = 500
+FINAL_RATE = 0.1
 LOOKED_AT = 10
-OFFLINE = "offline"
+OFFLINE, OFFLINE_CONSTANT = "offline", "offline, constant rates"
+UNFINISHED = "eta .7, no steps after"
 
 
 @dataclass(frozen=True)
@@ -70,6 +76,9 @@ def variants(sizes: Sizes, seed: int) -> dict[str, Callable[[], LocalGlobalPools
     local, old = sizes.local_size, sizes.global_size
     return {
         "eta .7 (paper)": lambda: LocalGlobalPools(local, old, 0.7, seed),
+        "eta .3": lambda: LocalGlobalPools(local, old, 0.3, seed),
+        "eta .3, new first": lambda: LocalGlobalPools(local, old, 0.3, seed, new_first=True),
+        UNFINISHED: lambda: LocalGlobalPools(local, old, 0.7, seed),
         "eta .7, new first": lambda: LocalGlobalPools(local, old, 0.7, seed, new_first=True),
         "eta 0": lambda: LocalGlobalPools(local, old, 0.0, seed),
         "eta 1": lambda: LocalGlobalPools(local, old, 1.0, seed),
@@ -103,9 +112,14 @@ class Bench:
     """A dataset in memory and runs of training over it."""
 
     def __init__(
-        self, dataset: TrackedDataset, seed: int, uv_resolution: int, images_per_second: float
+        self,
+        dataset: TrackedDataset,
+        seed: int,
+        uv_resolution: int,
+        images_per_second: float,
+        steps_after: int,
     ) -> None:
-        self.dataset, self.seed = dataset, seed
+        self.dataset, self.seed, self.steps_after = dataset, seed, steps_after
         self.config = AvatarConfig(uv_resolution=uv_resolution, scale_from_texel_spacing=True)
         self.steps_per_frame = images_per_second / FRAMES_PER_SECOND / BATCH_SIZE
         images = [torch.as_tensor(dataset.read_image(i)) for i in range(len(dataset))]
@@ -113,12 +127,13 @@ class Bench:
         self.looked_at = dataset.train[::LOOKED_AT]
         self.scored = dataset.test[:: max(1, len(dataset.test) // 30)]
 
-    @property
-    def steps(self) -> int:
-        """Steps of a run: a whole number of them has been taken after each frame."""
-        return math.ceil(len(self.dataset.train) * self.steps_per_frame)
-
-    def train(self, pools: LocalGlobalPools | None, advance: Callable[[], object]) -> Outcome:
+    def train(
+        self,
+        pools: LocalGlobalPools | None,
+        advance: Callable[[], object],
+        steps_after: int,
+        final_rate: float,
+    ) -> Outcome:
         """Stream all training frames through the pools; offline without pools."""
         head = HeadModel(self.dataset.arrays)
         avatar = Avatar(head, self.dataset.identity, self.config, seed=self.seed)
@@ -142,6 +157,16 @@ class Bench:
                 outcome.seconds.append(arrived / FRAMES_PER_SECOND)
                 outcome.psnr.append(self.psnr(avatar, self.scored))
             advance()
+        began = time.monotonic()
+        for _ in range(steps_after):
+            evenly = None if pools is None else pools.batch(BATCH_SIZE, evenly=True)
+            training_step(
+                avatar, optimizer, self.batch(evenly or offline.batch(step)), step, options
+            )
+            for group in optimizer.param_groups:
+                group["lr"] *= final_rate ** (1 / steps_after)
+            step += 1
+        outcome.train_seconds += time.monotonic() - began
         after = self.losses(avatar, list(self.looked_at))
         outcome.loss_after = [after[p] for p in self.looked_at]
         outcome.loss_lowest = [min(lowest[p], after[p]) for p in self.looked_at]
@@ -200,18 +225,37 @@ def subject(seed: int, arguments: argparse.Namespace, folder: Path) -> TrackedDa
         )
 
 
+def steps_after(arguments: argparse.Namespace) -> int:
+    """As many of the preset's steps after the stream as the stream is of two minutes."""
+    if arguments.steps_after_stream is not None:
+        return arguments.steps_after_stream
+    return round(PRESET_STEPS_AFTER * min(1.0, arguments.frames / PAPER_STREAM_FRAMES))
+
+
 def measure(seed: int, arguments: argparse.Namespace, folder: Path) -> dict[str, Outcome]:
     """Every variant's outcome for one seed."""
     dataset = subject(seed, arguments, folder)
-    bench = Bench(dataset, seed, arguments.uv_resolution, arguments.images_per_second)
+    bench = Bench(
+        dataset,
+        seed,
+        arguments.uv_resolution,
+        arguments.images_per_second,
+        steps_after(arguments),
+    )
     sizes = Sizes.for_stream(len(dataset.train))
     outcomes: dict[str, Outcome] = {}
     with Progress() as progress:
-        for name, make in {**variants(sizes, seed), OFFLINE: lambda: None}.items():
+        alone = dict.fromkeys([OFFLINE, OFFLINE_CONSTANT], lambda: None)
+        for name, make in {**variants(sizes, seed), **alone}.items():
             if arguments.variants and name not in arguments.variants:
                 continue
             bar = progress.add_task(f"seed {seed}: {name}", total=len(dataset.train))
-            outcomes[name] = one = bench.train(make(), lambda bar=bar: progress.advance(bar))
+            outcomes[name] = one = bench.train(
+                make(),
+                lambda bar=bar: progress.advance(bar),
+                0 if name == UNFINISHED else bench.steps_after,
+                1.0 if name == OFFLINE_CONSTANT else FINAL_RATE,
+            )
             progress.console.print(
                 f"seed {seed}, {name}: held-out {one.test_psnr:.2f} dB, streamed "
                 f"{one.streamed_psnr:.2f} dB, forgotten {one.forgotten:.5f}",
@@ -270,6 +314,7 @@ def draw(outcomes: dict[str, Outcome], out: Path) -> None:
 def report(runs: list[dict[str, Outcome]], arguments: argparse.Namespace) -> None:
     """Print the table, write figures and drawings."""
     images = math.ceil(arguments.frames * arguments.images_per_second / FRAMES_PER_SECOND)
+    images += BATCH_SIZE * steps_after(arguments)
     Console(width=110).print(table(runs, images))
     arguments.out.mkdir(parents=True, exist_ok=True)
     draw(runs[0], arguments.out)
@@ -294,6 +339,7 @@ def main() -> None:
     parser.add_argument("--image-size", type=int, default=256)
     parser.add_argument("--uv-resolution", type=int, default=128)
     parser.add_argument("--images-per-second", type=float, default=200.0)
+    parser.add_argument("--steps-after-stream", type=int, help="500 for 3,000 frames")
     parser.add_argument("--variants", nargs="+", help="only these, by their names")
     parser.add_argument("--subjects", type=Path, help="keep the subjects here")
     parser.add_argument("--out", type=Path, default=Path("outputs/online"))

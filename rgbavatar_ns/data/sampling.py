@@ -168,14 +168,17 @@ class LocalGlobalPools:
         self._global[slot], dropped = frame, self._global[slot]
         return dropped
 
-    def batch(self, batch_size: int) -> list[int]:
+    def batch(self, batch_size: int, evenly: bool = False) -> list[int]:
         """Draw different frames, the local pool's share of them (rounded) from the local pool.
 
         Where one pool has too few, the other fills up; the batch is smaller than asked for only
-        while both together hold fewer frames. Raises UserError while there are none.
+        while both together hold fewer frames. Once no more frames come, `evenly` gives all that
+        the pools hold the same chance. Raises UserError while there are none.
         """
         if not len(self):
             raise UserError("No frame has arrived yet.", "Add a frame before drawing a batch.")
+        if evenly:
+            return self._draw([*self._local, *self._global], min(batch_size, len(self)))
         wanted = round(self._present_local_share() * batch_size)
         from_global = min(batch_size - wanted, len(self._global))
         from_local = min(batch_size - from_global, len(self._local))

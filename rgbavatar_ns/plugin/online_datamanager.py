@@ -148,7 +148,7 @@ class OnlineDataManager(RGBAvatarDataManager):
 
     def next_train(self, step: int) -> tuple[Cameras, dict[str, Any]]:
         """A batch drawn from the pools now; UserError while they are empty."""
-        drawn = self.pools.batch(self.config.batch_size)
+        drawn = self.pools.batch(self.config.batch_size, evenly=self.ended_step is not None)
         count = len(drawn.serial)
         self.images_drawn += count
         cameras = to_nerfstudio(

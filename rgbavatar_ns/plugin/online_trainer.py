@@ -46,7 +46,9 @@ class OnlineTrainerConfig(RGBAvatarTrainerConfig):
     max_num_iterations: int = 1_000_000_000
     """Steps in all, if the run is to end before the stream does."""
     steps_after_stream: int = 500
-    """Steps on the pools once the stream has ended."""
+    """Steps on all that the pools hold, each frame as likely, once the stream has ended."""
+    final_learning_rate_factor: float = 0.1
+    """What the learning rates fall to in these steps, times what they were; 1 keeps them."""
 
 
 class OnlineStop(StopRequest):
@@ -73,6 +75,11 @@ class OnlineTrainer(RGBAvatarTrainer):
                 "Tracking is refined frame by frame, which a stream's passing frames do not wait "
                 "for.",
                 "Leave out --pipeline.model.refine-tracking, or train offline.",
+            )
+        if config.final_learning_rate_factor <= 0:
+            raise UserError(
+                f"Learning rates cannot fall to {config.final_learning_rate_factor} of themselves.",
+                "Pass --final-learning-rate-factor above 0; 1 keeps them.",
             )
         super().__init__(config, local_rank, world_size)
         self.stop = OnlineStop()
@@ -126,6 +133,7 @@ class OnlineTrainer(RGBAvatarTrainer):
                 self.step = step
                 seconds = time.monotonic() - began
                 self._train_seconds += seconds
+                self._settle()
                 self._follow_newest()
                 self._update_viewer_state(step)
                 if step_check(step, self.config.logging.steps_per_log, run_at_zero=True):
@@ -161,6 +169,19 @@ class OnlineTrainer(RGBAvatarTrainer):
                 f"{self.config.steps_after_stream} more steps follow.",
                 highlight=False,
             )
+
+    def _settle(self) -> None:
+        """After the stream, take the rates a little down after each step.
+
+        They are part of the optimizers' state, so that a resumed run falls on from there. Where
+        the user has named schedules these decide.
+        """
+        if self.stream.ended_step is None or self.optimizers.schedulers:
+            return
+        share = 1 / self.config.steps_after_stream
+        for optimizer in self.optimizers.optimizers.values():
+            for group in optimizer.param_groups:
+                group["lr"] *= self.config.final_learning_rate_factor**share
 
     def _log(self, step: int, parts: dict[str, torch.Tensor], seconds: float) -> None:
         """TensorBoard's curves."""

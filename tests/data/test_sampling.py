@@ -1,4 +1,5 @@
 import io
+from collections import Counter
 
 import numpy as np
 import pytest
@@ -176,6 +177,17 @@ def test_eta_is_the_local_share_of_a_batch(share, batch, local):
         drawn = pools.batch(batch)
         assert len(set(drawn)) == batch
         assert sum(frame >= 20 for frame in drawn) == local
+
+
+def test_evenly_drawn_every_held_frame_is_as_likely():
+    pools = LocalGlobalPools(local_size=5, global_size=15, local_share=0.7, seed=3)
+    for frame in range(100):
+        pools.add(frame)
+    drawn = Counter(frame for _ in range(1500) for frame in pools.batch(4, evenly=True))
+    assert set(drawn) == {*pools.local_frames, *pools.global_frames}
+    # 300 of each are expected; 66 are more than four standard deviations.
+    assert all(abs(count - 300) < 66 for count in drawn.values()), drawn
+    assert all(len(set(pools.batch(20, evenly=True))) == 20 for _ in range(5))
 
 
 def test_one_pool_fills_up_for_the_other():

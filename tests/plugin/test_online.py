@@ -6,6 +6,7 @@ import signal
 import subprocess
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -81,6 +82,59 @@ def test_a_replayed_stream_is_trained_on_to_its_end_and_a_little_longer(
     assert told["steps"] == ended + 5
     assert told["images"] <= 4 * told["steps"]
     assert list_checkpoints(trainer.checkpoint_dir)[-1][0] == trainer.step
+
+
+def test_after_the_stream_the_rates_fall_to_a_tenth_also_when_resumed(
+    tiny_data: Path, tmp_path: Path
+):
+    def rates(trainer: OnlineTrainer) -> dict[str, float]:
+        optimizers = trainer.optimizers.optimizers
+        return {name: each.param_groups[0]["lr"] for name, each in optimizers.items()}
+
+    config = online_config(tmp_path / "first", tiny_data, steps_after_stream=6)
+    trainer = online_trainer(config)
+    first, seen = rates(trainer), []
+
+    def look(step: int) -> None:
+        ended = trainer.stream.ended_step
+        if ended is None or step <= ended:
+            assert rates(trainer) == first
+        else:
+            seen.append(rates(trainer)["color"] / first["color"])
+        if len(seen) == 3:
+            trainer.shutdown()
+
+    before_each_step(trainer, look)
+    trainer.train()
+    # Three steps after the first one, half of the way down to a tenth.
+    assert seen == pytest.approx([10 ** (-step / 6) for step in (1, 2, 3)])
+    folder = trainer.checkpoint_dir
+    again = online_trainer(
+        online_config(tmp_path / "again", tiny_data, steps_after_stream=6, load_dir=folder)
+    )
+    again.train()
+    for name, rate in rates(again).items():
+        assert rate == pytest.approx(first[name] / 10)
+
+
+def test_after_the_stream_all_kept_frames_are_drawn_alike(tiny_data: Path, tmp_path: Path):
+    config = online_config(tmp_path, tiny_data, local_size=2, global_size=6, steps_after_stream=120)
+    config.pipeline.datamanager.local_share = 1.0
+    trainer = online_trainer(config)
+    drawn: Counter[int] = Counter()
+    plain = trainer.stream.next_train
+
+    def counted(step: int) -> Any:
+        cameras, batch = plain(step)
+        if trainer.stream.ended_step is not None:
+            drawn.update(batch["position"])
+        return cameras, batch
+
+    trainer.stream.next_train = counted  # type: ignore[method-assign]
+    trainer.train()
+    # Four of eight frames a step: each is in half of the batches.
+    assert len(drawn) == 8
+    assert all(40 < count < 80 for count in drawn.values()), drawn
 
 
 def test_the_streamed_avatar_learns_and_colours_its_gaussians(tiny_data: Path, tmp_path: Path):
@@ -284,6 +338,7 @@ def test_a_fault_of_the_source_saves_and_is_told(tiny_data: Path, tmp_path: Path
     ("fields", "told"),
     [
         ({"local_share": 1.5}, "pools are impossible"),
+        ({"final_learning_rate_factor": 0.0}, "cannot fall to 0"),
         ({"local_size": 0}, "pools are impossible"),
         ({"batch_size": 0}, "batch of 0"),
     ],
@@ -320,6 +375,9 @@ def test_the_methods_have_the_papers_pools_and_sizes():
         assert manager.strategy == "paper"
         assert manager.batch_size == 10
         assert manager.source.frames_per_second == 25
+    # On a CPU, with few steps a frame, old frames need the larger share.
+    assert full.pipeline.datamanager.local_share is None
+    assert tiny.pipeline.datamanager.local_share == 0.3
     assert full.pipeline.model.avatar == rgbavatar.config.pipeline.model.avatar
     assert tiny.pipeline.model.avatar.uv_resolution == 128
 

@@ -120,10 +120,10 @@ class FramePools:
         with self._changed:
             return self._changed.wait_for(lambda: self._added > 0, timeout_s)
 
-    def batch(self, batch_size: int) -> PooledBatch:
-        """Draw a batch; raises UserError while there are no frames."""
+    def batch(self, batch_size: int, evenly: bool = False) -> PooledBatch:
+        """Draw a batch as `LocalGlobalPools.batch`; raises UserError while there are no frames."""
         with self._lock:
-            serials = self._pools.batch(batch_size)
+            serials = self._pools.batch(batch_size, evenly)
             now = time.monotonic()
             for serial in serials:
                 arrived_s = self._waiting.pop(serial, None)
