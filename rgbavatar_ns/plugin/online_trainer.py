@@ -178,7 +178,8 @@ class OnlineTrainer(RGBAvatarTrainer):
         """
         if self.stream.ended_step is None or self.optimizers.schedulers:
             return
-        share = 1 / self.config.steps_after_stream
+        # The stream's end is seen before a step, so that one comes after it in any case.
+        share = 1 / max(1, self.config.steps_after_stream)
         for optimizer in self.optimizers.optimizers.values():
             for group in optimizer.param_groups:
                 group["lr"] *= self.config.final_learning_rate_factor**share

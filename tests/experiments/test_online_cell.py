@@ -13,6 +13,7 @@ from rgbavatar_ns.experiments.report import write_report
 from rgbavatar_ns.experiments.streamed import read_streamed, streamed_losses, write_streamed
 from rgbavatar_ns.experiments.sweep import sweep
 from rgbavatar_ns.head import HeadModel
+from tests.plugin.online_run import online_config, online_trainer
 from tests.plugin.run import SMALL
 from tests.plugin.tiny import tiny_dataset
 
@@ -53,6 +54,16 @@ def test_each_streamed_frame_has_its_own_loss(dataset, tmp_path):
     assert mean == pytest.approx(sum(losses) / 11)
     (tmp_path / "streamed.json").write_text("{")
     assert read_streamed(tmp_path) is None
+
+
+def test_training_may_end_with_the_stream(dataset, tmp_path):
+    """As in the paper, and in the experiments on streams."""
+    config = online_config(tmp_path / "out", tmp_path / "data", steps_after_stream=0)
+    trainer = online_trainer(config)
+    trainer.train()
+    assert trainer.stream.pools.num_added == len(dataset.train)
+    assert trainer.stream.ended_step == trainer.step
+    assert trainer.completed
 
 
 @pytest.mark.slow
