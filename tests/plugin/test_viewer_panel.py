@@ -95,7 +95,7 @@ def desk(pipeline: RGBAvatarPipeline, server: viser.ViserServer) -> Desk:
 @torch.no_grad()
 def _rendered(avatar: Avatar, theta: torch.Tensor, camera: Cameras, white: bool = False):
     ground = torch.ones(3) if white else torch.zeros(3)
-    return avatar.render(theta, from_nerfstudio(camera), ground).image[0]
+    return avatar.render(theta, from_nerfstudio(camera), ground).image[0].clamp(0, 1)
 
 
 def test_without_a_viewer_the_cameras_time_chooses_and_the_ground_is_black(
@@ -116,7 +116,7 @@ def test_a_cameras_own_theta_comes_before_the_panel(pipeline: RGBAvatarPipeline)
     camera, _ = next(iter(pipeline.datamanager.fixed_indices_eval_dataloader))
     drawn = pipeline.model.get_outputs_for_camera(camera)["rgb"]
     expected = _rendered(pipeline.model.avatar, camera.metadata["theta"], camera)
-    assert torch.equal(drawn, expected)
+    assert torch.equal(drawn.clamp(0, 1), expected)
 
 
 def test_frame_slider_shows_that_frame_over_the_backdrop(desk: Desk):
@@ -168,6 +168,20 @@ def test_random_expressions_stay_within_what_was_seen(desk: Desk):
     assert all(torch.equal(theta[layout.slice("rotation")], pose) for theta in drawn)
 
 
+def test_colours_beyond_white_stay_white(desk: Desk):
+    bright = desk.model.avatar.blendshapes.color_feature
+    before = bright.detach().clone()
+    try:
+        with torch.no_grad():
+            bright.add_(3.0)
+            camera = from_nerfstudio(desk.camera())
+            drawn = desk.model.avatar.render(desk.model.frame_theta[:1], camera).image
+        assert drawn.max() > 1.05
+        assert desk.picture().max() <= 1
+    finally:
+        bright.data.copy_(before)
+
+
 def test_a_weight_slider_overrides_the_network_until_it_is_given_back(desk: Desk):
     before = desk.picture()
     theta = desk.model.frame_theta[0:1]
@@ -178,7 +192,7 @@ def test_a_weight_slider_overrides_the_network_until_it_is_given_back(desk: Desk
     expected = desk.model.avatar.render(
         theta, from_nerfstudio(desk.camera()), torch.ones(3), psi=psi
     )
-    assert torch.allclose(desk.picture(), expected.image[0], atol=1e-5)
+    assert torch.allclose(desk.picture(), expected.image[0].clamp(0, 1), atol=1e-5)
     assert (desk.picture() - before).abs().max() > 0.005
     desk.set("Weights by hand", False, lambda: desk.panel.wishes.psi_by_hand is None)
     assert torch.equal(desk.picture(), before)
@@ -191,7 +205,7 @@ def test_bases_used_counts_the_first_ones(desk: Desk):
     desk.set("Bases used", 1, lambda: desk.panel.wishes.bases_used == 1)
     psi[:, 1:] = 0
     expected = avatar.render(theta, from_nerfstudio(desk.camera()), torch.ones(3), psi=psi)
-    assert torch.allclose(desk.picture(), expected.image[0], atol=1e-5)
+    assert torch.allclose(desk.picture(), expected.image[0].clamp(0, 1), atol=1e-5)
 
 
 def test_one_basis_alone_is_base_and_basis_on_the_neutral_frame(desk: Desk):
@@ -202,7 +216,7 @@ def test_one_basis_alone_is_base_and_basis_on_the_neutral_frame(desk: Desk):
     psi[0, 2] = 1.5 * extreme[2]
     camera = from_nerfstudio(desk.camera())
     expected = avatar.render(seen.theta_neutral[None], camera, torch.ones(3), psi=psi)
-    assert torch.allclose(desk.picture(), expected.image[0], atol=1e-5)
+    assert torch.allclose(desk.picture(), expected.image[0].clamp(0, 1), atol=1e-5)
     desk.set("One basis alone", "none", lambda: desk.panel.wishes.basis_alone is None)
     theta = desk.model.frame_theta[0:1]
     assert torch.equal(desk.picture(), _rendered(avatar, theta, desk.camera(), white=True))

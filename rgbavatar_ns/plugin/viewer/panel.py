@@ -55,7 +55,7 @@ class ViewerPanel(ViewerControl):
         self._viewer: Any = None
         self._widgets: Widgets | None = None
         self._drawn = threading.Event()
-        self._next_told_s = 0.0
+        self._next_told_s, self._told_size = 0.0, (0, 0)
 
     def _setup(self, viewer: Any) -> None:
         super()._setup(viewer)
@@ -209,10 +209,11 @@ class ViewerPanel(ViewerControl):
     def _tell(
         self, picture: ViewerPicture, camera: PinholeCameras, seconds: float, trouble: str
     ) -> None:
-        now = time.monotonic()
-        if self._widgets is None or (now < self._next_told_s and not trouble):
+        now, size = time.monotonic(), (camera.width, camera.height)
+        known = now < self._next_told_s and size == self._told_size and not trouble
+        if self._widgets is None or known:
             return
-        self._next_told_s = now + _TOLD_EVERY_S
+        self._next_told_s, self._told_size = now + _TOLD_EVERY_S, size
         lines = [
             f"{camera.width} x {camera.height} in {1e3 * seconds:.0f} ms: "
             f"{1 / max(seconds, 1e-6):.0f} frames/s"

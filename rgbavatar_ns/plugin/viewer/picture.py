@@ -59,7 +59,8 @@ def viewer_picture(
     drawn = _draw(stage, shown, wishes, camera, backend)
     assert drawn.depth is not None
     alpha, depth = drawn.alpha[0], filled_depth(drawn.depth, drawn.alpha)[0]
-    image = drawn.image[0]
+    # nerfstudio's viewer makes bytes of it, where 1.01 would be black.
+    image = drawn.image[0].clamp(0, 1)
     if wishes.picture == "alpha":
         image = alpha.expand(-1, -1, 3)
     elif wishes.picture == "depth":
