@@ -127,7 +127,7 @@ class OnlineDataManager(RGBAvatarDataManager):
         first = self.train_dataset.metadata["subject"]
         assert isinstance(first, Subject)
         self.train_dataset.metadata["subject"] = dataclasses.replace(
-            first, theta=first.theta[:1].clone(), frame_index=first.frame_index[:1]
+            first, theta=first.theta[:1].clone(), frame_index=first.frame_index[:1], train=(0,)
         )
 
     def start(self) -> None:
