@@ -37,7 +37,7 @@ class OnlinePipeline(RGBAvatarPipeline):
     def __init__(
         self, config: OnlinePipelineConfig, device: str | torch.device, **more: Any
     ) -> None:
-        super().__init__(config, str(device), **more)
+        super().__init__(config, device, **more)
         self.stream_note = PanelNote("Stream")
         self.model.viewer_panel.stage.film = None  # Of a stream only the newest frame is shown.
 

@@ -42,8 +42,10 @@ class RGBAvatarPipeline(VanillaPipeline):
     datamanager: RGBAvatarDataManager
     _model: RGBAvatarModel
 
-    def __init__(self, config: RGBAvatarPipelineConfig, device: str, **more: Any) -> None:
-        super().__init__(config, device, **more)
+    def __init__(
+        self, config: RGBAvatarPipelineConfig, device: str | torch.device, **more: Any
+    ) -> None:
+        super().__init__(config, str(device), **more)
         self.model.viewer_panel.stage.film = self.datamanager.dataparser.tracked
 
     @property
