@@ -17,7 +17,7 @@ rgbavatar_online_tiny = MethodSpecification(
         OnlineTrainerConfig,
         "rgbavatar-online-tiny",
         # A CPU takes too few steps a frame for the paper's .7: old frames would be seen too seldom.
-        # .3 brings .7 dB on held-out frames at 8 images a frame (benchmarks/online.py).
+        # .3 brings .4 dB on held-out frames at 8 images a frame (docs/online.md).
         pipeline=OnlinePipelineConfig(
             model=tiny_model(), datamanager=OnlineDataManagerConfig(local_share=0.3)
         ),

@@ -293,7 +293,7 @@ def test_the_sequence_cannot_be_chosen_before_it_is_there(desk: Desk):
     desk.wait(lambda: desk.control("Driven by").value == "dataset frame")
 
 
-def test_trouble_is_told_and_the_plain_avatar_drawn(desk: Desk, monkeypatch: pytest.MonkeyPatch):
+def test_trouble_is_told_and_the_plain_avatar_drawn(desk: Desk):
     plain = desk.picture()
     desk.panel.change(psi_by_hand=torch.zeros(99))
     assert torch.equal(desk.picture(), plain)
