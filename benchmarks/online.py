@@ -14,7 +14,8 @@ way at its end and with constant ones.
 
 Printed for each, as means over the seeds: held-out PSNR after the stream, PSNR over the streamed
 frames, and how much of each frame was forgotten (its L1 after the stream minus the lowest that it
-ever had, looked at twice a second for every tenth frame). Drawn: loss by frame and PSNR by time.
+ever had, looked at twice a second for every tenth frame; looking takes longer than training where
+streams are long, and `--looks-per-second .2` spares it). Drawn: loss by frame and PSNR by time.
 """
 
 import argparse
@@ -118,8 +119,10 @@ class Bench:
         uv_resolution: int,
         images_per_second: float,
         steps_after: int,
+        looks_per_second: float,
     ) -> None:
         self.dataset, self.seed, self.steps_after = dataset, seed, steps_after
+        self.frames_per_look = max(1, round(FRAMES_PER_SECOND / looks_per_second))
         self.config = AvatarConfig(uv_resolution=uv_resolution, scale_from_texel_spacing=True)
         self.steps_per_frame = images_per_second / FRAMES_PER_SECOND / BATCH_SIZE
         images = [torch.as_tensor(dataset.read_image(i)) for i in range(len(dataset))]
@@ -140,7 +143,6 @@ class Bench:
         optimizer, options = make_optimizer(avatar), TrainingOptions(seed=self.seed)
         offline = OfflineOrder(self.dataset.train, BATCH_SIZE, self.seed)
         outcome, lowest, step = Outcome(), dict.fromkeys(self.looked_at, math.inf), 0
-        looks = round(FRAMES_PER_SECOND / 2)
         for arrived, position in enumerate(self.dataset.train, start=1):
             if pools is not None:
                 pools.add(position)
@@ -150,7 +152,7 @@ class Bench:
                 training_step(avatar, optimizer, self.batch(chosen), step, options)
                 step += 1
             outcome.train_seconds += time.monotonic() - began
-            if arrived % looks == 0:
+            if arrived % self.frames_per_look == 0:
                 seen = [p for p in self.looked_at if p < position or pools is None]
                 for place, loss in self.losses(avatar, seen).items():
                     lowest[place] = min(lowest[place], loss)
@@ -241,6 +243,7 @@ def measure(seed: int, arguments: argparse.Namespace, folder: Path) -> dict[str,
         arguments.uv_resolution,
         arguments.images_per_second,
         steps_after(arguments),
+        arguments.looks_per_second,
     )
     sizes = Sizes.for_stream(len(dataset.train))
     outcomes: dict[str, Outcome] = {}
@@ -340,6 +343,7 @@ def main() -> None:
     parser.add_argument("--uv-resolution", type=int, default=128)
     parser.add_argument("--images-per-second", type=float, default=200.0)
     parser.add_argument("--steps-after-stream", type=int, help="500 for 3,000 frames")
+    parser.add_argument("--looks-per-second", type=float, default=2.0)
     parser.add_argument("--variants", nargs="+", help="only these, by their names")
     parser.add_argument("--subjects", type=Path, help="keep the subjects here")
     parser.add_argument("--out", type=Path, default=Path("outputs/online"))

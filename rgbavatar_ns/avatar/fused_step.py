@@ -84,7 +84,7 @@ class FusedStep:
         self.update_network(psi, gradient.weights)
         if gradient.vertices is not None:
             vertices.backward(gradient.vertices)
-        return psi.new_tensor(loss)
+        return loss
 
     def update_gaussians(
         self, renderer: BlendedRenderer, *, with_vertices: bool = False

@@ -44,7 +44,7 @@ class BlendedRenderer(Protocol):
 
     def compare(
         self, images_rgba: UInt8[Tensor, "B H W 4"], background: Float[Tensor, "#B 3"]
-    ) -> float:
+    ) -> Float[Tensor, ""]:
         """The mean absolute difference to straight-alpha images over the background."""
         ...
 
@@ -99,8 +99,15 @@ class Backend(Protocol):
 # Name -> module with `load() -> Backend`, which raises ImportError with the reason; the order is
 # the order of preference.
 _LOADERS = {
+    "cuda": "rgbavatar_ns.kernels.cuda.backend",
     "cpu": "rgbavatar_ns.kernels.cpu.backend",
     "reference": "rgbavatar_ns.kernels.reference_backend",
+}
+
+
+_REMEDIES = {
+    "cpu": "Reinstall the package with a C++17 compiler.",
+    "cuda": "Install cuda-bindings and nvidia-cuda-nvrtc as `pip install 'rgbavatar-ns[cuda]'` does.",
 }
 
 
@@ -148,7 +155,7 @@ def choose(name: str, device: torch.device, dtype: torch.dtype) -> Backend:
 def _warn_of_slow_choice(name: str, reason: str) -> None:
     warnings.warn(
         f"The rasterizer's {name} backend cannot be used ({reason}); rendering falls back to the "
-        "reference, which is many times slower. Reinstall the package with a C++17 compiler.",
+        f"reference, which is many times slower. {_REMEDIES[name]}",
         RuntimeWarning,
         stacklevel=4,
     )

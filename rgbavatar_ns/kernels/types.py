@@ -126,3 +126,9 @@ class AdamParameter:
     betas: tuple[float, float]
     epsilon: float
     step: int
+
+    def step_numbers(self) -> tuple[float, float, float, float, float]:
+        """The step as compiled code takes it, with the bias corrections folded in (AdamStep)."""
+        beta1, beta2 = self.betas
+        rate = self.learning_rate / (1 - beta1**self.step)
+        return rate, (1 - beta2**self.step) ** -0.5, beta1, beta2, self.epsilon

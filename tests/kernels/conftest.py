@@ -3,6 +3,7 @@
 import pytest
 
 from rgbavatar_ns.kernels import available_backends
+from tests.kernels.cuda import emulator
 
 
 def _variants() -> list[str]:
@@ -20,10 +21,15 @@ def instruction_set(request, monkeypatch) -> str:
     return request.param
 
 
-@pytest.fixture(params=[*_variants(), "reference32"])
+@pytest.fixture(params=[*_variants(), "reference32", "emulated"])
 def fast_backend(request, monkeypatch) -> str:
-    """Names of float32 backends; "cpu" is given once per instruction set."""
+    """Names of float32 backends; "cpu" is given once per instruction set, "cuda" emulated."""
     if request.param == "reference32":
         return "reference"
+    if request.param == "emulated":
+        if emulator.compiler() is None:
+            pytest.skip("no g++ to emulate CUDA with")
+        emulator.install(monkeypatch)
+        return "cuda"
     monkeypatch.setenv("RGBAVATAR_INSTRUCTION_SET", request.param)
     return "cpu"

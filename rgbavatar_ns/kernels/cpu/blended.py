@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from rgbavatar_ns.kernels.constants import MAX_AVERAGE_CHANNELS
+from rgbavatar_ns.kernels.checks import check_average_images, check_target_images
 from rgbavatar_ns.kernels.cpu import (
     INSTRUCTION_SET_VARIABLE,
     _native,  # pyright: ignore[reportMissingModuleSource]
@@ -82,11 +82,7 @@ class CpuBlendedRenderer:
 
     def weighted_color_average(self, images: Float[Tensor, "#B H W C"]) -> WeightedColors:
         """As `weighted_color_average`."""
-        self._check_images(images, self._weights.dtype)
-        if not 1 <= images.shape[-1] <= MAX_AVERAGE_CHANNELS:
-            raise ValueError(
-                f"images have {images.shape[-1]} channels. Pass 1 to {MAX_AVERAGE_CHANNELS}."
-            )
+        check_average_images(images, self._weights, self._cameras)
         new = self._weights.new_empty
         size = (len(self._weights), self._count)
         weighted_sum, weight_sum, max_weight = new(*size, images.shape[-1]), new(size), new(size)
@@ -95,17 +91,13 @@ class CpuBlendedRenderer:
 
     def compare(
         self, images_rgba: UInt8[Tensor, "B H W 4"], background: Float[Tensor, "#B 3"]
-    ) -> float:
+    ) -> Float[Tensor, ""]:
         """The mean absolute difference to straight-alpha images over the background."""
-        self._check_images(images_rgba, torch.uint8)
-        if len(images_rgba) != len(self._weights) or images_rgba.shape[-1] != 4:
-            raise ValueError(
-                f"images are {list(images_rgba.shape)}. Pass one RGBA image for each of the "
-                f"{len(self._weights)} sets."
-            )
+        check_target_images(images_rgba, len(self._weights), self._cameras)
         background = checked_background(self._weights, background, len(self._weights))
         self._compared = True
-        return self._session.compare(images_rgba.contiguous(), background.detach().contiguous())
+        loss = self._session.compare(images_rgba.contiguous(), background.detach().contiguous())
+        return self._weights.new_tensor(loss)
 
     def update(
         self, parameters: Mapping[str, AdamParameter] | None, *, with_vertices: bool = False
@@ -121,31 +113,12 @@ class CpuBlendedRenderer:
         self._session.update(groups, weights, vertices)
         return BlendedGradient(weights, vertices)
 
-    def _check_images(self, images: Tensor, dtype: torch.dtype) -> None:
-        """Compiled code reads what it is promised."""
-        size = (self._cameras.height, self._cameras.width)
-        if images.dtype != dtype or images.ndim != 4 or tuple(images.shape[1:3]) != size:
-            raise ValueError(
-                f"images are {images.dtype} {list(images.shape)}. Pass {dtype} "
-                f"[B, {size[0]}, {size[1]}, C]: the cameras' size."
-            )
-        if len(images) not in (1, len(self._weights)):
-            raise ValueError(f"There are {len(images)} images for {len(self._weights)} sets.")
-
 
 def _arrays(parameter: AdamParameter) -> tuple[Tensor, Tensor, Tensor, tuple[float, ...]]:
-    """A parameter as compiled code takes it, with the bias corrections folded into the numbers."""
-    beta1, beta2 = parameter.betas
-    numbers = (
-        parameter.learning_rate / (1 - beta1**parameter.step),
-        (1 - beta2**parameter.step) ** -0.5,
-        beta1,
-        beta2,
-        parameter.epsilon,
-    )
+    """A parameter as compiled code takes it."""
     return (
         parameter.value.detach(),
         parameter.first_moment.detach(),
         parameter.second_moment.detach(),
-        numbers,
+        parameter.step_numbers(),
     )

@@ -81,6 +81,22 @@ struct Camera {
   float min_u, max_u, min_v, max_v;
 };
 
+RGBAVATAR_FUNCTION Camera camera_of_arrays(const float* world_to_camera, const float* focal_px,
+                                           const float* principal_point_px, int width,
+                                           int height) {
+  const float* m = world_to_camera;
+  Camera c;
+  c.row0 = {m[0], m[1], m[2]}, c.row1 = {m[4], m[5], m[6]}, c.row2 = {m[8], m[9], m[10]};
+  c.translation = {m[3], m[7], m[11]};
+  c.fx = focal_px[0], c.fy = focal_px[1];
+  c.cx = principal_point_px[0], c.cy = principal_point_px[1];
+  const float margin_u = BlendingConstants::kFrustumMargin * 0.5f * width / c.fx;
+  const float margin_v = BlendingConstants::kFrustumMargin * 0.5f * height / c.fy;
+  c.min_u = -c.cx / c.fx - margin_u, c.max_u = (width - c.cx) / c.fx + margin_u;
+  c.min_v = -c.cy / c.fy - margin_v, c.max_v = (height - c.cy) / c.fy + margin_v;
+  return c;
+}
+
 template <class F>
 struct GaussianInput {
   Vec3<F> mean;
@@ -173,6 +189,20 @@ RGBAVATAR_FUNCTION auto is_drawable(const GaussianInput<F>& g, const Vec3<F>& co
   const F limit = F(1.0f / C::kMinQuatNorm);
   return (zero >= F(0.0f)) & (q.p.z >= F(C::kNearPlane)) & (q.determinant > F(0.0f)) &
          (q.inverse_norm <= limit) & (q.inverse_norm > F(0.0f)) & (g.opacity >= F(C::kMinAlpha));
+}
+
+// Where alpha falls to the cut: -k d^T Q d = log2(min alpha / o), an ellipse d^T cov^-1 d = reach
+// of half-widths sqrt(reach cov) = sqrt(2 ln(o / min alpha) cov).
+template <class F>
+struct Extent {
+  F reach, half_x, half_y;
+};
+
+template <class F>
+RGBAVATAR_FUNCTION Extent<F> extent_of(const Projection<F>& q, const F& log2_opacity) {
+  using C = BlendingConstants;
+  const F reach = (log2_opacity - C::kLog2MinAlpha) * (2.0f * C::kLn2);
+  return {reach, square_root(reach * q.cov00), square_root(reach * q.cov11)};
 }
 
 // Log2 of the alpha at offset (dx, dy) from the mean, before cut and cap.

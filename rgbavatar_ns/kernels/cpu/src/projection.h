@@ -6,17 +6,7 @@
 namespace rgbavatar::RGBAVATAR_ISA {
 
 static Camera camera_from(const float* c, int width, int height) {
-  Camera out;
-  out.row0 = {c[0], c[1], c[2]};
-  out.row1 = {c[4], c[5], c[6]};
-  out.row2 = {c[8], c[9], c[10]};
-  out.translation = {c[3], c[7], c[11]};
-  out.fx = c[16], out.fy = c[17], out.cx = c[18], out.cy = c[19];
-  const float margin_u = C::kFrustumMargin * 0.5f * width / out.fx;
-  const float margin_v = C::kFrustumMargin * 0.5f * height / out.fy;
-  out.min_u = -out.cx / out.fx - margin_u, out.max_u = (width - out.cx) / out.fx + margin_u;
-  out.min_v = -out.cy / out.fy - margin_v, out.max_v = (height - out.cy) / out.fy + margin_v;
-  return out;
+  return camera_of_arrays(c, c + 16, c + 18, width, height);
 }
 
 // Sixteen rows of a [N, K] array: in place, or a copy padded with zeros at the array's end.
@@ -173,10 +163,8 @@ static inline void project_lanes(int width, int height, const Camera& camera,
   const Projection<Wide> q = project(g, camera);
   const WideMask drawable = is_drawable(g, color, q);
   const Wide log2_opacity = log2_of(select(drawable, g.opacity, Wide(1.0f)));
-  // Where alpha falls to the cut: -k d^T Q d = log2(min alpha / o), an ellipse of half-widths
-  // sqrt(2 ln(o / min alpha) cov).
-  const Wide reach = (log2_opacity - C::kLog2MinAlpha) * (2.0f * C::kLn2);
-  const Wide half_x = square_root(reach * q.cov00), half_y = square_root(reach * q.cov11);
+  const Extent<Wide> extent = extent_of(q, log2_opacity);
+  const Wide reach = extent.reach, half_x = extent.half_x, half_y = extent.half_y;
   const Wide centre_x = q.mean_x - 0.5f, centre_y = q.mean_y - 0.5f;
   const Wide low_x = max_of(centre_x - half_x, Wide(0.0f));
   const Wide low_y = max_of(centre_y - half_y, Wide(0.0f));

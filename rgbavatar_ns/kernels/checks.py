@@ -1,0 +1,37 @@
+"""Checks of images that every compiled backend makes: compiled code reads what it is promised."""
+
+import torch
+from torch import Tensor
+
+from rgbavatar_ns.kernels.constants import MAX_AVERAGE_CHANNELS
+from rgbavatar_ns.kernels.types import PinholeCameras
+
+
+def check_average_images(images: Tensor, weights: Tensor, cameras: PinholeCameras) -> None:
+    """Raise ValueError unless the images can be averaged over the sets that `weights` [B, K] pose."""
+    _check_size(images, weights.dtype, cameras)
+    if len(images) not in (1, len(weights)):
+        raise ValueError(f"There are {len(images)} images for {len(weights)} sets.")
+    if not 1 <= images.shape[-1] <= MAX_AVERAGE_CHANNELS:
+        raise ValueError(
+            f"images have {images.shape[-1]} channels. Pass 1 to {MAX_AVERAGE_CHANNELS}."
+        )
+
+
+def check_target_images(images_rgba: Tensor, batch: int, cameras: PinholeCameras) -> None:
+    """Raise ValueError unless there is one RGBA image of 8 bits for each set."""
+    _check_size(images_rgba, torch.uint8, cameras)
+    if len(images_rgba) != batch or images_rgba.shape[-1] != 4:
+        raise ValueError(
+            f"images are {list(images_rgba.shape)}. Pass one RGBA image for each of the "
+            f"{batch} sets."
+        )
+
+
+def _check_size(images: Tensor, dtype: torch.dtype, cameras: PinholeCameras) -> None:
+    size = (cameras.height, cameras.width)
+    if images.dtype != dtype or images.ndim != 4 or tuple(images.shape[1:3]) != size:
+        raise ValueError(
+            f"images are {images.dtype} {list(images.shape)}. Pass {dtype} "
+            f"[B, {size[0]}, {size[1]}, C]: the cameras' size."
+        )

@@ -1,0 +1,226 @@
+"""The CUDA kernels behind torch's autograd."""
+
+import functools
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from rgbavatar_ns.kernels.cuda.binning import Bins, Capacities, Images, blocks, camera_values
+from rgbavatar_ns.kernels.cuda.blended import CudaBlendedRenderer
+from rgbavatar_ns.kernels.cuda.launcher import Launcher
+from rgbavatar_ns.kernels.cuda.tiles import Tiles
+from rgbavatar_ns.kernels.types import (
+    BlendedGaussians,
+    GaussianSet,
+    PinholeCameras,
+    RenderedBatch,
+    WeightedColors,
+)
+
+_WORLD = ("means", "quats", "scales", "opacities", "colors")
+
+
+@dataclass
+class _Request:
+    """What of a rendering is not differentiated, and the outputs that carry no gradient."""
+
+    launcher: Launcher
+    capacities: Capacities
+    cameras: PinholeCameras
+    batch: int
+    with_depth: bool
+    with_visibility: bool
+    depth: Tensor | None = None
+    visibility: Tensor | None = None
+
+
+def _world_values(gaussians: tuple[Tensor, ...]) -> dict[str, Any]:
+    """The fields of `World` in arguments.h."""
+    shared = {f"{name}_shared": int(len(t) == 1) for name, t in zip(_WORLD, gaussians)}
+    return {**dict(zip(_WORLD, gaussians)), **shared}
+
+
+def _tiles(request: _Request, gaussians: tuple[Tensor, ...]) -> Tiles:
+    count = gaussians[0].shape[1]
+    images = Images(request.batch, count, request.cameras.width, request.cameras.height)
+
+    def project(bins: Any) -> None:
+        request.launcher.launch(
+            "project",
+            (blocks(count, "kBlendThreads"), request.batch),
+            frame=images.values(),
+            cameras=camera_values(request.cameras),
+            world=_world_values(gaussians),
+            bins=bins,
+        )
+
+    bins = Bins(request.launcher, request.capacities, images, project)
+    return Tiles(request.launcher, bins)
+
+
+class _Rasterize(torch.autograd.Function):
+    """Image and alpha of (means, quats_wxyz, scales, opacities, colors, background)."""
+
+    @staticmethod
+    def forward(ctx: Any, request: _Request, *inputs: Tensor) -> tuple[Tensor, Tensor]:
+        *gaussians, background = (tensor.detach().contiguous() for tensor in inputs)
+        tiles = _tiles(request, tuple(gaussians))
+        image, alpha, request.depth = tiles.draw(background, with_depth=request.with_depth)
+        if request.with_visibility:
+            request.visibility = tiles.average(None)[2]
+        if any(ctx.needs_input_grad):
+            ctx.tiles, ctx.request = tiles, request
+            ctx.save_for_backward(*gaussians, image, alpha)
+            ctx.background_shape = background.shape
+            ctx.set_materialize_grads(False)
+        return image, alpha
+
+    @staticmethod
+    @once_differentiable
+    def backward(  # pyright: ignore[reportIncompatibleMethodOverride]
+        ctx: Any, *grad_outputs: Tensor | None
+    ) -> tuple[Tensor | None, ...]:
+        image_grad, alpha_grad = (None if g is None else g.contiguous() for g in grad_outputs)
+        *gaussians, image, alpha = ctx.saved_tensors
+        if image_grad is None and alpha_grad is None:
+            return (None,) * 7
+        grads: list[Tensor | None] = [None] * 5
+        if any(ctx.needs_input_grad[1:6]):
+            slots = ctx.tiles.differentiate(image, alpha, image_grad, alpha_grad)
+            filled = _gradients(ctx.request, ctx.tiles, tuple(gaussians), slots)
+            grads = [
+                grad.sum_to_size(tensor.shape) if needed else None
+                for grad, tensor, needed in zip(filled, gaussians, ctx.needs_input_grad[1:6])
+            ]
+        background_grad = None
+        if ctx.needs_input_grad[6] and image_grad is not None:
+            background_grad = ((1 - alpha) * image_grad).sum((1, 2))
+            background_grad = background_grad.sum_to_size(ctx.background_shape)
+        return (None, *grads, background_grad)
+
+
+def _gradients(
+    request: _Request, tiles: Tiles, gaussians: tuple[Tensor, ...], slots: Tensor
+) -> list[Tensor]:
+    """The gradients of each image."""
+    images = tiles.bins.images
+    filled = [t.new_empty(images.batch, *t.shape[1:]) for t in gaussians]
+    request.launcher.launch(
+        "project_backward",
+        (blocks(images.count, "kBlendThreads"), images.batch),
+        frame=images.values(),
+        cameras=camera_values(request.cameras),
+        world=_world_values(gaussians),
+        bins=tiles.bins.values(),
+        slots=slots,
+        **dict(zip(_WORLD, filled)),
+    )
+    return filled
+
+
+class CudaBackend:
+    """Runs float32 tensors on NVIDIA GPUs; the kernels are compiled at a GPU's first use."""
+
+    def __init__(self) -> None:
+        self._capacities: dict[torch.device, Capacities] = {}
+
+    def launcher(self, device: torch.device) -> Launcher:
+        """The device's launcher, made once."""
+        return _cuda_launcher(device)
+
+    def capacities(self, device: torch.device) -> Capacities:
+        """The device's experience of how much room is needed."""
+        return self._capacities.setdefault(device, Capacities())
+
+    def refusal(self, device: torch.device, dtype: torch.dtype) -> str | None:
+        """The reason, unless it is float32 on an NVIDIA GPU."""
+        if device.type != "cuda" or dtype != torch.float32:
+            return "it takes float32 tensors on NVIDIA GPUs"
+        return None
+
+    def _request(
+        self, gaussians: GaussianSet, cameras: PinholeCameras, batch: int, **wanted: bool
+    ) -> _Request:
+        device = gaussians.means.device
+        options = {"with_depth": False, "with_visibility": False} | wanted
+        return _Request(self.launcher(device), self.capacities(device), cameras, batch, **options)
+
+    def rasterize(
+        self,
+        gaussians: GaussianSet,
+        cameras: PinholeCameras,
+        background: Float[Tensor, "#B 3"],
+        *,
+        with_depth: bool,
+        with_visibility: bool,
+    ) -> RenderedBatch:
+        """As `functional.rasterize`; waits once for the length of the tiles' lists."""
+        inputs = _attributes(gaussians)
+        batch = max(t.shape[0] for t in (*inputs, background, cameras.focal_px))
+        request = self._request(
+            gaussians, cameras, batch, with_depth=with_depth, with_visibility=with_visibility
+        )
+        image, alpha = _Rasterize.apply(request, *inputs, background)
+        return RenderedBatch(image, alpha, request.depth, request.visibility)
+
+    @torch.no_grad()
+    def weighted_color_average(
+        self, gaussians: GaussianSet, cameras: PinholeCameras, images: Float[Tensor, "#B H W C"]
+    ) -> WeightedColors:
+        """As `functional.weighted_color_average`."""
+        inputs = tuple(tensor.detach().contiguous() for tensor in _attributes(gaussians))
+        batch = max(t.shape[0] for t in (*inputs, images, cameras.focal_px))
+        tiles = _tiles(self._request(gaussians, cameras, batch), inputs)
+        weighted_sum, weight_sum, max_weight = tiles.average(images.detach().contiguous())
+        assert weighted_sum is not None
+        return WeightedColors(weighted_sum, weight_sum, max_weight)
+
+    def blended_renderer(
+        self,
+        gaussians: BlendedGaussians,
+        weights: Float[Tensor, "B K"],
+        vertices: Float[Tensor, "B V 3"],
+        cameras: PinholeCameras,
+    ) -> CudaBlendedRenderer:
+        """As `blended.blended_renderer`."""
+        device = weights.device
+        return CudaBlendedRenderer(
+            self.launcher(device), self.capacities(device), gaussians, weights, vertices, cameras
+        )
+
+
+def _attributes(gaussians: GaussianSet) -> tuple[Tensor, ...]:
+    return (
+        gaussians.means,
+        gaussians.quats_wxyz,
+        gaussians.scales,
+        gaussians.opacities,
+        gaussians.colors,
+    )
+
+
+@functools.cache
+def _cuda_launcher(device: torch.device) -> Launcher:
+    from rgbavatar_ns.kernels.cuda.driver import CudaLauncher
+
+    return CudaLauncher(device)
+
+
+def load() -> CudaBackend:
+    """The backend; raises ImportError with the reason where there is no GPU for torch."""
+    if not torch.cuda.is_available():
+        built = torch.version.cuda is not None
+        raise ImportError(
+            "torch sees no NVIDIA GPU"
+            if built
+            else "this build of torch is for CPUs; install a CUDA build for a GPU"
+        )
+    try:
+        from rgbavatar_ns.kernels.cuda import driver as _driver  # noqa: F401
+    except ImportError as error:
+        raise ImportError(f"the CUDA bindings cannot be imported: {error}") from error
+    return CudaBackend()

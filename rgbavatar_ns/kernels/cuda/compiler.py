@@ -1,0 +1,118 @@
+"""CUDA C++ to machine code with NVRTC, kept on disk for the next time."""
+
+import contextlib
+import os
+import re
+import tempfile
+from pathlib import Path
+
+from cuda.bindings import nvrtc
+
+from rgbavatar_ns.kernels.cuda.source import MAIN, source_hash, sources
+
+OLDEST = 75
+"""The oldest architecture that the kernels are written for: Turing."""
+
+
+class KernelCompileError(RuntimeError):
+    """The kernels could not be compiled; says why and what to do."""
+
+
+def cache_folder() -> Path:
+    """Where compiled kernels are kept: RGBAVATAR_CACHE, or the user's cache folder."""
+    if "RGBAVATAR_CACHE" in os.environ:
+        return Path(os.environ["RGBAVATAR_CACHE"])
+    home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(home) / "rgbavatar_ns"
+
+
+def compile_kernels(architecture: str, *, cache: bool = True) -> bytes:
+    """Return the machine code of all kernels for an architecture such as "sm_90".
+
+    For a GPU newer than the compiler it is PTX of the newest architecture known, which the driver
+    translates. Raises KernelCompileError for GPUs older than sm_75 and where NVRTC fails, with its
+    log.
+    """
+    target = _target(architecture)
+    version = "{}.{}".format(*_checked(nvrtc.nvrtcVersion(), "tell its version"))
+    path = cache_folder() / f"{source_hash()}-{target}-nvrtc{version}.bin"
+    if cache and path.is_file():
+        return path.read_bytes()
+    code = _compile(target)
+    if cache:
+        # A cache that cannot be written costs seconds at the next start, nothing else.
+        with contextlib.suppress(OSError):
+            _write_whole(path, code)
+    return code
+
+
+def _target(architecture: str) -> str:
+    """The architecture itself, or the newest one known as a virtual one."""
+    match = re.fullmatch(r"sm_(\d+)", architecture)
+    if match is None or int(match[1]) < OLDEST:
+        raise KernelCompileError(
+            f"The kernels need a GPU of architecture sm_{OLDEST} (Turing) or newer; this one is "
+            f"{architecture}. Train on the CPU: --machine.device-type cpu."
+        )
+    known = _checked(nvrtc.nvrtcGetSupportedArchs(), "list its architectures")
+    if int(match[1]) in known:
+        return architecture
+    return f"compute_{max(n for n in known if n <= max(int(match[1]), OLDEST))}"
+
+
+def _compile(target: str) -> bytes:
+    texts = dict(sources())
+    main = texts.pop(MAIN)
+    program = _checked(
+        nvrtc.nvrtcCreateProgram(
+            main.encode(),
+            MAIN.encode(),
+            len(texts),
+            [text.encode() for text in texts.values()],
+            [name.encode() for name in texts],
+        ),
+        "take the sources",
+    )
+    options = [f"--gpu-architecture={target}".encode(), b"--std=c++17"]
+    try:
+        (error,) = nvrtc.nvrtcCompileProgram(program, len(options), options)
+        if error != nvrtc.nvrtcResult.NVRTC_SUCCESS:
+            raise KernelCompileError(
+                f"NVRTC could not compile the kernels for {target}:\n{_log(program)}\nIf the "
+                "sources are unchanged, reinstall cuda-bindings and nvidia-cuda-nvrtc of one "
+                "version, or train on the CPU: --machine.device-type cpu."
+            )
+        if target.startswith("compute_"):
+            return _output(program, nvrtc.nvrtcGetPTXSize, nvrtc.nvrtcGetPTX)
+        return _output(program, nvrtc.nvrtcGetCUBINSize, nvrtc.nvrtcGetCUBIN)
+    finally:
+        nvrtc.nvrtcDestroyProgram(program)
+
+
+def _output(program, size, get) -> bytes:
+    out = bytes(_checked(size(program), "give its output's size"))
+    _checked(get(program, out), "give its output")
+    return out
+
+
+def _log(program) -> str:
+    log = _output(program, nvrtc.nvrtcGetProgramLogSize, nvrtc.nvrtcGetProgramLog)
+    return log.rstrip(b"\0").decode(errors="replace").strip()
+
+
+def _checked(result: tuple, doing: str):
+    error, *values = result
+    if error != nvrtc.nvrtcResult.NVRTC_SUCCESS:
+        raise KernelCompileError(
+            f"NVRTC could not {doing} ({error}). Reinstall cuda-bindings and nvidia-cuda-nvrtc."
+        )
+    return values[0] if len(values) == 1 else values
+
+
+def _write_whole(path: Path, content: bytes) -> None:
+    """Other processes see nothing or all of it."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(dir=path.parent)
+    with os.fdopen(handle, "wb") as file:
+        file.write(content)
+    os.replace(name, path)

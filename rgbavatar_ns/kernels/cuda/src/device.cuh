@@ -1,0 +1,118 @@
+// The formulas for one float a thread, and what a warp does together.
+#define RGBAVATAR_FUNCTION __device__ __forceinline__
+
+RGBAVATAR_FUNCTION float select(bool mask, float a, float b) { return mask ? a : b; }
+RGBAVATAR_FUNCTION float min_of(float a, float b) { return fminf(a, b); }
+RGBAVATAR_FUNCTION float max_of(float a, float b) { return fmaxf(a, b); }
+RGBAVATAR_FUNCTION float square_root(float a) { return sqrtf(a); }
+RGBAVATAR_FUNCTION float inverse_root_of(float a) { return 1.0f / sqrtf(a); }
+RGBAVATAR_FUNCTION float log2_of(float a) { return log2f(a); }
+RGBAVATAR_FUNCTION float reciprocal_of(float a) { return 1.0f / a; }
+
+#include "gaussian_math.h"
+#include "tangent_math.h"
+
+typedef BlendingConstants C;
+constexpr unsigned kWholeWarp = 0xffffffffu;
+constexpr int kTileSide = 16;
+constexpr int kTileThreads = 256;
+constexpr int kMoments = 9;
+constexpr int kFrameFloats = 24;
+constexpr int kCarriedFloats = 12;
+constexpr int kBlendThreads = 128;
+constexpr int kBlendImages = 5;  // images whose sums stay in registers together
+constexpr float kColorScale = 0.28209479177387814f;  // of the zeroth spherical harmonic
+enum { kEntriesNeeded = 0, kSlotsNeeded = 1, kOverflow = 2, kOverflows = 3 };
+
+// 2^p for p from -8 to 0: within two units in the last place.
+RGBAVATAR_FUNCTION float power_of_two(float p) {
+#if defined(__CUDA_ARCH__)
+  float out;
+  asm("ex2.approx.ftz.f32 %0, %1;" : "=f"(out) : "f"(p));
+  return out;
+#else
+  return exp2f(p);
+#endif
+}
+
+// A projected Gaussian as the blending wants it: three reads of sixteen bytes. The first and the
+// last tile that it may touch, x | y << 16; where it is not drawn the first lies behind the last.
+struct alignas(16) Splat {
+  float mean_x, mean_y, log2_opacity, qa;
+  float qb, qc, depth, red;
+  float green, blue;
+  uint32_t first_tile, last_tile;
+
+  RGBAVATAR_FUNCTION int first_x() const { return int(first_tile & 0xffff); }
+  RGBAVATAR_FUNCTION int first_y() const { return int(first_tile >> 16); }
+  RGBAVATAR_FUNCTION int last_x() const { return int(last_tile & 0xffff); }
+  RGBAVATAR_FUNCTION int last_y() const { return int(last_tile >> 16); }
+  RGBAVATAR_FUNCTION bool drawn() const { return first_x() <= last_x(); }
+  RGBAVATAR_FUNCTION int tiles_across() const { return last_x() - first_x() + 1; }
+};
+static_assert(sizeof(Splat) == 48, "arguments.h gives a splat twelve floats");
+
+RGBAVATAR_FUNCTION const Splat* splats_of(const Frame& frame, const Bins& bins, int image) {
+  return reinterpret_cast<const Splat*>(bins.splats) + int64_t(image) * frame.count;
+}
+
+// Log2 of the alpha that a splat has at its best within the rectangle of pixel centres. The best
+// point of a rectangle that does not hold the mean lies on a side that faces the mean.
+RGBAVATAR_FUNCTION float best_log2_alpha(const Splat& s, float left, float top, float right,
+                                         float bottom) {
+  const float low_x = left - s.mean_x, high_x = right - s.mean_x;
+  const float low_y = top - s.mean_y, high_y = bottom - s.mean_y;
+  const float near_x = fminf(fmaxf(0.0f, low_x), high_x);
+  const float near_y = fminf(fmaxf(0.0f, low_y), high_y);
+  if (near_x == 0.0f && near_y == 0.0f) return s.log2_opacity;
+  const float along_y = fminf(fmaxf(-0.5f * s.qb * near_x / s.qc, low_y), high_y);
+  const float along_x = fminf(fmaxf(-0.5f * s.qb * near_y / s.qa, low_x), high_x);
+  const float on_x = log2_alpha(near_x, along_y, s.log2_opacity, s.qa, s.qb, s.qc);
+  const float on_y = log2_alpha(along_x, near_y, s.log2_opacity, s.qa, s.qb, s.qc);
+  return fmaxf(near_x != 0.0f ? on_x : on_y, near_y != 0.0f ? on_y : on_x);
+}
+
+// Whether a splat may be seen in the rectangle; the slack is more than rounding makes of a sum of
+// products that ends near the cut. Comparisons are such that NaN counts as seen.
+RGBAVATAR_FUNCTION bool touches(const Splat& s, float left, float top, float right, float bottom) {
+  constexpr float kSlack = 0.05f;
+  return !(best_log2_alpha(s, left, top, right, bottom) < C::kLog2MinAlpha - kSlack);
+}
+
+RGBAVATAR_FUNCTION bool touches_tile(const Splat& s, const Frame& frame, int tile_x, int tile_y) {
+  const float left = float(tile_x * kTileSide) + 0.5f, top = float(tile_y * kTileSide) + 0.5f;
+  const float right = fminf(left + (kTileSide - 1.0f), float(frame.width) - 0.5f);
+  const float bottom = fminf(top + (kTileSide - 1.0f), float(frame.height) - 0.5f);
+  return touches(s, left, top, right, bottom);
+}
+
+RGBAVATAR_FUNCTION float warp_sum(float value) {
+  for (int step = 16; step > 0; step /= 2) value += __shfl_xor_sync(kWholeWarp, value, step);
+  return value;
+}
+
+RGBAVATAR_FUNCTION float warp_max(float value) {
+  for (int step = 16; step > 0; step /= 2)
+    value = fmaxf(value, __shfl_xor_sync(kWholeWarp, value, step));
+  return value;
+}
+
+// Eight sums over a warp with nine exchanges: each lane gives away the half that it does not keep.
+// Lane l returns the sum of v[l / 4].
+RGBAVATAR_FUNCTION float warp_sums_of_eight(const float v[8]) {
+  const int lane = int(threadIdx.x) & 31;
+  float four[4], two[2];
+  const bool high = lane & 16, middle = lane & 8, low = lane & 4;
+  for (int i = 0; i < 4; ++i) {
+    const float given = high ? v[i] : v[i + 4], kept = high ? v[i + 4] : v[i];
+    four[i] = kept + __shfl_xor_sync(kWholeWarp, given, 16);
+  }
+  for (int i = 0; i < 2; ++i) {
+    const float given = middle ? four[i] : four[i + 2], kept = middle ? four[i + 2] : four[i];
+    two[i] = kept + __shfl_xor_sync(kWholeWarp, given, 8);
+  }
+  const float given = low ? two[0] : two[1], kept = low ? two[1] : two[0];
+  float sum = kept + __shfl_xor_sync(kWholeWarp, given, 4);
+  sum += __shfl_xor_sync(kWholeWarp, sum, 2);
+  return sum + __shfl_xor_sync(kWholeWarp, sum, 1);
+}

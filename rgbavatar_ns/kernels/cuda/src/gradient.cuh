@@ -1,0 +1,209 @@
+// From the slots to the gradients of Gaussians, and from these through Adam.
+
+// Calls visit(slot) with the slots of a Gaussian that a tile has written, in the tiles' order.
+template <class Visit>
+RGBAVATAR_FUNCTION void for_each_slot(const Frame& frame, const Bins& bins, const Splat& s,
+                                      int64_t row, const Visit& visit) {
+  int64_t slot = bins.slot_start[row];
+  for (int ty = s.first_y(); ty <= s.last_y(); ++ty)
+    for (int tx = s.first_x(); tx <= s.last_x(); ++tx, ++slot)
+      if (touches_tile(s, frame, tx, ty)) visit(slot);
+}
+
+RGBAVATAR_FUNCTION Moments<float> sum_slots(const Frame& frame, const Bins& bins, const Splat& s,
+                                            int64_t row, const float* slots) {
+  float m[kMoments] = {};
+  for_each_slot(frame, bins, s, row, [&](int64_t slot) {
+    for (int k = 0; k < kMoments; ++k) m[k] += slots[slot * kMoments + k];
+  });
+  return {{m[0], m[1], m[2]}, m[3], m[4], m[5], m[6], m[7], m[8]};
+}
+
+// Sums of `average` by Gaussian. Blocks of 128 Gaussians, by images.
+RGBAVATAR_KERNEL(collect, CollectArguments, kBlendThreads) {
+  const int gaussian = int(blockIdx.x * blockDim.x + threadIdx.x), image = int(blockIdx.y);
+  if (gaussian >= a.frame.count) return;
+  const int64_t row = int64_t(image) * a.frame.count + gaussian;
+  const Splat s = splats_of(a.frame, a.bins, image)[gaussian];
+  float sums[kMaxSums] = {};
+  const int width = a.channels + 2;
+  if (s.drawn() && !overflowed(a.bins))
+    for_each_slot(a.frame, a.bins, s, row, [&](int64_t slot) {
+      for (int k = 0; k < kMaxSums; ++k) {
+        if (k >= width) break;
+        const float value = a.slots[slot * width + k];
+        sums[k] = k == a.channels + 1 ? fmaxf(sums[k], value) : sums[k] + value;
+      }
+    });
+  for (int k = 0; k < kMaxSums; ++k) {
+    if (k < a.channels && a.weighted_sum) a.weighted_sum[row * a.channels + k] = sums[k];
+    if (k == a.channels && a.weight_sum) a.weight_sum[row] = sums[k];
+    if (k == a.channels + 1) a.max_weight[row] = sums[k];
+  }
+}
+
+// The gradient of world-space Gaussians, image by image; 0 for what was not drawn, which may hold
+// anything. Blocks of 128 Gaussians, by images.
+RGBAVATAR_KERNEL(project_backward, ProjectBackwardArguments, kBlendThreads) {
+  const int gaussian = int(blockIdx.x * blockDim.x + threadIdx.x), image = int(blockIdx.y);
+  if (gaussian >= a.frame.count) return;
+  const int64_t row = int64_t(image) * a.frame.count + gaussian;
+  const Splat s = splats_of(a.frame, a.bins, image)[gaussian];
+  GaussianGradient<float> d = {};
+  Vec3<float> color = {};
+  if (s.drawn() && !overflowed(a.bins)) {
+    const GaussianInput<float> g = world_gaussian(a.world, a.frame, image, gaussian);
+    const Camera camera = camera_of(a.cameras, a.frame, image);
+    const Moments<float> moments = sum_slots(a.frame, a.bins, s, row, a.slots);
+    d = project_backward(g, camera, project(g, camera), moments);
+    color = moments.color;
+  }
+  put_vec3(d.mean, a.means, row);
+  for (int k = 0; k < 4; ++k) a.quats[row * 4 + k] = d.quat[k];
+  put_vec3(d.scale, a.scales, row);
+  a.opacities[row] = d.opacity;
+  put_vec3(color, a.colors, row);
+}
+
+// The gradient of one blended Gaussian in one image.
+RGBAVATAR_FUNCTION void blended_gradient(const BlendBackwardArguments& a, int image, int gaussian,
+                                         const Carried& c) {
+  const int64_t row = int64_t(image) * a.frame.count + gaussian;
+  const Splat s = splats_of(a.frame, a.bins, image)[gaussian];
+  Vec3<float> position = {}, color = {}, log_scale = {};
+  float rotation[4] = {}, logit = 0.0f, carried[kCarriedFloats] = {};
+  if (s.drawn() && !overflowed(a.bins)) {
+    const GaussianInput<float>& g = c.gaussian;
+    const Camera camera = camera_of(a.cameras, a.frame, image);
+    const Moments<float> moments = sum_slots(a.frame, a.bins, s, row, a.slots);
+    const GaussianGradient<float> d = project_backward(g, camera, project(g, camera), moments);
+    position = add_scaled(add_scaled(scaled(c.row0, d.mean.x), c.row1, d.mean.y), c.row2, d.mean.z);
+    conjugate_product(c.frame_quat, d.quat, rotation);
+    color = scaled(moments.color, kColorScale);
+    log_scale = {d.scale.x * g.scale.x, d.scale.y * g.scale.y, d.scale.z * g.scale.z};
+    logit = d.opacity * g.opacity * (1.0f - g.opacity);
+    float quat[4];
+    product_conjugate(d.quat, c.rotation, quat);
+    const float values[kCarriedFloats] = {
+        d.mean.x, d.mean.y, d.mean.z, quat[0], quat[1], quat[2], quat[3],
+        dot(d.scale, g.scale) / c.ratio, c.position.x, c.position.y, c.position.z, 0.0f};
+    for (int k = 0; k < kCarriedFloats; ++k) carried[k] = values[k];
+  }
+  put_vec3(position, a.position, row);
+  for (int k = 0; k < 4; ++k) a.rotation[row * 4 + k] = rotation[k];
+  put_vec3(color, a.color, row);
+  put_vec3(log_scale, a.log_scale, row);
+  a.opacity_logit[row] = logit;
+  if (!a.carried) return;
+  for (int k = 0; k < kCarriedFloats; ++k) a.carried[row * kCarriedFloats + k] = carried[k];
+}
+
+// Blocks of 128 Gaussians, by groups of kBlendImages images.
+RGBAVATAR_KERNEL(blend_backward, BlendBackwardArguments, kBlendThreads) {
+  RGBAVATAR_DYNAMIC_SHARED(float, weights);
+  const int first_image = int(blockIdx.y) * kBlendImages;
+  load_weights(a.blended, a.frame, first_image, weights);
+  const int gaussian = int(blockIdx.x * blockDim.x + threadIdx.x);
+  if (gaussian >= a.frame.count) return;
+  Tangent tangent;
+  blend_gaussian(a.blended, a.frame, weights, gaussian, tangent);
+#pragma unroll
+  for (int i = 0; i < kBlendImages; ++i) {
+    const int image = first_image + i;
+    if (image >= a.frame.batch) break;
+    blended_gradient(a, image, gaussian,
+                     carry(a.blended, image, gaussian, tangent.position[i], tangent.rotation[i],
+                           tangent.color[i]));
+  }
+}
+
+// From the gradients of the triangles' frames to those of their corners.
+RGBAVATAR_KERNEL(frames_backward, FramesBackwardArguments, kBlendThreads) {
+  const int triangle = int(blockIdx.x * blockDim.x + threadIdx.x), image = int(blockIdx.y);
+  const Blended& b = a.blended;
+  if (triangle >= b.triangles) return;
+  const int64_t row = int64_t(image) * b.triangles + triangle;
+  const float *f = b.frames + row * kFrameFloats, *d = a.frame_gradient + row * kFrameFloats;
+  const auto frame_of = [](const float* c) {
+    return TangentFrame<float>{
+        {c[0], c[3], c[6]}, {c[1], c[4], c[7]}, {c[2], c[5], c[8]}, {c[9], c[10], c[11], c[12]}};
+  };
+  const Vec3<float> e1 = {f[16], f[17], f[18]}, e2 = {f[19], f[20], f[21]};
+  Vec3<float> corner = {d[13], d[14], d[15]}, first = {d[16], d[17], d[18]};
+  Vec3<float> second = {d[19], d[20], d[21]};
+  tangent_frame_backward(e1, e2, b.edges_to_frame + int64_t(triangle) * 4, b.variant, frame_of(f),
+                         frame_of(d), first, second);
+  if (b.rest_length) {  // the ratio is the root of |e1 x e2|, over a constant
+    const Vec3<float> area = cross(e1, e2);
+    const float square = dot(area, area);
+    if (square > 4e-32f) {
+      const Vec3<float> d_area = scaled(area, d[22] * f[22] * 0.5f / square);
+      first = add_scaled(first, cross(e2, d_area), 1.0f);
+      second = add_scaled(second, cross(d_area, e1), 1.0f);
+    }
+  }
+  corner = add_scaled(add_scaled(corner, first, -1.0f), second, -1.0f);
+  put_vec3(corner, a.corner_gradient, row * 3);
+  put_vec3(first, a.corner_gradient, row * 3 + 1);
+  put_vec3(second, a.corner_gradient, row * 3 + 2);
+}
+
+// ---- Adam ---------------------------------------------------------------------------------------
+
+RGBAVATAR_FUNCTION void adam_column(const float* numbers, float gradient, int64_t i, float* value,
+                                    float* first, float* second) {
+  const AdamStep step = {numbers[0], numbers[1], numbers[2], numbers[3], numbers[4]};
+  float v = value[i], m = first[i], s = second[i];
+  adam_update(gradient, step, v, m, s);
+  value[i] = v, first[i] = m, second[i] = s;
+}
+
+// Of a column: the gradients of base and bases, which go into Adam at once, and the block's part of
+// the weights' gradient. The gradients of sixteen images stay in registers.
+constexpr int kHeldImages = 16;
+RGBAVATAR_KERNEL(update, UpdateArguments, kTileThreads) {
+  RGBAVATAR_DYNAMIC_SHARED(float, shared);  // weights [B, K], then sums of the warps [8, B]
+  if (a.status[kOverflow]) return;
+  const int column = int(blockIdx.x * blockDim.x + threadIdx.x);
+  const int lane = int(threadIdx.x) & 31, warp = int(threadIdx.x) >> 5;
+  const bool exists = column < a.columns;
+  float* warp_sums = shared + a.batch * a.bases;
+  for (int i = int(threadIdx.x); i < a.batch * a.bases; i += kTileThreads) shared[i] = a.weights[i];
+  __syncthreads();
+  float held[kHeldImages], sum = 0.0f;
+#pragma unroll
+  for (int b = 0; b < kHeldImages; ++b)
+    held[b] = exists && b < a.batch ? a.gradient[int64_t(b) * a.columns + column] : 0.0f;
+  const auto of_image = [&](int b) {
+    return exists ? a.gradient[int64_t(b) * a.columns + column] : 0.0f;
+  };
+#pragma unroll
+  for (int b = 0; b < kHeldImages; ++b) sum += held[b];
+  for (int b = kHeldImages; b < a.batch; ++b) sum += of_image(b);
+  if (exists && a.base_first)
+    adam_column(a.numbers, sum, column, a.base, a.base_first, a.base_second);
+  for (int k = 0; k < a.bases; ++k) {
+    const int64_t place = int64_t(k) * a.columns + column;
+    const float value = exists ? a.basis[place] : 0.0f;
+    float gradient = 0.0f;
+    const auto take = [&](int b, float d) {
+      gradient += shared[b * a.bases + k] * d;
+      const float part = warp_sum(d * value);
+      if (lane == 0) warp_sums[warp * a.batch + b] = part;
+    };
+#pragma unroll
+    for (int b = 0; b < kHeldImages; ++b)
+      if (b < a.batch) take(b, held[b]);
+    for (int b = kHeldImages; b < a.batch; ++b) take(b, of_image(b));
+    if (exists && a.basis_first)
+      adam_column(a.numbers + 5, gradient, place, a.basis, a.basis_first, a.basis_second);
+    if (!a.weight_sums) continue;
+    __syncthreads();
+    for (int b = int(threadIdx.x); b < a.batch; b += kTileThreads) {
+      float all = 0.0f;
+      for (int w = 0; w < kWarps; ++w) all += warp_sums[w * a.batch + b];
+      a.weight_sums[(int64_t(blockIdx.x) * a.batch + b) * a.bases + k] = all;
+    }
+    __syncthreads();
+  }
+}

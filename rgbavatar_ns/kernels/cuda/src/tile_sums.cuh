@@ -1,0 +1,183 @@
+// Passes that sum over pixels for each Gaussian of a tile: gradients and weighted averages.
+//
+// Each warp sums its own pixels; the block then adds its eight warps in their order and writes the
+// (Gaussian, tile) slot, which the gradient kernels add in the order of the tiles. No floating-point
+// atomics: two runs give the same bits.
+
+constexpr int kWarps = kTileThreads / 32;
+
+template <int kSums>
+struct WarpSums {
+  float sums[kWarps][kBatch][kSums];
+  unsigned drawn[kWarps][kBatch / 32];  // which Gaussians of the batch each warp has summed
+};
+
+template <int kSums>
+RGBAVATAR_FUNCTION void clear_drawn(WarpSums<kSums>& shared) {
+  if (threadIdx.x < kWarps * (kBatch / 32))
+    shared.drawn[threadIdx.x / (kBatch / 32)][threadIdx.x % (kBatch / 32)] = 0u;
+}
+
+template <int kSums>
+RGBAVATAR_FUNCTION void mark_drawn(WarpSums<kSums>& shared, int place) {
+  if ((threadIdx.x & 31) == 0) shared.drawn[threadIdx.x >> 5][place >> 5] |= 1u << (place & 31);
+}
+
+// Adds up the warps' sums of a batch and writes its slots; `join(sum, other, which)` joins two.
+template <int kSums, class Join>
+RGBAVATAR_FUNCTION void write_slots(WarpSums<kSums>& shared, const Batch& batch, int number,
+                                    int width, float* slots, const Join& join) {
+  __syncthreads();
+  for (int i = int(threadIdx.x); i < number * width; i += kTileThreads) {
+    const int place = i / width, which = i % width;
+    float sum = 0.0f;
+    for (int warp = 0; warp < kWarps; ++warp)
+      if (shared.drawn[warp][place >> 5] >> (place & 31) & 1u)
+        sum = join(sum, shared.sums[warp][place][which], which);
+    slots[int64_t(batch.slots[place]) * width + which] = sum;
+  }
+  __syncthreads();
+  clear_drawn(shared);
+}
+
+// Zeros for the Gaussians that no pixel was open for any more.
+RGBAVATAR_FUNCTION void clear_rest(const TileList& list, int first, int width, float* slots) {
+  for (int entry = first + int(threadIdx.x); entry < list.count; entry += kTileThreads) {
+    uint32_t slot;
+    list.read(entry, slot);
+    for (int k = 0; k < width; ++k) slots[int64_t(slot) * width + k] = 0.0f;
+  }
+}
+
+// The backward pass of the blending (gaussian_math.h) from g = dL/dimage and the remainder S.
+RGBAVATAR_FUNCTION void differentiate_tile(const TileList& list, const Pixel& pixel, Batch& batch,
+                                           WarpSums<kMoments>& shared, const Vec3<float>& g,
+                                           float remainder, float* slots) {
+  const int lane = int(threadIdx.x) & 31, warp = int(threadIdx.x) >> 5;
+  float transmittance = pixel.inside ? 1.0f : 0.0f;
+  __syncthreads();
+  clear_drawn(shared);
+  const int read = walk(
+      list, pixel, batch, transmittance,
+      [&](int place, const Splat& s, const Touch& touch) {
+        if (!__ballot_sync(kWholeWarp, touch.alpha > 0.0f)) return;
+        const float w = touch.alpha * transmittance;
+        const float along = w * (g.x * s.red + g.y * s.green + g.z * s.blue);
+        remainder -= along;
+        transmittance -= w;
+        // alpha dL/dalpha; the cap has no gradient.
+        const float d_alpha = along - remainder * touch.alpha / (1.0f - touch.alpha);
+        const float d = touch.capped ? 0.0f : C::kLn2 * d_alpha;
+        const float d_x = d * touch.dx, d_y = d * touch.dy;
+        const float moments[8] = {w * g.x, w * g.y, w * g.z,      d,
+                                  d_x,     d_y,     d_x * touch.dx, d_x * touch.dy};
+        const float sum = warp_sums_of_eight(moments), last = warp_sum(d_y * touch.dy);
+        if ((lane & 3) == 0) shared.sums[warp][place][lane >> 2] = sum;
+        if (lane == 0) shared.sums[warp][place][8] = last;
+        mark_drawn(shared, place);
+      },
+      [&](int, int number) {
+        write_slots(shared, batch, number, kMoments, slots,
+                    [](float sum, float other, int) { return sum + other; });
+      });
+  clear_rest(list, read, kMoments, slots);
+}
+
+// From the gradients of image and alpha.
+RGBAVATAR_KERNEL(differentiate, DifferentiateArguments, kTileThreads) {
+  RGBAVATAR_SHARED Batch batch;
+  RGBAVATAR_SHARED WarpSums<kMoments> shared;
+  const TileList list(a.frame, a.bins);
+  const Pixel pixel(a.frame, list.tile_x, list.tile_y);
+  const int64_t at = int64_t(blockIdx.y) * a.frame.width * a.frame.height + pixel.index;
+  Vec3<float> g = {0.0f, 0.0f, 0.0f};
+  float remainder = 0.0f;
+  if (pixel.inside && a.image_gradient) {
+    g = vec3_at(a.image_gradient, at);
+    remainder = dot(g, vec3_at(a.image, at));
+  }
+  if (pixel.inside && a.alpha_gradient) remainder -= a.alpha_gradient[at] * (1.0f - a.alpha[at]);
+  differentiate_tile(list, pixel, batch, shared, g, remainder, a.slots);
+}
+
+// Forward pass, mean absolute difference to 8-bit images over a background, and backward pass in
+// one go: no image is written.
+RGBAVATAR_KERNEL(train, TrainArguments, kTileThreads) {
+  RGBAVATAR_SHARED Batch batch;
+  RGBAVATAR_SHARED WarpSums<kMoments> shared;
+  RGBAVATAR_SHARED float loss[kWarps];
+  const TileList list(a.frame, a.bins);
+  const Pixel pixel(a.frame, list.tile_x, list.tile_y);
+  Blend blend(pixel);
+  blend.run(list, pixel, batch);
+  Vec3<float> g = {0.0f, 0.0f, 0.0f};
+  float remainder = 0.0f, difference = 0.0f;
+  if (pixel.inside) {
+    const int image = int(blockIdx.y);
+    const int64_t which = a.image_of ? a.image_of[image] : image;
+    const int64_t at = which * a.frame.width * a.frame.height + pixel.index;
+    const uint32_t rgba = reinterpret_cast<const uint32_t*>(a.images)[at];
+    const float matte = float(rgba >> 24) * (1.0f / 255.0f);
+    const Vec3<float> behind = background_of(a.background, a.background_shared);
+    const auto channel = [&](float color, float back, int shift) {
+      const float drawn = color + blend.transmittance * back;
+      const float target = float(rgba >> shift & 255u) * (1.0f / 255.0f);
+      const float off = drawn - (back + matte * (target - back));
+      const float gradient = off > 0.0f ? a.gradient : off < 0.0f ? -a.gradient : 0.0f;
+      difference += fabsf(off);
+      remainder += gradient * drawn;
+      return gradient;
+    };
+    g.x = channel(blend.red, behind.x, 0);
+    g.y = channel(blend.green, behind.y, 8);
+    g.z = channel(blend.blue, behind.z, 16);
+  }
+  const float sum = warp_sum(difference);
+  if ((threadIdx.x & 31) == 0) loss[threadIdx.x >> 5] = sum;
+  __syncthreads();
+  if (threadIdx.x == 0) {
+    float all = 0.0f;
+    for (int warp = 0; warp < kWarps; ++warp) all += loss[warp];
+    a.loss[int64_t(blockIdx.y) * gridDim.x + blockIdx.x] = all;
+  }
+  differentiate_tile(list, pixel, batch, shared, g, remainder, a.slots);
+}
+
+// Sums of w I (C channels) and w, and the largest w.
+constexpr int kMaxSums = 10;
+RGBAVATAR_KERNEL(average, AverageArguments, kTileThreads) {
+  RGBAVATAR_SHARED Batch batch;
+  RGBAVATAR_SHARED WarpSums<kMaxSums> shared;
+  const TileList list(a.frame, a.bins);
+  const Pixel pixel(a.frame, list.tile_x, list.tile_y);
+  const int lane = int(threadIdx.x) & 31, warp = int(threadIdx.x) >> 5;
+  const int64_t image = a.images_shared ? 0 : int64_t(blockIdx.y);
+  const float* values =
+      a.images + (image * a.frame.width * a.frame.height + pixel.index) * a.channels;
+  float transmittance = pixel.inside ? 1.0f : 0.0f;
+  clear_drawn(shared);
+  const int read = walk(
+      list, pixel, batch, transmittance,
+      [&](int place, const Splat&, const Touch& touch) {
+        if (!__ballot_sync(kWholeWarp, touch.alpha > 0.0f)) return;
+        const float w = touch.alpha * transmittance;
+        transmittance -= w;
+        for (int k = 0; k < a.channels; ++k) {
+          const float sum = warp_sum(w > 0.0f ? w * values[k] : 0.0f);
+          if (lane == 0) shared.sums[warp][place][k] = sum;
+        }
+        const float sum = warp_sum(w), largest = warp_max(w);
+        if (lane == 0) {
+          shared.sums[warp][place][a.channels] = sum;
+          shared.sums[warp][place][a.channels + 1] = largest;
+        }
+        mark_drawn(shared, place);
+      },
+      [&](int, int number) {
+        write_slots(shared, batch, number, a.channels + 2, a.slots,
+                    [&](float sum, float other, int which) {
+                      return which > a.channels ? fmaxf(sum, other) : sum + other;
+                    });
+      });
+  clear_rest(list, read, a.channels + 2, a.slots);
+}
