@@ -10,28 +10,10 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from rgbavatar_ns.avatar.adam_states import AdamStates
 from rgbavatar_ns.avatar.avatar import Avatar
 from rgbavatar_ns.avatar.losses import require_images_of
-from rgbavatar_ns.kernels import (
-    AdamParameter,
-    BlendedGradient,
-    BlendedRenderer,
-    PinholeCameras,
-)
-
-_GROUPS = {
-    "position": "position",
-    "rotation_wxyz": "rotation",
-    "color_feature": "color",
-    "log_scale": "log_scale",
-    "opacity_logit": "opacity",
-    "basis_position": "basis_position",
-    "basis_rotation_wxyz": "basis_rotation",
-    "basis_color_feature": "basis_color",
-}
-"""The parameter group of each of the Gaussians' tensors."""
-
-_PLAIN_ADAM = {"weight_decay": 0, "amsgrad": False, "maximize": False, "differentiable": False}
+from rgbavatar_ns.kernels import BlendedGradient, BlendedRenderer, PinholeCameras
 
 
 class FusedStep:
@@ -40,21 +22,11 @@ class FusedStep:
     The optimisers' checkpoints are those of the eager path: a run can change between the two.
 
     Raises:
-        ValueError: `refusal` gives a reason for these optimisers.
+        ValueError: `adam_states.refusal` gives a reason for these optimisers.
     """
 
     def __init__(self, avatar: Avatar, optimizers: Iterable[torch.optim.Optimizer]) -> None:
-        self._avatar, self._optimizers = avatar, list(optimizers)
-        reason = refusal(avatar, self._optimizers)
-        if reason is not None:
-            raise ValueError(f"The fused step cannot be used: {reason}. Use the eager one.")
-        homes = _homes(self._optimizers)
-        groups = avatar.parameter_groups()
-        self._parameters = {
-            name: (groups[group][0], *homes[groups[group][0]])
-            for name, group in _GROUPS.items()
-            if group in groups
-        }
+        self._avatar, self._states = avatar, AdamStates(avatar, optimizers)
 
     def __call__(
         self,
@@ -90,62 +62,17 @@ class FusedStep:
         self, renderer: BlendedRenderer, *, with_vertices: bool = False
     ) -> BlendedGradient:
         """Step by the renderer's last comparison and return the gradient of what posed it."""
-        parameters = {name: self._adam(name) for name in self._parameters}
+        parameters = self._states.next_of_gaussians()
         return renderer.update(parameters, with_vertices=with_vertices)
 
     def update_network(
         self, psi: Float[Tensor, "B K"], weight_gradient: Float[Tensor, "B K"]
     ) -> None:
         """Step with the weight network that gave psi."""
-        for optimizer in self._optimizers:
+        for optimizer in self._states.optimizers:
             optimizer.zero_grad(set_to_none=True)
         if psi.requires_grad:
             psi.backward(weight_gradient)
         # Of the Gaussians they find no gradient; hooks and schedules still see each take its step.
-        for optimizer in self._optimizers:
+        for optimizer in self._states.optimizers:
             optimizer.step()
-
-    def _adam(self, name: str) -> AdamParameter:
-        """The parameter's next update; counts it."""
-        value, optimizer, group = self._parameters[name]
-        state = optimizer.state[value]
-        if not state:
-            # As torch.optim.Adam begins, so that either path can go on from the other's state.
-            state["step"] = torch.zeros((), dtype=torch.float32)
-            state["exp_avg"] = torch.zeros_like(value)
-            state["exp_avg_sq"] = torch.zeros_like(value)
-        state["step"] += 1
-        return AdamParameter(
-            value=value,
-            first_moment=state["exp_avg"],
-            second_moment=state["exp_avg_sq"],
-            learning_rate=float(group["lr"]),
-            betas=(float(group["betas"][0]), float(group["betas"][1])),
-            epsilon=float(group["eps"]),
-            step=int(state["step"]),
-        )
-
-
-def refusal(avatar: Avatar, optimizers: Iterable[torch.optim.Optimizer]) -> str | None:
-    """Return why the fused step cannot train this avatar with these optimisers; None if it can."""
-    homes = _homes(optimizers)
-    for name, parameters in avatar.parameter_groups().items():
-        for parameter in parameters:
-            if parameter not in homes:
-                return f"no optimiser holds the parameters of {name}"
-            optimizer, group = homes[parameter]
-            if type(optimizer) is not torch.optim.Adam:
-                return f"the optimiser of {name} is {type(optimizer).__name__}, not Adam"
-            for option, plain in _PLAIN_ADAM.items():
-                if group[option] != plain:
-                    return f"the optimiser of {name} has {option}={group[option]}"
-            if not parameter.is_contiguous():
-                return f"the parameters of {name} are not contiguous"
-    return None
-
-
-def _homes(
-    optimizers: Iterable[torch.optim.Optimizer],
-) -> dict[Tensor, tuple[torch.optim.Optimizer, dict]]:
-    """Each parameter's optimiser and group."""
-    return {p: (o, g) for o in optimizers for g in o.param_groups for p in g["params"]}

@@ -7,9 +7,10 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from rgbavatar_ns.avatar.adam_states import refusal
 from rgbavatar_ns.avatar.avatar import LEARNING_RATES, Avatar
 from rgbavatar_ns.avatar.color_init import ColorInitSchedule
-from rgbavatar_ns.avatar.fused_step import FusedStep, refusal
+from rgbavatar_ns.avatar.fused_step import FusedStep
 from rgbavatar_ns.avatar.losses import (
     LPIPSLoss,
     composite,

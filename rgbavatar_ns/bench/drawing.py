@@ -21,7 +21,7 @@ class DrawTimes:
     backward: Spread
     whole: Spread
     growth_bytes: int | None
-    """Memory of the first forward and backward (see `timing.PEAK_MEMORY_METHOD`)."""
+    """Memory of the first forward and backward (see `timing.peak_memory_method`)."""
 
 
 def leaf_gaussians(gaussians: GaussianSet) -> GaussianSet:
@@ -42,6 +42,7 @@ def time_draw(
     leaves = leaf_gaussians(gaussians)
     generator = torch.Generator().manual_seed(1)
     image_grad = torch.randn(image_shape, generator=generator) / image_shape[1] ** 2
+    image_grad = image_grad.to(gaussians.means.device)
 
     def once(lap: Lap) -> None:
         for leaf in vars(leaves).values():
@@ -51,6 +52,6 @@ def time_draw(
         image.backward(image_grad)
         lap("backward")
 
-    growth_bytes = peak_growth_bytes(lambda: once(lambda name: None))
+    growth_bytes = peak_growth_bytes(lambda: once(lambda name: None), gaussians.means.device)
     spread = stopwatch.laps(what, once)
     return DrawTimes(spread["forward"], spread["backward"], spread[WHOLE], growth_bytes)

@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from rgbavatar_ns.bench.timing import CPU, waiting_for
 from rgbavatar_ns.kernels import GaussianSet, PinholeCameras
 
 FORWARD_OPERATIONS_PER_PAIR = 16
@@ -33,22 +34,33 @@ class MachineSpeed:
 
 
 def measure_speed(
-    matrix_side: int = 2048, copy_mib: int = 256, repetitions: int = 5
+    device: torch.device = CPU,
+    matrix_side: int | None = None,
+    copy_mib: int | None = None,
+    repetitions: int = 5,
 ) -> MachineSpeed:
     """Arithmetic from a large float32 matrix product, bandwidth from a large copy.
 
-    The best of the repetitions each. A copy counts its bytes twice, read and written.
+    The best of the repetitions each, by default with sizes that keep the device busy. A copy
+    counts its bytes twice, read and written.
     """
-    factor = torch.randn(matrix_side, matrix_side)
+    large = device.type == "cuda"
+    matrix_side = matrix_side or (8192 if large else 2048)
+    copy_mib = copy_mib or (2048 if large else 256)
+    factor = torch.randn(matrix_side, matrix_side, device=device)
     product = torch.empty_like(factor)
-    source = torch.ones(copy_mib << 18)
+    source = torch.ones(copy_mib << 18, device=device)
     target = torch.zeros_like(source)
+    wait = waiting_for(device)
     multiply_s, copy_s = [], []
     for _ in range(repetitions + 1):
+        wait()
         start = time.perf_counter()
         torch.mm(factor, factor, out=product)
+        wait()
         middle = time.perf_counter()
         target.copy_(source)
+        wait()
         multiply_s.append(middle - start)
         copy_s.append(time.perf_counter() - middle)
     return MachineSpeed(

@@ -11,12 +11,14 @@ import torch
 
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.kernels import available_backends
+from rgbavatar_ns.kernels.cuda import backend as cuda_backend
 
 
 def machine_facts() -> dict[str, Any]:
     """Processor, instruction set of the rasterizer, versions, threads, load, commit and date."""
     return {
         "processor": _processor(),
+        "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
         "cores": len(os.sched_getaffinity(0))
         if hasattr(os, "sched_getaffinity")
         else os.cpu_count(),
@@ -31,11 +33,40 @@ def machine_facts() -> dict[str, Any]:
     }
 
 
-def require_backend(name: str = "auto") -> str:
-    """The backend that `name` stands for; raises UserError where it cannot be used here."""
+def chosen_device(name: str | None, backend: str = "auto") -> torch.device:
+    """The device to measure on: the one named, else the GPU where this backend can use it.
+
+    Raises UserError where the GPU is named and cannot be used, or another one than the backend's.
+    """
+    reason = _gpu_refusal()
+    if name is None:
+        name = "cuda" if reason is None and backend in ("auto", "cuda") else "cpu"
+    if name == "cuda" and reason is not None:
+        raise UserError(
+            f"There is no GPU to measure on: {reason}.", "Leave out --device, or pass --device cpu."
+        )
+    if backend in ("cpu", "cuda") and backend != name:
+        raise UserError(
+            f"The rasterizer's backend {backend!r} does not draw on the device {name!r}.",
+            f"Pass --device {backend}, or another --backend.",
+        )
+    return torch.device(name)
+
+
+def _gpu_refusal() -> str | None:
+    """Why the rasterizer cannot use a GPU here; None where it can."""
+    try:
+        cuda_backend.load()
+    except ImportError as error:
+        return str(error)
+    return None
+
+
+def require_backend(name: str = "auto", device: torch.device | None = None) -> str:
+    """The backend that `name` stands for on a device; raises UserError where it cannot be used."""
     available = available_backends()
     if name == "auto":
-        name = "cpu"
+        name = "cpu" if device is None else device.type
     if name not in available:
         raise UserError(
             f"The rasterizer's backend {name!r} cannot be used here (available: "

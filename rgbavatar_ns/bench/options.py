@@ -2,8 +2,12 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from rgbavatar_ns.errors import UserError
+
+Scheme = Literal["batch-parallel", "naive-batch", "single"]
+"""The training schemes of the paper's table."""
 
 
 @dataclass(frozen=True)
@@ -20,6 +24,8 @@ class CommonOptions:
     """Side of the images in pixels: 512, or the dataset's."""
     threads: int | None = None
     """Threads to use; as many as torch takes by default."""
+    device: Literal["cpu", "cuda"] | None = None
+    """Where to measure; the GPU where it can be used, else the CPU."""
 
     def __post_init__(self) -> None:
         """Refuse what cannot be measured."""
@@ -100,6 +106,10 @@ class StepOptions(AvatarOptions):
 
     batch: int = 10
     """Images a step."""
+    scheme: Scheme = "batch-parallel"
+    """How a batch is trained on: one step on its images drawn together, one step on its images
+    drawn one after another with their gradients summed, or a step for every image. Parts are timed
+    of the first alone."""
     repetitions: int = 15
     """Timings of each kind, after a warm-up."""
     trainer: bool = False

@@ -13,11 +13,13 @@ def count_pairs(gaussians: GaussianSet, cameras: PinholeCameras) -> int:
     Pairs behind an opaque surface count too, although a rasterizer may stop before them. Cameras
     and attributes have a leading dimension of B or 1.
     """
-    gaussians = GaussianSet(**{name: value.double() for name, value in vars(gaussians).items()})
+    exact = {"device": "cpu", "dtype": torch.float64}
+    values = {name: value.to(**exact) for name, value in vars(gaussians).items()}
+    gaussians = GaussianSet(**values)
     cameras = PinholeCameras(
-        cameras.world_to_camera.double(),
-        cameras.focal_px.double(),
-        cameras.principal_point_px.double(),
+        cameras.world_to_camera.to(**exact),
+        cameras.focal_px.to(**exact),
+        cameras.principal_point_px.to(**exact),
         cameras.width,
         cameras.height,
     )

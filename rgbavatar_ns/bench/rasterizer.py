@@ -7,25 +7,24 @@ import torch
 
 from rgbavatar_ns.bench.drawing import Draw, DrawTimes, time_draw
 from rgbavatar_ns.bench.floor import floor_figures, measure_speed, rasterizer_work
-from rgbavatar_ns.bench.machine import machine_facts, require_backend
+from rgbavatar_ns.bench.machine import chosen_device, machine_facts, require_backend
 from rgbavatar_ns.bench.options import AvatarOptions, RasterizerOptions
 from rgbavatar_ns.bench.pairs import count_pairs
-from rgbavatar_ns.bench.peers import time_peers
+from rgbavatar_ns.bench.peers import PEERS, time_peers
 from rgbavatar_ns.bench.report import Report
+from rgbavatar_ns.bench.scenes import DEFAULT_COUNT, DEFAULT_SIZE_PX, ellipsoid_scene, on_device
 from rgbavatar_ns.bench.timing import (
-    PEAK_MEMORY_METHOD,
     Progress,
     Spread,
     Stopwatch,
+    peak_memory_method,
     using_threads,
+    waiting_for,
 )
-from rgbavatar_ns.bench.workloads import (
-    DEFAULT_COUNT,
-    DEFAULT_SIZE_PX,
-    avatar_workload,
-    ellipsoid_scene,
-)
+from rgbavatar_ns.bench.workloads import avatar_workload
 from rgbavatar_ns.kernels import GaussianSet, PinholeCameras, rasterize
+
+_NO_PEERS_ON_GPUS = "drawn on a CPU only; benchmarks/gpu_check.py has gsplat's kernels"
 
 
 @dataclass(frozen=True)
@@ -38,16 +37,21 @@ class RasterizerTimes:
 
 def bench_rasterizer(options: RasterizerOptions, progress: Progress | None = None) -> Report:
     """Measure what the options say; raises UserError where that cannot be done here."""
-    backend = require_backend(options.backend)
+    device = chosen_device(options.device, options.backend)
+    backend = require_backend(options.backend, device)
     with using_threads(options.threads) as threads:
         gaussians, cameras, facts = _workload(options)
+        gaussians, cameras = on_device(gaussians, device), on_device(cameras, device)
         facts |= {"batch": options.batch, "backend": backend, "threads": threads}
+        facts |= {"device": device.type}
         pairs = count_pairs(gaussians, cameras)
-        stopwatch = Stopwatch(options.repetitions, progress)
+        stopwatch = Stopwatch(options.repetitions, progress, wait=waiting_for(device))
         times = time_rasterizer(gaussians, cameras, stopwatch, options.backend)
         whole_ms = times.training.whole.median_ms / options.batch
         peers: dict[str, Any] = {}
-        if options.peers:
+        if options.peers and device.type == "cuda":
+            peers = {name: {"unavailable": _NO_PEERS_ON_GPUS} for name in PEERS}
+        elif options.peers:
             few = Stopwatch(options.peer_repetitions, progress, warm_up=False)
 
             def ours(gaussians: GaussianSet, cameras: PinholeCameras) -> Draw:
@@ -113,7 +117,7 @@ def _report(
         "backward": times.training.backward,
         "forward and backward": times.training.whole,
     }
-    speed = measure_speed()
+    speed = measure_speed(gaussians.means.device)
     both = rasterizer_work(pairs, gaussians, cameras, backward=True)
     forward = rasterizer_work(pairs, gaussians, cameras, backward=False)
     floor = floor_figures([both], speed, batch, whole_ms / batch)
@@ -135,7 +139,7 @@ def _report(
         },
         memory={
             "bytes_per_image": None if growth is None else growth // batch,
-            "method": PEAK_MEMORY_METHOD,
+            "method": peak_memory_method(gaussians.means.device),
         },
         floor=floor,
         peers=peers,

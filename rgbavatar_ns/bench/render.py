@@ -11,20 +11,21 @@ import torch
 from rgbavatar_ns.avatar import Avatar
 from rgbavatar_ns.avatar.training import TrainingBatch
 from rgbavatar_ns.bench.floor import floor_figures, measure_speed, parameter_work, rasterizer_work
-from rgbavatar_ns.bench.machine import machine_facts, require_backend
+from rgbavatar_ns.bench.machine import chosen_device, machine_facts, require_backend
 from rgbavatar_ns.bench.options import RenderOptions
 from rgbavatar_ns.bench.pairs import count_pairs
 from rgbavatar_ns.bench.projection import one_camera
 from rgbavatar_ns.bench.report import Report
 from rgbavatar_ns.bench.timing import (
-    PEAK_MEMORY_METHOD,
     WHOLE,
     Lap,
     Progress,
     Spread,
     Stopwatch,
     peak_growth_bytes,
+    peak_memory_method,
     using_threads,
+    waiting_for,
 )
 from rgbavatar_ns.bench.workloads import AvatarWorkload, avatar_workload
 from rgbavatar_ns.kernels import rasterize
@@ -40,14 +41,15 @@ _JPEG_QUALITY = 75
 @torch.no_grad()
 def bench_render(options: RenderOptions, progress: Progress | None = None) -> Report:
     """Measure what the options say; raises UserError where that cannot be done here."""
-    backend = require_backend()
+    device = chosen_device(options.device)
+    backend = require_backend("auto", device)
     with using_threads(options.threads) as threads:
-        workload = avatar_workload(options, options.frames, with_images=False)
+        workload = avatar_workload(options, options.frames, with_images=False, device=device)
         facts = workload.facts | {"frames": options.frames, "batch": 1}
         facts |= {"backend": backend, "threads": threads}
-        stopwatch = Stopwatch(options.repetitions, progress)
+        stopwatch = Stopwatch(options.repetitions, progress, wait=waiting_for(device))
         frame = _frames_in_turn(workload.avatar, workload.batch)
-        growth_bytes = peak_growth_bytes(frame)
+        growth_bytes = peak_growth_bytes(frame, device)
         whole = stopwatch.time(WHOLE_FRAME, frame)
         spread = {WHOLE_FRAME: whole} | _time_parts(workload, stopwatch)
         spread[VIEWER_FRAME] = _time_viewer(workload, stopwatch)
@@ -68,7 +70,7 @@ def _frames_in_turn(avatar: Avatar, batch: TrainingBatch) -> Callable[[], Any]:
 def _time_parts(workload: AvatarWorkload, stopwatch: Stopwatch) -> dict[str, Spread]:
     """Times of one frame's parts as they follow one another."""
     avatar, theta = workload.avatar, workload.batch.theta[:1]
-    camera, background = one_camera(workload.batch.cameras, 0), torch.zeros(1, 3)
+    camera, background = one_camera(workload.batch.cameras, 0), theta.new_zeros(1, 3)
 
     def once(lap: Lap) -> None:
         vertices = avatar.head(theta, avatar.identity)
@@ -96,7 +98,7 @@ def _time_viewer(workload: AvatarWorkload, stopwatch: Stopwatch) -> Spread:
     def once() -> None:
         wishes = Wishes(frame=next(frames), backdrop=(1.0, 1.0, 1.0))
         image = viewer_picture(stage, wishes, camera).image
-        coded = (image * 255).type(torch.uint8).numpy()
+        coded = (image * 255).type(torch.uint8).cpu().numpy()
         imageio.imwrite(io.BytesIO(), coded, extension=".jpeg", quality=_JPEG_QUALITY)
 
     return stopwatch.time(VIEWER_FRAME, once)
@@ -134,8 +136,8 @@ def _report(
         parts={name: part.median_ms for name, part in spread.items()},
         spread=spread,
         pairs={"per_image": pairs, "per_second": 1e3 * pairs / whole_ms},
-        memory={"bytes_per_image": growth_bytes, "method": PEAK_MEMORY_METHOD},
-        floor=floor_figures(works, measure_speed(), 1, whole_ms),
+        memory={"bytes_per_image": growth_bytes, "method": peak_memory_method(theta.device)},
+        floor=floor_figures(works, measure_speed(theta.device), 1, whole_ms),
         peers={
             EAGER_FRAME: {
                 "whole_ms_per_image": spread[EAGER_FRAME].median_ms,

@@ -33,6 +33,9 @@ class Report:
     peers: dict[str, Any]
     machine: dict[str, Any]
     trainer: dict[str, Any] | None = field(default=None)
+    gpu_utilisation_percent: float | None = None
+    gpu_utilisation_note: str | None = None
+    """How it was measured, or why it was not; None on a CPU."""
 
     def to_json(self) -> dict[str, Any]:
         """The same as plain values."""
@@ -95,6 +98,10 @@ def _figures(report: Report) -> list[str]:
     growth = report.memory["bytes_per_image"]
     if growth is not None:
         lines.append(f"{growth / 2**20:.1f} MiB of memory an image")
+    if report.gpu_utilisation_note is not None:
+        percent = report.gpu_utilisation_percent
+        told = "not measured" if percent is None else f"{percent:.0f} %"
+        lines.append(f"GPU utilisation: {told} ({report.gpu_utilisation_note})")
     if report.trainer is not None:
         trainer = report.trainer
         lines.append(

@@ -1,110 +1,99 @@
 """`rgbavatar bench step`: a whole training step, its parts, and nerfstudio's trainer beside it."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from rgbavatar_ns.avatar import Avatar
 from rgbavatar_ns.avatar.composition import to_world
 from rgbavatar_ns.avatar.fused_step import FusedStep
 from rgbavatar_ns.avatar.losses import composite, l1_loss, random_backgrounds, rgba_to_float
-from rgbavatar_ns.avatar.training import (
-    TrainingBatch,
-    TrainingOptions,
-    make_optimizer,
-    training_step,
-)
+from rgbavatar_ns.avatar.training import TrainingOptions, make_optimizer
 from rgbavatar_ns.bench.drawing import leaf_gaussians
 from rgbavatar_ns.bench.floor import floor_figures, measure_speed, rasterizer_work, update_work
-from rgbavatar_ns.bench.machine import machine_facts, require_backend
-from rgbavatar_ns.bench.options import StepOptions
+from rgbavatar_ns.bench.machine import chosen_device, machine_facts, require_backend
+from rgbavatar_ns.bench.options import Scheme, StepOptions
 from rgbavatar_ns.bench.pairs import count_pairs
 from rgbavatar_ns.bench.report import Report
+from rgbavatar_ns.bench.schemes import (
+    EAGER_STEP,
+    UNRECORDED_STEP,
+    WHOLE_STEP,
+    WholeStep,
+    parameters_of,
+    steps_of,
+)
 from rgbavatar_ns.bench.timing import (
-    PEAK_MEMORY_METHOD,
     WHOLE,
     Lap,
     Progress,
     Spread,
     Stopwatch,
     peak_growth_bytes,
+    peak_memory_method,
     using_threads,
+    waiting_for,
 )
 from rgbavatar_ns.bench.trainer import bench_trainer
+from rgbavatar_ns.bench.utilisation import Utilisation, gpu_utilisation
 from rgbavatar_ns.bench.workloads import AvatarWorkload, avatar_workload
 from rgbavatar_ns.kernels import rasterize
 
-WHOLE_STEP = "whole step"
-EAGER_STEP = "whole step, eager"
 COLOR_INITIALISATION = "(colour initialisation, when due)"
 
 
 def bench_step(options: StepOptions, progress: Progress | None = None) -> Report:
     """Measure what the options say; raises UserError where that cannot be done here."""
-    backend = require_backend()
+    device = chosen_device(options.device)
+    backend = require_backend("auto", device)
     with using_threads(options.threads) as threads:
-        workload = avatar_workload(options, options.batch)
-        facts = workload.facts | {"backend": backend, "threads": threads}
-        stopwatch = Stopwatch(options.repetitions, progress)
-        whole, growth_bytes = time_step(workload, stopwatch)
-        parts = time_parts(workload, stopwatch)
-        eager_parts = time_eager_parts(workload, stopwatch)
-        trainer = bench_trainer(options, progress) if options.trainer else None
-        return _report(workload, facts, whole, parts, eager_parts, growth_bytes, trainer)
+        workload = avatar_workload(options, options.batch, device=device)
+        facts = workload.facts | {"backend": backend, "threads": threads, "scheme": options.scheme}
+        stopwatch = Stopwatch(options.repetitions, progress, wait=waiting_for(device))
+        whole = time_step(workload, stopwatch, options.scheme)
+        parts: dict[str, Spread] = {}
+        eager_parts: dict[str, Spread] = {}
+        if options.scheme == "batch-parallel":
+            parts = time_parts(workload, stopwatch)
+            eager_parts = time_eager_parts(workload, stopwatch)
+        trainer = bench_trainer(options, device, progress) if options.trainer else None
+        return _report(workload, facts, whole, parts, eager_parts, trainer)
+
+
+@dataclass(frozen=True)
+class StepTimes:
+    """A scheme's times and those beside it, by name; its memory, and the share of a GPU in use."""
+
+    spreads: dict[str, Spread]
+    growth_bytes: int | None
+    utilisation: Utilisation
 
 
 def time_step(
-    workload: AvatarWorkload, stopwatch: Stopwatch
-) -> tuple[dict[str, Spread], int | None]:
-    """Times of `training_step` and its memory, and times of its eager path.
+    workload: AvatarWorkload, stopwatch: Stopwatch, scheme: Scheme = "batch-parallel"
+) -> StepTimes:
+    """Time a scheme's step and those beside it.
 
     Every repetition starts from the same parameters, so that all of them do the same work.
     """
-    spreads, growth_bytes = {}, None
-    for name, options in _variants().items():
-        step = WholeStep(workload.avatar, workload.batch, options)
+    device = workload.batch.theta.device
+    spreads: dict[str, Spread] = {}
+    growth_bytes, utilisation = None, Utilisation(None, None)
+    kinds = steps_of(scheme, workload.avatar, workload.batch)
+    for name, make in kinds.items():
+        step = make()
         step.run()  # Makes the optimiser's state, which later steps find.
         step.restore()
-        if not spreads:
-            growth_bytes = peak_growth_bytes(step.run)
+        # What a recorded step needs was taken when it was recorded.
+        if name == (UNRECORDED_STEP if UNRECORDED_STEP in kinds else WHOLE_STEP):
+            growth_bytes = peak_growth_bytes(step.run, device)
         spreads[name] = stopwatch.time(name, step.run, step.restore)
+        if name == WHOLE_STEP:
+            utilisation = gpu_utilisation(step.run, device)
         step.restore()
-    return spreads, growth_bytes
-
-
-def _variants() -> dict[str, TrainingOptions]:
-    """Options of the step as training takes it, and of the eager one."""
-    return {
-        WHOLE_STEP: TrainingOptions(color_init=None),
-        EAGER_STEP: TrainingOptions(color_init=None, fast=False),
-    }
-
-
-class WholeStep:
-    """One training step that can be taken again from the same parameters."""
-
-    def __init__(self, avatar: Avatar, batch: TrainingBatch, options: TrainingOptions) -> None:
-        self._avatar, self._batch, self._options = avatar, batch, options
-        self.optimizer = make_optimizer(avatar)
-        self._parameters = parameters_of(avatar)
-        self._before = [parameter.detach().clone() for parameter in self._parameters]
-
-    def run(self) -> None:
-        """Take the step."""
-        training_step(self._avatar, self.optimizer, self._batch, 0, self._options)
-
-    @torch.no_grad()
-    def restore(self) -> None:
-        """Put the parameters back; the optimiser's moments stay, which changes no time."""
-        for parameter, before in zip(self._parameters, self._before):
-            parameter.copy_(before)
-
-
-def parameters_of(avatar: Avatar) -> list[nn.Parameter]:
-    """All that is trained."""
-    return [parameter for group in avatar.parameter_groups().values() for parameter in group]
+    return StepTimes(spreads, growth_bytes, utilisation)
 
 
 def _backward(tensors: tuple[Tensor, ...], gradients: tuple[Tensor, ...], inputs: Any) -> None:
@@ -115,7 +104,8 @@ def time_parts(workload: AvatarWorkload, stopwatch: Stopwatch) -> dict[str, Spre
     """Times of the fused step's parts as they follow one another, and of what is due at times."""
     avatar, batch = workload.avatar, workload.batch
     whole = WholeStep(avatar, batch, TrainingOptions(color_init=None))
-    background, images = random_backgrounds(0, len(batch.theta)), torch.as_tensor(batch.images_rgba)
+    background = random_backgrounds(0, len(batch.theta)).to(batch.theta.device)
+    images = torch.as_tensor(batch.images_rgba)
 
     def once(lap: Lap) -> None:
         step = FusedStep(avatar, [whole.optimizer])
@@ -153,7 +143,7 @@ def time_eager_parts(workload: AvatarWorkload, stopwatch: Stopwatch) -> dict[str
     """
     avatar, batch = workload.avatar, workload.batch
     optimizer = make_optimizer(avatar)
-    background = random_backgrounds(0, len(batch.theta))
+    background = random_backgrounds(0, len(batch.theta)).to(batch.theta.device)
     psi = avatar.weights(batch.theta)
     tangent = avatar.blendshapes.blend(psi)
     ratio = avatar.config.scale_with_triangle
@@ -184,7 +174,7 @@ def time_eager_parts(workload: AvatarWorkload, stopwatch: Stopwatch) -> dict[str
         "rasterize": lambda: rasterize(leaf, batch.cameras, background),
         "target": no_grad(lambda: composite(rgba_to_float(batch.images_rgba), background)),
         "loss": lambda: l1_loss(seen, target),
-        "loss, backward": lambda: _backward((loss,), (torch.ones(()),), seen),
+        "loss, backward": lambda: _backward((loss,), (torch.ones_like(loss),), seen),
         "rasterize, backward": lambda: _backward((image,), (image_gradient,), leaves),
         "to world, backward": lambda: _backward(outputs, outer, (*blended, *shared)),
         "blend and weights, backward": lambda: _backward(blended, inner, parameters),
@@ -199,14 +189,16 @@ def time_eager_parts(workload: AvatarWorkload, stopwatch: Stopwatch) -> dict[str
 def _report(
     workload: AvatarWorkload,
     facts: dict[str, Any],
-    whole: dict[str, Spread],
+    times: StepTimes,
     parts: dict[str, Spread],
     eager_parts: dict[str, Spread],
-    growth_bytes: int | None,
     trainer: dict[str, Any] | None,
 ) -> Report:
     batch = len(workload.batch.theta)
-    whole_ms = whole[WHOLE_STEP].median_ms
+    whole, growth_bytes = times.spreads, times.growth_bytes
+    whole_ms, device = whole[WHOLE_STEP].median_ms, workload.batch.theta.device
+    rasterizer = [eager_parts.get(name) for name in ("rasterize", "rasterize, backward")]
+    forward_ms, backward_ms = (part and part.median_ms / batch for part in rasterizer)
     peers = {
         name: {
             "whole_ms_per_image": spread.median_ms / batch,
@@ -214,7 +206,7 @@ def _report(
             "ratio": spread.median_ms / whole_ms,
             "threads": facts["threads"],
             "repetitions": spread.repetitions,
-            "parts": {part: times.median_ms for part, times in eager_parts.items()},
+            "parts": {part: s.median_ms for part, s in eager_parts.items() if name == EAGER_STEP},
         }
         for name, spread in whole.items()
         if name != WHOLE_STEP
@@ -231,8 +223,8 @@ def _report(
     return Report(
         benchmark="step",
         workload=facts,
-        forward_ms_per_image=eager_parts["rasterize"].median_ms / batch,
-        backward_ms_per_image=eager_parts["rasterize, backward"].median_ms / batch,
+        forward_ms_per_image=forward_ms,
+        backward_ms_per_image=backward_ms,
         images_per_second=1e3 * batch / whole_ms,
         frames_per_second=None,
         parts={name: part.median_ms for name, part in spread.items()},
@@ -240,10 +232,12 @@ def _report(
         pairs={"per_image": pairs / batch, "per_second": 1e3 * pairs / whole_ms},
         memory={
             "bytes_per_image": None if growth_bytes is None else growth_bytes // batch,
-            "method": PEAK_MEMORY_METHOD,
+            "method": peak_memory_method(device),
         },
-        floor=floor_figures(works, measure_speed(), batch, whole_ms / batch),
+        floor=floor_figures(works, measure_speed(device), batch, whole_ms / batch),
         peers=peers,
         machine=machine_facts(),
         trainer=trainer,
+        gpu_utilisation_percent=times.utilisation.percent,
+        gpu_utilisation_note=times.utilisation.note,
     )

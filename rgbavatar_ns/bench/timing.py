@@ -19,6 +19,14 @@ Lap = Callable[[str], None]
 """Called by what is timed, at the end of a part, with the part's name."""
 
 WHOLE = "whole"
+CPU = torch.device("cpu")
+
+
+def waiting_for(device: torch.device) -> Callable[[], None]:
+    """Return what waits until the device has done all that it was given; on a CPU nothing."""
+    if device.type == "cuda":
+        return lambda: torch.cuda.synchronize(device)
+    return lambda: None
 
 
 @dataclass(frozen=True)
@@ -41,12 +49,21 @@ class Spread:
 
 
 class Stopwatch:
-    """Times calls `repetitions` times after a warm-up, and says how far it is."""
+    """Times calls `repetitions` times after a warm-up, and says how far it is.
+
+    `wait` is called whenever the clock is read: what a device still has to do belongs to the part
+    that asked for it.
+    """
 
     def __init__(
-        self, repetitions: int, progress: Progress | None = None, *, warm_up: bool = True
+        self,
+        repetitions: int,
+        progress: Progress | None = None,
+        *,
+        warm_up: bool = True,
+        wait: Callable[[], None] | None = None,
     ) -> None:
-        self.repetitions = repetitions
+        self.repetitions, self._wait = repetitions, wait or waiting_for(CPU)
         self._warm_up = warm_up
         self._progress = progress or (lambda what, done, total: None)
 
@@ -66,9 +83,9 @@ class Stopwatch:
             if prepare is not None:
                 prepare()
             marks: list[tuple[str, float]] = []
-            start = time.perf_counter()
-            call(lambda name, marks=marks: marks.append((name, time.perf_counter())))
-            end = time.perf_counter()
+            start = self._now()
+            call(lambda name, marks=marks: marks.append((name, self._now())))
+            end = self._now()
             if repetition < 0:
                 continue
             last = start
@@ -78,6 +95,10 @@ class Stopwatch:
             seconds.setdefault(WHOLE, []).append(end - start)
         self._progress(what, self.repetitions, self.repetitions)
         return {name: Spread.of(values) for name, values in seconds.items()}
+
+    def _now(self) -> float:
+        self._wait()
+        return time.perf_counter()
 
 
 @contextmanager
@@ -99,11 +120,27 @@ PEAK_MEMORY_METHOD = (
 )
 
 
-def peak_growth_bytes(call: Callable[[], Any]) -> int | None:
-    """How far the process's resident memory rose above its level before the call.
+GPU_MEMORY_METHOD = (
+    "peak of the GPU memory in torch's tensors during one call less that before it; outputs, "
+    "gradients and buffers that are kept for later calls are in it, inputs are not"
+)
 
-    See PEAK_MEMORY_METHOD. None where the system does not tell (it needs Linux's /proc).
+
+def peak_memory_method(device: torch.device) -> str:
+    """What `peak_growth_bytes` measures there."""
+    return GPU_MEMORY_METHOD if device.type == "cuda" else PEAK_MEMORY_METHOD
+
+
+def peak_growth_bytes(call: Callable[[], Any], device: torch.device = CPU) -> int | None:
+    """How far the memory in use rose above its level before the call (see `peak_memory_method`).
+
+    None where the system does not tell: on a CPU it needs Linux's /proc.
     """
+    if device.type == "cuda":
+        torch.cuda.reset_peak_memory_stats(device)
+        before = torch.cuda.memory_allocated(device)
+        call()
+        return torch.cuda.max_memory_allocated(device) - before
     # With another C library, what it has freed but kept makes the growth look smaller.
     with suppress(OSError, AttributeError):
         ctypes.CDLL("libc.so.6").malloc_trim(0)

@@ -9,6 +9,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from rgbavatar_ns.avatar import Avatar
 from rgbavatar_ns.avatar.training import (
     TrainingBatch,
@@ -17,8 +19,9 @@ from rgbavatar_ns.avatar.training import (
     training_step,
 )
 from rgbavatar_ns.bench.options import StepOptions
-from rgbavatar_ns.bench.timing import Progress
-from rgbavatar_ns.bench.workloads import DEFAULT_SIZE_PX, read_images
+from rgbavatar_ns.bench.scenes import DEFAULT_SIZE_PX, on_device
+from rgbavatar_ns.bench.timing import Progress, waiting_for
+from rgbavatar_ns.bench.workloads import read_images
 from rgbavatar_ns.data import OfflineOrder, TrackedDataset, load_dataset
 from rgbavatar_ns.data.demo import DemoConfig, make_demo_dataset
 from rgbavatar_ns.head import HeadModel
@@ -28,7 +31,9 @@ _NUM_TEST_FRAMES = 2
 _SEED = 0
 
 
-def bench_trainer(options: StepOptions, progress: Progress | None = None) -> dict[str, Any]:
+def bench_trainer(
+    options: StepOptions, device: torch.device, progress: Progress | None = None
+) -> dict[str, Any]:
     """Train an avatar twice, by nerfstudio's trainer and by bare steps, and compare their speeds.
 
     On --data or on a small demo subject, without colour initialisation. The trainer's speed is
@@ -41,10 +46,12 @@ def bench_trainer(options: StepOptions, progress: Progress | None = None) -> dic
         else:
             dataset = load_dataset(options.data)
         config = _trainer_config(options, dataset, Path(folder))
+        config.machine.device_type = device.type
         summary = _train(config)
         model, datamanager = config.pipeline.model, config.pipeline.datamanager
         batch = min(datamanager.batch_size, len(dataset.train))
         avatar = Avatar(HeadModel(dataset.arrays), dataset.identity, model.avatar, seed=_SEED)
+        avatar = avatar.to(device)
         bare = _bare_images_per_second(avatar, dataset, batch, options.trainer_steps, progress)
     return {
         "images_per_second": summary["images_per_second"],
@@ -108,14 +115,16 @@ def _bare_images_per_second(
     order = OfflineOrder(dataset.train, batch, _SEED)
     images = read_images(dataset, dataset.train)
     options, optimizer = TrainingOptions(seed=_SEED, color_init=None), make_optimizer(avatar)
-    seconds = 0.0
+    device, seconds = avatar.identity.device, 0.0
+    wait = waiting_for(device)
     for step in range(steps):
         positions = order.batch(step)
         start = time.perf_counter()
         training = TrainingBatch(
             dataset.theta[positions], dataset.cameras.select(positions), images[positions]
         )
-        training_step(avatar, optimizer, training, step, options)
+        training_step(avatar, optimizer, on_device(training, device), step, options)
+        wait()
         seconds += time.perf_counter() - start
         if progress is not None:
             progress("bare steps beside the trainer", step + 1, steps)

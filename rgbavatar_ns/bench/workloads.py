@@ -1,4 +1,4 @@
-"""What is measured: the synthetic common workload, and avatars with theta, camera and pictures."""
+"""What is measured: avatars with theta, camera and pictures."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -6,69 +6,24 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 from torch import Tensor
 
 from rgbavatar_ns.avatar import Avatar, AvatarConfig
 from rgbavatar_ns.avatar.training import TrainingBatch
 from rgbavatar_ns.bench.options import AvatarOptions
+from rgbavatar_ns.bench.scenes import DEFAULT_SIZE_PX, front_camera, on_device
+from rgbavatar_ns.bench.timing import CPU
 from rgbavatar_ns.data import TrackedDataset, load_dataset
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadModel
-from rgbavatar_ns.kernels import GaussianSet, PinholeCameras
 
-DEFAULT_COUNT = 60_000
-DEFAULT_SIZE_PX = 512
 _THETA_DEVIATION = 0.05
-_HEAD_SHARE = 0.8
-"""Share of the image's height that the head takes without a dataset's camera."""
-
-
-def ellipsoid_scene(
-    count: int = DEFAULT_COUNT,
-    size_px: int = DEFAULT_SIZE_PX,
-    batch: int = 10,
-    *,
-    shared: bool = False,
-    seed: int = 0,
-) -> tuple[GaussianSet, PinholeCameras]:
-    """The common workload: Gaussians on a head-sized ellipsoid, and one camera for all images.
-
-    `shared` gives opacities and scales a leading dimension of 1. Everything in pixels grows with
-    the image, so that the number of pairs is proportional to its pixels.
-    """
-    generator = torch.Generator().manual_seed(seed)
-
-    def uniform(low: float, high: float, *size: int) -> Tensor:
-        return low + (high - low) * torch.rand(*size, generator=generator)
-
-    direction = torch.randn(batch, count, 3, generator=generator)
-    direction = direction / direction.norm(dim=-1, keepdim=True)
-    leading = 1 if shared else batch
-    # One pixel at 512 x 512 is 0.44 mm at the head's distance.
-    ranges_m = ((0.5e-3, 1.3e-3), (0.3e-3, 0.8e-3), (0.1e-3, 0.25e-3))
-    gaussians = GaussianSet(
-        means=direction * torch.tensor([0.085, 0.115, 0.1]),
-        quats_wxyz=torch.randn(batch, count, 4, generator=generator),
-        scales=torch.stack([uniform(*ends, leading, count) for ends in ranges_m], -1),
-        opacities=uniform(0.1, 0.95, leading, count),
-        colors=uniform(0.0, 1.0, batch, count, 3),
-    )
-    world_to_camera = torch.eye(4)[None].clone()
-    world_to_camera[0, 2, 3] = 1.0
-    cameras = PinholeCameras(
-        world_to_camera,
-        torch.full((1, 2), 4.4 * size_px),
-        torch.full((1, 2), size_px / 2),
-        size_px,
-        size_px,
-    )
-    return gaussians, cameras
 
 
 @dataclass(frozen=True)
 class AvatarWorkload:
-    """An avatar and a batch to draw or to train it with."""
+    """An avatar and a batch to draw or to train it with, on one device."""
 
     avatar: Avatar
     batch: TrainingBatch
@@ -77,7 +32,11 @@ class AvatarWorkload:
 
 
 def avatar_workload(
-    options: AvatarOptions, batch: int, *, with_images: bool = True
+    options: AvatarOptions,
+    batch: int,
+    *,
+    with_images: bool = True,
+    device: torch.device = CPU,
 ) -> AvatarWorkload:
     """The avatar that the options name, or a fresh one; driven by their dataset or at random.
 
@@ -101,8 +60,9 @@ def avatar_workload(
         "width_px": training.cameras.width,
         "height_px": training.cameras.height,
         "batch": batch,
+        "device": device.type,
     }
-    return AvatarWorkload(avatar, training, facts)
+    return AvatarWorkload(avatar.to(device), on_device(training, device), facts)
 
 
 def load_or_make(path: Path | None, dataset: TrackedDataset | None, config: AvatarConfig) -> Avatar:
@@ -150,20 +110,3 @@ def _batch(
 def read_images(dataset: TrackedDataset, positions: Sequence[int]) -> UInt8[Tensor, "B H W 4"]:
     """Decode these frames."""
     return torch.stack([torch.as_tensor(dataset.read_image(position)) for position in positions])
-
-
-def front_camera(avatar: Avatar, size_px: int) -> PinholeCameras:
-    """A camera a metre in front of the head, which takes most of the image's height."""
-    vertices: Float[Tensor, "V 3"] = torch.as_tensor(avatar.head.arrays.v_template).float()
-    low, high = vertices.amin(0), vertices.amax(0)
-    world_to_camera = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
-    shift = -world_to_camera[:3, :3] @ ((low + high) / 2)
-    world_to_camera[:3, 3] = shift + torch.tensor([0.0, 0.0, 1.0])
-    focal_px = _HEAD_SHARE * size_px / float(high[1] - low[1])
-    return PinholeCameras(
-        world_to_camera=world_to_camera[None],
-        focal_px=torch.full((1, 2), focal_px),
-        principal_point_px=torch.full((1, 2), size_px / 2),
-        width=size_px,
-        height=size_px,
-    )

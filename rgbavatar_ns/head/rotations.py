@@ -3,6 +3,7 @@
 Matrices act on columns, quaternions are real part first (wxyz), axis-angle is in radians.
 """
 
+import functools
 import math
 
 import roma
@@ -18,6 +19,13 @@ _CROSS_PRODUCT = (
 """What each component of v adds to the matrix of v x, row by row."""
 
 
+@functools.cache
+def _cross_product(dtype: torch.dtype, device: torch.device) -> Float[Tensor, "3 9"]:
+    """Copied to a device once: a copy in each call would keep a step out of a CUDA graph."""
+    with torch.inference_mode(False):
+        return torch.tensor(_CROSS_PRODUCT, dtype=dtype, device=device)
+
+
 def axis_angle_to_matrix(axis_angle: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
     """Rotation matrices of axis-angle vectors; zero gives the identity, with a finite gradient.
 
@@ -29,7 +37,7 @@ def axis_angle_to_matrix(axis_angle: Float[Tensor, "*batch 3"]) -> Float[Tensor,
     # torch.sinc(x) is sin(pi x) / (pi x); 1 - cos(a) = 2 sin(a / 2)^2 without cancellation.
     along_cross = torch.sinc(angle / math.pi)
     along_outer = 0.5 * torch.sinc(angle / (2 * math.pi)).square()
-    cross = axis_angle @ axis_angle.new_tensor(_CROSS_PRODUCT)
+    cross = axis_angle @ _cross_product(axis_angle.dtype, axis_angle.device)
     outer = axis_angle[..., :, None] * axis_angle[..., None, :]
     identity = torch.eye(3, dtype=axis_angle.dtype, device=axis_angle.device)
     about_axis = torch.addcmul(identity * torch.cos(angle), along_outer, outer)

@@ -6,8 +6,9 @@ from rgbavatar_ns.kernels.functional import (
     rasterize,
     weighted_color_average,
 )
-from rgbavatar_ns.kernels.registry import BlendedRenderer
+from rgbavatar_ns.kernels.registry import BlendedRenderer, DeviceRenderer
 from rgbavatar_ns.kernels.types import (
+    UPDATED_ATTRIBUTES,
     AdamParameter,
     BlendedGaussians,
     BlendedGradient,
@@ -18,10 +19,12 @@ from rgbavatar_ns.kernels.types import (
 )
 
 __all__ = [
+    "UPDATED_ATTRIBUTES",
     "AdamParameter",
     "BlendedGaussians",
     "BlendedGradient",
     "BlendedRenderer",
+    "DeviceRenderer",
     "GaussianSet",
     "PinholeCameras",
     "RenderedBatch",

@@ -8,7 +8,7 @@ from rgbavatar_ns.kernels.types import PinholeCameras
 
 
 def check_average_images(images: Tensor, weights: Tensor, cameras: PinholeCameras) -> None:
-    """Raise ValueError unless the images can be averaged over the sets that `weights` [B, K] pose."""
+    """Raise ValueError unless the images can be averaged over the sets of `weights` [B, K]."""
     _check_size(images, weights.dtype, cameras)
     if len(images) not in (1, len(weights)):
         raise ValueError(f"There are {len(images)} images for {len(weights)} sets.")

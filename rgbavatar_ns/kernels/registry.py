@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Protocol, runtime_checkable
 
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from rgbavatar_ns.kernels.types import (
@@ -60,6 +60,40 @@ class BlendedRenderer(Protocol):
 
 
 @runtime_checkable
+class DeviceRenderer(BlendedRenderer, Protocol):
+    """A renderer whose training steps need nothing from the host, so that they can be recorded."""
+
+    @property
+    def overflowed(self) -> Int[Tensor, ""]:
+        """1 where the last comparison found no room and updates change nothing, else 0."""
+        ...
+
+    def compare_with(
+        self,
+        images_rgba: UInt8[Tensor, "F H W 4"],
+        image_of: Int[Tensor, " B"],
+        background: Float[Tensor, "B 3"],
+    ) -> Float[Tensor, ""]:
+        """As `compare`, with each set's image chosen by its number."""
+        ...
+
+    def update_with(
+        self, parameters: Mapping[str, AdamParameter], numbers: Float[Tensor, "A 10"]
+    ) -> BlendedGradient:
+        """As `update`, with `AdamParameter.step_numbers` read on the device.
+
+        A row for each of UPDATED_ATTRIBUTES: the base's numbers, then its bases'.
+        """
+        ...
+
+    def update_parameter(
+        self, parameter: AdamParameter, gradient: Tensor, numbers: Float[Tensor, "10"]
+    ) -> None:
+        """Take the same step with any other parameter; none where the comparison overflowed."""
+        ...
+
+
+@runtime_checkable
 class Backend(Protocol):
     """What a rasterizer offers; shapes have been checked when its methods are called."""
 
@@ -107,7 +141,7 @@ _LOADERS = {
 
 _REMEDIES = {
     "cpu": "Reinstall the package with a C++17 compiler.",
-    "cuda": "Install cuda-bindings and nvidia-cuda-nvrtc as `pip install 'rgbavatar-ns[cuda]'` does.",
+    "cuda": "Install what is missing: pip install 'rgbavatar-ns[cuda]'.",
 }
 
 

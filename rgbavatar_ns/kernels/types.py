@@ -107,6 +107,16 @@ class BlendedGaussians:
     variant: Literal["normalized", "raw", "orthonormal"]
 
 
+UPDATED_ATTRIBUTES = (
+    "position",
+    "rotation_wxyz",
+    "color_feature",
+    "log_scale",
+    "opacity_logit",
+)
+"""What of blended Gaussians is trained; the first three have bases, named `basis_` and so."""
+
+
 @dataclass(frozen=True)
 class BlendedGradient:
     """The gradient of what poses blended Gaussians: `vertices` only when it was asked for."""

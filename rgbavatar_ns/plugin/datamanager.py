@@ -16,12 +16,16 @@ from nerfstudio.data.datamanagers.base_datamanager import DataManager
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader
+from rich.progress import track
+from torch import Tensor
 from torch.nn import Parameter
 
+from rgbavatar_ns.avatar.graphed_step import DeviceFrames
 from rgbavatar_ns.avatar.losses import random_backgrounds
 from rgbavatar_ns.data import ImageCache, OfflineOrder
 from rgbavatar_ns.data.check import quick_check
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.plugin.cameras import from_nerfstudio
 from rgbavatar_ns.plugin.dataparser import (
     FrameDataset,
     RGBAvatarDataParser,
@@ -30,6 +34,7 @@ from rgbavatar_ns.plugin.dataparser import (
 from rgbavatar_ns.plugin.errors import install_user_error_hook
 
 _MIB = 1 << 20
+_DECODED_TOGETHER = 32
 
 
 @runtime_checkable
@@ -62,6 +67,8 @@ class RGBAvatarDataManagerConfig(FullImageDatamanagerConfig):
     """Background threads that decode images."""
     prefetch_steps: int = 2
     """Steps whose images are decoded ahead."""
+    device_mib: int = 16384
+    """Budget for training images on a GPU in MiB; where all fit, it takes whole steps by itself."""
     check_data: bool = True
     """Refuse data whose head is not where its images show it (`rgbavatar check`), before the first
     step."""
@@ -178,6 +185,30 @@ class RGBAvatarDataManager(DataManager):
             rows = self._train_order.batch(step + ahead)
             self.image_cache.prefetch([positions[row] for row in rows])
         return batch
+
+    def device_frames(self) -> DeviceFrames | None:
+        """All training frames on the device; None where the images are beyond the budget."""
+        positions = self.dataparser.positions("train")
+        tracked = self.dataparser.tracked
+        each = tracked.width * tracked.height * 4
+        if len(positions) * each > self.config.device_mib * _MIB:
+            return None
+        shape = (len(positions), tracked.height, tracked.width, 4)
+        images = torch.empty(shape, dtype=torch.uint8, device=self.device)
+        chunks = range(0, len(positions), _DECODED_TOGETHER)
+        for first in track(chunks, "Images to the device...", transient=True):
+            chosen = positions[first : first + _DECODED_TOGETHER]
+            images[first : first + len(chosen)] = self.image_cache.get(chosen).to(self.device)
+        theta = (self._train_cameras.metadata or {})["theta"]
+        return DeviceFrames(theta, from_nerfstudio(self._train_cameras), images)
+
+    def next_choice(self, step: int) -> tuple[list[int], Tensor]:
+        """The frames of `step` among the training frames, and their backgrounds [B, 3].
+
+        The same as `next_train` shows.
+        """
+        rows = self._train_order.batch(step)
+        return rows, random_backgrounds(step, len(rows), self.seed)
 
     def next_eval(self, step: int) -> tuple[Cameras, dict[str, Any]]:
         """Some held-out frames, in the same form as a training batch."""

@@ -21,8 +21,10 @@ from torch import Tensor
 from torch.nn import Parameter
 
 from rgbavatar_ns.avatar import Avatar, AvatarConfig
+from rgbavatar_ns.avatar.adam_states import refusal
 from rgbavatar_ns.avatar.color_init import ColorInitSchedule
-from rgbavatar_ns.avatar.fused_step import FusedStep, refusal
+from rgbavatar_ns.avatar.fused_step import FusedStep
+from rgbavatar_ns.avatar.graphed_step import GraphedStep
 from rgbavatar_ns.avatar.losses import (
     LPIPSLoss,
     composite,
@@ -32,6 +34,7 @@ from rgbavatar_ns.avatar.losses import (
 from rgbavatar_ns.avatar.metrics import LPIPSMetric, evaluate_images
 from rgbavatar_ns.avatar.orthogonality import orthogonality_loss, orthogonalize
 from rgbavatar_ns.avatar.refinement import RefinementConfig
+from rgbavatar_ns.avatar.training import TrainingBatch
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.kernels import PinholeCameras, RenderedBatch
@@ -203,6 +206,7 @@ class RGBAvatarModel(Model):
             error = orthogonality_loss(self.avatar.blendshapes)
             losses["orthogonality"] = _ORTHOGONALITY_WEIGHT * error
         self._images_rgba = batch["image"]
+        self._shown = self._shown_batch
         return losses
 
     def can_fuse(self, step: int, optimizers: Iterable[torch.optim.Optimizer]) -> bool:
@@ -230,7 +234,23 @@ class RGBAvatarModel(Model):
             backend=self.config.rasterizer,
         )
         self._cameras, self._images_rgba = cameras, batch["image"]
+        self._shown = self._shown_batch
         return None if loss is None else {"l1": loss}
+
+    def graphed_losses(
+        self, graphed: GraphedStep, rows: list[int], background: Tensor
+    ) -> dict[str, Tensor]:
+        """Take a step on the training frames `rows` and return its losses."""
+        loss, frames = graphed(rows, background), graphed.frames
+        self._shown = lambda: TrainingBatch(
+            frames.theta[rows], frames.cameras.select(rows), frames.images_rgba[rows]
+        )
+        return {"l1": loss}
+
+    def _shown_batch(self) -> TrainingBatch:
+        """What a step through nerfstudio's cameras has shown."""
+        cameras = from_nerfstudio(self._cameras)
+        return TrainingBatch(self._theta.detach(), cameras, self._images_rgba)
 
     def driving_theta(self, positions: list[int]) -> Tensor:
         """What drives the avatar in these frames: [F H], tracked, and corrected or calibrated."""
@@ -290,9 +310,9 @@ class RGBAvatarModel(Model):
         """Initialise the colours of Gaussians that the batch of `step` shows for the first time."""
         if not self.color_schedule.due(step) or bool(self.avatar.color_initialized.all()):
             return
-        cameras = from_nerfstudio(self._cameras)
+        shown = self._shown()
         self.avatar.initialize_colors(
-            self._theta.detach(), cameras, self._images_rgba, backend=self.config.rasterizer
+            shown.theta, shown.cameras, shown.images_rgba, backend=self.config.rasterizer
         )
 
     def get_image_metrics_and_images(

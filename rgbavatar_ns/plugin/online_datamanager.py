@@ -166,6 +166,9 @@ class OnlineDataManager(RGBAvatarDataManager):
             "step": step,
         }
 
+    def device_frames(self) -> None:
+        """None: frames come and go."""
+
     def get_train_rays_per_batch(self) -> int:
         """Pixels of a whole batch."""
         tracked = self.dataparser.tracked

@@ -5,6 +5,7 @@
 
 import statistics
 from collections import defaultdict
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,12 +16,14 @@ from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineC
 from rich.progress import track
 from torch import Tensor
 
+from rgbavatar_ns.avatar.graphed_step import GraphedStep, Recorder, record_cuda_graph
 from rgbavatar_ns.avatar.metrics import LPIPSMetric, evaluate_images
 from rgbavatar_ns.avatar.orthogonality import orthogonality_error
 from rgbavatar_ns.avatar.refinement import fit_theta
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.plugin.cameras import from_nerfstudio
 from rgbavatar_ns.plugin.datamanager import RGBAvatarDataManager, RGBAvatarDataManagerConfig
+from rgbavatar_ns.plugin.device_training import recorded_step
 from rgbavatar_ns.plugin.model import RGBAvatarModel, RGBAvatarModelConfig
 
 
@@ -41,11 +44,15 @@ class RGBAvatarPipeline(VanillaPipeline):
     config: RGBAvatarPipelineConfig
     datamanager: RGBAvatarDataManager
     _model: RGBAvatarModel
+    recorder: Recorder = staticmethod(record_cuda_graph)
+    """How a step becomes one that the device takes by itself."""
 
     def __init__(
         self, config: RGBAvatarPipelineConfig, device: str | torch.device, **more: Any
     ) -> None:
         super().__init__(config, str(device), **more)
+        self._graphed: GraphedStep | None = None
+        self._graphed_tried = False
         self.model.viewer_panel.stage.film = self.datamanager.dataparser.tracked
 
     @property
@@ -64,8 +71,18 @@ class RGBAvatarPipeline(VanillaPipeline):
         plain = optimizers.optimizers.values()
         if not self.model.can_fuse(step, plain):
             return None
+        graphed = self._graphed_step(plain)
+        if graphed is not None:
+            return self.model.graphed_losses(graphed, *self.datamanager.next_choice(step))
         cameras, batch = self.datamanager.next_train(step)
         return self.model.fused_losses(cameras, batch, plain)
+
+    def _graphed_step(self, optimizers: Iterable[torch.optim.Optimizer]) -> GraphedStep | None:
+        """The step that the device takes by itself, made at the first call; None where none can."""
+        if not self._graphed_tried:
+            self._graphed_tried = True
+            self._graphed = recorded_step(self.model, self.datamanager, optimizers, self.recorder)
+        return self._graphed
 
     def get_average_eval_image_metrics(
         self, step: int | None = None, output_path: Path | None = None, get_std: bool = False

@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from rgbavatar_ns.avatar import Avatar, AvatarConfig
-from rgbavatar_ns.avatar.fused_step import FusedStep, refusal
+from rgbavatar_ns.avatar.adam_states import refusal
+from rgbavatar_ns.avatar.fused_step import FusedStep
 from rgbavatar_ns.avatar.losses import (
     random_backgrounds,
     require_images_of,

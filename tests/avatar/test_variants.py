@@ -4,7 +4,8 @@ import pytest
 import torch
 
 from rgbavatar_ns.avatar import Avatar, AvatarConfig
-from rgbavatar_ns.avatar.fused_step import FusedStep, refusal
+from rgbavatar_ns.avatar.adam_states import refusal
+from rgbavatar_ns.avatar.fused_step import FusedStep
 from rgbavatar_ns.errors import UserError
 
 from .small_head import NUM_EXPRESSION, front_camera, random_theta, small_head, small_identity

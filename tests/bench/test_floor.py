@@ -12,7 +12,7 @@ from rgbavatar_ns.bench.floor import (
     rasterizer_work,
     update_work,
 )
-from rgbavatar_ns.bench.workloads import ellipsoid_scene
+from rgbavatar_ns.bench.scenes import ellipsoid_scene
 
 SPEED = MachineSpeed(lane_operations_per_second=1e9, bytes_per_second=1e6)
 

@@ -3,7 +3,7 @@ import torch
 
 from rgbavatar_ns.bench.pairs import count_pairs
 from rgbavatar_ns.bench.projection import one_camera, one_image, project, row_spans, visible_index
-from rgbavatar_ns.bench.workloads import ellipsoid_scene
+from rgbavatar_ns.bench.scenes import ellipsoid_scene
 from rgbavatar_ns.kernels import GaussianSet, PinholeCameras
 from rgbavatar_ns.kernels.constants import DILATION_PX2, MIN_ALPHA
 from rgbavatar_ns.kernels.reference import project as reference_project

@@ -5,8 +5,8 @@ from rgbavatar_ns.bench.drawing import leaf_gaussians
 from rgbavatar_ns.bench.gsplat_torch import _weights, pixel_pairs
 from rgbavatar_ns.bench.pairs import count_pairs
 from rgbavatar_ns.bench.peers import PEERS, time_peers
+from rgbavatar_ns.bench.scenes import ellipsoid_scene
 from rgbavatar_ns.bench.timing import Stopwatch
-from rgbavatar_ns.bench.workloads import ellipsoid_scene
 from rgbavatar_ns.kernels import GaussianSet, PinholeCameras, rasterize
 from tests.kernels.scenes import relative_l2
 

@@ -12,10 +12,12 @@ from rgbavatar_ns.bench.floor import measure_speed
 from rgbavatar_ns.bench.options import RasterizerOptions, RenderOptions, StepOptions
 from rgbavatar_ns.bench.rasterizer import bench_rasterizer
 from rgbavatar_ns.bench.render import bench_render
-from rgbavatar_ns.bench.step import WholeStep, bench_step, parameters_of
-from rgbavatar_ns.bench.timing import Stopwatch
+from rgbavatar_ns.bench.scenes import ellipsoid_scene
+from rgbavatar_ns.bench.schemes import WholeStep, parameters_of
+from rgbavatar_ns.bench.step import bench_step
+from rgbavatar_ns.bench.timing import CPU, Stopwatch
 from rgbavatar_ns.bench.trainer import bench_trainer
-from rgbavatar_ns.bench.workloads import avatar_workload, ellipsoid_scene
+from rgbavatar_ns.bench.workloads import avatar_workload
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.kernels import rasterize
@@ -44,7 +46,7 @@ def small_probes(monkeypatch):
     """Measure the machine on small matrices: these tests ask for shapes, not for its speed."""
     speed = measure_speed(matrix_side=64, copy_mib=1, repetitions=1)
     for name in ("rasterizer", "step", "render"):
-        monkeypatch.setattr(f"rgbavatar_ns.bench.{name}.measure_speed", lambda: speed)
+        monkeypatch.setattr(f"rgbavatar_ns.bench.{name}.measure_speed", lambda device: speed)
 
 
 @pytest.fixture(scope="module")
@@ -154,7 +156,9 @@ def test_render_report(bundle):
 
 @pytest.mark.slow
 def test_the_trainer_is_compared_with_the_bare_step(dataset):
-    found = bench_trainer(StepOptions(data=dataset.root, uv=24, bases=2, batch=4, trainer_steps=6))
+    found = bench_trainer(
+        StepOptions(data=dataset.root, uv=24, bases=2, batch=4, trainer_steps=6), CPU
+    )
     assert found["steps"] == 6
     assert found["share_of_bare_step"] == pytest.approx(
         found["images_per_second"] / found["bare_images_per_second"]

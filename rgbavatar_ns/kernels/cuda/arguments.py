@@ -30,13 +30,12 @@ def fill(structure: str, values: Mapping[str, Any], device: torch.device) -> cty
     if names != set(values):
         raise TypeError(f"{structure}: missing or unknown {sorted(names ^ set(values))}.")
     out = structures()[structure]()
-    types = dict(structures()[structure]._fields_)  # pyright: ignore[reportArgumentType]
     for field in wanted:
         value = values[field.name]
         if field.pointed is not None:
             value = _address(structure, field.name, field.pointed, value, device)
         elif isinstance(value, Mapping):
-            value = fill(types[field.name].__name__, value, device)
+            value = fill(field.kind, value, device)
         setattr(out, field.name, value)
     return out
 

@@ -143,11 +143,16 @@ class CudaBackend:
         return None
 
     def _request(
-        self, gaussians: GaussianSet, cameras: PinholeCameras, batch: int, **wanted: bool
+        self,
+        gaussians: GaussianSet,
+        cameras: PinholeCameras,
+        batch: int,
+        with_depth: bool = False,
+        with_visibility: bool = False,
     ) -> _Request:
         device = gaussians.means.device
-        options = {"with_depth": False, "with_visibility": False} | wanted
-        return _Request(self.launcher(device), self.capacities(device), cameras, batch, **options)
+        launcher, capacities = self.launcher(device), self.capacities(device)
+        return _Request(launcher, capacities, cameras, batch, with_depth, with_visibility)
 
     def rasterize(
         self,
@@ -161,9 +166,7 @@ class CudaBackend:
         """As `functional.rasterize`; waits once for the length of the tiles' lists."""
         inputs = _attributes(gaussians)
         batch = max(t.shape[0] for t in (*inputs, background, cameras.focal_px))
-        request = self._request(
-            gaussians, cameras, batch, with_depth=with_depth, with_visibility=with_visibility
-        )
+        request = self._request(gaussians, cameras, batch, with_depth, with_visibility)
         image, alpha = _Rasterize.apply(request, *inputs, background)
         return RenderedBatch(image, alpha, request.depth, request.visibility)
 

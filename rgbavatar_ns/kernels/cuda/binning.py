@@ -79,7 +79,6 @@ class Capacities:
 
     def of(self, images: Images) -> int:
         """Entries to make room for."""
-        self._collect()
         each = self.per_image.get(self._key(images), max(_FIRST_GUESS * images.count, images.tiles))
         return min(each * images.batch, 2**31 - 1)
 
@@ -95,7 +94,8 @@ class Capacities:
         room = math.ceil(needed / batch * _ROOM) + 1
         self.per_image[key] = max(self.per_image.get(key, 0), room)
 
-    def _collect(self) -> None:
+    def collect(self) -> None:
+        """Learn from the reports that have arrived."""
         waiting = []
         for key, batch, read in self._reports:
             status = read()
@@ -130,6 +130,8 @@ class Bins:
         def integers(count: int, dtype: torch.dtype = torch.int32) -> Tensor:
             return torch.empty(count, dtype=dtype, device=device)
 
+        if not launcher.capturing():
+            capacities.collect()
         self._capacity = capacities.of(images)
         self._tensors = {
             "splats": torch.empty(places * _SPLAT_FLOATS, device=device),
@@ -173,8 +175,8 @@ class Bins:
             raise RuntimeError(
                 "A training step's lists overflowed and cannot be drawn. Render the batch anew."
             )
-        shared = {"frame": self.images.values()}
-        self._launcher.launch("scan", (1, 1), **shared, bins=self.values())
+        frame = self.images.values()
+        self._launcher.launch("scan", (1, 1), frame=frame, bins=self.values())
         if checked:
             needed = max(self.status.tolist()[: constants()["kOverflow"]])
             self._capacities.learn(self.images, needed)
@@ -183,12 +185,12 @@ class Bins:
                 self._tensors["entries"] = torch.empty(
                     self._capacity, dtype=torch.int64, device=self._launcher.device
                 )
-                self._launcher.launch("scan", (1, 1), **shared, bins=self.values())
+                self._launcher.launch("scan", (1, 1), frame=frame, bins=self.values())
         elif not self._launcher.capturing():
             self._capacities.await_report(self.images, self._launcher.read_later(self.status))
         grid = (blocks(self.images.count, "kTileThreads"), self.images.batch)
-        self._launcher.launch("scatter", grid, **shared, bins=self.values())
-        self._launcher.launch("sort", self.tile_grid, **shared, bins=self.values())
+        self._launcher.launch("scatter", grid, frame=frame, bins=self.values())
+        self._launcher.launch("sort", self.tile_grid, frame=frame, bins=self.values())
         self._sorted, self._checked = True, checked
 
     @property

@@ -15,6 +15,7 @@ from rgbavatar_ns.kernels.cuda.tiles import Tiles
 from rgbavatar_ns.kernels.functional import checked_background
 from rgbavatar_ns.kernels.types import (
     TANGENT_VARIANTS,
+    UPDATED_ATTRIBUTES,
     AdamParameter,
     BlendedGaussians,
     BlendedGradient,
@@ -23,15 +24,12 @@ from rgbavatar_ns.kernels.types import (
     WeightedColors,
 )
 
-_BLENDED = {
-    "position": "position",
-    "rotation": "rotation_wxyz",
-    "color": "color_feature",
-}
-"""What the bases change: its name in arguments.h and in BlendedGaussians."""
-_SHARED_BY_IMAGES = {"log_scale": "log_scale", "opacity_logit": "opacity_logit"}
-UPDATED = (*_BLENDED, *_SHARED_BY_IMAGES)
-"""The order of the numbers of Adam in `update_with`."""
+_SHORT = dict(
+    zip(UPDATED_ATTRIBUTES, ("position", "rotation", "color", "log_scale", "opacity_logit"))
+)
+"""Each attribute's name in arguments.h."""
+_BLENDED = UPDATED_ATTRIBUTES[:3]
+"""What the bases change."""
 
 
 class CudaBlendedRenderer:
@@ -49,9 +47,7 @@ class CudaBlendedRenderer:
         self._launcher, self._cameras = launcher, cameras
         self._weights = weights.detach().contiguous()
         self._values = _blended_values(gaussians, self._weights, vertices.detach().contiguous())
-        self._images = Images(
-            len(weights), len(gaussians.position), cameras.width, cameras.height
-        )
+        self._images = Images(len(weights), len(gaussians.position), cameras.width, cameras.height)
         self._slots: Tensor | None = None
         self._shared_bytes = 4 * constants()["kBlendImages"] * weights.shape[1]
         self._launch_by_triangle("frames")
@@ -86,9 +82,9 @@ class CudaBlendedRenderer:
         )
 
     @property
-    def status(self) -> Int[Tensor, "4"]:
-        """Of the tiles' lists, see arguments.h."""
-        return self._tiles.bins.status
+    def overflowed(self) -> Int[Tensor, ""]:
+        """1 where the last comparison found no room and updates change nothing, else 0."""
+        return self._tiles.bins.status[constants()["kOverflow"]]
 
     def draw(
         self,
@@ -122,7 +118,7 @@ class CudaBlendedRenderer:
     def compare_with(
         self,
         images_rgba: UInt8[Tensor, "F H W 4"],
-        image_of: Int[Tensor, "B"],
+        image_of: Int[Tensor, " B"],
         background: Float[Tensor, "B 3"],
     ) -> Float[Tensor, ""]:
         """As `compare`, with images chosen on the device: nothing is copied or waited for."""
@@ -137,26 +133,44 @@ class CudaBlendedRenderer:
         if parameters is not None:
             rows = [
                 _numbers(parameters[name]) + _numbers(parameters.get(f"basis_{name}"))
-                for name in (*_BLENDED.values(), *_SHARED_BY_IMAGES.values())
+                for name in UPDATED_ATTRIBUTES
             ]
             numbers = torch.tensor(rows).to(self._launcher.device, non_blocking=True)
-        return self.update_with(parameters, numbers, with_vertices=with_vertices)
+        return self._updated(parameters, numbers, with_vertices)
 
     def update_with(
+        self, parameters: Mapping[str, AdamParameter], numbers: Float[Tensor, "A 10"]
+    ) -> BlendedGradient:
+        """As `update`, with `AdamParameter.step_numbers` read on the device."""
+        return self._updated(parameters, numbers, False)
+
+    def update_parameter(
+        self, parameter: AdamParameter, gradient: Tensor, numbers: Float[Tensor, "10"]
+    ) -> None:
+        """Take the same step with any other parameter; none where the comparison overflowed."""
+        flat = gradient.reshape(1, -1).contiguous()
+        self._update_columns(flat, None, parameter, None, numbers)
+
+    def _updated(
         self,
         parameters: Mapping[str, AdamParameter] | None,
-        numbers: Float[Tensor, "5 10"] | None,
-        *,
-        with_vertices: bool = False,
+        numbers: Tensor | None,
+        with_vertices: bool,
     ) -> BlendedGradient:
-        """As `update`, with the numbers of Adam on the device (rows: UPDATED; base, then bases)."""
         if self._slots is None:
             raise ValueError("There is no gradient yet. Call compare() before update().")
         gradients = self._differentiate(with_vertices)
         weights = torch.zeros_like(self._weights)
-        for row, name in enumerate(UPDATED):
-            weights += self._update(
-                name, gradients[name], parameters, None if numbers is None else numbers[row]
+        for row, name in enumerate(UPDATED_ATTRIBUTES):
+            bases = self._values[f"basis_{_SHORT[name]}"] if name in _BLENDED else None
+            if parameters is None and bases is None:
+                continue
+            weights += self._update_columns(
+                gradients[_SHORT[name]],
+                bases,
+                None if parameters is None else parameters[name],
+                None if parameters is None else parameters.get(f"basis_{name}"),
+                None if numbers is None else numbers[row],
             )
         self._slots = None  # the parameters are others now
         vertices = self._vertex_gradient(gradients["carried"]) if with_vertices else None
@@ -178,30 +192,43 @@ class CudaBlendedRenderer:
         )
         return gradients
 
-    def _update(
+    def _update_columns(
         self,
-        name: str,
         gradient: Tensor,
-        parameters: Mapping[str, AdamParameter] | None,
-        numbers: Tensor | None,
+        bases: Tensor | None,
+        base: AdamParameter | None,
+        basis: AdamParameter | None,
+        numbers: Float[Tensor, "10"] | None,
     ) -> Tensor | float:
-        """Update one attribute and its bases; returns its part of the weights' gradient."""
-        bases = self._weights.shape[1] if name in _BLENDED else 0
-        if parameters is None and bases == 0:
-            return 0.0
-        field = (_BLENDED | _SHARED_BY_IMAGES)[name]
-        base = None if parameters is None else parameters[field]
-        basis = None if parameters is None or bases == 0 else parameters[f"basis_{field}"]
-        return update_columns(
-            self._launcher,
-            gradient,
-            self._weights,
-            self._values[f"basis_{name}"] if bases else None,
-            base,
-            basis,
-            numbers,
-            self.status,
+        """One step of Adam for an attribute (gradient [B, ...]) and its bases, where given.
+
+        Returns the gradient of the weights [B, K], 0 without bases.
+        """
+        batch, num_bases = len(gradient), 0 if bases is None else len(bases)
+        columns = gradient[0].numel()
+        count = blocks(columns, "kTileThreads")
+        sums = gradient.new_zeros(count, batch, num_bases) if num_bases else None
+        warps = constants()["kTileThreads"] // 32
+        self._launcher.launch(
+            "update",
+            (count, 1),
+            4 * (batch * num_bases + warps * batch),
+            batch=batch,
+            columns=columns,
+            bases=num_bases,
+            gradient=gradient,
+            weights=self._weights,
+            base=None if base is None else base.value.detach(),
+            base_first=None if base is None else base.first_moment,
+            base_second=None if base is None else base.second_moment,
+            basis=bases,
+            basis_first=None if basis is None else basis.first_moment,
+            basis_second=None if basis is None else basis.second_moment,
+            numbers=numbers,
+            weight_sums=sums,
+            status=self._tiles.bins.status,
         )
+        return 0.0 if sums is None else sums.sum(0)
 
     def _vertex_gradient(self, carried: Tensor) -> Tensor:
         """Gradients of the frames' parts, then of the corners, then of the vertices."""
@@ -230,47 +257,6 @@ class CudaBlendedRenderer:
         )
 
 
-def update_columns(
-    launcher: Launcher,
-    gradient: Tensor,
-    weights: Tensor,
-    basis_values: Tensor | None,
-    base: AdamParameter | None,
-    basis: AdamParameter | None,
-    numbers: Float[Tensor, "10"] | None,
-    status: Tensor,
-) -> Tensor | float:
-    """One step of Adam for an attribute (gradient [B, ...]) and its bases, where they are given.
-
-    Returns the gradient of the weights [B, K], 0 without bases.
-    """
-    batch, bases = len(gradient), 0 if basis_values is None else weights.shape[1]
-    columns = gradient[0].numel()
-    count = blocks(columns, "kTileThreads")
-    sums = weights.new_zeros(count, batch, bases) if bases else None
-    warps = constants()["kTileThreads"] // 32
-    launcher.launch(
-        "update",
-        (count, 1),
-        4 * (batch * bases + warps * batch),
-        batch=batch,
-        columns=columns,
-        bases=bases,
-        gradient=gradient,
-        weights=weights,
-        base=None if base is None else base.value.detach(),
-        base_first=None if base is None else base.first_moment,
-        base_second=None if base is None else base.second_moment,
-        basis=basis_values,
-        basis_first=None if basis is None else basis.first_moment,
-        basis_second=None if basis is None else basis.second_moment,
-        numbers=numbers,
-        weight_sums=sums,
-        status=status,
-    )
-    return 0.0 if sums is None else sums.sum(0)
-
-
 def _blended_values(
     gaussians: BlendedGaussians, weights: Tensor, vertices: Tensor
 ) -> dict[str, Any]:
@@ -285,9 +271,8 @@ def _blended_values(
     triangles = len(edges)
     return {
         "weights": weights,
-        **{short: tensors[name] for short, name in _BLENDED.items()},
-        **{f"basis_{short}": tensors[f"basis_{name}"] for short, name in _BLENDED.items()},
-        **{name: tensors[name] for name in _SHARED_BY_IMAGES},
+        **{short: tensors[name] for name, short in _SHORT.items()},
+        **{f"basis_{_SHORT[name]}": tensors[f"basis_{name}"] for name in _BLENDED},
         "barycentric": tensors["barycentric"],
         "triangle_of": tensors["triangle_of"],
         "triangle_vertices": tensors["triangle_vertices"],

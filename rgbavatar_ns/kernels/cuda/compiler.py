@@ -4,9 +4,11 @@ import contextlib
 import os
 import re
 import tempfile
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
-from cuda.bindings import nvrtc
+from cuda.bindings import nvrtc  # pyright: ignore[reportAttributeAccessIssue]
 
 from rgbavatar_ns.kernels.cuda.source import MAIN, source_hash, sources
 
@@ -60,7 +62,22 @@ def _target(architecture: str) -> str:
     return f"compute_{max(n for n in known if n <= max(int(match[1]), OLDEST))}"
 
 
+def resource_report(architecture: str) -> str:
+    """What the assembler says of each kernel's registers, shared memory and spills."""
+    with _compiled(_target(architecture), "--ptxas-options=-v") as program:
+        return _log(program)
+
+
 def _compile(target: str) -> bytes:
+    with _compiled(target) as program:
+        if target.startswith("compute_"):
+            return _output(program, nvrtc.nvrtcGetPTXSize, nvrtc.nvrtcGetPTX)
+        return _output(program, nvrtc.nvrtcGetCUBINSize, nvrtc.nvrtcGetCUBIN)
+
+
+@contextlib.contextmanager
+def _compiled(target: str, *more: str) -> Iterator[Any]:
+    """NVRTC's program of all kernels."""
     texts = dict(sources())
     main = texts.pop(MAIN)
     program = _checked(
@@ -73,34 +90,32 @@ def _compile(target: str) -> bytes:
         ),
         "take the sources",
     )
-    options = [f"--gpu-architecture={target}".encode(), b"--std=c++17"]
+    options = [f"--gpu-architecture={target}", "--std=c++17", *more]
     try:
-        (error,) = nvrtc.nvrtcCompileProgram(program, len(options), options)
+        (error,) = nvrtc.nvrtcCompileProgram(program, len(options), [o.encode() for o in options])
         if error != nvrtc.nvrtcResult.NVRTC_SUCCESS:
             raise KernelCompileError(
                 f"NVRTC could not compile the kernels for {target}:\n{_log(program)}\nIf the "
                 "sources are unchanged, reinstall cuda-bindings and nvidia-cuda-nvrtc of one "
                 "version, or train on the CPU: --machine.device-type cpu."
             )
-        if target.startswith("compute_"):
-            return _output(program, nvrtc.nvrtcGetPTXSize, nvrtc.nvrtcGetPTX)
-        return _output(program, nvrtc.nvrtcGetCUBINSize, nvrtc.nvrtcGetCUBIN)
+        yield program
     finally:
         nvrtc.nvrtcDestroyProgram(program)
 
 
-def _output(program, size, get) -> bytes:
+def _output(program: Any, size: Callable[..., tuple], get: Callable[..., tuple]) -> bytes:
     out = bytes(_checked(size(program), "give its output's size"))
     _checked(get(program, out), "give its output")
     return out
 
 
-def _log(program) -> str:
+def _log(program: Any) -> str:
     log = _output(program, nvrtc.nvrtcGetProgramLogSize, nvrtc.nvrtcGetProgramLog)
     return log.rstrip(b"\0").decode(errors="replace").strip()
 
 
-def _checked(result: tuple, doing: str):
+def _checked(result: tuple, doing: str) -> Any:
     error, *values = result
     if error != nvrtc.nvrtcResult.NVRTC_SUCCESS:
         raise KernelCompileError(

@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
-from cuda.bindings import driver
+from cuda.bindings import driver  # pyright: ignore[reportAttributeAccessIssue]
 from torch import Tensor
 
 from rgbavatar_ns.kernels.cuda.arguments import fill
@@ -36,7 +36,9 @@ class CudaLauncher:
         """The GPU."""
         return self._device
 
-    def launch(self, kernel: str, grid: Sequence[int], shared_bytes: int = 0, **values: Any) -> None:
+    def launch(
+        self, kernel: str, grid: Sequence[int], shared_bytes: int = 0, **values: Any
+    ) -> None:
         """See `Launcher`."""
         known = kernels()[kernel]
         arguments = fill(known.arguments.__name__, values, self._device)

@@ -16,7 +16,9 @@ class Launcher(Protocol):
         """Where the kernels' tensors must lie."""
         ...
 
-    def launch(self, kernel: str, grid: Sequence[int], shared_bytes: int = 0, **values: Any) -> None:
+    def launch(
+        self, kernel: str, grid: Sequence[int], shared_bytes: int = 0, **values: Any
+    ) -> None:
         """Start a kernel on `grid` blocks with the named values of its argument structure."""
         ...
 

@@ -22,10 +22,16 @@ _CONSTANT = re.compile(r"\b(k[A-Z]\w*) = (\d+)[,; ]")
 
 @dataclass(frozen=True)
 class Field:
-    """One argument: `pointed` is the type behind a pointer, None for numbers and structures."""
+    """One argument: of a plain type, or a pointer to one, or a structure."""
 
     name: str
-    pointed: str | None
+    kind: str
+    is_pointer: bool
+
+    @property
+    def pointed(self) -> str | None:
+        """The type behind a pointer."""
+        return self.kind if self.is_pointer else None
 
 
 @dataclass(frozen=True)
@@ -88,7 +94,7 @@ def fields(structure: str) -> tuple[Field, ...]:
 
 def _fields(body: str) -> Iterator[Field]:
     for match in filter(None, map(_FIELD.match, body.splitlines())):
-        yield Field(match[3], match[1] if match[2] else None)
+        yield Field(match[3], match[1], bool(match[2]))
 
 
 @functools.cache

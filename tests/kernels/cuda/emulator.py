@@ -57,7 +57,9 @@ class EmulatedLauncher:
     def __init__(self, seed: int = 0) -> None:
         self.seed, self.launched, self.pending = seed, [], False
 
-    def launch(self, kernel: str, grid: Sequence[int], shared_bytes: int = 0, **values: Any) -> None:
+    def launch(
+        self, kernel: str, grid: Sequence[int], shared_bytes: int = 0, **values: Any
+    ) -> None:
         known = source.kernels()[kernel]
         arguments = fill(known.arguments.__name__, values, self.device)
         assert shared_bytes <= 96 << 10, "more than every GPU of sm_75 or newer has"

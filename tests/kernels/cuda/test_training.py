@@ -5,7 +5,6 @@ import torch
 
 from rgbavatar_ns.avatar.fused_step import FusedStep
 from rgbavatar_ns.avatar.training import make_optimizer
-from tests.avatar.conftest import make_avatar  # noqa: F401  (a fixture)
 from tests.avatar.fused_scene import (
     eager_step,
     far_batch,
@@ -71,7 +70,10 @@ def test_parameters_after_some_steps(emulated, make_avatar):
         for _ in range(8):
             step(avatar, optimizer, batch, background)
         ends.append(
-            {n: torch.cat([p.detach().flatten() for p in ps]) for n, ps in avatar.parameter_groups().items()}
+            {
+                n: torch.cat([p.detach().flatten() for p in ps])
+                for n, ps in avatar.parameter_groups().items()
+            }
         )
     assert max(relative_differences(*ends).values()) < 1e-3
 
@@ -121,7 +123,9 @@ def test_a_step_that_overflows_changes_nothing_and_is_counted_and_the_next_has_r
     avatar = stir(make_avatar())
     capacities, batch, background = _crowd(emulated, avatar, 5)
     step = FusedStep(avatar, [make_optimizer(avatar)])
-    before = [p.detach().clone() for ps in list(avatar.parameter_groups().values())[:-1] for p in ps]
+    before = [
+        p.detach().clone() for ps in list(avatar.parameter_groups().values())[:-1] for p in ps
+    ]
 
     def changed() -> bool:
         parameters = [p for ps in list(avatar.parameter_groups().values())[:-1] for p in ps]

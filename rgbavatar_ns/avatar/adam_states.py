@@ -1,0 +1,93 @@
+"""torch's Adam optimisers, whose state and learning rates steps without autograd use."""
+
+from collections.abc import Iterable
+
+import torch
+from torch import Tensor
+
+from rgbavatar_ns.avatar.avatar import Avatar
+from rgbavatar_ns.kernels import AdamParameter
+
+_GROUPS = {
+    "position": "position",
+    "rotation_wxyz": "rotation",
+    "color_feature": "color",
+    "log_scale": "log_scale",
+    "opacity_logit": "opacity",
+    "basis_position": "basis_position",
+    "basis_rotation_wxyz": "basis_rotation",
+    "basis_color_feature": "basis_color",
+}
+"""The parameter group of each of the Gaussians' tensors."""
+
+_PLAIN_ADAM = {"weight_decay": 0, "amsgrad": False, "maximize": False, "differentiable": False}
+
+
+class AdamStates:
+    """Every parameter's next update; checkpoints stay those of the optimisers.
+
+    Raises:
+        ValueError: `refusal` gives a reason for these optimisers.
+    """
+
+    def __init__(self, avatar: Avatar, optimizers: Iterable[torch.optim.Optimizer]) -> None:
+        self.optimizers = list(optimizers)
+        reason = refusal(avatar, self.optimizers)
+        if reason is not None:
+            raise ValueError(f"The fused step cannot be used: {reason}. Use the eager one.")
+        self._homes = _homes(self.optimizers)
+        groups = avatar.parameter_groups()
+        self._gaussians = {n: groups[g][0] for n, g in _GROUPS.items() if g in groups}
+        self._network = groups.get("weight_network", [])
+
+    def next_of_gaussians(self) -> dict[str, AdamParameter]:
+        """The next update of each of the Gaussians' tensors, by its name; counts them."""
+        return {name: self._next(value) for name, value in self._gaussians.items()}
+
+    def next_of_network(self) -> list[AdamParameter]:
+        """The next update of each tensor of the weight network; counts them."""
+        return [self._next(value) for value in self._network]
+
+    def _next(self, value: Tensor) -> AdamParameter:
+        optimizer, group = self._homes[value]
+        state = optimizer.state[value]
+        if not state:
+            # As torch.optim.Adam begins, so that either path can go on from the other's state.
+            state["step"] = torch.zeros((), dtype=torch.float32)
+            state["exp_avg"] = torch.zeros_like(value)
+            state["exp_avg_sq"] = torch.zeros_like(value)
+        state["step"] += 1
+        return AdamParameter(
+            value=value,
+            first_moment=state["exp_avg"],
+            second_moment=state["exp_avg_sq"],
+            learning_rate=float(group["lr"]),
+            betas=(float(group["betas"][0]), float(group["betas"][1])),
+            epsilon=float(group["eps"]),
+            step=int(state["step"]),
+        )
+
+
+def refusal(avatar: Avatar, optimizers: Iterable[torch.optim.Optimizer]) -> str | None:
+    """Return why the fused step cannot train this avatar with these optimisers; None if it can."""
+    homes = _homes(optimizers)
+    for name, parameters in avatar.parameter_groups().items():
+        for parameter in parameters:
+            if parameter not in homes:
+                return f"no optimiser holds the parameters of {name}"
+            optimizer, group = homes[parameter]
+            if type(optimizer) is not torch.optim.Adam:
+                return f"the optimiser of {name} is {type(optimizer).__name__}, not Adam"
+            for option, plain in _PLAIN_ADAM.items():
+                if group[option] != plain:
+                    return f"the optimiser of {name} has {option}={group[option]}"
+            if not parameter.is_contiguous():
+                return f"the parameters of {name} are not contiguous"
+    return None
+
+
+def _homes(
+    optimizers: Iterable[torch.optim.Optimizer],
+) -> dict[Tensor, tuple[torch.optim.Optimizer, dict]]:
+    """Each parameter's optimiser and group."""
+    return {p: (o, g) for o in optimizers for g in o.param_groups for p in g["params"]}

@@ -1,0 +1,121 @@
+"""The kernels compile for every architecture, with no GPU; what goes wrong is told."""
+
+import ctypes
+import re
+
+import pytest
+import torch
+
+from rgbavatar_ns.kernels import constants
+from rgbavatar_ns.kernels.cuda import arguments, source
+from tests.kernels.cuda import emulator
+
+try:
+    from rgbavatar_ns.kernels.cuda import compiler
+except ImportError:
+    compiler = None
+
+ARCHITECTURES = ("sm_75", "sm_80", "sm_86", "sm_89", "sm_90", "sm_120")
+needs_nvrtc = pytest.mark.skipif(compiler is None, reason="cuda-bindings are not installed")
+
+
+@pytest.fixture
+def own_cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("RGBAVATAR_CACHE", str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+@needs_nvrtc
+@pytest.mark.parametrize("architecture", ARCHITECTURES)
+def test_compiles(architecture):
+    assert compiler is not None
+    code = compiler.compile_kernels(architecture, cache=False)
+    assert code.startswith(b"\x7fELF")
+    for kernel in source.kernels():
+        assert f"{kernel}_kernel".encode() in code
+
+
+@needs_nvrtc
+def test_nothing_spills(monkeypatch):
+    """A value that leaves the registers costs more than what is computed with it."""
+    assert compiler is not None
+    log = compiler.resource_report("sm_90")
+    spills = re.findall(r"(\d+) bytes spill stores", log)
+    assert len(spills) == len(source.kernels())
+    assert set(spills) == {"0"}
+
+
+@needs_nvrtc
+def test_a_newer_gpu_gets_ptx_and_an_older_one_the_reason():
+    assert compiler is not None
+    assert b".target sm_" in compiler.compile_kernels("sm_999", cache=False)
+    with pytest.raises(compiler.KernelCompileError, match=r"sm_75 .*sm_61.*device-type cpu"):
+        compiler.compile_kernels("sm_61")
+
+
+@needs_nvrtc
+def test_what_was_compiled_is_kept(own_cache, monkeypatch):
+    assert compiler is not None
+    code = compiler.compile_kernels("sm_90")
+    assert len(list(own_cache.iterdir())) == 1
+    monkeypatch.setattr(compiler, "_compile", lambda target: pytest.fail("compiled again"))
+    assert compiler.compile_kernels("sm_90") == code
+
+
+@needs_nvrtc
+def test_a_cache_that_cannot_be_written_is_done_without(own_cache, monkeypatch):
+    assert compiler is not None
+    own_cache.write_text("a file where the folder should be")
+    monkeypatch.setattr(compiler, "_compile", lambda target: b"code")
+    assert compiler.compile_kernels("sm_90") == b"code"
+
+
+@needs_nvrtc
+def test_a_failure_shows_nvrtc_s_log(own_cache, monkeypatch):
+    assert compiler is not None
+    broken = source.sources() | {"project.cuh": "int broken = ;"}
+    monkeypatch.setattr(compiler, "sources", lambda: broken)
+    with pytest.raises(compiler.KernelCompileError, match=r"(?s)project\.cuh.*expected an express"):
+        compiler.compile_kernels("sm_90")
+    assert not own_cache.exists()
+
+
+@pytest.mark.skipif(emulator.compiler() is None, reason="no g++ to emulate CUDA with")
+def test_structures_are_laid_out_as_the_compiler_s():
+    for name, kernel in source.kernels().items():
+        wanted = getattr(emulator.library(), f"{name}_argument_bytes")()
+        assert ctypes.sizeof(kernel.arguments) == wanted, name
+
+
+def test_the_sources_have_what_the_specification_says():
+    texts = source.sources()
+    assert source.constants()["kTileSide"] % constants.BLOCK_PX == 0
+    assert set(source.kernels()) >= {"project", "blend", "sort", "draw", "train", "update"}
+    assert {"kernels.cu", "arguments.h", "gaussian_math.h", "tangent_math.h"} <= set(texts)
+
+
+def _frame(**changes):
+    values = {"batch": 1, "count": 2, "width": 3, "height": 4, "tiles_x": 1, "tiles_y": 1}
+    return values | changes
+
+
+def test_values_that_do_not_fit_are_refused():
+    cpu = torch.device("cpu")
+    filled = arguments.fill("Frame", _frame(), cpu)
+    assert (filled.batch, filled.height) == (1, 4)
+    with pytest.raises(TypeError, match=r"missing or unknown.*depth"):
+        arguments.fill("Frame", _frame(depth=1), cpu)
+    cameras = {
+        "world_to_camera": torch.eye(4)[None],
+        "focal_px": torch.ones(1, 2),
+        "principal_point_px": torch.ones(1, 2),
+        "count": 1,
+    }
+    assert arguments.fill("CameraArrays", cameras, cpu).count == 1
+    for name, wrong in (
+        ("focal_px", torch.ones(1, 2, dtype=torch.float64)),
+        ("world_to_camera", torch.ones(1, 4, 4).expand(2, 4, 4)),
+        ("focal_px", torch.ones(1, 2, device="meta")),
+    ):
+        with pytest.raises(TypeError, match=name):
+            arguments.fill("CameraArrays", cameras | {name: wrong}, cpu)
