@@ -10,7 +10,7 @@ def run() -> None:
     import torch
 
     import rgbavatar_ns
-    from rgbavatar_ns.kernels import available_backends
+    from rgbavatar_ns.kernels import available_backends, unavailable_backends
 
     cuda = torch.cuda.get_device_name(0) if torch.cuda.is_available() else "none"
     rows = {
@@ -21,6 +21,7 @@ def run() -> None:
         "cpu": f"{os.cpu_count()} cores, {torch.get_num_threads()} threads used",
         "cuda": cuda,
         "rasterizer backends": ", ".join(available_backends()),
+        **{f"  without {name}": reason for name, reason in unavailable_backends().items()},
     }
     width = max(map(len, rows))
     for name, value in rows.items():

@@ -6,12 +6,13 @@ from rgbavatar_ns.kernels.functional import (
     rasterize,
     weighted_color_average,
 )
-from rgbavatar_ns.kernels.registry import BlendedRenderer, DeviceRenderer
+from rgbavatar_ns.kernels.registry import BlendedRenderer, DeviceRenderer, unavailable_backends
 from rgbavatar_ns.kernels.types import (
     UPDATED_ATTRIBUTES,
     AdamParameter,
     BlendedGaussians,
     BlendedGradient,
+    DeviceError,
     GaussianSet,
     PinholeCameras,
     RenderedBatch,
@@ -24,6 +25,7 @@ __all__ = [
     "BlendedGaussians",
     "BlendedGradient",
     "BlendedRenderer",
+    "DeviceError",
     "DeviceRenderer",
     "GaussianSet",
     "PinholeCameras",
@@ -32,5 +34,6 @@ __all__ = [
     "available_backends",
     "blended_renderer",
     "rasterize",
+    "unavailable_backends",
     "weighted_color_average",
 ]

@@ -158,6 +158,12 @@ def available_backends() -> tuple[str, ...]:
     return tuple(name for name in _LOADERS if not isinstance(_load(name), ImportError))
 
 
+def unavailable_backends() -> dict[str, str]:
+    """Why the others cannot be used, by their names."""
+    errors = {name: _load(name) for name in _LOADERS}
+    return {name: str(e) for name, e in errors.items() if isinstance(e, ImportError)}
+
+
 def choose(name: str, device: torch.device, dtype: torch.dtype) -> Backend:
     """The named backend, or for "auto" the first that takes such tensors.
 

@@ -12,6 +12,14 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 
+class DeviceError(RuntimeError):
+    """A GPU, its driver or its compiler cannot do what was asked; says why and what to do."""
+
+    def __init__(self, cause: str, remedy: str) -> None:
+        self.cause, self.remedy = cause, remedy
+        super().__init__(f"{cause} {remedy}")
+
+
 @dataclass(frozen=True)
 class GaussianSet:
     """B sets of N world-space Gaussians; a leading 1 stands for all B sets.

@@ -21,7 +21,7 @@ from nerfstudio.viewer.viewer import Viewer
 
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.plugin.checkpoints import load_newest, read_checkpoint, save_checkpoint
-from rgbavatar_ns.plugin.errors import install_user_error_hook
+from rgbavatar_ns.plugin.errors import device_errors_told, install_user_error_hook
 from rgbavatar_ns.plugin.interruption import StopRequest
 from rgbavatar_ns.plugin.optimizers import ExponentialConfig
 from rgbavatar_ns.plugin.pipeline import RGBAvatarPipeline, RGBAvatarPipelineConfig
@@ -128,7 +128,8 @@ class RGBAvatarTrainer(Trainer):
                 if self._wait_while_paused():
                     break
                 began = time.monotonic()
-                parts = self._train_one(step)
+                with device_errors_told(self.checkpoint_dir):
+                    parts = self._train_one(step)
                 self.step = step
                 seconds = time.monotonic() - began
                 self._train_seconds += seconds

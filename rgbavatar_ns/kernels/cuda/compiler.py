@@ -11,13 +11,14 @@ from typing import Any
 from cuda.bindings import nvrtc  # pyright: ignore[reportAttributeAccessIssue]
 
 from rgbavatar_ns.kernels.cuda.source import MAIN, source_hash, sources
+from rgbavatar_ns.kernels.types import DeviceError
 
 OLDEST = 75
 """The oldest architecture that the kernels are written for: Turing."""
 
 
-class KernelCompileError(RuntimeError):
-    """The kernels could not be compiled; says why and what to do."""
+_REINSTALL = "reinstall cuda-bindings and nvidia-cuda-nvrtc of one version."
+_CPU_INSTEAD = "Or train on the CPU: --machine.device-type cpu."
 
 
 def cache_folder() -> Path:
@@ -32,7 +33,7 @@ def compile_kernels(architecture: str, *, cache: bool = True) -> bytes:
     """Return the machine code of all kernels for an architecture such as "sm_90".
 
     For a GPU newer than the compiler it is PTX of the newest architecture known, which the driver
-    translates. Raises KernelCompileError for GPUs older than sm_75 and where NVRTC fails, with its
+    translates. Raises DeviceError for GPUs older than sm_75 and where NVRTC fails, with its
     log.
     """
     target = _target(architecture)
@@ -52,9 +53,10 @@ def _target(architecture: str) -> str:
     """The architecture itself, or the newest one known as a virtual one."""
     match = re.fullmatch(r"sm_(\d+)", architecture)
     if match is None or int(match[1]) < OLDEST:
-        raise KernelCompileError(
+        raise DeviceError(
             f"The kernels need a GPU of architecture sm_{OLDEST} (Turing) or newer; this one is "
-            f"{architecture}. Train on the CPU: --machine.device-type cpu."
+            f"{architecture}.",
+            f"Use another GPU. {_CPU_INSTEAD}",
         )
     known = _checked(nvrtc.nvrtcGetSupportedArchs(), "list its architectures")
     if int(match[1]) in known:
@@ -94,10 +96,9 @@ def _compiled(target: str, *more: str) -> Iterator[Any]:
     try:
         (error,) = nvrtc.nvrtcCompileProgram(program, len(options), [o.encode() for o in options])
         if error != nvrtc.nvrtcResult.NVRTC_SUCCESS:
-            raise KernelCompileError(
-                f"NVRTC could not compile the kernels for {target}:\n{_log(program)}\nIf the "
-                "sources are unchanged, reinstall cuda-bindings and nvidia-cuda-nvrtc of one "
-                "version, or train on the CPU: --machine.device-type cpu."
+            raise DeviceError(
+                f"NVRTC could not compile the kernels for {target}:\n{_log(program)}",
+                f"If the sources are unchanged, {_REINSTALL} {_CPU_INSTEAD}",
             )
         yield program
     finally:
@@ -118,8 +119,8 @@ def _log(program: Any) -> str:
 def _checked(result: tuple, doing: str) -> Any:
     error, *values = result
     if error != nvrtc.nvrtcResult.NVRTC_SUCCESS:
-        raise KernelCompileError(
-            f"NVRTC could not {doing} ({error}). Reinstall cuda-bindings and nvidia-cuda-nvrtc."
+        raise DeviceError(
+            f"NVRTC could not {doing} ({error}).", f"To mend it, {_REINSTALL} {_CPU_INSTEAD}"
         )
     return values[0] if len(values) == 1 else values
 

@@ -10,6 +10,7 @@ from torch import Tensor
 from rgbavatar_ns.kernels.cuda.arguments import fill
 from rgbavatar_ns.kernels.cuda.compiler import compile_kernels
 from rgbavatar_ns.kernels.cuda.source import kernels
+from rgbavatar_ns.kernels.types import DeviceError
 
 
 class CudaLauncher:
@@ -85,9 +86,9 @@ def _checked(result: tuple, doing: str) -> Any:
     if error == driver.CUresult.CUDA_SUCCESS:
         return values[0] if values else None
     _, name = driver.cuGetErrorName(error)
-    raise RuntimeError(
-        f"The GPU's driver could not {doing}: {name.decode() if name else error}. If it is older "
-        "than the cuda-bindings that are installed, update the driver or install the bindings of "
-        "its own version (`nvidia-smi` shows it); after a kernel's failure start again from the "
-        "last checkpoint."
+    raise DeviceError(
+        f"The GPU's driver could not {doing}: {name.decode() if name else error}.",
+        "If it is older than the installed cuda-bindings, update the driver or install bindings of "
+        "its version (`nvidia-smi` shows it). After a kernel's failure start again from the last "
+        "checkpoint. To go on without the GPU: --machine.device-type cpu.",
     )

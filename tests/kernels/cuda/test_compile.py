@@ -6,7 +6,7 @@ import re
 import pytest
 import torch
 
-from rgbavatar_ns.kernels import constants
+from rgbavatar_ns.kernels import DeviceError, constants
 from rgbavatar_ns.kernels.cuda import arguments, source
 from tests.kernels.cuda import emulator
 
@@ -49,17 +49,22 @@ def test_nothing_spills(monkeypatch):
 def test_a_newer_gpu_gets_ptx_and_an_older_one_the_reason():
     assert compiler is not None
     assert b".target sm_" in compiler.compile_kernels("sm_999", cache=False)
-    with pytest.raises(compiler.KernelCompileError, match=r"sm_75 .*sm_61.*device-type cpu"):
+    with pytest.raises(DeviceError, match=r"sm_75 .*sm_61.*device-type cpu"):
         compiler.compile_kernels("sm_61")
 
 
 @needs_nvrtc
 def test_what_was_compiled_is_kept(own_cache, monkeypatch):
     assert compiler is not None
-    code = compiler.compile_kernels("sm_90")
-    assert len(list(own_cache.iterdir())) == 1
+    monkeypatch.setattr(compiler, "_compile", lambda target: target.encode())
+    assert compiler.compile_kernels("sm_90") == b"sm_90"
+    assert compiler.compile_kernels("sm_80") == b"sm_80"
+    assert len(list(own_cache.iterdir())) == 2
     monkeypatch.setattr(compiler, "_compile", lambda target: pytest.fail("compiled again"))
-    assert compiler.compile_kernels("sm_90") == code
+    assert compiler.compile_kernels("sm_90") == b"sm_90"
+    monkeypatch.setattr(compiler, "source_hash", lambda: "of changed sources")
+    with pytest.raises(pytest.fail.Exception, match="compiled again"):
+        compiler.compile_kernels("sm_90")
 
 
 @needs_nvrtc
@@ -75,7 +80,7 @@ def test_a_failure_shows_nvrtc_s_log(own_cache, monkeypatch):
     assert compiler is not None
     broken = source.sources() | {"project.cuh": "int broken = ;"}
     monkeypatch.setattr(compiler, "sources", lambda: broken)
-    with pytest.raises(compiler.KernelCompileError, match=r"(?s)project\.cuh.*expected an express"):
+    with pytest.raises(DeviceError, match=r"(?s)project\.cuh.*expected an express"):
         compiler.compile_kernels("sm_90")
     assert not own_cache.exists()
 
