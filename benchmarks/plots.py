@@ -21,8 +21,8 @@ from rich.progress import Progress
 from rgbavatar_ns.bench.machine import machine_facts
 from rgbavatar_ns.bench.options import RasterizerOptions
 from rgbavatar_ns.bench.rasterizer import bench_rasterizer, time_rasterizer
+from rgbavatar_ns.bench.scenes import DEFAULT_COUNT, DEFAULT_SIZE_PX, ellipsoid_scene
 from rgbavatar_ns.bench.timing import Stopwatch, using_threads
-from rgbavatar_ns.bench.workloads import DEFAULT_COUNT, DEFAULT_SIZE_PX, ellipsoid_scene
 from rgbavatar_ns.errors import UserError
 
 Points = list[tuple[float, float, float, float]]
