@@ -1,5 +1,7 @@
 """Launching on a GPU through its driver."""
 
+import ctypes
+import threading
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -12,6 +14,8 @@ from rgbavatar_ns.kernels.cuda.compiler import compile_kernels
 from rgbavatar_ns.kernels.cuda.source import kernels
 from rgbavatar_ns.kernels.types import DeviceError
 
+_SHARED_WITHOUT_ASKING = 48 << 10
+
 
 class CudaLauncher:
     """One GPU, on torch's current stream."""
@@ -21,8 +25,8 @@ class CudaLauncher:
         capability = torch.cuda.get_device_capability(device)
         image = compile_kernels(f"sm_{capability[0]}{capability[1]}")
         with torch.cuda.device(device):
-            torch.cuda.current_stream()  # torch makes the context that the module is loaded into
-            torch.empty(1, device=device)
+            torch.zeros(1, device=device)  # torch makes the context that the module is loaded into
+            self._context = _checked(driver.cuCtxGetCurrent(), "tell its context")
             module = _checked(driver.cuModuleLoadData(image), "load the kernels")
             self._functions = {
                 name: _checked(
@@ -30,6 +34,7 @@ class CudaLauncher:
                 )
                 for name in kernels()
             }
+        self._seen = threading.local()
         self._large: set[str] = set()
 
     @property
@@ -43,30 +48,40 @@ class CudaLauncher:
         """See `Launcher`."""
         known = kernels()[kernel]
         arguments = fill(known.arguments.__name__, values, self._device)
+        # One parameter: an array of one address.
+        parameters = (ctypes.c_void_p * 1)(ctypes.addressof(arguments))
         function = self._functions[kernel]
-        if shared_bytes > 48 << 10 and kernel not in self._large:
-            attribute = driver.CUfunction_attribute.CU_FUNC_ATTRIBUTE_MAX_DYNAMIC_SHARED_SIZE_BYTES
-            most = torch.cuda.get_device_properties(self._device).shared_memory_per_block_optin
-            _checked(driver.cuFuncSetAttribute(function, attribute, most), "enlarge shared memory")
-            self._large.add(kernel)
+        if shared_bytes > _SHARED_WITHOUT_ASKING and kernel not in self._large:
+            self._enlarge_shared_memory(kernel)
         stream = torch.cuda.current_stream(self._device).cuda_stream
         with torch.cuda.device(self._device):
-            _checked(
-                driver.cuLaunchKernel(
-                    function,
-                    grid[0],
-                    grid[1],
-                    1,
-                    known.threads,
-                    1,
-                    1,
-                    shared_bytes,
-                    stream,
-                    ((arguments,), (None,)),
-                    0,
-                ),
-                f"start {kernel}",
+            self._enter_thread()
+            started = driver.cuLaunchKernel(
+                function,
+                *grid,
+                1,
+                known.threads,
+                1,
+                1,
+                shared_bytes,
+                stream,
+                ctypes.addressof(parameters),
+                0,
             )
+        _checked(started, f"start {kernel}")
+
+    def _enter_thread(self) -> None:
+        """A thread that has called nothing of CUDA's runtime yet has no context."""
+        if not getattr(self._seen, "entered", False):
+            _checked(driver.cuCtxSetCurrent(self._context), "enter its context")
+            self._seen.entered = True
+
+    def _enlarge_shared_memory(self, kernel: str) -> None:
+        attribute = driver.CUfunction_attribute.CU_FUNC_ATTRIBUTE_MAX_DYNAMIC_SHARED_SIZE_BYTES
+        most = torch.cuda.get_device_properties(self._device).shared_memory_per_block_optin
+        result = driver.cuFuncSetAttribute(self._functions[kernel], attribute, most)
+        _checked(result, "enlarge shared memory")
+        self._large.add(kernel)
 
     def read_later(self, numbers: Tensor) -> Callable[[], list[int] | None]:
         """See `Launcher`."""
