@@ -8,7 +8,12 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from rgbavatar_ns.avatar import Avatar
-from rgbavatar_ns.avatar.graphed_step import DeviceFrames, GraphedStep
+from rgbavatar_ns.avatar.graphed_step import (
+    DeviceFrames,
+    GraphedStep,
+    Recorder,
+    record_cuda_graph,
+)
 from rgbavatar_ns.avatar.losses import composite, l1_loss, random_backgrounds, rgba_to_float
 from rgbavatar_ns.avatar.training import (
     TrainingBatch,
@@ -68,11 +73,14 @@ class RecordedStep:
 
     _STEPS_BEFORE = 8
 
-    def __init__(self, avatar: Avatar, batch: TrainingBatch) -> None:
+    def __init__(
+        self, avatar: Avatar, batch: TrainingBatch, recorder: Recorder = record_cuda_graph
+    ) -> None:
         self._start = _Start(avatar)
         frames = DeviceFrames(batch.theta, batch.cameras, torch.as_tensor(batch.images_rgba))
         count = len(batch.theta)
-        self._step = GraphedStep(avatar, [make_optimizer(avatar)], frames, count)
+        optimizers = [make_optimizer(avatar)]
+        self._step = GraphedStep(avatar, optimizers, frames, count, recorder=recorder)
         self._chosen, self._background = list(range(count)), random_backgrounds(0, count)
         for _ in range(self._STEPS_BEFORE):
             self.run()

@@ -14,12 +14,19 @@ from rgbavatar_ns.bench.options import RasterizerOptions, RenderOptions, Scheme,
 from rgbavatar_ns.bench.rasterizer import bench_rasterizer
 from rgbavatar_ns.bench.render import bench_render
 from rgbavatar_ns.bench.report import print_report
-from rgbavatar_ns.bench.schemes import WHOLE_STEP, WholeStep, parameters_of, steps_of
+from rgbavatar_ns.bench.schemes import (
+    WHOLE_STEP,
+    RecordedStep,
+    WholeStep,
+    parameters_of,
+    steps_of,
+)
 from rgbavatar_ns.bench.step import bench_step
 from rgbavatar_ns.bench.timing import CPU, Stopwatch, waiting_for
 from rgbavatar_ns.bench.utilisation import gpu_utilisation, mean_while_busy
 from rgbavatar_ns.bench.workloads import avatar_workload
 from rgbavatar_ns.errors import UserError
+from tests.kernels.cuda import emulator
 
 TINY = {"uv": 24, "bases": 2, "size": 48}
 EAGER = TrainingOptions(color_init=None, fast=False)
@@ -69,6 +76,27 @@ def test_one_image_a_step_takes_as_many_steps_as_images(workload):
     step.run()
     counts = {int(state["step"]) for state in step.optimizer.state.values()}
     assert counts == {3}
+
+
+@pytest.mark.skipif(emulator.compiler() is None, reason="no g++ to emulate CUDA with")
+def test_a_recorded_step_is_the_same_step(workload, monkeypatch):
+    backend = emulator.install(monkeypatch)
+    recordings = []
+
+    def record(work):
+        recordings.append(work)
+        return work
+
+    before = [parameter.detach().clone() for parameter in parameters_of(workload.avatar)]
+    recorded = RecordedStep(workload.avatar, workload.batch, record)
+    assert len(recordings) == 1
+    assert all(torch.equal(a, b) for a, b in zip(before, parameters_of(workload.avatar)))
+    backend.emulated.launched.clear()
+    loss = recorded.run()
+    assert "train" in backend.emulated.launched
+    recorded.restore()
+    expected = WholeStep(workload.avatar, workload.batch, EAGER).run()
+    assert float(loss) == pytest.approx(float(expected), rel=1e-5)
 
 
 @pytest.mark.parametrize("scheme", get_args(Scheme))
