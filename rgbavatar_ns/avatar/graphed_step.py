@@ -15,6 +15,7 @@ from torch import Tensor
 
 from rgbavatar_ns.avatar.adam_states import AdamStates
 from rgbavatar_ns.avatar.avatar import Avatar
+from rgbavatar_ns.avatar.recording import Recorder, record_cuda_graph, supports
 from rgbavatar_ns.kernels import UPDATED_ATTRIBUTES, DeviceRenderer, PinholeCameras
 
 _NUMBERS = 5
@@ -22,9 +23,6 @@ _EAGER_STEPS = 3
 """Steps before the recording: libraries make their handles, and the lists' room is measured."""
 _LOOK_EVERY = 200
 """Steps between two looks at how many overflowed."""
-
-Recorder = Callable[[Callable[[], None]], Callable[[], None]]
-"""Turns work into what repeats it."""
 
 
 @dataclass(frozen=True)
@@ -34,15 +32,6 @@ class DeviceFrames:
     theta: Float[Tensor, "F H"]
     cameras: PinholeCameras
     images_rgba: UInt8[Tensor, "F height width 4"]
-
-
-def record_cuda_graph(work: Callable[[], None]) -> Callable[[], None]:
-    """Record the kernels that `work` starts and return what starts them all at once."""
-    graph = torch.cuda.CUDAGraph()
-    # Other threads, such as a viewer's, may use the device meanwhile.
-    with torch.cuda.graph(graph, capture_error_mode="thread_local"):
-        work()
-    return graph.replay
 
 
 class GraphedStep:
@@ -183,10 +172,3 @@ class GraphedStep:
         self.skipped_steps += overflows
         self._overflows.zero_()
         self._replay, self._steps = None, 0
-
-
-def supports(
-    avatar: Avatar, theta: Float[Tensor, "1 H"], cameras: PinholeCameras, backend: str = "auto"
-) -> bool:
-    """Whether steps of this avatar on theta's device can do without the host."""
-    return isinstance(avatar.renderer(theta, cameras, backend=backend), DeviceRenderer)

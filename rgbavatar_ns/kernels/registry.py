@@ -65,7 +65,14 @@ class DeviceRenderer(BlendedRenderer, Protocol):
 
     @property
     def overflowed(self) -> Int[Tensor, ""]:
-        """1 where the last comparison found no room and updates change nothing, else 0."""
+        """1 where the last comparison found no room and updates change nothing, else 0.
+
+        The same for `draw_at_once`, whose picture is then only background.
+        """
+        ...
+
+    def draw_at_once(self, background: Float[Tensor, "#B 3"]) -> RenderedBatch:
+        """As `draw`, without waiting for the room that it needs."""
         ...
 
     def compare_with(

@@ -4,7 +4,8 @@ from collections.abc import Iterable
 
 import torch
 
-from rgbavatar_ns.avatar.graphed_step import GraphedStep, Recorder, supports
+from rgbavatar_ns.avatar.graphed_step import GraphedStep
+from rgbavatar_ns.avatar.recording import Recorder, supports
 from rgbavatar_ns.plugin.cameras import from_nerfstudio
 from rgbavatar_ns.plugin.datamanager import RGBAvatarDataManager
 from rgbavatar_ns.plugin.model import RGBAvatarModel

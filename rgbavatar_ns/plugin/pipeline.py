@@ -16,9 +16,10 @@ from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineC
 from rich.progress import track
 from torch import Tensor
 
-from rgbavatar_ns.avatar.graphed_step import GraphedStep, Recorder, record_cuda_graph
+from rgbavatar_ns.avatar.graphed_step import GraphedStep
 from rgbavatar_ns.avatar.metrics import LPIPSMetric, evaluate_images
 from rgbavatar_ns.avatar.orthogonality import orthogonality_error
+from rgbavatar_ns.avatar.recording import Recorder, record_cuda_graph
 from rgbavatar_ns.avatar.refinement import fit_theta
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.plugin.cameras import from_nerfstudio

@@ -99,6 +99,11 @@ class CudaBlendedRenderer:
         visibility = self._tiles.average(None)[2] if with_visibility else None
         return RenderedBatch(image, alpha, depth, visibility)
 
+    def draw_at_once(self, background: Float[Tensor, "#B 3"]) -> RenderedBatch:
+        """As `draw`, without waiting for the room that it needs; see `overflowed`."""
+        image, alpha, _ = self._tiles.draw(background, with_depth=False, checked=False)
+        return RenderedBatch(image, alpha)
+
     def weighted_color_average(self, images: Float[Tensor, "#B H W C"]) -> WeightedColors:
         """As `weighted_color_average`."""
         check_average_images(images, self._weights, self._cameras)

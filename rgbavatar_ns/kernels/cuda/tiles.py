@@ -23,9 +23,11 @@ class Tiles:
     def _new(self, *shape: int) -> Tensor:
         return torch.empty(shape, device=self._launcher.device)
 
-    def draw(self, background: Tensor, *, with_depth: bool) -> tuple[Tensor, Tensor, Tensor | None]:
-        """Image, alpha and depth; waits for the lists' length."""
-        self.bins.sort(checked=True)
+    def draw(
+        self, background: Tensor, *, with_depth: bool, checked: bool = True
+    ) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Image, alpha and depth; where it is `checked`, waits for the lists' length."""
+        self.bins.sort(checked=checked)
         images = self.bins.images
         size = (images.batch, images.height, images.width)
         image, alpha = self._new(*size, 3), self._new(*size, 1)
