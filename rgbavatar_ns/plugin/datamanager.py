@@ -199,7 +199,7 @@ class RGBAvatarDataManager(DataManager):
         for first in track(chunks, "Images to the device...", transient=True):
             chosen = positions[first : first + _DECODED_TOGETHER]
             images[first : first + len(chosen)] = self.image_cache.get(chosen).to(self.device)
-        theta = (self._train_cameras.metadata or {})["theta"]
+        theta = (self._train_cameras.metadata or {})["theta"].to(self.device)
         return DeviceFrames(theta, from_nerfstudio(self._train_cameras), images)
 
     def next_choice(self, step: int) -> tuple[list[int], Tensor]:
