@@ -34,6 +34,7 @@ SECTIONS = {
     "compile": ("gpu_sections", "compilation"),
     "agreement": ("gpu_sections", "agreement"),
     "step": ("gpu_training", "step_gradients"),
+    "lists": ("gpu_lists", "lists"),
     "determinism": ("gpu_training", "determinism"),
     "overflow": ("gpu_training", "overflow"),
     "recorded-overflow": ("gpu_training", "recorded_overflow"),
@@ -45,7 +46,7 @@ SECTIONS = {
     "rendering": ("gpu_timings", "rendering"),
     "gsplat": ("gpu_timings", "gsplat"),
 }
-EMULATED = ("agreement", "step", "determinism", "overflow", "training")
+EMULATED = ("agreement", "step", "lists", "determinism", "overflow", "training")
 LIMIT_S = 150
 """Seconds that a section may take, imports included."""
 _NO_GPU = 3

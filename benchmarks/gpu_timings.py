@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import Any
 
 import torch
+from gpu_lists import Launch, launches_seen_by
 from gpu_sections import Finding, Place
 from gpu_training import film, step_of
 from torch import Tensor
@@ -169,23 +170,19 @@ def kernels(place: Place) -> Finding:
     training, steps = _Training(place, recorded=False), 5 if place.quick else 20
     for _ in range(5):
         training.step()
-    launcher = place.backend.launcher(place.device)
-    launch, marks = launcher.launch, []
+    marks: list[list[tuple[str, torch.cuda.Event, torch.cuda.Event]]] = []
 
-    def timed(kernel: str, *arguments: Any, **values: Any) -> None:
+    def timed(launch: Launch, kernel: str, arguments: tuple, values: Any) -> None:
         start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
         start.record()
         launch(kernel, *arguments, **values)
         end.record()
         marks[-1].append((kernel, start, end))
 
-    launcher.launch = timed
-    try:
+    with launches_seen_by(place, timed):
         for _ in range(steps):
             marks.append([])
             training.step()
-    finally:
-        del launcher.launch
     place.wait()
     by_kernel: dict[str, list[float]] = defaultdict(list)
     for step in marks:

@@ -81,7 +81,7 @@ def step_gradients(place: Place) -> Finding:
 
 def determinism(place: Place) -> Finding:
     """The largest difference between two runs with one seed; 0 is bit by bit."""
-    scene = random_scene(3, width=70, height=50, count=200 if place.emulated else 4000)
+    scene = random_scene(3, width=70, height=50, count=100 if place.emulated else 4000)
     there = to(on_device(scene.gaussians, place.device), torch.float32)
     gradient_runs = [_gradients(there, on_device(scene.cameras, place.device)) for _ in range(2)]
     runs = {"rasterizer": gradient_runs}
@@ -124,7 +124,7 @@ def recorded_step(
     return GraphedStep(avatar, [optimizer], frames, size)
 
 
-def _after_steps(place: Place, *, recorded: bool, steps: int = 6) -> list[Tensor]:
+def _after_steps(place: Place, *, recorded: bool, steps: int = 5) -> list[Tensor]:
     avatar = small_avatar().to(place.device)
     optimizer = make_optimizer(avatar)
     frames, background = small_frames(place, 3)
@@ -309,7 +309,7 @@ def film(avatar: Avatar, count: int, size_px: int, place: Place, small: bool) ->
 def training(place: Place) -> Finding:
     """A fit: the loss falls, and recorded steps give the losses of eager ones."""
     small = place.emulated
-    steps = 40 if small else (100 if place.quick else 300)
+    steps = 24 if small else (100 if place.quick else 300)
     count, size_px, batch = (4, 24, 2) if small else (40, 256, 10)
     losses = {}
     for recorded in (False, True):
