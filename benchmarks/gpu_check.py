@@ -38,6 +38,7 @@ SECTIONS = {
     "determinism": ("gpu_training", "determinism"),
     "overflow": ("gpu_training", "overflow"),
     "recorded-overflow": ("gpu_training", "recorded_overflow"),
+    "changeover": ("gpu_training", "changeover"),
     "waiting": ("gpu_training", "waiting"),
     "training": ("gpu_training", "training"),
     "rasterizer": ("gpu_timings", "rasterizer"),
@@ -46,7 +47,7 @@ SECTIONS = {
     "rendering": ("gpu_timings", "rendering"),
     "gsplat": ("gpu_timings", "gsplat"),
 }
-EMULATED = ("agreement", "step", "lists", "determinism", "overflow", "training")
+EMULATED = ("agreement", "step", "lists", "determinism", "overflow", "changeover", "training")
 LIMIT_S = 150
 """Seconds that a section may take, imports included."""
 _NO_GPU = 3

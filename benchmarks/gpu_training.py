@@ -12,7 +12,7 @@ from rgbavatar_ns.avatar import Avatar, AvatarConfig, graphed_step
 from rgbavatar_ns.avatar.fused_step import FusedStep
 from rgbavatar_ns.avatar.graphed_step import DeviceFrames, GraphedStep
 from rgbavatar_ns.avatar.losses import random_backgrounds
-from rgbavatar_ns.avatar.training import make_optimizer
+from rgbavatar_ns.avatar.training import TrainingBatch, make_optimizer
 from rgbavatar_ns.bench.scenes import front_camera as front_camera_of_head
 from rgbavatar_ns.bench.scenes import on_device
 from rgbavatar_ns.head import HeadModel
@@ -221,12 +221,36 @@ def recorded_overflow(place: Place) -> Finding:
     return Finding(still and moved and step.skipped_steps > 0, told, figures)
 
 
+def changeover(place: Place) -> Finding:
+    """Steps through autograd, fused and recorded, in turn and after loading: one run's losses."""
+    frames, background = small_frames(place, 3)
+    there = TrainingBatch(frames.theta, frames.cameras, frames.images_rgba)
+    losses = []
+    for kinds in (("autograd",) * 6, ("autograd", "fused", "autograd", "recorded", "loaded") * 2):
+        avatar = small_avatar().to(place.device)
+        optimizer, taken = make_optimizer(avatar), []
+        for kind in kinds:
+            if kind == "loaded":
+                optimizer.load_state_dict(optimizer.state_dict())
+            elif kind == "autograd":
+                on_gpu = background.to(place.device)
+                taken.append(eager_step(avatar, optimizer, there, on_gpu, "cuda"))
+            else:
+                step = step_of(place, avatar, optimizer, frames, 3, recorded=kind == "recorded")
+                taken.append(step([0, 1, 2], background))
+        losses.append(torch.stack(taken)[:6])
+    error = float((losses[1] / losses[0] - 1).abs().max())
+    told = f"losses within {error:.1e} of those of one kind"
+    return Finding(error < MOST_EARLY_DIFFERENCE, told, {"losses": [x.tolist() for x in losses]})
+
+
 def waiting(place: Place, steps: int = 5) -> Finding:
     """How often the host waits for the GPU in a step, once it is warm."""
     found = {}
     for name, take in {
         "eager step": _eager_take(place),
         "recorded step": _recorded_take(place),
+        "recorded step, resumed": _recorded_take(place, resumed=True),
     }.items():
         for _ in range(8):
             take()
@@ -250,10 +274,14 @@ def _eager_take(place: Place) -> Callable[[], object]:
     return lambda: step(frames.theta, frames.cameras, frames.images_rgba, there)
 
 
-def _recorded_take(place: Place) -> Callable[[], object]:
+def _recorded_take(place: Place, *, resumed: bool = False) -> Callable[[], object]:
     avatar = small_avatar().to(place.device)
     frames, background = small_frames(place, 3)
-    step = recorded_step(place, avatar, make_optimizer(avatar), frames, 3)
+    optimizer = make_optimizer(avatar)
+    if resumed:  # a loaded state lies where torch puts it
+        step_of(place, avatar, optimizer, frames, 3, recorded=False)([0, 1, 2], background)
+        optimizer.load_state_dict(optimizer.state_dict())
+    step = recorded_step(place, avatar, optimizer, frames, 3)
     return lambda: step([0, 1, 2], background)
 
 
