@@ -11,6 +11,7 @@ from jaxtyping import Float, UInt8
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.tracking.follow import FaceFollower
 from rgbavatar_ns.tracking.image_files import fitted_size
+from rgbavatar_ns.tracking.landmark_bytes import decoded, hand_over_bytes
 
 FOREHEAD, CHIN = 10, 152
 IRIS_CENTERS = (468, 473)
@@ -49,6 +50,7 @@ class FaceLandmarker:
         self._mesh = face_mesh.FaceMesh(
             static_image_mode=False, max_num_faces=_MOST_FACES, refine_landmarks=True
         )
+        hand_over_bytes(self._mesh)
         self._follower = FaceFollower()
 
     def __enter__(self) -> "FaceLandmarker":
@@ -76,8 +78,7 @@ class FaceLandmarker:
         if small != (width, height):
             image_rgb = cv2.resize(image_rgb, small, interpolation=cv2.INTER_AREA)
         found = self._mesh.process(np.ascontiguousarray(image_rgb)).multi_face_landmarks or []
-        points = [[(point.x, point.y) for point in face.landmark] for face in found]
-        return np.array(points, dtype=np.float64).reshape(-1, 478, 2)
+        return np.array([decoded(face) for face in found]).reshape(-1, 478, 2)
 
 
 def face_height_px(landmarks_px: Float[np.ndarray, "*batch 478 2"]) -> Float[np.ndarray, "*batch"]:
