@@ -1,6 +1,8 @@
 """torch's Adam optimisers, whose state and learning rates steps without autograd use."""
 
 from collections.abc import Iterable
+from dataclasses import dataclass
+from weakref import WeakKeyDictionary
 
 import torch
 from torch import Tensor
@@ -41,22 +43,53 @@ class AdamStates:
         self._network = groups.get("weight_network", [])
 
     def next_of_gaussians(self) -> dict[str, AdamParameter]:
-        """The next update of each of the Gaussians' tensors, by its name; counts them."""
+        """The next update of each of the Gaussians' tensors, by its name."""
         return {name: self._next(value) for name, value in self._gaussians.items()}
 
     def next_of_network(self) -> list[AdamParameter]:
-        """The next update of each tensor of the weight network; counts them."""
+        """The next update of each tensor of the weight network."""
         return [self._next(value) for value in self._network]
+
+    def count_gaussians(self) -> None:
+        """Count the step that the Gaussians' tensors have taken, in the optimisers' own states."""
+        values = list(self._gaussians.values())
+        _add_one(self._steps(values))
+        self._recount(values)
+
+    def add_one_to_all(self) -> None:
+        """Count a step of all in the optimisers' states: what of counting a device does."""
+        _add_one(self.steps())
+
+    def recount_all(self) -> None:
+        """Count a step of all on the host, after `add_one_to_all`, which may have been recorded."""
+        self._recount([*self._gaussians.values(), *self._network])
+
+    def steps(self) -> list[Tensor]:
+        """Where the optimisers' states count the steps of all tensors."""
+        return self._steps([*self._gaussians.values(), *self._network])
+
+    def _steps(self, values: Iterable[Tensor]) -> list[Tensor]:
+        return [self._homes[value][0].state[value]["step"] for value in values]
+
+    def _recount(self, values: Iterable[Tensor]) -> None:
+        for value, step in zip(values, self._steps(values)):
+            known = _counts(self._homes[value][0])
+            known[value] = _Count(step, step._version, known[value].number + 1)
 
     def _next(self, value: Tensor) -> AdamParameter:
         optimizer, group = self._homes[value]
         state = optimizer.state[value]
         if not state:
             # As torch.optim.Adam begins, so that either path can go on from the other's state.
-            state["step"] = torch.zeros((), dtype=torch.float32)
+            place = value.device if group["fused"] or group["capturable"] else "cpu"
+            state["step"] = torch.zeros((), dtype=torch.float32, device=place)
             state["exp_avg"] = torch.zeros_like(value)
             state["exp_avg_sq"] = torch.zeros_like(value)
-        state["step"] += 1
+        known, step = _counts(optimizer), state["step"]
+        count = known.get(value)
+        if count is None or count.step is not step or count.version != step._version:
+            # Others have counted, or a checkpoint was loaded: look, which waits for a device.
+            count = known[value] = _Count(step, step._version, int(step))
         return AdamParameter(
             value=value,
             first_moment=state["exp_avg"],
@@ -64,8 +97,30 @@ class AdamStates:
             learning_rate=float(group["lr"]),
             betas=(float(group["betas"][0]), float(group["betas"][1])),
             epsilon=float(group["eps"]),
-            step=int(state["step"]),
+            step=count.number + 1,
         )
+
+
+@dataclass(frozen=True)
+class _Count:
+    """A state's tensor as it was when its number was last known."""
+
+    step: Tensor
+    version: int
+    number: int
+
+
+# Known numbers outlive the objects that count, as long as their optimiser lives.
+_COUNTS: WeakKeyDictionary[torch.optim.Optimizer, dict[Tensor, _Count]] = WeakKeyDictionary()
+
+
+def _add_one(steps: list[Tensor]) -> None:
+    """In one launch for all of them."""
+    torch._foreach_add_(steps, 1)  # pyright: ignore[reportPrivateImportUsage]
+
+
+def _counts(optimizer: torch.optim.Optimizer) -> dict[Tensor, _Count]:
+    return _COUNTS.setdefault(optimizer, {})
 
 
 def refusal(avatar: Avatar, optimizers: Iterable[torch.optim.Optimizer]) -> str | None:

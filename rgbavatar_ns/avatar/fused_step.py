@@ -63,7 +63,9 @@ class FusedStep:
     ) -> BlendedGradient:
         """Step by the renderer's last comparison and return the gradient of what posed it."""
         parameters = self._states.next_of_gaussians()
-        return renderer.update(parameters, with_vertices=with_vertices)
+        gradient = renderer.update(parameters, with_vertices=with_vertices)
+        self._states.count_gaussians()
+        return gradient
 
     def update_network(
         self, psi: Float[Tensor, "B K"], weight_gradient: Float[Tensor, "B K"]

@@ -70,6 +70,7 @@ class GraphedStep:
         self._news = torch.zeros(sum(self._sizes), dtype=torch.float64, device=device)
         self._loss = torch.zeros((), device=device)
         self._overflows = torch.zeros((), dtype=torch.int64, device=device)
+        self._needed = torch.zeros((), dtype=torch.int32, device=device)
         first = frames.cameras.select([0])
         if not supports(avatar, frames.theta[:1], first, backend):
             raise ValueError("This backend's steps need the host. Use FusedStep.")
@@ -98,6 +99,7 @@ class GraphedStep:
             if self._replay is None:
                 self._replay = self._recorder(self._work)
             self._replay()
+        self._states.recount_all()
         self._steps += 1
         if self._steps % _LOOK_EVERY == 0:
             self._look()
@@ -142,7 +144,10 @@ class GraphedStep:
             grads = torch.autograd.grad(psi, self._network, gradient.weights)
             for state, grad in zip(self._network_states, grads):
                 renderer.update_parameter(state, grad, rows[-1])
+        self._states.add_one_to_all()
         self._overflows += renderer.overflowed
+        torch.maximum(self._needed, renderer.needed, out=self._needed)
+        self._renderer_of_last_step = renderer
 
     def _renderer(self, index: Tensor) -> tuple[Any, Tensor]:
         frames = self.frames
@@ -165,10 +170,11 @@ class GraphedStep:
         return renderer, psi
 
     def _look(self) -> None:
-        """Where steps overflowed: count them, and record the step anew after an eager one."""
+        """Where steps overflowed: count them, make room, and record the step anew."""
         overflows = int(self._overflows)
         if overflows == 0:
             return
         self.skipped_steps += overflows
         self._overflows.zero_()
+        self._renderer_of_last_step.make_room(int(self._needed))
         self._replay, self._steps = None, 0

@@ -71,6 +71,15 @@ class DeviceRenderer(BlendedRenderer, Protocol):
         """
         ...
 
+    @property
+    def needed(self) -> Int[Tensor, ""]:
+        """How much room was needed, in units of `make_room`."""
+        ...
+
+    def make_room(self, needed: int) -> None:
+        """Give later renderings of this kind at least so much room."""
+        ...
+
     def draw_at_once(self, background: Float[Tensor, "#B 3"]) -> RenderedBatch:
         """As `draw`, without waiting for the room that it needs."""
         ...

@@ -48,5 +48,6 @@ def decoded(serialized: bytes) -> Float[np.ndarray, "N 2"]:
         return positions
     from mediapipe.framework.formats import landmark_pb2
 
-    message = landmark_pb2.NormalizedLandmarkList.FromString(serialized)
+    message = landmark_pb2.NormalizedLandmarkList()
+    message.ParseFromString(serialized)  # pyright: ignore[reportAttributeAccessIssue]
     return np.array([(point.x, point.y) for point in message.landmark]).reshape(-1, 2)

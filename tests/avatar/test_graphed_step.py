@@ -5,10 +5,17 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from rgbavatar_ns import kernels
+from rgbavatar_ns.avatar.adam_states import AdamStates
 from rgbavatar_ns.avatar.fused_step import FusedStep
 from rgbavatar_ns.avatar.graphed_step import DeviceFrames, GraphedStep
 from rgbavatar_ns.avatar.training import make_optimizer
-from tests.avatar.fused_scene import far_batch, relative_differences, stir
+from tests.avatar.fused_scene import (
+    eager_step,
+    far_batch,
+    fused_step,
+    relative_differences,
+    stir,
+)
 from tests.kernels.cuda import emulator
 
 pytestmark = pytest.mark.skipif(emulator.compiler() is None, reason="no g++ to emulate CUDA with")
@@ -151,6 +158,24 @@ def test_overflows_are_counted_and_the_step_is_recorded_with_more_room(
     assert capacities.per_image[key] > 5
     assert not torch.equal(before, avatar.blendshapes.position)
     assert recorder.records == 2
+
+
+def test_every_way_goes_on_from_the_others_counts(emulated, make_avatar):
+    """Adam's bias corrections hang on the number of steps, whoever has taken them."""
+    avatar, recorder = stir(make_avatar()), Recorder()
+    frames, background = _frames(avatar)
+    optimizer = make_optimizer(avatar)
+    graphed = GraphedStep(avatar, [optimizer], frames, 2, recorder=recorder)
+    for chosen in ORDER[:5]:
+        graphed(chosen, background[chosen])
+    batch, colors = far_batch(avatar, 2, 24, 24)
+    eager_step(avatar, optimizer, batch, colors)
+    fused_step(avatar, optimizer, batch, colors)
+    graphed(ORDER[5], background[ORDER[5]])
+    assert {float(state["step"]) for state in optimizer.state.values()} == {8.0}
+    states = AdamStates(avatar, [optimizer])
+    counts = [*states.next_of_gaussians().values(), *states.next_of_network()]
+    assert {parameter.step for parameter in counts} == {9}
 
 
 def test_a_checkpoint_that_was_loaded_is_recorded_anew(emulated, make_avatar):

@@ -193,6 +193,10 @@ class Bins:
         self._launcher.launch("sort", self.tile_grid, frame=frame, bins=self.values())
         self._sorted, self._checked = True, checked
 
+    def make_room(self, needed: int) -> None:
+        """Give later batches of this kind room for at least so many entries and slots."""
+        self._capacities.learn(self.images, needed)
+
     @property
     def tile_grid(self) -> tuple[int, int]:
         """One block a tile of an image."""

@@ -86,6 +86,15 @@ class CudaBlendedRenderer:
         """1 where the last comparison found no room and updates change nothing, else 0."""
         return self._tiles.bins.status[constants()["kOverflow"]]
 
+    @property
+    def needed(self) -> Int[Tensor, ""]:
+        """How many entries or slots, whichever are more, were needed."""
+        return self._tiles.bins.status[: constants()["kOverflow"]].amax()
+
+    def make_room(self, needed: int) -> None:
+        """Give later renderings of this kind room for at least so many."""
+        self._tiles.bins.make_room(needed)
+
     def draw(
         self,
         background: Float[Tensor, "3"] | Float[Tensor, "#B 3"] | None = None,

@@ -1,5 +1,5 @@
 // What every kernel is given: one structure each, named after it. Python reads this file
-// (kernels/cuda/signatures.py): one field a line, pointers to plain types, nothing else.
+// (kernels/cuda/source.py): one field a line, pointers to plain types, nothing else.
 //
 // B images, N Gaussians, K bases, C channels, U triangles, V vertices, P = tiles of an image.
 

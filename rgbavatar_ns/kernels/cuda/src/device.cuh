@@ -58,6 +58,15 @@ RGBAVATAR_FUNCTION const Splat* splats_of(const Frame& frame, const Bins& bins, 
 
 // Log2 of the alpha that a splat has at its best within the rectangle of pixel centres. The best
 // point of a rectangle that does not hold the mean lies on a side that faces the mean.
+//
+// Several kernels ask this of a Gaussian and a tile and must get one answer, or a list would have
+// holes: the roundings are written out, so that no compiler fuses other products into sums.
+RGBAVATAR_FUNCTION float exact_log2_alpha(const Splat& s, float dx, float dy) {
+  const float across = __fmaf_rn(dx, s.qa, __fmul_rn(dy, s.qb));
+  const float down = __fmaf_rn(dy, __fmul_rn(dy, s.qc), s.log2_opacity);
+  return __fmaf_rn(dx, across, down);
+}
+
 RGBAVATAR_FUNCTION float best_log2_alpha(const Splat& s, float left, float top, float right,
                                          float bottom) {
   const float low_x = left - s.mean_x, high_x = right - s.mean_x;
@@ -65,10 +74,10 @@ RGBAVATAR_FUNCTION float best_log2_alpha(const Splat& s, float left, float top, 
   const float near_x = fminf(fmaxf(0.0f, low_x), high_x);
   const float near_y = fminf(fmaxf(0.0f, low_y), high_y);
   if (near_x == 0.0f && near_y == 0.0f) return s.log2_opacity;
-  const float along_y = fminf(fmaxf(-0.5f * s.qb * near_x / s.qc, low_y), high_y);
-  const float along_x = fminf(fmaxf(-0.5f * s.qb * near_y / s.qa, low_x), high_x);
-  const float on_x = log2_alpha(near_x, along_y, s.log2_opacity, s.qa, s.qb, s.qc);
-  const float on_y = log2_alpha(along_x, near_y, s.log2_opacity, s.qa, s.qb, s.qc);
+  const float best_y = __fdiv_rn(__fmul_rn(__fmul_rn(-0.5f, s.qb), near_x), s.qc);
+  const float best_x = __fdiv_rn(__fmul_rn(__fmul_rn(-0.5f, s.qb), near_y), s.qa);
+  const float on_x = exact_log2_alpha(s, near_x, fminf(fmaxf(best_y, low_y), high_y));
+  const float on_y = exact_log2_alpha(s, fminf(fmaxf(best_x, low_x), high_x), near_y);
   return fmaxf(near_x != 0.0f ? on_x : on_y, near_y != 0.0f ? on_y : on_x);
 }
 
