@@ -77,6 +77,8 @@ def variants(sizes: Sizes, seed: int) -> dict[str, Callable[[], LocalGlobalPools
     local, old = sizes.local_size, sizes.global_size
     return {
         "eta .7 (paper)": lambda: LocalGlobalPools(local, old, 0.7, seed),
+        "eta .1": lambda: LocalGlobalPools(local, old, 0.1, seed),
+        "eta .1, new first": lambda: LocalGlobalPools(local, old, 0.1, seed, new_first=True),
         "eta .3": lambda: LocalGlobalPools(local, old, 0.3, seed),
         "eta .3, new first": lambda: LocalGlobalPools(local, old, 0.3, seed, new_first=True),
         UNFINISHED: lambda: LocalGlobalPools(local, old, 0.7, seed),
@@ -86,6 +88,7 @@ def variants(sizes: Sizes, seed: int) -> dict[str, Callable[[], LocalGlobalPools
         "w/o global": lambda: LocalGlobalPools(local, 0, 1.0, seed),
         # One frame passes through on its way to the global pool.
         "w/o local": lambda: LocalGlobalPools(1, old, 0.0, seed),
+        "even": lambda: LocalGlobalPools(local, old, None, seed, "even"),
         "release": lambda: LocalGlobalPools(local, old, None, seed, "release"),
     }
 

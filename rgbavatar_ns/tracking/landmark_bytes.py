@@ -48,6 +48,6 @@ def decoded(serialized: bytes) -> Float[np.ndarray, "N 2"]:
         return positions
     from mediapipe.framework.formats import landmark_pb2
 
-    message = landmark_pb2.NormalizedLandmarkList()
-    message.ParseFromString(serialized)  # pyright: ignore[reportAttributeAccessIssue]
+    message: Any = landmark_pb2.NormalizedLandmarkList()
+    message.ParseFromString(serialized)
     return np.array([(point.x, point.y) for point in message.landmark]).reshape(-1, 2)
