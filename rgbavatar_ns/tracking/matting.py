@@ -9,6 +9,7 @@ from jaxtyping import Float, UInt8
 from rgbavatar_ns.tracking.landmarks import load_mediapipe
 
 _GUIDE_EPSILON = 1e-4 * 255**2
+_FINE_SIDE_PX = 512
 
 
 class PersonMatte:
@@ -46,8 +47,12 @@ def refined_matte(
     image_rgb: UInt8[np.ndarray, "H W 3"], coarse: Float[np.ndarray, "H W"]
 ) -> Float[np.ndarray, "H W"]:
     """The coarse matte drawn to the picture's own edges by a guided filter (He 2010)."""
-    radius = max(2, round(max(image_rgb.shape[:2]) / 45))
-    fine = cv2.ximgproc.guidedFilter(image_rgb, coarse, radius, _GUIDE_EPSILON)
+    longer = max(image_rgb.shape[:2])
+    radius = max(2, round(longer / 45))
+    # The filter's coefficients at half the size, where that is still finer than the segmentation: a
+    # third of the time, and no difference that the eye finds (He and Sun 2015).
+    scale = 0.5 if longer >= _FINE_SIDE_PX else 1.0
+    fine = cv2.ximgproc.guidedFilter(image_rgb, coarse, radius, _GUIDE_EPSILON, None, -1, scale)
     # The segmentation hovers a little off 0 and 1; an avatar would learn that as haze.
     return np.clip((fine - 0.06) / 0.88, 0, 1).astype(np.float32)
 
