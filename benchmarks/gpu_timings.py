@@ -14,6 +14,7 @@ from gpu_training import film, step_of
 from torch import Tensor
 
 from rgbavatar_ns.avatar import Avatar, AvatarConfig
+from rgbavatar_ns.avatar.graphed_rendering import GraphedRendering
 from rgbavatar_ns.avatar.losses import random_backgrounds
 from rgbavatar_ns.avatar.training import make_optimizer
 from rgbavatar_ns.bench.drawing import leaf_gaussians
@@ -241,20 +242,26 @@ def steps(place: Place) -> Finding:
 
 @torch.no_grad()
 def rendering(place: Place) -> Finding:
-    """Frames a second from theta to the image, one at a time and by ten."""
+    """Frames a second from theta to the image, one at a time and by ten, recorded and not."""
     training, figures = _Training(place, recorded=False), {}
     avatar, frames = training.avatar, training.frames
     for size in (1, BATCH):
         parts = frames.theta.split(size)
         rounds = 2 if place.quick else max(2, 20 * size // BATCH)
-        for theta in parts[:5]:
-            avatar.render(theta, frames.cameras, backend="cuda")
-        place.wait()
-        start = time.perf_counter()
-        for _ in range(rounds):
-            for theta in parts:
-                avatar.render(theta, frames.cameras, backend="cuda")
-        place.wait()
-        figures[f"frames_per_second_by_{size}"] = rounds * FRAMES / (time.perf_counter() - start)
-    one, ten = figures.values()
+        ways = {
+            "eager": lambda theta: avatar.render(theta, frames.cameras, backend="cuda"),
+            "recorded": GraphedRendering(avatar, parts[0], frames.cameras, backend="cuda"),
+        }
+        for name, draw in ways.items():
+            for theta in parts[:5]:
+                draw(theta)
+            place.wait()
+            start = time.perf_counter()
+            for _ in range(rounds):
+                for theta in parts:
+                    draw(theta)
+            place.wait()
+            seconds = time.perf_counter() - start
+            figures[f"{name}_frames_per_second_by_{size}"] = rounds * FRAMES / seconds
+    one, ten = (figures[f"recorded_frames_per_second_by_{size}"] for size in (1, BATCH))
     return Finding(True, f"{one:.0f} frames/s one at a time, {ten:.0f} by ten", figures)

@@ -9,6 +9,8 @@ import imageio.v3 as imageio
 import torch
 
 from rgbavatar_ns.avatar import Avatar
+from rgbavatar_ns.avatar.graphed_rendering import GraphedRendering
+from rgbavatar_ns.avatar.recording import supports
 from rgbavatar_ns.avatar.training import TrainingBatch
 from rgbavatar_ns.bench.floor import floor_figures, measure_speed, parameter_work, rasterizer_work
 from rgbavatar_ns.bench.machine import chosen_device, machine_facts, require_backend
@@ -64,7 +66,11 @@ def _frames_in_turn(avatar: Avatar, batch: TrainingBatch) -> Callable[[], Any]:
             for position in range(len(batch.theta))
         ]
     )
-    return lambda: avatar.render(*next(frames))
+    theta, camera = next(frames)
+    # Where a device can take whole pictures by itself, that is how they are drawn in a row.
+    recorded = supports(avatar, theta, camera)
+    draw = GraphedRendering(avatar, theta, camera) if recorded else avatar.render
+    return lambda: draw(*next(frames))
 
 
 def _time_parts(workload: AvatarWorkload, stopwatch: Stopwatch) -> dict[str, Spread]:
