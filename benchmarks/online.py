@@ -7,7 +7,7 @@ The frames of a performance at 25 frames/s are streamed in order; between two of
 are taken as a trainer of `--images-per-second` manages, so that the figures do not depend on how
 busy the machine is; then follow `--steps-after-stream` steps on all that the pools hold, while the
 rates fall to a tenth, as in `ns-train rgbavatar-online`. Variants: the paper's pools (eta = .7),
-eta = .3 (the tiny preset's), 0 and 1, without the global and without the local pool, the release's
+eta = .3 (the tiny preset's), .1, 0 and 1, without the global and without the local pool, the release's
 strategy, new frames first (the default of `ns-train rgbavatar-online`), the paper's without those
 last steps, and offline training with the same number of images, with rates that fall in the same
 way at its end and with constant ones.
@@ -78,7 +78,6 @@ def variants(sizes: Sizes, seed: int) -> dict[str, Callable[[], LocalGlobalPools
     return {
         "eta .7 (paper)": lambda: LocalGlobalPools(local, old, 0.7, seed),
         "eta .1": lambda: LocalGlobalPools(local, old, 0.1, seed),
-        "eta .1, new first": lambda: LocalGlobalPools(local, old, 0.1, seed, new_first=True),
         "eta .3": lambda: LocalGlobalPools(local, old, 0.3, seed),
         "eta .3, new first": lambda: LocalGlobalPools(local, old, 0.3, seed, new_first=True),
         UNFINISHED: lambda: LocalGlobalPools(local, old, 0.7, seed),
@@ -88,7 +87,6 @@ def variants(sizes: Sizes, seed: int) -> dict[str, Callable[[], LocalGlobalPools
         "w/o global": lambda: LocalGlobalPools(local, 0, 1.0, seed),
         # One frame passes through on its way to the global pool.
         "w/o local": lambda: LocalGlobalPools(1, old, 0.0, seed),
-        "even": lambda: LocalGlobalPools(local, old, None, seed, "even"),
         "release": lambda: LocalGlobalPools(local, old, None, seed, "release"),
     }
 

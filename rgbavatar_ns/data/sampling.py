@@ -15,17 +15,13 @@ _KEPT_EPOCHS = 4
 _RAMP_FRAMES = 600
 _NEWEST_FRAMES = 150.0
 
-PoolStrategy = Literal["paper", "release", "even"]
+PoolStrategy = Literal["paper", "release"]
 """paper: a fixed share of each batch from the local pool, all of its frames equally likely.
 release: as the authors' program is said to do, the global pool's share grows over the first 600
-frames and local draws favour the newest, exp(i / 150) for the i-th oldest.
-even: ours; local frames that no batch has held fill up to their share, the newest first, and all
-others are drawn as if the whole stream were at hand: a global frame stands for all that have left
-the local pool beside it."""
+frames and local draws favour the newest, exp(i / 150) for the i-th oldest."""
 
-DEFAULT_LOCAL_SHARE: dict[PoolStrategy, float] = {"paper": 0.7, "release": 0.3, "even": 0.5}
-"""The local pool's share of a batch; for "release" that which it falls to, from 1; for "even" the
-most that frames without a draw may take."""
+DEFAULT_LOCAL_SHARE: dict[PoolStrategy, float] = {"paper": 0.7, "release": 0.3}
+"""The local pool's share of a batch; for "release" that which it falls to, from 1."""
 
 
 class OfflineOrder:
@@ -183,28 +179,11 @@ class LocalGlobalPools:
             raise UserError("No frame has arrived yet.", "Add a frame before drawing a batch.")
         if evenly:
             return self._draw([*self._local, *self._global], min(batch_size, len(self)))
-        if self.strategy == "even":
-            return self._draw_as_from_all(batch_size)
         wanted = round(self._present_local_share() * batch_size)
         from_global = min(batch_size - wanted, len(self._global))
         from_local = min(batch_size - from_global, len(self._local))
         from_global = min(batch_size - from_local, len(self._global))
         return self._draw_local(from_local) + self._draw(self._global, from_global)
-
-    def _draw_as_from_all(self, batch_size: int) -> list[int]:
-        new = list(self._undrawn)[::-1][: round(self.local_share * batch_size)]
-        taken = set(new)
-        others = [frame for frame in self._local if frame not in taken]
-        stands_for = self._departed / max(1, len(self._global))
-        weight = torch.ones(len(others) + len(self._global), dtype=torch.float64)
-        weight[len(others) :] = stands_for
-        count = min(batch_size - len(new), len(weight))
-        order = torch.multinomial(weight, count, generator=self._generator) if count else []
-        kept = [*others, *self._global]
-        drawn = new + [kept[int(i)] for i in order]
-        for frame in drawn:
-            self._undrawn.pop(frame, None)
-        return drawn
 
     def _present_local_share(self) -> float:
         if self.strategy == "paper":

@@ -179,29 +179,6 @@ def test_eta_is_the_local_share_of_a_batch(share, batch, local):
         assert sum(frame >= 20 for frame in drawn) == local
 
 
-def test_even_shows_every_frame_at_once_and_the_past_as_often_as_it_is_long():
-    pools = LocalGlobalPools(local_size=50, global_size=100, seed=1, strategy="even")
-    for frame in range(1050):
-        pools.add(frame)
-        drawn = pools.batch(4)
-        assert drawn[0] == frame
-        assert len(set(drawn)) == min(4, frame + 1)
-    drawn = Counter(frame for _ in range(4000) for frame in pools.batch(1))
-    old = sum(count for frame, count in drawn.items() if frame in pools.global_frames)
-    # 1,000 of 1,050 frames have left the local pool; six standard deviations.
-    assert abs(old / 4000 - 1000 / 1050) < 0.02
-
-
-def test_even_gives_new_frames_no_more_than_their_share():
-    pools = LocalGlobalPools(40, 100, 0.5, strategy="even")
-    for frame in range(30):
-        pools.add(frame)
-    first = pools.batch(10)
-    assert first[:5] == [29, 28, 27, 26, 25]
-    assert len(set(first)) == 10
-    assert LocalGlobalPools(40, 100, strategy="even").local_share == 0.5
-
-
 def test_evenly_drawn_every_held_frame_is_as_likely():
     pools = LocalGlobalPools(local_size=5, global_size=15, local_share=0.7, seed=3)
     for frame in range(100):
@@ -238,7 +215,7 @@ def test_without_a_global_pool_old_frames_are_gone():
     assert set(pools.batch(10)) == {3, 4, 5, 6, 7}
 
 
-@pytest.mark.parametrize("strategy", ["paper", "release", "even"])
+@pytest.mark.parametrize("strategy", ["paper", "release"])
 @pytest.mark.parametrize("new_first", [False, True])
 def test_pools_go_on_from_their_state_as_if_uninterrupted(strategy, new_first):
     def stream(pools: LocalGlobalPools, frames: range) -> list[list[int]]:
