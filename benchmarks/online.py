@@ -7,10 +7,10 @@ The frames of a performance at 25 frames/s are streamed in order; between two of
 are taken as a trainer of `--images-per-second` manages, so that the figures do not depend on how
 busy the machine is; then follow `--steps-after-stream` steps on all that the pools hold, while the
 rates fall to a tenth, as in `ns-train rgbavatar-online`. Variants: the paper's pools (eta = .7),
-eta = .3 (the tiny preset's), .1, 0 and 1, without the global and without the local pool, the release's
-strategy, new frames first (the default of `ns-train rgbavatar-online`), the paper's without those
-last steps, and offline training with the same number of images, with rates that fall in the same
-way at its end and with constant ones.
+eta = .3 (the tiny preset's), .1, 0 and 1, without the global and without the local pool, the
+release's strategy, new frames first (the default of `ns-train rgbavatar-online`), the paper's
+without those last steps, and offline training with as many images, with rates that fall in the
+same way at its end and with constant ones.
 
 Printed for each, as means over the seeds: held-out PSNR after the stream, PSNR over the streamed
 frames, and how much of each frame was forgotten (its L1 after the stream minus the lowest that it

@@ -9,7 +9,7 @@ from types import TracebackType
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
-from threadpoolctl import threadpool_limits
+from threadpoolctl import ThreadpoolController
 from torch import Tensor
 
 from rgbavatar_ns.data import TrackedFrame
@@ -64,6 +64,7 @@ class LiveTracker:
         self._fit: _CausalFit | None = None
         self._crop: FollowingCrop | None = None
         self._size: tuple[int, int] | None = None
+        self._libraries = ThreadpoolController()  # to look for them takes milliseconds
         self._next_index = 0
         self.counts: Counter[str] = Counter()
 
@@ -113,7 +114,7 @@ class LiveTracker:
         self._next_index = index + 1
         self._require_size(image_rgb.shape[1], image_rgb.shape[0])
         # Small matrices: more threads would only wait for each other.
-        with threadpool_limits(1, user_api="blas"):
+        with self._libraries.limit(limits=1, user_api="blas"):
             if self._fit is None or self._crop is None:
                 self._collect(index, image_rgb)
                 return None

@@ -61,8 +61,9 @@ def straight_rgba(
     color: UInt8[np.ndarray, "H W 3"], alpha: Float[np.ndarray, "H W"]
 ) -> UInt8[np.ndarray, "H W 4"]:
     """Colour and alpha as a picture; colour under zero alpha is black, which compresses well."""
-    levels = np.round(alpha * 255).astype(np.uint8)
-    return np.dstack([color * (levels > 0)[..., None].astype(np.uint8), levels])
+    levels = cv2.convertScaleAbs(np.ascontiguousarray(alpha), alpha=255)
+    seen = cv2.bitwise_and(color, color, mask=levels)
+    return cv2.merge([*cv2.split(seen), levels])
 
 
 def foreground_color(
@@ -112,9 +113,13 @@ def _explained(
     alpha: Float[np.ndarray, "H W"],
 ) -> Float[np.ndarray, "H W 3"]:
     """The foreground, changed as far as alpha goes so that both together give the picture."""
-    mixed = alpha[..., None]
-    changed = image - background - mixed * (foreground - background)
-    return np.clip(foreground + mixed * changed, 0, 255)
+    mixed = cv2.merge([alpha, alpha, alpha])
+    changed = cv2.multiply(mixed, cv2.subtract(foreground, background))
+    cv2.add(changed, background, dst=changed)
+    cv2.subtract(image, changed, dst=changed)
+    cv2.multiply(mixed, changed, dst=changed)
+    cv2.add(foreground, changed, dst=changed)
+    return np.clip(changed, 0, 255, out=changed)
 
 
 def _weighted_blur(
