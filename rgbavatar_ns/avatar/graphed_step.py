@@ -115,7 +115,8 @@ class GraphedStep:
     def _forget_if_moved(self) -> None:
         """A recording names places in memory; a checkpoint that was loaded lies elsewhere."""
         states = [*self._gaussian_states.values(), *self._network_states]
-        places = [t.data_ptr() for s in states for t in (s.value, s.first_moment, s.second_moment)]
+        tensors = [t for s in states for t in (s.value, s.first_moment, s.second_moment)]
+        places = [t.data_ptr() for t in (*tensors, *self._states.steps())]
         if places != self._places:
             self._replay, self._places = None, places
 
