@@ -13,9 +13,10 @@ without those last steps, and offline training with as many images, with rates t
 same way at its end and with constant ones.
 
 Printed for each, as means over the seeds: held-out PSNR after the stream, PSNR over the streamed
-frames, and how much of each frame was forgotten (its L1 after the stream minus the lowest that it
-ever had, looked at twice a second for every tenth frame; looking takes longer than training where
-streams are long, and `--looks-per-second .2` spares it). Drawn: loss by frame and PSNR by time.
+frames, PSNR of the newest second's frames while the stream runs (in its second half), and how much
+of each frame was forgotten (its L1 after the stream minus the lowest that it ever had, looked at
+twice a second for every tenth frame; looking takes longer than training where streams are long, and
+`--looks-per-second .2` spares it). Drawn: loss by frame and PSNR by time.
 """
 
 import argparse
@@ -54,6 +55,7 @@ PAPER_STREAM_FRAMES = 3000
 PRESET_STEPS_AFTER = 500
 FINAL_RATE = 0.1
 LOOKED_AT = 10
+NEWEST, NEWEST_EVERY = 25, 4
 OFFLINE, OFFLINE_CONSTANT = "offline", "offline, constant rates"
 UNFINISHED = "eta .7, no steps after"
 
@@ -97,11 +99,17 @@ class Outcome:
 
     test_psnr: float = 0.0
     streamed_psnr: float = 0.0
+    newest: list[float] = field(default_factory=list)
     loss_after: list[float] = field(default_factory=list)
     loss_lowest: list[float] = field(default_factory=list)
     seconds: list[float] = field(default_factory=list)
     psnr: list[float] = field(default_factory=list)
     train_seconds: float = 0.0
+
+    @property
+    def newest_psnr(self) -> float:
+        """Mean over the stream's second half of what the newest second looked like."""
+        return statistics.fmean(self.newest[len(self.newest) // 2 :] or [math.nan])
 
     @property
     def forgotten(self) -> float:
@@ -159,6 +167,8 @@ class Bench:
                     lowest[place] = min(lowest[place], loss)
                 outcome.seconds.append(arrived / FRAMES_PER_SECOND)
                 outcome.psnr.append(self.psnr(avatar, self.scored))
+                newest = self.dataset.train[max(0, arrived - NEWEST) : arrived : NEWEST_EVERY]
+                outcome.newest.append(self.psnr(avatar, newest))
             advance()
         began = time.monotonic()
         for _ in range(steps_after):
@@ -262,7 +272,8 @@ def measure(seed: int, arguments: argparse.Namespace, folder: Path) -> dict[str,
             )
             progress.console.print(
                 f"seed {seed}, {name}: held-out {one.test_psnr:.2f} dB, streamed "
-                f"{one.streamed_psnr:.2f} dB, forgotten {one.forgotten:.5f}",
+                f"{one.streamed_psnr:.2f} dB, newest {one.newest_psnr:.2f} dB, "
+                f"forgotten {one.forgotten:.5f}",
                 highlight=False,
             )
     return outcomes
@@ -271,7 +282,15 @@ def measure(seed: int, arguments: argparse.Namespace, folder: Path) -> dict[str,
 def table(runs: list[dict[str, Outcome]], images: int) -> Table:
     """Means over the seeds, and the spread of the held-out PSNR."""
     drawn = Table(title=f"{len(runs)} seeds, {images} images a run")
-    for column in ("variant", "held-out PSNR", "by seed", "streamed PSNR", "forgotten L1"):
+    columns = (
+        "variant",
+        "held-out PSNR",
+        "by seed",
+        "streamed PSNR",
+        "newest PSNR",
+        "forgotten L1",
+    )
+    for column in columns:
         drawn.add_column(column)
     for name in runs[0]:
         mine = [run[name] for run in runs]
@@ -280,6 +299,7 @@ def table(runs: list[dict[str, Outcome]], images: int) -> Table:
             f"{statistics.fmean(one.test_psnr for one in mine):.2f}",
             " ".join(f"{one.test_psnr:.2f}" for one in mine),
             f"{statistics.fmean(one.streamed_psnr for one in mine):.2f}",
+            f"{statistics.fmean(one.newest_psnr for one in mine):.2f}",
             f"{statistics.fmean(one.forgotten for one in mine):.5f}",
         )
     return drawn
