@@ -199,7 +199,7 @@ static unsigned atomicSub(unsigned* at, unsigned value) {
 }
 static float __fmaf_rn(float a, float b, float c) { return std::fma(a, b, c); }
 static float __fmul_rn(float a, float b) { return a * b; }
-static float __fdiv_rn(float a, float b) { return a / b; }
+static float __fdividef(float a, float b) { return a / b; }
 static int __ffs(int value) { return __builtin_ffs(value); }
 static unsigned __float_as_uint(float value) {
   return unsigned(emulation::bits_of(value));

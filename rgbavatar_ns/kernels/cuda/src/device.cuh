@@ -60,7 +60,8 @@ RGBAVATAR_FUNCTION const Splat* splats_of(const Frame& frame, const Bins& bins, 
 // point of a rectangle that does not hold the mean lies on a side that faces the mean.
 //
 // Several kernels ask this of a Gaussian and a tile and must get one answer, or a list would have
-// holes: the roundings are written out, so that no compiler fuses other products into sums.
+// holes: the roundings are written out, so that no compiler fuses other products into sums. The
+// quick division is as good, since any point near the best one will do.
 RGBAVATAR_FUNCTION float exact_log2_alpha(const Splat& s, float dx, float dy) {
   const float across = __fmaf_rn(dx, s.qa, __fmul_rn(dy, s.qb));
   const float down = __fmaf_rn(dy, __fmul_rn(dy, s.qc), s.log2_opacity);
@@ -74,8 +75,8 @@ RGBAVATAR_FUNCTION float best_log2_alpha(const Splat& s, float left, float top, 
   const float near_x = fminf(fmaxf(0.0f, low_x), high_x);
   const float near_y = fminf(fmaxf(0.0f, low_y), high_y);
   if (near_x == 0.0f && near_y == 0.0f) return s.log2_opacity;
-  const float best_y = __fdiv_rn(__fmul_rn(__fmul_rn(-0.5f, s.qb), near_x), s.qc);
-  const float best_x = __fdiv_rn(__fmul_rn(__fmul_rn(-0.5f, s.qb), near_y), s.qa);
+  const float best_y = __fdividef(__fmul_rn(__fmul_rn(-0.5f, s.qb), near_x), s.qc);
+  const float best_x = __fdividef(__fmul_rn(__fmul_rn(-0.5f, s.qb), near_y), s.qa);
   const float on_x = exact_log2_alpha(s, near_x, fminf(fmaxf(best_y, low_y), high_y));
   const float on_y = exact_log2_alpha(s, fminf(fmaxf(best_x, low_x), high_x), near_y);
   return fmaxf(near_x != 0.0f ? on_x : on_y, near_y != 0.0f ? on_y : on_x);
