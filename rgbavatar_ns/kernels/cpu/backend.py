@@ -6,18 +6,18 @@ loops; without it the fastest that the processor runs is taken.
 
 import os
 from dataclasses import dataclass
-from typing import Any
+from functools import partial
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from rgbavatar_ns.kernels.cpu import (
     INSTRUCTION_SET_VARIABLE,
     _native,  # pyright: ignore[reportMissingModuleSource]
 )
 from rgbavatar_ns.kernels.cpu.blended import CpuBlendedRenderer
+from rgbavatar_ns.kernels.differentiable import Gradients, draw_differentiably
 from rgbavatar_ns.kernels.types import (
     BlendedGaussians,
     GaussianSet,
@@ -61,56 +61,41 @@ def _session(gaussians: tuple[Tensor, ...], cameras: PinholeCameras, batch: int)
     )
 
 
-class _Rasterize(torch.autograd.Function):
-    """Image and alpha of (means, quats_wxyz, scales, opacities, colors, background)."""
+def _draw(
+    request: _Request, gaussians: tuple[Tensor, ...], background: Tensor
+) -> tuple[Tensor, Tensor, Gradients]:
+    """See `kernels.differentiable.Draw`."""
+    size = (request.batch, request.cameras.height, request.cameras.width)
+    image, alpha = background.new_empty(*size, 3), background.new_empty(*size, 1)
+    session = _session(gaussians, request.cameras, request.batch)
+    session.draw(background, image, alpha, request.depth)
+    if request.visibility is not None:
+        session.average(None, None, None, request.visibility)
 
-    @staticmethod
-    def forward(ctx: Any, request: _Request, *inputs: Tensor) -> tuple[Tensor, Tensor]:
-        *gaussians, background = (tensor.detach().contiguous() for tensor in inputs)
-        size = (request.batch, request.cameras.height, request.cameras.width)
-        image, alpha = background.new_empty(*size, 3), background.new_empty(*size, 1)
-        session = _session(tuple(gaussians), request.cameras, request.batch)
-        session.draw(background, image, alpha, request.depth)
-        if request.visibility is not None:
-            session.average(None, None, None, request.visibility)
-        if any(ctx.needs_input_grad):
-            ctx.session = session
-            ctx.save_for_backward(*gaussians, image, alpha)
-            ctx.background_shape = background.shape
-            ctx.set_materialize_grads(False)
-        return image, alpha
+    def gradients(
+        gaussians: tuple[Tensor, ...],
+        image: Tensor,
+        alpha: Tensor,
+        image_grad: Tensor | None,
+        alpha_grad: Tensor | None,
+    ) -> list[Tensor]:
+        means, quats, scales, opacities, colors = filled = [torch.empty_like(t) for t in gaussians]
+        session.backward(
+            _native.Gaussians(*gaussians),
+            image,
+            alpha,
+            image_grad,
+            alpha_grad,
+            means,
+            quats,
+            scales,
+            opacities,
+            colors,
+            torch.get_num_threads(),
+        )
+        return filled
 
-    @staticmethod
-    @once_differentiable
-    def backward(  # pyright: ignore[reportIncompatibleMethodOverride]
-        ctx: Any, *grad_outputs: Tensor | None
-    ) -> tuple[Tensor | None, ...]:
-        image_grad, alpha_grad = grad_outputs
-        *gaussians, image, alpha = ctx.saved_tensors
-        if image_grad is None and alpha_grad is None:
-            return (None,) * 7
-        image_grad = None if image_grad is None else image_grad.contiguous()
-        alpha_grad = None if alpha_grad is None else alpha_grad.contiguous()
-        grads: list[Tensor | None] = [None] * 5
-        if any(ctx.needs_input_grad[1:6]):
-            filled = [torch.empty_like(tensor) for tensor in gaussians]
-            ctx.session.backward(
-                _native.Gaussians(*gaussians),
-                image,
-                alpha,
-                image_grad,
-                alpha_grad,
-                *filled,
-                torch.get_num_threads(),
-            )
-            grads = [
-                grad if needed else None for grad, needed in zip(filled, ctx.needs_input_grad[1:6])
-            ]
-        background_grad = None
-        if ctx.needs_input_grad[6] and image_grad is not None:
-            background_grad = ((1 - alpha) * image_grad).sum((1, 2))
-            background_grad = background_grad.sum_to_size(ctx.background_shape)
-        return (None, *grads, background_grad)
+    return image, alpha, gradients
 
 
 class CpuBackend:
@@ -142,7 +127,7 @@ class CpuBackend:
             new(size) if with_depth else None,
             new(batch, inputs[0].shape[1]) if with_visibility else None,
         )
-        image, alpha = _Rasterize.apply(request, *inputs, background)
+        image, alpha = draw_differentiably(partial(_draw, request), *inputs, background)
         return RenderedBatch(image, alpha, request.depth, request.visibility)
 
     @torch.no_grad()

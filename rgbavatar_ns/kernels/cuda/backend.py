@@ -2,17 +2,18 @@
 
 import functools
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from rgbavatar_ns.kernels.cuda.binning import Bins, Capacities, Images, blocks, camera_values
 from rgbavatar_ns.kernels.cuda.blended import CudaBlendedRenderer
 from rgbavatar_ns.kernels.cuda.launcher import Launcher
 from rgbavatar_ns.kernels.cuda.tiles import Tiles
+from rgbavatar_ns.kernels.differentiable import Gradients, draw_differentiably
 from rgbavatar_ns.kernels.types import (
     BlendedGaussians,
     GaussianSet,
@@ -62,45 +63,27 @@ def _tiles(request: _Request, gaussians: tuple[Tensor, ...]) -> Tiles:
     return Tiles(request.launcher, bins)
 
 
-class _Rasterize(torch.autograd.Function):
-    """Image and alpha of (means, quats_wxyz, scales, opacities, colors, background)."""
+def _draw(
+    request: _Request, gaussians: tuple[Tensor, ...], background: Tensor
+) -> tuple[Tensor, Tensor, Gradients]:
+    """See `kernels.differentiable.Draw`."""
+    tiles = _tiles(request, gaussians)
+    image, alpha, request.depth = tiles.draw(background, with_depth=request.with_depth)
+    if request.with_visibility:
+        request.visibility = tiles.average(None)[2]
 
-    @staticmethod
-    def forward(ctx: Any, request: _Request, *inputs: Tensor) -> tuple[Tensor, Tensor]:
-        *gaussians, background = (tensor.detach().contiguous() for tensor in inputs)
-        tiles = _tiles(request, tuple(gaussians))
-        image, alpha, request.depth = tiles.draw(background, with_depth=request.with_depth)
-        if request.with_visibility:
-            request.visibility = tiles.average(None)[2]
-        if any(ctx.needs_input_grad):
-            ctx.tiles, ctx.request = tiles, request
-            ctx.save_for_backward(*gaussians, image, alpha)
-            ctx.background_shape = background.shape
-            ctx.set_materialize_grads(False)
-        return image, alpha
+    def gradients(
+        gaussians: tuple[Tensor, ...],
+        image: Tensor,
+        alpha: Tensor,
+        image_grad: Tensor | None,
+        alpha_grad: Tensor | None,
+    ) -> list[Tensor]:
+        slots = tiles.differentiate(image, alpha, image_grad, alpha_grad)
+        filled = _gradients(request, tiles, gaussians, slots)
+        return [grad.sum_to_size(t.shape) for grad, t in zip(filled, gaussians)]
 
-    @staticmethod
-    @once_differentiable
-    def backward(  # pyright: ignore[reportIncompatibleMethodOverride]
-        ctx: Any, *grad_outputs: Tensor | None
-    ) -> tuple[Tensor | None, ...]:
-        image_grad, alpha_grad = (None if g is None else g.contiguous() for g in grad_outputs)
-        *gaussians, image, alpha = ctx.saved_tensors
-        if image_grad is None and alpha_grad is None:
-            return (None,) * 7
-        grads: list[Tensor | None] = [None] * 5
-        if any(ctx.needs_input_grad[1:6]):
-            slots = ctx.tiles.differentiate(image, alpha, image_grad, alpha_grad)
-            filled = _gradients(ctx.request, ctx.tiles, tuple(gaussians), slots)
-            grads = [
-                grad.sum_to_size(tensor.shape) if needed else None
-                for grad, tensor, needed in zip(filled, gaussians, ctx.needs_input_grad[1:6])
-            ]
-        background_grad = None
-        if ctx.needs_input_grad[6] and image_grad is not None:
-            background_grad = ((1 - alpha) * image_grad).sum((1, 2))
-            background_grad = background_grad.sum_to_size(ctx.background_shape)
-        return (None, *grads, background_grad)
+    return image, alpha, gradients
 
 
 def _gradients(
@@ -167,7 +150,7 @@ class CudaBackend:
         inputs = _attributes(gaussians)
         batch = max(t.shape[0] for t in (*inputs, background, cameras.focal_px))
         request = self._request(gaussians, cameras, batch, with_depth, with_visibility)
-        image, alpha = _Rasterize.apply(request, *inputs, background)
+        image, alpha = draw_differentiably(partial(_draw, request), *inputs, background)
         return RenderedBatch(image, alpha, request.depth, request.visibility)
 
     @torch.no_grad()

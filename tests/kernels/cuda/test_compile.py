@@ -36,7 +36,7 @@ def test_compiles(architecture):
 
 
 @needs_nvrtc
-def test_nothing_spills(monkeypatch):
+def test_nothing_spills():
     """A value that leaves the registers costs more than what is computed with it."""
     assert compiler is not None
     log = compiler.resource_report("sm_90")

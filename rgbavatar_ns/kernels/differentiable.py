@@ -1,0 +1,55 @@
+"""A compiled backend's drawing behind torch's autograd."""
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+Gradients = Callable[
+    [tuple[Tensor, ...], Tensor, Tensor, Tensor | None, Tensor | None], list[Tensor]
+]
+"""From (means, quats_wxyz, scales, opacities, colors), image, alpha and the gradients of both to
+those of the five, in their shapes. It must not hold image or alpha, which hold it."""
+
+Draw = Callable[[tuple[Tensor, ...], Tensor], tuple[Tensor, Tensor, Gradients]]
+"""Draws the five, contiguous, over a background: image, alpha, and how they are differentiated."""
+
+
+def draw_differentiably(draw: Draw, *inputs: Tensor) -> tuple[Tensor, Tensor]:
+    """Image and alpha of (means, quats_wxyz, scales, opacities, colors, background)."""
+    return _Drawn.apply(draw, *inputs)
+
+
+class _Drawn(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, draw: Draw, *inputs: Tensor) -> tuple[Tensor, Tensor]:
+        *gaussians, background = (tensor.detach().contiguous() for tensor in inputs)
+        image, alpha, gradients = draw(tuple(gaussians), background)
+        if any(ctx.needs_input_grad):
+            ctx.gradients = gradients
+            ctx.save_for_backward(*gaussians, image, alpha)
+            ctx.background_shape = background.shape
+            ctx.set_materialize_grads(False)
+        return image, alpha
+
+    @staticmethod
+    @once_differentiable
+    def backward(  # pyright: ignore[reportIncompatibleMethodOverride]
+        ctx: Any, *grad_outputs: Tensor | None
+    ) -> tuple[Tensor | None, ...]:
+        image_grad, alpha_grad = (None if g is None else g.contiguous() for g in grad_outputs)
+        *gaussians, image, alpha = ctx.saved_tensors
+        if image_grad is None and alpha_grad is None:
+            return (None,) * 7
+        grads: list[Tensor | None] = [None] * 5
+        needed = ctx.needs_input_grad[1:6]
+        if any(needed):
+            filled = ctx.gradients(tuple(gaussians), image, alpha, image_grad, alpha_grad)
+            grads = [grad if wanted else None for grad, wanted in zip(filled, needed)]
+        background_grad = None
+        if ctx.needs_input_grad[6] and image_grad is not None:
+            background_grad = ((1 - alpha) * image_grad).sum((1, 2))
+            background_grad = background_grad.sum_to_size(ctx.background_shape)
+        return (None, *grads, background_grad)
