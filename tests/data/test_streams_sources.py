@@ -19,6 +19,7 @@ from rgbavatar_ns.data.streams import (
     wire,
 )
 from rgbavatar_ns.data.streams.address import StreamAddress
+from rgbavatar_ns.data.streams.pushed import _CHUNK_BYTES, ACCEPTED
 from rgbavatar_ns.errors import UserError
 from tests.data.small_dataset import NUM_FRAMES, NUM_TEST, small_dataset
 from tests.data.streaming import HEAD, same, subject, take, tracked, until
@@ -201,6 +202,28 @@ def test_a_lost_client_comes_back_and_goes_on(pushed: PushedStream):
     got = take(pushed, 10)
     thread.join()
     assert [frame.index for frame in got] == [0, 1, 2, 3]
+    assert pushed.counts == {"source lost": 1, "reconnects": 1, "garbage bytes": 0}
+
+
+def test_who_comes_while_the_lost_one_is_still_being_read_is_not_refused(pushed: PushedStream):
+    place = StreamAddress.parse(pushed.address).place
+    greeting, one = wire.subject_record(subject("mine")), wire.frame_record(tracked(0))
+    repeats = 3 * _CHUNK_BYTES // len(one)  # more than is read at once
+    answers = []
+
+    def send() -> None:
+        with socket.create_connection(place, timeout=10) as first:
+            first.sendall(greeting)
+            answers.append(first.recv(100))
+            first.sendall(one * repeats)
+        with socket.create_connection(place, timeout=10) as second:
+            second.sendall(greeting + wire.end_record())
+            answers.append(second.recv(100))
+
+    thread = in_background(send)
+    assert len(take(pushed, repeats + 1)) == repeats
+    thread.join()
+    assert answers == [ACCEPTED] * 2
     assert pushed.counts == {"source lost": 1, "reconnects": 1, "garbage bytes": 0}
 
 

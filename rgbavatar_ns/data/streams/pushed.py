@@ -24,6 +24,9 @@ _MOST_GARBAGE_BYTES = 1 << 20
 """Between two whole records; a client that sends more is hung up on."""
 _LONGEST_WAIT_S = 0.05
 _FAREWELL_S = 0.2
+_KNOCK_S, _LONGEST_KNOCK_S = 0.5, 5.0
+"""How long a second client is kept waiting before it is refused: what the first has sent before
+it hung up may still have to be read. The longer time is for a first that never pauses."""
 
 
 @dataclasses.dataclass
@@ -41,8 +44,8 @@ class PushedStream:
 
     The client begins with its subject and is answered by a line, "OK" or "REFUSED" and the
     reason; nothing else is sent to it. While a client is connected and not silent, a second one
-    is refused. One that hangs up may come back, another may take its place, with the same head
-    and image size.
+    is refused, after half a second in which the first may prove to have hung up. One that hangs
+    up may come back, another may take its place, with the same head and image size.
 
     Args:
         listen: HOST:PORT (port 0: any that is free, see `address`) or unix:PATH.
@@ -68,6 +71,7 @@ class PushedStream:
         place = bound if isinstance(bound, str) else bound[:2]
         self.address = str(StreamAddress(wanted.family, place))
         self._client: _Client | None = None
+        self._knocked_s: float | None = None
         self._subject: StreamSubject | None = None
         self._frames: deque[StreamedFrame] = deque()
         self._end_seen = self._closed = False
@@ -106,22 +110,34 @@ class PushedStream:
         left = deadline - time.monotonic()
         if self._closed or left <= 0:
             return False
-        readers = [self._listener] + ([self._client.connection] if self._client else [])
+        connection = self._client and self._client.connection
+        knock_noted = connection is not None and self._knocked_s is not None
+        readers = [one for one in (connection, None if knock_noted else self._listener) if one]
         try:
             ready, _, _ = select.select(readers, [], [], min(left, _LONGEST_WAIT_S))
-            if self._client is not None and self._client.connection in ready:
+            if self._client is not None and connection in ready:
                 self._receive(self._client)
-            if self._listener in ready:
-                self._welcome()
+            if self._listener in ready or knock_noted:
+                self._answer_knock(client_pauses=connection not in ready)
         except (OSError, ValueError):
             if not self._closed:  # else the sockets were closed meanwhile
                 raise
         return True
 
-    def _welcome(self) -> None:
-        connection, _ = self._listener.accept()
+    def _answer_knock(self, client_pauses: bool) -> None:
+        """Admit or refuse the client that waits at the listener, once it is clear which."""
         now = time.monotonic()
-        if self._client is not None and now - self._client.heard_s < _SILENCE_S:
+        silent = self._client is None or now - self._client.heard_s >= _SILENCE_S
+        if not silent:
+            self._knocked_s = now if self._knocked_s is None else self._knocked_s
+            if now - self._knocked_s < (_KNOCK_S if client_pauses else _LONGEST_KNOCK_S):
+                return
+        self._knocked_s = None
+        try:
+            connection, _ = self._listener.accept()
+        except BlockingIOError:  # it did not wait so long
+            return
+        if not silent:
             self._refuse(connection, "another client is connected.")
             connection.close()
             return
@@ -241,6 +257,7 @@ def _listener(address: StreamAddress) -> socket.socket:
             listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             listener.bind(address.place)
         listener.listen(4)
+        listener.setblocking(False)
     except OSError as error:
         listener.close()
         raise UserError(
