@@ -134,7 +134,7 @@ def test_parts_of_large_images_match_reference(name):
 @pytest.mark.usefixtures("instruction_set")
 def test_one_to_sixteen_threads_give_the_same_bits():
     scene = random_scene(
-        4, width=203, height=141, batch=3, count=2500, num_cameras=3, shared=("opacities", "means")
+        4, width=203, height=141, batch=3, count=1200, num_cameras=3, shared=("opacities", "means")
     )
     gaussians, cameras = to(scene.gaussians, torch.float32), to(scene.cameras, torch.float32)
     threads = torch.get_num_threads()
