@@ -21,21 +21,22 @@ pytestmark = pytest.mark.skipif("cpu" not in available_backends(), reason="not c
 def test_held_out_psnr_is_that_of_the_eager_path(tmp_path):
     """Means over held-out frames of a small demo subject, five seeds, within a tenth of a dB.
 
-    Two runs of one seed part by about .1 dB either way, as two eager runs do.
+    Two runs of one seed part by about .05 dB either way, as two eager runs do, so that the means
+    of five seeds part by .02 dB. A third fewer steps cost .3 dB.
     """
-    config = DemoConfig(image_size=64, num_frames=32, num_test_frames=8)
+    config = DemoConfig(image_size=48, num_frames=20, num_test_frames=6, supersampling=1)
     dataset = make_demo_dataset(tmp_path / "subject", config)
     images = torch.stack([torch.as_tensor(dataset.read_image(i)) for i in range(len(dataset))])
-    order = OfflineOrder(dataset.train, 10, 0)
+    order = OfflineOrder(dataset.train, 5, 0)
 
     def batch(step: int) -> TrainingBatch:
         chosen = order.batch(step)
         return TrainingBatch(dataset.theta[chosen], dataset.cameras.select(chosen), images[chosen])
 
     def score(fast: bool, seed: int) -> float:
-        settings = AvatarConfig(num_bases=6, uv_resolution=48, scale_from_texel_spacing=True)
+        settings = AvatarConfig(num_bases=6, uv_resolution=32, scale_from_texel_spacing=True)
         avatar = Avatar(HeadModel(dataset.arrays), dataset.identity, settings, seed=seed)
-        fit(avatar, batch, 200, TrainingOptions(seed=seed, fast=fast))
+        fit(avatar, batch, 120, TrainingOptions(seed=seed, fast=fast))
         test = list(dataset.test)
         with torch.no_grad():
             drawn = avatar.render(dataset.theta[test], dataset.cameras.select(test)).image
