@@ -11,12 +11,14 @@ from rich.console import Console
 from rich.table import Table
 
 from rgbavatar_ns.cli.progress import stage_bars
+from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.tracking import TrackConfig, track_video
 
 
 def run(
-    videos: Annotated[tuple[Path, ...], tyro.conf.Positional],
-    dst: Annotated[Path, tyro.conf.Positional],
+    paths: Annotated[
+        tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="VIDEO [VIDEO ...] DATASET")
+    ] = (),
     config: Annotated[TrackConfig, tyro.conf.arg(name="")] = TrackConfig(),
 ) -> None:
     """Find the face, cut out the person, fit the head model and write a dataset.
@@ -24,10 +26,16 @@ def run(
     An interrupted command goes on where it was when it is given again.
 
     Args:
-        videos: one file, a folder of images, or several clips of one person.
-        dst: the dataset's folder.
+        paths: one file, a folder of images, or several clips of one person; then the folder of
+            the dataset.
         config: options of the tracker.
     """
+    if len(paths) < 2:
+        raise UserError(
+            "A video and a place for the dataset are needed.",
+            "Try `rgbavatar track me.mp4 data/me`.",
+        )
+    *videos, dst = paths
     try:
         with stage_bars("frames") as update:
             dataset = track_video(videos, dst, config, progress=update)

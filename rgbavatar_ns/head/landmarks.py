@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 LANDMARK_FILE = Path(__file__).parent / "assets" / "facemesh_landmarks.npz"
+RESPONSE_FILE = LANDMARK_FILE.with_name("facemesh_response.npz")
 
 SPARSE_51 = (
     *(70, 63, 105, 66, 107, 336, 296, 334, 293, 300),
@@ -24,9 +25,12 @@ class LandmarkResponse:
     """Where a detector puts L points apart from the skin they lie on, in the skull's frame, metres.
 
     Detectors follow faces incompletely: they round off expressions, and points of the outline
-    slide over the skin as the head turns. Offsets are `rest`, plus the others times: the head's
-    direction to the camera (x, y, x^2, y^2, xy), expression coefficients, the sine of the jaw's
-    angle, the sines of the eyes' pitch and yaw, identity coefficients.
+    slide over the skin as the head turns. Offsets are `rest`, plus the others times: the direction
+    from the skull to the camera (x, y, x^2, y^2, xy), expression coefficients, the sine of the
+    jaw's first angle, the sines of the eyes' pitch and yaw (their mean), identity coefficients.
+
+    Ours: the usual way is to trust the points. FaceMesh's on the embedded head is made by
+    scripts/build_landmark_response.py, from renders whose truth is known.
     """
 
     rest: Float[np.ndarray, "L 3"]
@@ -59,14 +63,11 @@ class LandmarkMap:
     def select(self, facemesh_indices: tuple[int, ...]) -> "LandmarkMap":
         """These points, in this order; raises KeyError for a point that is not in the map."""
         places = {int(index): place for place, index in enumerate(self.facemesh_index)}
-        chosen = np.array([places[index] for index in facemesh_indices], dtype=np.int64)
-        return LandmarkMap(
-            self.facemesh_index[chosen],
-            self.triangle[chosen],
-            self.barycentric[chosen],
-            self.mirror[chosen],
-            self.spread_m[chosen],
-        )
+        return self.select_rows(np.array([places[index] for index in facemesh_indices], np.int64))
+
+    def select_rows(self, rows: Int[np.ndarray, "K"]) -> "LandmarkMap":
+        """The same of these rows."""
+        return LandmarkMap(*(getattr(self, field.name)[rows] for field in fields(self)))
 
     def as_dict(self) -> dict[int, tuple[int, tuple[float, float, float]]]:
         """FaceMesh index -> (triangle, barycentric coordinates)."""
@@ -88,4 +89,13 @@ def facemesh_landmarks() -> LandmarkMap:
             file["barycentric"].astype(np.float64),
             file["mirror"].astype(np.int64),
             file["spread_m"].astype(np.float64),
+        )
+
+
+@cache
+def facemesh_response() -> LandmarkResponse:
+    """How FaceMesh's points follow the embedded head; rows as in `facemesh_landmarks`."""
+    with np.load(RESPONSE_FILE, allow_pickle=False) as file:
+        return LandmarkResponse(
+            *(file[field.name].astype(np.float64) for field in fields(LandmarkResponse))
         )

@@ -60,6 +60,7 @@ def minimize_box_quadratic(
 
 
 def levenberg_marquardt(
+    cost_at: Callable[[Vector], float],
     model_at: Callable[[Vector], QuadraticModel],
     start: Vector,
     lower: Vector,
@@ -67,16 +68,19 @@ def levenberg_marquardt(
     *,
     iterations: int,
     tolerance: float = 1e-4,
-) -> tuple[Vector, QuadraticModel]:
+) -> tuple[Vector, float]:
     """Minimise inside the bounds, from `start`; the damping follows whether steps succeed.
 
-    Returns the best point and its model. Stops when a step lowers the cost by less than
-    `tolerance` of it. Deterministic.
+    `model_at` is asked only where a step is taken from, `cost_at` where one may end. Returns the
+    best point and its cost. Stops when a step lowers the cost by less than `tolerance` of it.
+    Deterministic.
     """
-    point = np.clip(start, lower, upper)
-    model = model_at(point)
-    damping = 1e-4
+    point, damping = np.clip(start, lower, upper), 1e-4
+    model, cost = None, np.inf
     for _ in range(iterations):
+        if model is None:
+            model = model_at(point)
+            cost = model.cost
         diagonal = np.maximum(np.diag(model.hessian), 1e-9)
         damped = model.hessian + np.diag(damping * diagonal + 1e-12)
         try:
@@ -85,14 +89,14 @@ def levenberg_marquardt(
             damping = max(damping, 1e-6) * 10
             continue
         trial = np.clip(point + step, lower, upper)
-        trial_model = model_at(trial)
-        if trial_model.cost < model.cost:
-            gained = model.cost - trial_model.cost
-            point, model, damping = trial, trial_model, max(damping / 5, 1e-9)
-            if gained < tolerance * (model.cost + 1e-12):
+        trial_cost = cost_at(trial)
+        if trial_cost < cost:
+            gained = cost - trial_cost
+            point, cost, model, damping = trial, trial_cost, None, max(damping / 5, 1e-9)
+            if gained < tolerance * (cost + 1e-12):
                 break
         else:
             damping = max(damping, 1e-6) * 10
             if damping > 1e6:
                 break
-    return point, model
+    return point, cost if np.isfinite(cost) else cost_at(point)

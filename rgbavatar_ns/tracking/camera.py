@@ -24,6 +24,11 @@ class StillCamera:
         matrix[2, 3] = self.distance_m
         return matrix
 
+    @property
+    def eye_m(self) -> Float[np.ndarray, "3"]:
+        """Where the camera is, in the world."""
+        return np.array([0.0, 0.0, self.distance_m])
+
     def project(self, points_m: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 2"]:
         """Image points in pixels."""
         depth = self.distance_m - points_m[..., 2]

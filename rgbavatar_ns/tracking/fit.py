@@ -88,7 +88,7 @@ def initial_camera(
 def rigid_start(cost: FrameCost, camera: StillCamera, target: Target) -> Float[np.ndarray, "P"]:
     """Frontal pose whose landmarks' centre lies on the observed one."""
     base, identity = blank(cost)
-    points = cost.head.points(base, identity)
+    points = cost.head.points(base, identity, camera.eye_m)
     depth = camera.distance_m - points[:, 2].mean()
     wanted = (target.points_px.mean(0) - camera.center_px) * depth / camera.focal_px
     shift = np.array([wanted[0], -wanted[1]]) - points[:, :2].mean(0)
@@ -113,11 +113,17 @@ def fit_frame(
 ) -> Float[np.ndarray, "P"]:
     """One frame's bounded fit from `start`, drawn towards `neighbours` if given.
 
-    The last `_ROBUST_STEPS` of at most `iterations` steps let go of landmarks that are far off.
+    The last third of at most `iterations` steps, and no fewer than `_ROBUST_STEPS`, let go of
+    landmarks that are far off.
     """
     base, identity = blank(cost)
-    values = start
-    for steps, redescending in ((iterations - _ROBUST_STEPS, False), (_ROBUST_STEPS, True)):
+    values, robust = start, max(_ROBUST_STEPS, iterations // 3)
+    for steps, redescending in ((iterations - robust, False), (robust, True)):
+
+        def cost_at(values: Float[np.ndarray, "P"], redescending: bool = redescending) -> float:
+            theta = cost.theta(values, base)
+            data = cost.value(theta, identity, camera, target, redescending=redescending)
+            return data + cost.prior_value(values, neighbours, temporal_weight)
 
         def model_at(
             values: Float[np.ndarray, "P"], redescending: bool = redescending
@@ -128,6 +134,7 @@ def fit_frame(
             return cost.add_priors(values, model, neighbours, temporal_weight)
 
         values, _ = levenberg_marquardt(
+            cost_at,
             model_at,
             values,
             cost.parameters.lower,
@@ -187,7 +194,7 @@ def subject_offsets(
     found = []
     for values, target in zip(subject.key_values, keys):
         theta = cost.theta(values, base)
-        points = cost.head.points(theta, subject.identity)
+        points = cost.head.points(theta, subject.identity, subject.camera.eye_m)
         residual = subject.camera.project(points) - target.points_px
         depth = subject.camera.distance_m - points[:, 2]
         across = -residual * (1.0, -1.0) * (depth / subject.camera.focal_px)[:, None]
@@ -243,7 +250,18 @@ def _fit_keys(
             hessian[common, common] += data.hessian[size:, size:]
         return QuadraticModel(total, gradient, hessian)
 
-    packed, model = levenberg_marquardt(
+    def cost_at(packed: Float[np.ndarray, "Q"]) -> float:
+        person = identity.copy()
+        person[:shared] = packed[frames * size :]
+        total = 0.5 * precision * float(person[:shared] @ person[:shared])
+        for number, key in enumerate(keys):
+            values = packed[number * size : (number + 1) * size]
+            total += joint.value(cost.theta(values, base), person, camera, key)
+            total += cost.prior_value(values, None, 0.0)
+        return total
+
+    packed, total = levenberg_marquardt(
+        cost_at,
         model_at,
         np.concatenate([*rigid, np.zeros(shared)]),
         lower,
@@ -253,7 +271,7 @@ def _fit_keys(
     )
     identity[:shared] = packed[frames * size :]
     values = packed[: frames * size].reshape(frames, size)
-    return model.cost, SubjectFit(identity, camera, values)
+    return total, SubjectFit(identity, camera, values)
 
 
 def key_frame_positions(landmarks_px: Float[np.ndarray, "F L 2"], count: int) -> list[int]:

@@ -8,11 +8,20 @@ import torch
 from jaxtyping import Float, Int
 
 from rgbavatar_ns.head import HeadModel
+from rgbavatar_ns.head.landmarks import LandmarkResponse
 from rgbavatar_ns.head.rotations import axis_angle_to_matrix
+from rgbavatar_ns.tracking.pose_chain import (
+    JAW,
+    ROOT,
+    SKULL,
+    PoseChain,
+    PoseView,
+    angular_velocities,
+    cross_matrix,
+    signal_slope,
+)
 
 POSE_FIELDS = ("rotation", "neck", "jaw", "left_eye", "right_eye")
-_SKULL = 1
-_NO_ANGLE_RAD = 1e-7
 
 
 @dataclass(frozen=True)
@@ -24,31 +33,12 @@ class LandmarkJacobian:
 
 
 @dataclass(frozen=True)
-class _Chain:
-    """Joints of a pose: what rests at x on joint j goes to turned_j (x - at_rest_j) + placed_j.
-
-    `local` are the joints' own rotations; column k of `spin` is the angular velocity in the world
-    as entry k of the joint's axis angle grows.
-    """
-
-    local: Float[np.ndarray, "5 3 3"]
-    turned: Float[np.ndarray, "5 3 3"]
-    spin: Float[np.ndarray, "5 3 3"]
-    at_rest: Float[np.ndarray, "5 3"]
-    placed: Float[np.ndarray, "5 3"]
-
-    @property
-    def features(self) -> Float[np.ndarray, "36"]:
-        """R - I of all joints but the root, FLAME's order."""
-        return (self.local[1:] - np.eye(3)).reshape(36)
-
-
-@dataclass(frozen=True)
 class _JointMoments:
     """What one joint carries: `rows` are the landmarks with any weight on it.
 
     share [R] sums barycentric * skinning weight; rest [3, R], dirs [3, R, C] and pose_dirs
-    [3, R, 36] are the positions' and offsets' sums with the same weights.
+    [3, R, 36] are the positions' and offsets' sums with the same weights; slides [3, R, 8] is what
+    a detector's response adds for each signal.
     """
 
     joint: int
@@ -57,6 +47,20 @@ class _JointMoments:
     rest: Float[np.ndarray, "3 R"]
     dirs: Float[np.ndarray, "3 R C"]
     pose_dirs: Float[np.ndarray, "3 R 36"] | None
+    slides: Float[np.ndarray, "3 R 8"] | None = None
+
+
+@dataclass(frozen=True)
+class ResponseTerms:
+    """What a detector's response is a linear function of, in one pose.
+
+    terms [K]: 1, then `LandmarkResponse`'s other factors in its order; points [L, 3] where the
+    mesh has them, metres; turned [L, 3, 3] takes an offset at rest to the world.
+    """
+
+    terms: Float[np.ndarray, "K"]
+    points: Float[np.ndarray, "L 3"]
+    turned: Float[np.ndarray, "L 3 3"]
 
 
 @dataclass(frozen=True)
@@ -157,6 +161,22 @@ class LandmarkHead:
         ]
         return moved
 
+    def with_response(self, response: LandmarkResponse) -> "LandmarkHead":
+        """The same landmarks where a detector sees them; before any identity is folded in."""
+        slides = np.concatenate([response.view, response.jaw_open[..., None], response.gaze], -1)
+        count = self.num_identity + response.expression.shape[-1]
+        coefficients = np.concatenate([response.identity, response.expression], -1)
+        moved = copy(self)
+        moved._moments = []
+        for part in self._moments:
+            share = part.share[:, None, None]
+            dirs = part.dirs.copy()
+            dirs[..., :count] += (share * coefficients[part.rows]).transpose(1, 0, 2)
+            rest = part.rest + (share[..., 0] * response.rest[part.rows]).T
+            own = np.ascontiguousarray((share * slides[part.rows]).transpose(1, 0, 2))
+            moved._moments.append(replace(part, rest=rest, dirs=dirs, slides=own))
+        return moved
+
     def expression_size_m(self) -> Float[np.ndarray, "E"]:
         """How far each expression at 1 moves the landmark that it moves most."""
         first = self.num_identity
@@ -196,30 +216,44 @@ class LandmarkHead:
         )
 
     def points(
-        self, theta: Float[np.ndarray, "H"], identity: Float[np.ndarray, "I"]
+        self,
+        theta: Float[np.ndarray, "H"],
+        identity: Float[np.ndarray, "I"],
+        eye_m: Float[np.ndarray, "3"] | None = None,
     ) -> Float[np.ndarray, "L 3"]:
-        """Landmarks in world space, metres."""
+        """Landmarks in world space, metres; a response sees them from `eye_m` (far off in z)."""
         coefficients = self._coefficients(theta, identity)
-        chain = self._chain(theta, coefficients)
-        return sum(self._carried(chain, coefficients), np.zeros((3, self.num_landmarks))).T
+        view = self._view(theta, coefficients, eye_m)
+        return sum(self._carried(view, coefficients), np.zeros((3, self.num_landmarks))).T
 
     def head_rotation(self, theta: Float[np.ndarray, "H"]) -> Float[np.ndarray, "3 3"]:
         """World rotation of the skull: global rotation, then neck."""
-        return self._chain(theta, np.zeros(self._joint_dirs.shape[-1])).turned[_SKULL]
+        return self._chain(theta, np.zeros(self._joint_dirs.shape[-1])).turned[SKULL]
 
     def jacobian(
-        self, theta: Float[np.ndarray, "H"], identity: Float[np.ndarray, "I"], unknowns: Unknowns
+        self,
+        theta: Float[np.ndarray, "H"],
+        identity: Float[np.ndarray, "I"],
+        unknowns: Unknowns,
+        eye_m: Float[np.ndarray, "3"] | None = None,
     ) -> LandmarkJacobian:
-        """Landmarks with their exact derivatives to `unknowns` of this head."""
+        """Landmarks with their derivatives to `unknowns` of this head.
+
+        Exact but for the direction to the camera, which counts as fixed while the head moves
+        sideways.
+        """
         coefficients = self._coefficients(theta, identity)
-        chain = self._chain(theta, coefficients)
-        carried = self._carried(chain, coefficients)
+        view = self._view(theta, coefficients, eye_m)
+        carried, chain = self._carried(view, coefficients), view.chain
         derivative = np.zeros((3, self.num_landmarks, unknowns.size))
         derivative[..., unknowns.coefficients] = self._coefficient_jacobian(chain, unknowns)
         for axis, place in unknowns.shifts:
             derivative[axis, :, place] = 1.0
-        for joint, axis, place in unknowns.angles:
-            derivative[..., place] = self._turning(chain, carried, joint, axis)
+        for joint in range(len(POSE_FIELDS)):
+            asked = [(axis, place) for own, axis, place in unknowns.angles if own == joint]
+            if asked:
+                axes, places = (list(part) for part in zip(*asked))
+                derivative[..., places] = self._turning(view, carried, joint, axes)
         return LandmarkJacobian(sum(carried, np.zeros((3, self.num_landmarks))).T, derivative)
 
     def _coefficients(
@@ -231,14 +265,16 @@ class LandmarkHead:
         return np.concatenate(parts)
 
     def _carried(
-        self, chain: _Chain, coefficients: Float[np.ndarray, "C"]
+        self, view: PoseView, coefficients: Float[np.ndarray, "C"]
     ) -> list[Float[np.ndarray, "3 L"]]:
         """What each part of `_moments` adds to the landmarks in the world."""
-        found = []
+        found, chain = [], view.chain
         for part in self._moments:
             rest = part.rest + part.dirs @ coefficients
             if part.pose_dirs is not None:
                 rest = rest + part.pose_dirs @ chain.features
+            if part.slides is not None:
+                rest = rest + part.slides @ view.signals
             rest -= part.share * chain.at_rest[part.joint][:, None]
             carried = np.zeros((3, self.num_landmarks))
             placed = chain.placed[part.joint][:, None] * part.share
@@ -247,7 +283,7 @@ class LandmarkHead:
         return found
 
     def _coefficient_jacobian(
-        self, chain: _Chain, unknowns: Unknowns
+        self, chain: PoseChain, unknowns: Unknowns
     ) -> Float[np.ndarray, "3 L K"]:
         placed = np.zeros_like(unknowns.joint_dirs)
         for joint, parent in enumerate(self._parents):
@@ -264,27 +300,31 @@ class LandmarkHead:
         return moved
 
     def _turning(
-        self,
-        chain: _Chain,
-        carried: list[Float[np.ndarray, "3 L"]],
-        joint: int,
-        axis: int,
-    ) -> Float[np.ndarray, "3 L"]:
-        """Derivative of the landmarks to one entry of a joint's axis angle."""
-        spin = chain.spin[joint, :, axis]
+        self, view: PoseView, carried: list[Float[np.ndarray, "3 L"]], joint: int, axes: list[int]
+    ) -> Float[np.ndarray, "3 L A"]:
+        """Derivative of the landmarks to entries of a joint's axis angle."""
+        chain = view.chain
         lever = np.zeros((3, self.num_landmarks))
         for part, own in zip(self._moments, carried):
             if self._hangs_on(part.joint, joint):
                 lever += own
                 lever[:, part.rows] -= chain.placed[joint][:, None] * part.share
-        moved = _cross_matrix(spin) @ lever
-        if joint == 0:
+        spins = chain.spin[joint][:, axes]
+        moved = np.stack([cross_matrix(spin) @ lever for spin in spins.T], axis=-1)
+        slopes = np.stack([signal_slope(view, joint, axis) for axis in axes], axis=-1)
+        for part in self._moments:
+            if part.slides is not None and np.any(slopes):
+                slid = (part.slides @ slopes).reshape(3, -1)
+                moved[:, part.rows] += (chain.turned[part.joint] @ slid).reshape(3, -1, len(axes))
+        if joint == ROOT:
             return moved
-        local = _cross_matrix(chain.turned[self._parents[joint]].T @ spin) @ chain.local[joint]
+        above = chain.turned[self._parents[joint]].T
+        local = np.stack([cross_matrix(above @ spin) @ chain.local[joint] for spin in spins.T], -1)
         for part in self._moments:
             if part.pose_dirs is not None:
-                corrected = part.pose_dirs[..., 9 * joint - 9 : 9 * joint] @ local.reshape(9)
-                moved[:, part.rows] += chain.turned[part.joint] @ corrected
+                own = part.pose_dirs[..., 9 * joint - 9 : 9 * joint] @ local.reshape(9, -1)
+                turned = chain.turned[part.joint] @ own.reshape(3, -1)
+                moved[:, part.rows] += turned.reshape(3, -1, len(axes))
         return moved
 
     def _hangs_on(self, joint: int, ancestor: int) -> bool:
@@ -292,7 +332,44 @@ class LandmarkHead:
             joint = self._parents[joint]
         return joint == ancestor
 
-    def _chain(self, theta: Float[np.ndarray, "H"], coefficients: Float[np.ndarray, "C"]) -> _Chain:
+    def response_terms(
+        self,
+        theta: Float[np.ndarray, "H"],
+        identity: Float[np.ndarray, "I"],
+        eye_m: Float[np.ndarray, "3"],
+    ) -> ResponseTerms:
+        """What `with_response` would multiply a response with; for those who measure one."""
+        coefficients = self._coefficients(theta, identity)
+        view = self._view(theta, coefficients, eye_m)
+        turned = np.zeros((self.num_landmarks, 3, 3))
+        for part in self._moments:
+            turned[part.rows] += part.share[:, None, None] * view.chain.turned[part.joint]
+        expression = theta[self.layout.slice("expression")]
+        terms = [np.ones(1), view.signals[:5], expression, view.signals[5:], identity]
+        points = sum(self._carried(view, coefficients), np.zeros((3, self.num_landmarks))).T
+        return ResponseTerms(np.concatenate(terms), points, turned)
+
+    def _view(
+        self,
+        theta: Float[np.ndarray, "H"],
+        coefficients: Float[np.ndarray, "C"],
+        eye_m: Float[np.ndarray, "3"] | None,
+    ) -> PoseView:
+        chain = self._chain(theta, coefficients)
+        towards = np.array([0.0, 0.0, 1.0]) if eye_m is None else eye_m - chain.placed[SKULL]
+        towards = towards / np.linalg.norm(towards)
+        x, y, _ = chain.turned[SKULL].T @ towards
+        angles = np.zeros((3, 2))
+        for row, name in enumerate(POSE_FIELDS[JAW:]):
+            if name in self.layout:
+                angles[row] = theta[self.layout.slice(name)][:2]
+        sines = np.sin(angles)
+        signals = np.array([x, y, x * x, y * y, x * y, sines[0, 0], *sines[1:].mean(0)])
+        return PoseView(chain, towards, np.cos(angles), signals)
+
+    def _chain(
+        self, theta: Float[np.ndarray, "H"], coefficients: Float[np.ndarray, "C"]
+    ) -> PoseChain:
         poses = np.zeros((5, 3))
         for joint, name in enumerate(POSE_FIELDS):
             if name in self.layout:
@@ -302,26 +379,10 @@ class LandmarkHead:
         turned, placed, spin = local.copy(), at_rest.copy(), np.zeros((5, 3, 3))
         for joint, parent in enumerate(self._parents):
             above = turned[parent] if parent >= 0 else np.eye(3)
-            spin[joint] = above @ _spin(poses[joint], local[joint])
+            spin[joint] = above @ angular_velocities(poses[joint], local[joint])
             if parent < 0:
                 placed[joint] += theta[self.layout.slice("translation")]
                 continue
             turned[joint] = above @ local[joint]
             placed[joint] = placed[parent] + above @ (at_rest[joint] - at_rest[parent])
-        return _Chain(local, turned, spin, at_rest, placed)
-
-
-def _cross_matrix(vector: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    x, y, z = vector
-    return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-
-
-def _spin(
-    axis_angle: Float[np.ndarray, "3"], rotation: Float[np.ndarray, "3 3"]
-) -> Float[np.ndarray, "3 3"]:
-    """Column k: angular velocity of exp(v) as v's entry k grows (Gallego and Yezzi 2015)."""
-    squared = float(axis_angle @ axis_angle)
-    if squared < _NO_ANGLE_RAD**2:
-        return np.eye(3)
-    across = _cross_matrix(axis_angle) @ (np.eye(3) - rotation)
-    return (np.outer(axis_angle, axis_angle) + across) / squared
+        return PoseChain(local, turned, spin, at_rest, placed)

@@ -5,11 +5,17 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from threadpoolctl import threadpool_limits
 
 from rgbavatar_ns.head import HeadModel
-from rgbavatar_ns.head.landmarks import SPARSE_51, LandmarkMap, facemesh_landmarks
+from rgbavatar_ns.head.landmarks import (
+    SPARSE_51,
+    LandmarkMap,
+    LandmarkResponse,
+    facemesh_landmarks,
+    facemesh_response,
+)
 from rgbavatar_ns.tracking.config import TrackConfig
 from rgbavatar_ns.tracking.fit import (
     ClipFit,
@@ -42,9 +48,12 @@ class SubjectTracker:
     config: TrackConfig
     landmarks: LandmarkMap = field(default_factory=facemesh_landmarks)
     """Where FaceMesh's points lie on this head; by default on the embedded one."""
+    response: LandmarkResponse | None = field(default_factory=facemesh_response)
+    """How they follow it, row for row of `landmarks`; None takes them to stay on the skin."""
 
     def __post_init__(self) -> None:
-        marks = _chosen_landmarks(self.landmarks)
+        rows = _chosen_rows(self.landmarks)
+        marks = self.landmarks.select_rows(rows)
         self.facemesh_index = marks.facemesh_index
         vertex_ids = self.head.arrays.faces[marks.triangle].astype(np.int64)
         self.mesh_landmarks = LandmarkHead(self.head, vertex_ids, marks.barycentric)
@@ -53,9 +62,11 @@ class SubjectTracker:
             self.head.arrays.expression_names,
             self.mesh_landmarks.expression_size_m(),
         )
-        self.cost = FrameCost(
-            self.mesh_landmarks, marks.facemesh_index, _landmark_weights(marks), parameters
-        )
+        seen = self.mesh_landmarks
+        if self.response is not None:
+            seen = seen.with_response(self.response.select(rows))
+        self._seen = seen
+        self.cost = FrameCost(seen, marks.facemesh_index, _landmark_weights(marks), parameters)
 
     def targets(self, landmarks_px: Float[np.ndarray, "F 478 2"]) -> list[Target]:
         """Each frame's landmarks in the order of the landmark head."""
@@ -103,17 +114,24 @@ class SubjectTracker:
         return self.cost.theta(fit.values[position], np.zeros(self.head.layout.size))
 
     def fitted_px(self, fit: ClipFit, *, with_offsets: bool = True) -> Float[np.ndarray, "F L 2"]:
-        """Projected landmarks in source pixels, as fitted or as the bare mesh has them."""
-        head = self.cost.head if with_offsets else self.mesh_landmarks
+        """Where the fitted head's landmarks are detected, source pixels, with or without offsets.
+
+        The offsets are the subject's own; the detector's response is in both.
+        """
+        head = self.cost.head if with_offsets else self._seen
         identity = fit.subject.identity
+        camera = fit.subject.camera
         return np.array(
-            [fit.subject.camera.project(head.points(theta, identity)) for theta in self.thetas(fit)]
+            [
+                camera.project(head.points(theta, identity, camera.eye_m))
+                for theta in self.thetas(fit)
+            ]
         )
 
     def frame_px(self, fit: ClipFit, position: int) -> Float[np.ndarray, "L 2"]:
-        """Projected landmarks of the bare mesh in one frame, source pixels."""
-        theta = self._theta(fit, position)
-        return fit.subject.camera.project(self.mesh_landmarks.points(theta, fit.subject.identity))
+        """One frame's landmarks without the subject's offsets, source pixels."""
+        theta, camera = self._theta(fit, position), fit.subject.camera
+        return camera.project(self._seen.points(theta, fit.subject.identity, camera.eye_m))
 
     def rejected(self, fit: ClipFit, landmarks_px: Float[np.ndarray, "F 478 2"]) -> list[int]:
         """Positions whose landmarks no pose of the head explains."""
@@ -129,13 +147,13 @@ class SubjectTracker:
         return fit.subject.camera.project(vertices.numpy())
 
 
-def _chosen_landmarks(marks: LandmarkMap) -> LandmarkMap:
+def _chosen_rows(marks: LandmarkMap) -> Int[np.ndarray, "L"]:
     kept = []
-    for index in map(int, marks.facemesh_index):
+    for row, index in enumerate(map(int, marks.facemesh_index)):
         wanted = index in _FEATURES or index in IRIS_CENTERS or index in FACE_OVAL
         if wanted or (index < IRIS_CENTERS[0] and index % 4 == 0):
-            kept.append(index)
-    return marks.select(tuple(kept))
+            kept.append(row)
+    return np.array(kept, dtype=np.int64)
 
 
 def _landmark_weights(marks: LandmarkMap) -> Float[np.ndarray, "L"]:

@@ -46,7 +46,7 @@ def _performance(head: HeadModel, frames: int) -> tuple[np.ndarray, np.ndarray]:
 def _observed(tracker: SubjectTracker, theta: np.ndarray, identity: np.ndarray) -> np.ndarray:
     points = np.zeros((len(theta), 478, 2))
     for frame, row in enumerate(theta):
-        projected = CAMERA.project(tracker.mesh_landmarks.points(row, identity))
+        projected = CAMERA.project(tracker.cost.head.points(row, identity, CAMERA.eye_m))
         points[frame, tracker.facemesh_index] = projected
     return points
 

@@ -5,6 +5,8 @@ import pytest
 import torch
 
 from rgbavatar_ns.head import HeadModel
+from rgbavatar_ns.head.landmarks import LandmarkResponse, facemesh_landmarks, facemesh_response
+from rgbavatar_ns.head.rotations import axis_angle_to_matrix
 from rgbavatar_ns.tracking.landmark_head import LandmarkHead
 
 
@@ -90,3 +92,68 @@ def test_offsets_ride_with_the_head(head: HeadModel) -> None:
     moved = reduced.with_offsets(offsets).points(theta, identity)
     turned = offsets @ reduced.head_rotation(theta).T
     np.testing.assert_allclose(moved - reduced.points(theta, identity), turned, atol=1e-12)
+
+
+def _response(head: HeadModel, count: int) -> LandmarkResponse:
+    random = np.random.default_rng(11)
+    sizes = ((), (5,), (head.arrays.num_expressions,), (), (2,), (head.num_identity,))
+    return LandmarkResponse(*(0.005 * random.normal(size=(count, 3, *size)) for size in sizes))
+
+
+def test_a_response_adds_its_terms_in_the_turned_frame(head: HeadModel) -> None:
+    vertex_ids, barycentric = _landmarks(head, 10)
+    bare, response = LandmarkHead(head, vertex_ids, barycentric), _response(head, 10)
+    theta, identity = _theta(head, 4)
+    eye = np.array([0.1, -0.2, 0.9])
+    added = bare.with_response(response).points(theta, identity, eye) - bare.points(theta, identity)
+    skull = bare.head_rotation(theta)
+    # Expressions move the joints too; the second is where the neck carries the skull.
+    at_rest = bare._joint_rest + bare._joint_dirs @ bare._coefficients(theta, identity)
+    rotation, shift = (theta[head.layout.slice(name)] for name in ("rotation", "translation"))
+    root = axis_angle_to_matrix(torch.from_numpy(rotation)).numpy()
+    towards = eye - (root @ (at_rest[1] - at_rest[0]) + at_rest[0] + shift)
+    x, y, _ = skull.T @ (towards / np.linalg.norm(towards))
+    eyes = [theta[head.layout.slice(name)][:2] for name in ("left_eye", "right_eye")]
+    by_hand = (
+        response.rest
+        + response.view @ [x, y, x * x, y * y, x * y]
+        + response.expression @ theta[head.layout.slice("expression")]
+        + response.jaw_open * np.sin(theta[head.layout.slice("jaw").start])
+        + response.gaze @ (np.sin(eyes[0]) + np.sin(eyes[1])) / 2
+        + response.identity @ identity
+    )
+    terms = bare.response_terms(theta, identity, eye)
+    np.testing.assert_allclose(added, np.einsum("lab,lb->la", terms.turned, by_hand), atol=1e-12)
+
+
+@pytest.mark.parametrize("still", [False, True])
+def test_derivatives_with_a_response_equal_finite_differences(head: HeadModel, still: bool) -> None:
+    vertex_ids, barycentric = _landmarks(head, 12)
+    seen = LandmarkHead(head, vertex_ids, barycentric).with_response(_response(head, 12))
+    theta, identity = _theta(head, 6)
+    if still:
+        theta[:] = 0
+    columns, step = np.arange(head.layout.size), 1e-6
+    found = seen.jacobian(theta, identity, seen.unknowns(columns, 3)).derivative
+    for place in range(len(columns) + 3):
+        low, high = (np.concatenate([theta, identity]) for _ in range(2))
+        entry = place if place < len(columns) else place - len(columns) + len(theta)
+        low[entry] -= step
+        high[entry] += step
+        ends = [seen.points(*np.split(both, [len(theta)])) for both in (low, high)]
+        slope = (ends[1] - ends[0]) / (2 * step)
+        np.testing.assert_allclose(found[..., place].T, slope, atol=1e-8)
+    # A person's head has it folded in.
+    person = seen.of_person(identity)
+    np.testing.assert_allclose(
+        person.points(theta, np.zeros(0)), seen.points(theta, identity), atol=1e-12
+    )
+
+
+def test_facemeshs_response_is_one_for_each_landmark_and_moderate(head: HeadModel) -> None:
+    response, marks = facemesh_response(), facemesh_landmarks()
+    assert response.rest.shape == (len(marks.triangle), 3)
+    assert response.expression.shape[-1] == head.arrays.num_expressions
+    assert response.identity.shape[-1] == head.num_identity
+    assert all(np.isfinite(part).all() for part in vars(response).values())
+    assert np.abs(response.rest).max() < 0.02

@@ -42,7 +42,7 @@ def test_a_pose_stays_right_when_landmarks_go_wrong(spoil: Spoil, seed: int) -> 
     theta[layout.slice("rotation")] = random.uniform(-0.25, 0.25, 3)
     theta[layout.slice("translation")] = random.uniform(-0.02, 0.02, 3)
     identity = np.zeros(tracker.head.num_identity)
-    points = CAMERA.project(tracker.mesh_landmarks.points(theta, identity))
+    points = CAMERA.project(tracker.cost.head.points(theta, identity, CAMERA.eye_m))
     whole = np.zeros((478, 2))
     whole[tracker.facemesh_index] = points
     face_px = float(face_height_px(whole[None])[0])

@@ -1,0 +1,216 @@
+"""Find how FaceMesh's points follow the embedded head: by looking at renders whose truth is known.
+
+    python scripts/build_landmark_response.py [--people 40]
+
+writes `rgbavatar_ns/head/assets/facemesh_response.npz`. People of the procedural subject's kind,
+every second one mirrored and half of them with glasses, speak, turn, and make faces at random;
+for each FaceMesh point the difference between where it is found and where its place on the mesh
+is seen is explained, in the skull's frame, by `LandmarkResponse`'s terms: a robust ridge regression
+whose priors say how many millimetres a term may be expected to do. Seeds begin at 100: the
+benchmarks' people are others. Takes about a quarter of an hour; needs mediapipe 0.10.9.
+"""
+
+import argparse
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.spatial import KDTree
+
+from rgbavatar_ns.data.demo import DemoConfig
+from rgbavatar_ns.data.demo.make import DemoPerson
+from rgbavatar_ns.data.demo.performance import perform
+from rgbavatar_ns.head import HeadModel
+from rgbavatar_ns.head.landmarks import RESPONSE_FILE, facemesh_landmarks
+from rgbavatar_ns.tracking.landmark_head import LandmarkHead
+from rgbavatar_ns.tracking.landmarks import FaceLandmarker
+
+FIRST_SEED = 100
+ACTED, MADE = 30, 40
+"""Frames of each person: from a performance, and faces made at random."""
+# What a term may be expected to do, metres, at its usual size: constant, view's five, each
+# expression, jaw, both angles of the gaze, each identity component.
+USUAL_SIZE = {"rest": 1.0, "view": (0.2, 0.15, 0.06, 0.04, 0.05), "expression": 0.2}
+USUAL_SIZE |= {"jaw_open": 0.12, "gaze": (0.1, 0.15), "identity": 0.6}
+EXPECTED_M = {"rest": 4e-3, "view": 1.5e-3, "expression": 1.2e-3}
+EXPECTED_M |= {"jaw_open": 1.5e-3, "gaze": 7e-4, "identity": 1.2e-3}
+# More than a point's own noise: the pictures of one person err together.
+NOISE_PX = 2.5
+OUTLIER_PX = 3.0
+
+
+@dataclass(frozen=True)
+class Observation:
+    """One picture: terms [K]; per point image derivative [L, 2, 3] and what is left [L, 2], px."""
+
+    terms: np.ndarray
+    derivative: np.ndarray
+    residual_px: np.ndarray
+
+
+class Mirror:
+    """Theta and identity of the mirrored person; the embedded head is symmetric."""
+
+    def __init__(self, head: HeadModel) -> None:
+        arrays, self.layout = head.arrays, head.layout
+        flip = np.array([-1.0, 1.0, 1.0])
+        partner = np.asarray(KDTree(arrays.v_template).query(arrays.v_template * flip)[1])
+        dirs = arrays.shapedirs[..., : arrays.num_identity].astype(np.float64)
+        overlap = (dirs * (dirs[partner] * flip[:, None])).sum((0, 1))
+        self.parity = np.sign(overlap)
+        names = arrays.expression_names
+        swapped = {"Left": "Right", "Right": "Left"}
+        self.expressions = [
+            names.index(name.removesuffix(side) + other) if name.endswith(side) else place
+            for place, name in enumerate(names)
+            for side, other in [next((p for p in swapped.items() if name.endswith(p[0])), ("", ""))]
+        ]
+
+    def theta(self, theta: np.ndarray) -> np.ndarray:
+        """[F, H] -> [F, H]."""
+        parts = {
+            field.name: theta[:, self.layout.slice(field.name)] for field in self.layout.fields
+        }
+        turned = parts | {name: parts[name] * [1, -1, -1] for name in ("rotation", "neck", "jaw")}
+        turned["left_eye"] = parts["right_eye"] * [1, -1, -1]
+        turned["right_eye"] = parts["left_eye"] * [1, -1, -1]
+        turned["translation"] = parts["translation"] * [-1, 1, 1]
+        turned["expression"] = parts["expression"][:, self.expressions]
+        result = np.empty_like(theta)
+        for name, values in turned.items():
+            result[:, self.layout.slice(name)] = values
+        return result
+
+
+def made_faces(head: HeadModel, count: int, rng: np.random.Generator) -> np.ndarray:
+    """Random combinations of expressions, jaw, gaze and turns as theta [F, H]."""
+    layout, names = head.layout, head.arrays.expression_names
+    usable = [k for k, name in enumerate(names) if not name.startswith(("eyeLook", "jaw"))]
+    theta = np.zeros((count, layout.size))
+    for row in theta:
+        expression = np.zeros(len(names))
+        for chosen in rng.choice(usable, size=rng.integers(1, 7), replace=False):
+            expression[chosen] = rng.uniform(0.3, 1.0)
+            for side, other in (("Left", "Right"), ("Right", "Left")):
+                if names[chosen].endswith(side) and rng.uniform() < 0.7:
+                    partner = names.index(names[chosen].removesuffix(side) + other)
+                    expression[partner] = expression[chosen]
+        row[layout.slice("expression")] = expression
+        row[layout.slice("jaw").start] = rng.choice([0.0, rng.uniform(0, 0.33)])
+        gaze = rng.uniform([-0.12, -0.28], [0.15, 0.28])
+        for name, vergence in (("left_eye", -0.02), ("right_eye", 0.02)):
+            first = layout.slice(name).start
+            row[first : first + 2] = np.add(gaze, (0.0, vergence))
+        row[layout.slice("neck")] = np.radians(rng.normal(size=3) * [9, 13, 6])
+        row[layout.slice("translation")] = rng.normal(size=3) * 0.004
+    return theta
+
+
+def seen(seed: int) -> tuple[DemoPerson, np.ndarray, np.ndarray]:
+    """A person, theta [F, H] and FaceMesh's points [F, 478, 2] where a face was found."""
+    config = DemoConfig(
+        num_frames=8 * ACTED, seed=seed, glasses=seed % 4 < 2, supersampling=1, frames_per_second=12
+    )
+    person = DemoPerson.of(config)
+    head, rng = person.head, np.random.default_rng(seed)
+    script = perform(head.layout, head.arrays.expression_names, 8 * ACTED, 60, 12.0, seed)
+    theta = np.concatenate([script.theta[::8], made_faces(head, MADE, rng)])
+    mirrored, room = seed % 2 == 1, rng.uniform(60, 190, 3)
+    kept, points = [], []
+    with FaceLandmarker() as landmarker:
+        for number, image in enumerate(person.draw(torch.from_numpy(theta).float())):
+            alpha = image[..., 3:] / 255
+            picture = (image[..., :3] * alpha + room * (1 - alpha)).round().astype(np.uint8)
+            picture = np.ascontiguousarray(picture[:, ::-1]) if mirrored else picture
+            landmarker(picture)  # the next call looks where this one found the face
+            found = landmarker(picture)
+            if found is not None:
+                kept.append(number)
+                points.append(found)
+    theta = theta[kept]
+    return person, Mirror(head).theta(theta) if mirrored else theta, np.array(points)
+
+
+def observations(landmarks: LandmarkHead, index: np.ndarray, seeds: range) -> Iterator[Observation]:
+    """Every picture of every person."""
+    for seed in seeds:
+        person, thetas, found = seen(seed)
+        identity = person.identity.double().numpy()
+        if seed % 2 == 1:
+            identity = identity * Mirror(person.head).parity
+        camera = person.camera
+        eye = np.array([0.0, camera.height_m, camera.distance_m])
+        print(f"person {seed}: {len(thetas)} of {ACTED + MADE} pictures", flush=True)
+        for theta, points_px in zip(thetas, found):
+            response = landmarks.response_terms(theta, identity, eye)
+            away = response.points - eye
+            across = camera.focal_px / -away[:, 2]
+            image = np.zeros((len(away), 2, 3))
+            image[:, 0, 0], image[:, 1, 1] = across, -across
+            image[:, :, 2] = image[:, [0, 1], [0, 1]] * away[:, :2] / -away[:, 2:]
+            expected = away[:, :2] * [1, -1] * across[:, None] + camera.size / 2
+            yield Observation(response.terms, image @ response.turned, points_px[index] - expected)
+
+
+def regress(derivative: np.ndarray, terms: np.ndarray, residual_px: np.ndarray) -> np.ndarray:
+    """One point's offsets a unit of each (scaled) term [K, 3]; outliers count less and less."""
+    rows = np.einsum("fac,fk->fakc", derivative, terms).reshape(2 * len(terms), -1)
+    wanted, weight = residual_px.reshape(-1), np.ones(residual_px.size)
+    solution = np.zeros(rows.shape[1])
+    for _ in range(3):
+        weighted = rows * weight[:, None] / NOISE_PX**2
+        normal = weighted.T @ rows + np.eye(rows.shape[1])
+        solution = np.linalg.solve(normal, weighted.T @ wanted)
+        off = np.linalg.norm((wanted - rows @ solution).reshape(-1, 2), axis=1)
+        weight = np.repeat(1 / (1 + (off / OUTLIER_PX) ** 2) ** 2, 2)
+    return solution.reshape(-1, 3)
+
+
+def build(people: int) -> dict[str, np.ndarray]:
+    """The asset's arrays."""
+    head = HeadModel.embedded(dtype=torch.float64)
+    marks = facemesh_landmarks()
+    corners = head.arrays.faces[marks.triangle].astype(np.int64)
+    landmarks = LandmarkHead(head, corners, marks.barycentric)
+    found = list(
+        observations(landmarks, marks.facemesh_index, range(FIRST_SEED, FIRST_SEED + people))
+    )
+    counts = {"rest": 1, "view": 5, "expression": head.arrays.num_expressions}
+    counts |= {"jaw_open": 1, "gaze": 2, "identity": head.arrays.num_identity}
+    scale = np.concatenate(
+        [
+            np.full(count, EXPECTED_M[name]) / np.broadcast_to(USUAL_SIZE[name], count)
+            for name, count in counts.items()
+        ]
+    )
+    terms = np.array([one.terms for one in found]) * scale
+    derivative = np.array([one.derivative for one in found])
+    residual = np.array([one.residual_px for one in found])
+    offsets = np.array(
+        [
+            (regress(derivative[:, point], terms, residual[:, point]) * scale[:, None]).T
+            for point in range(landmarks.num_landmarks)
+        ]
+    )
+    explained = np.einsum("flac,lck,fk->fla", derivative, offsets, terms / scale)
+    before, after = np.abs(residual).mean(), np.abs(residual - explained).mean()
+    print(f"{len(found)} pictures: {before:.2f} px off before, {after:.2f} px after")
+    parts = np.split(offsets, np.cumsum(list(counts.values()))[:-1], axis=2)
+    arrays = dict(zip(counts, parts))
+    for name in ("rest", "jaw_open"):
+        arrays[name] = arrays[name][..., 0]
+    return {name: values.astype(np.float16) for name, values in arrays.items()}
+
+
+def main() -> None:
+    """Write the asset."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--people", type=int, default=40)
+    arrays = build(parser.parse_args().people)
+    np.savez_compressed(RESPONSE_FILE, **arrays)  # pyright: ignore[reportArgumentType]
+    print(f"{RESPONSE_FILE.name}: {RESPONSE_FILE.stat().st_size / 1e3:.0f} kB")
+
+
+if __name__ == "__main__":
+    main()
