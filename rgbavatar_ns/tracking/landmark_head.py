@@ -4,20 +4,20 @@ from copy import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 from jaxtyping import Float, Int
 
 from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.head.landmarks import LandmarkResponse
-from rgbavatar_ns.head.rotations import axis_angle_to_matrix
 from rgbavatar_ns.tracking.pose_chain import (
     JAW,
+    NUM_SIGNALS,
     ROOT,
     SKULL,
     PoseChain,
     PoseView,
     angular_velocities,
     cross_matrix,
+    rotation_matrices,
     signal_slope,
 )
 
@@ -249,11 +249,15 @@ class LandmarkHead:
         derivative[..., unknowns.coefficients] = self._coefficient_jacobian(chain, unknowns)
         for axis, place in unknowns.shifts:
             derivative[axis, :, place] = 1.0
+        slid = self._slid(chain)
         for joint in range(len(POSE_FIELDS)):
             asked = [(axis, place) for own, axis, place in unknowns.angles if own == joint]
             if asked:
                 axes, places = (list(part) for part in zip(*asked))
                 derivative[..., places] = self._turning(view, carried, joint, axes)
+                if slid is not None:
+                    slopes = [signal_slope(view, joint, axis) for axis in axes]
+                    derivative[..., places] += slid @ np.stack(slopes, axis=-1)
         return LandmarkJacobian(sum(carried, np.zeros((3, self.num_landmarks))).T, derivative)
 
     def _coefficients(
@@ -311,11 +315,6 @@ class LandmarkHead:
                 lever[:, part.rows] -= chain.placed[joint][:, None] * part.share
         spins = chain.spin[joint][:, axes]
         moved = np.stack([cross_matrix(spin) @ lever for spin in spins.T], axis=-1)
-        slopes = np.stack([signal_slope(view, joint, axis) for axis in axes], axis=-1)
-        for part in self._moments:
-            if part.slides is not None and np.any(slopes):
-                slid = (part.slides @ slopes).reshape(3, -1)
-                moved[:, part.rows] += (chain.turned[part.joint] @ slid).reshape(3, -1, len(axes))
         if joint == ROOT:
             return moved
         above = chain.turned[self._parents[joint]].T
@@ -326,6 +325,16 @@ class LandmarkHead:
                 turned = chain.turned[part.joint] @ own.reshape(3, -1)
                 moved[:, part.rows] += turned.reshape(3, -1, len(axes))
         return moved
+
+    def _slid(self, chain: PoseChain) -> Float[np.ndarray, "3 L 8"] | None:
+        """What each signal moves in the world."""
+        slid = None
+        for part in self._moments:
+            if part.slides is not None:
+                slid = np.zeros((3, self.num_landmarks, NUM_SIGNALS)) if slid is None else slid
+                own = chain.turned[part.joint] @ part.slides.reshape(3, -1)
+                slid[:, part.rows] += own.reshape(part.slides.shape)
+        return slid
 
     def _hangs_on(self, joint: int, ancestor: int) -> bool:
         while joint != ancestor and joint >= 0:
@@ -374,7 +383,7 @@ class LandmarkHead:
         for joint, name in enumerate(POSE_FIELDS):
             if name in self.layout:
                 poses[joint] = theta[self.layout.slice(name)]
-        local = axis_angle_to_matrix(torch.from_numpy(poses)).numpy()
+        local = rotation_matrices(poses)
         at_rest = self._joint_rest + self._joint_dirs @ coefficients
         turned, placed, spin = local.copy(), at_rest.copy(), np.zeros((5, 3, 3))
         for joint, parent in enumerate(self._parents):

@@ -64,6 +64,15 @@ def cross_matrix(vector: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
     return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
 
 
+def rotation_matrices(axis_angles: Float[np.ndarray, "J 3"]) -> Float[np.ndarray, "J 3 3"]:
+    """Rodrigues' formula; `head.rotations` has it for torch, which takes longer for five joints."""
+    angles = np.linalg.norm(axis_angles, axis=1)[:, None, None]
+    cross = np.stack([cross_matrix(vector) for vector in axis_angles])
+    # sin(a) / a and (1 - cos(a)) / a^2, without dividing by 0.
+    first, half = np.sinc(angles / np.pi), np.sinc(angles / (2 * np.pi))
+    return np.eye(3) + first * cross + 0.5 * half**2 * (cross @ cross)
+
+
 def angular_velocities(
     axis_angle: Float[np.ndarray, "3"], rotation: Float[np.ndarray, "3 3"]
 ) -> Float[np.ndarray, "3 3"]:
