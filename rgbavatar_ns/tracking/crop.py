@@ -47,6 +47,8 @@ class SquareCrop:
         """1 where the square shows the frame, 0 where it reaches beyond."""
         rows = np.arange(self.top, self.top + self.side)
         columns = np.arange(self.left, self.left + self.side)
+        if rows[0] >= 0 and rows[-1] < height and columns[0] >= 0 and columns[-1] < width:
+            return np.ones((self.size, self.size), np.float32)
         within = ((rows >= 0) & (rows < height))[:, None] & ((columns >= 0) & (columns < width))
         return cv2.resize(
             within.astype(np.float32), (self.size, self.size), interpolation=cv2.INTER_AREA

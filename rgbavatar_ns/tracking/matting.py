@@ -72,22 +72,34 @@ def foreground_color(
     """Straight-alpha colour: what the person's own colour is where the background shines through.
 
     Blurred-fusion estimate (Forte 2021, "Approximate fast foreground colour estimation") from
-    coarse to fine: at a quarter of the size, at half of it, and the last correction at full size;
-    without it hair edges keep a fringe of the background's colour.
+    coarse to fine: at a quarter of the size, at half of it, and the last correction at full size
+    where both shine through; without it hair edges keep a fringe of the background's colour. Under
+    zero alpha the picture stays as it is.
     """
     height, width = alpha.shape
     longer = max(height, width)
-    image, weight = image_rgb.astype(np.float32), alpha.astype(np.float32)
-    near, far = image, image
+    weight = alpha.astype(np.float32, copy=False)
+    near = far = image_rgb
     for coarser, diameter in ((4, longer // 6), (2, longer // 40)):
         few = (max(1, width // coarser), max(1, height // coarser))
-        small, before, behind, small_weight = (
-            cv2.resize(part, few, interpolation=cv2.INTER_AREA)
-            for part in (image, near, far, weight)
+        small = cv2.resize(image_rgb, few, interpolation=cv2.INTER_AREA).astype(np.float32)
+        before, behind = (
+            small if part is image_rgb else cv2.resize(part, few, interpolation=cv2.INTER_AREA)
+            for part in (near, far)
         )
+        small_weight = cv2.resize(weight, few, interpolation=cv2.INTER_AREA)
         near, far = _fuse(small, before, behind, small_weight, diameter // coarser | 1)
-    near, far = cv2.resize(near, (width, height)), cv2.resize(far, (width, height))
-    return (_explained(image, near, far, weight) + 0.5).astype(np.uint8)
+    mixed = np.flatnonzero((weight > 0) & (weight < 1))
+    found = image_rgb.copy()
+    if mixed.size:
+        # As a picture of one row, which is what OpenCV's arithmetic takes.
+        image, near, far = (
+            part.reshape(-1, 3)[mixed][None].astype(np.float32, copy=False)
+            for part in (image_rgb, *(cv2.resize(part, (width, height)) for part in (near, far)))
+        )
+        color = _explained(image, near, far, weight.reshape(-1)[mixed][None])
+        found.reshape(-1, 3)[mixed] = (color[0] + 0.5).astype(np.uint8)
+    return found
 
 
 def _fuse(

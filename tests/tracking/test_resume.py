@@ -168,7 +168,7 @@ def test_ctrl_c_ends_with_one_line_and_code_130(
 
     monkeypatch.setattr(command, "track_video", interrupted)
     with pytest.raises(SystemExit) as told:
-        command.run((tmp_path / "clip.mp4",), tmp_path / "set")
+        command.run((tmp_path / "clip.mp4", tmp_path / "set"))
     assert told.value.code == 130
     assert "the same command goes on from there" in capsys.readouterr().err
 
