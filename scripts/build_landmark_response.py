@@ -1,6 +1,6 @@
 """Find how FaceMesh's points follow the embedded head: by looking at renders whose truth is known.
 
-    python scripts/build_landmark_response.py [--people 40]
+    python scripts/build_landmark_response.py [--people 50]
 
 writes `rgbavatar_ns/head/assets/facemesh_response.npz`. People of the procedural subject's kind,
 every second one mirrored and half of them with glasses, speak, turn, and make faces at random;
@@ -206,7 +206,7 @@ def build(people: int) -> dict[str, np.ndarray]:
 def main() -> None:
     """Write the asset."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--people", type=int, default=40)
+    parser.add_argument("--people", type=int, default=50)
     arrays = build(parser.parse_args().people)
     np.savez_compressed(RESPONSE_FILE, **arrays)  # pyright: ignore[reportArgumentType]
     print(f"{RESPONSE_FILE.name}: {RESPONSE_FILE.stat().st_size / 1e3:.0f} kB")
