@@ -68,10 +68,11 @@ def _scan_focal(
     """The focal length with the cheapest short fit of a few key frames, in pixels."""
     side = max(width, height)
     few = keys[:: max(1, len(keys) // _SCAN_KEYS)]
-    best = (np.inf, side * _FOCAL_USUAL)
+    best, starts = (np.inf, side * _FOCAL_USUAL), None
     for share in FOCAL_SCAN:
         camera = initial_camera(few, side * share, (width / 2, height / 2))
-        total, _ = _fit_keys(cost, few, camera, identity_components, 8)
+        total, found = _fit_keys(cost, few, camera, identity_components, 8, starts)
+        starts = found.key_values  # the next camera is not far off
         total += 0.5 * (np.log(share / _FOCAL_USUAL) / _FOCAL_LOG_WIDTH) ** 2
         best = min(best, (total, side * share))
     return best[1]
@@ -209,11 +210,16 @@ def _fit_keys(
     camera: StillCamera,
     identity_components: int,
     iterations: int,
+    starts: Float[np.ndarray, "K P"] | None = None,
 ) -> tuple[float, SubjectFit]:
     base, identity = blank(cost)
-    rigid = [
-        fit_frame(cost, camera, key, rigid_start(cost, camera, key), None, 0.0, 15) for key in keys
-    ]
+    if starts is None:
+        starts = np.array(
+            [
+                fit_frame(cost, camera, key, rigid_start(cost, camera, key), None, 0.0, 15)
+                for key in keys
+            ]
+        )
     frames, size = len(keys), len(cost.parameters.columns)
     shared = min(identity_components, len(identity))
     joint = replace(cost, identity_columns=shared)
@@ -263,7 +269,7 @@ def _fit_keys(
     packed, total = levenberg_marquardt(
         cost_at,
         model_at,
-        np.concatenate([*rigid, np.zeros(shared)]),
+        np.concatenate([starts.reshape(-1), np.zeros(shared)]),
         lower,
         upper,
         iterations=iterations,
