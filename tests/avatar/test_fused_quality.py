@@ -21,8 +21,8 @@ pytestmark = pytest.mark.skipif("cpu" not in available_backends(), reason="not c
 def test_held_out_psnr_is_that_of_the_eager_path(tmp_path):
     """Means over held-out frames of a small demo subject, five seeds, within a tenth of a dB.
 
-    Two runs of one seed part by about .05 dB either way, as two eager runs do, so that the means
-    of five seeds part by .02 dB. A third fewer steps cost .3 dB.
+    The two runs of a seed part by about .05 dB either way, so that the means of five seeds part by
+    .02 dB. A third fewer steps would cost .3 dB.
     """
     config = DemoConfig(image_size=48, num_frames=20, num_test_frames=6, supersampling=1)
     dataset = make_demo_dataset(tmp_path / "subject", config)
