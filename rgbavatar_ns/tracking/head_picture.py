@@ -17,7 +17,6 @@ from rgbavatar_ns.tracking.region import HeadRegion
 class MattedCrop:
     """A crop of one frame: the person's own colour and alpha in [0, 1]."""
 
-    crop: SquareCrop
     color: UInt8[np.ndarray, "S S 3"]
     alpha: Float[np.ndarray, "S S"]
 
@@ -48,17 +47,24 @@ class HeadPicture:
         """The crop with its background's share taken out of the colour."""
         picture = crop.apply(image_rgb)
         alpha = self._matte(picture) * crop.inside(image_rgb.shape[1], image_rgb.shape[0])
-        return MattedCrop(crop, foreground_color(picture, alpha), alpha)
+        return MattedCrop(foreground_color(picture, alpha), alpha)
 
-    def rgba(
+    def region(
         self,
-        matted: MattedCrop,
+        crop: SquareCrop,
         vertices_px: Float[np.ndarray, "V 2"],
         landmarks_px: Float[np.ndarray, "478 2"],
-    ) -> UInt8[np.ndarray, "S S 4"]:
-        """Straight-alpha picture; mesh vertices and FaceMesh landmarks in pixels of the frame."""
-        alpha, crop = matted.alpha, matted.crop
-        if not self._keep_torso:
-            points = crop.points(landmarks_px[[FOREHEAD, CHIN]])
-            alpha = alpha * self._region(crop.points(vertices_px), points[0], points[1], crop.size)
-        return straight_rgba(matted.color, alpha)
+    ) -> Float[np.ndarray, "S S"] | None:
+        """What of the crop may stay; mesh vertices and FaceMesh landmarks in the frame's pixels."""
+        if self._keep_torso:
+            return None
+        points = crop.points(landmarks_px[[FOREHEAD, CHIN]])
+        return self._region(crop.points(vertices_px), points[0], points[1], crop.size)
+
+
+def cut_out(
+    matted: MattedCrop, region: Float[np.ndarray, "S S"] | None
+) -> UInt8[np.ndarray, "S S 4"]:
+    """Straight-alpha picture of what the matte holds in the region (None: everywhere)."""
+    alpha = matted.alpha if region is None else matted.alpha * region
+    return straight_rgba(matted.color, alpha)

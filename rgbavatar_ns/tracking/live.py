@@ -16,9 +16,10 @@ from rgbavatar_ns.data import TrackedFrame
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.tracking.config import TrackConfig
+from rgbavatar_ns.tracking.crop import SquareCrop
 from rgbavatar_ns.tracking.fit import ClipFit, SubjectFit, fit_frame, rigid_start
 from rgbavatar_ns.tracking.following_crop import FollowingCrop
-from rgbavatar_ns.tracking.head_picture import HeadPicture, MattedCrop
+from rgbavatar_ns.tracking.head_picture import HeadPicture, MattedCrop, cut_out
 from rgbavatar_ns.tracking.landmarks import FaceLandmarker
 from rgbavatar_ns.tracking.pictures import pinhole
 from rgbavatar_ns.tracking.subject import SubjectTracker
@@ -125,7 +126,7 @@ class LiveTracker:
                 self._fit.forget()
                 self.counts["no face"] += 1
                 return None
-            frame = self._tracked(self._fit, index, landmarks, matted.result)
+            frame = self._tracked(self._fit, index, landmarks, square, matted.result)
             self._crop.follow(landmarks)
             return frame
 
@@ -155,8 +156,11 @@ class LiveTracker:
         self._fit = _CausalFit(self._tracker, self._tracker.meet(landmarks, width, height))
         self._crop = FollowingCrop.around(landmarks, width, height, self._config.image_size)
         for one in seen:
-            matted = self._picture.matted(one.image_rgb, self._crop.square)
-            frame = self._tracked(self._fit, one.index, one.landmarks_px, lambda m=matted: m)
+            square = self._crop.square
+            matted = self._picture.matted(one.image_rgb, square)
+            frame = self._tracked(
+                self._fit, one.index, one.landmarks_px, square, lambda matted=matted: matted
+            )
             if frame is not None:
                 self._backlog.append(frame)
 
@@ -165,17 +169,18 @@ class LiveTracker:
         fit: "_CausalFit",
         index: int,
         landmarks_px: Float[np.ndarray, "478 2"],
+        crop: SquareCrop,
         matted: Callable[[], MattedCrop],
     ) -> TrackedFrame | None:
         """Fit the head, then cut it out of what `matted` waits for."""
         values = fit(landmarks_px)
-        cut = matted()
         if values is None:
+            matted()
             self.counts["does not fit"] += 1
             return None
         one = ClipFit(fit.subject, values[None])
-        rgba = self._picture.rgba(cut, self._tracker.vertices_px(one, 0), landmarks_px)
-        crop = cut.crop
+        region = self._picture.region(crop, self._tracker.vertices_px(one, 0), landmarks_px)
+        rgba = cut_out(matted(), region)
         camera = fit.subject.camera.cropped(crop.left, crop.top, crop.scale)
         theta = torch.from_numpy(self._tracker.thetas(one)[0]).float()
         self.counts["tracked"] += 1
