@@ -1,17 +1,25 @@
 """A compiled backend's drawing behind torch's autograd."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-Gradients = Callable[
-    [tuple[Tensor, ...], Tensor, Tensor, Tensor | None, Tensor | None], list[Tensor]
-]
-"""From (means, quats_wxyz, scales, opacities, colors), image, alpha and the gradients of both to
-those of the five, in their shapes. It must not hold image or alpha, which hold it."""
+
+class Drawn(NamedTuple):
+    """What a backward pass may start from: it takes the remainder from the image, or what is
+    behind the Gaussians from the background."""
+
+    background: Tensor
+    image: Tensor
+    alpha: Tensor
+
+
+Gradients = Callable[[tuple[Tensor, ...], Drawn, Tensor | None, Tensor | None], list[Tensor]]
+"""From (means, quats_wxyz, scales, opacities, colors), what was drawn and the gradients of image
+and alpha to those of the five, in their shapes. It must not hold image or alpha, which hold it."""
 
 Draw = Callable[[tuple[Tensor, ...], Tensor], tuple[Tensor, Tensor, Gradients]]
 """Draws the five, contiguous, over a background: image, alpha, and how they are differentiated."""
@@ -29,8 +37,7 @@ class _Drawn(torch.autograd.Function):
         image, alpha, gradients = draw(tuple(gaussians), background)
         if any(ctx.needs_input_grad):
             ctx.gradients = gradients
-            ctx.save_for_backward(*gaussians, image, alpha)
-            ctx.background_shape = background.shape
+            ctx.save_for_backward(*gaussians, background, image, alpha)
             ctx.set_materialize_grads(False)
         return image, alpha
 
@@ -40,16 +47,17 @@ class _Drawn(torch.autograd.Function):
         ctx: Any, *grad_outputs: Tensor | None
     ) -> tuple[Tensor | None, ...]:
         image_grad, alpha_grad = (None if g is None else g.contiguous() for g in grad_outputs)
-        *gaussians, image, alpha = ctx.saved_tensors
+        *gaussians, background, image, alpha = ctx.saved_tensors
         if image_grad is None and alpha_grad is None:
             return (None,) * 7
         grads: list[Tensor | None] = [None] * 5
         needed = ctx.needs_input_grad[1:6]
         if any(needed):
-            filled = ctx.gradients(tuple(gaussians), image, alpha, image_grad, alpha_grad)
+            drawn = Drawn(background, image, alpha)
+            filled = ctx.gradients(tuple(gaussians), drawn, image_grad, alpha_grad)
             grads = [grad if wanted else None for grad, wanted in zip(filled, needed)]
         background_grad = None
         if ctx.needs_input_grad[6] and image_grad is not None:
             background_grad = ((1 - alpha) * image_grad).sum((1, 2))
-            background_grad = background_grad.sum_to_size(ctx.background_shape)
+            background_grad = background_grad.sum_to_size(background.shape)
         return (None, *grads, background_grad)

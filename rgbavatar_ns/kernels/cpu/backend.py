@@ -17,7 +17,7 @@ from rgbavatar_ns.kernels.cpu import (
     _native,  # pyright: ignore[reportMissingModuleSource]
 )
 from rgbavatar_ns.kernels.cpu.blended import CpuBlendedRenderer
-from rgbavatar_ns.kernels.differentiable import Gradients, draw_differentiably
+from rgbavatar_ns.kernels.differentiable import Drawn, Gradients, draw_differentiably
 from rgbavatar_ns.kernels.types import (
     BlendedGaussians,
     GaussianSet,
@@ -74,16 +74,14 @@ def _draw(
 
     def gradients(
         gaussians: tuple[Tensor, ...],
-        image: Tensor,
-        alpha: Tensor,
+        drawn: Drawn,
         image_grad: Tensor | None,
         alpha_grad: Tensor | None,
     ) -> list[Tensor]:
         means, quats, scales, opacities, colors = filled = [torch.empty_like(t) for t in gaussians]
         session.backward(
             _native.Gaussians(*gaussians),
-            image,
-            alpha,
+            drawn.background,
             image_grad,
             alpha_grad,
             means,

@@ -13,7 +13,7 @@ from rgbavatar_ns.kernels.cuda.binning import Bins, Capacities, Images, blocks, 
 from rgbavatar_ns.kernels.cuda.blended import CudaBlendedRenderer
 from rgbavatar_ns.kernels.cuda.launcher import Launcher
 from rgbavatar_ns.kernels.cuda.tiles import Tiles
-from rgbavatar_ns.kernels.differentiable import Gradients, draw_differentiably
+from rgbavatar_ns.kernels.differentiable import Drawn, Gradients, draw_differentiably
 from rgbavatar_ns.kernels.types import (
     BlendedGaussians,
     GaussianSet,
@@ -74,12 +74,11 @@ def _draw(
 
     def gradients(
         gaussians: tuple[Tensor, ...],
-        image: Tensor,
-        alpha: Tensor,
+        drawn: Drawn,
         image_grad: Tensor | None,
         alpha_grad: Tensor | None,
     ) -> list[Tensor]:
-        slots = tiles.differentiate(image, alpha, image_grad, alpha_grad)
+        slots = tiles.differentiate(drawn.image, drawn.alpha, image_grad, alpha_grad)
         filled = _gradients(request, tiles, gaussians, slots)
         return [grad.sum_to_size(t.shape) for grad, t in zip(filled, gaussians)]
 

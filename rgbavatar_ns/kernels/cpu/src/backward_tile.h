@@ -25,67 +25,84 @@ static void load_color_block(const Tile& tile, const float* image, const BlockPi
 
 // Begins to fetch the block two below, whose rows lie too far apart for the processor to guess.
 static void prefetch_block(const Tile& tile, const float* image, const BlockPixels& pixels) {
-  if (!image) return;
   for (int y = 0; y < kBlockSide; ++y)
     __builtin_prefetch(image + (pixels.first + (2 * kBlockSide + y) * int64_t(tile.width)) * 3);
 }
 
-// Sets the remainder to g . image - h (1 - alpha) and the channels to g; both are 0 outside the
-// image.
-static void start_remainder(const Tile& tile, const BackwardInput& in, TileScratch& scratch) {
+// Sets the channels to g = dL/dimage and `behind` to g . background - dL/dalpha; all are 0 outside
+// the image.
+static void start_gradient(const Tile& tile, const BackwardInput& in, TileScratch& scratch) {
   for (int block = 0; block < kBlocksPerTile; ++block) {
     float(*rows)[kBlockPixels] = block_rows<kBlendRows>(scratch, block);
     float(*g)[kBlockPixels] = rows + kColor;
-    float* remainder = rows[kRemainder];
     const BlockPixels pixels(tile, block);
-    prefetch_block(tile, in.image, pixels);
-    prefetch_block(tile, in.image_grad, pixels);
-    Wide rest(0.0f);
+    Wide behind(0.0f);
     if (in.image_grad) {
-      float image[3][kBlockPixels];
-      load_color_block(tile, in.image, pixels, image);
+      prefetch_block(tile, in.image_grad, pixels);
       load_color_block(tile, in.image_grad, pixels, g);
-      for (int k = 0; k < 3; ++k) rest = rest + load_wide(g[k]) * load_wide(image[k]);
+      for (int k = 0; k < 3; ++k) behind = behind + load_wide(g[k]) * in.background[k];
+    } else {
+      for (int k = 0; k < 3; ++k) store(Wide(0.0f), g[k]);
     }
-    store(rest, remainder);
+    store(behind, rows[kBehind]);
     if (in.alpha_grad)
       pixels.for_each(tile, [&](int lane, int64_t pixel) {
-        remainder[lane] -= in.alpha_grad[pixel] * (1.0f - in.alpha[pixel]);
+        rows[kBehind][lane] -= in.alpha_grad[pixel];
       });
   }
 }
 
-static void clear_slot(float* slots, uint32_t slot, int width) {
-  for (int k = 0; k < width; ++k) slots[int64_t(slot) * width + k] = 0.0f;
+// Where a Gaussian's sums over a tile go.
+static RGBAVATAR_MEMBER float* slot_of(const Tile& tile, const Splat& s, float* slots, int width) {
+  const int first_x = s.bounds.first_block_x >> kTileBlocksShift;
+  const int first_y = s.bounds.first_block_y >> kTileBlocksShift;
+  const int across = (s.bounds.last_block_x >> kTileBlocksShift) - first_x + 1;
+  const int place = (tile.tile_y - first_y) * across + tile.tile_x - first_x;
+  return slots + (int64_t(s.first_slot) + place) * width;
 }
 
-// The sums over the jobs of one Gaussian of the group, which are written to its slot.
-static RGBAVATAR_MEMBER void sum_moments(const BlockGrid& grid, const Group& group, int place,
-                                         TileScratch& scratch, float* slots) {
+static void clear_slot(const Tile& tile, const Splat& s, float* slots, int width) {
+  float* slot = slot_of(tile, s, slots, width);
+  for (int k = 0; k < width; ++k) slot[k] = 0.0f;
+}
+
+// Where pixel (0, 0) of a block is, from that of the tile's first block.
+struct BlockOffsets {
+  float x[kBlocksPerTile], y[kBlocksPerTile];
+  constexpr BlockOffsets() : x(), y() {
+    for (int block = 0; block < kBlocksPerTile; ++block) {
+      x[block] = float(block % kTileBlocks * kBlockSide);
+      y[block] = float(block / kTileBlocks * kBlockSide);
+    }
+  }
+};
+static constexpr BlockOffsets kBlockOffsets = {};
+
+// The sums over the jobs of one Gaussian of the group, which are written to its slot. What is behind
+// it moves on: `behind`, of the pixel's loss by what the Gaussian lets through, takes it in.
+static RGBAVATAR_MEMBER void sum_moments(const Tile& tile, const BlockGrid& grid, const Group& group, int place,
+                                         const Kept& kept, TileScratch& scratch, float* slots) {
   const Splat& s = group.splats[place];
   const Wide color_red(s.red), color_green(s.green), color_blue(s.blue);
   const Wide zero(0.0f);
+  const Wide x = load_wide(grid.x[0]) - s.mean_x, y = load_wide(grid.y[0]) - s.mean_y;
   Wide sum_red = zero, sum_green = zero, sum_blue = zero;
   Wide sum_one = zero, sum_x = zero, sum_y = zero, sum_xx = zero, sum_xy = zero, sum_yy = zero;
-  const int stop = int(group.first_job[place + 1]);
-  for (int i = int(group.first_job[place]); i < stop; ++i) {
-    const unsigned block = Job(group, i).block;
+  const float *alpha_row = kept.alpha[group.first_job[place]],
+              *weight_row = kept.weight[group.first_job[place]];
+  for (uint64_t left = group.blocks[place]; left; left &= left - 1) {
+    const int block = __builtin_ctzll(left);
     float* row = block_rows<kBlendRows>(scratch, block)[0];
-    const Wide t = load_wide(row);
-    if (!is_open(t)) continue;
     const Wide red = load_wide(row + kColor * kBlockPixels);
     const Wide green = load_wide(row + (kColor + 1) * kBlockPixels);
     const Wide blue = load_wide(row + (kColor + 2) * kBlockPixels);
-    const Wide alpha = load_wide(group.alpha[i]);
-    const Wide w = alpha * t;
-    const Wide along = w * (red * color_red + green * color_green + blue * color_blue);
-    const Wide remainder = load_wide(row + kRemainder * kBlockPixels) - along;
-    store(t - w, row);
-    store(remainder, row + kRemainder * kBlockPixels);
+    const Wide behind = load_wide(row + kBehind * kBlockPixels);
+    const Wide alpha = load_wide(alpha_row), w = load_wide(weight_row);
+    const Wide more = red * color_red + green * color_green + blue * color_blue - behind;
+    store(behind + alpha * more, row + kBehind * kBlockPixels);
     // alpha dL/dalpha, whose ln 2 follows below; the cap has no gradient.
-    const Wide d_p = select(Wide(C::kMaxAlpha) > alpha,
-                            along - remainder * load_wide(group.odds[i]), zero);
-    const Wide dx = grid.from_mean_x(s, block), dy = grid.from_mean_y(s, block);
+    const Wide d_p = select(Wide(C::kMaxAlpha) > alpha, w * more, zero);
+    const Wide dx = x + kBlockOffsets.x[block], dy = y + kBlockOffsets.y[block];
     const Wide d_x = d_p * dx, d_y = d_p * dy;
     sum_red = sum_red + w * red;
     sum_green = sum_green + w * green;
@@ -96,68 +113,52 @@ static RGBAVATAR_MEMBER void sum_moments(const BlockGrid& grid, const Group& gro
     sum_xx = sum_xx + d_x * dx;
     sum_xy = sum_xy + d_x * dy;
     sum_yy = sum_yy + d_y * dy;
+    alpha_row += kBlockPixels;
+    weight_row += kBlockPixels;
   }
-  Quad first = sums_of(sum_red, sum_green, sum_blue, sum_one) * Quad{1.0f, 1.0f, 1.0f, C::kLn2};
-  Quad second = sums_of(sum_x, sum_y, sum_xx, sum_xy) * C::kLn2;
-  float last = sum_of(sum_yy) * C::kLn2;
-  float* slot = slots + int64_t(group.slot[place]) * kMoments;
-  if (group.continued[place]) {
-    first = first + load_quad(slot);
-    second = second + load_quad(slot + 4);
-    last += slot[8];
-  }
-  store_quad(first, slot);
-  store_quad(second, slot + 4);
-  slot[8] = last;
+  float* slot = slot_of(tile, s, slots, kMoments);
+  store_quad(sums_of(sum_red, sum_green, sum_blue, sum_one) * Quad{1.0f, 1.0f, 1.0f, C::kLn2}, slot);
+  store_quad(sums_of(sum_x, sum_y, sum_xx, sum_xy) * C::kLn2, slot + 4);
+  slot[8] = sum_of(sum_yy) * C::kLn2;
 }
 
-static void sum_group(const BlockGrid& grid, const Group& group, TileScratch& scratch,
-                      float* slots) {
-  for (int i = 0; i < group.splat_count; ++i) sum_moments(grid, group, i, scratch, slots);
-}
-
-// Reads on to the end, from rows that hold dL/dimage and the remainder.
-static void sum_rest(const BlockGrid& grid, GroupReader& reader, TileScratch& scratch,
-                     float* slots) {
-  Group& group = scratch.groups[0];
-  while (any_open<kBlendRows>(scratch) && reader.next(group)) {
-    fill_alphas<true>(grid, group);
-    sum_group(grid, group, scratch, slots);
-  }
-  reader.rest([&](uint32_t slot) { clear_slot(slots, slot, kMoments); });
+static void sum_group(const Tile& tile, const BlockGrid& grid, const Group& group, const Kept& kept,
+                      TileScratch& scratch, float* slots) {
+  for (int i = group.count; i-- > 0;) sum_moments(tile, grid, group, i, kept, scratch, slots);
 }
 
 static void backward_tile(const Tile& tile, const BackwardInput& in, TileScratch& scratch,
                           float* slots) {
+  const BlockGrid grid(tile);
+  KeptGroups<kBlendRows> groups;
   start_rows<kBlendRows>(tile, scratch);
-  start_remainder(tile, in, scratch);
-  GroupReader reader(tile);
-  sum_rest(BlockGrid(tile), reader, scratch, slots);
+  groups.template blend<false>(tile, grid, scratch,
+                      [&](const Splat& s) { clear_slot(tile, s, slots, kMoments); });
+  start_gradient(tile, in, scratch);
+  groups.visit_back_to_front(tile, grid, scratch, [&](const Group& group, const Kept& kept) {
+    sum_group(tile, grid, group, kept, scratch, slots);
+  });
 }
 
 template <int kChannels>
-static RGBAVATAR_MEMBER void sum_channels(const Group& group, int place, int channels,
-                                          TileScratch& scratch, float* slots) {
+static RGBAVATAR_MEMBER void sum_channels(const Tile& tile, const Group& group, int place, const Kept& kept,
+                                          int channels, TileScratch& scratch, float* slots) {
   Wide sums[kChannels + 1], largest(0.0f);
   for (int k = 0; k <= kChannels; ++k) sums[k] = Wide(0.0f);
-  const int stop = int(group.first_job[place + 1]);
-  for (int i = int(group.first_job[place]); i < stop; ++i) {
-    float* row = block_rows<1 + kChannels>(scratch, Job(group, i).block)[0];
-    const Wide t = load_wide(row);
-    if (!is_open(t)) continue;
-    const Wide w = load_wide(group.alpha[i]) * t;
-    store(t - w, row);
+  const float* weight_row = kept.weight[group.first_job[place]];
+  for (uint64_t left = group.blocks[place]; left; left &= left - 1) {
+    const float* row = block_rows<1 + kChannels>(scratch, __builtin_ctzll(left))[0];
+    const Wide w = load_wide(weight_row);
     largest = max_of(largest, w);
     sums[kChannels] = sums[kChannels] + w;
     for (int k = 0; k < kChannels; ++k)
       sums[k] = sums[k] + w * load_wide(row + (1 + k) * kBlockPixels);
+    weight_row += kBlockPixels;
   }
-  float* slot = slots + int64_t(group.slot[place]) * (channels + 2);
-  if (!group.continued[place]) clear_slot(slots, group.slot[place], channels + 2);
-  for (int k = 0; k < channels; ++k) slot[k] += sum_of(sums[k]);
-  slot[channels] += sum_of(sums[kChannels]);
-  const float lane = max_lane(largest);
-  slot[channels + 1] = lane > slot[channels + 1] ? lane : slot[channels + 1];
+  float* slot = slot_of(tile, group.splats[place], slots, channels + 2);
+  for (int k = 0; k < channels; ++k) slot[k] = sum_of(sums[k]);
+  slot[channels] = sum_of(sums[kChannels]);
+  slot[channels + 1] = max_lane(largest);
 }
 
 template <int kChannels>
@@ -172,14 +173,14 @@ static void average_channels(const Tile& tile, const float* image, int channels,
       for (int k = 0; k < channels; ++k) values[k][lane] = image[pixel * channels + k];
     });
   }
-  GroupReader reader(tile);
-  Group& group = scratch.groups[0];
-  while (any_open<kRows>(scratch) && reader.next(group)) {
-    fill_alphas<false>(grid, group);
-    for (int i = 0; i < group.splat_count; ++i)
-      sum_channels<kChannels>(group, i, channels, scratch, slots);
-  }
-  reader.rest([&](uint32_t slot) { clear_slot(slots, slot, channels + 2); });
+  KeptGroups<kRows> groups;
+  groups.template blend<false>(tile, grid, scratch, [&](const Splat& s) {
+    clear_slot(tile, s, slots, channels + 2);
+  });
+  groups.visit_back_to_front(tile, grid, scratch, [&](const Group& group, const Kept& kept) {
+    for (int i = 0; i < group.count; ++i)
+      sum_channels<kChannels>(tile, group, i, kept, channels, scratch, slots);
+  });
 }
 
 static void average_tile(const Tile& tile, const float* image, int channels, TileScratch& scratch,

@@ -55,7 +55,7 @@ void BlendedRendering::lay_out_blending(const BlendedScene& scene, const Team& t
 double BlendedRendering::compare(const uint8_t* images, const Attribute& background, int threads) {
   Team team(threads);
   Workspace& w = *workspace_;
-  w.scratch.reserve(team.size());
+  make_scratch(team.size());
   lay_out_slots(kMoments);
   const int tiles = tiles_per_image();
   const size_t pixels = size_t(width_) * height_;

@@ -48,8 +48,8 @@ struct BlockPixels {
 };
 
 // Rows of a block in the scratch memory: transmittance, red, green and blue (or other channels),
-// then depth (forward) or remainder (backward).
-enum { kTransmittance = 0, kColor = 1, kDepth = 4, kRemainder = 4, kBlendRows = 5 };
+// then depth (forward) or what is behind (backward).
+enum { kTransmittance = 0, kColor = 1, kDepth = 4, kBehind = 4, kBlendRows = 5 };
 
 template <int kRows>
 static RGBAVATAR_MEMBER float (*block_rows(TileScratch& scratch, int block))[kBlockPixels] {
@@ -78,118 +78,83 @@ static RGBAVATAR_MEMBER bool is_open(const Wide& transmittance) {
   return any(transmittance >= Wide(C::kMinTransmittance));
 }
 
+// The blocks with pixels that let light through.
 template <int kRows>
-static bool any_open(TileScratch& scratch) {
+static uint64_t open_blocks(TileScratch& scratch) {
+  uint64_t open = 0;
   for (int block = 0; block < kBlocksPerTile; ++block)
-    if (is_open(load_wide(block_rows<kRows>(scratch, block)[kTransmittance]))) return true;
-  return false;
+    if (is_open(load_wide(block_rows<kRows>(scratch, block)[kTransmittance])))
+      open |= uint64_t(1) << block;
+  return open;
 }
 
-// ---- Jobs: a Gaussian over a block of pixels ----------------------------------------------------
-// A tile's Gaussians are taken in groups, whose jobs stand in one list. A loop over the list has no
-// inner loops that end after a few blocks, at places that no processor guesses.
-
-struct Job {
-  const Splat* splat;
-  unsigned block;
-
-  Job(const Group& group, int i)
-      : splat(group.splats + (group.jobs[i] >> 16)), block(group.jobs[i] & 0xffff) {}
-};
-
-// Four jobs at a time: a processor does not look far enough ahead to overlap chains of operations as
-// long as these by itself.
-typedef Floats<4 * kLanes> FourJobs;
-template <class Value>
-static RGBAVATAR_MEMBER FourJobs of_four(const Job jobs[4], const Value& value) {
-  return {{value(jobs[0]), value(jobs[1])}, {value(jobs[2]), value(jobs[3])}};
-}
-static RGBAVATAR_MEMBER void store_four(const FourJobs& a, float to[4][kBlockPixels]) {
-  store(a.low.low, to[0]);
-  store(a.low.high, to[1]);
-  store(a.high.low, to[2]);
-  store(a.high.high, to[3]);
-}
-
-// Fills the group's alphas, after cut and cap, and alpha / (1 - alpha) where asked for.
-template <bool kWithOdds>
-static void fill_alphas(const BlockGrid& grid, Group& group) {
-  for (int i = 0; i < 4; ++i) group.jobs[group.job_count + i] = 0;
-  for (int i = 0; i < group.job_count; i += 4) {
-    const Job jobs[4] = {{group, i}, {group, i + 1}, {group, i + 2}, {group, i + 3}};
-    const auto of = [&](auto value) __attribute__((always_inline)) {
-      return of_four(jobs, value);
-    };
-    const FourJobs dx = of([&](const Job& j) { return grid.from_mean_x(*j.splat, j.block); });
-    const FourJobs dy = of([&](const Job& j) { return grid.from_mean_y(*j.splat, j.block); });
-    const FourJobs p = log2_alpha(dx, dy, of([](const Job& j) { return Wide(j.splat->log2_opacity); }),
-                                  of([](const Job& j) { return Wide(j.splat->qa); }),
-                                  of([](const Job& j) { return Wide(j.splat->qb); }),
-                                  of([](const Job& j) { return Wide(j.splat->qc); }));
-    const FourJobs alpha =
-        min_of(exp2_where(p >= FourJobs(C::kLog2MinAlpha), p), FourJobs(C::kMaxAlpha));
-    store_four(alpha, group.alpha + i);
-    if (kWithOdds) store_four(alpha * reciprocal_of(FourJobs(1.0f) - alpha), group.odds + i);
-  }
-}
-
-// Appends jobs for the blocks of an 8 x 8 window, whose first one is `first` of the tile.
-static RGBAVATAR_MEMBER void add_jobs(uint64_t blocks, int first, Group& group) {
-  const int code = group.splat_count << 16;
-  uint32_t* to = group.jobs + group.job_count;
-#if defined(__AVX512F__)
-  // Two rows of the window at a time.
-  const __m512i pair = _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, kTileBlocks, kTileBlocks + 1,
-                                         kTileBlocks + 2, kTileBlocks + 3, kTileBlocks + 4,
-                                         kTileBlocks + 5, kTileBlocks + 6, kTileBlocks + 7);
-  for (int row = 0; row < kWindow; row += 2) {
-    if (row == kWindow / 2 && blocks >> (8 * row) == 0) break;  // most end here
-    const __mmask16 mask = __mmask16(blocks >> (8 * row));
-    const __m512i codes =
-        _mm512_add_epi32(pair, _mm512_set1_epi32(code + first + row * kTileBlocks));
-    _mm512_storeu_si512(to, _mm512_maskz_compress_epi32(mask, codes));
-    to += __builtin_popcount(mask);
-  }
-#else
-  for (; blocks; blocks &= blocks - 1) {
-    const int bit = __builtin_ctzll(blocks);
-    *to++ = uint32_t(code + first + bit / kWindow * kTileBlocks + bit % kWindow);
-  }
-#endif
-  group.job_count = int(to - group.jobs);
-}
+// ---- Groups: Gaussians of a tile that are taken together ----------------------------------------
+// A group is a 64 x 64 matrix of bits: which of its Gaussians touches which block of the tile. A job
+// is a bit that is set. Jobs of one block are blended in a row, with the block's pixels in registers;
+// sums over pixels take the jobs of one Gaussian in a row.
 
 // Bits low..high of eight.
 static constexpr uint64_t bit_span(int low, int high) {
-  const int from = low > 0 ? low : 0, to = high < kWindow - 1 ? high : kWindow - 1;
+  const int from = low > 0 ? low : 0, to = high < kTileBlocks - 1 ? high : kTileBlocks - 1;
   return from > to ? 0 : (uint64_t(2) << to) - (uint64_t(1) << from);
 }
 
-// The blocks (x, y) of a window with 0 <= left + x < side_x and 0 <= top + y < side_y.
-static constexpr uint64_t blocks_within(int left, int top, int side_x, int side_y) {
-  const uint64_t rows = bit_span(-top, side_y - 1 - top);
+// Bits of the blocks (x, y) of a window of 8 x 8 with first_x <= x <= last_x, first_y <= y <= last_y.
+static constexpr uint64_t blocks_within(int first_x, int first_y, int last_x, int last_y) {
+  const uint64_t rows = bit_span(first_y, last_y), row = bit_span(first_x, last_x);
   uint64_t blocks = 0;
-  for (int row = 0; row < kWindow; ++row)
-    if (rows >> row & 1) blocks |= bit_span(-left, side_x - 1 - left) << (kWindow * row);
+  for (int y = 0; y < kTileBlocks; ++y)
+    if (rows >> y & 1) blocks |= row << (kTileBlocks * y);
   return blocks;
 }
 
 // A window's blocks within the tile, by where the window begins.
 struct TileClips {
-  uint64_t x[kWindow - 1 + kTileBlocks], y[kWindow - 1 + kTileBlocks];
+  uint64_t x[2 * kTileBlocks - 1], y[2 * kTileBlocks - 1];
 
   constexpr TileClips() : x(), y() {
-    for (int i = 0; i < kWindow - 1 + kTileBlocks; ++i) {
-      const int first = i - (kWindow - 1);
-      x[i] = blocks_within(first, 0, kTileBlocks, kWindow);
-      y[i] = blocks_within(0, first, kWindow, kTileBlocks);
+    for (int i = 0; i < 2 * kTileBlocks - 1; ++i) {
+      const int first = i - (kTileBlocks - 1);
+      x[i] = blocks_within(-first, 0, kTileBlocks - 1 - first, kTileBlocks - 1);
+      y[i] = blocks_within(0, -first, kTileBlocks - 1, kTileBlocks - 1 - first);
     }
   }
   uint64_t of(int first_x, int first_y) const {
-    return x[first_x + kWindow - 1] & y[first_y + kWindow - 1];
+    return x[first_x + kTileBlocks - 1] & y[first_y + kTileBlocks - 1];
   }
 };
 static constexpr TileClips kTileClips = {};
+
+static inline uint64_t rotated_left(uint64_t bits, unsigned by) {
+  return bits << (by & 63) | bits >> (-by & 63);
+}
+
+// The blocks of a tile that a Gaussian touches; the tile's first block is (origin_x, origin_y).
+static RGBAVATAR_MEMBER uint64_t blocks_of_tile(const Splat& s, int origin_x, int origin_y) {
+  const int x = s.bounds.first_block_x - origin_x, y = s.bounds.first_block_y - origin_y;
+  if (__builtin_expect(s.blocks == kAllBlocks, false))
+    return blocks_within(x, y, s.bounds.last_block_x - origin_x, s.bounds.last_block_y - origin_y);
+  return rotated_left(s.blocks & kTileClips.of(x, y), unsigned(y * kTileBlocks + x));
+}
+
+// Rows become columns.
+template <int kHalf>
+static RGBAVATAR_MEMBER void transpose_bits_by(uint64_t* bits, uint64_t mask) {
+  for (int block = 0; block < 64; block += 2 * kHalf)
+    for (int i = block; i < block + kHalf; ++i) {
+      const uint64_t swapped = (bits[i] >> kHalf ^ bits[i + kHalf]) & mask;
+      bits[i + kHalf] ^= swapped;
+      bits[i] ^= swapped << kHalf;
+    }
+}
+static void transpose_bits(uint64_t bits[64]) {
+  transpose_bits_by<32>(bits, 0x00000000ffffffffu);
+  transpose_bits_by<16>(bits, 0x0000ffff0000ffffu);
+  transpose_bits_by<8>(bits, 0x00ff00ff00ff00ffu);
+  transpose_bits_by<4>(bits, 0x0f0f0f0f0f0f0f0fu);
+  transpose_bits_by<2>(bits, 0x3333333333333333u);
+  transpose_bits_by<1>(bits, 0x5555555555555555u);
+}
 
 // Reads a tile's Gaussians front to back, in groups.
 class GroupReader {
@@ -199,85 +164,190 @@ class GroupReader {
         origin_x_(tile.tile_x * kTileBlocks),
         origin_y_(tile.tile_y * kTileBlocks) {}
 
-  // Fills the group with the next Gaussians; false when there are none left.
-  bool next(Group& group) {
+  // Fills the group with the next Gaussians that touch open blocks, with at most `room` jobs; false
+  // when there are none left. Calls skip(splat) for those before them that touch none.
+  template <class Skip>
+  bool next(Group& group, uint64_t open, int room, const Skip& skip) {
     constexpr uint32_t kAhead = 16;
-    group.splat_count = group.job_count = 0;
-    while (entry_ < tile_.entry_count && group.splat_count < kGroupSplats &&
-           group.job_count <= kGroupJobs - kWindow * kWindow) {
+    int count = 0, jobs = 0;
+    for (; entry_ < tile_.entry_count && count < kGroupSplats && jobs <= room - kBlocksPerTile;
+         ++entry_) {
       if (entry_ + kAhead < tile_.entry_count)
-        __builtin_prefetch(tile_.splats + tile_.entries[entry_ + kAhead].gaussian);
-      const Entry entry = tile_.entries[entry_];
-      const Splat& s = tile_.splats[entry.gaussian];
-      if (s.blocks == kAllBlocks) {
-        add_window(s, entry.slot, group);
+        __builtin_prefetch(tile_.splats + uint32_t(tile_.entries[entry_ + kAhead]));
+      const Splat& s = tile_.splats[uint32_t(tile_.entries[entry_])];
+      const uint64_t blocks = blocks_of_tile(s, origin_x_, origin_y_) & open;
+      if (!blocks) {
+        skip(s);
         continue;
       }
-      const int x = s.bounds.first_block_x - origin_x_, y = s.bounds.first_block_y - origin_y_;
-      add(s, entry.slot, false, s.blocks & kTileClips.of(x, y), y * kTileBlocks + x, group);
-      ++entry_;
+      group.splats[count] = s;
+      group.blocks[count] = blocks;
+      group.first_job[count] = jobs;
+      jobs += __builtin_popcountll(blocks);
+      ++count;
     }
-    return group.splat_count > 0;
+    group.count = count;
+    group.jobs = jobs;
+    for (int i = 0; i < count; ++i) group.touching[i] = group.blocks[i];
+    for (int i = count; i < kGroupSplats; ++i) group.touching[i] = 0;
+    transpose_bits(group.touching);
+    return count > 0;
+  }
+  // Calls skip(splat) for all that were not read.
+  template <class Skip>
+  void rest(const Skip& skip) const {
+    for (uint32_t i = entry_; i < tile_.entry_count; ++i) skip(tile_.splats[uint32_t(tile_.entries[i])]);
   }
 
-  // Calls visit(slot) for the Gaussians that no group has begun with.
-  template <class Visit>
-  void rest(const Visit& visit) const {
-    for (uint32_t i = entry_ + (window_ > 0); i < tile_.entry_count; ++i)
-      visit(tile_.entries[i].slot);
-  }
+  bool more() const { return entry_ < tile_.entry_count; }
+  uint32_t entry() const { return entry_; }
+  void go_to(uint32_t entry) { entry_ = entry; }
 
  private:
-  static RGBAVATAR_MEMBER void add(const Splat& s, uint32_t slot, bool continued, uint64_t blocks,
-                                   int first_block, Group& group) {
-    const int place = group.splat_count;
-    group.splats[place] = s;
-    group.slot[place] = slot;
-    group.continued[place] = continued;
-    group.first_job[place] = uint32_t(group.job_count);
-    add_jobs(blocks, first_block, group);
-    group.first_job[++group.splat_count] = uint32_t(group.job_count);
-  }
-
-  // One window of a Gaussian that needs several.
-  __attribute__((noinline)) void add_window(const Splat& s, uint32_t slot, Group& group) {
-    const int last_x = s.bounds.last_block_x - origin_x_;
-    const int last_y = s.bounds.last_block_y - origin_y_;
-    const int side_x = last_x < kTileBlocks ? last_x + 1 : kTileBlocks;
-    const int side_y = last_y < kTileBlocks ? last_y + 1 : kTileBlocks;
-    const int first_x = s.bounds.first_block_x > origin_x_ ? s.bounds.first_block_x - origin_x_ : 0;
-    const int first_y = s.bounds.first_block_y > origin_y_ ? s.bounds.first_block_y - origin_y_ : 0;
-    const int across = (side_x - first_x + kWindow - 1) / kWindow;
-    const int down = (side_y - first_y + kWindow - 1) / kWindow;
-    const int x = first_x + window_ % across * kWindow, y = first_y + window_ / across * kWindow;
-    add(s, slot, window_ > 0, blocks_within(x, y, side_x, side_y), y * kTileBlocks + x, group);
-    if (++window_ < across * down) return;
-    window_ = 0;
-    ++entry_;
-  }
-
   const Tile& tile_;
   int origin_x_, origin_y_;
   uint32_t entry_ = 0;
-  int window_ = 0;  // the next one of the present Gaussian, where it needs several
 };
 
-template <int kRows, bool kWithDepth>
-static void blend_group(const Group& group, TileScratch& scratch) {
-  for (int i = 0; i < group.job_count; ++i) {
-    const Job job(group, i);
-    float* row = block_rows<kRows>(scratch, job.block)[0];
-    const Wide t = load_wide(row);
-    if (!is_open(t)) continue;
-    const Splat& s = *job.splat;
-    const Wide w = load_wide(group.alpha[i]) * t;
-    store(t - w, row);
-    add_to(row + kColor * kBlockPixels, w * s.red);
-    add_to(row + (kColor + 1) * kBlockPixels, w * s.green);
-    add_to(row + (kColor + 2) * kBlockPixels, w * s.blue);
-    if (kWithDepth) add_to(row + kDepth * kBlockPixels, w * s.depth);
-  }
+static RGBAVATAR_MEMBER Wide alpha_of(const Wide& x, const Wide& y, const Splat& s) {
+  const Wide dx = x - s.mean_x, dy = y - s.mean_y;
+  const Wide p = log2_alpha(dx, dy, Wide(s.log2_opacity), Wide(s.qa), Wide(s.qb), Wide(s.qc));
+  return min_of(exp2_where(p >= Wide(C::kLog2MinAlpha), p), Wide(C::kMaxAlpha));
 }
+
+// Blends a group's jobs over a block; false when this closed it.
+template <int kRows, bool kColors, bool kWithDepth, bool kKeep>
+static RGBAVATAR_MEMBER bool blend_block(const BlockGrid& grid, const Group& group, int block,
+                                         float (*rows)[kBlockPixels], const Kept& kept) {
+  const Wide x = load_wide(grid.x[block % kTileBlocks]), y = load_wide(grid.y[block / kTileBlocks]);
+  const uint64_t below = (uint64_t(1) << block) - 1;
+  Wide t = load_wide(rows[kTransmittance]), red, green, blue, depth;
+  if (kColors) {
+    red = load_wide(rows[kColor]), green = load_wide(rows[kColor + 1]);
+    blue = load_wide(rows[kColor + 2]);
+  }
+  if (kWithDepth) depth = load_wide(rows[kDepth]);
+  bool open = true;
+  for (uint64_t left = group.touching[block]; left; left &= left - 1) {
+    const int i = __builtin_ctzll(left);
+    const Splat& s = group.splats[i];
+    const size_t job = kKeep ? group.first_job[i] + __builtin_popcountll(group.blocks[i] & below) : 0;
+    if (__builtin_expect(!open, false)) {
+      if (!kKeep) break;
+      store(Wide(0.0f), kept.alpha[job]);
+      store(Wide(0.0f), kept.weight[job]);
+      continue;
+    }
+    const Wide alpha = alpha_of(x, y, s);
+    const Wide w = alpha * t;
+    t = t - w;
+    if (kColors) {
+      red = red + w * s.red;
+      green = green + w * s.green;
+      blue = blue + w * s.blue;
+    }
+    if (kWithDepth) depth = depth + w * s.depth;
+    if (kKeep) {
+      store(alpha, kept.alpha[job]);
+      store(w, kept.weight[job]);
+    }
+    open = is_open(t);
+  }
+  store(t, rows[kTransmittance]);
+  if (kColors) {
+    store(red, rows[kColor]);
+    store(green, rows[kColor + 1]);
+    store(blue, rows[kColor + 2]);
+  }
+  if (kWithDepth) store(depth, rows[kDepth]);
+  return open;
+}
+
+// Blends a group over the tile; returns the blocks that it closed.
+template <int kRows, bool kColors, bool kWithDepth, bool kKeep>
+static uint64_t blend_group(const BlockGrid& grid, const Group& group, TileScratch& scratch,
+                            const Kept& kept) {
+  uint64_t closed = 0;
+  for (int block = 0; block < kBlocksPerTile; ++block)
+    if (group.touching[block] &&
+        !blend_block<kRows, kColors, kWithDepth, kKeep>(grid, group, block,
+                                                block_rows<kRows>(scratch, block), kept))
+      closed |= uint64_t(1) << block;
+  return closed;
+}
+
+// ---- Keeping what sums over pixels need ---------------------------------------------------------
+
+static RGBAVATAR_MEMBER Kept kept_from(TileScratch& scratch, int first) {
+  return {scratch.alpha + first, scratch.weight + first};
+}
+
+// Blends a tile and keeps its groups with their jobs' alphas and weights, so that they can be visited
+// again from back to front. Groups that there is no room for are made again: of those, only where
+// they begin and the transmittance there is kept.
+template <int kRows>
+class KeptGroups {
+ public:
+  // Calls skip(splat) for the Gaussians that are in no group.
+  template <bool kColors, class Skip>
+  void blend(const Tile& tile, const BlockGrid& grid, TileScratch& scratch, const Skip& skip) {
+    GroupReader reader(tile);
+    uint64_t open = open_blocks<kRows>(scratch);
+    int jobs = 0;
+    while (open && kept_ < kKeptGroups && jobs <= kKeptJobs - kBlocksPerTile) {
+      Group& group = scratch.groups[kept_];
+      if (!reader.next(group, open, kKeptJobs - jobs, skip)) break;
+      group.kept_from = jobs;
+      open &= ~blend_group<kRows, kColors, false, true>(grid, group, scratch,
+                                                        kept_from(scratch, jobs));
+      jobs += group.jobs;
+      ++kept_;
+    }
+    Group& group = scratch.groups[kKeptGroups];
+    while (open && reader.more()) {
+      Checkpoint& checkpoint = scratch.checkpoints[remade_];
+      save(reader, scratch, checkpoint);
+      if (!reader.next(group, open, kNoLimit, skip)) break;
+      open &= ~blend_group<kRows, kColors, false, false>(grid, group, scratch, {});
+      ++remade_;
+    }
+    reader.rest(skip);
+  }
+
+  // Calls visit(group, kept alphas and weights) from the last group to the first; the tile's
+  // transmittance is lost.
+  template <class Visit>
+  void visit_back_to_front(const Tile& tile, const BlockGrid& grid, TileScratch& scratch,
+                           const Visit& visit) const {
+    const Kept spare = kept_from(scratch, kKeptJobs);
+    for (int i = remade_; i-- > 0;) {
+      GroupReader reader(tile);
+      restore(reader, scratch, scratch.checkpoints[i]);
+      Group& group = scratch.groups[kKeptGroups];
+      reader.next(group, open_blocks<kRows>(scratch), kNoLimit, [](const Splat&) {});
+      blend_group<kRows, false, false, true>(grid, group, scratch, spare);
+      visit(group, spare);
+    }
+    for (int i = kept_; i-- > 0;) {
+      const Group& group = scratch.groups[i];
+      visit(group, kept_from(scratch, group.kept_from));
+    }
+  }
+
+ private:
+  static void save(const GroupReader& reader, TileScratch& scratch, Checkpoint& to) {
+    to.entry = reader.entry();
+    for (int block = 0; block < kBlocksPerTile; ++block)
+      store(load_wide(block_rows<kRows>(scratch, block)[kTransmittance]), to.transmittance[block]);
+  }
+  static void restore(GroupReader& reader, TileScratch& scratch, const Checkpoint& from) {
+    reader.go_to(from.entry);
+    for (int block = 0; block < kBlocksPerTile; ++block)
+      store(load_wide(from.transmittance[block]), block_rows<kRows>(scratch, block)[kTransmittance]);
+  }
+
+  int kept_ = 0, remade_ = 0;
+};
 
 // Puts the background behind the block and writes it to the image.
 template <int kRows>
@@ -318,10 +388,9 @@ static void forward_rows(const Tile& tile, const ForwardOutput& out, TileScratch
   GroupReader reader(tile);
   Group& group = scratch.groups[0];
   start_rows<kRows>(tile, scratch);
-  while (any_open<kRows>(scratch) && reader.next(group)) {
-    fill_alphas<false>(grid, group);
-    blend_group<kRows, kWithDepth>(group, scratch);
-  }
+  uint64_t open = open_blocks<kRows>(scratch);
+  while (open && reader.next(group, open, kNoLimit, [](const Splat&) {}))
+    open &= ~blend_group<kRows, true, kWithDepth, false>(grid, group, scratch, {});
   for (int block = 0; block < kBlocksPerTile; ++block)
     write_block<kRows>(tile, out, block, scratch);
 }

@@ -27,14 +27,10 @@ struct alignas(64) Splat {
   Bounds bounds;
   uint64_t blocks;  // bit 8 y + x: it touches the block (x, y) counted from the first one of the
                     // bounds; kAllBlocks where the bounds do not fit the window
-  uint64_t unused;
+  uint32_t first_slot;  // of its sums: one for every tile that it touches, row by row
+  uint32_t unused;
 };
 constexpr uint64_t kAllBlocks = ~uint64_t(0);
-
-// A Gaussian in a tile, and where its gradient's sums over the tile's pixels go.
-struct Entry {
-  uint32_t gaussian, slot;
-};
 
 // [B or 1, N, width] floats; the stride is 0 when the batch shares them.
 struct Attribute {
@@ -53,11 +49,18 @@ struct SceneGradient {
   float *means, *quats, *scales, *opacities, *colors;
 };
 
+// Which tiles a Gaussian touches: the first one << 2, and whether those to the right and below are
+// among them; kManyTiles where others are, which its bounds tell; the number past the last tile << 2
+// where it is out of sight.
+constexpr uint32_t kTileRight = 1, kTileBelow = 2, kManyTiles = ~uint32_t(0);
+constexpr int kTileShift = 2;
+
 // Where the projection of one image goes.
 struct Projected {
-  Splat* splats;  // those out of sight hold anything
-  float* depth;   // the same again in arrays, for the sorting
-  uint32_t *first_block, *last_block;  // x | y << 16; first x > last x where out of sight
+  Splat* splats;    // those out of sight hold anything
+  float* depth;     // the same again in an array, for the sorting
+  uint32_t* tiles;  // which they touch
+  int tiles_x, tile_count;
 };
 
 // The nine sums of the blending's backward pass, in the order of Moments.
@@ -72,7 +75,7 @@ struct ImageSlots {
 // One tile of one image.
 struct Tile {
   const Splat* splats;
-  const Entry* entries;  // front to back
+  const uint64_t* entries;  // front to back: the Gaussian is the lower half
   uint32_t entry_count;
   int tile_x, tile_y, width, height;
 };
@@ -83,28 +86,41 @@ struct ForwardOutput {
 };
 
 struct BackwardInput {
-  const float *image, *alpha;            // the forward result
-  const float *image_grad, *alpha_grad;  // each may be null
+  const float* background;
+  const float *image_grad, *alpha_grad;  // of one image; each may be null
 };
 
-// Gaussians of a tile that are taken together. Each has some jobs: blocks of pixels.
-constexpr int kGroupSplats = 64, kGroupJobs = 192;
+// Gaussians of a tile that are taken together, and which of its blocks they touch.
+constexpr int kGroupSplats = 64;
+constexpr int kNoLimit = 1 << 30;
 struct alignas(64) Group {
   Splat splats[kGroupSplats];
-  float alpha[kGroupJobs + 4][kBlockPixels], odds[kGroupJobs + 4][kBlockPixels];
-  uint32_t jobs[kGroupJobs + kBlockPixels];  // place of the Gaussian << 16 | block of the tile
-  uint32_t first_job[kGroupSplats + 1];
-  uint32_t slot[kGroupSplats];
-  bool continued[kGroupSplats];  // it had jobs in earlier groups
-  int splat_count, job_count;
+  uint64_t blocks[kGroupSplats];        // by Gaussian: the blocks
+  uint64_t touching[kBlocksPerTile];  // by block: the Gaussians
+  uint32_t first_job[kGroupSplats];
+  int count, jobs, kept_from;
+};
+
+// What the blending keeps of jobs for the sums over pixels.
+struct Kept {
+  float (*alpha)[kBlockPixels], (*weight)[kBlockPixels];
+};
+
+// Where a group begins that was not kept.
+struct alignas(64) Checkpoint {
+  float transmittance[kBlocksPerTile][kBlockPixels];
+  uint32_t entry;
 };
 
 // Scratch memory of one thread: what a pass keeps for every block, a few rows each, the
-// transmittance first.
-constexpr int kKeptGroups = 96;
+// transmittance first; groups with their jobs, and room for one more that is made again.
+constexpr int kKeptGroups = 128, kKeptJobs = 24576;
 struct alignas(64) TileScratch {
   float rows[kBlocksPerTile * (1 + kMaxChannels)][kBlockPixels];
+  float alpha[kKeptJobs + kGroupSplats * kBlocksPerTile][kBlockPixels];
+  float weight[kKeptJobs + kGroupSplats * kBlocksPerTile][kBlockPixels];
   Group groups[kKeptGroups + 1];
+  Checkpoint* checkpoints;  // one for every kGroupSplats entries of the fullest tile, and one
 };
 
 // ---- Blended Gaussians ------------------------------------------------------------------------

@@ -104,13 +104,13 @@ struct Session : Drawing<rgbavatar::Rendering> {
         width(width),
         height(height) {}
 
-  void backward(const Gaussians& gaussians, const Input& image, const Input& alpha,
+  void backward(const Gaussians& gaussians, const Input& background,
                 const std::optional<Input>& image_grad, const std::optional<Input>& alpha_grad,
                 const Output& means, const Output& quats, const Output& scales,
                 const Output& opacities, const Output& colors, int threads) {
     rendering.backward(
-        gaussians.scene(batch, width, height),
-        {image.data(), alpha.data(), pointer(image_grad), pointer(alpha_grad)},
+        gaussians.scene(batch, width, height), attribute(background), pointer(image_grad),
+        pointer(alpha_grad),
         {means.data(), quats.data(), scales.data(), opacities.data(), colors.data()}, threads);
   }
 };
@@ -234,8 +234,8 @@ NB_MODULE(_native, m) {
            "gaussians"_a, "world_to_camera"_a.noconvert(), "focal_px"_a.noconvert(),
            "principal_point_px"_a.noconvert(), "batch"_a, "width"_a, "height"_a, "threads"_a,
            "instruction_set"_a, Release())
-      .def("backward", &Session::backward, "gaussians"_a, "image"_a.noconvert(),
-           "alpha"_a.noconvert(), "image_grad"_a.noconvert().none(),
+      .def("backward", &Session::backward, "gaussians"_a, "background"_a.noconvert(),
+           "image_grad"_a.noconvert().none(),
            "alpha_grad"_a.noconvert().none(), "means"_a.noconvert(), "quats_wxyz"_a.noconvert(),
            "scales"_a.noconvert(), "opacities"_a.noconvert(), "colors"_a.noconvert(), "threads"_a,
            Release());

@@ -155,6 +155,18 @@ static inline TouchedBlocks touched_blocks(int width, const Projection<Wide>& q,
   return touched;
 }
 
+// The tiles of these blocks as `Projected` has them, in the bits of floats.
+static RGBAVATAR_MEMBER Wide tiles_of(const BlockSpan& x, const BlockSpan& y, int tiles_x) {
+  const WideInt first_x = x.first >> kTileBlocksShift, first_y = y.first >> kTileBlocksShift;
+  const WideInt right = (x.last >> kTileBlocksShift) - first_x;
+  const WideInt below = (y.last >> kTileBlocksShift) - first_y;
+  const WideInt first = to_ints(to_floats(first_y) * float(tiles_x) + to_floats(first_x));
+  const WideMask few = (Wide(1.0f) >= to_floats(right)) & (Wide(1.0f) >= to_floats(below));
+  static_assert(kTileRight == 1 && kTileBelow == 2, "right and below are bits as they stand");
+  return select(few, bits_as_floats((first << kTileShift) | right | (below << 1)),
+                bits_as_floats(WideInt(int32_t(kManyTiles))));
+}
+
 // Projects sixteen Gaussians and writes their splats.
 static inline void project_lanes(int width, int height, const Camera& camera,
                                  const GaussianInput<Wide>& g, const Vec3<Wide>& color, int first,
@@ -182,9 +194,6 @@ static inline void project_lanes(int width, int height, const Camera& camera,
                         (Wide(kWindow - 1.0f) >= to_floats(y.last - y.first));
   const TouchedBlocks touched = touched_blocks(
       width, q, zero - q.conic01 * q.determinant, reach, half_x, half_y, x, y, fits);
-  const Wide first_block = select(seen, bits_as_floats(x.first | (y.first << 16)),
-                                  bits_as_floats(WideInt(1)));
-  const Wide last_block = select(seen, bits_as_floats(x.last | (y.last << 16)), zero);
   const WideInt all(-1);
   const Wide columns[16] = {q.mean_x,
                             q.mean_y,
@@ -196,8 +205,8 @@ static inline void project_lanes(int width, int height, const Camera& camera,
                             color.y,
                             color.z,
                             q.p.z,
-                            first_block,
-                            last_block,
+                            bits_as_floats(x.first | (y.first << 16)),
+                            bits_as_floats(x.last | (y.last << 16)),
                             select(fits, bits_as_floats(touched.upper), bits_as_floats(all)),
                             select(fits, bits_as_floats(touched.lower), bits_as_floats(all)),
                             zero,
@@ -209,8 +218,8 @@ static inline void project_lanes(int width, int height, const Camera& camera,
   if (lanes < kLanes)
     for (int lane = 0; lane < lanes; ++lane) out.splats[first + lane] = padded[lane];
   store(q.p.z, OutputRows<1>(out.depth, first, lanes).data);
-  store(first_block, OutputRows<1>(reinterpret_cast<float*>(out.first_block), first, lanes).data);
-  store(last_block, OutputRows<1>(reinterpret_cast<float*>(out.last_block), first, lanes).data);
+  store(select(seen, tiles_of(x, y, out.tiles_x), bits_as_floats(WideInt(out.tile_count << kTileShift))),
+        OutputRows<1>(reinterpret_cast<float*>(out.tiles), first, lanes).data);
 }
 
 static void project_image(const Scene& scene, const float* camera_floats, int image, int begin,

@@ -46,29 +46,27 @@ class Buffer {
   size_t capacity_ = 0;
 };
 
-// An image's Gaussians by tile: as they stand in memory, and front to back.
-struct ImageEntries {
-  Buffer<Entry> binned, sorted;
-  Buffer<uint32_t> depth_bits;  // of the binned ones
-};
-
 // What one rendering needs; returned to a small pool, because fresh pages cost as much as work.
 struct Workspace {
   Buffer<float> cameras;         // [B, kCameraFloats]
   Buffer<uint32_t> slot_offset;  // [B, N + 1]: first (Gaussian, tile) slot of every Gaussian
   Buffer<uint32_t> tile_start;   // [B, tiles + 1]: into the image's entries
   Buffer<Splat> splats;                // [B, N]; those out of sight hold anything
-  std::vector<ImageEntries> images;    // [B]
-  Buffer<size_t> slot_count;           // [B]: (Gaussian, tile) pairs of each image
   Buffer<size_t> slot_start;           // [B + 1]: their sums, each image's first slot
   Buffer<float> slots;
   Buffer<ImageSlots> image_slots;  // [B]
   Buffer<TileScratch> scratch;     // [threads]
+  Buffer<Checkpoint> checkpoints;  // [threads, ...]: what the scratch memory points to
+  uint32_t most_entries;           // of a tile
   // Of the projection.
   Buffer<float> depth;             // [B, N]
-  Buffer<uint32_t> bounds;         // [2, B, N]: first blocks, last blocks
+  Buffer<uint32_t> tiles;          // [B, N]
   Buffer<Projected> projected;     // [B]
-  Buffer<uint64_t> sort_keys;      // [threads, 2, most entries of a tile]
+  // Of the sorting.
+  std::vector<Buffer<uint64_t>> entries;  // [B]: an image's Gaussians by tile, front to back
+  Buffer<uint32_t> part_start;     // [B, parts, tiles + 1]: where a part's next entry of a tile goes
+  Buffer<size_t> part_slots;       // [B, parts]: (Gaussian, tile) pairs
+  Buffer<uint64_t> sort_keys;      // [threads, most entries of a tile]
   // Of blended Gaussians.
   Buffer<float> frames;            // [B, U, kFrameFloats]
   Buffer<BlendScratch> blending;   // [threads]
@@ -108,14 +106,15 @@ class Rendering {
                float* max_weight, int threads);
 
   // Fills `gradient`, whose arrays have the shapes of the scene's attributes.
-  void backward(const Scene& scene, const BackwardInput& input, const SceneGradient& gradient,
-                int threads);
+  void backward(const Scene& scene, const Attribute& background, const float* image_grad,
+                const float* alpha_grad, const SceneGradient& gradient, int threads);
 
  protected:
   Rendering(int batch, int count, int width, int height, const Cameras& cameras,
             const std::string& instruction_set);
   void sort(class Team& team);
   void lay_out_slots(int width);
+  void make_scratch(int threads);
   Tile tile(int image, int index) const;
   int tiles_per_image() const { return tiles_x_ * tiles_y_; }
 
@@ -124,8 +123,11 @@ class Rendering {
   std::unique_ptr<Workspace> workspace_;
 
  private:
-  void bin_image(int image);
-  void sort_tile(int image, int index, uint64_t* keys, uint32_t most);
+  int parts_per_image() const;
+  uint32_t* part_start(int image, int part);
+  void count_part(int image, int part);
+  void lay_out_entries(int image);
+  void fill_part(int image, int part);
 };
 
 // A Rendering of blended Gaussians, which can train them. The scene's memory is not kept.

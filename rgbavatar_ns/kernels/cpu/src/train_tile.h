@@ -27,8 +27,8 @@ static Wide lanes_inside(const Tile& tile, const BlockPixels& pixels) {
   return load_wide(within);
 }
 
-// From the drawn rows to those of the backward pass: T starts again, the channels become dL/dimage
-// of the mean absolute difference, and the remainder g . image. Returns the differences' sums.
+// From the drawn rows to those of the backward pass: the channels become dL/dimage of the mean
+// absolute difference, and what is behind g . background. Returns the differences' sums.
 static Wide compare_block(const Tile& tile, const TrainingTarget& target, int block,
                           TileScratch& scratch) {
   float(*rows)[kBlockPixels] = block_rows<kBlendRows>(scratch, block);
@@ -37,7 +37,7 @@ static Wide compare_block(const Tile& tile, const TrainingTarget& target, int bl
   const Wide zero(0.0f), one(1.0f), t = load_wide(rows[kTransmittance]);
   const Wide inside = pixels.whole() ? one : lanes_inside(tile, pixels);
   const Wide matte = to_floats((rgba >> 24) & 255) * (1.0f / 255.0f);
-  Wide remainder = zero, sum = zero;
+  Wide behind = zero, sum = zero;
   for (int k = 0; k < 3; ++k) {
     const Wide background(target.background[k]);
     const Wide color = to_floats((rgba >> (8 * k)) & 255) * (1.0f / 255.0f);
@@ -46,36 +46,26 @@ static Wide compare_block(const Tile& tile, const TrainingTarget& target, int bl
     const Wide sign = select(difference > zero, one, zero) - select(zero > difference, one, zero);
     const Wide g = sign * target.gradient;
     sum = sum + sign * difference;
-    remainder = remainder + g * image;
+    behind = behind + g * background;
     store(g, rows[kColor + k]);
   }
-  store(inside, rows[kTransmittance]);
-  store(remainder, rows[kRemainder]);
+  store(behind, rows[kBehind]);
   return sum;
 }
 
 static double train_tile(const Tile& tile, const TrainingTarget& target, TileScratch& scratch,
                          float* slots) {
   const BlockGrid grid(tile);
+  KeptGroups<kBlendRows> groups;
   start_rows<kBlendRows>(tile, scratch);
-  // Groups stay in memory for the backward pass; those beyond the room are made again.
-  GroupReader reader(tile);
-  int kept = 0;
-  while (kept < kKeptGroups && any_open<kBlendRows>(scratch) && reader.next(scratch.groups[kept])) {
-    fill_alphas<true>(grid, scratch.groups[kept]);
-    blend_group<kBlendRows, false>(scratch.groups[kept++], scratch);
-  }
-  GroupReader ahead = reader;
-  Group& last = scratch.groups[kKeptGroups];
-  while (any_open<kBlendRows>(scratch) && ahead.next(last)) {
-    fill_alphas<false>(grid, last);
-    blend_group<kBlendRows, false>(last, scratch);
-  }
+  groups.template blend<true>(tile, grid, scratch,
+                              [&](const Splat& s) { clear_slot(tile, s, slots, kMoments); });
   Wide sum(0.0f);
   for (int block = 0; block < kBlocksPerTile; ++block)
     sum = sum + compare_block(tile, target, block, scratch);
-  for (int i = 0; i < kept; ++i) sum_group(grid, scratch.groups[i], scratch, slots);
-  sum_rest(grid, reader, scratch, slots);
+  groups.visit_back_to_front(tile, grid, scratch, [&](const Group& group, const Kept& kept) {
+    sum_group(tile, grid, group, kept, scratch, slots);
+  });
   return double(sum_of(sum));
 }
 
