@@ -28,6 +28,10 @@ class TrackConfig:
     """Your own mattes, in place of those that are found: a folder with one image a frame (named
     like the frames, or in the order of their numbers; white or opaque is the person), or a mask
     video. The alpha channel of a folder of images is used by itself."""
+    flame: Path | None = None
+    """Track with your own FLAME (a pickle, or the folder that holds it) or with the head of a
+    dataset (its npz file), in place of the embedded head. Where the face's landmarks lie on it is
+    found by laying the embedded head over it."""
     temporal_weight: float = 1.0
     """How strongly each frame is drawn to the mean of its neighbours; 0 switches it off."""
     overwrite: bool = False

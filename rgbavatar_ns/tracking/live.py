@@ -14,13 +14,13 @@ from torch import Tensor
 
 from rgbavatar_ns.data import TrackedFrame
 from rgbavatar_ns.errors import UserError
-from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.tracking.config import TrackConfig
 from rgbavatar_ns.tracking.crop import SquareCrop
 from rgbavatar_ns.tracking.fit import ClipFit, SubjectFit, fit_frame, rigid_start
 from rgbavatar_ns.tracking.following_crop import FollowingCrop
 from rgbavatar_ns.tracking.head_picture import HeadPicture, MattedCrop, cut_out
 from rgbavatar_ns.tracking.landmarks import FaceLandmarker
+from rgbavatar_ns.tracking.own_head import read_own_head, subject_tracker
 from rgbavatar_ns.tracking.pictures import pinhole
 from rgbavatar_ns.tracking.subject import SubjectTracker
 
@@ -55,8 +55,8 @@ class LiveTracker:
 
     def __init__(self, config: TrackConfig | None = None) -> None:
         self._config = config or TrackConfig(image_size=512)
-        self.head = HeadModel.embedded(dtype=torch.float64)
-        self._tracker = SubjectTracker(self.head, self._config)
+        self._tracker = subject_tracker(self._config, read_own_head(self._config.flame))
+        self.head = self._tracker.head
         self._landmarker = FaceLandmarker()
         self._picture = HeadPicture(self.head.arrays, self._config.keep_torso)
         self._worker = ThreadPoolExecutor(1, "rgbavatar-matte")

@@ -28,6 +28,7 @@ from rgbavatar_ns.tracking.fit import (
 from rgbavatar_ns.tracking.frame_cost import LID_PAIRS, LIP_PAIRS, FrameCost, Target
 from rgbavatar_ns.tracking.landmark_head import LandmarkHead
 from rgbavatar_ns.tracking.landmarks import FACE_OVAL, IRIS_CENTERS, face_height_px
+from rgbavatar_ns.tracking.own_parameters import with_signed_expressions
 from rgbavatar_ns.tracking.parameters import fit_parameters
 
 # Lips, lids, brows, nose and irises are seen; cheeks and forehead are interpolated by FaceMesh,
@@ -57,11 +58,10 @@ class SubjectTracker:
         self.facemesh_index = marks.facemesh_index
         vertex_ids = self.head.arrays.faces[marks.triangle].astype(np.int64)
         self.mesh_landmarks = LandmarkHead(self.head, vertex_ids, marks.barycentric)
-        parameters = fit_parameters(
-            self.head.layout,
-            self.head.arrays.expression_names,
-            self.mesh_landmarks.expression_size_m(),
-        )
+        size_m = self.mesh_landmarks.expression_size_m()
+        names, layout = self.head.arrays.expression_names, self.head.layout
+        parameters = fit_parameters(layout, names, size_m)
+        parameters = with_signed_expressions(parameters, layout, names, size_m)
         seen = self.mesh_landmarks
         if self.response is not None:
             seen = seen.with_response(self.response.select(rows))

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from rgbavatar_ns.data import DatasetWriter, TrackedDataset
 from rgbavatar_ns.errors import UserError
-from rgbavatar_ns.head import HeadModel
+from rgbavatar_ns.head import HeadArrays
 from rgbavatar_ns.tracking.clip import ClipLandmarks, followed_face
 from rgbavatar_ns.tracking.config import TrackConfig
 from rgbavatar_ns.tracking.crop import SquareCrop, steady_crop
@@ -25,6 +25,7 @@ from rgbavatar_ns.tracking.find_faces import find_faces
 from rgbavatar_ns.tracking.fit import ClipFit
 from rgbavatar_ns.tracking.landmarks import load_mediapipe
 from rgbavatar_ns.tracking.mattes import UserMattes
+from rgbavatar_ns.tracking.own_head import head_digest, read_own_head, subject_tracker
 from rgbavatar_ns.tracking.pictures import TrackedPictures
 from rgbavatar_ns.tracking.report import fit_quality, silhouette_summary, verdict, write_report
 from rgbavatar_ns.tracking.sheet import write_sheet
@@ -47,18 +48,21 @@ def track_video(
     `videos` is a file that PyAV reads, a folder of images, or several of them in order. Writes
     the dataset to `dst`, with `tracking.json` (errors, rejected frames, speed, a verdict) and
     `overlay.png` (the fitted mesh over frames). Frames without the followed face are left out and
-    listed. The result is the same on every run. An interrupted call leaves what it has done in
-    `dst`; the same call goes on from there and ends with the same dataset. Raises UserError for
-    unreadable input, no face, no mediapipe, or a destination that cannot be used.
+    listed. The head is the embedded one or `config.flame`, which the dataset then holds, as an
+    imported one does. The result is the same on every run. An interrupted call leaves what it has
+    done in `dst`; the same call goes on from there and ends with the same dataset. Raises
+    UserError for unreadable input, no face, no mediapipe, a head model that is none, or a
+    destination that cannot be used.
     """
     config = config or TrackConfig()
+    own_head = read_own_head(config.flame)
     source = FrameSource.open(videos, config.max_frames)
     mattes = None if config.mattes is None else UserMattes.open(config.mattes, source)
     load_mediapipe()
-    run = UnfinishedRun.open(Path(dst), _settings(source, config), config.overwrite)
+    run = UnfinishedRun.open(Path(dst), _settings(source, config, own_head), config.overwrite)
     stages = _Stages(progress)
     with _one_thread_a_call():
-        clip = _tracked_clip(source, mattes, config, run, stages)
+        clip = _tracked_clip(source, mattes, own_head, config, run, stages)
         return _written(clip, source, mattes, config, run, stages)
 
 
@@ -78,6 +82,7 @@ class _TrackedClip:
 def _tracked_clip(
     source: FrameSource,
     mattes: UserMattes | None,
+    own_head: HeadArrays | None,
     config: TrackConfig,
     run: UnfinishedRun,
     stages: "_Stages",
@@ -90,7 +95,7 @@ def _tracked_clip(
         if mattes is not None:
             mattes.require_count(seen.frames_read, config.max_frames is not None)
         stages.begin("fit", len(seen))
-        tracker = SubjectTracker(HeadModel.embedded(dtype=torch.float64), config)
+        tracker = subject_tracker(config, own_head)
         fit = tracker.fit(seen.points_px, seen.follows(), width, height, stages.half_done)
         lost = tracker.rejected(fit, seen.points_px)
         found, fit = seen.without(lost), fit.without(lost)
@@ -120,7 +125,7 @@ def _written(
     noted = run.pictures(_name_of_fit(clip, thetas, identity))
     writer = DatasetWriter(
         dst,
-        "makehuman",
+        clip.tracker.head.arrays,
         identity,
         clip.tracker.head.layout,
         config.image_size,
@@ -178,6 +183,7 @@ def _report(
     tracked = set(clip.found.frame_index)
     given = "the user's mattes" if mattes is not None else "the source's alpha channel"
     report: dict[str, Any] = {
+        "head_model": clip.tracker.head.arrays.name,
         "frames_read": seen.frames_read,
         "frames_tracked": len(clip.found),
         "rejected": {
@@ -199,13 +205,17 @@ def _report(
     return {"verdict": verdict(report), **report}
 
 
-def _settings(source: FrameSource, config: TrackConfig) -> dict[str, Any]:
+def _settings(
+    source: FrameSource, config: TrackConfig, own_head: HeadArrays | None
+) -> dict[str, Any]:
     """What must be alike for a run to go on with what another one has done."""
-    options = {name: value for name, value in asdict(config).items() if name != "overwrite"}
-    mattes = options.pop("mattes")
+    by_content = ("overwrite", "mattes", "flame")
+    options = {name: value for name, value in asdict(config).items() if name not in by_content}
+    mattes = config.mattes
     return {
         "the video": [fingerprint(path) for path in source.paths],
         "the mattes": None if mattes is None else fingerprint(Path(mattes)),
+        "the head model": head_digest(own_head),
         **options,
         "the version of this program": version("rgbavatar-ns"),
     }

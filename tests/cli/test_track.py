@@ -35,6 +35,16 @@ def test_options_may_come_before_and_after_the_paths(
     assert asked == ASKED
 
 
+def test_a_head_model_that_is_not_there_is_told_before_the_video_is_read(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    nowhere = str(tmp_path / "flame2023.pkl")
+    with pytest.raises(SystemExit):
+        main(["track", "a.mp4", str(tmp_path / "set"), "--flame", nowhere])
+    assert f"no FLAME model at {nowhere}" in " ".join(capsys.readouterr().err.split())
+    assert not (tmp_path / "set").exists()
+
+
 @pytest.mark.parametrize("paths", [(), (Path("me.mp4"),)])
 def test_a_video_without_a_place_for_its_dataset_is_refused(paths: tuple[Path, ...]) -> None:
     with pytest.raises(UserError, match="place for the dataset are needed"):

@@ -1,0 +1,124 @@
+"""Nearest places on a head's skin, among those that look the same way and move alike."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import trimesh
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import KDTree
+
+from rgbavatar_ns.head.arrays import HeadArrays
+
+# What counts as distance beside metres: a normal that points elsewhere (per unit), and another
+# share in the jaw's motion, which keeps the upper lip apart from the lower one it rests on.
+_NORMAL_M, _JAW_M = 0.01, 0.008
+# The share of that once the alike are found: then it only has to part what lies face to face.
+_EXACT_SHARE = 0.3
+# Each triangle is sampled as often as gives about so many samples in all.
+_SAMPLES, _MOST_SPLITS = 120_000, 6
+_CANDIDATES = 12
+_JAW = 2
+
+
+@dataclass(frozen=True)
+class SkinPoints:
+    """Points on a head at rest, metres, with their outward normals and their share in the jaw."""
+
+    points: Float[np.ndarray, "N 3"]
+    normals: Float[np.ndarray, "N 3"]
+    jaw: Float[np.ndarray, "N"]
+
+    def features(self, share: float = 1.0) -> Float[np.ndarray, "N 7"]:
+        """Coordinates whose distance, in metres, says how unlike two points are.
+
+        `share` is how much normal and jaw count beside the place.
+        """
+        normals, jaw = share * _NORMAL_M * self.normals, share * _JAW_M * self.jaw
+        return np.concatenate([self.points, normals, jaw[:, None]], axis=1)
+
+    def select(self, rows: Int[np.ndarray, "M"]) -> "SkinPoints":
+        """These points, in this order."""
+        return SkinPoints(self.points[rows], self.normals[rows], self.jaw[rows])
+
+
+@dataclass(frozen=True)
+class SkinPlaces:
+    """Where on a surface points were found: triangle of the head, barycentric place, the point
+    there, and how unlike it is the one looked for, metres."""
+
+    triangle: Int[np.ndarray, "N"]
+    barycentric: Float[np.ndarray, "N 3"]
+    found: SkinPoints
+    unlike_m: Float[np.ndarray, "N"]
+
+
+class SkinSurface:
+    """The skin of a head at rest as a surface to search; eyeballs, teeth and tongue are no skin."""
+
+    def __init__(self, arrays: HeadArrays) -> None:
+        self._triangles = np.flatnonzero(is_skin(arrays)[arrays.faces].all(1))
+        self._faces = arrays.faces[self._triangles].astype(np.int64)
+        self._vertices = arrays.v_template.astype(np.float64)
+        self._normals = vertex_normals(self._vertices, self._faces)
+        self._jaw = arrays.skinning_weights[:, _JAW].astype(np.float64)
+        splits = int(np.sqrt(2 * _SAMPLES / max(len(self._faces), 1)))
+        splits = min(max(splits, 1), _MOST_SPLITS)
+        steps = range(splits)
+        grid = [(i, j, splits - 1 - i - j) for i in steps for j in steps if i + j < splits]
+        places = (np.array(grid) + 1 / 3) / splits
+        self._owners = np.repeat(np.arange(len(self._faces)), len(places))
+        self._samples = self._at(self._owners, np.tile(places, (len(self._faces), 1)))
+        self._tree = KDTree(self._samples.features())
+
+    def sampled(self, points: SkinPoints) -> tuple[SkinPoints, Float[np.ndarray, "N"]]:
+        """The sample of the surface that is most like each point, and how unlike it is, metres."""
+        unlike_m, found = self._tree.query(points.features())
+        return self._samples.select(np.atleast_1d(found)), np.atleast_1d(unlike_m)
+
+    def nearest(self, points: SkinPoints) -> SkinPlaces:
+        """The place of the surface that is most like each point."""
+        _, samples = self._tree.query(points.features(), k=_CANDIDATES)
+        rows = self._owners[samples].reshape(-1)
+        corners = self._vertices[self._faces[rows]]
+        closest = trimesh.triangles.closest_point(
+            corners, np.repeat(points.points, _CANDIDATES, axis=0)
+        )
+        places = trimesh.triangles.points_to_barycentric(corners, closest).clip(0, 1)
+        places /= places.sum(1, keepdims=True)
+        candidates = self._at(rows, places)
+        wanted = np.repeat(points.features(_EXACT_SHARE), _CANDIDATES, axis=0)
+        apart = candidates.features(_EXACT_SHARE) - wanted
+        unlike_m = np.linalg.norm(apart, axis=1).reshape(-1, _CANDIDATES)
+        best = np.arange(len(unlike_m)) * _CANDIDATES + unlike_m.argmin(1)
+        triangles = self._triangles[rows[best]]
+        return SkinPlaces(triangles, places[best], candidates.select(best), unlike_m.min(1))
+
+    def _at(self, rows: Int[np.ndarray, "N"], places: Float[np.ndarray, "N 3"]) -> SkinPoints:
+        corners = self._faces[rows]
+        normals = np.einsum("nk,nkx->nx", places, self._normals[corners])
+        return SkinPoints(
+            np.einsum("nk,nkx->nx", places, self._vertices[corners]),
+            normals / (np.linalg.norm(normals, axis=1, keepdims=True) + 1e-12),
+            np.einsum("nk,nk->n", places, self._jaw[corners]),
+        )
+
+
+def is_skin(arrays: HeadArrays) -> Bool[np.ndarray, "V"]:
+    """Vertices of the skin: what the head's groups say, else all but the eyeballs."""
+    if "skin" not in arrays.vertex_groups:
+        return arrays.skinning_weights[:, 3:].max(1) <= 0.5
+    skin = np.zeros(len(arrays.v_template), dtype=bool)
+    skin[arrays.vertex_groups["skin"]] = True
+    return skin
+
+
+def vertex_normals(
+    vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]
+) -> Float[np.ndarray, "V 3"]:
+    """Unit normals, the mean of the triangles around weighed by area; 0 where there is none."""
+    a, b, c = vertices[faces].transpose(1, 0, 2)
+    areas = np.cross(b - a, c - a)
+    normals = np.zeros_like(vertices)
+    for corner in range(3):
+        np.add.at(normals, faces[:, corner], areas)
+    return normals / (np.linalg.norm(normals, axis=1, keepdims=True) + 1e-12)
