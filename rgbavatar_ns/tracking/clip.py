@@ -15,8 +15,9 @@ from rgbavatar_ns.tracking.landmarks import face_height_px
 _JUMP_SHARE, _JUMP_SIZE = 0.4, 1.3
 # A pause between two frames' times beyond this many usual ones is a gap.
 _PAUSE = 4.0
-# Sharpness below this share of the clip's median is noted as blur.
-_BLURRED = 0.25
+# Sharpness below this share of the clip's sharp frames' (its 90th percentile: most frames may be
+# blurred) is noted as blur. Frames of a face that talks and keeps still are above .7.
+_BLURRED, _SHARP_PERCENT = 0.35, 90
 
 
 @dataclass(frozen=True)
@@ -158,5 +159,5 @@ def _segments(
 
 
 def _blurred(sharpness: Float[np.ndarray, "F"], index: list[int]) -> tuple[int, ...]:
-    poor = sharpness < _BLURRED * np.median(sharpness)
+    poor = sharpness < _BLURRED * np.percentile(sharpness, _SHARP_PERCENT)
     return tuple(index[k] for k in np.flatnonzero(poor))
