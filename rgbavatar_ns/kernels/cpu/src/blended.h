@@ -279,11 +279,15 @@ static RGBAVATAR_MEMBER AdamStep adam_step(const AdamGroup& group) {
   return {group.rate, group.inverse_root, group.beta1, group.beta2, group.epsilon};
 }
 
-static void adam_columns(const AdamGroup& group, int64_t start, int columns,
-                         const float* gradient) {
+// Meanwhile begins to fetch the columns from `next` on.
+static void adam_columns(const AdamGroup& group, int64_t start, int columns, const float* gradient,
+                         int64_t next) {
   const AdamStep step = adam_step(group);
   for (int i = 0; i < columns; i += kLanes) {
     const int rest = columns - i;
+    __builtin_prefetch(group.value + next + i);
+    __builtin_prefetch(group.first + next + i);
+    __builtin_prefetch(group.second + next + i);
     Wide value = load_some(group.value + start + i, rest);
     Wide first = load_some(group.first + start + i, rest);
     Wide second = load_some(group.second + start + i, rest);
@@ -339,7 +343,8 @@ static void update_bases(const BlendedScene& scene, int kind, int begin, int cou
             scene.bases * kLanes);
       image += rest < kBlendImages ? rest : kBlendImages;
     }
-    if (group) adam_columns(*group, start, columns, scratch.gradient);
+    if (group)
+      adam_columns(*group, start, columns, scratch.gradient, start + int64_t(scene.count) * width);
   }
 }
 
@@ -352,7 +357,8 @@ static void update_base(const BlendedScene& scene, int kind, int begin, int coun
       sum = sum + load_wide(scratch.tangent[kind] + image * kBlendChunk * width + i);
     store(sum, scratch.gradient + i);
   }
-  adam_columns(group, int64_t(begin) * width, columns, scratch.gradient);
+  const int64_t start = int64_t(begin) * width;
+  adam_columns(group, start, columns, scratch.gradient, start + columns);
 }
 
 static void update_blended(const BlendedScene& scene, const float* cameras, int begin, int end,
@@ -371,8 +377,9 @@ static void update_blended(const BlendedScene& scene, const float* cameras, int 
   for (int i = 0; i < weights; ++i)
     weight_gradient[i] = sum_of(load_wide(scratch.weight_sums + i * kLanes));
   if (!optimizer) return;
-  adam_columns(optimizer->log_scale, int64_t(begin) * 3, count * 3, scratch.scale_gradient);
-  adam_columns(optimizer->opacity_logit, begin, count, scratch.opacity_gradient);
+  adam_columns(optimizer->log_scale, int64_t(begin) * 3, count * 3, scratch.scale_gradient,
+               int64_t(end) * 3);
+  adam_columns(optimizer->opacity_logit, begin, count, scratch.opacity_gradient, end);
 }
 
 }  // namespace rgbavatar::RGBAVATAR_ISA

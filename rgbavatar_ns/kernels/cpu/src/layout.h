@@ -128,8 +128,9 @@ struct alignas(64) TileScratch {
 // Position, rotation and colour: what the bases change.
 constexpr int kBlendedKinds = 3;
 constexpr int kBlendedWidth[kBlendedKinds] = {3, 4, 3};
-// Gaussians that are blended at a time; the columns of a few images then fit the nearest cache.
-constexpr int kBlendChunk = 256;
+// Gaussians that are blended at a time: many, because each basis is a stretch of memory of its own,
+// which a processor has to find first; the columns of a batch still fit the second cache.
+constexpr int kBlendChunk = 1024;
 constexpr int kBlendColumns = kBlendChunk * 4;
 
 // A triangle's frame, corner, edges and length ratio in an image: 23 numbers, and one unused.
