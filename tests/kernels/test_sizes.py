@@ -11,6 +11,7 @@ from rgbavatar_ns.kernels import (
     rasterize,
     weighted_color_average,
 )
+from tests.kernels.agreement import assert_agrees, expect
 from tests.kernels.scenes import (
     ATTRIBUTES,
     Scene,
@@ -243,3 +244,27 @@ def test_order_of_half_a_million_in_memory_does_not_matter(crowd):
     assert (rendered.image - expected.image).abs().mean() < 1e-5
     for name in ATTRIBUTES:
         assert relative_l2(grads[name], expected_grads[name][:, order]) < 1e-2, name
+
+
+@pytest.mark.usefixtures("instruction_set")
+@pytest.mark.parametrize(
+    ("side_px", "count", "radius_px"),
+    [(12, 9000, (0.3, 0.6)), (32, 700, (12.0, 40.0))],
+    ids=["more groups than are kept", "more pixels than are kept"],
+)
+def test_a_tile_fuller_than_what_is_kept_of_it_matches_reference(side_px, count, radius_px):
+    """So faint that light comes through all of them: the last ones are drawn again backwards."""
+    gaussians, cameras = _plane_scene(side_px, side_px, count, seed=5, radius_px=radius_px)
+    gaussians.opacities.mul_(0.004).add_(0.0045)
+    generator = torch.Generator().manual_seed(6)
+    size = (1, side_px, side_px)
+    scene = Scene(
+        to(gaussians, torch.float64),
+        to(cameras, torch.float64),
+        torch.rand(3, generator=generator, dtype=torch.float64),
+        torch.randn(*size, 3, generator=generator, dtype=torch.float64),
+        torch.randn(*size, 1, generator=generator, dtype=torch.float64),
+    )
+    expected = expect(scene, least_settled=0.3)
+    assert (1 - expected.rendered.alpha).amin() > 1e-3
+    assert_agrees(expected, "cpu")
