@@ -26,9 +26,9 @@ _DAMPING, _LONGEST_STEP = 1e-7, 0.2
 # From a plate to a cloth, and how much of a distance along the surface counts: points may slide.
 _STIFFNESS = (300.0, 30.0, 3.0)
 _ALONG = 0.05
-# A head whose skin stays this far from the embedded one's, laid over it, is no face. Neither is
-# one far from upright or of another size: the tracker knows heads in metres.
-_NO_FACE_M, _MOST_TURNED, _MOST_GROWN = 0.003, 0.5, 1.5
+# A head on which no person of the embedded one's comes nearer than this is no face. Neither is one
+# far from upright or of another size: the tracker knows heads in metres.
+_NO_FACE_M, _MOST_TURNED, _MOST_GROWN = 0.006, 0.5, 1.5
 
 
 @dataclass(frozen=True)
@@ -77,10 +77,11 @@ def register(head: HeadArrays) -> Registration:
     if turned > _MOST_TURNED or not 1 / _MOST_GROWN < pose.scale < _MOST_GROWN:
         why = f"it has to be turned by {np.degrees(turned):.0f} degrees and made {pose.scale:.2g}"
         raise _no_face(head, f"{why} times as large")
-    placed = _close_the_rest(face, surface, pose(face.vertices(identity)))
-    unlike_m = np.median(surface.nearest(face.points(placed)).unlike_m[face.weight == 1])
-    if not unlike_m < _NO_FACE_M:
+    placed = pose(face.vertices(identity))
+    unlike_m = float(np.median(surface.sampled(face.points(placed))[1][face.weight == 1]))
+    if unlike_m > _NO_FACE_M:
         raise _no_face(head, f"it stays {1e3 * unlike_m:.0f} mm away")
+    placed = _close_the_rest(face, surface, placed)
     return Registration(pose, identity, placed)
 
 

@@ -88,6 +88,7 @@ def errors(
     return float(np.degrees(np.arccos(np.clip(cosines, -1, 1))).mean()), float(away_mm)
 
 
+@pytest.mark.slow
 def test_other_models_of_the_head_are_fitted_as_well_as_the_embedded_one(
     seen, flame_path: Path
 ) -> None:
@@ -146,6 +147,7 @@ def test_a_head_that_is_none_is_refused_with_cause_and_remedy(tmp_path: Path) ->
     assert read_own_head(None) is None
 
 
+@pytest.mark.slow
 def test_a_video_tracked_with_flame_holds_that_head(flame_path: Path, tmp_path: Path) -> None:
     pytest.importorskip("mediapipe", reason="the tracker's optional extra is not installed")
     image = astronaut()
