@@ -30,6 +30,7 @@ from rgbavatar_ns.kernels import (
     rasterize,
     weighted_color_average,
 )
+from rgbavatar_ns.kernels.checks import holds_nonfinite
 
 LEARNING_RATES: dict[str, float] = {
     "position": 8e-4,
@@ -341,8 +342,8 @@ class Avatar(nn.Module):
                 f"'{self.head.arrays.name}' takes {describe_layout(self.layout)}.",
                 "Give theta of the head model that the avatar was trained with.",
             )
-        # On a GPU the check would wait for the device each step; data is checked when loaded.
-        if theta.device.type == "cpu" and not torch.isfinite(theta.detach()).all():
+        # Of a GPU this is not asked; data is checked when loaded.
+        if holds_nonfinite(theta):
             raise UserError(
                 "theta holds NaN or infinite values.", "Repair or leave out these frames."
             )

@@ -1,10 +1,20 @@
-"""Checks of images that every compiled backend makes: compiled code reads what it is promised."""
+"""Checks of tensors before compiled code reads them: it reads what it is promised."""
+
+import math
 
 import torch
 from torch import Tensor
 
 from rgbavatar_ns.kernels.constants import MAX_AVERAGE_CHANNELS
 from rgbavatar_ns.kernels.types import PinholeCameras
+
+
+def holds_nonfinite(tensor: Tensor) -> bool:
+    """Whether a tensor in main memory holds NaN or infinity; not asked of a GPU, which it stops."""
+    if tensor.device.type != "cpu":
+        return False
+    # Only finite numbers have a finite sum, which is one operation where the exact test is five.
+    return not math.isfinite(tensor.detach().sum().item()) and not bool(tensor.isfinite().all())
 
 
 def check_average_images(images: Tensor, weights: Tensor, cameras: PinholeCameras) -> None:

@@ -1,9 +1,9 @@
 """The only entrance to the rasterizer: checks its arguments and hands them to a backend."""
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from rgbavatar_ns.kernels.checks import holds_nonfinite
 from rgbavatar_ns.kernels.constants import MAX_AVERAGE_CHANNELS
 from rgbavatar_ns.kernels.registry import available_backends, choose
 from rgbavatar_ns.kernels.types import GaussianSet, PinholeCameras, RenderedBatch, WeightedColors
@@ -83,7 +83,7 @@ def checked_background(
     _check_like(like, background, "background")
     if background.ndim != 2 or background.shape[1] != 3:
         raise ValueError(f"background is {_shape(background)}. Pass [3] or [B, 3].")
-    if background.device.type == "cpu" and not torch.isfinite(background).all():
+    if holds_nonfinite(background):
         raise ValueError("background holds NaN or infinity. Pass a colour.")
     _join(batch, "background", background.shape[0])
     return background
@@ -139,7 +139,7 @@ def check_cameras(means: Tensor, cameras: PinholeCameras) -> int:
         _check_like(means, tensor, name)
         if tuple(tensor.shape) != shape:
             raise ValueError(f"{name} is {_shape(tensor)}. Pass {list(shape)}.")
-        if tensor.device.type == "cpu" and not torch.isfinite(tensor).all():
+        if holds_nonfinite(tensor):
             raise ValueError(f"{name} holds NaN or infinity. Check where the camera comes from.")
     if cameras.focal_px.device.type == "cpu" and (cameras.focal_px <= 0).any():
         raise ValueError("focal_px must be positive. Cameras here look along +z, y down (OpenCV).")
