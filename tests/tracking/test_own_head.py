@@ -1,7 +1,6 @@
 """Tracking with a head model of the user's own, against the truth and the embedded head."""
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +11,6 @@ from scipy.spatial import KDTree
 from rgbavatar_ns.data import load_dataset
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadArrays, HeadModel
-from rgbavatar_ns.head.flame import load_flame
 from rgbavatar_ns.head.synthetic_flame import write_synthetic_flame
 from rgbavatar_ns.tracking import TrackConfig, track_video
 from rgbavatar_ns.tracking.camera import StillCamera
@@ -89,27 +87,21 @@ def errors(
 
 
 @pytest.mark.slow
-def test_other_models_of_the_head_are_fitted_as_well_as_the_embedded_one(
-    seen, flame_path: Path
-) -> None:
-    head = HeadArrays.embedded()
-    mix, _ = np.linalg.qr(np.random.default_rng(2).normal(size=(head.num_expressions,) * 2))
-    retriangulated, flame = remeshed(), load_flame(flame_path)
-    other = as_another_model(retriangulated, np.zeros(head.num_identity), mix)
-    found = {}
-    for name, own, same, turn in (
-        ("embedded", None, head, np.eye(3)),
-        ("remeshed", other, retriangulated, TURN),
-        ("FLAME", replace(flame, eyelid_dirs=None), flame, np.eye(3)),
-    ):
+def test_another_model_of_the_head_is_fitted_nearly_as_well_as_the_embedded_one(seen) -> None:
+    """Of other triangles, person, size and tilt, and expressions that are mixtures."""
+    head, random = HeadArrays.embedded(), np.random.default_rng(2)
+    mix, _ = np.linalg.qr(random.normal(size=(head.num_expressions,) * 2))
+    same = remeshed()
+    other = as_another_model(same, 0.3 * random.normal(size=head.num_identity), mix)
+    found = []
+    for own, surface, turn in ((None, head, np.eye(3)), (other, same, TURN)):
         tracker = subject_tracker(CONFIG, own)
         fit = tracker.fit(seen[2], [False] + [True] * (FRAMES - 1), 320, 240)
-        found[name] = errors(tracker, fit, same, turn, seen)
-    for name in ("remeshed", "FLAME"):
-        degrees, away_mm = found[name]
-        # Depth turns with the person's profile: that error is the landmarks', not the head's.
-        assert degrees < found["embedded"][0] + 0.5, (name, found)
-        assert away_mm < found["embedded"][1] + 0.7, (name, found)
+        found.append(errors(tracker, fit, surface, turn, seen))
+    print(f"degrees, mm: embedded {found[0]}, another model {found[1]}")
+    # What both are off by is depth, which turns with the person's profile.
+    assert found[1][0] < found[0][0] + 0.7
+    assert found[1][1] < found[0][1] + 0.8
 
 
 def test_numbered_expressions_go_both_ways_and_named_ones_do_not() -> None:
