@@ -6,8 +6,10 @@ writes `rgbavatar_ns/head/assets/facemesh_response.npz`. People of the procedura
 every second one mirrored and half of them with glasses, speak, turn, and make faces at random;
 for each FaceMesh point the difference between where it is found and where its place on the mesh
 is seen is explained, in the skull's frame, by `LandmarkResponse`'s terms: a robust ridge regression
-whose priors say how many millimetres a term may be expected to do. Seeds begin at 100: the
-benchmarks' people are others. Takes about a quarter of an hour; needs mediapipe 0.10.9.
+whose priors say how many millimetres a term may be expected to do. What the response leaves of a
+person on whom it was not measured is the points' noise: its principal components are stored too.
+Seeds begin at 100: the benchmarks' people are others. Takes about a quarter of an hour; needs
+mediapipe 0.10.9.
 """
 
 import argparse
@@ -24,7 +26,7 @@ from rgbavatar_ns.data.demo.performance import perform
 from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.head.landmarks import RESPONSE_FILE, facemesh_landmarks
 from rgbavatar_ns.tracking.landmark_head import LandmarkHead
-from rgbavatar_ns.tracking.landmarks import FaceLandmarker
+from rgbavatar_ns.tracking.landmarks import FaceLandmarker, face_height_px, upright_turn
 
 FIRST_SEED = 100
 ACTED, MADE = 30, 40
@@ -38,15 +40,29 @@ EXPECTED_M |= {"jaw_open": 1.5e-3, "gaze": 7e-4, "identity": 1.2e-3}
 # More than a point's own noise: the pictures of one person err together.
 NOISE_PX = 2.5
 OUTLIER_PX = 3.0
+# Shares of the face's height: what a point errs by itself, and the most that one point tells.
+OWN_SHARE, MOST_SHARE = 0.004, 0.04
+# A point errs the more by itself, the less sure its place on the mesh is: twice at sqrt(3) of this.
+UNSURE_M = 0.002
+# Faces made at random are harder than usual ones: common errors are taken for a little smaller
+# than here. (At full size they explain so much that expressions come out weaker than they are.)
+NOISE_MODES, USUAL_SHARE = 48, 0.6
+# Pictures that are off by more than this times the median count less and less.
+USUAL_TIMES = 1.3
 
 
 @dataclass(frozen=True)
 class Observation:
-    """One picture: terms [K]; per point image derivative [L, 2, 3] and what is left [L, 2], px."""
+    """One picture: terms [K]; per point image derivative [L, 2, 3] and what is left [L, 2], px.
 
+    `to_shares` [2, 2] takes what is left to the upright face, in shares of its height.
+    """
+
+    person: int
     terms: np.ndarray
     derivative: np.ndarray
     residual_px: np.ndarray
+    to_shares: np.ndarray
 
 
 class Mirror:
@@ -150,21 +166,49 @@ def observations(landmarks: LandmarkHead, index: np.ndarray, seeds: range) -> It
             image[:, 0, 0], image[:, 1, 1] = across, -across
             image[:, :, 2] = image[:, [0, 1], [0, 1]] * away[:, :2] / -away[:, 2:]
             expected = away[:, :2] * [1, -1] * across[:, None] + camera.size / 2
-            yield Observation(response.terms, image @ response.turned, points_px[index] - expected)
+            yield Observation(
+                seed,
+                response.terms,
+                image @ response.turned,
+                points_px[index] - expected,
+                upright_turn(points_px) / face_height_px(points_px),
+            )
 
 
-def regress(derivative: np.ndarray, terms: np.ndarray, residual_px: np.ndarray) -> np.ndarray:
-    """One point's offsets a unit of each (scaled) term [K, 3]; outliers count less and less."""
+def regress(
+    derivative: np.ndarray, terms: np.ndarray, residual_px: np.ndarray, person: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """One point's offsets a unit of each (scaled) term [K, 3]; outliers count less and less.
+
+    Also what is left [F, 2] of each person by a regression from all others.
+    """
     rows = np.einsum("fac,fk->fakc", derivative, terms).reshape(2 * len(terms), -1)
     wanted, weight = residual_px.reshape(-1), np.ones(residual_px.size)
-    solution = np.zeros(rows.shape[1])
+    weighted, normal, solution = rows, np.eye(rows.shape[1]), np.zeros(rows.shape[1])
     for _ in range(3):
         weighted = rows * weight[:, None] / NOISE_PX**2
         normal = weighted.T @ rows + np.eye(rows.shape[1])
         solution = np.linalg.solve(normal, weighted.T @ wanted)
         off = np.linalg.norm((wanted - rows @ solution).reshape(-1, 2), axis=1)
         weight = np.repeat(1 / (1 + (off / OUTLIER_PX) ** 2) ** 2, 2)
-    return solution.reshape(-1, 3)
+    left = np.empty_like(wanted)
+    for one in np.unique(person):
+        own = np.repeat(person == one, 2)
+        others = normal - weighted[own].T @ rows[own]
+        elsewhere = np.linalg.solve(others, weighted[~own].T @ wanted[~own])
+        left[own] = wanted[own] - rows[own] @ elsewhere
+    return solution.reshape(-1, 3), left.reshape(-1, 2)
+
+
+def noise_modes(left: np.ndarray) -> np.ndarray:
+    """Principal components [L, 2, K] of errors [F, L, 2] beyond what each point errs by itself."""
+    errors = left.clip(-MOST_SHARE, MOST_SHARE).reshape(len(left), -1)
+    off = np.sqrt((errors**2).mean(1))
+    weight = 1 / (1 + (off / (USUAL_TIMES * np.median(off))) ** 2) ** 2
+    variance, directions = np.linalg.eigh((errors * weight[:, None]).T @ errors / weight.sum())
+    strength = np.sqrt(np.maximum(variance[::-1][:NOISE_MODES] - OWN_SHARE**2, 0))
+    modes = USUAL_SHARE * directions[:, ::-1][:, :NOISE_MODES] * strength
+    return modes.reshape(*left.shape[1:], -1)
 
 
 def build(people: int) -> dict[str, np.ndarray]:
@@ -187,19 +231,21 @@ def build(people: int) -> dict[str, np.ndarray]:
     terms = np.array([one.terms for one in found]) * scale
     derivative = np.array([one.derivative for one in found])
     residual = np.array([one.residual_px for one in found])
-    offsets = np.array(
-        [
-            (regress(derivative[:, point], terms, residual[:, point]) * scale[:, None]).T
-            for point in range(landmarks.num_landmarks)
-        ]
-    )
-    explained = np.einsum("flac,lck,fk->fla", derivative, offsets, terms / scale)
-    before, after = np.abs(residual).mean(), np.abs(residual - explained).mean()
-    print(f"{len(found)} pictures: {before:.2f} px off before, {after:.2f} px after")
+    person = np.array([one.person for one in found])
+    offsets = np.zeros((landmarks.num_landmarks, 3, len(scale)))
+    left = np.zeros_like(residual)
+    for point in range(landmarks.num_landmarks):
+        one, left[:, point] = regress(derivative[:, point], terms, residual[:, point], person)
+        offsets[point] = (one * scale[:, None]).T
+    before, after = np.abs(residual).mean(), np.abs(left).mean()
+    print(f"{len(found)} pictures: {before:.2f} px off before, {after:.2f} px after, left out")
+    shares = np.einsum("fab,flb->fla", np.array([one.to_shares for one in found]), left)
     parts = np.split(offsets, np.cumsum(list(counts.values()))[:-1], axis=2)
     arrays = dict(zip(counts, parts))
     for name in ("rest", "jaw_open"):
         arrays[name] = arrays[name][..., 0]
+    own_share = OWN_SHARE * np.sqrt(1 + (marks.spread_m / UNSURE_M) ** 2)
+    arrays |= {"noise_modes": noise_modes(shares), "noise_own_share": own_share}
     return {name: values.astype(np.float16) for name, values in arrays.items()}
 
 

@@ -46,6 +46,27 @@ class LandmarkResponse:
 
 
 @dataclass(frozen=True)
+class LandmarkNoise:
+    """How a detector's points err together: what remains when their response is known.
+
+    A landmark's error in an upright face, as a share of the face's height, is taken for the sum of
+    `modes`, each times a standard normal number that all landmarks share, and of an error of its
+    own with the standard deviation `own_share` along each image axis.
+
+    Ours: the usual way is to take each point's error for its own; but neighbours err together, so
+    that many wrong points would outvote what a few right ones tell. Rows are FaceMesh indices.
+    Made with the response; probabilistic principal components (Tipping and Bishop 1999).
+    """
+
+    modes: Float[np.ndarray, "L 2 K"]
+    own_share: Float[np.ndarray, "L"]
+
+    def select(self, rows: Int[np.ndarray, "N"]) -> "LandmarkNoise":
+        """The same of these rows."""
+        return LandmarkNoise(self.modes[rows], self.own_share[rows])
+
+
+@dataclass(frozen=True)
 class LandmarkMap:
     """L FaceMesh points as places on triangles of the embedded head, by FaceMesh index.
 
@@ -98,4 +119,13 @@ def facemesh_response() -> LandmarkResponse:
     with np.load(RESPONSE_FILE, allow_pickle=False) as file:
         return LandmarkResponse(
             *(file[field.name].astype(np.float64) for field in fields(LandmarkResponse))
+        )
+
+
+@cache
+def facemesh_noise() -> LandmarkNoise:
+    """How FaceMesh's points err beside their response; rows are FaceMesh indices."""
+    with np.load(RESPONSE_FILE, allow_pickle=False) as file:
+        return LandmarkNoise(
+            file["noise_modes"].astype(np.float64), file["noise_own_share"].astype(np.float64)
         )

@@ -14,7 +14,7 @@ from rgbavatar_ns.tracking.frame_cost import FrameCost, Target
 # the width of the prior around a usual camera: a face's landmarks say little about it.
 FOCAL_SCAN = (0.9, 1.2, 1.6, 2.2, 3.0)
 _FOCAL_USUAL, _FOCAL_LOG_WIDTH = 1.4, 0.5
-_IDENTITY_WIDTH = 2.5
+_IDENTITY_WIDTH = 1.0  # principal components, of variance 1
 _SCAN_KEYS = 4
 _HEAD_HEIGHT_M = 0.19
 _OFFSET_SHRINK = 0.8

@@ -4,24 +4,17 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
+from scipy.linalg import cho_factor, cho_solve
 
+from rgbavatar_ns.head.landmarks import LandmarkNoise
 from rgbavatar_ns.tracking.bounded import QuadraticModel
 from rgbavatar_ns.tracking.camera import StillCamera
 from rgbavatar_ns.tracking.landmark_head import LandmarkHead
 from rgbavatar_ns.tracking.parameters import FitParameters
 
-# Pairs of landmarks whose distance says how far lips and lids are open: their difference counts
-# by itself, so that a bias of both points does not hide a closed mouth or eye.
-LIP_PAIRS = ((13, 14), (82, 87), (312, 317), (81, 178), (311, 402), (80, 88), (310, 318))
-LID_PAIRS = ((159, 145), (158, 153), (160, 144), (386, 374), (385, 380), (387, 373))
-# One standard deviation of a landmark is this share of the face's height. Neighbouring landmarks
-# err together: the sum over all counts as about `_INDEPENDENT` independent points.
-_SIGMA_SHARE = 0.01
-_INDEPENDENT = 120.0
-_PAIR_WEIGHT = 3.0
 # Huber's loss finds the head from afar; then points beyond `_REDESCENDING_SIGMAS` (a hand, a slip)
-# count ever less: Geman and McClure's loss.
+# count ever less: Geman and McClure's loss. Sigmas are of a landmark's own error.
 _HUBER_SIGMAS = 2.5
 _REDESCENDING_SIGMAS = 3.0
 
@@ -37,6 +30,8 @@ class Target:
 
     points_px: Float[np.ndarray, "L 2"]
     face_height_px: float
+    to_upright: Float[np.ndarray, "2 2"]
+    """Rotation of the image after which the forehead is straight above the chin."""
 
 
 @dataclass(frozen=True)
@@ -48,27 +43,33 @@ class Linearized:
     hessian: Float[np.ndarray, "PI PI"]
 
 
+@dataclass(frozen=True)
+class _Explained:
+    """Residuals taken apart: cost, its gradient `pull` to them, weights of their coordinates, and
+    the factor of I + modes' weights modes."""
+
+    cost: float
+    pull: Float[np.ndarray, "R"]
+    weight: Float[np.ndarray, "R"]
+    factor: tuple[Float[np.ndarray, "K K"], bool]
+
+
 @dataclass
 class FrameCost:
-    """Reprojection of landmarks and of their pairs, plus priors; shared by all frames."""
+    """Reprojection of landmarks, weighed by how they err together, plus priors; for all frames."""
 
     head: LandmarkHead
-    facemesh_index: Int[np.ndarray, "L"]
-    landmark_weight: Float[np.ndarray, "L"]
+    noise: LandmarkNoise
+    """Of the landmarks, row for row of `head`."""
     parameters: FitParameters
     identity_columns: int = 0
     """How many identity coefficients are unknown too."""
 
     def __post_init__(self) -> None:
         self._unknowns = self.head.unknowns(self.parameters.columns, self.identity_columns)
-        place = {int(index): row for row, index in enumerate(self.facemesh_index)}
-        pairs = [
-            (place[a], place[b]) for a, b in LIP_PAIRS + LID_PAIRS if a in place and b in place
-        ]
-        self._pairs = np.array(pairs, dtype=np.int64).reshape(-1, 2)
-        scale = _INDEPENDENT / max(float((self.landmark_weight**2).sum()), 1e-9)
-        pair_weight = np.full(len(self._pairs), _PAIR_WEIGHT * np.sqrt(scale))
-        self._all_weights = np.concatenate([self.landmark_weight * np.sqrt(scale), pair_weight])
+        self._prior_precision = self.parameters.prior_precision()
+        scaled = self.noise.modes / self.noise.own_share[:, None, None]
+        self._modes = scaled.reshape(-1, scaled.shape[2])
 
     def theta(
         self, values: Float[np.ndarray, "P"], base: Float[np.ndarray, "H"]
@@ -93,14 +94,13 @@ class FrameCost:
         """
         derivatives = self.head.jacobian(theta, identity, self._unknowns, camera.eye_m)
         jacobian = camera.image_derivative(derivatives.points, derivatives.derivative)
-        unit = _SIGMA_SHARE * target.face_height_px
-        first, second = self._pairs.T
-        return _robust_normal_equations(
-            self._residual(derivatives.points, camera, target),
-            np.concatenate([jacobian, jacobian[first] - jacobian[second]]) / unit,
-            self._all_weights,
-            _geman_mcclure if redescending else _huber,
-        )
+        found = self._explained(self._residual(derivatives.points, camera, target), redescending)
+        turn = target.to_upright / (target.face_height_px * self.noise.own_share[:, None, None])
+        rows = (turn @ jacobian).reshape(len(found.pull), -1)
+        weighted = rows * found.weight[:, None]
+        shared = self._modes.T @ weighted
+        hessian = rows.T @ weighted - shared.T @ cho_solve(found.factor, shared)
+        return Linearized(found.cost, rows.T @ found.pull, hessian)
 
     def value(
         self,
@@ -113,18 +113,49 @@ class FrameCost:
     ) -> float:
         """The cost of `linearize` alone, in a fraction of its time."""
         points = self.head.points(theta, identity, camera.eye_m)
-        away = np.linalg.norm(self._residual(points, camera, target), axis=1)
-        loss, _ = (_geman_mcclure if redescending else _huber)(away)
-        return float(self._all_weights**2 @ loss)
+        return self._explained(self._residual(points, camera, target), redescending).cost
 
     def _residual(
         self, points: Float[np.ndarray, "L 3"], camera: StillCamera, target: Target
-    ) -> Float[np.ndarray, "R 2"]:
-        """Of landmarks and pairs, in standard deviations of a landmark."""
-        unit = _SIGMA_SHARE * target.face_height_px
-        residual = (camera.project(points) - target.points_px) / unit
-        first, second = self._pairs.T
-        return np.concatenate([residual, residual[first] - residual[second]])
+    ) -> Float[np.ndarray, "L 2"]:
+        """In the upright face, in standard deviations of a landmark's own error."""
+        away_px = camera.project(points) - target.points_px
+        own_px = target.face_height_px * self.noise.own_share
+        return away_px @ target.to_upright.T / own_px[:, None]
+
+    def _explained(self, residual: Float[np.ndarray, "L 2"], redescending: bool) -> "_Explained":
+        """The cheapest explanation: modes of the detector's noise, and what is left robustly.
+
+        Found by reweighting, from Huber's loss on, since the other one has many minima.
+        """
+        losses = _REDESCENDING if redescending else _FROM_AFAR
+        found = self._reweighted(residual, np.zeros(self._modes.shape[1]), losses[0])
+        for robust in losses[1:]:
+            found = self._reweighted(residual, found[0], robust)
+        amounts, weight, factor = found
+        left = residual - (self._modes @ amounts).reshape(-1, 2)
+        loss, soften = losses[-1](np.linalg.norm(left, axis=1))
+        cost = float(loss.sum() + 0.5 * amounts @ amounts)
+        return _Explained(cost, (left * soften[:, None]).reshape(-1), weight, factor)
+
+    def _reweighted(
+        self, residual: Float[np.ndarray, "L 2"], amounts: Float[np.ndarray, "K"], loss: RobustLoss
+    ) -> tuple[
+        Float[np.ndarray, "K"],
+        Float[np.ndarray, "R"],
+        tuple[Float[np.ndarray, "K K"], bool],
+    ]:
+        """The modes' amounts that suit the weights that the last ones leave; weights, factor."""
+        left = residual - (self._modes @ amounts).reshape(-1, 2)
+        weight = np.repeat(loss(np.linalg.norm(left, axis=1))[1], 2)
+        weighted = self._modes * weight[:, None]
+        normal = weighted.T @ self._modes + np.eye(len(amounts))
+        factor = cho_factor(normal, check_finite=False)
+        return (
+            cho_solve(factor, weighted.T @ residual.reshape(-1), check_finite=False),
+            weight,
+            factor,
+        )
 
     def prior_value(
         self,
@@ -133,7 +164,7 @@ class FrameCost:
         temporal_weight: float,
     ) -> float:
         """The cost that `add_priors` adds."""
-        cost = 0.5 * float(self.parameters.prior_width**-2.0 @ values**2)
+        cost = 0.5 * float(values @ self._prior_precision @ values)
         if neighbours is not None and temporal_weight > 0:
             closeness = temporal_weight * self.parameters.temporal_width**-2.0
             cost += 0.5 * float(closeness @ (values - neighbours) ** 2)
@@ -146,15 +177,15 @@ class FrameCost:
         neighbours: Float[np.ndarray, "P"] | None,
         temporal_weight: float,
     ) -> QuadraticModel:
-        """The frame's own prior to 0 and the temporal one to its neighbours' mean."""
-        precision = self.parameters.prior_width**-2.0
-        pull = precision * values
+        """The frame's own prior and the temporal one to its neighbours' mean."""
+        precision = self._prior_precision
+        pull = precision @ values
         if neighbours is not None and temporal_weight > 0:
             closeness = temporal_weight * self.parameters.temporal_width**-2.0
             pull = pull + closeness * (values - neighbours)
-            precision = precision + closeness
+            precision = precision + np.diag(closeness)
         cost = model.cost + self.prior_value(values, neighbours, temporal_weight)
-        return QuadraticModel(cost, model.gradient + pull, model.hessian + np.diag(precision))
+        return QuadraticModel(cost, model.gradient + pull, model.hessian + precision)
 
 
 def _huber(
@@ -174,17 +205,5 @@ def _geman_mcclure(
     return 0.5 * distance**2 * share, share**2
 
 
-def _robust_normal_equations(
-    residual: Float[np.ndarray, "R 2"],
-    jacobian: Float[np.ndarray, "R 2 Q"],
-    weight: Float[np.ndarray, "R"],
-    robust: RobustLoss,
-) -> Linearized:
-    loss, soften = robust(np.linalg.norm(residual, axis=1))
-    root = (weight * np.sqrt(soften))[:, None]
-    scaled = (jacobian * root[..., None]).reshape(-1, jacobian.shape[-1])
-    return Linearized(
-        float((weight**2) @ loss),
-        scaled.T @ (residual * root).reshape(-1),
-        scaled.T @ scaled,
-    )
+_FROM_AFAR: tuple[RobustLoss, ...] = (_huber,) * 3
+_REDESCENDING: tuple[RobustLoss, ...] = (_huber, _huber, *(_geman_mcclure,) * 3)

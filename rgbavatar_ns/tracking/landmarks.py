@@ -21,6 +21,9 @@ FACE_OVAL = (
     *(152, 148, 176, 149, 150, 136, 172, 58, 132, 93, 234, 127, 162, 21, 54, 103, 67, 109),
 )
 """Where FaceMesh puts the outline of the face as seen: these points slide over the skin."""
+LIP_PAIRS = ((13, 14), (82, 87), (312, 317), (81, 178), (311, 402), (80, 88), (310, 318))
+LID_PAIRS = ((159, 145), (158, 153), (160, 144), (386, 374), (385, 380), (387, 373))
+"""Pairs of points whose distance says how far lips and lids are open."""
 MAX_SIDE_PX = 1280
 """Pictures that are larger are made smaller before faces are looked for."""
 _MOST_FACES = 3
@@ -85,3 +88,12 @@ def face_height_px(landmarks_px: Float[np.ndarray, "*batch 478 2"]) -> Float[np.
     """Distance from the top of the forehead to the chin, the measure of errors."""
     span = landmarks_px[..., FOREHEAD, :] - landmarks_px[..., CHIN, :]
     return np.linalg.norm(span, axis=-1)
+
+
+def upright_turn(
+    landmarks_px: Float[np.ndarray, "*batch 478 2"],
+) -> Float[np.ndarray, "*batch 2 2"]:
+    """Rotation of the image after which the forehead is straight above the chin (-y)."""
+    span = landmarks_px[..., FOREHEAD, :] - landmarks_px[..., CHIN, :]
+    x, y = np.moveaxis(span / np.linalg.norm(span, axis=-1, keepdims=True), -1, 0)
+    return np.stack([np.stack([-y, x], -1), np.stack([-x, -y], -1)], -2)

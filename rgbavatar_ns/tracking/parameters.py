@@ -1,5 +1,6 @@
 """Which parts of theta the tracker fits, within which bounds, and how they are drawn."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,13 +12,32 @@ from rgbavatar_ns.head import ThetaLayout
 _JAW_OPEN = (-0.02, 0.45)
 _GAZE = (-0.55, 0.55)
 _EXPRESSION = (0.0, 1.0)
+_EXPRESSION_WIDTH, _BLINK_WIDTH = 0.5, 1.0
+# Landmarks hardly see some expressions (cheeks, lower lids), but muscles seldom act alone: both
+# sides of a face mostly do the same, and what is done by one muscle, or in one act such as a
+# smile, goes together. Muscles and their partners: Facial Action Coding System (Ekman and Friesen
+# 1978), whose action units stand beside. How closely is ours, from renders of procedural people.
+_SIDES_WIDTH, _PARTNERS_WIDTH = 0.3, 0.4
+_PARTNERS = (
+    ("browInnerUp", "browOuterUp"),  # 1, 2: frontalis
+    ("browOuterUp", "eyeWide"),  # 2, 5: surprise
+    ("browDown", "eyeSquint"),  # 4, 7: a frown against light
+    ("cheekSquint", "eyeSquint"),  # 6, 7: orbicularis oculi
+    ("cheekSquint", "mouthSmile"),  # 6, 12: Duchenne's smile
+    ("mouthUpperUp", "noseSneer"),  # 10, 9: levator labii superioris
+    ("mouthFrown", "mouthShrugLower"),  # 15, 17: sadness
+    ("mouthFunnel", "mouthPucker"),  # 22, 18: rounded lips
+    ("mouthRollLower", "mouthPress"),  # 28, 24: orbicularis oris
+    ("mouthRollLower", "mouthRollUpper"),  # 28: both lips
+)
 
 
 @dataclass(frozen=True)
 class FitParameters:
     """The fitted entries of theta (`columns`), with bounds, prior width and temporal width.
 
-    Widths are standard deviations in the entry's unit; inf means free.
+    Widths are standard deviations in the entry's unit; inf means free. `ties` are pairs of columns
+    whose difference has a prior too, of width `tie_width`.
     """
 
     columns: Int[np.ndarray, "P"]
@@ -25,6 +45,18 @@ class FitParameters:
     upper: Float[np.ndarray, "P"]
     prior_width: Float[np.ndarray, "P"]
     temporal_width: Float[np.ndarray, "P"]
+    ties: Int[np.ndarray, "T 2"]
+    tie_width: Float[np.ndarray, "T"]
+
+    def prior_precision(self) -> Float[np.ndarray, "P P"]:
+        """Inverse covariance of the prior around 0."""
+        precision = np.diag(self.prior_width**-2.0)
+        place = {int(column): number for number, column in enumerate(self.columns)}
+        for tie, width in zip(self.ties, self.tie_width):
+            apart = np.zeros(len(self.columns))
+            apart[[place[int(column)] for column in tie]] = 1.0, -1.0
+            precision += np.outer(apart, apart) / width**2
+        return precision
 
 
 def fit_parameters(
@@ -52,13 +84,34 @@ def fit_parameters(
         if expression_size_m[number] < 2e-4 or name.startswith("eyeLook"):
             continue
         quick = name.startswith("eyeBlink")
-        # Small motions are hardly seen and would wander: the prior is in millimetres moved.
-        width = 1.0 if quick else min(0.5, 0.002 / expression_size_m[number] + 0.15)
+        width = _BLINK_WIDTH if quick else _EXPRESSION_WIDTH
         rows.append((first + number, *_EXPRESSION, width, 0.6 if quick else 0.12))
     if "eyelids" in layout:
         rows += [(column, 0.0, 1.0, 1.0, 0.6) for column in _columns(layout, "eyelids")]
     columns, lower, upper, prior, temporal = (np.array(part) for part in zip(*rows))
-    return FitParameters(columns.astype(np.int64), lower, upper, prior, temporal)
+    fitted = {name: first + number for number, name in enumerate(expression_names)}
+    fitted = {name: column for name, column in fitted.items() if column in set(columns.tolist())}
+    ties, tie_width = _ties(fitted)
+    return FitParameters(columns.astype(np.int64), lower, upper, prior, temporal, ties, tie_width)
+
+
+def _ties(
+    fitted: Mapping[str, int],
+) -> tuple[Int[np.ndarray, "T 2"], Float[np.ndarray, "T"]]:
+    """Columns by name -> pairs of sides and of partners on each side, with their widths."""
+    found: dict[tuple[str, str], float] = {}
+    for name in fitted:
+        other = name.removesuffix("Left") + "Right"
+        # The jaw and the whole mouth go to one side or the other.
+        if name.endswith("Left") and name not in ("jawLeft", "mouthLeft"):
+            found[name, other] = _SIDES_WIDTH
+    for pair in _PARTNERS:
+        for side in ("Left", "Right"):
+            first, second = (name if name in fitted else name + side for name in pair)
+            found[first, second] = _PARTNERS_WIDTH
+    known = {pair: width for pair, width in found.items() if set(pair) <= set(fitted)}
+    ties = [(fitted[first], fitted[second]) for first, second in known]
+    return np.array(ties, np.int64).reshape(-1, 2), np.array(list(known.values()), np.float64)
 
 
 def _columns(layout: ThetaLayout, name: str) -> range:

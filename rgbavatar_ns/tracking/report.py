@@ -9,8 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from rgbavatar_ns.tracking.fit import ClipFit
-from rgbavatar_ns.tracking.frame_cost import LID_PAIRS, LIP_PAIRS
-from rgbavatar_ns.tracking.landmarks import face_height_px
+from rgbavatar_ns.tracking.landmarks import LID_PAIRS, LIP_PAIRS, face_height_px
 from rgbavatar_ns.tracking.subject import SubjectTracker
 
 # An eye is closed where its lids' gap is below this share of the clip's widely open ones.

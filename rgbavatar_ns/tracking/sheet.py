@@ -9,8 +9,7 @@ from rgbavatar_ns.data.png import read_png_rgba
 from rgbavatar_ns.tracking.clip import ClipLandmarks
 from rgbavatar_ns.tracking.crop import SquareCrop
 from rgbavatar_ns.tracking.fit import ClipFit
-from rgbavatar_ns.tracking.frame_cost import LID_PAIRS, LIP_PAIRS
-from rgbavatar_ns.tracking.landmarks import face_height_px
+from rgbavatar_ns.tracking.landmarks import LID_PAIRS, LIP_PAIRS, face_height_px
 from rgbavatar_ns.tracking.overlay import OverlayTile, write_contact_sheet
 from rgbavatar_ns.tracking.report import mean_gap
 from rgbavatar_ns.tracking.subject import SubjectTracker

@@ -12,8 +12,10 @@ from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.head.landmarks import (
     SPARSE_51,
     LandmarkMap,
+    LandmarkNoise,
     LandmarkResponse,
     facemesh_landmarks,
+    facemesh_noise,
     facemesh_response,
 )
 from rgbavatar_ns.tracking.config import TrackConfig
@@ -25,18 +27,23 @@ from rgbavatar_ns.tracking.fit import (
     key_frame_positions,
     subject_offsets,
 )
-from rgbavatar_ns.tracking.frame_cost import LID_PAIRS, LIP_PAIRS, FrameCost, Target
+from rgbavatar_ns.tracking.frame_cost import FrameCost, Target
 from rgbavatar_ns.tracking.landmark_head import LandmarkHead
-from rgbavatar_ns.tracking.landmarks import FACE_OVAL, IRIS_CENTERS, face_height_px
+from rgbavatar_ns.tracking.landmarks import (
+    FACE_OVAL,
+    IRIS_CENTERS,
+    LID_PAIRS,
+    LIP_PAIRS,
+    face_height_px,
+    upright_turn,
+)
 from rgbavatar_ns.tracking.own_parameters import with_signed_expressions
 from rgbavatar_ns.tracking.parameters import fit_parameters
 
 # Lips, lids, brows, nose and irises are seen; cheeks and forehead are interpolated by FaceMesh,
 # so every fourth of those points does. The outline slides over the skin as the head turns, but
 # without it the pitch of the head is badly known: on renders the error halves with it.
-_FEATURE_WEIGHT, _IRIS_WEIGHT, _OTHER_WEIGHT, _OVAL_WEIGHT = 1.0, 2.0, 0.7, 1.0
 _FEATURES = frozenset(SPARSE_51) | {index for pair in LIP_PAIRS + LID_PAIRS for index in pair}
-_UNSURE_M = 0.002
 # A frame whose landmarks the head cannot follow to this share of the face's height is left out.
 _REJECT_SHARE = 0.06
 
@@ -51,6 +58,8 @@ class SubjectTracker:
     """Where FaceMesh's points lie on this head; by default on the embedded one."""
     response: LandmarkResponse | None = field(default_factory=facemesh_response)
     """How they follow it, row for row of `landmarks`; None takes them to stay on the skin."""
+    noise: LandmarkNoise = field(default_factory=facemesh_noise)
+    """How they err beside; rows are FaceMesh indices."""
 
     def __post_init__(self) -> None:
         rows = _chosen_rows(self.landmarks)
@@ -66,14 +75,14 @@ class SubjectTracker:
         if self.response is not None:
             seen = seen.with_response(self.response.select(rows))
         self._seen = seen
-        self.cost = FrameCost(seen, marks.facemesh_index, _landmark_weights(marks), parameters)
+        self.cost = FrameCost(seen, self.noise.select(marks.facemesh_index), parameters)
 
     def targets(self, landmarks_px: Float[np.ndarray, "F 478 2"]) -> list[Target]:
         """Each frame's landmarks in the order of the landmark head."""
-        heights = face_height_px(landmarks_px)
+        heights, turns = face_height_px(landmarks_px), upright_turn(landmarks_px)
         return [
-            Target(points[self.facemesh_index], float(height))
-            for points, height in zip(landmarks_px, heights)
+            Target(points[self.facemesh_index], float(height), turn)
+            for points, height, turn in zip(landmarks_px, heights, turns)
         ]
 
     def fit(
@@ -154,11 +163,3 @@ def _chosen_rows(marks: LandmarkMap) -> Int[np.ndarray, "L"]:
         if wanted or (index < IRIS_CENTERS[0] and index % 4 == 0):
             kept.append(row)
     return np.array(kept, dtype=np.int64)
-
-
-def _landmark_weights(marks: LandmarkMap) -> Float[np.ndarray, "L"]:
-    weights = np.full(len(marks.facemesh_index), _OTHER_WEIGHT)
-    weights[np.isin(marks.facemesh_index, sorted(_FEATURES))] = _FEATURE_WEIGHT
-    weights[np.isin(marks.facemesh_index, FACE_OVAL)] = _OVAL_WEIGHT
-    weights[np.isin(marks.facemesh_index, IRIS_CENTERS)] = _IRIS_WEIGHT
-    return weights / np.sqrt(1 + (marks.spread_m / _UNSURE_M) ** 2)
