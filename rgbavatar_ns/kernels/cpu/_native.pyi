@@ -36,8 +36,7 @@ class Session(_Drawing):
     def backward(
         self,
         gaussians: Gaussians,
-        image: Tensor,
-        alpha: Tensor,
+        background: Tensor,
         image_grad: Tensor | None,
         alpha_grad: Tensor | None,
         means: Tensor,
