@@ -24,9 +24,9 @@
 //   dL/dalpha_i = T_i (g.c_i) - rem_i / (1 - alpha_i),   rem_i = S - sum_{j<=i} w_j (g.c_j).
 // S = g.image - h (1 - alpha) is known from the forward result, so one pass front to back with the
 // scalar rem suffices. Where the weights were kept, one pass back to front does it without dividing:
-// with behind_i = rem_i / T_i+1, what Gaussian i lets through,
-//   w_i (g.c_i - behind_i) = alpha_i dL/dalpha_i,   behind_i-1 = behind_i + alpha_i (g.c_i - behind_i),
-// beginning with g.background - h. A Gaussian gets nine sums over its pixels: w g (3), and G = dL/dp times
+// with behind_i = rem_i / T_i+1, what Gaussian i lets through, beginning with g.background - h,
+//   alpha_i dL/dalpha_i = w_i (g.c_i - behind_i),  behind_i-1 = behind_i + alpha_i (g.c_i - behind_i).
+// A Gaussian gets nine sums over its pixels: w g (3), and G = dL/dp times
 // {1, dx, dy, dx^2, dx dy, dy^2}, where dL/dp = ln 2 alpha dL/dalpha.
 //
 // ---- Projection, backward ---------------------------------------------------------------------

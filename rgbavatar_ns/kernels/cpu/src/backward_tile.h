@@ -78,10 +78,11 @@ struct BlockOffsets {
 };
 static constexpr BlockOffsets kBlockOffsets = {};
 
-// The sums over the jobs of one Gaussian of the group, which are written to its slot. What is behind
-// it moves on: `behind`, of the pixel's loss by what the Gaussian lets through, takes it in.
-static RGBAVATAR_MEMBER void sum_moments(const Tile& tile, const BlockGrid& grid, const Group& group, int place,
-                                         const Kept& kept, TileScratch& scratch, float* slots) {
+// The sums over the jobs of one Gaussian of the group, which are written to its slot. Then it stands
+// behind those in front of it.
+static RGBAVATAR_MEMBER void sum_moments(const Tile& tile, const BlockGrid& grid,
+                                         const Group& group, int place, const Kept& kept,
+                                         TileScratch& scratch, float* slots) {
   const Splat& s = group.splats[place];
   const Wide color_red(s.red), color_green(s.green), color_blue(s.blue);
   const Wide zero(0.0f);
@@ -117,7 +118,8 @@ static RGBAVATAR_MEMBER void sum_moments(const Tile& tile, const BlockGrid& grid
     weight_row += kBlockPixels;
   }
   float* slot = slot_of(tile, s, slots, kMoments);
-  store_quad(sums_of(sum_red, sum_green, sum_blue, sum_one) * Quad{1.0f, 1.0f, 1.0f, C::kLn2}, slot);
+  const Quad units = {1.0f, 1.0f, 1.0f, C::kLn2};
+  store_quad(sums_of(sum_red, sum_green, sum_blue, sum_one) * units, slot);
   store_quad(sums_of(sum_x, sum_y, sum_xx, sum_xy) * C::kLn2, slot + 4);
   slot[8] = sum_of(sum_yy) * C::kLn2;
 }
@@ -141,8 +143,9 @@ static void backward_tile(const Tile& tile, const BackwardInput& in, TileScratch
 }
 
 template <int kChannels>
-static RGBAVATAR_MEMBER void sum_channels(const Tile& tile, const Group& group, int place, const Kept& kept,
-                                          int channels, TileScratch& scratch, float* slots) {
+static RGBAVATAR_MEMBER void sum_channels(const Tile& tile, const Group& group, int place,
+                                          const Kept& kept, int channels, TileScratch& scratch,
+                                          float* slots) {
   Wide sums[kChannels + 1], largest(0.0f);
   for (int k = 0; k <= kChannels; ++k) sums[k] = Wide(0.0f);
   const float* weight_row = kept.weight[group.first_job[place]];

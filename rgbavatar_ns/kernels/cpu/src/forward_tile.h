@@ -196,7 +196,8 @@ class GroupReader {
   // Calls skip(splat) for all that were not read.
   template <class Skip>
   void rest(const Skip& skip) const {
-    for (uint32_t i = entry_; i < tile_.entry_count; ++i) skip(tile_.splats[uint32_t(tile_.entries[i])]);
+    for (uint32_t i = entry_; i < tile_.entry_count; ++i)
+      skip(tile_.splats[uint32_t(tile_.entries[i])]);
   }
 
   bool more() const { return entry_ < tile_.entry_count; }
@@ -231,7 +232,8 @@ static RGBAVATAR_MEMBER bool blend_block(const BlockGrid& grid, const Group& gro
   for (uint64_t left = group.touching[block]; left; left &= left - 1) {
     const int i = __builtin_ctzll(left);
     const Splat& s = group.splats[i];
-    const size_t job = kKeep ? group.first_job[i] + __builtin_popcountll(group.blocks[i] & below) : 0;
+    const size_t job =
+        kKeep ? group.first_job[i] + __builtin_popcountll(group.blocks[i] & below) : 0;
     if (__builtin_expect(!open, false)) {
       if (!kKeep) break;
       store(Wide(0.0f), kept.alpha[job]);

@@ -218,7 +218,8 @@ static inline void project_lanes(int width, int height, const Camera& camera,
   if (lanes < kLanes)
     for (int lane = 0; lane < lanes; ++lane) out.splats[first + lane] = padded[lane];
   store(q.p.z, OutputRows<1>(out.depth, first, lanes).data);
-  store(select(seen, tiles_of(x, y, out.tiles_x), bits_as_floats(WideInt(out.tile_count << kTileShift))),
+  const Wide none = bits_as_floats(WideInt(out.tile_count << kTileShift));
+  store(select(seen, tiles_of(x, y, out.tiles_x), none),
         OutputRows<1>(reinterpret_cast<float*>(out.tiles), first, lanes).data);
 }
 

@@ -98,7 +98,8 @@ void Rendering::make_scratch(int threads) {
   const size_t checkpoints = w.most_entries / kGroupSplats + 1;
   w.scratch.reserve(threads);
   w.checkpoints.reserve(threads * checkpoints);
-  for (int i = 0; i < threads; ++i) w.scratch[i].checkpoints = w.checkpoints.data() + i * checkpoints;
+  for (int i = 0; i < threads; ++i)
+    w.scratch[i].checkpoints = w.checkpoints.data() + i * checkpoints;
 }
 
 // `width` floats a slot.
