@@ -16,13 +16,6 @@ struct alignas(64) BlockGrid {
         y[block][i] = float((tile.tile_y * kTileBlocks + block) * kBlockSide + i / kBlockSide) + 0.5f;
       }
   }
-  // Pixels from a Gaussian's mean.
-  RGBAVATAR_MEMBER Wide from_mean_x(const Splat& s, unsigned block) const {
-    return load_wide(x[block % kTileBlocks]) - s.mean_x;
-  }
-  RGBAVATAR_MEMBER Wide from_mean_y(const Splat& s, unsigned block) const {
-    return load_wide(y[block / kTileBlocks]) - s.mean_y;
-  }
 };
 
 // The part of a block that lies in the image.
@@ -68,10 +61,6 @@ static void start_rows(const Tile& tile, TileScratch& scratch) {
       pixels.for_each(tile, [&](int lane, int64_t) { rows[kTransmittance][lane] = 1.0f; });
     for (int k = 1; k < kRows; ++k) store(Wide(0.0f), rows[k]);
   }
-}
-
-static RGBAVATAR_MEMBER void add_to(float* row, const Wide& value) {
-  store(load_wide(row) + value, row);
 }
 
 static RGBAVATAR_MEMBER bool is_open(const Wide& transmittance) {
@@ -273,7 +262,7 @@ static uint64_t blend_group(const BlockGrid& grid, const Group& group, TileScrat
   for (int block = 0; block < kBlocksPerTile; ++block)
     if (group.touching[block] &&
         !blend_block<kRows, kColors, kWithDepth, kKeep>(grid, group, block,
-                                                block_rows<kRows>(scratch, block), kept))
+                                                        block_rows<kRows>(scratch, block), kept))
       closed |= uint64_t(1) << block;
   return closed;
 }

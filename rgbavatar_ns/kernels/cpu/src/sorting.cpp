@@ -114,8 +114,8 @@ void Rendering::sort(Team& team) {
   team.run(int64_t(batch_) * tiles, [&](int64_t item, int thread) {
     const int image = int(item / tiles), tile = int(item % tiles);
     const uint32_t* start = &w.tile_start[size_t(image) * (tiles + 1) + tile];
-    radix_sort(&w.entries[image][start[0]], &w.sort_keys[size_t(thread) * w.most_entries],
-               start[1] - start[0]);
+    radix_sort(w.entries[image].data() + start[0],
+               w.sort_keys.data() + size_t(thread) * w.most_entries, start[1] - start[0]);
   });
 }
 
@@ -156,7 +156,7 @@ void Rendering::fill_part(int image, int part) {
   uint64_t* entries = w.entries[image].data();
   uint32_t* start = part_start(image, part);
   uint32_t* slot_offset = w.slot_offset.data() + size_t(image) * (count_ + 1);
-  const size_t* slots = &w.part_slots[size_t(image) * parts_per_image()];
+  const size_t* slots = w.part_slots.data() + size_t(image) * parts_per_image();
   size_t slot = 0;
   for (int i = 0; i < part; ++i) slot += slots[i];
   const int end = std::min((part + 1) * kPart, count_);
