@@ -16,7 +16,7 @@ class TrackConfig:
     """Read at most so many frames in all; None reads everything."""
     focal_px: float | None = None
     """Focal length in pixels of the source frame; None estimates it."""
-    identity_components: int = 20
+    identity_components: int = 30
     """How many identity components of the head model are fitted."""
     key_frames: int = 12
     """Frames that identity and focal length are fitted on."""

@@ -223,8 +223,7 @@ def _fit_keys(
     frames, size = len(keys), len(cost.parameters.columns)
     shared = min(identity_components, len(identity))
     joint = replace(cost, identity_columns=shared)
-    # All key frames share FaceMesh's bias, so they count as one observation of the identity.
-    precision = frames / _IDENTITY_WIDTH**2
+    precision = _IDENTITY_WIDTH**-2.0
     lower = np.concatenate([np.tile(cost.parameters.lower, frames), np.full(shared, -3.0)])
     upper = np.concatenate([np.tile(cost.parameters.upper, frames), np.full(shared, 3.0)])
 

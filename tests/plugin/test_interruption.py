@@ -2,7 +2,6 @@
 
 import signal
 import threading
-from collections.abc import Iterator
 
 import pytest
 
@@ -23,15 +22,6 @@ def test_first_signal_is_a_request(number: signal.Signals, code: int):
     assert signal.getsignal(number) == before
 
 
-@pytest.fixture
-def pythons_own_handler() -> Iterator[None]:
-    """Python's handler for SIGINT, which a background shell has its programs ignore."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
-
-
-@pytest.mark.usefixtures("pythons_own_handler")
 def test_second_interrupt_breaks():
     with StopRequest() as stop:
         signal.raise_signal(signal.SIGINT)
