@@ -40,7 +40,7 @@ class RefinementConfig:
     """Expected error of the head's place in metres, along each axis."""
     expression_sigma: float = 0.05
     """Expected error of the coefficients of expressions and eyelids."""
-    learning_rate: float = 0.2
+    learning_rate: float = 0.4
     """Largest change in a step, in these standard deviations; falls as a frame is seen again."""
     prior_weight: float = 3e-5
     """What a correction of one standard deviation in one number adds to the loss of its frame."""
