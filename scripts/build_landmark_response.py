@@ -25,7 +25,7 @@ from rgbavatar_ns.data.demo import DemoConfig
 from rgbavatar_ns.data.demo.make import DemoPerson
 from rgbavatar_ns.data.demo.performance import perform
 from rgbavatar_ns.head import HeadModel
-from rgbavatar_ns.head.landmarks import RESPONSE_FILE, facemesh_landmarks
+from rgbavatar_ns.head.landmarks import RESPONSE_FILE, UNSURE_M, facemesh_landmarks
 from rgbavatar_ns.tracking.landmark_head import LandmarkHead
 from rgbavatar_ns.tracking.landmarks import FaceLandmarker, face_height_px, upright_turn
 
@@ -45,8 +45,6 @@ OUTLIER_PX = 3.0
 # (.001 to .004 were tried: the smaller, the better the head's turn, and from .002 on the better a
 # real speaker's avatar; expressions are best at .002.)
 OWN_SHARE, MOST_SHARE = 0.0015, 0.04
-# A point errs the more by itself, the less sure its place on the mesh is: twice at sqrt(3) of this.
-UNSURE_M = 0.002
 # Of performances alone: faces made at random are harder than usual ones.
 NOISE_MODES = 48
 # Pictures that are off by more than this times the median count less and less.

@@ -10,9 +10,12 @@ from jaxtyping import Float, Int
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head.arrays import HeadArrays
 from rgbavatar_ns.head.landmarks import (
+    UNSURE_M,
     LandmarkMap,
+    LandmarkNoise,
     LandmarkResponse,
     facemesh_landmarks,
+    facemesh_noise,
     facemesh_response,
 )
 from rgbavatar_ns.head.registration import Registration, register, similarity_slopes
@@ -34,6 +37,7 @@ class FittedHead:
     response: LandmarkResponse
     """Row for row of `landmarks`. Its expression part goes on with the eyelids, if the head has
     any, as the head's coefficients do."""
+    noise: LandmarkNoise
 
 
 def fitted_head(head: HeadArrays) -> FittedHead:
@@ -47,7 +51,8 @@ def fitted_head(head: HeadArrays) -> FittedHead:
     if head.eyelid_dirs is None and not has_blinks(head):
         head = replace(head, eyelid_dirs=carried_blinks(head, registration))
     landmarks = carried_landmarks(head, eyeballs, registration)
-    return FittedHead(head, landmarks, carried_response(head, landmarks, registration))
+    response = carried_response(head, landmarks, registration)
+    return FittedHead(head, landmarks, response, carried_noise(landmarks))
 
 
 def has_blinks(head: HeadArrays) -> bool:
@@ -83,6 +88,15 @@ def carried_landmarks(
             head, joint, eyeballs[column], at_rest[rows] - center
         )
     return replace(marks, triangle=triangle, barycentric=barycentric, spread_m=spread_m)
+
+
+def carried_noise(landmarks: LandmarkMap) -> LandmarkNoise:
+    """FaceMesh's noise, larger where `landmarks`, carried over, are less sure of their place."""
+    noise, known = facemesh_noise(), facemesh_landmarks().spread_m
+    own_share = noise.own_share.copy()
+    ratio = (UNSURE_M**2 + landmarks.spread_m**2) / (UNSURE_M**2 + known**2)
+    own_share[landmarks.facemesh_index] *= np.sqrt(ratio)
+    return replace(noise, own_share=own_share)
 
 
 def _eyeball(head: HeadArrays, joint: int) -> Int[np.ndarray, "_"]:

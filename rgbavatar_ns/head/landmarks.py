@@ -10,6 +10,9 @@ from jaxtyping import Float, Int
 LANDMARK_FILE = Path(__file__).parent / "assets" / "facemesh_landmarks.npz"
 RESPONSE_FILE = LANDMARK_FILE.with_name("facemesh_response.npz")
 
+UNSURE_M = 0.002
+"""Where a place on the mesh is unsure by sqrt(3) of this, a point errs twice as much by itself."""
+
 SPARSE_51 = (
     *(70, 63, 105, 66, 107, 336, 296, 334, 293, 300),
     *(168, 197, 195, 4, 98, 97, 2, 326, 327),

@@ -23,7 +23,7 @@ def subject_tracker(config: TrackConfig, own_head: HeadArrays | None = None) -> 
         return SubjectTracker(HeadModel.embedded(dtype=torch.float64), config)
     known = fitted_head(own_head)
     head = HeadModel(known.arrays, dtype=torch.float64)
-    return SubjectTracker(head, config, known.landmarks, known.response)
+    return SubjectTracker(head, config, known.landmarks, known.response, known.noise)
 
 
 def read_own_head(path: Path | None) -> HeadArrays | None:

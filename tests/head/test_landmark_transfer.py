@@ -10,8 +10,8 @@ import pytest
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadArrays, facemesh_landmarks
 from rgbavatar_ns.head.flame import load_flame
-from rgbavatar_ns.head.landmark_transfer import FittedHead, fitted_head
-from rgbavatar_ns.head.landmarks import LandmarkMap, facemesh_response
+from rgbavatar_ns.head.landmark_transfer import FittedHead, carried_noise, fitted_head
+from rgbavatar_ns.head.landmarks import LandmarkMap, facemesh_noise, facemesh_response
 from rgbavatar_ns.head.registration import register
 from rgbavatar_ns.head.synthetic_flame import write_synthetic_flame
 
@@ -44,6 +44,18 @@ def flame(folder: Path) -> FittedHead:
 @pytest.fixture(scope="module")
 def flame_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("flame")
+
+
+def test_a_point_whose_place_is_less_sure_than_before_counts_less() -> None:
+    marks, known = facemesh_landmarks(), facemesh_noise()
+    np.testing.assert_allclose(carried_noise(marks).own_share, known.own_share)
+    first = int(marks.facemesh_index[0])
+    at_first = np.arange(len(marks.spread_m)) == 0
+    sure = np.where(at_first, 0.0, marks.spread_m)
+    unsure = np.where(at_first, 0.002 * np.sqrt(3), marks.spread_m)
+    shares = [carried_noise(replace(marks, spread_m=spread)).own_share for spread in (sure, unsure)]
+    np.testing.assert_allclose(shares[1][first], 2 * shares[0][first])
+    np.testing.assert_allclose(np.delete(shares[1], first), np.delete(known.own_share, first))
 
 
 @pytest.mark.slow
