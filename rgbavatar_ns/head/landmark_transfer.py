@@ -38,6 +38,7 @@ class FittedHead:
     """Row for row of `landmarks`. Its expression part goes on with the eyelids, if the head has
     any, as the head's coefficients do."""
     noise: LandmarkNoise
+    """Rows are FaceMesh indices."""
 
 
 def fitted_head(head: HeadArrays) -> FittedHead:
