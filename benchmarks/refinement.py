@@ -5,12 +5,15 @@
 
 Without --data the demo subject is rendered and its theta, which is known, made as noisy as a poor
 tracker's, training and held-out frames alike. An avatar is trained without and with refinement, and
-scored on held-out frames three times: driven by what the tracker said ("tracked"), by that after
-the linear map that refinement has learnt from the training frames ("calibrated", the method's own
-score), and by theta fitted to the held-out images with the avatar frozen ("fitted"). The error of
-theta is the root mean square over the training frames, each number's mean error taken out, since an
-avatar may agree with any constant offset; that of vertices likewise, in millimetres. Rotation and
-neck turn the same head about near points, so that vertices tell more than either.
+scored on held-out frames: driven by what the tracker said ("tracked"), by that after the linear
+map that refinement has learnt from the training frames ("calibrated", the method's own score), by
+theta fitted to the held-out images with the avatar frozen ("fitted"), and, where it is known, by
+the truth ("true": what the avatar is worth, which noise in the held-out frames' theta hides).
+
+The error of theta is the root mean square over the training frames, each number's mean error taken
+out, since an avatar may agree with any constant offset; that of vertices likewise, in millimetres,
+once as they are and once of the face in its own frame ("face_mm": the pose made right). Rotation
+and neck turn the same head about near points, so that vertices tell more than either.
 """
 
 import argparse
@@ -82,6 +85,7 @@ def train(
     avatar = Avatar(HeadModel(dataset.arrays), dataset.identity, config, seed=seed)
     optimizer = make_optimizer(avatar)
     first_rates = [group["lr"] for group in optimizer.param_groups]
+    first_of_bases = 0 if refinement is None else int(refinement.config.bases_start * steps)
     order = OfflineOrder(dataset.train, BATCH_SIZE, seed)
     row_of = {position: row for row, position in enumerate(dataset.train)}
     seen: dict[str, torch.Tensor] = {}
@@ -89,6 +93,8 @@ def train(
     def batch(step: int) -> TrainingBatch:
         for group, rate in zip(optimizer.param_groups, first_rates):
             group["lr"] = rate * LAST_RATE ** (step / steps)
+            if step < first_of_bases and group["name"].startswith("basis_"):
+                group["lr"] = 0.0
         positions = order.batch(step)
         seen["rows"] = torch.tensor([row_of[position] for position in positions])
         theta = subject.theta[positions]
@@ -154,15 +160,19 @@ def errors(subject: Subject, theta: torch.Tensor) -> dict[str, float]:
         part = part[:, truth[:, layout.slice(name)].std(0) > 1e-6]
         if part.numel():
             found[name] = float((part - part.mean(0)).square().mean().sqrt())
-    apart = head(theta, dataset.identity) - head(truth, dataset.identity)
-    apart = apart - apart.mean(0)
-    found["vertices_mm"] = 1e3 * float(apart.square().sum(-1).mean().sqrt())
+    still = theta.clone()
+    for name in ("rotation", "neck", "translation"):
+        still[:, layout.slice(name)] = truth[:, layout.slice(name)]
+    for name, driven in (("vertices_mm", theta), ("face_mm", still)):
+        apart = head(driven, dataset.identity) - head(truth, dataset.identity)
+        apart = apart - apart.mean(0)
+        found[name] = 1e3 * float(apart.square().sum(-1).mean().sqrt())
     return found
 
 
 def measure(subject: Subject, arguments: argparse.Namespace, noisy: bool) -> dict[str, Any]:
     """Both trainings and all their figures."""
-    config = RefinementConfig(start_step=arguments.steps // 8)
+    config = RefinementConfig()
     rows: dict[str, Any] = {}
     for name in ("without", "with"):
         refinement = None
@@ -179,6 +189,7 @@ def measure(subject: Subject, arguments: argparse.Namespace, noisy: bool) -> dic
         fitted_theta = fitted(subject, avatar, theta, arguments.fit_steps, config)
         row["fitted"] = scores(subject, avatar, fitted_theta)
         if noisy:
+            row["true"] = scores(subject, avatar, subject.dataset.theta[list(subject.dataset.test)])
             found = subject.of_training() if refinement is None else refinement.theta()
             row["error"] = errors(subject, found)
         if arguments.pictures:
@@ -199,11 +210,13 @@ def _picture(subject: Subject, avatar: Avatar, theta: torch.Tensor, path: Path) 
 def tell(rows: dict[str, Any]) -> None:
     """Print the table: PSNR over the full frame and over the head, then the errors of theta."""
     print(f"{'held-out PSNR / of the head, dB':<34}{'without':>16}{'with refinement':>20}")
-    for name in ("tracked", "calibrated", "fitted"):
+    for name in ("tracked", "calibrated", "fitted", "true"):
         cells = [
             f"{row[name]['psnr']:.2f} / {row[name]['psnr_head']:.2f}" if name in row else "-"
             for row in rows.values()
         ]
+        if cells == ["-", "-"]:
+            continue
         print(f"{name:<34}{cells[0]:>16}{cells[1]:>20}")
     if "error" in rows["with"]:
         before, after = rows["without"]["error"], rows["with"]["error"]

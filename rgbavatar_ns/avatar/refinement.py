@@ -30,8 +30,11 @@ _HEAD_POSE = "rotation"
 class RefinementConfig:
     """How far tracked theta may be corrected, and how quickly."""
 
-    start_step: int = 150
+    start_step: int = 50
     """First training step that corrects; before, the avatar explains too little."""
+    bases_start: float = 0.45
+    """Share of training after which the blendshapes' bases begin to learn. Sooner, they would learn
+    the tracker's errors by heart, frame by frame, and leave nothing to correct."""
     rotation_sigma_rad: float = 0.01
     """Expected error of the head's rotation, in radians about each axis."""
     joint_sigma_rad: float = 0.01
@@ -42,7 +45,7 @@ class RefinementConfig:
     """Expected error of the coefficients of expressions and eyelids."""
     learning_rate: float = 0.4
     """Largest change in a step, in these standard deviations; falls as a frame is seen again."""
-    prior_weight: float = 3e-5
+    prior_weight: float = 1e-5
     """What a correction of one standard deviation in one number adds to the loss of its frame."""
 
 

@@ -32,7 +32,8 @@ class AdamConfig(OptimizerConfig):
 
 @dataclass
 class ExponentialConfig(SchedulerConfig):
-    """From the optimizer's rate to `factor` times it, exponentially, then constant.
+    """Nothing before `start_step`; from the optimizer's rate at step 0 to `factor` times it at
+    step `steps`, exponentially, then constant.
 
     nerfstudio's own schedule computes with numpy, whose scalars end up in the checkpoint and
     make it unreadable for torch's safe loading.
@@ -43,6 +44,8 @@ class ExponentialConfig(SchedulerConfig):
     """Final learning rate divided by the first one."""
     steps: int = 5000
     """Steps until the final rate is reached."""
+    start_step: int = 0
+    """First step with a rate that is not zero."""
 
 
 class Exponential(Scheduler):
@@ -53,7 +56,12 @@ class Exponential(Scheduler):
     def get_scheduler(self, optimizer: torch.optim.Optimizer, lr_init: float) -> LambdaLR:
         """Torch's scheduler for `optimizer`; `lr_init` is taken from the optimizer itself."""
         log_factor, steps = math.log(self.config.factor), max(1, self.config.steps)
-        return LambdaLR(optimizer, lambda step: math.exp(log_factor * min(step / steps, 1.0)))
+        start = self.config.start_step
+
+        def share(step: int) -> float:
+            return math.exp(log_factor * min(step / steps, 1.0)) if step >= start else 0.0
+
+        return LambdaLR(optimizer, share)
 
 
 def paper_optimizers() -> dict[str, Any]:

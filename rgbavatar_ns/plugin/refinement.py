@@ -21,7 +21,8 @@ class FrameRefinement(nn.Module):
     """Corrections to the training frames of a dataset, found by position in it.
 
     Raises:
-        UserError: the frames are those of a stream, which are not known beforehand.
+        UserError: the frames are those of a stream, which are not known beforehand; or the bases
+            are never to learn.
     """
 
     _row_of: Tensor
@@ -32,6 +33,12 @@ class FrameRefinement(nn.Module):
             raise UserError(
                 "Tracking cannot be refined while frames arrive: each is seen too seldom.",
                 "Leave out --pipeline.model.refine-tracking, or train on the recorded frames.",
+            )
+        if not 0 <= config.bases_start < 1:
+            raise UserError(
+                f"--pipeline.model.refinement.bases-start is {config.bases_start}, but it is the "
+                "share of training before the bases learn, at least 0 and below 1.",
+                "Pass such a number, or leave it out.",
             )
         train = torch.tensor(subject.train, dtype=torch.int64)
         row_of = torch.full((len(subject.theta),), -1, dtype=torch.int64)

@@ -25,7 +25,7 @@ def _config(data: Path, output: Path, steps: int = 8, *, fast: bool = True, refi
     config.learning_rate_steps = 8
     config.pipeline.model.fast = fast
     config.pipeline.model.refine_tracking = refine
-    config.pipeline.model.refinement = RefinementConfig(start_step=START)
+    config.pipeline.model.refinement = RefinementConfig(start_step=START, bases_start=0.0)
     return config
 
 
@@ -89,6 +89,26 @@ def test_nothing_is_corrected_before_the_start(tiny_data, tmp_path):
         torch.testing.assert_close(first, second, rtol=1e-4, atol=1e-6)
 
 
+@pytest.mark.parametrize("fast", [True, False], ids=["fused", "eager"])
+def test_bases_wait_for_corrections_and_then_learn(tiny_data, tmp_path, fast):
+    bases = {}
+    for steps in (4, 5):
+        config = _config(tiny_data, tmp_path / str(steps), steps, fast=fast)
+        config.pipeline.model.refinement = RefinementConfig(start_step=START, bases_start=0.5)
+        trained = _train(config).pipeline.model.avatar.blendshapes
+        bases[steps] = [trained.basis_position, trained.basis_color_feature]
+    assert not any(bool(basis.any()) for basis in bases[4])
+    assert all(bool(basis.any()) for basis in bases[5])
+
+
+@pytest.mark.parametrize("share", [-0.1, 1.0])
+def test_bases_that_would_never_learn_are_refused(tiny_data, tmp_path, share):
+    config = _config(tiny_data, tmp_path)
+    config.pipeline.model.refinement = RefinementConfig(bases_start=share)
+    with pytest.raises(UserError, match="bases-start"):
+        make_trainer(config)
+
+
 def test_resume_equals_uninterrupted_run(tiny_data, tmp_path):
     whole = _train(_config(tiny_data, tmp_path / "whole", 8))
     half = _train(_config(tiny_data, tmp_path / "half", 5))
@@ -129,11 +149,11 @@ def test_held_out_frames_are_fitted_apart_from_the_plain_score(tiny_data, tmp_pa
     plain = pipeline.get_average_eval_image_metrics()
     assert not any(name.endswith("_refined") for name in plain)
     model = pipeline.model
-    model.frame_theta[TRAINED:, model.avatar.layout.slice("rotation").start + 1] += 0.02
+    model.frame_theta[TRAINED:, model.avatar.layout.slice("rotation").start + 1] += 0.05
     scores = {}
     for steps in (1, 40):
         pipeline.config.model.refine_held_out = steps
         scores[steps] = pipeline.get_average_eval_image_metrics()
         assert scores[steps]["psnr"] == plain["psnr"]
         assert {"psnr_refined", "psnr_head_refined", "ssim_refined"} <= scores[steps].keys()
-    assert scores[40]["psnr_refined"] > scores[1]["psnr_refined"] + 0.01
+    assert scores[40]["psnr_refined"] > scores[1]["psnr_refined"] + 0.3
