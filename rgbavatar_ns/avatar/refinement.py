@@ -121,18 +121,19 @@ class TrackingRefinement(nn.Module):
         """Theta of new frames of the same tracker, without the errors that all its frames have.
 
         The corrections found so far, as far as a linear map predicts them from the tracked theta;
-        none larger than in the frames that it was learnt from.
+        none larger than in the frames that it was learnt from. What a bound cut off is none.
         """
         middle, spread = self.tracked.mean(0), self.tracked.std(0)
         steady = self._sigma == 0
+        found = (self.theta() - self.tracked) / self._sigma.masked_fill(steady, 1)
 
         def standardized(values: Float[Tensor, "B H"]) -> Float[Tensor, "B H"]:
             return ((values - middle) / spread.clamp(min=1e-9)).masked_fill(steady, 0)
 
-        mean = self.correction.mean(0)
-        learnt = fit_ridge(standardized(self.tracked), self.correction - mean)
+        mean = found.mean(0)
+        learnt = fit_ridge(standardized(self.tracked), found - mean)
         correction = standardized(theta) @ learnt + mean
-        correction = correction.clamp(self.correction.amin(0), self.correction.amax(0))
+        correction = correction.clamp(found.amin(0), found.amax(0))
         return theta + correction * self._sigma
 
     @torch.no_grad()

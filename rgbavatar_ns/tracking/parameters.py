@@ -12,12 +12,12 @@ from rgbavatar_ns.head import ThetaLayout
 _JAW_OPEN = (-0.02, 0.45)
 _GAZE = (-0.55, 0.55)
 _EXPRESSION = (0.0, 1.0)
-_EXPRESSION_WIDTH, _BLINK_WIDTH = 0.5, 1.0
+_EXPRESSION_WIDTH, _BLINK_WIDTH = 0.4, 1.0
 # Landmarks hardly see some expressions (cheeks, lower lids), but muscles seldom act alone: both
 # sides of a face mostly do the same, and what is done by one muscle, or in one act such as a
 # smile, goes together. Muscles and their partners: Facial Action Coding System (Ekman and Friesen
 # 1978), whose action units stand beside. How closely is ours, from renders of procedural people.
-_SIDES_WIDTH, _PARTNERS_WIDTH = 0.3, 0.4
+_SIDES_WIDTH, _PARTNERS_WIDTH = 0.25, 0.4
 _PARTNERS = (
     ("browInnerUp", "browOuterUp"),  # 1, 2: frontalis
     ("browOuterUp", "eyeWide"),  # 2, 5: surprise

@@ -152,6 +152,17 @@ def test_calibration_knows_what_every_frame_has_wrong():
     assert (wrong - expected).square().mean() < 0.01 * expected.square().mean()
 
 
+def test_calibration_learns_nothing_from_what_bounds_cut_off():
+    """An expression at rest that is pushed further down stays, and so do new frames at rest."""
+    tracked = _tracked(80)
+    column = LAYOUT.slice("expression").start
+    tracked[:, column] = (torch.arange(80) % 3 == 0).float()
+    refinement = TrackingRefinement(tracked, LAYOUT, CONFIG)
+    refinement.correction[:, column] = torch.where(tracked[:, column] > 0, 0.0, -2.0)
+    assert torch.equal(refinement.theta(), tracked)
+    assert torch.equal(refinement.calibrated(tracked), tracked)
+
+
 def test_without_corrections_calibration_changes_nothing():
     new = _tracked(3, seed=9)
     assert torch.equal(_refinement().calibrated(new), new)
