@@ -85,7 +85,6 @@ def train(
     avatar = Avatar(HeadModel(dataset.arrays), dataset.identity, config, seed=seed)
     optimizer = make_optimizer(avatar)
     first_rates = [group["lr"] for group in optimizer.param_groups]
-    first_of_bases = 0 if refinement is None else int(refinement.config.bases_start * steps)
     order = OfflineOrder(dataset.train, BATCH_SIZE, seed)
     row_of = {position: row for row, position in enumerate(dataset.train)}
     seen: dict[str, torch.Tensor] = {}
@@ -93,7 +92,7 @@ def train(
     def batch(step: int) -> TrainingBatch:
         for group, rate in zip(optimizer.param_groups, first_rates):
             group["lr"] = rate * LAST_RATE ** (step / steps)
-            if step < first_of_bases and group["name"].startswith("basis_"):
+            if refinement and step < refinement.config.first_step_of(group["name"], steps):
                 group["lr"] = 0.0
         positions = order.batch(step)
         seen["rows"] = torch.tensor([row_of[position] for position in positions])

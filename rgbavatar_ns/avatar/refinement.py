@@ -33,8 +33,9 @@ class RefinementConfig:
     start_step: int = 50
     """First training step that corrects; before, the avatar explains too little."""
     bases_start: float = 0.45
-    """Share of training after which the blendshapes' bases begin to learn. Sooner, they would learn
-    the tracker's errors by heart, frame by frame, and leave nothing to correct."""
+    """Share of training (of the steps over which learning rates fall) after which the bases of
+    the blendshapes begin to learn. Sooner, they would learn the tracker's errors by heart, frame by
+    frame, and leave nothing to correct."""
     rotation_sigma_rad: float = 0.01
     """Expected error of the head's rotation, in radians about each axis."""
     joint_sigma_rad: float = 0.01
@@ -47,6 +48,10 @@ class RefinementConfig:
     """Largest change in a step, in these standard deviations; falls as a frame is seen again."""
     prior_weight: float = 1e-5
     """What a correction of one standard deviation in one number adds to the loss of its frame."""
+
+    def first_step_of(self, group: str, steps: int) -> int:
+        """The first of `steps` training steps in which a parameter group of the avatar learns."""
+        return int(self.bases_start * steps) if group.startswith("basis_") else 0
 
 
 class TrackingRefinement(nn.Module):

@@ -91,7 +91,6 @@ class RGBAvatarTrainer(Trainer):
         groups = self.pipeline.get_param_groups()
         steps = self.config.learning_rate_steps or self.config.max_num_iterations
         model = self.config.pipeline.model
-        first_of_bases = int(model.refinement.bases_start * steps) if model.refine_tracking else 0
         settings: dict[str, Any] = {}
         for name in groups:
             settings[name] = dict(self.config.optimizers[name])
@@ -99,7 +98,7 @@ class RGBAvatarTrainer(Trainer):
             factor = self.config.learning_rate_factor
             if name == "position" and self.config.position_lr_final is not None:
                 factor = self.config.position_lr_final / rate
-            start = first_of_bases if name.startswith("basis_") else 0
+            start = model.refinement.first_step_of(name, steps) if model.refine_tracking else 0
             if (factor != 1.0 or start > 0) and settings[name].get("scheduler") is None:
                 settings[name]["scheduler"] = ExponentialConfig(
                     factor=factor, steps=steps, start_step=start

@@ -109,10 +109,16 @@ def test_bases_that_would_never_learn_are_refused(tiny_data, tmp_path, share):
         make_trainer(config)
 
 
-def test_resume_equals_uninterrupted_run(tiny_data, tmp_path):
-    whole = _train(_config(tiny_data, tmp_path / "whole", 8))
-    half = _train(_config(tiny_data, tmp_path / "half", 5))
-    config = _config(tiny_data, tmp_path / "rest", 8)
+@pytest.mark.parametrize("first_end", [3, 5], ids=["bases wait", "bases learn"])
+def test_resume_equals_uninterrupted_run(tiny_data, tmp_path, first_end):
+    def configured(name: str, steps: int):
+        config = _config(tiny_data, tmp_path / name, steps)
+        config.pipeline.model.refinement = RefinementConfig(start_step=START, bases_start=0.5)
+        return config
+
+    whole = _train(configured("whole", 8))
+    half = _train(configured("half", first_end))
+    config = configured("rest", 8)
     config.load_dir = half.checkpoint_dir
     rest = _train(config)
     first, second = (t.pipeline.model.state_dict() for t in (whole, rest))
