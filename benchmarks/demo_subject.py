@@ -25,12 +25,12 @@ from rich.progress import Progress
 
 from rgbavatar_ns import Avatar
 from rgbavatar_ns.avatar import AvatarConfig
-from rgbavatar_ns.avatar.losses import composite, rgba_to_float
 from rgbavatar_ns.avatar.metrics import psnr
-from rgbavatar_ns.avatar.training import TrainingBatch, TrainingOptions, fit
+from rgbavatar_ns.avatar.training.loop import TrainingBatch, TrainingOptions, fit
+from rgbavatar_ns.avatar.training.losses import composite, rgba_to_float
 from rgbavatar_ns.data import LocalGlobalPools, OfflineOrder, TrackedDataset
-from rgbavatar_ns.data.demo import DemoConfig, make_demo_dataset
 from rgbavatar_ns.head import HeadModel
+from rgbavatar_ns.synthetic import DemoConfig, make_demo_dataset
 
 BATCH_SIZE = 10
 WINDOW = 10

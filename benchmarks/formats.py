@@ -29,11 +29,11 @@ from nerfstudio.utils import writer
 from rich.progress import Progress
 
 from rgbavatar_ns.data import load_dataset
-from rgbavatar_ns.data.demo import DemoConfig
-from rgbavatar_ns.data.exporters import DEMO_FORMATS, FLAME_FOLDER, FlameFilm, NativeWriter
 from rgbavatar_ns.head.flame import FLAME_VARIABLE
 from rgbavatar_ns.plugin.methods import rgbavatar_tiny
-from rgbavatar_ns.plugin.trainer import RGBAvatarTrainer, RGBAvatarTrainerConfig
+from rgbavatar_ns.plugin.training.trainer import RGBAvatarTrainer, RGBAvatarTrainerConfig
+from rgbavatar_ns.synthetic import DemoConfig
+from rgbavatar_ns.synthetic.exporters import DEMO_FORMATS, FLAME_FOLDER, FlameFilm, NativeWriter
 
 WITHIN_DB = 0.2
 

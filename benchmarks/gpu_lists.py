@@ -14,7 +14,7 @@ from gpu_sections import Finding, Place
 from gpu_training import small_avatar, small_frames, step_of
 from torch import Tensor
 
-from rgbavatar_ns.avatar.training import make_optimizer
+from rgbavatar_ns.avatar.training.loop import make_optimizer
 from rgbavatar_ns.bench.drawing import leaf_gaussians
 from rgbavatar_ns.bench.scenes import ellipsoid_scene, on_device
 from rgbavatar_ns.kernels import rasterize

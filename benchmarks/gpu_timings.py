@@ -14,9 +14,9 @@ from gpu_training import film, step_of
 from torch import Tensor
 
 from rgbavatar_ns.avatar import Avatar, AvatarConfig
-from rgbavatar_ns.avatar.graphed_rendering import GraphedRendering
-from rgbavatar_ns.avatar.losses import random_backgrounds
-from rgbavatar_ns.avatar.training import make_optimizer
+from rgbavatar_ns.avatar.recorded_rendering import RecordedRendering
+from rgbavatar_ns.avatar.training.loop import make_optimizer
+from rgbavatar_ns.avatar.training.losses import random_backgrounds
 from rgbavatar_ns.bench.drawing import leaf_gaussians
 from rgbavatar_ns.bench.scenes import DEFAULT_COUNT, DEFAULT_SIZE_PX, ellipsoid_scene, on_device
 from rgbavatar_ns.bench.timing import Spread, peak_growth_bytes
@@ -250,7 +250,7 @@ def rendering(place: Place) -> Finding:
         rounds = 2 if place.quick else max(2, 20 * size // BATCH)
         ways = {
             "eager": lambda theta: avatar.render(theta, frames.cameras, backend="cuda"),
-            "recorded": GraphedRendering(avatar, parts[0], frames.cameras, backend="cuda"),
+            "recorded": RecordedRendering(avatar, parts[0], frames.cameras, backend="cuda"),
         }
         for name, draw in ways.items():
             for theta in parts[:5]:

@@ -8,11 +8,12 @@ import torch
 from gpu_sections import MOST_GRADIENT_ERROR, Finding, Place
 from torch import Tensor
 
-from rgbavatar_ns.avatar import Avatar, AvatarConfig, graphed_step
-from rgbavatar_ns.avatar.fused_step import FusedStep
-from rgbavatar_ns.avatar.graphed_step import DeviceFrames, GraphedStep
-from rgbavatar_ns.avatar.losses import random_backgrounds
-from rgbavatar_ns.avatar.training import TrainingBatch, make_optimizer
+from rgbavatar_ns.avatar import Avatar, AvatarConfig
+from rgbavatar_ns.avatar.training import recorded_step as graphed_step
+from rgbavatar_ns.avatar.training.fused_step import FusedStep
+from rgbavatar_ns.avatar.training.loop import TrainingBatch, make_optimizer
+from rgbavatar_ns.avatar.training.losses import random_backgrounds
+from rgbavatar_ns.avatar.training.recorded_step import DeviceFrames, RecordedStep
 from rgbavatar_ns.bench.scenes import front_camera as front_camera_of_head
 from rgbavatar_ns.bench.scenes import on_device
 from rgbavatar_ns.head import HeadModel
@@ -117,11 +118,11 @@ def small_frames(place: Place, count: int) -> tuple[DeviceFrames, Tensor]:
 
 def recorded_step(
     place: Place, avatar: Avatar, optimizer: torch.optim.Optimizer, frames: DeviceFrames, size: int
-) -> GraphedStep:
+) -> RecordedStep:
     """The step as it is trained with; emulated, what would be recorded is done again."""
     if place.emulated:
-        return GraphedStep(avatar, [optimizer], frames, size, recorder=lambda work: work)
-    return GraphedStep(avatar, [optimizer], frames, size)
+        return RecordedStep(avatar, [optimizer], frames, size, recorder=lambda work: work)
+    return RecordedStep(avatar, [optimizer], frames, size)
 
 
 def _after_steps(place: Place, *, recorded: bool, steps: int = 5) -> list[Tensor]:

@@ -13,8 +13,8 @@ import cv2
 import tyro
 
 from rgbavatar_ns.tracking import TrackConfig
+from rgbavatar_ns.tracking.input.video import FrameSource
 from rgbavatar_ns.tracking.live import LiveTracker
-from rgbavatar_ns.tracking.video import FrameSource
 
 
 @dataclass

@@ -38,16 +38,16 @@ from rich.table import Table
 
 from rgbavatar_ns import Avatar
 from rgbavatar_ns.avatar import AvatarConfig
-from rgbavatar_ns.avatar.losses import composite, rgba_to_float
-from rgbavatar_ns.avatar.training import (
+from rgbavatar_ns.avatar.training.loop import (
     TrainingBatch,
     TrainingOptions,
     make_optimizer,
     training_step,
 )
+from rgbavatar_ns.avatar.training.losses import composite, rgba_to_float
 from rgbavatar_ns.data import LocalGlobalPools, OfflineOrder, TrackedDataset, load_dataset
-from rgbavatar_ns.data.demo import DemoConfig, make_demo_dataset
 from rgbavatar_ns.head import HeadModel
+from rgbavatar_ns.synthetic import DemoConfig, make_demo_dataset
 
 BATCH_SIZE = 10
 FRAMES_PER_SECOND = 25.0

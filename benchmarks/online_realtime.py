@@ -28,7 +28,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from rgbavatar_ns.data import load_dataset
-from rgbavatar_ns.data.demo import DemoConfig, make_demo_dataset
+from rgbavatar_ns.synthetic import DemoConfig, make_demo_dataset
 
 FRAMES_PER_SECOND = 25.0
 MOST_LATENCY_S = 0.5

@@ -33,13 +33,17 @@ from rich.progress import Progress
 from rgbavatar_ns import Avatar
 from rgbavatar_ns.avatar import AvatarConfig
 from rgbavatar_ns.avatar.metrics import evaluate_images
-from rgbavatar_ns.avatar.refinement import RefinementConfig, TrackingRefinement, fit_theta
-from rgbavatar_ns.avatar.training import TrainingBatch, TrainingOptions, fit, make_optimizer
+from rgbavatar_ns.avatar.refinement.corrections import (
+    RefinementConfig,
+    TrackingRefinement,
+    fit_theta,
+)
+from rgbavatar_ns.avatar.training.loop import TrainingBatch, TrainingOptions, fit, make_optimizer
 from rgbavatar_ns.data import OfflineOrder, TrackedDataset, load_dataset
-from rgbavatar_ns.data.demo import DemoConfig, make_demo_dataset
-from rgbavatar_ns.data.demo.performance import with_tracker_noise
 from rgbavatar_ns.export.comparison import write_comparison
 from rgbavatar_ns.head import HeadModel
+from rgbavatar_ns.synthetic import DemoConfig, make_demo_dataset
+from rgbavatar_ns.synthetic.performer.performance import with_tracker_noise
 
 BATCH_SIZE = 10
 LAST_RATE = 0.1

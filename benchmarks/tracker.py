@@ -23,14 +23,14 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from rgbavatar_ns.data.demo import DemoConfig
-from rgbavatar_ns.data.demo.make import DemoPerson
-from rgbavatar_ns.data.demo.performance import perform
 from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.head.rotations import matrix_to_axis_angle
+from rgbavatar_ns.synthetic import DemoConfig
+from rgbavatar_ns.synthetic.make import DemoPerson
+from rgbavatar_ns.synthetic.performer.performance import perform
 from rgbavatar_ns.tracking.config import TrackConfig
-from rgbavatar_ns.tracking.landmarks import FaceLandmarker
-from rgbavatar_ns.tracking.subject import SubjectTracker
+from rgbavatar_ns.tracking.face.detector import FaceLandmarker
+from rgbavatar_ns.tracking.fit.subject import SubjectTracker
 
 FRAMES_PER_SECOND = 12.0
 FACE_FRONT_M = 0.02

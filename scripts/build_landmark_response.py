@@ -21,13 +21,13 @@ import numpy as np
 import torch
 from scipy.spatial import KDTree
 
-from rgbavatar_ns.data.demo import DemoConfig
-from rgbavatar_ns.data.demo.make import DemoPerson
-from rgbavatar_ns.data.demo.performance import perform
 from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.head.landmarks import RESPONSE_FILE, UNSURE_M, facemesh_landmarks
-from rgbavatar_ns.tracking.landmark_head import LandmarkHead
-from rgbavatar_ns.tracking.landmarks import FaceLandmarker, face_height_px, upright_turn
+from rgbavatar_ns.synthetic import DemoConfig
+from rgbavatar_ns.synthetic.make import DemoPerson
+from rgbavatar_ns.synthetic.performer.performance import perform
+from rgbavatar_ns.tracking.face.detector import FaceLandmarker, face_height_px, upright_turn
+from rgbavatar_ns.tracking.fit.landmark_head import LandmarkHead
 
 FIRST_SEED = 100
 ACTED, MADE = 30, 40

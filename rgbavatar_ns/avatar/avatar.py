@@ -8,25 +8,25 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 
-from rgbavatar_ns.avatar.anchors import GaussianAnchors
-from rgbavatar_ns.avatar.blendshapes import GaussianBlendshapes, feature_from_color
-from rgbavatar_ns.avatar.bundle import load_any, save_bundle
-from rgbavatar_ns.avatar.bundle_head import reference_to
-from rgbavatar_ns.avatar.bundle_statistics import TrainingStatistics
-from rgbavatar_ns.avatar.color_init import color_estimate, premultiplied
-from rgbavatar_ns.avatar.composition import to_world
 from rgbavatar_ns.avatar.config import AvatarConfig
-from rgbavatar_ns.avatar.losses import require_images_of
-from rgbavatar_ns.avatar.weights import WeightNetwork
+from rgbavatar_ns.avatar.model.anchors import GaussianAnchors
+from rgbavatar_ns.avatar.model.blendshapes import GaussianBlendshapes, feature_from_color
+from rgbavatar_ns.avatar.model.tangent_to_world import tangent_to_world
+from rgbavatar_ns.avatar.model.weight_network import WeightNetwork
+from rgbavatar_ns.avatar.storage.bundle import load_any, save_bundle
+from rgbavatar_ns.avatar.storage.head_reference import reference_to
+from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
+from rgbavatar_ns.avatar.training.color_init import color_estimate, premultiplied
+from rgbavatar_ns.avatar.training.losses import require_images_of
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadArrays, HeadModel, ThetaLayout, UVAnchors, uv_anchors
 from rgbavatar_ns.kernels import (
-    BlendedGaussians,
-    BlendedRenderer,
     GaussianSet,
+    MorphedGaussians,
+    MorphedRenderer,
     PinholeCameras,
     RenderedBatch,
-    blended_renderer,
+    morphed_renderer,
     rasterize,
     weighted_color_average,
 )
@@ -143,10 +143,10 @@ class Avatar(nn.Module):
         psi. Raises UserError where theta has another size or holds NaN.
         """
         theta = self._checked(theta)
-        tangent = self.blendshapes.blend(self.weights(theta) if psi is None else psi)
+        tangent = self.blendshapes.morph(self.weights(theta) if psi is None else psi)
         vertices = self.carrier_vertices(theta)
         frames = self.anchors.frames(vertices, with_length_ratio=self.config.scale_with_triangle)
-        return to_world(tangent, frames)
+        return tangent_to_world(tangent, frames)
 
     def render(
         self,
@@ -182,7 +182,7 @@ class Avatar(nn.Module):
         vertices: Float[Tensor, "B V 3"] | None = None,
         *,
         backend: str = "auto",
-    ) -> BlendedRenderer | None:
+    ) -> MorphedRenderer | None:
         """Return the backend's way to draw and train without `gaussians`, if it has one.
 
         `psi` and `vertices` replace the answers of weight network and head model. Raises UserError
@@ -192,13 +192,13 @@ class Avatar(nn.Module):
         with torch.no_grad():
             weights = self.weights(theta) if psi is None else psi
             posed = self.carrier_vertices(theta) if vertices is None else vertices
-        return blended_renderer(self._blended_gaussians(), weights, posed, cameras, backend)
+        return morphed_renderer(self._morphed_gaussians(), weights, posed, cameras, backend)
 
-    def _blended_gaussians(self) -> BlendedGaussians:
-        names = [field.name for field in fields(BlendedGaussians)]
+    def _morphed_gaussians(self) -> MorphedGaussians:
+        names = [field.name for field in fields(MorphedGaussians)]
         tensors: dict[str, Any] = {n: getattr(self.blendshapes, n, None) for n in names}
         follows = self.config.scale_with_triangle
-        return BlendedGaussians(**tensors | self.anchors.triangles(with_rest_length=follows))
+        return MorphedGaussians(**tensors | self.anchors.triangles(with_rest_length=follows))
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         """Return the parameters by the names in `LEARNING_RATES`; none for bases where K = 0."""

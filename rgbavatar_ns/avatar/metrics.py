@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from rgbavatar_ns.avatar.losses import LPIPSLoss, composite, rgba_to_float
+from rgbavatar_ns.avatar.training.losses import LPIPSLoss, composite, rgba_to_float
 from rgbavatar_ns.errors import UserError
 
 

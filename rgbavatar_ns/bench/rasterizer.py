@@ -6,12 +6,12 @@ from typing import Any
 import torch
 
 from rgbavatar_ns.bench.drawing import Draw, DrawTimes, time_draw
-from rgbavatar_ns.bench.floor import floor_figures, measure_speed, rasterizer_work
 from rgbavatar_ns.bench.machine import chosen_device, machine_facts, require_backend
 from rgbavatar_ns.bench.options import AvatarOptions, RasterizerOptions
 from rgbavatar_ns.bench.pairs import count_pairs
 from rgbavatar_ns.bench.peers import PEERS, time_peers
 from rgbavatar_ns.bench.report import Report
+from rgbavatar_ns.bench.roofline import measure_speed, rasterizer_work, roofline_figures
 from rgbavatar_ns.bench.scenes import DEFAULT_COUNT, DEFAULT_SIZE_PX, ellipsoid_scene, on_device
 from rgbavatar_ns.bench.timing import (
     Progress,
@@ -120,8 +120,8 @@ def _report(
     speed = measure_speed(gaussians.means.device)
     both = rasterizer_work(pairs, gaussians, cameras, backward=True)
     forward = rasterizer_work(pairs, gaussians, cameras, backward=False)
-    floor = floor_figures([both], speed, batch, whole_ms / batch)
-    floor["forward"] = floor_figures([forward], speed, batch, times.forward.median_ms / batch)
+    floor = roofline_figures([both], speed, batch, whole_ms / batch)
+    floor["forward"] = roofline_figures([forward], speed, batch, times.forward.median_ms / batch)
     growth = times.training.growth_bytes
     return Report(
         benchmark="rasterizer",

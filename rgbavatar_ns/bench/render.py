@@ -9,15 +9,20 @@ import imageio.v3 as imageio
 import torch
 
 from rgbavatar_ns.avatar import Avatar
-from rgbavatar_ns.avatar.graphed_rendering import GraphedRendering
-from rgbavatar_ns.avatar.recording import supports
-from rgbavatar_ns.avatar.training import TrainingBatch
-from rgbavatar_ns.bench.floor import floor_figures, measure_speed, parameter_work, rasterizer_work
+from rgbavatar_ns.avatar.recorded_rendering import RecordedRendering
+from rgbavatar_ns.avatar.training.cuda_graph import supports
+from rgbavatar_ns.avatar.training.loop import TrainingBatch
 from rgbavatar_ns.bench.machine import chosen_device, machine_facts, require_backend
 from rgbavatar_ns.bench.options import RenderOptions
 from rgbavatar_ns.bench.pairs import count_pairs
 from rgbavatar_ns.bench.projection import one_camera
 from rgbavatar_ns.bench.report import Report
+from rgbavatar_ns.bench.roofline import (
+    measure_speed,
+    parameter_work,
+    rasterizer_work,
+    roofline_figures,
+)
 from rgbavatar_ns.bench.timing import (
     WHOLE,
     Lap,
@@ -31,8 +36,8 @@ from rgbavatar_ns.bench.timing import (
 )
 from rgbavatar_ns.bench.workloads import AvatarWorkload, avatar_workload
 from rgbavatar_ns.kernels import rasterize
-from rgbavatar_ns.plugin.viewer.picture import viewer_picture
-from rgbavatar_ns.plugin.viewer.wishes import Stage, Wishes
+from rgbavatar_ns.plugin.viewer.render import viewer_picture
+from rgbavatar_ns.plugin.viewer.viewer_state import Stage, ViewerState
 
 WHOLE_FRAME = "whole frame"
 EAGER_FRAME = "whole frame, eager"
@@ -69,7 +74,7 @@ def _frames_in_turn(avatar: Avatar, batch: TrainingBatch) -> Callable[[], Any]:
     theta, camera = next(frames)
     # Where a device can take whole pictures by itself, that is how they are drawn in a row.
     recorded = supports(avatar, theta, camera)
-    draw = GraphedRendering(avatar, theta, camera) if recorded else avatar.render
+    draw = RecordedRendering(avatar, theta, camera) if recorded else avatar.render
     return lambda: draw(*next(frames))
 
 
@@ -102,7 +107,7 @@ def _time_viewer(workload: AvatarWorkload, stopwatch: Stopwatch) -> Spread:
     frames = cycle(range(len(theta)))
 
     def once() -> None:
-        wishes = Wishes(frame=next(frames), backdrop=(1.0, 1.0, 1.0))
+        wishes = ViewerState(frame=next(frames), backdrop=(1.0, 1.0, 1.0))
         image = viewer_picture(stage, wishes, camera).image
         coded = (image * 255).type(torch.uint8).cpu().numpy()
         imageio.imwrite(io.BytesIO(), coded, extension=".jpeg", quality=_JPEG_QUALITY)
@@ -143,7 +148,7 @@ def _report(
         spread=spread,
         pairs={"per_image": pairs, "per_second": 1e3 * pairs / whole_ms},
         memory={"bytes_per_image": growth_bytes, "method": peak_memory_method(theta.device)},
-        floor=floor_figures(works, measure_speed(theta.device), 1, whole_ms),
+        floor=roofline_figures(works, measure_speed(theta.device), 1, whole_ms),
         peers={
             EAGER_FRAME: {
                 "whole_ms_per_image": spread[EAGER_FRAME].median_ms,

@@ -8,18 +8,23 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from rgbavatar_ns.avatar import Avatar
-from rgbavatar_ns.avatar.graphed_step import (
-    DeviceFrames,
-    GraphedStep,
-    Recorder,
-    record_cuda_graph,
-)
-from rgbavatar_ns.avatar.losses import composite, l1_loss, random_backgrounds, rgba_to_float
-from rgbavatar_ns.avatar.training import (
+from rgbavatar_ns.avatar.training.loop import (
     TrainingBatch,
     TrainingOptions,
     make_optimizer,
     training_step,
+)
+from rgbavatar_ns.avatar.training.losses import (
+    composite,
+    l1_loss,
+    random_backgrounds,
+    rgba_to_float,
+)
+from rgbavatar_ns.avatar.training.recorded_step import (
+    DeviceFrames,
+    RecordedStep,
+    Recorder,
+    record_cuda_graph,
 )
 from rgbavatar_ns.bench.options import Scheme
 from rgbavatar_ns.bench.projection import one_camera
@@ -68,7 +73,7 @@ class WholeStep:
         self._start.restore()
 
 
-class RecordedStep:
+class RecordedScheme:
     """A batch's training by one recorded CUDA graph, which is recorded when this is made."""
 
     _STEPS_BEFORE = 8
@@ -80,7 +85,7 @@ class RecordedStep:
         frames = DeviceFrames(batch.theta, batch.cameras, torch.as_tensor(batch.images_rgba))
         count = len(batch.theta)
         optimizers = [make_optimizer(avatar)]
-        self._step = GraphedStep(avatar, optimizers, frames, count, recorder=recorder)
+        self._step = RecordedStep(avatar, optimizers, frames, count, recorder=recorder)
         self._chosen, self._background = list(range(count)), random_backgrounds(0, count)
         for _ in range(self._STEPS_BEFORE):
             self.run()
@@ -124,7 +129,7 @@ def steps_of(scheme: Scheme, avatar: Avatar, batch: TrainingBatch) -> dict[str, 
         return {WHOLE_STEP: whole(eager, scheme), TOGETHER_STEP: whole(eager, "batch-parallel")}
     if scheme == "batch-parallel" and batch.theta.device.type == "cuda":
         return {
-            WHOLE_STEP: lambda: RecordedStep(avatar, batch),
+            WHOLE_STEP: lambda: RecordedScheme(avatar, batch),
             UNRECORDED_STEP: whole(fast, scheme),
             EAGER_STEP: whole(eager, scheme),
         }

@@ -7,16 +7,26 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from rgbavatar_ns.avatar.composition import to_world
-from rgbavatar_ns.avatar.fused_step import FusedStep
-from rgbavatar_ns.avatar.losses import composite, l1_loss, random_backgrounds, rgba_to_float
-from rgbavatar_ns.avatar.training import TrainingOptions, make_optimizer
+from rgbavatar_ns.avatar.model.tangent_to_world import tangent_to_world
+from rgbavatar_ns.avatar.training.fused_step import FusedStep
+from rgbavatar_ns.avatar.training.loop import TrainingOptions, make_optimizer
+from rgbavatar_ns.avatar.training.losses import (
+    composite,
+    l1_loss,
+    random_backgrounds,
+    rgba_to_float,
+)
 from rgbavatar_ns.bench.drawing import leaf_gaussians
-from rgbavatar_ns.bench.floor import floor_figures, measure_speed, rasterizer_work, update_work
 from rgbavatar_ns.bench.machine import chosen_device, machine_facts, require_backend
 from rgbavatar_ns.bench.options import Scheme, StepOptions
 from rgbavatar_ns.bench.pairs import count_pairs
 from rgbavatar_ns.bench.report import Report
+from rgbavatar_ns.bench.roofline import (
+    measure_speed,
+    rasterizer_work,
+    roofline_figures,
+    update_work,
+)
 from rgbavatar_ns.bench.schemes import (
     EAGER_STEP,
     UNRECORDED_STEP,
@@ -117,7 +127,7 @@ def time_parts(workload: AvatarWorkload, stopwatch: Stopwatch) -> dict[str, Spre
         renderer = avatar.renderer(batch.theta, batch.cameras, psi.detach(), vertices)
         lap("prepare")
         assert renderer is not None
-        renderer.compare(images, background)
+        renderer.forward_loss(images, background)
         lap("compare")
         weight_gradient = step.update_gaussians(renderer).weights
         lap("update")
@@ -145,13 +155,13 @@ def time_eager_parts(workload: AvatarWorkload, stopwatch: Stopwatch) -> dict[str
     optimizer = make_optimizer(avatar)
     background = random_backgrounds(0, len(batch.theta)).to(batch.theta.device)
     psi = avatar.weights(batch.theta)
-    tangent = avatar.blendshapes.blend(psi)
+    tangent = avatar.blendshapes.morph(psi)
     ratio = avatar.config.scale_with_triangle
     with torch.no_grad():
         vertices = avatar.head(batch.theta, avatar.identity)
         frames = avatar.anchors.frames(vertices, with_length_ratio=ratio)
     blended = (tangent.position, tangent.rotation_wxyz, tangent.color_feature)
-    world = to_world(tangent, frames)
+    world = tangent_to_world(tangent, frames)
     outputs = tuple(vars(world).values())
     leaf = leaf_gaussians(world)
     image = rasterize(leaf, batch.cameras, background).image
@@ -167,10 +177,10 @@ def time_eager_parts(workload: AvatarWorkload, stopwatch: Stopwatch) -> dict[str
     no_grad: Callable[[Callable[[], Any]], Callable[[], Any]] = torch.no_grad()
     parts: dict[str, Callable[[], Any]] = {
         "weights": lambda: avatar.weights(batch.theta),
-        "blend": lambda: avatar.blendshapes.blend(psi),
+        "blend": lambda: avatar.blendshapes.morph(psi),
         "head": no_grad(lambda: avatar.head(batch.theta, avatar.identity)),
         "frames": no_grad(lambda: avatar.anchors.frames(vertices, with_length_ratio=ratio)),
-        "to world": lambda: to_world(tangent, frames),
+        "to world": lambda: tangent_to_world(tangent, frames),
         "rasterize": lambda: rasterize(leaf, batch.cameras, background),
         "target": no_grad(lambda: composite(rgba_to_float(batch.images_rgba), background)),
         "loss": lambda: l1_loss(seen, target),
@@ -234,7 +244,7 @@ def _report(
             "bytes_per_image": None if growth_bytes is None else growth_bytes // batch,
             "method": peak_memory_method(device),
         },
-        floor=floor_figures(works, measure_speed(device), batch, whole_ms / batch),
+        floor=roofline_figures(works, measure_speed(device), batch, whole_ms / batch),
         peers=peers,
         machine=machine_facts(),
         trainer=trainer,

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 
 from rgbavatar_ns.avatar import Avatar
-from rgbavatar_ns.avatar.training import (
+from rgbavatar_ns.avatar.training.loop import (
     TrainingBatch,
     TrainingOptions,
     make_optimizer,
@@ -23,8 +23,8 @@ from rgbavatar_ns.bench.scenes import DEFAULT_SIZE_PX, on_device
 from rgbavatar_ns.bench.timing import Progress, waiting_for
 from rgbavatar_ns.bench.workloads import read_images
 from rgbavatar_ns.data import OfflineOrder, TrackedDataset, load_dataset
-from rgbavatar_ns.data.demo import DemoConfig, make_demo_dataset
 from rgbavatar_ns.head import HeadModel
+from rgbavatar_ns.synthetic import DemoConfig, make_demo_dataset
 
 _NUM_FRAMES = 22
 _NUM_TEST_FRAMES = 2
@@ -100,7 +100,7 @@ def _train(config: Any) -> dict[str, Any]:
     with warnings.catch_warnings():
         # nerfstudio's and torchvision's, about parts that are not used here.
         warnings.simplefilter("ignore")
-        from rgbavatar_ns.plugin.trainer import SUMMARY_NAME
+        from rgbavatar_ns.plugin.training.trainer import SUMMARY_NAME
 
         trainer = config.setup()
         trainer.setup()

@@ -14,7 +14,7 @@ from rgbavatar_ns.cli.progress import progress_bar, stage_bars
 from rgbavatar_ns.cli.stages import Result, Stages
 from rgbavatar_ns.data.json_file import write_json
 from rgbavatar_ns.errors import UserError
-from rgbavatar_ns.plugin.commands import run_nerfstudio
+from rgbavatar_ns.experiments.commands import run_nerfstudio
 
 METHOD = "rgbavatar-tiny"
 HELD_OUT_STEPS = 40
@@ -94,7 +94,7 @@ def _fingerprint(path: Path) -> tuple[str, int, float]:
 
 
 def _demo(destination: Path, settings: dict[str, Any]) -> Result:
-    from rgbavatar_ns.data.demo import DemoConfig, make_demo_dataset
+    from rgbavatar_ns.synthetic import DemoConfig, make_demo_dataset
 
     shutil.rmtree(destination, ignore_errors=True)
     config = DemoConfig(
@@ -155,7 +155,7 @@ def _film(run_folder: Path, data: Path, output: Path) -> Result:
     from rgbavatar_ns import Avatar
     from rgbavatar_ns.data import load_dataset
     from rgbavatar_ns.export import write_comparison
-    from rgbavatar_ns.plugin.refinement import REFINED_NAME
+    from rgbavatar_ns.plugin.training.refinement import REFINED_NAME
 
     video, picture = output / "comparison.mp4", output / "comparison.png"
     dataset, refined = load_dataset(data), run_folder / REFINED_NAME

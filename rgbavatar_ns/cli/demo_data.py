@@ -6,8 +6,8 @@ from typing import Annotated, Literal
 import tyro
 
 from rgbavatar_ns.cli.progress import progress_bar
-from rgbavatar_ns.data.demo import DemoConfig, make_demo_dataset
-from rgbavatar_ns.data.exporters import write_demo
+from rgbavatar_ns.synthetic import DemoConfig, make_demo_dataset
+from rgbavatar_ns.synthetic.exporters import write_demo
 
 DataFormat = Literal["native", "insta", "metrical", "vhap", "flashavatar", "imavatar"]
 

@@ -50,7 +50,7 @@ def run(
     avatar = Avatar.load(run_folder)
     dataset = _dataset(avatar, data)
     if format == "bundle":
-        from rgbavatar_ns.avatar.bundle import load_statistics
+        from rgbavatar_ns.avatar.storage.bundle import load_statistics
         from rgbavatar_ns.export import statistics_of
 
         seen = load_statistics(run_folder) if dataset is None else statistics_of(avatar, dataset)

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from rgbavatar_ns.avatar import Avatar
-    from rgbavatar_ns.avatar.bundle_statistics import TrainingStatistics
+    from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
     from rgbavatar_ns.data import TrackedDataset
     from rgbavatar_ns.export.scenes import Scene
     from rgbavatar_ns.kernels import PinholeCameras
@@ -126,7 +126,7 @@ class _Subject:
 
 def _subject(run_folder: Path, data: Path | None, picture: PictureOptions) -> _Subject:
     from rgbavatar_ns import Avatar
-    from rgbavatar_ns.avatar.bundle import load_statistics
+    from rgbavatar_ns.avatar.storage.bundle import load_statistics
     from rgbavatar_ns.data import load_dataset
     from rgbavatar_ns.export import dataset_folder, front_camera, resized, statistics_of
 

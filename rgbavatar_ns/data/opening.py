@@ -8,10 +8,10 @@ from rich.console import Console
 from rich.progress import Progress as Bars
 from rich.progress import TaskID
 
-from rgbavatar_ns.data.dataset import TrackedDataset, load_native
 from rgbavatar_ns.data.importers import ImportOptions, find_format, open_foreign
 from rgbavatar_ns.data.importers.frame_files import Progress
-from rgbavatar_ns.data.native_format import INDEX_FILE
+from rgbavatar_ns.data.native.dataset import TrackedDataset, load_native
+from rgbavatar_ns.data.native.format import INDEX_FILE
 
 
 def load_dataset(

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rgbavatar_ns.data.demo import DemoConfig
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.experiments.spec import Experiment, Overrides
+from rgbavatar_ns.synthetic import DemoConfig
 
 _DEMO = "demo"
 

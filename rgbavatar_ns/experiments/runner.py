@@ -16,15 +16,15 @@ from rgbavatar_ns.data import load_dataset
 from rgbavatar_ns.data.json_file import write_json
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.experiments.cells import Cell
-from rgbavatar_ns.experiments.guard import alone_in, end_with_parent
+from rgbavatar_ns.experiments.commands import run_nerfstudio
 from rgbavatar_ns.experiments.overrides import as_flags
+from rgbavatar_ns.experiments.process_lock import alone_in, end_with_parent
 from rgbavatar_ns.experiments.reenactment import (
     OnnxFaceRecognition,
     load_tracker,
     reenactment_scores,
 )
 from rgbavatar_ns.experiments.streamed import write_streamed
-from rgbavatar_ns.plugin.commands import run_nerfstudio
 
 CELL_FILE, RESULT_FILE, LOG_FILE = "cell.json", "result.json", "log.txt"
 _EVALUATION = "eval.json"

@@ -6,7 +6,7 @@ from pathlib import Path
 import torch
 
 from rgbavatar_ns.avatar import Avatar
-from rgbavatar_ns.avatar.losses import composite, rgba_to_float
+from rgbavatar_ns.avatar.training.losses import composite, rgba_to_float
 from rgbavatar_ns.data import TrackedDataset
 from rgbavatar_ns.data.json_file import write_json
 from rgbavatar_ns.export import draw

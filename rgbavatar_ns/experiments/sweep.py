@@ -7,16 +7,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from rgbavatar_ns.data.demo import make_demo_dataset
 from rgbavatar_ns.data.json_file import write_json
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.experiments.cells import Cell, cells_of, demo_config
+from rgbavatar_ns.experiments.commands import killed_by
 from rgbavatar_ns.experiments.engines import Engine
 from rgbavatar_ns.experiments.overrides import check_overrides
 from rgbavatar_ns.experiments.reenactment import load_tracker
 from rgbavatar_ns.experiments.runner import LOG_FILE, read_result, write_cell
 from rgbavatar_ns.experiments.spec import Experiment, nearest
-from rgbavatar_ns.plugin.commands import killed_by
+from rgbavatar_ns.synthetic import make_demo_dataset
 
 State = Literal["waiting", "running", "done", "failed"]
 _ATTEMPTS = 2
@@ -37,7 +37,8 @@ class CellStatus:
 def check_experiment(experiment: Experiment) -> None:
     """Raise UserError where the preset or an override does not exist or does not fit."""
     # Loads nerfstudio, which takes seconds.
-    from rgbavatar_ns.plugin import methods, online_methods
+    from rgbavatar_ns.plugin import methods
+    from rgbavatar_ns.plugin.online import methods as online_methods
 
     found = [*vars(methods).values(), *vars(online_methods).values()]
     configs = [getattr(one, "config", None) for one in found]

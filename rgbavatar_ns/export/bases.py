@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from rgbavatar_ns.avatar.avatar import Avatar
-from rgbavatar_ns.avatar.bundle_statistics import TrainingStatistics
+from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.export.drawing import Color, Picture, pictures
 from rgbavatar_ns.kernels import PinholeCameras

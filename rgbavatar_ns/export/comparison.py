@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from rgbavatar_ns.avatar.avatar import Avatar
-from rgbavatar_ns.data.dataset import TrackedDataset
+from rgbavatar_ns.data.native.dataset import TrackedDataset
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.export.drawing import draw, to_uint8
 from rgbavatar_ns.export.video import write_png, write_video

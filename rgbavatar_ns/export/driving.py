@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from rgbavatar_ns.avatar.bundle_statistics import TrainingStatistics, neutral_frame
+from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics, neutral_frame
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.export.one_euro import OneEuroOptions, one_euro
 from rgbavatar_ns.head import HeadArrays, ThetaLayout

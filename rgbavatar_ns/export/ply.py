@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from rgbavatar_ns.avatar.blendshapes import feature_from_color
+from rgbavatar_ns.avatar.model.blendshapes import feature_from_color
 from rgbavatar_ns.export.whole_file import whole_file
 from rgbavatar_ns.kernels import GaussianSet
 

@@ -11,8 +11,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from rgbavatar_ns.avatar.avatar import Avatar
-from rgbavatar_ns.avatar.bundle_statistics import TrainingStatistics
-from rgbavatar_ns.data.dataset import TrackedDataset
+from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
+from rgbavatar_ns.data.native.dataset import TrackedDataset
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.export.drawing import Color, Picture, pictures, to_uint8
 from rgbavatar_ns.export.driving import DrivingOptions, MappedTheta, ThetaNames, drive

@@ -3,8 +3,8 @@
 import torch
 
 from rgbavatar_ns.avatar.avatar import Avatar
-from rgbavatar_ns.avatar.bundle_statistics import TrainingStatistics
-from rgbavatar_ns.data.dataset import TrackedDataset
+from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
+from rgbavatar_ns.data.native.dataset import TrackedDataset
 
 
 @torch.no_grad()

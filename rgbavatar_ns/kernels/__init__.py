@@ -1,19 +1,19 @@
 """Batch rasterizer of Gaussians: one specification, several backends, one entrance."""
 
-from rgbavatar_ns.kernels.blended import blended_renderer
 from rgbavatar_ns.kernels.functional import (
     available_backends,
     rasterize,
     weighted_color_average,
 )
-from rgbavatar_ns.kernels.registry import BlendedRenderer, DeviceRenderer, unavailable_backends
+from rgbavatar_ns.kernels.morphed import morphed_renderer
+from rgbavatar_ns.kernels.registry import DeviceRenderer, MorphedRenderer, unavailable_backends
 from rgbavatar_ns.kernels.types import (
     UPDATED_ATTRIBUTES,
     AdamParameter,
-    BlendedGaussians,
-    BlendedGradient,
     DeviceError,
     GaussianSet,
+    MorphedGaussians,
+    MorphedGradient,
     PinholeCameras,
     RenderedBatch,
     WeightedColors,
@@ -22,17 +22,17 @@ from rgbavatar_ns.kernels.types import (
 __all__ = [
     "UPDATED_ATTRIBUTES",
     "AdamParameter",
-    "BlendedGaussians",
-    "BlendedGradient",
-    "BlendedRenderer",
     "DeviceError",
     "DeviceRenderer",
     "GaussianSet",
+    "MorphedGaussians",
+    "MorphedGradient",
+    "MorphedRenderer",
     "PinholeCameras",
     "RenderedBatch",
     "WeightedColors",
     "available_backends",
-    "blended_renderer",
+    "morphed_renderer",
     "rasterize",
     "unavailable_backends",
     "weighted_color_average",

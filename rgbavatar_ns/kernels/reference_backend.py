@@ -9,8 +9,8 @@ from rgbavatar_ns.kernels.reference import (
     weighted_color_average_reference,
 )
 from rgbavatar_ns.kernels.types import (
-    BlendedGaussians,
     GaussianSet,
+    MorphedGaussians,
     PinholeCameras,
     RenderedBatch,
     WeightedColors,
@@ -20,7 +20,7 @@ from rgbavatar_ns.kernels.types import (
 class ReferenceBackend:
     """Runs everywhere torch does."""
 
-    def refusal(self, device: torch.device, dtype: torch.dtype) -> str | None:
+    def unsupported_reason(self, device: torch.device, dtype: torch.dtype) -> str | None:
         """None: every device and floating type is taken."""
         return None
 
@@ -48,9 +48,9 @@ class ReferenceBackend:
         """As `functional.weighted_color_average`."""
         return weighted_color_average_reference(gaussians, cameras, images)
 
-    def blended_renderer(
+    def morphed_renderer(
         self,
-        gaussians: BlendedGaussians,
+        gaussians: MorphedGaussians,
         weights: Float[Tensor, "B K"],
         vertices: Float[Tensor, "B V 3"],
         cameras: PinholeCameras,

@@ -12,9 +12,9 @@ from torch import Tensor
 
 from rgbavatar_ns.kernels.types import (
     AdamParameter,
-    BlendedGaussians,
-    BlendedGradient,
     GaussianSet,
+    MorphedGaussians,
+    MorphedGradient,
     PinholeCameras,
     RenderedBatch,
     WeightedColors,
@@ -22,7 +22,7 @@ from rgbavatar_ns.kernels.types import (
 
 
 @runtime_checkable
-class BlendedRenderer(Protocol):
+class MorphedRenderer(Protocol):
     """B posed sets of the same blended Gaussians, projected and sorted; carries no autograd graph.
 
     Neither Gaussians, weights nor vertices may change before `update`.
@@ -42,15 +42,15 @@ class BlendedRenderer(Protocol):
         """As `weighted_color_average`."""
         ...
 
-    def compare(
+    def forward_loss(
         self, images_rgba: UInt8[Tensor, "B H W 4"], background: Float[Tensor, "#B 3"]
     ) -> Float[Tensor, ""]:
         """The mean absolute difference to straight-alpha images over the background."""
         ...
 
-    def update(
+    def backward_adam(
         self, parameters: Mapping[str, AdamParameter] | None, *, with_vertices: bool = False
-    ) -> BlendedGradient:
+    ) -> MorphedGradient:
         """Take one step of Adam by the gradient of the last comparison, in place.
 
         `parameters` holds one entry for each of the Gaussians' tensors, by its name; None leaves
@@ -60,7 +60,7 @@ class BlendedRenderer(Protocol):
 
 
 @runtime_checkable
-class DeviceRenderer(BlendedRenderer, Protocol):
+class DeviceRenderer(MorphedRenderer, Protocol):
     """A renderer whose training steps need nothing from the host, so that they can be recorded."""
 
     @property
@@ -90,12 +90,12 @@ class DeviceRenderer(BlendedRenderer, Protocol):
         image_of: Int[Tensor, " B"],
         background: Float[Tensor, "B 3"],
     ) -> Float[Tensor, ""]:
-        """As `compare`, with each set's image chosen by its number."""
+        """As `forward_loss`, with each set's image chosen by its number."""
         ...
 
     def update_with(
         self, parameters: Mapping[str, AdamParameter], numbers: Float[Tensor, "A 10"]
-    ) -> BlendedGradient:
+    ) -> MorphedGradient:
         """As `update`, with `AdamParameter.step_numbers` read on the device.
 
         A row for each of UPDATED_ATTRIBUTES: the base's numbers, then its bases'.
@@ -113,7 +113,7 @@ class DeviceRenderer(BlendedRenderer, Protocol):
 class Backend(Protocol):
     """What a rasterizer offers; shapes have been checked when its methods are called."""
 
-    def refusal(self, device: torch.device, dtype: torch.dtype) -> str | None:
+    def unsupported_reason(self, device: torch.device, dtype: torch.dtype) -> str | None:
         """Why tensors of this device and type cannot be taken; None if they can."""
         ...
 
@@ -135,14 +135,14 @@ class Backend(Protocol):
         """As `functional.weighted_color_average`."""
         ...
 
-    def blended_renderer(
+    def morphed_renderer(
         self,
-        gaussians: BlendedGaussians,
+        gaussians: MorphedGaussians,
         weights: Float[Tensor, "B K"],
         vertices: Float[Tensor, "B V 3"],
         cameras: PinholeCameras,
-    ) -> BlendedRenderer | None:
-        """As `blended.blended_renderer`; None where this backend has none."""
+    ) -> MorphedRenderer | None:
+        """As `blended.morphed_renderer`; None where this backend has none."""
         ...
 
 
@@ -197,10 +197,10 @@ def choose(name: str, device: torch.device, dtype: torch.dtype) -> Backend:
                 _warn_of_slow_choice(candidate, str(backend))
             refusals.append(f"{candidate}: {backend}")
             continue
-        refusal = backend.refusal(device, dtype)
-        if refusal is None:
+        unsupported_reason = backend.unsupported_reason(device, dtype)
+        if unsupported_reason is None:
             return backend
-        refusals.append(f"{candidate}: {refusal}")
+        refusals.append(f"{candidate}: {unsupported_reason}")
     raise ValueError(
         f"No backend for {dtype} tensors on {device} ({'; '.join(refusals)}). "
         "Move the tensors, convert them, or pass backend='auto'."

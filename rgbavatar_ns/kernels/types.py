@@ -90,7 +90,7 @@ TANGENT_VARIANTS = ("normalized", "raw", "orthonormal")
 
 
 @dataclass(frozen=True)
-class BlendedGaussians:
+class MorphedGaussians:
     """N Gaussians in the tangent frames of a mesh's triangles, with K bases (RGBAvatar, eq. 1).
 
     `basis_*` are None where K = 0. Scales are activated by exp, opacities by the sigmoid, colours
@@ -126,7 +126,7 @@ UPDATED_ATTRIBUTES = (
 
 
 @dataclass(frozen=True)
-class BlendedGradient:
+class MorphedGradient:
     """The gradient of what poses blended Gaussians: `vertices` only when it was asked for."""
 
     weights: Float[Tensor, "B K"]

@@ -20,8 +20,8 @@ from rich.progress import track
 from torch import Tensor
 from torch.nn import Parameter
 
-from rgbavatar_ns.avatar.graphed_step import DeviceFrames
-from rgbavatar_ns.avatar.losses import random_backgrounds
+from rgbavatar_ns.avatar.training.losses import random_backgrounds
+from rgbavatar_ns.avatar.training.recorded_step import DeviceFrames
 from rgbavatar_ns.data import ImageCache, OfflineOrder
 from rgbavatar_ns.data.check import quick_check
 from rgbavatar_ns.errors import UserError
@@ -31,7 +31,7 @@ from rgbavatar_ns.plugin.dataparser import (
     RGBAvatarDataParser,
     RGBAvatarDataParserConfig,
 )
-from rgbavatar_ns.plugin.errors import install_user_error_hook
+from rgbavatar_ns.plugin.training.errors import install_user_error_hook
 
 _MIB = 1 << 20
 _DECODED_TOGETHER = 32

@@ -14,9 +14,9 @@ from nerfstudio.plugins.types import MethodSpecification
 from rgbavatar_ns.avatar import AvatarConfig
 from rgbavatar_ns.kernels import available_backends
 from rgbavatar_ns.plugin.model import RGBAvatarModelConfig
-from rgbavatar_ns.plugin.optimizers import paper_optimizers
 from rgbavatar_ns.plugin.pipeline import RGBAvatarPipelineConfig
-from rgbavatar_ns.plugin.trainer import RGBAvatarTrainerConfig
+from rgbavatar_ns.plugin.training.optimizers import paper_optimizers
+from rgbavatar_ns.plugin.training.trainer import RGBAvatarTrainerConfig
 
 TrainerKind = TypeVar("TrainerKind", bound=RGBAvatarTrainerConfig)
 

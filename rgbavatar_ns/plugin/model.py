@@ -21,30 +21,30 @@ from torch import Tensor
 from torch.nn import Parameter
 
 from rgbavatar_ns.avatar import Avatar, AvatarConfig
-from rgbavatar_ns.avatar.adam_states import refusal
-from rgbavatar_ns.avatar.color_init import ColorInitSchedule
-from rgbavatar_ns.avatar.fused_step import FusedStep
-from rgbavatar_ns.avatar.graphed_step import GraphedStep
-from rgbavatar_ns.avatar.losses import (
+from rgbavatar_ns.avatar.metrics import LPIPSMetric, evaluate_images
+from rgbavatar_ns.avatar.refinement.corrections import RefinementConfig
+from rgbavatar_ns.avatar.training.color_init import ColorInitSchedule
+from rgbavatar_ns.avatar.training.fused_step import FusedStep
+from rgbavatar_ns.avatar.training.loop import TrainingBatch
+from rgbavatar_ns.avatar.training.losses import (
     LPIPSLoss,
     composite,
     l1_loss,
     rgba_to_float,
 )
-from rgbavatar_ns.avatar.metrics import LPIPSMetric, evaluate_images
-from rgbavatar_ns.avatar.orthogonality import orthogonality_loss, orthogonalize
-from rgbavatar_ns.avatar.refinement import RefinementConfig
-from rgbavatar_ns.avatar.training import TrainingBatch
+from rgbavatar_ns.avatar.training.optimizer_states import unsupported_reason
+from rgbavatar_ns.avatar.training.orthogonality import orthogonality_loss, orthogonalize
+from rgbavatar_ns.avatar.training.recorded_step import RecordedStep
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.kernels import PinholeCameras, RenderedBatch
 from rgbavatar_ns.plugin.cameras import from_nerfstudio, head_to_nerfstudio
-from rgbavatar_ns.plugin.checkpoint_state import model_state, require_same_layout
 from rgbavatar_ns.plugin.dataparser import Subject
-from rgbavatar_ns.plugin.refinement import FrameRefinement, require_same_refinement
+from rgbavatar_ns.plugin.training.checkpoint_state import model_state, require_same_layout
+from rgbavatar_ns.plugin.training.refinement import FrameRefinement, require_same_refinement
 from rgbavatar_ns.plugin.viewer.panel import ViewerPanel, Viewpoint
-from rgbavatar_ns.plugin.viewer.picture import filled_depth
-from rgbavatar_ns.plugin.viewer.wishes import Stage
+from rgbavatar_ns.plugin.viewer.render import filled_depth
+from rgbavatar_ns.plugin.viewer.viewer_state import Stage
 
 Outputs = dict[str, Tensor]
 
@@ -213,7 +213,7 @@ class RGBAvatarModel(Model):
         """Say whether `fused_losses` may be asked for this step."""
         own_loss = not self._lpips_counts(step) and self._orthogonality() != "loss"
         wanted = self.config.fast and self.config.batch_parallel and own_loss
-        return wanted and refusal(self.avatar, optimizers) is None
+        return wanted and unsupported_reason(self.avatar, optimizers) is None
 
     def fused_losses(
         self,
@@ -238,7 +238,7 @@ class RGBAvatarModel(Model):
         return None if loss is None else {"l1": loss}
 
     def graphed_losses(
-        self, graphed: GraphedStep, rows: list[int], background: Tensor
+        self, graphed: RecordedStep, rows: list[int], background: Tensor
     ) -> dict[str, Tensor]:
         """Take a step on the training frames `rows` and return its losses."""
         loss, frames = graphed(rows, background), graphed.frames

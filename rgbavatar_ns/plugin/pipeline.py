@@ -16,16 +16,16 @@ from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineC
 from rich.progress import track
 from torch import Tensor
 
-from rgbavatar_ns.avatar.graphed_step import GraphedStep
 from rgbavatar_ns.avatar.metrics import LPIPSMetric, evaluate_images
-from rgbavatar_ns.avatar.orthogonality import orthogonality_error
-from rgbavatar_ns.avatar.recording import Recorder, record_cuda_graph
-from rgbavatar_ns.avatar.refinement import fit_theta
+from rgbavatar_ns.avatar.refinement.corrections import fit_theta
+from rgbavatar_ns.avatar.training.cuda_graph import Recorder, record_cuda_graph
+from rgbavatar_ns.avatar.training.orthogonality import orthogonality_error
+from rgbavatar_ns.avatar.training.recorded_step import RecordedStep
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.plugin.cameras import from_nerfstudio
 from rgbavatar_ns.plugin.datamanager import RGBAvatarDataManager, RGBAvatarDataManagerConfig
-from rgbavatar_ns.plugin.device_training import recorded_step
 from rgbavatar_ns.plugin.model import RGBAvatarModel, RGBAvatarModelConfig
+from rgbavatar_ns.plugin.training.device_training import recorded_step
 
 
 @dataclass
@@ -52,7 +52,7 @@ class RGBAvatarPipeline(VanillaPipeline):
         self, config: RGBAvatarPipelineConfig, device: str | torch.device, **more: Any
     ) -> None:
         super().__init__(config, str(device), **more)
-        self._graphed: GraphedStep | None = None
+        self._graphed: RecordedStep | None = None
         self._graphed_tried = False
         self.model.viewer_panel.stage.film = self.datamanager.dataparser.tracked
 
@@ -78,7 +78,7 @@ class RGBAvatarPipeline(VanillaPipeline):
         cameras, batch = self.datamanager.next_train(step)
         return self.model.fused_losses(cameras, batch, plain)
 
-    def _graphed_step(self, optimizers: Iterable[torch.optim.Optimizer]) -> GraphedStep | None:
+    def _graphed_step(self, optimizers: Iterable[torch.optim.Optimizer]) -> RecordedStep | None:
         """The step that the device takes by itself, made at the first call; None where none can."""
         if not self._graphed_tried:
             self._graphed_tried = True

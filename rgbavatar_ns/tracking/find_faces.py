@@ -6,11 +6,11 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from rgbavatar_ns.tracking.clip import SeenFaces
-from rgbavatar_ns.tracking.landmarks import MAX_SIDE_PX, FaceLandmarker
+from rgbavatar_ns.tracking.face.clip import SeenFaces
+from rgbavatar_ns.tracking.face.detector import MAX_SIDE_PX, FaceLandmarker
+from rgbavatar_ns.tracking.input.video import FrameSource, SourceFrame
+from rgbavatar_ns.tracking.resumable_run import ResumableRun
 from rgbavatar_ns.tracking.threads import in_background
-from rgbavatar_ns.tracking.unfinished import UnfinishedRun
-from rgbavatar_ns.tracking.video import FrameSource, SourceFrame
 
 # FaceMesh goes on from the frame before, so a run that was interrupted could not be continued
 # alike. About every so many frames a fresh FaceMesh takes over: it looks at the last few frames
@@ -24,7 +24,7 @@ _SHARPNESS_PX = 96
 
 def find_faces(
     source: FrameSource,
-    run: UnfinishedRun,
+    run: ResumableRun,
     advance: Callable[[int], None],
     block_frames: int = BLOCK_FRAMES,
 ) -> tuple[SeenFaces, int, int]:
@@ -46,7 +46,7 @@ def find_faces(
 
 
 def _read_blocks(
-    source: FrameSource, run: UnfinishedRun, advance: Callable[[int], None], block_frames: int
+    source: FrameSource, run: ResumableRun, advance: Callable[[int], None], block_frames: int
 ) -> None:
     start = run.frames_with_faces()
     border = start + block_frames

@@ -15,14 +15,14 @@ from torch import Tensor
 from rgbavatar_ns.data import TrackedFrame
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.tracking.config import TrackConfig
-from rgbavatar_ns.tracking.crop import SquareCrop
-from rgbavatar_ns.tracking.fit import ClipFit, SubjectFit, fit_frame, rigid_start
-from rgbavatar_ns.tracking.following_crop import FollowingCrop
-from rgbavatar_ns.tracking.head_picture import HeadPicture, MattedCrop, cut_out
-from rgbavatar_ns.tracking.landmarks import FaceLandmarker
-from rgbavatar_ns.tracking.own_head import read_own_head, subject_tracker
-from rgbavatar_ns.tracking.pictures import pinhole
-from rgbavatar_ns.tracking.subject import SubjectTracker
+from rgbavatar_ns.tracking.face.detector import FaceLandmarker
+from rgbavatar_ns.tracking.fit.fit import ClipFit, SubjectFit, fit_frame, rigid_start
+from rgbavatar_ns.tracking.fit.own_head import read_own_head, subject_tracker
+from rgbavatar_ns.tracking.fit.subject import SubjectTracker
+from rgbavatar_ns.tracking.image.crop import SquareCrop
+from rgbavatar_ns.tracking.image.cut_out import HeadPicture, MattedCrop, cut_out
+from rgbavatar_ns.tracking.image.following_crop import FollowingCrop
+from rgbavatar_ns.tracking.image.frame_images import pinhole
 
 # Share of a clip's pull to both neighbours: a stream has only the past, and must not lag.
 _CAUSAL_SHARE = 0.25
@@ -153,7 +153,7 @@ class LiveTracker:
         seen, self._warm_up = self._warm_up, []
         landmarks = np.stack([one.landmarks_px for one in seen])
         height, width = seen[0].image_rgb.shape[:2]
-        self._fit = _CausalFit(self._tracker, self._tracker.meet(landmarks, width, height))
+        self._fit = _CausalFit(self._tracker, self._tracker.fit_subject(landmarks, width, height))
         self._crop = FollowingCrop.around(landmarks, width, height, self._config.image_size)
         for one in seen:
             square = self._crop.square

@@ -18,20 +18,25 @@ from torch import Tensor
 from rgbavatar_ns.data import DatasetWriter, TrackedDataset
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadArrays
-from rgbavatar_ns.tracking.clip import ClipLandmarks, followed_face
 from rgbavatar_ns.tracking.config import TrackConfig
-from rgbavatar_ns.tracking.crop import SquareCrop, steady_crop
+from rgbavatar_ns.tracking.face.clip import ClipLandmarks, followed_face
+from rgbavatar_ns.tracking.face.detector import load_mediapipe
 from rgbavatar_ns.tracking.find_faces import find_faces
-from rgbavatar_ns.tracking.fit import ClipFit
-from rgbavatar_ns.tracking.landmarks import load_mediapipe
-from rgbavatar_ns.tracking.mattes import UserMattes
-from rgbavatar_ns.tracking.own_head import head_digest, read_own_head, subject_tracker
-from rgbavatar_ns.tracking.pictures import TrackedPictures
-from rgbavatar_ns.tracking.report import fit_quality, silhouette_summary, verdict, write_report
-from rgbavatar_ns.tracking.sheet import write_sheet
-from rgbavatar_ns.tracking.subject import SubjectTracker
-from rgbavatar_ns.tracking.unfinished import UnfinishedRun, fingerprint, telling_of_the_disk
-from rgbavatar_ns.tracking.video import FrameSource
+from rgbavatar_ns.tracking.fit.fit import ClipFit
+from rgbavatar_ns.tracking.fit.own_head import head_digest, read_own_head, subject_tracker
+from rgbavatar_ns.tracking.fit.subject import SubjectTracker
+from rgbavatar_ns.tracking.image.crop import SquareCrop, steady_crop
+from rgbavatar_ns.tracking.image.frame_images import TrackedPictures
+from rgbavatar_ns.tracking.input.mattes import UserMattes
+from rgbavatar_ns.tracking.input.video import FrameSource
+from rgbavatar_ns.tracking.resumable_run import ResumableRun, fingerprint, telling_of_the_disk
+from rgbavatar_ns.tracking.verify.contact_sheet import write_sheet
+from rgbavatar_ns.tracking.verify.report import (
+    fit_quality,
+    silhouette_summary,
+    verdict,
+    write_report,
+)
 
 Progress = Callable[[str, int, int | None], None]
 """Called with (stage, frames done, frames in all); None where a file does not say how many."""
@@ -59,7 +64,7 @@ def track_video(
     source = FrameSource.open(videos, config.max_frames)
     mattes = None if config.mattes is None else UserMattes.open(config.mattes, source)
     load_mediapipe()
-    run = UnfinishedRun.open(Path(dst), _settings(source, config, own_head), config.overwrite)
+    run = ResumableRun.open(Path(dst), _settings(source, config, own_head), config.overwrite)
     stages = _Stages(progress)
     with _one_thread_a_call():
         clip = _tracked_clip(source, mattes, own_head, config, run, stages)
@@ -84,7 +89,7 @@ def _tracked_clip(
     mattes: UserMattes | None,
     own_head: HeadArrays | None,
     config: TrackConfig,
-    run: UnfinishedRun,
+    run: ResumableRun,
     stages: "_Stages",
 ) -> _TrackedClip:
     hint = source.count_hint()
@@ -116,7 +121,7 @@ def _written(
     source: FrameSource,
     mattes: UserMattes | None,
     config: TrackConfig,
-    run: UnfinishedRun,
+    run: ResumableRun,
     stages: "_Stages",
 ) -> TrackedDataset:
     found, dst = clip.found, run.dst

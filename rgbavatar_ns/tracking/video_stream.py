@@ -16,7 +16,7 @@ from rgbavatar_ns.data.streams import StreamedFrame, StreamSubject
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.tracking.config import TrackConfig
-from rgbavatar_ns.tracking.live_pictures import FilePictures, NewestPictures, Pictures
+from rgbavatar_ns.tracking.input.capture import FilePictures, NewestPictures, Pictures
 
 _PNG_COMPRESSION = 1
 

@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rgbavatar_ns.avatar import GaussianBlendshapes
-from rgbavatar_ns.avatar.blendshapes import color_from_feature, feature_from_color
+from rgbavatar_ns.avatar.model.blendshapes import color_from_feature, feature_from_color
 
 
 def filled(num_gaussians: int, num_bases: int, seed: int = 0) -> GaussianBlendshapes:
@@ -29,7 +29,7 @@ def test_blend_is_base_plus_weighted_residuals(num_gaussians, num_bases, batch, 
     psi = torch.randn(
         batch, num_bases, generator=torch.Generator().manual_seed(seed), dtype=torch.float64
     )
-    blended = shapes.blend(psi)
+    blended = shapes.morph(psi)
     for name in ("position", "rotation_wxyz", "color_feature"):
         base = getattr(shapes, name).detach().numpy()
         bases = getattr(shapes, f"basis_{name}").detach().numpy()
@@ -39,7 +39,7 @@ def test_blend_is_base_plus_weighted_residuals(num_gaussians, num_bases, batch, 
 
 def test_zero_psi_gives_the_base():
     shapes = filled(5, 3)
-    blended = shapes.blend(torch.zeros(2, 3, dtype=torch.float64))
+    blended = shapes.morph(torch.zeros(2, 3, dtype=torch.float64))
     for name in ("position", "rotation_wxyz", "color_feature"):
         torch.testing.assert_close(
             getattr(blended, name), getattr(shapes, name).expand(2, -1, -1), rtol=0, atol=0
@@ -58,13 +58,13 @@ def test_opacity_and_scale_have_no_residuals():
 def test_without_bases_the_blend_is_the_base():
     shapes = filled(4, 0)
     assert not any(name.startswith("basis") for name, _ in shapes.named_parameters())
-    blended = shapes.blend(torch.zeros(3, 0, dtype=torch.float64))
+    blended = shapes.morph(torch.zeros(3, 0, dtype=torch.float64))
     torch.testing.assert_close(blended.position, shapes.position.expand(3, -1, -1))
 
 
 def test_initial_values():
     shapes = GaussianBlendshapes(4, 2, scale_m=8e-4, opacity=0.25, color=0.75)
-    blended = shapes.blend(torch.randn(1, 2))
+    blended = shapes.morph(torch.randn(1, 2))
     torch.testing.assert_close(blended.position, torch.zeros(1, 4, 3))
     identity = torch.tensor([1.0, 0, 0, 0]).expand(1, 4, 4)
     torch.testing.assert_close(blended.rotation_wxyz, identity)
@@ -90,7 +90,7 @@ def test_blend_has_right_gradients():
     parameters = [shapes.position, shapes.basis_position, shapes.basis_rotation_wxyz]
 
     def blend(psi, *_):
-        blended = shapes.blend(psi)
+        blended = shapes.morph(psi)
         return blended.position, blended.rotation_wxyz
 
     assert torch.autograd.gradcheck(blend, (psi, *parameters))

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from rgbavatar_ns import Avatar
-from rgbavatar_ns.avatar import bundle
+from rgbavatar_ns.avatar.storage import bundle
 from rgbavatar_ns.errors import UserError
 
 from .small_head import front_camera, random_theta

@@ -3,11 +3,11 @@ import torch
 
 from rgbavatar_ns import Avatar
 from rgbavatar_ns.avatar import AvatarConfig
-from rgbavatar_ns.avatar.bundle_head import fingerprint
+from rgbavatar_ns.avatar.storage.head_reference import fingerprint
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadArrays, HeadModel
 from rgbavatar_ns.head.flame import load_flame
-from rgbavatar_ns.head.synthetic_flame import write_synthetic_flame
+from rgbavatar_ns.synthetic.flame import write_synthetic_flame
 
 from .small_head import front_camera, random_theta
 

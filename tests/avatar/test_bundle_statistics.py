@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from rgbavatar_ns import Avatar
-from rgbavatar_ns.avatar.bundle import load_statistics
-from rgbavatar_ns.avatar.bundle_statistics import TrainingStatistics
+from rgbavatar_ns.avatar.storage.bundle import load_statistics
+from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import ThetaLayout
 

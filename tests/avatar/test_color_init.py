@@ -3,8 +3,12 @@ import math
 import pytest
 import torch
 
-from rgbavatar_ns.avatar.blendshapes import color_from_feature
-from rgbavatar_ns.avatar.color_init import WEIGHT_THRESHOLD, ColorInitSchedule, estimate_colors
+from rgbavatar_ns.avatar.model.blendshapes import color_from_feature
+from rgbavatar_ns.avatar.training.color_init import (
+    WEIGHT_THRESHOLD,
+    ColorInitSchedule,
+    estimate_colors,
+)
 from rgbavatar_ns.kernels import GaussianSet
 
 from .small_head import front_camera, random_theta

@@ -7,7 +7,7 @@ from rgbavatar_ns.avatar.avatar import Avatar
 
 def test_all_tensors_go_along(make_avatar):
     avatar: Avatar = make_avatar(scale_with_triangle=True).to("meta")
-    gaussians = vars(avatar._blended_gaussians())
+    gaussians = vars(avatar._morphed_gaussians())
     places = {name: v.device.type for name, v in gaussians.items() if isinstance(v, torch.Tensor)}
     assert set(places.values()) == {"meta"}, places
     assert len(places) == len(gaussians) - 1  # all but the variant's name

@@ -2,8 +2,8 @@ import pytest
 import torch
 
 from rgbavatar_ns.avatar import LEARNING_RATES
-from rgbavatar_ns.avatar.color_init import ColorInitSchedule
-from rgbavatar_ns.avatar.training import (
+from rgbavatar_ns.avatar.training.color_init import ColorInitSchedule
+from rgbavatar_ns.avatar.training.loop import (
     TrainingBatch,
     TrainingOptions,
     fit,
@@ -112,7 +112,7 @@ def test_an_lpips_loss_that_cannot_be_had_is_refused(make_avatar, batch_at, monk
     def unavailable(self):
         raise UserError("LPIPS (vgg) is unavailable: offline.", "Go online.")
 
-    monkeypatch.setattr("rgbavatar_ns.avatar.losses.LPIPSLoss.network", unavailable)
+    monkeypatch.setattr("rgbavatar_ns.avatar.training.losses.LPIPSLoss.network", unavailable)
     with pytest.raises(UserError, match="unavailable"):
         fit(make_avatar(), batch_at, 1, TrainingOptions(lpips_weight=0.05))
     # Before its first step it is not needed.

@@ -6,13 +6,13 @@ import pytest
 import torch
 
 from rgbavatar_ns.avatar import Avatar, AvatarConfig
-from rgbavatar_ns.avatar.losses import composite, rgba_to_float
 from rgbavatar_ns.avatar.metrics import psnr
-from rgbavatar_ns.avatar.training import TrainingBatch, TrainingOptions, fit
+from rgbavatar_ns.avatar.training.loop import TrainingBatch, TrainingOptions, fit
+from rgbavatar_ns.avatar.training.losses import composite, rgba_to_float
 from rgbavatar_ns.data import OfflineOrder
-from rgbavatar_ns.data.demo import DemoConfig, make_demo_dataset
 from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.kernels import available_backends
+from rgbavatar_ns.synthetic import DemoConfig, make_demo_dataset
 
 pytestmark = pytest.mark.skipif("cpu" not in available_backends(), reason="not compiled")
 

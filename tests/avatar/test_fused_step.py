@@ -8,18 +8,18 @@ import pytest
 import torch
 
 from rgbavatar_ns.avatar import Avatar, AvatarConfig
-from rgbavatar_ns.avatar.adam_states import refusal
-from rgbavatar_ns.avatar.fused_step import FusedStep
-from rgbavatar_ns.avatar.losses import (
-    random_backgrounds,
-    require_images_of,
-    rgba_to_float,
-)
-from rgbavatar_ns.avatar.training import (
+from rgbavatar_ns.avatar.training.fused_step import FusedStep
+from rgbavatar_ns.avatar.training.loop import (
     TrainingOptions,
     make_optimizer,
     training_step,
 )
+from rgbavatar_ns.avatar.training.losses import (
+    random_backgrounds,
+    require_images_of,
+    rgba_to_float,
+)
+from rgbavatar_ns.avatar.training.optimizer_states import unsupported_reason
 from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.kernels import available_backends
 
@@ -234,7 +234,7 @@ def test_the_bits_do_not_depend_on_threads(stirred):
             for _ in range(2):
                 renderer = avatar.renderer(batch.theta, batch.cameras, psi, vertices)
                 assert renderer is not None
-                loss = renderer.compare(batch.images_rgba, background)
+                loss = renderer.forward_loss(batch.images_rgba, background)
                 gradient = step.update_gaussians(renderer, with_vertices=True)
             found = (loss, gradient.weights, gradient.vertices)
             results.append((*found, *avatar.blendshapes.state_dict().values()))
@@ -293,7 +293,7 @@ def test_other_optimisers_are_refused_and_stepped_eagerly(stirred, make, reason)
     avatar = stirred()
     groups = [{"params": parameters} for parameters in avatar.parameter_groups().values()]
     optimizer = make(groups)
-    assert reason in str(refusal(avatar, [optimizer]))
+    assert reason in str(unsupported_reason(avatar, [optimizer]))
     with pytest.raises(ValueError, match="Use the eager one"):
         FusedStep(avatar, [optimizer])
     before = avatar.blendshapes.color_feature.detach().clone()
@@ -306,7 +306,7 @@ def test_what_the_backend_cannot_take_is_stepped_eagerly(stirred):
     avatar = stirred()
     batch, background = far_batch(avatar, 2)
     optimizer = make_optimizer(avatar)
-    assert refusal(avatar, [optimizer]) is None
+    assert unsupported_reason(avatar, [optimizer]) is None
     step = FusedStep(avatar, [optimizer])
     arguments = (batch.theta, batch.cameras, batch.images_rgba, background)
     assert step(*arguments, backend="reference") is None
@@ -421,9 +421,9 @@ def test_a_renderer_refuses_what_its_loops_would_read_wrongly(stirred):
     with pytest.raises(ValueError, match="9 channels"):
         renderer.weighted_color_average(torch.zeros(2, height, width, 9))
     with pytest.raises(ValueError, match="one RGBA image for each of the 2 sets"):
-        renderer.compare(batch.images_rgba[:1], background[:1])
-    with pytest.raises(ValueError, match="before update"):
-        renderer.update({})
+        renderer.forward_loss(batch.images_rgba[:1], background[:1])
+    with pytest.raises(ValueError, match="no gradient"):
+        renderer.backward_adam({})
     with pytest.raises(ValueError, match=r"weights are \[2, 1\]"):
         avatar.renderer(batch.theta, batch.cameras, torch.zeros(2, 1))
 

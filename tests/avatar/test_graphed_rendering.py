@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from rgbavatar_ns.avatar.graphed_rendering import GraphedRendering
+from rgbavatar_ns.avatar.recorded_rendering import RecordedRendering
 from tests.avatar.fused_scene import far_batch, stir
 from tests.avatar.test_graphed_step import Recorder
 from tests.kernels.cuda import emulator
@@ -19,7 +19,7 @@ def emulated(monkeypatch):
 def _rendering(avatar, cameras=1):
     batch, background = far_batch(avatar, 2, 30, 20, cameras=cameras)
     recorder = Recorder()
-    rendering = GraphedRendering(avatar, batch.theta, batch.cameras, recorder=recorder)
+    rendering = RecordedRendering(avatar, batch.theta, batch.cameras, recorder=recorder)
     return rendering, recorder, batch, background
 
 
@@ -58,4 +58,4 @@ def test_other_sizes_and_backends_are_refused(emulated, make_avatar):
     with pytest.raises(ValueError, match="Another batch"):
         rendering(batch.theta[:1])
     with pytest.raises(ValueError, match="need the host"):
-        GraphedRendering(avatar, batch.theta, batch.cameras, backend="cpu")
+        RecordedRendering(avatar, batch.theta, batch.cameras, backend="cpu")

@@ -5,10 +5,10 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from rgbavatar_ns import kernels
-from rgbavatar_ns.avatar.adam_states import AdamStates
-from rgbavatar_ns.avatar.fused_step import FusedStep
-from rgbavatar_ns.avatar.graphed_step import DeviceFrames, GraphedStep
-from rgbavatar_ns.avatar.training import make_optimizer
+from rgbavatar_ns.avatar.training.fused_step import FusedStep
+from rgbavatar_ns.avatar.training.loop import make_optimizer
+from rgbavatar_ns.avatar.training.optimizer_states import AdamStates
+from rgbavatar_ns.avatar.training.recorded_step import DeviceFrames, RecordedStep
 from tests.avatar.fused_scene import (
     eager_step,
     far_batch,
@@ -87,7 +87,7 @@ def test_steps_equal_the_fused_ones(emulated, make_avatar, cameras, changes):
     graphed, fused = stir(make_avatar(**changes)), stir(make_avatar(**changes))
     frames, background = _frames(graphed, cameras)
     optimizer = _slow(make_optimizer(graphed))
-    step = GraphedStep(graphed, [optimizer], frames, 2, recorder=recorder)
+    step = RecordedStep(graphed, [optimizer], frames, 2, recorder=recorder)
     for number, chosen in enumerate(ORDER):
         if number == 4:  # a schedule's new rate reaches a step that was recorded before
             optimizer.param_groups[0]["lr"] *= 0.5
@@ -110,9 +110,9 @@ def test_nothing_in_a_recorded_step_waits_for_the_device(emulated, make_avatar, 
     frames, background = _frames(avatar, 4)
     # These look at numbers on a CPU only, where looking costs nothing.
     monkeypatch.setattr(avatar, "_checked", lambda theta: theta)
-    monkeypatch.setattr(kernels.blended, "check_cameras", lambda _, cameras: len(cameras.focal_px))
+    monkeypatch.setattr(kernels.morphed, "check_cameras", lambda _, cameras: len(cameras.focal_px))
     recorder = Recorder(NothingWaits())
-    step = GraphedStep(avatar, [make_optimizer(avatar)], frames, 2, recorder=recorder)
+    step = RecordedStep(avatar, [make_optimizer(avatar)], frames, 2, recorder=recorder)
     reads = []
     launcher = emulated.emulated
     monkeypatch.setattr(launcher, "read_later", lambda numbers: reads.append(1) or (lambda: None))
@@ -137,12 +137,12 @@ def test_a_watch_that_sees_nothing_would_be_no_test():
 def test_overflows_are_counted_and_the_step_is_recorded_with_more_room(
     emulated, make_avatar, monkeypatch
 ):
-    from rgbavatar_ns.avatar import graphed_step
+    from rgbavatar_ns.avatar.training import recorded_step as graphed_step
 
     monkeypatch.setattr(graphed_step, "_LOOK_EVERY", 5)
     avatar, recorder = stir(make_avatar()), Recorder()
     frames, background = _frames(avatar)
-    step = GraphedStep(avatar, [make_optimizer(avatar)], frames, 2, recorder=recorder)
+    step = RecordedStep(avatar, [make_optimizer(avatar)], frames, 2, recorder=recorder)
     for chosen in ORDER[:4]:
         step(chosen, background[chosen])
     key = (avatar.num_gaussians, 24, 24)
@@ -165,7 +165,7 @@ def test_every_way_goes_on_from_the_others_counts(emulated, make_avatar):
     avatar, recorder = stir(make_avatar()), Recorder()
     frames, background = _frames(avatar)
     optimizer = make_optimizer(avatar)
-    graphed = GraphedStep(avatar, [optimizer], frames, 2, recorder=recorder)
+    graphed = RecordedStep(avatar, [optimizer], frames, 2, recorder=recorder)
     for chosen in ORDER[:5]:
         graphed(chosen, background[chosen])
     batch, colors = far_batch(avatar, 2, 24, 24)
@@ -182,7 +182,7 @@ def test_a_checkpoint_that_was_loaded_is_recorded_anew(emulated, make_avatar):
     avatar, recorder = stir(make_avatar()), Recorder()
     frames, background = _frames(avatar)
     optimizer = make_optimizer(avatar)
-    step = GraphedStep(avatar, [optimizer], frames, 2, recorder=recorder)
+    step = RecordedStep(avatar, [optimizer], frames, 2, recorder=recorder)
     for chosen in ORDER[:5]:
         step(chosen, background[chosen])
     optimizer.load_state_dict(optimizer.state_dict())
@@ -196,12 +196,12 @@ def test_what_cannot_be_recorded_is_refused(make_avatar):
     avatar = stir(make_avatar())
     frames, _ = _frames(avatar)
     with pytest.raises(ValueError, match="need the host"):
-        GraphedStep(avatar, [make_optimizer(avatar)], frames, 2)
+        RecordedStep(avatar, [make_optimizer(avatar)], frames, 2)
 
 
 def test_another_number_of_frames_is_refused(emulated, make_avatar):
     avatar = stir(make_avatar())
     frames, background = _frames(avatar)
-    step = GraphedStep(avatar, [make_optimizer(avatar)], frames, 2, recorder=Recorder())
+    step = RecordedStep(avatar, [make_optimizer(avatar)], frames, 2, recorder=Recorder())
     with pytest.raises(ValueError, match="3 frames"):
         step([0, 1, 2], background[:3])

@@ -3,8 +3,8 @@ import pytest
 import torch
 from scipy import stats
 
-from rgbavatar_ns.avatar import losses
-from rgbavatar_ns.avatar.losses import (
+from rgbavatar_ns.avatar.training import losses
+from rgbavatar_ns.avatar.training.losses import (
     LPIPSLoss,
     composite,
     l1_loss,

@@ -8,8 +8,8 @@ import torch
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from rgbavatar_ns.avatar import metrics
-from rgbavatar_ns.avatar.losses import LPIPSLoss
 from rgbavatar_ns.avatar.metrics import LPIPSMetric, evaluate_images, psnr, ssim
+from rgbavatar_ns.avatar.training.losses import LPIPSLoss
 from rgbavatar_ns.errors import UserError
 
 
@@ -104,7 +104,7 @@ def test_the_network_is_named_beside_the_number(monkeypatch):
 
 def test_importing_the_avatar_loads_neither_torchmetrics_nor_torchvision():
     code = (
-        "import sys, rgbavatar_ns.avatar.metrics, rgbavatar_ns.avatar.training;"
+        "import sys, rgbavatar_ns.avatar.metrics, rgbavatar_ns.avatar.training.loop;"
         "print([m for m in ('torchmetrics', 'torchvision', 'nerfstudio') if m in sys.modules])"
     )
     answer = subprocess.run(

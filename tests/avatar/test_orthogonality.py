@@ -1,8 +1,8 @@
 import pytest
 import torch
 
-from rgbavatar_ns.avatar.blendshapes import GaussianBlendshapes
-from rgbavatar_ns.avatar.orthogonality import (
+from rgbavatar_ns.avatar.model.blendshapes import GaussianBlendshapes
+from rgbavatar_ns.avatar.training.orthogonality import (
     orthogonality_error,
     orthogonality_loss,
     orthogonalize,

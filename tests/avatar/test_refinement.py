@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 import torch
 
-from rgbavatar_ns.avatar.calibration import fit_ridge
-from rgbavatar_ns.avatar.losses import composite, l1_loss, rgba_to_float
-from rgbavatar_ns.avatar.refinement import (
+from rgbavatar_ns.avatar.refinement.calibration import fit_ridge
+from rgbavatar_ns.avatar.refinement.corrections import (
     RefinementConfig,
     TrackingRefinement,
     fit_theta,
     frame_gradients,
 )
+from rgbavatar_ns.avatar.training.losses import composite, l1_loss, rgba_to_float
 from rgbavatar_ns.head import ThetaField, ThetaLayout
 
 from .fused_scene import far_batch, stir

@@ -3,9 +3,9 @@
 import pytest
 import torch
 
-from rgbavatar_ns.avatar.fused_step import FusedStep
-from rgbavatar_ns.avatar.losses import composite, l1_loss, rgba_to_float
-from rgbavatar_ns.avatar.training import make_optimizer
+from rgbavatar_ns.avatar.training.fused_step import FusedStep
+from rgbavatar_ns.avatar.training.loop import make_optimizer
+from rgbavatar_ns.avatar.training.losses import composite, l1_loss, rgba_to_float
 from rgbavatar_ns.kernels import available_backends
 
 from .fused_scene import double, far_batch, in_double, stir
@@ -73,9 +73,9 @@ def test_gradients_of_a_frozen_avatar_change_nothing_else(make_avatar):
     for frozen in (True, False):
         renderer = avatar.renderer(batch.theta, batch.cameras)
         assert renderer is not None
-        renderer.compare(batch.images_rgba, background)
+        renderer.forward_loss(batch.images_rgba, background)
         if frozen:
-            gradients.append(renderer.update(None, with_vertices=True))
+            gradients.append(renderer.backward_adam(None, with_vertices=True))
             after = avatar.state_dict()
             assert all(torch.equal(after[name], value) for name, value in before.items())
         else:
@@ -90,8 +90,8 @@ def test_vertices_that_carry_no_gaussian_have_no_gradient(make_avatar):
     batch, background = far_batch(avatar, 2)
     renderer = avatar.renderer(batch.theta, batch.cameras)
     assert renderer is not None
-    renderer.compare(batch.images_rgba, background)
-    gradient = renderer.update(None, with_vertices=True).vertices
+    renderer.forward_loss(batch.images_rgba, background)
+    gradient = renderer.backward_adam(None, with_vertices=True).vertices
     assert gradient is not None
     carrying = torch.zeros(gradient.shape[1], dtype=torch.bool)
     carrying[avatar.head.faces[avatar.anchors.triangle_index].flatten()] = True

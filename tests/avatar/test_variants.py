@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from rgbavatar_ns.avatar import Avatar, AvatarConfig
-from rgbavatar_ns.avatar.adam_states import refusal
-from rgbavatar_ns.avatar.fused_step import FusedStep
+from rgbavatar_ns.avatar.training.fused_step import FusedStep
+from rgbavatar_ns.avatar.training.optimizer_states import unsupported_reason
 from rgbavatar_ns.errors import UserError
 
 from .small_head import NUM_EXPRESSION, front_camera, random_theta, small_head, small_identity
@@ -57,7 +57,7 @@ def test_the_fused_step_trains_both(make_avatar):
         before = {name: p.detach().clone() for name, p in avatar.named_parameters()}
         parameters = [p for group in avatar.parameter_groups().values() for p in group]
         optimizer = torch.optim.Adam(parameters, lr=1e-2)
-        assert refusal(avatar, [optimizer]) is None
+        assert unsupported_reason(avatar, [optimizer]) is None
         images = torch.randint(0, 256, (2, 16, 16, 4), dtype=torch.uint8)
         step = FusedStep(avatar, [optimizer])
         loss = step(random_theta(avatar.layout, 2), front_camera(16), images, torch.zeros(2, 3))

@@ -1,15 +1,15 @@
 import pytest
 import torch
 
-from rgbavatar_ns.bench.floor import (
+from rgbavatar_ns.bench.roofline import (
     BACKWARD_OPERATIONS_PER_PAIR,
     FORWARD_OPERATIONS_PER_PAIR,
     MachineSpeed,
     Work,
-    floor_figures,
     measure_speed,
     parameter_work,
     rasterizer_work,
+    roofline_figures,
     update_work,
 )
 from rgbavatar_ns.bench.scenes import ellipsoid_scene
@@ -25,9 +25,9 @@ def test_the_slower_of_arithmetic_and_memory_decides():
 @pytest.mark.parametrize("factor", [2, 10])
 def test_the_floor_grows_linearly_with_the_work(factor):
     stages = ((3_000_000_000, 100_000), (0, 4_000_000))
-    one = floor_figures([Work(*stage) for stage in stages], SPEED, 2, 50_000.0)
+    one = roofline_figures([Work(*stage) for stage in stages], SPEED, 2, 50_000.0)
     larger = [Work(factor * operations, factor * moved) for operations, moved in stages]
-    more = floor_figures(larger, SPEED, 2, 50_000.0)
+    more = roofline_figures(larger, SPEED, 2, 50_000.0)
     assert one["ms_per_image"] == pytest.approx(1e3 * (3 + 4) / 2)
     assert one["reached"] == pytest.approx(one["ms_per_image"] / 50_000)
     for name in ("ms_per_image", "arithmetic_ms_per_image", "traffic_ms_per_image"):

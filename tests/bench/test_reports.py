@@ -6,12 +6,12 @@ import pytest
 import torch
 
 from rgbavatar_ns.avatar import Avatar, AvatarConfig
-from rgbavatar_ns.avatar.training import TrainingOptions
+from rgbavatar_ns.avatar.training.loop import TrainingOptions
 from rgbavatar_ns.bench import machine, step
-from rgbavatar_ns.bench.floor import measure_speed
 from rgbavatar_ns.bench.options import RasterizerOptions, RenderOptions, StepOptions
 from rgbavatar_ns.bench.rasterizer import bench_rasterizer
 from rgbavatar_ns.bench.render import bench_render
+from rgbavatar_ns.bench.roofline import measure_speed
 from rgbavatar_ns.bench.scenes import ellipsoid_scene
 from rgbavatar_ns.bench.schemes import WholeStep, parameters_of
 from rgbavatar_ns.bench.step import bench_step

@@ -7,16 +7,16 @@ from typing import get_args
 import pytest
 import torch
 
-from rgbavatar_ns.avatar.training import TrainingOptions
+from rgbavatar_ns.avatar.training.loop import TrainingOptions
 from rgbavatar_ns.bench import machine, utilisation
-from rgbavatar_ns.bench.floor import measure_speed
 from rgbavatar_ns.bench.options import RasterizerOptions, RenderOptions, Scheme, StepOptions
 from rgbavatar_ns.bench.rasterizer import bench_rasterizer
 from rgbavatar_ns.bench.render import bench_render
 from rgbavatar_ns.bench.report import print_report
+from rgbavatar_ns.bench.roofline import measure_speed
 from rgbavatar_ns.bench.schemes import (
     WHOLE_STEP,
-    RecordedStep,
+    RecordedScheme,
     WholeStep,
     parameters_of,
     steps_of,
@@ -88,7 +88,7 @@ def test_a_recorded_step_is_the_same_step(workload, monkeypatch):
         return work
 
     before = [parameter.detach().clone() for parameter in parameters_of(workload.avatar)]
-    recorded = RecordedStep(workload.avatar, workload.batch, record)
+    recorded = RecordedScheme(workload.avatar, workload.batch, record)
     assert len(recordings) == 1
     assert all(torch.equal(a, b) for a, b in zip(before, parameters_of(workload.avatar)))
     backend.emulated.launched.clear()

@@ -8,7 +8,7 @@ import torch
 from plyfile import PlyData
 
 from rgbavatar_ns import Avatar
-from rgbavatar_ns.avatar.bundle import load_statistics
+from rgbavatar_ns.avatar.storage.bundle import load_statistics
 from rgbavatar_ns.cli import main as cli
 from rgbavatar_ns.data import load_dataset
 from tests.data.small_dataset import NUM_FRAMES, NUM_TEST, small_dataset

@@ -8,8 +8,8 @@ import pytest
 
 from rgbavatar_ns.cli import main as cli
 from rgbavatar_ns.data import load_dataset
-from rgbavatar_ns.data.exporters.folders import VhapWriter
-from rgbavatar_ns.head.synthetic_flame import write_synthetic_flame
+from rgbavatar_ns.synthetic.exporters.folders import VhapWriter
+from rgbavatar_ns.synthetic.flame import write_synthetic_flame
 from tests.data.importers.takes import NUM_FRAMES, NUM_TEST, make_take
 
 

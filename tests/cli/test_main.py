@@ -28,7 +28,7 @@ def test_a_users_mistake_is_told_in_one_line_without_a_traceback(capsys, tmp_pat
 
 
 def test_a_failed_nerfstudio_command_says_what_to_do(monkeypatch, tmp_path):
-    from rgbavatar_ns.plugin.commands import run_nerfstudio
+    from rgbavatar_ns.experiments.commands import run_nerfstudio
 
     program = tmp_path / "ns-train"
     program.write_text("#!/bin/sh\nexit 3\n")

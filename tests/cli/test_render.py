@@ -13,7 +13,7 @@ from rgbavatar_ns.cli import main as cli
 from rgbavatar_ns.data import DatasetWriter, TrackedFrame
 from rgbavatar_ns.data.png import read_png_rgba
 from rgbavatar_ns.export import front_camera, pictures
-from rgbavatar_ns.head.synthetic_flame import write_synthetic_flame
+from rgbavatar_ns.synthetic.flame import write_synthetic_flame
 from tests.export.subject import avatar_of, lively_theta
 
 _SIZE, _FRAMES, _HELD_OUT = 32, 7, 3

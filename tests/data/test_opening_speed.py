@@ -57,7 +57,7 @@ def test_five_thousand_frames_open_quickly_without_being_decoded(long_dataset, m
     def refuse(*_):
         raise AssertionError("decoded")
 
-    monkeypatch.setattr("rgbavatar_ns.data.dataset.read_png_rgba", refuse)
+    monkeypatch.setattr("rgbavatar_ns.data.native.dataset.read_png_rgba", refuse)
     # Processor time: what else runs on the machine is not ours to measure.
     began = time.process_time()
     dataset = load_dataset(long_dataset)

@@ -11,17 +11,17 @@ import pytest
 import torch
 
 from rgbavatar_ns.data import LocalGlobalPools
-from rgbavatar_ns.data.streams import FramePools, ReplayStream
+from rgbavatar_ns.data.streams import ReplayBuffer, ReplayStream
 from rgbavatar_ns.errors import UserError
 from tests.data.small_dataset import small_dataset
 from tests.data.streaming import HEAD, cheap, streamed, subject, tracked
 
 
-def pools(local: int = 3, old: int = 4, seed: int = 0, keep_png: bool = True) -> FramePools:
-    return FramePools(subject(), LocalGlobalPools(local, old, seed=seed), keep_png)
+def pools(local: int = 3, old: int = 4, seed: int = 0, keep_png: bool = True) -> ReplayBuffer:
+    return ReplayBuffer(subject(), LocalGlobalPools(local, old, seed=seed), keep_png)
 
 
-def fill(frames: FramePools, indices: range) -> None:
+def fill(frames: ReplayBuffer, indices: range) -> None:
     for index in indices:
         frames.add(tracked(index), streamed(index))
 
@@ -90,7 +90,7 @@ def test_latency_is_from_arrival_to_the_first_batch():
 
 
 def test_memory_stays_flat_over_an_hour_of_frames():
-    frames = FramePools(subject(), LocalGlobalPools(150, 1000), keep_png=True)
+    frames = ReplayBuffer(subject(), LocalGlobalPools(150, 1000), keep_png=True)
     one, wire = cheap(0)
 
     def stream(count: int) -> int:
@@ -140,7 +140,7 @@ def test_a_checkpoint_without_images_needs_its_stream():
 def test_a_checkpoint_of_another_image_size_is_refused():
     whole = pools()
     fill(whole, range(3))
-    other = FramePools(subject(width=24), LocalGlobalPools(3, 4))
+    other = ReplayBuffer(subject(width=24), LocalGlobalPools(3, 4))
     with pytest.raises(UserError, match="24 x 8"):
         other.load_state_dict(whole.state_dict())
 

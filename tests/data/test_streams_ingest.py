@@ -8,18 +8,18 @@ import pytest
 import torch
 
 from rgbavatar_ns.data import LocalGlobalPools
-from rgbavatar_ns.data.streams import FramePools, FrameStream, Ingest, StreamedFrame
+from rgbavatar_ns.data.streams import FrameStream, Ingest, ReplayBuffer, StreamedFrame
 from rgbavatar_ns.data.streams.ingest import FrameQueue
-from rgbavatar_ns.data.streams.numbering import SeenNumbers
+from rgbavatar_ns.data.streams.sequence_numbers import SeenNumbers
 from tests.data.streaming import GivenStream, streamed, subject, until
 
 
-def ingest_of(stream: FrameStream, queue_frames: int = 256, **more) -> tuple[Ingest, FramePools]:
-    frames = FramePools(subject(), LocalGlobalPools(150, 1000))
+def ingest_of(stream: FrameStream, queue_frames: int = 256, **more) -> tuple[Ingest, ReplayBuffer]:
+    frames = ReplayBuffer(subject(), LocalGlobalPools(150, 1000))
     return Ingest(stream, subject(), frames, queue_frames, **more), frames
 
 
-def taken_in(given: list[StreamedFrame]) -> tuple[Ingest, FramePools]:
+def taken_in(given: list[StreamedFrame]) -> tuple[Ingest, ReplayBuffer]:
     ingest, frames = ingest_of(GivenStream(given))
     ingest.start()
     until(lambda: ingest.finished)

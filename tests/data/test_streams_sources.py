@@ -16,10 +16,10 @@ from rgbavatar_ns.data.streams import (
     PushedStream,
     ReplayStream,
     StreamClient,
-    wire,
 )
+from rgbavatar_ns.data.streams import message_format as wire
 from rgbavatar_ns.data.streams.address import StreamAddress
-from rgbavatar_ns.data.streams.pushed import _CHUNK_BYTES, ACCEPTED
+from rgbavatar_ns.data.streams.socket_server import _CHUNK_BYTES, ACCEPTED
 from rgbavatar_ns.errors import UserError
 from tests.data.small_dataset import NUM_FRAMES, NUM_TEST, small_dataset
 from tests.data.streaming import HEAD, same, subject, take, tracked, until

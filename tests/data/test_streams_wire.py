@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rgbavatar_ns.data.streams import wire
+from rgbavatar_ns.data.streams import message_format as wire
 from rgbavatar_ns.errors import UserError
 from tests.data.streaming import HEAD, same, subject, tracked
 

@@ -11,13 +11,12 @@ import pytest
 
 from rgbavatar_ns.cli import main as cli
 from rgbavatar_ns.errors import UserError
-from rgbavatar_ns.experiments import engines, read_experiment, runner
+from rgbavatar_ns.experiments import commands, engines, read_experiment, runner
 from rgbavatar_ns.experiments import sweep as sweep_module
 from rgbavatar_ns.experiments.engines import LocalEngine
-from rgbavatar_ns.experiments.guard import alone_in
+from rgbavatar_ns.experiments.process_lock import alone_in
 from rgbavatar_ns.experiments.runner import run_cell, write_cell
 from rgbavatar_ns.experiments.sweep import cells_of, sweep
-from rgbavatar_ns.plugin import commands
 
 TEXT = """
 title: Failures
@@ -145,7 +144,7 @@ def test_a_finished_cell_is_not_run_again_by_a_second_process(tmp_path, monkeypa
 
 _HOLD = """
 import pathlib, sys, time
-from rgbavatar_ns.experiments.guard import alone_in
+from rgbavatar_ns.experiments.process_lock import alone_in
 folder = pathlib.Path(sys.argv[1])
 with alone_in(folder):
     (folder / "held").touch()
@@ -157,7 +156,7 @@ _ORPHAN = """
 import pathlib, subprocess, sys
 child = '''
 import pathlib, sys, time
-from rgbavatar_ns.experiments.guard import end_with_parent
+from rgbavatar_ns.experiments.process_lock import end_with_parent
 end_with_parent()
 folder = pathlib.Path(sys.argv[1])
 (folder / "begun").touch()

@@ -11,11 +11,11 @@ import pytest
 import torch
 
 from rgbavatar_ns.avatar import Avatar, AvatarConfig
-from rgbavatar_ns.avatar.bundle_statistics import TrainingStatistics, expressive_numbers
-from rgbavatar_ns.data.demo.config import DemoConfig
-from rgbavatar_ns.data.demo.make import DemoPerson, as_pinhole
-from rgbavatar_ns.data.demo.performance import perform
+from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics, expressive_numbers
 from rgbavatar_ns.export import DrivingOptions, ThetaNames, draw, drive
+from rgbavatar_ns.synthetic.config import DemoConfig
+from rgbavatar_ns.synthetic.make import DemoPerson, as_pinhole
+from rgbavatar_ns.synthetic.performer.performance import perform
 
 from .subject import psnr
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from rgbavatar_ns.avatar.bundle_statistics import TrainingStatistics
+from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
 from rgbavatar_ns.data.png import read_png_rgba
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.export import (

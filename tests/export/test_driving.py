@@ -5,7 +5,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rgbavatar_ns.avatar.bundle_statistics import TrainingStatistics
+from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.export.driving import (
     DrivingOptions,

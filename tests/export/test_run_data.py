@@ -7,8 +7,8 @@ from rgbavatar_ns.export import dataset_folder
 
 # As nerfstudio writes it: Python objects as tags, which must not be built.
 _CONFIG = """\
-!!python/object:rgbavatar_ns.plugin.trainer.RGBAvatarTrainerConfig
-_target: !!python/name:rgbavatar_ns.plugin.trainer.RGBAvatarTrainer ''
+!!python/object:rgbavatar_ns.plugin.training.trainer.RGBAvatarTrainerConfig
+_target: !!python/name:rgbavatar_ns.plugin.training.trainer.RGBAvatarTrainer ''
 data: &id002 !!python/object/apply:pathlib.PosixPath
 - /
 - some

@@ -15,7 +15,7 @@ from rgbavatar_ns.head import HeadModel, frame_quats_wxyz, tangent_frames, uv_an
 from rgbavatar_ns.head.arrays import HeadArrays
 from rgbavatar_ns.head.flame import FLAME_VARIABLE, load_flame
 from rgbavatar_ns.head.flame_uv import make_uv_map, read_uv_map
-from rgbavatar_ns.head.synthetic_flame import write_synthetic_flame
+from rgbavatar_ns.synthetic.flame import write_synthetic_flame
 
 
 @pytest.fixture(scope="module")

@@ -6,8 +6,8 @@ import torch
 
 from rgbavatar_ns.head import HeadArrays, uv_anchors
 from rgbavatar_ns.head.flame import load_flame
-from rgbavatar_ns.head.synthetic_flame import write_synthetic_flame
 from rgbavatar_ns.head.teeth import LOWER_LIP, UPPER_LIP, with_teeth
+from rgbavatar_ns.synthetic.flame import write_synthetic_flame
 
 
 @pytest.fixture(scope="module")

@@ -4,8 +4,8 @@ import copy
 from pathlib import Path
 from typing import Any
 
-from rgbavatar_ns.plugin.online_methods import rgbavatar_online_tiny
-from rgbavatar_ns.plugin.online_trainer import OnlineTrainer, OnlineTrainerConfig
+from rgbavatar_ns.plugin.online.methods import rgbavatar_online_tiny
+from rgbavatar_ns.plugin.online.trainer import OnlineTrainer, OnlineTrainerConfig
 from tests.plugin.run import SMALL, make_trainer
 
 

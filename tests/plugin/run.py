@@ -13,7 +13,7 @@ from nerfstudio.utils import writer
 
 from rgbavatar_ns.avatar import AvatarConfig
 from rgbavatar_ns.plugin.methods import rgbavatar_tiny
-from rgbavatar_ns.plugin.trainer import RGBAvatarTrainer, RGBAvatarTrainerConfig
+from rgbavatar_ns.plugin.training.trainer import RGBAvatarTrainer, RGBAvatarTrainerConfig
 
 SMALL = AvatarConfig(uv_resolution=16, num_bases=3, hidden_width=16, scale_from_texel_spacing=True)
 # Entry points exist only once the package is installed; the variable works without.

@@ -13,8 +13,8 @@ import pytest
 import torch
 
 from rgbavatar_ns.errors import UserError
-from rgbavatar_ns.plugin import checkpoints
-from rgbavatar_ns.plugin.checkpoints import (
+from rgbavatar_ns.plugin.training import checkpoints
+from rgbavatar_ns.plugin.training.checkpoints import (
     list_checkpoints,
     load_newest,
     read_checkpoint,
@@ -130,7 +130,7 @@ def test_failing_write_keeps_the_old_checkpoint(tmp_path: Path):
 _KILLED_WHILE_WRITING = """
 import os, signal, sys, torch
 from pathlib import Path
-from rgbavatar_ns.plugin.checkpoints import save_checkpoint
+from rgbavatar_ns.plugin.training.checkpoints import save_checkpoint
 def die(*_): os.kill(os.getpid(), signal.SIGKILL)
 setattr(os, sys.argv[2], die)
 state = {"step": 20, "pipeline": {"w": torch.zeros(1000)}}

@@ -7,7 +7,7 @@ import torch
 
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.kernels import DeviceError
-from rgbavatar_ns.plugin.checkpoints import list_checkpoints, read_checkpoint
+from rgbavatar_ns.plugin.training.checkpoints import list_checkpoints, read_checkpoint
 from tests.plugin.run import make_trainer, small_config
 
 ERRORS = {

@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from rgbavatar_ns.avatar.graphed_step import GraphedStep
+from rgbavatar_ns.avatar.training.recorded_step import RecordedStep
 from rgbavatar_ns.plugin.pipeline import RGBAvatarPipeline
-from rgbavatar_ns.plugin.trainer import RGBAvatarTrainer
+from rgbavatar_ns.plugin.training.trainer import RGBAvatarTrainer
 from tests.kernels.cuda import emulator
 from tests.plugin.run import make_trainer, small_config
 
@@ -20,13 +20,13 @@ def recorded(monkeypatch) -> list[int]:
     """The emulated backend, and a list that grows with each recorded step."""
     emulator.install(monkeypatch)
     steps: list[int] = []
-    original = GraphedStep.__call__
+    original = RecordedStep.__call__
 
     def counted(self, chosen, background):
         steps.append(len(chosen))
         return original(self, chosen, background)
 
-    monkeypatch.setattr(GraphedStep, "__call__", counted)
+    monkeypatch.setattr(RecordedStep, "__call__", counted)
     monkeypatch.setattr(RGBAvatarPipeline, "recorder", staticmethod(lambda work: work))
     return steps
 

@@ -7,10 +7,10 @@ from typing import Any
 import pytest
 import torch
 
-from rgbavatar_ns.avatar.fused_step import FusedStep
+from rgbavatar_ns.avatar.training.fused_step import FusedStep
 from rgbavatar_ns.kernels import available_backends
-from rgbavatar_ns.plugin.checkpoints import list_checkpoints, read_checkpoint
-from rgbavatar_ns.plugin.trainer import RGBAvatarTrainer, RGBAvatarTrainerConfig
+from rgbavatar_ns.plugin.training.checkpoints import list_checkpoints, read_checkpoint
+from rgbavatar_ns.plugin.training.trainer import RGBAvatarTrainer, RGBAvatarTrainerConfig
 from tests.plugin.run import make_trainer, small_config
 
 pytestmark = pytest.mark.skipif("cpu" not in available_backends(), reason="not compiled")

@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 
 from rgbavatar_ns.data import load_dataset
-from rgbavatar_ns.data.demo import DemoConfig
-from rgbavatar_ns.data.exporters import DEMO_FORMATS, FLAME_FOLDER, FlameFilm, NativeWriter
+from rgbavatar_ns.synthetic import DemoConfig
+from rgbavatar_ns.synthetic.exporters import DEMO_FORMATS, FLAME_FOLDER, FlameFilm, NativeWriter
 from tests.plugin.run import make_trainer, small_config
 
 STEPS = 60

@@ -5,7 +5,7 @@ import threading
 
 import pytest
 
-from rgbavatar_ns.plugin.interruption import StopRequest
+from rgbavatar_ns.plugin.training.interruption import StopRequest
 
 
 @pytest.mark.parametrize(

@@ -22,10 +22,10 @@ from rgbavatar_ns import Avatar
 from rgbavatar_ns.data import TrackedFrame, load_dataset
 from rgbavatar_ns.data.streams import FolderWriter, StreamClient, StreamSubject
 from rgbavatar_ns.errors import UserError
-from rgbavatar_ns.plugin.checkpoints import list_checkpoints, read_checkpoint
 from rgbavatar_ns.plugin.methods import rgbavatar
-from rgbavatar_ns.plugin.online_methods import rgbavatar_online, rgbavatar_online_tiny
-from rgbavatar_ns.plugin.online_trainer import OnlineTrainer
+from rgbavatar_ns.plugin.online.methods import rgbavatar_online, rgbavatar_online_tiny
+from rgbavatar_ns.plugin.online.trainer import OnlineTrainer
+from rgbavatar_ns.plugin.training.checkpoints import list_checkpoints, read_checkpoint
 from tests.plugin.online_run import online_config, online_trainer
 from tests.plugin.run import environment, program
 from tests.plugin.tiny import NUM_FRAMES, NUM_TEST, SIZE
@@ -392,7 +392,7 @@ def test_the_methods_have_the_papers_pools_and_sizes():
     assert tiny.pipeline.model.avatar.uv_resolution == 128
 
 
-_METHOD = "rgbavatar-online-tiny=rgbavatar_ns.plugin.online_methods:rgbavatar_online_tiny"
+_METHOD = "rgbavatar-online-tiny=rgbavatar_ns.plugin.online.methods:rgbavatar_online_tiny"
 
 
 @pytest.mark.slow

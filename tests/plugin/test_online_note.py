@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from rgbavatar_ns.plugin.online_progress import OnlineProgress, StreamReport
-from rgbavatar_ns.plugin.viewer.note import PanelNote
+from rgbavatar_ns.plugin.online.progress import OnlineProgress, StreamReport
+from rgbavatar_ns.plugin.viewer.status_panel import StatusPanel
 
 REPORT = StreamReport(
     step=40,
@@ -51,7 +51,7 @@ def test_log_has_a_line_now_and_then(capsys: pytest.CaptureFixture[str]):
 def test_rate_is_that_of_the_last_second(monkeypatch: pytest.MonkeyPatch):
     clock = SimpleNamespace(now=100.0)
     monkeypatch.setattr(
-        "rgbavatar_ns.plugin.online_progress.time",
+        "rgbavatar_ns.plugin.online.progress.time",
         SimpleNamespace(monotonic=lambda: clock.now),
     )
     progress = OnlineProgress()
@@ -65,7 +65,7 @@ def test_rate_is_that_of_the_last_second(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_note_shows_the_picture_and_keeps_it():
-    note = PanelNote("Stream")
+    note = StatusPanel("Stream")
     note.show(["before the viewer"], None)
     note._handle = SimpleNamespace(content="")
     rng = np.random.default_rng(0)

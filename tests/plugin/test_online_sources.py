@@ -15,7 +15,7 @@ from rgbavatar_ns.data.streams import (
     StreamSubject,
 )
 from rgbavatar_ns.errors import UserError
-from rgbavatar_ns.plugin.online_sources import SourceConfig, await_subject, open_source
+from rgbavatar_ns.plugin.online.sources import SourceConfig, await_subject, open_source
 from tests.data.streaming import GivenStream, streamed, subject
 from tests.plugin.online_run import online_config, online_trainer
 
@@ -69,7 +69,7 @@ def test_ctrl_c_while_waiting_ends_with_exit_code_0(
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("rgbavatar_ns.plugin.online_datamanager.await_subject", interrupted)
+    monkeypatch.setattr("rgbavatar_ns.plugin.online.datamanager.await_subject", interrupted)
     config = online_config(tmp_path / "out", tmp_path / "live")
     config.pipeline.datamanager.source.kind = "folder"
     with pytest.raises(SystemExit) as ended:

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from rgbavatar_ns.avatar.orthogonality import orthogonality_error
+from rgbavatar_ns.avatar.training.orthogonality import orthogonality_error
 from rgbavatar_ns.plugin import model as model_module
 from tests.plugin.run import make_trainer, small_config
 

@@ -8,11 +8,11 @@ import pytest
 import torch
 
 from rgbavatar_ns.avatar import AvatarConfig
-from rgbavatar_ns.avatar.refinement import RefinementConfig
+from rgbavatar_ns.avatar.refinement.corrections import RefinementConfig
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.kernels import available_backends
-from rgbavatar_ns.plugin.refinement import FrameRefinement
-from rgbavatar_ns.plugin.trainer import RGBAvatarTrainer
+from rgbavatar_ns.plugin.training.refinement import FrameRefinement
+from rgbavatar_ns.plugin.training.trainer import RGBAvatarTrainer
 from tests.plugin.run import make_trainer, small_config
 from tests.plugin.tiny import NUM_FRAMES, NUM_TEST
 

@@ -14,9 +14,9 @@ from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocati
 
 from rgbavatar_ns import Avatar
 from rgbavatar_ns.errors import UserError
-from rgbavatar_ns.plugin.checkpoints import list_checkpoints, read_checkpoint
 from rgbavatar_ns.plugin.methods import rgbavatar
-from rgbavatar_ns.plugin.trainer import RGBAvatarTrainer, RGBAvatarTrainerConfig
+from rgbavatar_ns.plugin.training.checkpoints import list_checkpoints, read_checkpoint
+from rgbavatar_ns.plugin.training.trainer import RGBAvatarTrainer, RGBAvatarTrainerConfig
 from tests.plugin.run import SMALL, make_trainer, small_config
 
 STEPS = 12
@@ -214,7 +214,9 @@ def test_full_disk_at_a_checkpoint_is_a_user_error_and_the_old_one_survives(
 ):
     trainer = _train(tiny_data, tmp_path, max_num_iterations=3)
     usage = shutil.disk_usage(tmp_path)._replace(free=100)
-    monkeypatch.setattr("rgbavatar_ns.plugin.checkpoints.shutil.disk_usage", lambda _: usage)
+    monkeypatch.setattr(
+        "rgbavatar_ns.plugin.training.checkpoints.shutil.disk_usage", lambda _: usage
+    )
     with pytest.raises(UserError, match="does not fit"):
         _train(tiny_data, tmp_path, max_num_iterations=6, load_dir=trainer.checkpoint_dir)
     assert _newest(trainer)["step"] == 2

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.optimize import lsq_linear
 
-from rgbavatar_ns.tracking.bounded import (
+from rgbavatar_ns.tracking.fit.levenberg_marquardt import (
     QuadraticModel,
     levenberg_marquardt,
     minimize_box_quadratic,

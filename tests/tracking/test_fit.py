@@ -6,11 +6,11 @@ import torch
 
 from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.head.rotations import axis_angle_to_matrix
-from rgbavatar_ns.tracking.camera import StillCamera
 from rgbavatar_ns.tracking.config import TrackConfig
-from rgbavatar_ns.tracking.fit import fit_clip, key_frame_positions
-from rgbavatar_ns.tracking.report import fit_quality
-from rgbavatar_ns.tracking.subject import SubjectTracker
+from rgbavatar_ns.tracking.fit.camera import StillCamera
+from rgbavatar_ns.tracking.fit.fit import fit_clip, key_frame_positions
+from rgbavatar_ns.tracking.fit.subject import SubjectTracker
+from rgbavatar_ns.tracking.verify.report import fit_quality
 
 CAMERA = StillCamera(700.0, (160.0, 120.0), 0.8)
 ACTIVE = ("mouthSmileLeft", "mouthPucker", "browInnerUp", "eyeBlinkLeft", "eyeBlinkRight")

@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from rgbavatar_ns.tracking.clip import SeenFaces, followed_face
-from rgbavatar_ns.tracking.follow import FaceFollower
+from rgbavatar_ns.tracking.face.clip import SeenFaces, followed_face
+from rgbavatar_ns.tracking.face.follow import FaceFollower
 
 from .clips import astronaut
 
@@ -145,7 +145,7 @@ def test_blurred_frames_are_noted_and_kept() -> None:
 
 def test_real_faces_that_cross_in_a_picture() -> None:
     pytest.importorskip("mediapipe", reason="the tracker's optional extra is not installed")
-    from rgbavatar_ns.tracking.landmarks import FaceLandmarker
+    from rgbavatar_ns.tracking.face.detector import FaceLandmarker
 
     portrait = cv2.resize(astronaut()[:290, 40:330], (200, 200))
     other = np.clip(portrait[:, ::-1].astype(int)[..., ::-1] * 0.9, 0, 255).astype(np.uint8)

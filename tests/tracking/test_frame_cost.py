@@ -8,11 +8,11 @@ import torch
 
 from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.head.landmarks import LandmarkNoise, facemesh_noise
-from rgbavatar_ns.tracking.camera import StillCamera
 from rgbavatar_ns.tracking.config import TrackConfig
-from rgbavatar_ns.tracking.frame_cost import FrameCost, Target
-from rgbavatar_ns.tracking.parameters import FitParameters
-from rgbavatar_ns.tracking.subject import SubjectTracker
+from rgbavatar_ns.tracking.fit.camera import StillCamera
+from rgbavatar_ns.tracking.fit.landmark_cost import FrameCost, Target
+from rgbavatar_ns.tracking.fit.parameters import FitParameters
+from rgbavatar_ns.tracking.fit.subject import SubjectTracker
 
 CAMERA, FACE_PX = StillCamera(700.0, (160.0, 120.0), 0.8), 150.0
 

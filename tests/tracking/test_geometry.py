@@ -1,11 +1,11 @@
 import numpy as np
 import pytest
 
-from rgbavatar_ns.data.mesh_drawing import mesh_silhouette
-from rgbavatar_ns.tracking.camera import StillCamera
-from rgbavatar_ns.tracking.crop import SquareCrop, steady_crop
-from rgbavatar_ns.tracking.matting import foreground_color
-from rgbavatar_ns.tracking.region import HeadRegion, neck_ring
+from rgbavatar_ns.drawing.wireframe import mesh_silhouette
+from rgbavatar_ns.tracking.fit.camera import StillCamera
+from rgbavatar_ns.tracking.image.crop import SquareCrop, steady_crop
+from rgbavatar_ns.tracking.image.head_mask import HeadMask, neck_ring
+from rgbavatar_ns.tracking.image.matting import foreground_color
 
 
 def test_projection_worked_by_hand() -> None:
@@ -103,7 +103,7 @@ def test_head_region_keeps_hair_and_fades_out_below_the_neck() -> None:
     np.testing.assert_array_equal(ring, np.arange(24))
     forehead, chin = np.array([100.0, 60.0]), np.array([100.0, 150.0])
     with_neck = np.eye(5)[np.ones(len(points), dtype=int)]
-    region = HeadRegion(faces, with_neck)(points, forehead, chin, 256)
+    region = HeadMask(faces, with_neck)(points, forehead, chin, 256)
     assert region[100, 100] == pytest.approx(1, abs=1e-3)
     assert region[25, 100] > 0.95, "hair above the skull"
     assert region[80, 150] > 0.9, "hair beside the skull"

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from rgbavatar_ns.errors import UserError
-from rgbavatar_ns.tracking.image_files import image_files, read_image_rgba
-from rgbavatar_ns.tracking.video import FrameSource
+from rgbavatar_ns.tracking.input.image_files import image_files, read_image_rgba
+from rgbavatar_ns.tracking.input.video import FrameSource
 
 from .clips import gradient_images, write_clip
 
@@ -223,7 +223,7 @@ def test_damage_in_the_middle_costs_those_frames_and_is_noted(tmp_path: Path) ->
 _MEMORY = """
 import resource, sys
 from rgbavatar_ns.tracking.threads import in_background
-from rgbavatar_ns.tracking.video import FrameSource
+from rgbavatar_ns.tracking.input.video import FrameSource
 peak = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 for frame in in_background(FrameSource.open(sys.argv[1]), 2):
     early = peak() if frame.index <= 8 else early

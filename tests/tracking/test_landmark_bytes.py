@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rgbavatar_ns.tracking.landmark_bytes import decoded, positions_of
+from rgbavatar_ns.tracking.face.landmark_bytes import decoded, positions_of
 
 landmark_pb2 = pytest.importorskip("mediapipe.framework.formats.landmark_pb2")
 

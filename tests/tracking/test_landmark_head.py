@@ -7,7 +7,7 @@ import torch
 from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.head.landmarks import LandmarkResponse, facemesh_landmarks, facemesh_response
 from rgbavatar_ns.head.rotations import axis_angle_to_matrix
-from rgbavatar_ns.tracking.landmark_head import LandmarkHead
+from rgbavatar_ns.tracking.fit.landmark_head import LandmarkHead
 
 
 @pytest.fixture(scope="module")

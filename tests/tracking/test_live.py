@@ -7,8 +7,8 @@ import torch
 
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.tracking import TrackConfig
-from rgbavatar_ns.tracking.following_crop import FollowingCrop
-from rgbavatar_ns.tracking.video import FrameSource
+from rgbavatar_ns.tracking.image.following_crop import FollowingCrop
+from rgbavatar_ns.tracking.input.video import FrameSource
 
 from .clips import REAL_CLIPS, astronaut
 

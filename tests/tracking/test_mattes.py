@@ -8,9 +8,9 @@ import pytest
 
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.tracking import TrackConfig, track_video
-from rgbavatar_ns.tracking.mattes import UserMattes
-from rgbavatar_ns.tracking.steady_matte import CoarseMatte, head_motion, steadied
-from rgbavatar_ns.tracking.video import FrameSource
+from rgbavatar_ns.tracking.image.steady_matte import CoarseMatte, head_motion, steadied
+from rgbavatar_ns.tracking.input.mattes import UserMattes
+from rgbavatar_ns.tracking.input.video import FrameSource
 
 from .clips import astronaut, gradient_images, write_clip
 

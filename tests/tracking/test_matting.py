@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from rgbavatar_ns.tracking.matting import refined_matte
+from rgbavatar_ns.tracking.image.matting import refined_matte
 
 
 @pytest.mark.parametrize("side", [256, 640])

@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 import torch
 
-from rgbavatar_ns.data.demo import DemoConfig
-from rgbavatar_ns.data.demo.make import DemoPerson
 from rgbavatar_ns.head import ThetaLayout
-from rgbavatar_ns.tracking.clip import ClipLandmarks, SeenFaces, followed_face
+from rgbavatar_ns.synthetic import DemoConfig
+from rgbavatar_ns.synthetic.make import DemoPerson
 from rgbavatar_ns.tracking.config import TrackConfig
+from rgbavatar_ns.tracking.face.clip import ClipLandmarks, SeenFaces, followed_face
+from rgbavatar_ns.tracking.face.detector import FaceLandmarker
 from rgbavatar_ns.tracking.find_faces import sharpness
-from rgbavatar_ns.tracking.landmarks import FaceLandmarker
-from rgbavatar_ns.tracking.own_head import subject_tracker
-from rgbavatar_ns.tracking.subject import SubjectTracker
+from rgbavatar_ns.tracking.fit.own_head import subject_tracker
+from rgbavatar_ns.tracking.fit.subject import SubjectTracker
 
 from .clips import astronaut
 

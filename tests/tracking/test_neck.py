@@ -6,7 +6,7 @@ import torch
 
 from rgbavatar_ns.head import HeadArrays, HeadModel, facemesh_landmarks
 from rgbavatar_ns.head.rotations import axis_angle_to_matrix
-from rgbavatar_ns.tracking.landmarks import CHIN
+from rgbavatar_ns.tracking.face.detector import CHIN
 
 TURNS = {"pitch": (0.26, 0.0, 0.0), "yaw": (0.0, 0.26, 0.0), "roll": (0.0, 0.0, 0.26)}
 """15 degrees about each axis."""

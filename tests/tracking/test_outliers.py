@@ -5,12 +5,12 @@ import pytest
 import torch
 
 from rgbavatar_ns.head import HeadModel
-from rgbavatar_ns.tracking.camera import StillCamera
 from rgbavatar_ns.tracking.config import TrackConfig
-from rgbavatar_ns.tracking.fit import fit_frame
-from rgbavatar_ns.tracking.frame_cost import Target
-from rgbavatar_ns.tracking.landmarks import face_height_px
-from rgbavatar_ns.tracking.subject import SubjectTracker
+from rgbavatar_ns.tracking.face.detector import face_height_px
+from rgbavatar_ns.tracking.fit.camera import StillCamera
+from rgbavatar_ns.tracking.fit.fit import fit_frame
+from rgbavatar_ns.tracking.fit.landmark_cost import Target
+from rgbavatar_ns.tracking.fit.subject import SubjectTracker
 
 CAMERA = StillCamera(700.0, (160.0, 120.0), 0.8)
 Spoil = Callable[[np.ndarray, float, np.random.Generator], np.ndarray]

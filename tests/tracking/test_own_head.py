@@ -11,18 +11,18 @@ from scipy.spatial import KDTree
 from rgbavatar_ns.data import load_dataset
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadArrays, HeadModel
-from rgbavatar_ns.head.synthetic_flame import write_synthetic_flame
+from rgbavatar_ns.synthetic.flame import write_synthetic_flame
 from rgbavatar_ns.tracking import TrackConfig, track_video
-from rgbavatar_ns.tracking.camera import StillCamera
-from rgbavatar_ns.tracking.fit import ClipFit
-from rgbavatar_ns.tracking.own_head import head_digest, read_own_head, subject_tracker
-from rgbavatar_ns.tracking.own_parameters import with_signed_expressions
-from rgbavatar_ns.tracking.parameters import fit_parameters
-from rgbavatar_ns.tracking.subject import SubjectTracker
+from rgbavatar_ns.tracking.fit.camera import StillCamera
+from rgbavatar_ns.tracking.fit.fit import ClipFit
+from rgbavatar_ns.tracking.fit.own_head import head_digest, read_own_head, subject_tracker
+from rgbavatar_ns.tracking.fit.own_parameters import with_signed_expressions
+from rgbavatar_ns.tracking.fit.parameters import fit_parameters
+from rgbavatar_ns.tracking.fit.subject import SubjectTracker
 
-from ..head.remeshed_head import TURN, as_another_model, remeshed
 from ..head.synthetic_head import flame_shaped_arrays
 from .clips import astronaut, write_clip
+from .remeshed_head import TURN, as_another_model, remeshed
 
 CAMERA = StillCamera(700.0, (160.0, 120.0), 0.8)
 CONFIG = TrackConfig(focal_px=CAMERA.focal_px, key_frames=6, identity_components=10)

@@ -9,17 +9,17 @@ import pytest
 from rich.console import Console
 
 from rgbavatar_ns.cli.track import summary_table
-from rgbavatar_ns.tracking.overlay import OverlayTile, write_contact_sheet
-from rgbavatar_ns.tracking.region import height_above_chin, mesh_silhouette
-from rgbavatar_ns.tracking.report import (
+from rgbavatar_ns.tracking.image.head_mask import height_above_chin, mesh_silhouette
+from rgbavatar_ns.tracking.image.silhouette import silhouette_agreement
+from rgbavatar_ns.tracking.verify.contact_sheet import sheet_frames
+from rgbavatar_ns.tracking.verify.overlay import OverlayTile, write_contact_sheet
+from rgbavatar_ns.tracking.verify.report import (
     closed_eyes,
     count_blinks,
     gap_correlation,
     silhouette_summary,
     verdict,
 )
-from rgbavatar_ns.tracking.sheet import sheet_frames
-from rgbavatar_ns.tracking.silhouette import silhouette_agreement
 
 GOOD: dict[str, Any] = {
     "frames_read": 200,

@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 import torch
 
-from rgbavatar_ns.data.demo import DemoConfig
-from rgbavatar_ns.data.demo.make import DemoPerson
-from rgbavatar_ns.data.demo.performance import perform
 from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.head.landmarks import facemesh_response
+from rgbavatar_ns.synthetic import DemoConfig
+from rgbavatar_ns.synthetic.make import DemoPerson
+from rgbavatar_ns.synthetic.performer.performance import perform
 from rgbavatar_ns.tracking.config import TrackConfig
-from rgbavatar_ns.tracking.landmarks import FaceLandmarker
-from rgbavatar_ns.tracking.subject import SubjectTracker
+from rgbavatar_ns.tracking.face.detector import FaceLandmarker
+from rgbavatar_ns.tracking.fit.subject import SubjectTracker
 
 pytest.importorskip("mediapipe", reason="the tracker needs mediapipe")
 # Not among the people on whom the response was measured.

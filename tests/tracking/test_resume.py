@@ -17,7 +17,7 @@ from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.tracking import TrackConfig, track_video
 from rgbavatar_ns.tracking import track as track_module
 from rgbavatar_ns.tracking.find_faces import find_faces
-from rgbavatar_ns.tracking.unfinished import WORK_FOLDER, UnfinishedRun, fingerprint
+from rgbavatar_ns.tracking.resumable_run import WORK_FOLDER, ResumableRun, fingerprint
 
 from .clips import astronaut, gradient_images, write_clip
 
@@ -142,7 +142,7 @@ def test_a_finished_dataset_stands_until_the_new_ones_pictures_begin(
 
 
 def test_a_torn_line_and_a_torn_picture_are_made_again(tmp_path: Path) -> None:
-    run = UnfinishedRun.open(tmp_path / "set", {"a": 1}, overwrite=False)
+    run = ResumableRun.open(tmp_path / "set", {"a": 1}, overwrite=False)
     images = tmp_path / "set" / "images"
     images.mkdir()
     assert run.pictures("fit") == {}

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from rgbavatar_ns.errors import UserError
-from rgbavatar_ns.tracking.video import FrameSource
+from rgbavatar_ns.tracking.input.video import FrameSource
 
 from .clips import gradient_images, write_clip
 

@@ -13,7 +13,7 @@ from rgbavatar_ns.data.streams import Backoff, StreamedFrame
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.kernels import PinholeCameras
-from rgbavatar_ns.tracking.live_pictures import FilePictures, NewestPictures
+from rgbavatar_ns.tracking.input.capture import FilePictures, NewestPictures
 from rgbavatar_ns.tracking.video_stream import VideoStream
 
 from .clips import REAL_CLIPS, gradient_images, write_clip

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from rgbavatar_ns.data.check.problems import Problem, first_few
-from rgbavatar_ns.data.dataset import TrackedDataset
+from rgbavatar_ns.data.native.dataset import TrackedDataset
 
 _LARGEST_COEFFICIENT, _LARGEST_TURN_RAD = 12.0, np.pi + 0.01
 _NARROWEST_DEGREES, _WIDEST_DEGREES = 3.0, 120.0

@@ -27,9 +27,9 @@ from rgbavatar_ns.data.check.sample import (
 )
 from rgbavatar_ns.data.check.sheet import MAX_TILES, spread, write_sheet
 from rgbavatar_ns.data.check.timing import frame_offset_problem, longest_run
-from rgbavatar_ns.data.dataset import TrackedDataset
 from rgbavatar_ns.data.importers import find_format
-from rgbavatar_ns.data.native_format import FORMAT, INDEX_FILE
+from rgbavatar_ns.data.native.dataset import TrackedDataset
+from rgbavatar_ns.data.native.format import FORMAT, INDEX_FILE
 from rgbavatar_ns.errors import UserError
 
 _FEW_SPREAD = 4

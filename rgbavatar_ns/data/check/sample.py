@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 
-from rgbavatar_ns.data.dataset import TrackedDataset
-from rgbavatar_ns.data.mesh_drawing import mesh_silhouette
+from rgbavatar_ns.data.native.dataset import TrackedDataset
+from rgbavatar_ns.drawing.wireframe import mesh_silhouette
 from rgbavatar_ns.head import HeadModel
 
 SMALL_PX = 96

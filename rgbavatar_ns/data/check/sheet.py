@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Int, UInt8
 
 from rgbavatar_ns.data.check.sample import Agreement, Sample, projected
-from rgbavatar_ns.data.dataset import TrackedDataset
-from rgbavatar_ns.data.mesh_drawing import with_wireframe
+from rgbavatar_ns.data.native.dataset import TrackedDataset
+from rgbavatar_ns.drawing.wireframe import with_wireframe
 
 _TILE_PX, _COLUMNS, MAX_TILES = 320, 4, 16
 _BEHIND = 128

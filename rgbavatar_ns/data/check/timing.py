@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from rgbavatar_ns.data.check.problems import Problem
 from rgbavatar_ns.data.check.sample import Sample, projected
-from rgbavatar_ns.data.dataset import TrackedDataset
+from rgbavatar_ns.data.native.dataset import TrackedDataset
 
 LARGEST_OFFSET = 2
 MAX_FRAMES = 90

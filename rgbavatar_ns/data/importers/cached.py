@@ -8,7 +8,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from rgbavatar_ns.data.dataset import TrackedDataset, load_native
 from rgbavatar_ns.data.importers.convert import (
     CACHE_FOLDER,
     fingerprint,
@@ -19,7 +18,8 @@ from rgbavatar_ns.data.importers.convert import (
 from rgbavatar_ns.data.importers.formats import find_format
 from rgbavatar_ns.data.importers.frame_files import Progress
 from rgbavatar_ns.data.importers.options import ImportOptions
-from rgbavatar_ns.data.native_format import INDEX_FILE
+from rgbavatar_ns.data.native.dataset import TrackedDataset, load_native
+from rgbavatar_ns.data.native.format import INDEX_FILE
 from rgbavatar_ns.errors import UserError
 
 _NO_BACKUP = "Signature: 8a477f597d28d172789f06886806bc55\n# Made by rgbavatar; may be deleted.\n"

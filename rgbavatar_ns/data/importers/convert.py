@@ -9,18 +9,18 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from rgbavatar_ns.data.dataset import TrackedDataset, load_native
-from rgbavatar_ns.data.importers.findings import Findings, UnusableFrameError
 from rgbavatar_ns.data.importers.flashavatar import tracker_folder
 from rgbavatar_ns.data.importers.folder import Folder
 from rgbavatar_ns.data.importers.formats import find_format, read_source
 from rgbavatar_ns.data.importers.frame_files import Progress
+from rgbavatar_ns.data.importers.frame_images import make_png
+from rgbavatar_ns.data.importers.import_report import ImportReport, UnusableFrameError
 from rgbavatar_ns.data.importers.options import ImportOptions
-from rgbavatar_ns.data.importers.pictures import make_png
 from rgbavatar_ns.data.importers.source import Source
 from rgbavatar_ns.data.json_file import write_json
-from rgbavatar_ns.data.native_format import INDEX_FILE
-from rgbavatar_ns.data.writer import DatasetWriter
+from rgbavatar_ns.data.native.dataset import TrackedDataset, load_native
+from rgbavatar_ns.data.native.format import INDEX_FILE
+from rgbavatar_ns.data.native.writer import DatasetWriter
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head.flame import FLAME_VARIABLE
 
@@ -143,7 +143,7 @@ def _write_image(source: Source, writer: DatasetWriter, position: int, link: boo
 
 
 def _settle(source: Source, unusable: dict[int, str], allow_partial: bool) -> None:
-    findings = Findings()
+    findings = ImportReport()
     for position, reason in sorted(unusable.items()):
         findings.leave_out(reason, [source.pictures[position].color.name])
     findings.settle(f"The {source.format} data in {source.root}", allow_partial)

@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from rgbavatar_ns.data.importers.findings import UnusableFrameError
 from rgbavatar_ns.data.importers.folder import finite
+from rgbavatar_ns.data.importers.import_report import UnusableFrameError
 from rgbavatar_ns.data.importers.source import Reading
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadArrays

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from rgbavatar_ns.data.importers.findings import UnusableFrameError, first_few
+from rgbavatar_ns.data.importers.import_report import UnusableFrameError, first_few
 from rgbavatar_ns.errors import UserError
 
 PICTURES = (".png", ".jpg", ".jpeg")

@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from rgbavatar_ns.data.importers.findings import UnusableFrameError
 from rgbavatar_ns.data.importers.flame_parameters import (
     flame_for,
     from_6d_rows,
@@ -23,6 +22,7 @@ from rgbavatar_ns.data.importers.flame_parameters import (
 )
 from rgbavatar_ns.data.importers.folder import matrix, numbers
 from rgbavatar_ns.data.importers.frame_record import CameraRecord
+from rgbavatar_ns.data.importers.import_report import UnusableFrameError
 from rgbavatar_ns.data.importers.source import Reading
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadArrays

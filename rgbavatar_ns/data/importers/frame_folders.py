@@ -4,11 +4,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from rgbavatar_ns.data.importers.findings import first_few
 from rgbavatar_ns.data.importers.folder import PICTURES, Folder
 from rgbavatar_ns.data.importers.frame_files import Progress, TrackedHeads, read_frame_files
+from rgbavatar_ns.data.importers.frame_images import Picture
 from rgbavatar_ns.data.importers.frame_record import FrameRecord
-from rgbavatar_ns.data.importers.pictures import Picture
+from rgbavatar_ns.data.importers.import_report import first_few
 from rgbavatar_ns.data.importers.source import Reading, Source, Split, assemble
 from rgbavatar_ns.errors import UserError
 

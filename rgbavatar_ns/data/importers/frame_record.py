@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from rgbavatar_ns.data.importers.findings import UnusableFrameError
-from rgbavatar_ns.data.importers.pictures import Picture
+from rgbavatar_ns.data.importers.frame_images import Picture
+from rgbavatar_ns.data.importers.import_report import UnusableFrameError
 
 _ROTATION_TOLERANCE = 1e-3
 

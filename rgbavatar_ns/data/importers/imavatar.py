@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 
-from rgbavatar_ns.data.importers.findings import UnusableFrameError
 from rgbavatar_ns.data.importers.flame_parameters import flame_for, padded
 from rgbavatar_ns.data.importers.folder import (
     PICTURES,
@@ -16,8 +15,9 @@ from rgbavatar_ns.data.importers.folder import (
     read_json,
 )
 from rgbavatar_ns.data.importers.frame_files import Progress
+from rgbavatar_ns.data.importers.frame_images import Picture, picture_header
 from rgbavatar_ns.data.importers.frame_record import CameraRecord, FrameRecord
-from rgbavatar_ns.data.importers.pictures import Picture, picture_header
+from rgbavatar_ns.data.importers.import_report import UnusableFrameError
 from rgbavatar_ns.data.importers.source import Reading, Source, Split, assemble
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadArrays

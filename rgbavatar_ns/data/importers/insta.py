@@ -6,14 +6,14 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from rgbavatar_ns.data.importers.findings import UnusableFrameError
 from rgbavatar_ns.data.importers.flame_parameters import flame_for, padded
 from rgbavatar_ns.data.importers.folder import Folder, number_of
 from rgbavatar_ns.data.importers.frame_files import FLAME_VERSION, Progress, read_frame_files
 from rgbavatar_ns.data.importers.frame_folders import CHECKPOINTS
+from rgbavatar_ns.data.importers.frame_images import Picture
 from rgbavatar_ns.data.importers.frame_record import FrameRecord
+from rgbavatar_ns.data.importers.import_report import UnusableFrameError
 from rgbavatar_ns.data.importers.mesh_fit import fit_meshes
-from rgbavatar_ns.data.importers.pictures import Picture
 from rgbavatar_ns.data.importers.source import Reading, Source, Split, assemble
 from rgbavatar_ns.data.importers.transforms import (
     INDEX_FILE,

@@ -9,8 +9,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from rgbavatar_ns.data.importers.findings import UnusableFrameError
 from rgbavatar_ns.data.importers.frame_files import Progress
+from rgbavatar_ns.data.importers.import_report import UnusableFrameError
 from rgbavatar_ns.data.importers.source import Reading
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadArrays, HeadModel

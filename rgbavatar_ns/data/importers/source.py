@@ -10,12 +10,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from rgbavatar_ns.data.importers.findings import Findings, UnusableFrameError
 from rgbavatar_ns.data.importers.folder import Folder
+from rgbavatar_ns.data.importers.frame_images import Picture, PictureHeader, picture_header
 from rgbavatar_ns.data.importers.frame_record import FrameRecord
 from rgbavatar_ns.data.importers.head_pose import all_is_the_cameras, place_head_pose
+from rgbavatar_ns.data.importers.import_report import ImportReport, UnusableFrameError
 from rgbavatar_ns.data.importers.options import HeadPose, ImportOptions
-from rgbavatar_ns.data.importers.pictures import Picture, PictureHeader, picture_header
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadArrays, HeadModel, ThetaLayout
 from rgbavatar_ns.kernels.types import PinholeCameras
@@ -38,7 +38,7 @@ class Reading:
     format: str
     folder: Folder
     options: ImportOptions
-    findings: Findings = field(default_factory=Findings)
+    findings: ImportReport = field(default_factory=ImportReport)
 
     def __str__(self) -> str:
         return f"The {self.format} data in {self.folder.root}"

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from rgbavatar_ns.data.importers.findings import UnusableFrameError
 from rgbavatar_ns.data.importers.folder import PICTURES, matrix, numbers, read_json
 from rgbavatar_ns.data.importers.frame_record import CameraRecord
+from rgbavatar_ns.data.importers.import_report import UnusableFrameError
 from rgbavatar_ns.data.importers.source import Reading
 from rgbavatar_ns.errors import UserError
 

@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from rgbavatar_ns.data.importers.findings import UnusableFrameError
 from rgbavatar_ns.data.importers.flame_parameters import flame_for, padded
 from rgbavatar_ns.data.importers.folder import Folder, finite, numbers, read_npz
 from rgbavatar_ns.data.importers.frame_files import Progress
+from rgbavatar_ns.data.importers.frame_images import Picture
 from rgbavatar_ns.data.importers.frame_record import FrameRecord
-from rgbavatar_ns.data.importers.pictures import Picture
+from rgbavatar_ns.data.importers.import_report import UnusableFrameError
 from rgbavatar_ns.data.importers.source import Reading, Source, Split, assemble
 from rgbavatar_ns.data.importers.transforms import (
     INDEX_FILE,

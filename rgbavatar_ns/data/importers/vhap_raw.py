@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from rgbavatar_ns.data.importers.findings import UnusableFrameError
 from rgbavatar_ns.data.importers.folder import PICTURES, Folder, numbers, read_npz
 from rgbavatar_ns.data.importers.frame_files import Progress
+from rgbavatar_ns.data.importers.frame_images import Picture, picture_header
 from rgbavatar_ns.data.importers.frame_record import CameraRecord, FrameRecord
-from rgbavatar_ns.data.importers.pictures import Picture, picture_header
+from rgbavatar_ns.data.importers.import_report import UnusableFrameError
 from rgbavatar_ns.data.importers.source import Reading, Source, Split, assemble
 from rgbavatar_ns.data.importers.vhap import VhapSubject
 from rgbavatar_ns.errors import UserError

@@ -6,12 +6,12 @@ import socket
 import time
 from types import TracebackType
 
-from rgbavatar_ns.data.frame import TrackedFrame
-from rgbavatar_ns.data.streams import wire
+from rgbavatar_ns.data.native.frame import TrackedFrame
+from rgbavatar_ns.data.streams import message_format as wire
 from rgbavatar_ns.data.streams.address import DEFAULT_ADDRESS, StreamAddress
 from rgbavatar_ns.data.streams.backoff import Backoff
 from rgbavatar_ns.data.streams.protocol import StreamSubject
-from rgbavatar_ns.data.streams.pushed import ACCEPTED, REFUSED
+from rgbavatar_ns.data.streams.socket_server import ACCEPTED, REFUSED
 from rgbavatar_ns.errors import UserError
 
 _ANSWER_S = 10.0

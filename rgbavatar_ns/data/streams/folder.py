@@ -6,10 +6,10 @@ import time
 from collections import Counter, deque
 from pathlib import Path
 
-from rgbavatar_ns.data.frame import TrackedFrame
-from rgbavatar_ns.data.streams import wire
-from rgbavatar_ns.data.streams.numbering import SeenNumbers
+from rgbavatar_ns.data.native.frame import TrackedFrame
+from rgbavatar_ns.data.streams import message_format as wire
 from rgbavatar_ns.data.streams.protocol import StreamedFrame, StreamSubject
+from rgbavatar_ns.data.streams.sequence_numbers import SeenNumbers
 from rgbavatar_ns.errors import UserError
 
 SUBJECT_FILE = "subject.rga"

@@ -8,9 +8,9 @@ from typing import Any
 import torch
 
 from rgbavatar_ns.data.png import png_header_size
-from rgbavatar_ns.data.streams.numbering import SeenNumbers
-from rgbavatar_ns.data.streams.pooled import FramePools
 from rgbavatar_ns.data.streams.protocol import FrameStream, Rewindable, StreamedFrame, StreamSubject
+from rgbavatar_ns.data.streams.replay_buffer import ReplayBuffer
+from rgbavatar_ns.data.streams.sequence_numbers import SeenNumbers
 from rgbavatar_ns.errors import UserError
 
 _PATIENCE_S = 0.1
@@ -79,7 +79,7 @@ class Ingest:
         self,
         stream: FrameStream,
         subject: StreamSubject,
-        pools: FramePools,
+        pools: ReplayBuffer,
         queue_frames: int = 256,
         tell: Callable[[str], None] = lambda line: None,
     ) -> None:

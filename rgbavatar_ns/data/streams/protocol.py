@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from rgbavatar_ns.data.frame import TrackedFrame
+from rgbavatar_ns.data.native.frame import TrackedFrame
 from rgbavatar_ns.data.png import decode_png_rgba
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadArrays, HeadModel, ThetaLayout

@@ -4,7 +4,7 @@ import bisect
 import time
 from collections import Counter
 
-from rgbavatar_ns.data.dataset import TrackedDataset
+from rgbavatar_ns.data.native.dataset import TrackedDataset
 from rgbavatar_ns.data.streams.protocol import StreamedFrame, StreamSubject
 from rgbavatar_ns.errors import UserError
 

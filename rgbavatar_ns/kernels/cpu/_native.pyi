@@ -47,7 +47,7 @@ class Session(_Drawing):
         threads: int,
     ) -> None: ...
 
-class Blended:
+class Morphed:
     def __init__(
         self,
         position: Tensor,
@@ -66,10 +66,10 @@ class Blended:
         variant: int,
     ) -> None: ...
 
-class BlendedSession(_Drawing):
+class MorphedSession(_Drawing):
     def __init__(
         self,
-        blended: Blended,
+        blended: Morphed,
         weights: Tensor,
         vertices: Tensor,
         world_to_camera: Tensor,
@@ -80,8 +80,8 @@ class BlendedSession(_Drawing):
         threads: int,
         instruction_set: str,
     ) -> None: ...
-    def compare(self, images_rgba: Tensor, background: Tensor) -> float: ...
-    def update(
+    def forward_loss(self, images_rgba: Tensor, background: Tensor) -> float: ...
+    def backward_adam(
         self,
         groups: list[tuple[Tensor, Tensor, Tensor, tuple[float, ...]]],
         weight_gradient: Tensor,

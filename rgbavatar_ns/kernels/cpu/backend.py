@@ -16,11 +16,11 @@ from rgbavatar_ns.kernels.cpu import (
     INSTRUCTION_SET_VARIABLE,
     _native,  # pyright: ignore[reportMissingModuleSource]
 )
-from rgbavatar_ns.kernels.cpu.blended import CpuBlendedRenderer
+from rgbavatar_ns.kernels.cpu.morphed import CpuMorphedRenderer
 from rgbavatar_ns.kernels.differentiable import Drawn, Gradients, draw_differentiably
 from rgbavatar_ns.kernels.types import (
-    BlendedGaussians,
     GaussianSet,
+    MorphedGaussians,
     PinholeCameras,
     RenderedBatch,
     WeightedColors,
@@ -99,7 +99,7 @@ def _draw(
 class CpuBackend:
     """Runs float32 tensors in main memory, on as many threads as torch uses."""
 
-    def refusal(self, device: torch.device, dtype: torch.dtype) -> str | None:
+    def unsupported_reason(self, device: torch.device, dtype: torch.dtype) -> str | None:
         """The reason, unless it is float32 on a CPU."""
         if device.type != "cpu" or dtype != torch.float32:
             return "it takes float32 tensors on the CPU"
@@ -142,15 +142,15 @@ class CpuBackend:
         session.average(images.detach().contiguous(), weighted_sum, weight_sum, max_weight)
         return WeightedColors(weighted_sum, weight_sum, max_weight)
 
-    def blended_renderer(
+    def morphed_renderer(
         self,
-        gaussians: BlendedGaussians,
+        gaussians: MorphedGaussians,
         weights: Float[Tensor, "B K"],
         vertices: Float[Tensor, "B V 3"],
         cameras: PinholeCameras,
-    ) -> CpuBlendedRenderer:
-        """As `blended.blended_renderer`."""
-        return CpuBlendedRenderer(gaussians, weights, vertices, cameras)
+    ) -> CpuMorphedRenderer:
+        """As `blended.morphed_renderer`."""
+        return CpuMorphedRenderer(gaussians, weights, vertices, cameras)
 
 
 def _attributes(gaussians: GaussianSet) -> tuple[Tensor, ...]:

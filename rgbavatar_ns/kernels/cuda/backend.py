@@ -10,13 +10,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from rgbavatar_ns.kernels.cuda.binning import Bins, Capacities, Images, blocks, camera_values
-from rgbavatar_ns.kernels.cuda.blended import CudaBlendedRenderer
 from rgbavatar_ns.kernels.cuda.launcher import Launcher
+from rgbavatar_ns.kernels.cuda.morphed import CudaMorphedRenderer
 from rgbavatar_ns.kernels.cuda.tiles import Tiles
 from rgbavatar_ns.kernels.differentiable import Drawn, Gradients, draw_differentiably
 from rgbavatar_ns.kernels.types import (
-    BlendedGaussians,
     GaussianSet,
+    MorphedGaussians,
     PinholeCameras,
     RenderedBatch,
     WeightedColors,
@@ -118,7 +118,7 @@ class CudaBackend:
         """The device's experience of how much room is needed."""
         return self._capacities.setdefault(device, Capacities())
 
-    def refusal(self, device: torch.device, dtype: torch.dtype) -> str | None:
+    def unsupported_reason(self, device: torch.device, dtype: torch.dtype) -> str | None:
         """The reason, unless it is float32 on an NVIDIA GPU."""
         if device.type != "cuda" or dtype != torch.float32:
             return "it takes float32 tensors on NVIDIA GPUs"
@@ -164,16 +164,16 @@ class CudaBackend:
         assert weighted_sum is not None
         return WeightedColors(weighted_sum, weight_sum, max_weight)
 
-    def blended_renderer(
+    def morphed_renderer(
         self,
-        gaussians: BlendedGaussians,
+        gaussians: MorphedGaussians,
         weights: Float[Tensor, "B K"],
         vertices: Float[Tensor, "B V 3"],
         cameras: PinholeCameras,
-    ) -> CudaBlendedRenderer:
-        """As `blended.blended_renderer`."""
+    ) -> CudaMorphedRenderer:
+        """As `blended.morphed_renderer`."""
         device = weights.device
-        return CudaBlendedRenderer(
+        return CudaMorphedRenderer(
             self.launcher(device), self.capacities(device), gaussians, weights, vertices, cameras
         )
 

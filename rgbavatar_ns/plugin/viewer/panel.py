@@ -19,9 +19,9 @@ from rgbavatar_ns.export import dataset_folder
 from rgbavatar_ns.export.driving import DrivingOptions
 from rgbavatar_ns.export.scenes import driven_by
 from rgbavatar_ns.kernels import PinholeCameras
-from rgbavatar_ns.plugin.viewer.picture import ViewerPicture, viewer_picture
+from rgbavatar_ns.plugin.viewer.render import ViewerPicture, viewer_picture
+from rgbavatar_ns.plugin.viewer.viewer_state import Stage, ViewerState, random_expression
 from rgbavatar_ns.plugin.viewer.widgets import Widgets
-from rgbavatar_ns.plugin.viewer.wishes import Stage, Wishes, random_expression
 
 # nerfstudio shows its world ten times as large in viser.
 _VISER_PER_METRE = 10.0
@@ -48,7 +48,7 @@ class ViewerPanel(ViewerControl):
 
     def __init__(self, stage: Stage, viewpoint: Viewpoint) -> None:
         self.stage = stage
-        self.wishes = Wishes(driven_by="viewer's time")
+        self.wishes = ViewerState(driven_by="viewer's time")
         self.playing = False
         self.frames_per_second = 25.0
         self._viewpoint = viewpoint
@@ -60,7 +60,7 @@ class ViewerPanel(ViewerControl):
     def _setup(self, viewer: Any) -> None:
         super()._setup(viewer)
         self._viewer = viewer
-        self.wishes = Wishes(backdrop=(1.0, 1.0, 1.0))
+        self.wishes = ViewerState(backdrop=(1.0, 1.0, 1.0))
         self._widgets = Widgets(viewer.viser_server.gui, self)
         viewer.viser_server.scene.set_up_direction("+z")
         viewer.viser_server.on_client_connect(self._place_camera)
@@ -85,7 +85,9 @@ class ViewerPanel(ViewerControl):
             if self._widgets is None:
                 raise
             trouble = _in_words(error)
-            plain = Wishes(driven_by=wishes.driven_by, frame=wishes.frame, backdrop=wishes.backdrop)
+            plain = ViewerState(
+                driven_by=wishes.driven_by, frame=wishes.frame, backdrop=wishes.backdrop
+            )
             picture = viewer_picture(self.stage, plain, camera, time_share, backend=backend)
         self._tell(picture, camera, time.perf_counter() - began, trouble)
         self._drawn.set()
@@ -184,10 +186,10 @@ class ViewerPanel(ViewerControl):
         if self._widgets is not None:
             self._widgets.tell(text)
 
-    def _present(self) -> Wishes:
+    def _present(self) -> ViewerState:
         """The wishes, but a camera path that is previewed shows what `ns-render` will."""
         if self._viewer is not None and self._viewer.render_tab_state.preview_render:
-            return Wishes(driven_by="viewer's time", backdrop=self.wishes.backdrop)
+            return ViewerState(driven_by="viewer's time", backdrop=self.wishes.backdrop)
         return self.wishes
 
     def _theta_now(self) -> Float[Tensor, "H"]:

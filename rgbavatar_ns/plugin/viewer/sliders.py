@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass
 
-from rgbavatar_ns.avatar.bundle_statistics import TrainingStatistics
+from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
 from rgbavatar_ns.export.driving import ThetaNames
 
 _AXES = "xyz"

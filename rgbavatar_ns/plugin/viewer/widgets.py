@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, get_args
 
 from rgbavatar_ns.export.driving import ThetaNames
 from rgbavatar_ns.plugin.viewer.sliders import TITLES, NumberSlider, number_sliders
-from rgbavatar_ns.plugin.viewer.wishes import DrivenBy, PictureKind, Wishes
+from rgbavatar_ns.plugin.viewer.viewer_state import DrivenBy, PictureKind, ViewerState
 
 if TYPE_CHECKING:
     from rgbavatar_ns.plugin.viewer.panel import ViewerPanel
@@ -39,7 +39,7 @@ class Widgets:
             with tabs.add_tab("Look"):
                 self._add_looks()
 
-    def follow(self, wishes: Wishes) -> None:
+    def follow(self, wishes: ViewerState) -> None:
         """Bring the controls to the panel's state."""
         self._put(self._driven_by, wishes.driven_by)
         self._put(self._frame, wishes.frame)

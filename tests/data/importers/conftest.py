@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from rgbavatar_ns.data.exporters import Take, TakeFrame
-from rgbavatar_ns.head.synthetic_flame import write_synthetic_flame
+from rgbavatar_ns.synthetic.exporters import Take, TakeFrame
+from rgbavatar_ns.synthetic.flame import write_synthetic_flame
 from tests.data.importers.takes import make_take
 
 

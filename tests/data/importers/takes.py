@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from rgbavatar_ns.data.exporters import Take, TakeFrame
 from rgbavatar_ns.head.flame import load_flame
 from rgbavatar_ns.kernels import PinholeCameras
+from rgbavatar_ns.synthetic.exporters import Take, TakeFrame
 
 WIDTH, HEIGHT = 24, 18
 NUM_FRAMES, NUM_TEST = 6, 2

@@ -15,8 +15,8 @@ from PIL import Image
 
 from rgbavatar_ns.data.check import unreadable_report
 from rgbavatar_ns.data.importers import ImportOptions, Source, frame_files, read_source
-from rgbavatar_ns.data.importers.findings import UnusableFrameError
-from rgbavatar_ns.data.importers.pictures import Picture, make_png, picture_header
+from rgbavatar_ns.data.importers.frame_images import Picture, make_png, picture_header
+from rgbavatar_ns.data.importers.import_report import UnusableFrameError
 from rgbavatar_ns.data.png import decode_png_rgba
 from rgbavatar_ns.errors import UserError
 from tests.data.importers.takes import FIRST, HEIGHT, NUM_FRAMES, WIDTH

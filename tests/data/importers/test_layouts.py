@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from rgbavatar_ns.data.importers import ImportOptions, find_format, read_source
-from rgbavatar_ns.data.importers.pictures import make_png
+from rgbavatar_ns.data.importers.frame_images import make_png
 from rgbavatar_ns.data.png import decode_png_rgba
 from rgbavatar_ns.errors import UserError
 from tests.data.importers.takes import FIRST, HEIGHT, NUM_FRAMES, WIDTH

@@ -10,20 +10,20 @@ import pytest
 import torch
 
 from rgbavatar_ns.data import TrackedDataset, load_dataset
-from rgbavatar_ns.data.exporters import Take, TakeFrame
-from rgbavatar_ns.data.exporters.folders import (
+from rgbavatar_ns.data.importers import ImportOptions, Source, import_dataset, read_source
+from rgbavatar_ns.data.importers.frame_images import Picture
+from rgbavatar_ns.data.importers.frame_record import CameraRecord, FrameRecord
+from rgbavatar_ns.data.importers.head_pose import place_head_pose
+from rgbavatar_ns.head import HeadModel
+from rgbavatar_ns.head.rotations import axis_angle_to_matrix
+from rgbavatar_ns.synthetic.exporters import Take, TakeFrame
+from rgbavatar_ns.synthetic.exporters.folders import (
     FlashAvatarWriter,
     IMAvatarWriter,
     InstaWriter,
     MetricalWriter,
     VhapWriter,
 )
-from rgbavatar_ns.data.importers import ImportOptions, Source, import_dataset, read_source
-from rgbavatar_ns.data.importers.frame_record import CameraRecord, FrameRecord
-from rgbavatar_ns.data.importers.head_pose import place_head_pose
-from rgbavatar_ns.data.importers.pictures import Picture
-from rgbavatar_ns.head import HeadModel
-from rgbavatar_ns.head.rotations import axis_angle_to_matrix
 from tests.data.importers.takes import FIRST, NUM_FRAMES, NUM_TEST
 
 FORMATS = {
@@ -213,8 +213,8 @@ def test_a_folder_of_another_system_opens_directly_and_the_second_time_as_our_ow
 
 @pytest.mark.slow
 def test_the_demo_subject_itself_comes_back(tmp_path):
-    from rgbavatar_ns.data.demo import DemoConfig, film_demo
-    from rgbavatar_ns.data.exporters import FLAME_FOLDER, write_demo
+    from rgbavatar_ns.synthetic import DemoConfig, film_demo
+    from rgbavatar_ns.synthetic.exporters import FLAME_FOLDER, write_demo
 
     config = DemoConfig(image_size=32, num_frames=2, num_test_frames=1, supersampling=1)
     write_demo(tmp_path / "data", "insta", config)

@@ -85,7 +85,7 @@ class EmulatedBackend(CudaBackend):
     def launcher(self, device: torch.device) -> Launcher:
         return self.emulated
 
-    def refusal(self, device: torch.device, dtype: torch.dtype) -> str | None:
+    def unsupported_reason(self, device: torch.device, dtype: torch.dtype) -> str | None:
         return None if dtype == torch.float32 else "it takes float32 tensors"
 
 

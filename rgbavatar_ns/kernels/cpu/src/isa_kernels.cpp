@@ -1,7 +1,7 @@
 // The loops over Gaussians and pixels. Compiled once per instruction set with RGBAVATAR_ISA naming
 // it; uses no inline function or template of the standard library, because the linker would merge
 // those of different instruction sets.
-#include "blended.h"
+#include "morphed.h"
 #include "mesh_gradient.h"
 #include "train_tile.h"
 
@@ -9,7 +9,7 @@ namespace rgbavatar::RGBAVATAR_ISA {
 
 extern const Kernels kernels;
 const Kernels kernels = {project_image, forward_tile, backward_tile, average_tile,
-                         project_image_backward, fill_frames, project_blended, train_tile,
-                         update_blended, mesh_gradient};
+                         project_image_backward, fill_frames, project_morphed, train_tile,
+                         update_morphed, mesh_gradient};
 
 }  // namespace rgbavatar::RGBAVATAR_ISA

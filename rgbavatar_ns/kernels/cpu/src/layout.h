@@ -123,11 +123,11 @@ struct alignas(64) TileScratch {
   Checkpoint* checkpoints;  // one for every kGroupSplats entries of the fullest tile, and one
 };
 
-// ---- Blended Gaussians ------------------------------------------------------------------------
+// ---- Morphed Gaussians ------------------------------------------------------------------------
 
 // Position, rotation and colour: what the bases change.
-constexpr int kBlendedKinds = 3;
-constexpr int kBlendedWidth[kBlendedKinds] = {3, 4, 3};
+constexpr int kMorphedKinds = 3;
+constexpr int kMorphedWidth[kMorphedKinds] = {3, 4, 3};
 // Gaussians that are blended at a time: many, because each basis is a stretch of memory of its own,
 // which a processor has to find first; the columns of a batch still fit the second cache.
 constexpr int kBlendChunk = 1024;
@@ -142,12 +142,12 @@ constexpr int kCarriedFloats = 12;
 
 // Gaussians in the tangent frames of a mesh, as base plus weighted bases (paper, eq. 1), for a
 // batch of meshes.
-struct BlendedScene {
+struct MorphedScene {
   int batch, count, bases, width, height;
   int vertices, triangles, variant;  // variant: TangentVariant
   const float* weights;              // [B, K]
-  const float* base[kBlendedKinds];   // [N, 3 or 4]
-  const float* basis[kBlendedKinds];  // [K, N, 3 or 4]
+  const float* base[kMorphedKinds];   // [N, 3 or 4]
+  const float* basis[kMorphedKinds];  // [K, N, 3 or 4]
   const float *log_scale, *opacity_logit;  // [N, 3], [N]
   const float *vertex, *barycentric;       // [B, V, 3], [N, 3]
   const int64_t *triangle_vertices, *triangle_of;  // [U, 3], [N]
@@ -161,13 +161,13 @@ struct AdamGroup {
   float rate, inverse_root, beta1, beta2, epsilon;
 };
 
-struct BlendedOptimizer {
-  AdamGroup base[kBlendedKinds], basis[kBlendedKinds], log_scale, opacity_logit;
+struct MorphedOptimizer {
+  AdamGroup base[kMorphedKinds], basis[kMorphedKinds], log_scale, opacity_logit;
 };
 
 // Scratch memory of one thread for a chunk of Gaussians.
 struct BlendScratch {
-  float* tangent[kBlendedKinds];   // [B, kBlendChunk * width]: blended, or the gradient of that
+  float* tangent[kMorphedKinds];   // [B, kBlendChunk * width]: blended, or the gradient of that
   float* weight_sums;              // [B, K, 16]
   float gradient[kBlendColumns];
   float scale[3][kBlendChunk], opacity[kBlendChunk];
@@ -196,10 +196,10 @@ struct Kernels {
   void (*project_backward)(const Scene&, const float* camera, int image, int begin, int end,
                            const ImageSlots&, const SceneGradient&);
   // Fills the frames [begin, end) of an image.
-  void (*fill_frames)(const BlendedScene&, int image, int begin, int end);
+  void (*fill_frames)(const MorphedScene&, int image, int begin, int end);
   // Blends and projects Gaussians [begin, end), at most kBlendChunk, of all images. `cameras` and
   // `images` hold one entry an image.
-  void (*project_blended)(const BlendedScene&, const float* cameras, int begin, int end,
+  void (*project_morphed)(const MorphedScene&, const float* cameras, int begin, int end,
                           BlendScratch&, const Projected* images);
   // Draws the tile, compares it with the target and writes its slots; returns the sum of absolute
   // differences.
@@ -207,12 +207,12 @@ struct Kernels {
   // Updates the parameters of Gaussians [begin, end), where there is an optimizer, and writes the
   // gradient of the weights that comes from them, [B, K], and, where it is asked for, what
   // `mesh_gradient` needs of them, [B, N, kCarriedFloats].
-  void (*update_blended)(const BlendedScene&, const float* cameras, int begin, int end,
-                         BlendScratch&, const ImageSlots* images, const BlendedOptimizer*,
+  void (*update_morphed)(const MorphedScene&, const float* cameras, int begin, int end,
+                         BlendScratch&, const ImageSlots* images, const MorphedOptimizer*,
                          float* weight_gradient, float* carried);
   // Writes the gradient of an image's vertices, [V, 3]; `frame_gradient` is scratch memory for
   // [U, kFrameFloats].
-  void (*mesh_gradient)(const BlendedScene&, int image, const float* carried,
+  void (*mesh_gradient)(const MorphedScene&, int image, const float* carried,
                         float* frame_gradient, float* vertex_gradient);
 };
 

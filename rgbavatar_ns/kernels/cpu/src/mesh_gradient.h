@@ -1,13 +1,13 @@
 // From the gradients of blended Gaussians to that of the mesh that carries them.
 #pragma once
 
-#include "blended.h"
+#include "morphed.h"
 
 namespace rgbavatar::RGBAVATAR_ISA {
 
 // Sums what a triangle's Gaussians pass on to its row of kFrameFloats: matrix, rotation, corner,
 // edges and length ratio, in the order of `fill_frames`.
-static void sum_frame_gradients(const BlendedScene& scene, const float* carried,
+static void sum_frame_gradients(const MorphedScene& scene, const float* carried,
                                 float* frame_gradient) {
   const int64_t floats = int64_t(scene.triangles) * kFrameFloats;
   for (int64_t i = 0; i < floats; ++i) frame_gradient[i] = 0.0f;
@@ -31,7 +31,7 @@ struct EdgeGradient {
   Vec3<Wide> corner, first, second;
 };
 
-static EdgeGradient edge_gradient(const BlendedScene& scene, const Wide frame[kFrameFloats],
+static EdgeGradient edge_gradient(const MorphedScene& scene, const Wide frame[kFrameFloats],
                                   const Wide d[kFrameFloats], const Wide inverse[4]) {
   const auto vec = [](const Wide* c) __attribute__((always_inline)) {
     return Vec3<Wide>{c[0], c[1], c[2]};
@@ -55,7 +55,7 @@ static EdgeGradient edge_gradient(const BlendedScene& scene, const Wide frame[kF
   return out;
 }
 
-static void mesh_gradient(const BlendedScene& scene, int image, const float* carried,
+static void mesh_gradient(const MorphedScene& scene, int image, const float* carried,
                           float* frame_gradient, float* vertex_gradient) {
   const float* frames = scene.frames + int64_t(image) * scene.triangles * kFrameFloats;
   sum_frame_gradients(scene, carried + int64_t(image) * scene.count * kCarriedFloats,

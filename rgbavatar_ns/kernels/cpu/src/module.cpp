@@ -115,8 +115,8 @@ struct Session : Drawing<rgbavatar::Rendering> {
   }
 };
 
-// Blended Gaussians with the mesh that carries them; keeps the tensors alive.
-struct Blended {
+// Morphed Gaussians with the mesh that carries them; keeps the tensors alive.
+struct Morphed {
   Input position, rotation, color, log_scale, opacity_logit;
   std::optional<Input> basis_position, basis_rotation, basis_color;
   Input barycentric, edges_to_frame;
@@ -124,7 +124,7 @@ struct Blended {
   Indices triangle_vertices, triangle_of;
   int variant;
 
-  rgbavatar::BlendedScene scene(const Input& weights, const Input& vertices, int width,
+  rgbavatar::MorphedScene scene(const Input& weights, const Input& vertices, int width,
                                 int height) const {
     return {int(weights.shape(0)),
             int(position.shape(0)),
@@ -157,13 +157,13 @@ rgbavatar::AdamGroup adam_group(const AdamArrays& arrays) {
   return {value.data(), first.data(), second.data(), n[0], n[1], n[2], n[3], n[4]};
 }
 
-// A BlendedRendering with the tensors that its later calls need.
-struct BlendedSession : Drawing<rgbavatar::BlendedRendering> {
-  Blended blended;
+// A MorphedRendering with the tensors that its later calls need.
+struct MorphedSession : Drawing<rgbavatar::MorphedRendering> {
+  Morphed blended;
   Input weights, vertices;
   int width, height;
 
-  BlendedSession(const Blended& blended, const Input& weights, const Input& vertices,
+  MorphedSession(const Morphed& blended, const Input& weights, const Input& vertices,
                  const Input& world_to_camera, const Input& focal_px,
                  const Input& principal_point_px, int width, int height, int threads,
                  const std::string& instruction_set)
@@ -176,25 +176,25 @@ struct BlendedSession : Drawing<rgbavatar::BlendedRendering> {
         width(width),
         height(height) {}
 
-  double compare(const Pixels& images, const Input& background) {
-    return rendering.compare(images.data(), attribute(background), threads);
+  double forward_loss(const Pixels& images, const Input& background) {
+    return rendering.forward_loss(images.data(), attribute(background), threads);
   }
 
-  void update(const std::vector<AdamArrays>& groups, const Output& weight_gradient,
+  void backward_adam(const std::vector<AdamArrays>& groups, const Output& weight_gradient,
               const std::optional<Output>& vertex_gradient) {
-    const rgbavatar::BlendedScene scene = blended.scene(weights, vertices, width, height);
+    const rgbavatar::MorphedScene scene = blended.scene(weights, vertices, width, height);
     if (groups.empty())
-      return rendering.update(scene, nullptr, weight_gradient.data(), pointer(vertex_gradient),
+      return rendering.backward_adam(scene, nullptr, weight_gradient.data(), pointer(vertex_gradient),
                               threads);
-    rgbavatar::BlendedOptimizer optimizer = {};
-    for (int kind = 0; kind < rgbavatar::kBlendedKinds; ++kind) {
+    rgbavatar::MorphedOptimizer optimizer = {};
+    for (int kind = 0; kind < rgbavatar::kMorphedKinds; ++kind) {
       optimizer.base[kind] = adam_group(groups[kind]);
       if (weights.shape(1) > 0)
         optimizer.basis[kind] = adam_group(groups[5 + kind]);
     }
     optimizer.log_scale = adam_group(groups[3]);
     optimizer.opacity_logit = adam_group(groups[4]);
-    rendering.update(scene, &optimizer, weight_gradient.data(), pointer(vertex_gradient), threads);
+    rendering.backward_adam(scene, &optimizer, weight_gradient.data(), pointer(vertex_gradient), threads);
   }
 };
 
@@ -226,8 +226,8 @@ NB_MODULE(_native, m) {
   using Release = nb::call_guard<nb::gil_scoped_release>;
   nb::class_<Drawing<rgbavatar::Rendering>> drawing(m, "Drawing");
   Drawing<rgbavatar::Rendering>::bind(drawing);
-  nb::class_<Drawing<rgbavatar::BlendedRendering>> blended_drawing(m, "BlendedDrawing");
-  Drawing<rgbavatar::BlendedRendering>::bind(blended_drawing);
+  nb::class_<Drawing<rgbavatar::MorphedRendering>> morphed_drawing(m, "MorphedDrawing");
+  Drawing<rgbavatar::MorphedRendering>::bind(morphed_drawing);
   nb::class_<Session, Drawing<rgbavatar::Rendering>>(m, "Session")
       .def(nb::init<const Gaussians&, const Input&, const Input&, const Input&, int, int, int, int,
                     const std::string&>(),
@@ -239,14 +239,14 @@ NB_MODULE(_native, m) {
            "alpha_grad"_a.noconvert().none(), "means"_a.noconvert(), "quats_wxyz"_a.noconvert(),
            "scales"_a.noconvert(), "opacities"_a.noconvert(), "colors"_a.noconvert(), "threads"_a,
            Release());
-  nb::class_<Blended>(m, "Blended")
+  nb::class_<Morphed>(m, "Morphed")
       .def("__init__",
-           [](Blended* self, Input position, Input rotation, Input color, Input log_scale,
+           [](Morphed* self, Input position, Input rotation, Input color, Input log_scale,
               Input opacity_logit, std::optional<Input> basis_position,
               std::optional<Input> basis_rotation, std::optional<Input> basis_color,
               Input barycentric, Input edges_to_frame, std::optional<Input> rest_length,
               Indices triangle_vertices, Indices triangle_of, int variant) {
-             new (self) Blended{position,       rotation,    color,          log_scale,
+             new (self) Morphed{position,       rotation,    color,          log_scale,
                                 opacity_logit,  basis_position, basis_rotation, basis_color,
                                 barycentric,    edges_to_frame, rest_length,
                                 triangle_vertices, triangle_of, variant};
@@ -257,15 +257,15 @@ NB_MODULE(_native, m) {
            "basis_color_feature"_a.noconvert().none(), "barycentric"_a.noconvert(),
            "edges_to_frame"_a.noconvert(), "rest_length"_a.noconvert().none(),
            "triangle_vertices"_a.noconvert(), "triangle_of"_a.noconvert(), "variant"_a);
-  nb::class_<BlendedSession, Drawing<rgbavatar::BlendedRendering>>(m, "BlendedSession")
-      .def(nb::init<const Blended&, const Input&, const Input&, const Input&, const Input&,
+  nb::class_<MorphedSession, Drawing<rgbavatar::MorphedRendering>>(m, "MorphedSession")
+      .def(nb::init<const Morphed&, const Input&, const Input&, const Input&, const Input&,
                     const Input&, int, int, int, const std::string&>(),
            "blended"_a, "weights"_a.noconvert(), "vertices"_a.noconvert(),
            "world_to_camera"_a.noconvert(), "focal_px"_a.noconvert(),
            "principal_point_px"_a.noconvert(), "width"_a, "height"_a, "threads"_a,
            "instruction_set"_a, Release())
-      .def("compare", &BlendedSession::compare, "images_rgba"_a.noconvert(),
+      .def("forward_loss", &MorphedSession::forward_loss, "images_rgba"_a.noconvert(),
            "background"_a.noconvert(), Release())
-      .def("update", &BlendedSession::update, "groups"_a, "weight_gradient"_a.noconvert(),
+      .def("backward_adam", &MorphedSession::backward_adam, "groups"_a, "weight_gradient"_a.noconvert(),
            "vertex_gradient"_a.noconvert().none() = nb::none(), Release());
 }

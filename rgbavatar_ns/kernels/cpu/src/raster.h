@@ -131,22 +131,22 @@ class Rendering {
 };
 
 // A Rendering of blended Gaussians, which can train them. The scene's memory is not kept.
-class BlendedRendering : public Rendering {
+class MorphedRendering : public Rendering {
  public:
-  BlendedRendering(BlendedScene scene, const Cameras& cameras, const std::string& instruction_set,
+  MorphedRendering(MorphedScene scene, const Cameras& cameras, const std::string& instruction_set,
                    int threads);
 
   // The mean absolute difference to images [B, H, W, 4] of 8 bits over backgrounds [B or 1, 3];
   // keeps what `update` needs.
-  double compare(const uint8_t* images, const Attribute& background, int threads);
+  double forward_loss(const uint8_t* images, const Attribute& background, int threads);
 
   // One step of Adam by the gradient of the last comparison, or none without an optimizer; writes
   // the gradients of the weights, [B, K], and, unless it is null, of the vertices, [B, V, 3].
-  void update(BlendedScene scene, const BlendedOptimizer* optimizer, float* weight_gradient,
+  void backward_adam(MorphedScene scene, const MorphedOptimizer* optimizer, float* weight_gradient,
               float* vertex_gradient, int threads);
 
  private:
-  void lay_out_blending(const BlendedScene& scene, const class Team& team);
+  void lay_out_blending(const MorphedScene& scene, const class Team& team);
 };
 
 }  // namespace rgbavatar

@@ -34,7 +34,7 @@ struct Bins {
 };
 
 // Gaussians in the tangent frames of a mesh, as base plus weighted bases (paper, eq. 1).
-struct Blended {
+struct Morphed {
   const float* weights;              // [B, K]
   const float* position;             // [N, 3]
   const float* rotation;             // [N, 4]
@@ -80,13 +80,13 @@ struct ProjectArguments {
 
 struct FramesArguments {
   Frame frame;
-  Blended blended;
+  Morphed blended;
 };
 
 struct BlendArguments {
   Frame frame;
   CameraArrays cameras;
-  Blended blended;
+  Morphed blended;
   Bins bins;
 };
 
@@ -172,7 +172,7 @@ struct ProjectBackwardArguments {
 struct BlendBackwardArguments {
   Frame frame;
   CameraArrays cameras;
-  Blended blended;
+  Morphed blended;
   Bins bins;
   const float* slots;    // [capacity, 9]
   float* position;       // [B, N, 3], like the others the gradient of each image
@@ -185,7 +185,7 @@ struct BlendBackwardArguments {
 
 struct FramesBackwardArguments {
   Frame frame;
-  Blended blended;
+  Morphed blended;
   const float* frame_gradient;  // [B, U, 24]
   float* corner_gradient;       // [B, U, 3, 3]
 };

@@ -66,7 +66,7 @@ RGBAVATAR_KERNEL(project_backward, ProjectBackwardArguments, kBlendThreads) {
 }
 
 // The gradient of one blended Gaussian in one image.
-RGBAVATAR_FUNCTION void blended_gradient(const BlendBackwardArguments& a, int image, int gaussian,
+RGBAVATAR_FUNCTION void morphed_gradient(const BlendBackwardArguments& a, int image, int gaussian,
                                          const Carried& c) {
   const int64_t row = int64_t(image) * a.frame.count + gaussian;
   const Splat s = splats_of(a.frame, a.bins, image)[gaussian];
@@ -111,7 +111,7 @@ RGBAVATAR_KERNEL(blend_backward, BlendBackwardArguments, kBlendThreads) {
   for (int i = 0; i < kBlendImages; ++i) {
     const int image = first_image + i;
     if (image >= a.frame.batch) break;
-    blended_gradient(a, image, gaussian,
+    morphed_gradient(a, image, gaussian,
                      carry(a.blended, image, gaussian, tangent.position[i], tangent.rotation[i],
                            tangent.color[i]));
   }
@@ -120,7 +120,7 @@ RGBAVATAR_KERNEL(blend_backward, BlendBackwardArguments, kBlendThreads) {
 // From the gradients of the triangles' frames to those of their corners.
 RGBAVATAR_KERNEL(frames_backward, FramesBackwardArguments, kBlendThreads) {
   const int triangle = int(blockIdx.x * blockDim.x + threadIdx.x), image = int(blockIdx.y);
-  const Blended& b = a.blended;
+  const Morphed& b = a.blended;
   if (triangle >= b.triangles) return;
   const int64_t row = int64_t(image) * b.triangles + triangle;
   const float *f = b.frames + row * kFrameFloats, *d = a.frame_gradient + row * kFrameFloats;

@@ -96,12 +96,12 @@ RGBAVATAR_KERNEL(project, ProjectArguments, kBlendThreads) {
        project(g, camera_of(a.cameras, a.frame, image)));
 }
 
-// ---- Blended Gaussians --------------------------------------------------------------------------
+// ---- Morphed Gaussians --------------------------------------------------------------------------
 
 // A triangle's frame in an image. `rows`: matrix, rotation, corner, edges, length ratio.
 RGBAVATAR_KERNEL(frames, FramesArguments, kBlendThreads) {
   const int triangle = int(blockIdx.x * blockDim.x + threadIdx.x), image = int(blockIdx.y);
-  const Blended& b = a.blended;
+  const Morphed& b = a.blended;
   if (triangle >= b.triangles) return;
   const float* vertices = b.vertices + int64_t(image) * b.vertex_count * 3;
   const int64_t* corners = b.triangle_vertices + int64_t(triangle) * 3;
@@ -150,7 +150,7 @@ RGBAVATAR_FUNCTION void blend_attribute(const float* base, const float* basis, i
 }
 
 // `weights` are those of the images that the block blends, [kBlendImages, K].
-RGBAVATAR_FUNCTION void blend_gaussian(const Blended& b, const Frame& frame, const float* weights,
+RGBAVATAR_FUNCTION void blend_gaussian(const Morphed& b, const Frame& frame, const float* weights,
                                        int gaussian, Tangent& out) {
   const int count = frame.count, bases = b.bases;
   blend_attribute<3>(b.position, b.basis_position, count, bases, weights, gaussian, out.position);
@@ -159,7 +159,7 @@ RGBAVATAR_FUNCTION void blend_gaussian(const Blended& b, const Frame& frame, con
 }
 
 // Copies the weights of a block's images to shared memory; 0 for images behind the batch's end.
-RGBAVATAR_FUNCTION void load_weights(const Blended& b, const Frame& frame, int first_image,
+RGBAVATAR_FUNCTION void load_weights(const Morphed& b, const Frame& frame, int first_image,
                                      float* weights) {
   for (int i = int(threadIdx.x); i < kBlendImages * b.bases; i += int(blockDim.x)) {
     const int image = first_image + i / b.bases;
@@ -183,7 +183,7 @@ RGBAVATAR_FUNCTION float bounded_exp(float x) {
   return exp2f(fminf(fmaxf(x * (2.0f * C::kHalfLog2E), -125.0f), 125.0f));
 }
 
-RGBAVATAR_FUNCTION Carried carry(const Blended& b, int image, int gaussian,
+RGBAVATAR_FUNCTION Carried carry(const Morphed& b, int image, int gaussian,
                                  const float position[3], const float rotation[4],
                                  const float color[3]) {
   const float* f =

@@ -1,0 +1,1 @@
+"""Corrections of tracked theta, learnt together with the avatar."""

@@ -1,0 +1,1 @@
+"""How an avatar learns: the step, the loop, losses and first colours."""

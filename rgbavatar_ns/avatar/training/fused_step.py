@@ -1,0 +1,80 @@
+"""The optimiser step without autograd, for what the eager step spends its time on.
+
+Blending, tangent frames, rasterisation, L1 and Adam of all Gaussian parameters run in the backend's
+own loops; torch keeps the weight network. Agrees with `training_step`'s eager path up to rounding.
+"""
+
+from collections.abc import Iterable
+
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from rgbavatar_ns.avatar.avatar import Avatar
+from rgbavatar_ns.avatar.training.losses import require_images_of
+from rgbavatar_ns.avatar.training.optimizer_states import AdamStates
+from rgbavatar_ns.kernels import MorphedGradient, MorphedRenderer, PinholeCameras
+
+
+class FusedStep:
+    """Trains an avatar with torch's Adam optimisers, whose state and learning rates it uses.
+
+    The optimisers' checkpoints are those of the eager path: a run can change between the two.
+
+    Raises:
+        ValueError: `unsupported_reason` gives a reason for these optimisers.
+    """
+
+    def __init__(self, avatar: Avatar, optimizers: Iterable[torch.optim.Optimizer]) -> None:
+        self._avatar, self._states = avatar, AdamStates(avatar, optimizers)
+
+    def __call__(
+        self,
+        theta: Float[Tensor, "B H"],
+        cameras: PinholeCameras,
+        images_rgba: UInt8[Tensor, "B H_px W_px 4"],
+        background: Float[Tensor, "B 3"],
+        backend: str = "auto",
+    ) -> Float[Tensor, ""] | None:
+        """Take one step and return the loss; None, and no step, where the backend cannot.
+
+        Where theta requires a gradient, `theta.grad` gets that of the loss before the step, as
+        from `backward`. Raises ValueError where the images are not of the cameras' size, or not as
+        many as theta.
+        """
+        # Compiled code reads what it is promised.
+        require_images_of(images_rgba, len(theta), cameras)
+        background = background.expand(len(theta), 3)
+        psi = self._avatar.weights(theta)
+        with torch.set_grad_enabled(theta.requires_grad):
+            vertices = self._avatar.carrier_vertices(theta.to(psi))
+        renderer = self._avatar.renderer(theta, cameras, psi.detach(), vertices, backend=backend)
+        if renderer is None:
+            return None
+        loss = renderer.forward_loss(images_rgba, background)
+        gradient = self.update_gaussians(renderer, with_vertices=theta.requires_grad)
+        self.update_network(psi, gradient.weights)
+        if gradient.vertices is not None:
+            vertices.backward(gradient.vertices)
+        return loss
+
+    def update_gaussians(
+        self, renderer: MorphedRenderer, *, with_vertices: bool = False
+    ) -> MorphedGradient:
+        """Step by the renderer's last comparison and return the gradient of what posed it."""
+        parameters = self._states.next_of_gaussians()
+        gradient = renderer.backward_adam(parameters, with_vertices=with_vertices)
+        self._states.count_gaussians()
+        return gradient
+
+    def update_network(
+        self, psi: Float[Tensor, "B K"], weight_gradient: Float[Tensor, "B K"]
+    ) -> None:
+        """Step with the weight network that gave psi."""
+        for optimizer in self._states.optimizers:
+            optimizer.zero_grad(set_to_none=True)
+        if psi.requires_grad:
+            psi.backward(weight_gradient)
+        # Of the Gaussians they find no gradient; hooks and schedules still see each take its step.
+        for optimizer in self._states.optimizers:
+            optimizer.step()

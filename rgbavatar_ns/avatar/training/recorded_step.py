@@ -1,0 +1,181 @@
+"""The whole optimiser step as one CUDA graph: the host says which frames, and waits for nothing.
+
+Frames lie on the device as 8-bit images. A replay takes what changes from step to step (frames,
+backgrounds, Adam's numbers) from one small buffer; blending, drawing, loss, gradients, Adam and the
+weight network with its own gradients and Adam are in the graph.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from rgbavatar_ns.avatar.avatar import Avatar
+from rgbavatar_ns.avatar.training.cuda_graph import Recorder, record_cuda_graph, supports
+from rgbavatar_ns.avatar.training.optimizer_states import AdamStates
+from rgbavatar_ns.kernels import UPDATED_ATTRIBUTES, DeviceRenderer, PinholeCameras
+
+_NUMBERS = 5
+_EAGER_STEPS = 3
+"""Steps before the recording: libraries make their handles, and the lists' room is measured."""
+_LOOK_EVERY = 200
+"""Steps between two looks at how many overflowed."""
+
+
+@dataclass(frozen=True)
+class DeviceFrames:
+    """All frames that are trained on, on one device; one camera, or one a frame."""
+
+    theta: Float[Tensor, "F H"]
+    cameras: PinholeCameras
+    images_rgba: UInt8[Tensor, "F height width 4"]
+
+
+class RecordedStep:
+    """Trains an avatar with torch's Adam optimisers on frames that lie on its device.
+
+    The first steps run kernel by kernel, then the step is recorded. A step whose tiles' lists do
+    not fit changes no Gaussian; `skipped_steps` counts them, and the step is recorded anew with
+    more room.
+
+    Raises:
+        ValueError: the optimisers cannot be used (`unsupported_reason`), or the frames' backend has
+            no renderer that works without the host (`supports`).
+    """
+
+    def __init__(
+        self,
+        avatar: Avatar,
+        optimizers: Iterable[torch.optim.Optimizer],
+        frames: DeviceFrames,
+        batch_size: int,
+        *,
+        backend: str = "auto",
+        recorder: Recorder = record_cuda_graph,
+    ) -> None:
+        self._avatar, self.frames, self._backend = avatar, frames, backend
+        self._states, self._recorder = AdamStates(avatar, optimizers), recorder
+        self._replay: Callable[[], None] | None = None
+        self._places: list[int] = []
+        self._optimizers_told = False
+        self._steps = self.skipped_steps = 0
+        device = frames.theta.device
+        self._network = avatar.parameter_groups().get("weight_network", [])
+        rows = len(UPDATED_ATTRIBUTES) + 1
+        # One buffer, so that one copy brings a step's news: frames, backgrounds, Adam's numbers.
+        self._sizes = (batch_size, 3 * batch_size, rows * 2 * _NUMBERS)
+        self._step_inputs = torch.zeros(sum(self._sizes), dtype=torch.float64, device=device)
+        self._loss = torch.zeros((), device=device)
+        self._overflows = torch.zeros((), dtype=torch.int64, device=device)
+        self._needed = torch.zeros((), dtype=torch.int32, device=device)
+        first = frames.cameras.select([0])
+        if not supports(avatar, frames.theta[:1], first, backend):
+            raise ValueError("This backend's steps need the host. Use FusedStep.")
+
+    def __call__(
+        self, chosen: Sequence[int], background: Float[Tensor, "B 3"]
+    ) -> Float[Tensor, ""]:
+        """Take one step on the frames `chosen`; returns its loss, on the device.
+
+        The backgrounds come from main memory. Raises ValueError for another number of frames than
+        `batch_size`.
+        """
+        if len(chosen) != self._sizes[0] or len(background) != len(chosen):
+            raise ValueError(f"{len(chosen)} frames in a step recorded for {self._sizes[0]}.")
+        self._gaussian_states = self._states.next_of_gaussians()
+        self._network_states = self._states.next_of_network()
+        self._forget_if_moved()
+        if not self._optimizers_told:
+            self._tell_optimizers()
+        news = [*map(float, chosen), *background.flatten().tolist(), *self._numbers()]
+        # From pageable memory: the driver keeps its own copy at once, whatever the device does.
+        self._step_inputs.copy_(torch.tensor(news, dtype=torch.float64), non_blocking=True)
+        if self._steps < _EAGER_STEPS:
+            self._work()
+        else:
+            if self._replay is None:
+                self._replay = self._recorder(self._work)
+            self._replay()
+        self._states.recount_all()
+        self._steps += 1
+        if self._steps % _LOOK_EVERY == 0:
+            self._look()
+        return self._loss.clone()
+
+    def _tell_optimizers(self) -> None:
+        """A step without gradients changes nothing; schedules ask that there was one."""
+        for optimizer in self._states.optimizers:
+            optimizer.zero_grad(set_to_none=True)
+            optimizer.step()
+        self._optimizers_told = True
+
+    def _forget_if_moved(self) -> None:
+        """A recording names places in memory; a checkpoint that was loaded lies elsewhere."""
+        states = [*self._gaussian_states.values(), *self._network_states]
+        tensors = [t for s in states for t in (s.value, s.first_moment, s.second_moment)]
+        places = [t.data_ptr() for t in (*tensors, *self._states.steps())]
+        if places != self._places:
+            self._replay, self._places = None, places
+
+    def _numbers(self) -> list[float]:
+        """Adam's numbers, row by row: base and bases of each attribute, then the network's."""
+        states, numbers = self._gaussian_states, []
+        for name in UPDATED_ATTRIBUTES:
+            for key in (name, f"basis_{name}"):
+                numbers += states[key].step_numbers() if key in states else (0.0,) * _NUMBERS
+        network = self._network_states
+        numbers += network[0].step_numbers() if network else (0.0,) * _NUMBERS
+        return [*numbers, *(0.0,) * _NUMBERS]
+
+    def _work(self) -> None:
+        """One step, from the news: nothing here may wait for the device or copy from the host."""
+        chosen, background, numbers = self._step_inputs.split(self._sizes)
+        rows = numbers.float().view(-1, 2 * _NUMBERS)
+        index = chosen.long()
+        renderer, psi = self._renderer(index)
+        assert isinstance(renderer, DeviceRenderer)
+        self._loss.copy_(
+            renderer.compare_with(self.frames.images_rgba, index, background.float().view(-1, 3))
+        )
+        gradient = renderer.update_with(self._gaussian_states, rows[:-1])
+        if self._network:
+            grads = torch.autograd.grad(psi, self._network, gradient.weights)
+            for state, grad in zip(self._network_states, grads):
+                renderer.update_parameter(state, grad, rows[-1])
+        self._states.add_one_to_all()
+        self._overflows += renderer.overflowed
+        torch.maximum(self._needed, renderer.needed, out=self._needed)
+        self._renderer_of_last_step = renderer
+
+    def _renderer(self, index: Tensor) -> tuple[Any, Tensor]:
+        frames = self.frames
+        theta, cameras = frames.theta.index_select(0, index), frames.cameras
+        if len(cameras.focal_px) > 1:
+            cameras = PinholeCameras(
+                cameras.world_to_camera.index_select(0, index),
+                cameras.focal_px.index_select(0, index),
+                cameras.principal_point_px.index_select(0, index),
+                cameras.width,
+                cameras.height,
+            )
+        with torch.enable_grad():
+            psi = self._avatar.weights(theta)
+        with torch.no_grad():
+            vertices = self._avatar.carrier_vertices(theta)
+        renderer = self._avatar.renderer(
+            theta, cameras, psi.detach(), vertices, backend=self._backend
+        )
+        return renderer, psi
+
+    def _look(self) -> None:
+        """Where steps overflowed: count them, make room, and record the step anew."""
+        overflows = int(self._overflows)
+        if overflows == 0:
+            return
+        self.skipped_steps += overflows
+        self._overflows.zero_()
+        self._renderer_of_last_step.make_room(int(self._needed))
+        self._replay, self._steps = None, 0

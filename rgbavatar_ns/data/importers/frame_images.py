@@ -1,0 +1,163 @@
+"""How a frame's RGBA image is made of a format's files: colour, matte and parsing masks."""
+
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from rgbavatar_ns.data.importers.import_report import UnusableFrameError
+from rgbavatar_ns.data.png import decode_png_rgba, encode_png_rgba, png_damage, png_header_size
+from rgbavatar_ns.errors import UserError
+
+_JPEG_START, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
+_GREY_TOLERANCE = 24
+"""JPEG files of grey pictures come out a little coloured."""
+_PNG_COMPRESSION = 1
+"""Half the time of the usual 3, for files a few percent larger."""
+_PNG_HEADER_BYTES, _JPEG_HEADER_BYTES = 33, 1 << 16
+
+
+@dataclass(frozen=True)
+class Picture:
+    """Files of one image, all of one size.
+
+    color: PNG or JPEG; its own alpha counts where there is no `alpha`.
+    alpha: grey picture that is the matte.
+    regions: grey pictures; the matte is kept only where one of them is white.
+    """
+
+    color: Path
+    alpha: Path | None = None
+    regions: tuple[Path, ...] = ()
+
+
+@dataclass(frozen=True)
+class PictureHeader:
+    """What a file's first bytes say."""
+
+    width: int
+    height: int
+    has_alpha: bool
+
+
+def picture_header(path: Path) -> PictureHeader:
+    """Size and kind from a file's first bytes; raises UnusableFrameError."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(_PNG_HEADER_BYTES)
+            if head[:2] == _JPEG_START:
+                head += file.read(_JPEG_HEADER_BYTES)
+                # A long colour profile or thumbnail may come first.
+                found = _jpeg_header(head) or _jpeg_header(head + file.read())
+                size, has_alpha = (None if found is None else found[:2]), False
+            else:
+                # Colour types 4 and 6 are grey and RGB with alpha.
+                size, has_alpha = png_header_size(head), head[25:26] in (b"\x04", b"\x06")
+    except FileNotFoundError:
+        raise UnusableFrameError("images that are missing") from None
+    except OSError:
+        raise UnusableFrameError("images that cannot be read") from None
+    if not size or 0 in size:
+        raise UnusableFrameError("images that are neither PNG nor JPEG, or damaged")
+    return PictureHeader(*size, has_alpha)
+
+
+@dataclass(frozen=True)
+class EncodedPicture:
+    """A PNG; `is_original` where it is the very bytes of the colour's file."""
+
+    encoded: bytes
+    is_original: bool
+
+
+def make_png(picture: Picture, size: tuple[int, int]) -> EncodedPicture:
+    """The picture as an RGBA PNG, straight alpha; a file that is one already stays as it is.
+
+    size: (width, height) that every part must have. Raises UnusableFrameError.
+    """
+    encoded = _read(picture.color)
+    plain = picture.alpha is None and not picture.regions
+    # Colour type 6 at depth 8 is RGBA of bytes.
+    if plain and encoded[:4] == b"\x89PNG" and encoded[24:26] == b"\x08\x06":
+        if png_damage(encoded) is not None:
+            raise UnusableFrameError("images that are damaged or cut short")
+        _require_size(png_header_size(encoded), size)
+        return EncodedPicture(encoded, True)
+    image = _compose(picture, encoded, size)
+    return EncodedPicture(encode_png_rgba(image, _PNG_COMPRESSION), False)
+
+
+def _compose(
+    picture: Picture, encoded: bytes, size: tuple[int, int]
+) -> UInt8[np.ndarray, "height width 4"]:
+    image = _decode(encoded)
+    _require_size(image.shape[1::-1], size)
+    if picture.alpha is not None:
+        image[..., 3] = _grey(picture.alpha, size)
+    if picture.regions:
+        kept = np.maximum.reduce([_grey(path, size) for path in picture.regions])
+        product = image[..., 3].astype(np.uint16) * kept
+        image[..., 3] = ((product + 127) // 255).astype(np.uint8)
+    return image
+
+
+def _read(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except FileNotFoundError:
+        raise UnusableFrameError("images that are missing") from None
+    except OSError:
+        raise UnusableFrameError("images that cannot be read") from None
+
+
+def _require_size(found: tuple[int, ...] | None, size: tuple[int, int]) -> None:
+    if found is None or tuple(found) != size:
+        raise UnusableFrameError("images whose parts differ in size")
+
+
+def _decode(encoded: bytes) -> UInt8[np.ndarray, "height width 4"]:
+    """RGBA of a PNG of any kind or an RGB or grey JPEG; raises UnusableFrameError."""
+    if encoded[:2] != _JPEG_START:
+        try:
+            return decode_png_rgba(encoded, "")
+        except UserError:
+            raise UnusableFrameError("images that are damaged or cut short") from None
+    header = _jpeg_header(encoded)
+    if header is None or encoded.rfind(_JPEG_END) < encoded.find(b"\xff\xda"):
+        raise UnusableFrameError("images that are damaged or cut short")
+    if header[2] == 4:
+        raise UnusableFrameError("CMYK JPEG images (convert them to RGB)")
+    # As most trackers read it: turned as its EXIF orientation says.
+    decoded = cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_COLOR)
+    if decoded is None:
+        raise UnusableFrameError("images that are damaged or cut short")
+    return cv2.cvtColor(decoded, cv2.COLOR_BGR2RGBA)
+
+
+def _grey(path: Path, size: tuple[int, int]) -> UInt8[np.ndarray, "height width"]:
+    """A mask from 0 to 255; one that holds nothing but 0 and 1 is meant as 0 and 255."""
+    image = _decode(_read(path))
+    _require_size(image.shape[1::-1], size)
+    color = image[..., :3]
+    if int((color.max(-1) - color.min(-1)).max()) > _GREY_TOLERANCE:
+        raise UnusableFrameError("masks that are coloured")
+    grey = color[..., 1]
+    return grey * np.uint8(255) if grey.max() == 1 else grey
+
+
+def _jpeg_header(encoded: bytes) -> tuple[int, int, int] | None:
+    """(width, height, components) from a JPEG's frame header; None where there is none."""
+    place = 2
+    while place + 9 < len(encoded) and encoded[place] == 0xFF:
+        marker = encoded[place + 1]
+        if marker == 0xFF:  # fill bytes
+            place += 1
+            continue
+        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
+            height, width, components = struct.unpack(">HHB", encoded[place + 5 : place + 10])
+            return width, height, components
+        place += 2 + struct.unpack(">H", encoded[place + 2 : place + 4])[0]
+    return None

@@ -1,0 +1,328 @@
+"""A folder of tracked frames, read and checked: every fault is one error with its remedy."""
+
+import json
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from rgbavatar_ns.data.native.format import (
+    FORMAT,
+    HEAD_FILE,
+    INDEX_FILE,
+    THETA_FILE,
+    VERSIONS,
+    cameras_from_json,
+)
+from rgbavatar_ns.data.png import png_size, read_png_rgba
+from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.head import HeadArrays, HeadModel, ThetaLayout
+from rgbavatar_ns.kernels.types import PinholeCameras
+
+_MAKE_ONE = (
+    "Make a dataset with `rgbavatar demo-data FOLDER` or `rgbavatar track VIDEO FOLDER` and pass "
+    "that folder, or pass another system's output as docs/dataset_format.md lists them."
+)
+_WRITE_AGAIN = "Write the dataset again, or mend this file."
+
+
+@dataclass(frozen=True)
+class TrackedDataset:
+    """Tracked frames of one person; images stay on disk until they are asked for.
+
+    A "position" counts frames in the order of this dataset from 0; `frame_index` says which frame
+    of the source that is. `train` and `test` partition the positions.
+    """
+
+    root: Path
+    arrays: HeadArrays
+    identity: Float[Tensor, "I"]
+    layout: ThetaLayout
+    theta: Float[Tensor, "F H"]
+    cameras: PinholeCameras
+    """One for each frame (C = F), also where all are the same."""
+    image_paths: list[Path]
+    frame_index: tuple[int, ...]
+    width: int
+    height: int
+    test: tuple[int, ...]
+    """Positions of the held-out frames: the last ones as in the paper, or those of held-out
+    cameras and moments, as the source has it."""
+    camera_names: tuple[str, ...] = ()
+    """Which of several cameras saw each frame; empty where there is one camera."""
+    timesteps: tuple[int, ...] = ()
+    """The moment of each frame, the same for all cameras; empty where each frame has its own."""
+    source: Mapping[str, Any] = field(default_factory=dict)
+    """Where an imported dataset came from: `format`, `path`, `notes`."""
+
+    def __len__(self) -> int:
+        return len(self.image_paths)
+
+    @property
+    def train(self) -> tuple[int, ...]:
+        """Positions of the frames to train from."""
+        held_out = set(self.test)
+        return tuple(position for position in range(len(self)) if position not in held_out)
+
+    def read_image(self, position: int) -> UInt8[np.ndarray, "height width 4"]:
+        """Decode one frame to RGBA with straight alpha.
+
+        Raises UserError naming the file where it is missing, damaged or of another size.
+        """
+        path = self.image_paths[position]
+        image = read_png_rgba(path)
+        height, width = image.shape[:2]
+        _check_size(path, (width, height), (self.width, self.height))
+        return image
+
+
+def load_native(path: str | Path) -> TrackedDataset:
+    """Read a folder in the project's own format; pixels are read and checked when decoded.
+
+    Raises UserError for a missing or empty folder, another format or version, theta that holds
+    NaN or does not fit the head, cameras that are none, images that are missing, cut short or
+    of different sizes.
+    """
+    root = Path(path)
+    index = _read_index(root)
+    width, height = _whole(index, "width"), _whole(index, "height")
+    arrays = _read_head(root, str(index.get("head")))
+    layout = _read_layout(root, index, arrays)
+    identity = _read_identity(root, index, arrays)
+    frames = _read_frames(root, index)
+    numbers = tuple(frame["index"] for frame in frames)
+    theta = _read_theta(root, layout, numbers)
+    cameras = cameras_from_json(_camera_records(root, index, frames), width, height)
+    image_paths = [root / frame["image"] for frame in frames]
+    for image_path in image_paths:
+        _check_size(image_path, png_size(image_path), (width, height))
+    source = index.get("source", {})
+    return TrackedDataset(
+        root,
+        arrays,
+        identity,
+        layout,
+        theta,
+        cameras,
+        image_paths,
+        numbers,
+        width,
+        height,
+        _read_test(root, index, numbers),
+        _column(root, frames, "camera_name", str),
+        _column(root, frames, "timestep", int),
+        source if isinstance(source, dict) else {},
+    )
+
+
+def _read_index(root: Path) -> dict[str, Any]:
+    if not root.exists():
+        raise UserError(f"The dataset folder {root} does not exist.", _MAKE_ONE)
+    if not root.is_dir():
+        raise UserError(f"{root} is a file, not a dataset folder.", _MAKE_ONE)
+    path = root / INDEX_FILE
+    if not path.exists():
+        what = "is empty" if not any(root.iterdir()) else f"has no {INDEX_FILE}"
+        raise UserError(f"The dataset folder {root} {what}.", _MAKE_ONE)
+    try:
+        index = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise UserError(f"{path} cannot be read: {error}.", _WRITE_AGAIN) from None
+    if not isinstance(index, dict) or index.get("format") != FORMAT:
+        raise UserError(f'{path} does not say "format": "{FORMAT}".', _MAKE_ONE)
+    if index.get("version") not in VERSIONS:
+        raise UserError(
+            f"{path} has version {index.get('version')} of the format; versions "
+            f"{', '.join(map(str, VERSIONS))} are known.",
+            "Update rgbavatar-ns, or write the dataset again with this version of it.",
+        )
+    missing = [name for name in ("head", "identity", "layout", "frames") if name not in index]
+    if missing:
+        raise UserError(f"{path} lacks {', '.join(missing)}.", _WRITE_AGAIN)
+    return index
+
+
+def _whole(index: dict[str, Any], name: str) -> int:
+    value = index.get(name)
+    if not isinstance(value, int) or value < 1:
+        raise UserError(
+            f"{INDEX_FILE} has {name} = {value!r}; a positive whole number is needed.",
+            _WRITE_AGAIN,
+        )
+    return value
+
+
+def _read_head(root: Path, name: str) -> HeadArrays:
+    path = root / HEAD_FILE
+    if path.exists():
+        return HeadArrays.load(path)
+    embedded = HeadArrays.embedded()
+    if name != embedded.name:
+        raise UserError(
+            f"The dataset {root} was made for the head '{name}', which is not known here.",
+            f"Put its arrays beside it as {HEAD_FILE}, or track the video with the embedded head "
+            f"'{embedded.name}'.",
+        )
+    return embedded
+
+
+def _read_layout(root: Path, index: dict[str, Any], arrays: HeadArrays) -> ThetaLayout:
+    layout = ThetaLayout.from_json(index["layout"])
+    expected = HeadModel(arrays).layout
+    if layout != expected:
+        raise UserError(
+            f"The dataset {root} has theta of {layout.size} values ({layout}), but the head "
+            f"'{arrays.name}' takes {expected.size} ({expected}).",
+            "Track the video again with this head.",
+        )
+    return layout
+
+
+def _read_identity(root: Path, index: dict[str, Any], arrays: HeadArrays) -> Float[Tensor, "I"]:
+    try:
+        identity = torch.tensor(index["identity"], dtype=torch.float32)
+    except (TypeError, ValueError):
+        identity = torch.full((1,), torch.nan)
+    if identity.shape != (arrays.num_identity,) or not torch.isfinite(identity).all():
+        raise UserError(
+            f"The identity in {root / INDEX_FILE} is not a list of {arrays.num_identity} finite "
+            f"numbers, which the head '{arrays.name}' takes.",
+            _WRITE_AGAIN,
+        )
+    return identity
+
+
+def _read_frames(root: Path, index: dict[str, Any]) -> list[dict[str, Any]]:
+    frames = index["frames"]
+    if not isinstance(frames, list) or not frames:
+        raise UserError(f"The dataset {root} lists no frames.", _MAKE_ONE)
+    for frame in frames:
+        whole = isinstance(frame, dict) and isinstance(frame.get("index"), int)
+        if not whole or not isinstance(frame.get("image"), str):
+            raise UserError(
+                f"{root / INDEX_FILE} has a frame without a number or an image: {frame}.",
+                _WRITE_AGAIN,
+            )
+        relative = PurePosixPath(frame["image"])
+        if relative.is_absolute() or ".." in relative.parts:
+            raise UserError(
+                f"{root / INDEX_FILE} names the image {relative}, which is not in its folder.",
+                _WRITE_AGAIN,
+            )
+    counts = Counter(frame["index"] for frame in frames)
+    twice = [number for number, count in counts.items() if count > 1]
+    if twice:
+        raise UserError(
+            f"The dataset {root} has {len(twice)} frame numbers more than once "
+            f"({_first_few(twice)}).",
+            "Give every frame a number of its own.",
+        )
+    return frames
+
+
+def _read_theta(root: Path, layout: ThetaLayout, numbers: tuple[int, ...]) -> Float[Tensor, "F H"]:
+    path = root / THETA_FILE
+    try:
+        theta = np.load(path, allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise UserError(f"{path} cannot be read: {error}.", _WRITE_AGAIN) from None
+    expected = (len(numbers), layout.size)
+    if theta.shape != expected or theta.dtype.kind != "f":
+        raise UserError(
+            f"{path} holds {theta.dtype} of shape {theta.shape}; {len(numbers)} frames of "
+            f"{layout.size} values ({layout}) need floats of shape {expected}.",
+            "Write the dataset again with the layout of its head.",
+        )
+    wrong = [number for number, row in zip(numbers, theta) if not np.isfinite(row).all()]
+    if wrong:
+        raise UserError(
+            f"{path} holds NaN or infinite values in {len(wrong)} of {len(numbers)} frames "
+            f"({_first_few(wrong)}).",
+            "Track these frames again, or leave them out of the dataset.",
+        )
+    return torch.from_numpy(theta.astype(np.float32))
+
+
+def _camera_records(
+    root: Path, index: dict[str, Any], frames: list[dict[str, Any]]
+) -> list[tuple[str, Any]]:
+    """Each frame's label and camera: its own, one of a name, or the one for all."""
+    shared, named = index.get("camera"), index.get("cameras", {})
+    records = []
+    for frame in frames:
+        camera = frame.get("camera", shared)
+        if isinstance(camera, str):
+            if not isinstance(named, dict) or camera not in named:
+                raise UserError(
+                    f"{root / INDEX_FILE} names the camera '{camera}' in frame {frame['index']}, "
+                    "but does not describe it.",
+                    _WRITE_AGAIN,
+                )
+            camera = named[camera]
+        records.append((f"frame {frame['index']}", camera))
+    return records
+
+
+def _read_test(root: Path, index: dict[str, Any], numbers: tuple[int, ...]) -> tuple[int, ...]:
+    """Positions of held-out frames: `test` names them, `test_frames` counts them from the end."""
+    if "test" not in index:
+        count = _read_test_frames(root, index, len(numbers))
+        return tuple(range(len(numbers) - count, len(numbers)))
+    listed = index["test"]
+    if not isinstance(listed, list) or not {type(number) for number in listed} <= {int}:
+        raise UserError(
+            f"{root / INDEX_FILE} has a `test` that is no list of frame numbers.", _WRITE_AGAIN
+        )
+    held_out = set(listed)
+    unknown = sorted(held_out - set(numbers))
+    if unknown or len(held_out) >= len(numbers):
+        what = f"{len(unknown)} that are not there ({_first_few(unknown)})" if unknown else "all"
+        raise UserError(
+            f"The dataset {root} holds out {what} of its {len(numbers)} frames.",
+            f"Mend the list `test` in {INDEX_FILE}: numbers of frames, but not of all.",
+        )
+    return tuple(place for place, number in enumerate(numbers) if number in held_out)
+
+
+def _read_test_frames(root: Path, index: dict[str, Any], num_frames: int) -> int:
+    count = index.get("test_frames")
+    if not isinstance(count, int) or not 0 <= count < num_frames:
+        raise UserError(
+            f"The dataset {root} holds out {count!r} of {num_frames} frames.",
+            f"Set test_frames in {INDEX_FILE} to a number from 0 to {num_frames - 1}.",
+        )
+    return count
+
+
+def _column(root: Path, frames: list[dict[str, Any]], name: str, kind: type) -> tuple[Any, ...]:
+    """An optional entry of all frames, or nothing where none has it."""
+    values = tuple(frame.get(name) for frame in frames)
+    if all(value is None for value in values):
+        return ()
+    if not all(isinstance(value, kind) for value in values):
+        raise UserError(
+            f"{root / INDEX_FILE} has a {name} for some frames only, or one that is no "
+            f"{kind.__name__}.",
+            _WRITE_AGAIN,
+        )
+    return values
+
+
+def _check_size(path: Path, size: tuple[int, int], expected: tuple[int, int]) -> None:
+    if size != expected:
+        raise UserError(
+            f"The image {path} is {size[0]} x {size[1]}, but the dataset's images are "
+            f"{expected[0]} x {expected[1]} pixels.",
+            "Bring all images to one size, or leave this frame out.",
+        )
+
+
+def _first_few(numbers: list[int]) -> str:
+    shown = ", ".join(map(str, numbers[:5]))
+    return shown if len(numbers) <= 5 else f"{shown}, ..."

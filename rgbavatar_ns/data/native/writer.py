@@ -1,0 +1,241 @@
+"""Write a dataset frame by frame; a reader sees all of it or nothing."""
+
+import errno
+import json
+import os
+from collections.abc import Callable, Collection, Mapping
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from rgbavatar_ns.data.native.dataset import TrackedDataset, load_native
+from rgbavatar_ns.data.native.format import (
+    FORMAT,
+    HEAD_FILE,
+    IMAGE_FOLDER,
+    INDEX_FILE,
+    THETA_FILE,
+    camera_to_json,
+)
+from rgbavatar_ns.data.native.frame import TrackedFrame
+from rgbavatar_ns.data.png import encode_png_rgba
+from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.head import HeadArrays, ThetaLayout
+from rgbavatar_ns.kernels.types import PinholeCameras
+
+
+class DatasetWriter:
+    """Writes the project's own format; `dataset.json` comes last and whole.
+
+    Args:
+        dst: folder to write to; made where missing.
+        arrays: the head model, or the embedded one's name ("makehuman").
+        identity: the person's identity coefficients.
+        layout: what theta holds.
+        width, height: of every image, in pixels.
+        overwrite: replace a dataset that is there; else a folder with anything in it is refused.
+        keep_images: go on with an unfinished dataset: images that are there stay, for
+            `add_encoded`. Implies overwrite.
+        source: where the frames came from, for people to read.
+    """
+
+    def __init__(
+        self,
+        dst: str | Path,
+        arrays: str | HeadArrays,
+        identity: Float[Tensor, "I"],
+        layout: ThetaLayout,
+        width: int,
+        height: int,
+        overwrite: bool = False,
+        keep_images: bool = False,
+        source: Mapping[str, Any] | None = None,
+    ) -> None:
+        self._root = Path(dst)
+        self._arrays = arrays
+        self._identity = identity.detach().to("cpu", torch.float32)
+        self._layout = layout
+        self._width, self._height = width, height
+        self._theta: list[np.ndarray] = []
+        self._frames: list[dict[str, Any]] = []
+        self._numbers: set[int] = set()
+        self._source = dict(source or {})
+        self._clear(overwrite or keep_images, keep_images)
+
+    def _clear(self, overwrite: bool, keep_images: bool) -> None:
+        """Make room; the old index goes first, so that no mixture can be taken for a dataset."""
+        if self._root.exists() and not self._root.is_dir():
+            raise UserError(f"{self._root} is a file.", "Name a folder to write to.")
+        if not overwrite and self._root.exists() and any(self._root.iterdir()):
+            raise UserError(
+                f"The folder {self._root} is not empty.",
+                "Name a new folder, or allow to overwrite the dataset in it.",
+            )
+        for name in (INDEX_FILE, THETA_FILE, HEAD_FILE):
+            (self._root / name).unlink(missing_ok=True)
+        for image in () if keep_images else (self._root / IMAGE_FOLDER).glob("*.png"):
+            image.unlink()
+        try:
+            (self._root / IMAGE_FOLDER).mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise UserError(
+                f"The folder {self._root} cannot be made: {error.strerror}.",
+                "Name a folder that you may write to.",
+            ) from None
+
+    def add(self, frame: TrackedFrame) -> None:
+        """Write a frame's image now; the rest follows at the end.
+
+        Raises UserError where its number was used before, theta does not fit the layout or is
+        not finite, or the image has another size.
+        """
+        height, width = frame.image_rgba.shape[:2]
+        self._require_size(frame.index, width, height)
+        png = encode_png_rgba(frame.image_rgba)
+        self.add_encoded(
+            frame.index, frame.theta, frame.camera, png, frame.camera_name, frame.timestep
+        )
+
+    def add_encoded(
+        self,
+        index: int,
+        theta: Float[Tensor, "H"],
+        camera: PinholeCameras,
+        png: bytes | None,
+        camera_name: str | None = None,
+        timestep: int | None = None,
+    ) -> None:
+        """As `add`, with the image as a PNG file's bytes; None where it is in its place already.
+
+        The image's own size is taken on trust.
+        """
+        name = f"frame {index}"
+        if index in self._numbers:
+            raise UserError(f"There are two frames {index}.", "Number frames once each.")
+        values = theta.detach().to("cpu", torch.float32).numpy()
+        if values.shape != (self._layout.size,):
+            raise UserError(
+                f"theta of {name} has {len(values)} values; the layout has {self._layout.size}.",
+                "Make theta with the layout of the dataset's head (`ThetaLayout.join`).",
+            )
+        if not np.isfinite(values).all():
+            raise UserError(f"theta of {name} holds NaN or infinity.", "Leave this frame out.")
+        self._require_size(index, camera.width, camera.height)
+        path = self.image_path(index)
+        if png is not None:
+            _write_whole(path, lambda file: file.write(png))
+        self._numbers.add(index)
+        self._theta.append(values.copy())
+        relative = path.relative_to(self._root).as_posix()
+        entry = {"index": index, "image": relative, "camera": camera_to_json(camera, 0)}
+        if camera_name is not None:
+            entry["camera_name"] = camera_name
+        if timestep is not None:
+            entry["timestep"] = timestep
+        self._frames.append(entry)
+
+    def image_path(self, index: int) -> Path:
+        """Where a frame's image lies."""
+        return self._root / IMAGE_FOLDER / f"{index:05d}.png"
+
+    def write_image(self, index: int, png: bytes) -> None:
+        """Put a PNG into its place ahead of `add_encoded`; several threads may do so."""
+        _write_whole(self.image_path(index), lambda file: file.write(png))
+
+    def _require_size(self, index: int, width: int, height: int) -> None:
+        if (width, height) != (self._width, self._height):
+            raise UserError(
+                f"Image or camera of frame {index} is not {self._width} x {self._height} pixels.",
+                "Bring all images to one size, and scale the camera with them.",
+            )
+
+    def finish(self, test: int | Collection[int]) -> TrackedDataset:
+        """Write theta, the head if it is not the embedded one, and the index; load the result.
+
+        test: how many of the last frames are held out, or the numbers of those that are; at least
+        one frame must remain.
+        """
+        held_out = test if isinstance(test, int) else len(set(test) & self._numbers)
+        if not 0 <= held_out < len(self._frames):
+            raise UserError(
+                f"{held_out} of {len(self._frames)} frames cannot be held out.",
+                "Hold out fewer frames, or write more.",
+            )
+        index: dict[str, Any] = {
+            "format": FORMAT,
+            "version": 1,
+            "head": self._write_head(),
+            "identity": self._identity.tolist(),
+            "layout": self._layout.to_json(),
+            "width": self._width,
+            "height": self._height,
+        }
+        index |= self._split(test) | self._shared_cameras()
+        if self._source:
+            index["source"] = self._source
+        of_version_2 = {"test", "cameras", "source"} & index.keys()
+        if of_version_2 or any(len(frame) > 3 for frame in self._frames):
+            index["version"] = 2
+        index["frames"] = self._frames
+        theta = np.stack(self._theta)
+        _write_whole(self._root / THETA_FILE, lambda file: np.save(file, theta))
+        text = json.dumps(index, indent=1).encode()
+        _write_whole(self._root / INDEX_FILE, lambda file: file.write(text))
+        return load_native(self._root)
+
+    def _split(self, test: int | Collection[int]) -> dict[str, Any]:
+        """The held-out frames as a count where they are the last ones, else by number."""
+        if isinstance(test, int):
+            return {"test_frames": test}
+        numbers = [frame["index"] for frame in self._frames]
+        held_out = [number for number in numbers if number in set(test)]
+        if held_out == numbers[len(numbers) - len(held_out) :]:
+            return {"test_frames": len(held_out)}
+        return {"test": held_out}
+
+    def _shared_cameras(self) -> dict[str, Any]:
+        """Cameras of many frames, taken out of them: one for all, or one of each name."""
+        cameras = [frame["camera"] for frame in self._frames]
+        if all(camera == cameras[0] for camera in cameras):
+            for frame in self._frames:
+                del frame["camera"]
+            return {"camera": cameras[0]}
+        if any("camera_name" not in frame for frame in self._frames):
+            return {}
+        named: dict[str, Any] = {}
+        for frame in self._frames:
+            if named.setdefault(frame["camera_name"], frame["camera"]) == frame["camera"]:
+                frame["camera"] = frame["camera_name"]
+        return {"cameras": named}
+
+    def _write_head(self) -> str:
+        if isinstance(self._arrays, str):
+            return self._arrays
+        embedded = HeadArrays.embedded()
+        if not (
+            self._arrays.name == embedded.name
+            and self._arrays.v_template.shape == embedded.v_template.shape
+            and np.array_equal(self._arrays.shapedirs, embedded.shapedirs)
+        ):
+            self._arrays.save(self._root / HEAD_FILE)
+        return self._arrays.name
+
+
+def _write_whole(path: Path, write: Callable[[BinaryIO], object]) -> None:
+    """Write beside `path`, then move into place; a full disk is told as such."""
+    partial = path.with_name(f".{path.name}.partial")
+    try:
+        with partial.open("wb") as file:
+            write(file)
+        os.replace(partial, path)
+    except OSError as error:
+        partial.unlink(missing_ok=True)
+        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+            raise UserError(
+                f"There is no space left to write {path}.", "Free some space, or name another disk."
+            ) from None
+        raise

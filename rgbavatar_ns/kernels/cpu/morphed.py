@@ -1,0 +1,126 @@
+"""The compiled loops for blended Gaussians."""
+
+import os
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from rgbavatar_ns.kernels.checks import check_average_images, check_target_images
+from rgbavatar_ns.kernels.cpu import (
+    INSTRUCTION_SET_VARIABLE,
+    _native,  # pyright: ignore[reportMissingModuleSource]
+)
+from rgbavatar_ns.kernels.functional import checked_background
+from rgbavatar_ns.kernels.types import (
+    TANGENT_VARIANTS,
+    AdamParameter,
+    MorphedGaussians,
+    MorphedGradient,
+    PinholeCameras,
+    RenderedBatch,
+    WeightedColors,
+)
+
+_BASE = ("position", "rotation_wxyz", "color_feature", "log_scale", "opacity_logit")
+_BASES = ("basis_position", "basis_rotation_wxyz", "basis_color_feature")
+
+
+class CpuMorphedRenderer:
+    """See `kernels.morphed.MorphedRenderer`."""
+
+    def __init__(
+        self,
+        gaussians: MorphedGaussians,
+        weights: Float[Tensor, "B K"],
+        vertices: Float[Tensor, "B V 3"],
+        cameras: PinholeCameras,
+    ) -> None:
+        self._cameras, self._count = cameras, len(gaussians.position)
+        self._weights = weights.detach().contiguous()
+        self._vertices = vertices.detach().contiguous()
+        self._compared = False
+        tensors: dict[str, Any] = {
+            name: None if value is None else value.detach().contiguous()
+            for name, value in vars(gaussians).items()
+            if name != "variant"
+        }
+        self._session = _native.MorphedSession(
+            _native.Morphed(**tensors, variant=TANGENT_VARIANTS.index(gaussians.variant)),
+            self._weights,
+            self._vertices,
+            cameras.world_to_camera.detach().contiguous(),
+            cameras.focal_px.detach().contiguous(),
+            cameras.principal_point_px.detach().contiguous(),
+            cameras.width,
+            cameras.height,
+            torch.get_num_threads(),
+            os.environ.get(INSTRUCTION_SET_VARIABLE, ""),
+        )
+
+    def draw(
+        self,
+        background: Float[Tensor, "3"] | Float[Tensor, "#B 3"] | None = None,
+        *,
+        with_depth: bool = False,
+        with_visibility: bool = False,
+    ) -> RenderedBatch:
+        """As `rasterize`, without gradients."""
+        background = checked_background(self._weights, background, len(self._weights))
+        batch, new = len(self._weights), self._weights.new_empty
+        size = (batch, self._cameras.height, self._cameras.width)
+        image, alpha = new(*size, 3), new(*size, 1)
+        depth = new(*size, 1) if with_depth else None
+        self._session.draw(background.detach().contiguous(), image, alpha, depth)
+        visibility = None
+        if with_visibility:
+            visibility = new(batch, self._count)
+            self._session.average(None, None, None, visibility)
+        return RenderedBatch(image, alpha, depth, visibility)
+
+    def weighted_color_average(self, images: Float[Tensor, "#B H W C"]) -> WeightedColors:
+        """As `weighted_color_average`."""
+        check_average_images(images, self._weights, self._cameras)
+        new = self._weights.new_empty
+        size = (len(self._weights), self._count)
+        weighted_sum, weight_sum, max_weight = new(*size, images.shape[-1]), new(size), new(size)
+        self._session.average(images.contiguous(), weighted_sum, weight_sum, max_weight)
+        return WeightedColors(weighted_sum, weight_sum, max_weight)
+
+    def forward_loss(
+        self, images_rgba: UInt8[Tensor, "B H W 4"], background: Float[Tensor, "#B 3"]
+    ) -> Float[Tensor, ""]:
+        """The mean absolute difference to straight-alpha images over the background."""
+        check_target_images(images_rgba, len(self._weights), self._cameras)
+        background = checked_background(self._weights, background, len(self._weights))
+        self._compared = True
+        loss = self._session.forward_loss(
+            images_rgba.contiguous(), background.detach().contiguous()
+        )
+        return self._weights.new_tensor(loss)
+
+    def backward_adam(
+        self, parameters: Mapping[str, AdamParameter] | None, *, with_vertices: bool = False
+    ) -> MorphedGradient:
+        """Take one step of Adam, or none, by the gradient of the last comparison."""
+        if not self._compared:
+            raise ValueError("There is no gradient yet. Call forward_loss() first.")
+        self._compared = False  # the parameters are others now
+        names = _BASE + (_BASES if self._weights.shape[1] else ())
+        groups = [] if parameters is None else [_arrays(parameters[name]) for name in names]
+        weights = torch.empty_like(self._weights)
+        vertices = torch.empty_like(self._vertices) if with_vertices else None
+        self._session.backward_adam(groups, weights, vertices)
+        return MorphedGradient(weights, vertices)
+
+
+def _arrays(parameter: AdamParameter) -> tuple[Tensor, Tensor, Tensor, tuple[float, ...]]:
+    """A parameter as compiled code takes it."""
+    return (
+        parameter.value.detach(),
+        parameter.first_moment.detach(),
+        parameter.second_moment.detach(),
+        parameter.step_numbers(),
+    )

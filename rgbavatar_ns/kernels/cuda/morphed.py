@@ -1,0 +1,305 @@
+"""Morphed Gaussians drawn and trained on a GPU."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from jaxtyping import Float, Int, UInt8
+from torch import Tensor
+
+from rgbavatar_ns.kernels.checks import check_average_images, check_target_images
+from rgbavatar_ns.kernels.cuda.binning import Bins, Capacities, Images, blocks, camera_values
+from rgbavatar_ns.kernels.cuda.launcher import Launcher
+from rgbavatar_ns.kernels.cuda.source import constants
+from rgbavatar_ns.kernels.cuda.tiles import Tiles
+from rgbavatar_ns.kernels.functional import checked_background
+from rgbavatar_ns.kernels.types import (
+    TANGENT_VARIANTS,
+    UPDATED_ATTRIBUTES,
+    AdamParameter,
+    MorphedGaussians,
+    MorphedGradient,
+    PinholeCameras,
+    RenderedBatch,
+    WeightedColors,
+)
+
+_SHORT = dict(
+    zip(UPDATED_ATTRIBUTES, ("position", "rotation", "color", "log_scale", "opacity_logit"))
+)
+"""Each attribute's name in arguments.h."""
+_BLENDED = UPDATED_ATTRIBUTES[:3]
+"""What the bases change."""
+
+
+class CudaMorphedRenderer:
+    """See `kernels.morphed.MorphedRenderer`."""
+
+    def __init__(
+        self,
+        launcher: Launcher,
+        capacities: Capacities,
+        gaussians: MorphedGaussians,
+        weights: Float[Tensor, "B K"],
+        vertices: Float[Tensor, "B V 3"],
+        cameras: PinholeCameras,
+    ) -> None:
+        self._launcher, self._cameras = launcher, cameras
+        self._weights = weights.detach().contiguous()
+        self._values = _morphed_values(gaussians, self._weights, vertices.detach().contiguous())
+        self._images = Images(len(weights), len(gaussians.position), cameras.width, cameras.height)
+        self._slots: Tensor | None = None
+        self._shared_bytes = 4 * constants()["kBlendImages"] * weights.shape[1]
+        self._launch_by_triangle("frames")
+        bins = Bins(
+            launcher, capacities, self._images, lambda bins: self._launch("blend", bins=bins)
+        )
+        self._tiles = Tiles(launcher, bins)
+
+    def _launch(self, kernel: str, **values: Any) -> None:
+        """Start a kernel by Gaussians and groups of images."""
+        images = self._images
+        self._launcher.launch(
+            kernel,
+            (
+                blocks(images.count, "kBlendThreads"),
+                -(-images.batch // constants()["kBlendImages"]),
+            ),
+            self._shared_bytes,
+            frame=images.values(),
+            cameras=camera_values(self._cameras),
+            blended=self._values,
+            **values,
+        )
+
+    def _launch_by_triangle(self, kernel: str, **values: Any) -> None:
+        self._launcher.launch(
+            kernel,
+            (blocks(self._values["triangles"], "kBlendThreads"), self._images.batch),
+            frame=self._images.values(),
+            blended=self._values,
+            **values,
+        )
+
+    @property
+    def overflowed(self) -> Int[Tensor, ""]:
+        """1 where the last comparison found no room and updates change nothing, else 0."""
+        return self._tiles.bins.status[constants()["kOverflow"]]
+
+    @property
+    def needed(self) -> Int[Tensor, ""]:
+        """How many entries or slots, whichever are more, were needed."""
+        return self._tiles.bins.status[: constants()["kOverflow"]].amax()
+
+    def make_room(self, needed: int) -> None:
+        """Give later renderings of this kind room for at least so many."""
+        self._tiles.bins.make_room(needed)
+
+    def draw(
+        self,
+        background: Float[Tensor, "3"] | Float[Tensor, "#B 3"] | None = None,
+        *,
+        with_depth: bool = False,
+        with_visibility: bool = False,
+    ) -> RenderedBatch:
+        """As `rasterize`, without gradients."""
+        background = checked_background(self._weights, background, self._images.batch)
+        image, alpha, depth = self._tiles.draw(background.detach(), with_depth=with_depth)
+        visibility = self._tiles.average(None)[2] if with_visibility else None
+        return RenderedBatch(image, alpha, depth, visibility)
+
+    def draw_at_once(self, background: Float[Tensor, "#B 3"]) -> RenderedBatch:
+        """As `draw`, without waiting for the room that it needs; see `overflowed`."""
+        image, alpha, _ = self._tiles.draw(background, with_depth=False, checked=False)
+        return RenderedBatch(image, alpha)
+
+    def weighted_color_average(self, images: Float[Tensor, "#B H W C"]) -> WeightedColors:
+        """As `weighted_color_average`."""
+        check_average_images(images, self._weights, self._cameras)
+        weighted_sum, weight_sum, max_weight = self._tiles.average(images.detach().contiguous())
+        assert weighted_sum is not None
+        return WeightedColors(weighted_sum, weight_sum, max_weight)
+
+    def forward_loss(
+        self, images_rgba: UInt8[Tensor, "B H W 4"], background: Float[Tensor, "#B 3"]
+    ) -> Float[Tensor, ""]:
+        """The mean absolute difference to straight-alpha images over the background."""
+        check_target_images(images_rgba, self._images.batch, self._cameras)
+        background = checked_background(self._weights, background, self._images.batch)
+        loss, self._slots = self._tiles.train(images_rgba.contiguous(), None, background.detach())
+        return loss
+
+    def compare_with(
+        self,
+        images_rgba: UInt8[Tensor, "F H W 4"],
+        image_of: Int[Tensor, " B"],
+        background: Float[Tensor, "B 3"],
+    ) -> Float[Tensor, ""]:
+        """As `forward_loss`, with images chosen on the device: nothing is copied or waited for."""
+        loss, self._slots = self._tiles.train(images_rgba, image_of, background)
+        return loss
+
+    def backward_adam(
+        self, parameters: Mapping[str, AdamParameter] | None, *, with_vertices: bool = False
+    ) -> MorphedGradient:
+        """Take one step of Adam, or none, by the gradient of the last comparison."""
+        numbers = None
+        if parameters is not None:
+            rows = [
+                _numbers(parameters[name]) + _numbers(parameters.get(f"basis_{name}"))
+                for name in UPDATED_ATTRIBUTES
+            ]
+            numbers = torch.tensor(rows).to(self._launcher.device, non_blocking=True)
+        return self._updated(parameters, numbers, with_vertices)
+
+    def update_with(
+        self, parameters: Mapping[str, AdamParameter], numbers: Float[Tensor, "A 10"]
+    ) -> MorphedGradient:
+        """As `update`, with `AdamParameter.step_numbers` read on the device."""
+        return self._updated(parameters, numbers, False)
+
+    def update_parameter(
+        self, parameter: AdamParameter, gradient: Tensor, numbers: Float[Tensor, "10"]
+    ) -> None:
+        """Take the same step with any other parameter; none where the comparison overflowed."""
+        flat = gradient.reshape(1, -1).contiguous()
+        self._update_columns(flat, None, parameter, None, numbers)
+
+    def _updated(
+        self,
+        parameters: Mapping[str, AdamParameter] | None,
+        numbers: Tensor | None,
+        with_vertices: bool,
+    ) -> MorphedGradient:
+        if self._slots is None:
+            raise ValueError("There is no gradient yet. Call forward_loss() first.")
+        gradients = self._differentiate(with_vertices)
+        weights = torch.zeros_like(self._weights)
+        for row, name in enumerate(UPDATED_ATTRIBUTES):
+            bases = self._values[f"basis_{_SHORT[name]}"] if name in _BLENDED else None
+            if parameters is None and bases is None:
+                continue
+            weights += self._update_columns(
+                gradients[_SHORT[name]],
+                bases,
+                None if parameters is None else parameters[name],
+                None if parameters is None else parameters.get(f"basis_{name}"),
+                None if numbers is None else numbers[row],
+            )
+        self._slots = None  # the parameters are others now
+        vertices = self._vertex_gradient(gradients["carried"]) if with_vertices else None
+        return MorphedGradient(weights, vertices)
+
+    def _differentiate(self, with_vertices: bool) -> dict[str, Tensor]:
+        """The gradients of each image by name."""
+        size = (self._images.batch, self._images.count)
+        new = self._weights.new_empty
+        widths = {"position": 3, "rotation": 4, "color": 3, "log_scale": 3, "opacity_logit": 1}
+        gradients = {name: new(*size, width) for name, width in widths.items()}
+        if with_vertices:
+            gradients["carried"] = new(*size, constants()["kCarriedFloats"])
+        self._launch(
+            "blend_backward",
+            bins=self._tiles.bins.values(),
+            slots=self._slots,
+            **({"carried": None} | gradients),
+        )
+        return gradients
+
+    def _update_columns(
+        self,
+        gradient: Tensor,
+        bases: Tensor | None,
+        base: AdamParameter | None,
+        basis: AdamParameter | None,
+        numbers: Float[Tensor, "10"] | None,
+    ) -> Tensor | float:
+        """One step of Adam for an attribute (gradient [B, ...]) and its bases, where given.
+
+        Returns the gradient of the weights [B, K], 0 without bases.
+        """
+        batch, num_bases = len(gradient), 0 if bases is None else len(bases)
+        columns = gradient[0].numel()
+        count = blocks(columns, "kTileThreads")
+        sums = gradient.new_zeros(count, batch, num_bases) if num_bases else None
+        warps = constants()["kTileThreads"] // 32
+        self._launcher.launch(
+            "update",
+            (count, 1),
+            4 * (batch * num_bases + warps * batch),
+            batch=batch,
+            columns=columns,
+            bases=num_bases,
+            gradient=gradient,
+            weights=self._weights,
+            base=None if base is None else base.value.detach(),
+            base_first=None if base is None else base.first_moment,
+            base_second=None if base is None else base.second_moment,
+            basis=bases,
+            basis_first=None if basis is None else basis.first_moment,
+            basis_second=None if basis is None else basis.second_moment,
+            numbers=numbers,
+            weight_sums=sums,
+            status=self._tiles.bins.status,
+        )
+        return 0.0 if sums is None else sums.sum(0)
+
+    def _vertex_gradient(self, carried: Tensor) -> Tensor:
+        """Gradients of the frames' parts, then of the corners, then of the vertices."""
+        batch, triangles = self._images.batch, self._values["triangles"]
+        d_mean, d_quat, d_ratio = carried[..., :3], carried[..., 3:7], carried[..., 7:8]
+        position, along = carried[..., 8:11], self._values["barycentric"]
+        rows = torch.cat(
+            [
+                (d_mean[..., :, None] * position[..., None, :]).flatten(-2),
+                d_quat,
+                d_mean,
+                d_mean * along[:, 1:2],
+                d_mean * along[:, 2:3],
+                d_ratio,
+                torch.zeros_like(d_ratio),
+            ],
+            dim=-1,
+        )
+        frames = rows.new_zeros(batch, triangles, constants()["kFrameFloats"])
+        frames.index_add_(1, self._values["triangle_of"], rows)
+        corners = rows.new_empty(batch, triangles, 3, 3)
+        self._launch_by_triangle("frames_backward", frame_gradient=frames, corner_gradient=corners)
+        vertices = torch.zeros_like(self._values["vertices"])
+        return vertices.index_add_(
+            1, self._values["triangle_vertices"].flatten(), corners.flatten(1, 2)
+        )
+
+
+def _morphed_values(
+    gaussians: MorphedGaussians, weights: Tensor, vertices: Tensor
+) -> dict[str, Any]:
+    """The fields of `Morphed` in arguments.h."""
+    tensors = {
+        name: None if value is None else value.detach().contiguous()
+        for name, value in vars(gaussians).items()
+        if name != "variant"
+    }
+    edges = tensors["edges_to_frame"]
+    assert edges is not None
+    triangles = len(edges)
+    return {
+        "weights": weights,
+        **{short: tensors[name] for name, short in _SHORT.items()},
+        **{f"basis_{_SHORT[name]}": tensors[f"basis_{name}"] for name in _BLENDED},
+        "barycentric": tensors["barycentric"],
+        "triangle_of": tensors["triangle_of"],
+        "triangle_vertices": tensors["triangle_vertices"],
+        "edges_to_frame": edges,
+        "rest_length": tensors["rest_length"],
+        "vertices": vertices,
+        "frames": weights.new_empty(len(weights), triangles, constants()["kFrameFloats"]),
+        "bases": weights.shape[1],
+        "triangles": triangles,
+        "vertex_count": vertices.shape[1],
+        "variant": TANGENT_VARIANTS.index(gaussians.variant),
+    }
+
+
+def _numbers(parameter: AdamParameter | None) -> tuple[float, ...]:
+    return (0.0,) * 5 if parameter is None else parameter.step_numbers()

@@ -1,0 +1,245 @@
+"""Batches from the pools of a running stream."""
+
+# pyright: reportIncompatibleVariableOverride=false
+# nerfstudio's classes are used by narrowing their fields, which a strict type system forbids.
+
+import dataclasses
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+import tyro
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.utils.rich_utils import CONSOLE
+
+from rgbavatar_ns.avatar.training.losses import random_backgrounds
+from rgbavatar_ns.data import DatasetWriter, LocalGlobalPools
+from rgbavatar_ns.data.sampling import PoolStrategy
+from rgbavatar_ns.data.streams import FrameStream, Ingest, ReplayBuffer, ReplayStream, Rewindable
+from rgbavatar_ns.data.streams.protocol import Rereadable
+from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.plugin.cameras import to_nerfstudio
+from rgbavatar_ns.plugin.datamanager import RGBAvatarDataManager, RGBAvatarDataManagerConfig
+from rgbavatar_ns.plugin.dataparser import Subject
+from rgbavatar_ns.plugin.online.sources import SourceConfig, await_subject, open_source
+
+
+@dataclass
+class OnlineDataManagerConfig(RGBAvatarDataManagerConfig):
+    """A stream of frames, and which of them a batch holds (RGBAvatar, sec. 3.3)."""
+
+    _target: type = field(default_factory=lambda: OnlineDataManager)
+    source: SourceConfig = field(default_factory=SourceConfig)
+    """Where the frames come from."""
+    strategy: PoolStrategy = "paper"
+    """paper: a fixed share of each batch from the local pool; release: the global pool's share
+    grows over the first 600 frames to .7, and local draws favour the newest."""
+    local_size: int = 150
+    """Newest frames, which make up the local pool."""
+    global_size: int = 1000
+    """Frames of the whole past, each equally likely, in the global pool."""
+    local_share: float | None = None
+    """The paper's eta, the part of a batch from the local pool: by default .7, and .3 for the
+    release's strategy, which begins with 1."""
+    new_first: bool = True
+    """Let frames that no batch has held yet fill up to half of the local part, so that none waits
+    for chance. False draws from the local pool by chance alone, as in the paper."""
+    queue_frames: int = 256
+    """Frames that may wait to be decoded; beyond, the oldest is dropped, or the source waits
+    where it keeps them (a folder, a video file)."""
+    recorded: tyro.conf.Suppress[Path | None] = None
+    """Dataset of the frames that the pools held, which the trainer writes for later commands."""
+
+
+class OnlineDataManager(RGBAvatarDataManager):
+    """Serves batches from local and global pool while the stream goes on.
+
+    In training its dataset is the replayed one, or one of the stream's first frame; nerfstudio's
+    other commands see the replayed dataset, or the recorded one.
+    """
+
+    config: OnlineDataManagerConfig
+
+    def __init__(
+        self,
+        config: OnlineDataManagerConfig,
+        device: torch.device | str = "cpu",
+        test_mode: Literal["test", "val", "inference", "train"] = "val",
+        **more: Any,
+    ) -> None:
+        self._ingest: Ingest | None = None
+        self.images_drawn = 0
+        self.ended_step: int | None = None
+        """Step before which the stream ended; None while it goes on."""
+        replayed = config.source.kind == "replay"
+        if test_mode == "val":
+            if not replayed:
+                # Then --data is no dataset; the first frame makes one.
+                self._open(config)
+            super().__init__(_of_dataset(config, replayed), device, test_mode, **more)
+            if replayed:
+                self._open(config)
+            self.config = config
+            self._show_first_frame_only()
+        else:
+            super().__init__(_of_dataset(config, replayed), device, test_mode, **more)
+
+    @property
+    def ingest(self) -> Ingest:
+        """The stream's way into the pools; RuntimeError in commands that do not train."""
+        if self._ingest is None:
+            raise RuntimeError("There is a stream only while training.")
+        return self._ingest
+
+    def _open(self, config: OnlineDataManagerConfig) -> None:
+        stream = open_source(config.source, config.data or config.dataparser.data)
+        try:
+            self._prepare(config, stream)
+        except BaseException:
+            stream.close()
+            raise
+
+    def _prepare(self, config: OnlineDataManagerConfig, stream: FrameStream) -> None:
+        seed = 0 if config.seed is None else config.seed
+        pools = _pools(config, seed)
+        subject, self._first = stream.subject(0.0), None
+        if not isinstance(stream, ReplayStream):
+            subject, self._first = await_subject(stream, _tell)
+            _record(config, subject, [(0, self._first)])
+        assert subject is not None
+        self.pools = ReplayBuffer(subject, pools, keep_png=not isinstance(stream, Rereadable))
+        self._ingest = Ingest(stream, subject, self.pools, config.queue_frames, _tell)
+        self._subject, self._stream = subject, stream
+        self._resumed = False
+        if not isinstance(stream, Rewindable):
+            # Nothing may be lost while the avatar is being built.
+            self._hand_over_first()
+            self._ingest.listen()
+
+    def _hand_over_first(self) -> None:
+        if self._first is not None:
+            self.ingest.give(self._first)
+            self._first = None
+
+    def _show_first_frame_only(self) -> None:
+        """The model's one frame is the newest; what has not arrived must not be known."""
+        first = self.train_dataset.metadata["subject"]
+        assert isinstance(first, Subject)
+        self.train_dataset.metadata["subject"] = dataclasses.replace(
+            first, theta=first.theta[:1].clone(), frame_index=first.frame_index[:1], train=(0,)
+        )
+
+    def start(self) -> None:
+        """Begin to fill the pools."""
+        if not (self._resumed and isinstance(self._stream, Rewindable)):
+            self._hand_over_first()
+        self.ingest.start()
+
+    def close(self) -> None:
+        """End the stream and its threads."""
+        if self._ingest is not None:
+            self._ingest.close()
+
+    def record(self) -> None:
+        """Write the frames that the pools hold as a dataset, where there is none to replay."""
+        if self.config.source.kind != "replay" and self.pools.num_added:
+            _record(self.config, self._subject, self.pools.held())
+
+    def next_train(self, step: int) -> tuple[Cameras, dict[str, Any]]:
+        """A batch drawn from the pools now; UserError while they are empty."""
+        drawn = self.pools.batch(self.config.batch_size, evenly=self.ended_step is not None)
+        count = len(drawn.serial)
+        self.images_drawn += count
+        cameras = to_nerfstudio(
+            drawn.cameras,
+            theta=drawn.theta,
+            position=torch.zeros(count, 1),
+            times=torch.zeros(count),
+        ).to(self.device)
+        background = random_backgrounds(step, count, self.seed).to(self.device)
+        cameras.metadata = {**(cameras.metadata or {}), "background": background}
+        return cameras, {
+            "image": drawn.images_rgba.to(self.device),
+            "background": background,
+            "position": list(drawn.serial),
+            "step": step,
+        }
+
+    def device_frames(self) -> None:
+        """None: frames come and go."""
+
+    def get_train_rays_per_batch(self) -> int:
+        """Pixels of a whole batch."""
+        tracked = self.dataparser.tracked
+        return self.config.batch_size * tracked.width * tracked.height
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """Pools, frames, counters and random numbers: all of the stream that a run goes on from."""
+        if self._ingest is None:
+            return {}
+        stream = self._ingest.state_dict()
+        return {"stream": stream, "images": self.images_drawn, "ended_step": self.ended_step}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Go on from a checkpoint; nothing where there is no stream to go on with."""
+        if self._ingest is None or "stream" not in state:
+            return
+        self._ingest.load_state_dict(state["stream"])
+        self.images_drawn, self.ended_step = state["images"], state["ended_step"]
+        self._resumed = True
+
+
+def _pools(config: OnlineDataManagerConfig, seed: int) -> LocalGlobalPools:
+    if config.batch_size < 1:
+        raise UserError(
+            f"A batch of {config.batch_size} frames is impossible.",
+            "Pass --pipeline.datamanager.batch-size with 1 or more.",
+        )
+    try:
+        return LocalGlobalPools(
+            config.local_size,
+            config.global_size,
+            config.local_share,
+            seed,
+            config.strategy,
+            config.new_first,
+        )
+    except ValueError as error:
+        raise UserError(
+            f"Such pools are impossible: {error}",
+            "Mend --pipeline.datamanager.local-size, global-size or local-share.",
+        ) from None
+
+
+def _of_dataset(config: OnlineDataManagerConfig, replayed: bool) -> OnlineDataManagerConfig:
+    """The config as `RGBAvatarDataManager` takes it: `data` is a dataset in the own format."""
+    if replayed:
+        return config
+    if config.recorded is None or not config.recorded.exists():
+        raise UserError(
+            f"The run has recorded no frames ({config.recorded}).",
+            "Train it until its first checkpoint.",
+        )
+    dataparser = dataclasses.replace(config.dataparser)
+    return dataclasses.replace(config, data=config.recorded, dataparser=dataparser)
+
+
+def _record(config: OnlineDataManagerConfig, subject: Any, frames: Any) -> None:
+    assert config.recorded is not None
+    writer = DatasetWriter(
+        config.recorded,
+        subject.arrays,
+        subject.identity,
+        subject.layout,
+        subject.width,
+        subject.height,
+        overwrite=True,
+    )
+    for serial, frame in frames:
+        writer.add_encoded(serial, frame.theta, frame.camera, frame.png)
+    writer.finish(0)
+
+
+def _tell(line: str) -> None:
+    CONSOLE.print(line, highlight=False, soft_wrap=True)

@@ -1,0 +1,61 @@
+"""nerfstudio's pipeline of an online run: it also looks at what has just arrived."""
+
+# pyright: reportIncompatibleVariableOverride=false
+# nerfstudio's classes are used by narrowing their fields, which a strict type system forbids.
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from jaxtyping import UInt8
+from torch import Tensor
+
+from rgbavatar_ns.avatar.training.losses import composite, rgba_to_float
+from rgbavatar_ns.data.streams import ReplayBatch
+from rgbavatar_ns.plugin.online.datamanager import OnlineDataManager, OnlineDataManagerConfig
+from rgbavatar_ns.plugin.pipeline import RGBAvatarPipeline, RGBAvatarPipelineConfig
+from rgbavatar_ns.plugin.viewer.status_panel import StatusPanel
+
+_SMALLEST_ERROR = 1e-10
+
+
+@dataclass
+class OnlinePipelineConfig(RGBAvatarPipelineConfig):
+    """The stream and what is trained on it."""
+
+    _target: type = field(default_factory=lambda: OnlinePipeline)
+    datamanager: OnlineDataManagerConfig = field(default_factory=OnlineDataManagerConfig)
+    """The stream, and what a batch is drawn from."""
+
+
+class OnlinePipeline(RGBAvatarPipeline):
+    """Adds the newest frame beside the avatar, for the viewer and for the log."""
+
+    config: OnlinePipelineConfig
+    datamanager: OnlineDataManager
+
+    def __init__(
+        self, config: OnlinePipelineConfig, device: str | torch.device, **more: Any
+    ) -> None:
+        super().__init__(config, device, **more)
+        self.status_panel = StatusPanel("Stream")
+        self.model.viewer_panel.stage.film = None  # Of a stream only the newest frame is shown.
+
+    @torch.no_grad()
+    def look_at(self, newest_first: ReplayBatch) -> tuple[float, UInt8[Tensor, "H W 3"]]:
+        """Draw frames as they were filmed: mean PSNR over black in dB, and the newest of them.
+
+        The picture is the frame with the avatar, driven by it, on its right.
+        """
+        drawn = self.model.avatar.render(
+            newest_first.theta.to(self.device),
+            newest_first.cameras,
+            backend=self.config.model.rasterizer,
+        ).image.clamp(0, 1)
+        black = drawn.new_zeros(len(drawn), 3)
+        truth = composite(rgba_to_float(newest_first.images_rgba.to(self.device)), black)
+        # By hand: the metrics library takes seconds to import, in the middle of a stream.
+        error = (drawn - truth).square().mean(dim=(1, 2, 3)).clamp(min=_SMALLEST_ERROR)
+        score = float((-10 * error.log10()).mean())
+        pair = torch.cat([truth[0], drawn[0]], dim=1)
+        return score, (pair * 255).round().to(torch.uint8).cpu()

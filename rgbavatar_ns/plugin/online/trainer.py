@@ -1,0 +1,280 @@
+"""Training while the frames arrive: from the first of them until the stream ends, and a little on.
+
+RGBAvatar, sec. 3.3. The stream runs in its own threads; a step takes what the pools hold.
+"""
+
+# pyright: reportIncompatibleVariableOverride=false
+# nerfstudio's classes are used by narrowing their fields, which a strict type system forbids.
+
+import dataclasses
+import json
+import signal
+import time
+from dataclasses import dataclass, field
+from typing import Literal
+
+import torch
+from nerfstudio.utils import writer
+from nerfstudio.utils.misc import step_check
+from nerfstudio.utils.rich_utils import CONSOLE
+
+from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.plugin.online.datamanager import OnlineDataManager
+from rgbavatar_ns.plugin.online.pipeline import OnlinePipeline, OnlinePipelineConfig
+from rgbavatar_ns.plugin.online.progress import OnlineProgress, StreamReport
+from rgbavatar_ns.plugin.training.errors import install_user_error_hook
+from rgbavatar_ns.plugin.training.interruption import StopRequest
+from rgbavatar_ns.plugin.training.trainer import (
+    SUMMARY_NAME,
+    RGBAvatarTrainer,
+    RGBAvatarTrainerConfig,
+)
+
+_LOOK_INTERVAL_S = 1.0
+_LOOKED_AT = 2
+_LOOK_SHARE = 0.05
+"""Of the time, at most, that looking at the newest frames may take."""
+
+
+@dataclass
+class OnlineTrainerConfig(RGBAvatarTrainerConfig):
+    """A run on a stream, which ends some steps after it."""
+
+    _target: type = field(default_factory=lambda: OnlineTrainer)
+    pipeline: OnlinePipelineConfig = field(default_factory=OnlinePipelineConfig)
+    """Stream and model."""
+    max_num_iterations: int = 1_000_000_000
+    """Steps in all, if the run is to end before the stream does."""
+    steps_after_stream: int = 500
+    """Steps on all that the pools hold, each frame as likely, once the stream has ended."""
+    final_learning_rate_factor: float = 0.1
+    """What the learning rates fall to in these steps, times what they were; 1 keeps them."""
+
+
+class OnlineStop(StopRequest):
+    """Ctrl-C is how a live run ends: it leaves exit code 0."""
+
+    @property
+    def exit_code(self) -> int:
+        """0 after Ctrl-C, 143 after SIGTERM."""
+        return 0 if self.signal_number == signal.SIGINT else super().exit_code
+
+
+class OnlineTrainer(RGBAvatarTrainer):
+    """Trains from the first frame on; the stream's end, Ctrl-C and faults of the source save."""
+
+    config: OnlineTrainerConfig
+    pipeline: OnlinePipeline
+
+    def __init__(
+        self, config: OnlineTrainerConfig, local_rank: int = 0, world_size: int = 1
+    ) -> None:
+        install_user_error_hook()
+        if config.pipeline.model.refine_tracking:
+            raise UserError(
+                "Tracking is refined frame by frame, which a stream's passing frames do not wait "
+                "for.",
+                "Leave out --pipeline.model.refine-tracking, or train offline.",
+            )
+        if config.final_learning_rate_factor <= 0:
+            raise UserError(
+                f"Learning rates cannot fall to {config.final_learning_rate_factor} of themselves.",
+                "Pass --final-learning-rate-factor above 0; 1 keeps them.",
+            )
+        super().__init__(config, local_rank, world_size)
+        self.stop = OnlineStop()
+        config.pipeline.datamanager.recorded = config.get_base_dir() / "stream"
+        self._next_look_s = 0.0
+        self._psnr: float | None = None
+
+    @property
+    def stream(self) -> OnlineDataManager:
+        """Where the frames come from."""
+        return self.pipeline.datamanager
+
+    def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
+        """Wait for the stream's subject, then build everything; Ctrl-C meanwhile ends the run."""
+        # What this class has set must be known to later commands.
+        self.config.save_config()
+        try:
+            super().setup(test_mode)
+        except KeyboardInterrupt:
+            CONSOLE.print("Stopped before the first frame; there is nothing to save.")
+            raise SystemExit(0) from None
+
+    def train(self) -> None:
+        """Train until the stream has ended, or a stop is asked for; then save."""
+        try:
+            super().train()
+        finally:
+            self.stream.close()
+
+    @property
+    def completed(self) -> bool:
+        """Whether the steps after the stream's end are done."""
+        return self.step + 1 >= self._last_step()
+
+    def _last_step(self) -> int:
+        """Steps that the run has in all, as far as is known."""
+        most, ended = self.config.max_num_iterations, self.stream.ended_step
+        return most if ended is None else min(most, ended + self.config.steps_after_stream)
+
+    def _train_steps(self) -> None:
+        step = self._start_step
+        self.step = step - 1
+        self.stream.start()
+        with OnlineProgress() as progress:
+            if not self._await_frame():
+                return
+            while step < self._last_step() and not self._wait_while_paused():
+                self._notice_end(step)
+                began = time.monotonic()
+                parts = self._train_one(step)
+                self.step = step
+                seconds = time.monotonic() - began
+                self._train_seconds += seconds
+                self._settle()
+                self._follow_newest()
+                self._update_viewer_state(step)
+                if step_check(step, self.config.logging.steps_per_log, run_at_zero=True):
+                    self._log(step, parts, seconds)
+                self._look_at_newest(parts, progress)
+                if len(self.stream.eval_dataset) > 0:
+                    with self.train_lock:
+                        self.eval_iteration(step)
+                if step_check(step, self.config.steps_per_save):
+                    self.save_checkpoint(step)
+                writer.write_out_storage()
+                step += 1
+
+    def _await_frame(self) -> bool:
+        """Wait for the first frame; False if a stop was asked for, or none will come."""
+        while not self.stream.pools.wait(0.05):
+            if self.stop.requested or self.stream.ingest.finished:
+                return False
+            self._notice_end(self._start_step)
+        return True
+
+    def _notice_end(self, step: int) -> None:
+        """See whether the stream has ended; raises what ended it against its will, after saving."""
+        ingest = self.stream.ingest
+        if ingest.failure is not None:
+            if self.step >= 0:
+                self.save_checkpoint(self.step)
+            raise ingest.failure
+        if ingest.finished and self.stream.ended_step is None:
+            self.stream.ended_step = step
+            CONSOLE.print(
+                f"The stream has ended after {self.stream.pools.num_added} frames; "
+                f"{self.config.steps_after_stream} more steps follow.",
+                highlight=False,
+            )
+
+    def _settle(self) -> None:
+        """After the stream, take the rates a little down after each step.
+
+        They are part of the optimizers' state, so that a resumed run falls on from there. Where
+        the user has named schedules these decide.
+        """
+        if self.stream.ended_step is None or self.optimizers.schedulers:
+            return
+        # The stream's end is seen before a step, so that one comes after it in any case.
+        share = 1 / max(1, self.config.steps_after_stream)
+        for optimizer in self.optimizers.optimizers.values():
+            for group in optimizer.param_groups:
+                group["lr"] *= self.config.final_learning_rate_factor**share
+
+    def _log(self, step: int, parts: dict[str, torch.Tensor], seconds: float) -> None:
+        """TensorBoard's curves."""
+        loss = self._finite(_total(parts), step)
+        batch = self.config.pipeline.datamanager.batch_size
+        pixels = self.stream.get_train_rays_per_batch()
+        self._write_scalars(step, loss, parts, seconds, batch, pixels)
+        for name, value in self._report(loss).scalars().items():
+            writer.put_scalar(name=f"Stream/{name}", scalar=value, step=step)
+
+    def _report(self, loss: float) -> StreamReport:
+        return StreamReport(
+            step=self.step + 1,
+            frames=self.stream.pools.num_added,
+            fill=self.stream.pools.fill,
+            images=self.stream.images_drawn,
+            latency_s=self.stream.pools.median_latency_s(),
+            psnr=self._psnr,
+            loss=loss,
+            counts=dict(self.stream.ingest.counts()),
+        )
+
+    def _follow_newest(self) -> None:
+        """Let the newest frame drive the viewer's avatar."""
+        theta = self.stream.pools.newest_theta()
+        if theta is not None:
+            with self.train_lock:
+                self.pipeline.model.frame_theta[0] = theta.to(self.pipeline.device)
+
+    def _look_at_newest(self, parts: dict[str, torch.Tensor], progress: OnlineProgress) -> None:
+        """About once a second: score the newest frames and tell how things stand."""
+        began = time.monotonic()
+        if began < self._next_look_s:
+            return
+        recent = self.stream.pools.recent(_LOOK_INTERVAL_S, _LOOKED_AT)
+        self._psnr, picture = None, None
+        if recent is not None:
+            with self.train_lock:
+                self._psnr, picture = self.pipeline.look_at(recent)
+        report = self._report(self._finite(_total(parts), self.step))
+        rate = progress.images_per_second(report.images)
+        progress.show(report, rate)
+        self.pipeline.status_panel.show(report.lines(rate), picture)
+        took = time.monotonic() - began
+        self._next_look_s = began + max(_LOOK_INTERVAL_S, took / _LOOK_SHARE)
+
+    def save_checkpoint(self, step: int) -> None:
+        """Write avatar, pools and frames atomically; raises UserError if they do not fit."""
+        model = self.pipeline.model
+        theta, index = self.stream.pools.thetas()
+        model.subject = dataclasses.replace(model.subject, theta=theta, frame_index=index)
+        super().save_checkpoint(step)
+
+    def _after_train(self) -> None:
+        self.stream.record()
+        super()._after_train()
+
+    def _tell_end(self, completed: bool) -> None:
+        summary = self._write_summary()
+        frames, steps, rate = summary["frames"], summary["steps"], summary["images_per_second"]
+        CONSOLE.print(
+            f"{'Trained' if completed else 'Stopped after'} {steps} steps on {frames} frames, "
+            f"{rate:.1f} images/s.",
+            highlight=False,
+        )
+        if not completed:
+            CONSOLE.print(
+                f"Go on with the same command and --load-dir {self.checkpoint_dir}",
+                highlight=False,
+                soft_wrap=True,
+            )
+        CONSOLE.print(f"Config: {self.base_dir / 'config.yml'}", highlight=False, soft_wrap=True)
+
+    def _write_summary(self) -> dict[str, int | float]:
+        """The run's length and speed, and what the stream brought, as training.json."""
+        seconds, images = self._train_seconds, self.stream.images_drawn
+        latency = self.stream.pools.median_latency_s()
+        summary: dict[str, int | float] = {
+            "steps": self.step + 1,
+            "images": images,
+            "train_seconds": seconds,
+            "images_per_second": images / seconds if seconds > 0 else 0.0,
+            "frames": self.stream.pools.num_added,
+        }
+        if latency is not None:
+            summary["median_latency_s"] = latency
+        counts = self.stream.ingest.counts()
+        path = self.base_dir / SUMMARY_NAME
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps({**summary, "stream": dict(counts)}, indent=2) + "\n")
+        return summary
+
+
+def _total(parts: dict[str, torch.Tensor]) -> float:
+    return sum(map(float, parts.values()))

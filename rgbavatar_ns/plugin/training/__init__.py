@@ -1,0 +1,1 @@
+"""nerfstudio's trainer, with checkpoints that can be relied on."""

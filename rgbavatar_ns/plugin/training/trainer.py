@@ -1,0 +1,335 @@
+"""nerfstudio's trainer with checkpoints, resuming and interruption that can be relied on."""
+
+# pyright: reportIncompatibleVariableOverride=false
+# nerfstudio's classes are used by narrowing their fields, which a strict type system forbids.
+
+import json
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from nerfstudio.engine.callbacks import TrainingCallbackLocation
+from nerfstudio.engine.optimizers import Optimizers
+from nerfstudio.engine.trainer import Trainer, TrainerConfig
+from nerfstudio.utils import writer
+from nerfstudio.utils.misc import step_check
+from nerfstudio.utils.rich_utils import CONSOLE
+from nerfstudio.utils.writer import EventName
+from nerfstudio.viewer.viewer import Viewer
+
+from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.plugin.pipeline import RGBAvatarPipeline, RGBAvatarPipelineConfig
+from rgbavatar_ns.plugin.training.checkpoints import load_newest, read_checkpoint, save_checkpoint
+from rgbavatar_ns.plugin.training.errors import device_errors_told, install_user_error_hook
+from rgbavatar_ns.plugin.training.interruption import StopRequest
+from rgbavatar_ns.plugin.training.optimizers import ExponentialConfig
+from rgbavatar_ns.plugin.training.progress import TrainingProgress
+from rgbavatar_ns.plugin.training.refinement import REFINED_NAME
+
+SUMMARY_NAME = "training.json"
+
+
+@dataclass
+class RGBAvatarTrainerConfig(TrainerConfig):
+    """A run of this method; learning rates are in `optimizers`, one group a kind of parameter."""
+
+    _target: type = field(default_factory=lambda: RGBAvatarTrainer)
+    pipeline: RGBAvatarPipelineConfig = field(default_factory=RGBAvatarPipelineConfig)
+    """Data and model."""
+    max_num_iterations: int = 5000
+    """Steps in all, those before a resume included."""
+    position_lr_final: float | None = None
+    """Let the learning rate of positions fall exponentially to this (the release: 8e-6)."""
+    learning_rate_factor: float = 1.0
+    """Let all other learning rates fall exponentially to this multiple of the first one."""
+    learning_rate_steps: int | None = None
+    """Steps over which learning rates fall; by default max_num_iterations. Name it where a run
+    is to be continued beyond its first end."""
+    keep_checkpoints: int = 2
+    """Newest checkpoints kept where save_only_latest_checkpoint is on: a second one, in case the
+    newest is damaged."""
+    mixed_precision: bool = False
+    """Half precision is not used: the rasterizer computes in float32."""
+
+
+class RGBAvatarTrainer(Trainer):
+    """Trains by nerfstudio's hooks, in a loop of its own.
+
+    What differs: `max_num_iterations` counts all steps also after a resume; checkpoints are
+    atomic and the newest readable one is loaded; SIGINT and SIGTERM save after the present step
+    and exit with 130 and 143; scalars are written every `steps_per_log` steps only; the run's
+    speed is written to training.json.
+    """
+
+    config: RGBAvatarTrainerConfig
+    pipeline: RGBAvatarPipeline
+
+    def __init__(
+        self, config: RGBAvatarTrainerConfig, local_rank: int = 0, world_size: int = 1
+    ) -> None:
+        install_user_error_hook()
+        if world_size != 1:
+            raise UserError("This method trains on one device.", "Leave out --machine.num-devices.")
+        _use_run_seed(config)
+        super().__init__(config, local_rank, world_size)
+        self.stop = StopRequest()
+        self.stop_training = False
+        self._train_seconds = 0.0
+        self._saved_step: int | None = None
+
+    def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
+        """Build pipeline, optimisers, viewer and writers; load a checkpoint if one is named."""
+        super().setup(test_mode)
+        if isinstance(self.viewer_state, Viewer):
+            for line in self.viewer_state.viewer_info:
+                CONSOLE.print(line, highlight=False)
+
+    def setup_optimizers(self) -> Optimizers:
+        """One optimiser a parameter group, with the schedules that the config asks for."""
+        groups = self.pipeline.get_param_groups()
+        steps = self.config.learning_rate_steps or self.config.max_num_iterations
+        model = self.config.pipeline.model
+        settings: dict[str, Any] = {}
+        for name in groups:
+            settings[name] = dict(self.config.optimizers[name])
+            rate = settings[name]["optimizer"].lr
+            factor = self.config.learning_rate_factor
+            if name == "position" and self.config.position_lr_final is not None:
+                factor = self.config.position_lr_final / rate
+            start = model.refinement.first_step_of(name, steps) if model.refine_tracking else 0
+            if (factor != 1.0 or start > 0) and settings[name].get("scheduler") is None:
+                settings[name]["scheduler"] = ExponentialConfig(
+                    factor=factor, steps=steps, start_step=start
+                )
+        return Optimizers(settings, groups)
+
+    def train(self) -> None:
+        """Train up to `max_num_iterations`, or until a stop is asked for; then save."""
+        outputs = self.pipeline.datamanager.train_dataparser_outputs
+        outputs.save_dataparser_transform(self.base_dir / "dataparser_transforms.json")
+        self._init_viewer_state()
+        with self.stop:
+            self._train_steps()
+            self._after_train()
+        if self.stop.exit_code:
+            raise SystemExit(self.stop.exit_code)
+
+    def shutdown(self) -> None:
+        """Stop after the present step and close the viewer."""
+        self.stop.request()
+        super().shutdown()
+
+    def _train_steps(self) -> None:
+        total, start = self.config.max_num_iterations, self._start_step
+        pixels = self.pipeline.datamanager.get_train_rays_per_batch()
+        tracked = self.pipeline.datamanager.dataparser.tracked
+        images_per_step = pixels // (tracked.width * tracked.height)
+        self.step = start - 1
+        with TrainingProgress(start, total, images_per_step) as progress:
+            for step in range(start, total):
+                if self._wait_while_paused():
+                    break
+                began = time.monotonic()
+                with device_errors_told(self.checkpoint_dir):
+                    parts = self._train_one(step)
+                self.step = step
+                seconds = time.monotonic() - began
+                self._train_seconds += seconds
+                self._update_viewer_state(step)
+                last = step == total - 1
+                if last or step_check(step, self.config.logging.steps_per_log, run_at_zero=True):
+                    value = self._finite(sum(map(float, parts.values())), step)
+                    self._write_scalars(step, value, parts, seconds, images_per_step, pixels)
+                    progress.show(step + 1, value)
+                if len(self.pipeline.datamanager.eval_dataset) > 0:
+                    with self.train_lock:
+                        self.eval_iteration(step)
+                if step_check(step, self.config.steps_per_save):
+                    self.save_checkpoint(step)
+                writer.write_out_storage()
+
+    def _wait_while_paused(self) -> bool:
+        """Wait while the viewer's pause button is on; True if training is to stop."""
+        while self.training_state == "paused" and not self.stop.requested:
+            self.stop.wait(0.01)
+        return self.stop.requested or self.stop_training
+
+    def _train_one(self, step: int) -> dict[str, torch.Tensor]:
+        """One step: loss, gradients, optimisers, callbacks. Under the viewer's lock.
+
+        Returns the parts of the loss, detached.
+        """
+        with self.train_lock:
+            self.pipeline.train()
+            self._run_callbacks(step, TrainingCallbackLocation.BEFORE_TRAIN_ITERATION)
+            parts = None
+            if not self.grad_scaler.is_enabled():
+                parts = self.pipeline.fused_train_step(step, self.optimizers)
+            if parts is None:
+                parts = self._eager_step(step)
+            for scheduler in self.optimizers.schedulers.values():
+                scheduler.step()
+            self._run_callbacks(step, TrainingCallbackLocation.AFTER_TRAIN_ITERATION)
+        return parts
+
+    def _eager_step(self, step: int) -> dict[str, torch.Tensor]:
+        """Loss, gradients by autograd, optimisers; the parts of the loss."""
+        self.optimizers.zero_grad_all()
+        _, parts, _ = self.pipeline.get_train_loss_dict(step=step)
+        torch.stack(list(parts.values())).sum().backward()
+        self.optimizers.optimizer_scaler_step_all(self.grad_scaler)
+        return {name: part.detach() for name, part in parts.items()}
+
+    def _run_callbacks(self, step: int, location: TrainingCallbackLocation) -> None:
+        for callback in self.callbacks:
+            callback.run_callback_at_location(step, location)
+
+    def _finite(self, loss: float, step: int) -> float:
+        if loss != loss or abs(loss) == float("inf"):
+            raise UserError(
+                f"The loss of step {step} is {loss}.",
+                f"Resume from the last checkpoint in {self.checkpoint_dir} with smaller learning "
+                "rates, for example --optimizers.color.optimizer.lr 0.005.",
+            )
+        return loss
+
+    def _write_scalars(
+        self,
+        step: int,
+        loss: float,
+        parts: dict[str, torch.Tensor],
+        seconds: float,
+        images_per_step: int,
+        pixels: int,
+    ) -> None:
+        """TensorBoard's curves, and the speeds that the viewer shares the device by."""
+        writer.put_scalar(name="Train Loss", scalar=loss, step=step)
+        writer.put_dict(name="Train Loss Dict", scalar_dict={**parts}, step=step)
+        writer.put_scalar(name="Train Images / Sec", scalar=images_per_step / seconds, step=step)
+        writer.put_time(EventName.ITER_TRAIN_TIME, seconds, step, update_eta=True)
+        writer.put_time(EventName.TRAIN_RAYS_PER_SEC, pixels / seconds, step)
+        for name, scheduler in self.optimizers.schedulers.items():
+            rate = scheduler.get_last_lr()[0]
+            writer.put_scalar(name=f"learning_rate/{name}", scalar=rate, step=step)
+
+    @property
+    def completed(self) -> bool:
+        """Whether all steps are done."""
+        return self.step >= self.config.max_num_iterations - 1
+
+    def _after_train(self) -> None:
+        """Save, say how it went, and keep the viewer open if it is to stay."""
+        completed = self.completed
+        self.training_state = "completed" if completed else "paused"
+        if self.step >= 0 and self.step != self._saved_step:
+            self.save_checkpoint(self.step)
+        writer.write_out_storage()
+        self._save_refined()
+        self._tell_end(completed)
+        self._run_callbacks(self.step, TrainingCallbackLocation.AFTER_TRAIN)
+        if completed and not self.config.viewer.quit_on_train_completion:
+            self._train_complete_viewer()
+
+    def _tell_end(self, completed: bool) -> None:
+        summary = self._write_summary()
+        steps, rate = summary["steps"], summary["images_per_second"]
+        if completed:
+            CONSOLE.print(f"Trained {steps} steps, {rate:.1f} images/s.", highlight=False)
+        else:
+            CONSOLE.print(
+                f"Stopped after {steps} of {self.config.max_num_iterations} steps; resume with "
+                f"the same command and --load-dir {self.checkpoint_dir}",
+                highlight=False,
+                soft_wrap=True,
+            )
+        CONSOLE.print(f"Config: {self.base_dir / 'config.yml'}", highlight=False, soft_wrap=True)
+        CONSOLE.print(f"Checkpoints: {self.checkpoint_dir}", highlight=False, soft_wrap=True)
+
+    def _save_refined(self) -> None:
+        """Write what refinement made of the frames' theta beside the config."""
+        model = self.pipeline.model
+        if model.refinement is not None:
+            model.refinement.save(self.base_dir / REFINED_NAME, model.frame_theta)
+
+    def _write_summary(self) -> dict[str, int | float]:
+        """The run's length and speed over all its sessions, as training.json."""
+        steps = self.step + 1
+        datamanager = self.pipeline.datamanager
+        tracked = datamanager.dataparser.tracked
+        batch = datamanager.get_train_rays_per_batch() // (tracked.width * tracked.height)
+        seconds = self._train_seconds
+        summary = {
+            "steps": steps,
+            "images": steps * batch,
+            "train_seconds": seconds,
+            "images_per_second": steps * batch / seconds if seconds > 0 else 0.0,
+        }
+        path = self.base_dir / SUMMARY_NAME
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(summary, indent=2) + "\n")
+        return summary
+
+    def _train_complete_viewer(self) -> None:
+        """Keep the viewer open until Ctrl-C, which then ends the run with exit code 0."""
+        if self.viewer_state is None:
+            return
+        self.viewer_state.training_complete()
+        CONSOLE.print("The viewer stays open; Ctrl-C ends it.")
+        while not self.stop.wait(1.0):
+            pass
+        self.stop.signal_number = None
+
+    def _load_checkpoint(self) -> None:
+        """Load what --load-dir (newest readable) or --load-checkpoint names, if anything."""
+        config = self.config
+        if config.load_dir is not None:
+            state, path = self._choose(config.load_dir)
+        elif config.load_checkpoint is not None:
+            state, path = read_checkpoint(config.load_checkpoint), config.load_checkpoint
+        else:
+            CONSOLE.print("Training from the start.")
+            return
+        self._start_step = int(state["step"]) + 1
+        self._saved_step = int(state["step"])
+        self._train_seconds = float(state.get("train_seconds", 0.0))
+        self.pipeline.load_pipeline(state["pipeline"], int(state["step"]))
+        self.optimizers.load_optimizers(state["optimizers"])
+        if config.load_scheduler:
+            known = self.optimizers.schedulers
+            self.optimizers.load_schedulers(
+                {name: saved for name, saved in state["schedulers"].items() if name in known}
+            )
+        CONSOLE.print(
+            f"Resuming after step {state['step']} from {path}", highlight=False, soft_wrap=True
+        )
+
+    def _choose(self, folder: Path) -> tuple[dict[str, Any], Path]:
+        if self.config.load_step is not None:
+            path = folder / f"step-{self.config.load_step:09d}.ckpt"
+            return read_checkpoint(path), path
+        return load_newest(folder, lambda line: CONSOLE.print(line, soft_wrap=True))
+
+    def save_checkpoint(self, step: int) -> None:
+        """Write a checkpoint atomically; raises UserError if it does not fit on the disk."""
+        state = {
+            "step": step,
+            "train_seconds": self._train_seconds,
+            "pipeline": self.pipeline.state_dict(),
+            "optimizers": {k: v.state_dict() for k, v in self.optimizers.optimizers.items()},
+            "schedulers": {k: v.state_dict() for k, v in self.optimizers.schedulers.items()},
+            "scalers": self.grad_scaler.state_dict(),
+        }
+        keep = self.config.keep_checkpoints
+        if not self.config.save_only_latest_checkpoint:
+            keep = self.config.max_num_iterations
+        save_checkpoint(state, self.checkpoint_dir, step, keep)
+        self._saved_step = step
+
+
+def _use_run_seed(config: RGBAvatarTrainerConfig) -> None:
+    """Let data and model follow --machine.seed unless they have a seed of their own."""
+    for part in (config.pipeline.datamanager, config.pipeline.model):
+        if part.seed is None:
+            part.seed = config.machine.seed

@@ -1,0 +1,200 @@
+"""Pictures for the viewer: the avatar, what helps to judge it, and the film beside it."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from rgbavatar_ns.data.check.sample import project
+from rgbavatar_ns.drawing.wireframe import with_wireframe
+from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.kernels import PinholeCameras, RenderedBatch
+from rgbavatar_ns.plugin.viewer.viewer_state import Shown, Stage, ViewerState
+
+_ERROR_GAIN = 4.0
+_SEEN = 0.02
+_CENTRE_RGB = (60, 255, 120)
+
+_Bytes = UInt8[np.ndarray, "H W 3"]
+_Image = Float[Tensor, "H W 3"]
+
+
+@dataclass(frozen=True)
+class ViewerPicture:
+    """One picture, and what nerfstudio wants beside it."""
+
+    image: _Image
+    alpha: Float[Tensor, "H W 1"]
+    depth: Float[Tensor, "H W 1"]
+    """In metres along the camera's z."""
+    psnr: float | None = None
+    """Against the film in dB, where it is beside."""
+
+    def outputs(self) -> dict[str, Tensor]:
+        """By the names that nerfstudio's viewer and `ns-render` use."""
+        return {"rgb": self.image, "accumulation": self.alpha, "depth": self.depth}
+
+
+@torch.no_grad()
+def viewer_picture(
+    stage: Stage,
+    wishes: ViewerState,
+    camera: PinholeCameras,
+    time: float | None = None,
+    *,
+    backend: str = "auto",
+) -> ViewerPicture:
+    """Draw what is wished for from one camera (C = 1); pictures beside the film from its own.
+
+    Raises UserError where there is no film to compare with.
+    """
+    shown = stage.shown(wishes, time)
+    if wishes.picture in ("beside the film", "error"):
+        return _beside_film(stage, wishes, shown, camera, backend)
+    drawn = _draw(stage, shown, wishes, camera, backend)
+    assert drawn.depth is not None
+    alpha, depth = drawn.alpha[0], filled_depth(drawn.depth, drawn.alpha)[0]
+    # nerfstudio's viewer makes bytes of it, where 1.01 would be black.
+    image = drawn.image[0].clamp(0, 1)
+    if wishes.picture == "alpha":
+        image = alpha.expand(-1, -1, 3)
+    elif wishes.picture == "depth":
+        image = _depth_colors(depth, alpha)
+    image = _with_overlays(image, stage, shown, wishes, camera, drawn.visibility)
+    return ViewerPicture(image, alpha, depth)
+
+
+def filled_depth(
+    depth: Float[Tensor, "B H W 1"], alpha: Float[Tensor, "B H W 1"]
+) -> Float[Tensor, "B H W 1"]:
+    """Put what is not covered behind everything else, as the viewer's compositing expects."""
+    return torch.where(alpha > 0.5, depth, depth.amax())
+
+
+def _draw(
+    stage: Stage, shown: Shown, wishes: ViewerState, camera: PinholeCameras, backend: str
+) -> RenderedBatch:
+    return stage.avatar.render(
+        shown.theta,
+        camera,
+        shown.theta.new_tensor(wishes.backdrop),
+        psi=shown.psi,
+        backend=backend,
+        with_depth=True,
+        with_visibility=wishes.centres,
+    )
+
+
+def _beside_film(
+    stage: Stage, wishes: ViewerState, shown: Shown, camera: PinholeCameras, backend: str
+) -> ViewerPicture:
+    """Film, avatar and error in a row, or the error alone, scaled to fit the viewer's window."""
+    film = stage.film
+    if film is None or shown.position is None:
+        raise UserError(
+            "There is no film to compare this with.",
+            "Choose another picture, or drive the avatar by a dataset frame.",
+        )
+    own = film.cameras.select([shown.position])
+    device = shown.theta.device
+    own = PinholeCameras(
+        own.world_to_camera.to(device),
+        own.focal_px.to(device),
+        own.principal_point_px.to(device),
+        own.width,
+        own.height,
+    )
+    drawn = _draw(stage, shown, wishes, own, backend)
+    rgba = torch.from_numpy(film.read_image(shown.position)).to(device).float() / 255
+    ground = rgba.new_tensor(wishes.backdrop)
+    truth = rgba[..., :3] * rgba[..., 3:] + ground * (1 - rgba[..., 3:])
+    avatar = drawn.image[0].clamp(0, 1)
+    difference = (avatar - truth).abs()
+    psnr = float(-10 * difference.square().mean().clamp(min=1e-10).log10())
+    error = _colored(difference.mean(-1).mul(_ERROR_GAIN), cv2.COLORMAP_INFERNO)
+    tiles = [error]
+    if wishes.picture == "beside the film":
+        avatar = _with_overlays(avatar, stage, shown, wishes, own, drawn.visibility)
+        tiles = [truth, avatar, error]
+    image = _fitted(torch.cat(tiles, 1), camera, wishes.backdrop)
+    covered = image.new_ones(camera.height, camera.width, 1)
+    return ViewerPicture(image, covered, covered, psnr)
+
+
+def _fitted(row: _Image, camera: PinholeCameras, backdrop: tuple[float, float, float]) -> _Image:
+    """The row in the middle of a picture of the camera's size, as large as it fits."""
+    height, width = row.shape[:2]
+    zoom = min(camera.height / height, camera.width / width)
+    size = max(1, int(width * zoom)), max(1, int(height * zoom))
+    smooth = cv2.INTER_AREA if zoom < 1 else cv2.INTER_LINEAR
+    scaled = torch.from_numpy(cv2.resize(row.cpu().numpy(), size, interpolation=smooth))
+    image = row.new_tensor(backdrop).expand(camera.height, camera.width, 3).clone()
+    top, left = (camera.height - size[1]) // 2, (camera.width - size[0]) // 2
+    image[top : top + size[1], left : left + size[0]] = scaled.to(image)
+    return image
+
+
+def _depth_colors(depth: Float[Tensor, "H W 1"], alpha: Float[Tensor, "H W 1"]) -> _Image:
+    """Near is bright, over the range of what is covered; black where nothing is."""
+    covered = alpha > 0.5
+    if not bool(covered.any()):
+        return torch.zeros_like(depth).expand(-1, -1, 3)
+    near, far = depth[covered].aminmax()
+    closeness = (far - depth) / (far - near).clamp(min=1e-6)
+    return _colored(closeness[..., 0], cv2.COLORMAP_VIRIDIS) * covered
+
+
+def _colored(values: Float[Tensor, "H W"], color_map: int) -> _Image:
+    """Values in [0, 1] by one of OpenCV's colour maps."""
+    coded = (values.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
+    return _as_image(cv2.applyColorMap(coded, color_map)[..., ::-1], values)
+
+
+def _with_overlays(
+    image: _Image,
+    stage: Stage,
+    shown: Shown,
+    wishes: ViewerState,
+    camera: PinholeCameras,
+    visibility: Tensor | None,
+) -> _Image:
+    if wishes.centres and visibility is not None:
+        means = stage.avatar.gaussians(shown.theta, shown.psi).means[0, visibility[0] > _SEEN]
+        image = _over(image, lambda picture: _with_points(picture, _pixels(means, camera)))
+    if wishes.mesh:
+        vertices = stage.avatar.carrier_vertices(shown.theta)[0]
+        points, faces = _pixels(vertices, camera), stage.avatar.head.arrays.faces
+        # The drawing's colours are OpenCV's: blue first.
+        image = _over(
+            image, lambda rgb: with_wireframe(rgb[..., ::-1].copy(), points, faces)[..., ::-1]
+        )
+    return image
+
+
+def _pixels(points: Float[Tensor, "P 3"], camera: PinholeCameras) -> Float[np.ndarray, "P 2"]:
+    parts = (points[None], camera.world_to_camera, camera.focal_px, camera.principal_point_px)
+    return project(*(part.cpu().numpy() for part in parts)).points_px[0]
+
+
+def _with_points(picture: _Bytes, points_px: Float[np.ndarray, "P 2"]) -> _Bytes:
+    column, row = np.floor(points_px).astype(int).T
+    height, width = picture.shape[:2]
+    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    marked = picture.copy()
+    marked[row[inside], column[inside]] = _CENTRE_RGB
+    return marked
+
+
+def _over(image: _Image, drawing: Callable[[Any], Any]) -> _Image:
+    """The image after something was drawn into its bytes."""
+    coded = (image.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
+    return _as_image(drawing(coded), image)
+
+
+def _as_image(coded: Any, like: Tensor) -> _Image:
+    return torch.from_numpy(np.ascontiguousarray(coded)).to(like.device).float() / 255

@@ -1,0 +1,256 @@
+"""A take written as each system would have left it on disk."""
+
+import math
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from rgbavatar_ns.data.json_file import write_json
+from rgbavatar_ns.head import HeadModel
+from rgbavatar_ns.synthetic.exporters.frame_images import write_color, write_grey, write_rgba
+from rgbavatar_ns.synthetic.exporters.frame_writer import FrameWriter
+from rgbavatar_ns.synthetic.exporters.take import (
+    Take,
+    TakeFrame,
+    focal_px,
+    principal_point_px,
+    world_to_camera,
+)
+
+_OPENGL_ROWS = np.diag([1.0, -1.0, -1.0, 1.0])
+_IMAVATAR_SCALE = 4.0
+_VALIDATION = 20
+_VHAP_VERTICES = 5023 + 120
+
+
+class TakeWriter(Protocol):
+    """Writes frame after frame, then what tells of them all."""
+
+    def add(self, frame: TakeFrame) -> None:
+        """Write one frame."""
+        ...
+
+    def finish(self) -> None:
+        """Write the index, where the format has one."""
+        ...
+
+
+class MetricalWriter:
+    """metrical-tracker's output; mattes lie beside it in `alpha`, since it has none."""
+
+    def __init__(self, dst: Path, take: Take) -> None:
+        self._dst = dst
+        self._frames = FrameWriter(dst, take)
+
+    def add(self, frame: TakeFrame) -> None:
+        """One frame's files."""
+        self._frames.write(frame)
+        write_color(self._dst / f"input/{frame.index:05d}.png", frame.image_rgba)
+        write_grey(self._dst / f"alpha/{frame.index:05d}.png", frame.image_rgba[..., 3])
+
+    def finish(self) -> None:
+        """There is no index."""
+
+
+class FlashAvatarWriter:
+    """FlashAvatar: JPEG files whose number is the frame's plus one."""
+
+    def __init__(self, dst: Path, take: Take) -> None:
+        self._dst = dst
+        output = dst / "metrical-tracker" / "output" / dst.resolve().name
+        self._frames = FrameWriter(output, take)
+
+    def add(self, frame: TakeFrame) -> None:
+        """One frame's files; the parsing masks are the matte's lower and upper half."""
+        self._frames.write(frame)
+        number = frame.index + 1
+        alpha = frame.image_rgba[..., 3]
+        write_color(self._dst / f"imgs/{number:05d}.jpg", frame.image_rgba)
+        write_grey(self._dst / f"alpha/{number:05d}.jpg", alpha)
+        face = np.where(alpha > 127, 255, 0).astype(np.uint8)
+        mouth = face.copy()
+        mouth[: len(mouth) // 2] = 0
+        write_grey(self._dst / f"parsing/{number:05d}_neckhead.png", face)
+        write_grey(self._dst / f"parsing/{number:05d}_mouth.png", mouth)
+
+    def finish(self) -> None:
+        """There is no index."""
+
+
+class InstaWriter:
+    """INSTA: OpenCV cameras in transforms.json, `.frame` files, meshes and expressions."""
+
+    def __init__(self, dst: Path, take: Take) -> None:
+        self._dst, self._take = dst, take
+        self._tracker = FrameWriter(dst, take)
+        self._head = HeadModel(take.arrays, torch.float64)
+        self._frames: list[dict[str, Any]] = []
+        self._shared: dict[str, Any] = {}
+        for name in ("flame/exp", "meshes"):
+            (dst / name).mkdir(parents=True, exist_ok=True)
+
+    def add(self, frame: TakeFrame) -> None:
+        """One frame's files and its entry."""
+        number = f"{frame.index:05d}"
+        self._tracker.write(frame)
+        write_rgba(self._dst / f"images/{number}.png", frame.image_rgba)
+        expression = "\n".join(f"{value:.9g}" for value in frame.theta["expression"])
+        (self._dst / f"flame/exp/{number}.txt").write_text(expression + "\n")
+        (self._dst / f"meshes/{number}.obj").write_text(self._mesh(frame))
+        self._shared = _intrinsics(frame, self._take)
+        self._frames.append(
+            {
+                "file_path": f"images/{number}.png",
+                "mesh_path": f"meshes/{number}.obj",
+                "exp_path": f"flame/exp/{number}.txt",
+                "transform_matrix": np.linalg.inv(self._tracker.camera(frame)).tolist(),
+            }
+        )
+
+    def _mesh(self, frame: TakeFrame) -> str:
+        still = ("rotation", "neck", "translation")
+        parts = {name: value for name, value in frame.theta.items() if name not in still}
+        theta = self._head.layout.join({n: torch.from_numpy(v) for n, v in parts.items()})
+        with torch.no_grad():
+            vertices = self._head(theta, torch.from_numpy(self._take.identity))
+        return "".join(f"v {x:.7f} {y:.7f} {z:.7f}\n" for x, y, z in vertices.tolist())
+
+    def finish(self) -> None:
+        """transforms.json and the three splits; the last 20 of train are val."""
+        last = len(self._frames) - self._take.num_test_frames
+        train = self._frames[:last]
+        write_json(self._dst / "transforms.json", {**self._shared, "frames": self._frames})
+        for split, frames in (
+            ("train", train),
+            ("val", train[-_VALIDATION:]),
+            ("test", self._frames[last:]),
+        ):
+            path = self._dst / f"transforms_{split}.json"
+            write_json(path, {**self._shared, "frames": frames})
+
+
+class VhapWriter:
+    """VHAP's export of one camera: OpenGL, masks beside images, parameters as npz."""
+
+    def __init__(self, dst: Path, take: Take) -> None:
+        self._dst, self._take = dst, take
+        self._frames: list[dict[str, Any]] = []
+        (dst / "flame_param").mkdir(parents=True, exist_ok=True)
+
+    def add(self, frame: TakeFrame) -> None:
+        """One frame's files and its entry."""
+        number, theta = f"{frame.index:05d}", frame.theta
+        image = f"images/{number}_00.png"
+        mask, parameters = f"fg_masks/{number}_00.png", f"flame_param/{number}.npz"
+        write_color(self._dst / image, frame.image_rgba)
+        write_grey(self._dst / mask, frame.image_rgba[..., 3])
+        np.savez(self._dst / parameters, **self._parameters(theta))
+        camera_to_world = np.linalg.inv(_OPENGL_ROWS @ world_to_camera(frame))
+        self._frames.append(
+            {
+                "timestep_index": frame.index,
+                "timestep_index_original": frame.index,
+                "timestep_id": number,
+                "camera_index": 0,
+                "camera_id": "00",
+                **_intrinsics(frame, self._take),
+                "transform_matrix": camera_to_world.tolist(),
+                "file_path": image,
+                "fg_mask_path": mask,
+                "flame_param_path": parameters,
+            }
+        )
+
+    def _parameters(self, theta: dict[str, Float[np.ndarray, "_"]]) -> dict[str, np.ndarray]:
+        eyes = np.concatenate([theta["left_eye"], theta["right_eye"]])
+        values = {
+            "translation": theta["translation"][None],
+            "rotation": theta["rotation"][None],
+            "neck_pose": theta["neck"][None],
+            "jaw_pose": theta["jaw"][None],
+            "eyes_pose": eyes[None],
+            "shape": self._take.identity,
+            "expr": theta["expression"][None],
+            "static_offset": np.zeros((1, _VHAP_VERTICES, 3)),
+        }
+        return {name: value.astype(np.float32) for name, value in values.items()}
+
+    def finish(self) -> None:
+        """transforms.json, the splits and the canonical pose."""
+        last = len(self._frames) - self._take.num_test_frames
+        splits = {"": self._frames, "_train": self._frames[:last], "_val": self._frames[last:]}
+        splits["_test"] = self._frames[last:]
+        for split, frames in splits.items():
+            index = {
+                "frames": frames,
+                "timestep_indices": [frame["timestep_index"] for frame in frames],
+                "camera_indices": [0],
+            }
+            write_json(self._dst / f"transforms{split}.json", index)
+        zero = {name: np.zeros(3) for name in ("translation", "rotation", "neck")}
+        zero |= {"left_eye": np.zeros(3), "right_eye": np.zeros(3), "expression": np.zeros(100)}
+        canonical = self._parameters({**zero, "jaw": np.array([0.3, 0, 0])})
+        np.savez(self._dst / "canonical_flame_param.npz", **canonical)
+
+
+class IMAvatarWriter:
+    """IMAvatar: one JSON of all frames, a world four times as large, OpenGL rows."""
+
+    def __init__(self, dst: Path, take: Take) -> None:
+        self._dst, self._take = dst, take
+        self._frames: list[dict[str, Any]] = []
+        self._intrinsics: list[float] = []
+
+    def add(self, frame: TakeFrame) -> None:
+        """One frame's files and its entry; the head's shift goes into the camera."""
+        theta, name = frame.theta, f"{frame.index:05d}"
+        write_color(self._dst / f"image/{name}.png", frame.image_rgba)
+        write_grey(self._dst / f"mask/{name}.png", frame.image_rgba[..., 3])
+        matrix = world_to_camera(frame).copy()
+        matrix[:3, 3] += matrix[:3, :3] @ theta["translation"]
+        matrix[:3, 3] *= _IMAVATAR_SCALE
+        pose = [theta[part] for part in ("rotation", "neck", "jaw", "left_eye", "right_eye")]
+        size = np.array([self._take.width, self._take.height])
+        self._intrinsics = [
+            *(focal_px(frame) / size * [-1, 1]).tolist(),
+            *(principal_point_px(frame) / size).tolist(),
+        ]
+        self._frames.append(
+            {
+                "file_path": f"./image/{name}",
+                "world_mat": (_OPENGL_ROWS @ matrix)[:3].tolist(),
+                "expression": theta["expression"].tolist(),
+                "pose": np.concatenate(pose).tolist(),
+                "bbox": [-1, -1, 1, 1],
+                "flame_keypoints": [],
+            }
+        )
+
+    def finish(self) -> None:
+        """flame_params.json."""
+        write_json(
+            self._dst / "flame_params.json",
+            {
+                "frames": self._frames,
+                "intrinsics": self._intrinsics,
+                "shape_params": self._take.identity[:100].tolist(),
+            },
+        )
+
+
+def _intrinsics(frame: TakeFrame, take: Take) -> dict[str, Any]:
+    """As transforms.json has them: pixels, and angles of view in radians."""
+    (focal_x, focal_y), (cx, cy) = focal_px(frame).tolist(), principal_point_px(frame).tolist()
+    return {
+        "cx": cx,
+        "cy": cy,
+        "fl_x": focal_x,
+        "fl_y": focal_y,
+        "w": take.width,
+        "h": take.height,
+        "camera_angle_x": 2 * math.atan(0.5 * take.width / focal_x),
+        "camera_angle_y": 2 * math.atan(0.5 * take.height / focal_y),
+    }

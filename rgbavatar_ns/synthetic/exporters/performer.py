@@ -1,0 +1,62 @@
+"""`demo-data --format`: the demo subject, as a system of another format would have left it."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.synthetic import DemoConfig
+from rgbavatar_ns.synthetic.exporters.folders import (
+    FlashAvatarWriter,
+    IMAvatarWriter,
+    InstaWriter,
+    MetricalWriter,
+    TakeWriter,
+    VhapWriter,
+)
+from rgbavatar_ns.synthetic.exporters.take import FlameFilm, Take
+
+Progress = Callable[[int, int], None]
+"""Called with (frames done, frames in all)."""
+
+
+@dataclass(frozen=True)
+class DemoFormat:
+    """How the subject is filmed for a format, and who writes it.
+
+    stiff_neck: the format knows no neck.
+    """
+
+    writer: Callable[[Path, Take], TakeWriter]
+    version: str
+    stiff_neck: bool
+
+
+DEMO_FORMATS = {
+    "insta": DemoFormat(InstaWriter, "2020", True),
+    "metrical": DemoFormat(MetricalWriter, "2020", True),
+    "vhap": DemoFormat(VhapWriter, "2023", False),
+    "flashavatar": DemoFormat(FlashAvatarWriter, "2020", True),
+    "imavatar": DemoFormat(IMAvatarWriter, "2020", False),
+}
+
+
+def write_demo(
+    dst: str | Path, format: str, config: DemoConfig, progress: Progress | None = None
+) -> Path:
+    """Write the demo subject in a format of `DEMO_FORMATS`; returns the FLAME-shaped pickle.
+
+    Raises UserError where the folder holds something already.
+    """
+    dst, chosen = Path(dst), DEMO_FORMATS[format]
+    if dst.exists() and (not dst.is_dir() or any(dst.iterdir())):
+        raise UserError(f"The folder {dst} is not empty.", "Name a new folder.")
+    dst.mkdir(parents=True, exist_ok=True)
+    film = FlameFilm(dst, config, chosen.version, chosen.stiff_neck)
+    writer = chosen.writer(dst, film.take)
+    for frame in film.frames():
+        writer.add(frame)
+        if progress is not None:
+            progress(frame.index + 1, config.num_frames)
+    writer.finish()
+    return film.flame_path

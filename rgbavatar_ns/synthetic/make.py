@@ -1,0 +1,211 @@
+"""The demo dataset from its script: a person who does not exist, filmed by ray casting."""
+
+from collections import deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from rgbavatar_ns.data.native.dataset import TrackedDataset
+from rgbavatar_ns.data.native.frame import TrackedFrame
+from rgbavatar_ns.data.native.writer import DatasetWriter
+from rgbavatar_ns.head import HeadModel
+from rgbavatar_ns.head.rotations import axis_angle_to_matrix, matrix_to_axis_angle
+from rgbavatar_ns.kernels.types import PinholeCameras
+from rgbavatar_ns.synthetic.config import DemoConfig
+from rgbavatar_ns.synthetic.performer.glasses import make_glasses
+from rgbavatar_ns.synthetic.performer.paint import paint_head
+from rgbavatar_ns.synthetic.performer.performance import perform, with_tracker_noise
+from rgbavatar_ns.synthetic.performer.surface import TrueSurface
+from rgbavatar_ns.synthetic.performer.wrinkles import wrinkle_activations
+from rgbavatar_ns.synthetic.renderer.raycast import StillCamera
+from rgbavatar_ns.synthetic.renderer.render import DemoRenderer, Moment
+
+Progress = Callable[[int, int], None]
+"""Called with (frames done, frames in all)."""
+
+WIDE_OPEN_RAD = 0.33
+_THREADS = 2
+_CHUNK = 16
+_CAMERA_HEIGHT_M = 0.007
+_CAMERA_DISTANCE_M = 1.1
+_HALF_VIEW_M = 0.153
+
+
+def demo_camera(size: int) -> StillCamera:
+    """The camera in front of the person, which never moves."""
+    focal_px = 0.5 * size * _CAMERA_DISTANCE_M / _HALF_VIEW_M
+    return StillCamera(_CAMERA_HEIGHT_M, _CAMERA_DISTANCE_M, focal_px, size)
+
+
+def as_pinhole(camera: StillCamera) -> PinholeCameras:
+    """The same camera in OpenCV's axes."""
+    world_to_camera = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))[None]
+    world_to_camera[0, 1, 3] = camera.height_m
+    world_to_camera[0, 2, 3] = camera.distance_m
+    half = torch.full((1, 2), camera.size / 2)
+    focal_px = torch.full((1, 2), camera.focal_px)
+    return PinholeCameras(world_to_camera, focal_px, half, camera.size, camera.size)
+
+
+@dataclass(frozen=True)
+class DemoPerson:
+    """Head model, looks and renderer of the person of one config."""
+
+    head: HeadModel
+    identity: Float[Tensor, "I"]
+    renderer: DemoRenderer
+    camera: StillCamera
+
+    @classmethod
+    def of(cls, config: DemoConfig) -> "DemoPerson":
+        """Model, paint and light the person; a few seconds."""
+        head = HeadModel.embedded()
+        identity = _identity(head.num_identity, config.seed)
+        surface = TrueSurface(head.arrays, config.seed, config.wrinkles)
+        resolution = min(max(256, 2 ** int(np.ceil(np.log2(2 * config.image_size)))), 2048)
+        paint = paint_head(head.arrays, resolution, config.seed, config.wrinkles)
+        rest = torch.zeros(2, head.layout.size)
+        rest[1, head.layout.slice("jaw").start] = WIDE_OPEN_RAD
+        at_rest, jaw_open = head(rest, identity).numpy()
+        glasses = None
+        if config.glasses:
+            eyes = head.joints(identity)[3:].numpy()
+            bridge = np.abs(at_rest[:, 0]) < 0.012
+            bridge &= np.abs(at_rest[:, 1] - eyes[:, 1].mean()) < 0.008
+            glasses = make_glasses(eyes[0], eyes[1], float(at_rest[bridge, 2].max()))
+        camera = demo_camera(config.image_size)
+        renderer = DemoRenderer(
+            surface, paint, glasses, at_rest, jaw_open, camera, config.supersampling
+        )
+        return cls(head, identity, renderer, camera)
+
+    def moments(self, theta: Float[Tensor, "F H"]) -> Iterator[Moment]:
+        """What to draw for each theta."""
+        layout = self.head.layout
+        expression = theta[:, layout.slice("expression")].double().numpy()
+        names = self.head.arrays.expression_names
+        vertices = np.zeros((0, 0, 3), np.float32)
+        activations = wrinkle_activations(expression, names)
+        jaw = theta[:, layout.slice("jaw").start].double().numpy() / WIDE_OPEN_RAD
+        smile = 0.5 * (
+            expression[:, names.index("mouthSmileLeft")]
+            + expression[:, names.index("mouthSmileRight")]
+        )
+        for k in range(len(theta)):
+            if k % _CHUNK == 0:
+                vertices = self.head(theta[k : k + _CHUNK], self.identity).numpy()
+            rotation, shift = self._skull(theta[k])
+            yield Moment(
+                tracked=vertices[k % _CHUNK],
+                activations=activations[k],
+                blush=float(smile[k]),
+                jaw_open=float(np.clip(jaw[k], 0, 1)),
+                head_rotation=rotation,
+                head_shift_m=shift,
+            )
+
+    def _skull(
+        self, theta: Float[Tensor, "H"]
+    ) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:
+        """The rigid motion of what follows neck and body wholly."""
+        parts = self.head.layout.split(theta)
+        root, neck = self.head.joints(self.identity)[:2]
+        body = axis_angle_to_matrix(parts["rotation"])
+        turn = axis_angle_to_matrix(parts["neck"])
+        shift = body @ (neck - turn @ neck - root) + root + parts["translation"]
+        return (body @ turn).numpy(), shift.numpy()
+
+    def with_stiff_neck(self, theta: Float[Tensor, "F H"]) -> Float[Tensor, "F H"]:
+        """Theta that moves the skull likewise, and everything else with it."""
+        parts = self.head.layout.split(theta)
+        root = self.head.joints(self.identity)[0]
+        turns, shifts = zip(*(self._skull(row) for row in theta))
+        turn, shift = (torch.from_numpy(np.stack(values)) for values in (turns, shifts))
+        moved = {
+            "rotation": matrix_to_axis_angle(turn),
+            "translation": shift - root + turn @ root,
+            "neck": torch.zeros_like(parts["neck"]),
+        }
+        return self.head.layout.join({**parts, **moved})
+
+    def draw(self, theta: Float[Tensor, "F H"]) -> Iterator[UInt8[np.ndarray, "S S 4"]]:
+        """Images of each theta in order, a few frames at work at a time."""
+        waiting: deque[Future[np.ndarray]] = deque()
+        with ThreadPoolExecutor(_THREADS) as pool:
+            for moment in self.moments(theta):
+                waiting.append(pool.submit(self.renderer.render, moment))
+                if len(waiting) > 2 * _THREADS:
+                    yield waiting.popleft().result()
+            while waiting:
+                yield waiting.popleft().result()
+
+
+@dataclass(frozen=True)
+class DemoFilm:
+    """The demo subject's performance: theta as a tracker finds it, and images when asked for."""
+
+    person: DemoPerson
+    tracked: Float[Tensor, "F H"]
+    true: Float[Tensor, "F H"]
+    camera: PinholeCameras
+
+    def frames(self) -> Iterator[TrackedFrame]:
+        """Render frame after frame."""
+        for index, image in enumerate(self.person.draw(self.true)):
+            yield TrackedFrame(index, self.tracked[index], self.camera, image)
+
+
+def film_demo(config: DemoConfig, stiff_neck: bool = False) -> DemoFilm:
+    """Cast, script and track the demo subject; the same config gives the same film on every run.
+
+    stiff_neck: the body turns in the neck's stead, so that the head moves as one piece, as
+    trackers assume that put all of its motion into the camera.
+    """
+    person = DemoPerson.of(config)
+    layout = person.head.layout
+    performance = perform(
+        layout,
+        person.head.arrays.expression_names,
+        config.num_frames,
+        config.num_test_frames,
+        config.frames_per_second,
+        config.seed,
+    )
+    tracked = with_tracker_noise(performance.theta, layout, config.theta_noise, config.seed)
+    found, true = (torch.from_numpy(theta).float() for theta in (tracked, performance.theta))
+    if stiff_neck:
+        found, true = person.with_stiff_neck(found), person.with_stiff_neck(true)
+    return DemoFilm(person, found, true, as_pinhole(person.camera))
+
+
+def make_demo_dataset(
+    dst: str | Path, config: DemoConfig | None = None, progress: Progress | None = None
+) -> TrackedDataset:
+    """Render the demo subject and write it to `dst`, replacing a dataset that is there.
+
+    The same config gives the same person, performance, noise and images on every run. Calls
+    `progress(frames done, frames in all)` after each frame.
+    """
+    config = config or DemoConfig()
+    film = film_demo(config)
+    head, size = film.person.head, config.image_size
+    writer = DatasetWriter(
+        dst, head.arrays, film.person.identity, head.layout, size, size, overwrite=True
+    )
+    for frame in film.frames():
+        writer.add(frame)
+        if progress is not None:
+            progress(frame.index + 1, config.num_frames)
+    return writer.finish(config.num_test_frames)
+
+
+def _identity(count: int, seed: int) -> Float[Tensor, "I"]:
+    """Looks of their own, but no caricature."""
+    drawn = np.random.default_rng([seed, 0]).standard_normal(count)
+    return torch.from_numpy(np.clip(0.6 * drawn, -1.2, 1.2)).float()

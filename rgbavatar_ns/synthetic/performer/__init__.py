@@ -1,0 +1,1 @@
+"""The procedural person: surface, paint, performance."""

@@ -1,0 +1,1 @@
+"""Landmarks, and how they lie on a head."""

@@ -1,0 +1,163 @@
+"""The landmarks of the followed face over a whole clip, and which frames have none."""
+
+from collections.abc import Collection
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.tracking.face.detector import face_height_px
+from rgbavatar_ns.tracking.face.follow import FaceFollower
+
+# In one frame's time a face moves and grows by less than this; more is a cut or a jump.
+_JUMP_SHARE, _JUMP_SIZE = 0.4, 1.3
+# A pause between two frames' times beyond this many usual ones is a gap.
+_PAUSE = 4.0
+# Sharpness below this share of the clip's sharp frames' (its 90th percentile: most frames may be
+# blurred) is noted as blur. Frames of a face that talks and keeps still are above .7.
+_BLURRED, _SHARP_PERCENT = 0.35, 90
+
+
+@dataclass(frozen=True)
+class SeenFaces:
+    """Every face in every frame read: `count` faces of frame f lie in a row in `points`.
+
+    `points` are shares of the frame's width and height; `sharpness` has any unit; `time_s` is NaN
+    where the source has no clock; `has_alpha` tells frames that bring their own matte.
+    """
+
+    count: Int[np.ndarray, "F"]
+    clip: Int[np.ndarray, "F"]
+    time_s: Float[np.ndarray, "F"]
+    has_alpha: Bool[np.ndarray, "F"]
+    points: Float[np.ndarray, "N 478 2"]
+    sharpness: Float[np.ndarray, "N"]
+
+    def __len__(self) -> int:
+        return len(self.count)
+
+    @classmethod
+    def joined(cls, parts: "Collection[SeenFaces]") -> "SeenFaces":
+        """One after the other."""
+        names = ("count", "clip", "time_s", "has_alpha", "points", "sharpness")
+        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+
+
+@dataclass(frozen=True)
+class ClipLandmarks:
+    """Landmarks (source pixels) of the frames that show the followed face, and which those are.
+
+    `frame_index` counts all frames read, `clip` says from which file each one is, `segment` counts
+    up at each gap, cut or jump. `with_others` lists frames in which another face was seen too,
+    `blurred` those whose face is far less sharp than usual.
+    """
+
+    points_px: Float[np.ndarray, "F 478 2"]
+    frame_index: tuple[int, ...]
+    clip: tuple[int, ...]
+    segment: tuple[int, ...]
+    frames_read: int
+    width: int
+    height: int
+    with_others: tuple[int, ...]
+    blurred: tuple[int, ...]
+
+    def __len__(self) -> int:
+        return len(self.frame_index)
+
+    def follows(self) -> list[bool]:
+        """Whether each frame comes directly after the one before it, without gap, cut or jump."""
+        steps = zip(self.frame_index, self.frame_index[1:], self.segment, self.segment[1:])
+        return [False] + [b == a + 1 and c == d for a, b, c, d in steps]
+
+    def without(self, positions: Collection[int]) -> "ClipLandmarks":
+        """The same without the frames at these positions."""
+        keep = [k for k in range(len(self)) if k not in set(positions)]
+        return replace(
+            self,
+            points_px=self.points_px[keep],
+            frame_index=tuple(self.frame_index[k] for k in keep),
+            clip=tuple(self.clip[k] for k in keep),
+            segment=tuple(self.segment[k] for k in keep),
+        )
+
+    def segments(self) -> list[dict[str, Any]]:
+        """First and last frame of each stretch that is tracked without a break."""
+        starts = [k for k, goes_on in enumerate(self.follows()) if not goes_on]
+        ends = [*(k - 1 for k in starts[1:]), len(self) - 1]
+        return [
+            {
+                "first_frame": self.frame_index[a],
+                "last_frame": self.frame_index[b],
+                "clip": self.clip[a],
+            }
+            for a, b in zip(starts, ends)
+        ]
+
+
+def followed_face(seen: SeenFaces, width: int, height: int) -> ClipLandmarks:
+    """Keep to one face of those that were seen; UserError if there is none in any frame."""
+    follower = FaceFollower()
+    first_face = np.concatenate([[0], np.cumsum(seen.count)])
+    points: list[Float[np.ndarray, "478 2"]] = []
+    sharpness: list[float] = []
+    index: list[int] = []
+    jumps: set[int] = set()
+    others: list[int] = []
+    for frame in range(len(seen)):
+        rows = slice(int(first_face[frame]), int(first_face[frame + 1]))
+        faces = seen.points[rows] * (width, height)
+        sighting = follower(faces, width, height)
+        if sighting.others:
+            others.append(frame)
+        if sighting.position is not None:
+            points.append(faces[sighting.position])
+            sharpness.append(float(seen.sharpness[rows][sighting.position]))
+            index.append(frame)
+            if sighting.jumped:
+                jumps.add(frame)
+    if not points:
+        raise UserError(
+            f"No face was found in any of the {len(seen)} frames.",
+            "Use a video in which a face is seen from the front, in good light, and at least "
+            "60 pixels high.",
+        )
+    landmarks = np.array(points)
+    return ClipLandmarks(
+        landmarks,
+        tuple(index),
+        tuple(int(seen.clip[k]) for k in index),
+        _segments(landmarks, np.array(index), seen, jumps),
+        len(seen),
+        width,
+        height,
+        tuple(others),
+        _blurred(np.array(sharpness), index),
+    )
+
+
+def _segments(
+    points_px: Float[np.ndarray, "F 478 2"],
+    index: Int[np.ndarray, "F"],
+    seen: SeenFaces,
+    jumps: Collection[int],
+) -> tuple[int, ...]:
+    height = face_height_px(points_px) + 1e-9
+    center = points_px.mean(1)
+    moved = np.linalg.norm(np.diff(center, axis=0), axis=1) / height[1:]
+    grown = np.maximum(height[1:], height[:-1]) / np.minimum(height[1:], height[:-1])
+    breaks = (moved > _JUMP_SHARE) | (grown > _JUMP_SIZE) | (np.diff(index) > 1)
+    breaks |= np.diff(seen.clip[index]) != 0
+    breaks |= np.isin(index[1:], sorted(jumps))
+    steps = np.diff(seen.time_s)
+    if np.isfinite(steps).any():
+        usual = float(np.nanmedian(steps))
+        breaks |= np.nan_to_num(np.diff(seen.time_s[index]), nan=usual) > _PAUSE * usual
+    return tuple(int(number) for number in np.concatenate([[0], np.cumsum(breaks)]))
+
+
+def _blurred(sharpness: Float[np.ndarray, "F"], index: list[int]) -> tuple[int, ...]:
+    poor = sharpness < _BLURRED * np.percentile(sharpness, _SHARP_PERCENT)
+    return tuple(index[k] for k in np.flatnonzero(poor))

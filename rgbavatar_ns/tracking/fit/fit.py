@@ -1,0 +1,295 @@
+"""Fit of the head model to a clip's landmarks: identity and camera once, then every frame."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from rgbavatar_ns.tracking.fit.camera import StillCamera
+from rgbavatar_ns.tracking.fit.landmark_cost import FrameCost, Target
+from rgbavatar_ns.tracking.fit.levenberg_marquardt import QuadraticModel, levenberg_marquardt
+
+# Focal lengths tried, as multiples of the frame's longer side (38 to 17 degrees of view), and
+# the width of the prior around a usual camera: a face's landmarks say little about it.
+FOCAL_SCAN = (0.9, 1.2, 1.6, 2.2, 3.0)
+_FOCAL_USUAL, _FOCAL_LOG_WIDTH = 1.4, 0.5
+_IDENTITY_WIDTH = 1.0  # principal components, of variance 1
+_SCAN_KEYS = 4
+_HEAD_HEIGHT_M = 0.19
+_OFFSET_SHRINK = 0.8
+_ROBUST_STEPS = 2
+
+
+@dataclass(frozen=True)
+class SubjectFit:
+    """What is the same in all frames."""
+
+    identity: Float[np.ndarray, "I"]
+    camera: StillCamera
+    key_values: Float[np.ndarray, "K P"]
+
+
+@dataclass(frozen=True)
+class ClipFit:
+    """Every frame's fitted theta entries and what is shared."""
+
+    subject: SubjectFit
+    values: Float[np.ndarray, "F P"]
+
+    def without(self, rejected: Sequence[int]) -> "ClipFit":
+        """The same without the given positions."""
+        return replace(self, values=np.delete(self.values, list(rejected), axis=0))
+
+
+def fit_subject(
+    cost: FrameCost,
+    keys: Sequence[Target],
+    width: int,
+    height: int,
+    identity_components: int,
+    focal_px: float | None,
+) -> SubjectFit:
+    """Identity, focal length and camera distance from key frames.
+
+    The focal length is scanned; each candidate gets a full joint fit and the best one wins,
+    weighed by a broad prior (ours: landmarks of one face hardly observe it).
+    """
+    center = (width / 2, height / 2)
+    if focal_px is None:
+        focal_px = _scan_focal(cost, keys, width, height, identity_components)
+    camera = initial_camera(keys, focal_px, center)
+    return _fit_keys(cost, keys, camera, identity_components, 15)[1]
+
+
+def _scan_focal(
+    cost: FrameCost, keys: Sequence[Target], width: int, height: int, identity_components: int
+) -> float:
+    """The focal length with the cheapest short fit of a few key frames, in pixels."""
+    side = max(width, height)
+    few = keys[:: max(1, len(keys) // _SCAN_KEYS)]
+    best, starts = (np.inf, side * _FOCAL_USUAL), None
+    for share in FOCAL_SCAN:
+        camera = initial_camera(few, side * share, (width / 2, height / 2))
+        total, found = _fit_keys(cost, few, camera, identity_components, 8, starts)
+        starts = found.key_values  # the next camera is not far off
+        total += 0.5 * (np.log(share / _FOCAL_USUAL) / _FOCAL_LOG_WIDTH) ** 2
+        best = min(best, (total, side * share))
+    return best[1]
+
+
+def initial_camera(
+    keys: Sequence[Target], focal_px: float, center_px: tuple[float, float]
+) -> StillCamera:
+    """A camera at the distance at which a usual head has the observed size."""
+    face = float(np.median([key.face_height_px for key in keys]))
+    return StillCamera(focal_px, center_px, focal_px * _HEAD_HEIGHT_M / face)
+
+
+def rigid_start(cost: FrameCost, camera: StillCamera, target: Target) -> Float[np.ndarray, "P"]:
+    """Frontal pose whose landmarks' centre lies on the observed one."""
+    base, identity = blank(cost)
+    points = cost.head.points(base, identity, camera.eye_m)
+    depth = camera.distance_m - points[:, 2].mean()
+    wanted = (target.points_px.mean(0) - camera.center_px) * depth / camera.focal_px
+    shift = np.array([wanted[0], -wanted[1]]) - points[:, :2].mean(0)
+    translation = cost.head.layout.slice("translation")
+    base[translation.start : translation.start + 2] = shift
+    return base[cost.parameters.columns]
+
+
+def blank(cost: FrameCost) -> tuple[Float[np.ndarray, "H"], Float[np.ndarray, "I"]]:
+    """theta and identity of the template."""
+    return np.zeros(cost.head.layout.size), np.zeros(cost.head.num_identity)
+
+
+def fit_frame(
+    cost: FrameCost,
+    camera: StillCamera,
+    target: Target,
+    start: Float[np.ndarray, "P"],
+    neighbours: Float[np.ndarray, "P"] | None,
+    temporal_weight: float,
+    iterations: int,
+) -> Float[np.ndarray, "P"]:
+    """One frame's bounded fit from `start`, drawn towards `neighbours` if given.
+
+    The last third of at most `iterations` steps, and no fewer than `_ROBUST_STEPS`, let go of
+    landmarks that are far off.
+    """
+    base, identity = blank(cost)
+    values, robust = start, max(_ROBUST_STEPS, iterations // 3)
+    for steps, redescending in ((iterations - robust, False), (robust, True)):
+
+        def cost_at(values: Float[np.ndarray, "P"], redescending: bool = redescending) -> float:
+            theta = cost.theta(values, base)
+            data = cost.value(theta, identity, camera, target, redescending=redescending)
+            return data + cost.prior_value(values, neighbours, temporal_weight)
+
+        def model_at(
+            values: Float[np.ndarray, "P"], redescending: bool = redescending
+        ) -> QuadraticModel:
+            theta = cost.theta(values, base)
+            data = cost.linearize(theta, identity, camera, target, redescending=redescending)
+            model = QuadraticModel(data.cost, data.gradient, data.hessian)
+            return cost.add_priors(values, model, neighbours, temporal_weight)
+
+        values, _ = levenberg_marquardt(
+            cost_at,
+            model_at,
+            values,
+            cost.parameters.lower,
+            cost.parameters.upper,
+            iterations=steps,
+            tolerance=1e-3,
+        )
+    return values
+
+
+def fit_clip(
+    cost: FrameCost,
+    subject: SubjectFit,
+    targets: Sequence[Target],
+    follows: Sequence[bool],
+    temporal_weight: float,
+    advance: Callable[[], None] = lambda: None,
+) -> ClipFit:
+    """Every frame: once forward, starting from the frame before, then once more with neighbours.
+
+    `follows[i]` says that frame i comes directly after frame i - 1. The second pass draws each
+    frame to the mean of both neighbours, so smoothing has no lag; a gap is never bridged.
+    """
+    person = replace(cost, head=cost.head.of_person(subject.identity))
+    values: list[np.ndarray] = []
+    for number, target in enumerate(targets):
+        if number and follows[number]:
+            start, iterations = values[-1], 6
+        else:
+            start, iterations = rigid_start(person, subject.camera, target), 25
+        values.append(fit_frame(person, subject.camera, target, start, None, 0.0, iterations))
+        advance()
+    for number, target in enumerate(targets):
+        near = []
+        if number and follows[number]:
+            near.append(values[number - 1])
+        if number + 1 < len(targets) and follows[number + 1]:
+            near.append(values[number + 1])
+        if near and temporal_weight > 0:
+            middle = np.mean(near, axis=0)
+            values[number] = fit_frame(
+                person, subject.camera, target, values[number], middle, temporal_weight, 3
+            )
+        advance()
+    return ClipFit(subject, np.array(values))
+
+
+def subject_offsets(
+    cost: FrameCost, subject: SubjectFit, keys: Sequence[Target]
+) -> Float[np.ndarray, "L 3"]:
+    """Constant disagreement of each landmark with the mesh, as an offset at rest, metres.
+
+    FaceMesh's idea of a point and the mesh's differ from subject to subject by a little; what is
+    the same in all key frames is no expression. The median over key frames, shrunk.
+    """
+    base, _ = blank(cost)
+    found = []
+    for values, target in zip(subject.key_values, keys):
+        theta = cost.theta(values, base)
+        points = cost.head.points(theta, subject.identity, subject.camera.eye_m)
+        residual = subject.camera.project(points) - target.points_px
+        depth = subject.camera.distance_m - points[:, 2]
+        across = -residual * (1.0, -1.0) * (depth / subject.camera.focal_px)[:, None]
+        shift = np.concatenate([across, np.zeros((len(across), 1))], axis=1)
+        found.append(shift @ cost.head.head_rotation(theta))
+    return _OFFSET_SHRINK * np.median(found, axis=0)
+
+
+def _fit_keys(
+    cost: FrameCost,
+    keys: Sequence[Target],
+    camera: StillCamera,
+    identity_components: int,
+    iterations: int,
+    starts: Float[np.ndarray, "K P"] | None = None,
+) -> tuple[float, SubjectFit]:
+    base, identity = blank(cost)
+    if starts is None:
+        starts = np.array(
+            [
+                fit_frame(cost, camera, key, rigid_start(cost, camera, key), None, 0.0, 15)
+                for key in keys
+            ]
+        )
+    frames, size = len(keys), len(cost.parameters.columns)
+    shared = min(identity_components, len(identity))
+    joint = replace(cost, identity_columns=shared)
+    precision = _IDENTITY_WIDTH**-2.0
+    lower = np.concatenate([np.tile(cost.parameters.lower, frames), np.full(shared, -3.0)])
+    upper = np.concatenate([np.tile(cost.parameters.upper, frames), np.full(shared, 3.0)])
+
+    def model_at(packed: Float[np.ndarray, "Q"]) -> QuadraticModel:
+        person = identity.copy()
+        person[:shared] = packed[frames * size :]
+        pull = precision * person[:shared]
+        total = 0.5 * float(pull @ person[:shared])
+        gradient, hessian = np.zeros(len(packed)), np.zeros((len(packed), len(packed)))
+        common = slice(frames * size, len(packed))
+        gradient[common] = pull
+        hessian[common, common] = precision * np.eye(shared)
+        for number, key in enumerate(keys):
+            own = slice(number * size, (number + 1) * size)
+            values = packed[own]
+            data = joint.linearize(cost.theta(values, base), person, camera, key)
+            frame = cost.add_priors(
+                values,
+                QuadraticModel(data.cost, data.gradient[:size], data.hessian[:size, :size]),
+                None,
+                0.0,
+            )
+            total += frame.cost
+            gradient[own] = frame.gradient
+            gradient[common] += data.gradient[size:]
+            hessian[own, own] = frame.hessian
+            hessian[own, common] = data.hessian[:size, size:]
+            hessian[common, own] = data.hessian[size:, :size]
+            hessian[common, common] += data.hessian[size:, size:]
+        return QuadraticModel(total, gradient, hessian)
+
+    def cost_at(packed: Float[np.ndarray, "Q"]) -> float:
+        person = identity.copy()
+        person[:shared] = packed[frames * size :]
+        total = 0.5 * precision * float(person[:shared] @ person[:shared])
+        for number, key in enumerate(keys):
+            values = packed[number * size : (number + 1) * size]
+            total += joint.value(cost.theta(values, base), person, camera, key)
+            total += cost.prior_value(values, None, 0.0)
+        return total
+
+    packed, total = levenberg_marquardt(
+        cost_at,
+        model_at,
+        np.concatenate([starts.reshape(-1), np.zeros(shared)]),
+        lower,
+        upper,
+        iterations=iterations,
+        tolerance=1e-3,
+    )
+    identity[:shared] = packed[frames * size :]
+    values = packed[: frames * size].reshape(frames, size)
+    return total, SubjectFit(identity, camera, values)
+
+
+def key_frame_positions(landmarks_px: Float[np.ndarray, "F L 2"], count: int) -> list[int]:
+    """Frames that differ most from each other: farthest-point choice over aligned landmarks.
+
+    Starts from the frame nearest to the median shape; deterministic.
+    """
+    centred = landmarks_px - landmarks_px.mean(1, keepdims=True)
+    shapes = centred.reshape(len(centred), -1)
+    median = np.median(shapes, axis=0)
+    chosen = [int(np.argmin(((shapes - median) ** 2).sum(1)))]
+    nearest = ((shapes - shapes[chosen[0]]) ** 2).sum(1)
+    while len(chosen) < min(count, len(shapes)):
+        chosen.append(int(np.argmax(nearest)))
+        nearest = np.minimum(nearest, ((shapes - shapes[chosen[-1]]) ** 2).sum(1))
+    return sorted(chosen)

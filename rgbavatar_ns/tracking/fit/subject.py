@@ -1,0 +1,165 @@
+"""The head model fitted to one speaker: the landmark map, its weights, the stages of the fit."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from threadpoolctl import threadpool_limits
+
+from rgbavatar_ns.head import HeadModel
+from rgbavatar_ns.head.landmarks import (
+    SPARSE_51,
+    LandmarkMap,
+    LandmarkNoise,
+    LandmarkResponse,
+    facemesh_landmarks,
+    facemesh_noise,
+    facemesh_response,
+)
+from rgbavatar_ns.tracking.config import TrackConfig
+from rgbavatar_ns.tracking.face.detector import (
+    FACE_OVAL,
+    IRIS_CENTERS,
+    LID_PAIRS,
+    LIP_PAIRS,
+    face_height_px,
+    upright_turn,
+)
+from rgbavatar_ns.tracking.fit.fit import (
+    ClipFit,
+    SubjectFit,
+    fit_clip,
+    fit_subject,
+    key_frame_positions,
+    subject_offsets,
+)
+from rgbavatar_ns.tracking.fit.landmark_cost import FrameCost, Target
+from rgbavatar_ns.tracking.fit.landmark_head import LandmarkHead
+from rgbavatar_ns.tracking.fit.own_parameters import with_signed_expressions
+from rgbavatar_ns.tracking.fit.parameters import fit_parameters
+
+# Lips, lids, brows, nose and irises are seen; cheeks and forehead are interpolated by FaceMesh,
+# so every fourth of those points does. The outline slides over the skin as the head turns, but
+# without it the pitch of the head is badly known: on renders the error halves with it.
+_FEATURES = frozenset(SPARSE_51) | {index for pair in LIP_PAIRS + LID_PAIRS for index in pair}
+# A frame whose landmarks the head cannot follow to this share of the face's height is left out.
+_REJECT_SHARE = 0.06
+
+
+@dataclass
+class SubjectTracker:
+    """Fits the head to a clip; after `fit` it knows the subject's landmark offsets too."""
+
+    head: HeadModel
+    config: TrackConfig
+    landmarks: LandmarkMap = field(default_factory=facemesh_landmarks)
+    """Where FaceMesh's points lie on this head; by default on the embedded one."""
+    response: LandmarkResponse | None = field(default_factory=facemesh_response)
+    """How they follow it, row for row of `landmarks`; None takes them to stay on the skin."""
+    noise: LandmarkNoise = field(default_factory=facemesh_noise)
+    """How they err beside; rows are FaceMesh indices."""
+
+    def __post_init__(self) -> None:
+        rows = _chosen_rows(self.landmarks)
+        marks = self.landmarks.select_rows(rows)
+        self.facemesh_index = marks.facemesh_index
+        vertex_ids = self.head.arrays.faces[marks.triangle].astype(np.int64)
+        self.mesh_landmarks = LandmarkHead(self.head, vertex_ids, marks.barycentric)
+        size_m = self.mesh_landmarks.expression_size_m()
+        names, layout = self.head.arrays.expression_names, self.head.layout
+        parameters = fit_parameters(layout, names, size_m)
+        parameters = with_signed_expressions(parameters, layout, names, size_m)
+        seen = self.mesh_landmarks
+        if self.response is not None:
+            seen = seen.with_response(self.response.select(rows))
+        self._seen = seen
+        self.cost = FrameCost(seen, self.noise.select(marks.facemesh_index), parameters)
+
+    def targets(self, landmarks_px: Float[np.ndarray, "F 478 2"]) -> list[Target]:
+        """Each frame's landmarks in the order of the landmark head."""
+        heights, turns = face_height_px(landmarks_px), upright_turn(landmarks_px)
+        return [
+            Target(points[self.facemesh_index], float(height), turn)
+            for points, height, turn in zip(landmarks_px, heights, turns)
+        ]
+
+    def fit(
+        self,
+        landmarks_px: Float[np.ndarray, "F 478 2"],
+        follows: Sequence[bool],
+        width: int,
+        height: int,
+        advance: Callable[[], None] = lambda: None,
+    ) -> ClipFit:
+        """Identity, camera and offsets from key frames, then every frame."""
+        # The matrices are small: more threads would only wait for each other.
+        with threadpool_limits(1):
+            subject = self.fit_subject(landmarks_px, width, height)
+            targets = self.targets(landmarks_px)
+            weight = self.config.temporal_weight
+            return fit_clip(self.cost, subject, targets, follows, weight, advance)
+
+    def fit_subject(
+        self, landmarks_px: Float[np.ndarray, "F 478 2"], width: int, height: int
+    ) -> SubjectFit:
+        """Identity, camera and landmark offsets from the frames that differ most."""
+        targets = self.targets(landmarks_px)
+        picked = key_frame_positions(landmarks_px, self.config.key_frames)
+        keys = [targets[position] for position in picked]
+        subject = fit_subject(
+            self.cost, keys, width, height, self.config.identity_components, self.config.focal_px
+        )
+        offsets = subject_offsets(self.cost, subject, keys)
+        self.cost = replace(self.cost, head=self.cost.head.with_offsets(offsets))
+        return subject
+
+    def thetas(self, fit: ClipFit) -> Float[np.ndarray, "F H"]:
+        """theta of every frame."""
+        return np.array([self._theta(fit, position) for position in range(len(fit.values))])
+
+    def _theta(self, fit: ClipFit, position: int) -> Float[np.ndarray, "H"]:
+        return self.cost.theta(fit.values[position], np.zeros(self.head.layout.size))
+
+    def fitted_px(self, fit: ClipFit, *, with_offsets: bool = True) -> Float[np.ndarray, "F L 2"]:
+        """Where the fitted head's landmarks are detected, source pixels, with or without offsets.
+
+        The offsets are the subject's own; the detector's response is in both.
+        """
+        head = self.cost.head if with_offsets else self._seen
+        identity = fit.subject.identity
+        camera = fit.subject.camera
+        return np.array(
+            [
+                camera.project(head.points(theta, identity, camera.eye_m))
+                for theta in self.thetas(fit)
+            ]
+        )
+
+    def frame_px(self, fit: ClipFit, position: int) -> Float[np.ndarray, "L 2"]:
+        """One frame's landmarks without the subject's offsets, source pixels."""
+        theta, camera = self._theta(fit, position), fit.subject.camera
+        return camera.project(self._seen.points(theta, fit.subject.identity, camera.eye_m))
+
+    def rejected(self, fit: ClipFit, landmarks_px: Float[np.ndarray, "F 478 2"]) -> list[int]:
+        """Positions whose landmarks no pose of the head explains."""
+        away = self.fitted_px(fit) - landmarks_px[:, self.facemesh_index]
+        share = np.linalg.norm(away, axis=-1).mean(1) / face_height_px(landmarks_px)
+        return [int(position) for position in np.flatnonzero(share > _REJECT_SHARE)]
+
+    def vertices_px(self, fit: ClipFit, position: int) -> Float[np.ndarray, "V 2"]:
+        """The full mesh of one frame in source pixels."""
+        theta = torch.from_numpy(self._theta(fit, position))
+        with torch.no_grad():
+            vertices = self.head(theta, torch.from_numpy(fit.subject.identity))
+        return fit.subject.camera.project(vertices.numpy())
+
+
+def _chosen_rows(marks: LandmarkMap) -> Int[np.ndarray, "L"]:
+    kept = []
+    for row, index in enumerate(map(int, marks.facemesh_index)):
+        wanted = index in _FEATURES or index in IRIS_CENTERS or index in FACE_OVAL
+        if wanted or (index < IRIS_CENTERS[0] and index % 4 == 0):
+            kept.append(row)
+    return np.array(kept, dtype=np.int64)

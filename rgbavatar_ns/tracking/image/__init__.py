@@ -1,0 +1,1 @@
+"""A frame cut out for the dataset."""

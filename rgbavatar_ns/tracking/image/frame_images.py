@@ -1,0 +1,225 @@
+"""The second reading of a clip: crops and mattes of the tracked frames."""
+
+from collections import deque
+from collections.abc import Collection, Generator, Iterable, Iterator
+from contextlib import ExitStack, closing
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+
+from rgbavatar_ns.data.png import encode_png_rgba
+from rgbavatar_ns.kernels.types import PinholeCameras
+from rgbavatar_ns.tracking.face.clip import ClipLandmarks
+from rgbavatar_ns.tracking.face.detector import CHIN, FOREHEAD
+from rgbavatar_ns.tracking.fit.camera import StillCamera
+from rgbavatar_ns.tracking.fit.fit import ClipFit
+from rgbavatar_ns.tracking.fit.subject import SubjectTracker
+from rgbavatar_ns.tracking.image.crop import SquareCrop
+from rgbavatar_ns.tracking.image.head_mask import REGION_PX, HeadMask, height_above_chin
+from rgbavatar_ns.tracking.image.matting import (
+    PersonMatte,
+    foreground_color,
+    refined_matte,
+    straight_rgba,
+)
+from rgbavatar_ns.tracking.image.silhouette import SilhouetteAgreement, silhouette_agreement
+from rgbavatar_ns.tracking.image.steady_matte import NEIGHBOURS, CoarseMatte, head_motion, steadied
+from rgbavatar_ns.tracking.input.mattes import UserMattes
+from rgbavatar_ns.tracking.input.video import FrameSource
+from rgbavatar_ns.tracking.threads import in_background, map_in_order
+
+_AHEAD, _WORKERS = 2, 2
+# A fast level: the files grow by a few hundredths and take a third of the time.
+_PNG_LEVEL = 1
+
+
+@dataclass(frozen=True)
+class TrackedPicture:
+    """One tracked frame's picture as a PNG file's bytes; `position` counts tracked frames."""
+
+    position: int
+    png: bytes
+    agreement: SilhouetteAgreement
+
+
+@dataclass(frozen=True)
+class _Cropped:
+    """A crop on its way: with its alpha if the user gave one, else with the coarse matte."""
+
+    position: int
+    image_rgb: UInt8[np.ndarray, "S S 3"]
+    alpha: Float[np.ndarray, "S S"] | None
+    color_is_clean: bool
+    coarse: Float[np.ndarray, "S S"] | None = None
+    small: CoarseMatte | None = None
+
+
+_Window = tuple[_Cropped, tuple[_Cropped, ...]]
+
+
+class TrackedPictures:
+    """Makes tracked frames' pictures: crop, matte, colour at soft edges, fade-out at the neck.
+
+    Mattes are the user's own (`mattes`), or the alpha channel of the source where
+    `source_alpha`, or found. Reading, segmentation and the rest run in threads of their own; a
+    few frames are in memory at a time. Each picture depends on the clip and the fit alone.
+    """
+
+    def __init__(
+        self,
+        tracker: SubjectTracker,
+        fit: ClipFit,
+        found: ClipLandmarks,
+        crop: SquareCrop,
+        keep_torso: bool,
+        mattes: UserMattes | None = None,
+        source_alpha: bool = False,
+    ) -> None:
+        arrays = tracker.head.arrays
+        self._tracker, self._fit, self._found, self._crop = tracker, fit, found, crop
+        self._keep_torso = keep_torso
+        self._mattes, self._source_alpha = mattes, source_alpha
+        self._region = HeadMask(arrays.faces, arrays.skinning_weights)
+        self._inside = crop.inside(found.width, found.height)
+        self._follows = found.follows()
+        self.camera = pinhole(
+            fit.subject.camera.cropped(crop.left, crop.top, crop.scale), crop.size
+        )
+
+    def pictures(
+        self, source: FrameSource, without: Collection[int] = ()
+    ) -> Generator[TrackedPicture, None, None]:
+        """The picture of every tracked frame, in order, but for the positions in `without`."""
+        wanted = [k for k in range(len(self._found)) if k not in set(without)]
+        read = sorted({near for k in wanted for near in self._window(k)})
+        if not wanted:
+            return
+        with ExitStack() as closed:
+            crops = in_background(self._crops(source, read), _AHEAD)
+            closed.enter_context(closing(crops))
+            segmented = in_background(self._segmented(crops), _AHEAD)
+            closed.enter_context(closing(segmented))
+            windows = self._windows(segmented, frozenset(wanted))
+            yield from closed.enter_context(closing(map_in_order(self._finish, windows, _WORKERS)))
+
+    def _window(self, position: int) -> range:
+        """Positions around this one whose frames come directly before and after it."""
+        first = last = position
+        if self._mattes is not None or self._source_alpha:
+            return range(first, last + 1)
+        while first > position - NEIGHBOURS and self._follows[first]:
+            first -= 1
+        while (
+            last < position + NEIGHBOURS
+            and last + 1 < len(self._follows)
+            and self._follows[last + 1]
+        ):
+            last += 1
+        return range(first, last + 1)
+
+    def _crops(self, source: FrameSource, positions: list[int]) -> Iterator[_Cropped]:
+        place = {self._found.frame_index[k]: k for k in positions}
+        wanted, last = frozenset(place), max(place)
+        mattes = None
+        if self._mattes is not None:
+            mattes = self._mattes.levels(wanted, self._found.width, self._found.height)
+        for frame in source.read(wanted.__contains__):
+            alpha, clean = None, False
+            if mattes is not None:
+                alpha = next(mattes)[1]
+            elif self._source_alpha:
+                clean = frame.alpha is not None
+                alpha = frame.alpha
+                if alpha is None:
+                    alpha = np.full((frame.height, frame.width), 255, np.uint8)
+            yield _Cropped(
+                place[frame.index],
+                self._crop.apply(frame.image_rgb),
+                None if alpha is None else self._crop.apply(alpha).astype(np.float32) / 255,
+                clean,
+            )
+            if frame.index == last:
+                return
+
+    def _segmented(self, crops: Iterable[_Cropped]) -> Iterator[_Cropped]:
+        matte = None
+        try:
+            for crop in crops:
+                if crop.alpha is not None:
+                    yield crop
+                    continue
+                matte = matte or PersonMatte()
+                coarse = matte.coarse(crop.image_rgb)
+                small = CoarseMatte.of(crop.image_rgb, coarse)
+                yield _Cropped(crop.position, crop.image_rgb, None, False, coarse, small)
+        finally:
+            if matte is not None:
+                matte.__exit__(None, None, None)
+
+    def _windows(self, crops: Iterable[_Cropped], wanted: frozenset[int]) -> Iterator[_Window]:
+        """Each wanted crop with those around it, as soon as the last of them is there."""
+        held: deque[_Cropped] = deque()
+        waiting: deque[int] = deque()
+        for crop in crops:
+            held.append(crop)
+            if crop.position in wanted:
+                waiting.append(crop.position)
+            while waiting and self._window(waiting[0])[-1] <= crop.position:
+                position = waiting.popleft()
+                around = self._window(position)
+                window = tuple(one for one in held if one.position in around)
+                yield next(one for one in window if one.position == position), window
+            needed = self._window(waiting[0])[0] if waiting else crop.position - NEIGHBOURS
+            while held and held[0].position < needed:
+                held.popleft()
+
+    def _finish(self, window: _Window) -> TrackedPicture:
+        crop, around = window
+        position = crop.position
+        alpha = self._alpha(crop, around) * self._inside
+        color = crop.image_rgb if crop.color_is_clean else foreground_color(crop.image_rgb, alpha)
+        few = min(self._crop.size, REGION_PX)
+        shrink = few / self._crop.size
+        vertices = shrink * self._crop.points(self._tracker.vertices_px(self._fit, position))
+        ends = shrink * self._crop.points(self._found.points_px[position][[FOREHEAD, CHIN]])
+        silhouette = self._region.silhouette(vertices, few)
+        agreement = silhouette_agreement(
+            silhouette,
+            cv2.resize(alpha, (few, few), interpolation=cv2.INTER_AREA),
+            cv2.resize(self._inside, (few, few), interpolation=cv2.INTER_AREA),
+            height_above_chin(ends[0], ends[1], few),
+            float(np.linalg.norm(ends[0] - ends[1])),
+        )
+        if not self._keep_torso:
+            region = self._region.of_silhouette(silhouette, vertices, ends[0], ends[1])
+            alpha = alpha * cv2.resize(region, alpha.shape)
+        png = encode_png_rgba(straight_rgba(color, alpha), _PNG_LEVEL)
+        return TrackedPicture(position, png, agreement)
+
+    def _alpha(self, crop: _Cropped, around: tuple[_Cropped, ...]) -> Float[np.ndarray, "S S"]:
+        if crop.alpha is not None:
+            return crop.alpha
+        assert crop.coarse is not None
+        assert crop.small is not None
+        points = self._found.points_px
+        now = self._crop.points(points[crop.position])
+        near = [
+            (other.small, head_motion(self._crop.points(points[other.position]), now))
+            for other in around
+            if other.small is not None and other.position != crop.position
+        ]
+        return refined_matte(crop.image_rgb, steadied(crop.coarse, crop.small, near))
+
+
+def pinhole(camera: StillCamera, size: int) -> PinholeCameras:
+    """The rasterizer's form of the still camera, for a square image."""
+    return PinholeCameras(
+        torch.from_numpy(camera.world_to_camera).float()[None],
+        torch.tensor([[camera.focal_px, camera.focal_px]], dtype=torch.float32),
+        torch.tensor([camera.center_px], dtype=torch.float32),
+        size,
+        size,
+    )

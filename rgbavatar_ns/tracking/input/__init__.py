@@ -1,0 +1,1 @@
+"""Where frames come from: videos, image files, cameras, a user's mattes."""

@@ -1,0 +1,120 @@
+"""A user's own mattes, which take precedence over ours."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.tracking.input.image_files import (
+    image_files,
+    last_number,
+    read_image_rgba,
+    require_image_files,
+)
+from rgbavatar_ns.tracking.input.video import FrameSource
+
+_AS_MANY = "Give one matte a frame: white (or opaque) is the person."
+
+
+@dataclass(frozen=True)
+class UserMattes:
+    """Masks of a folder, or of a mask video, one for every frame of the source.
+
+    Files go to frames by name where the source is one folder of images with the same names, else
+    in the order of their numbers. A file's alpha channel counts where it has one, else its grey.
+    """
+
+    path: Path
+    files: tuple[Path, ...] | None
+
+    @classmethod
+    def open(cls, path: Path, source: FrameSource) -> "UserMattes":
+        """Find the mattes; UserError where there are none, or files without a frame."""
+        if not path.exists():
+            raise UserError(f"There are no mattes at {path}.", "Check the path.")
+        if not path.is_dir():
+            return cls(path, None)
+        files = require_image_files(path)
+        if len(source.paths) == 1 and source.paths[0].is_dir():
+            named = _by_name(files, image_files(source.paths[0]))
+            if named is not None:
+                return cls(path, named)
+        numbers = [last_number(file) for file in files]
+        if None not in numbers and len(set(numbers)) == len(numbers):
+            files = [file for _, file in sorted(zip(numbers, files), key=lambda pair: pair[0] or 0)]
+        return cls(path, tuple(files))
+
+    def require_count(self, frames: int, limited: bool) -> None:
+        """UserError unless each frame has a matte; too many are right if frames are limited.
+
+        A mask video may announce its length inexactly: one in a hundred is let pass here.
+        """
+        if self.files is None:
+            count, slack = FrameSource.open(self.path).count_hint() or frames, 1 + frames // 100
+        else:
+            count, slack = len(self.files), 0
+        if count < frames - slack or (count > frames + slack and not limited):
+            raise UserError(
+                f"{self.path} holds {count} mattes, the video has {frames} frames.", _AS_MANY
+            )
+
+    def levels(
+        self, frames: frozenset[int], width: int, height: int
+    ) -> Iterator[tuple[int, UInt8[np.ndarray, "H W"]]]:
+        """The mattes of these frames, in order, with the frame's number.
+
+        UserError where one is missing or has another size than the video.
+        """
+        last = -1
+        for index, matte in self._matte_files(frames) if self.files else self._matte_video(frames):
+            if matte.shape != (height, width):
+                raise UserError(
+                    f"The matte of frame {index} in {self.path} has {matte.shape[1]} x "
+                    f"{matte.shape[0]} pixels, the video {width} x {height}.",
+                    "Bring mattes and video to one size.",
+                )
+            last = index
+            yield index, matte
+        if frames and last != max(frames):
+            raise UserError(
+                f"{self.path} ends before frame {max(frames)} of the video has a matte.", _AS_MANY
+            )
+
+    def _matte_files(
+        self, frames: frozenset[int]
+    ) -> Iterator[tuple[int, UInt8[np.ndarray, "H W"]]]:
+        for index, file in enumerate(self.files or ()):
+            if index in frames:
+                yield index, _level(read_image_rgba(file))
+
+    def _matte_video(
+        self, frames: frozenset[int]
+    ) -> Iterator[tuple[int, UInt8[np.ndarray, "H W"]]]:
+        for frame in FrameSource.open(self.path).read(lambda index: index in frames):
+            grey = cv2.cvtColor(frame.image_rgb, cv2.COLOR_RGB2GRAY)
+            yield frame.index, grey if frame.alpha is None else frame.alpha
+
+
+def _level(rgba: UInt8[np.ndarray, "H W 4"]) -> UInt8[np.ndarray, "H W"]:
+    if rgba[..., 3].min() < 255:
+        return np.ascontiguousarray(rgba[..., 3])
+    return cv2.cvtColor(rgba, cv2.COLOR_RGBA2GRAY)
+
+
+def _by_name(mattes: list[Path], images: list[Path]) -> tuple[Path, ...] | None:
+    """Each image's matte, if all names agree; None if none does; UserError if only some do."""
+    by_stem = {matte.stem: matte for matte in mattes}
+    missing = [image.stem for image in images if image.stem not in by_stem]
+    if len(missing) == len(images):
+        return None
+    if missing:
+        raise UserError(
+            f"{mattes[0].parent} has no matte named {missing[0]} ({len(missing)} of "
+            f"{len(images)} images have none).",
+            _AS_MANY,
+        )
+    return tuple(by_stem[image.stem] for image in images)

@@ -1,0 +1,238 @@
+"""Frames of videos and image folders, upright, with square pixels, in order."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+from av.container import InputContainer
+from av.error import FFmpegError
+from av.stream import Disposition
+from av.video.reformatter import Interpolation
+from av.video.stream import VideoStream
+from jaxtyping import UInt8
+
+from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.tracking.input.image_files import (
+    fitted_size,
+    image_files,
+    read_image_rgba,
+    require_image_files,
+)
+
+
+@dataclass(frozen=True)
+class SourceFrame:
+    """One frame: `index` runs over all clips together, `clip` says which one it is from.
+
+    `width` and `height` are the whole frame's; the picture may have been read smaller.
+    `alpha` is None where everything is opaque; `time_s` where the source has no clock.
+    """
+
+    index: int
+    clip: int
+    image_rgb: UInt8[np.ndarray, "h w 3"]
+    alpha: UInt8[np.ndarray, "h w"] | None
+    width: int
+    height: int
+    time_s: float | None
+
+
+@dataclass(frozen=True)
+class _Undecoded:
+    """A frame whose picture is made when it is wanted; at most `max_side` pixels long."""
+
+    size: tuple[int, int]
+    time_s: float | None
+    picture: Callable[[int | None], UInt8[np.ndarray, "h w *C"]]
+
+
+@dataclass
+class FrameSource:
+    """Clips of one speaker, read as often as wanted, one frame in memory at a time.
+
+    Each path is a file that PyAV reads or a folder of images (sorted by name). All frames must
+    have one size, since they share a camera. `notes` collects what a reader should know about
+    damaged clips. Raises UserError for what cannot be read.
+    """
+
+    paths: tuple[Path, ...]
+    max_frames: int | None = None
+    notes: list[str] = field(default_factory=list)
+
+    @classmethod
+    def open(
+        cls, videos: Path | str | Sequence[Path | str], max_frames: int | None = None
+    ) -> "FrameSource":
+        """Check that every path exists and that folders hold images; videos are read later."""
+        listed = [videos] if isinstance(videos, str | Path) else list(videos)
+        if not listed:
+            raise UserError("No video was given.", "Name at least one video file or image folder.")
+        for path in map(Path, listed):
+            if not path.exists():
+                raise UserError(f"There is no video at {path}.", "Check the path.")
+            if path.is_dir():
+                require_image_files(path)
+            elif path.stat().st_size == 0:
+                raise UserError(f"{path} is empty (0 bytes).", "Copy or record it again.")
+        return cls(tuple(map(Path, listed)), max_frames)
+
+    def __iter__(self) -> Iterator[SourceFrame]:
+        """Every frame of every clip; the order and the indices are the same each time."""
+        return self.read()
+
+    def read(
+        self,
+        wanted: Callable[[int], bool] = lambda index: True,
+        max_side: int | None = None,
+    ) -> Iterator[SourceFrame]:
+        """The wanted frames, their pictures no longer than `max_side`; the others cost little."""
+        self.notes.clear()
+        index, size = 0, None
+        for clip, path in enumerate(self.paths):
+            for frame in self._folder(path) if path.is_dir() else self._video(path):
+                if self.max_frames is not None and index >= self.max_frames:
+                    return
+                if size is not None and frame.size != size:
+                    raise UserError(
+                        f"{path}: a frame has {frame.size[0]} x {frame.size[1]} pixels, the "
+                        f"ones before it {size[0]} x {size[1]}.",
+                        "Bring all clips to one size; they share one camera.",
+                    )
+                size = frame.size
+                if wanted(index):
+                    image = frame.picture(max_side)
+                    alpha = np.ascontiguousarray(image[..., 3]) if image.shape[2] == 4 else None
+                    if alpha is not None and alpha.min() == 255:
+                        alpha = None
+                    color = np.ascontiguousarray(image[..., :3])
+                    yield SourceFrame(index, clip, color, alpha, *size, frame.time_s)
+                index += 1
+
+    def count_hint(self) -> int | None:
+        """How many frames to expect, for a progress bar; None where a file does not say."""
+        total = 0
+        for path in self.paths:
+            count = len(image_files(path)) if path.is_dir() else _declared_frames(path)
+            if not count:
+                return None
+            total += count
+        return total if self.max_frames is None else min(total, self.max_frames)
+
+    def _folder(self, folder: Path) -> Iterator[_Undecoded]:
+        size = None
+        for path in require_image_files(folder):
+            # The first picture's size is enough for those that are passed over unread.
+            picture = _FolderPicture(path)
+            if size is None:
+                height, width = picture(None).shape[:2]
+                size = (width, height)
+            picture.expected = size
+            yield _Undecoded(size, None, picture)
+
+    def _video(self, path: Path) -> Iterator[_Undecoded]:
+        decoded, damaged, broken = 0, 0, None
+        try:
+            with av.open(str(path)) as container:
+                stream = _picture_stream(container, path)
+                stream.thread_type = "AUTO"
+                aspect = stream.sample_aspect_ratio or Fraction(1)
+                for packet in container.demux(stream):
+                    try:
+                        frames = packet.decode()
+                    except FFmpegError as error:
+                        damaged, broken = damaged + 1, error
+                        continue
+                    for frame in frames:
+                        decoded += 1
+                        damaged += bool(frame.is_corrupt)
+                        yield _upright(frame, aspect)
+                declared = stream.frames
+        except (FFmpegError, OSError) as error:
+            if not decoded:
+                raise _unreadable(path, error) from error
+            self.notes.append(f"{path.name} breaks off after {decoded} frames ({error})")
+            return
+        if not decoded and broken is not None:
+            raise _unreadable(path, broken)
+        if not decoded:
+            raise UserError(f"{path} holds no frame.", "Give a video with at least one frame.")
+        if damaged:
+            self.notes.append(f"{path.name}: {damaged} frames or packets are damaged")
+        if declared and decoded < declared and not damaged:
+            self.notes.append(f"{path.name} holds {decoded} of the {declared} frames it announces")
+
+
+class _FolderPicture:
+    """Reads one picture of a folder and holds it to the size of the first."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self.expected: tuple[int, int] | None = None
+
+    def __call__(self, max_side: int | None) -> UInt8[np.ndarray, "h w 4"]:
+        image = read_image_rgba(self._path)
+        height, width = image.shape[:2]
+        if self.expected is not None and (width, height) != self.expected:
+            raise UserError(
+                f"{self._path} has {width} x {height} pixels, the images before it "
+                f"{self.expected[0]} x {self.expected[1]}.",
+                "Bring all images to one size; they share one camera.",
+            )
+        smaller = fitted_size(width, height, max_side)
+        if smaller == (width, height):
+            return image
+        return cv2.resize(image, smaller, interpolation=cv2.INTER_AREA)
+
+
+def _picture_stream(container: InputContainer, path: Path) -> VideoStream:
+    """The first stream of pictures; a cover image in a sound file is none."""
+    for stream in container.streams.video:
+        if not stream.disposition & Disposition.attached_pic:
+            return stream
+    raise UserError(f"{path} holds no video stream.", "Give a file with pictures.")
+
+
+def _upright(frame: av.VideoFrame, aspect: Fraction) -> _Undecoded:
+    """The frame turned as its rotation metadata asks, with pixels made square in width."""
+    width = max(1, round(frame.width * aspect)) if aspect > 0 else frame.width
+    stored = (width, frame.height)
+    turns = round(frame.rotation / 90) % 4
+    has_alpha = any(part.is_alpha for part in frame.format.components)
+
+    def picture(max_side: int | None) -> UInt8[np.ndarray, "h w *C"]:
+        layout = "rgba" if has_alpha else "rgb24"
+        wide, high = fitted_size(*stored, max_side)
+        if (wide, high) == (frame.width, frame.height):
+            image = frame.to_ndarray(format=layout)
+        else:
+            image = frame.reformat(
+                wide, high, format=layout, interpolation=Interpolation.AREA
+            ).to_ndarray()
+        return np.ascontiguousarray(np.rot90(image, turns))
+
+    size = (frame.height, width) if turns % 2 else stored
+    return _Undecoded(size, frame.time, picture)
+
+
+def _unreadable(path: Path, error: Exception) -> UserError:
+    return UserError(
+        f"{path} cannot be read as a video ({error}).",
+        "Give a file that ffmpeg can decode, or a folder of images.",
+    )
+
+
+def _declared_frames(path: Path) -> int:
+    try:
+        with av.open(str(path)) as container:
+            stream = _picture_stream(container, path)
+            if stream.frames:
+                return stream.frames
+            if stream.average_rate is None or container.duration is None:
+                return 0
+            return round(container.duration / av.time_base * float(stream.average_rate))
+    except (FFmpegError, OSError, UserError):
+        return 0

@@ -1,0 +1,1 @@
+"""Whether tracking can be trusted."""

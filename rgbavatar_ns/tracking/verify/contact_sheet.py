@@ -1,0 +1,73 @@
+"""Which frames the contact sheet shows: those most likely to be wrong, and some of the rest."""
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from rgbavatar_ns.data.png import read_png_rgba
+from rgbavatar_ns.tracking.face.clip import ClipLandmarks
+from rgbavatar_ns.tracking.face.detector import LID_PAIRS, LIP_PAIRS, face_height_px
+from rgbavatar_ns.tracking.fit.fit import ClipFit
+from rgbavatar_ns.tracking.fit.subject import SubjectTracker
+from rgbavatar_ns.tracking.image.crop import SquareCrop
+from rgbavatar_ns.tracking.resumable_run import picture_path
+from rgbavatar_ns.tracking.verify.overlay import OverlayTile, write_contact_sheet
+from rgbavatar_ns.tracking.verify.report import mean_gap
+
+_TILES = 12
+# FaceMesh points at the face's sides and the tip of the nose: they tell how far it is turned.
+_SIDES, _NOSE_TIP = (234, 454), 4
+
+
+def write_sheet(
+    dst: Path, tracker: SubjectTracker, fit: ClipFit, found: ClipLandmarks, crop: SquareCrop
+) -> None:
+    """`overlay.png` beside the pictures, which are read back from the destination."""
+    error = np.linalg.norm(
+        tracker.fitted_px(fit, with_offsets=False) - found.points_px[:, tracker.facemesh_index],
+        axis=-1,
+    ).mean(1)
+    tiles = []
+    for position, why in sheet_frames(found.points_px, error).items():
+        index = found.frame_index[position]
+        tiles.append(
+            OverlayTile(
+                f"{index} {why}".strip(),
+                read_png_rgba(picture_path(dst, index)),
+                crop.points(tracker.vertices_px(fit, position)),
+                crop.points(found.points_px[position][tracker.facemesh_index]),
+                crop.points(tracker.frame_px(fit, position)),
+            )
+        )
+    write_contact_sheet(dst / "overlay.png", tiles, tracker.head.arrays.faces)
+
+
+def sheet_frames(
+    points_px: Float[np.ndarray, "F 478 2"], error_px: Float[np.ndarray, "F"]
+) -> dict[int, str]:
+    """Positions in order, with what each one is shown for ("" for those in between).
+
+    The worst fit, the widest mouth, the most closed eyes, the furthest turns to both sides, then
+    frames evenly over the clip.
+    """
+    height = face_height_px(points_px)
+    every = np.arange(points_px.shape[1])
+    nose, left, right = (points_px[:, k, 0] for k in (_NOSE_TIP, *_SIDES))
+    turn = (nose - left) / (right - left + 1e-9)
+    notable = {
+        "worst fit": int(np.argmax(error_px / height)),
+        "widest mouth": int(np.argmax(mean_gap(points_px, every, LIP_PAIRS) / height)),
+        "eyes most closed": int(np.argmin(mean_gap(points_px, every, LID_PAIRS) / height)),
+        "turned left": int(np.argmax(turn)),
+        "turned right": int(np.argmin(turn)),
+    }
+    reasons: dict[int, list[str]] = {}
+    for why, position in notable.items():
+        reasons.setdefault(position, []).append(why)
+    shown = min(_TILES, len(points_px))
+    spread = np.linspace(0, len(points_px) - 1, shown).round().astype(int).tolist()
+    for position in sorted(spread, key=lambda k: -min(abs(k - other) for other in reasons)):
+        if len(reasons) < shown:
+            reasons.setdefault(position, [])
+    return {position: ", ".join(reasons[position]) for position in sorted(reasons)}

@@ -1,0 +1,39 @@
+from functools import partial
+
+import pytest
+import torch
+
+from rgbavatar_ns.synthetic import DemoConfig, DemoPerson
+
+SIZE = 96
+
+
+@pytest.fixture(scope="session")
+def person() -> DemoPerson:
+    return DemoPerson.of(DemoConfig(image_size=SIZE))
+
+
+@pytest.fixture(scope="session")
+def person_without_glasses() -> DemoPerson:
+    return DemoPerson.of(DemoConfig(image_size=SIZE, glasses=False))
+
+
+@pytest.fixture(scope="session")
+def person_without_wrinkles() -> DemoPerson:
+    return DemoPerson.of(DemoConfig(image_size=SIZE, wrinkles=0.0))
+
+
+@pytest.fixture(scope="session")
+def theta_of(person):
+    return partial(_theta, person)
+
+
+def _theta(person: DemoPerson, expression: dict[str, float] | None = None, **fields):
+    """Theta from expression coefficients by name and other fields as lists."""
+    layout, names = person.head.layout, person.head.arrays.expression_names
+    theta = torch.zeros(layout.size)
+    for name, value in (expression or {}).items():
+        theta[names.index(name)] = value
+    for name, values in fields.items():
+        theta[layout.slice(name)] = torch.tensor(values)
+    return theta
