@@ -36,8 +36,9 @@ from rgbavatar_ns.bench.timing import (
 )
 from rgbavatar_ns.bench.workloads import AvatarWorkload, avatar_workload
 from rgbavatar_ns.kernels import rasterize
-from rgbavatar_ns.plugin.viewer.render import viewer_picture
-from rgbavatar_ns.plugin.viewer.viewer_state import Stage, ViewerState
+from rgbavatar_ns.plugin.viewer.driving import DrivingSignal
+from rgbavatar_ns.plugin.viewer.render import viewer_render
+from rgbavatar_ns.plugin.viewer.viewer_state import ViewerState
 
 WHOLE_FRAME = "whole frame"
 EAGER_FRAME = "whole frame, eager"
@@ -100,15 +101,11 @@ def _time_parts(workload: AvatarWorkload, stopwatch: Stopwatch) -> dict[str, Spr
 
 def _time_viewer(workload: AvatarWorkload, stopwatch: Stopwatch) -> Spread:
     """A frame as nerfstudio's viewer shows it: drawn with depth, to bytes, to JPEG, to be sent."""
-    theta, camera = workload.batch.theta, one_camera(workload.batch.cameras, 0)
-    stage = Stage(
-        workload.avatar, len(theta), lambda position: theta[position : position + 1], lambda: theta
-    )
-    frames = cycle(range(len(theta)))
+    camera, state = one_camera(workload.batch.cameras, 0), ViewerState(background=(1.0, 1.0, 1.0))
+    signals = cycle([DrivingSignal(theta[None]) for theta in workload.batch.theta])
 
     def once() -> None:
-        wishes = ViewerState(frame=next(frames), backdrop=(1.0, 1.0, 1.0))
-        image = viewer_picture(stage, wishes, camera).image
+        image = viewer_render(workload.avatar, next(signals), state, camera).image
         coded = (image * 255).type(torch.uint8).cpu().numpy()
         imageio.imwrite(io.BytesIO(), coded, extension=".jpeg", quality=_JPEG_QUALITY)
 

@@ -21,11 +21,13 @@ from rgbavatar_ns.avatar.refinement.corrections import fit_theta
 from rgbavatar_ns.avatar.training.cuda_graph import Recorder, record_cuda_graph
 from rgbavatar_ns.avatar.training.orthogonality import orthogonality_error
 from rgbavatar_ns.avatar.training.recorded_step import RecordedStep
+from rgbavatar_ns.data import TrackedDataset
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.plugin.cameras import from_nerfstudio
 from rgbavatar_ns.plugin.datamanager import RGBAvatarDataManager, RGBAvatarDataManagerConfig
 from rgbavatar_ns.plugin.model import RGBAvatarModel, RGBAvatarModelConfig
 from rgbavatar_ns.plugin.training.device_training import recorded_step
+from rgbavatar_ns.plugin.viewer.panel import ViewerPanel
 
 
 @dataclass
@@ -54,12 +56,18 @@ class RGBAvatarPipeline(VanillaPipeline):
         super().__init__(config, str(device), **more)
         self._graphed: RecordedStep | None = None
         self._graphed_tried = False
-        self.model.viewer_panel.stage.film = self.datamanager.dataparser.tracked
+        self.viewer_panel = ViewerPanel(self.model, self.film)
+        self.model.view = self.viewer_panel.draw
 
     @property
     def model(self) -> RGBAvatarModel:
         """The model; this method trains on one device, so it is never wrapped."""
         return self._model
+
+    @property
+    def film(self) -> TrackedDataset | None:
+        """What the viewer compares the avatar with."""
+        return self.datamanager.dataparser.tracked
 
     def fused_train_step(self, step: int, optimizers: Optimizers) -> dict[str, Tensor] | None:
         """Take a training step without autograd and return its losses.
