@@ -51,6 +51,24 @@ def l1_loss(image: Float[Tensor, "B H W 3"], target: Float[Tensor, "B H W 3"]) -
     return F.l1_loss(image, target)
 
 
+def image_losses(
+    image: Float[Tensor, "B H W 3"],
+    images_rgba: UInt8[Tensor, "B H W 4"] | Float[Tensor, "B H W 4"],
+    background: Float[Tensor, "B 3"],
+    lpips: "LPIPSLoss | None" = None,
+    lpips_weight: float = 0.0,
+) -> dict[str, Float[Tensor, ""]]:
+    """The parts of the loss between drawn images and filmed ones over the same backgrounds.
+
+    "l1" and, where it is given, "lpips" times its weight (paper, sec. 3.2).
+    """
+    target = composite(rgba_to_float(images_rgba, image.dtype), background)
+    losses = {"l1": l1_loss(image, target)}
+    if lpips is not None:
+        losses["lpips"] = lpips_weight * lpips(image, target)
+    return losses
+
+
 class LPIPSLoss:
     """LPIPS between images in [0, 1], its network built on first use; gradients reach both.
 
