@@ -63,8 +63,8 @@ def write_comparison(
         compared = comparison_frames(avatar, dataset, chosen, background)
         for done, (position, row) in enumerate(zip(chosen, compared), start=1):
             if position in shown:
-                kept.append(np.vstack(row))
-            yield np.hstack(row)
+                kept.append(np.vstack([*row]))
+            yield np.hstack([*row])
             if progress is not None:
                 progress(done, len(chosen))
 
