@@ -8,8 +8,8 @@ import torch
 from rgbavatar_ns.avatar import Avatar, AvatarConfig
 from rgbavatar_ns.avatar.metrics import psnr
 from rgbavatar_ns.avatar.training import TrainingBatch, TrainingOptions, TrainingStep, fit
-from rgbavatar_ns.avatar.training.losses import composite, rgba_to_float
 from rgbavatar_ns.data import OfflineOrder
+from rgbavatar_ns.drawing.compositing import composite, rgba_to_float
 from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.kernels import available_backends
 from rgbavatar_ns.synthetic import DemoConfig, make_demo_dataset

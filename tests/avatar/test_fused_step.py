@@ -14,12 +14,9 @@ from rgbavatar_ns.avatar.training import (
     make_optimizer,
 )
 from rgbavatar_ns.avatar.training.fused_step import FusedStep
-from rgbavatar_ns.avatar.training.losses import (
-    random_backgrounds,
-    require_images_of,
-    rgba_to_float,
-)
+from rgbavatar_ns.avatar.training.losses import random_backgrounds, require_images_of
 from rgbavatar_ns.avatar.training.optimizer_states import unsupported_reason
+from rgbavatar_ns.drawing.compositing import rgba_to_float
 from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.kernels import available_backends
 
