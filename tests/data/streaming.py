@@ -29,15 +29,14 @@ def tracked(index: int) -> TrackedFrame:
 def streamed(index: int, session: str = "", image: np.ndarray | None = None) -> StreamedFrame:
     one = tracked(index)
     png = encode_png_rgba(one.image_rgba if image is None else image)
-    return StreamedFrame(index, one.theta, one.camera, png, time.monotonic(), session)
+    return StreamedFrame(index, one.theta, one.camera, time.monotonic(), session, png=png)
 
 
-def cheap(index: int) -> tuple[TrackedFrame, StreamedFrame]:
+def cheap(index: int) -> StreamedFrame:
     """A frame whose making costs next to nothing."""
     theta = torch.full((HEAD.layout.size,), float(index))
     image = np.full((HEIGHT, WIDTH, 4), index % 251, np.uint8)
-    camera, now = odd_camera(), time.monotonic()
-    return TrackedFrame(index, theta, camera, image), StreamedFrame(index, theta, camera, b"", now)
+    return StreamedFrame(index, theta, odd_camera(), time.monotonic(), image_rgba=image)
 
 
 class GivenStream:

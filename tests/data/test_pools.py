@@ -17,13 +17,13 @@ from tests.data.small_dataset import small_dataset
 from tests.data.streaming import HEAD, cheap, streamed, subject, tracked
 
 
-def pools(local: int = 3, old: int = 4, seed: int = 0, keep_png: bool = True) -> ReplayBuffer:
-    return ReplayBuffer(subject(), LocalGlobalPools(local, old, seed=seed), keep_png)
+def pools(local: int = 3, old: int = 4, seed: int = 0, save_images: bool = True) -> ReplayBuffer:
+    return ReplayBuffer(subject(), LocalGlobalPools(local, old, seed=seed), save_images)
 
 
 def fill(frames: ReplayBuffer, indices: range) -> None:
     for index in indices:
-        frames.add(tracked(index), streamed(index))
+        frames.add(streamed(index))
 
 
 def saved(state: dict[str, Any]) -> dict[str, Any]:
@@ -90,12 +90,12 @@ def test_latency_is_from_arrival_to_the_first_batch():
 
 
 def test_memory_stays_flat_over_an_hour_of_frames():
-    frames = ReplayBuffer(subject(), LocalGlobalPools(150, 1000), keep_png=True)
-    one, wire = cheap(0)
+    frames = ReplayBuffer(subject(), LocalGlobalPools(150, 1000))
+    one = cheap(0)
 
     def stream(count: int) -> int:
         for _ in range(count):
-            frames.add(one, wire)
+            frames.add(one)
             if frames.num_added % 200 == 0:
                 frames.batch(10)
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
@@ -108,16 +108,16 @@ def test_memory_stays_flat_over_an_hour_of_frames():
     assert after_kib - before_kib < 6 * 1024
 
 
-@pytest.mark.parametrize("keep_png", [True, False])
-def test_pools_go_on_from_a_checkpoint_as_they_were(keep_png: bool, tmp_path: Path):
+@pytest.mark.parametrize("save_images", [True, False])
+def test_pools_go_on_from_a_checkpoint_as_they_were(save_images: bool, tmp_path: Path):
     stream = ReplayStream(small_dataset(tmp_path / "data", HEAD, per_frame_camera=True))
-    whole = pools(2, 2, seed=3, keep_png=keep_png)
+    whole = pools(2, 2, seed=3, save_images=save_images)
     fill(whole, range(6))
     whole.batch(3)
     state = saved(whole.state_dict())
-    assert ("png" in state) is keep_png
-    resumed = pools(2, 2, seed=99, keep_png=keep_png)
-    resumed.load_state_dict(state, None if keep_png else stream)
+    assert ("png" in state) is save_images
+    resumed = pools(2, 2, seed=99, save_images=save_images)
+    resumed.load_state_dict(state, None if save_images else stream)
     assert resumed.num_added == 6
     for _ in range(5):
         one, other = whole.batch(3), resumed.batch(3)
@@ -131,7 +131,7 @@ def test_pools_go_on_from_a_checkpoint_as_they_were(keep_png: bool, tmp_path: Pa
 
 
 def test_a_checkpoint_without_images_needs_its_stream():
-    whole = pools(keep_png=False)
+    whole = pools(save_images=False)
     fill(whole, range(3))
     with pytest.raises(UserError, match="holds no images"):
         pools().load_state_dict(whole.state_dict())
@@ -146,8 +146,8 @@ def test_a_checkpoint_of_another_image_size_is_refused():
 
 
 def test_held_frames_come_in_order_with_their_images():
-    for keep_png in (True, False):
-        frames = pools(keep_png=keep_png)
+    for save_images in (True, False):
+        frames = pools(save_images=save_images)
         fill(frames, range(12))
         held = frames.held()
         assert len(held) == 7

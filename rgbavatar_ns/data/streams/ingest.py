@@ -7,7 +7,6 @@ from typing import Any
 
 import torch
 
-from rgbavatar_ns.data.png import png_header_size
 from rgbavatar_ns.data.streams.protocol import FrameStream, Rewindable, StreamedFrame, StreamSubject
 from rgbavatar_ns.data.streams.replay_buffer import ReplayBuffer
 from rgbavatar_ns.data.streams.sequence_numbers import SeenNumbers
@@ -178,7 +177,7 @@ class Ingest:
             return "theta of another size"
         if not bool(torch.isfinite(frame.theta).all()):
             return "theta not finite"
-        size, wanted = png_header_size(frame.png), (self._subject.width, self._subject.height)
+        size, wanted = frame.image_size, (self._subject.width, self._subject.height)
         if size is not None and size != wanted:
             if not self._counts["another resolution"]:
                 self._tell(
@@ -190,10 +189,9 @@ class Ingest:
 
     def _take_in(self, frame: StreamedFrame) -> str | None:
         try:
-            decoded = frame.decode()
+            self._pools.add(frame)
         except UserError:
             return "unreadable"
-        self._pools.add(decoded, frame)
         return None
 
     def state_dict(self) -> dict[str, Any]:

@@ -126,7 +126,7 @@ def parse_frame(record: Record, subject: StreamSubject, arrived_s: float) -> Str
     named = [(f"streamed frame {index}", record.fields.get("camera"))]
     camera = cameras_from_json(named, subject.width, subject.height)
     values = torch.from_numpy(theta)
-    return StreamedFrame(index, values, camera, record.data, arrived_s, subject.session)
+    return StreamedFrame(index, values, camera, arrived_s, subject.session, png=record.data)
 
 
 def _whole(value: Any) -> int:

@@ -88,4 +88,4 @@ class ReplayStream:
             ) from None
         camera = data.cameras.select([position])
         index = data.frame_index[position]
-        return StreamedFrame(index, data.theta[position], camera, png, arrived_s)
+        return StreamedFrame(index, data.theta[position], camera, arrived_s, png=png)

@@ -108,7 +108,7 @@ class OnlineDataManager(RGBAvatarDataManager):
             subject, self._first = await_subject(stream, _tell)
             _record(config, subject, [(0, self._first)])
         assert subject is not None
-        self.pools = ReplayBuffer(subject, pools, keep_png=not isinstance(stream, Rereadable))
+        self.pools = ReplayBuffer(subject, pools, save_images=not isinstance(stream, Rereadable))
         self._ingest = Ingest(stream, subject, self.pools, config.queue_frames, _tell)
         self._subject, self._stream = subject, stream
         self._resumed = False
@@ -237,7 +237,7 @@ def _record(config: OnlineDataManagerConfig, subject: Any, frames: Any) -> None:
         overwrite=True,
     )
     for serial, frame in frames:
-        writer.add_encoded(serial, frame.theta, frame.camera, frame.png)
+        writer.add_encoded(serial, frame.theta, frame.camera, frame.encoded())
     writer.finish(0)
 
 
