@@ -269,6 +269,7 @@ class ReplayBuffer:
         if not isinstance(stream, Rereadable):
             raise UserError(
                 "The checkpoint was made while a dataset was replayed and holds no images.",
-                "Resume with that dataset: --data FOLDER --pipeline.datamanager.source.kind replay.",
+                "Resume with that dataset: --data FOLDER "
+                "--pipeline.datamanager.source.kind replay.",
             )
         return [stream.again(index).encoded() for index in state["index"].tolist()]
