@@ -47,7 +47,7 @@ class OnlineDataManagerConfig(RGBAvatarDataManagerConfig):
     for chance. False draws from the local pool by chance alone, as in the paper."""
     queue_frames: int = 256
     """Frames that may wait to be decoded; beyond, the oldest is dropped, or the source waits
-    where it keeps them (a folder, a video file)."""
+    where it keeps them (a video file)."""
     recorded: tyro.conf.Suppress[Path | None] = None
     """Dataset of the frames that the pools held, which the trainer writes for later commands."""
 
@@ -93,7 +93,7 @@ class OnlineDataManager(RGBAvatarDataManager):
         return self._ingest
 
     def _open(self, config: OnlineDataManagerConfig) -> None:
-        stream = open_source(config.source, config.data or config.dataparser.data)
+        stream = open_source(config.source, config.data or config.dataparser.data, _tell)
         try:
             self._prepare(config, stream)
         except BaseException:
@@ -242,4 +242,4 @@ def _record(config: OnlineDataManagerConfig, subject: Any, frames: Any) -> None:
 
 
 def _tell(line: str) -> None:
-    CONSOLE.print(line, highlight=False, soft_wrap=True)
+    CONSOLE.print(line, highlight=False, markup=False, soft_wrap=True)
