@@ -5,7 +5,7 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -15,13 +15,18 @@ _SECONDS_TO_SAVE = 60.0
 
 
 @contextmanager
-def alone_in(folder: Path) -> Iterator[None]:
-    """Hold the folder's lock; waits while another process does. It goes with the process."""
+def alone_in(
+    folder: Path, tell: Callable[[str], None] = lambda line: print(line, flush=True)
+) -> Iterator[None]:
+    """Hold the folder's lock; waits, and tells so, while another process does.
+
+    The lock goes with the process.
+    """
     with (folder / _LOCK_FILE).open("a") as lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            print("Another process still works on this cell; waiting for it.", flush=True)
+            tell("Another process still works on this cell; waiting for it.")
             fcntl.flock(lock, fcntl.LOCK_EX)
         yield
 

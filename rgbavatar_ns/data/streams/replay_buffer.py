@@ -3,7 +3,7 @@
 import threading
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -52,12 +52,17 @@ class ReplayBuffer:
         subject: whose frames these are.
         pools: the sampling; nobody else must use it.
         keep_png: whether the encoded images are kept for `state_dict`.
+        now: the clock by which frames say when they arrived, in seconds.
     """
 
     def __init__(
-        self, subject: StreamSubject, pools: LocalGlobalPools, keep_png: bool = True
+        self,
+        subject: StreamSubject,
+        pools: LocalGlobalPools,
+        keep_png: bool = True,
+        now: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._subject, self._pools, self._keep_png = subject, pools, keep_png
+        self._subject, self._pools, self._keep_png, self._now = subject, pools, keep_png, now
         places = pools.local_size + pools.global_size
         height, width = subject.height, subject.width
         # The system gives memory to the places as they are first written to.
@@ -124,7 +129,7 @@ class ReplayBuffer:
         """Draw a batch as `LocalGlobalPools.batch`; raises UserError while there are no frames."""
         with self._lock:
             serials = self._pools.batch(batch_size, evenly)
-            now = time.monotonic()
+            now = self._now()
             for serial in serials:
                 arrived_s = self._waiting.pop(serial, None)
                 if arrived_s is not None:
@@ -143,7 +148,7 @@ class ReplayBuffer:
         None where there are none.
         """
         with self._lock:
-            since = time.monotonic() - seconds
+            since = self._now() - seconds
             local = self._pools.local_frames
             late = [serial for serial in local if self._kept[serial].arrived_s >= since]
             chosen = late[:: -max(1, -(-len(late) // most))]
@@ -222,7 +227,7 @@ class ReplayBuffer:
         """
         images = self._saved_images(state, stream)
         size = self._subject.width, self._subject.height
-        now = time.monotonic()
+        now = self._now()
         with self._lock:
             self._pools.load_state_dict(state["pools"])
             for row, (serial, index) in enumerate(
