@@ -17,7 +17,7 @@ from rgbavatar_ns.synthetic import DemoConfig, make_demo_dataset
 pytestmark = pytest.mark.skipif("cpu" not in available_backends(), reason="not compiled")
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_held_out_psnr_is_that_of_the_eager_path(tmp_path):
     """Means over held-out frames of a small demo subject, five seeds, within a tenth of a dB.
 

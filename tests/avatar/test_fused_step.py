@@ -160,7 +160,7 @@ def test_parameters_after_a_hundred_small_steps(stirred):
     assert max(relative_differences(fused, eager).values()) < 1e-3
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_parameters_after_a_hundred_steps_lie_within_the_eager_spread(stirred, monkeypatch):
     """At full rates pixels reach their targets, where the sign of L1 is decided by rounding.
 
