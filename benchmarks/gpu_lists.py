@@ -12,10 +12,10 @@ from typing import Any
 import torch
 from gpu_sections import Finding, Place
 from gpu_training import small_avatar, small_frames, step_of
+from rgbavatar_ns.bench.drawing import leaf_gaussians
 from torch import Tensor
 
 from rgbavatar_ns.avatar.training.loop import make_optimizer
-from rgbavatar_ns.bench.drawing import leaf_gaussians
 from rgbavatar_ns.bench.scenes import ellipsoid_scene, on_device
 from rgbavatar_ns.kernels import rasterize
 

@@ -11,16 +11,16 @@ import torch
 from gpu_lists import Launch, launches_seen_by
 from gpu_sections import Finding, Place
 from gpu_training import film, step_of
+from rgbavatar_ns.bench.drawing import leaf_gaussians
+from rgbavatar_ns.bench.utilisation import gpu_utilisation
 from torch import Tensor
 
 from rgbavatar_ns.avatar import Avatar, AvatarConfig
 from rgbavatar_ns.avatar.recorded_rendering import RecordedRendering
 from rgbavatar_ns.avatar.training.loop import make_optimizer
 from rgbavatar_ns.avatar.training.losses import random_backgrounds
-from rgbavatar_ns.bench.drawing import leaf_gaussians
 from rgbavatar_ns.bench.scenes import DEFAULT_COUNT, DEFAULT_SIZE_PX, ellipsoid_scene, on_device
 from rgbavatar_ns.bench.timing import Spread, peak_growth_bytes
-from rgbavatar_ns.bench.utilisation import gpu_utilisation
 from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.kernels import GaussianSet, PinholeCameras, rasterize
 

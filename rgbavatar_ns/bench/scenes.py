@@ -31,6 +31,13 @@ def on_device(record: _Record, device: torch.device) -> _Record:
     return type(record)(**values)
 
 
+def leaf_gaussians(gaussians: GaussianSet) -> GaussianSet:
+    """The same Gaussians as leaves that ask for gradients."""
+    return GaussianSet(
+        **{name: value.detach().requires_grad_() for name, value in vars(gaussians).items()}
+    )
+
+
 def ellipsoid_scene(
     count: int = DEFAULT_COUNT,
     size_px: int = DEFAULT_SIZE_PX,

@@ -1,7 +1,7 @@
 """What refining the tracking while training is worth, on the demo subject or a tracked dataset.
 
-    python benchmarks/refinement.py --json refinement.json
-    python benchmarks/refinement.py --data FOLDER
+    python benchmarks/quality/refinement.py --json refinement.json
+    python benchmarks/quality/refinement.py --data FOLDER
 
 Without --data the demo subject is rendered and its theta, which is known, made as noisy as a poor
 tracker's, training and held-out frames alike. An avatar is trained without and with refinement, and

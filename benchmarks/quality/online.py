@@ -1,7 +1,7 @@
 """What the two pools are worth: online training on the demo subject, without a clock.
 
-    python benchmarks/online.py --seeds 0 1 2 --out outputs/online
-    python benchmarks/online.py --frames 750 --image-size 128 --uv-resolution 64 --out outputs/small
+    python benchmarks/quality/online.py --seeds 0 1 2 --out outputs/online
+    python benchmarks/quality/online.py --frames 750 --image-size 128 --uv-resolution 64
 
 The frames of a performance at 25 frames/s are streamed in order; between two of them as many steps
 are taken as a trainer of `--images-per-second` manages, so that the figures do not depend on how

@@ -1,6 +1,6 @@
 """What each part of the method is worth on the demo subject, over several seeds.
 
-    python benchmarks/demo_subject.py --seeds 0 1 2 --steps 600 --json demo_subject.json
+    python benchmarks/quality/demo_subject.py --seeds 0 1 2 --steps 600 --json demo_subject.json
 
 For each seed (of the subject and of the training) it prints the held-out PSNR with K = 20, with
 K = 0 and without pose input after the same steps; how many steps colour initialisation needs to
