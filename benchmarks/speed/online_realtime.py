@@ -1,6 +1,6 @@
 """Whether `ns-train rgbavatar-online-tiny` keeps up with a stream while a viewer looks on.
 
-    python benchmarks/online_realtime.py --seconds 120 --browser
+    python benchmarks/speed/online_realtime.py --seconds 120 --browser
 
 Replays a demo subject in real time through the command itself and prints what it told at its end:
 frames that arrived and were dropped, the median time from a frame's arrival to its first use in a

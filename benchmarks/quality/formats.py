@@ -1,6 +1,6 @@
 """Whether training on another system's format reaches what the project's own format reaches.
 
-    python benchmarks/formats.py --json formats.json
+    python benchmarks/quality/formats.py --json formats.json
 
 The demo subject is filmed as `rgbavatar demo-data --format X` films it and written in that format
 and in the project's own: the same images, the same head (a FLAME-shaped pickle that holds nothing

@@ -1,7 +1,7 @@
 """Draw docs/speed.png: the rasterizer's cost against N, B and pixels, and beside its peers.
 
-    python benchmarks/plots.py --json speed.json
-    python benchmarks/plots.py --from-json speed.json
+    python benchmarks/speed/plots.py --json speed.json
+    python benchmarks/speed/plots.py --from-json speed.json
 
 The first line measures (a few minutes, on a machine that does nothing else); the second draws
 again what was measured. The workload is the ellipsoid of `rgbavatar bench rasterizer`, forward
@@ -20,7 +20,7 @@ from rich.progress import Progress
 
 from rgbavatar_ns.bench.machine import machine_facts
 from rgbavatar_ns.bench.options import RasterizerOptions
-from rgbavatar_ns.bench.rasterizer import bench_rasterizer, time_rasterizer
+from rgbavatar_ns.bench.rasterizer import WHOLE, bench_rasterizer, time_rasterizer
 from rgbavatar_ns.bench.scenes import DEFAULT_COUNT, DEFAULT_SIZE_PX, ellipsoid_scene
 from rgbavatar_ns.bench.timing import Stopwatch, using_threads
 from rgbavatar_ns.errors import UserError
@@ -77,7 +77,7 @@ def _sweep(
     for count, size_px, batch in scenes:
         gaussians, cameras = ellipsoid_scene(count, size_px, batch)
         stopwatch = Stopwatch(options.repetitions)
-        whole = time_rasterizer(gaussians, cameras, stopwatch).training.whole
+        whole = time_rasterizer(gaussians, cameras, stopwatch)[0][WHOLE]
         found.append((whole.median_ms, whole.lower_ms, whole.upper_ms))
         bar.update(task, advance=1, refresh=True)
     return found
@@ -133,7 +133,7 @@ def _line(axis: Any, points: Points, unit: float, label: str, per: str) -> None:
 def _bars(axis: Any, report: dict[str, Any]) -> None:
     """Milliseconds an image, ours and the peers', on a logarithmic axis."""
     ours = 1e3 / report["images_per_second"]
-    rows = {"floor": report["floor"]["ms_per_image"], "rgbavatar_ns": ours}
+    rows = {"roofline": report["roofline"]["ms_per_image"], "rgbavatar_ns": ours}
     for name, peer in report["peers"].items():
         if "unavailable" not in peer:
             rows[name] = peer["whole_ms_per_image"]

@@ -1,6 +1,6 @@
 """How near the tracker comes to the truth on the procedural subject.
 
-    python benchmarks/tracker.py --seeds 0 1 2 --sizes 256 512 --json tracker.json
+    python benchmarks/quality/tracker.py --seeds 0 1 2 --sizes 256 512 --json tracker.json
 
 For each subject it renders a performance, finds landmarks on the images with mediapipe, fits the
 head model and prints: rotation error of the skull (mean, degrees; its constant part as pitch, yaw,

@@ -1,6 +1,6 @@
 """Frames per second of the live tracker on a video, warm-up apart.
 
-python benchmarks/live_tracker.py me.mp4 --height-px 512 --frames 75
+python benchmarks/speed/live_tracker.py me.mp4 --height-px 512 --frames 75
 """
 
 import statistics
