@@ -24,9 +24,9 @@ from rgbavatar_ns.data.importers.folder import matrix, numbers
 from rgbavatar_ns.data.importers.frame_record import CameraRecord
 from rgbavatar_ns.data.importers.import_report import UnusableFrameError
 from rgbavatar_ns.data.importers.source import Reading
+from rgbavatar_ns.data.importers.torch_file import read_torch_file
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadArrays
-from rgbavatar_ns.head.safe_pickle import read_torch_file
 
 FLAME_VERSION = "2020"
 MANY_FILES = 400
