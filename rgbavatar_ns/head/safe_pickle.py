@@ -32,6 +32,7 @@ _PLAIN = {"str", "bytes", "bytes_or_str", "int", "int_or_bool", "bool", "float",
 """What pickletools calls the types that may be keys."""
 _KEYED = ("SETITEM", "SETITEMS", "DICT", "ADDITEMS", "FROZENSET")
 _MARK = pickletools.markobject
+_OPCODES = {opcode.code.encode("latin-1"): opcode for opcode in pickletools.opcodes}
 _DTYPE = re.compile(r"[<>=|]?(\?|[bBhHiIlLqQefdFD]|b1|[iu][1248]|f[248]|c8|c16|[SU]\d{1,4})")
 _REMEDY = (
     "Get the file again from its maker; if it holds more than plain arrays, write those arrays "
@@ -201,7 +202,7 @@ def _vet(file: io.BytesIO) -> None:
 def _opcodes(file: io.BytesIO) -> Iterator[tuple[pickletools.OpcodeInfo, Any]]:
     """Opcodes with their arguments; unlike `pickletools.genops` takes Python 2's text as it is."""
     for _ in range(MAX_OPCODES):
-        opcode = pickletools.code2op[file.read(1).decode("latin-1")]
+        opcode = _OPCODES[file.read(1)]
         argument = None
         if opcode.name == "STRING":
             argument = file.readline()
