@@ -1,13 +1,11 @@
 """Training on streams through nerfstudio's trainer: pools, ends, faults, resuming."""
 
+import dataclasses
 import json
-import os
 import signal
-import subprocess
+import socket
 import threading
-import time
 from collections import Counter
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,19 +13,23 @@ import numpy as np
 import pytest
 import torch
 from nerfstudio.configs.method_configs import all_methods
-from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.utils.eval_utils import eval_setup
 
 from rgbavatar_ns import Avatar
 from rgbavatar_ns.data import TrackedFrame, load_dataset
-from rgbavatar_ns.data.streams import FolderWriter, StreamClient, StreamSubject
+from rgbavatar_ns.data.streams import StreamClient, StreamSubject
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.plugin.methods import rgbavatar
 from rgbavatar_ns.plugin.online.methods import rgbavatar_online, rgbavatar_online_tiny
+from rgbavatar_ns.plugin.online.sources import SourceConfig
 from rgbavatar_ns.plugin.online.trainer import OnlineTrainer
 from rgbavatar_ns.plugin.training.checkpoints import list_checkpoints, read_checkpoint
-from tests.plugin.online_run import online_config, online_trainer
-from tests.plugin.run import environment, program
+from tests.plugin.online_run import (
+    before_each_step,
+    hold_back_after,
+    online_config,
+    online_trainer,
+)
 from tests.plugin.tiny import NUM_FRAMES, NUM_TEST, SIZE
 
 STREAMED = NUM_FRAMES - NUM_TEST
@@ -43,11 +45,6 @@ def newest(folder: Path) -> dict[str, Any]:
 
 def stream_state(folder: Path) -> dict[str, Any]:
     return newest(folder)["pipeline"]["datamanager._extra_state"]["stream"]
-
-
-def before_each_step(trainer: OnlineTrainer, work: Callable[[int], None]) -> None:
-    where = [TrainingCallbackLocation.BEFORE_TRAIN_ITERATION]
-    trainer.callbacks.append(TrainingCallback(where, lambda step: work(step)))
 
 
 def subject_and_frames(data: Path) -> tuple[StreamSubject, list[TrackedFrame]]:
@@ -151,10 +148,11 @@ def test_the_streamed_avatar_learns_and_colours_its_gaussians(tiny_data: Path, t
     assert bool(pipeline.model.avatar.color_initialized.any())
 
 
-def test_training_begins_with_the_first_frame(tiny_data: Path, tmp_path: Path):
-    config = online_config(tmp_path, tiny_data, max_num_iterations=2)
-    config.pipeline.datamanager.source.frames_per_second = 0.1  # the second comes in ten seconds
-    trainer = online_trainer(config)
+def test_training_begins_with_the_first_frame(
+    tiny_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    hold_back_after(1, monkeypatch)
+    trainer = online_trainer(online_config(tmp_path, tiny_data, max_num_iterations=2))
     trainer.train()
     assert trainer.stream.pools.num_added == 1
     assert summary(trainer)["images"] == 2
@@ -210,32 +208,27 @@ def test_sigterm_saves_and_is_told_by_the_exit_code(tiny_data: Path, tmp_path: P
     assert [step for step, _ in list_checkpoints(trainer.checkpoint_dir)] == [0]
 
 
-def test_a_resumed_stream_goes_on_where_it_was(tiny_data: Path, tmp_path: Path):
-    config = online_config(tmp_path / "first", tiny_data, local_size=2, global_size=3)
-    config.pipeline.datamanager.source.frames_per_second = 5.0
-    trainer = online_trainer(config)
+def test_a_resumed_stream_goes_on_where_it_was(
+    tiny_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    sizes = {"local_size": 2, "global_size": 3}
+    trainer = online_trainer(online_config(tmp_path / "first", tiny_data, **sizes))
     pools = trainer.stream.pools
 
     def stop_in_the_middle(step: int) -> None:
-        if pools.num_added >= 5:
+        if pools.num_added == 5:
             trainer.shutdown()
 
     before_each_step(trainer, stop_in_the_middle)
-    trainer.train()
+    with monkeypatch.context() as patched:
+        hold_back_after(5, patched)
+        trainer.train()
     state = stream_state(trainer.checkpoint_dir)
-    added = state["frames"]["added"]
-    assert 5 <= added < STREAMED
 
-    again = online_trainer(
-        online_config(
-            tmp_path / "second",
-            tiny_data,
-            local_size=2,
-            global_size=3,
-            load_dir=trainer.checkpoint_dir,
-        )
-    )
-    assert again.stream.pools.num_added == added
+    folder = trainer.checkpoint_dir
+    config = online_config(tmp_path / "second", tiny_data, load_dir=folder, **sizes)
+    again = online_trainer(config)
+    assert again.stream.pools.num_added == state["frames"]["added"] == 5
     resumed = again.pipeline.state_dict()["datamanager._extra_state"]["stream"]["frames"]
     for name in ("serial", "index", "theta", "world_to_camera"):
         assert torch.equal(resumed[name], state["frames"][name])
@@ -246,41 +239,50 @@ def test_a_resumed_stream_goes_on_where_it_was(tiny_data: Path, tmp_path: Path):
     # Every frame once, over both runs.
     assert told["taken in"] == told["arrived"] == STREAMED
     assert again.stream.pools.num_added == STREAMED
+    folder = again.checkpoint_dir
     finished = online_trainer(
-        online_config(
-            tmp_path / "third",
-            tiny_data,
-            local_size=2,
-            global_size=3,
-            load_dir=again.checkpoint_dir,
-        )
+        online_config(tmp_path / "third", tiny_data, load_dir=folder, **sizes)
     )
     finished.train()
     assert finished.step == again.step
 
 
-def test_a_folder_is_trained_on_while_it_is_written(
+def test_frames_sent_over_a_socket_are_trained_on_and_kept(
     tiny_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     subject, frames = subject_and_frames(tiny_data)
-    folder = tmp_path / "live"
+    subject = dataclasses.replace(subject, session="mine")
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        address = f"127.0.0.1:{free.getsockname()[1]}"
 
-    def write() -> None:
-        time.sleep(0.3)
-        writer = FolderWriter(folder, subject)
-        for frame in frames:
-            writer.send(frame)
-            time.sleep(0.01)
-        writer.end()
+    def send() -> None:
+        client = StreamClient(subject, address)
+        for frame in frames[:5]:
+            client.send(frame)
+        client.close()  # lost; the training goes on, and another client too
+        with StreamClient(subject, address) as again:
+            for frame in frames[5:]:
+                again.send(frame)
 
-    thread = threading.Thread(target=write, daemon=True)
-    thread.start()
-    config = online_config(tmp_path / "out", folder)
-    config.pipeline.datamanager.source.kind = "folder"
-    trainer = online_trainer(config)
-    trainer.train()
-    thread.join()
-    assert summary(trainer)["frames"] == STREAMED
+    def train(output: Path, **fields: Any) -> OnlineTrainer:
+        thread = threading.Thread(target=send, daemon=True)
+        thread.start()
+        config = online_config(output, **fields)
+        config.pipeline.datamanager.source = SourceConfig("socket", listen=address)
+        trainer = online_trainer(config)
+        trainer.train()
+        thread.join()
+        return trainer
+
+    trainer = train(tmp_path / "out")
+    told = summary(trainer)["stream"]
+    assert told["taken in"] == STREAMED
+    assert told["source lost"] == told["reconnects"] == 1
+    # The checkpoint is an avatar with the performance that the pools held.
+    loaded = Avatar.load(trainer.base_dir)
+    frames_saved = newest(trainer.checkpoint_dir)["pipeline"]["_model._extra_state"]["frames"]
+    assert torch.equal(frames_saved["theta"], load_dataset(tiny_data).theta[:STREAMED])
+    assert loaded.num_gaussians == trainer.pipeline.model.avatar.num_gaussians
     # The run is complete in itself: it holds the frames, and other commands find them.
     recorded = load_dataset(trainer.base_dir / "stream")
     assert len(recorded) == STREAMED
@@ -290,43 +292,10 @@ def test_a_folder_is_trained_on_while_it_is_written(
     _, pipeline, _, step = eval_setup(trainer.base_dir / "config.yml")
     assert step == trainer.step
     assert len(pipeline.datamanager.train_dataset) == STREAMED
-    # Resuming passes over what has been there.
-    config = online_config(tmp_path / "more", folder, load_dir=trainer.checkpoint_dir)
-    config.pipeline.datamanager.source.kind = "folder"
-    again = online_trainer(config)
-    again.train()
-    assert summary(again)["stream"] == summary(trainer)["stream"]
-
-
-def test_frames_pushed_over_a_socket_are_trained_on(tiny_data: Path, tmp_path: Path):
-    subject, frames = subject_and_frames(tiny_data)
-    address = f"unix:{tmp_path / 'socket'}"
-
-    def push() -> None:
-        client = StreamClient(subject, address)
-        for frame in frames[:5]:
-            client.send(frame)
-        client.close()  # lost; the training goes on, and another client too
-        with StreamClient(subject, address) as again:
-            for frame in frames[5:]:
-                again.send(frame)
-
-    thread = threading.Thread(target=push, daemon=True)
-    thread.start()
-    config = online_config(tmp_path / "out")
-    config.pipeline.datamanager.source.kind = "socket"
-    config.pipeline.datamanager.source.listen = address
-    trainer = online_trainer(config)
-    trainer.train()
-    thread.join()
-    told = summary(trainer)["stream"]
-    assert told["taken in"] == STREAMED
-    assert told["source lost"] == told["reconnects"] == 1
-    # The checkpoint is an avatar with the performance that the pools held.
-    loaded = Avatar.load(trainer.base_dir)
-    frames_saved = newest(trainer.checkpoint_dir)["pipeline"]["_model._extra_state"]["frames"]
-    assert torch.equal(frames_saved["theta"], load_dataset(tiny_data).theta[:STREAMED])
-    assert loaded.num_gaussians == trainer.pipeline.model.avatar.num_gaussians
+    # A resumed run knows what has been there.
+    again = summary(train(tmp_path / "more", load_dir=trainer.checkpoint_dir))["stream"]
+    assert again["taken in"] == STREAMED
+    assert again["duplicate"] == STREAMED
 
 
 def test_a_fault_of_the_source_saves_and_is_told(tiny_data: Path, tmp_path: Path):
@@ -361,7 +330,7 @@ def test_impossible_flags_are_refused(
 
 
 @pytest.mark.parametrize(
-    ("kind", "told"), [("replay", "No dataset"), ("folder", "No folder"), ("video", "No video")]
+    ("kind", "told"), [("replay", "No dataset"), ("folder", "no longer"), ("video", "No video")]
 )
 def test_a_source_without_a_place_is_refused(tmp_path: Path, kind: Any, told: str):
     config = online_config(tmp_path)
@@ -392,37 +361,28 @@ def test_the_methods_have_the_papers_pools_and_sizes():
     assert tiny.pipeline.model.avatar.uv_resolution == 128
 
 
-_METHOD = "rgbavatar-online-tiny=rgbavatar_ns.plugin.online.methods:rgbavatar_online_tiny"
+class _Killed(BaseException):
+    """Ends a run in the middle of a step, as SIGKILL does: nothing more is saved."""
 
 
-@pytest.mark.slow
-def test_a_killed_run_goes_on_from_its_last_checkpoint(tiny_data: Path, tmp_path: Path):
-    command = [program("ns-train"), "rgbavatar-online-tiny", "--data", str(tiny_data)]
-    command += ["--output-dir", str(tmp_path), "--timestamp", "run", "--vis", "tensorboard"]
-    command += ["--pipeline.model.avatar.uv-resolution", "16", "--steps-per-save", "1"]
-    command += ["--pipeline.model.avatar.num-bases", "3"]
-    command += ["--pipeline.model.avatar.hidden-width", "16"]
-    command += ["--pipeline.datamanager.source.frames-per-second", "0.5"]
-    run = tmp_path / "data" / "rgbavatar-online-tiny" / "run"
-    own = environment(NERFSTUDIO_METHOD_CONFIGS=_METHOD)
-    log = tmp_path / "log.txt"
-    with log.open("w") as output:
-        process = subprocess.Popen(command, env=own, stdout=output, stderr=subprocess.STDOUT)
-    deadline = time.monotonic() + 300
-    while not list_checkpoints(run / "nerfstudio_models"):
-        assert process.poll() is None, log.read_text()
-        assert time.monotonic() < deadline, log.read_text()
-        time.sleep(0.05)
-    os.kill(process.pid, signal.SIGKILL)
-    process.wait()
-    state = stream_state(run / "nerfstudio_models")
-    again = online_trainer(
-        online_config(
-            tmp_path / "again",
-            tiny_data,
-            load_dir=run / "nerfstudio_models",
-        )
-    )
+def test_a_killed_run_goes_on_from_its_last_checkpoint(
+    tiny_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    trainer = online_trainer(online_config(tmp_path / "first", tiny_data, steps_per_save=1))
+
+    def kill(step: int) -> None:
+        if step == 3:
+            raise _Killed
+
+    before_each_step(trainer, kill)
+    with monkeypatch.context() as patched:
+        hold_back_after(5, patched)
+        with pytest.raises(_Killed):
+            trainer.train()
+    folder = trainer.checkpoint_dir
+    assert list_checkpoints(folder)[-1][0] == 2
+    state = stream_state(folder)
+    again = online_trainer(online_config(tmp_path / "again", tiny_data, load_dir=folder))
     assert again.stream.pools.num_added == state["frames"]["added"] > 0
     assert torch.equal(again.stream.pools.thetas()[0], state["frames"]["theta"])
     again.train()

@@ -11,9 +11,10 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from rgbavatar_ns.avatar import Avatar
-from rgbavatar_ns.avatar.training.losses import composite, rgba_to_float
+from rgbavatar_ns.avatar.metrics import psnr
 from rgbavatar_ns.data import TrackedDataset
 from rgbavatar_ns.data.check.sample import project
+from rgbavatar_ns.drawing.compositing import composite, rgba_to_float, shown_error
 from rgbavatar_ns.drawing.wireframe import with_wireframe
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.kernels import PinholeCameras, RenderedBatch
@@ -21,7 +22,6 @@ from rgbavatar_ns.plugin.cameras import filled_depth
 from rgbavatar_ns.plugin.viewer.driving import DrivingSignal
 from rgbavatar_ns.plugin.viewer.viewer_state import ViewerState
 
-_ERROR_GAIN = 4.0
 _SEEN = 0.02
 _CENTRE_RGB = (60, 255, 120)
 
@@ -105,17 +105,16 @@ def _beside_film(
     own = film.cameras.select([signal.frame]).to(signal.theta.device)
     drawn = _draw(avatar, signal, state, own, backend)
     rgba = torch.from_numpy(film.read_image(signal.frame)).to(signal.theta.device)
-    truth = composite(rgba_to_float(rgba[None]), signal.theta.new_tensor(state.background))[0]
+    truth = composite(rgba_to_float(rgba), signal.theta.new_tensor(state.background))
     image = drawn.image[0].clamp(0, 1)
-    difference = (image - truth).abs()
-    psnr = float(-10 * difference.square().mean().clamp(min=1e-10).log10())
-    tiles = [_colored(difference.mean(-1).mul(_ERROR_GAIN), cv2.COLORMAP_INFERNO)]
+    quality_db = float(psnr(image[None], truth[None]).clamp(max=100))
+    tiles = [_colored(shown_error(image, truth).mean(-1), cv2.COLORMAP_INFERNO)]
     if state.picture == "beside the film":
         overlaid = _with_overlays(image, avatar, signal, state, own, drawn.visibility)
         tiles = [truth, overlaid, *tiles]
     image = _fitted(torch.cat(tiles, 1), camera, state.background)
     covered = image.new_ones(camera.height, camera.width, 1)
-    return ViewerRender(image, covered, covered, psnr)
+    return ViewerRender(image, covered, covered, quality_db)
 
 
 def _fitted(row: _Image, camera: PinholeCameras, background: tuple[float, float, float]) -> _Image:
