@@ -67,18 +67,10 @@ def test_another_head_travels_with_its_subject():
 
 
 def test_answers_are_read_or_refused():
-    assert messages.parse_answer(messages.accepted(7)) == 7
+    assert messages.parse_answer("accepted 7") == 7
     with pytest.raises(UserError, match=r"refuses this client\. Another"):
-        messages.parse_answer(messages.refused("Another client is connected."))
-    for other in (
-        "Hello",
-        b"\xff",
-        "[]",
-        "3",
-        '{"received": -1}',
-        '{"received": 1e999}',
-        "[" * 9999,
-    ):
+        messages.parse_answer("refused Another client is connected.")
+    for other in ("Hello", b"\xff", "", "accepted", "accepted -1", "accepted all"):
         with pytest.raises(UserError, match="Something else"):
             messages.parse_answer(other)
 

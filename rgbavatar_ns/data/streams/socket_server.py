@@ -135,10 +135,10 @@ class SocketStream:
             except UserError as error:
                 with self._changed:
                     self._counts["refused clients"] += 1
-                connection.send(message_format.refused(_printable(error)))
+                connection.send(f"{message_format.REFUSED} {_printable(error)}")
                 return
             try:
-                connection.send(message_format.accepted(self._received))
+                connection.send(f"{message_format.ACCEPTED} {self._received}")
                 self._receive(connection, subject)
             finally:
                 self._release(connection)
