@@ -12,7 +12,7 @@ and an image or nothing:
 The subject comes first and is answered by a text message, "accepted N", where N messages of this
 session were had before, or "refused" and the reason. A head other than the
 embedded one follows its subject as safetensors of its arrays, and the object has its
-"num_identity" and "expression_names". The session tells a client that comes back from another.
+"num_identity" and "expression_names". Numbers begin anew with another session.
 """
 
 import json

@@ -31,9 +31,9 @@ class SocketStream:
     """Listens for one client at a time, which sends messages as `message_format` describes them.
 
     While a client is connected a second one is refused, unless the first has been silent for
-    `silence_s`, or is the same one over a connection that was lost. One that hangs up may come
-    back, another may take its place, with the same head and image size. What is no message of a
-    stream is counted as "unreadable", and told once a client. Web pages are refused.
+    `silence_s`. One that hangs up may come back, another may take its place, with the same head
+    and image size. What is no message of a stream is counted as "unreadable", and told once a
+    client. Web pages are refused.
 
     Args:
         listen: HOST:PORT (port 0: any that is free, see `address`).
@@ -42,8 +42,8 @@ class SocketStream:
         tell: called, from a thread, with what a user should read at once.
         clock: in seconds.
         silence_s: also how long a client may take to send its subject.
-        grace_s: how long a second client waits before it is refused or takes over: what the first
-            has sent before it hung up may still have to be read.
+        grace_s: how long a second client waits before it is refused: what the first has sent
+            before it hung up may still have to be read.
 
     Raises:
         UserError: the address is none, is taken, or other machines can reach it unasked.
@@ -148,18 +148,15 @@ class SocketStream:
         with self._changed:
             if self._subject is not None:
                 _check_same(subject, self._subject)
-            same = subject.session == self._session and subject.session != ""
-            had = self._received
             if not self._is_silent():
                 self._changed.wait_for(lambda: self._client is None or self._closed, self._grace_s)
             before = self._client
-            lost = self._is_silent() or (same and self._received == had)
-            if self._closed or (before is not None and not lost):
+            if self._closed or (before is not None and not self._is_silent()):
                 raise UserError("Another client is connected.", "End it first, or wait.")
             self._client, self._listening_since_s = connection, self._clock()
             if self._subject is not None:
                 self._counts["reconnects"] += 1
-            if not same:
+            if subject.session == "" or subject.session != self._session:
                 self._session, self._received = subject.session, 0
             self._subject = self._subject or subject
             self._changed.notify_all()
