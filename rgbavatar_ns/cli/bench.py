@@ -27,12 +27,12 @@ _SECONDS_PER_REFRESH = 0.2
 
 
 def run(options: Annotated[Options, tyro.conf.arg(name="")]) -> None:
-    """Measure on this machine: medians, parts, floor, and the peers or paths beside it.
+    """Measure on this machine: medians, parts, roofline, and what else draws the same.
 
     Other programs that run meanwhile make every figure worse.
     """
     from rgbavatar_ns.bench.report import print_report
-    from rgbavatar_ns.data.json_file import write_json
+    from rgbavatar_ns.files import write_json
 
     if options.json is not None:
         _require_writable(options.json)
