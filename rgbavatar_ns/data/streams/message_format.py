@@ -17,7 +17,7 @@ embedded one follows its subject as safetensors of its arrays, and the object ha
 
 import json
 import struct
-from typing import Any
+from typing import Any, Literal
 
 import safetensors.numpy
 import torch
@@ -120,11 +120,14 @@ def parse_subject(message: bytes | str) -> StreamSubject:
         raise UserError(f"A stream's subject cannot be used: {reason}.", _CLIENT) from None
 
 
-def parse_frame(
-    header: Header, png: bytes, subject: StreamSubject, arrived_s: float
-) -> StreamedFrame:
-    """The frame of a message; raises UserError for anything that is none."""
+def parse_message(
+    message: bytes | str, subject: StreamSubject, arrived_s: float
+) -> StreamedFrame | Literal["end"]:
+    """The frame of a message that follows the subject, or "end"; raises UserError for others."""
+    header, png = decode(message)
     try:
+        if header["type"] == "end":
+            return "end"
         if header["type"] != "frame":
             raise ValueError("its type is not 'frame'")
         index, theta = _whole(header["index"]), _numbers(header["theta"])

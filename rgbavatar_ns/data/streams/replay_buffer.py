@@ -41,6 +41,17 @@ class _Held:
     arrived_s: float
     png: bytes | None
 
+    def as_png(self) -> bytes:
+        if self.png is None:
+            self.png = encode_png_rgba(self.frame.image_rgba)
+        return self.png
+
+    def as_streamed(self) -> StreamedFrame:
+        frame = self.frame
+        return StreamedFrame(
+            frame.index, frame.theta, frame.camera, self.arrived_s, png=self.as_png()
+        )
+
 
 class ReplayBuffer:
     """Feeds `LocalGlobalPools` and keeps the frames that they hold, and no others.
@@ -142,21 +153,14 @@ class ReplayBuffer:
         """Theta and serial of all that the pools hold, in the order of their arrival."""
         with self._lock:
             serials = sorted(self._held)
-            return self._columns(serials)["theta"], tuple(serials)
+            theta = self._columns(serials)["theta"].reshape(-1, self._subject.layout.size)
+            return theta, tuple(serials)
 
     def held(self) -> list[tuple[int, StreamedFrame]]:
         """Serial and frame of all that the pools hold, in the order of their arrival."""
         with self._lock:
             held = sorted(self._held.items())
-        return [
-            (
-                serial,
-                StreamedFrame(
-                    one.frame.index, one.frame.theta, one.frame.camera, one.arrived_s, png=_png(one)
-                ),
-            )
-            for serial, one in held
-        ]
+        return [(serial, one.as_streamed()) for serial, one in held]
 
     def median_latency_s(self) -> float | None:
         """From arrival to first use in a batch, of the last 500 frames used first; None before."""
@@ -166,13 +170,10 @@ class ReplayBuffer:
     def _columns(self, serials: Sequence[int]) -> dict[str, Tensor]:
         """Theta and the cameras' parts of frames, one row a frame."""
         frames = [self._held[serial].frame for serial in serials]
-        if not frames:
-            shapes = (self._subject.layout.size,), (4, 4), (2,), (2,)
-            return {k: torch.empty(0, *s) for k, s in zip(("theta", *_CAMERA_PARTS), shapes)}
-        columns = {"theta": torch.stack([frame.theta for frame in frames])}
-        for part in _CAMERA_PARTS:
-            columns[part] = torch.cat([getattr(frame.camera, part) for frame in frames])
-        return columns
+        parts = {"theta": [frame.theta[None] for frame in frames]}
+        for name in _CAMERA_PARTS:
+            parts[name] = [getattr(frame.camera, name) for frame in frames]
+        return {name: torch.cat(rows or [torch.empty(0)]) for name, rows in parts.items()}
 
     def _gather(self, serials: Sequence[int]) -> ReplayBatch:
         columns = self._columns(serials)
@@ -194,7 +195,7 @@ class ReplayBuffer:
                 **self._columns(serials),
             }
         if self._save_images:
-            images = [_png(one) for one in held]
+            images = [one.as_png() for one in held]
             state["png_bytes"] = torch.tensor([len(png) for png in images], dtype=torch.long)
             state["png"] = torch.from_numpy(np.frombuffer(b"".join(images), np.uint8).copy())
         return state
@@ -225,13 +226,6 @@ class ReplayBuffer:
                     )
                 self._held[serial] = self._decoded(streamed)
             self._added = state["added"]
-
-
-def _png(held: _Held) -> bytes:
-    """A frame's image encoded, once; the next checkpoint holds it too."""
-    if held.png is None:
-        held.png = encode_png_rgba(held.frame.image_rgba)
-    return held.png
 
 
 def _saved_images(state: dict[str, Any], stream: object) -> list[bytes]:
