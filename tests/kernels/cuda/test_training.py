@@ -6,6 +6,8 @@ import torch
 from rgbavatar_ns.avatar.training import make_optimizer
 from rgbavatar_ns.avatar.training.fused_step import FusedStep
 from tests.avatar.fused_scene import (
+    VARIANTS,
+    assert_gradients_agree,
     eager_step,
     far_batch,
     first_moments,
@@ -13,7 +15,6 @@ from tests.avatar.fused_scene import (
     relative_differences,
     stir,
 )
-from tests.avatar.test_fused_step import VARIANTS, assert_gradients_agree
 from tests.kernels.cuda import emulator
 
 pytestmark = pytest.mark.skipif(emulator.compiler() is None, reason="no g++ to emulate CUDA with")

@@ -19,9 +19,10 @@ from rgbavatar_ns.avatar.training.optimizer_states import unsupported_reason
 from rgbavatar_ns.drawing.compositing import rgba_to_float
 from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.kernels import available_backends
-
-from .conftest import SMALL_CONFIG
-from .fused_scene import (
+from tests.avatar.conftest import SMALL_CONFIG
+from tests.avatar.fused_scene import (
+    VARIANTS,
+    assert_gradients_agree,
     double,
     eager_step,
     far_batch,
@@ -32,23 +33,9 @@ from .fused_scene import (
     reordered,
     stir,
 )
-from .small_head import front_camera, small_head, small_head_arrays, small_identity
+from tests.avatar.small_head import front_camera, small_head, small_head_arrays, small_identity
 
 pytestmark = pytest.mark.skipif("cpu" not in available_backends(), reason="not compiled")
-
-ROUNDING = 3e-5
-AT_THE_CUT, MOST_AT_THE_CUT = 2e-3, 5
-VARIANTS = {
-    "paper": {},
-    "no bases": {"num_bases": 0},
-    "many bases": {"num_bases": 21},
-    "linear network": {"weight_network": "linear"},
-    "no pose": {"pose_input": False},
-    "raw": {"tangent_variant": "raw"},
-    "orthonormal": {"tangent_variant": "orthonormal"},
-    "scaled": {"scale_with_triangle": True},
-    "raw and scaled": {"tangent_variant": "raw", "scale_with_triangle": True},
-}
 
 
 def _instruction_sets() -> tuple[str, ...]:
@@ -62,29 +49,6 @@ def _instruction_sets() -> tuple[str, ...]:
 @pytest.fixture
 def stirred(make_avatar):
     return lambda **changes: stir(make_avatar(**changes))
-
-
-def assert_gradients_agree(avatar, optimizer, expected, expected_optimizer) -> None:
-    """Each group's first moments within rounding; the second avatar's are right.
-
-    A (pixel, Gaussian) pair counts where alpha is at least 1/255. A pair that lies at that cut up
-    to rounding belongs to one way and not to the other; in a hundred thousand there may be one.
-    So a few Gaussians (its own and those behind it) may differ by more, yet not by much.
-    """
-    found = first_moments(avatar, optimizer)
-    right = first_moments(expected, expected_optimizer)
-    whole = relative_differences(found, right)
-    assert max(whole.values()) < AT_THE_CUT, whole
-    if max(whole.values()) < ROUNDING:
-        return
-    count = avatar.num_gaussians
-    for name, value in right.items():
-        if name == "weight_network":
-            continue
-        bases = avatar.config.num_bases if name.startswith("basis") else 1
-        error = (found[name].double() - value.double()).view(bases, count, -1)
-        squares = error.square().sum((0, 2)).sort().values[:-MOST_AT_THE_CUT]
-        assert squares.sum().sqrt() < ROUNDING * value.double().norm(), (name, whole)
 
 
 def _compare(build, batch, background, *, reference: bool = False) -> None:

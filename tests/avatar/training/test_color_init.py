@@ -11,8 +11,7 @@ from rgbavatar_ns.avatar.training.color_init import (
     initialize_colors,
 )
 from rgbavatar_ns.kernels import GaussianSet
-
-from .small_head import front_camera, random_theta
+from tests.avatar.small_head import front_camera, random_theta
 
 
 def one_gaussian(opacity: float, x_m: float = 0.0, count: int = 1) -> GaussianSet:
