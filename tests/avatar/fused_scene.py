@@ -144,6 +144,14 @@ def first_moments(avatar: Avatar, optimizer: torch.optim.Optimizer) -> dict[str,
     }
 
 
+def values_by_group(avatar: Avatar) -> dict[str, Tensor]:
+    """Each group's parameters as one vector."""
+    return {
+        name: torch.cat([p.detach().flatten() for p in parameters])
+        for name, parameters in avatar.parameter_groups().items()
+    }
+
+
 def relative_differences(first: dict[str, Tensor], second: dict[str, Tensor]) -> dict[str, float]:
     """Each group's relative L2 difference; the second is the right one."""
     assert first.keys() == second.keys()
@@ -151,6 +159,11 @@ def relative_differences(first: dict[str, Tensor], second: dict[str, Tensor]) ->
         name: float((first[name].double() - value.double()).norm() / value.double().norm())
         for name, value in second.items()
     }
+
+
+def parting(avatar: Avatar, expected: Avatar) -> float:
+    """The largest relative difference of a group's parameters."""
+    return max(relative_differences(values_by_group(avatar), values_by_group(expected)).values())
 
 
 def assert_gradients_agree(avatar, optimizer, expected, expected_optimizer) -> None:

@@ -14,6 +14,7 @@ from tests.avatar.fused_scene import (
     fused_step,
     relative_differences,
     stir,
+    values_by_group,
 )
 from tests.kernels.cuda import emulator
 
@@ -70,12 +71,7 @@ def test_parameters_after_some_steps(emulated, make_avatar):
             group["lr"] *= 0.1
         for _ in range(8):
             step(avatar, optimizer, batch, background)
-        ends.append(
-            {
-                n: torch.cat([p.detach().flatten() for p in ps])
-                for n, ps in avatar.parameter_groups().items()
-            }
-        )
+        ends.append(values_by_group(avatar))
     assert max(relative_differences(*ends).values()) < 1e-3
 
 
