@@ -173,13 +173,13 @@ def test_the_newest_frame_drives_the_viewers_avatar(tiny_data: Path, tmp_path: P
 
 
 def test_the_viewers_panel_knows_the_newest_frame_only(tiny_data: Path, tmp_path: Path):
-    trainer = online_trainer(online_config(tmp_path, tiny_data))
-    stage = trainer.pipeline.model.viewer_panel.stage
-    assert (stage.num_frames, stage.film) == (1, None)
-    assert stage.statistics().num_frames == 1
+    pipeline = (trainer := online_trainer(online_config(tmp_path, tiny_data))).pipeline
+    assert (len(pipeline.model.frame_theta), pipeline.film) == (1, None)
     trainer.train()
     newest = load_dataset(tiny_data).theta[STREAMED - 1]
-    assert torch.equal(stage.statistics().theta_neutral, newest)
+    assert torch.equal(pipeline.viewer_panel.theta_shown(), newest)
+    pipeline.viewer_panel.show_neutral()
+    assert torch.equal(pipeline.viewer_panel.theta_shown(), newest)
 
 
 def test_ctrl_c_saves_and_leaves_exit_code_0(tiny_data: Path, tmp_path: Path):
