@@ -8,8 +8,8 @@ import torch
 
 from rgbavatar_ns.avatar import Avatar
 from rgbavatar_ns.avatar.recorded_rendering import RecordedRendering
+from rgbavatar_ns.avatar.training import TrainingBatch
 from rgbavatar_ns.avatar.training.cuda_graph import supports
-from rgbavatar_ns.avatar.training.loop import TrainingBatch
 from rgbavatar_ns.bench.machine import chosen_device, require_backend
 from rgbavatar_ns.bench.options import RenderOptions
 from rgbavatar_ns.bench.pairs import count_pairs, one_camera

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from rgbavatar_ns.avatar import Avatar
-from rgbavatar_ns.avatar.training.loop import TrainingBatch
+from rgbavatar_ns.avatar.training import TrainingBatch
 from rgbavatar_ns.kernels import GaussianSet, PinholeCameras
 
 DEFAULT_COUNT = 60_000

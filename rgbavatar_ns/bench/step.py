@@ -4,24 +4,20 @@ from collections.abc import Callable
 from typing import Any
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from rgbavatar_ns.avatar import Avatar
-from rgbavatar_ns.avatar.training.fused_step import FusedStep
-from rgbavatar_ns.avatar.training.loop import (
+from rgbavatar_ns.avatar.training import (
     TrainingBatch,
     TrainingOptions,
+    TrainingStep,
     make_optimizer,
-    training_step,
 )
+from rgbavatar_ns.avatar.training.batches import ChosenFrames, DeviceFrames
+from rgbavatar_ns.avatar.training.color_init import initialize_colors
+from rgbavatar_ns.avatar.training.cuda_graph import Recorder, record_cuda_graph
+from rgbavatar_ns.avatar.training.fused_step import FusedStep
 from rgbavatar_ns.avatar.training.losses import random_backgrounds
-from rgbavatar_ns.avatar.training.recorded_step import (
-    DeviceFrames,
-    RecordedStep,
-    Recorder,
-    record_cuda_graph,
-)
+from rgbavatar_ns.avatar.training.step import Losses
 from rgbavatar_ns.bench.machine import chosen_device, require_backend
 from rgbavatar_ns.bench.options import StepOptions
 from rgbavatar_ns.bench.pairs import count_pairs
@@ -49,8 +45,8 @@ EAGER_STEP = "whole step, eager"
 UNRECORDED_STEP = "whole step, without the CUDA graph"
 COLOR_INITIALISATION = "(colour initialisation, when due)"
 
-Take = Callable[[], Float[Tensor, ""]]
-"""Trains on a batch once and returns the loss."""
+Take = Callable[[], Losses]
+"""Trains on a batch once."""
 
 
 def bench_step(options: StepOptions, progress: Progress | None = None) -> Report:
@@ -112,23 +108,23 @@ def time_step(
 
 def step_by_step(avatar: Avatar, batch: TrainingBatch, *, fast: bool) -> Take:
     """A step by the backend's loops, or through autograd."""
-    optimizer, options = make_optimizer(avatar), TrainingOptions(color_init=None, fast=fast)
-    return lambda: training_step(avatar, optimizer, batch, 0, options)
+    take = TrainingStep(avatar, options=TrainingOptions(color_init=None, fast=fast))
+    return lambda: take(batch, 0)
 
 
 def recorded_step(
     avatar: Avatar, batch: TrainingBatch, recorder: Recorder = record_cuda_graph
 ) -> Take:
     """A step as one CUDA graph, which is recorded when this is made."""
-    start = StartingPoint(avatar)
+    start, count = StartingPoint(avatar), len(batch.theta)
     frames = DeviceFrames(batch.theta, batch.cameras, torch.as_tensor(batch.images_rgba))
-    count = len(batch.theta)
-    step = RecordedStep(avatar, [make_optimizer(avatar)], frames, count, recorder=recorder)
-    chosen, background = list(range(count)), random_backgrounds(0, count)
+    options = TrainingOptions(color_init=None)
+    take = TrainingStep(avatar, options=options, frames=lambda: frames, recorder=recorder)
+    chosen = ChosenFrames(list(range(count)), random_backgrounds(0, count))
     for _ in range(8):
-        step(chosen, background)
+        take(chosen, 0)
     start.restore()
-    return lambda: step(chosen, background)
+    return lambda: take(chosen, 0)
 
 
 def time_parts(workload: AvatarWorkload, stopwatch: Stopwatch) -> dict[str, Spread]:
@@ -160,7 +156,8 @@ def time_parts(workload: AvatarWorkload, stopwatch: Stopwatch) -> dict[str, Spre
     del parts[WHOLE]
     initialized = avatar.color_initialized.clone()
     parts[COLOR_INITIALISATION] = stopwatch.time(
-        COLOR_INITIALISATION, lambda: avatar.initialize_colors(batch.theta, batch.cameras, images)
+        COLOR_INITIALISATION,
+        lambda: initialize_colors(avatar, batch.theta, batch.cameras, images),
     )
     start.restore()
     avatar.color_initialized.copy_(initialized)

@@ -12,7 +12,7 @@ import torch
 from torch.utils import benchmark
 
 from rgbavatar_ns.avatar import Avatar
-from rgbavatar_ns.avatar.training.loop import TrainingBatch, TrainingOptions, fit
+from rgbavatar_ns.avatar.training import TrainingBatch, TrainingOptions, TrainingStep, fit
 from rgbavatar_ns.bench.options import StepOptions
 from rgbavatar_ns.bench.scenes import DEFAULT_SIZE_PX, on_device
 from rgbavatar_ns.bench.timing import Progress
@@ -111,6 +111,7 @@ def _bare_images_per_second(
         cameras = dataset.cameras.select(chosen)
         return on_device(TrainingBatch(dataset.theta[chosen], cameras, images[chosen]), device)
 
+    take = TrainingStep(avatar, options=TrainingOptions(seed=_SEED, color_init=None))
     start = benchmark.timer()
-    fit(avatar, batch_at, steps, TrainingOptions(seed=_SEED, color_init=None))
+    fit(take, batch_at, range(steps))
     return steps * batch / (benchmark.timer() - start)

@@ -10,7 +10,7 @@ from jaxtyping import UInt8
 from torch import Tensor, nn
 
 from rgbavatar_ns.avatar import Avatar, AvatarConfig
-from rgbavatar_ns.avatar.training.loop import TrainingBatch
+from rgbavatar_ns.avatar.training import TrainingBatch
 from rgbavatar_ns.bench.options import AvatarOptions
 from rgbavatar_ns.bench.scenes import DEFAULT_SIZE_PX, front_camera, on_device
 from rgbavatar_ns.bench.timing import CPU

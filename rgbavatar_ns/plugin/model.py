@@ -20,6 +20,7 @@ from rgbavatar_ns.avatar.refinement import RefinementConfig
 from rgbavatar_ns.avatar.training.color_init import ColorInitSchedule
 from rgbavatar_ns.avatar.training.losses import LPIPSLoss, image_losses
 from rgbavatar_ns.avatar.training.step import Orthogonality, TrainingOptions
+from rgbavatar_ns.drawing.compositing import error_strip, straight_alpha
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.plugin.cameras import from_nerfstudio, head_to_nerfstudio
@@ -210,14 +211,13 @@ class RGBAvatarModel(Model):
         rgba = batch["image_rgba"].to(self.device)[None]
         scores = evaluate_images(image, rgba, self.lpips_metric)
         metrics = {name: value for name, value in scores.items() if isinstance(value, float)}
-        error = ((image - truth).abs() * 4).clamp(0, 1)
-        row = torch.cat([truth, image.clamp(0, 1), error], dim=2)[0]
+        row = torch.cat([*error_strip(truth, image)], dim=2)[0]
         return metrics, {"truth_avatar_error": row}
 
     def get_rgba_image(self, outputs: Outputs, output_name: str = "rgb") -> Tensor:
         """Straight-alpha RGBA [H W 4] of an image over black."""
         alpha = outputs["accumulation"]
-        return torch.cat([(outputs[output_name] / alpha.clamp(min=1e-6)).clamp(0, 1), alpha], -1)
+        return straight_alpha(outputs[output_name], alpha).clamp(0, 1)
 
     def get_extra_state(self) -> dict[str, Any]:
         """What rebuilds the avatar without this dataset: its make, and every frame's theta."""

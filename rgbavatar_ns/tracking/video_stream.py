@@ -165,7 +165,7 @@ class VideoStream:
             return
         png = encode_png_rgba(frame.image_rgba, _PNG_COMPRESSION)
         self._ready.append(
-            StreamedFrame(frame.index, frame.theta, frame.camera, png, seen_s, self._session)
+            StreamedFrame(frame.index, frame.theta, frame.camera, seen_s, self._session, png=png)
         )
 
 

@@ -9,7 +9,8 @@ from torch import Tensor
 from rgbavatar_ns.avatar import Avatar
 from rgbavatar_ns.avatar.training import TrainingBatch
 from rgbavatar_ns.avatar.training.fused_step import FusedStep
-from rgbavatar_ns.avatar.training.losses import composite, l1_loss, rgba_to_float
+from rgbavatar_ns.avatar.training.losses import l1_loss
+from rgbavatar_ns.drawing.compositing import composite, rgba_to_float
 from rgbavatar_ns.kernels import PinholeCameras
 
 from .small_head import front_camera, random_theta

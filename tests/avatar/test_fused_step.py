@@ -14,12 +14,9 @@ from rgbavatar_ns.avatar.training import (
     make_optimizer,
 )
 from rgbavatar_ns.avatar.training.fused_step import FusedStep
-from rgbavatar_ns.avatar.training.losses import (
-    random_backgrounds,
-    require_images_of,
-    rgba_to_float,
-)
+from rgbavatar_ns.avatar.training.losses import random_backgrounds, require_images_of
 from rgbavatar_ns.avatar.training.optimizer_states import unsupported_reason
+from rgbavatar_ns.drawing.compositing import rgba_to_float
 from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.kernels import available_backends
 
@@ -163,7 +160,7 @@ def test_parameters_after_a_hundred_small_steps(stirred):
     assert max(relative_differences(fused, eager).values()) < 1e-3
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_parameters_after_a_hundred_steps_lie_within_the_eager_spread(stirred, monkeypatch):
     """At full rates pixels reach their targets, where the sign of L1 is decided by rounding.
 

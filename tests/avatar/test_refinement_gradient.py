@@ -5,7 +5,8 @@ import torch
 
 from rgbavatar_ns.avatar.training import make_optimizer
 from rgbavatar_ns.avatar.training.fused_step import FusedStep
-from rgbavatar_ns.avatar.training.losses import composite, l1_loss, rgba_to_float
+from rgbavatar_ns.avatar.training.losses import l1_loss
+from rgbavatar_ns.drawing.compositing import composite, rgba_to_float
 from rgbavatar_ns.kernels import available_backends
 
 from .fused_scene import double, far_batch, in_double, stir

@@ -12,7 +12,8 @@ from torch import Tensor
 
 from rgbavatar_ns.avatar.avatar import Avatar
 from rgbavatar_ns.avatar.model.blendshapes import feature_from_color
-from rgbavatar_ns.avatar.training.losses import require_images_of, rgba_to_float
+from rgbavatar_ns.avatar.training.losses import require_images_of
+from rgbavatar_ns.drawing.compositing import rgba_to_float
 from rgbavatar_ns.kernels import (
     GaussianSet,
     PinholeCameras,

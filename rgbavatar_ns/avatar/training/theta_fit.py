@@ -6,11 +6,7 @@ from torch import Tensor
 
 from rgbavatar_ns.avatar.avatar import Avatar
 from rgbavatar_ns.avatar.refinement.corrections import RefinementConfig, TrackingRefinement
-from rgbavatar_ns.avatar.training.losses import (
-    image_losses,
-    random_backgrounds,
-    require_images_of,
-)
+from rgbavatar_ns.avatar.training.losses import image_losses, random_backgrounds, require_images_of
 from rgbavatar_ns.kernels import PinholeCameras
 
 
