@@ -26,7 +26,13 @@ from rich.progress import Progress
 from rgbavatar_ns import Avatar
 from rgbavatar_ns.avatar import AvatarConfig
 from rgbavatar_ns.avatar.metrics import psnr
-from rgbavatar_ns.avatar.training.loop import TrainingBatch, TrainingOptions, fit
+from rgbavatar_ns.avatar.training import (
+    LossCurve,
+    TrainingBatch,
+    TrainingOptions,
+    TrainingStep,
+    fit,
+)
 from rgbavatar_ns.data import LocalGlobalPools, OfflineOrder, TrackedDataset
 from rgbavatar_ns.drawing.compositing import composite, rgba_to_float
 from rgbavatar_ns.head import HeadModel
@@ -71,14 +77,12 @@ class Bench:
         def batch(step: int) -> TrainingBatch:
             chosen = list(frames_of(step))
             cameras = self.dataset.cameras.select(chosen)
+            self.progress.update(bar, completed=step + 1)
             return TrainingBatch(self.dataset.theta[chosen], cameras, self.images[chosen])
 
-        def on_step(step: int, _: torch.Tensor) -> None:
-            self.progress.update(bar, completed=step + 1)
-
-        started = time.monotonic()
-        losses = fit(avatar, batch, steps, options, on_step=on_step)
-        return avatar, losses, time.monotonic() - started
+        started, curve = time.monotonic(), LossCurve(steps)
+        fit(TrainingStep(avatar, options=options), batch, range(steps), curve)
+        return avatar, curve.losses, time.monotonic() - started
 
     def stream(self, title: str, config: AvatarConfig, steps: int, global_size: int) -> float:
         """Train while the frames arrive evenly and in order; return the PSNR over them all."""

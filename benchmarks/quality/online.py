@@ -38,12 +38,7 @@ from rich.table import Table
 
 from rgbavatar_ns import Avatar
 from rgbavatar_ns.avatar import AvatarConfig
-from rgbavatar_ns.avatar.training.loop import (
-    TrainingBatch,
-    TrainingOptions,
-    make_optimizer,
-    training_step,
-)
+from rgbavatar_ns.avatar.training import TrainingBatch, TrainingOptions, TrainingStep
 from rgbavatar_ns.data import LocalGlobalPools, OfflineOrder, TrackedDataset, load_dataset
 from rgbavatar_ns.drawing.compositing import composite, rgba_to_float
 from rgbavatar_ns.head import HeadModel
@@ -149,7 +144,7 @@ class Bench:
         """Stream all training frames through the pools; offline without pools."""
         head = HeadModel(self.dataset.arrays)
         avatar = Avatar(head, self.dataset.identity, self.config, seed=self.seed)
-        optimizer, options = make_optimizer(avatar), TrainingOptions(seed=self.seed)
+        take = TrainingStep(avatar, options=TrainingOptions(seed=self.seed))
         offline = OfflineOrder(self.dataset.train, BATCH_SIZE, self.seed)
         outcome, lowest, step = Outcome(), dict.fromkeys(self.looked_at, math.inf), 0
         for arrived, position in enumerate(self.dataset.train, start=1):
@@ -158,7 +153,7 @@ class Bench:
             began = time.monotonic()
             while step < arrived * self.steps_per_frame:
                 chosen = offline.batch(step) if pools is None else pools.batch(BATCH_SIZE)
-                training_step(avatar, optimizer, self.batch(chosen), step, options)
+                take(self.batch(chosen), step)
                 step += 1
             outcome.train_seconds += time.monotonic() - began
             if arrived % self.frames_per_look == 0:
@@ -173,10 +168,8 @@ class Bench:
         began = time.monotonic()
         for _ in range(steps_after):
             evenly = None if pools is None else pools.batch(BATCH_SIZE, evenly=True)
-            training_step(
-                avatar, optimizer, self.batch(evenly or offline.batch(step)), step, options
-            )
-            for group in optimizer.param_groups:
+            take(self.batch(evenly or offline.batch(step)), step)
+            for group in take.optimizers[0].param_groups:
                 group["lr"] *= final_rate ** (1 / steps_after)
             step += 1
         outcome.train_seconds += time.monotonic() - began

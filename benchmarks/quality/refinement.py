@@ -33,12 +33,16 @@ from rich.progress import Progress
 from rgbavatar_ns import Avatar
 from rgbavatar_ns.avatar import AvatarConfig
 from rgbavatar_ns.avatar.metrics import evaluate_images
-from rgbavatar_ns.avatar.refinement.corrections import (
-    RefinementConfig,
-    TrackingRefinement,
-    fit_theta,
+from rgbavatar_ns.avatar.refinement import RefinementConfig, TrackingRefinement
+from rgbavatar_ns.avatar.training import (
+    FitHooks,
+    TrainingBatch,
+    TrainingOptions,
+    TrainingStep,
+    fit,
+    make_optimizer,
 )
-from rgbavatar_ns.avatar.training.loop import TrainingBatch, TrainingOptions, fit, make_optimizer
+from rgbavatar_ns.avatar.training.theta_fit import fit_theta
 from rgbavatar_ns.data import OfflineOrder, TrackedDataset, load_dataset
 from rgbavatar_ns.export.comparison import write_comparison
 from rgbavatar_ns.head import HeadModel
@@ -110,14 +114,18 @@ def train(
     with Progress() as progress:
         bar = progress.add_task("with" if refinement else "without", total=steps)
 
-        def on_step(step: int, _: torch.Tensor) -> None:
-            gradient = seen["theta"].grad
-            if refinement is not None and gradient is not None:
-                refinement.step(seen["rows"], gradient * len(gradient))
-            progress.update(bar, completed=step + 1)
+        class Corrected(FitHooks):
+            def after_step(
+                self, step: int, losses: dict[str, torch.Tensor], seconds: float
+            ) -> None:
+                gradient = seen["theta"].grad
+                if refinement is not None and gradient is not None:
+                    refinement.step(seen["rows"], gradient * len(gradient))
+                progress.update(bar, completed=step + 1)
 
         started = time.monotonic()
-        fit(avatar, batch, steps, TrainingOptions(seed=seed), optimizer=optimizer, on_step=on_step)
+        take = TrainingStep(avatar, optimizer, TrainingOptions(seed=seed))
+        fit(take, batch, range(steps), Corrected())
     return avatar, time.monotonic() - started
 
 

@@ -4,6 +4,8 @@ from collections.abc import Callable
 from typing import Any
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from rgbavatar_ns.avatar import Avatar
 from rgbavatar_ns.avatar.training import (
@@ -17,7 +19,6 @@ from rgbavatar_ns.avatar.training.color_init import initialize_colors
 from rgbavatar_ns.avatar.training.cuda_graph import Recorder, record_cuda_graph
 from rgbavatar_ns.avatar.training.fused_step import FusedStep
 from rgbavatar_ns.avatar.training.losses import random_backgrounds
-from rgbavatar_ns.avatar.training.step import Losses
 from rgbavatar_ns.bench.machine import chosen_device, require_backend
 from rgbavatar_ns.bench.options import StepOptions
 from rgbavatar_ns.bench.pairs import count_pairs
@@ -45,8 +46,8 @@ EAGER_STEP = "whole step, eager"
 UNRECORDED_STEP = "whole step, without the CUDA graph"
 COLOR_INITIALISATION = "(colour initialisation, when due)"
 
-Take = Callable[[], Losses]
-"""Trains on a batch once."""
+Take = Callable[[], Float[Tensor, ""]]
+"""Trains on a batch once and returns the loss."""
 
 
 def bench_step(options: StepOptions, progress: Progress | None = None) -> Report:
@@ -108,23 +109,24 @@ def time_step(
 
 def step_by_step(avatar: Avatar, batch: TrainingBatch, *, fast: bool) -> Take:
     """A step by the backend's loops, or through autograd."""
-    take = TrainingStep(avatar, options=TrainingOptions(color_init=None, fast=fast))
-    return lambda: take(batch, 0)
+    step = TrainingStep(avatar, options=TrainingOptions(color_init=None, fast=fast))
+    return lambda: step(batch, 0)["l1"]
 
 
 def recorded_step(
     avatar: Avatar, batch: TrainingBatch, recorder: Recorder = record_cuda_graph
 ) -> Take:
     """A step as one CUDA graph, which is recorded when this is made."""
-    start, count = StartingPoint(avatar), len(batch.theta)
+    start = StartingPoint(avatar)
     frames = DeviceFrames(batch.theta, batch.cameras, torch.as_tensor(batch.images_rgba))
+    count = len(batch.theta)
     options = TrainingOptions(color_init=None)
-    take = TrainingStep(avatar, options=options, frames=lambda: frames, recorder=recorder)
+    step = TrainingStep(avatar, options=options, frames=lambda: frames, recorder=recorder)
     chosen = ChosenFrames(list(range(count)), random_backgrounds(0, count))
     for _ in range(8):
-        take(chosen, 0)
+        step(chosen, 0)
     start.restore()
-    return lambda: take(chosen, 0)
+    return lambda: step(chosen, 0)["l1"]
 
 
 def time_parts(workload: AvatarWorkload, stopwatch: Stopwatch) -> dict[str, Spread]:
@@ -156,8 +158,7 @@ def time_parts(workload: AvatarWorkload, stopwatch: Stopwatch) -> dict[str, Spre
     del parts[WHOLE]
     initialized = avatar.color_initialized.clone()
     parts[COLOR_INITIALISATION] = stopwatch.time(
-        COLOR_INITIALISATION,
-        lambda: initialize_colors(avatar, batch.theta, batch.cameras, images),
+        COLOR_INITIALISATION, lambda: initialize_colors(avatar, batch.theta, batch.cameras, images)
     )
     start.restore()
     avatar.color_initialized.copy_(initialized)

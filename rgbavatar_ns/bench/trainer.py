@@ -111,7 +111,7 @@ def _bare_images_per_second(
         cameras = dataset.cameras.select(chosen)
         return on_device(TrainingBatch(dataset.theta[chosen], cameras, images[chosen]), device)
 
-    take = TrainingStep(avatar, options=TrainingOptions(seed=_SEED, color_init=None))
+    step = TrainingStep(avatar, options=TrainingOptions(seed=_SEED, color_init=None))
     start = benchmark.timer()
-    fit(take, batch_at, range(steps))
+    fit(step, batch_at, range(steps))
     return steps * batch / (benchmark.timer() - start)

@@ -170,12 +170,15 @@ def _pump(source: socket.socket, sink: socket.socket, limit: int) -> None:
 
 
 def test_what_a_lost_connection_had_on_its_way_is_sent_again(stream: SocketStream):
-    greeting = 400 + len(message_format.subject_message(subject()))
+    with contextlib.closing(StreamClient(subject("mine"), stream.address)) as earlier:
+        earlier.send(tracked(0))
+        earlier.send(tracked(1))
+    greeting = 400 + len(message_format.subject_message(subject("mine")))
     relay = Relay(stream.address, greeting + 3 * FRAME_BYTES, greeting + 5 * FRAME_BYTES)
 
     def send() -> None:
-        with StreamClient(subject(), relay.address) as client:
-            for index in range(30):
+        with StreamClient(subject("mine"), relay.address) as client:
+            for index in range(2, 30):
                 client.send(tracked(index))
 
     sender = threading.Thread(target=send, daemon=True)
@@ -183,7 +186,7 @@ def test_what_a_lost_connection_had_on_its_way_is_sent_again(stream: SocketStrea
     assert indices(stream, 100) == list(range(30))
     sender.join(DEADLINE_S)
     assert not sender.is_alive()
-    assert stream.counts == {"source lost": 2, "reconnects": 2}
+    assert stream.counts == {"source lost": 3, "reconnects": 3}
 
 
 def test_another_program_may_go_on(stream: SocketStream):

@@ -1,9 +1,10 @@
 """Training on streams through nerfstudio's trainer: pools, ends, faults, resuming."""
 
+import dataclasses
 import json
 import signal
+import socket
 import threading
-import time
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -16,10 +17,11 @@ from nerfstudio.utils.eval_utils import eval_setup
 
 from rgbavatar_ns import Avatar
 from rgbavatar_ns.data import TrackedFrame, load_dataset
-from rgbavatar_ns.data.streams import FolderWriter, StreamClient, StreamSubject
+from rgbavatar_ns.data.streams import StreamClient, StreamSubject
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.plugin.methods import rgbavatar
 from rgbavatar_ns.plugin.online.methods import rgbavatar_online, rgbavatar_online_tiny
+from rgbavatar_ns.plugin.online.sources import SourceConfig
 from rgbavatar_ns.plugin.online.trainer import OnlineTrainer
 from rgbavatar_ns.plugin.training.checkpoints import list_checkpoints, read_checkpoint
 from tests.plugin.online_run import (
@@ -245,28 +247,42 @@ def test_a_resumed_stream_goes_on_where_it_was(
     assert finished.step == again.step
 
 
-def test_a_folder_is_trained_on_while_it_is_written(
+def test_frames_sent_over_a_socket_are_trained_on_and_kept(
     tiny_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     subject, frames = subject_and_frames(tiny_data)
-    folder = tmp_path / "live"
+    subject = dataclasses.replace(subject, session="mine")
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        address = f"127.0.0.1:{free.getsockname()[1]}"
 
-    def write() -> None:
-        time.sleep(0.3)
-        writer = FolderWriter(folder, subject)
-        for frame in frames:
-            writer.send(frame)
-            time.sleep(0.01)
-        writer.end()
+    def send() -> None:
+        client = StreamClient(subject, address)
+        for frame in frames[:5]:
+            client.send(frame)
+        client.close()  # lost; the training goes on, and another client too
+        with StreamClient(subject, address) as again:
+            for frame in frames[5:]:
+                again.send(frame)
 
-    thread = threading.Thread(target=write, daemon=True)
-    thread.start()
-    config = online_config(tmp_path / "out", folder)
-    config.pipeline.datamanager.source.kind = "folder"
-    trainer = online_trainer(config)
-    trainer.train()
-    thread.join()
-    assert summary(trainer)["frames"] == STREAMED
+    def train(output: Path, **fields: Any) -> OnlineTrainer:
+        thread = threading.Thread(target=send, daemon=True)
+        thread.start()
+        config = online_config(output, **fields)
+        config.pipeline.datamanager.source = SourceConfig("socket", listen=address)
+        trainer = online_trainer(config)
+        trainer.train()
+        thread.join()
+        return trainer
+
+    trainer = train(tmp_path / "out")
+    told = summary(trainer)["stream"]
+    assert told["taken in"] == STREAMED
+    assert told["source lost"] == told["reconnects"] == 1
+    # The checkpoint is an avatar with the performance that the pools held.
+    loaded = Avatar.load(trainer.base_dir)
+    frames_saved = newest(trainer.checkpoint_dir)["pipeline"]["_model._extra_state"]["frames"]
+    assert torch.equal(frames_saved["theta"], load_dataset(tiny_data).theta[:STREAMED])
+    assert loaded.num_gaussians == trainer.pipeline.model.avatar.num_gaussians
     # The run is complete in itself: it holds the frames, and other commands find them.
     recorded = load_dataset(trainer.base_dir / "stream")
     assert len(recorded) == STREAMED
@@ -276,43 +292,10 @@ def test_a_folder_is_trained_on_while_it_is_written(
     _, pipeline, _, step = eval_setup(trainer.base_dir / "config.yml")
     assert step == trainer.step
     assert len(pipeline.datamanager.train_dataset) == STREAMED
-    # Resuming passes over what has been there.
-    config = online_config(tmp_path / "more", folder, load_dir=trainer.checkpoint_dir)
-    config.pipeline.datamanager.source.kind = "folder"
-    again = online_trainer(config)
-    again.train()
-    assert summary(again)["stream"] == summary(trainer)["stream"]
-
-
-def test_frames_pushed_over_a_socket_are_trained_on(tiny_data: Path, tmp_path: Path):
-    subject, frames = subject_and_frames(tiny_data)
-    address = f"unix:{tmp_path / 'socket'}"
-
-    def push() -> None:
-        client = StreamClient(subject, address)
-        for frame in frames[:5]:
-            client.send(frame)
-        client.close()  # lost; the training goes on, and another client too
-        with StreamClient(subject, address) as again:
-            for frame in frames[5:]:
-                again.send(frame)
-
-    thread = threading.Thread(target=push, daemon=True)
-    thread.start()
-    config = online_config(tmp_path / "out")
-    config.pipeline.datamanager.source.kind = "socket"
-    config.pipeline.datamanager.source.listen = address
-    trainer = online_trainer(config)
-    trainer.train()
-    thread.join()
-    told = summary(trainer)["stream"]
-    assert told["taken in"] == STREAMED
-    assert told["source lost"] == told["reconnects"] == 1
-    # The checkpoint is an avatar with the performance that the pools held.
-    loaded = Avatar.load(trainer.base_dir)
-    frames_saved = newest(trainer.checkpoint_dir)["pipeline"]["_model._extra_state"]["frames"]
-    assert torch.equal(frames_saved["theta"], load_dataset(tiny_data).theta[:STREAMED])
-    assert loaded.num_gaussians == trainer.pipeline.model.avatar.num_gaussians
+    # A resumed run knows what has been there.
+    again = summary(train(tmp_path / "more", load_dir=trainer.checkpoint_dir))["stream"]
+    assert again["taken in"] == STREAMED
+    assert again["duplicate"] == STREAMED
 
 
 def test_a_fault_of_the_source_saves_and_is_told(tiny_data: Path, tmp_path: Path):
@@ -347,7 +330,7 @@ def test_impossible_flags_are_refused(
 
 
 @pytest.mark.parametrize(
-    ("kind", "told"), [("replay", "No dataset"), ("folder", "No folder"), ("video", "No video")]
+    ("kind", "told"), [("replay", "No dataset"), ("folder", "no longer"), ("video", "No video")]
 )
 def test_a_source_without_a_place_is_refused(tmp_path: Path, kind: Any, told: str):
     config = online_config(tmp_path)

@@ -13,10 +13,9 @@ import torch
 from torch import Tensor
 
 from rgbavatar_ns.avatar import Avatar
-from rgbavatar_ns.avatar.training import make_optimizer
+from rgbavatar_ns.avatar.training import TrainingBatch, make_optimizer
 from rgbavatar_ns.avatar.training import recorded_step as recorded_steps
 from rgbavatar_ns.avatar.training.batches import DeviceFrames
-from rgbavatar_ns.avatar.training.cuda_graph import record_cuda_graph
 from rgbavatar_ns.avatar.training.fused_step import FusedStep
 from rgbavatar_ns.avatar.training.losses import random_backgrounds
 from rgbavatar_ns.avatar.training.recorded_step import RecordedStep
@@ -122,15 +121,17 @@ def frames_on(place: Place, avatar: Avatar, count: int) -> tuple[DeviceFrames, T
 def step_of(place: Place, avatar, optimizer, frames: DeviceFrames, size: int, kind: str) -> Step:
     """A step on chosen frames, recorded, fused or through autograd."""
     if kind == "recorded":
-        recorder = (lambda work: work) if place.emulated else record_cuda_graph
+        recorder = (lambda work: work) if place.emulated else recorded_steps.record_cuda_graph
         return RecordedStep(avatar, [optimizer], frames, size, recorder=recorder)
 
     def take(chosen: list[int], background: Tensor) -> Tensor:
-        batch, there = frames.batch(chosen), background.to(place.device)
+        images, theta = frames.images_rgba[chosen], frames.theta[chosen]
+        batch = TrainingBatch(theta, frames.cameras, images)
+        there = background.to(place.device)
         if kind == "autograd":
             return eager_step(avatar, optimizer, batch, there, "cuda")
-        fused = FusedStep(avatar, [optimizer], "cuda")
-        return fused(batch.theta, batch.cameras, torch.as_tensor(batch.images_rgba), there).clone()
+        loss = FusedStep(avatar, [optimizer])(theta, frames.cameras, images, there, "cuda")
+        return torch.as_tensor(loss).clone()
 
     return take
 
@@ -254,8 +255,8 @@ def test_nothing_waits_in_a_step(gpu, make_avatar, kind, resumed):
     avatar = stir(make_avatar()).to(gpu)
     frames, background = frames_on(place, avatar, 3)
     optimizer, there = make_optimizer(avatar), background.to(gpu)
-    fused = FusedStep(avatar, [optimizer], "cuda")
-    values = (frames.theta, frames.cameras, frames.images_rgba, there)
+    fused = FusedStep(avatar, [optimizer])
+    values = (frames.theta, frames.cameras, frames.images_rgba, there, "cuda")
     if resumed:  # a loaded state lies where torch puts it
         fused(*values)
         optimizer.load_state_dict(optimizer.state_dict())
