@@ -2,7 +2,7 @@
 
 import importlib
 import os
-from types import ModuleType, TracebackType
+from types import ModuleType
 
 import cv2
 import numpy as np
@@ -56,15 +56,8 @@ class FaceLandmarker:
         hand_over_bytes(self._mesh)
         self._follower = FaceFollower()
 
-    def __enter__(self) -> "FaceLandmarker":
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        value: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def close(self) -> None:
+        """Free mediapipe's graph."""
         self._mesh.close()
 
     def __call__(self, image_rgb: UInt8[np.ndarray, "H W 3"]) -> Float[np.ndarray, "478 2"] | None:

@@ -1,7 +1,5 @@
 """A soft matte of the person: selfie segmentation, sharpened along the picture's edges."""
 
-from types import TracebackType
-
 import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -22,15 +20,8 @@ class PersonMatte:
         selfie = load_mediapipe().solutions.selfie_segmentation
         self._segmenter = selfie.SelfieSegmentation(model_selection=0)
 
-    def __enter__(self) -> "PersonMatte":
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        value: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def close(self) -> None:
+        """Free mediapipe's graph."""
         self._segmenter.close()
 
     def __call__(self, image_rgb: UInt8[np.ndarray, "H W 3"]) -> Float[np.ndarray, "H W"]:
