@@ -32,7 +32,7 @@ def run(options: Annotated[Options, tyro.conf.arg(name="")]) -> None:
     Other programs that run meanwhile make every figure worse.
     """
     from rgbavatar_ns.bench.report import print_report
-    from rgbavatar_ns.data.json_file import write_json
+    from rgbavatar_ns.files import write_json
 
     if options.json is not None:
         _require_writable(options.json)

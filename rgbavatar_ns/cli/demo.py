@@ -11,11 +11,11 @@ from typing import Any
 from rich.console import Console
 
 from rgbavatar_ns.cli.progress import progress_bar, stage_bars
-from rgbavatar_ns.cli.stages import Result, Stages
-from rgbavatar_ns.data.json_file import write_json
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.experiments.commands import run_nerfstudio
+from rgbavatar_ns.files import Stages, write_json
 
+Result = dict[str, Any]
 METHOD = "rgbavatar-tiny"
 HELD_OUT_STEPS = 40
 """Steps of fitting a video's held-out frames, for the score that looks at their images."""
@@ -51,7 +51,7 @@ def run(
     if output is None:
         output = Path("outputs") / (video[0].stem if video else "demo")
     output = output.resolve()
-    stages = Stages(output, fresh)
+    stages = Stages(output, fresh=fresh, tell=_tell_stage)
     if video:
         settings: dict[str, Any] = {"video": [_fingerprint(clip) for clip in video]}
         settings["image_size"] = image_size
@@ -164,6 +164,14 @@ def _film(run_folder: Path, data: Path, output: Path) -> Result:
         dataset = replace(dataset, theta=theta)
     count = write_comparison(Avatar.load(run_folder), dataset, video, picture)
     return {"video": str(video), "picture": str(picture), "frames": count}
+
+
+def _tell_stage(name: str, seconds: float | None) -> None:
+    console = Console()
+    if seconds is None:
+        console.rule(name)
+    else:
+        console.print(f"[dim]{name}: done before ({seconds:.0f} s)[/dim]")
 
 
 def _tell(summary: dict[str, Any], output: Path) -> None:

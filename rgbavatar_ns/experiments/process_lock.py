@@ -1,6 +1,5 @@
 """That a cell is run by one process at a time, and by none that has been forgotten."""
 
-import fcntl
 import os
 import signal
 import threading
@@ -9,7 +8,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from rgbavatar_ns.files import hold_lock
+
 _LOCK_FILE = ".lock"
+_WAITING = "Another process still works on this cell; waiting for it."
 _WATCH_INTERVAL_S = 1.0
 _SECONDS_TO_SAVE = 60.0
 
@@ -17,12 +19,7 @@ _SECONDS_TO_SAVE = 60.0
 @contextmanager
 def alone_in(folder: Path) -> Iterator[None]:
     """Hold the folder's lock; waits while another process does. It goes with the process."""
-    with (folder / _LOCK_FILE).open("a") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            print("Another process still works on this cell; waiting for it.", flush=True)
-            fcntl.flock(lock, fcntl.LOCK_EX)
+    with hold_lock(folder / _LOCK_FILE, lambda: print(_WAITING, flush=True)):
         yield
 
 

@@ -13,7 +13,6 @@ from typing import Any
 
 from rgbavatar_ns.avatar import Avatar
 from rgbavatar_ns.data import load_dataset
-from rgbavatar_ns.data.json_file import write_json
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.experiments.cells import Cell
 from rgbavatar_ns.experiments.commands import run_nerfstudio
@@ -25,6 +24,7 @@ from rgbavatar_ns.experiments.reenactment import (
     reenactment_scores,
 )
 from rgbavatar_ns.experiments.streamed import write_streamed
+from rgbavatar_ns.files import write_json
 
 CELL_FILE, RESULT_FILE, LOG_FILE = "cell.json", "result.json", "log.txt"
 _EVALUATION = "eval.json"

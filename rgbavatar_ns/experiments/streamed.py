@@ -8,8 +8,8 @@ import torch
 from rgbavatar_ns.avatar import Avatar
 from rgbavatar_ns.avatar.training.losses import composite, rgba_to_float
 from rgbavatar_ns.data import TrackedDataset
-from rgbavatar_ns.data.json_file import write_json
 from rgbavatar_ns.export import draw
+from rgbavatar_ns.files import write_json
 
 _FILE = "streamed.json"
 _BATCH = 8

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from rgbavatar_ns.data.json_file import write_json
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.experiments.cells import Cell, cells_of, demo_config
 from rgbavatar_ns.experiments.commands import killed_by
@@ -16,6 +15,7 @@ from rgbavatar_ns.experiments.overrides import check_overrides
 from rgbavatar_ns.experiments.reenactment import load_tracker
 from rgbavatar_ns.experiments.runner import LOG_FILE, read_result, write_cell
 from rgbavatar_ns.experiments.spec import Experiment, nearest
+from rgbavatar_ns.files import write_json
 from rgbavatar_ns.synthetic import make_demo_dataset
 
 State = Literal["waiting", "running", "done", "failed"]

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from rgbavatar_ns.avatar.model.blendshapes import feature_from_color
-from rgbavatar_ns.export.whole_file import whole_file
+from rgbavatar_ns.files import atomic_write
 from rgbavatar_ns.kernels import GaussianSet
 
 _NUM_REST = 45
@@ -39,7 +39,7 @@ def write_ply(path: Path, gaussians: GaussianSet) -> int:
     header = (
         f"ply\nformat binary_little_endian 1.0\nelement vertex {len(table)}\n{header}end_header\n"
     )
-    with whole_file(path) as partial:
+    with atomic_write(path) as partial:
         partial.write_bytes(header.encode("ascii") + table.tobytes())
     return len(table)
 

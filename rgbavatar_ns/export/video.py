@@ -9,7 +9,7 @@ import numpy as np
 from av.filter import Graph
 
 from rgbavatar_ns.data.png import encode_png_rgba
-from rgbavatar_ns.export.whole_file import whole_file
+from rgbavatar_ns.files import atomic_write
 
 
 def write_video(path: Path, frames: Iterable[np.ndarray], frames_per_second: float = 25.0) -> int:
@@ -19,7 +19,7 @@ def write_video(path: Path, frames: Iterable[np.ndarray], frames_per_second: flo
     asks. The file appears under its name only when it is complete.
     """
     count = 0
-    with whole_file(path) as partial, av.open(str(partial), "w", format="mp4") as container:
+    with atomic_write(path) as partial, av.open(str(partial), "w", format="mp4") as container:
         stream = None
         for frame in frames:
             frame = np.pad(frame, ((0, frame.shape[0] % 2), (0, frame.shape[1] % 2), (0, 0)))
@@ -52,7 +52,7 @@ def write_gif(path: Path, frames: Iterable[np.ndarray], frames_per_second: float
         picture.pts = place
         graph.push(picture)
     graph.push(None)
-    with whole_file(path) as partial, av.open(str(partial), "w", format="gif") as container:
+    with atomic_write(path) as partial, av.open(str(partial), "w", format="gif") as container:
         stream = container.add_stream("gif", rate=rate)
         stream.height, stream.width, stream.pix_fmt = height, width, "pal8"
         for place in range(len(kept)):
@@ -92,5 +92,5 @@ def write_png(path: Path, picture: np.ndarray) -> None:
     """Write one picture, uint8 [H, W, 3] or [H, W, 4] with straight alpha."""
     if picture.shape[-1] == 3:
         picture = np.concatenate([picture, np.full_like(picture[..., :1], 255)], -1)
-    with whole_file(path) as partial:
+    with atomic_write(path) as partial:
         partial.write_bytes(encode_png_rgba(picture))

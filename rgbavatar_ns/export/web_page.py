@@ -16,7 +16,7 @@ from torch import Tensor
 
 from rgbavatar_ns.avatar.avatar import Avatar
 from rgbavatar_ns.export.web_arrays import gaussian_arrays, head_arrays, network_arrays, pack
-from rgbavatar_ns.export.whole_file import whole_file
+from rgbavatar_ns.files import atomic_write
 from rgbavatar_ns.kernels import PinholeCameras
 
 SCRIPTS = (
@@ -68,7 +68,7 @@ def write_web_page(
     directory, block = pack(head_arrays(avatar) | gaussian_arrays(avatar) | network | frames)
     manifest = _manifest(avatar, camera, theta, options) | {"network": layers, "arrays": directory}
     text = _assemble(manifest, block, options.title)
-    with whole_file(path) as partial:
+    with atomic_write(path) as partial:
         partial.write_text(text, encoding="utf-8")
     return len(text)
 

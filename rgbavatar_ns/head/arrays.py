@@ -13,6 +13,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.files import digest
 
 EMBEDDED_HEAD = Path(__file__).parent / "assets" / "makehuman_head.npz"
 _GROUP = "group_"
@@ -139,6 +140,13 @@ class HeadArrays:
             raise UserError(
                 f"This state holds no head model: {error}.", "Save the avatar again."
             ) from None
+
+    def digest(self) -> str:
+        """SHA-256 of all arrays and names: what tells one head model from another."""
+        parts: list[str | np.ndarray] = []
+        for name, value in sorted(self._items(), key=lambda item: item[0]):
+            parts += [name, value if isinstance(value, np.ndarray) else repr(value)]
+        return digest(parts)
 
     def _items(self) -> list[tuple[str, Any]]:
         """Flat names and values; nothing for absent eyelids."""

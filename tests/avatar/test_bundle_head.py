@@ -3,7 +3,6 @@ import torch
 
 from rgbavatar_ns import Avatar
 from rgbavatar_ns.avatar import AvatarConfig
-from rgbavatar_ns.avatar.storage.head_reference import fingerprint
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadArrays, HeadModel
 from rgbavatar_ns.head.flame import load_flame
@@ -73,9 +72,13 @@ def test_flame_is_found_by_its_version_and_form(tmp_path, monkeypatch):
         Avatar.load(tmp_path / "me")
 
 
-def test_a_fingerprint_knows_every_number_and_survives_the_file(make_avatar, tmp_path):
+def test_a_digest_knows_every_number_and_survives_the_file(make_avatar, tmp_path):
     arrays = make_avatar().head.arrays
     arrays.save(tmp_path / "head.npz")
-    assert fingerprint(HeadArrays.load(tmp_path / "head.npz")) == fingerprint(arrays)
+    assert HeadArrays.load(tmp_path / "head.npz").digest() == arrays.digest()
     changed = dict(vars(arrays), v_template=arrays.v_template + 1e-6)
-    assert fingerprint(HeadArrays(**changed)) != fingerprint(arrays)
+    assert HeadArrays(**changed).digest() != arrays.digest()
+
+
+def test_a_head_has_the_digest_that_bundles_of_before_name():
+    assert HeadArrays.embedded().digest().startswith("e051afbf4dfe7848")

@@ -1,12 +1,9 @@
 """A bundle's head model by reference, for models that may not be passed on (FLAME)."""
 
-import hashlib
 import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, get_args
-
-import numpy as np
 
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadArrays
@@ -20,13 +17,13 @@ _MARK = "reference"
 
 
 def reference_to(arrays: HeadArrays) -> dict[str, Any]:
-    """Name, sizes and fingerprint in place of a head model's arrays."""
+    """Name, sizes and digest in place of a head model's arrays."""
     described = {
         "name": arrays.name,
         "num_identity": arrays.num_identity,
         "num_expressions": arrays.num_expressions,
         "num_vertices": len(arrays.v_template),
-        "sha256": fingerprint(arrays),
+        "sha256": arrays.digest(),
     }
     return {_MARK: described}
 
@@ -46,7 +43,7 @@ def resolve(state: dict[str, Any], bundle: Path) -> dict[str, Any]:
     name = described["name"]
     found: list[str] = []
     for arrays in _candidates(described):
-        if fingerprint(arrays) == described["sha256"]:
+        if arrays.digest() == described["sha256"]:
             return arrays.to_state()
         found.append(arrays.name)
     remedy = (
@@ -66,7 +63,7 @@ def resolve(state: dict[str, Any], bundle: Path) -> dict[str, Any]:
 
 
 def _candidates(described: dict[str, Any]) -> Iterator[HeadArrays]:
-    """Heads of this name on this machine; only its fingerprint says whether one is the same."""
+    """Heads of this name on this machine; only its digest says whether one is the same."""
     name = described["name"]
     file = os.environ.get(HEAD_VARIABLE)
     if file:
@@ -84,17 +81,3 @@ def _candidates(described: dict[str, Any]) -> Iterator[HeadArrays]:
                 num_identity=described["num_identity"],
                 num_expressions=described["num_expressions"],
             )
-
-
-def fingerprint(arrays: HeadArrays) -> str:
-    """SHA-256 of all arrays and names."""
-    digest = hashlib.sha256()
-    for name, value in sorted(arrays.to_state().items()):
-        digest.update(name.encode())
-        if isinstance(value, (str, int, list)):
-            digest.update(repr(value).encode())
-        else:
-            array = np.ascontiguousarray(value.numpy())
-            digest.update(f"{array.dtype.str}{array.shape}".encode())
-            digest.update(array.tobytes())
-    return digest.hexdigest()

@@ -1,11 +1,8 @@
 """Folders of other systems, imported once behind the scenes and then opened as our own."""
 
-import fcntl
 import glob
 import os
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 from rgbavatar_ns.data.importers.convert import (
@@ -21,6 +18,7 @@ from rgbavatar_ns.data.importers.options import ImportOptions
 from rgbavatar_ns.data.native.dataset import TrackedDataset, load_native
 from rgbavatar_ns.data.native.format import INDEX_FILE
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.files import hold_lock
 
 _NO_BACKUP = "Signature: 8a477f597d28d172789f06886806bc55\n# Made by rgbavatar; may be deleted.\n"
 
@@ -55,7 +53,8 @@ def open_foreign(
             "Free some space or name a folder: rgbavatar import SRC DST.",
         )
     found = find_format(src, options)
-    with _alone(place):
+    # Two programs that open the same data import it one after the other.
+    with hold_lock(place.with_name(f"{place.name}.lock")):
         if not (place / INDEX_FILE).exists():
             recognised = "" if found is None else f"{found.name} data in "
             print(f"{recognised}{src}: imported once into {place}", file=sys.stderr)
@@ -81,11 +80,3 @@ def _can_be_made(place: Path) -> bool:
     except OSError:
         return False
     return os.access(place, os.W_OK)
-
-
-@contextmanager
-def _alone(place: Path) -> Iterator[None]:
-    """Two programs that open the same data import it one after the other."""
-    with place.with_name(f"{place.name}.lock").open("w") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
-        yield

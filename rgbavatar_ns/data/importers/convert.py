@@ -1,7 +1,5 @@
 """From a source's records to a folder in the project's own format, on all cores, resumable."""
 
-import hashlib
-import json
 import os
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
@@ -17,11 +15,11 @@ from rgbavatar_ns.data.importers.frame_images import make_png
 from rgbavatar_ns.data.importers.import_report import ImportReport, UnusableFrameError
 from rgbavatar_ns.data.importers.options import ImportOptions
 from rgbavatar_ns.data.importers.source import Source
-from rgbavatar_ns.data.json_file import write_json
 from rgbavatar_ns.data.native.dataset import TrackedDataset, load_native
 from rgbavatar_ns.data.native.format import INDEX_FILE
 from rgbavatar_ns.data.native.writer import DatasetWriter
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.files import digest, read_json, write_json
 from rgbavatar_ns.head.flame import FLAME_VARIABLE
 
 CACHE_FOLDER = ".rgbavatar"
@@ -95,10 +93,7 @@ def _refuse_nested(src: Path, dst: Path) -> None:
 
 def _state(dst: Path) -> dict[str, Any] | None:
     """What an earlier import into this folder noted; None where there was none."""
-    try:
-        state = json.loads((dst / _STATE_FILE).read_text())
-    except (OSError, ValueError):
-        return None
+    state = read_json(dst / _STATE_FILE)
     return state if isinstance(state, dict) else None
 
 
@@ -159,10 +154,10 @@ def fingerprint(src: Path, options: ImportOptions) -> str:
 def source_fingerprint(src: Path, options: ImportOptions) -> str:
     """Names, sizes and times of all files of the data, and all options but FLAME's place."""
     others = replace(options, flame=None, flame_uv=None, flame_eyelids=None)
-    digest = hashlib.sha256(f"{_IMPORTER_VERSION} {others}".encode())
     found = find_format(src, options) if src.is_dir() else None
     extra = tracker_folder(Folder(src)) if found and found.key == "flashavatar" else None
-    return _hashed(digest, [src, extra, options.images, options.masks])
+    places = [src, extra, options.images, options.masks]
+    return digest([f"{_IMPORTER_VERSION} {others}", *_listing(places)])[:16]
 
 
 def flame_fingerprint(options: ImportOptions) -> str | None:
@@ -170,17 +165,16 @@ def flame_fingerprint(options: ImportOptions) -> str | None:
     flame = options.flame or os.environ.get(FLAME_VARIABLE)
     if not flame:
         return None
-    return _hashed(hashlib.sha256(), [flame, options.flame_uv, options.flame_eyelids])[:8]
+    return digest(_listing([flame, options.flame_uv, options.flame_eyelids]))[:8]
 
 
-def _hashed(digest: "hashlib._Hash", places: Sequence[str | Path | None]) -> str:
+def _listing(places: Sequence[str | Path | None]) -> Iterator[str]:
     for place in places:
-        for line in _listing(place) if place is not None else ():
-            digest.update(line.encode("utf-8", "surrogateescape"))
-    return digest.hexdigest()[:16]
+        if place is not None:
+            yield from _lines(place)
 
 
-def _listing(place: str | Path) -> Iterator[str]:
+def _lines(place: str | Path) -> Iterator[str]:
     top = os.path.realpath(os.path.expanduser(place))
     if os.path.isfile(top):
         yield _line(os.path.dirname(top), os.path.basename(top))

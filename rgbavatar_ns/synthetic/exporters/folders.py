@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from rgbavatar_ns.data.json_file import write_json
+from rgbavatar_ns.files import write_json
 from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.synthetic.exporters.frame_images import write_color, write_grey, write_rgba
 from rgbavatar_ns.synthetic.exporters.frame_writer import FrameWriter
