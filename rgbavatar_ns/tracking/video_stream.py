@@ -125,7 +125,11 @@ class VideoStream:
         if frame.index > self._passed_over:
             self._ready.append(
                 StreamedFrame(
-                    *(frame.index, frame.theta, frame.camera, captured_s, self._session),
+                    frame.index,
+                    frame.theta,
+                    frame.camera,
+                    captured_s,
+                    self._session,
                     image_rgba=frame.image_rgba,
                 )
             )

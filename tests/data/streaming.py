@@ -14,7 +14,20 @@ from rgbavatar_ns.head import HeadModel
 from tests.data.small_dataset import HEIGHT, WIDTH, frame, odd_camera
 
 HEAD = HeadModel.embedded()
-DEADLINE_S = 30.0
+DEADLINE_S = 60.0
+
+
+class Clock:
+    """Time that passes only when it is told to."""
+
+    def __init__(self) -> None:
+        self.now_s = 1000.0
+
+    def __call__(self) -> float:
+        return self.now_s
+
+    def sleep(self, seconds: float) -> None:
+        self.now_s += seconds
 
 
 def subject(session: str = "", width: int = WIDTH, height: int = HEIGHT) -> StreamSubject:
@@ -26,18 +39,24 @@ def tracked(index: int) -> TrackedFrame:
     return frame(HEAD, index, per_frame_camera=True)
 
 
-def streamed(index: int, session: str = "", image: np.ndarray | None = None) -> StreamedFrame:
+def streamed(
+    index: int,
+    session: str = "",
+    image: np.ndarray | None = None,
+    arrived_s: float = 0.0,
+    encode: bool = True,
+) -> StreamedFrame:
     one = tracked(index)
-    png = encode_png_rgba(one.image_rgba if image is None else image)
-    return StreamedFrame(index, one.theta, one.camera, png, time.monotonic(), session)
+    rgba = one.image_rgba if image is None else image
+    kind = {"png": encode_png_rgba(rgba)} if encode else {"image_rgba": rgba}
+    return StreamedFrame(index, one.theta, one.camera, arrived_s, session, **kind)
 
 
-def cheap(index: int) -> tuple[TrackedFrame, StreamedFrame]:
+def cheap(index: int) -> StreamedFrame:
     """A frame whose making costs next to nothing."""
     theta = torch.full((HEAD.layout.size,), float(index))
     image = np.full((HEIGHT, WIDTH, 4), index % 251, np.uint8)
-    camera, now = odd_camera(), time.monotonic()
-    return TrackedFrame(index, theta, camera, image), StreamedFrame(index, theta, camera, b"", now)
+    return StreamedFrame(index, theta, odd_camera(), 0.0, image_rgba=image)
 
 
 class GivenStream:
@@ -49,7 +68,7 @@ class GivenStream:
         self._frames = deque(frames)
         self.closed = False
 
-    def subject(self, timeout_s: float) -> StreamSubject:
+    def subject(self, timeout_s: float) -> StreamSubject | None:
         return subject()
 
     @property
@@ -75,6 +94,7 @@ def take(stream, count: int) -> list[StreamedFrame]:
 
 
 def until(condition) -> None:
+    """Wait for what another thread does."""
     deadline = time.monotonic() + DEADLINE_S
     while not condition():
         assert time.monotonic() < deadline

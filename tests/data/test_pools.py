@@ -2,7 +2,6 @@
 
 import io
 import resource
-import time
 from pathlib import Path
 from typing import Any
 
@@ -11,19 +10,20 @@ import pytest
 import torch
 
 from rgbavatar_ns.data import LocalGlobalPools
-from rgbavatar_ns.data.streams import ReplayBuffer, ReplayStream
+from rgbavatar_ns.data.png import decode_png_rgba
+from rgbavatar_ns.data.streams import ReplayBuffer, ReplayStream, StreamedFrame
 from rgbavatar_ns.errors import UserError
 from tests.data.small_dataset import small_dataset
-from tests.data.streaming import HEAD, cheap, streamed, subject, tracked
+from tests.data.streaming import HEAD, Clock, cheap, streamed, subject, tracked
 
 
-def pools(local: int = 3, old: int = 4, seed: int = 0, keep_png: bool = True) -> ReplayBuffer:
-    return ReplayBuffer(subject(), LocalGlobalPools(local, old, seed=seed), keep_png)
+def pools(local: int = 3, old: int = 4, seed: int = 0, **more: Any) -> ReplayBuffer:
+    return ReplayBuffer(subject(), LocalGlobalPools(local, old, seed=seed), **more)
 
 
-def fill(frames: ReplayBuffer, indices: range) -> None:
+def fill(frames: ReplayBuffer, indices: range, encode: bool = True) -> None:
     for index in indices:
-        frames.add(tracked(index), streamed(index))
+        frames.add(streamed(index, arrived_s=10.0 * index, encode=encode))
 
 
 def saved(state: dict[str, Any]) -> dict[str, Any]:
@@ -56,7 +56,8 @@ def test_every_drawn_frame_brings_its_own_picture_theta_and_camera():
 
 
 def test_newest_and_recent_frames():
-    frames = pools()
+    clock = Clock()
+    frames = pools(clock=clock)
     assert frames.newest() is None
     assert frames.newest_theta() is None
     assert frames.recent(1.0, 2) is None
@@ -68,34 +69,33 @@ def test_newest_and_recent_frames():
     assert theta is not None
     assert newest.serial == (9,)
     assert torch.equal(theta, tracked(9).theta)
+    clock.now_s = 91.0
     recent = frames.recent(60.0, 2)
     assert recent is not None
     assert recent.serial == (9, 7)
-    time.sleep(0.01)
-    assert frames.recent(0.001, 2) is None
+    assert frames.recent(0.9, 2) is None
 
 
 def test_latency_is_from_arrival_to_the_first_batch():
-    frames = pools(local=10)
+    clock = Clock()
+    frames = pools(local=10, clock=clock)
     assert frames.median_latency_s() is None
-    fill(frames, range(4))
-    time.sleep(0.05)
-    frames.batch(4)
-    first = frames.median_latency_s()
-    assert first is not None
-    assert 0.05 <= first < 5.0
-    time.sleep(0.2)
-    frames.batch(4)  # the same frames again: no first use
-    assert frames.median_latency_s() == first
+    fill(frames, range(3))  # they arrive at 0, 10 and 20 s
+    clock.now_s = 25.0
+    frames.batch(3)
+    assert frames.median_latency_s() == 15.0
+    clock.now_s = 30.0
+    frames.batch(3)  # the same frames again: no first use
+    assert frames.median_latency_s() == 15.0
 
 
 def test_memory_stays_flat_over_an_hour_of_frames():
-    frames = ReplayBuffer(subject(), LocalGlobalPools(150, 1000), keep_png=True)
-    one, wire = cheap(0)
+    frames = pools(150, 1000)
+    one = cheap(0)
 
     def stream(count: int) -> int:
         for _ in range(count):
-            frames.add(one, wire)
+            frames.add(one)
             if frames.num_added % 200 == 0:
                 frames.batch(10)
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
@@ -108,30 +108,32 @@ def test_memory_stays_flat_over_an_hour_of_frames():
     assert after_kib - before_kib < 6 * 1024
 
 
-@pytest.mark.parametrize("keep_png", [True, False])
-def test_pools_go_on_from_a_checkpoint_as_they_were(keep_png: bool, tmp_path: Path):
+@pytest.mark.parametrize(("save_images", "encode"), [(True, True), (True, False), (False, True)])
+def test_pools_go_on_from_a_checkpoint_as_they_were(
+    save_images: bool, encode: bool, tmp_path: Path
+):
     stream = ReplayStream(small_dataset(tmp_path / "data", HEAD, per_frame_camera=True))
-    whole = pools(2, 2, seed=3, keep_png=keep_png)
-    fill(whole, range(6))
+    whole = pools(2, 2, seed=3, save_images=save_images)
+    fill(whole, range(6), encode)
     whole.batch(3)
+    assert ("png" in whole.state_dict()) is save_images
     state = saved(whole.state_dict())
-    assert ("png" in state) is keep_png
-    resumed = pools(2, 2, seed=99, keep_png=keep_png)
-    resumed.load_state_dict(state, None if keep_png else stream)
+    resumed = pools(2, 2, seed=99, save_images=save_images)
+    resumed.load_state_dict(state, None if save_images else stream)
     assert resumed.num_added == 6
     for _ in range(5):
         one, other = whole.batch(3), resumed.batch(3)
         assert one.serial == other.serial
         assert torch.equal(one.images_rgba, other.images_rgba)
         assert torch.equal(one.theta, other.theta)
-    fill(whole, range(6, 20))
-    fill(resumed, range(6, 20))
+    fill(whole, range(6, 20), encode)
+    fill(resumed, range(6, 20), encode)
     assert whole.thetas()[1] == resumed.thetas()[1]
     assert torch.equal(whole.thetas()[0], resumed.thetas()[0])
 
 
 def test_a_checkpoint_without_images_needs_its_stream():
-    whole = pools(keep_png=False)
+    whole = pools(save_images=False)
     fill(whole, range(3))
     with pytest.raises(UserError, match="holds no images"):
         pools().load_state_dict(whole.state_dict())
@@ -145,12 +147,20 @@ def test_a_checkpoint_of_another_image_size_is_refused():
         other.load_state_dict(whole.state_dict())
 
 
-def test_held_frames_come_in_order_with_their_images():
-    for keep_png in (True, False):
-        frames = pools(keep_png=keep_png)
-        fill(frames, range(12))
-        held = frames.held()
-        assert len(held) == 7
-        assert [serial for serial, _ in held] == sorted(serial for serial, _ in held)
-        for serial, frame in held:
-            assert np.array_equal(frame.decode().image_rgba, tracked(serial).image_rgba)
+@pytest.mark.parametrize("save_images", [True, False])
+@pytest.mark.parametrize("encode", [True, False])
+def test_held_frames_come_in_order_with_their_images(save_images: bool, encode: bool):
+    frames = pools(save_images=save_images)
+    fill(frames, range(12), encode)
+    held = frames.held()
+    assert len(held) == 7
+    assert [serial for serial, _ in held] == sorted(serial for serial, _ in held)
+    for serial, frame in held:
+        assert np.array_equal(decode_png_rgba(frame.encoded(), ""), tracked(serial).image_rgba)
+
+
+def test_a_frame_has_its_image_once():
+    one = tracked(0)
+    for both in ({}, {"png": b"", "image_rgba": one.image_rgba}):
+        with pytest.raises(ValueError, match="either"):
+            StreamedFrame(0, one.theta, one.camera, 0.0, **both)

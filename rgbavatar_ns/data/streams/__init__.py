@@ -2,24 +2,21 @@
 
 from rgbavatar_ns.data.streams.backoff import Backoff
 from rgbavatar_ns.data.streams.client import StreamClient
-from rgbavatar_ns.data.streams.folder import FolderStream, FolderWriter
 from rgbavatar_ns.data.streams.ingest import Ingest
 from rgbavatar_ns.data.streams.protocol import FrameStream, Rewindable, StreamedFrame, StreamSubject
 from rgbavatar_ns.data.streams.replay import ReplayStream
 from rgbavatar_ns.data.streams.replay_buffer import ReplayBatch, ReplayBuffer
-from rgbavatar_ns.data.streams.socket_server import PushedStream
+from rgbavatar_ns.data.streams.socket_server import SocketStream
 
 __all__ = [
     "Backoff",
-    "FolderStream",
-    "FolderWriter",
     "FrameStream",
     "Ingest",
-    "PushedStream",
     "ReplayBatch",
     "ReplayBuffer",
     "ReplayStream",
     "Rewindable",
+    "SocketStream",
     "StreamClient",
     "StreamSubject",
     "StreamedFrame",

@@ -7,7 +7,6 @@ from typing import Any
 
 import torch
 
-from rgbavatar_ns.data.png import png_header_size
 from rgbavatar_ns.data.streams.protocol import FrameStream, Rewindable, StreamedFrame, StreamSubject
 from rgbavatar_ns.data.streams.replay_buffer import ReplayBuffer
 from rgbavatar_ns.data.streams.sequence_numbers import SeenNumbers
@@ -102,7 +101,7 @@ class Ingest:
 
     def counts(self) -> Counter[str]:
         """Frames "arrived" and "taken in", and what went wrong, by name."""
-        counts = self._counts + self._stream.counts
+        counts = self._counts.copy() + self._stream.counts
         counts["arrived"] += 0
         counts["taken in"] += 0
         counts["dropped"] = self._queue.dropped
@@ -159,11 +158,18 @@ class Ingest:
             if frame is None:
                 self._finished.set()
                 return
-            with self._between_frames:
-                fault = self._fault(frame)
-                if fault is None:
-                    fault = self._take_in(frame)
-                self._counts[fault or "taken in"] += 1
+            self.take_in(frame)
+
+    def take_in(self, frame: StreamedFrame) -> None:
+        """Put one frame into the pools, or count why it is left out."""
+        with self._between_frames:
+            fault = self._fault(frame)
+            if fault is None:
+                try:
+                    self._pools.add(frame)
+                except UserError:
+                    fault = "unreadable"
+            self._counts[fault or "taken in"] += 1
 
     def _fault(self, frame: StreamedFrame) -> str | None:
         """Why a frame is left out, found without decoding it; None if it is not."""
@@ -178,7 +184,7 @@ class Ingest:
             return "theta of another size"
         if not bool(torch.isfinite(frame.theta).all()):
             return "theta not finite"
-        size, wanted = png_header_size(frame.png), (self._subject.width, self._subject.height)
+        size, wanted = frame.image_size, (self._subject.width, self._subject.height)
         if size is not None and size != wanted:
             if not self._counts["another resolution"]:
                 self._tell(
@@ -186,14 +192,6 @@ class Ingest:
                     f"{wanted[0]} x {wanted[1]}, and frames of another resolution are left out."
                 )
             return "another resolution"
-        return None
-
-    def _take_in(self, frame: StreamedFrame) -> str | None:
-        try:
-            decoded = frame.decode()
-        except UserError:
-            return "unreadable"
-        self._pools.add(decoded, frame)
         return None
 
     def state_dict(self) -> dict[str, Any]:

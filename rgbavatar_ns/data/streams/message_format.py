@@ -1,240 +1,200 @@
-"""Frames as bytes: one format for sockets and for the files of a folder.
+"""Frames as messages: what one binary WebSocket message holds.
 
-A record is a header of 28 bytes and three parts. Little-endian, nothing is pickled:
+A message is the number of bytes of a JSON object (uint32, little-endian), the object in UTF-8,
+and an image or nothing:
 
-    offset  size
-    0       4     magic, 0x93 "RGA"
-    4       2     version, 1
-    6       2     kind: 1 subject, 2 frame, 3 end
-    8       4     bytes of the JSON part, at most 4 MiB
-    12      4     bytes of the theta part, at most 64 KiB
-    16      4     bytes of the data part, at most 64 MiB
-    20      4     CRC-32 of the three parts
-    24      4     CRC-32 of the 24 bytes before
+    {"type": "subject", "head": its name, "identity": [I numbers], "layout": as in dataset.json,
+     "width": ..., "height": ..., "session": any text}
+    {"type": "frame", "index": a whole number, unique within the session, "theta": [H numbers],
+     "camera": as in dataset.json}, then a PNG, RGBA with straight alpha
+    {"type": "end"}
 
-The JSON part is an object in UTF-8, theta is float32, and what they hold depends on the kind:
-
-    subject  JSON: head (its name), identity [I], layout (as in dataset.json), width, height,
-             session (any text); data: the head's npz, empty for the embedded head
-    frame    JSON: index (a whole number, unique within the session), camera (as in
-             dataset.json); theta; data: the image, a PNG with straight alpha
-    end      nothing; no frame follows
-
-The subject comes first. Where bytes are damaged the reader looks for the next record.
+The subject comes first and is answered by a text message, {"accepted": true, "received": how many
+messages of this session were had before} or {"refused": the reason}. A head other than the
+embedded one follows its subject as safetensors of its arrays, and the object has its
+"num_identity" and "expression_names". The session tells a client that comes back from another.
 """
 
-import io
 import json
 import struct
-import zipfile
-import zlib
-from collections.abc import Iterator
-from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
+import safetensors.numpy
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from rgbavatar_ns.data.native.format import camera_to_json, cameras_from_json
 from rgbavatar_ns.data.native.frame import TrackedFrame
 from rgbavatar_ns.data.png import encode_png_rgba
 from rgbavatar_ns.data.streams.protocol import StreamedFrame, StreamSubject
 from rgbavatar_ns.errors import UserError
-from rgbavatar_ns.head import HeadArrays, ThetaLayout
+from rgbavatar_ns.head import HeadArrays, HeadModel, ThetaLayout
 
-MAGIC = b"\x93RGA"
-VERSION = 1
-SUBJECT, FRAME, END = 1, 2, 3
-LARGEST_JSON, LARGEST_THETA, LARGEST_DATA = 4 << 20, 64 << 10, 64 << 20
-LARGEST_HEAD = 512 << 20
-"""Of a head's arrays in memory."""
-_HEADER = struct.Struct("<4sHHIIIII")
-_CLIENT = "Send what `rgbavatar_ns.data.streams.StreamClient` sends."
+LARGEST_MESSAGE = 64 << 20
+LARGEST_HEADER = 1 << 20
+LARGEST_SIDE = 8192
+"""Of an image, in pixels."""
+_LONGEST_SESSION = 200
+_PNG_COMPRESSION = 1
+_SIZE = struct.Struct("<I")
+_HEAD_FIELDS = ("num_identity", "expression_names")
+_CLIENT = "Send what `rgbavatar_ns.data.streams.StreamClient` sends; docs/online.md describes it."
 
-
-@dataclass(frozen=True)
-class Record:
-    """One record taken apart; the parts are not checked beyond their sums."""
-
-    kind: int
-    fields: dict[str, Any] = field(default_factory=dict)
-    theta: bytes = b""
-    data: bytes = b""
+Header = dict[str, Any]
 
 
-def encode(record: Record) -> bytes:
-    """The record's bytes."""
-    text = json.dumps(record.fields).encode() if record.fields else b""
-    body = text + record.theta + record.data
-    sizes = len(text), len(record.theta), len(record.data)
-    head = struct.pack("<4sHHIIII", MAGIC, VERSION, record.kind, *sizes, zlib.crc32(body))
-    return head + struct.pack("<I", zlib.crc32(head)) + body
+def encode(header: Header, payload: bytes = b"") -> bytes:
+    """A message's bytes."""
+    text = json.dumps(header).encode()
+    return _SIZE.pack(len(text)) + text + payload
 
 
-def subject_record(subject: StreamSubject) -> bytes:
-    """The bytes that introduce a subject."""
-    arrays, data = subject.arrays, b""
-    embedded = HeadArrays.embedded()
-    if arrays is not embedded:
-        packed = io.BytesIO()
-        np.savez_compressed(packed, **{k: np.array(v) for k, v in arrays.to_state().items()})
-        data = packed.getvalue()
-    fields = {
-        "head": arrays.name,
+def decode(message: bytes | str) -> tuple[Header, bytes]:
+    """A message's header and payload; raises UserError for anything else."""
+    try:
+        if isinstance(message, str):
+            raise ValueError("it is text")
+        (size,) = _SIZE.unpack_from(message)
+        if size > min(LARGEST_HEADER, len(message) - _SIZE.size):
+            raise ValueError(f"its header is said to have {size} bytes")
+        header = json.loads(message[_SIZE.size : _SIZE.size + size])
+        if not isinstance(header, dict):
+            raise ValueError("its header is no JSON object")
+    except (ValueError, RecursionError, struct.error) as error:
+        raise UserError(f"This is no message of a stream: {error}.", _CLIENT) from None
+    return header, message[_SIZE.size + size :]
+
+
+def subject_message(subject: StreamSubject) -> bytes:
+    """The message that introduces a subject."""
+    header = {
+        "type": "subject",
+        "head": subject.arrays.name,
         "identity": subject.identity.tolist(),
         "layout": subject.layout.to_json(),
         "width": subject.width,
         "height": subject.height,
         "session": subject.session,
     }
-    return encode(Record(SUBJECT, fields, data=data))
+    if subject.arrays is HeadArrays.embedded():
+        return encode(header)
+    state = subject.arrays.to_state()
+    header |= {name: state[name] for name in _HEAD_FIELDS}
+    arrays = {name: value.numpy() for name, value in state.items() if torch.is_tensor(value)}
+    return encode(header, safetensors.numpy.save(arrays))
 
 
-def frame_record(frame: TrackedFrame, png: bytes | None = None) -> bytes:
-    """The bytes of a frame; `png` is its image where that is encoded already."""
-    png = encode_png_rgba(frame.image_rgba, 1) if png is None else png
-    fields = {"index": frame.index, "camera": camera_to_json(frame.camera, 0)}
-    theta = frame.theta.detach().cpu().numpy().astype("<f4").tobytes()
-    return encode(Record(FRAME, fields, theta, png))
+def frame_message(frame: TrackedFrame, png: bytes | None = None) -> bytes:
+    """The message of a frame; `png` is its image where that is encoded already."""
+    png = encode_png_rgba(frame.image_rgba, _PNG_COMPRESSION) if png is None else png
+    theta, camera = frame.theta.tolist(), camera_to_json(frame.camera, 0)
+    return encode({"type": "frame", "index": frame.index, "theta": theta, "camera": camera}, png)
 
 
-def end_record() -> bytes:
-    """The bytes that say that no frame follows."""
-    return encode(Record(END))
+def end_message() -> bytes:
+    """The message that says that no frame follows."""
+    return encode({"type": "end"})
 
 
-def parse_subject(record: Record) -> StreamSubject:
-    """The subject of a record; raises UserError for anything that is none."""
-    fields = record.fields
+def parse_subject(message: bytes | str) -> StreamSubject:
+    """The subject of a message; raises UserError for anything that is none.
+
+    A stranger's head is built and posed once, so that one that cannot be posed ends no run.
+    """
+    header, payload = decode(message)
+    if header.get("type") != "subject":
+        raise UserError("A stream begins with its subject.", "Send it first.")
     try:
-        identity = torch.tensor(fields["identity"], dtype=torch.float32)
-        width, height = _whole(fields["width"]), _whole(fields["height"])
-        layout = ThetaLayout.from_json(fields["layout"])
-        name, session = str(fields["head"]), str(fields.get("session", ""))
-    except (KeyError, TypeError, ValueError, RuntimeError) as error:
-        raise UserError(f"A stream's subject is incomplete: {error}.", _CLIENT) from None
-    return StreamSubject(_head(name, record.data), identity, layout, width, height, session)
+        width, height = _whole(header["width"]), _whole(header["height"])
+        if max(width, height) > LARGEST_SIDE:
+            raise ValueError(f"images of {width} x {height} pixels are too large")
+        session = header.get("session", "")
+        if not isinstance(session, str) or len(session) > _LONGEST_SESSION:
+            raise ValueError("its session is no short text")
+        arrays, identity = _head(header, payload), _numbers(header["identity"])
+        layout = ThetaLayout.from_json(header["layout"])
+        subject = StreamSubject(arrays, identity, layout, width, height, session)
+        posed = HeadModel(arrays)(torch.zeros(1, layout.size), identity)
+        if not (len(arrays.faces) and posed.numel() and bool(posed.isfinite().all())):
+            raise ValueError("its head has no surface")
+    except UserError:
+        raise
+    except Exception as error:  # What a stranger's numbers can break is not to be foreseen.
+        reason = f"{type(error).__name__}: {error}"
+        raise UserError(f"A stream's subject cannot be used: {reason}.", _CLIENT) from None
+    return subject
 
 
-def parse_frame(record: Record, subject: StreamSubject, arrived_s: float) -> StreamedFrame:
-    """The frame of a record; raises UserError for anything that is none."""
+def parse_frame(
+    header: Header, png: bytes, subject: StreamSubject, arrived_s: float
+) -> StreamedFrame:
+    """The frame of a message; raises UserError for anything that is none."""
     try:
-        index = _whole(record.fields["index"])
-        theta = np.frombuffer(record.theta, "<f4").astype(np.float32)
-    except (KeyError, TypeError, ValueError) as error:
+        if header["type"] != "frame":
+            raise ValueError("its type is not 'frame'")
+        index, theta = _whole(header["index"]), _numbers(header["theta"])
+        named = [(f"streamed frame {index}", header["camera"])]
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise UserError(f"A streamed frame is incomplete: {error}.", _CLIENT) from None
-    named = [(f"streamed frame {index}", record.fields.get("camera"))]
     camera = cameras_from_json(named, subject.width, subject.height)
-    values = torch.from_numpy(theta)
-    return StreamedFrame(index, values, camera, record.data, arrived_s, subject.session)
+    return StreamedFrame(index, theta, camera, arrived_s, subject.session, png=png)
+
+
+def accepted(received: int) -> str:
+    """The answer to a subject that is welcome."""
+    return json.dumps({"accepted": True, "received": received})
+
+
+def refused(reason: str) -> str:
+    """The answer to a client that is not."""
+    return json.dumps({"refused": reason})
+
+
+def parse_answer(answer: bytes | str) -> int:
+    """How many messages of its session a client need not send again.
+
+    Raises:
+        UserError: the client is refused, or the answer is none.
+    """
+    try:
+        fields = json.loads(answer)
+        if "refused" in fields:
+            raise UserError("The stream refuses this client.", str(fields["refused"]))
+        return _whole(fields["received"])
+    except (KeyError, TypeError, ValueError, RecursionError):
+        raise UserError(
+            "Something else than a stream of frames listens at this address.",
+            "Give the address at which `ns-train rgbavatar-online` waits for frames.",
+        ) from None
 
 
 def _whole(value: Any) -> int:
     if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < 1 << 62:
-        raise ValueError(f"{value!r} is no whole number that is not negative")
+        raise ValueError(f"{str(value)[:40]} is no whole number that is not negative")
     return value
 
 
-def _head(name: str, packed: bytes) -> HeadArrays:
-    if not packed:
-        embedded = HeadArrays.embedded()
-        if name != embedded.name:
-            raise UserError(
-                f"The stream is of the head '{name}', which is not known here.",
-                f"Send its arrays with the subject, or use the embedded head '{embedded.name}'.",
-            )
-        return embedded
-    try:
-        with zipfile.ZipFile(io.BytesIO(packed)) as archive:
-            if sum(entry.file_size for entry in archive.infolist()) > LARGEST_HEAD:
-                raise ValueError(f"it holds more than {LARGEST_HEAD >> 20} MiB")
-        with np.load(io.BytesIO(packed), allow_pickle=False) as file:
-            state = {key: _plain(file[key]) for key in file.files}
-    except (OSError, EOFError, ValueError, zipfile.BadZipFile) as error:
-        raise UserError(f"A stream's head model cannot be read: {error}.", _CLIENT) from None
-    return HeadArrays.from_state(state)
+def _numbers(values: Any) -> Float[Tensor, "_"]:
+    if not isinstance(values, list) or not all(type(value) in (int, float) for value in values):
+        raise TypeError("theta and identity are lists of numbers")
+    return torch.tensor([float(value) for value in values], dtype=torch.float32)
 
 
-def _plain(value: np.ndarray) -> Any:
-    """Text and single numbers as what they were before numpy packed them."""
-    if value.dtype.kind in "US" or value.ndim == 0:
-        return value.tolist()
-    return torch.from_numpy(value)
-
-
-class RecordReader:
-    """Takes bytes apart into records as they come, and finds its way back after damage.
-
-    At most one record of the largest size is held. `garbage_bytes` counts what belonged to no
-    whole record.
-    """
-
-    def __init__(self) -> None:
-        self._buffer = bytearray()
-        self.garbage_bytes = 0
-
-    def feed(self, data: bytes) -> Iterator[Record]:
-        """Records that are complete with `data`.
-
-        Raises:
-            UserError: a whole record is of another version of the format.
-        """
-        self._buffer += data
-        while True:
-            size = self._next_record()
-            if size is None:
-                return
-            body = bytes(self._buffer[_HEADER.size : size])
-            _, version, kind, *sizes, checksum, _ = _HEADER.unpack_from(self._buffer)
-            record = None
-            if zlib.crc32(body) == checksum:
-                record = _taken_apart(kind, sizes, body)
-            if record is None:
-                self._skip(1)
-                continue
-            del self._buffer[:size]
-            if version != VERSION:
-                raise UserError(
-                    f"The stream's records have version {version}; version {VERSION} is known.",
-                    "Use the same version of rgbavatar-ns on both sides.",
-                )
-            yield record
-
-    def close(self) -> None:
-        """Nothing follows: what is left is a record cut short."""
-        self.garbage_bytes += len(self._buffer)
-        self._buffer.clear()
-
-    def _next_record(self) -> int | None:
-        """The size of the record at the buffer's start, once all of it is there."""
-        while True:
-            place = self._buffer.find(MAGIC)
-            if place < 0:
-                # The magic's first bytes may have come already.
-                self._skip(max(0, len(self._buffer) - len(MAGIC) + 1))
-                return None
-            self._skip(place)
-            if len(self._buffer) < _HEADER.size:
-                return None
-            _, _, _, *sizes, _, checksum = _HEADER.unpack_from(self._buffer)
-            sound = zlib.crc32(memoryview(self._buffer)[: _HEADER.size - 4]) == checksum
-            limits = (LARGEST_JSON, LARGEST_THETA, LARGEST_DATA)
-            if sound and all(size <= limit for size, limit in zip(sizes, limits)):
-                whole = _HEADER.size + sum(sizes)
-                return whole if len(self._buffer) >= whole else None
-            self._skip(1)
-
-    def _skip(self, count: int) -> None:
-        self.garbage_bytes += count
-        del self._buffer[:count]
-
-
-def _taken_apart(kind: int, sizes: list[int], body: bytes) -> Record | None:
-    text, theta = sizes[0], sizes[0] + sizes[1]
-    try:
-        fields = json.loads(body[:text]) if text else {}
-    except (ValueError, RecursionError):
-        return None
-    if not isinstance(fields, dict):
-        return None
-    return Record(kind, fields, body[text:theta], body[theta:])
+def _head(header: Header, payload: bytes) -> HeadArrays:
+    name = str(header["head"])
+    if payload:
+        fields = {field: header[field] for field in _HEAD_FIELDS}
+        _whole(fields["num_identity"])
+        arrays = {
+            name: torch.from_numpy(value.copy())
+            for name, value in safetensors.numpy.load(payload).items()
+        }
+        return HeadArrays.from_state({**arrays, **fields, "name": name})
+    embedded = HeadArrays.embedded()
+    if name != embedded.name:
+        raise UserError(
+            f"The stream is of the head '{name}', which is not known here.",
+            f"Send its arrays with the subject, or use the embedded head '{embedded.name}'.",
+        )
+    return embedded

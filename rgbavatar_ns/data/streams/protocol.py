@@ -1,15 +1,16 @@
 """What a stream of tracked frames is, wherever it comes from."""
 
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from rgbavatar_ns.data.native.frame import TrackedFrame
-from rgbavatar_ns.data.png import decode_png_rgba
+from rgbavatar_ns.data.png import decode_png_rgba, encode_png_rgba, png_header_size
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadArrays, HeadModel, ThetaLayout
 from rgbavatar_ns.kernels.types import PinholeCameras
@@ -54,26 +55,45 @@ class StreamSubject:
 
 @dataclass(frozen=True)
 class StreamedFrame:
-    """A tracked frame with its image still encoded, as it came in.
+    """A tracked frame with its image as it came: encoded, or as pixels; exactly one of the two.
 
     index: number of the frame in its source.
     theta: head parameters in the order of the subject's layout; not checked yet.
     camera: exactly one camera (C = 1), of the subject's image size.
-    png: the image, RGBA with straight alpha.
-    arrived_s: when it arrived, by time.monotonic().
+    arrived_s: when it arrived, by the source's clock (time.monotonic()).
+    png: the image as a PNG, RGBA with straight alpha; not checked yet.
+    image_rgba: the image's pixels, straight alpha.
     """
 
     index: int
     theta: Float[Tensor, "_"]
     camera: PinholeCameras
-    png: bytes
     arrived_s: float
     session: str = ""
+    png: bytes | None = field(default=None, kw_only=True)
+    image_rgba: UInt8[np.ndarray, "height width 4"] | None = field(default=None, kw_only=True)
+
+    def __post_init__(self) -> None:
+        if (self.png is None) == (self.image_rgba is None):
+            raise ValueError("A frame has its image either as a PNG or as pixels.")
+
+    @property
+    def image_size(self) -> tuple[int, int] | None:
+        """Width and height as the image says, nothing is decoded; None where it is no PNG."""
+        if self.image_rgba is not None:
+            return self.image_rgba.shape[1], self.image_rgba.shape[0]
+        return png_header_size(self.png or b"")
 
     def decode(self) -> TrackedFrame:
-        """The frame with its picture; raises UserError where that is damaged or no PNG."""
-        image = decode_png_rgba(self.png, f"frame {self.index}")
+        """The frame with its pixels; raises UserError where the PNG is damaged or none."""
+        image = self.image_rgba
+        if image is None:
+            image = decode_png_rgba(self.png or b"", f"frame {self.index}")
         return TrackedFrame(self.index, self.theta, self.camera, image)
+
+    def encoded(self) -> bytes:
+        """The image as a PNG."""
+        return encode_png_rgba(self.decode().image_rgba) if self.png is None else self.png
 
 
 @runtime_checkable

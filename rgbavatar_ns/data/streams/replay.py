@@ -3,6 +3,7 @@
 import bisect
 import time
 from collections import Counter
+from collections.abc import Callable
 
 from rgbavatar_ns.data.native.dataset import TrackedDataset
 from rgbavatar_ns.data.streams.protocol import StreamedFrame, StreamSubject
@@ -18,14 +19,20 @@ class ReplayStream:
 
     keeps_frames = False
 
-    def __init__(self, dataset: TrackedDataset, frames_per_second: float = 25.0) -> None:
+    def __init__(
+        self,
+        dataset: TrackedDataset,
+        frames_per_second: float = 25.0,
+        clock: Callable[[], float] = time.monotonic,
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:
         if not frames_per_second > 0:
             raise UserError(
                 f"{frames_per_second} frames a second cannot be replayed.",
                 "Pass a positive rate; the paper's is 25.",
             )
         self.counts: Counter[str] = Counter()
-        self._dataset = dataset
+        self._dataset, self._clock, self._sleep = dataset, clock, sleep
         self._interval_s = 1.0 / frames_per_second
         self._first = self._next = 0
         self._began_s: float | None = None
@@ -45,12 +52,12 @@ class ReplayStream:
         """The next frame when its time has come."""
         if self.ended:
             return None
-        now = time.monotonic()
+        now = self._clock()
         if self._began_s is None:
             self._began_s = now
         due = self._began_s + (self._next - self._first) * self._interval_s
         if due > now:
-            time.sleep(min(due - now, timeout_s))
+            self._sleep(min(due - now, timeout_s))
             if due > now + timeout_s:
                 return None
         position = self._dataset.train[self._next]
@@ -65,7 +72,7 @@ class ReplayStream:
                 f"The dataset {self._dataset.root} has no frame {index}.",
                 "Resume with the dataset that the run was started with.",
             )
-        return self._frame(position, time.monotonic())
+        return self._frame(position, self._clock())
 
     def go_on_after(self, index: int) -> None:
         """Begin behind the frame with this number."""
@@ -88,4 +95,4 @@ class ReplayStream:
             ) from None
         camera = data.cameras.select([position])
         index = data.frame_index[position]
-        return StreamedFrame(index, data.theta[position], camera, png, arrived_s)
+        return StreamedFrame(index, data.theta[position], camera, arrived_s, png=png)

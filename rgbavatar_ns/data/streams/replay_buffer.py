@@ -3,7 +3,7 @@
 import threading
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -32,13 +32,14 @@ class ReplayBatch:
     images_rgba: UInt8[Tensor, "B H_px W_px 4"]
 
 
-@dataclass(frozen=True)
+@dataclass
 class _Kept:
     """What belongs to a frame beside its rows in the tables."""
 
     index: int
     arrived_s: float
     png: bytes | None
+    """As it came, or as it was encoded for a checkpoint."""
 
 
 class ReplayBuffer:
@@ -51,13 +52,20 @@ class ReplayBuffer:
     Args:
         subject: whose frames these are.
         pools: the sampling; nobody else must use it.
-        keep_png: whether the encoded images are kept for `state_dict`.
+        save_images: whether `state_dict` holds the images. Those that came as pixels are encoded
+            when it is called.
+        clock: in seconds, the source's.
     """
 
     def __init__(
-        self, subject: StreamSubject, pools: LocalGlobalPools, keep_png: bool = True
+        self,
+        subject: StreamSubject,
+        pools: LocalGlobalPools,
+        save_images: bool = True,
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._subject, self._pools, self._keep_png = subject, pools, keep_png
+        self._subject, self._pools, self._save_images = subject, pools, save_images
+        self._clock = clock
         places = pools.local_size + pools.global_size
         height, width = subject.height, subject.width
         # The system gives memory to the places as they are first written to.
@@ -86,22 +94,23 @@ class ReplayBuffer:
         with self._lock:
             return len(self._pools.local_frames), len(self._pools.global_frames)
 
-    def add(self, frame: TrackedFrame, streamed: StreamedFrame) -> None:
-        """Take in the next frame, decoded and as it came."""
+    def add(self, frame: StreamedFrame) -> None:
+        """Take in the next frame, decoded; raises UserError where its image is damaged."""
+        decoded = frame.decode()
         with self._changed:
             serial = self._added
             dropped = self._pools.add(serial)
             if dropped is not None:
                 self._forget(dropped)
-            self._hold(serial, frame, streamed)
-            self._waiting[serial] = streamed.arrived_s
+            self._hold(serial, decoded, frame)
+            self._waiting[serial] = frame.arrived_s
             self._added += 1
             self._changed.notify_all()
 
     def _hold(self, serial: int, frame: TrackedFrame, streamed: StreamedFrame) -> None:
         place = self._free.pop()
         self._place[serial] = place
-        png = streamed.png if self._keep_png else None
+        png = streamed.png if self._save_images else None
         self._kept[serial] = _Kept(frame.index, streamed.arrived_s, png)
         self._images[place] = torch.from_numpy(frame.image_rgba)
         self._theta[place] = frame.theta
@@ -124,7 +133,7 @@ class ReplayBuffer:
         """Draw a batch as `LocalGlobalPools.batch`; raises UserError while there are no frames."""
         with self._lock:
             serials = self._pools.batch(batch_size, evenly)
-            now = time.monotonic()
+            now = self._clock()
             for serial in serials:
                 arrived_s = self._waiting.pop(serial, None)
                 if arrived_s is not None:
@@ -143,7 +152,7 @@ class ReplayBuffer:
         None where there are none.
         """
         with self._lock:
-            since = time.monotonic() - seconds
+            since = self._clock() - seconds
             local = self._pools.local_frames
             late = [serial for serial in local if self._kept[serial].arrived_s >= since]
             chosen = late[:: -max(1, -(-len(late) // most))]
@@ -168,8 +177,18 @@ class ReplayBuffer:
 
     def _streamed(self, serial: int) -> StreamedFrame:
         kept, batch = self._kept[serial], self._gather([serial])
-        png = encode_png_rgba(batch.images_rgba[0].numpy()) if kept.png is None else kept.png
-        return StreamedFrame(kept.index, batch.theta[0], batch.cameras, png, kept.arrived_s)
+        return StreamedFrame(
+            kept.index, batch.theta[0], batch.cameras, kept.arrived_s, png=self._png(serial)
+        )
+
+    def _png(self, serial: int) -> bytes:
+        kept = self._kept[serial]
+        png = kept.png
+        if png is None:
+            png = encode_png_rgba(self._images[self._place[serial]].numpy())
+            if self._save_images:
+                kept.png = png  # The next checkpoint holds it too.
+        return png
 
     def _gather(self, serials: Sequence[int]) -> ReplayBatch:
         rows = torch.tensor([self._place[serial] for serial in serials])
@@ -200,8 +219,8 @@ class ReplayBuffer:
                 "index": torch.tensor([one.index for one in kept], dtype=torch.long),
                 **{name: table[rows] for name, table in self._tables().items()},
             }
-        if self._keep_png:
-            images = [one.png or b"" for one in kept]
+            images = [self._png(serial) for serial in serials] if self._save_images else []
+        if self._save_images:
             state["png_bytes"] = torch.tensor([len(png) for png in images], dtype=torch.long)
             state["png"] = torch.from_numpy(np.frombuffer(b"".join(images), np.uint8).copy())
         return state
@@ -222,7 +241,7 @@ class ReplayBuffer:
         """
         images = self._saved_images(state, stream)
         size = self._subject.width, self._subject.height
-        now = time.monotonic()
+        now = self._clock()
         with self._lock:
             self._pools.load_state_dict(state["pools"])
             for row, (serial, index) in enumerate(
@@ -231,7 +250,7 @@ class ReplayBuffer:
                 tables = {name: state[name][row : row + 1].cpu() for name in self._tables()}
                 theta = tables.pop("theta")[0]
                 camera = PinholeCameras(**tables, width=size[0], height=size[1])
-                streamed = StreamedFrame(index, theta, camera, images[row], now)
+                streamed = StreamedFrame(index, theta, camera, now, png=images[row])
                 frame = streamed.decode()
                 if frame.image_rgba.shape[1::-1] != size:
                     raise UserError(
@@ -250,6 +269,7 @@ class ReplayBuffer:
         if not isinstance(stream, Rereadable):
             raise UserError(
                 "The checkpoint was made while a dataset was replayed and holds no images.",
-                "Resume with that dataset: --data FOLDER --pipeline.datamanager.source replay.",
+                "Resume with that dataset: --data FOLDER "
+                "--pipeline.datamanager.source.kind replay.",
             )
-        return [stream.again(index).png for index in state["index"].tolist()]
+        return [stream.again(index).encoded() for index in state["index"].tolist()]

@@ -38,11 +38,6 @@ class SeenNumbers:
         """The highest number so far; -1 before the first."""
         return self._newest
 
-    def pass_over(self, number: int) -> None:
-        """Take every number up to this one for one that has been there."""
-        self._newest = max(self._newest, number)
-        self._seen = set(range(max(0, self._newest - _REMEMBERED), self._newest + 1))
-
     def _forget(self, oldest_before: int) -> None:
         oldest = self._newest - _REMEMBERED
         if oldest - oldest_before <= _REMEMBERED:

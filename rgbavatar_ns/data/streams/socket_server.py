@@ -1,56 +1,49 @@
-"""Frames that another process pushes over a socket."""
+"""Frames that another process sends over a WebSocket."""
 
 import contextlib
-import dataclasses
-import os
-import select
+import logging
 import socket
-import stat
+import threading
 import time
 from collections import Counter, deque
+from collections.abc import Callable
 
-import numpy as np
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.server import Server, ServerConnection, serve
 
-from rgbavatar_ns.data.streams import message_format as wire
+from rgbavatar_ns.avatar.storage.head_reference import fingerprint
+from rgbavatar_ns.data.streams import message_format
 from rgbavatar_ns.data.streams.address import DEFAULT_ADDRESS, StreamAddress
 from rgbavatar_ns.data.streams.protocol import StreamedFrame, StreamSubject
 from rgbavatar_ns.errors import UserError
 
-ACCEPTED, REFUSED = b"OK\n", b"REFUSED "
-_CHUNK_BYTES = 1 << 18
-_SILENCE_S = 10.0
-"""A client that has sent nothing for so long may be replaced by another."""
-_MOST_GARBAGE_BYTES = 1 << 20
-"""Between two whole records; a client that sends more is hung up on."""
-_LONGEST_WAIT_S = 0.05
-_FAREWELL_S = 0.2
-_KNOCK_S, _LONGEST_KNOCK_S = 0.5, 5.0
-"""How long a second client is kept waiting before it is refused: what the first has sent before
-it hung up may still have to be read. The longer time is for a first that never pauses."""
+_MOST_WAITING = 16
+"""Frames that wait to be taken; a client that sends more is made to wait."""
+_OPEN_S, _CLOSE_S = 3.0, 1.0
+"""For WebSocket's own greetings and farewells."""
+_LONGEST_TOLD = 400
+# Port scanners and browsers are no news to the user.
+_log = logging.getLogger(f"{__name__}.websockets")
+_log.setLevel(logging.CRITICAL)
 
 
-@dataclasses.dataclass
-class _Client:
-    connection: socket.socket
-    heard_s: float
-    reader: wire.RecordReader = dataclasses.field(default_factory=wire.RecordReader)
-    subject: StreamSubject | None = None
-    garbage_noted: int = 0
-    garbage_at_last_record: int = 0
+class SocketStream:
+    """Listens for one client at a time, which sends messages as `message_format` describes them.
 
-
-class PushedStream:
-    """Listens for one client at a time, which sends records as `wire` describes them.
-
-    The client begins with its subject and is answered by a line, "OK" or "REFUSED" and the
-    reason; nothing else is sent to it. While a client is connected and not silent, a second one
-    is refused, after half a second in which the first may prove to have hung up. One that hangs
-    up may come back, another may take its place, with the same head and image size.
+    While a client is connected a second one is refused, unless the first has been silent for
+    `silence_s`, or is the same one over a connection that was lost. One that hangs up may come
+    back, another may take its place, with the same head and image size. What is no message of a
+    stream is counted as "unreadable", and told once a client. Web pages are refused.
 
     Args:
-        listen: HOST:PORT (port 0: any that is free, see `address`) or unix:PATH.
+        listen: HOST:PORT (port 0: any that is free, see `address`).
         allow_remote: listen also where other machines can reach it. Whoever can, can send
             frames: nothing is encrypted or signed.
+        tell: called, from a thread, with what a user should read at once.
+        clock: in seconds.
+        silence_s: also how long a client may take to send its subject.
+        grace_s: how long a second client waits before it is refused or takes over: what the first
+            has sent before it hung up may still have to be read.
 
     Raises:
         UserError: the address is none, is taken, or other machines can reach it unasked.
@@ -58,23 +51,44 @@ class PushedStream:
 
     keeps_frames = False
 
-    def __init__(self, listen: str = DEFAULT_ADDRESS, allow_remote: bool = False) -> None:
-        self.counts: Counter[str] = Counter()
+    def __init__(
+        self,
+        listen: str = DEFAULT_ADDRESS,
+        allow_remote: bool = False,
+        tell: Callable[[str], None] = lambda line: None,
+        clock: Callable[[], float] = time.monotonic,
+        silence_s: float = 10.0,
+        grace_s: float = 2.0,
+    ) -> None:
+        self._tell, self._clock = tell, clock
+        self._silence_s, self._grace_s = silence_s, grace_s
+        self._counts: Counter[str] = Counter()
+        self._subject: StreamSubject | None = None
+        self._client: ServerConnection | None = None
+        self._session: str | None = None
+        self._received = 0  # messages of the session
+        self._listening_since_s: float | None = None
+        self._frames: deque[StreamedFrame] = deque()
+        self._end_seen = self._closed = False
+        self._changed = threading.Condition()
         wanted = StreamAddress.parse(listen)
         if not wanted.is_local and not allow_remote:
             raise UserError(
                 f"Other machines could send frames to {listen}.",
                 f"Listen at {DEFAULT_ADDRESS}, or allow remote clients on purpose.",
             )
-        self._listener = _listener(wanted)
-        bound = self._listener.getsockname()
-        place = bound if isinstance(bound, str) else bound[:2]
-        self.address = str(StreamAddress(wanted.family, place))
-        self._client: _Client | None = None
-        self._knocked_s: float | None = None
-        self._subject: StreamSubject | None = None
-        self._frames: deque[StreamedFrame] = deque()
-        self._end_seen = self._closed = False
+        self._server = _listen(wanted, self._serve_client)
+        self.address = str(StreamAddress(*self._server.socket.getsockname()[:2]))
+        # The threads of clients inherit that this one keeps no program alive.
+        threading.Thread(
+            target=self._server.serve_forever, name="rgbavatar socket", daemon=True
+        ).start()
+
+    @property
+    def counts(self) -> Counter[str]:
+        """What went wrong, by name."""
+        with self._changed:
+            return self._counts.copy()
 
     @property
     def ended(self) -> bool:
@@ -83,196 +97,165 @@ class PushedStream:
 
     def subject(self, timeout_s: float) -> StreamSubject | None:
         """The first client's subject."""
-        deadline = time.monotonic() + timeout_s
-        while self._subject is None and self._wait(deadline):
-            pass
-        return self._subject
+        with self._changed:
+            self._changed.wait_for(lambda: self._subject is not None or self._closed, timeout_s)
+            return self._subject
 
     def next(self, timeout_s: float) -> StreamedFrame | None:
-        """The next frame; also the time in which clients are answered."""
-        deadline = time.monotonic() + timeout_s
-        while not self._frames and not self._end_seen and self._wait(deadline):
-            pass
-        return None if self._closed or not self._frames else self._frames.popleft()
+        """The next frame."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._frames or self.ended, timeout_s)
+            if self._closed or not self._frames:
+                return None
+            self._changed.notify_all()
+            return self._frames.popleft()
 
     def close(self) -> None:
         """Hang up and stop listening."""
-        self._closed = True
-        for one in (self._listener, self._client and self._client.connection):
-            if one:
-                one.close()
-        place = StreamAddress.parse(self.address).place
-        if isinstance(place, str) and os.path.exists(place):
-            os.unlink(place)
-
-    def _wait(self, deadline: float) -> bool:
-        """Answer whoever wants something until the deadline; False once it has passed."""
-        left = deadline - time.monotonic()
-        if self._closed or left <= 0:
-            return False
-        connection = self._client and self._client.connection
-        knock_noted = connection is not None and self._knocked_s is not None
-        readers = [one for one in (connection, None if knock_noted else self._listener) if one]
-        try:
-            ready, _, _ = select.select(readers, [], [], min(left, _LONGEST_WAIT_S))
-            if self._client is not None and connection in ready:
-                self._receive(self._client)
-            if self._listener in ready or knock_noted:
-                self._answer_knock(client_pauses=connection not in ready)
-        except (OSError, ValueError):
-            if not self._closed:  # else the sockets were closed meanwhile
-                raise
-        return True
-
-    def _answer_knock(self, client_pauses: bool) -> None:
-        """Admit or refuse the client that waits at the listener, once it is clear which."""
-        now = time.monotonic()
-        silent = self._client is None or now - self._client.heard_s >= _SILENCE_S
-        if not silent:
-            self._knocked_s = now if self._knocked_s is None else self._knocked_s
-            if now - self._knocked_s < (_KNOCK_S if client_pauses else _LONGEST_KNOCK_S):
+        with self._changed:
+            if self._closed:
                 return
-        self._knocked_s = None
-        try:
-            connection, _ = self._listener.accept()
-        except BlockingIOError:  # it did not wait so long
-            return
-        if not silent:
-            self._refuse(connection, "another client is connected.")
-            connection.close()
-            return
-        if self._client is not None:
-            self._hang_up(self._client)
-        connection.setblocking(False)
-        self._client = _Client(connection, now)
+            self._closed = True
+            client = self._client
+            self._changed.notify_all()
+        if client is not None:
+            client.close()
+        self._server.shutdown()
 
-    def _receive(self, client: _Client) -> None:
-        try:
-            data = client.connection.recv(_CHUNK_BYTES)
-        except BlockingIOError:
-            return
-        except OSError:
-            data = b""
-        if not data:
-            self._hang_up(client)
-            return
-        client.heard_s = time.monotonic()
-        try:
-            for record in client.reader.feed(data):
-                self._take(client, record, client.heard_s)
-                client.garbage_at_last_record = client.reader.garbage_bytes
-        except UserError as error:
-            self._refuse(client.connection, str(error))
-            self._hang_up(client)
-            return
-        self._note_garbage(client)
-        # Who does not speak this format at all is no client of ours.
-        allowed = _MOST_GARBAGE_BYTES if client.subject is not None else 0
-        if client.reader.garbage_bytes - client.garbage_at_last_record > allowed:
-            self._refuse(client.connection, "this is no stream of records.")
-            self._hang_up(client)
-
-    def _take(self, client: _Client, record: wire.Record, now: float) -> None:
-        if record.kind == wire.SUBJECT:
-            client.subject = self._admit(wire.parse_subject(record))
-            _answer(client.connection, ACCEPTED)
-        elif client.subject is None:
-            raise UserError("A stream begins with its subject.", "Send it first.")
-        elif record.kind == wire.END:
-            self._end_seen = True
-        elif record.kind == wire.FRAME:
+    def _serve_client(self, connection: ServerConnection) -> None:
+        """Answer one client, in a thread of its own, until it has gone."""
+        with contextlib.suppress(ConnectionClosed):
             try:
-                self._frames.append(wire.parse_frame(record, client.subject, now))
-            except UserError:
-                self.counts["unreadable"] += 1
+                try:
+                    greeting = connection.recv(timeout=self._silence_s)
+                except TimeoutError:
+                    raise UserError("No subject has come in time.", "Send it first.") from None
+                subject = message_format.parse_subject(greeting)
+                self._admit(connection, subject)
+            except UserError as error:
+                with self._changed:
+                    self._counts["refused clients"] += 1
+                connection.send(message_format.refused(_printable(error)))
+                return
+            try:
+                connection.send(message_format.accepted(self._received))
+                self._receive(connection, subject)
+            finally:
+                self._release(connection)
 
-    def _admit(self, subject: StreamSubject) -> StreamSubject:
-        """The subject, if it is the stream's; raises UserError if not."""
-        if self._subject is None:
-            self._subject = subject
-            return subject
-        self.counts["reconnects"] += 1
-        mine = self._subject
-        if (subject.width, subject.height) != (mine.width, mine.height):
-            raise UserError(
-                f"The stream began with images of {mine.width} x {mine.height} pixels, this "
-                f"client's are {subject.width} x {subject.height}.",
-                "Keep to one size.",
-            )
-        if subject.layout != mine.layout or not _same_head(subject, mine):
-            raise UserError(
-                f"The stream began with the head '{mine.arrays.name}', this client's is another.",
-                "Keep to one head model.",
-            )
-        return subject
+    def _admit(self, connection: ServerConnection, subject: StreamSubject) -> None:
+        """Make this the client; raises UserError if there is another, or its subject is."""
+        with self._changed:
+            if self._subject is not None:
+                _check_same(subject, self._subject)
+            same = subject.session == self._session and subject.session != ""
+            had = self._received
+            if not self._is_silent():
+                self._changed.wait_for(lambda: self._client is None or self._closed, self._grace_s)
+            before = self._client
+            lost = self._is_silent() or (same and self._received == had)
+            if self._closed or (before is not None and not lost):
+                raise UserError("Another client is connected.", "End it first, or wait.")
+            self._client, self._listening_since_s = connection, self._clock()
+            if self._subject is not None:
+                self._counts["reconnects"] += 1
+            if not same:
+                self._session, self._received = subject.session, 0
+            self._subject = self._subject or subject
+            self._changed.notify_all()
+        if before is not None:
+            before.close()
 
-    def _hang_up(self, client: _Client) -> None:
-        client.reader.close()
-        self._note_garbage(client)
-        client.connection.close()
-        if client is self._client:
-            self._client = None
-        if client.subject is not None and not self._end_seen:
-            self.counts["source lost"] += 1
+    def _is_silent(self) -> bool:
+        since_s = self._listening_since_s
+        return since_s is not None and self._clock() - since_s >= self._silence_s
 
-    def _note_garbage(self, client: _Client) -> None:
-        self.counts["garbage bytes"] += client.reader.garbage_bytes - client.garbage_noted
-        client.garbage_noted = client.reader.garbage_bytes
+    def _receive(self, connection: ServerConnection, subject: StreamSubject) -> None:
+        """Take this client's messages until it ends, or another has taken its place."""
+        told = False
+        while not self._end_seen:
+            message, frame, ends = connection.recv(), None, False
+            try:
+                header, png = message_format.decode(message)
+                ends = header.get("type") == "end"
+                if not ends:
+                    frame = message_format.parse_frame(header, png, subject, self._clock())
+            except UserError as error:
+                if not told:
+                    self._tell(f"A message from {self.address} is left out: {_printable(error)}")
+                told = True
+            if not self._take(connection, frame, ends):
+                return
 
-    def _refuse(self, connection: socket.socket, reason: str) -> None:
-        self.counts["refused clients"] += 1
-        _answer(connection, REFUSED + reason.encode() + b"\n")
-        # Closing while something is unread would reset the connection, and the answer be lost.
-        with contextlib.suppress(OSError):
-            connection.shutdown(socket.SHUT_WR)
-            connection.settimeout(_FAREWELL_S)
-            unread = _MOST_GARBAGE_BYTES
-            while unread > 0 and (data := connection.recv(_CHUNK_BYTES)):
-                unread -= len(data)
+    def _take(self, connection: ServerConnection, frame: StreamedFrame | None, ends: bool) -> bool:
+        """Count a message and queue its frame; False if this is the client no more."""
+
+        def gone() -> bool:
+            return self._closed or self._client is not connection
+
+        with self._changed:
+            if not gone():
+                self._listening_since_s = None
+            self._changed.wait_for(lambda: gone() or len(self._frames) < _MOST_WAITING)
+            if gone():
+                return False
+            self._listening_since_s = self._clock()
+            self._received += 1
+            self._end_seen = ends
+            if frame is not None:
+                self._frames.append(frame)
+            elif not ends:
+                self._counts["unreadable"] += 1
+            self._changed.notify_all()
+            return True
+
+    def _release(self, connection: ServerConnection) -> None:
+        with self._changed:
+            if self._client is connection:
+                self._client = self._listening_since_s = None
+            if not self._end_seen and not self._closed:
+                self._counts["source lost"] += 1
+            self._changed.notify_all()
 
 
-def _answer(connection: socket.socket, line: bytes) -> None:
-    with contextlib.suppress(OSError):  # it may have gone, which the next receive will tell
-        connection.send(line)
+def _printable(error: UserError) -> str:
+    """An error that may quote what a stranger sent, fit for a terminal."""
+    return "".join(c if c.isprintable() else "?" for c in str(error)[:_LONGEST_TOLD])
 
 
-def _same_head(one: StreamSubject, other: StreamSubject) -> bool:
-    a, b = one.arrays, other.arrays
-    return a is b or (
-        a.name == b.name
-        and a.v_template.shape == b.v_template.shape
-        and np.array_equal(a.v_template, b.v_template)
-        and np.array_equal(a.shapedirs, b.shapedirs)
-    )
+def _check_same(subject: StreamSubject, first: StreamSubject) -> None:
+    """Raise UserError where a client's images or head are not those of the first."""
+    if (subject.width, subject.height) != (first.width, first.height):
+        raise UserError(
+            f"The stream began with images of {first.width} x {first.height} pixels, this "
+            f"client's are {subject.width} x {subject.height}.",
+            "Keep to one size.",
+        )
+    mine, other = first.arrays, subject.arrays
+    if mine is not other and fingerprint(mine) != fingerprint(other):
+        raise UserError(
+            f"The stream began with the head '{mine.name}', this client's is another.",
+            "Keep to one head model.",
+        )
 
 
-def _listener(address: StreamAddress) -> socket.socket:
-    listener = socket.socket(address.family, socket.SOCK_STREAM)
+def _listen(address: StreamAddress, serve_client: Callable[[ServerConnection], None]) -> Server:
     try:
-        if isinstance(address.place, str):
-            _remove_stale(address.place)
-            listener.bind(address.place)
-            os.chmod(address.place, 0o600)
-        else:
-            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            listener.bind(address.place)
-        listener.listen(4)
-        listener.setblocking(False)
+        return serve(
+            serve_client,
+            *address,
+            family=socket.AF_INET6 if ":" in address.host else socket.AF_INET,
+            origins=[None],  # Only browsers name one.
+            compression=None,
+            open_timeout=_OPEN_S,
+            close_timeout=_CLOSE_S,
+            ping_interval=None,
+            max_size=message_format.LARGEST_MESSAGE,
+            max_queue=1,
+            logger=_log,
+        )
     except OSError as error:
-        listener.close()
         raise UserError(
             f"Frames cannot be listened for at {address}: {error.strerror}.",
             "Choose another address, or end the program that uses this one.",
         ) from None
-    return listener
-
-
-def _remove_stale(path: str) -> None:
-    """Remove a socket that nobody listens at any more."""
-    if not os.path.exists(path) or not stat.S_ISSOCK(os.stat(path).st_mode):
-        return
-    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
-        try:
-            probe.connect(path)
-        except OSError:
-            os.unlink(path)

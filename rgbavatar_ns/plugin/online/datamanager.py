@@ -47,7 +47,7 @@ class OnlineDataManagerConfig(RGBAvatarDataManagerConfig):
     for chance. False draws from the local pool by chance alone, as in the paper."""
     queue_frames: int = 256
     """Frames that may wait to be decoded; beyond, the oldest is dropped, or the source waits
-    where it keeps them (a folder, a video file)."""
+    where it keeps them (a video file)."""
     recorded: tyro.conf.Suppress[Path | None] = None
     """Dataset of the frames that the pools held, which the trainer writes for later commands."""
 
@@ -93,7 +93,7 @@ class OnlineDataManager(RGBAvatarDataManager):
         return self._ingest
 
     def _open(self, config: OnlineDataManagerConfig) -> None:
-        stream = open_source(config.source, config.data or config.dataparser.data)
+        stream = open_source(config.source, config.data or config.dataparser.data, _tell)
         try:
             self._prepare(config, stream)
         except BaseException:
@@ -108,7 +108,7 @@ class OnlineDataManager(RGBAvatarDataManager):
             subject, self._first = await_subject(stream, _tell)
             _record(config, subject, [(0, self._first)])
         assert subject is not None
-        self.pools = ReplayBuffer(subject, pools, keep_png=not isinstance(stream, Rereadable))
+        self.pools = ReplayBuffer(subject, pools, save_images=not isinstance(stream, Rereadable))
         self._ingest = Ingest(stream, subject, self.pools, config.queue_frames, _tell)
         self._subject, self._stream = subject, stream
         self._resumed = False
@@ -237,9 +237,9 @@ def _record(config: OnlineDataManagerConfig, subject: Any, frames: Any) -> None:
         overwrite=True,
     )
     for serial, frame in frames:
-        writer.add_encoded(serial, frame.theta, frame.camera, frame.png)
+        writer.add_encoded(serial, frame.theta, frame.camera, frame.encoded())
     writer.finish(0)
 
 
 def _tell(line: str) -> None:
-    CONSOLE.print(line, highlight=False, soft_wrap=True)
+    CONSOLE.print(line, highlight=False, markup=False, soft_wrap=True)

@@ -8,10 +8,9 @@ from typing import Literal
 
 from rgbavatar_ns.data import load_dataset
 from rgbavatar_ns.data.streams import (
-    FolderStream,
     FrameStream,
-    PushedStream,
     ReplayStream,
+    SocketStream,
     StreamedFrame,
     StreamSubject,
 )
@@ -28,13 +27,13 @@ class SourceConfig:
     """The source of a stream's frames."""
 
     kind: SourceKind = "replay"
-    """replay: the dataset of --data in real time; folder: the folder of --data, into which
-    another program writes records; socket: another program pushes records; video: a video file,
-    camera or network address, tracked as it comes."""
+    """replay: the dataset of --data in real time; socket: another program sends frames over a
+    WebSocket; video: a video file, camera or network address, tracked as it comes. (folder is no
+    more: its message says what to use.)"""
     frames_per_second: float = 25.0
     """Rate of a replay (paper: 25)."""
     listen: str = DEFAULT_ADDRESS
-    """Where a socket waits for frames: HOST:PORT, or unix:PATH."""
+    """Where a socket waits for frames: HOST:PORT."""
     allow_remote: bool = False
     """Let a socket be reached from other machines. Nothing is encrypted, and whoever reaches it
     can send frames."""
@@ -43,10 +42,22 @@ class SourceConfig:
     (rtsp://...)."""
 
 
-def open_source(config: SourceConfig, data: Path | None) -> FrameStream:
-    """The stream that the flags name; raises UserError where they do not suffice."""
+def open_source(
+    config: SourceConfig, data: Path | None, tell: Callable[[str], None] = lambda line: None
+) -> FrameStream:
+    """The stream that the flags name; raises UserError where they do not suffice.
+
+    `tell` is called, also from threads, with what a user should read at once.
+    """
+    if config.kind == "folder":
+        raise UserError(
+            "Frames are no longer taken from a folder into which another program writes.",
+            "Send them with StreamClient and --pipeline.datamanager.source.kind socket, or write "
+            "a dataset with DatasetWriter and replay it: --data FOLDER "
+            "--pipeline.datamanager.source.kind replay.",
+        )
     if config.kind == "socket":
-        return PushedStream(config.listen, config.allow_remote)
+        return SocketStream(config.listen, config.allow_remote, tell)
     if config.kind == "video":
         if not config.video:
             raise UserError(
@@ -60,65 +71,65 @@ def open_source(config: SourceConfig, data: Path | None) -> FrameStream:
         return VideoStream(config.video)
     if data is None or data == Path():
         raise UserError(
-            "No dataset was named." if config.kind == "replay" else "No folder was named.",
+            "No dataset was named.",
             "Pass --data FOLDER; `rgbavatar demo-data FOLDER` makes a dataset to try.",
         )
-    if config.kind == "folder":
-        return FolderStream(data)
     return ReplayStream(load_dataset(data), config.frames_per_second)
 
 
 def await_subject(
-    stream: FrameStream, tell: Callable[[str], None]
+    stream: FrameStream,
+    tell: Callable[[str], None],
+    clock: Callable[[], float] = time.monotonic,
 ) -> tuple[StreamSubject, StreamedFrame]:
     """The subject and its first usable frame, however long they take; tells what is waited for.
 
     Raises:
         UserError: the stream ends before.
     """
-    waiting = _Waiting(tell, _place(stream))
+    waiting = _Waiting(tell, stream, clock)
     subject = stream.subject(_PATIENCE_S)
     while subject is None:
-        waiting.go_on(stream, "a subject")
+        waiting.go_on("a subject")
         subject = stream.subject(_PATIENCE_S)
     while True:
         frame = stream.next(_PATIENCE_S)
         if frame is None:
-            waiting.go_on(stream, "a frame")
+            waiting.go_on("a frame")
         elif _usable(frame, subject):
             return subject, frame
 
 
 def _usable(frame: StreamedFrame, subject: StreamSubject) -> bool:
     fits = frame.theta.shape == (subject.layout.size,) and bool(frame.theta.isfinite().all())
-    if not fits:
+    if not fits or frame.image_size != (subject.width, subject.height):
         return False
     try:
-        height, width = frame.decode().image_rgba.shape[:2]
+        frame.decode()
     except UserError:
         return False
-    return (width, height) == (subject.width, subject.height)
+    return True
 
 
 class _Waiting:
     """Says once what is waited for, if that takes long."""
 
-    def __init__(self, tell: Callable[[str], None], place: str) -> None:
-        self._tell, self._place = tell, place
-        self._since_s: float | None = time.monotonic()
+    def __init__(
+        self, tell: Callable[[str], None], stream: FrameStream, clock: Callable[[], float]
+    ) -> None:
+        self._tell, self._stream, self._clock = tell, stream, clock
+        self._since_s: float | None = clock()
 
-    def go_on(self, stream: FrameStream, what: str) -> None:
+    def go_on(self, what: str) -> None:
+        stream = self._stream
         if stream.ended:
             raise UserError(
                 f"The stream ended before {what} came.",
                 "Check the source: nothing in it could be used.",
             )
-        if self._since_s is not None and time.monotonic() - self._since_s > _SILENT_S:
+        if self._since_s is not None and self._clock() - self._since_s > _SILENT_S:
             self._since_s = None
+            place = f" at {stream.address}" if isinstance(stream, SocketStream) else ""
             troubles = ", ".join(f"{name}: {count}" for name, count in (+stream.counts).items())
             told = f" ({troubles})" if troubles else ""
-            self._tell(f"Waiting for frames{self._place}{told}; Ctrl-C ends.")
-
-
-def _place(stream: FrameStream) -> str:
-    return f" at {stream.address}" if isinstance(stream, PushedStream) else ""
+            self._tell(f"Waiting for frames{place}{told}; Ctrl-C ends.")
