@@ -1,6 +1,7 @@
 """Frames that were exposed while the head moved: followed, and noted as blurred."""
 
 from collections.abc import Sequence
+from contextlib import closing
 
 import cv2
 import numpy as np
@@ -13,7 +14,7 @@ from rgbavatar_ns.synthetic.make import DemoPerson
 from rgbavatar_ns.tracking.config import TrackConfig
 from rgbavatar_ns.tracking.face.clip import ClipLandmarks, SeenFaces, followed_face
 from rgbavatar_ns.tracking.face.detector import FaceLandmarker
-from rgbavatar_ns.tracking.find_faces import sharpness
+from rgbavatar_ns.tracking.face.find_faces import sharpness
 from rgbavatar_ns.tracking.fit.own_head import subject_tracker
 from rgbavatar_ns.tracking.fit.subject import SubjectTracker
 
@@ -26,7 +27,7 @@ def follow(pictures: Sequence[np.ndarray]) -> ClipLandmarks:
     """The face as `rgbavatar track` sees it, frame after frame."""
     height, width = pictures[0].shape[:2]
     points, found, sharp = [], [], []
-    with FaceLandmarker() as landmarker:
+    with closing(FaceLandmarker()) as landmarker:
         for picture in pictures:
             faces = landmarker.faces(picture)
             found.append(len(faces))

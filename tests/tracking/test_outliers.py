@@ -49,7 +49,7 @@ def test_a_pose_stays_right_when_landmarks_go_wrong(spoil: Spoil, seed: int) -> 
     start = np.zeros(len(tracker.cost.parameters.columns))
     target = Target(spoil(points, face_px, random), face_px, np.eye(2))
     values = fit_frame(tracker.cost, CAMERA, target, start, None, 0.0, 12)
-    found = tracker.cost.theta(values, np.zeros(layout.size))
+    found = tracker.cost.theta(values)
 
     turned = tracker.mesh_landmarks.head_rotation(found)
     turned = turned @ tracker.mesh_landmarks.head_rotation(theta).T

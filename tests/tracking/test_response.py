@@ -1,5 +1,7 @@
 """What FaceMesh's measured response is worth on a person whose truth is known."""
 
+from contextlib import closing
+
 import numpy as np
 import pytest
 import torch
@@ -27,7 +29,7 @@ def test_head_jaw_and_expressions_come_nearer_to_the_truth() -> None:
     names, layout = person.head.arrays.expression_names, person.head.layout
     theta = perform(layout, names, 4 * FRAMES, FRAMES, 8.0, SEED).theta[::4]
     found, kept = [], []
-    with FaceLandmarker() as landmarker:
+    with closing(FaceLandmarker()) as landmarker:
         for number, image in enumerate(person.draw(torch.from_numpy(theta).float())):
             alpha = image[..., 3:] / 255
             picture = (image[..., :3] * alpha + 120 * (1 - alpha)).round().astype(np.uint8)

@@ -13,7 +13,7 @@ from rgbavatar_ns.data.streams import Backoff, StreamedFrame
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.kernels import PinholeCameras
-from rgbavatar_ns.tracking.input.capture import FilePictures, NewestPictures
+from rgbavatar_ns.tracking.input.capture import FileCapture, LatestFrameCapture
 from rgbavatar_ns.tracking.video_stream import VideoStream
 
 from .clips import REAL_CLIPS, gradient_images, write_clip
@@ -106,7 +106,7 @@ def test_a_file_goes_on_in_its_middle_with_the_same_subject(clip: Path):
 
 def test_a_missing_file_is_refused(tmp_path: Path):
     with pytest.raises(UserError, match="no video"):
-        FilePictures(tmp_path / "absent.mp4")
+        FileCapture(tmp_path / "absent.mp4")
 
 
 class FakeCamera:
@@ -138,8 +138,8 @@ def test_a_lost_camera_is_opened_again_and_faceless_pictures_are_counted():
         FakeCamera([lit(80), lit(90, side=6), lit(100), *[lit(110)] * 1000]),
     ]
     opened = iter(cameras)
-    pictures = NewestPictures("0", lambda _: next(opened), Backoff(0.01, 0.02))
-    stream = VideoStream("0", tracker=CountingTracker(), pictures=pictures)
+    capture = LatestFrameCapture("0", lambda _: next(opened), Backoff(0.01, 0.02))
+    stream = VideoStream("0", tracker=CountingTracker(), capture=capture)
     frames = take(stream, 6)
     indices = [frame.index for frame in frames]
     assert indices == sorted(set(indices))
@@ -158,16 +158,16 @@ def test_a_lost_camera_is_opened_again_and_faceless_pictures_are_counted():
 
 def test_a_slow_tracker_gets_the_newest_picture():
     camera = FakeCamera([lit(10 + i) for i in range(200)])
-    pictures = NewestPictures("0", lambda _: camera)
+    capture = LatestFrameCapture("0", lambda _: camera)
     time.sleep(0.3)
-    first = pictures.next(1.0)
+    first = capture.next(1.0)
     time.sleep(0.3)
-    second = pictures.next(1.0)
-    pictures.close()
+    second = capture.next(1.0)
+    capture.close()
     assert first is not None
     assert second is not None
     assert second.index > first.index + 1
-    assert pictures.counts["skipped"] >= second.index - 2
+    assert capture.counts["skipped"] >= second.index - 2
     assert int(second.image_rgb[0, 0, 0]) == 10 + second.index
 
 

@@ -11,7 +11,6 @@ from collections.abc import Callable
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.server import Server, ServerConnection, serve
 
-from rgbavatar_ns.avatar.storage.head_reference import fingerprint
 from rgbavatar_ns.data.streams import message_format
 from rgbavatar_ns.data.streams.address import DEFAULT_ADDRESS, StreamAddress
 from rgbavatar_ns.data.streams.protocol import StreamedFrame, StreamSubject
@@ -232,7 +231,7 @@ def _check_same(subject: StreamSubject, first: StreamSubject) -> None:
             "Keep to one size.",
         )
     mine, other = first.arrays, subject.arrays
-    if mine is not other and fingerprint(mine) != fingerprint(other):
+    if mine is not other and mine.digest() != other.digest():
         raise UserError(
             f"The stream began with the head '{mine.name}', this client's is another.",
             "Keep to one head model.",

@@ -27,10 +27,9 @@ def write_tracking_sheet(
     dst: Path, tracker: SubjectTracker, fit: ClipFit, found: ClipLandmarks, crop: SquareCrop
 ) -> None:
     """`overlay.png` in the dataset `dst`, whose images are there."""
-    error = np.linalg.norm(
-        tracker.fitted_px(fit, with_offsets=False) - found.points_px[:, tracker.facemesh_index],
-        axis=-1,
-    ).mean(1)
+    found_px = found.points_px[:, tracker.facemesh_index]
+    fitted_px = tracker.fitted_px(fit, with_offsets=False)
+    error = np.linalg.norm(fitted_px - found_px, axis=-1).mean(1)
     tiles = []
     for position, why in sheet_frames(found.points_px, error).items():
         index = found.frame_index[position]
@@ -40,8 +39,8 @@ def write_tracking_sheet(
                 read_png_rgba(image_path(dst, index)),
                 crop.points(tracker.vertices_px(fit, position)),
                 tracker.head.arrays.faces,
-                crop.points(found.points_px[position][tracker.facemesh_index]),
-                crop.points(tracker.frame_px(fit, position)),
+                crop.points(found_px[position]),
+                crop.points(fitted_px[position]),
             )
         )
     write_contact_sheet(dst / "overlay.png", tiles)

@@ -132,36 +132,23 @@ def tracking_findings(report: Mapping[str, Any]) -> list[Finding]:
     height = report["face_height_px"]
     fitted, mesh = (report[f"{one}reprojection_error_share"] for one in ("", "mesh_"))
     mouth, lids = (report[f"{one}_opening_correlation"] for one in ("mouth", "eyelid"))
-    found = [
-        _beyond("landmarks", "the fit leaves the landmarks", fitted, _FITTED_ERROR),
-        _beyond("misfit", "the mesh lies off the face", mesh, _MESH_ERROR),
-        _beyond("landmarks", "the mouth is not followed", mouth, _CORRELATION),
-        _beyond("landmarks", "the eyelids are not followed", lids, _CORRELATION),
-        _beyond(
-            "mattes", "the matte misses part of the head", report["silhouette_coverage"], _COVERAGE
-        ),
-        _beyond(
-            "faces",
-            f"{read - tracked} of {read} frames are left out",
-            1 - tracked / read,
-            _REJECTED,
-        ),
-        _beyond("faces", f"{len(blurred)} frames are blurred", len(blurred) / tracked, _BLURRED),
-        _beyond("faces", f"the face is only {height:.0f} pixels high", height, _FACE_PX),
-        _beyond("faces", f"there are only {tracked} frames", tracked, _FRAMES),
-    ]
+    found = []
+    for kind, cause, value, (mild, grave) in (
+        ("landmarks", "the fit leaves the landmarks", fitted, _FITTED_ERROR),
+        ("misfit", "the mesh lies off the face", mesh, _MESH_ERROR),
+        ("landmarks", "the mouth is not followed", mouth, _CORRELATION),
+        ("landmarks", "the eyelids are not followed", lids, _CORRELATION),
+        ("mattes", "the matte misses part of the head", report["silhouette_coverage"], _COVERAGE),
+        ("faces", f"{read - tracked} of {read} frames are left out", 1 - tracked / read, _REJECTED),
+        ("faces", f"{len(blurred)} frames are blurred", len(blurred) / tracked, _BLURRED),
+        ("faces", f"the face is only {height:.0f} pixels high", height, _FACE_PX),
+        ("faces", f"there are only {tracked} frames", tracked, _FRAMES),
+    ):
+        sign = 1 if grave > mild else -1
+        if value is not None and sign * (value - mild) > 0:
+            severity: Severity = "error" if sign * (value - grave) > 0 else "warning"
+            found.append(Finding(kind, severity, cause))
     others = len(report["other_faces"])
     if others:
         found.append(Finding("faces", "error", f"another face is seen in {others} frames"))
-    return [one for one in found if one is not None]
-
-
-def _beyond(
-    kind: str, cause: str, value: float | None, limits: tuple[float, float]
-) -> Finding | None:
-    """A warning beyond the first limit, an error beyond the second; on which side, they tell."""
-    sign = 1 if limits[1] > limits[0] else -1
-    if value is None or sign * (value - limits[0]) <= 0:
-        return None
-    severity: Severity = "error" if sign * (value - limits[1]) > 0 else "warning"
-    return Finding(kind, severity, cause)
+    return found
