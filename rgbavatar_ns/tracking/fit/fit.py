@@ -11,6 +11,9 @@ from rgbavatar_ns.tracking.fit.camera import StillCamera
 from rgbavatar_ns.tracking.fit.landmark_cost import FrameCost, FrameTerms, Target
 from rgbavatar_ns.tracking.fit.levenberg_marquardt import QuadraticModel, levenberg_marquardt
 
+_Values = Float[np.ndarray, "P"]
+_Packed = Float[np.ndarray, "Q"]
+
 # Focal lengths tried, as multiples of the frame's longer side (38 to 17 degrees of view), and
 # the width of the prior around a usual camera: a face's landmarks say little about it.
 FOCAL_SCAN = (0.9, 1.2, 1.6, 2.2, 3.0)
@@ -87,7 +90,7 @@ def initial_camera(
     return StillCamera(focal_px, center_px, focal_px * _HEAD_HEIGHT_M / face)
 
 
-def rigid_start(cost: FrameCost, camera: StillCamera, target: Target) -> Float[np.ndarray, "P"]:
+def rigid_start(cost: FrameCost, camera: StillCamera, target: Target) -> _Values:
     """Frontal pose whose landmarks' centre lies on the observed one."""
     base = np.zeros(cost.head.layout.size)
     points = cost.head.points(base, np.zeros(cost.head.num_identity), camera.eye_m)
@@ -103,11 +106,11 @@ def fit_frame(
     cost: FrameCost,
     camera: StillCamera,
     target: Target,
-    start: Float[np.ndarray, "P"],
-    neighbours: Float[np.ndarray, "P"] | None,
+    start: _Values,
+    neighbours: _Values | None,
     temporal_weight: float,
     iterations: int,
-) -> Float[np.ndarray, "P"]:
+) -> _Values:
     """One frame's bounded fit from `start`, drawn towards `neighbours` if given.
 
     The last third of at most `iterations` steps, and no fewer than `_ROBUST_STEPS`, let go of
@@ -210,13 +213,13 @@ def _fit_keys(
     upper = np.concatenate([np.tile(cost.parameters.upper, frames), np.full(shared, 3.0)])
     common = slice(frames * size, frames * size + shared)
 
-    def unpacked(packed: Float[np.ndarray, "Q"]) -> tuple[np.ndarray, np.ndarray]:
+    def unpacked(packed: _Packed) -> tuple[np.ndarray, np.ndarray]:
         """Each frame's values, and the person."""
         person = np.zeros(cost.head.num_identity)
         person[:shared] = packed[common]
         return packed[: common.start].reshape(frames, size), person
 
-    def model_at(packed: Float[np.ndarray, "Q"]) -> QuadraticModel:
+    def model_at(packed: _Packed) -> QuadraticModel:
         values, person = unpacked(packed)
         pull = precision * packed[common]
         total = 0.5 * float(pull @ packed[common])
@@ -235,7 +238,7 @@ def _fit_keys(
             hessian[common, common] += model.hessian[size:, size:]
         return QuadraticModel(total, gradient, hessian)
 
-    def cost_at(packed: Float[np.ndarray, "Q"]) -> float:
+    def cost_at(packed: _Packed) -> float:
         values, person = unpacked(packed)
         total = 0.5 * precision * float(packed[common] @ packed[common])
         return total + sum(joint.value(own, person, frame) for own, frame in zip(values, terms))

@@ -13,15 +13,18 @@ from rgbavatar_ns.tracking.fit.landmark_head import LandmarkHead
 from rgbavatar_ns.tracking.fit.levenberg_marquardt import QuadraticModel
 from rgbavatar_ns.tracking.fit.parameters import FitParameters
 
+_Values = Float[np.ndarray, "P"]
+_Theta = Float[np.ndarray, "H"]
+_Identity = Float[np.ndarray, "I"]
+_Distances = Float[np.ndarray, "R"]
+
 # Huber's loss finds the head from afar; then points beyond `_REDESCENDING_SIGMAS` (a hand, a slip)
 # count ever less: Geman and McClure's loss. Sigmas are of a landmark's own error.
 _HUBER_SIGMAS = 2.5
 _REDESCENDING_SIGMAS = 3.0
 
 
-RobustLoss = Callable[
-    [Float[np.ndarray, "R"]], tuple[Float[np.ndarray, "R"], Float[np.ndarray, "R"]]
-]
+RobustLoss = Callable[[_Distances], tuple[_Distances, _Distances]]
 
 
 @dataclass(frozen=True)
@@ -45,7 +48,7 @@ class FrameTerms:
     target: Target
     camera: StillCamera
     redescending: bool = False
-    neighbours: Float[np.ndarray, "P"] | None = None
+    neighbours: _Values | None = None
     temporal_weight: float = 0.0
 
 
@@ -77,21 +80,17 @@ class FrameCost:
         scaled = self.noise.modes / self.noise.own_share[:, None, None]
         self._modes = scaled.reshape(-1, scaled.shape[2])
 
-    def theta(self, values: Float[np.ndarray, "P"]) -> Float[np.ndarray, "H"]:
+    def theta(self, values: _Values) -> _Theta:
         """theta with these fitted entries, and 0 elsewhere."""
         theta = np.zeros(self.head.layout.size)
         theta[self.parameters.columns] = values
         return theta
 
-    def value(
-        self, values: Float[np.ndarray, "P"], identity: Float[np.ndarray, "I"], frame: FrameTerms
-    ) -> float:
+    def value(self, values: _Values, identity: _Identity, frame: FrameTerms) -> float:
         """The cost of `model` alone, in a fraction of its time."""
         return self.data_cost(self.theta(values), identity, frame) + self._prior(values, frame)
 
-    def model(
-        self, values: Float[np.ndarray, "P"], identity: Float[np.ndarray, "I"], frame: FrameTerms
-    ) -> QuadraticModel:
+    def model(self, values: _Values, identity: _Identity, frame: FrameTerms) -> QuadraticModel:
         """The cost around a frame's values; derivatives to identity's first columns come last."""
         data = self.data_model(self.theta(values), identity, frame)
         own = slice(len(values))
@@ -103,23 +102,19 @@ class FrameCost:
             data.hessian[own, own] += np.diag(closeness)
         return replace(data, cost=data.cost + self._prior(values, frame))
 
-    def _prior(self, values: Float[np.ndarray, "P"], frame: FrameTerms) -> float:
+    def _prior(self, values: _Values, frame: FrameTerms) -> float:
         cost = 0.5 * float(values @ self._prior_precision @ values)
         if frame.neighbours is not None and frame.temporal_weight > 0:
             closeness = frame.temporal_weight * self.parameters.temporal_width**-2.0
             cost += 0.5 * float(closeness @ (values - frame.neighbours) ** 2)
         return cost
 
-    def data_cost(
-        self, theta: Float[np.ndarray, "H"], identity: Float[np.ndarray, "I"], frame: FrameTerms
-    ) -> float:
+    def data_cost(self, theta: _Theta, identity: _Identity, frame: FrameTerms) -> float:
         """What the landmarks cost."""
         points = self.head.points(theta, identity, frame.camera.eye_m)
         return self._explained(points, frame).cost
 
-    def data_model(
-        self, theta: Float[np.ndarray, "H"], identity: Float[np.ndarray, "I"], frame: FrameTerms
-    ) -> QuadraticModel:
+    def data_model(self, theta: _Theta, identity: _Identity, frame: FrameTerms) -> QuadraticModel:
         """What the landmarks cost around theta."""
         camera, target = frame.camera, frame.target
         derivatives = self.head.jacobian(theta, identity, self._unknowns, camera.eye_m)
@@ -157,18 +152,14 @@ class FrameCost:
         return _Explained(cost, (left * soften[:, None]).reshape(-1), weight, factor)
 
 
-def _huber(
-    distance: Float[np.ndarray, "R"],
-) -> tuple[Float[np.ndarray, "R"], Float[np.ndarray, "R"]]:
+def _huber(distance: _Distances) -> tuple[_Distances, _Distances]:
     """Loss and weight (its derivative by distance^2 / 2): far-off points pull evenly."""
     far = distance > _HUBER_SIGMAS
     loss = np.where(far, _HUBER_SIGMAS * (distance - 0.5 * _HUBER_SIGMAS), 0.5 * distance**2)
     return loss, np.where(far, _HUBER_SIGMAS / np.maximum(distance, 1e-12), 1.0)
 
 
-def _geman_mcclure(
-    distance: Float[np.ndarray, "R"],
-) -> tuple[Float[np.ndarray, "R"], Float[np.ndarray, "R"]]:
+def _geman_mcclure(distance: _Distances) -> tuple[_Distances, _Distances]:
     """Loss and weight: far-off points cost a constant and hardly pull."""
     share = 1 / (1 + (distance / _REDESCENDING_SIGMAS) ** 2)
     return 0.5 * distance**2 * share, share**2
