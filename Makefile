@@ -8,7 +8,9 @@ BIN := .venv/bin
 export OMP_WAIT_POLICY ?= PASSIVE
 STARTED := $(shell date +%s)
 
-.PHONY: help setup demo test test-fast lint format clean
+PYTEST := PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
+
+.PHONY: help setup demo test test-fast test-nightly lint format clean
 
 help:  ## Show this list
 	@grep -hE '^[a-z-]+:.*##' Makefile | sed -E 's/:.*## /\t/' | expand -t 14
@@ -20,12 +22,15 @@ demo: setup  ## Make a head, train its avatar, evaluate, film it (VIDEO=me.mp4 f
 	@PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/rgbavatar demo --started-at $(STARTED) \
 		$(if $(VIDEO),--video "$(VIDEO)")
 
-test: setup lint  ## Linters, type check and the whole test suite
-	@PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
+test: setup lint  ## Linters, type check and the tests, but those of the night
+	@$(PYTEST) -m "not nightly"
 
 test-fast: setup  ## The tests that take seconds
-	@PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal \
-		-m "not slow and not browser"
+	@$(PYTEST) -m "not (slow or nightly)"
+
+test-nightly: setup  ## The tests of the night: sanitizers, a Ray cluster, many trainings, formats
+	@$(BIN)/python -m uv pip install -q --python $(BIN)/python -c requirements/constraints.txt ray
+	@$(PYTEST) -m nightly
 
 lint: setup  ## Format check, lint, import rules, types
 	@$(BIN)/ruff format --check .

@@ -27,8 +27,8 @@ from rgbavatar_ns import Avatar
 from rgbavatar_ns.avatar import AvatarConfig
 from rgbavatar_ns.avatar.metrics import psnr
 from rgbavatar_ns.avatar.training.loop import TrainingBatch, TrainingOptions, fit
-from rgbavatar_ns.avatar.training.losses import composite, rgba_to_float
 from rgbavatar_ns.data import LocalGlobalPools, OfflineOrder, TrackedDataset
+from rgbavatar_ns.drawing.compositing import composite, rgba_to_float
 from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.synthetic import DemoConfig, make_demo_dataset
 

@@ -44,8 +44,8 @@ from rgbavatar_ns.avatar.training.loop import (
     make_optimizer,
     training_step,
 )
-from rgbavatar_ns.avatar.training.losses import composite, rgba_to_float
 from rgbavatar_ns.data import LocalGlobalPools, OfflineOrder, TrackedDataset, load_dataset
+from rgbavatar_ns.drawing.compositing import composite, rgba_to_float
 from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.synthetic import DemoConfig, make_demo_dataset
 

@@ -1,8 +1,10 @@
 """Shared by all tests: few threads, so that the suite's time is steady on small machines."""
 
 import os
+import re
 import signal
 
+import pytest
 import torch
 
 os.environ.setdefault("MPLBACKEND", "Agg")
@@ -10,3 +12,33 @@ torch.set_num_threads(min(2, os.cpu_count() or 1))
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
     # A shell that starts the suite in its background has it, and what it starts, ignore interrupts.
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+# What no package brings: a GPU or its absence, and films that are not in the repository.
+_NOT_OF_PACKAGES = re.compile(r"there is a GPU|no clips? |the clip ")
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption(
+        "--fail-on-missing",
+        action="store_true",
+        help="a test that is skipped for want of a package or a program fails",
+    )
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item: pytest.Item):
+    report = yield
+    return report if item.get_closest_marker("cuda") else _failed_if_missing(report, item.config)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_make_collect_report(collector: pytest.Collector):
+    return _failed_if_missing((yield), collector.config)
+
+
+def _failed_if_missing(report, config: pytest.Config):
+    if config.option.fail_on_missing and report.skipped and not hasattr(report, "wasxfail"):
+        reason = report.longrepr[-1] if isinstance(report.longrepr, tuple) else str(report.longrepr)
+        if not _NOT_OF_PACKAGES.search(reason):
+            report.outcome, report.longrepr = "failed", f"--fail-on-missing: {reason}"
+    return report

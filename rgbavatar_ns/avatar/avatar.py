@@ -5,19 +5,17 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from rgbavatar_ns.avatar.config import AvatarConfig
 from rgbavatar_ns.avatar.model.anchors import GaussianAnchors
-from rgbavatar_ns.avatar.model.blendshapes import GaussianBlendshapes, feature_from_color
+from rgbavatar_ns.avatar.model.blendshapes import GaussianBlendshapes
 from rgbavatar_ns.avatar.model.tangent_to_world import tangent_to_world
 from rgbavatar_ns.avatar.model.weight_network import WeightNetwork
 from rgbavatar_ns.avatar.storage.bundle import load_any, save_bundle
 from rgbavatar_ns.avatar.storage.head_reference import reference_to
 from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
-from rgbavatar_ns.avatar.training.color_init import color_estimate, premultiplied
-from rgbavatar_ns.avatar.training.losses import require_images_of
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadArrays, HeadModel, ThetaLayout, UVAnchors, uv_anchors
 from rgbavatar_ns.kernels import (
@@ -28,7 +26,6 @@ from rgbavatar_ns.kernels import (
     RenderedBatch,
     morphed_renderer,
     rasterize,
-    weighted_color_average,
 )
 from rgbavatar_ns.kernels.checks import holds_nonfinite
 
@@ -158,21 +155,25 @@ class Avatar(nn.Module):
         backend: str = "auto",
         with_depth: bool = False,
         with_visibility: bool = False,
+        differentiable: bool = False,
     ) -> RenderedBatch:
         """Draw a batch of theta; `psi` replaces the weight network's answer.
 
-        The options are those of `rgbavatar_ns.kernels.rasterize`. Without gradients
-        (`torch.no_grad`) a backend may draw the blended Gaussians directly, several times faster,
-        to the same numbers.
+        The other options are those of `rgbavatar_ns.kernels.rasterize`. The picture carries no
+        graph, unless it is to be `differentiable` in the parameters, theta and psi: then it goes
+        through autograd, to the same numbers in several times as long.
         """
         options = {"with_depth": with_depth, "with_visibility": with_visibility}
-        if not torch.is_grad_enabled():
+        if differentiable:
+            gaussians = self.gaussians(theta, psi)
+            return rasterize(gaussians, cameras, background, backend=backend, **options)
+        with torch.no_grad():
             renderer = self.renderer(theta, cameras, psi, backend=backend)
-            if renderer is not None:
-                color = theta.new_zeros(3) if background is None else background
-                return renderer.draw(color.expand(len(theta), 3).to(self.identity), **options)
-        gaussians = self.gaussians(theta, psi)
-        return rasterize(gaussians, cameras, background, backend=backend, **options)
+            if renderer is None:
+                gaussians = self.gaussians(theta, psi)
+                return rasterize(gaussians, cameras, background, backend=backend, **options)
+            color = theta.new_zeros(3) if background is None else background
+            return renderer.draw(color.expand(len(theta), 3).to(self.identity), **options)
 
     def renderer(
         self,
@@ -226,36 +227,6 @@ class Avatar(nn.Module):
                 f"'{self.head.arrays.name}' takes {describe_layout(self.layout)}.",
                 "Use data of the same head model, or train an avatar on this data.",
             )
-
-    @torch.no_grad()
-    def initialize_colors(
-        self,
-        theta: Float[Tensor, "B H"],
-        cameras: PinholeCameras,
-        images_rgba: UInt8[Tensor, "B H_px W_px 4"] | Float[Tensor, "B H_px W_px 4"],
-        *,
-        backend: str = "auto",
-    ) -> int:
-        """Give Gaussians seen well for the first time the mean colour under them; return how many.
-
-        Paper, sec. 3.2; see `color_init` for the weights. The images' colour is straight (not
-        multiplied by alpha). Only base colours change, and each Gaussian's only once: bases and
-        optimiser state stay, and `color_initialized` remembers.
-        """
-        require_images_of(images_rgba, len(theta), cameras)
-        images = premultiplied(images_rgba, self.blendshapes.position.dtype)
-        renderer = self.renderer(theta, cameras, backend=backend)
-        if renderer is not None:
-            sums = renderer.weighted_color_average(images)
-        else:
-            gaussians = self.gaussians(theta)
-            sums = weighted_color_average(gaussians, cameras, images, backend=backend)
-        estimate = color_estimate(sums)
-        fresh = estimate.reliable & ~self.color_initialized
-        feature = self.blendshapes.color_feature
-        feature[fresh] = feature_from_color(estimate.color[fresh]).to(feature.dtype)
-        self.color_initialized |= fresh
-        return int(fresh.sum())
 
     def save(
         self,

@@ -14,12 +14,7 @@ from rgbavatar_ns.avatar.training.loop import (
     make_optimizer,
     training_step,
 )
-from rgbavatar_ns.avatar.training.losses import (
-    composite,
-    l1_loss,
-    random_backgrounds,
-    rgba_to_float,
-)
+from rgbavatar_ns.avatar.training.losses import l1_loss, random_backgrounds
 from rgbavatar_ns.avatar.training.recorded_step import (
     DeviceFrames,
     RecordedStep,
@@ -28,6 +23,7 @@ from rgbavatar_ns.avatar.training.recorded_step import (
 )
 from rgbavatar_ns.bench.options import Scheme
 from rgbavatar_ns.bench.projection import one_camera
+from rgbavatar_ns.drawing.compositing import composite, rgba_to_float
 
 WHOLE_STEP = "whole step"
 EAGER_STEP = "whole step, eager"

@@ -10,12 +10,7 @@ from torch import Tensor
 from rgbavatar_ns.avatar.model.tangent_to_world import tangent_to_world
 from rgbavatar_ns.avatar.training.fused_step import FusedStep
 from rgbavatar_ns.avatar.training.loop import TrainingOptions, make_optimizer
-from rgbavatar_ns.avatar.training.losses import (
-    composite,
-    l1_loss,
-    random_backgrounds,
-    rgba_to_float,
-)
+from rgbavatar_ns.avatar.training.losses import l1_loss, random_backgrounds
 from rgbavatar_ns.bench.drawing import leaf_gaussians
 from rgbavatar_ns.bench.machine import chosen_device, machine_facts, require_backend
 from rgbavatar_ns.bench.options import Scheme, StepOptions
@@ -49,6 +44,7 @@ from rgbavatar_ns.bench.timing import (
 from rgbavatar_ns.bench.trainer import bench_trainer
 from rgbavatar_ns.bench.utilisation import Utilisation, gpu_utilisation
 from rgbavatar_ns.bench.workloads import AvatarWorkload, avatar_workload
+from rgbavatar_ns.drawing.compositing import composite, rgba_to_float
 from rgbavatar_ns.kernels import rasterize
 
 COLOR_INITIALISATION = "(colour initialisation, when due)"

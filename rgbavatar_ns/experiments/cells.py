@@ -1,6 +1,5 @@
 """The cells of an experiment: one training each, known by the hash of what decides its result."""
 
-import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -9,6 +8,7 @@ from typing import Any
 
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.experiments.spec import Experiment, Overrides
+from rgbavatar_ns.files import digest
 from rgbavatar_ns.synthetic import DemoConfig
 
 _DEMO = "demo"
@@ -33,7 +33,7 @@ class Cell:
         decides.append(sorted(self.overrides.items()))
         if self.cross_identity is not None:
             decides.append(sorted(self.cross_identity.items()))
-        return hashlib.sha256(json.dumps(decides).encode()).hexdigest()[:12]
+        return digest([json.dumps(decides)])[:12]
 
     def to_json(self) -> dict[str, Any]:
         """Plain values, with the key."""

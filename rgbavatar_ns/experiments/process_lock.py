@@ -4,7 +4,7 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -17,9 +17,14 @@ _SECONDS_TO_SAVE = 60.0
 
 
 @contextmanager
-def alone_in(folder: Path) -> Iterator[None]:
-    """Hold the folder's lock; waits while another process does. It goes with the process."""
-    with hold_lock(folder / _LOCK_FILE, lambda: print(_WAITING, flush=True)):
+def alone_in(
+    folder: Path, tell: Callable[[str], None] = lambda line: print(line, flush=True)
+) -> Iterator[None]:
+    """Hold the folder's lock; waits, and tells so, while another process does.
+
+    The lock goes with the process.
+    """
+    with hold_lock(folder / _LOCK_FILE, lambda: tell(_WAITING)):
         yield
 
 

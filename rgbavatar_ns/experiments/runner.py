@@ -24,7 +24,7 @@ from rgbavatar_ns.experiments.reenactment import (
     reenactment_scores,
 )
 from rgbavatar_ns.experiments.streamed import write_streamed
-from rgbavatar_ns.files import write_json
+from rgbavatar_ns.files import read_json, write_json
 
 CELL_FILE, RESULT_FILE, LOG_FILE = "cell.json", "result.json", "log.txt"
 _EVALUATION = "eval.json"
@@ -39,10 +39,7 @@ def write_cell(folder: Path, cell: Cell, data: Path, driver: Path | None = None)
 
 def read_result(folder: Path) -> dict[str, Any] | None:
     """The metrics of a finished cell; None where it is not done."""
-    try:
-        return json.loads((folder / RESULT_FILE).read_text())
-    except (OSError, ValueError):
-        return None
+    return read_json(folder / RESULT_FILE)
 
 
 def run_cell(folder: Path) -> dict[str, Any]:

@@ -1,15 +1,14 @@
 """What an online run has kept of its stream: the loss of each streamed frame after the end."""
 
-import json
 from pathlib import Path
 
 import torch
 
 from rgbavatar_ns.avatar import Avatar
-from rgbavatar_ns.avatar.training.losses import composite, rgba_to_float
 from rgbavatar_ns.data import TrackedDataset
+from rgbavatar_ns.drawing.compositing import composite, rgba_to_float
 from rgbavatar_ns.export import draw
-from rgbavatar_ns.files import write_json
+from rgbavatar_ns.files import read_json, write_json
 
 _FILE = "streamed.json"
 _BATCH = 8
@@ -43,8 +42,5 @@ def write_streamed(avatar: Avatar, dataset: TrackedDataset, folder: Path) -> flo
 
 def read_streamed(folder: Path) -> tuple[list[int], list[float]] | None:
     """Frame numbers and their losses that `write_streamed` left; None where it did not."""
-    try:
-        curve = json.loads((folder / _FILE).read_text())
-        return curve["frame_index"], curve["l1"]
-    except (OSError, ValueError, KeyError):
-        return None
+    curve = read_json(folder / _FILE)
+    return None if curve is None else (curve["frame_index"], curve["l1"])

@@ -1,7 +1,6 @@
 """Run what is missing of an experiment; what is there already is kept."""
 
 import json
-import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,7 +14,7 @@ from rgbavatar_ns.experiments.overrides import check_overrides
 from rgbavatar_ns.experiments.reenactment import load_tracker
 from rgbavatar_ns.experiments.runner import LOG_FILE, read_result, write_cell
 from rgbavatar_ns.experiments.spec import Experiment, nearest
-from rgbavatar_ns.files import write_json
+from rgbavatar_ns.files import DiskError, atomic_folder, disk_errors, write_json
 from rgbavatar_ns.synthetic import make_demo_dataset
 
 State = Literal["waiting", "running", "done", "failed"]
@@ -72,13 +71,13 @@ def sweep(
     and where `folder` cannot be written, such as on a full disk.
     """
     check_experiment(experiment)
+    remedy = "Make room or mend the permissions, then call it again: finished cells are kept."
     try:
-        return _sweep(experiment, cells_of(experiment), folder, engine, progress)
-    except OSError as error:
-        raise UserError(
-            f"The sweep of {experiment.name} cannot go on in {folder}: {error}.",
-            "Make room or mend the permissions, then call it again: finished cells are kept.",
-        ) from error
+        with disk_errors(folder, remedy):
+            return _sweep(experiment, cells_of(experiment), folder, engine, progress)
+    except DiskError as error:
+        cause = f"The sweep of {experiment.name} cannot go on: {error.cause}"
+        raise DiskError(cause, remedy) from error
 
 
 def _sweep(
@@ -164,9 +163,8 @@ def _dataset(subject: str, folder: Path) -> Path:
     if config is None:
         return Path(subject)
     name = f"demo-{config.seed}-{config.num_frames}-{config.image_size}"
-    path, partial = folder / "data" / name, folder / "data" / f".{name}"
+    path = folder / "data" / name
     if not path.exists():
-        shutil.rmtree(partial, ignore_errors=True)
-        make_demo_dataset(partial, config)
-        partial.rename(path)
+        with atomic_folder(path) as partial:
+            make_demo_dataset(partial, config)
     return path

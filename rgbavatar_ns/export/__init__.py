@@ -6,8 +6,7 @@ from rgbavatar_ns.export.drawing import Color, Picture, draw, pictures
 from rgbavatar_ns.export.driving import DrivingOptions, MappedTheta, ThetaNames, drive
 from rgbavatar_ns.export.one_euro import OneEuroOptions, one_euro
 from rgbavatar_ns.export.ply import write_ply
-from rgbavatar_ns.export.run_data import dataset_folder
-from rgbavatar_ns.export.statistics import statistics_of
+from rgbavatar_ns.export.run_data import dataset_folder, statistics_of
 from rgbavatar_ns.export.video import write_gif, write_png, write_pngs, write_video
 from rgbavatar_ns.export.views import (
     four_views,

@@ -1,15 +1,12 @@
 """The learned bases, each alone, as the paper's figure of blendshapes shows them."""
 
-import math
-
-import cv2
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from rgbavatar_ns.avatar.avatar import Avatar
 from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
+from rgbavatar_ns.drawing.contact_sheet import contact_sheet, labelled
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.export.drawing import Color, Picture, pictures
 from rgbavatar_ns.kernels import PinholeCameras
@@ -45,23 +42,5 @@ def basis_grid(
     theta = statistics.theta_neutral.expand(len(psi), -1)
     tiles = list(pictures(avatar, theta, camera, background, psi))
     labels = ["base", *(f"psi {k}: {psi[k + 1, k]:+.2f}" for k in range(len(psi) - 1))]
-    return tile([_labelled(picture, text) for picture, text in zip(tiles, labels)], columns)
-
-
-def tile(tiles: list[np.ndarray], columns: int) -> Picture:
-    """Pictures of one size in rows; the last row is filled up with blank ones."""
-    columns = min(columns, len(tiles))
-    blank = np.full_like(tiles[0], 255 if tiles[0].shape[-1] == 3 else 0)
-    filled = tiles + [blank] * (math.ceil(len(tiles) / columns) * columns - len(tiles))
-    rows = [filled[start : start + columns] for start in range(0, len(filled), columns)]
-    return np.concatenate([np.concatenate(row, axis=1) for row in rows], axis=0)
-
-
-def _labelled(picture: Picture, text: str) -> Picture:
-    """The picture with a small text in its upper left corner."""
-    written = np.ascontiguousarray(picture)
-    size = picture.shape[0] / 500
-    color = (90, 90, 90, 255)[: picture.shape[-1]]
-    place = (round(8 * size), round(20 * size) + 4)
-    cv2.putText(written, text, place, cv2.FONT_HERSHEY_SIMPLEX, size, color, 1, cv2.LINE_AA)
-    return written
+    written = [labelled(picture, text) for picture, text in zip(tiles, labels)]
+    return contact_sheet(written, columns, blank=0 if background is None else 255)

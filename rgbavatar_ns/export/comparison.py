@@ -8,11 +8,10 @@ import torch
 
 from rgbavatar_ns.avatar.avatar import Avatar
 from rgbavatar_ns.data.native.dataset import TrackedDataset
+from rgbavatar_ns.drawing.compositing import composite, error_strip, rgba_to_float, to_uint8
 from rgbavatar_ns.errors import UserError
-from rgbavatar_ns.export.drawing import draw, to_uint8
+from rgbavatar_ns.export.drawing import draw
 from rgbavatar_ns.export.video import write_png, write_video
-
-ERROR_GAIN = 4.0
 
 
 def comparison_frames(
@@ -20,20 +19,19 @@ def comparison_frames(
     dataset: TrackedDataset,
     positions: Sequence[int],
     background: tuple[float, float, float] = (1.0, 1.0, 1.0),
-) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Yield (truth, avatar, error) for each position, uint8 [H, W, 3] on one background.
+) -> Iterator[np.ndarray]:
+    """Yield truth, avatar and error for each position, uint8 [3, H, W, 3] on one background.
 
     The error picture is the absolute difference times 4, so that 1/4 is white.
     """
     device = avatar.identity.device
     ground = torch.tensor(background, device=device)
     for position in positions:
-        rgba = torch.from_numpy(dataset.read_image(position)).to(device).float() / 255
-        truth = rgba[..., :3] * rgba[..., 3:] + ground * (1 - rgba[..., 3:])
+        rgba = torch.from_numpy(dataset.read_image(position)).to(device)
+        truth = composite(rgba_to_float(rgba), ground)
         theta = dataset.theta[position : position + 1]
         image = draw(avatar, theta, dataset.cameras.select([position]), background).image[0]
-        error = (image - truth).abs() * ERROR_GAIN
-        yield to_uint8(truth), to_uint8(image), to_uint8(error)
+        yield to_uint8(error_strip(truth, image))
 
 
 def write_comparison(
@@ -65,8 +63,8 @@ def write_comparison(
         compared = comparison_frames(avatar, dataset, chosen, background)
         for done, (position, row) in enumerate(zip(chosen, compared), start=1):
             if position in shown:
-                kept.append(np.concatenate(row, axis=0))
-            yield np.concatenate(row, axis=1)
+                kept.append(np.vstack([*row]))
+            yield np.hstack([*row])
             if progress is not None:
                 progress(done, len(chosen))
 

@@ -8,6 +8,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from rgbavatar_ns.avatar.avatar import Avatar
+from rgbavatar_ns.drawing.compositing import straight_alpha, to_uint8
 from rgbavatar_ns.kernels import PinholeCameras, RenderedBatch
 
 Picture = UInt8[np.ndarray, "height width channels"]
@@ -50,17 +51,4 @@ def pictures(
         weights = None if psi is None else psi[places]
         rendered = draw(avatar, theta[places], seen_by, background, weights)
         for image, alpha in zip(rendered.image, rendered.alpha):
-            yield to_uint8(image if background is not None else with_straight_alpha(image, alpha))
-
-
-def with_straight_alpha(
-    image: Float[Tensor, "H W 3"], alpha: Float[Tensor, "H W 1"]
-) -> Float[Tensor, "H W 4"]:
-    """RGBA of a picture over black: colour divided by alpha, black where nothing is seen."""
-    color = torch.where(alpha > 0, image / alpha.clamp(min=1e-6), 0.0)
-    return torch.cat([color, alpha], -1)
-
-
-def to_uint8(image: Float[Tensor, "H W C"]) -> UInt8[np.ndarray, "height width channels"]:
-    """Values in [0, 1] as bytes, rounded; what lies outside is cut."""
-    return (image.clamp(0, 1) * 255 + 0.5).to(torch.uint8).cpu().numpy()
+            yield to_uint8(image if background is not None else straight_alpha(image, alpha))

@@ -1,10 +1,14 @@
-"""Which dataset a run of ns-train was trained on, without nerfstudio."""
+"""Which dataset a run of ns-train was trained on, without nerfstudio, and what was seen in it."""
 
 from pathlib import Path
 from typing import Any
 
+import torch
 import yaml
 
+from rgbavatar_ns.avatar.avatar import Avatar
+from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
+from rgbavatar_ns.data.native.dataset import TrackedDataset
 from rgbavatar_ns.errors import UserError
 
 _CONFIG = "config.yml"
@@ -49,3 +53,15 @@ def dataset_folder(path: Path) -> Path:
             f"{config} does not say which dataset was trained on: {error!r}.",
             "Name the dataset's folder instead.",
         ) from None
+
+
+@torch.no_grad()
+def statistics_of(avatar: Avatar, dataset: TrackedDataset) -> TrainingStatistics:
+    """Statistics over the dataset's training frames, with the avatar's own weights psi.
+
+    Raises UserError where the dataset's theta does not fit the avatar.
+    """
+    avatar.require_layout(dataset.layout, f"The dataset {dataset.root}")
+    theta = dataset.theta[list(dataset.train)]
+    psi = avatar.weights(theta.to(avatar.identity.device)).cpu()
+    return TrainingStatistics.of(theta, psi, avatar.layout)

@@ -4,7 +4,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -13,8 +12,10 @@ from torch import Tensor
 from rgbavatar_ns.avatar.avatar import Avatar
 from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
 from rgbavatar_ns.data.native.dataset import TrackedDataset
+from rgbavatar_ns.drawing.compositing import composite, rgba_to_float, to_uint8
+from rgbavatar_ns.drawing.contact_sheet import scaled
 from rgbavatar_ns.errors import UserError
-from rgbavatar_ns.export.drawing import Color, Picture, pictures, to_uint8
+from rgbavatar_ns.export.drawing import Color, Picture, pictures
 from rgbavatar_ns.export.driving import DrivingOptions, MappedTheta, ThetaNames, drive
 from rgbavatar_ns.export.views import four_views, head_centre, orbit, read_camera_path, swing
 from rgbavatar_ns.kernels import PinholeCameras
@@ -135,10 +136,6 @@ def beside_driver(
     ground = torch.tensor(background)
     drawn = pictures(avatar, scene.theta, scene.cameras, background)
     for position, picture in zip(chosen, drawn):
-        rgba = torch.from_numpy(driver.read_image(position)).float() / 255
-        seen = to_uint8(rgba[..., :3] * rgba[..., 3:] + ground * (1 - rgba[..., 3:]))
-        height = picture.shape[0]
-        width = round(seen.shape[1] * height / seen.shape[0])
-        shrinking = cv2.INTER_AREA if height < seen.shape[0] else cv2.INTER_CUBIC
-        seen = np.asarray(cv2.resize(seen, (width, height), interpolation=shrinking))
-        yield np.concatenate([seen, picture], axis=1)
+        rgba = rgba_to_float(torch.from_numpy(driver.read_image(position)))
+        seen = to_uint8(composite(rgba, ground))
+        yield np.concatenate([scaled(seen, len(picture) / len(seen)), picture], axis=1)

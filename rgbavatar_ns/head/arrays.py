@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from rgbavatar_ns.errors import UserError
-from rgbavatar_ns.files import digest
+from rgbavatar_ns.files import atomic_write, digest
 
 EMBEDDED_HEAD = Path(__file__).parent / "assets" / "makehuman_head.npz"
 _GROUP = "group_"
@@ -104,7 +104,7 @@ class HeadArrays:
         arrays = {}
         for name, value in self._items():
             arrays[name] = np.array(value)
-        with Path(path).open("wb") as file:
+        with atomic_write(Path(path)) as partial, partial.open("wb") as file:
             np.savez_compressed(file, **arrays)
 
     @classmethod

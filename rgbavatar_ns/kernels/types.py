@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
@@ -45,6 +46,16 @@ class PinholeCameras:
     principal_point_px: Float[Tensor, "C 2"]
     width: int
     height: int
+
+    def to(self, device: torch.device | str) -> "PinholeCameras":
+        """The same cameras there."""
+        return PinholeCameras(
+            self.world_to_camera.to(device),
+            self.focal_px.to(device),
+            self.principal_point_px.to(device),
+            self.width,
+            self.height,
+        )
 
     def select(self, positions: Sequence[int]) -> "PinholeCameras":
         """The cameras at these positions, in this order."""

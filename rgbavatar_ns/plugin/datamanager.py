@@ -17,11 +17,10 @@ from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatama
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader
 from rich.progress import track
-from torch import Tensor
 from torch.nn import Parameter
 
+from rgbavatar_ns.avatar.training.batches import ChosenFrames, DeviceFrames
 from rgbavatar_ns.avatar.training.losses import random_backgrounds
-from rgbavatar_ns.avatar.training.recorded_step import DeviceFrames
 from rgbavatar_ns.data import ImageCache, OfflineOrder
 from rgbavatar_ns.data.check import quick_check
 from rgbavatar_ns.errors import UserError
@@ -187,8 +186,10 @@ class RGBAvatarDataManager(DataManager):
         return batch
 
     def device_frames(self) -> DeviceFrames | None:
-        """All training frames on the device; None where the images are beyond the budget."""
+        """All training frames on the device; None without any, or beyond the budget."""
         positions = self.dataparser.positions("train")
+        if not positions:
+            return None
         tracked = self.dataparser.tracked
         each = tracked.width * tracked.height * 4
         if len(positions) * each > self.config.device_mib * _MIB:
@@ -202,13 +203,10 @@ class RGBAvatarDataManager(DataManager):
         theta = (self._train_cameras.metadata or {})["theta"].to(self.device)
         return DeviceFrames(theta, from_nerfstudio(self._train_cameras), images)
 
-    def next_choice(self, step: int) -> tuple[list[int], Tensor]:
-        """The frames of `step` among the training frames, and their backgrounds [B, 3].
-
-        The same as `next_train` shows.
-        """
+    def next_choice(self, step: int) -> ChosenFrames:
+        """The frames of `step` among the training frames, the same as `next_train` shows."""
         rows = self._train_order.batch(step)
-        return rows, random_backgrounds(step, len(rows), self.seed)
+        return ChosenFrames(rows, random_backgrounds(step, len(rows), self.seed))
 
     def next_eval(self, step: int) -> tuple[Cameras, dict[str, Any]]:
         """Some held-out frames, in the same form as a training batch."""
@@ -230,7 +228,6 @@ class RGBAvatarDataManager(DataManager):
         chosen.metadata = {**(chosen.metadata or {}), "background": background}
         batch = {
             "image": images,
-            "background": background,
             "position": positions,
             "step": step,
         }

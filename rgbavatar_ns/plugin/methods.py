@@ -1,5 +1,6 @@
 """The methods that nerfstudio's commands list: `rgbavatar` and `rgbavatar-tiny`."""
 
+import sys
 from typing import Any, TypeVar
 
 import torch
@@ -15,8 +16,13 @@ from rgbavatar_ns.avatar import AvatarConfig
 from rgbavatar_ns.kernels import available_backends
 from rgbavatar_ns.plugin.model import RGBAvatarModelConfig
 from rgbavatar_ns.plugin.pipeline import RGBAvatarPipelineConfig
+from rgbavatar_ns.plugin.training import optimizers, trainer
 from rgbavatar_ns.plugin.training.optimizers import paper_optimizers
 from rgbavatar_ns.plugin.training.trainer import RGBAvatarTrainerConfig
+
+# Earlier runs name their configs in config.yml by the modules that these then were.
+for _earlier, _module in {"trainer": trainer, "optimizers": optimizers}.items():
+    sys.modules.setdefault(f"rgbavatar_ns.plugin.{_earlier}", _module)
 
 TrainerKind = TypeVar("TrainerKind", bound=RGBAvatarTrainerConfig)
 

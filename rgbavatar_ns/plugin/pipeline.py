@@ -5,8 +5,7 @@
 
 import statistics
 from collections import defaultdict
-from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,18 +13,17 @@ import torch
 from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from rich.progress import track
-from torch import Tensor
 
 from rgbavatar_ns.avatar.metrics import LPIPSMetric, evaluate_images
-from rgbavatar_ns.avatar.refinement.corrections import fit_theta
+from rgbavatar_ns.avatar.training.batches import ChosenFrames, TrainingBatch
 from rgbavatar_ns.avatar.training.cuda_graph import Recorder, record_cuda_graph
 from rgbavatar_ns.avatar.training.orthogonality import orthogonality_error
-from rgbavatar_ns.avatar.training.recorded_step import RecordedStep
+from rgbavatar_ns.avatar.training.step import StepKind, TrainingStep
+from rgbavatar_ns.avatar.training.theta_fit import fit_theta
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.plugin.cameras import from_nerfstudio
 from rgbavatar_ns.plugin.datamanager import RGBAvatarDataManager, RGBAvatarDataManagerConfig
 from rgbavatar_ns.plugin.model import RGBAvatarModel, RGBAvatarModelConfig
-from rgbavatar_ns.plugin.training.device_training import recorded_step
 
 
 @dataclass
@@ -52,8 +50,6 @@ class RGBAvatarPipeline(VanillaPipeline):
         self, config: RGBAvatarPipelineConfig, device: str | torch.device, **more: Any
     ) -> None:
         super().__init__(config, str(device), **more)
-        self._graphed: RecordedStep | None = None
-        self._graphed_tried = False
         self.model.viewer_panel.stage.film = self.datamanager.dataparser.tracked
 
     @property
@@ -61,29 +57,37 @@ class RGBAvatarPipeline(VanillaPipeline):
         """The model; this method trains on one device, so it is never wrapped."""
         return self._model
 
-    def fused_train_step(self, step: int, optimizers: Optimizers) -> dict[str, Tensor] | None:
-        """Take a training step without autograd and return its losses.
+    def training_step(self, optimizers: Optimizers) -> TrainingStep:
+        """The step that trains the model, for a run."""
+        groups = {name: group["optimizer"] for name, group in optimizers.config.items()}
+        norms = {name: group.max_norm for name, group in groups.items()}
+        options = replace(
+            self.model.training_options(),
+            max_norm={k: v for k, v in norms.items() if v is not None},
+        )
+        return TrainingStep(
+            self.model.avatar,
+            optimizers.optimizers.values(),
+            options,
+            frames=self.datamanager.device_frames,
+            refinement=self.model.refinement,
+            lpips=self.model.lpips_loss,
+            recorder=self.recorder,
+        )
 
-        None, and no step, where `get_train_loss_dict`, its gradients and the optimizers are needed.
-        """
-        groups = optimizers.config.values()
-        if any(group["optimizer"].max_norm is not None for group in groups):
-            return None
-        plain = optimizers.optimizers.values()
-        if not self.model.can_fuse(step, plain):
-            return None
-        graphed = self._graphed_step(plain)
-        if graphed is not None:
-            return self.model.graphed_losses(graphed, *self.datamanager.next_choice(step))
+    def training_batch(self, step: int, kind: StepKind) -> TrainingBatch | ChosenFrames:
+        """What `step` is taken on; where steps are recorded, frames that lie on the device."""
+        if kind == "recorded":
+            return self.datamanager.next_choice(step)
         cameras, batch = self.datamanager.next_train(step)
-        return self.model.fused_losses(cameras, batch, plain)
-
-    def _graphed_step(self, optimizers: Iterable[torch.optim.Optimizer]) -> RecordedStep | None:
-        """The step that the device takes by itself, made at the first call; None where none can."""
-        if not self._graphed_tried:
-            self._graphed_tried = True
-            self._graphed = recorded_step(self.model, self.datamanager, optimizers, self.recorder)
-        return self._graphed
+        metadata = cameras.metadata or {}
+        return TrainingBatch(
+            metadata["theta"],
+            from_nerfstudio(cameras),
+            batch["image"],
+            metadata["background"],
+            metadata["position"][:, 0].long(),
+        )
 
     def get_average_eval_image_metrics(
         self, step: int | None = None, output_path: Path | None = None, get_std: bool = False

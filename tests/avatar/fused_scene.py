@@ -7,9 +7,10 @@ import torch
 from torch import Tensor
 
 from rgbavatar_ns.avatar import Avatar
+from rgbavatar_ns.avatar.training import TrainingBatch
 from rgbavatar_ns.avatar.training.fused_step import FusedStep
-from rgbavatar_ns.avatar.training.loop import TrainingBatch
-from rgbavatar_ns.avatar.training.losses import composite, l1_loss, rgba_to_float
+from rgbavatar_ns.avatar.training.losses import l1_loss
+from rgbavatar_ns.drawing.compositing import composite, rgba_to_float
 from rgbavatar_ns.kernels import PinholeCameras
 
 from .small_head import front_camera, random_theta
@@ -94,7 +95,7 @@ def reordered(
 
 def fused_step(
     avatar: Avatar, optimizer: torch.optim.Optimizer, batch: TrainingBatch, background: Tensor
-) -> Tensor | None:
+) -> Tensor:
     """Without autograd."""
     images = batch.images_rgba
     return FusedStep(avatar, [optimizer])(batch.theta, batch.cameras, images, background)
@@ -110,7 +111,9 @@ def eager_step(
     """The readable way, through autograd."""
     optimizer.zero_grad(set_to_none=True)
     dtype = background.dtype
-    image = avatar.render(batch.theta, batch.cameras, background, backend=backend).image
+    image = avatar.render(
+        batch.theta, batch.cameras, background, backend=backend, differentiable=True
+    ).image
     loss = l1_loss(image, composite(rgba_to_float(batch.images_rgba, dtype), background))
     loss.backward()
     optimizer.step()

@@ -132,7 +132,7 @@ def test_batched_render_equals_a_loop(make_avatar):
 def test_every_parameter_gets_a_gradient(make_avatar, kind):
     avatar = make_avatar(random=True, weight_network=kind)
     theta = random_theta(avatar.layout, 2)
-    rendered = avatar.render(theta, front_camera(24), torch.rand(2, 3))
+    rendered = avatar.render(theta, front_camera(24), torch.rand(2, 3), differentiable=True)
     (rendered.image * torch.rand(rendered.image.shape)).sum().backward()
     for name, parameters in avatar.parameter_groups().items():
         for parameter in parameters:

@@ -67,7 +67,7 @@ def test_a_save_that_fails_leaves_the_old_bundle(make_avatar, tmp_path, monkeypa
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(bundle, "save_file", full)
-    with pytest.raises(UserError, match=r"No space left.*Free some space"):
+    with pytest.raises(UserError, match=r"no space left.*Free some space"):
         make_avatar().save(tmp_path / "me")
     assert_renders_the_same(avatar, Avatar.load(tmp_path / "me"))
     assert {path.name for path in tmp_path.iterdir()} == {"me"}

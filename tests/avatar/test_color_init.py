@@ -8,6 +8,7 @@ from rgbavatar_ns.avatar.training.color_init import (
     WEIGHT_THRESHOLD,
     ColorInitSchedule,
     estimate_colors,
+    initialize_colors,
 )
 from rgbavatar_ns.kernels import GaussianSet
 
@@ -93,7 +94,7 @@ def test_colors_are_initialised_once_and_nothing_else_changes(make_avatar):
     avatar = make_avatar(random=True)
     camera, theta = front_camera(48), random_theta(avatar.layout, 2)
     before = {name: p.detach().clone() for name, p in avatar.named_parameters()}
-    count = avatar.initialize_colors(theta, camera, images([0.2, 0.4, 0.9, 1.0], 48, 2))
+    count = initialize_colors(avatar, theta, camera, images([0.2, 0.4, 0.9, 1.0], 48, 2))
     fresh = avatar.color_initialized.clone()
     assert 0 < count < avatar.num_gaussians
     assert count == int(fresh.sum())
@@ -106,7 +107,7 @@ def test_colors_are_initialised_once_and_nothing_else_changes(make_avatar):
         else:
             assert torch.equal(parameter, before[name]), name
 
-    again = avatar.initialize_colors(theta, camera, images([0.9, 0.1, 0.1, 1.0], 48, 2))
+    again = initialize_colors(avatar, theta, camera, images([0.9, 0.1, 0.1, 1.0], 48, 2))
     assert again == 0
     torch.testing.assert_close(color_from_feature(avatar.blendshapes.color_feature), colors)
 
@@ -116,13 +117,13 @@ def test_gaussians_seen_later_are_initialised_later(make_avatar):
     with torch.no_grad():
         avatar.blendshapes.opacity_logit[:50] = math.log(0.05 / 0.95)
     camera, theta = front_camera(48), torch.zeros(1, avatar.layout.size)
-    avatar.initialize_colors(theta, camera, images([0.2, 0.4, 0.9, 1.0], 48))
+    initialize_colors(avatar, theta, camera, images([0.2, 0.4, 0.9, 1.0], 48))
     assert not avatar.color_initialized[:50].any()
     grey = color_from_feature(avatar.blendshapes.color_feature)[:50]
     torch.testing.assert_close(grey, torch.full((50, 3), 0.5))
     with torch.no_grad():
         avatar.blendshapes.opacity_logit[:50] = 3.0
-    assert avatar.initialize_colors(theta, camera, images([0.9, 0.1, 0.1, 1.0], 48)) > 0
+    assert initialize_colors(avatar, theta, camera, images([0.9, 0.1, 0.1, 1.0], 48)) > 0
     late = avatar.color_initialized[:50]
     colors = color_from_feature(avatar.blendshapes.color_feature)[:50][late]
     torch.testing.assert_close(colors, torch.tensor([0.9, 0.1, 0.1]).expand_as(colors))
@@ -148,7 +149,7 @@ def test_the_compiled_way_gives_the_same_colors(make_avatar, scale_with_triangle
         avatar = make_avatar(random=True, scale_with_triangle=scale_with_triangle)
         theta = random_theta(avatar.layout, 3)
         before = rgba.clone()
-        assert avatar.initialize_colors(theta, camera, rgba, backend=backend) > 0
+        assert initialize_colors(avatar, theta, camera, rgba, backend=backend) > 0
         assert torch.equal(before, rgba)
         features.append((avatar.color_initialized, avatar.blendshapes.color_feature.detach()))
     (seen, colors), (expected_seen, expected_colors) = features

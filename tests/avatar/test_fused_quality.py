@@ -7,9 +7,9 @@ import torch
 
 from rgbavatar_ns.avatar import Avatar, AvatarConfig
 from rgbavatar_ns.avatar.metrics import psnr
-from rgbavatar_ns.avatar.training.loop import TrainingBatch, TrainingOptions, fit
-from rgbavatar_ns.avatar.training.losses import composite, rgba_to_float
+from rgbavatar_ns.avatar.training import TrainingBatch, TrainingOptions, TrainingStep, fit
 from rgbavatar_ns.data import OfflineOrder
+from rgbavatar_ns.drawing.compositing import composite, rgba_to_float
 from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.kernels import available_backends
 from rgbavatar_ns.synthetic import DemoConfig, make_demo_dataset
@@ -17,7 +17,7 @@ from rgbavatar_ns.synthetic import DemoConfig, make_demo_dataset
 pytestmark = pytest.mark.skipif("cpu" not in available_backends(), reason="not compiled")
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_held_out_psnr_is_that_of_the_eager_path(tmp_path):
     """Means over held-out frames of a small demo subject, five seeds, within a tenth of a dB.
 
@@ -36,7 +36,8 @@ def test_held_out_psnr_is_that_of_the_eager_path(tmp_path):
     def score(fast: bool, seed: int) -> float:
         settings = AvatarConfig(num_bases=6, uv_resolution=32, scale_from_texel_spacing=True)
         avatar = Avatar(HeadModel(dataset.arrays), dataset.identity, settings, seed=seed)
-        fit(avatar, batch, 120, TrainingOptions(seed=seed, fast=fast))
+        step = TrainingStep(avatar, options=TrainingOptions(seed=seed, fast=fast))
+        fit(step, batch, range(120))
         test = list(dataset.test)
         with torch.no_grad():
             drawn = avatar.render(dataset.theta[test], dataset.cameras.select(test)).image

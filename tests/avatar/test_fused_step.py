@@ -8,18 +8,15 @@ import pytest
 import torch
 
 from rgbavatar_ns.avatar import Avatar, AvatarConfig
-from rgbavatar_ns.avatar.training.fused_step import FusedStep
-from rgbavatar_ns.avatar.training.loop import (
+from rgbavatar_ns.avatar.training import (
     TrainingOptions,
+    TrainingStep,
     make_optimizer,
-    training_step,
 )
-from rgbavatar_ns.avatar.training.losses import (
-    random_backgrounds,
-    require_images_of,
-    rgba_to_float,
-)
+from rgbavatar_ns.avatar.training.fused_step import FusedStep
+from rgbavatar_ns.avatar.training.losses import random_backgrounds, require_images_of
 from rgbavatar_ns.avatar.training.optimizer_states import unsupported_reason
+from rgbavatar_ns.drawing.compositing import rgba_to_float
 from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.kernels import available_backends
 
@@ -163,7 +160,7 @@ def test_parameters_after_a_hundred_small_steps(stirred):
     assert max(relative_differences(fused, eager).values()) < 1e-3
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_parameters_after_a_hundred_steps_lie_within_the_eager_spread(stirred, monkeypatch):
     """At full rates pixels reach their targets, where the sign of L1 is decided by rounding.
 
@@ -298,7 +295,10 @@ def test_other_optimisers_are_refused_and_stepped_eagerly(stirred, make, reason)
         FusedStep(avatar, [optimizer])
     before = avatar.blendshapes.color_feature.detach().clone()
     batch, _ = far_batch(avatar, 2)
-    training_step(avatar, optimizer, batch, 0, TrainingOptions(color_init=None))
+    step = TrainingStep(avatar, optimizer, TrainingOptions(color_init=None))
+    assert step.kind == "eager"
+    assert reason in step.reason
+    step(batch, 0)
     assert not torch.equal(avatar.blendshapes.color_feature, before)
 
 
@@ -307,16 +307,15 @@ def test_what_the_backend_cannot_take_is_stepped_eagerly(stirred):
     batch, background = far_batch(avatar, 2)
     optimizer = make_optimizer(avatar)
     assert unsupported_reason(avatar, [optimizer]) is None
-    step = FusedStep(avatar, [optimizer])
-    arguments = (batch.theta, batch.cameras, batch.images_rgba, background)
-    assert step(*arguments, backend="reference") is None
+    step = FusedStep(avatar, [optimizer], "reference")
+    with pytest.raises(ValueError, match="Use the eager step"):
+        step(batch.theta, batch.cameras, batch.images_rgba, background)
     assert not optimizer.state
     wide = double(avatar)
-    wide_batch, wide_background = in_double(batch), background.double()
-    optimizer = make_optimizer(wide)
-    assert fused_step(wide, optimizer, wide_batch, wide_background) is None
     before = wide.blendshapes.color_feature.detach().clone()
-    training_step(wide, optimizer, wide_batch, 0, TrainingOptions(color_init=None))
+    step = TrainingStep(wide, options=TrainingOptions(color_init=None))
+    assert (step.kind, step.reason.split()[:2]) == ("eager", ["the", "rasterizer's"])
+    step(in_double(batch), 0)
     assert not torch.equal(wide.blendshapes.color_feature, before)
 
 
@@ -328,7 +327,7 @@ def test_the_training_step_is_the_fused_one_for_8_bit_images(stirred, floating):
         batch = dataclasses.replace(batch, images_rgba=rgba_to_float(batch.images_rgba))
     optimizers = make_optimizer(avatar), make_optimizer(expected)
     options = TrainingOptions(color_init=None)
-    loss = training_step(avatar, optimizers[0], batch, 4, options)
+    loss = TrainingStep(avatar, optimizers[0], options)(batch, 4)["l1"]
     background = random_backgrounds(4, 3)
     step = eager_step if floating else fused_step
     assert float(loss) == float(step(expected, optimizers[1], batch, background))
@@ -344,9 +343,10 @@ def test_rendering_without_gradients_is_rendering(stirred, variant, count):
     batch, background = far_batch(avatar, count, 45, 38, count)
     for color in (None, background[0], background):
         options = {"with_depth": True, "with_visibility": True}
-        expected = avatar.render(batch.theta, batch.cameras, color, **options)
-        with torch.no_grad():
-            drawn = avatar.render(batch.theta, batch.cameras, color, **options)
+        expected = avatar.render(batch.theta, batch.cameras, color, differentiable=True, **options)
+        assert expected.image.requires_grad
+        drawn = avatar.render(batch.theta, batch.cameras, color, **options)
+        assert not drawn.image.requires_grad
         for name in ("image", "alpha", "visibility"):
             error = (getattr(drawn, name) - getattr(expected, name)).abs()
             # A pair at the cut of alpha = 1/255 may be there or not.
@@ -354,8 +354,7 @@ def test_rendering_without_gradients_is_rendering(stirred, variant, count):
             assert error.max() < 5e-3, name
         assert drawn.depth is not None
         torch.testing.assert_close(drawn.depth, expected.depth, atol=2e-3, rtol=0)
-    with torch.no_grad():
-        bare = avatar.render(batch.theta, batch.cameras)
+    bare = avatar.render(batch.theta, batch.cameras)
     assert bare.depth is None
     assert bare.visibility is None
 
@@ -396,9 +395,9 @@ def test_rendering_without_gradients_refuses_what_rendering_refuses(stirred):
         focal_px=camera.focal_px.repeat(2, 1),
         principal_point_px=camera.principal_point_px.repeat(2, 1),
     )
-    with torch.no_grad(), pytest.raises(ValueError, match="cameras"):
+    with pytest.raises(ValueError, match="cameras"):
         avatar.render(theta, two)
-    with torch.no_grad(), pytest.raises(ValueError, match="no backend"):
+    with pytest.raises(ValueError, match="no backend"):
         avatar.render(theta, camera, backend="none")
 
 

@@ -4,33 +4,8 @@ import torch
 from scipy import stats
 
 from rgbavatar_ns.avatar.training import losses
-from rgbavatar_ns.avatar.training.losses import (
-    LPIPSLoss,
-    composite,
-    l1_loss,
-    random_backgrounds,
-    rgba_to_float,
-)
+from rgbavatar_ns.avatar.training.losses import LPIPSLoss, l1_loss, random_backgrounds
 from rgbavatar_ns.errors import UserError
-
-
-def test_composite_by_hand():
-    rgba = torch.tensor([[[[1.0, 0.0, 0.5, 0.25]]], [[[1.0, 0.0, 0.5, 1.0]]]])
-    background = torch.tensor([[0.2, 0.4, 0.8], [0.9, 0.9, 0.9]])
-    expected = torch.tensor([[[[0.4, 0.3, 0.725]]], [[[1.0, 0.0, 0.5]]]])
-    torch.testing.assert_close(composite(rgba, background), expected)
-
-
-def test_composite_over_one_color_for_all():
-    rgba = torch.rand(3, 4, 5, 4)
-    black = composite(rgba, torch.zeros(3))
-    torch.testing.assert_close(black, rgba[..., :3] * rgba[..., 3:])
-
-
-def test_8_bit_values_become_fractions():
-    rgba = torch.tensor([0, 51, 255, 128], dtype=torch.uint8).reshape(1, 1, 1, 4)
-    expected = torch.tensor([0.0, 0.2, 1.0, 128 / 255]).reshape(1, 1, 1, 4)
-    torch.testing.assert_close(rgba_to_float(rgba), expected)
 
 
 def test_l1_by_hand():

@@ -4,14 +4,11 @@ import numpy as np
 import pytest
 import torch
 
+from rgbavatar_ns.avatar.refinement import RefinementConfig, TrackingRefinement
 from rgbavatar_ns.avatar.refinement.calibration import fit_ridge
-from rgbavatar_ns.avatar.refinement.corrections import (
-    RefinementConfig,
-    TrackingRefinement,
-    fit_theta,
-    frame_gradients,
-)
-from rgbavatar_ns.avatar.training.losses import composite, l1_loss, rgba_to_float
+from rgbavatar_ns.avatar.training.losses import l1_loss
+from rgbavatar_ns.avatar.training.theta_fit import fit_theta, frame_gradients
+from rgbavatar_ns.drawing.compositing import composite, rgba_to_float
 from rgbavatar_ns.head import ThetaField, ThetaLayout
 
 from .fused_scene import far_batch, stir
@@ -180,7 +177,9 @@ def test_each_frame_has_the_gradient_of_its_own_loss(make_avatar, backend):
     for i in range(3):
         theta = batch.theta[[i]].requires_grad_()
         camera = batch.cameras.select([i])
-        image = avatar.render(theta, camera, background[[i]], backend="reference").image
+        image = avatar.render(
+            theta, camera, background[[i]], backend="reference", differentiable=True
+        ).image
         target = composite(rgba_to_float(batch.images_rgba[[i]]), background[[i]])
         l1_loss(image, target).backward()
         # A pair of pixel and Gaussian at the cut of 1/255 may belong to one way alone.

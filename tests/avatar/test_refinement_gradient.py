@@ -3,9 +3,10 @@
 import pytest
 import torch
 
+from rgbavatar_ns.avatar.training import make_optimizer
 from rgbavatar_ns.avatar.training.fused_step import FusedStep
-from rgbavatar_ns.avatar.training.loop import make_optimizer
-from rgbavatar_ns.avatar.training.losses import composite, l1_loss, rgba_to_float
+from rgbavatar_ns.avatar.training.losses import l1_loss
+from rgbavatar_ns.drawing.compositing import composite, rgba_to_float
 from rgbavatar_ns.kernels import available_backends
 
 from .fused_scene import double, far_batch, in_double, stir
@@ -16,7 +17,9 @@ compiled = pytest.mark.skipif("cpu" not in available_backends(), reason="not com
 
 def _eager_gradient(avatar, theta, batch, background, backend="auto"):
     theta = theta.clone().requires_grad_()
-    image = avatar.render(theta, batch.cameras, background, backend=backend).image
+    image = avatar.render(
+        theta, batch.cameras, background, backend=backend, differentiable=True
+    ).image
     target = composite(rgba_to_float(batch.images_rgba, theta.dtype), background)
     return torch.autograd.grad(l1_loss(image, target), theta)[0]
 
@@ -30,7 +33,9 @@ def test_gradient_of_theta_against_finite_differences(make_avatar):
 
     def loss(theta):
         with torch.no_grad():
-            image = avatar.render(theta, batch.cameras, background, backend="reference").image
+            image = avatar.render(
+                theta, batch.cameras, background, backend="reference", differentiable=True
+            ).image
             return l1_loss(
                 image, composite(rgba_to_float(batch.images_rgba, theta.dtype), background)
             )

@@ -1,5 +1,6 @@
 """The pools with their frames: the right pictures, bounded memory, and resuming."""
 
+import dataclasses
 import io
 import resource
 from pathlib import Path
@@ -89,9 +90,10 @@ def test_latency_is_from_arrival_to_the_first_batch():
     assert frames.median_latency_s() == 15.0
 
 
-def test_memory_stays_flat_over_an_hour_of_frames():
-    frames = pools(150, 1000)
-    one = cheap(0)
+def test_memory_stays_flat_however_many_frames_come():
+    large = subject(width=64, height=64)
+    frames = ReplayBuffer(large, LocalGlobalPools(150, 500))
+    one = dataclasses.replace(cheap(0), image_rgba=np.zeros((64, 64, 4), np.uint8))
 
     def stream(count: int) -> int:
         for _ in range(count):
@@ -100,12 +102,12 @@ def test_memory_stays_flat_over_an_hour_of_frames():
                 frames.batch(10)
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
-    before_kib = stream(10_000)
-    after_kib = stream(90_000)
-    assert frames.num_added == 100_000
-    assert frames.fill == (150, 1000)
-    # Were every frame kept, 384 bytes of pixels and 280 of theta each would be 60 MB.
-    assert after_kib - before_kib < 6 * 1024
+    before_kib = stream(2_000)
+    after_kib = stream(8_000)
+    assert frames.num_added == 10_000
+    assert frames.fill == (150, 500)
+    # Were every frame kept, its 16 KiB of pixels would make 128 MiB.
+    assert after_kib - before_kib < 16 * 1024
 
 
 @pytest.mark.parametrize(("save_images", "encode"), [(True, True), (True, False), (False, True)])

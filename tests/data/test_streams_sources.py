@@ -1,28 +1,36 @@
-"""Replay, folder and socket give every frame once, bit for bit, and live through their faults."""
+"""Replay and socket give every frame once, bit for bit, and live through their faults."""
 
+import contextlib
 import dataclasses
 import socket
 import threading
-import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import ClientConnection, connect
 
 from rgbavatar_ns.data import TrackedDataset
-from rgbavatar_ns.data.streams import (
-    FolderStream,
-    FolderWriter,
-    PushedStream,
-    ReplayStream,
-    StreamClient,
-)
-from rgbavatar_ns.data.streams import message_format as wire
+from rgbavatar_ns.data.png import encode_png_rgba
+from rgbavatar_ns.data.streams import ReplayStream, SocketStream, StreamClient, message_format
 from rgbavatar_ns.data.streams.address import StreamAddress
-from rgbavatar_ns.data.streams.socket_server import _CHUNK_BYTES, ACCEPTED
 from rgbavatar_ns.errors import UserError
-from tests.data.small_dataset import NUM_FRAMES, NUM_TEST, small_dataset
-from tests.data.streaming import HEAD, same, subject, take, tracked, until
+from tests.data.small_dataset import HEIGHT, NUM_FRAMES, NUM_TEST, WIDTH, small_dataset
+from tests.data.streaming import (
+    DEADLINE_S,
+    HEAD,
+    Clock,
+    same,
+    subject,
+    take,
+    tracked,
+    until,
+)
+
+ANY = "127.0.0.1:0"
+FRAME_BYTES = len(message_format.frame_message(tracked(0)))
 
 
 @pytest.fixture(scope="module")
@@ -31,34 +39,50 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> TrackedDataset:
 
 
 @pytest.fixture
-def pushed():
-    stream = PushedStream("127.0.0.1:0")
-    yield stream
-    stream.close()
+def open_stream() -> Iterator[Callable[..., SocketStream]]:
+    with contextlib.ExitStack() as opened:
+
+        def opener(listen: str = ANY, **options) -> SocketStream:
+            stream = SocketStream(listen, **options)
+            opened.callback(stream.close)
+            return stream
+
+        yield opener
 
 
-def in_background(work) -> threading.Thread:
-    thread = threading.Thread(target=work, daemon=True)
-    thread.start()
-    return thread
+@pytest.fixture
+def stream(open_stream: Callable[..., SocketStream]) -> SocketStream:
+    return open_stream(grace_s=0.2)
+
+
+def stranger(stream: SocketStream, **options) -> ClientConnection:
+    """A client of its own making."""
+    return connect(f"ws://{stream.address}", proxy=None, **options).__enter__()
+
+
+def indices(stream: SocketStream, count: int) -> list[int]:
+    return [frame.index for frame in take(stream, count)]
 
 
 def test_replay_gives_the_training_frames_in_time(dataset: TrackedDataset):
-    stream = ReplayStream(dataset, frames_per_second=50.0)
-    began = time.monotonic()
+    clock = Clock()
+    stream = ReplayStream(dataset, 50.0, clock, clock.sleep)
+    began_s = clock.now_s
+    assert stream.next(0.0) is not None
+    assert stream.next(0.005) is None  # the second is due after .02 s
+    assert clock.now_s == pytest.approx(began_s + 0.005)
     frames = take(stream, 100)
-    took = time.monotonic() - began
-    assert [frame.index for frame in frames] == list(range(NUM_FRAMES - NUM_TEST))
+    assert [frame.index for frame in frames] == list(range(1, NUM_FRAMES - NUM_TEST))
     assert stream.ended
-    # The last of five frames is due four intervals after the first.
-    assert took >= 0.08
-    arrivals = np.array([frame.arrived_s for frame in frames])
-    np.testing.assert_allclose(np.diff(arrivals), 0.02, atol=1e-6)
+    arrivals_s = [frame.arrived_s - began_s for frame in frames]
+    np.testing.assert_allclose(arrivals_s, [0.02, 0.04, 0.06, 0.08], atol=1e-6)
+    assert clock.now_s == pytest.approx(began_s + 0.08)
     assert all(same(tracked(frame.index), frame) for frame in frames)
 
 
 def test_replay_goes_on_in_the_middle_and_shows_frames_again(dataset: TrackedDataset):
-    stream = ReplayStream(dataset, frames_per_second=1000.0)
+    clock = Clock()
+    stream = ReplayStream(dataset, 1000.0, clock, clock.sleep)
     stream.go_on_after(2)
     assert [frame.index for frame in take(stream, 100)] == [3, 4]
     assert same(tracked(1), stream.again(1))
@@ -68,215 +92,191 @@ def test_replay_goes_on_in_the_middle_and_shows_frames_again(dataset: TrackedDat
         ReplayStream(dataset, 0.0)
 
 
-def test_folder_gives_what_is_there_and_what_comes(tmp_path: Path):
-    stream = FolderStream(tmp_path / "live")
-    assert stream.subject(0.02) is None
-    assert stream.next(0.02) is None
-    writer = FolderWriter(tmp_path / "live", subject())
-    for index in (2, 0):
-        writer.send(tracked(index))
-    got = take(stream, 2)
-    assert [frame.index for frame in got] == [0, 2]
-    assert all(same(tracked(frame.index), frame) for frame in got)
-    # Late and early ones, each once.
-    for index in (1, 7):
-        writer.send(tracked(index))
-    writer.end()
-    assert [frame.index for frame in take(stream, 10)] == [1, 7]
-    assert stream.ended
-
-
-def test_folder_lives_through_damaged_files_and_its_absence(tmp_path: Path):
-    folder = tmp_path / "live"
-    writer = FolderWriter(folder, subject())
-    writer.send(tracked(0))
-    (folder / "frame-0000000001.rga").write_bytes(b"garbage")
-    (folder / "frame-0000000002.rga").mkdir()
-    (folder / "notes.txt").write_text("not a frame")
-    stream = FolderStream(folder)
-    assert [frame.index for frame in take(stream, 1)] == [0]
-    assert stream.next(0.05) is None
-    assert stream.counts["garbage bytes"] == len(b"garbage")
-    assert stream.counts["unreadable"] == 1
-    folder.rename(tmp_path / "away")
-    assert stream.next(0.1) is None
-    assert stream.counts["source lost"] == 1
-    (tmp_path / "away").rename(folder)
-    writer.send(tracked(3))
-    assert [frame.index for frame in take(stream, 1)] == [3]
-
-
-def test_folder_passes_over_what_a_resumed_run_has_seen(tmp_path: Path):
-    writer = FolderWriter(tmp_path / "live", subject())
-    for index in range(6):
-        writer.send(tracked(index))
-    writer.end()
-    stream = FolderStream(tmp_path / "live")
-    assert take(stream, 1)[0].index == 0
-    stream.go_on_after(3)
-    assert [frame.index for frame in take(stream, 10)] == [4, 5]
-    with pytest.raises(UserError, match="holds a stream already"):
-        FolderWriter(tmp_path / "live", subject())
-
-
-def test_folder_with_another_file_for_a_subject_is_refused(tmp_path: Path):
-    (tmp_path / "subject.rga").write_bytes(wire.frame_record(tracked(0)))
-    with pytest.raises(UserError, match="no subject"):
-        FolderStream(tmp_path).subject(0.1)
-
-
-def test_a_client_in_another_thread_is_heard(pushed: PushedStream):
+def test_a_client_is_heard_and_made_to_wait(stream: SocketStream):
     def send() -> None:
-        with StreamClient(subject(), pushed.address) as client:
-            for index in range(20):
+        with StreamClient(subject(), stream.address) as client:
+            for index in range(40):
                 client.send(tracked(index))
 
-    thread = in_background(send)
-    assert pushed.subject(10.0) is not None
-    got = take(pushed, 100)
-    thread.join()
-    assert [frame.index for frame in got] == list(range(20))
+    assert stream.subject(0.0) is None
+    assert stream.next(0.0) is None
+    sender = threading.Thread(target=send, daemon=True)
+    sender.start()
+    got = take(stream, 100)
+    sender.join(DEADLINE_S)
+    assert not sender.is_alive()
+    assert stream.subject(0.0) is not None
+    assert [frame.index for frame in got] == list(range(40))
     assert all(same(tracked(frame.index), frame) for frame in got)
-    assert pushed.ended
-    assert not +pushed.counts
+    assert stream.ended
+    assert not stream.counts
 
 
-def test_unix_socket(tmp_path: Path):
-    place = tmp_path / "stream"
-    stream = PushedStream(f"unix:{place}")
-    assert place.stat().st_mode & 0o777 == 0o600
-    thread = in_background(lambda: StreamClient(subject(), f"unix:{place}").send(tracked(4)))
-    assert same(tracked(4), take(stream, 1)[0])
-    thread.join()
-    with pytest.raises(UserError, match="cannot be listened"):
-        PushedStream(f"unix:{place}")
+def test_a_second_client_is_refused_and_the_first_goes_on(stream: SocketStream):
+    first = StreamClient(subject("same name"), stream.address)
+    first.send(tracked(0))
+    with pytest.raises(UserError, match="Another client is connected"):
+        StreamClient(subject(), stream.address)
+    first.send(tracked(1))
+    first.end()
+    assert indices(stream, 10) == [0, 1]
+    assert stream.counts == {"refused clients": 1}
+
+
+def test_a_silent_client_is_replaced(open_stream: Callable[..., SocketStream]):
+    clock = Clock()
+    stream = open_stream(clock=clock, grace_s=0.1)
+    first = StreamClient(subject(), stream.address)
+    first.send(tracked(0))
+    assert indices(stream, 1) == [0]
+    clock.now_s += 11.0
+
+    def send_on() -> None:
+        for index in range(2, 100):  # the first writes into a dead connection may seem to work
+            first.send(tracked(index))
+
+    with StreamClient(subject(), stream.address) as second:
+        second.send(tracked(1))
+        with pytest.raises(UserError, match="Another client is connected"):
+            send_on()
+    assert indices(stream, 10) == [1]
+
+
+class Relay:
+    """Passes bytes on to a stream, and breaks a connection after so many of them."""
+
+    def __init__(self, address: str, *limits: int) -> None:
+        self._to = StreamAddress.parse(address)
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self.address = f"127.0.0.1:{self._listener.getsockname()[1]}"
+        threading.Thread(target=self._serve, args=(limits,), daemon=True).start()
+
+    def _serve(self, limits: tuple[int, ...]) -> None:
+        for limit in (*limits, 1 << 30):
+            client, _ = self._listener.accept()
+            server = socket.create_connection(self._to)
+            threading.Thread(target=_pump, args=(server, client, 1 << 30), daemon=True).start()
+            _pump(client, server, limit)
+
+
+def _pump(source: socket.socket, sink: socket.socket, limit: int) -> None:
+    with contextlib.suppress(OSError):
+        while limit > 0 and (data := source.recv(min(limit, 4096))):
+            limit -= len(data)
+            sink.sendall(data)
+    for end in (source, sink):
+        with contextlib.suppress(OSError):
+            end.shutdown(socket.SHUT_RDWR)
+
+
+def test_what_a_lost_connection_had_on_its_way_is_sent_again(stream: SocketStream):
+    greeting = 400 + len(message_format.subject_message(subject()))
+    relay = Relay(stream.address, greeting + 3 * FRAME_BYTES, greeting + 5 * FRAME_BYTES)
+
+    def send() -> None:
+        with StreamClient(subject(), relay.address) as client:
+            for index in range(30):
+                client.send(tracked(index))
+
+    sender = threading.Thread(target=send, daemon=True)
+    sender.start()
+    assert indices(stream, 100) == list(range(30))
+    sender.join(DEADLINE_S)
+    assert not sender.is_alive()
+    assert stream.counts == {"source lost": 2, "reconnects": 2}
+
+
+def test_another_program_may_go_on(stream: SocketStream):
+    first = StreamClient(subject(), stream.address)
+    first.send(tracked(0))
+    first.close()
+    with pytest.raises(RuntimeError, match="tracker"), StreamClient(subject(), stream.address):
+        raise RuntimeError("the tracker broke; the stream has not ended")
+    with StreamClient(subject(), stream.address) as last:
+        last.send(tracked(1))
+    assert indices(stream, 10) == [0, 1]
+    assert stream.counts == {"source lost": 2, "reconnects": 2}
+
+
+def test_a_client_goes_on_with_a_stream_that_was_started_again(
+    open_stream: Callable[..., SocketStream],
+):
+    stream = open_stream()
+    client = StreamClient(subject(), stream.address)
+    client.send(tracked(0))
+    assert indices(stream, 1) == [0]
     stream.close()
-    assert not place.exists()
-    # Left behind by a program that was killed.
-    with socket.socket(socket.AF_UNIX) as left:
-        left.bind(str(place))
-    PushedStream(f"unix:{place}").close()
+    assert stream.next(DEADLINE_S) is None
+    again = open_stream(stream.address)
+    client.send(tracked(1))
+    client.end()
+    client.close()
+    # What the first one may not have saved comes once more.
+    assert indices(again, 10) == [0, 1]
 
 
-def test_a_second_client_is_refused_and_the_first_goes_on(pushed: PushedStream):
-    ready, done = threading.Event(), threading.Event()
-    refused = []
-
-    def first() -> None:
-        client = StreamClient(subject(), pushed.address)
-        client.send(tracked(0))
-        ready.set()
-        done.wait(30)
-        client.send(tracked(1))
-        client.end()
-        client.close()
-
-    def second() -> None:
-        ready.wait(30)
-        try:
-            StreamClient(subject(), pushed.address, patience_s=5.0)
-        except UserError as error:
-            refused.append(error)
-        done.set()
-
-    threads = [in_background(first), in_background(second)]
-    got = take(pushed, 10)
-    for thread in threads:
-        thread.join()
-    assert [frame.index for frame in got] == [0, 1]
-    assert len(refused) == 1
-    assert "another client" in str(refused[0])
-    assert pushed.counts["refused clients"] == 1
+@pytest.mark.parametrize("greeting", [message_format.frame_message(tracked(0)), b"junk", "text"])
+def test_who_does_not_begin_with_a_subject_is_refused(stream: SocketStream, greeting: bytes | str):
+    client = stranger(stream)
+    client.send(greeting)
+    assert '"refused"' in str(client.recv(DEADLINE_S))
+    with pytest.raises(ConnectionClosed):
+        client.recv(DEADLINE_S)
+    assert stream.subject(0.0) is None
+    assert stream.counts == {"refused clients": 1}
 
 
-def test_a_lost_client_comes_back_and_goes_on(pushed: PushedStream):
-    def send() -> None:
-        client = StreamClient(subject("mine"), pushed.address)
-        for index in range(3):
-            client.send(tracked(index))
-        client.close()  # without an end: it has crashed
-        with StreamClient(subject("mine"), pushed.address) as again:
-            again.send(tracked(3))
-
-    thread = in_background(send)
-    got = take(pushed, 10)
-    thread.join()
-    assert [frame.index for frame in got] == [0, 1, 2, 3]
-    assert pushed.counts == {"source lost": 1, "reconnects": 1, "garbage bytes": 0}
+def test_a_subject_is_not_waited_for_for_ever(open_stream: Callable[..., SocketStream]):
+    stream = open_stream(silence_s=0.01)
+    assert "No subject has come in time" in str(stranger(stream).recv(DEADLINE_S))
 
 
-def test_who_comes_while_the_lost_one_is_still_being_read_is_not_refused(pushed: PushedStream):
-    place = StreamAddress.parse(pushed.address).place
-    greeting, one = wire.subject_record(subject("mine")), wire.frame_record(tracked(0))
-    repeats = 3 * _CHUNK_BYTES // len(one)  # more than is read at once
-    answers = []
-
-    def send() -> None:
-        with socket.create_connection(place, timeout=10) as first:
-            first.sendall(greeting)
-            answers.append(first.recv(100))
-            first.sendall(one * repeats)
-        with socket.create_connection(place, timeout=10) as second:
-            second.sendall(greeting + wire.end_record())
-            answers.append(second.recv(100))
-
-    thread = in_background(send)
-    assert len(take(pushed, repeats + 1)) == repeats
-    thread.join()
-    assert answers == [ACCEPTED] * 2
-    assert pushed.counts == {"source lost": 1, "reconnects": 1, "garbage bytes": 0}
+def test_web_pages_are_kept_out(stream: SocketStream):
+    with pytest.raises(InvalidStatus, match="403"):
+        stranger(stream, origin="https://example.org")
 
 
-def test_client_connects_again_where_the_server_has_hung_up():
-    stream = PushedStream("127.0.0.1:0")
-    address = stream.address
-    restarted = threading.Event()
-    sent = []
-
-    def send() -> None:
-        client = StreamClient(subject(), address, patience_s=20.0)
-        sent.append(0)
-        restarted.wait(30)
-        # The first writes into a dead connection may still seem to work.
-        for index in range(30):
-            client.send(tracked(index))
-            time.sleep(0.01)
-        client.end()
-        client.close()
-
-    thread = in_background(send)
-    until(lambda: stream.subject(0.05) is not None and sent)
-    stream.close()
-    again = PushedStream(address)
-    restarted.set()
-    got = take(again, 100)
-    thread.join()
-    indices = [frame.index for frame in got]
-    assert indices[-1] == 29
-    assert indices == list(range(indices[0], 30))
-    again.close()
+def test_bad_messages_are_counted_told_once_and_cost_nothing_else(
+    open_stream: Callable[..., SocketStream],
+):
+    told: list[str] = []
+    stream = open_stream(tell=told.append)
+    client = stranger(stream)
+    bad = message_format.encode({"type": "frame", "index": "\x1b[2J"})
+    messages = [message_format.subject_message(subject()), bad, "text", b"", b"\xff" * 1000]
+    messages += [message_format.frame_message(tracked(0)), message_format.encode({"type": []})]
+    messages += [message_format.frame_message(tracked(1), b"cut short")]
+    for message in messages:
+        client.send(message)
+    got = take(stream, 2)
+    assert same(tracked(0), got[0])
+    with pytest.raises(UserError, match="not a PNG"):
+        got[1].decode()
+    client.send(message_format.end_message())
+    until(lambda: stream.ended)
+    assert stream.counts == {"unreadable": 5}
+    assert len(told) == 1
+    assert "no whole number" in told[0]
+    assert told[0].isprintable()
 
 
-@pytest.mark.parametrize("data", [b"GET / HTTP/1.1\r\n\r\n" * 20, wire.frame_record(tracked(0))])
-def test_who_does_not_begin_with_a_subject_is_hung_up_on(pushed: PushedStream, data: bytes):
-    place = StreamAddress.parse(pushed.address).place
-    with socket.create_connection(place, timeout=10) as stranger:
-        stranger.sendall(data)
-        assert pushed.subject(0.3) is None
-        assert stranger.recv(100).startswith(b"REFUSED ")
-    assert pushed.counts["refused clients"] == 1
-
-
-def test_garbage_within_a_stream_costs_nothing_that_had_arrived(pushed: PushedStream):
-    place = StreamAddress.parse(pushed.address).place
-    with socket.create_connection(place, timeout=10) as client:
-        garbage = bytes(range(256)) * 40
-        parts = [wire.subject_record(subject()), wire.frame_record(tracked(0)), garbage]
-        parts += [wire.frame_record(tracked(1)), wire.frame_record(tracked(2))[:100]]
-        client.sendall(b"".join(parts))
-        assert [frame.index for frame in take(pushed, 2)] == [0, 1]
-    until(lambda: pushed.next(0.01) is None and pushed.counts["source lost"] == 1)
-    assert pushed.counts["garbage bytes"] == len(garbage) + 100
+def test_too_large_a_message_costs_its_client_the_connection(
+    open_stream: Callable[..., SocketStream], monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(message_format, "LARGEST_MESSAGE", 100_000)
+    stream = open_stream()
+    client = stranger(stream)
+    client.send(message_format.subject_message(subject()))
+    assert '"accepted"' in str(client.recv(DEADLINE_S))
+    client.send(bytes(200_000))
+    with pytest.raises(ConnectionClosed):
+        client.recv(DEADLINE_S)
+    with StreamClient(subject(), stream.address) as other:
+        other.send(tracked(0))
+        with pytest.raises(UserError, match="too large"):
+            other.send(tracked(1), png=bytes(200_000))
+    assert indices(stream, 10) == [0]
+    assert stream.counts == {"source lost": 1, "reconnects": 1}
 
 
 @pytest.mark.parametrize(
@@ -289,43 +289,73 @@ def test_garbage_within_a_stream_costs_nothing_that_had_arrived(pushed: PushedSt
         ),
     ],
 )
-def test_another_size_or_head_is_refused_by_name(pushed: PushedStream, other, told):
-    failures = []
-
-    def send() -> None:
-        StreamClient(subject(), pushed.address).close()
-        try:
-            StreamClient(other, pushed.address, patience_s=5.0)
-        except UserError as error:
-            failures.append(str(error))
-
-    thread = in_background(send)
-    until(lambda: pushed.next(0.02) is None and not thread.is_alive())
-    assert len(failures) == 1
-    assert told in failures[0]
+def test_another_size_or_head_is_refused_by_name(stream: SocketStream, other, told):
+    StreamClient(subject(), stream.address).close()
+    with pytest.raises(UserError, match=told):
+        StreamClient(other, stream.address)
+    assert stream.counts["refused clients"] == 1
 
 
 def test_without_a_listener_the_client_gives_up_with_a_reason():
+    clock = Clock()
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{taken.getsockname()[1]}"
         with pytest.raises(UserError, match="Nobody takes frames"):
-            StreamClient(subject(), address, patience_s=0.3)
+            StreamClient(subject(), address, clock=clock, sleep=clock.sleep)
+    # Pauses of .25, .5, 1, 2, 4, 8, 10 ... s, as long as they end within a minute.
+    assert clock.now_s == 1055.75
 
 
-def test_only_this_machine_is_listened_to_unless_asked():
+def test_closing_ends_who_waits(stream: SocketStream):
+    client = StreamClient(subject(), stream.address)
+    threading.Timer(0.05, stream.close).start()
+    assert stream.next(DEADLINE_S) is None
+    assert stream.ended
+    assert stream.counts == {}
+    client.close()
+
+
+def test_an_address_is_local_free_and_readable(stream: SocketStream):
+    with pytest.raises(UserError, match="cannot be listened"):
+        SocketStream(stream.address)
     with pytest.raises(UserError, match="Other machines"):
-        PushedStream("0.0.0.0:0")
-    PushedStream("0.0.0.0:0", allow_remote=True).close()
+        SocketStream("0.0.0.0:0")
+    SocketStream("0.0.0.0:0", allow_remote=True).close()
+    for text in ("7070", "localhost", "127.0.0.1:", "127.0.0.1:99999", ":7070", "a@b:1", "unix:/x"):
+        with pytest.raises(UserError, match="no address"):
+            StreamAddress.parse(text)
+    for text in ("127.0.0.1:7070", "[::1]:80", "localhost:1"):
+        assert str(StreamAddress.parse(text)) == text
+        assert StreamAddress.parse(text).is_local
+    assert not StreamAddress.parse("example.org:80").is_local
 
 
-@pytest.mark.parametrize("text", ["7070", "localhost", "127.0.0.1:", "127.0.0.1:99999", ":7070"])
-def test_addresses_that_are_none_are_refused(text: str):
-    with pytest.raises(UserError, match="no address"):
-        StreamAddress.parse(text)
+MANUAL = (Path(__file__).parents[2] / "docs/online.md").read_text().split("```python\n")[1:]
 
 
-@pytest.mark.parametrize("text", ["127.0.0.1:7070", "[::1]:80", "unix:/tmp/x", "localhost:1"])
-def test_addresses_read_as_they_are_written(text: str):
-    assert str(StreamAddress.parse(text)) == text
-    assert StreamAddress.parse(text).is_local
+@pytest.mark.parametrize("program", [part.split("```")[0] for part in MANUAL])
+def test_the_senders_in_the_manual_work(stream: SocketStream, program: str):
+    own = "StreamClient" in program
+    frames = [tracked(index) for index in range(5)]
+    told = {"WIDTH": WIDTH, "HEIGHT": HEIGHT, "identity": subject().identity}
+    told |= {"IDENTITY": subject().identity.tolist(), "LAYOUT": HEAD.layout.to_json()}
+    told["my_tracker"] = lambda: [
+        (one.theta, one.camera, one.image_rgba)
+        if own
+        else (
+            one.theta.tolist(),
+            message_format.camera_to_json(one.camera, 0),
+            encode_png_rgba(one.image_rgba),
+        )
+        for one in frames
+    ]
+    exec(program.replace("127.0.0.1:7070", stream.address), told)
+    got = take(stream, 10)
+    assert len(got) == 5
+    assert all(same(*pair) for pair in zip(frames, got))
+    assert not stream.counts
+
+
+def test_the_manual_names_both_senders():
+    assert len(MANUAL) == 2

@@ -1,11 +1,10 @@
 """What can go wrong while cells run: each is named, ends in an exit code, and loses nothing."""
 
 import errno
+import multiprocessing
 import os
 import signal
-import subprocess
 import sys
-import time
 
 import pytest
 
@@ -14,7 +13,7 @@ from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.experiments import commands, engines, read_experiment, runner
 from rgbavatar_ns.experiments import sweep as sweep_module
 from rgbavatar_ns.experiments.engines import LocalEngine
-from rgbavatar_ns.experiments.process_lock import alone_in
+from rgbavatar_ns.experiments.process_lock import alone_in, end_with_parent
 from rgbavatar_ns.experiments.runner import run_cell, write_cell
 from rgbavatar_ns.experiments.sweep import cells_of, sweep
 
@@ -97,7 +96,7 @@ def test_a_full_disk_is_named_and_finished_cells_are_kept(sweep_of, tmp_path, mo
         experiment = read_experiment(tmp_path / "failures.yaml")
     with monkeypatch.context() as patched:
         patched.setattr(sweep_module, full, _no_space)
-        with pytest.raises(UserError, match="No space left on device") as refused:
+        with pytest.raises(UserError, match=r"(?i)no space left") as refused:
             sweep(experiment, tmp_path / "out", LocalEngine())
     assert "finished cells are kept" in refused.value.remedy
     assert not list((tmp_path / "out").glob("data/demo*"))
@@ -142,51 +141,57 @@ def test_a_finished_cell_is_not_run_again_by_a_second_process(tmp_path, monkeypa
     runner.main()
 
 
-_HOLD = """
-import pathlib, sys, time
-from rgbavatar_ns.experiments.process_lock import alone_in
-folder = pathlib.Path(sys.argv[1])
-with alone_in(folder):
-    (folder / "held").touch()
-    time.sleep(3)
-    (folder / "ended").touch()
-"""
-
-_ORPHAN = """
-import pathlib, subprocess, sys
-child = '''
-import pathlib, sys, time
-from rgbavatar_ns.experiments.process_lock import end_with_parent
-end_with_parent()
-folder = pathlib.Path(sys.argv[1])
-(folder / "begun").touch()
-try:
-    time.sleep(120)
-except KeyboardInterrupt:
-    (folder / "interrupted").touch()
-'''
-subprocess.Popen([sys.executable, "-c", child, sys.argv[1]], start_new_session=True).wait()
-"""
+# Copies of this process: they need not import anything again.
+_fork = multiprocessing.get_context("fork")
+_SECONDS = 60.0
 
 
-def _await(path, seconds=60.0):
-    end = time.monotonic() + seconds
-    while not path.exists():
-        assert time.monotonic() < end, f"{path} never came"
-        time.sleep(0.05)
+def _hold(folder, pipe):
+    with alone_in(folder):
+        pipe.send("held")
+        pipe.recv()
+        (folder / "ended").touch()
 
 
-def test_one_process_at_a_time_works_in_a_folder(tmp_path, capsys):
-    with subprocess.Popen([sys.executable, "-c", _HOLD, str(tmp_path)]):
-        _await(tmp_path / "held")
+def test_one_process_at_a_time_works_in_a_folder(tmp_path):
+    here, there = _fork.Pipe()
+    other = _fork.Process(target=_hold, args=(tmp_path, there))
+    other.start()
+    assert here.poll(_SECONDS)
+
+    def let_it_end(line):
+        assert "still works on this cell" in line
         assert not (tmp_path / "ended").exists()
-        with alone_in(tmp_path):
-            assert (tmp_path / "ended").exists()
-    assert "still works on this cell" in capsys.readouterr().out
+        here.send("end")
+
+    with alone_in(tmp_path, let_it_end):
+        assert (tmp_path / "ended").exists()
+    other.join()
 
 
-def test_a_cell_ends_with_the_worker_that_started_it(tmp_path):
-    with subprocess.Popen([sys.executable, "-c", _ORPHAN, str(tmp_path)]) as worker:
-        _await(tmp_path / "begun")
-        worker.send_signal(signal.SIGKILL)
-    _await(tmp_path / "interrupted")
+def _work(pipe):
+    cell = _fork.Process(target=_work_on_a_cell, args=(pipe,))
+    cell.start()
+    cell.join()
+
+
+def _work_on_a_cell(pipe):
+    os.setsid()
+    end_with_parent()
+    try:
+        pipe.send("begun")
+        signal.pause()
+    except KeyboardInterrupt:
+        pipe.send("interrupted")
+
+
+def test_a_cell_ends_with_the_worker_that_started_it():
+    here, there = _fork.Pipe()
+    worker = _fork.Process(target=_work, args=(there,))
+    worker.start()
+    assert here.poll(_SECONDS)
+    assert here.recv() == "begun"
+    worker.kill()
+    assert here.poll(_SECONDS)
+    assert here.recv() == "interrupted"
+    worker.join()

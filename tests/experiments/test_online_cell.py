@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from rgbavatar_ns.avatar import Avatar
-from rgbavatar_ns.avatar.training.losses import composite, rgba_to_float
+from rgbavatar_ns.drawing.compositing import composite, rgba_to_float
 from rgbavatar_ns.experiments import read_experiment
 from rgbavatar_ns.experiments.engines import LocalEngine
 from rgbavatar_ns.experiments.report import write_report

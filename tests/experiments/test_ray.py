@@ -13,7 +13,7 @@ from rgbavatar_ns.experiments.runner import LOG_FILE
 from rgbavatar_ns.experiments.sweep import sweep
 from tests.plugin.tiny import tiny_dataset
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.nightly
 
 TEXT = """
 title: On a cluster

@@ -12,6 +12,7 @@ import torch
 
 from rgbavatar_ns.avatar import Avatar, AvatarConfig
 from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics, expressive_numbers
+from rgbavatar_ns.avatar.training.color_init import initialize_colors
 from rgbavatar_ns.export import DrivingOptions, ThetaNames, draw, drive
 from rgbavatar_ns.synthetic.config import DemoConfig
 from rgbavatar_ns.synthetic.make import DemoPerson, as_pinhole
@@ -69,7 +70,7 @@ def pair() -> _Pair:
     with torch.no_grad():
         avatar.blendshapes.opacity_logit.fill_(2.5)
     (image,) = target.draw(theta[:1])
-    avatar.initialize_colors(theta[:1], as_pinhole(target.camera), torch.from_numpy(image)[None])
+    initialize_colors(avatar, theta[:1], as_pinhole(target.camera), torch.from_numpy(image)[None])
     tracked = theta + bias_of_target
     own = TrainingStatistics.of(tracked, torch.zeros(_FRAMES, 1), target.head.layout)
     truth = _performance(target, seed=5)

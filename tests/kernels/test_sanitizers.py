@@ -85,7 +85,6 @@ def _run(command: list[str], **options) -> subprocess.CompletedProcess[str]:
         stderr=subprocess.STDOUT,
         text=True,
         errors="replace",
-        timeout=600,
         **options,
     )
 
@@ -154,7 +153,8 @@ def _summary(output: str) -> str:
     return output[-4000:]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
+@pytest.mark.timeout(1800)
 @pytest.mark.parametrize("which", VARIANTS)
 def test_kernel_tests_are_clean(sanitized, which):
     from rgbavatar_ns.kernels.cpu.backend import instruction_sets

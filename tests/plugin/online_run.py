@@ -1,9 +1,15 @@
 """Online runs in this process, small enough for a test."""
 
 import copy
+import threading
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import pytest
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
+
+from rgbavatar_ns.data.streams import ReplayStream, StreamedFrame
 from rgbavatar_ns.plugin.online.methods import rgbavatar_online_tiny
 from rgbavatar_ns.plugin.online.trainer import OnlineTrainer, OnlineTrainerConfig
 from tests.plugin.run import SMALL, make_trainer
@@ -39,3 +45,24 @@ def online_trainer(config: OnlineTrainerConfig) -> OnlineTrainer:
     trainer = make_trainer(config)
     assert isinstance(trainer, OnlineTrainer)
     return trainer
+
+
+def before_each_step(trainer: OnlineTrainer, work: Callable[[int], None]) -> None:
+    """Call `work` with the step's number."""
+    where = [TrainingCallbackLocation.BEFORE_TRAIN_ITERATION]
+    trainer.callbacks.append(TrainingCallback(where, lambda step: work(step)))
+
+
+def hold_back_after(count: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Replayed streams stand still after so many frames."""
+    given, plain, never = [], ReplayStream.next, threading.Event()
+
+    def held(self: ReplayStream, timeout_s: float) -> StreamedFrame | None:
+        if len(given) == count:
+            never.wait(timeout_s)
+            return None
+        frame = plain(self, timeout_s)
+        given.extend([] if frame is None else [frame])
+        return frame
+
+    monkeypatch.setattr(ReplayStream, "next", held)

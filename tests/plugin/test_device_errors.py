@@ -36,14 +36,14 @@ def test_the_reason_is_told_and_checkpoints_stay(
     trainer = make_trainer(
         small_config(tiny_data, tmp_path, max_num_iterations=9, steps_per_save=2)
     )
-    taken = trainer.pipeline.fused_train_step
+    batch = trainer.pipeline.training_batch
 
-    def fails_later(step, optimizers):
+    def fails_later(step, kind):
         if step == 5:
             raise error
-        return taken(step, optimizers)
+        return batch(step, kind)
 
-    monkeypatch.setattr(trainer.pipeline, "fused_train_step", fails_later)
+    monkeypatch.setattr(trainer.pipeline, "training_batch", fails_later)
     with pytest.raises(UserError, match=message) as told:
         trainer.train()
     assert str(trainer.checkpoint_dir) in told.value.remedy

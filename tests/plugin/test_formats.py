@@ -39,7 +39,7 @@ def held_out_psnr(data: Path, output: Path) -> float:
     return float(metrics["psnr"])
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_format_reaches_the_native_held_out_psnr(both, tmp_path, monkeypatch):
     data, native, flame = both
     monkeypatch.setenv("RGBAVATAR_FLAME", str(flame))

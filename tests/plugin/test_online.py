@@ -1,13 +1,10 @@
 """Training on streams through nerfstudio's trainer: pools, ends, faults, resuming."""
 
 import json
-import os
 import signal
-import subprocess
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +12,6 @@ import numpy as np
 import pytest
 import torch
 from nerfstudio.configs.method_configs import all_methods
-from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.utils.eval_utils import eval_setup
 
 from rgbavatar_ns import Avatar
@@ -26,8 +22,12 @@ from rgbavatar_ns.plugin.methods import rgbavatar
 from rgbavatar_ns.plugin.online.methods import rgbavatar_online, rgbavatar_online_tiny
 from rgbavatar_ns.plugin.online.trainer import OnlineTrainer
 from rgbavatar_ns.plugin.training.checkpoints import list_checkpoints, read_checkpoint
-from tests.plugin.online_run import online_config, online_trainer
-from tests.plugin.run import environment, program
+from tests.plugin.online_run import (
+    before_each_step,
+    hold_back_after,
+    online_config,
+    online_trainer,
+)
 from tests.plugin.tiny import NUM_FRAMES, NUM_TEST, SIZE
 
 STREAMED = NUM_FRAMES - NUM_TEST
@@ -43,11 +43,6 @@ def newest(folder: Path) -> dict[str, Any]:
 
 def stream_state(folder: Path) -> dict[str, Any]:
     return newest(folder)["pipeline"]["datamanager._extra_state"]["stream"]
-
-
-def before_each_step(trainer: OnlineTrainer, work: Callable[[int], None]) -> None:
-    where = [TrainingCallbackLocation.BEFORE_TRAIN_ITERATION]
-    trainer.callbacks.append(TrainingCallback(where, lambda step: work(step)))
 
 
 def subject_and_frames(data: Path) -> tuple[StreamSubject, list[TrackedFrame]]:
@@ -151,10 +146,11 @@ def test_the_streamed_avatar_learns_and_colours_its_gaussians(tiny_data: Path, t
     assert bool(pipeline.model.avatar.color_initialized.any())
 
 
-def test_training_begins_with_the_first_frame(tiny_data: Path, tmp_path: Path):
-    config = online_config(tmp_path, tiny_data, max_num_iterations=2)
-    config.pipeline.datamanager.source.frames_per_second = 0.1  # the second comes in ten seconds
-    trainer = online_trainer(config)
+def test_training_begins_with_the_first_frame(
+    tiny_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    hold_back_after(1, monkeypatch)
+    trainer = online_trainer(online_config(tmp_path, tiny_data, max_num_iterations=2))
     trainer.train()
     assert trainer.stream.pools.num_added == 1
     assert summary(trainer)["images"] == 2
@@ -210,32 +206,27 @@ def test_sigterm_saves_and_is_told_by_the_exit_code(tiny_data: Path, tmp_path: P
     assert [step for step, _ in list_checkpoints(trainer.checkpoint_dir)] == [0]
 
 
-def test_a_resumed_stream_goes_on_where_it_was(tiny_data: Path, tmp_path: Path):
-    config = online_config(tmp_path / "first", tiny_data, local_size=2, global_size=3)
-    config.pipeline.datamanager.source.frames_per_second = 5.0
-    trainer = online_trainer(config)
+def test_a_resumed_stream_goes_on_where_it_was(
+    tiny_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    sizes = {"local_size": 2, "global_size": 3}
+    trainer = online_trainer(online_config(tmp_path / "first", tiny_data, **sizes))
     pools = trainer.stream.pools
 
     def stop_in_the_middle(step: int) -> None:
-        if pools.num_added >= 5:
+        if pools.num_added == 5:
             trainer.shutdown()
 
     before_each_step(trainer, stop_in_the_middle)
-    trainer.train()
+    with monkeypatch.context() as patched:
+        hold_back_after(5, patched)
+        trainer.train()
     state = stream_state(trainer.checkpoint_dir)
-    added = state["frames"]["added"]
-    assert 5 <= added < STREAMED
 
-    again = online_trainer(
-        online_config(
-            tmp_path / "second",
-            tiny_data,
-            local_size=2,
-            global_size=3,
-            load_dir=trainer.checkpoint_dir,
-        )
-    )
-    assert again.stream.pools.num_added == added
+    folder = trainer.checkpoint_dir
+    config = online_config(tmp_path / "second", tiny_data, load_dir=folder, **sizes)
+    again = online_trainer(config)
+    assert again.stream.pools.num_added == state["frames"]["added"] == 5
     resumed = again.pipeline.state_dict()["datamanager._extra_state"]["stream"]["frames"]
     for name in ("serial", "index", "theta", "world_to_camera"):
         assert torch.equal(resumed[name], state["frames"][name])
@@ -246,14 +237,9 @@ def test_a_resumed_stream_goes_on_where_it_was(tiny_data: Path, tmp_path: Path):
     # Every frame once, over both runs.
     assert told["taken in"] == told["arrived"] == STREAMED
     assert again.stream.pools.num_added == STREAMED
+    folder = again.checkpoint_dir
     finished = online_trainer(
-        online_config(
-            tmp_path / "third",
-            tiny_data,
-            local_size=2,
-            global_size=3,
-            load_dir=again.checkpoint_dir,
-        )
+        online_config(tmp_path / "third", tiny_data, load_dir=folder, **sizes)
     )
     finished.train()
     assert finished.step == again.step
@@ -392,37 +378,28 @@ def test_the_methods_have_the_papers_pools_and_sizes():
     assert tiny.pipeline.model.avatar.uv_resolution == 128
 
 
-_METHOD = "rgbavatar-online-tiny=rgbavatar_ns.plugin.online.methods:rgbavatar_online_tiny"
+class _Killed(BaseException):
+    """Ends a run in the middle of a step, as SIGKILL does: nothing more is saved."""
 
 
-@pytest.mark.slow
-def test_a_killed_run_goes_on_from_its_last_checkpoint(tiny_data: Path, tmp_path: Path):
-    command = [program("ns-train"), "rgbavatar-online-tiny", "--data", str(tiny_data)]
-    command += ["--output-dir", str(tmp_path), "--timestamp", "run", "--vis", "tensorboard"]
-    command += ["--pipeline.model.avatar.uv-resolution", "16", "--steps-per-save", "1"]
-    command += ["--pipeline.model.avatar.num-bases", "3"]
-    command += ["--pipeline.model.avatar.hidden-width", "16"]
-    command += ["--pipeline.datamanager.source.frames-per-second", "0.5"]
-    run = tmp_path / "data" / "rgbavatar-online-tiny" / "run"
-    own = environment(NERFSTUDIO_METHOD_CONFIGS=_METHOD)
-    log = tmp_path / "log.txt"
-    with log.open("w") as output:
-        process = subprocess.Popen(command, env=own, stdout=output, stderr=subprocess.STDOUT)
-    deadline = time.monotonic() + 300
-    while not list_checkpoints(run / "nerfstudio_models"):
-        assert process.poll() is None, log.read_text()
-        assert time.monotonic() < deadline, log.read_text()
-        time.sleep(0.05)
-    os.kill(process.pid, signal.SIGKILL)
-    process.wait()
-    state = stream_state(run / "nerfstudio_models")
-    again = online_trainer(
-        online_config(
-            tmp_path / "again",
-            tiny_data,
-            load_dir=run / "nerfstudio_models",
-        )
-    )
+def test_a_killed_run_goes_on_from_its_last_checkpoint(
+    tiny_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    trainer = online_trainer(online_config(tmp_path / "first", tiny_data, steps_per_save=1))
+
+    def kill(step: int) -> None:
+        if step == 3:
+            raise _Killed
+
+    before_each_step(trainer, kill)
+    with monkeypatch.context() as patched:
+        hold_back_after(5, patched)
+        with pytest.raises(_Killed):
+            trainer.train()
+    folder = trainer.checkpoint_dir
+    assert list_checkpoints(folder)[-1][0] == 2
+    state = stream_state(folder)
+    again = online_trainer(online_config(tmp_path / "again", tiny_data, load_dir=folder))
     assert again.stream.pools.num_added == state["frames"]["added"] > 0
     assert torch.equal(again.stream.pools.thetas()[0], state["frames"]["theta"])
     again.train()

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
+from rgbavatar_ns.avatar.training import step as step_module
 from rgbavatar_ns.avatar.training.orthogonality import orthogonality_error
-from rgbavatar_ns.plugin import model as model_module
 from tests.plugin.run import make_trainer, small_config
 
 
@@ -21,7 +21,7 @@ def _trained(data: Path, output: Path, kind: str, steps: int = 8):
 def test_bases_are_made_orthogonal_at_the_interval(
     tiny_data: Path, tmp_path: Path, kind: str, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr(model_module, "_ORTHOGONALIZE_EVERY", 4)
+    monkeypatch.setattr(step_module, "ORTHOGONALIZE_EVERY", 4)
     at_the_interval = _trained(tiny_data, tmp_path / "a", kind)
     assert orthogonality_error(at_the_interval.avatar.blendshapes) < 1e-5
     beyond = _trained(tiny_data, tmp_path / "b", kind, steps=10)
@@ -30,16 +30,14 @@ def test_bases_are_made_orthogonal_at_the_interval(
 
 def test_the_loss_counts_and_needs_the_readable_path(tiny_data: Path, tmp_path: Path):
     free = _trained(tiny_data, tmp_path / "free", "free", steps=20)
-    bound = _trained(tiny_data, tmp_path / "loss", "loss", steps=20)
-    assert not bound.can_fuse(0, [])
-    losses = bound.get_loss_dict(*_drawn(bound))
-    assert set(losses) == {"l1", "orthogonality"}
+    config = small_config(tiny_data, tmp_path / "loss", max_num_iterations=20)
+    config.pipeline.model.orthogonality = "loss"
+    trainer = make_trainer(config)
+    trainer.train()
+    pipeline = trainer.pipeline
+    step = pipeline.training_step(trainer.optimizers)
+    assert (step.kind, "orthogonal" in step.reason) == ("eager", True)
+    assert set(step(pipeline.training_batch(20, step.kind), 20)) == {"l1", "orthogonality"}
+    bound = pipeline.model
     errors = [orthogonality_error(model.avatar.blendshapes).item() for model in (free, bound)]
     assert errors[1] < errors[0]
-
-
-def _drawn(model):
-    batch = {"image": model._images_rgba, "background": None, "step": 0}
-    cameras = model._cameras
-    batch["background"] = (cameras.metadata or {})["background"]
-    return model.get_outputs(cameras), batch

@@ -8,10 +8,11 @@ import pytest
 import torch
 
 from rgbavatar_ns.avatar import AvatarConfig
+from rgbavatar_ns.avatar.refinement import FrameRefinement
 from rgbavatar_ns.avatar.refinement.corrections import RefinementConfig
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.kernels import available_backends
-from rgbavatar_ns.plugin.training.refinement import FrameRefinement
+from rgbavatar_ns.plugin.training.refinement import frame_refinement
 from rgbavatar_ns.plugin.training.trainer import RGBAvatarTrainer
 from tests.plugin.run import make_trainer, small_config
 from tests.plugin.tiny import NUM_FRAMES, NUM_TEST
@@ -142,7 +143,7 @@ def test_a_stream_is_refused(tiny_data, tmp_path):
     model = trainer.pipeline.model
     streamed = dataclasses.replace(model.subject, theta=model.subject.theta[:1])
     with pytest.raises(UserError, match="while frames arrive"):
-        FrameRefinement(streamed, model.config.refinement)
+        frame_refinement(streamed, model.config.refinement)
 
 
 def test_held_out_frames_are_fitted_apart_from_the_plain_score(tiny_data, tmp_path):

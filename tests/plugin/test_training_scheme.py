@@ -36,11 +36,16 @@ def _gradients(data: Path, output: Path, *, batch_parallel: bool) -> dict[str, t
     with torch.no_grad():
         for parameter in model.avatar.parameters():
             parameter += 0.01 * torch.randn(parameter.shape, generator=generator)
-    trainer.pipeline.train()
-    _, parts, _ = trainer.pipeline.get_train_loss_dict(step=0)
-    torch.stack(list(parts.values())).sum().backward()
+    pipeline = trainer.pipeline
+    batch = pipeline.training_batch(0, "eager")
+    assert batch.background is not None
+    theta = batch.theta.clone().requires_grad_()
+    losses = pipeline.training_step(trainer.optimizers).eager_losses(
+        batch, theta, batch.background, 0
+    )
+    losses["l1"].backward()
     gradients = {name: p.grad for name, p in model.avatar.named_parameters()}
-    gradients["theta"] = model._theta.grad
+    gradients["theta"] = theta.grad
     assert all(gradient is not None for gradient in gradients.values())
     return {name: gradient for name, gradient in gradients.items() if gradient is not None}
 

@@ -2,10 +2,7 @@
 
 import json
 import logging
-import os
 import pickle
-import shutil
-import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +14,7 @@ from torch import Tensor
 from rgbavatar_ns.avatar.storage.head_reference import is_reference, resolve
 from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.files import atomic_folder
 from rgbavatar_ns.head import ThetaLayout
 
 BUNDLE_FORMAT = "rgbavatar-bundle"
@@ -47,7 +45,7 @@ def save_bundle(
     """Write a bundle directory: complete or not at all; an older bundle there is replaced.
 
     The layout says to other programs what theta holds. Raises UserError where `path` is something
-    else than a bundle or an empty directory.
+    else than a bundle or an empty directory, or the disk refuses it.
     """
     path = path.absolute()
     if path.exists() and not _replaceable(path):
@@ -64,27 +62,12 @@ def save_bundle(
     if statistics is not None:
         seen = statistics.to_state()
         manifest["statistics"] = _split_off_tensors(seen, "statistics", tensors)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        scratch = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
-    except OSError as error:
-        raise UserError(f"Cannot write {path}: {error}.", "Give a path you can write to.") from None
-    try:
-        scratch.chmod(0o755)
-        # Cloned, since safetensors refuses tensors that share memory.
-        dense = {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}
-        save_file(dense, scratch / TENSORS_NAME)
-        (scratch / MANIFEST_NAME).write_text(json.dumps(manifest, indent=1) + "\n")
-        for name in (TENSORS_NAME, MANIFEST_NAME):
-            (scratch / name).chmod(0o644)  # safetensors keeps its files to their owner.
-            _sync(scratch / name)
-        _replace_directory(scratch, path)
-    except (OSError, SafetensorError) as error:
-        raise UserError(
-            f"Cannot write {path}: {error}.", "Free some space or give another path."
-        ) from error
-    finally:
-        shutil.rmtree(scratch, ignore_errors=True)
+    # Cloned, since safetensors refuses tensors that share memory.
+    dense = {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}
+    with atomic_folder(path, also=(SafetensorError,)) as partial:
+        save_file(dense, partial / TENSORS_NAME)
+        (partial / TENSORS_NAME).chmod(0o644)  # safetensors keeps its files to their owner.
+        (partial / MANIFEST_NAME).write_text(json.dumps(manifest, indent=1) + "\n")
 
 
 def load_any(path: Path) -> AvatarState:
@@ -233,21 +216,3 @@ def _join_tensors(value: Any, tensors: dict[str, Tensor]) -> Any:
 
 def _replaceable(path: Path) -> bool:
     return path.is_dir() and ((path / MANIFEST_NAME).exists() or not any(path.iterdir()))
-
-
-def _replace_directory(source: Path, target: Path) -> None:
-    """Move a directory to where an older one may be; killed midway, one of them is whole."""
-    if not target.exists():
-        source.rename(target)
-        return
-    aside = Path(tempfile.mkdtemp(prefix=f".{target.name}.old.", dir=target.parent))
-    # Renaming onto an empty directory is allowed, so each move is one atomic step.
-    target.rename(aside)
-    source.rename(target)
-    shutil.rmtree(aside, ignore_errors=True)
-
-
-def _sync(path: Path) -> None:
-    """Have the file's bytes on the disk before it gets its name."""
-    with path.open("rb") as file:
-        os.fsync(file.fileno())

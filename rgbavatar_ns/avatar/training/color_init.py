@@ -10,7 +10,10 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
-from rgbavatar_ns.avatar.training.losses import rgba_to_float
+from rgbavatar_ns.avatar.avatar import Avatar
+from rgbavatar_ns.avatar.model.blendshapes import feature_from_color
+from rgbavatar_ns.avatar.training.losses import require_images_of
+from rgbavatar_ns.drawing.compositing import rgba_to_float
 from rgbavatar_ns.kernels import (
     GaussianSet,
     PinholeCameras,
@@ -98,3 +101,33 @@ def color_estimate(sums: WeightedColors) -> ColorEstimate:
         reliable=(sums.max_weight.amax(0) > WEIGHT_THRESHOLD)
         & (matte_sum.squeeze(-1) > _SMALLEST_MATTE_SUM),
     )
+
+
+@torch.no_grad()
+def initialize_colors(
+    avatar: Avatar,
+    theta: Float[Tensor, "B H"],
+    cameras: PinholeCameras,
+    images_rgba: UInt8[Tensor, "B H_px W_px 4"] | Float[Tensor, "B H_px W_px 4"],
+    *,
+    backend: str = "auto",
+) -> int:
+    """Give Gaussians seen well for the first time the mean colour under them; return how many.
+
+    Paper, sec. 3.2. The images' colour is straight (not multiplied by alpha). Only base colours
+    change, and each Gaussian's only once: bases and optimiser state stay, and the avatar's
+    `color_initialized` remembers.
+    """
+    require_images_of(images_rgba, len(theta), cameras)
+    images = premultiplied(images_rgba, avatar.blendshapes.position.dtype)
+    renderer = avatar.renderer(theta, cameras, backend=backend)
+    if renderer is not None:
+        sums = renderer.weighted_color_average(images)
+    else:
+        sums = weighted_color_average(avatar.gaussians(theta), cameras, images, backend=backend)
+    estimate = color_estimate(sums)
+    fresh = estimate.reliable & ~avatar.color_initialized
+    feature = avatar.blendshapes.color_feature
+    feature[fresh] = feature_from_color(estimate.color[fresh]).to(feature.dtype)
+    avatar.color_initialized |= fresh
+    return int(fresh.sum())

@@ -25,8 +25,11 @@ class FusedStep:
         ValueError: `unsupported_reason` gives a reason for these optimisers.
     """
 
-    def __init__(self, avatar: Avatar, optimizers: Iterable[torch.optim.Optimizer]) -> None:
+    def __init__(
+        self, avatar: Avatar, optimizers: Iterable[torch.optim.Optimizer], backend: str = "auto"
+    ) -> None:
         self._avatar, self._states = avatar, AdamStates(avatar, optimizers)
+        self._backend = backend
 
     def __call__(
         self,
@@ -34,13 +37,12 @@ class FusedStep:
         cameras: PinholeCameras,
         images_rgba: UInt8[Tensor, "B H_px W_px 4"],
         background: Float[Tensor, "B 3"],
-        backend: str = "auto",
-    ) -> Float[Tensor, ""] | None:
-        """Take one step and return the loss; None, and no step, where the backend cannot.
+    ) -> Float[Tensor, ""]:
+        """Take one step and return the loss.
 
         Where theta requires a gradient, `theta.grad` gets that of the loss before the step, as
-        from `backward`. Raises ValueError where the images are not of the cameras' size, or not as
-        many as theta.
+        from `backward`. Raises ValueError where the images are not of the cameras' size or not as
+        many as theta, or the backend has no step without autograd.
         """
         # Compiled code reads what it is promised.
         require_images_of(images_rgba, len(theta), cameras)
@@ -48,9 +50,11 @@ class FusedStep:
         psi = self._avatar.weights(theta)
         with torch.set_grad_enabled(theta.requires_grad):
             vertices = self._avatar.carrier_vertices(theta.to(psi))
-        renderer = self._avatar.renderer(theta, cameras, psi.detach(), vertices, backend=backend)
+        renderer = self._avatar.renderer(
+            theta, cameras, psi.detach(), vertices, backend=self._backend
+        )
         if renderer is None:
-            return None
+            raise ValueError("This backend's steps go through autograd. Use the eager step.")
         loss = renderer.forward_loss(images_rgba, background)
         gradient = self.update_gaussians(renderer, with_vertices=theta.requires_grad)
         self.update_network(psi, gradient.weights)

@@ -5,20 +5,11 @@ from typing import Literal
 import numpy as np
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.kernels import PinholeCameras
-
-
-def rgba_to_float(
-    rgba: UInt8[Tensor, "B H W 4"] | Float[Tensor, "B H W 4"], dtype: torch.dtype = torch.float32
-) -> Float[Tensor, "B H W 4"]:
-    """Turn 8-bit RGBA into [0, 1]; floating values pass through."""
-    if rgba.dtype == torch.uint8:
-        return rgba.to(dtype).mul_(1 / 255)
-    return rgba.to(dtype)
 
 
 def require_images_of(images_rgba: Tensor, count: int, cameras: PinholeCameras) -> None:
@@ -26,14 +17,6 @@ def require_images_of(images_rgba: Tensor, count: int, cameras: PinholeCameras) 
     wanted = (count, cameras.height, cameras.width, 4)
     if tuple(images_rgba.shape) != wanted:
         raise ValueError(f"The images are {tuple(images_rgba.shape)}. Pass {wanted}.")
-
-
-def composite(
-    rgba: Float[Tensor, "B H W 4"], background: Float[Tensor, "B 3"] | Float[Tensor, "3"]
-) -> Float[Tensor, "B H W 3"]:
-    """Lay straight-alpha images over one background colour each (or one for all)."""
-    colors = background.reshape(-1, 1, 1, 3)
-    return torch.lerp(colors, rgba[..., :3], rgba[..., 3:])
 
 
 def random_backgrounds(step: int, batch: int, seed: int = 0) -> Float[Tensor, "batch 3"]:
@@ -49,6 +32,24 @@ def random_backgrounds(step: int, batch: int, seed: int = 0) -> Float[Tensor, "b
 def l1_loss(image: Float[Tensor, "B H W 3"], target: Float[Tensor, "B H W 3"]) -> Float[Tensor, ""]:
     """Return the mean absolute difference (paper, sec. 3.2)."""
     return F.l1_loss(image, target)
+
+
+def image_losses(
+    image: Float[Tensor, "B H W 3"],
+    images_rgba: UInt8[Tensor, "B H W 4"] | Float[Tensor, "B H W 4"],
+    background: Float[Tensor, "B 3"],
+    lpips: "LPIPSLoss | None" = None,
+    lpips_weight: float = 0.0,
+) -> dict[str, Float[Tensor, ""]]:
+    """The parts of the loss between drawn images and filmed ones over the same backgrounds.
+
+    "l1" and, where it is given, "lpips" times its weight (paper, sec. 3.2).
+    """
+    target = composite(rgba_to_float(images_rgba, image.dtype), background)
+    losses = {"l1": l1_loss(image, target)}
+    if lpips is not None:
+        losses["lpips"] = lpips_weight * lpips(image, target)
+    return losses
 
 
 class LPIPSLoss:

@@ -12,6 +12,8 @@ from torch import Tensor
 
 from rgbavatar_ns.avatar.model.blendshapes import GaussianBlendshapes
 
+ORTHOGONALITY_WEIGHT, ORTHOGONALIZE_EVERY = 10.0, 1000
+"""Of the loss, and how many steps lie between two orthogonalizations."""
 _BASES = ("basis_position", "basis_rotation_wxyz", "basis_color_feature")
 
 

@@ -6,14 +6,14 @@ weight network with its own gradients and Adam are in the graph.
 """
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from torch import Tensor
 
 from rgbavatar_ns.avatar.avatar import Avatar
+from rgbavatar_ns.avatar.training.batches import DeviceFrames
 from rgbavatar_ns.avatar.training.cuda_graph import Recorder, record_cuda_graph, supports
 from rgbavatar_ns.avatar.training.optimizer_states import AdamStates
 from rgbavatar_ns.kernels import UPDATED_ATTRIBUTES, DeviceRenderer, PinholeCameras
@@ -23,15 +23,6 @@ _EAGER_STEPS = 3
 """Steps before the recording: libraries make their handles, and the lists' room is measured."""
 _LOOK_EVERY = 200
 """Steps between two looks at how many overflowed."""
-
-
-@dataclass(frozen=True)
-class DeviceFrames:
-    """All frames that are trained on, on one device; one camera, or one a frame."""
-
-    theta: Float[Tensor, "F H"]
-    cameras: PinholeCameras
-    images_rgba: UInt8[Tensor, "F height width 4"]
 
 
 class RecordedStep:

@@ -1,4 +1,4 @@
-"""Contact sheets: a head mesh drawn over the frames that it was fitted to."""
+"""The contact sheet of `check`: the head mesh drawn over frames of a dataset."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,10 +10,11 @@ from jaxtyping import UInt8
 from rgbavatar_ns.data.check.sample import Sample, projected
 from rgbavatar_ns.data.check.silhouette import SilhouetteOverlap
 from rgbavatar_ns.data.native.dataset import TrackedDataset
+from rgbavatar_ns.drawing.contact_sheet import contact_sheet, labelled, over_gray_bgr
 from rgbavatar_ns.drawing.wireframe import with_wireframe
+from rgbavatar_ns.files import atomic_write
 
 _TILE_PX, _COLUMNS, MAX_TILES = 320, 4, 16
-_BEHIND = 128
 
 
 def write_check_sheet(
@@ -35,33 +36,13 @@ def write_check_sheet(
         zoom = _TILE_PX / max(image.shape[:2])
         faces = sample.faces[points.seen[place][sample.faces].all(1)]
         vertices_px = points.points_px[place] / sample.scale * zoom
-        drawn = with_wireframe(over_gray(image, zoom), vertices_px, faces)
+        drawn = with_wireframe(over_gray_bgr(image, zoom), vertices_px, faces)
         iou = f"  IoU {overlaps[place].iou:.2f}" if overlaps else ""
         tiles.append(labelled(drawn, f"{dataset.frame_index[position]}{iou}"))
     write_contact_sheet(path, tiles)
 
 
 def write_contact_sheet(path: Path, tiles: Sequence[UInt8[np.ndarray, "h w 3"]]) -> None:
-    """Tiles of one size in rows of four, blue first, as a PNG; an existing file is replaced."""
-    columns = min(_COLUMNS, len(tiles))
-    whole = [*tiles, *[np.zeros_like(tiles[0])] * (-len(tiles) % columns)]
-    rows = [np.hstack(whole[start : start + columns]) for start in range(0, len(whole), columns)]
-    path.write_bytes(cv2.imencode(".png", np.vstack(rows))[1].tobytes())
-
-
-def over_gray(image_rgba: UInt8[np.ndarray, "H W 4"], zoom: float) -> UInt8[np.ndarray, "h w 3"]:
-    """The image, blue first, over grey where its matte is clear, `zoom` times as large."""
-    alpha = image_rgba[..., 3:].astype(np.float32) / 255
-    over = image_rgba[..., 2::-1] * alpha + _BEHIND * (1 - alpha)
-    size = [max(1, round(side * zoom)) for side in image_rgba.shape[1::-1]]
-    method = cv2.INTER_AREA if zoom < 1 else cv2.INTER_CUBIC
-    return np.asarray(cv2.resize((over + 0.5).astype(np.uint8), size, interpolation=method))
-
-
-def labelled(tile_bgr: UInt8[np.ndarray, "h w 3"], text: str) -> UInt8[np.ndarray, "h w 3"]:
-    """The tile with white words, edged in black, at its upper left; drawn in place."""
-    for color, width in (((0, 0, 0), 3), ((255, 255, 255), 1)):
-        cv2.putText(
-            tile_bgr, text, (6, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.5, color, width, cv2.LINE_AA
-        )
-    return tile_bgr
+    """Write tiles, blue first, in rows of four as a PNG; an existing file is replaced."""
+    with atomic_write(path) as partial:
+        partial.write_bytes(cv2.imencode(".png", contact_sheet(tiles, _COLUMNS))[1].tobytes())

@@ -126,7 +126,6 @@ def check_dataset(
         found_overlaps = overlaps(sample, projected(sample))
         found = _image_problems(dataset, sample, found_overlaps)
         if sheet is not None:
-            sheet.parent.mkdir(parents=True, exist_ok=True)
             shown = spread(len(sample), MAX_TILES).tolist()
             write_check_sheet(sheet, dataset, sample, found_overlaps, shown)
     except UserError as error:

@@ -1,11 +1,8 @@
 """Write a dataset frame by frame; a reader sees all of it or nothing."""
 
-import errno
-import json
-import os
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 import torch
@@ -25,6 +22,7 @@ from rgbavatar_ns.data.native.format import (
 from rgbavatar_ns.data.native.frame import TrackedFrame
 from rgbavatar_ns.data.png import encode_png_rgba
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.files import atomic_write, write_json
 from rgbavatar_ns.head import HeadArrays, ThetaLayout
 from rgbavatar_ns.kernels.types import PinholeCameras
 
@@ -128,7 +126,7 @@ class DatasetWriter:
         self._require_size(index, camera.width, camera.height)
         path = self.image_path(index)
         if png is not None:
-            _write_whole(path, lambda file: file.write(png))
+            self.write_image(index, png)
         self._numbers.add(index)
         self._theta.append(values.copy())
         relative = path.relative_to(self._root).as_posix()
@@ -145,7 +143,9 @@ class DatasetWriter:
 
     def write_image(self, index: int, png: bytes) -> None:
         """Put a PNG into its place ahead of `add_encoded`; several threads may do so."""
-        _write_whole(self.image_path(index), lambda file: file.write(png))
+        # Not synced: there are thousands, and what a power cut cuts short is told when read.
+        with atomic_write(self.image_path(index), sync=False) as partial:
+            partial.write_bytes(png)
 
     def _require_size(self, index: int, width: int, height: int) -> None:
         if (width, height) != (self._width, self._height):
@@ -182,10 +182,9 @@ class DatasetWriter:
         if of_version_2 or any(len(frame) > 3 for frame in self._frames):
             index["version"] = 2
         index["frames"] = self._frames
-        theta = np.stack(self._theta)
-        _write_whole(self._root / THETA_FILE, lambda file: np.save(file, theta))
-        text = json.dumps(index, indent=1).encode()
-        _write_whole(self._root / INDEX_FILE, lambda file: file.write(text))
+        with atomic_write(self._root / THETA_FILE) as partial:
+            np.save(partial, np.stack(self._theta))
+        write_json(self._root / INDEX_FILE, index)
         return load_native(self._root)
 
     def _split(self, test: int | Collection[int]) -> dict[str, Any]:
@@ -216,27 +215,6 @@ class DatasetWriter:
     def _write_head(self) -> str:
         if isinstance(self._arrays, str):
             return self._arrays
-        embedded = HeadArrays.embedded()
-        if not (
-            self._arrays.name == embedded.name
-            and self._arrays.v_template.shape == embedded.v_template.shape
-            and np.array_equal(self._arrays.shapedirs, embedded.shapedirs)
-        ):
+        if self._arrays.digest() != HeadArrays.embedded().digest():
             self._arrays.save(self._root / HEAD_FILE)
         return self._arrays.name
-
-
-def _write_whole(path: Path, write: Callable[[BinaryIO], object]) -> None:
-    """Write beside `path`, then move into place; a full disk is told as such."""
-    partial = path.with_name(f".{path.name}.partial")
-    try:
-        with partial.open("wb") as file:
-            write(file)
-        os.replace(partial, path)
-    except OSError as error:
-        partial.unlink(missing_ok=True)
-        if error.errno in (errno.ENOSPC, errno.EDQUOT):
-            raise UserError(
-                f"There is no space left to write {path}.", "Free some space, or name another disk."
-            ) from None
-        raise

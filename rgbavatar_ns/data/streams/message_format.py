@@ -98,10 +98,7 @@ def end_message() -> bytes:
 
 
 def parse_subject(message: bytes | str) -> StreamSubject:
-    """The subject of a message; raises UserError for anything that is none.
-
-    A stranger's head is built and posed once, so that one that cannot be posed ends no run.
-    """
+    """The subject of a message; raises UserError for anything that is none."""
     header, payload = decode(message)
     if header.get("type") != "subject":
         raise UserError("A stream begins with its subject.", "Send it first.")
@@ -114,16 +111,12 @@ def parse_subject(message: bytes | str) -> StreamSubject:
             raise ValueError("its session is no short text")
         arrays, identity = _head(header, payload), _numbers(header["identity"])
         layout = ThetaLayout.from_json(header["layout"])
-        subject = StreamSubject(arrays, identity, layout, width, height, session)
-        posed = HeadModel(arrays)(torch.zeros(1, layout.size), identity)
-        if not (len(arrays.faces) and posed.numel() and bool(posed.isfinite().all())):
-            raise ValueError("its head has no surface")
+        return StreamSubject(arrays, identity, layout, width, height, session)
     except UserError:
         raise
     except Exception as error:  # What a stranger's numbers can break is not to be foreseen.
         reason = f"{type(error).__name__}: {error}"
         raise UserError(f"A stream's subject cannot be used: {reason}.", _CLIENT) from None
-    return subject
 
 
 def parse_frame(
@@ -182,19 +175,21 @@ def _numbers(values: Any) -> Float[Tensor, "_"]:
 
 
 def _head(header: Header, payload: bytes) -> HeadArrays:
-    name = str(header["head"])
-    if payload:
-        fields = {field: header[field] for field in _HEAD_FIELDS}
-        _whole(fields["num_identity"])
-        arrays = {
-            name: torch.from_numpy(value.copy())
-            for name, value in safetensors.numpy.load(payload).items()
-        }
-        return HeadArrays.from_state({**arrays, **fields, "name": name})
-    embedded = HeadArrays.embedded()
-    if name != embedded.name:
-        raise UserError(
-            f"The stream is of the head '{name}', which is not known here.",
-            f"Send its arrays with the subject, or use the embedded head '{embedded.name}'.",
-        )
-    return embedded
+    """The embedded head, or the one that is sent: posed once, for it must not end the run later."""
+    name, embedded = str(header["head"]), HeadArrays.embedded()
+    if not payload:
+        if name != embedded.name:
+            raise UserError(
+                f"The stream is of the head '{name}', which is not known here.",
+                f"Send its arrays with the subject, or use the embedded head '{embedded.name}'.",
+            )
+        return embedded
+    loaded = safetensors.numpy.load(payload)
+    state = {part: torch.from_numpy(value.copy()) for part, value in loaded.items()}
+    fields = {field: header[field] for field in _HEAD_FIELDS}
+    arrays = HeadArrays.from_state({**state, **fields, "name": name})
+    model = HeadModel(arrays)
+    posed = model(torch.full((1, model.layout.size), 0.1), torch.ones(model.num_identity))
+    if not (len(arrays.faces) and posed.numel() and bool(posed.isfinite().all())):
+        raise ValueError("its head has no surface")
+    return arrays

@@ -161,7 +161,6 @@ class OnlineDataManager(RGBAvatarDataManager):
         cameras.metadata = {**(cameras.metadata or {}), "background": background}
         return cameras, {
             "image": drawn.images_rgba.to(self.device),
-            "background": background,
             "position": list(drawn.serial),
             "step": step,
         }

@@ -1,11 +1,19 @@
 """The methods that train while the frames arrive: `rgbavatar-online`, `rgbavatar-online-tiny`."""
 
+import sys
+
 from nerfstudio.plugins.types import MethodSpecification
 
 from rgbavatar_ns.plugin.methods import preset, tiny_model
+from rgbavatar_ns.plugin.online import datamanager, pipeline, sources, trainer
 from rgbavatar_ns.plugin.online.datamanager import OnlineDataManagerConfig
 from rgbavatar_ns.plugin.online.pipeline import OnlinePipelineConfig
 from rgbavatar_ns.plugin.online.trainer import OnlineTrainerConfig
+
+# As in `plugin.methods`.
+for _module in (datamanager, pipeline, sources, trainer):
+    _earlier = _module.__name__.replace("plugin.online.", "plugin.online_")
+    sys.modules.setdefault(_earlier, _module)
 
 rgbavatar_online = MethodSpecification(
     config=preset(OnlineTrainerConfig, "rgbavatar-online", steps_per_save=500),

@@ -10,13 +10,14 @@ import torch
 from jaxtyping import UInt8
 from torch import Tensor
 
-from rgbavatar_ns.avatar.training.losses import composite, rgba_to_float
+from rgbavatar_ns.avatar.metrics import psnr
 from rgbavatar_ns.data.streams import ReplayBatch
+from rgbavatar_ns.drawing.compositing import composite, rgba_to_float
 from rgbavatar_ns.plugin.online.datamanager import OnlineDataManager, OnlineDataManagerConfig
 from rgbavatar_ns.plugin.pipeline import RGBAvatarPipeline, RGBAvatarPipelineConfig
 from rgbavatar_ns.plugin.viewer.status_panel import StatusPanel
 
-_SMALLEST_ERROR = 1e-10
+_BEST_DB = 100.0
 
 
 @dataclass
@@ -54,8 +55,6 @@ class OnlinePipeline(RGBAvatarPipeline):
         ).image.clamp(0, 1)
         black = drawn.new_zeros(len(drawn), 3)
         truth = composite(rgba_to_float(newest_first.images_rgba.to(self.device)), black)
-        # By hand: the metrics library takes seconds to import, in the middle of a stream.
-        error = (drawn - truth).square().mean(dim=(1, 2, 3)).clamp(min=_SMALLEST_ERROR)
-        score = float((-10 * error.log10()).mean())
+        score = float(psnr(drawn, truth).clamp(max=_BEST_DB).mean())
         pair = torch.cat([truth[0], drawn[0]], dim=1)
         return score, (pair * 255).round().to(torch.uint8).cpu()

@@ -10,14 +10,16 @@ import dataclasses
 import json
 import signal
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Literal
 
-import torch
 from nerfstudio.utils import writer
 from nerfstudio.utils.misc import step_check
 from nerfstudio.utils.rich_utils import CONSOLE
 
+from rgbavatar_ns.avatar.training.step import Losses
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.plugin.online.datamanager import OnlineDataManager
 from rgbavatar_ns.plugin.online.pipeline import OnlinePipeline, OnlinePipelineConfig
@@ -119,33 +121,46 @@ class OnlineTrainer(RGBAvatarTrainer):
         most, ended = self.config.max_num_iterations, self.stream.ended_step
         return most if ended is None else min(most, ended + self.config.steps_after_stream)
 
-    def _train_steps(self) -> None:
-        step = self._start_step
-        self.step = step - 1
+    @contextmanager
+    def _shown_progress(self) -> Iterator[None]:
+        """Show how stream and training stand, while they run."""
         self.stream.start()
-        with OnlineProgress() as progress:
-            if not self._await_frame():
-                return
-            while step < self._last_step() and not self._wait_while_paused():
-                self._notice_end(step)
-                began = time.monotonic()
-                parts = self._train_one(step)
-                self.step = step
-                seconds = time.monotonic() - began
-                self._train_seconds += seconds
-                self._settle()
-                self._follow_newest()
-                self._update_viewer_state(step)
-                if step_check(step, self.config.logging.steps_per_log, run_at_zero=True):
-                    self._log(step, parts, seconds)
-                self._look_at_newest(parts, progress)
-                if len(self.stream.eval_dataset) > 0:
-                    with self.train_lock:
-                        self.eval_iteration(step)
-                if step_check(step, self.config.steps_per_save):
-                    self.save_checkpoint(step)
-                writer.write_out_storage()
-                step += 1
+        with OnlineProgress() as self._stream_progress:
+            yield
+
+    def _steps(self) -> Iterator[int]:
+        """From the first frame on; the stream may end before any of them."""
+        if not self._await_frame():
+            return
+        step = self._start_step
+        while step < self._last_step():
+            yield step
+            step += 1
+
+    def goes_on(self, step: int) -> bool:
+        """As offline; also sees whether the stream has ended."""
+        if not super().goes_on(step):
+            return False
+        self._notice_end(step)
+        return True
+
+    def after_step(self, step: int, losses: Losses, seconds: float) -> None:
+        """As offline, and look at what has just arrived."""
+        self._settle()
+        self._follow_newest()
+        super().after_step(step, losses, seconds)
+
+    def _tell_step(self, step: int, losses: Losses, seconds: float) -> None:
+        """TensorBoard's curves, and about once a second how things stand."""
+        if step_check(step, self.config.logging.steps_per_log, run_at_zero=True):
+            loss = self._write_scalars(step, losses, seconds)
+            for name, value in self._report(loss).scalars().items():
+                writer.put_scalar(name=f"Stream/{name}", scalar=value, step=step)
+        self._look_at_newest(losses, self._stream_progress)
+
+    @property
+    def _images_per_step(self) -> int:
+        return self.config.pipeline.datamanager.batch_size
 
     def _await_frame(self) -> bool:
         """Wait for the first frame; False if a stop was asked for, or none will come."""
@@ -184,15 +199,6 @@ class OnlineTrainer(RGBAvatarTrainer):
             for group in optimizer.param_groups:
                 group["lr"] *= self.config.final_learning_rate_factor**share
 
-    def _log(self, step: int, parts: dict[str, torch.Tensor], seconds: float) -> None:
-        """TensorBoard's curves."""
-        loss = self._finite(_total(parts), step)
-        batch = self.config.pipeline.datamanager.batch_size
-        pixels = self.stream.get_train_rays_per_batch()
-        self._write_scalars(step, loss, parts, seconds, batch, pixels)
-        for name, value in self._report(loss).scalars().items():
-            writer.put_scalar(name=f"Stream/{name}", scalar=value, step=step)
-
     def _report(self, loss: float) -> StreamReport:
         return StreamReport(
             step=self.step + 1,
@@ -212,7 +218,7 @@ class OnlineTrainer(RGBAvatarTrainer):
             with self.train_lock:
                 self.pipeline.model.frame_theta[0] = theta.to(self.pipeline.device)
 
-    def _look_at_newest(self, parts: dict[str, torch.Tensor], progress: OnlineProgress) -> None:
+    def _look_at_newest(self, losses: Losses, progress: OnlineProgress) -> None:
         """About once a second: score the newest frames and tell how things stand."""
         began = time.monotonic()
         if began < self._next_look_s:
@@ -222,7 +228,7 @@ class OnlineTrainer(RGBAvatarTrainer):
         if recent is not None:
             with self.train_lock:
                 self._psnr, picture = self.pipeline.look_at(recent)
-        report = self._report(self._finite(_total(parts), self.step))
+        report = self._report(self._finite_loss(losses, self.step))
         rate = progress.images_per_second(report.images)
         progress.show(report, rate)
         self.pipeline.status_panel.show(report.lines(rate), picture)
@@ -274,7 +280,3 @@ class OnlineTrainer(RGBAvatarTrainer):
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps({**summary, "stream": dict(counts)}, indent=2) + "\n")
         return summary
-
-
-def _total(parts: dict[str, torch.Tensor]) -> float:
-    return sum(map(float, parts.values()))

@@ -1,6 +1,5 @@
 """Checkpoints that survive being killed: written whole or not at all, read from the newest good."""
 
-import os
 import re
 import shutil
 import zipfile
@@ -11,6 +10,7 @@ from typing import Any
 import torch
 
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.files import atomic_write
 
 _NAME = re.compile(r"step-(\d+)\.ckpt")
 _REQUIRED = frozenset({"step", "pipeline", "optimizers", "schedulers", "scalers"})
@@ -37,22 +37,16 @@ def save_checkpoint(state: dict[str, Any], folder: Path, step: int, keep: int) -
     """
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"step-{step:09d}.ckpt"
-    partial = folder.parent / f".{folder.name}.partial"
-    _require_space(folder, sum(tensor.nbytes for tensor in _tensors(state)) + _OVERHEAD_BYTES)
-    try:
-        with partial.open("wb") as file:
-            torch.save(state, file)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(partial, path)
-    except (OSError, RuntimeError) as error:
-        partial.unlink(missing_ok=True)
-        raise UserError(
-            f"The checkpoint {path} could not be written: {error}.",
-            f"Free space under {folder} and resume with --load-dir {folder}; "
-            "the checkpoints there are untouched.",
-        ) from error
-    _sync_folder(folder)
+    beside = folder.parent / f".{folder.name}.partial"
+    remedy = f"Free space and resume with --load-dir {folder}; the checkpoints there are untouched."
+    _require_space(
+        folder, sum(tensor.nbytes for tensor in _tensors(state)) + _OVERHEAD_BYTES, remedy
+    )
+    with (
+        atomic_write(path, partial=beside, remedy=remedy, also=(RuntimeError,)) as partial,
+        partial.open("wb") as file,
+    ):
+        torch.save(state, file)
     for _, old in list_checkpoints(folder)[: -max(1, keep)]:
         old.unlink()
     return path
@@ -106,23 +100,14 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     return state
 
 
-def _require_space(folder: Path, needed: int) -> None:
+def _require_space(folder: Path, needed: int, remedy: str) -> None:
     free = shutil.disk_usage(folder).free
     if free < needed:
         raise UserError(
             f"A checkpoint of {needed / 1e6:.0f} MB does not fit into the {free / 1e6:.0f} MB "
             f"free under {folder}.",
-            f"Free space and resume with --load-dir {folder}; the checkpoints there are untouched.",
+            remedy,
         )
-
-
-def _sync_folder(folder: Path) -> None:
-    """Make a rename last through a power cut, where the system lets folders be synced."""
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 def _tensors(state: Any) -> Iterator[torch.Tensor]:

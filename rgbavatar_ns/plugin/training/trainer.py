@@ -4,12 +4,13 @@
 # nerfstudio's classes are used by narrowing their fields, which a strict type system forbids.
 
 import json
-import time
+import math
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-import torch
 from nerfstudio.engine.callbacks import TrainingCallbackLocation
 from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
@@ -19,6 +20,9 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from nerfstudio.utils.writer import EventName
 from nerfstudio.viewer.viewer import Viewer
 
+from rgbavatar_ns.avatar.training.batches import ChosenFrames, TrainingBatch
+from rgbavatar_ns.avatar.training.loop import FitHooks, fit
+from rgbavatar_ns.avatar.training.step import Losses
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.plugin.pipeline import RGBAvatarPipeline, RGBAvatarPipelineConfig
 from rgbavatar_ns.plugin.training.checkpoints import load_newest, read_checkpoint, save_checkpoint
@@ -26,7 +30,7 @@ from rgbavatar_ns.plugin.training.errors import device_errors_told, install_user
 from rgbavatar_ns.plugin.training.interruption import StopRequest
 from rgbavatar_ns.plugin.training.optimizers import ExponentialConfig
 from rgbavatar_ns.plugin.training.progress import TrainingProgress
-from rgbavatar_ns.plugin.training.refinement import REFINED_NAME
+from rgbavatar_ns.plugin.training.refinement import REFINED_NAME, save_refined
 
 SUMMARY_NAME = "training.json"
 
@@ -54,8 +58,8 @@ class RGBAvatarTrainerConfig(TrainerConfig):
     """Half precision is not used: the rasterizer computes in float32."""
 
 
-class RGBAvatarTrainer(Trainer):
-    """Trains by nerfstudio's hooks, in a loop of its own.
+class RGBAvatarTrainer(Trainer, FitHooks):
+    """Trains with nerfstudio's parts around `fit`, whose hooks it is.
 
     What differs: `max_num_iterations` counts all steps also after a resume; checkpoints are
     atomic and the newest readable one is loaded; SIGINT and SIGTERM save after the present step
@@ -110,8 +114,13 @@ class RGBAvatarTrainer(Trainer):
         outputs = self.pipeline.datamanager.train_dataparser_outputs
         outputs.save_dataparser_transform(self.base_dir / "dataparser_transforms.json")
         self._init_viewer_state()
+        self.step = self._start_step - 1
         with self.stop:
-            self._train_steps()
+            with device_errors_told(self.checkpoint_dir):
+                self._take = self.pipeline.training_step(self.optimizers)
+            CONSOLE.print(f"Steps are {self._take.kind}: {self._take.reason}.", highlight=False)
+            with self._shown_progress():
+                fit(self._take, self._batch, self._steps(), self)
             self._after_train()
         if self.stop.exit_code:
             raise SystemExit(self.stop.exit_code)
@@ -121,73 +130,69 @@ class RGBAvatarTrainer(Trainer):
         self.stop.request()
         super().shutdown()
 
-    def _train_steps(self) -> None:
-        total, start = self.config.max_num_iterations, self._start_step
-        pixels = self.pipeline.datamanager.get_train_rays_per_batch()
-        tracked = self.pipeline.datamanager.dataparser.tracked
-        images_per_step = pixels // (tracked.width * tracked.height)
-        self.step = start - 1
-        with TrainingProgress(start, total, images_per_step) as progress:
-            for step in range(start, total):
-                if self._wait_while_paused():
-                    break
-                began = time.monotonic()
-                with device_errors_told(self.checkpoint_dir):
-                    parts = self._train_one(step)
-                self.step = step
-                seconds = time.monotonic() - began
-                self._train_seconds += seconds
-                self._update_viewer_state(step)
-                last = step == total - 1
-                if last or step_check(step, self.config.logging.steps_per_log, run_at_zero=True):
-                    value = self._finite(sum(map(float, parts.values())), step)
-                    self._write_scalars(step, value, parts, seconds, images_per_step, pixels)
-                    progress.show(step + 1, value)
-                if len(self.pipeline.datamanager.eval_dataset) > 0:
-                    with self.train_lock:
-                        self.eval_iteration(step)
-                if step_check(step, self.config.steps_per_save):
-                    self.save_checkpoint(step)
-                writer.write_out_storage()
+    @contextmanager
+    def _shown_progress(self) -> Iterator[None]:
+        """Show how far training is, while it runs."""
+        total = self.config.max_num_iterations
+        with TrainingProgress(self._start_step, total, self._images_per_step) as self._progress:
+            yield
 
-    def _wait_while_paused(self) -> bool:
-        """Wait while the viewer's pause button is on; True if training is to stop."""
+    @property
+    def _images_per_step(self) -> int:
+        tracked = self.pipeline.datamanager.dataparser.tracked
+        pixels = self.pipeline.datamanager.get_train_rays_per_batch()
+        return pixels // (tracked.width * tracked.height)
+
+    def _steps(self) -> Iterable[int]:
+        return range(self._start_step, self.config.max_num_iterations)
+
+    def _batch(self, step: int) -> TrainingBatch | ChosenFrames:
+        return self.pipeline.training_batch(step, self._take.kind)
+
+    def goes_on(self, step: int) -> bool:
+        """Wait while the viewer's pause button is on; False if training is to stop."""
         while self.training_state == "paused" and not self.stop.requested:
             self.stop.wait(0.01)
-        return self.stop.requested or self.stop_training
+        return not (self.stop.requested or self.stop_training)
 
-    def _train_one(self, step: int) -> dict[str, torch.Tensor]:
-        """One step: loss, gradients, optimisers, callbacks. Under the viewer's lock.
-
-        Returns the parts of the loss, detached.
-        """
-        with self.train_lock:
+    @contextmanager
+    def around_step(self, step: int) -> Iterator[None]:
+        """Under the viewer's lock: nerfstudio's callbacks, the step, the schedules."""
+        with device_errors_told(self.checkpoint_dir), self.train_lock:
             self.pipeline.train()
             self._run_callbacks(step, TrainingCallbackLocation.BEFORE_TRAIN_ITERATION)
-            parts = None
-            if not self.grad_scaler.is_enabled():
-                parts = self.pipeline.fused_train_step(step, self.optimizers)
-            if parts is None:
-                parts = self._eager_step(step)
+            yield
             for scheduler in self.optimizers.schedulers.values():
                 scheduler.step()
             self._run_callbacks(step, TrainingCallbackLocation.AFTER_TRAIN_ITERATION)
-        return parts
 
-    def _eager_step(self, step: int) -> dict[str, torch.Tensor]:
-        """Loss, gradients by autograd, optimisers; the parts of the loss."""
-        self.optimizers.zero_grad_all()
-        _, parts, _ = self.pipeline.get_train_loss_dict(step=step)
-        torch.stack(list(parts.values())).sum().backward()
-        self.optimizers.optimizer_scaler_step_all(self.grad_scaler)
-        return {name: part.detach() for name, part in parts.items()}
+    def after_step(self, step: int, losses: Losses, seconds: float) -> None:
+        """Tell, evaluate and save what is due."""
+        self.step = step
+        self._train_seconds += seconds
+        self._update_viewer_state(step)
+        self._tell_step(step, losses, seconds)
+        if len(self.pipeline.datamanager.eval_dataset) > 0:
+            with self.train_lock:
+                self.eval_iteration(step)
+        if step_check(step, self.config.steps_per_save):
+            self.save_checkpoint(step)
+        writer.write_out_storage()
+
+    def _tell_step(self, step: int, losses: Losses, seconds: float) -> None:
+        """Curves and progress, every `steps_per_log` steps and at the end."""
+        last = step == self.config.max_num_iterations - 1
+        if last or step_check(step, self.config.logging.steps_per_log, run_at_zero=True):
+            self._progress.show(step + 1, self._write_scalars(step, losses, seconds))
 
     def _run_callbacks(self, step: int, location: TrainingCallbackLocation) -> None:
         for callback in self.callbacks:
             callback.run_callback_at_location(step, location)
 
-    def _finite(self, loss: float, step: int) -> float:
-        if loss != loss or abs(loss) == float("inf"):
+    def _finite_loss(self, losses: Losses, step: int) -> float:
+        """The whole loss; raises UserError where it is not finite."""
+        loss = sum(map(float, losses.values()))
+        if not math.isfinite(loss):
             raise UserError(
                 f"The loss of step {step} is {loss}.",
                 f"Resume from the last checkpoint in {self.checkpoint_dir} with smaller learning "
@@ -195,24 +200,20 @@ class RGBAvatarTrainer(Trainer):
             )
         return loss
 
-    def _write_scalars(
-        self,
-        step: int,
-        loss: float,
-        parts: dict[str, torch.Tensor],
-        seconds: float,
-        images_per_step: int,
-        pixels: int,
-    ) -> None:
-        """TensorBoard's curves, and the speeds that the viewer shares the device by."""
+    def _write_scalars(self, step: int, losses: Losses, seconds: float) -> float:
+        """TensorBoard's curves, and the speeds the viewer shares the device by; the loss."""
+        loss = self._finite_loss(losses, step)
+        pixels = self.pipeline.datamanager.get_train_rays_per_batch()
+        rate = self._images_per_step / seconds
         writer.put_scalar(name="Train Loss", scalar=loss, step=step)
-        writer.put_dict(name="Train Loss Dict", scalar_dict={**parts}, step=step)
-        writer.put_scalar(name="Train Images / Sec", scalar=images_per_step / seconds, step=step)
+        writer.put_dict(name="Train Loss Dict", scalar_dict={**losses}, step=step)
+        writer.put_scalar(name="Train Images / Sec", scalar=rate, step=step)
         writer.put_time(EventName.ITER_TRAIN_TIME, seconds, step, update_eta=True)
         writer.put_time(EventName.TRAIN_RAYS_PER_SEC, pixels / seconds, step)
         for name, scheduler in self.optimizers.schedulers.items():
             rate = scheduler.get_last_lr()[0]
             writer.put_scalar(name=f"learning_rate/{name}", scalar=rate, step=step)
+        return loss
 
     @property
     def completed(self) -> bool:
@@ -251,15 +252,11 @@ class RGBAvatarTrainer(Trainer):
         """Write what refinement made of the frames' theta beside the config."""
         model = self.pipeline.model
         if model.refinement is not None:
-            model.refinement.save(self.base_dir / REFINED_NAME, model.frame_theta)
+            save_refined(self.base_dir / REFINED_NAME, model.refinement, model.frame_theta)
 
     def _write_summary(self) -> dict[str, int | float]:
         """The run's length and speed over all its sessions, as training.json."""
-        steps = self.step + 1
-        datamanager = self.pipeline.datamanager
-        tracked = datamanager.dataparser.tracked
-        batch = datamanager.get_train_rays_per_batch() // (tracked.width * tracked.height)
-        seconds = self._train_seconds
+        steps, batch, seconds = self.step + 1, self._images_per_step, self._train_seconds
         summary = {
             "steps": steps,
             "images": steps * batch,

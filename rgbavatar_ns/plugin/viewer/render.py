@@ -10,13 +10,14 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from rgbavatar_ns.avatar.metrics import psnr
 from rgbavatar_ns.data.check.sample import project
+from rgbavatar_ns.drawing.compositing import composite, rgba_to_float, shown_error
 from rgbavatar_ns.drawing.wireframe import with_wireframe
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.kernels import PinholeCameras, RenderedBatch
 from rgbavatar_ns.plugin.viewer.viewer_state import Shown, Stage, ViewerState
 
-_ERROR_GAIN = 4.0
 _SEEN = 0.02
 _CENTRE_RGB = (60, 255, 120)
 
@@ -110,20 +111,18 @@ def _beside_film(
         own.height,
     )
     drawn = _draw(stage, shown, wishes, own, backend)
-    rgba = torch.from_numpy(film.read_image(shown.position)).to(device).float() / 255
-    ground = rgba.new_tensor(wishes.backdrop)
-    truth = rgba[..., :3] * rgba[..., 3:] + ground * (1 - rgba[..., 3:])
+    rgba = rgba_to_float(torch.from_numpy(film.read_image(shown.position)).to(device))
+    truth = composite(rgba, rgba.new_tensor(wishes.backdrop))
     avatar = drawn.image[0].clamp(0, 1)
-    difference = (avatar - truth).abs()
-    psnr = float(-10 * difference.square().mean().clamp(min=1e-10).log10())
-    error = _colored(difference.mean(-1).mul(_ERROR_GAIN), cv2.COLORMAP_INFERNO)
+    quality_db = float(psnr(avatar[None], truth[None]).clamp(max=100))
+    error = _colored(shown_error(avatar, truth).mean(-1), cv2.COLORMAP_INFERNO)
     tiles = [error]
     if wishes.picture == "beside the film":
         avatar = _with_overlays(avatar, stage, shown, wishes, own, drawn.visibility)
         tiles = [truth, avatar, error]
     image = _fitted(torch.cat(tiles, 1), camera, wishes.backdrop)
     covered = image.new_ones(camera.height, camera.width, 1)
-    return ViewerPicture(image, covered, covered, psnr)
+    return ViewerPicture(image, covered, covered, quality_db)
 
 
 def _fitted(row: _Image, camera: PinholeCameras, backdrop: tuple[float, float, float]) -> _Image:

@@ -6,9 +6,10 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from rgbavatar_ns.data.check.contact_sheet import labelled, over_gray, write_contact_sheet
+from rgbavatar_ns.data.check.contact_sheet import write_contact_sheet
 from rgbavatar_ns.data.native.format import image_path
 from rgbavatar_ns.data.png import read_png_rgba
+from rgbavatar_ns.drawing.contact_sheet import labelled, over_gray_bgr
 from rgbavatar_ns.drawing.wireframe import fixed_point, with_wireframe
 from rgbavatar_ns.tracking.face.clip import ClipLandmarks
 from rgbavatar_ns.tracking.face.detector import LID_PAIRS, LIP_PAIRS, face_height_px
@@ -57,7 +58,7 @@ def draw_tile(
     """The matted image, and beside it the same with the mesh (blue), found (green) and fitted
     (red) landmarks; blue first."""
     zoom = _TILE_PX / image_rgba.shape[0]
-    image = over_gray(image_rgba, zoom)
+    image = over_gray_bgr(image_rgba, zoom)
     drawn = with_wireframe(image, vertices_px * zoom, faces)
     for points, bgr in ((found_px, _FOUND_BGR), (fitted_px, _FITTED_BGR)):
         for x, y in fixed_point(points * zoom).tolist():

@@ -115,7 +115,7 @@ def damage_json(path: Path, key: int, value: tuple | None) -> None:
 
 @pytest.mark.parametrize(
     "name",
-    [pytest.param(n, marks=pytest.mark.slow) if n == "insta-meshes" else n for n in FORMATS],
+    [pytest.param(n, marks=pytest.mark.nightly) if n == "insta-meshes" else n for n in FORMATS],
 )
 @settings(
     deadline=None,

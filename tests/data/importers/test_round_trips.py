@@ -211,7 +211,7 @@ def test_a_folder_of_another_system_opens_directly_and_the_second_time_as_our_ow
         load_dataset(tmp_path / "data", options)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_demo_subject_itself_comes_back(tmp_path):
     from rgbavatar_ns.synthetic import DemoConfig, film_demo
     from rgbavatar_ns.synthetic.exporters import FLAME_FOLDER, write_demo

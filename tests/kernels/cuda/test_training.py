@@ -3,8 +3,8 @@
 import pytest
 import torch
 
+from rgbavatar_ns.avatar.training import make_optimizer
 from rgbavatar_ns.avatar.training.fused_step import FusedStep
-from rgbavatar_ns.avatar.training.loop import make_optimizer
 from tests.avatar.fused_scene import (
     eager_step,
     far_batch,

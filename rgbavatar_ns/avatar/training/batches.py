@@ -1,0 +1,46 @@
+"""What a training step sees: tracked frames, or the numbers of frames that lie on the device."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from jaxtyping import Float, Int, UInt8
+from torch import Tensor
+
+from rgbavatar_ns.kernels import PinholeCameras
+
+
+@dataclass(frozen=True)
+class TrainingBatch:
+    """B tracked frames: theta, cameras (one, or one an image) and straight-alpha images."""
+
+    theta: Float[Tensor, "B H"]
+    cameras: PinholeCameras
+    images_rgba: UInt8[Tensor, "B H_px W_px 4"] | Float[Tensor, "B H_px W_px 4"]
+    background: Float[Tensor, "B 3"] | None = None
+    """Colours behind the images; where None, random ones of seed and step."""
+    position: Int[Tensor, "B"] | None = None
+    """The frames' places in the dataset; refined tracking asks for them."""
+
+
+@dataclass(frozen=True)
+class ChosenFrames:
+    """A batch by the numbers of its frames among those that lie on the device."""
+
+    rows: list[int]
+    background: Float[Tensor, "B 3"]
+    """In main memory."""
+
+
+@dataclass(frozen=True)
+class DeviceFrames:
+    """All frames that are trained on, on one device; one camera, or one a frame."""
+
+    theta: Float[Tensor, "F H"]
+    cameras: PinholeCameras
+    images_rgba: UInt8[Tensor, "F height width 4"]
+
+    def batch(self, rows: Sequence[int]) -> TrainingBatch:
+        """These frames by themselves."""
+        chosen, shared = list(rows), len(self.cameras.focal_px) == 1
+        cameras = self.cameras if shared else self.cameras.select(chosen)
+        return TrainingBatch(self.theta[chosen], cameras, self.images_rgba[chosen])

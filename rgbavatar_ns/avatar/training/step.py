@@ -1,0 +1,276 @@
+"""One optimiser step on a batch of frames, and what follows it.
+
+There are three ways to take it, with the same numbers up to rounding: recorded (one CUDA graph,
+frames on the device), fused (the backend's own loops, without autograd) and eager (torch).
+"""
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from rgbavatar_ns.avatar.avatar import LEARNING_RATES, Avatar
+from rgbavatar_ns.avatar.refinement.frames import FrameRefinement
+from rgbavatar_ns.avatar.training.batches import ChosenFrames, DeviceFrames, TrainingBatch
+from rgbavatar_ns.avatar.training.color_init import ColorInitSchedule, initialize_colors
+from rgbavatar_ns.avatar.training.cuda_graph import Recorder, record_cuda_graph
+from rgbavatar_ns.avatar.training.fused_step import FusedStep
+from rgbavatar_ns.avatar.training.losses import LPIPSLoss, image_losses, random_backgrounds
+from rgbavatar_ns.avatar.training.optimizer_states import unsupported_reason
+from rgbavatar_ns.avatar.training.orthogonality import (
+    ORTHOGONALITY_WEIGHT,
+    ORTHOGONALIZE_EVERY,
+    orthogonality_loss,
+    orthogonalize,
+)
+from rgbavatar_ns.avatar.training.recorded_step import RecordedStep
+from rgbavatar_ns.kernels import DeviceRenderer, MorphedRenderer, PinholeCameras
+
+Losses = dict[str, Float[Tensor, ""]]
+StepKind = Literal["recorded", "fused", "eager"]
+Orthogonality = Literal["free", "loss", "qr", "gram_schmidt"]
+
+
+@dataclass(frozen=True)
+class TrainingOptions:
+    """What the paper leaves to choose about training."""
+
+    seed: int = 0
+    """Seed of the random backgrounds."""
+    lpips_weight: float = 0.0
+    """Weight of the LPIPS loss (paper's variant: .05); 0 needs no LPIPS network."""
+    lpips_start_step: int = 0
+    """First step with the LPIPS loss (release: after 20k images)."""
+    color_init: ColorInitSchedule | None = field(default_factory=ColorInitSchedule)
+    """When colours are initialised; None leaves them grey."""
+    orthogonality: Orthogonality = "free"
+    """How bases are kept orthogonal: not at all, by a loss, or by QR or Gram-Schmidt at times."""
+    max_norm: Mapping[str, float] = field(default_factory=dict)
+    """Largest norm of a parameter group's gradient, by its name; others are not clipped."""
+    fast: bool = True
+    """Do without autograd where that can be; False keeps to the readable way."""
+    batch_parallel: bool = True
+    """Draw a batch together; False draws image by image (the paper's "naive batch"), eagerly."""
+    backend: str = "auto"
+    """Backend of the rasterizer."""
+
+    def lpips_counts(self, step: int) -> bool:
+        """Whether the loss of `step` has an LPIPS part."""
+        return self.lpips_weight > 0 and step >= self.lpips_start_step
+
+
+def make_optimizer(
+    avatar: Avatar, learning_rates: dict[str, float] | None = None
+) -> torch.optim.Adam:
+    """Return Adam over the avatar's parameter groups, with the paper's learning rates.
+
+    Epsilon 1e-15 as the release and 3DGS: gradients of single Gaussians are far below Adam's
+    default of 1e-8. Fused: four times faster on a CPU.
+    """
+    rates = LEARNING_RATES | (learning_rates or {})
+    groups = [
+        {"name": name, "params": parameters, "lr": rates[name]}
+        for name, parameters in avatar.parameter_groups().items()
+    ]
+    return torch.optim.Adam(groups, eps=1e-15, fused=True)
+
+
+class TrainingStep:
+    """Trains an avatar in place, a batch a call; built once a run, which chooses the way.
+
+    Args:
+        avatar: what is trained.
+        optimizers: those that hold its parameters; by default `make_optimizer`'s.
+        options: losses, colours, and which ways may be taken.
+        frames: gives all training frames on the device, or None; asked only where steps could be
+            recorded. A recorded step takes `ChosenFrames` of them in place of a `TrainingBatch`.
+        refinement: corrects the frames' theta by the gradient that each step leaves there.
+        lpips: the LPIPS loss, where it counts.
+        recorder: how a step becomes one that the device takes by itself.
+
+    Attributes:
+        kind: the way that is taken: "recorded", "fused" or "eager".
+        reason: why it is this one, as the rest of a sentence.
+    """
+
+    def __init__(
+        self,
+        avatar: Avatar,
+        optimizers: torch.optim.Optimizer | Iterable[torch.optim.Optimizer] | None = None,
+        options: TrainingOptions | None = None,
+        *,
+        frames: Callable[[], DeviceFrames | None] | None = None,
+        refinement: FrameRefinement | None = None,
+        lpips: LPIPSLoss | None = None,
+        recorder: Recorder = record_cuda_graph,
+    ) -> None:
+        if optimizers is None or isinstance(optimizers, torch.optim.Optimizer):
+            optimizers = [make_optimizer(avatar) if optimizers is None else optimizers]
+        self.avatar, self.optimizers = avatar, list(optimizers)
+        self.options = TrainingOptions() if options is None else options
+        self.refinement = refinement
+        self._lpips = LPIPSLoss() if lpips is None else lpips
+        self._orthogonality = self.options.orthogonality if avatar.config.num_bases else "free"
+        self._fused: FusedStep | None = None
+        self._frames: DeviceFrames | None = None
+        self._recorded: RecordedStep | None = None
+        self._recorder = recorder
+        self.kind: StepKind = "eager"
+        renderer = _probe(avatar, self.options.backend) if self.options.fast else None
+        autograd = self._autograd_reason(renderer)
+        if autograd is not None:
+            self.reason = autograd
+            return
+        self.kind, self._fused = "fused", FusedStep(avatar, self.optimizers, self.options.backend)
+        host = self._host_reason(renderer)
+        if host is None and frames is not None:
+            self._frames = frames()
+        if self._frames is not None:
+            self.kind, self.reason = "recorded", "all frames lie on the device"
+        else:
+            self.reason = host or "not all frames lie on the device"
+
+    def _autograd_reason(self, renderer: MorphedRenderer | None) -> str | None:
+        """Why steps go through autograd; None where they need not."""
+        options = self.options
+        if not options.fast:
+            return "the fast ways are switched off"
+        if not options.batch_parallel:
+            return "images are drawn one by one"
+        if self._orthogonality == "loss":
+            return "the loss of orthogonal bases goes through autograd"
+        if options.max_norm:
+            return "gradients are clipped"
+        if options.lpips_counts(0):
+            return "the LPIPS loss goes through autograd"
+        if renderer is None:
+            return "the rasterizer's backend has no other way for this avatar"
+        return unsupported_reason(self.avatar, self.optimizers)
+
+    def _host_reason(self, renderer: MorphedRenderer | None) -> str | None:
+        """Why a step needs the host; None where the device can take it alone."""
+        if self.options.lpips_weight > 0:
+            return f"the LPIPS loss takes over, eagerly, at step {self.options.lpips_start_step}"
+        if not isinstance(renderer, DeviceRenderer):
+            return "the rasterizer's backend needs the host"
+        return "tracking is refined" if self.refinement is not None else None
+
+    def __call__(self, batch: TrainingBatch | ChosenFrames, step: int) -> Losses:
+        """Take step `step` and what is due after it; returns the parts of the loss, detached.
+
+        Raises ValueError for `ChosenFrames` where steps are not recorded, or images that do not
+        fit; UserError where an LPIPS loss is asked for but unavailable.
+        """
+        if isinstance(batch, ChosenFrames):
+            return self._take_recorded(batch, step)
+        theta = batch.theta
+        if self.refinement is not None:
+            assert batch.position is not None, "Refined tracking needs the frames' positions."
+            theta = self.refinement.corrected(theta, batch.position).requires_grad_()
+        losses = self._losses(batch, theta, step)
+        if self.refinement is not None and theta.grad is not None:
+            assert batch.position is not None
+            self.refinement.step(step, batch.position, theta.grad)
+        theta = theta.detach()
+        self._finish(step, lambda: TrainingBatch(theta, batch.cameras, batch.images_rgba))
+        return losses
+
+    def _take_recorded(self, chosen: ChosenFrames, step: int) -> Losses:
+        frames, rows = self._frames, chosen.rows
+        if frames is None:
+            raise ValueError(f"Steps are {self.kind}: {self.reason}. Pass a TrainingBatch.")
+        if self._recorded is None:
+            self._recorded = RecordedStep(
+                self.avatar,
+                self.optimizers,
+                frames,
+                len(rows),
+                backend=self.options.backend,
+                recorder=self._recorder,
+            )
+        losses = {"l1": self._recorded(rows, chosen.background)}
+        self._finish(step, lambda: frames.batch(rows))
+        return losses
+
+    def _losses(self, batch: TrainingBatch, theta: Float[Tensor, "B H"], step: int) -> Losses:
+        """Step with the optimisers; `theta.grad` is left where theta requires it."""
+        background = batch.background
+        if background is None:
+            background = random_backgrounds(step, len(theta), self.options.seed)
+        background = background.to(theta.device, self.avatar.blendshapes.position.dtype)
+        images, by_autograd = batch.images_rgba, self.options.lpips_counts(step)
+        # Compiled loops read 8-bit images; others have more to say.
+        if self._fused is not None and images.dtype == torch.uint8 and not by_autograd:
+            return {"l1": self._fused(theta, batch.cameras, images, background)}
+        for optimizer in self.optimizers:
+            optimizer.zero_grad(set_to_none=True)
+        losses = self.eager_losses(batch, theta, background, step)
+        torch.stack(list(losses.values())).sum().backward()
+        groups = self.avatar.parameter_groups()
+        for name, norm in self.options.max_norm.items():
+            torch.nn.utils.clip_grad_norm_(groups[name], norm)
+        for optimizer in self.optimizers:
+            optimizer.step()
+        return {name: loss.detach() for name, loss in losses.items()}
+
+    def eager_losses(
+        self,
+        batch: TrainingBatch,
+        theta: Float[Tensor, "B H"],
+        background: Float[Tensor, "B 3"],
+        step: int,
+    ) -> Losses:
+        """The parts of the loss with their graph (paper, sec. 3.2); changes nothing."""
+        cameras = batch.cameras
+        draw = partial(self.avatar.render, backend=self.options.backend, differentiable=True)
+        if self.options.batch_parallel:
+            image = draw(theta, cameras, background).image
+        else:
+            each = [cameras.select([k % len(cameras.focal_px)]) for k in range(len(theta))]
+            one_by_one = map(draw, theta.split(1), each, background.split(1))
+            image = torch.cat([drawn.image for drawn in one_by_one])
+        losses = image_losses(
+            image,
+            batch.images_rgba,
+            background,
+            self._lpips if self.options.lpips_counts(step) else None,
+            self.options.lpips_weight,
+        )
+        if self._orthogonality == "loss":
+            error = orthogonality_loss(self.avatar.blendshapes)
+            losses["orthogonality"] = ORTHOGONALITY_WEIGHT * error
+        return losses
+
+    def _finish(self, step: int, shown: Callable[[], TrainingBatch]) -> None:
+        """What is due after a step: orthogonal bases, first colours."""
+        method, schedule = self._orthogonality, self.options.color_init
+        if (step + 1) % ORTHOGONALIZE_EVERY == 0 and method in ("qr", "gram_schmidt"):
+            orthogonalize(self.avatar.blendshapes, method)
+        if schedule is None or not schedule.due(step):
+            return
+        if not bool(self.avatar.color_initialized.all()):
+            batch = shown()
+            initialize_colors(
+                self.avatar,
+                batch.theta,
+                batch.cameras,
+                batch.images_rgba,
+                backend=self.options.backend,
+            )
+
+
+def _probe(avatar: Avatar, backend: str) -> MorphedRenderer | None:
+    """How the backend draws this avatar without autograd, tried on a tiny image."""
+    position = avatar.blendshapes.position
+    camera = PinholeCameras(
+        torch.eye(4).to(position)[None],
+        position.new_full((1, 2), 8.0),
+        position.new_full((1, 2), 8.0),
+        width=16,
+        height=16,
+    )
+    return avatar.renderer(position.new_zeros(1, avatar.layout.size), camera, backend=backend)

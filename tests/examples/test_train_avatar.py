@@ -1,0 +1,39 @@
+"""The example that needs no nerfstudio: a dataset in, an avatar, its score and its picture out."""
+
+import re
+import runpy
+import sys
+from pathlib import Path
+
+import cv2
+import pytest
+
+from rgbavatar_ns import Avatar
+from tests.plugin.tiny import NUM_TEST, SIZE, tiny_dataset
+
+SCRIPT = Path(__file__).parents[2] / "examples" / "train_avatar.py"
+
+
+def test_it_trains_scores_and_draws(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    tiny_dataset(tmp_path / "data")
+    folders, scores = [str(tmp_path / "data"), str(tmp_path / "out")], {}
+    for steps in ("1", "60"):
+        arguments = [*folders, "--steps", steps, "--uv-resolution", "16"]
+        monkeypatch.setattr(sys, "argv", [str(SCRIPT), *arguments])
+        runpy.run_path(str(SCRIPT), run_name="__main__")
+        told = capsys.readouterr().out
+        score, frames = re.findall(r"held-out PSNR ([\d.]+) dB over (\d+) frames", told)[0]
+        scores[steps] = float(score)
+    assert scores["60"] > scores["1"] + 2
+    assert int(frames) == NUM_TEST
+    avatar = Avatar.load(tmp_path / "out" / "trained.avatar")
+    assert avatar.num_gaussians > 50
+    picture = cv2.imread(str(tmp_path / "out" / "held_out.png"))
+    assert picture.shape[0] == 3 * SIZE
+    assert len(SCRIPT.read_text().splitlines()) <= 80
+
+
+def test_it_needs_no_nerfstudio():
+    assert "nerfstudio" not in SCRIPT.read_text().split('"""', 2)[2]
