@@ -1,7 +1,6 @@
 import numpy as np
 import pytest
 
-from rgbavatar_ns.drawing.wireframe import mesh_silhouette
 from rgbavatar_ns.tracking.fit.camera import StillCamera
 from rgbavatar_ns.tracking.image.crop import SquareCrop, steady_crop
 from rgbavatar_ns.tracking.image.head_mask import HeadMask, neck_ring
@@ -114,10 +113,3 @@ def test_head_region_keeps_hair_and_fades_out_below_the_neck() -> None:
     column = region[150:215, 100]
     assert (np.diff(column) <= 1e-4).all()
     assert np.abs(np.diff(column)).max() < 0.15, "a soft fade"
-
-
-def test_silhouette_of_a_square_covers_its_area() -> None:
-    corners = np.array([[10.0, 10], [50, 10], [50, 40], [10, 40]])
-    mask = mesh_silhouette(corners, np.array([[0, 2, 1], [0, 3, 2]]), 64)
-    assert mask[10:40, 10:50].min() == 1
-    assert mask.sum() == pytest.approx(40 * 30, rel=0.08)

@@ -188,6 +188,8 @@ def test_a_destination_that_is_a_file_is_refused(clip: Path, tmp_path: Path) -> 
     with pytest.raises(UserError, match="is a file"):
         track_video(clip, tmp_path / "set")
     assert (tmp_path / "set").read_text() == "mine"
+    with pytest.raises(UserError, match="not empty"):
+        track_video(clip, tmp_path)
 
 
 def _failing(code: int, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
