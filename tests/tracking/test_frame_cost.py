@@ -14,7 +14,9 @@ from rgbavatar_ns.tracking.fit.landmark_cost import FrameCost, FrameTerms, Targe
 from rgbavatar_ns.tracking.fit.parameters import FitParameters
 from rgbavatar_ns.tracking.fit.subject import SubjectTracker
 
-CAMERA, FACE_PX = StillCamera(700.0, (160.0, 120.0), 0.8), 150.0
+from .acting import CAMERA
+
+FACE_PX = 150.0
 
 
 @pytest.fixture(scope="module")

@@ -13,17 +13,16 @@ from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadArrays, HeadModel
 from rgbavatar_ns.synthetic.flame import write_synthetic_flame
 from rgbavatar_ns.tracking import TrackConfig, track_video
-from rgbavatar_ns.tracking.fit.camera import StillCamera
 from rgbavatar_ns.tracking.fit.fit import ClipFit
 from rgbavatar_ns.tracking.fit.own_head import read_own_head, subject_tracker
 from rgbavatar_ns.tracking.fit.parameters import fit_parameters
 from rgbavatar_ns.tracking.fit.subject import SubjectTracker
 
 from ..head.synthetic_head import flame_shaped_arrays
+from .acting import CAMERA, degrees_apart, observed, performance, skulls
 from .clips import astronaut, write_clip
 from .remeshed_head import TURN, as_another_model, remeshed
 
-CAMERA = StillCamera(700.0, (160.0, 120.0), 0.8)
 CONFIG = TrackConfig(focal_px=CAMERA.focal_px, key_frames=6, identity_components=10)
 FRAMES = 10
 
@@ -37,21 +36,9 @@ def flame_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def seen() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """theta and vertices of an acted clip of the embedded head, and what FaceMesh sees of it."""
     tracker = subject_tracker(CONFIG)
-    head, layout = tracker.head, tracker.head.layout
-    time = np.linspace(0, 2 * np.pi, FRAMES)
-    theta = np.zeros((FRAMES, layout.size))
-    turns = [0.12 * np.sin(time), 0.25 * np.sin(2 * time + 1), 0.08 * np.cos(time)]
-    theta[:, layout.slice("rotation")] = np.stack(turns, axis=1)
-    theta[:, layout.slice("jaw").start] = 0.12 * (1 - np.cos(2 * time))
-    first, names = layout.slice("expression").start, head.arrays.expression_names
-    for number, name in enumerate(("mouthSmileLeft", "browInnerUp", "eyeBlinkLeft")):
-        theta[:, first + names.index(name)] = 0.4 + 0.4 * np.sin(time + number)
-    identity = np.zeros(head.num_identity)
-    identity[:8] = 0.5 * np.random.default_rng(11).normal(size=8)
-    points = np.zeros((FRAMES, 478, 2))
-    for frame, row in enumerate(theta):
-        found = tracker.cost.head.points(row, identity, CAMERA.eye_m)
-        points[frame, tracker.facemesh_index] = CAMERA.project(found)
+    head = tracker.head
+    theta, identity = performance(head, FRAMES)
+    points = observed(tracker, theta, identity)
     with torch.no_grad():
         vertices = head(torch.from_numpy(theta), torch.from_numpy(identity)).numpy()
     return theta, vertices, points
@@ -66,7 +53,7 @@ def errors(
     that. Depth and size, which one camera does not tell apart, are aligned.
     """
     theta, true, _ = seen
-    plain = subject_tracker(CONFIG).mesh_landmarks
+    plain = subject_tracker(CONFIG)
     fitted = tracker.thetas(fit)
     with torch.no_grad():
         identity = torch.from_numpy(fit.subject.identity)
@@ -78,11 +65,8 @@ def errors(
     ours, true = (points - points.mean(1, keepdims=True) for points in (ours, true))
     grown = np.linalg.norm(true, axis=-1).mean() / np.linalg.norm(ours, axis=-1).mean()
     away_mm = 1e3 * np.linalg.norm(grown * ours - true, axis=-1).mean()
-    cosines = []
-    for own, real in zip(fitted, theta):
-        turned = tracker.mesh_landmarks.head_rotation(own) @ turn
-        cosines.append((np.trace(turned @ plain.head_rotation(real).T) - 1) / 2)
-    return float(np.degrees(np.arccos(np.clip(cosines, -1, 1))).mean()), float(away_mm)
+    away_deg = degrees_apart(skulls(tracker, fitted) @ turn, skulls(plain, theta))
+    return float(away_deg.mean()), float(away_mm)
 
 
 @pytest.mark.slow

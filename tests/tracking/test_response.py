@@ -15,6 +15,8 @@ from rgbavatar_ns.tracking.config import TrackConfig
 from rgbavatar_ns.tracking.face.detector import FaceLandmarker
 from rgbavatar_ns.tracking.fit.subject import SubjectTracker
 
+from .acting import degrees_apart, skulls
+
 pytest.importorskip("mediapipe", reason="the tracker needs mediapipe")
 # Not among the people on whom the response was measured.
 SEED, FRAMES = 4, 20
@@ -47,13 +49,7 @@ def test_head_jaw_and_expressions_come_nearer_to_the_truth() -> None:
         tracker = SubjectTracker(head, camera, response=response)
         fit = tracker.fit(np.array(found), [False] * len(found), 192, 192)
         fitted = tracker.thetas(fit)
-        turns = [
-            tracker.mesh_landmarks.head_rotation(ours)
-            @ tracker.mesh_landmarks.head_rotation(real).T
-            for ours, real in zip(fitted, true)
-        ]
-        cosine = [(np.trace(turn) - 1) / 2 for turn in turns]
-        degrees = np.degrees(np.arccos(np.clip(cosine, -1, 1))).mean()
+        degrees = degrees_apart(skulls(tracker, fitted), skulls(tracker, true)).mean()
         expression = layout.slice("expression")
         active = [
             column

@@ -45,7 +45,7 @@ class Fit:
     iou: float
     covered: float
     up: float
-    """Cosine of the head's up and the picture's up."""
+    """Cosine of the head's up and the image's up."""
     facing: float
     """Cosine of where the head looks and where the camera is."""
     mattes: bool

@@ -18,7 +18,7 @@ from rgbavatar_ns.drawing.wireframe import mesh_silhouette
 from rgbavatar_ns.head import HeadModel
 
 SMALL_PX = 96
-"""Longer side of the pictures that silhouettes are compared in."""
+"""Longer side of the images that silhouettes are compared in."""
 _CHUNK = 16
 _NEAREST_M = 1e-3
 _OPAQUE, _MATTED_SHARE = 0.5, 0.98

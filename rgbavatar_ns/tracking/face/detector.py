@@ -25,7 +25,7 @@ LIP_PAIRS = ((13, 14), (82, 87), (312, 317), (81, 178), (311, 402), (80, 88), (3
 LID_PAIRS = ((159, 145), (158, 153), (160, 144), (386, 374), (385, 380), (387, 373))
 """Pairs of points whose distance says how far lips and lids are open."""
 MAX_SIDE_PX = 1280
-"""Pictures that are larger are made smaller before faces are looked for."""
+"""Images that are larger are made smaller before faces are looked for."""
 _MOST_FACES = 3
 
 
@@ -68,7 +68,7 @@ class FaceLandmarker:
         return None if followed is None else faces[followed]
 
     def faces(self, image_rgb: UInt8[np.ndarray, "H W 3"]) -> Float[np.ndarray, "N 478 2"]:
-        """Every face's landmarks as shares of the picture's width and height."""
+        """Every face's landmarks as shares of the image's width and height."""
         height, width = image_rgb.shape[:2]
         small = fitted_size(width, height, MAX_SIDE_PX)
         if small != (width, height):

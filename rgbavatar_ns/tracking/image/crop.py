@@ -38,7 +38,7 @@ class SquareCrop:
     def apply(
         self, image: UInt8[np.ndarray, "H W *channels"]
     ) -> UInt8[np.ndarray, "size size *channels"]:
-        """The square part of the frame (of a picture or a mask) at the output size."""
+        """The square part of the frame (of an image or a mask) at the output size."""
         height, width = image.shape[:2]
         top, bottom = _within(self.top, self.side, height)
         left, right = _within(self.left, self.side, width)

@@ -1,4 +1,4 @@
-"""A soft matte of the person: selfie segmentation, sharpened along the picture's edges."""
+"""A soft matte of the person: selfie segmentation, sharpened along the image's edges."""
 
 import cv2
 import numpy as np
@@ -17,7 +17,7 @@ _FINE_SIDE_PX = 512
 class PersonMatte:
     """mediapipe's selfie segmentation, refined by a guided filter.
 
-    Each frame by itself: the result depends on one picture alone.
+    Each frame by itself: the result depends on one image alone.
     """
 
     def __init__(self) -> None:
@@ -39,7 +39,7 @@ class PersonMatte:
 
 
 def refined_matte(image_rgb: _Image, coarse: _Alpha) -> _Alpha:
-    """The coarse matte drawn to the picture's own edges by a guided filter (He 2010)."""
+    """The coarse matte drawn to the image's own edges by a guided filter (He 2010)."""
     longer = max(image_rgb.shape[:2])
     radius = max(2, round(longer / 45))
     # The filter's coefficients at half the size, where that is still finer than the segmentation: a
@@ -51,7 +51,7 @@ def refined_matte(image_rgb: _Image, coarse: _Alpha) -> _Alpha:
 
 
 def straight_rgba(color: _Image, alpha: _Alpha) -> UInt8[np.ndarray, "H W 4"]:
-    """Colour and alpha as a picture; colour under zero alpha is black, which compresses well."""
+    """Colour and alpha as an image; colour under zero alpha is black, which compresses well."""
     levels = cv2.convertScaleAbs(np.ascontiguousarray(alpha), alpha=255)
     seen = cv2.bitwise_and(color, color, mask=levels)
     return cv2.merge([*cv2.split(seen), levels])
@@ -63,7 +63,7 @@ def foreground_color(image_rgb: _Image, alpha: _Alpha) -> _Image:
     Blurred-fusion estimate (Forte 2021, "Approximate fast foreground colour estimation") from
     coarse to fine: at a quarter of the size, at half of it, and the last correction at full size
     where both shine through; without it hair edges keep a fringe of the background's colour. Under
-    zero alpha the picture stays as it is.
+    zero alpha the image stays as it is.
     """
     height, width = alpha.shape
     longer = max(height, width)
@@ -81,7 +81,7 @@ def foreground_color(image_rgb: _Image, alpha: _Alpha) -> _Image:
     mixed = np.flatnonzero((weight > 0) & (weight < 1))
     found = image_rgb.copy()
     if mixed.size:
-        # As a picture of one row, which is what OpenCV's arithmetic takes.
+        # As an image of one row, which is what OpenCV's arithmetic takes.
         image, near, far = (
             part.reshape(-1, 3)[mixed][None].astype(np.float32, copy=False)
             for part in (image_rgb, *(cv2.resize(part, (width, height)) for part in (near, far)))
@@ -104,7 +104,7 @@ def _fuse(
 
 
 def _explained(image: _Colors, foreground: _Colors, background: _Colors, alpha: _Alpha) -> _Colors:
-    """The foreground, changed as far as alpha goes so that both together give the picture."""
+    """The foreground, changed as far as alpha goes so that both together give the image."""
     mixed = cv2.merge([alpha, alpha, alpha])
     changed = cv2.multiply(mixed, cv2.subtract(foreground, background))
     cv2.add(changed, background, dst=changed)

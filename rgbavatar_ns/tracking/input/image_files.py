@@ -67,7 +67,7 @@ def read_image_rgba(path: Path) -> UInt8[np.ndarray, "H W 4"]:
         raise UserError(f"{path} cannot be decoded as an image.", "Remove or replace it.")
     if decoded.dtype not in (np.uint8, np.uint16):
         raise UserError(
-            f"{path} holds {decoded.dtype} values.", "Store pictures with 8 or 16 bits a channel."
+            f"{path} holds {decoded.dtype} values.", "Store images with 8 or 16 bits a channel."
         )
     turn = cv2.COLOR_BGRA2RGBA if decoded.shape[2] == 4 else cv2.COLOR_BGR2RGBA
     rgba = cv2.cvtColor(decoded, turn)
