@@ -56,7 +56,7 @@ class RecordedStep:
         device = frames.theta.device
         self._network = avatar.parameter_groups().get("weight_network", [])
         rows = len(UPDATED_ATTRIBUTES) + 1
-        # One buffer, so that one copy brings all of a step's inputs: frames, backgrounds, Adam's numbers.
+        # One buffer, so that one copy brings a step's inputs: frames, backgrounds, Adam's numbers.
         self._sizes = (batch_size, 3 * batch_size, rows * 2 * _NUMBERS)
         self._step_inputs = torch.zeros(sum(self._sizes), dtype=torch.float64, device=device)
         self._loss = torch.zeros((), device=device)
@@ -81,9 +81,9 @@ class RecordedStep:
         self._forget_if_moved()
         if not self._optimizers_told:
             self._tell_optimizers()
-        news = [*map(float, chosen), *background.flatten().tolist(), *self._numbers()]
+        inputs = [*map(float, chosen), *background.flatten().tolist(), *self._numbers()]
         # From pageable memory: the driver keeps its own copy at once, whatever the device does.
-        self._step_inputs.copy_(torch.tensor(news, dtype=torch.float64), non_blocking=True)
+        self._step_inputs.copy_(torch.tensor(inputs, dtype=torch.float64), non_blocking=True)
         if self._steps < _EAGER_STEPS:
             self._work()
         else:
@@ -122,7 +122,7 @@ class RecordedStep:
         return [*numbers, *(0.0,) * _NUMBERS]
 
     def _work(self) -> None:
-        """One step, from `_step_inputs`: nothing here may wait for the device or copy from the host."""
+        """One step, from its inputs: nothing here may wait for the device or copy from the host."""
         chosen, background, numbers = self._step_inputs.split(self._sizes)
         rows = numbers.float().view(-1, 2 * _NUMBERS)
         index = chosen.long()
