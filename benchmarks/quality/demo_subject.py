@@ -10,8 +10,6 @@ were streamed, with local and global pool and with the local pool alone.
 """
 
 import argparse
-import json
-import platform
 import statistics
 import tempfile
 import time
@@ -22,10 +20,10 @@ from typing import Any
 
 import torch
 from rich.progress import Progress
+from subject import BATCH_SIZE, Subject, write_figures
 
 from rgbavatar_ns import Avatar
 from rgbavatar_ns.avatar import AvatarConfig
-from rgbavatar_ns.avatar.metrics import psnr
 from rgbavatar_ns.avatar.training import (
     LossCurve,
     TrainingBatch,
@@ -33,12 +31,9 @@ from rgbavatar_ns.avatar.training import (
     TrainingStep,
     fit,
 )
-from rgbavatar_ns.data import LocalGlobalPools, OfflineOrder, TrackedDataset
-from rgbavatar_ns.drawing.compositing import composite, rgba_to_float
-from rgbavatar_ns.head import HeadModel
+from rgbavatar_ns.data import LocalGlobalPools
 from rgbavatar_ns.synthetic import DemoConfig, make_demo_dataset
 
-BATCH_SIZE = 10
 WINDOW = 10
 LOCAL_SIZE, GLOBAL_SIZE = 15, 100
 """Pools as large a part of 180 training frames as the paper's 150 and 1,000 of a two-minute clip
@@ -46,12 +41,10 @@ are of its 3,000, but for the global one, which would hold only the first 60."""
 
 
 class Bench:
-    """One demo subject in memory, and runs of training over it."""
+    """Runs of training over one demo subject."""
 
-    def __init__(self, dataset: TrackedDataset, seed: int, progress: Progress) -> None:
-        self.dataset, self.seed, self.progress = dataset, seed, progress
-        images = [torch.as_tensor(dataset.read_image(i)) for i in range(len(dataset))]
-        self.images = torch.stack(images)
+    def __init__(self, subject: Subject, progress: Progress) -> None:
+        self.subject, self.progress = subject, progress
 
     def train(
         self,
@@ -65,20 +58,16 @@ class Bench:
 
         `frames_of(step)` gives the frames of a step; by default the offline order.
         """
-        frames_of = frames_of or OfflineOrder(self.dataset.train, BATCH_SIZE, self.seed).batch
-        options = TrainingOptions(seed=self.seed)
+        chosen = frames_of or self.subject.offline().batch
+        options = TrainingOptions(seed=self.subject.seed)
         if not color_init:
             options = replace(options, color_init=None)
-        avatar = Avatar(
-            HeadModel(self.dataset.arrays), self.dataset.identity, config, seed=self.seed
-        )
-        bar = self.progress.add_task(f"seed {self.seed}: {title}", total=steps)
+        avatar = self.subject.avatar(config)
+        bar = self.progress.add_task(f"seed {self.subject.seed}: {title}", total=steps)
 
         def batch(step: int) -> TrainingBatch:
-            chosen = list(frames_of(step))
-            cameras = self.dataset.cameras.select(chosen)
             self.progress.update(bar, completed=step + 1)
-            return TrainingBatch(self.dataset.theta[chosen], cameras, self.images[chosen])
+            return self.subject.batch(chosen(step))
 
         started, curve = time.monotonic(), LossCurve(steps)
         fit(TrainingStep(avatar, options=options), batch, range(steps), curve)
@@ -86,9 +75,9 @@ class Bench:
 
     def stream(self, title: str, config: AvatarConfig, steps: int, global_size: int) -> float:
         """Train while the frames arrive evenly and in order; return the PSNR over them all."""
-        pools = LocalGlobalPools(LOCAL_SIZE, global_size, seed=self.seed)
-        waiting = list(self.dataset.train)
-        count = len(waiting)
+        train = self.subject.dataset.train
+        pools = LocalGlobalPools(LOCAL_SIZE, global_size, seed=self.subject.seed)
+        waiting, count = list(train), len(train)
 
         def frames_of(step: int) -> list[int]:
             while waiting and count - len(waiting) <= step * count // steps:
@@ -96,18 +85,7 @@ class Bench:
             return pools.batch(BATCH_SIZE)
 
         avatar, _, _ = self.train(title, config, steps, frames_of=frames_of)
-        return self.psnr(avatar, self.dataset.train)
-
-    @torch.no_grad()
-    def psnr(self, avatar: Avatar, positions: Sequence[int]) -> float:
-        """Mean PSNR in dB over these frames: full frame, black background."""
-        scores = []
-        for position in positions:
-            camera = self.dataset.cameras.select([position])
-            image = avatar.render(self.dataset.theta[[position]], camera).image.clamp(0, 1)
-            target = composite(rgba_to_float(self.images[[position]]), torch.zeros(1, 3))
-            scores.append(float(psnr(image, target)))
-        return statistics.fmean(scores)
+        return self.subject.psnr(avatar, train)
 
 
 def steps_to_reach(losses: torch.Tensor, level: float) -> int | None:
@@ -120,16 +98,16 @@ def steps_to_reach(losses: torch.Tensor, level: float) -> int | None:
 def measure(bench: Bench, steps: int, uv_resolution: int) -> dict[str, Any]:
     """Train the variants of one seed and return its figures."""
     config = AvatarConfig(uv_resolution=uv_resolution, scale_from_texel_spacing=True)
-    test = bench.dataset.test
+    test, psnr = bench.subject.dataset.test, bench.subject.psnr
     full, losses, seconds = bench.train("K = 20", config, steps)
     base, _, _ = bench.train("K = 0", replace(config, num_bases=0), steps)
     no_pose, _, _ = bench.train("no pose input", replace(config, pose_input=False), steps)
     _, losses_grey, _ = bench.train("no colour initialisation", config, 200, color_init=False)
     return {
-        "seed": bench.seed,
-        "psnr": bench.psnr(full, test),
-        "psnr_no_bases": bench.psnr(base, test),
-        "psnr_no_pose_input": bench.psnr(no_pose, test),
+        "seed": bench.subject.seed,
+        "psnr": psnr(full, test),
+        "psnr_no_bases": psnr(base, test),
+        "psnr_no_pose_input": psnr(no_pose, test),
         "color_init_steps_to_loss_200": steps_to_reach(losses, float(losses_grey[-WINDOW:].mean())),
         "streamed_psnr": bench.stream("streamed", config, steps, GLOBAL_SIZE),
         "streamed_psnr_no_global": bench.stream("streamed, no global pool", config, steps, 0),
@@ -158,18 +136,13 @@ def main() -> None:
         with tempfile.TemporaryDirectory() as folder, Progress() as progress:
             progress.add_task(f"seed {seed}: subject", total=None)
             dataset = make_demo_dataset(Path(folder) / "subject", DemoConfig(seed=seed))
-            bench = Bench(dataset, seed, progress)
+            bench = Bench(Subject.of(dataset, seed), progress)
             rows.append(measure(bench, arguments.steps, arguments.uv_resolution))
         print(row_text(rows[-1]), flush=True)
-    machine = {"processor": platform.processor() or platform.machine(), "torch": torch.__version__}
-    machine |= {"threads": str(torch.get_num_threads()), "python": platform.python_version()}
     keys = [key for key in rows[0] if key != "seed" and all(row[key] is not None for row in rows)]
     medians = {key: statistics.median(row[key] for row in rows) for key in keys}
     print("medians:  " + row_text(medians))
-    if arguments.json:
-        settings = {"seeds": arguments.seeds, "steps": arguments.steps}
-        content = {"settings": settings, "machine": machine, "rows": rows, "medians": medians}
-        arguments.json.write_text(json.dumps(content, indent=2))
+    write_figures(arguments.json, arguments, rows=rows, medians=medians)
 
 
 if __name__ == "__main__":

@@ -20,31 +20,25 @@ twice a second for every tenth frame; looking takes longer than training where s
 """
 
 import argparse
-import json
 import math
-import platform
 import statistics
 import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
-import torch
 from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
+from subject import BATCH_SIZE, Subject, write_figures
 
 from rgbavatar_ns import Avatar
 from rgbavatar_ns.avatar import AvatarConfig
-from rgbavatar_ns.avatar.training import TrainingBatch, TrainingOptions, TrainingStep
-from rgbavatar_ns.data import LocalGlobalPools, OfflineOrder, TrackedDataset, load_dataset
-from rgbavatar_ns.drawing.compositing import composite, rgba_to_float
-from rgbavatar_ns.head import HeadModel
+from rgbavatar_ns.avatar.training import TrainingOptions, TrainingStep
+from rgbavatar_ns.data import LocalGlobalPools, TrackedDataset, load_dataset
 from rgbavatar_ns.synthetic import DemoConfig, make_demo_dataset
 
-BATCH_SIZE = 10
 FRAMES_PER_SECOND = 25.0
 PAPER_STREAM_FRAMES = 3000
 PRESET_STEPS_AFTER = 500
@@ -55,23 +49,10 @@ OFFLINE, OFFLINE_CONSTANT = "offline", "offline, constant rates"
 UNFINISHED = "eta .7, no steps after"
 
 
-@dataclass(frozen=True)
-class Sizes:
-    """Pools as large a part of the stream as the paper's are of two minutes."""
-
-    local_size: int
-    global_size: int
-
-    @classmethod
-    def for_stream(cls, frames: int) -> "Sizes":
-        """150 and 1,000 for 3,000 frames."""
-        part = min(1.0, frames / PAPER_STREAM_FRAMES)
-        return cls(max(BATCH_SIZE, round(150 * part)), max(BATCH_SIZE, round(1000 * part)))
-
-
-def variants(sizes: Sizes, seed: int) -> dict[str, Callable[[], LocalGlobalPools]]:
-    """The pools of each variant by its name."""
-    local, old = sizes.local_size, sizes.global_size
+def variants(frames: int, seed: int) -> dict[str, Callable[[], LocalGlobalPools]]:
+    """The pools of each variant by its name, as large a part of the stream as the paper's are."""
+    part = min(1.0, frames / PAPER_STREAM_FRAMES)
+    local, old = (max(BATCH_SIZE, round(size * part)) for size in (150, 1000))
     return {
         "eta .7 (paper)": lambda: LocalGlobalPools(local, old, 0.7, seed),
         "eta .1": lambda: LocalGlobalPools(local, old, 0.1, seed),
@@ -114,25 +95,18 @@ class Outcome:
 
 
 class Bench:
-    """A dataset in memory and runs of training over it."""
+    """Runs of training over a subject; `arguments` are the command's."""
 
-    def __init__(
-        self,
-        dataset: TrackedDataset,
-        seed: int,
-        uv_resolution: int,
-        images_per_second: float,
-        steps_after: int,
-        looks_per_second: float,
-    ) -> None:
-        self.dataset, self.seed, self.steps_after = dataset, seed, steps_after
-        self.frames_per_look = max(1, round(FRAMES_PER_SECOND / looks_per_second))
-        self.config = AvatarConfig(uv_resolution=uv_resolution, scale_from_texel_spacing=True)
-        self.steps_per_frame = images_per_second / FRAMES_PER_SECOND / BATCH_SIZE
-        images = [torch.as_tensor(dataset.read_image(i)) for i in range(len(dataset))]
-        self.images = torch.stack(images)
-        self.looked_at = dataset.train[::LOOKED_AT]
-        self.scored = dataset.test[:: max(1, len(dataset.test) // 30)]
+    def __init__(self, subject: Subject, arguments: argparse.Namespace) -> None:
+        self.subject, self.dataset = subject, subject.dataset
+        self.steps_after = steps_after(arguments)
+        self.frames_per_look = max(1, round(FRAMES_PER_SECOND / arguments.looks_per_second))
+        self.config = AvatarConfig(
+            uv_resolution=arguments.uv_resolution, scale_from_texel_spacing=True
+        )
+        self.steps_per_frame = arguments.images_per_second / FRAMES_PER_SECOND / BATCH_SIZE
+        self.looked_at = self.dataset.train[::LOOKED_AT]
+        self.scored = self.dataset.test[:: max(1, len(self.dataset.test) // 30)]
 
     def train(
         self,
@@ -142,10 +116,8 @@ class Bench:
         final_rate: float,
     ) -> Outcome:
         """Stream all training frames through the pools; offline without pools."""
-        head = HeadModel(self.dataset.arrays)
-        avatar = Avatar(head, self.dataset.identity, self.config, seed=self.seed)
-        take = TrainingStep(avatar, options=TrainingOptions(seed=self.seed))
-        offline = OfflineOrder(self.dataset.train, BATCH_SIZE, self.seed)
+        avatar, offline = self.subject.avatar(self.config), self.subject.offline()
+        take = TrainingStep(avatar, options=TrainingOptions(seed=self.subject.seed))
         outcome, lowest, step = Outcome(), dict.fromkeys(self.looked_at, math.inf), 0
         for arrived, position in enumerate(self.dataset.train, start=1):
             if pools is not None:
@@ -153,7 +125,7 @@ class Bench:
             began = time.monotonic()
             while step < arrived * self.steps_per_frame:
                 chosen = offline.batch(step) if pools is None else pools.batch(BATCH_SIZE)
-                take(self.batch(chosen), step)
+                take(self.subject.batch(chosen), step)
                 step += 1
             outcome.train_seconds += time.monotonic() - began
             if arrived % self.frames_per_look == 0:
@@ -161,14 +133,14 @@ class Bench:
                 for place, loss in self.losses(avatar, seen).items():
                     lowest[place] = min(lowest[place], loss)
                 outcome.seconds.append(arrived / FRAMES_PER_SECOND)
-                outcome.psnr.append(self.psnr(avatar, self.scored))
+                outcome.psnr.append(self.subject.psnr(avatar, self.scored))
                 newest = self.dataset.train[max(0, arrived - NEWEST) : arrived : NEWEST_EVERY]
-                outcome.newest.append(self.psnr(avatar, newest))
+                outcome.newest.append(self.subject.psnr(avatar, newest))
             advance()
         began = time.monotonic()
         for _ in range(steps_after):
             evenly = None if pools is None else pools.batch(BATCH_SIZE, evenly=True)
-            take(self.batch(evenly or offline.batch(step)), step)
+            take(self.subject.batch(evenly or offline.batch(step)), step)
             for group in take.optimizers[0].param_groups:
                 group["lr"] *= final_rate ** (1 / steps_after)
             step += 1
@@ -176,43 +148,22 @@ class Bench:
         after = self.losses(avatar, list(self.looked_at))
         outcome.loss_after = [after[p] for p in self.looked_at]
         outcome.loss_lowest = [min(lowest[p], after[p]) for p in self.looked_at]
-        outcome.test_psnr = self.psnr(avatar, self.dataset.test)
-        outcome.streamed_psnr = self.psnr(avatar, self.looked_at)
+        outcome.test_psnr = self.subject.psnr(avatar, self.dataset.test)
+        outcome.streamed_psnr = self.subject.psnr(avatar, self.looked_at)
         return outcome
-
-    def batch(self, chosen: list[int]) -> TrainingBatch:
-        """These frames as a training batch."""
-        cameras = self.dataset.cameras.select(chosen)
-        return TrainingBatch(self.dataset.theta[chosen], cameras, self.images[chosen])
-
-    @torch.no_grad()
-    def errors(self, avatar: Avatar, chosen: list[int]) -> torch.Tensor:
-        """Differences of these frames over black [B, H, W, 3]."""
-        batch = self.batch(chosen)
-        image = avatar.render(batch.theta, batch.cameras).image.clamp(0, 1)
-        black = torch.zeros(len(chosen), 3)
-        return image - composite(rgba_to_float(batch.images_rgba), black)
 
     def losses(self, avatar: Avatar, positions: list[int]) -> dict[int, float]:
         """L1 of each frame."""
         found: dict[int, float] = {}
         for start in range(0, len(positions), BATCH_SIZE):
             chosen = positions[start : start + BATCH_SIZE]
-            errors = self.errors(avatar, chosen).abs().mean(dim=(1, 2, 3))
+            image, target = self.subject.shown(avatar, chosen)
+            errors = (image - target).abs().mean(dim=(1, 2, 3))
             found |= dict(zip(chosen, errors.tolist()))
         return found
 
-    def psnr(self, avatar: Avatar, positions: tuple[int, ...]) -> float:
-        """Mean PSNR in dB: full frame, black background."""
-        scores: list[float] = []
-        for start in range(0, len(positions), BATCH_SIZE):
-            chosen = list(positions[start : start + BATCH_SIZE])
-            mean_square = self.errors(avatar, chosen).square().mean(dim=(1, 2, 3))
-            scores += (-10 * mean_square.log10()).tolist()
-        return statistics.fmean(scores)
 
-
-def subject(seed: int, arguments: argparse.Namespace, folder: Path) -> TrackedDataset:
+def film(seed: int, arguments: argparse.Namespace, folder: Path) -> TrackedDataset:
     """The demo subject of a seed, made once where `--subjects` names a folder."""
     config = DemoConfig(
         image_size=arguments.image_size,
@@ -240,23 +191,15 @@ def steps_after(arguments: argparse.Namespace) -> int:
 
 def measure(seed: int, arguments: argparse.Namespace, folder: Path) -> dict[str, Outcome]:
     """Every variant's outcome for one seed."""
-    dataset = subject(seed, arguments, folder)
-    bench = Bench(
-        dataset,
-        seed,
-        arguments.uv_resolution,
-        arguments.images_per_second,
-        steps_after(arguments),
-        arguments.looks_per_second,
-    )
-    sizes = Sizes.for_stream(len(dataset.train))
+    bench = Bench(Subject.of(film(seed, arguments, folder), seed), arguments)
+    frames = len(bench.dataset.train)
     outcomes: dict[str, Outcome] = {}
     with Progress() as progress:
         alone = dict.fromkeys([OFFLINE, OFFLINE_CONSTANT], lambda: None)
-        for name, make in {**variants(sizes, seed), **alone}.items():
+        for name, make in {**variants(frames, seed), **alone}.items():
             if arguments.variants and name not in arguments.variants:
                 continue
-            bar = progress.add_task(f"seed {seed}: {name}", total=len(dataset.train))
+            bar = progress.add_task(f"seed {seed}: {name}", total=frames)
             outcomes[name] = one = bench.train(
                 make(),
                 lambda bar=bar: progress.advance(bar),
@@ -335,16 +278,8 @@ def report(runs: list[dict[str, Outcome]], arguments: argparse.Namespace) -> Non
     Console(width=110).print(table(runs, images))
     arguments.out.mkdir(parents=True, exist_ok=True)
     draw(runs[0], arguments.out)
-    content: dict[str, Any] = {
-        "settings": {key: str(value) for key, value in vars(arguments).items()},
-        "machine": {
-            "processor": platform.processor() or platform.machine(),
-            "threads": torch.get_num_threads(),
-            "torch": torch.__version__,
-        },
-        "runs": [{name: vars(one) for name, one in run.items()} for run in runs],
-    }
-    (arguments.out / "online.json").write_text(json.dumps(content, indent=1))
+    figures = [{name: vars(one) for name, one in run.items()} for run in runs]
+    write_figures(arguments.out / "online.json", arguments, runs=figures)
 
 
 def main() -> None:

@@ -17,8 +17,6 @@ and neck turn the same head about near points, so that vertices tell more than e
 """
 
 import argparse
-import json
-import platform
 import statistics
 import tempfile
 import time
@@ -29,13 +27,13 @@ from typing import Any
 import numpy as np
 import torch
 from rich.progress import Progress
+from subject import BATCH_SIZE, Subject, write_figures
 
 from rgbavatar_ns import Avatar
 from rgbavatar_ns.avatar import AvatarConfig
 from rgbavatar_ns.avatar.metrics import evaluate_images
-from rgbavatar_ns.avatar.refinement import RefinementConfig, TrackingRefinement
+from rgbavatar_ns.avatar.refinement import FrameRefinement, RefinementConfig
 from rgbavatar_ns.avatar.training import (
-    FitHooks,
     TrainingBatch,
     TrainingOptions,
     TrainingStep,
@@ -43,115 +41,96 @@ from rgbavatar_ns.avatar.training import (
     make_optimizer,
 )
 from rgbavatar_ns.avatar.training.theta_fit import fit_theta
-from rgbavatar_ns.data import OfflineOrder, TrackedDataset, load_dataset
+from rgbavatar_ns.data import TrackedDataset, load_dataset
 from rgbavatar_ns.export.comparison import write_comparison
 from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.synthetic import DemoConfig, make_demo_dataset
 from rgbavatar_ns.synthetic.performer.performance import with_tracker_noise
 
-BATCH_SIZE = 10
 LAST_RATE = 0.1
 
 
 @dataclass(frozen=True)
-class Subject:
-    """A dataset in memory, with the theta that a tracker found."""
+class Tracked:
+    """A subject whose dataset holds theta as a tracker found it, and the dataset's own theta."""
 
-    dataset: TrackedDataset
-    images: torch.Tensor
-    theta: torch.Tensor
+    subject: Subject
+    true_theta: torch.Tensor
 
     @classmethod
-    def of(cls, dataset: TrackedDataset, noise: float, seed: int) -> "Subject":
+    def of(cls, dataset: TrackedDataset, noise: float, seed: int) -> "Tracked":
         """Read the images; make theta noisy where `noise` is not zero."""
-        images = [torch.as_tensor(dataset.read_image(i)) for i in range(len(dataset))]
         theta = dataset.theta
         if noise > 0:
             noisy = with_tracker_noise(theta.double().numpy(), dataset.layout, noise, seed)
             theta = torch.from_numpy(np.asarray(noisy)).float()
-        return cls(dataset, torch.stack(images), theta)
+        return cls(Subject.of(replace(dataset, theta=theta), seed), dataset.theta)
+
+    @property
+    def dataset(self) -> TrackedDataset:
+        """With theta as tracked."""
+        return self.subject.dataset
 
     def of_training(self) -> torch.Tensor:
         """Theta of the training frames."""
-        return self.theta[list(self.dataset.train)]
+        return self.dataset.theta[list(self.dataset.train)]
 
     def of_held_out(self) -> torch.Tensor:
         """Theta of the held-out frames."""
-        return self.theta[list(self.dataset.test)]
+        return self.dataset.theta[list(self.dataset.test)]
 
 
 def train(
-    subject: Subject,
-    steps: int,
-    uv_resolution: int,
-    seed: int,
-    refinement: TrackingRefinement | None,
+    subject: Subject, steps: int, uv_resolution: int, refinement: FrameRefinement | None
 ) -> tuple[Avatar, float]:
     """Train as `rgbavatar-tiny` does, correcting theta where there is a refinement; and seconds."""
-    dataset = subject.dataset
     config = AvatarConfig(uv_resolution=uv_resolution, scale_from_texel_spacing=True)
-    avatar = Avatar(HeadModel(dataset.arrays), dataset.identity, config, seed=seed)
+    avatar, order = subject.avatar(config), subject.offline()
     optimizer = make_optimizer(avatar)
     first_rates = [group["lr"] for group in optimizer.param_groups]
-    order = OfflineOrder(dataset.train, BATCH_SIZE, seed)
-    row_of = {position: row for row, position in enumerate(dataset.train)}
-    seen: dict[str, torch.Tensor] = {}
-
-    def batch(step: int) -> TrainingBatch:
-        for group, rate in zip(optimizer.param_groups, first_rates):
-            group["lr"] = rate * LAST_RATE ** (step / steps)
-            if refinement and step < refinement.config.first_step_of(group["name"], steps):
-                group["lr"] = 0.0
-        positions = order.batch(step)
-        seen["rows"] = torch.tensor([row_of[position] for position in positions])
-        theta = subject.theta[positions]
-        if refinement is not None:
-            theta = refinement.theta(seen["rows"])
-            theta.requires_grad_(step >= refinement.config.start_step)
-        seen["theta"] = theta
-        return TrainingBatch(theta, dataset.cameras.select(positions), subject.images[positions])
-
+    options = TrainingOptions(seed=subject.seed)
+    take = TrainingStep(avatar, optimizer, options, refinement=refinement)
     with Progress() as progress:
         bar = progress.add_task("with" if refinement else "without", total=steps)
 
-        class Corrected(FitHooks):
-            def after_step(
-                self, step: int, losses: dict[str, torch.Tensor], seconds: float
-            ) -> None:
-                gradient = seen["theta"].grad
-                if refinement is not None and gradient is not None:
-                    refinement.step(seen["rows"], gradient * len(gradient))
-                progress.update(bar, completed=step + 1)
+        def batch(step: int) -> TrainingBatch:
+            progress.update(bar, completed=step + 1)
+            for group, rate in zip(optimizer.param_groups, first_rates):
+                group["lr"] = rate * LAST_RATE ** (step / steps)
+                if refinement is None:
+                    continue
+                if step < refinement.frames.config.first_step_of(group["name"], steps):
+                    group["lr"] = 0.0
+            return subject.batch(order.batch(step))
 
         started = time.monotonic()
-        take = TrainingStep(avatar, optimizer, TrainingOptions(seed=seed))
-        fit(take, batch, range(steps), Corrected())
+        fit(take, batch, range(steps))
     return avatar, time.monotonic() - started
 
 
 @torch.no_grad()
-def scores(subject: Subject, avatar: Avatar, theta: torch.Tensor) -> dict[str, float]:
+def scores(tracked: Tracked, avatar: Avatar, theta: torch.Tensor) -> dict[str, float]:
     """Mean scores of the held-out frames, driven by `theta`."""
     found: dict[str, list[float]] = {"psnr": [], "psnr_head": []}
-    for row, position in enumerate(subject.dataset.test):
-        camera = subject.dataset.cameras.select([position])
+    for row, position in enumerate(tracked.dataset.test):
+        camera = tracked.dataset.cameras.select([position])
         image = avatar.render(theta[[row]], camera).image
-        values = evaluate_images(image, subject.images[[position]])
+        values = evaluate_images(image, tracked.subject.images[[position]])
         for name in found:
             found[name].append(float(values[name] or 0.0))
     return {name: statistics.fmean(values) for name, values in found.items()}
 
 
 def fitted(
-    subject: Subject, avatar: Avatar, theta: torch.Tensor, steps: int, config: RefinementConfig
+    tracked: Tracked, avatar: Avatar, theta: torch.Tensor, steps: int, config: RefinementConfig
 ) -> torch.Tensor:
     """The held-out frames' theta from `theta`, fitted to their images."""
     parts = []
     for rows in torch.arange(len(theta)).split(BATCH_SIZE):
-        positions = [subject.dataset.test[row] for row in rows]
-        cameras = subject.dataset.cameras.select(positions)
-        images = subject.images[positions]
-        reference = subject.of_training()
+        positions = [tracked.dataset.test[row] for row in rows]
+        cameras = tracked.dataset.cameras.select(positions)
+        images = tracked.subject.images[positions]
+        reference = tracked.of_training()
         part = fit_theta(
             avatar, theta[rows], cameras, images, steps, config=config, reference=reference
         )
@@ -160,10 +139,10 @@ def fitted(
 
 
 @torch.no_grad()
-def errors(subject: Subject, theta: torch.Tensor) -> dict[str, float]:
+def errors(tracked: Tracked, theta: torch.Tensor) -> dict[str, float]:
     """How far the training frames' theta is from the truth, by field, and their vertices in mm."""
-    dataset = subject.dataset
-    truth = dataset.theta[list(dataset.train)]
+    dataset = tracked.dataset
+    truth = tracked.true_theta[list(dataset.train)]
     layout, head = dataset.layout, HeadModel(dataset.arrays)
     found = {}
     for name in layout.names:
@@ -181,41 +160,42 @@ def errors(subject: Subject, theta: torch.Tensor) -> dict[str, float]:
     return found
 
 
-def measure(subject: Subject, arguments: argparse.Namespace, noisy: bool) -> dict[str, Any]:
+def measure(tracked: Tracked, arguments: argparse.Namespace, noisy: bool) -> dict[str, Any]:
     """Both trainings and all their figures."""
     config = RefinementConfig()
     rows: dict[str, Any] = {}
     for name in ("without", "with"):
         refinement = None
         if name == "with":
-            refinement = TrackingRefinement(subject.of_training(), subject.dataset.layout, config)
+            dataset = tracked.dataset
+            refinement = FrameRefinement(dataset.theta, dataset.train, dataset.layout, config)
         avatar, seconds = train(
-            subject, arguments.steps, arguments.uv_resolution, arguments.seed, refinement
+            tracked.subject, arguments.steps, arguments.uv_resolution, refinement
         )
-        theta = subject.of_held_out()
-        row = {"train_seconds": seconds, "tracked": scores(subject, avatar, theta)}
+        theta = tracked.of_held_out()
+        row = {"train_seconds": seconds, "tracked": scores(tracked, avatar, theta)}
         if refinement is not None:
-            theta = refinement.calibrated(theta)
-            row["calibrated"] = scores(subject, avatar, theta)
-        fitted_theta = fitted(subject, avatar, theta, arguments.fit_steps, config)
-        row["fitted"] = scores(subject, avatar, fitted_theta)
+            theta = refinement.frames.calibrated(theta)
+            row["calibrated"] = scores(tracked, avatar, theta)
+        fitted_theta = fitted(tracked, avatar, theta, arguments.fit_steps, config)
+        row["fitted"] = scores(tracked, avatar, fitted_theta)
         if noisy:
-            row["true"] = scores(subject, avatar, subject.dataset.theta[list(subject.dataset.test)])
-            found = subject.of_training() if refinement is None else refinement.theta()
-            row["error"] = errors(subject, found)
+            row["true"] = scores(tracked, avatar, tracked.true_theta[list(tracked.dataset.test)])
+            found = tracked.of_training() if refinement is None else refinement.frames.theta()
+            row["error"] = errors(tracked, found)
         if arguments.pictures:
-            _picture(subject, avatar, theta, arguments.pictures / f"{name}.png")
-            _picture(subject, avatar, fitted_theta, arguments.pictures / f"{name}_fitted.png")
+            _picture(tracked, avatar, theta, arguments.pictures / f"{name}.png")
+            _picture(tracked, avatar, fitted_theta, arguments.pictures / f"{name}_fitted.png")
         rows[name] = row
     return rows
 
 
-def _picture(subject: Subject, avatar: Avatar, theta: torch.Tensor, path: Path) -> None:
+def _picture(tracked: Tracked, avatar: Avatar, theta: torch.Tensor, path: Path) -> None:
     """Held-out frames beside the avatar driven by `theta`."""
-    whole = subject.theta.clone()
-    whole[list(subject.dataset.test)] = theta
+    whole = tracked.dataset.theta.clone()
+    whole[list(tracked.dataset.test)] = theta
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_comparison(avatar, replace(subject.dataset, theta=whole), path.with_suffix(".mp4"), path)
+    write_comparison(avatar, replace(tracked.dataset, theta=whole), path.with_suffix(".mp4"), path)
 
 
 def tell(rows: dict[str, Any]) -> None:
@@ -266,15 +246,10 @@ def main() -> None:
             dataset = make_demo_dataset(Path(folder) / "subject", demo)
         else:
             dataset = load_dataset(arguments.data)
-        subject = Subject.of(dataset, arguments.noise if noisy else 0.0, arguments.seed)
-        rows = measure(subject, arguments, noisy)
+        tracked = Tracked.of(dataset, arguments.noise if noisy else 0.0, arguments.seed)
+        rows = measure(tracked, arguments, noisy)
     tell(rows)
-    if arguments.json:
-        machine = {"processor": platform.processor() or platform.machine()}
-        machine |= {"torch": torch.__version__, "threads": str(torch.get_num_threads())}
-        settings = {name: str(value) for name, value in vars(arguments).items()}
-        content = {"settings": settings, "machine": machine, "rows": rows}
-        arguments.json.write_text(json.dumps(content, indent=2) + "\n")
+    write_figures(arguments.json, arguments, rows=rows)
 
 
 if __name__ == "__main__":

@@ -29,6 +29,7 @@ _ITERATIONS, _ITERATIONS_ANEW = 4, 25
 
 _Image = UInt8[np.ndarray, "H W 3"]
 _Landmarks = Float[np.ndarray, "478 2"]
+_Parameters = Float[np.ndarray, "P"]
 
 
 class LiveTracker:
@@ -176,7 +177,7 @@ class _CausalFit:
         head = tracker.cost.head.of_person(subject.identity)
         self._cost = replace(tracker.cost, head=head)
         self._weight = _CAUSAL_SHARE * tracker.config.temporal_weight
-        self._previous: Float[np.ndarray, "P"] | None = None
+        self._previous: _Parameters | None = None
 
     def forget(self) -> None:
         """A gap: the next frame starts anew."""

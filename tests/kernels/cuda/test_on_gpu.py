@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from rgbavatar_ns.avatar import Avatar
-from rgbavatar_ns.avatar.training import TrainingBatch, make_optimizer
+from rgbavatar_ns.avatar.training import make_optimizer
 from rgbavatar_ns.avatar.training import recorded_step as recorded_steps
 from rgbavatar_ns.avatar.training.batches import DeviceFrames
 from rgbavatar_ns.avatar.training.fused_step import FusedStep
@@ -125,13 +125,11 @@ def step_of(place: Place, avatar, optimizer, frames: DeviceFrames, size: int, ki
         return RecordedStep(avatar, [optimizer], frames, size, recorder=recorder)
 
     def take(chosen: list[int], background: Tensor) -> Tensor:
-        images, theta = frames.images_rgba[chosen], frames.theta[chosen]
-        batch = TrainingBatch(theta, frames.cameras, images)
-        there = background.to(place.device)
+        batch, there = frames.batch(chosen), background.to(place.device)
         if kind == "autograd":
             return eager_step(avatar, optimizer, batch, there, "cuda")
-        loss = FusedStep(avatar, [optimizer])(theta, frames.cameras, images, there, "cuda")
-        return torch.as_tensor(loss).clone()
+        fused = FusedStep(avatar, [optimizer], "cuda")
+        return fused(batch.theta, batch.cameras, torch.as_tensor(batch.images_rgba), there).clone()
 
     return take
 
@@ -255,8 +253,8 @@ def test_nothing_waits_in_a_step(gpu, make_avatar, kind, resumed):
     avatar = stir(make_avatar()).to(gpu)
     frames, background = frames_on(place, avatar, 3)
     optimizer, there = make_optimizer(avatar), background.to(gpu)
-    fused = FusedStep(avatar, [optimizer])
-    values = (frames.theta, frames.cameras, frames.images_rgba, there, "cuda")
+    fused = FusedStep(avatar, [optimizer], "cuda")
+    values = (frames.theta, frames.cameras, frames.images_rgba, there)
     if resumed:  # a loaded state lies where torch puts it
         fused(*values)
         optimizer.load_state_dict(optimizer.state_dict())

@@ -1,0 +1,86 @@
+"""A dataset in memory and what is asked of avatars of it: shared by the scripts beside this one."""
+
+import argparse
+import json
+import statistics
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from rgbavatar_ns import Avatar
+from rgbavatar_ns.avatar import AvatarConfig
+from rgbavatar_ns.avatar.metrics import psnr
+from rgbavatar_ns.avatar.training import TrainingBatch
+from rgbavatar_ns.bench.machine import machine_facts
+from rgbavatar_ns.data import OfflineOrder, TrackedDataset
+from rgbavatar_ns.drawing.compositing import composite, rgba_to_float
+from rgbavatar_ns.head import HeadModel
+
+BATCH_SIZE = 10
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A dataset with its images in memory, and the seed of what is random in training on it."""
+
+    dataset: TrackedDataset
+    images: Tensor
+    seed: int
+
+    @classmethod
+    def of(cls, dataset: TrackedDataset, seed: int) -> "Subject":
+        """Read the images."""
+        images = [torch.as_tensor(dataset.read_image(i)) for i in range(len(dataset))]
+        return cls(dataset, torch.stack(images), seed)
+
+    def avatar(self, config: AvatarConfig) -> Avatar:
+        """A fresh one."""
+        head = HeadModel(self.dataset.arrays)
+        return Avatar(head, self.dataset.identity, config, seed=self.seed)
+
+    def offline(self) -> OfflineOrder:
+        """The training frames step by step, as `ns-train` takes them."""
+        return OfflineOrder(self.dataset.train, BATCH_SIZE, self.seed)
+
+    def batch(self, positions: Sequence[int]) -> TrainingBatch:
+        """These frames."""
+        chosen = list(positions)
+        cameras = self.dataset.cameras.select(chosen)
+        return TrainingBatch(
+            self.dataset.theta[chosen],
+            cameras,
+            self.images[chosen],
+            position=torch.tensor(chosen),
+        )
+
+    @torch.no_grad()
+    def shown(
+        self, avatar: Avatar, positions: Sequence[int]
+    ) -> tuple[Float[Tensor, "B H W 3"], Float[Tensor, "B H W 3"]]:
+        """Drawn and filmed frames over black."""
+        batch = self.batch(positions)
+        image = avatar.render(batch.theta, batch.cameras).image.clamp(0, 1)
+        black = torch.zeros(len(positions), 3)
+        return image, composite(rgba_to_float(batch.images_rgba), black)
+
+    def psnr(self, avatar: Avatar, positions: Sequence[int]) -> float:
+        """Mean PSNR in dB over these frames: full frame, black background."""
+        scores: list[float] = []
+        for start in range(0, len(positions), BATCH_SIZE):
+            scores += psnr(*self.shown(avatar, positions[start : start + BATCH_SIZE])).tolist()
+        return statistics.fmean(scores)
+
+
+def write_figures(path: Path | None, arguments: argparse.Namespace, **figures: Any) -> None:
+    """Write figures with their settings and machine as JSON, where a path is given."""
+    if path is None:
+        return
+    path.parent.mkdir(parents=True, exist_ok=True)
+    settings = {name: str(value) for name, value in vars(arguments).items()}
+    content = {"settings": settings, "machine": machine_facts(), **figures}
+    path.write_text(json.dumps(content, indent=2) + "\n")
