@@ -23,8 +23,9 @@ BLOCK_FRAMES, _WARM_UP = 256, 8
 _AGREE_SHARE = 0.03
 _AHEAD = 4
 _SHARPNESS_PX = 96
+_NONE = np.zeros(0, np.int64)
 _NO_FRAMES = SeenFaces(
-    *np.zeros((2, 0), np.int64), np.zeros(0), np.zeros(0, bool), np.zeros((0, 478, 2)), np.zeros(0)
+    _NONE, _NONE, np.zeros(0), np.zeros(0, bool), np.zeros((0, 478, 2)), np.zeros(0)
 )
 
 
