@@ -177,7 +177,7 @@ class _CausalFit:
         head = tracker.cost.head.of_person(subject.identity)
         self._cost = replace(tracker.cost, head=head)
         self._weight = _CAUSAL_SHARE * tracker.config.temporal_weight
-        self._previous: Float[np.ndarray, P] | None = None
+        self._previous: _Values | None = None
 
     def forget(self) -> None:
         """A gap: the next frame starts anew."""
