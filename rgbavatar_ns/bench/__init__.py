@@ -1,1 +1,1 @@
-"""How fast the project is on this machine: workloads, timing, floors and peers."""
+"""How fast the project is on this machine: workloads, timing, rooflines, what runs beside it."""

@@ -1,4 +1,4 @@
-"""A peer: gsplat's functions in torch, as far as they run without CUDA.
+"""gsplat's functions in torch beside ours, as far as they run without CUDA.
 
 gsplat's projection and `accumulate` are used as they are. Two pieces need CUDA and are given: the
 list of (Gaussian, pixel) pairs, made before the clock starts, and nerfacc's scan along rays
@@ -12,8 +12,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from rgbavatar_ns.bench.projection import project, row_spans, visible_index
+from rgbavatar_ns.bench.pairs import pixel_pairs
 from rgbavatar_ns.kernels import GaussianSet, PinholeCameras
+from rgbavatar_ns.kernels.reference import project
 
 
 def gsplat_torch(
@@ -24,7 +25,7 @@ def gsplat_torch(
     from gsplat.cuda import _torch_impl as gsplat
 
     width, height = cameras.width, cameras.height
-    gaussian_ids, pixel_ids = pixel_pairs(gaussians, cameras)
+    gaussian_ids, pixel_ids = sorted_pairs(gaussians, cameras)
     camera_ids = torch.zeros_like(gaussian_ids)
     intrinsics = torch.eye(3)[None].to(cameras.focal_px).clone()
     intrinsics[:, [0, 1], [0, 1]] = cameras.focal_px
@@ -56,29 +57,14 @@ def gsplat_torch(
 
 
 @torch.no_grad()
-def pixel_pairs(
+def sorted_pairs(
     gaussians: GaussianSet, cameras: PinholeCameras
 ) -> tuple[Int[Tensor, "m"], Int[Tensor, "m"]]:
-    """Gaussian and pixel (row-major) of every pair with alpha >= 1/255 of a single image.
-
-    Ordered by pixel, and from front to back within one.
-    """
-    visible = visible_index(gaussians, cameras)
-    projected = project(gaussians, cameras, visible)
-    rank = torch.argsort(torch.argsort(projected.depth_m, stable=True))
-    gaussian_ids, pixel_ids = [], []
-    for spans in row_spans(projected, cameras.width, cameras.height):
-        count = spans.last - spans.first + 1
-        begin = torch.repeat_interleave(torch.cumsum(count, 0) - count, count)
-        column = torch.repeat_interleave(spans.first, count) + torch.arange(len(begin)) - begin
-        pixel_ids.append(torch.repeat_interleave(spans.row * cameras.width, count) + column)
-        gaussian_ids.append(torch.repeat_interleave(spans.index, count))
-    if not gaussian_ids:
-        empty = torch.zeros(0, dtype=torch.int64)
-        return empty, empty
-    gaussian, pixel = torch.cat(gaussian_ids), torch.cat(pixel_ids)
+    """Gaussian and pixel of an image's pairs by pixel, and from front to back within one."""
+    gaussian, pixel = pixel_pairs(gaussians, cameras)
+    rank = project(gaussians, cameras).depth_m[0].argsort(stable=True).argsort()
     order = torch.argsort(pixel * len(rank) + rank[gaussian])
-    return visible[gaussian[order]], pixel[order]
+    return gaussian[order], pixel[order]
 
 
 @contextmanager

@@ -38,7 +38,7 @@ def chosen_device(name: str | None, backend: str = "auto") -> torch.device:
 
     Raises UserError where the GPU is named and cannot be used, or another one than the backend's.
     """
-    reason = _gpu_refusal()
+    reason = _unsupported_reason()
     if name is None:
         name = "cuda" if reason is None and backend in ("auto", "cuda") else "cpu"
     if name == "cuda" and reason is not None:
@@ -53,7 +53,7 @@ def chosen_device(name: str | None, backend: str = "auto") -> torch.device:
     return torch.device(name)
 
 
-def _gpu_refusal() -> str | None:
+def _unsupported_reason() -> str | None:
     """Why the rasterizer cannot use a GPU here; None where it can."""
     try:
         cuda_backend.load()

@@ -6,9 +6,6 @@ from typing import Literal
 
 from rgbavatar_ns.errors import UserError
 
-Scheme = Literal["batch-parallel", "naive-batch", "single"]
-"""The training schemes of the paper's table."""
-
 
 @dataclass(frozen=True)
 class CommonOptions:
@@ -106,10 +103,6 @@ class StepOptions(AvatarOptions):
 
     batch: int = 10
     """Images a step."""
-    scheme: Scheme = "batch-parallel"
-    """How a batch is trained on: one step on its images drawn together, one step on its images
-    drawn one after another with their gradients summed, or a step for every image. Parts are timed
-    of the first alone."""
     repetitions: int = 15
     """Timings of each kind, after a warm-up."""
     trainer: bool = False

@@ -1,38 +1,44 @@
 """`rgbavatar bench rasterizer`: forward and backward of a batch of Gaussian sets."""
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
-from rgbavatar_ns.bench.drawing import Draw, DrawTimes, time_draw
-from rgbavatar_ns.bench.machine import chosen_device, machine_facts, require_backend
+from rgbavatar_ns.bench import timing
+from rgbavatar_ns.bench.gsplat_torch import gsplat_torch
+from rgbavatar_ns.bench.machine import chosen_device, require_backend
 from rgbavatar_ns.bench.options import AvatarOptions, RasterizerOptions
-from rgbavatar_ns.bench.pairs import count_pairs
-from rgbavatar_ns.bench.peers import PEERS, time_peers
+from rgbavatar_ns.bench.pairs import count_pairs, one_image
 from rgbavatar_ns.bench.report import Report
 from rgbavatar_ns.bench.roofline import measure_speed, rasterizer_work, roofline_figures
-from rgbavatar_ns.bench.scenes import DEFAULT_COUNT, DEFAULT_SIZE_PX, ellipsoid_scene, on_device
+from rgbavatar_ns.bench.scenes import (
+    DEFAULT_COUNT,
+    DEFAULT_SIZE_PX,
+    ellipsoid_scene,
+    leaf_gaussians,
+    on_device,
+)
 from rgbavatar_ns.bench.timing import (
+    Lap,
     Progress,
     Spread,
     Stopwatch,
-    peak_memory_method,
+    peak_growth_bytes,
     using_threads,
-    waiting_for,
 )
 from rgbavatar_ns.bench.workloads import avatar_workload
 from rgbavatar_ns.kernels import GaussianSet, PinholeCameras, rasterize
 
-_NO_PEERS_ON_GPUS = "drawn on a CPU only; benchmarks/gpu_check.py has gsplat's kernels"
+FORWARD, BACKWARD = "forward, no gradients", "backward"
+WHOLE = "forward and backward"
+GSPLAT = "gsplat torch"
+_NOT_ON_GPUS = "drawn on a CPU only; benchmarks/speed/gpu.py has gsplat's kernels"
 
-
-@dataclass(frozen=True)
-class RasterizerTimes:
-    """A batch's times: forward without gradients, and forward with backward."""
-
-    forward: Spread
-    training: DrawTimes
+Draw = Callable[[GaussianSet], Float[Tensor, "B H W 3"]]
 
 
 def bench_rasterizer(options: RasterizerOptions, progress: Progress | None = None) -> Report:
@@ -44,49 +50,108 @@ def bench_rasterizer(options: RasterizerOptions, progress: Progress | None = Non
         gaussians, cameras = on_device(gaussians, device), on_device(cameras, device)
         facts |= {"batch": options.batch, "backend": backend, "threads": threads}
         facts |= {"device": device.type}
-        pairs = count_pairs(gaussians, cameras)
-        stopwatch = Stopwatch(options.repetitions, progress, wait=waiting_for(device))
-        times = time_rasterizer(gaussians, cameras, stopwatch, options.backend)
-        whole_ms = times.training.whole.median_ms / options.batch
-        peers: dict[str, Any] = {}
+        stopwatch = Stopwatch(options.repetitions, progress)
+        spread, growth_bytes = time_rasterizer(gaussians, cameras, stopwatch, options.backend)
+        whole_ms = spread[WHOLE].median_ms / options.batch
+        peers = {}
         if options.peers and device.type == "cuda":
-            peers = {name: {"unavailable": _NO_PEERS_ON_GPUS} for name in PEERS}
+            peers = {GSPLAT: {"unavailable": _NOT_ON_GPUS}}
         elif options.peers:
-            few = Stopwatch(options.peer_repetitions, progress, warm_up=False)
-
-            def ours(gaussians: GaussianSet, cameras: PinholeCameras) -> Draw:
-                return lambda leaves: rasterize(leaves, cameras, backend=options.backend).image
-
-            peers = time_peers(ours, gaussians, cameras, whole_ms, few)
-        return _report(options.batch, times, facts, gaussians, cameras, pairs, peers)
+            few = replace(stopwatch, repetitions=options.peer_repetitions, warm_up=False)
+            peers = {GSPLAT: time_gsplat(gaussians, cameras, few, whole_ms)}
+        return Report(
+            benchmark="rasterizer",
+            workload=facts,
+            images_per_second=1e3 / whole_ms,
+            spread=spread,
+            bytes_per_image=None if growth_bytes is None else growth_bytes // options.batch,
+            roofline=_roofline(gaussians, cameras, spread, options.batch),
+            peers=peers,
+            forward_ms_per_image=spread[FORWARD].median_ms / options.batch,
+            backward_ms_per_image=spread[BACKWARD].median_ms / options.batch,
+        )
 
 
 def time_rasterizer(
-    gaussians: GaussianSet,
-    cameras: PinholeCameras,
-    stopwatch: Stopwatch,
-    backend: str = "auto",
-) -> RasterizerTimes:
-    """Time a batch with one of our backends."""
+    gaussians: GaussianSet, cameras: PinholeCameras, stopwatch: Stopwatch, backend: str = "auto"
+) -> tuple[dict[str, Spread], int | None]:
+    """Time a batch with one of our backends, and the memory it needs, as `time_draw`."""
+
+    def draw(gaussians: GaussianSet) -> Tensor:
+        return rasterize(gaussians, cameras, backend=backend).image
+
+    return time_draw(WHOLE, draw, gaussians, cameras, stopwatch)
+
+
+def time_draw(
+    what: str, draw: Draw, gaussians: GaussianSet, cameras: PinholeCameras, stopwatch: Stopwatch
+) -> tuple[dict[str, Spread], int | None]:
+    """Time forward and backward to all attributes, from a random gradient of the image.
+
+    Also returns the memory of the first forward and backward (see `peak_growth_bytes`).
+    """
+    device, leaves = gaussians.means.device, leaf_gaussians(gaussians)
     batch = max(len(gaussians.means), len(cameras.focal_px))
+    generator = torch.Generator().manual_seed(1)
+    image_grad = torch.randn(batch, cameras.height, cameras.width, 3, generator=generator)
+    image_grad = (image_grad / cameras.height**2).to(device)
 
-    @torch.no_grad()
-    def forward() -> None:
-        rasterize(gaussians, cameras, backend=backend)
+    def once(lap: Lap) -> None:
+        for leaf in vars(leaves).values():
+            leaf.grad = None
+        image = draw(leaves)
+        lap("forward, for the backward")
+        image.backward(image_grad)
+        lap(BACKWARD)
 
-    training = time_draw(
-        "forward and backward",
-        lambda leaves: rasterize(leaves, cameras, backend=backend).image,
-        gaussians,
-        (batch, cameras.height, cameras.width, 3),
-        stopwatch,
-    )
-    return RasterizerTimes(stopwatch.time("forward", forward), training)
+    growth_bytes = peak_growth_bytes(lambda: once(lambda name: None), device)
+    spread = stopwatch.laps(what, once)
+    spread[WHOLE] = spread.pop(timing.WHOLE)
+    forward = stopwatch.time(FORWARD, lambda: torch.no_grad()(draw)(gaussians))
+    return {FORWARD: forward, **spread}, growth_bytes
 
 
-def _workload(
-    options: RasterizerOptions,
-) -> tuple[GaussianSet, PinholeCameras, dict[str, Any]]:
+def time_gsplat(
+    gaussians: GaussianSet, cameras: PinholeCameras, stopwatch: Stopwatch, ours_ms: float
+) -> dict[str, Any]:
+    """gsplat's torch functions on the batch's first image, or {"unavailable": reason}.
+
+    `ratio` is their forward and backward over ours an image in the whole batch.
+    """
+    single, camera = one_image(gaussians, cameras, 0)
+    try:
+        draw = gsplat_torch(single, camera)
+        with torch.no_grad():
+            difference = (draw(single) - rasterize(single, camera).image).abs()
+        spread, growth_bytes = time_draw(GSPLAT, draw, single, camera, stopwatch)
+    except (ImportError, RuntimeError, AttributeError, OSError) as error:
+        reason = (str(error).splitlines() or [""])[0]
+        return {"unavailable": f"{type(error).__name__}: {reason}"}
+    return {
+        "forward_ms_per_image": spread[FORWARD].median_ms,
+        "backward_ms_per_image": spread[BACKWARD].median_ms,
+        "whole_ms_per_image": spread[WHOLE].median_ms,
+        "ratio": spread[WHOLE].median_ms / ours_ms,
+        "bytes_per_image": growth_bytes,
+        "mean_difference": float(difference.mean()),
+    }
+
+
+def _roofline(
+    gaussians: GaussianSet, cameras: PinholeCameras, spread: dict[str, Spread], images: int
+) -> dict[str, Any]:
+    """Of forward and backward together, and under "forward" of the forward pass alone."""
+    pairs, speed = count_pairs(gaussians, cameras), measure_speed(gaussians.means.device)
+
+    def figures(reached: Spread, *, backward: bool) -> dict[str, Any]:
+        work = rasterizer_work(pairs, gaussians, cameras, backward=backward)
+        return roofline_figures([work], speed, images, reached.median_ms / images, pairs / images)
+
+    forward = figures(spread[FORWARD], backward=False)
+    return figures(spread[WHOLE], backward=True) | {"forward": forward}
+
+
+def _workload(options: RasterizerOptions) -> tuple[GaussianSet, PinholeCameras, dict[str, Any]]:
     if options.avatar is None:
         count = options.count or DEFAULT_COUNT
         size_px = options.size or DEFAULT_SIZE_PX
@@ -99,49 +164,3 @@ def _workload(
     with torch.no_grad():
         gaussians = workload.avatar.gaussians(workload.batch.theta)
     return gaussians, workload.batch.cameras, {"name": "avatar", **workload.facts}
-
-
-def _report(
-    batch: int,
-    times: RasterizerTimes,
-    facts: dict[str, Any],
-    gaussians: GaussianSet,
-    cameras: PinholeCameras,
-    pairs: int,
-    peers: dict[str, Any],
-) -> Report:
-    whole_ms = times.training.whole.median_ms
-    spread = {
-        "forward, no gradients": times.forward,
-        "forward, for the backward": times.training.forward,
-        "backward": times.training.backward,
-        "forward and backward": times.training.whole,
-    }
-    speed = measure_speed(gaussians.means.device)
-    both = rasterizer_work(pairs, gaussians, cameras, backward=True)
-    forward = rasterizer_work(pairs, gaussians, cameras, backward=False)
-    floor = roofline_figures([both], speed, batch, whole_ms / batch)
-    floor["forward"] = roofline_figures([forward], speed, batch, times.forward.median_ms / batch)
-    growth = times.training.growth_bytes
-    return Report(
-        benchmark="rasterizer",
-        workload=facts,
-        forward_ms_per_image=times.forward.median_ms / batch,
-        backward_ms_per_image=times.training.backward.median_ms / batch,
-        images_per_second=1e3 * batch / whole_ms,
-        frames_per_second=None,
-        parts={name: part.median_ms for name, part in spread.items()},
-        spread=spread,
-        pairs={
-            "per_image": pairs / batch,
-            "per_second": 1e3 * pairs / whole_ms,
-            "per_second_forward": 1e3 * pairs / times.forward.median_ms,
-        },
-        memory={
-            "bytes_per_image": None if growth is None else growth // batch,
-            "method": peak_memory_method(gaussians.means.device),
-        },
-        floor=floor,
-        peers=peers,
-        machine=machine_facts(),
-    )

@@ -1,21 +1,18 @@
-"""`rgbavatar bench render`: from theta to the image and to the viewer, one image at a time."""
+"""`rgbavatar bench render`: from theta to the image, one image at a time."""
 
-import io
 from collections.abc import Callable
 from itertools import cycle
 from typing import Any
 
-import imageio.v3 as imageio
 import torch
 
 from rgbavatar_ns.avatar import Avatar
 from rgbavatar_ns.avatar.recorded_rendering import RecordedRendering
+from rgbavatar_ns.avatar.training import TrainingBatch
 from rgbavatar_ns.avatar.training.cuda_graph import supports
-from rgbavatar_ns.avatar.training.loop import TrainingBatch
-from rgbavatar_ns.bench.machine import chosen_device, machine_facts, require_backend
+from rgbavatar_ns.bench.machine import chosen_device, require_backend
 from rgbavatar_ns.bench.options import RenderOptions
-from rgbavatar_ns.bench.pairs import count_pairs
-from rgbavatar_ns.bench.projection import one_camera
+from rgbavatar_ns.bench.pairs import count_pairs, one_camera
 from rgbavatar_ns.bench.report import Report
 from rgbavatar_ns.bench.roofline import (
     measure_speed,
@@ -30,19 +27,13 @@ from rgbavatar_ns.bench.timing import (
     Spread,
     Stopwatch,
     peak_growth_bytes,
-    peak_memory_method,
     using_threads,
-    waiting_for,
 )
-from rgbavatar_ns.bench.workloads import AvatarWorkload, avatar_workload
+from rgbavatar_ns.bench.workloads import AvatarWorkload, avatar_workload, parameters_of
 from rgbavatar_ns.kernels import rasterize
-from rgbavatar_ns.plugin.viewer.render import viewer_picture
-from rgbavatar_ns.plugin.viewer.viewer_state import Stage, ViewerState
 
 WHOLE_FRAME = "whole frame"
 EAGER_FRAME = "whole frame, eager"
-VIEWER_FRAME = "viewer's picture"
-_JPEG_QUALITY = 75
 
 
 @torch.no_grad()
@@ -54,12 +45,11 @@ def bench_render(options: RenderOptions, progress: Progress | None = None) -> Re
         workload = avatar_workload(options, options.frames, with_images=False, device=device)
         facts = workload.facts | {"frames": options.frames, "batch": 1}
         facts |= {"backend": backend, "threads": threads}
-        stopwatch = Stopwatch(options.repetitions, progress, wait=waiting_for(device))
+        stopwatch = Stopwatch(options.repetitions, progress)
         frame = _frames_in_turn(workload.avatar, workload.batch)
         growth_bytes = peak_growth_bytes(frame, device)
         whole = stopwatch.time(WHOLE_FRAME, frame)
         spread = {WHOLE_FRAME: whole} | _time_parts(workload, stopwatch)
-        spread[VIEWER_FRAME] = _time_viewer(workload, stopwatch)
         spread[EAGER_FRAME] = _time_eager(workload, stopwatch)
         return _report(workload, facts, spread, growth_bytes)
 
@@ -95,24 +85,8 @@ def _time_parts(workload: AvatarWorkload, stopwatch: Stopwatch) -> dict[str, Spr
         lap("draw")
 
     parts = stopwatch.laps("parts", once)
-    return {name: part for name, part in parts.items() if name != WHOLE}
-
-
-def _time_viewer(workload: AvatarWorkload, stopwatch: Stopwatch) -> Spread:
-    """A frame as nerfstudio's viewer shows it: drawn with depth, to bytes, to JPEG, to be sent."""
-    theta, camera = workload.batch.theta, one_camera(workload.batch.cameras, 0)
-    stage = Stage(
-        workload.avatar, len(theta), lambda position: theta[position : position + 1], lambda: theta
-    )
-    frames = cycle(range(len(theta)))
-
-    def once() -> None:
-        wishes = ViewerState(frame=next(frames), backdrop=(1.0, 1.0, 1.0))
-        image = viewer_picture(stage, wishes, camera).image
-        coded = (image * 255).type(torch.uint8).cpu().numpy()
-        imageio.imwrite(io.BytesIO(), coded, extension=".jpeg", quality=_JPEG_QUALITY)
-
-    return stopwatch.time(VIEWER_FRAME, once)
+    del parts[WHOLE]
+    return parts
 
 
 def _time_eager(workload: AvatarWorkload, stopwatch: Stopwatch) -> Spread:
@@ -131,31 +105,26 @@ def _report(
     theta, cameras = workload.batch.theta, workload.batch.cameras
     gaussians = workload.avatar.gaussians(theta)
     pairs = count_pairs(gaussians, cameras) / len(theta)
-    whole_ms = spread[WHOLE_FRAME].median_ms
+    whole_ms, eager = spread[WHOLE_FRAME].median_ms, spread[EAGER_FRAME]
     one = workload.avatar.gaussians(theta[:1])
     works = [
         rasterizer_work(round(pairs), one, one_camera(cameras, 0), backward=False),
-        parameter_work([p for g in workload.avatar.parameter_groups().values() for p in g]),
+        parameter_work(parameters_of(workload.avatar)),
     ]
     return Report(
         benchmark="render",
         workload=facts,
-        forward_ms_per_image=whole_ms,
-        backward_ms_per_image=None,
         images_per_second=1e3 / whole_ms,
         frames_per_second=1e3 / whole_ms,
-        parts={name: part.median_ms for name, part in spread.items()},
+        forward_ms_per_image=whole_ms,
         spread=spread,
-        pairs={"per_image": pairs, "per_second": 1e3 * pairs / whole_ms},
-        memory={"bytes_per_image": growth_bytes, "method": peak_memory_method(theta.device)},
-        floor=roofline_figures(works, measure_speed(theta.device), 1, whole_ms),
+        bytes_per_image=growth_bytes,
+        roofline=roofline_figures(works, measure_speed(theta.device), 1, whole_ms, pairs),
         peers={
             EAGER_FRAME: {
-                "whole_ms_per_image": spread[EAGER_FRAME].median_ms,
-                "ratio": spread[EAGER_FRAME].median_ms / whole_ms,
-                "threads": facts["threads"],
-                "repetitions": spread[EAGER_FRAME].repetitions,
+                "whole_ms_per_image": eager.median_ms,
+                "ratio": eager.median_ms / whole_ms,
+                "repetitions": eager.repetitions,
             }
         },
-        machine=machine_facts(),
     )

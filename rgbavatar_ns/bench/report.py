@@ -6,6 +6,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
+from rgbavatar_ns.bench.machine import machine_facts
 from rgbavatar_ns.bench.timing import Spread
 
 
@@ -13,33 +14,33 @@ from rgbavatar_ns.bench.timing import Spread
 class Report:
     """What a benchmark found; None where a figure does not apply.
 
-    `forward_ms_per_image` and `backward_ms_per_image` are the rasterizer's alone, also beside a
-    step, whose own loops do both at once; of a rendering they are the whole way from theta to the
-    image, which has no backward.
+    `forward_ms_per_image` and `backward_ms_per_image` are the rasterizer's, or of a rendering the
+    whole way from theta to the image, which has no backward.
     `parts` are milliseconds a batch; `spread` has median and quartiles in milliseconds a batch.
     """
 
     benchmark: str
     workload: dict[str, Any]
-    forward_ms_per_image: float | None
-    backward_ms_per_image: float | None
-    images_per_second: float | None
-    frames_per_second: float | None
-    parts: dict[str, float]
+    images_per_second: float
     spread: dict[str, Spread]
-    pairs: dict[str, float]
-    memory: dict[str, Any]
-    floor: dict[str, Any]
+    bytes_per_image: int | None
+    """Memory of one call (see `timing.peak_growth_bytes`)."""
+    roofline: dict[str, Any]
     peers: dict[str, Any]
-    machine: dict[str, Any]
-    trainer: dict[str, Any] | None = field(default=None)
-    gpu_utilisation_percent: float | None = None
-    gpu_utilisation_note: str | None = None
-    """How it was measured, or why it was not; None on a CPU."""
+    forward_ms_per_image: float | None = None
+    backward_ms_per_image: float | None = None
+    frames_per_second: float | None = None
+    trainer: dict[str, Any] | None = None
+    machine: dict[str, Any] = field(default_factory=machine_facts)
+
+    @property
+    def parts(self) -> dict[str, float]:
+        """The medians."""
+        return {name: spread.median_ms for name, spread in self.spread.items()}
 
     def to_json(self) -> dict[str, Any]:
         """The same as plain values."""
-        return asdict(self)
+        return asdict(self) | {"parts": self.parts}
 
 
 def print_report(report: Report, console: Console | None = None) -> None:
@@ -61,7 +62,7 @@ def _facts(facts: dict[str, Any]) -> str:
 
 
 def _times(report: Report, images: int) -> Table:
-    table = Table("part", "ms a batch", "quartiles", "ms an image", title_justify="left")
+    table = Table("part", "ms a batch", "quartiles", "ms an image")
     for column in table.columns[1:]:
         column.justify = "right"
     for name, spread in report.spread.items():
@@ -82,26 +83,20 @@ def _figures(report: Report) -> list[str]:
         lines.append(f"rasterizer: {forward:.2f} ms an image forward, {backward:.2f} ms backward")
     if report.frames_per_second is not None:
         lines.append(f"{report.frames_per_second:.1f} frames/s")
-    elif report.images_per_second is not None:
+    else:
         lines.append(f"{report.images_per_second:.1f} images/s")
-    floor, pairs = report.floor, report.pairs
+    roofline = report.roofline
     lines.append(
-        f"floor {floor['ms_per_image']:.2f} ms an image (arithmetic "
-        f"{floor['arithmetic_ms_per_image']:.2f}, memory {floor['traffic_ms_per_image']:.2f}; "
-        f"{floor['lane_operations_per_second'] / 1e9:.0f} G lane operations/s, "
-        f"{floor['bytes_per_second'] / 1e9:.1f} GB/s), reached {100 * floor['reached']:.0f} %"
+        f"roofline {roofline['ms_per_image']:.2f} ms an image (arithmetic "
+        f"{roofline['arithmetic_ms_per_image']:.2f}, memory "
+        f"{roofline['traffic_ms_per_image']:.2f}; "
+        f"{roofline['lane_operations_per_second'] / 1e9:.0f} G lane operations/s, "
+        f"{roofline['bytes_per_second'] / 1e9:.1f} GB/s), reached "
+        f"{100 * roofline['reached']:.0f} %"
     )
-    lines.append(
-        f"{pairs['per_image'] / 1e6:.2f} M (pixel, Gaussian) pairs an image, "
-        f"{pairs['per_second'] / 1e6:.0f} M pairs/s"
-    )
-    growth = report.memory["bytes_per_image"]
-    if growth is not None:
-        lines.append(f"{growth / 2**20:.1f} MiB of memory an image")
-    if report.gpu_utilisation_note is not None:
-        percent = report.gpu_utilisation_percent
-        told = "not measured" if percent is None else f"{percent:.0f} %"
-        lines.append(f"GPU utilisation: {told} ({report.gpu_utilisation_note})")
+    lines.append(f"{roofline['pairs_per_image'] / 1e6:.2f} M (pixel, Gaussian) pairs an image")
+    if report.bytes_per_image is not None:
+        lines.append(f"{report.bytes_per_image / 2**20:.1f} MiB of memory an image")
     if report.trainer is not None:
         trainer = report.trainer
         lines.append(
@@ -113,24 +108,13 @@ def _figures(report: Report) -> list[str]:
 
 
 def _peers(peers: dict[str, Any]) -> Table:
-    table = Table("peer", "forward ms", "backward ms", "whole ms", "times ours", "MiB an image")
+    table = Table("beside it", "forward ms", "backward ms", "whole ms", "times ours")
     for column in table.columns[1:]:
         column.justify = "right"
     for name, figures in peers.items():
         if "unavailable" in figures:
             table.add_row(name, f"unavailable: {figures['unavailable']}")
             continue
-        growth = figures.get("bytes_per_image")
-        table.add_row(
-            name,
-            _number(figures.get("forward_ms_per_image")),
-            _number(figures.get("backward_ms_per_image")),
-            _number(figures.get("whole_ms_per_image")),
-            _number(figures.get("ratio")),
-            "-" if growth is None else f"{growth / 2**20:.0f}",
-        )
+        keys = ("forward_ms_per_image", "backward_ms_per_image", "whole_ms_per_image", "ratio")
+        table.add_row(name, *(f"{figures[key]:.1f}" if key in figures else "-" for key in keys))
     return table
-
-
-def _number(value: float | None) -> str:
-    return "-" if value is None else f"{value:.1f}"

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from rgbavatar_ns.avatar import Avatar
-from rgbavatar_ns.avatar.training.loop import TrainingBatch
+from rgbavatar_ns.avatar.training import TrainingBatch
 from rgbavatar_ns.kernels import GaussianSet, PinholeCameras
 
 DEFAULT_COUNT = 60_000
@@ -29,6 +29,13 @@ def on_device(record: _Record, device: torch.device) -> _Record:
         elif isinstance(value, PinholeCameras):
             values[name] = on_device(value, device)
     return type(record)(**values)
+
+
+def leaf_gaussians(gaussians: GaussianSet) -> GaussianSet:
+    """The same Gaussians as leaves that ask for gradients."""
+    return GaussianSet(
+        **{name: value.detach().requires_grad_() for name, value in vars(gaussians).items()}
+    )
 
 
 def ellipsoid_scene(

@@ -3,7 +3,6 @@
 import ctypes
 import re
 import statistics
-import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -11,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch.utils import benchmark
 
 Progress = Callable[[str, int, int], None]
 """Called with (what is timed, timings done, timings in all), never while the clock runs."""
@@ -20,13 +20,6 @@ Lap = Callable[[str], None]
 
 WHOLE = "whole"
 CPU = torch.device("cpu")
-
-
-def waiting_for(device: torch.device) -> Callable[[], None]:
-    """Return what waits until the device has done all that it was given; on a CPU nothing."""
-    if device.type == "cuda":
-        return lambda: torch.cuda.synchronize(device)
-    return lambda: None
 
 
 @dataclass(frozen=True)
@@ -48,57 +41,49 @@ class Spread:
         return cls(median, lower, upper, len(times_ms))
 
 
+@dataclass(frozen=True)
 class Stopwatch:
     """Times calls `repetitions` times after a warm-up, and says how far it is.
 
-    `wait` is called whenever the clock is read: what a device still has to do belongs to the part
-    that asked for it.
+    By the clock of `torch.utils.benchmark`, which waits for a GPU: what it still has to do belongs
+    to the part that asked for it. Its `Timer` neither marks parts nor prepares each call.
     """
 
-    def __init__(
-        self,
-        repetitions: int,
-        progress: Progress | None = None,
-        *,
-        warm_up: bool = True,
-        wait: Callable[[], None] | None = None,
-    ) -> None:
-        self.repetitions, self._wait = repetitions, wait or waiting_for(CPU)
-        self._warm_up = warm_up
-        self._progress = progress or (lambda what, done, total: None)
+    repetitions: int
+    progress: Progress | None = None
+    warm_up: bool = True
+    clock: Callable[[], float] = benchmark.timer
 
     def time(
-        self, what: str, call: Callable[[], Any], prepare: Callable[[], Any] | None = None
+        self, what: str, call: Callable[[], Any], prepare: Callable[[], Any] = lambda: None
     ) -> Spread:
         """Time a call; `prepare` runs before each one, outside of the time."""
         return self.laps(what, lambda lap: call(), prepare)[WHOLE]
 
     def laps(
-        self, what: str, call: Callable[[Lap], Any], prepare: Callable[[], Any] | None = None
+        self, what: str, call: Callable[[Lap], Any], prepare: Callable[[], Any] = lambda: None
     ) -> dict[str, Spread]:
         """Time a call and the parts that it marks; the call itself is under "whole"."""
         seconds: dict[str, list[float]] = {}
-        for repetition in range(-int(self._warm_up), self.repetitions):
-            self._progress(what, max(repetition, 0), self.repetitions)
-            if prepare is not None:
-                prepare()
+        for repetition in range(-int(self.warm_up), self.repetitions):
+            self._tell(what, max(repetition, 0))
+            prepare()
             marks: list[tuple[str, float]] = []
-            start = self._now()
-            call(lambda name, marks=marks: marks.append((name, self._now())))
-            end = self._now()
+            start = last = self.clock()
+            call(lambda name, marks=marks: marks.append((name, self.clock())))
+            end = self.clock()
             if repetition < 0:
                 continue
-            last = start
             for name, mark in marks:
                 seconds.setdefault(name, []).append(mark - last)
                 last = mark
             seconds.setdefault(WHOLE, []).append(end - start)
-        self._progress(what, self.repetitions, self.repetitions)
+        self._tell(what, self.repetitions)
         return {name: Spread.of(values) for name, values in seconds.items()}
 
-    def _now(self) -> float:
-        self._wait()
-        return time.perf_counter()
+    def _tell(self, what: str, done: int) -> None:
+        if self.progress is not None:
+            self.progress(what, done, self.repetitions)
 
 
 @contextmanager
@@ -113,28 +98,12 @@ def using_threads(count: int | None) -> Iterator[int]:
         torch.set_num_threads(before)
 
 
-PEAK_MEMORY_METHOD = (
-    "peak resident memory of the process during one call (VmHWM, reset before it) less the "
-    "resident memory before it, freed memory handed back first; outputs, gradients and buffers "
-    "that are kept for later calls are in it, inputs and what earlier calls kept are not"
-)
-
-
-GPU_MEMORY_METHOD = (
-    "peak of the GPU memory in torch's tensors during one call less that before it; outputs, "
-    "gradients and buffers that are kept for later calls are in it, inputs are not"
-)
-
-
-def peak_memory_method(device: torch.device) -> str:
-    """What `peak_growth_bytes` measures there."""
-    return GPU_MEMORY_METHOD if device.type == "cuda" else PEAK_MEMORY_METHOD
-
-
 def peak_growth_bytes(call: Callable[[], Any], device: torch.device = CPU) -> int | None:
-    """How far the memory in use rose above its level before the call (see `peak_memory_method`).
+    """How far the memory in use rose above its level before the call, at most.
 
-    None where the system does not tell: on a CPU it needs Linux's /proc.
+    On a GPU that of torch's tensors; else the process's resident memory (VmHWM, reset before; freed
+    memory is handed back first), None where the system does not tell. What is kept for later calls,
+    such as gradients, is in it; inputs and what earlier calls kept are not.
     """
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)

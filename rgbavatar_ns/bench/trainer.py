@@ -3,31 +3,25 @@
 import copy
 import json
 import tempfile
-import time
 import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import torch
+from torch.utils import benchmark
 
 from rgbavatar_ns.avatar import Avatar
-from rgbavatar_ns.avatar.training.loop import (
-    TrainingBatch,
-    TrainingOptions,
-    make_optimizer,
-    training_step,
-)
+from rgbavatar_ns.avatar.training import TrainingBatch, TrainingOptions, TrainingStep, fit
 from rgbavatar_ns.bench.options import StepOptions
 from rgbavatar_ns.bench.scenes import DEFAULT_SIZE_PX, on_device
-from rgbavatar_ns.bench.timing import Progress, waiting_for
+from rgbavatar_ns.bench.timing import Progress
 from rgbavatar_ns.bench.workloads import read_images
 from rgbavatar_ns.data import OfflineOrder, TrackedDataset, load_dataset
 from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.synthetic import DemoConfig, make_demo_dataset
 
-_NUM_FRAMES = 22
-_NUM_TEST_FRAMES = 2
+_NUM_FRAMES, _NUM_TEST_FRAMES = 22, 2
 _SEED = 0
 
 
@@ -39,10 +33,18 @@ def bench_trainer(
     On --data or on a small demo subject, without colour initialisation. The trainer's speed is
     what it writes to training.json, its wait for the first pictures included.
     """
+    tell = progress or (lambda what, done, total: None)
     with tempfile.TemporaryDirectory(prefix="rgbavatar-bench-") as folder:
         if options.data is None:
-            size_px = options.size or DEFAULT_SIZE_PX
-            dataset = _demo(Path(folder) / "data", size_px, progress)
+            demo = DemoConfig(
+                image_size=options.size or DEFAULT_SIZE_PX,
+                num_frames=_NUM_FRAMES,
+                num_test_frames=_NUM_TEST_FRAMES,
+                seed=_SEED,
+            )
+            dataset = make_demo_dataset(
+                Path(folder) / "data", demo, lambda done, total: tell("demo subject", done, total)
+            )
         else:
             dataset = load_dataset(options.data)
         config = _trainer_config(options, dataset, Path(folder))
@@ -52,7 +54,7 @@ def bench_trainer(
         batch = min(datamanager.batch_size, len(dataset.train))
         avatar = Avatar(HeadModel(dataset.arrays), dataset.identity, model.avatar, seed=_SEED)
         avatar = avatar.to(device)
-        bare = _bare_images_per_second(avatar, dataset, batch, options.trainer_steps, progress)
+        bare = _bare_images_per_second(avatar, dataset, batch, options.trainer_steps, tell)
     return {
         "images_per_second": summary["images_per_second"],
         "bare_images_per_second": bare,
@@ -64,18 +66,6 @@ def bench_trainer(
         "height_px": dataset.height,
         "gaussians": avatar.num_gaussians,
     }
-
-
-def _demo(folder: Path, size_px: int, progress: Progress | None) -> TrackedDataset:
-    config = DemoConfig(
-        image_size=size_px, num_frames=_NUM_FRAMES, num_test_frames=_NUM_TEST_FRAMES, seed=_SEED
-    )
-
-    def told(done: int, total: int) -> None:
-        if progress is not None:
-            progress("demo subject", done, total)
-
-    return make_demo_dataset(folder, config, told)
 
 
 def _trainer_config(options: StepOptions, dataset: TrackedDataset, folder: Path) -> Any:
@@ -109,23 +99,19 @@ def _train(config: Any) -> dict[str, Any]:
 
 
 def _bare_images_per_second(
-    avatar: Avatar, dataset: TrackedDataset, batch: int, steps: int, progress: Progress | None
+    avatar: Avatar, dataset: TrackedDataset, batch: int, steps: int, tell: Progress
 ) -> float:
     """The speed of as many bare steps over the same batches, pictures at hand."""
-    order = OfflineOrder(dataset.train, batch, _SEED)
-    images = read_images(dataset, dataset.train)
-    options, optimizer = TrainingOptions(seed=_SEED, color_init=None), make_optimizer(avatar)
-    device, seconds = avatar.identity.device, 0.0
-    wait = waiting_for(device)
-    for step in range(steps):
-        positions = order.batch(step)
-        start = time.perf_counter()
-        training = TrainingBatch(
-            dataset.theta[positions], dataset.cameras.select(positions), images[positions]
-        )
-        training_step(avatar, optimizer, on_device(training, device), step, options)
-        wait()
-        seconds += time.perf_counter() - start
-        if progress is not None:
-            progress("bare steps beside the trainer", step + 1, steps)
-    return steps * batch / seconds
+    order, device = OfflineOrder(dataset.train, batch, _SEED), avatar.identity.device
+    images = read_images(dataset, range(len(dataset)))
+
+    def batch_at(step: int) -> TrainingBatch:
+        tell("bare steps beside the trainer", step, steps)
+        chosen = order.batch(step)
+        cameras = dataset.cameras.select(chosen)
+        return on_device(TrainingBatch(dataset.theta[chosen], cameras, images[chosen]), device)
+
+    step = TrainingStep(avatar, options=TrainingOptions(seed=_SEED, color_init=None))
+    start = benchmark.timer()
+    fit(step, batch_at, range(steps))
+    return steps * batch / (benchmark.timer() - start)

@@ -7,10 +7,10 @@ from typing import Any
 
 import torch
 from jaxtyping import UInt8
-from torch import Tensor
+from torch import Tensor, nn
 
 from rgbavatar_ns.avatar import Avatar, AvatarConfig
-from rgbavatar_ns.avatar.training.loop import TrainingBatch
+from rgbavatar_ns.avatar.training import TrainingBatch
 from rgbavatar_ns.bench.options import AvatarOptions
 from rgbavatar_ns.bench.scenes import DEFAULT_SIZE_PX, front_camera, on_device
 from rgbavatar_ns.bench.timing import CPU
@@ -63,6 +63,11 @@ def avatar_workload(
         "device": device.type,
     }
     return AvatarWorkload(avatar.to(device), on_device(training, device), facts)
+
+
+def parameters_of(avatar: Avatar) -> list[nn.Parameter]:
+    """All that is trained."""
+    return [parameter for group in avatar.parameter_groups().values() for parameter in group]
 
 
 def load_or_make(path: Path | None, dataset: TrackedDataset | None, config: AvatarConfig) -> Avatar:

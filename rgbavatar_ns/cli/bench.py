@@ -27,7 +27,7 @@ _SECONDS_PER_REFRESH = 0.2
 
 
 def run(options: Annotated[Options, tyro.conf.arg(name="")]) -> None:
-    """Measure on this machine: medians, parts, floor, and the peers or paths beside it.
+    """Measure on this machine: medians, parts, roofline, and what else draws the same.
 
     Other programs that run meanwhile make every figure worse.
     """

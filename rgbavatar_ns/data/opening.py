@@ -9,7 +9,7 @@ from rich.progress import Progress as Bars
 from rich.progress import TaskID
 
 from rgbavatar_ns.data.importers import ImportOptions, find_format, open_foreign
-from rgbavatar_ns.data.importers.frame_files import Progress
+from rgbavatar_ns.data.importers.options import Progress
 from rgbavatar_ns.data.native.dataset import TrackedDataset, load_native
 from rgbavatar_ns.data.native.format import INDEX_FILE
 

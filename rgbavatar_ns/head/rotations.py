@@ -91,18 +91,3 @@ def matrix_to_quat_wxyz(matrix: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*
         pick(wz, xz, yz, square) * factor,
     ]
     return torch.stack(quat).movedim(0, -1).contiguous()
-
-
-def quat_wxyz_to_matrix(quat_wxyz: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3 3"]:
-    """Rotation matrices of quaternions of any length but zero."""
-    return roma.unitquat_to_rotmat(
-        torch.nn.functional.normalize(roma.quat_wxyz_to_xyzw(quat_wxyz), dim=-1)
-    )
-
-
-def quat_multiply_wxyz(
-    first: Float[Tensor, "*batch 4"], second: Float[Tensor, "*batch 4"]
-) -> Float[Tensor, "*batch 4"]:
-    """Hamilton product: the rotation by `second`, then by `first`. Broadcasts."""
-    product = roma.quat_product(roma.quat_wxyz_to_xyzw(first), roma.quat_wxyz_to_xyzw(second))
-    return roma.quat_xyzw_to_wxyz(product)

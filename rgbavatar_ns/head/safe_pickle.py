@@ -1,48 +1,47 @@
-"""Pickles and torch files of others, read as plain arrays: nothing in them is ever run.
+"""Pickles of others, read as plain arrays: nothing in them is ever run.
 
-FLAME's models and metrical-tracker's frames are pickles, which by design may call any function.
-Here an opcode machine of our own builds numbers, texts, containers and arrays, and refuses every
-name that is not on a short list, before anything of the size that it claims is made.
+FLAME's models are pickles, which by design may call any function. Python's own `pickle.Unpickler`
+reads them, but its `find_class` gives inert stand-ins for the few names that arrays need and
+refuses every other. A stand-in only holds what it is given; when the whole file is read,
+`Resolver` makes the arrays. What the Unpickler could not refuse alone, `_vet` refuses first.
 """
 
 import io
-import struct
-import zipfile
-from collections.abc import Callable
+import pickle
+import pickletools
+import re
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from math import prod
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
+import scipy.sparse
 from jaxtyping import Shaped
 
 from rgbavatar_ns.errors import UserError
-from rgbavatar_ns.head.pickle_machine import (
-    Budget,
-    PickleGlobal,
-    PickleMachine,
-    RefusedPickleError,
-    StandIn,
-)
-from rgbavatar_ns.head.pickle_values import ARRAY_GLOBALS, resolve, whole_numbers
 
 MAX_FILE_BYTES = 512 * 2**20
 """FLAME's largest file has 53 MB, a tracker's frame 20 kB."""
-_TORCH_MAGIC = 0x1950A86A20F9469CFC6C
-_STORAGES = {
-    "Double": np.float64,
-    "Float": np.float32,
-    "Half": np.float16,
-    "Long": np.int64,
-    "Int": np.int32,
-    "Short": np.int16,
-    "Char": np.int8,
-    "Byte": np.uint8,
-    "Bool": np.bool_,
-}
+MAX_OPCODES = 500_000
+"""Model files need thousands; this many take a second or two and 100 MB at most."""
+_MAX_NUMBER_BITS, _MAX_DIMENSIONS, _MAX_DEPTH = 512, 32, 50
+_UNUSED = ("EXT1", "EXT2", "EXT4", "INST", "OBJ", "NEWOBJ_EX", "NEXT_BUFFER", "READONLY_BUFFER")
+_PLAIN = {"str", "bytes", "bytes_or_str", "int", "int_or_bool", "bool", "float", "None"}
+"""What pickletools calls the types that may be keys."""
+_KEYED = ("SETITEM", "SETITEMS", "DICT", "ADDITEMS", "FROZENSET")
+_MARK = pickletools.markobject
+_OPCODES = {opcode.code.encode("latin-1"): opcode for opcode in pickletools.opcodes}
+_DTYPE = re.compile(r"[<>=|]?(\?|[bBhHiIlLqQefdFD]|b1|[iu][1248]|f[248]|c8|c16|[SU]\d{1,4})")
 _REMEDY = (
     "Get the file again from its maker; if it holds more than plain arrays, write those arrays "
     "to a file of their own first. Nothing in it was run."
 )
+
+
+class RefusedPickleError(ValueError):
+    """A pickle that is damaged or asks for something that is not on the list."""
 
 
 def read_pickle(path: Path, max_bytes: int = MAX_FILE_BYTES) -> Any:
@@ -52,196 +51,356 @@ def read_pickle(path: Path, max_bytes: int = MAX_FILE_BYTES) -> Any:
     Raises UserError where the file is missing, longer than `max_bytes`, damaged, or asks for
     anything that is not on the list; arrays may take `max_bytes` of memory altogether.
     """
+    file = io.BytesIO(read_bytes(path, max_bytes))
+    with refusals_told(path):
+        return Resolver(max_bytes)(unpickle(file, ARRAY_NAMES))
+
+
+def read_bytes(path: Path, max_bytes: int) -> bytes:
+    """A file's content; raises UserError where it is missing, unreadable or longer."""
     path = Path(path)
-    data = _read(path, max_bytes)
-
-    def load() -> Any:
-        budget = Budget(max_bytes)
-        return resolve(PickleMachine(data, ARRAY_GLOBALS, budget).load(), budget)
-
-    return _guarded(path, load)
-
-
-def read_torch_file(path: Path, max_bytes: int = MAX_FILE_BYTES) -> Any:
-    """What `torch.save` wrote, tensors as numpy arrays; the zip form and the older one.
-
-    Holds containers of numpy arrays and of dense CPU tensors (metrical-tracker's `.frame`), under
-    the rules of `read_pickle`. Compressed zip members are refused: torch writes none, and only
-    they can unpack to more than the file holds.
-    """
-    path = Path(path)
-    data = _read(path, max_bytes)
-    load = _load_zip if data[:4] == b"PK\x03\x04" else _load_legacy
-    return _guarded(path, lambda: load(data, Budget(max_bytes)))
-
-
-def _read(path: Path, max_bytes: int) -> bytes:
     if not path.is_file():
         raise UserError(f"There is no file {path}.", "Name an existing file.")
+    if path.stat().st_size > max_bytes:
+        raise UserError(
+            f"{path} is longer than {max_bytes} bytes.", "Check that it is the right file."
+        )
     try:
-        with path.open("rb") as file:
-            data = file.read(min(max_bytes, path.stat().st_size) + 1)
+        return path.read_bytes()
     except OSError as error:
         raise UserError(
             f"{path} cannot be read: {error.strerror}.", "Name a file that you may read."
         ) from None
-    if len(data) > max_bytes:
-        raise UserError(
-            f"{path} is longer than {max_bytes} bytes.", "Check that it is the right file."
-        )
-    return data
 
 
-def _guarded(path: Path, load: Callable[[], Any]) -> Any:
+@contextmanager
+def refusals_told(path: Path) -> Iterator[None]:
+    """Whatever goes wrong within becomes a UserError about this file."""
     try:
-        return load()
+        yield
     except RefusedPickleError as error:
         raise UserError(f"{path} was not read: {error}.", _REMEDY) from None
-    except (
-        ArithmeticError,
-        EOFError,
-        IndexError,
-        KeyError,
-        MemoryError,
-        NotImplementedError,
-        OSError,
-        RecursionError,
-        RuntimeError,
-        TypeError,
-        ValueError,
-        struct.error,
-        zipfile.BadZipFile,
-    ) as error:
+    except Exception as error:
+        # Bytes of others can provoke nearly any error in pickle, zipfile, numpy and scipy.
         raise UserError(
             f"{path} was not read: it is damaged ({type(error).__name__}).", _REMEDY
         ) from None
 
 
-class _Storage(StandIn):
-    """A torch storage: `count` numbers under a key, elsewhere in the file."""
+class StandIn:
+    """What a name in a pickle becomes: calling it makes a holder of the arguments.
 
-    def __init__(self, persistent_id: Any) -> None:
-        if not isinstance(persistent_id, tuple) or len(persistent_id) not in (5, 6):
+    It takes a state as the real class would, cannot be a key, and runs nothing.
+    """
+
+    __slots__ = ("arguments", "state")
+    __hash__ = None  # pyright: ignore[reportAssignmentType]
+    name: ClassVar[str]
+    convert: ClassVar["Convert"]
+
+    def __new__(cls, *arguments: Any) -> "StandIn":
+        """Not `__init__`, which pickle may pass over."""
+        made = super().__new__(cls)
+        made.arguments, made.state = arguments, None
+        return made
+
+    def __setstate__(self, state: Any) -> None:
+        self.state = state
+
+
+Convert = Callable[[Any, "Resolver"], Any]
+"""From a StandIn, whose parts are not yet resolved, to its value."""
+
+
+def stand_in(name: str, convert: Convert) -> type[StandIn]:
+    """The stand-in for a name."""
+    return type(name, (StandIn,), {"__slots__": (), "name": name, "convert": convert})
+
+
+def unpickle(
+    file: io.BytesIO,
+    names: Mapping[str, type[StandIn]],
+    persistent_load: Callable[[Any], StandIn] | None = None,
+) -> Any:
+    """The next pickle in the file, its stand-ins not yet resolved.
+
+    persistent_load: makes a stand-in of a persistent id; None refuses them. Raises
+    RefusedPickleError, and where the file is damaged whatever Python raises.
+    """
+    start = file.tell()
+    _vet(file)
+    end = file.tell()
+    file.seek(start)
+    value = _Unpickler(file, names, persistent_load).load()
+    file.seek(end)
+    return value
+
+
+class _Unpickler(pickle.Unpickler):
+    def __init__(
+        self,
+        file: io.BytesIO,
+        names: Mapping[str, type[StandIn]],
+        persistent: Callable[[Any], StandIn] | None,
+    ) -> None:
+        # Python 2 strings are read as Latin-1, one character a byte.
+        super().__init__(file, encoding="latin1")
+        self._names = names
+        self._persistent = persistent
+
+    def find_class(self, module: str, name: str, /) -> type[StandIn]:
+        full = f"{module}.{name}"
+        if full not in self._names:
+            raise RefusedPickleError(f"it asks for {full[:120]!a}, which is not on the list")
+        return self._names[full]
+
+    def persistent_load(self, pid: Any, /) -> StandIn:
+        if self._persistent is None:
             raise RefusedPickleError("it refers to data outside of it")
-        what, kind, key, _, count = persistent_id[:5]
-        if what != "storage" or not isinstance(kind, PickleGlobal) or not isinstance(key, str):
-            raise RefusedPickleError("it refers to data outside of it")
-        if len(persistent_id) == 6 and persistent_id[5] is not None:
-            raise RefusedPickleError("it shares a part of a storage, as very old files do")
-        name = kind.name.removeprefix("torch.").removesuffix("Storage")
-        if name not in _STORAGES:
-            raise RefusedPickleError(f"it takes {kind.name} for a kind of numbers")
-        self.dtype = np.dtype(_STORAGES[name]).newbyteorder("<")
-        self.key = key
-        (self.count,) = whole_numbers(count)
+        return self._persistent(pid)
 
 
-class _Tensor(StandIn):
-    """A dense torch tensor: a view of a storage."""
+def _vet(file: io.BytesIO) -> None:
+    """Walk over one pickle's opcodes and refuse what the Unpickler alone could not.
 
-    def __init__(self, arguments: tuple[Any, ...]) -> None:
-        storage, offset, size, stride = arguments[:4]
-        if not isinstance(storage, _Storage):
-            raise RefusedPickleError("it holds a tensor without a storage")
-        self.storage = storage
-        self.shape, self.stride = whole_numbers(size), whole_numbers(stride)
-        (self.offset,) = whole_numbers(offset)
-        last = sum((size - 1) * step for size, step in zip(self.shape, self.stride))
-        empty = 0 in self.shape
-        if len(self.shape) != len(self.stride) or (
-            not empty and self.offset + last >= storage.count
-        ):
-            raise RefusedPickleError("it holds a tensor that reaches beyond its storage")
+    That is: lengths beyond the file's end and high memo numbers, for which it takes memory at once;
+    numbers of a million digits; steps without end; classes that others registered (EXT); and
+    tuples as keys, since a few nested ones can take for ever to hash. For these the types on the
+    stack are followed, as pickletools describes them.
+    """
+    stack: list[Any] = []
+    memo: dict[int, Any] = {}
+    for opcode, argument in _opcodes(file):
+        name, before, after = opcode.name, opcode.stack_before, opcode.stack_after
+        if name in _UNUSED:
+            raise RefusedPickleError(f"it holds the opcode {name}, not needed here")
+        if isinstance(argument, int) and argument.bit_length() > _MAX_NUMBER_BITS:
+            raise RefusedPickleError("it holds a number of too many digits")
+        if "PUT" in name:
+            if argument > MAX_OPCODES:
+                raise RefusedPickleError(f"it remembers more than {MAX_OPCODES} values")
+            memo[argument] = stack[-1]
+        elif name == "MEMOIZE":
+            memo[len(memo)] = stack[-1]
+            after = stack[-1:]
+        elif "GET" in name:
+            after = [memo[argument]]
+        items: list[Any] = []
+        if _MARK in before or (name == "POP" and stack[-1] is _MARK):
+            while (top := stack.pop()) is not _MARK:
+                items.append(top)
+            before = before[: before.index(_MARK)] if _MARK in before else []
+        elif name == "SETITEM":
+            items = [stack[-1], stack[-2]]
+        keys = items[1::2] if name in ("SETITEM", "SETITEMS", "DICT") else items
+        if name in _KEYED and (odd := {key.name for key in keys} - _PLAIN):
+            raise RefusedPickleError(f"it uses a {min(odd)} as a key")
+        del stack[len(stack) - len(before) :]
+        stack += after
 
-    def resolved(self, numbers: Shaped[np.ndarray, "n"], budget: Budget) -> Any:
-        """A copy of its own, native byte order."""
-        count = 1
-        for size in self.shape:
-            count *= size
-        native = self.storage.dtype.newbyteorder("=")
-        budget.spend(count * native.itemsize)
-        if count == 0:
-            return np.zeros(self.shape, native)
-        steps = tuple(step * native.itemsize for step in self.stride)
-        view = np.lib.stride_tricks.as_strided(numbers[self.offset :], self.shape, steps)
-        return view.astype(native)
+
+def _opcodes(file: io.BytesIO) -> Iterator[tuple[pickletools.OpcodeInfo, Any]]:
+    """Opcodes with their arguments; unlike `pickletools.genops` takes Python 2's text as it is."""
+    for _ in range(MAX_OPCODES):
+        opcode = _OPCODES[file.read(1)]
+        argument = None
+        if opcode.name == "STRING":
+            argument = file.readline()
+        elif opcode.arg is not None:
+            argument = opcode.arg.reader(file)
+        yield opcode, argument
+        if opcode.name == "STOP":
+            return
+    raise RefusedPickleError(f"it has more than {MAX_OPCODES} steps")
 
 
-def _torch_globals() -> dict[str, PickleGlobal]:
-    def refused(budget: Budget, arguments: tuple[Any, ...]) -> Any:
-        raise RefusedPickleError("it makes a storage inside the pickle")
+class Resolver:
+    """Replaces stand-ins by their values, each once; `max_bytes` bounds all arrays together."""
 
-    makers = {
-        "torch._utils._rebuild_tensor_v2": lambda budget, arguments: _Tensor(arguments),
-        "torch._utils._rebuild_parameter": lambda budget, arguments: arguments[0],
-        "torch.Size": lambda budget, arguments: whole_numbers(arguments[0]),
+    def __init__(self, max_bytes: int) -> None:
+        self._left = max_bytes
+        self._depth = 0
+        self._done: dict[int, tuple[Any, Any]] = {}
+
+    def spend(self, count: int) -> None:
+        """Raises RefusedPickleError once more bytes than allowed are asked for."""
+        self._left -= count
+        if self._left < 0:
+            raise RefusedPickleError("its arrays claim more memory than a model file may hold")
+
+    def __call__(self, value: Any) -> Any:
+        """The value with all stand-ins within replaced."""
+        if isinstance(value, type):
+            raise RefusedPickleError(f"it holds {value.name} itself, not a value")
+        if not isinstance(value, StandIn | list | tuple | dict):
+            return value
+        if id(value) in self._done:
+            return self._done[id(value)][1]
+        if self._depth > _MAX_DEPTH:
+            raise RefusedPickleError("it is nested too deeply")
+        self._depth += 1
+        if isinstance(value, list | dict):
+            # Known before its items are: it may contain itself.
+            result: Any = type(value)()
+            self._done[id(value)] = value, result
+            if isinstance(value, list):
+                result.extend(map(self, value))
+            else:
+                result.update({key: self(item) for key, item in value.items()})
+        else:
+            is_tuple = isinstance(value, tuple)
+            result = tuple(map(self, value)) if is_tuple else value.convert(self)
+            self._done[id(value)] = value, result
+        self._depth -= 1
+        return result
+
+
+def whole_numbers(shape: Any) -> tuple[int, ...]:
+    """A shape as a tuple; raises RefusedPickleError for what is none."""
+    if isinstance(shape, int) and not isinstance(shape, bool):
+        shape = (shape,)
+    if not isinstance(shape, tuple | list) or len(shape) > _MAX_DIMENSIONS:
+        raise RefusedPickleError("it holds an array without a shape")
+    sizes = [int(size) for size in shape if isinstance(size, int | np.integer)]
+    if len(sizes) != len(shape) or any(not 0 <= size < 2**40 for size in sizes):
+        raise RefusedPickleError("it claims an array of an impossible shape")
+    return tuple(sizes)
+
+
+def _data_type(made: StandIn, resolve: Resolver) -> np.dtype:
+    """numpy.dtype of plain numbers or short texts; never of Python objects or records."""
+    name, state = resolve(made.arguments[0]), resolve(made.state)
+    if isinstance(name, bytes):
+        name = name.decode("latin-1")
+    if not isinstance(name, str) or not _DTYPE.fullmatch(name):
+        raise RefusedPickleError(f"it holds an array of {str(name)[:40]!r}, which are no numbers")
+    if state is None:
+        return np.dtype(name)
+    if len(state) < 5 or state[1] not in ("<", ">", "|", "="):
+        raise RefusedPickleError("it holds a broken number type")
+    if any(part is not None for part in state[2:5]):
+        raise RefusedPickleError("it holds an array of records")
+    return np.dtype(name).newbyteorder(state[1])
+
+
+def _array(made: StandIn, resolve: Resolver) -> Shaped[np.ndarray, "..."]:
+    """numpy.ndarray from its state ([version,] shape, dtype, is_fortran, bytes)."""
+    shape, dtype, fortran, raw = made.state[-4:]
+    return _filled(resolve, shape, dtype, raw, bool(fortran))
+
+
+def _filled(
+    resolve: Resolver, shape: Any, dtype: Any, raw: Any, fortran: bool = False
+) -> Shaped[np.ndarray, "..."]:
+    """A writable array of its own; the claimed size is checked before anything is made."""
+    dtype, raw, shape = resolve(dtype), resolve(raw), whole_numbers(resolve(shape))
+    if not isinstance(dtype, np.dtype) or not isinstance(raw, bytes | bytearray | str):
+        raise RefusedPickleError("it holds an array of objects, not of numbers")
+    claimed = prod(shape) * dtype.itemsize
+    if claimed != len(raw):
+        raise RefusedPickleError(
+            f"it claims an array of {claimed} bytes where there are {len(raw)}"
+        )
+    resolve.spend(claimed)
+    raw = raw.encode("latin-1") if isinstance(raw, str) else raw
+    flat = np.frombuffer(raw, dtype) if claimed else np.zeros(0, dtype)
+    return flat.reshape(shape, order="F" if fortran else "C").copy(order="K")
+
+
+def _scalar(made: StandIn, resolve: Resolver) -> Any:
+    return _filled(resolve, (), *made.arguments)[()]
+
+
+def _from_buffer(made: StandIn, resolve: Resolver) -> Shaped[np.ndarray, "..."]:
+    raw, dtype, shape, order = made.arguments
+    return _filled(resolve, shape, dtype, raw, order == "F")
+
+
+def _parts(made: StandIn, resolve: Resolver) -> dict[str, Any]:
+    state = made.state
+    if not isinstance(state, dict) or not all(isinstance(key, str) for key in state):
+        raise RefusedPickleError("it holds an object without named parts")
+    return {key: resolve(value) for key, value in state.items()}
+
+
+def _sparse(made: StandIn, resolve: Resolver) -> Any:
+    """A compressed scipy.sparse matrix, its indices checked."""
+    parts = _parts(made, resolve)
+    shape = whole_numbers(parts.get("_shape", parts.get("shape")))
+    arrays = tuple(parts[name] for name in ("data", "indices", "indptr"))
+    if not all(isinstance(array, np.ndarray) and array.dtype.kind in "biuf" for array in arrays):
+        raise RefusedPickleError("it holds a sparse matrix that is not of numbers")
+    by_columns = made.name.rpartition(".")[2].startswith("csc")
+    if len(arrays[2]) != shape[by_columns] + 1:
+        raise RefusedPickleError("it holds a sparse matrix of the wrong size")
+    kind = scipy.sparse.csc_matrix if by_columns else scipy.sparse.csr_matrix
+    matrix = kind(arrays, shape=shape)
+    matrix.check_format(full_check=True)
+    return matrix
+
+
+def _chumpy(made: StandIn, resolve: Resolver) -> Shaped[np.ndarray, "..."]:
+    """A chumpy array's numbers: `x`, or for a selection those entries of another array."""
+    parts = _parts(made, resolve)
+    if "x" in parts:
+        value = np.asarray(parts["x"])
+    elif {"a", "idxs"} <= parts.keys():
+        chosen = np.asarray(parts["idxs"])
+        resolve.spend(chosen.size * 8)
+        shape = whole_numbers(parts.get("preferred_shape", chosen.shape))
+        value = np.asarray(parts["a"]).reshape(-1)[chosen].reshape(shape)
+    else:
+        raise RefusedPickleError(f"its {made.name} is computed from others by chumpy's code")
+    if value.dtype.kind not in "biuf":
+        raise RefusedPickleError(f"its {made.name} does not hold numbers")
+    return value
+
+
+def _encoded(made: StandIn, resolve: Resolver) -> bytes:
+    """Bytes that protocol 2 stores as text of one character a byte."""
+    text, *encoding = made.arguments or (b"",)
+    if not isinstance(text, str | bytes) or encoding not in ([], ["latin1"], ["latin-1"]):
+        raise RefusedPickleError("it makes bytes from something other than text")
+    resolve.spend(len(text))
+    return text.encode("latin-1") if isinstance(text, str) else text
+
+
+def _reconstructed(made: StandIn, resolve: Resolver) -> Any:
+    """copy_reg._reconstructor(class, object, None): an object of an allowed class."""
+    kind, base, _ = made.arguments
+    if not all(isinstance(part, type) for part in (kind, base)) or "object" not in base.name:
+        raise RefusedPickleError("it makes an object of something that is no class")
+    real = kind()
+    real.__setstate__(made.state)
+    return real.convert(resolve)
+
+
+def _refused(made: StandIn, resolve: Resolver) -> Any:
+    raise RefusedPickleError(f"it makes a bare {made.name}")
+
+
+def _array_names() -> dict[str, type[StandIn]]:
+    known: dict[str, Convert] = {
+        "numpy.dtype": _data_type,
+        "numpy.ndarray": _refused,
+        "_codecs.encode": _encoded,
+        "copy_reg._reconstructor": _reconstructed,
+        "copyreg._reconstructor": _reconstructed,
     }
-    makers |= {f"torch.{name}Storage": refused for name in _STORAGES}
-    return ARRAY_GLOBALS | {name: PickleGlobal(name, make) for name, make in makers.items()}
+    for module in ("numpy.core", "numpy._core"):
+        known[f"{module}.multiarray._reconstruct"] = _array
+        known[f"{module}.multiarray.scalar"] = _scalar
+        known[f"{module}.numeric._frombuffer"] = _from_buffer
+    for module in ("builtins", "__builtin__"):
+        known[f"{module}.object"] = _refused
+        known[f"{module}.bytes"] = _encoded
+    for form in ("csc", "csr"):
+        for module in (f"scipy.sparse.{form}", f"scipy.sparse._{form}"):
+            known |= {f"{module}.{form}_{kind}": _sparse for kind in ("matrix", "array")}
+    for name in ("chumpy.ch.Ch", "chumpy.reordering.Select", "chumpy.Ch"):
+        known[name] = _chumpy
+    return {name: stand_in(name, convert) for name, convert in known.items()}
 
 
-_TORCH_GLOBALS = _torch_globals()
-
-
-def _load_zip(data: bytes, budget: Budget) -> Any:
-    with zipfile.ZipFile(io.BytesIO(data)) as archive:
-        members = {member.filename: member for member in archive.infolist()}
-        pickles = [name for name in members if name.endswith("data.pkl")]
-        if len(pickles) != 1:
-            raise RefusedPickleError("it is a zip, but not one that torch.save wrote")
-        folder = pickles[0].removesuffix("data.pkl")
-
-        def member(name: str) -> bytes:
-            info = members[folder + name]
-            if info.compress_type != zipfile.ZIP_STORED or info.file_size > len(data):
-                raise RefusedPickleError(f"its part {info.filename[:80]!r} is compressed")
-            budget.spend(info.file_size)
-            return archive.read(info)
-
-        if folder + "byteorder" in members and member("byteorder") != b"little":
-            raise RefusedPickleError("its numbers are stored in the other byte order")
-        machine = PickleMachine(member("data.pkl"), _TORCH_GLOBALS, budget, _Storage)
-        storages: dict[str, bytes] = {}
-
-        def numbers(storage: _Storage) -> bytes:
-            if storage.key not in storages:
-                storages[storage.key] = member(f"data/{storage.key}")
-            return storages[storage.key]
-
-        return _resolve_tensors(machine.load(), budget, numbers)
-
-
-def _load_legacy(data: bytes, budget: Budget) -> Any:
-    """Magic number, version, platform, the value, its storages' keys; then their numbers."""
-    named: dict[str, _Storage] = {}
-
-    def storage(persistent_id: Any) -> _Storage:
-        made = _Storage(persistent_id)
-        return named.setdefault(made.key, made)
-
-    machine = PickleMachine(data, _TORCH_GLOBALS, budget, storage)
-    if machine.load() != _TORCH_MAGIC:
-        raise RefusedPickleError("it is no file of torch.save")
-    version, platform = machine.load(), machine.load()
-    if version != 1001 or not isinstance(platform, dict) or not platform.get("little_endian"):
-        raise RefusedPickleError("it is of an unknown version of torch.save")
-    value, keys = machine.load(), machine.load()
-    if not isinstance(keys, list) or set(keys) != set(named):
-        raise RefusedPickleError("it does not name its storages")
-    numbers: dict[str, bytes] = {}
-    for key in keys:
-        count = int.from_bytes(machine.take(8), "little")
-        numbers[key] = machine.take(count * named[key].dtype.itemsize)
-    return _resolve_tensors(value, budget, lambda storage: numbers[storage.key])
-
-
-def _resolve_tensors(value: Any, budget: Budget, numbers: Callable[[_Storage], bytes]) -> Any:
-    def other(part: Any) -> Any:
-        if not isinstance(part, _Tensor):
-            raise RefusedPickleError("it holds a storage that is no tensor")
-        raw = numbers(part.storage)
-        if len(raw) != part.storage.count * part.storage.dtype.itemsize:
-            raise RefusedPickleError("a storage is not as long as it claims")
-        return part.resolved(np.frombuffer(raw, part.storage.dtype), budget)
-
-    return resolve(value, budget, other)
+ARRAY_NAMES = _array_names()
+"""numpy arrays, scipy.sparse matrices, chumpy arrays and plain containers, by full name."""

@@ -1,6 +1,6 @@
 """Teeth for FLAME, which has none: strips built behind its lips."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -88,19 +88,16 @@ def with_teeth(arrays: HeadArrays, form: TeethForm = "strips") -> HeadArrays:
     groups["upper_teeth"] = places[follows == _NECK]
     groups["lower_teeth"] = places[follows == _JAW]
     eyelids = arrays.eyelid_dirs
-    return HeadArrays(
-        name=arrays.name,
+    return replace(
+        arrays,
         v_template=_below(arrays.v_template, positions),
         shapedirs=_below(arrays.shapedirs, directions),
-        num_identity=arrays.num_identity,
         posedirs=_below(arrays.posedirs, np.zeros((count, 3, 36))),
         joint_regressor=np.pad(arrays.joint_regressor, ((0, 0), (0, count))),
-        parents=arrays.parents,
         skinning_weights=_below(arrays.skinning_weights, weights),
         faces=_below(arrays.faces, faces + vertices),
         uv=_below(arrays.uv, uv),
         uv_faces=_below(arrays.uv_faces, uv_faces + len(arrays.uv)),
-        expression_names=arrays.expression_names,
         eyelid_dirs=None if eyelids is None else _below(eyelids, np.zeros((count, 3, 2))),
         vertex_groups=groups,
     )

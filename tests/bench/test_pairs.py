@@ -1,18 +1,18 @@
 import pytest
 import torch
 
+from rgbavatar_ns.bench.gsplat_torch import sorted_pairs
 from rgbavatar_ns.bench.pairs import count_pairs
-from rgbavatar_ns.bench.projection import one_camera, one_image, project, row_spans, visible_index
 from rgbavatar_ns.bench.scenes import ellipsoid_scene
 from rgbavatar_ns.kernels import GaussianSet, PinholeCameras
 from rgbavatar_ns.kernels.constants import DILATION_PX2, MIN_ALPHA
-from rgbavatar_ns.kernels.reference import project as reference_project
+from rgbavatar_ns.kernels.reference import project
 from tests.kernels.scenes import random_scene
 
 
 def alphas(gaussians: GaussianSet, cameras: PinholeCameras) -> torch.Tensor:
     """Alpha of every Gaussian at every pixel [B, N, H, W], by the specification's projection."""
-    projected = reference_project(gaussians, cameras)
+    projected = project(gaussians, cameras)
     y, x = torch.meshgrid(torch.arange(cameras.height), torch.arange(cameras.width), indexing="ij")
     pixels = torch.stack([x, y], -1).to(projected.mean_px) + 0.5
     offset = pixels - projected.mean_px[:, :, None, None]
@@ -46,31 +46,19 @@ def test_a_round_gaussian_touches_the_pixels_of_its_disc():
     assert count_pairs(gaussians, cameras) == 13
 
 
-def test_chunks_of_rows_cover_the_same_pixels():
+def test_nothing_in_view_has_no_pairs():
+    gaussians, cameras = ellipsoid_scene(50, 16, 1)
+    gaussians.opacities.zero_()
+    assert count_pairs(gaussians, cameras) == 0
+
+
+def test_the_sorted_list_holds_every_pair_once_by_pixel_and_depth():
     gaussians, cameras = ellipsoid_scene(300, 64, 1)
-    projected = project(gaussians, cameras, visible_index(gaussians, cameras))
-    whole = row_spans(projected, 64, 64)
-    parts = row_spans(projected, 64, 64, max_rows=50)
-    assert len(whole) == 1
-    assert len(parts) > 3
-    for name in ("index", "row", "first", "last"):
-        joined = torch.cat([getattr(part, name) for part in parts])
-        assert torch.equal(joined, getattr(whole[0], name))
-
-
-def test_projection_agrees_with_the_specification():
-    scene = random_scene(4, num_cameras=3, batch=3)
-    expected = reference_project(scene.gaussians, scene.cameras)
-    for position in range(3):
-        single = one_image(scene.gaussians, position)
-        camera = one_camera(scene.cameras, position)
-        index = visible_index(single, camera)
-        assert torch.equal(index, torch.nonzero(expected.visible[position])[:, 0])
-        mine = project(single, camera, index)
-        covariance = expected.covariance_px2[position, index]
-        inverse = torch.linalg.inv(covariance)
-        conic = torch.stack([inverse[:, 0, 0], inverse[:, 0, 1], inverse[:, 1, 1]], -1)
-        torch.testing.assert_close(mine.mean_px, expected.mean_px[position, index])
-        torch.testing.assert_close(mine.conic, conic)
-        torch.testing.assert_close(mine.variance_px2, covariance.diagonal(dim1=1, dim2=2))
-        torch.testing.assert_close(mine.depth_m, expected.depth_m[position, index])
+    gaussian, pixel = sorted_pairs(gaussians, cameras)
+    assert len(pixel) == count_pairs(gaussians, cameras)
+    keys = pixel * 300 + gaussian
+    assert len(torch.unique(keys)) == len(keys)
+    assert bool((pixel.diff() >= 0).all())
+    depth = gaussians.means[0, gaussian, 2]
+    same = pixel.diff() == 0
+    assert bool((depth.diff()[same] >= 0).all())

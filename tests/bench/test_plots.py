@@ -4,7 +4,7 @@ from pathlib import Path
 import cv2
 import pytest
 
-SCRIPT = Path(__file__).parents[2] / "benchmarks" / "plots.py"
+SCRIPT = Path(__file__).parents[2] / "benchmarks" / "speed" / "plots.py"
 
 
 def test_the_plot_is_drawn_from_figures_with_a_peer_missing(tmp_path):
@@ -17,9 +17,14 @@ def test_the_plot_is_drawn_from_figures_with_a_peer_missing(tmp_path):
     points = [(1000.0, 1.0, 0.9, 1.2), (2000.0, 2.0, 1.9, 2.1)]
     names = ("ms_per_image_by_count", "ms_per_batch_by_batch", "ms_per_image_by_pixels")
     peers = {"one": {"whole_ms_per_image": 300.0}, "other": {"unavailable": "not installed"}}
+    least = {"ms_per_image": 3.0}
     facts = {"processor": "a processor", "threads": 2, "instruction_set": "avx2"}
     figures = {name: points for name in names} | {
-        "rasterizer": {"images_per_second": 120.0, "floor": {"ms_per_image": 3.0}, "peers": peers},
+        "rasterizer": {
+            "images_per_second": 120.0,
+            "roofline": least,
+            "peers": peers,
+        },
         "machine": facts | {"commit": None, "date": "2020-01-01 00:00"},
     }
     path = tmp_path / "docs" / "speed.png"

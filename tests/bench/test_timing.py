@@ -1,9 +1,20 @@
-import time
-
 import pytest
 import torch
 
 from rgbavatar_ns.bench.timing import WHOLE, Spread, Stopwatch, peak_growth_bytes, using_threads
+
+
+class Clock:
+    """Stands still but where a test moves it."""
+
+    def __init__(self) -> None:
+        self.seconds = 100.0
+
+    def __call__(self) -> float:
+        return self.seconds
+
+    def move(self, seconds: float) -> None:
+        self.seconds += seconds
 
 
 def test_spread_is_median_and_quartiles():
@@ -14,30 +25,33 @@ def test_spread_is_median_and_quartiles():
 
 
 def test_the_warm_up_and_what_is_prepared_are_outside_of_the_time():
-    calls = []
+    clock, calls = Clock(), []
 
     def call():
         calls.append("call")
-        time.sleep(0.3 if len(calls) == 1 else 0.0)
+        clock.move(9.0 if len(calls) == 1 else 0.002)
 
-    spread = Stopwatch(3).time("nothing", call, lambda: time.sleep(0.1))
+    spread = Stopwatch(3, clock=clock).time("nothing", call, lambda: clock.move(5.0))
     assert len(calls) == 4
     assert spread.repetitions == 3
-    assert spread.upper_ms < 50
+    assert (spread.lower_ms, spread.upper_ms) == pytest.approx((2, 2))
+    assert Stopwatch(1, warm_up=False, clock=clock).time("", call).repetitions == 1
+    assert len(calls) == 5
 
 
 def test_laps_share_out_the_whole():
-    def call(lap):
-        time.sleep(0.02)
-        lap("first")
-        time.sleep(0.04)
-        lap("second")
+    clock = Clock()
 
-    laps = Stopwatch(1).laps("two", call)
-    assert laps["first"].median_ms >= 20
-    assert laps["second"].median_ms >= 40
-    parts = laps["first"].median_ms + laps["second"].median_ms
-    assert laps[WHOLE].median_ms == pytest.approx(parts, abs=5)
+    def call(lap):
+        clock.move(0.02)
+        lap("first")
+        clock.move(0.04)
+        lap("second")
+        clock.move(0.01)
+
+    laps = Stopwatch(2, clock=clock).laps("two", call)
+    found = [laps[name].median_ms for name in ("first", "second", WHOLE)]
+    assert found == pytest.approx([20, 40, 70])
 
 
 def test_progress_goes_to_the_end():

@@ -49,13 +49,14 @@ def assert_agrees(
     value_error: float = 1e-4,
     gradient_error: float = 1e-3,
     attributes: tuple[str, ...] = (*ATTRIBUTES, "background"),
+    device: str = "cpu",
 ) -> None:
     """Largest error of image and alpha, and relative L2 error of these attributes' gradients.
 
     The others' gradients must be finite.
     """
     mask, rendered = expected.mask, expected.rendered
-    got, grads = render_and_differentiate(expected.scene, torch.float32, backend, mask)
+    got, grads = render_and_differentiate(expected.scene, torch.float32, backend, mask, device)
     for name in ("image", "alpha"):
         value, wanted = getattr(got, name), getattr(rendered, name)
         assert torch.isfinite(value).all()

@@ -1,6 +1,6 @@
 """Random scenes, and what the tests ask of a rendering."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, is_dataclass
 
 import torch
 from torch import Tensor
@@ -24,14 +24,12 @@ class Scene:
 
 
 def to(value, like):
-    """The dataclass with its tensors converted and detached."""
-    converted = {
-        field.name: getattr(value, field.name).detach().to(like).clone()
-        if isinstance(getattr(value, field.name), Tensor)
-        else getattr(value, field.name)
-        for field in fields(value)
-    }
-    return type(value)(**converted)
+    """The dataclass and those in it with their tensors converted and detached."""
+    if isinstance(value, Tensor):
+        return value.detach().to(like).clone()
+    if not is_dataclass(value):
+        return value
+    return type(value)(**{f.name: to(getattr(value, f.name), like) for f in fields(value)})
 
 
 def random_cameras(generator, count: int, width: int, height: int, distance_m: float = 2.3):
@@ -118,8 +116,11 @@ def settled_pixels(scene: Scene, margin: float = 1e-4) -> Tensor:
     return ~near.any(-1, keepdim=True)
 
 
-def render_and_differentiate(scene: Scene, dtype: torch.dtype, backend: str, mask=None):
+def render_and_differentiate(
+    scene: Scene, dtype: torch.dtype, backend: str, mask=None, device: str = "cpu"
+):
     """The rendering and the gradients of all attributes and the background, in float64."""
+    scene, mask = to(scene, device), None if mask is None else mask.to(device)
     gaussians, cameras = to(scene.gaussians, dtype), to(scene.cameras, dtype)
     background = scene.background.to(dtype).clone().requires_grad_()
     leaves = [getattr(gaussians, name).requires_grad_() for name in ATTRIBUTES]
@@ -132,10 +133,10 @@ def render_and_differentiate(scene: Scene, dtype: torch.dtype, backend: str, mas
     loss.backward()
     names = (*ATTRIBUTES, "background")
     gradients = {
-        name: torch.as_tensor(leaf.grad).double()
+        name: torch.as_tensor(leaf.grad).double().cpu()
         for name, leaf in zip(names, [*leaves, background])
     }
-    return to(rendered, torch.float64), gradients
+    return to(to(rendered, torch.float64), "cpu"), gradients
 
 
 def relative_l2(value: Tensor, expected: Tensor) -> float:

@@ -5,8 +5,6 @@ import warnings
 
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from rgbavatar_ns.kernels import (
     GaussianSet,
@@ -20,12 +18,6 @@ from tests.kernels.scenes import ATTRIBUTES, random_scene, render_and_differenti
 
 DTYPES = {"reference": torch.float64, "cpu": torch.float32}
 COUNT = 60
-BAD = st.tuples(
-    st.sampled_from(ATTRIBUTES),
-    st.integers(0, COUNT - 1),
-    st.sampled_from([math.nan, math.inf, -math.inf]),
-    st.integers(0, 3),
-)
 
 
 def _changed(scene, gaussians):
@@ -51,25 +43,15 @@ def _assert_isolated(scene, broken, indices, backend):
 
 
 @pytest.mark.parametrize("backend", available_backends())
-@settings(max_examples=12, deadline=None)
-@given(bad=st.lists(BAD, min_size=1, max_size=5), seed=st.integers(0, 3))
-def test_not_finite_gaussians_contribute_nothing(backend, bad, seed):
-    scene = random_scene(seed, count=COUNT, batch=1, width=9, height=10, extremes=False)
-    values = {name: value.clone() for name, value in vars(scene.gaussians).items()}
-    for name, index, value, component in bad:
-        row = values[name][:, index]
-        if row.ndim == 1:
-            values[name][:, index] = value
-        else:
-            row[:, component % row.shape[1]] = value
-    indices = sorted({index for _, index, _, _ in bad})
-    _assert_isolated(scene, _changed(scene, values), indices, backend)
-
-
-@pytest.mark.parametrize("backend", available_backends())
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("quats_wxyz", 0.0), ("quats_wxyz", 1e-20), ("quats_wxyz", 1e200), ("scales", 1e200)],
+    [
+        *((name, value) for name in ATTRIBUTES for value in (math.nan, math.inf, -math.inf)),
+        ("quats_wxyz", 0.0),
+        ("quats_wxyz", 1e-20),
+        ("quats_wxyz", 1e200),
+        ("scales", 1e200),
+    ],
 )
 def test_degenerate_gaussians_contribute_nothing(backend, name, value):
     scene = random_scene(0, count=COUNT, batch=1, width=9, height=10, extremes=False)

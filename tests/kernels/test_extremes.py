@@ -227,27 +227,3 @@ def _of_size(width: int, height: int):
 @pytest.mark.usefixtures("instruction_set")
 def test_small_and_odd_sizes_match_reference(width, height):
     assert_agrees(_of_size(width, height), "cpu")
-
-
-BATCHES = {
-    "1": {"batch": 1},
-    "10": {"batch": 10},
-    "10 with cameras": {"batch": 10, "num_cameras": 10},
-    "1 with 10 cameras": {"batch": 1, "num_cameras": 10},
-    "10 of shared shapes": {"batch": 10, "num_cameras": 10, "shared": ("scales", "opacities")},
-    "10 of one means": {"batch": 10, "shared": ("means",)},
-    "3 of one look": {"batch": 3, "shared": ("colors", "quats_wxyz"), "num_cameras": 3},
-    "3 of one Gaussian": {"batch": 3, "count": 1},
-}
-
-
-@functools.cache
-def _of_batch(name: str):
-    options = {"count": 70, "width": 18, "height": 13, "extremes": True, **BATCHES[name]}
-    return expect(random_scene(9, **options), 0.4)
-
-
-@pytest.mark.parametrize("name", BATCHES)
-@pytest.mark.usefixtures("instruction_set")
-def test_batches_match_reference(name):
-    assert_agrees(_of_batch(name), "cpu")

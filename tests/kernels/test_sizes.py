@@ -141,7 +141,7 @@ def test_one_to_sixteen_threads_give_the_same_bits():
     threads = torch.get_num_threads()
     results = []
     try:
-        for count in (1, 2, 3, 5, 8, 16):
+        for count in (1, 2, 3, 5, 8, 16, 2):
             torch.set_num_threads(count)
             rendered, grads = render_and_differentiate(scene, torch.float32, "cpu")
             average = weighted_color_average(gaussians, cameras, rendered.image.float())
@@ -157,15 +157,10 @@ def test_one_to_sixteen_threads_give_the_same_bits():
 COUNT = 500_000
 
 
-@pytest.fixture(scope="module")
-def crowd() -> tuple[GaussianSet, PinholeCameras]:
-    return _plane_scene(512, 509, COUNT, seed=2, radius_px=(0.3, 1.5))
-
-
 @pytest.mark.slow
-def test_half_a_million_gaussians_obey_euler(crowd):
+def test_half_a_million_gaussians_obey_euler():
     """Gradients as sums that scalings of the scene make known, for every Gaussian."""
-    gaussians, cameras = crowd
+    gaussians, cameras = _plane_scene(512, 509, COUNT, seed=2, radius_px=(0.3, 1.5))
     generator = torch.Generator().manual_seed(0)
     image_grad = torch.randn(1, cameras.height, cameras.width, 3, generator=generator)
     rendered, grads = _gradients(gaussians, cameras, image_grad)
@@ -196,17 +191,6 @@ def test_half_a_million_gaussians_obey_euler(crowd):
 
 
 @pytest.mark.slow
-def test_half_a_million_weights_sum_to_alpha(crowd):
-    gaussians, cameras = crowd
-    rendered = rasterize(gaussians, cameras, backend="cpu", with_visibility=True)
-    ones = torch.ones(1, cameras.height, cameras.width, 1)
-    average = weighted_color_average(gaussians, cameras, ones, backend="cpu")
-    alpha = rendered.alpha.double().sum()
-    assert (average.weight_sum.double().sum() - alpha).abs() < 1e-5 * alpha
-    assert torch.equal(average.max_weight, torch.as_tensor(rendered.visibility))
-
-
-@pytest.mark.slow
 @pytest.mark.usefixtures("instruction_set")
 def test_half_a_million_unseen_gaussians_change_nothing():
     few, cameras = _plane_scene(251, 197, 1000, seed=3)
@@ -230,20 +214,6 @@ def test_half_a_million_unseen_gaussians_change_nothing():
     for name in ATTRIBUTES:
         assert torch.equal(grads[name][:, places], expected_grads[name]), name
         assert (grads[name][:, hidden] == 0).all()
-
-
-@pytest.mark.slow
-def test_order_of_half_a_million_in_memory_does_not_matter(crowd):
-    gaussians, cameras = crowd
-    order = torch.randperm(COUNT, generator=torch.Generator().manual_seed(0))
-    shuffled = GaussianSet(**{name: value[:, order] for name, value in vars(gaussians).items()})
-    image_grad = torch.randn(1, 509, 512, 3, generator=torch.Generator().manual_seed(1))
-    expected, expected_grads = _gradients(gaussians, cameras, image_grad)
-    rendered, grads = _gradients(shuffled, cameras, image_grad)
-    # Where depths are equal the order in memory decides; of random ones few are.
-    assert (rendered.image - expected.image).abs().mean() < 1e-5
-    for name in ATTRIBUTES:
-        assert relative_l2(grads[name], expected_grads[name][:, order]) < 1e-2, name
 
 
 @pytest.mark.usefixtures("instruction_set")

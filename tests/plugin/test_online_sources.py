@@ -1,34 +1,29 @@
 """What happens before the first step: sources by their flags, and waiting for a subject."""
 
 import dataclasses
-import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from rgbavatar_ns.data.streams import (
-    FolderStream,
-    PushedStream,
-    ReplayStream,
-    StreamSubject,
-)
+from rgbavatar_ns.data.streams import ReplayStream, SocketStream, StreamSubject
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.plugin.online.sources import SourceConfig, await_subject, open_source
-from tests.data.streaming import GivenStream, streamed, subject
+from tests.data.streaming import Clock, GivenStream, streamed, subject
 from tests.plugin.online_run import online_config, online_trainer
 
 
-def test_flags_name_the_source(tiny_data: Path, tmp_path: Path):
+def test_flags_name_the_source(tiny_data: Path):
     replay = open_source(SourceConfig(), tiny_data)
     assert isinstance(replay, ReplayStream)
-    assert isinstance(open_source(SourceConfig("folder"), tmp_path), FolderStream)
-    pushed = open_source(SourceConfig("socket", listen="127.0.0.1:0"), None)
-    assert isinstance(pushed, PushedStream)
-    pushed.close()
+    listening = open_source(SourceConfig("socket", listen="127.0.0.1:0"), None)
+    assert isinstance(listening, SocketStream)
+    listening.close()
     with pytest.raises(UserError, match="Other machines"):
         open_source(SourceConfig("socket", listen="0.0.0.0:0"), None)
+    with pytest.raises(UserError, match="kind socket"):
+        open_source(SourceConfig("folder"), tiny_data)
 
 
 def test_the_first_usable_frame_is_waited_for():
@@ -40,24 +35,24 @@ def test_the_first_usable_frame_is_waited_for():
 
 
 def test_a_stream_without_a_usable_frame_is_an_error():
-    broken = dataclasses.replace(streamed(1), png=b"no picture")
+    broken = dataclasses.replace(streamed(1), png=(streamed(1).png or b"")[:-20])
     large = np.zeros((16, 24, 4), np.uint8)
     with pytest.raises(UserError, match="ended before a frame"):
         await_subject(GivenStream([broken, streamed(2, image=large)]), print)
 
 
 def test_what_is_waited_for_is_told_once_with_what_went_wrong():
-    class Slow(GivenStream):
-        began = time.monotonic()
+    clock = Clock()
 
+    class Slow(GivenStream):
         def subject(self, timeout_s: float) -> StreamSubject | None:
-            time.sleep(0.05)
-            return subject() if time.monotonic() - self.began > 1.3 else None
+            clock.sleep(timeout_s)
+            return subject() if clock.now_s > 1003.0 else None
 
     stream = Slow([streamed(0)])
     stream.counts["failed openings"] = 2
     told: list[str] = []
-    await_subject(stream, told.append)
+    await_subject(stream, told.append, clock)
     assert len(told) == 1
     assert "Waiting for frames" in told[0]
     assert "failed openings: 2" in told[0]
@@ -71,7 +66,7 @@ def test_ctrl_c_while_waiting_ends_with_exit_code_0(
 
     monkeypatch.setattr("rgbavatar_ns.plugin.online.datamanager.await_subject", interrupted)
     config = online_config(tmp_path / "out", tmp_path / "live")
-    config.pipeline.datamanager.source.kind = "folder"
+    config.pipeline.datamanager.source = SourceConfig("socket", listen="127.0.0.1:0")
     with pytest.raises(SystemExit) as ended:
         online_trainer(config)
     assert ended.value.code == 0

@@ -5,9 +5,10 @@ from typing import Literal
 import numpy as np
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 
+from rgbavatar_ns.drawing.compositing import composite, rgba_to_float
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.kernels import PinholeCameras
 

@@ -13,8 +13,7 @@ from rgbavatar_ns.data.importers.convert import (
     source_fingerprint,
 )
 from rgbavatar_ns.data.importers.formats import find_format
-from rgbavatar_ns.data.importers.frame_files import Progress
-from rgbavatar_ns.data.importers.options import ImportOptions
+from rgbavatar_ns.data.importers.options import ImportOptions, Progress
 from rgbavatar_ns.data.native.dataset import TrackedDataset, load_native
 from rgbavatar_ns.data.native.format import INDEX_FILE
 from rgbavatar_ns.errors import UserError

@@ -10,10 +10,9 @@ from typing import Any
 from rgbavatar_ns.data.importers.flashavatar import tracker_folder
 from rgbavatar_ns.data.importers.folder import Folder
 from rgbavatar_ns.data.importers.formats import find_format, read_source
-from rgbavatar_ns.data.importers.frame_files import Progress
 from rgbavatar_ns.data.importers.frame_images import make_png
 from rgbavatar_ns.data.importers.import_report import ImportReport, UnusableFrameError
-from rgbavatar_ns.data.importers.options import ImportOptions
+from rgbavatar_ns.data.importers.options import ImportOptions, Progress
 from rgbavatar_ns.data.importers.source import Source
 from rgbavatar_ns.data.native.dataset import TrackedDataset, load_native
 from rgbavatar_ns.data.native.format import INDEX_FILE
@@ -122,14 +121,14 @@ def _write_images(
 
 
 def _write_image(source: Source, writer: DatasetWriter, position: int, link: bool) -> None:
-    picture, index = source.pictures[position], source.index[position]
+    frame_image, index = source.frame_images[position], source.index[position]
     place = writer.image_path(index)
     if place.exists():
         return
-    png = make_png(picture, (source.cameras.width, source.cameras.height))
+    png = make_png(frame_image, (source.cameras.width, source.cameras.height))
     if link and png.is_original:
         try:
-            os.link(picture.color.resolve(), place)
+            os.link(frame_image.color.resolve(), place)
         except OSError:  # another disk, or one without links
             pass
         else:
@@ -138,10 +137,10 @@ def _write_image(source: Source, writer: DatasetWriter, position: int, link: boo
 
 
 def _settle(source: Source, unusable: dict[int, str], allow_partial: bool) -> None:
-    findings = ImportReport()
+    report = ImportReport()
     for position, reason in sorted(unusable.items()):
-        findings.leave_out(reason, [source.pictures[position].color.name])
-    findings.settle(f"The {source.format} data in {source.root}", allow_partial)
+        report.leave_out(reason, [source.frame_images[position].color.name])
+    report.settle(f"The {source.format} data in {source.root}", allow_partial)
     if len(unusable) == len(source):
         raise UserError(f"No image of {source.root} can be used.", "Look at its files.")
 

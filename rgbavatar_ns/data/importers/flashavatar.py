@@ -3,8 +3,8 @@
 from dataclasses import replace
 from pathlib import Path
 
-from rgbavatar_ns.data.importers.folder import PICTURES, Folder
-from rgbavatar_ns.data.importers.frame_files import Progress, read_frame_files
+from rgbavatar_ns.data.importers.folder import IMAGE_SUFFIXES, Folder
+from rgbavatar_ns.data.importers.frame_files import read_frame_files
 from rgbavatar_ns.data.importers.frame_folders import CHECKPOINTS, pair, require_one
 from rgbavatar_ns.data.importers.source import Reading, Source, Split, assemble
 from rgbavatar_ns.errors import UserError
@@ -21,7 +21,7 @@ def is_flashavatar(folder: Folder) -> bool:
     return folder.has("dataset", "metrical-tracker/output")
 
 
-def read_flashavatar(reading: Reading, progress: Progress | None = None) -> Source:
+def read_flashavatar(reading: Reading) -> Source:
     """Image n belongs to frame n - 1; the last 500 frames are held out.
 
     With the option `region` = head the matte ends where the parsing masks end.
@@ -29,29 +29,29 @@ def read_flashavatar(reading: Reading, progress: Progress | None = None) -> Sour
     subject = _subject(reading.folder)
     frames = replace(subject, root=tracker_folder(reading.folder))
     files = frames.numbered(CHECKPOINTS, (".frame",))
-    pictures = subject.numbered("imgs", PICTURES)
-    if pictures and pictures.keys() == files.keys():
+    numbered = subject.numbered("imgs", IMAGE_SUFFIXES)
+    if numbered and numbered.keys() == files.keys():
         raise UserError(
             f"{reading} counts images and frames alike, from {min(files)} to {max(files)}, but "
             f"image n of FlashAvatar belongs to frame n - {IMAGE_MINUS_FRAME}.",
             "If image n shows frame n, number all pictures one higher; if not, the first image and "
             "the last frame belong to nothing: remove them.",
         )
-    images = _of_frames(pictures)
-    masks = _of_frames(subject.numbered("alpha", PICTURES))
+    images = _of_frames(numbered)
+    masks = _of_frames(subject.numbered("alpha", IMAGE_SUFFIXES))
     regions = None
     if reading.options.region == "head":
         neckhead, mouth = (
-            _of_frames(subject.numbered("parsing", PICTURES, ending)) for ending in _REGIONS
+            _of_frames(subject.numbered("parsing", IMAGE_SUFFIXES, ending)) for ending in _REGIONS
         )
         regions = {n: (neckhead[n], mouth[n]) for n in neckhead.keys() & mouth.keys()}
-    tracked = read_frame_files(reading, files, progress)
+    tracked = read_frame_files(reading, files)
     records = pair(reading, tracked, images, masks, regions)
     return assemble(reading, records, tracked.arrays, tracked.identity, Split(_HELD_OUT))
 
 
-def _of_frames(pictures: dict[int, Path]) -> dict[int, Path]:
-    return {number - IMAGE_MINUS_FRAME: path for number, path in pictures.items()}
+def _of_frames(numbered: dict[int, Path]) -> dict[int, Path]:
+    return {number - IMAGE_MINUS_FRAME: path for number, path in numbered.items()}
 
 
 def _subject(folder: Folder) -> Folder:

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from rgbavatar_ns.data.importers.import_report import UnusableFrameError, first_few
-from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.data.importers.import_report import UnusableFrameError
+from rgbavatar_ns.errors import UserError, first_few
 
-PICTURES = (".png", ".jpg", ".jpeg")
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 _NUMBER = re.compile(r"(?:.*\D)?(\d{1,15})")
 _MAX_BYTES = 1 << 30
 
@@ -124,15 +124,30 @@ def read_npz(path: Path) -> dict[str, np.ndarray]:
 
 def numbers(value: Any, count: int, what: str) -> Float[np.ndarray, "_"]:
     """`count` finite numbers, whatever batch axes of 1 they have; raises UnusableFrameError."""
-    if value is None:
-        raise UnusableFrameError(f"no {what}")
-    try:
-        array = np.asarray(value)
-    except (TypeError, ValueError, OverflowError):
-        array = np.empty(0, object)
+    array = _array(value, what)
     if array.dtype.kind not in "iuf" or array.size != count or count not in (1, *array.shape):
         raise UnusableFrameError(f"{what} that is not {count} numbers")
     return finite(array.reshape(count), what)
+
+
+def matrix(value: Any, rows: int, columns: int, what: str) -> Float[np.ndarray, "R C"]:
+    """A matrix of finite numbers, one batch axis of 1 allowed; raises UnusableFrameError."""
+    array = _array(value, what)
+    if array.ndim == 3 and len(array) == 1:
+        array = array[0]
+    if array.dtype.kind not in "iuf" or array.shape != (rows, columns):
+        raise UnusableFrameError(f"{what} that is not {rows} x {columns} numbers")
+    return finite(array, what)
+
+
+def _array(value: Any, what: str) -> np.ndarray:
+    """What is there as an array; of objects where it is none."""
+    if value is None:
+        raise UnusableFrameError(f"no {what}")
+    try:
+        return np.asarray(value)
+    except (TypeError, ValueError, OverflowError):
+        return np.empty(0, object)
 
 
 def finite(array: np.ndarray, what: str) -> Float[np.ndarray, "*shape"]:
@@ -142,18 +157,3 @@ def finite(array: np.ndarray, what: str) -> Float[np.ndarray, "*shape"]:
     if not (np.abs(array) < 1e30).all():
         raise UnusableFrameError(f"NaN or infinity in {what}")
     return array
-
-
-def matrix(value: Any, rows: int, columns: int, what: str) -> Float[np.ndarray, "R C"]:
-    """A matrix of finite numbers, one batch axis of 1 allowed; raises UnusableFrameError."""
-    if value is None:
-        raise UnusableFrameError(f"no {what}")
-    try:
-        array = np.asarray(value)
-    except (TypeError, ValueError, OverflowError):
-        array = np.empty(0, object)
-    if array.ndim == 3 and len(array) == 1:
-        array = array[0]
-    if array.dtype.kind not in "iuf" or array.shape != (rows, columns):
-        raise UnusableFrameError(f"{what} that is not {rows} x {columns} numbers")
-    return finite(array, what)

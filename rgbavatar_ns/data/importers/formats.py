@@ -13,8 +13,7 @@ from rgbavatar_ns.data.importers import (
     vhap_raw,
 )
 from rgbavatar_ns.data.importers.folder import Folder
-from rgbavatar_ns.data.importers.frame_files import Progress
-from rgbavatar_ns.data.importers.options import ImportOptions
+from rgbavatar_ns.data.importers.options import ImportOptions, Progress
 from rgbavatar_ns.data.importers.source import Reading, Source
 from rgbavatar_ns.errors import UserError
 
@@ -29,7 +28,7 @@ class Format:
     key: str
     name: str
     recognises: Callable[[Folder], bool]
-    read: Callable[[Reading, Progress | None], Source]
+    read: Callable[[Reading], Source]
 
 
 FORMATS = (
@@ -80,7 +79,8 @@ def read_source(root: Path, options: ImportOptions, progress: Progress | None = 
     Raises UserError where no format is recognised, or about what cannot be used in it.
     """
     found = _require_format(root, options)
-    return found.read(Reading(found.name, Folder(root, options.allow_outside), options), progress)
+    folder = Folder(root, options.allow_outside)
+    return found.read(Reading(found.name, folder, options, progress))
 
 
 def _require_format(root: Path, options: ImportOptions) -> Format:

@@ -1,13 +1,6 @@
 """metrical-tracker's `.frame` files, which five systems share."""
 
-import multiprocessing
-import os
-import signal
-from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,20 +17,14 @@ from rgbavatar_ns.data.importers.folder import matrix, numbers
 from rgbavatar_ns.data.importers.frame_record import CameraRecord
 from rgbavatar_ns.data.importers.import_report import UnusableFrameError
 from rgbavatar_ns.data.importers.source import Reading
+from rgbavatar_ns.data.importers.torch_file import read_torch_file
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadArrays
-from rgbavatar_ns.head.safe_pickle import read_torch_file
 
 FLAME_VERSION = "2020"
-MANY_FILES = 400
-"""From here on a process for each core pays."""
-_FILES_AT_ONCE = 32
 _SHAPE_TOLERANCE = 1e-3
 _SKEW_TOLERANCE = 1e-3
 _TURNS = ("jaw", "left_eye", "right_eye")
-
-Progress = Callable[[str, int, int], None]
-"""Called with (stage, done, in all)."""
 
 
 @dataclass(frozen=True)
@@ -63,89 +50,30 @@ class TrackedHeads:
     unreadable: frozenset[int]
 
 
-@dataclass(frozen=True)
-class HeadSizes:
-    """What of the head model a file is checked against; small enough to be sent to a process."""
-
-    name: str
-    num_identity: int
-    num_expressions: int
-    has_eyelids: bool
-
-
-def read_frame_files(
-    reading: Reading, files: dict[int, Path], progress: Progress | None = None
-) -> TrackedHeads:
-    """Read all `.frame` files; a broken one is a finding. Raises UserError where all are."""
+def read_frame_files(reading: Reading, files: dict[int, Path]) -> TrackedHeads:
+    """Read all `.frame` files, broken ones into the report; raises UserError where all are."""
     arrays = flame_for(reading, FLAME_VERSION)
     if arrays.eyelid_dirs is None:
-        reading.findings.note(
+        reading.report.note(
             "the FLAME model has no eyelid offsets (l_eyelid.npy, r_eyelid.npy): the tracked "
             "eyelids are left out"
         )
     frames: dict[int, TrackedHead] = {}
-    sizes = HeadSizes(
-        arrays.name, arrays.num_identity, arrays.num_expressions, arrays.eyelid_dirs is not None
-    )
-    with _on_all_cores(len(files)) as each:
-        found = each(partial(_read_file, sizes), list(files.values()))
-        for done, (number, head) in enumerate(zip(files, found), 1):
-            with reading.findings.frame(files[number].name):
-                if isinstance(head, UnusableFrameError):
-                    raise head
-                frames[number] = head
-            if progress is not None:
-                progress("reading frames", done, len(files))
+    for number in reading.each(files):
+        with reading.report.frame(files[number].name):
+            frames[number] = parse_frame(_read(files[number]), arrays)
     unreadable = frozenset(files.keys() - frames.keys())
     if not frames:
-        reading.findings.settle(str(reading), False)
+        reading.report.settle(str(reading), False)
         raise UserError(f"{reading} has no .frame files.", "Name the tracker's output folder.")
     identity = next(iter(frames.values())).shape
     other = [n for n, f in frames.items() if np.abs(f.shape - identity).max() > _SHAPE_TOLERANCE]
-    reading.findings.leave_out(
+    reading.report.leave_out(
         "records of another head shape than the first", [files[number].name for number in other]
     )
     for number in other:
         del frames[number]
     return TrackedHeads(arrays, identity, _turned(frames), unreadable | frozenset(other))
-
-
-_Each = Callable[
-    [Callable[[Path], "TrackedHead | UnusableFrameError"], list[Path]],
-    "Iterator[TrackedHead | UnusableFrameError]",
-]
-
-
-@contextmanager
-def _on_all_cores(count: int) -> Iterator[_Each]:
-    """`map`, for many files in a process for each core: Python holds all threads but one.
-
-    The processes are forked, since starting Python and this package anew takes seconds; they use
-    numpy alone, whose state is safe to fork, and no torch.
-    """
-    cores = os.cpu_count() or 1
-    if count < MANY_FILES or cores < 2 or "fork" not in multiprocessing.get_all_start_methods():
-        yield map
-        return
-    # Ctrl-C is the parent's to handle: it ends the others.
-    pool = ProcessPoolExecutor(
-        cores,
-        multiprocessing.get_context("fork"),
-        initializer=signal.signal,
-        initargs=(signal.SIGINT, signal.SIG_IGN),
-    )
-    try:
-        yield partial(pool.map, chunksize=_FILES_AT_ONCE)
-    finally:
-        pool.shutdown(cancel_futures=True)
-
-
-def _read_file(sizes: HeadSizes, path: Path) -> TrackedHead | UnusableFrameError:
-    """The file's content with turns still as rows of matrices, or why it has none."""
-    try:
-        return parse_frame(_read(path), sizes)
-    except UnusableFrameError as error:
-        return error
 
 
 def _turned(frames: dict[int, TrackedHead]) -> dict[int, TrackedHead]:
@@ -163,15 +91,12 @@ def _read(path: Path) -> Any:
     try:
         return read_torch_file(path)
     except UserError as error:
-        raise UnusableFrameError(f"records that cannot be read ({_cause(error, path)})") from None
+        # Without the file's name, so that equal faults are counted together.
+        cause = error.cause.replace(str(path), "the file").rstrip(".")
+        raise UnusableFrameError(f"records that cannot be read ({cause})") from None
 
 
-def _cause(error: UserError, path: Path) -> str:
-    """What is wrong, without the file's name, so that equal faults are counted together."""
-    return error.cause.replace(str(path), "the file").rstrip(".")
-
-
-def parse_frame(content: Any, sizes: HeadSizes) -> TrackedHead:
+def parse_frame(content: Any, arrays: HeadArrays) -> TrackedHead:
     """One file's dict, its turns as the first two rows of matrices.
 
     Raises UnusableFrameError where it lacks something or is not finite.
@@ -188,13 +113,13 @@ def parse_frame(content: Any, sizes: HeadSizes) -> TrackedHead:
     if expression is None or shape is None:
         raise UnusableFrameError("records without 'exp' or 'shape'")
     theta = {
-        "expression": padded(expression, sizes.num_expressions, "exp", sizes.name),
+        "expression": padded(expression, arrays.num_expressions, "exp", arrays.name),
         **dict(zip(_TURNS, turns)),
     }
-    if sizes.has_eyelids and "eyelids" in flame:
+    if arrays.eyelid_dirs is not None and "eyelids" in flame:
         theta["eyelids"] = numbers(flame["eyelids"], 2, "eyelids")
     return TrackedHead(
-        shape=padded(shape, sizes.num_identity, "shape", sizes.name),
+        shape=padded(shape, arrays.num_identity, "shape", arrays.name),
         theta=theta,
         camera=_camera(opencv),
         size=_size(content.get("img_size")),

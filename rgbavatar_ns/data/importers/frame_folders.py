@@ -4,13 +4,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from rgbavatar_ns.data.importers.folder import PICTURES, Folder
-from rgbavatar_ns.data.importers.frame_files import Progress, TrackedHeads, read_frame_files
-from rgbavatar_ns.data.importers.frame_images import Picture
+from rgbavatar_ns.data.importers.folder import IMAGE_SUFFIXES, Folder
+from rgbavatar_ns.data.importers.frame_files import TrackedHeads, read_frame_files
+from rgbavatar_ns.data.importers.frame_images import FrameImage
 from rgbavatar_ns.data.importers.frame_record import FrameRecord
-from rgbavatar_ns.data.importers.import_report import first_few
 from rgbavatar_ns.data.importers.source import Reading, Source, Split, assemble
-from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.errors import UserError, first_few
 
 CHECKPOINTS = "checkpoint"
 _MATTES = ("alpha", "matted", "mask", "masks", "matte", "seg_mask", "image_mask")
@@ -56,7 +55,7 @@ def _has_background(folder: Folder) -> bool:
     return folder.has("bc.jpg") or folder.has("image_mask")
 
 
-def read_metrical(reading: Reading, progress: Progress | None = None) -> Source:
+def read_metrical(reading: Reading) -> Source:
     """metrical-tracker's output; it has no mattes of its own, so they are looked for."""
     options, folder = reading.options, reading.folder
     images = next(name for name in ("input", *_IMAGES) if folder.has(name))
@@ -64,34 +63,34 @@ def read_metrical(reading: Reading, progress: Progress | None = None) -> Source:
     if options.images is not None or options.masks is not None:
         images = str(options.images or images)
         masks = None if options.masks is None else str(options.masks)
-    return _read(reading, Layout(images, masks, last=350), progress)
+    return _read(reading, Layout(images, masks, last=350))
 
 
-def read_gaussian_blendshapes(reading: Reading, progress: Progress | None = None) -> Source:
+def read_gaussian_blendshapes(reading: Reading) -> Source:
     """GaussianBlendshapes: the last 350 frames are held out."""
-    return _read(reading, Layout("images", None, last=350), progress)
+    return _read(reading, Layout("images", None, last=350))
 
 
-def read_nerf_blend_shape(reading: Reading, progress: Progress | None = None) -> Source:
+def read_nerf_blend_shape(reading: Reading) -> Source:
     """NeRFBlendShape: mattes in image_mask, the last 500 frames are held out."""
     masks = "image_mask" if reading.folder.has("image_mask") else None
-    return _read(reading, Layout("images", masks, last=500), progress)
+    return _read(reading, Layout("images", masks, last=500))
 
 
-def read_rgbavatar(reading: Reading, progress: Progress | None = None) -> Source:
+def read_rgbavatar(reading: Reading) -> Source:
     """RGBAvatar's own: frames and images belong together in the order of their names."""
-    return _read(reading, Layout("images", None, last=350, by_order=True), progress)
+    return _read(reading, Layout("images", None, last=350, by_order=True))
 
 
-def _read(reading: Reading, layout: Layout, progress: Progress | None) -> Source:
+def _read(reading: Reading, layout: Layout) -> Source:
     folder = reading.folder
     files = folder.numbered(CHECKPOINTS, (".frame",))
-    images = folder.numbered(layout.images, PICTURES)
+    images = folder.numbered(layout.images, IMAGE_SUFFIXES)
     if layout.by_order and len(files) == len(images) and list(files) != list(images):
-        reading.findings.note("frames and images have other numbers: paired in order")
+        reading.report.note("frames and images have other numbers: paired in order")
         images = dict(zip(files, images.values()))
-    masks = None if layout.masks is None else folder.numbered(layout.masks, PICTURES)
-    tracked = read_frame_files(reading, files, progress)
+    masks = None if layout.masks is None else folder.numbered(layout.masks, IMAGE_SUFFIXES)
+    tracked = read_frame_files(reading, files)
     records = pair(reading, tracked, images, masks)
     return assemble(reading, records, tracked.arrays, tracked.identity, Split(layout.last))
 
@@ -103,31 +102,29 @@ def pair(
     masks: Mapping[int, Path] | None,
     regions: Mapping[int, tuple[Path, ...]] | None = None,
 ) -> list[FrameRecord]:
-    """Records of the frames that have all their files; what lacks one is a finding."""
-    findings = reading.findings
+    """Records of the frames that have all their files; what lacks one goes into the report."""
+    report = reading.report
     known = tracked.frames.keys() | tracked.unreadable
-    findings.leave_out(
-        "images without a record", [images[n].name for n in images if n not in known]
-    )
-    findings.leave_out(
+    report.leave_out("images without a record", [images[n].name for n in images if n not in known])
+    report.leave_out(
         "records without an image", [f"frame {n}" for n in tracked.frames if n not in images]
     )
     records = []
     for number, head in tracked.frames.items():
         if number not in images:
             continue
-        picture = Picture(images[number])
+        frame_image = FrameImage(images[number])
         if masks is not None:
             if number not in masks:
-                findings.leave_out("images without a matte", [images[number].name])
+                report.leave_out("images without a matte", [images[number].name])
                 continue
-            picture = replace(picture, alpha=masks[number])
+            frame_image = replace(frame_image, alpha=masks[number])
         if regions is not None:
             if number not in regions:
-                findings.leave_out("images without parsing masks", [images[number].name])
+                report.leave_out("images without parsing masks", [images[number].name])
                 continue
-            picture = replace(picture, regions=regions[number])
-        records.append(FrameRecord(number, picture, head.theta, head.camera, head.size))
+            frame_image = replace(frame_image, regions=regions[number])
+        records.append(FrameRecord(number, frame_image, head.theta, head.camera, head.size))
     return records
 
 

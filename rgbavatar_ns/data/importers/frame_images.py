@@ -21,7 +21,7 @@ _PNG_HEADER_BYTES, _JPEG_HEADER_BYTES = 33, 1 << 16
 
 
 @dataclass(frozen=True)
-class Picture:
+class FrameImage:
     """Files of one image, all of one size.
 
     color: PNG or JPEG; its own alpha counts where there is no `alpha`.
@@ -35,7 +35,7 @@ class Picture:
 
 
 @dataclass(frozen=True)
-class PictureHeader:
+class ImageHeader:
     """What a file's first bytes say."""
 
     width: int
@@ -43,7 +43,7 @@ class PictureHeader:
     has_alpha: bool
 
 
-def picture_header(path: Path) -> PictureHeader:
+def image_header(path: Path) -> ImageHeader:
     """Size and kind from a file's first bytes; raises UnusableFrameError."""
     try:
         with path.open("rb") as file:
@@ -62,43 +62,43 @@ def picture_header(path: Path) -> PictureHeader:
         raise UnusableFrameError("images that cannot be read") from None
     if not size or 0 in size:
         raise UnusableFrameError("images that are neither PNG nor JPEG, or damaged")
-    return PictureHeader(*size, has_alpha)
+    return ImageHeader(*size, has_alpha)
 
 
 @dataclass(frozen=True)
-class EncodedPicture:
+class EncodedImage:
     """A PNG; `is_original` where it is the very bytes of the colour's file."""
 
     encoded: bytes
     is_original: bool
 
 
-def make_png(picture: Picture, size: tuple[int, int]) -> EncodedPicture:
-    """The picture as an RGBA PNG, straight alpha; a file that is one already stays as it is.
+def make_png(frame_image: FrameImage, size: tuple[int, int]) -> EncodedImage:
+    """The frame image as an RGBA PNG, straight alpha; a file that is one already stays as it is.
 
     size: (width, height) that every part must have. Raises UnusableFrameError.
     """
-    encoded = _read(picture.color)
-    plain = picture.alpha is None and not picture.regions
+    encoded = _read(frame_image.color)
+    plain = frame_image.alpha is None and not frame_image.regions
     # Colour type 6 at depth 8 is RGBA of bytes.
     if plain and encoded[:4] == b"\x89PNG" and encoded[24:26] == b"\x08\x06":
         if png_damage(encoded) is not None:
             raise UnusableFrameError("images that are damaged or cut short")
         _require_size(png_header_size(encoded), size)
-        return EncodedPicture(encoded, True)
-    image = _compose(picture, encoded, size)
-    return EncodedPicture(encode_png_rgba(image, _PNG_COMPRESSION), False)
+        return EncodedImage(encoded, True)
+    image = _compose(frame_image, encoded, size)
+    return EncodedImage(encode_png_rgba(image, _PNG_COMPRESSION), False)
 
 
 def _compose(
-    picture: Picture, encoded: bytes, size: tuple[int, int]
+    frame_image: FrameImage, encoded: bytes, size: tuple[int, int]
 ) -> UInt8[np.ndarray, "height width 4"]:
     image = _decode(encoded)
     _require_size(image.shape[1::-1], size)
-    if picture.alpha is not None:
-        image[..., 3] = _grey(picture.alpha, size)
-    if picture.regions:
-        kept = np.maximum.reduce([_grey(path, size) for path in picture.regions])
+    if frame_image.alpha is not None:
+        image[..., 3] = _grey(frame_image.alpha, size)
+    if frame_image.regions:
+        kept = np.maximum.reduce([_grey(path, size) for path in frame_image.regions])
         product = image[..., 3].astype(np.uint16) * kept
         image[..., 3] = ((product + 127) // 255).astype(np.uint8)
     return image

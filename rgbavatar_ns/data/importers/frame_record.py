@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from rgbavatar_ns.data.importers.frame_images import Picture
+from rgbavatar_ns.data.importers.frame_images import FrameImage
 from rgbavatar_ns.data.importers.import_report import UnusableFrameError
 
 _ROTATION_TOLERANCE = 1e-3
@@ -39,7 +39,7 @@ class FrameRecord:
     """
 
     index: int
-    picture: Picture
+    frame_image: FrameImage
     theta: Mapping[str, Float[np.ndarray, "_"]]
     camera: CameraRecord
     size: tuple[int, int] | None = None

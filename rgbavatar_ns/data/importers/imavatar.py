@@ -7,15 +7,14 @@ import numpy as np
 
 from rgbavatar_ns.data.importers.flame_parameters import flame_for, padded
 from rgbavatar_ns.data.importers.folder import (
-    PICTURES,
+    IMAGE_SUFFIXES,
     Folder,
     matrix,
     number_of,
     numbers,
     read_json,
 )
-from rgbavatar_ns.data.importers.frame_files import Progress
-from rgbavatar_ns.data.importers.frame_images import Picture, picture_header
+from rgbavatar_ns.data.importers.frame_images import FrameImage, image_header
 from rgbavatar_ns.data.importers.frame_record import CameraRecord, FrameRecord
 from rgbavatar_ns.data.importers.import_report import UnusableFrameError
 from rgbavatar_ns.data.importers.source import Reading, Source, Split, assemble
@@ -36,7 +35,7 @@ def is_imavatar(folder: Folder) -> bool:
     return folder.has(INDEX_FILE)
 
 
-def read_imavatar(reading: Reading, progress: Progress | None = None) -> Source:
+def read_imavatar(reading: Reading) -> Source:
     """Metres instead of quarters of them, OpenCV instead of OpenGL cameras.
 
     Mattes are in `mask`, where there is one. The last 350 frames are held out.
@@ -56,9 +55,9 @@ def read_imavatar(reading: Reading, progress: Progress | None = None) -> Source:
         raise UserError(f"{path} has {error}.", "Export the data again.") from None
     masks = "mask" if reading.folder.has("mask") else None
     records, named, lengths = [], set(), set()
-    for place, frame in enumerate(frames):
+    for place, frame in enumerate(reading.each(frames)):
         name = str(frame.get("file_path")) if isinstance(frame, dict) else f"frame {place}"
-        with reading.findings.frame(name):
+        with reading.report.frame(name):
             if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
                 raise UnusableFrameError("frames without file_path")
             image = _image(reading.folder, name)
@@ -66,8 +65,6 @@ def read_imavatar(reading: Reading, progress: Progress | None = None) -> Source:
             if isinstance(frame.get("expression"), list):
                 lengths.add(len(frame["expression"]))
             records.append(_record(reading.folder, frame, image, masks, intrinsics, arrays))
-        if progress is not None:
-            progress("reading frames", place + 1, len(frames))
     _tell_unnamed(reading, named)
     if len(lengths) > 1:
         raise UserError(
@@ -88,7 +85,7 @@ def _record(
     number = number_of(image.name)
     if number is None:
         raise UnusableFrameError("images without a number")
-    header = picture_header(image)
+    header = image_header(image)
     world_to_camera = np.eye(4)
     world_to_camera[:3] = matrix(_three_rows(frame.get("world_mat")), 3, 4, "world_mat")
     # OpenGL looks along -z with y up, and the world is scaled.
@@ -105,7 +102,7 @@ def _record(
     count = arrays.num_expressions
     theta = {"expression": padded(expression, count, "expression", arrays.name)}
     return FrameRecord(
-        number, _picture(folder, image, masks), theta | dict(zip(_POSE, pose)), camera
+        number, _frame_image(folder, image, masks), theta | dict(zip(_POSE, pose)), camera
     )
 
 
@@ -120,24 +117,24 @@ def _image(folder: Folder, file_path: str) -> Path:
     named = PurePosixPath(file_path)
     parents = [named.parent, *(named.parent.parent / name for name in _IMAGES)]
     for parent in parents:
-        for suffix in ("", *PICTURES):
+        for suffix in ("", *IMAGE_SUFFIXES):
             candidate = folder.path(f"{parent / named.name}{suffix}")
             if candidate.is_file():
                 return candidate
     raise UnusableFrameError("records without an image")
 
 
-def _picture(folder: Folder, image: Path, masks: str | None) -> Picture:
+def _frame_image(folder: Folder, image: Path, masks: str | None) -> FrameImage:
     if masks is None:
-        return Picture(image)
-    for suffix in PICTURES:
+        return FrameImage(image)
+    for suffix in IMAGE_SUFFIXES:
         candidate = folder.path(f"{masks}/{image.stem}{suffix}")
         if candidate.is_file():
-            return Picture(image, alpha=candidate)
+            return FrameImage(image, alpha=candidate)
     raise UnusableFrameError("images without a matte")
 
 
 def _tell_unnamed(reading: Reading, named: set[str]) -> None:
     for name in _IMAGES:
-        left = [image for image in reading.folder.names(name, PICTURES) if image not in named]
-        reading.findings.leave_out("images without a record", left)
+        left = [image for image in reading.folder.names(name, IMAGE_SUFFIXES) if image not in named]
+        reading.report.leave_out("images without a record", left)

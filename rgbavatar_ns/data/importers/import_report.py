@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
-from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.errors import UserError, first_few
 
 _SHOWN = 4
 
@@ -31,7 +31,7 @@ class ImportReport:
 
     @contextmanager
     def frame(self, name: str) -> Iterator[None]:
-        """An UnusableFrameError within becomes a finding of this name."""
+        """An UnusableFrameError within goes into the report under this name."""
         try:
             yield
         except UnusableFrameError as error:
@@ -45,7 +45,7 @@ class ImportReport:
         if not self._left_out:
             return
         told = "; ".join(
-            f"{reason}: {len(names)} ({first_few(names)})"
+            f"{reason}: {len(names)} ({first_few(names, _SHOWN)})"
             for reason, names in self._left_out.items()
         )
         if not allow_partial:
@@ -55,9 +55,3 @@ class ImportReport:
             )
         self.note(f"left out: {told}")
         self._left_out = {}
-
-
-def first_few(names: Sequence[str]) -> str:
-    """The first names, and that there are more."""
-    shown = ", ".join(names[:_SHOWN])
-    return shown if len(names) <= _SHOWN else f"{shown}, ..."

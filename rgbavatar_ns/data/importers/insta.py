@@ -8,9 +8,9 @@ from jaxtyping import Float
 
 from rgbavatar_ns.data.importers.flame_parameters import flame_for, padded
 from rgbavatar_ns.data.importers.folder import Folder, number_of
-from rgbavatar_ns.data.importers.frame_files import FLAME_VERSION, Progress, read_frame_files
+from rgbavatar_ns.data.importers.frame_files import FLAME_VERSION, read_frame_files
 from rgbavatar_ns.data.importers.frame_folders import CHECKPOINTS
-from rgbavatar_ns.data.importers.frame_images import Picture
+from rgbavatar_ns.data.importers.frame_images import FrameImage
 from rgbavatar_ns.data.importers.frame_record import FrameRecord
 from rgbavatar_ns.data.importers.import_report import UnusableFrameError
 from rgbavatar_ns.data.importers.mesh_fit import fit_meshes
@@ -20,11 +20,9 @@ from rgbavatar_ns.data.importers.transforms import (
     Entry,
     camera_of,
     first_frame,
-    has_transforms,
     read_transforms,
     size_of,
 )
-from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadArrays
 from rgbavatar_ns.head.flame import EXPRESSIONS
 
@@ -44,16 +42,13 @@ class _Parameters:
 
 def is_insta(folder: Folder) -> bool:
     """A transforms.json whose frames name no VHAP parameters, beside meshes or `.frame` files."""
-    if not has_transforms(folder.has):
-        return False
-    name = INDEX_FILE if folder.has(INDEX_FILE) else "transforms_train.json"
-    frame = first_frame(folder.root / name)
-    if "flame_param_path" in frame:
+    frame = first_frame(folder)
+    if frame is None or "flame_param_path" in frame:
         return False
     return bool({"exp_path", "mesh_path"} & frame.keys()) or folder.has(CHECKPOINTS)
 
 
-def read_insta(reading: Reading, progress: Progress | None = None) -> Source:
+def read_insta(reading: Reading) -> Source:
     """INSTA data with `.frame` files, or without: then jaw, eyes and eyelids are fitted to meshes.
 
     Images are RGBA with soft alpha. The last 350 frames are held out where no file tells.
@@ -61,7 +56,7 @@ def read_insta(reading: Reading, progress: Progress | None = None) -> Source:
     transforms = read_transforms(reading)
     entries: dict[int, Entry] = {}
     for entry in transforms.entries:
-        with reading.findings.frame(entry.name):
+        with reading.report.frame(entry.name):
             number = number_of(entry.name)
             if number is None:
                 raise UnusableFrameError("images without a number")
@@ -69,13 +64,10 @@ def read_insta(reading: Reading, progress: Progress | None = None) -> Source:
                 raise UnusableFrameError("images of the same number")
             entries[number] = entry
     files = reading.folder.numbered(CHECKPOINTS, (".frame",))
-    if files:
-        parameters = _from_frames(reading, entries, files, progress)
-    else:
-        parameters = _from_meshes(reading, entries, progress)
+    parameters = _from_frames(reading, entries, files) if files else _from_meshes(reading, entries)
     records = []
     for number, entry in entries.items():
-        with reading.findings.frame(entry.name):
+        with reading.report.frame(entry.name):
             if number in parameters.theta:
                 records.append(_record(reading, number, entry, parameters.theta[number]))
     split = Split(last=_HELD_OUT)
@@ -87,21 +79,21 @@ def read_insta(reading: Reading, progress: Progress | None = None) -> Source:
 def _record(
     reading: Reading, number: int, entry: Entry, theta: dict[str, Float[np.ndarray, "_"]]
 ) -> FrameRecord:
-    picture = Picture(reading.folder.path(entry.name))
+    frame_image = FrameImage(reading.folder.path(entry.name))
     camera = camera_of(entry.values, opengl=False)
-    return FrameRecord(number, picture, theta, camera, size_of(entry.values))
+    return FrameRecord(number, frame_image, theta, camera, size_of(entry.values))
 
 
 def _from_frames(
-    reading: Reading, entries: dict[int, Entry], files: dict[int, Path], progress: Progress | None
+    reading: Reading, entries: dict[int, Entry], files: dict[int, Path]
 ) -> _Parameters:
-    findings = reading.findings
+    report = reading.report
     missing = [entry.name for number, entry in entries.items() if number not in files]
-    findings.leave_out("images without a .frame file", missing)
+    report.leave_out("images without a .frame file", missing)
     wanted = {number: path for number, path in files.items() if number in entries}
-    tracked = read_frame_files(reading, wanted, progress)
+    tracked = read_frame_files(reading, wanted)
     for number, head in tracked.frames.items():
-        with findings.frame(entries[number].name):
+        with report.frame(entries[number].name):
             _require_same(entries[number], head.camera.world_to_camera)
     theta = {number: head.theta for number, head in tracked.frames.items()}
     return _Parameters(tracked.arrays, tracked.identity, theta)
@@ -121,29 +113,26 @@ def _require_same(entry: Entry, tracked: Float[np.ndarray, "4 4"]) -> None:
     raise UnusableFrameError(told)
 
 
-def _from_meshes(
-    reading: Reading, entries: dict[int, Entry], progress: Progress | None
-) -> _Parameters:
-    findings, folder = reading.findings, reading.folder
+def _from_meshes(reading: Reading, entries: dict[int, Entry]) -> _Parameters:
+    report, folder = reading.report, reading.folder
     arrays = flame_for(reading, FLAME_VERSION)
     expressions = {}
     meshes = {}
     for number, entry in entries.items():
-        with findings.frame(entry.name):
+        with report.frame(entry.name):
             expressions[number] = _expression(folder, entry, arrays)
             mesh = entry.values.get("mesh_path", f"meshes/{number:05d}.obj")
             if not isinstance(mesh, str) or not folder.path(mesh).is_file():
                 raise UnusableFrameError("frames with neither a .frame file nor a mesh")
             meshes[number] = folder.path(mesh)
     if not meshes:
-        findings.settle(str(reading), False)
-        raise UserError(f"{reading} has no frames.", "Name the folder that holds the data.")
-    findings.note(
+        raise reading.no_frames()
+    report.note(
         f"there are no .frame files: head shape, jaw, eyes and eyelids are fitted to "
         f"{len(meshes)} meshes"
     )
-    fitted = fit_meshes(reading, arrays, {n: expressions[n] for n in meshes}, meshes, progress)
-    return _Parameters(arrays, fitted.identity, fitted.theta)
+    fitted = fit_meshes(reading, arrays, {n: expressions[n] for n in meshes}, meshes)
+    return _Parameters(arrays, *fitted)
 
 
 def _expression(folder: Folder, entry: Entry, arrays: HeadArrays) -> Float[np.ndarray, "_"]:

@@ -1,7 +1,7 @@
 """Head shape, jaw, eyes and eyelids from meshes that a tracker wrote, where nothing else tells."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +9,6 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from rgbavatar_ns.data.importers.frame_files import Progress
 from rgbavatar_ns.data.importers.import_report import UnusableFrameError
 from rgbavatar_ns.data.importers.source import Reading
 from rgbavatar_ns.errors import UserError
@@ -24,22 +23,13 @@ _WORST_M = 3e-4
 """Meshes farther from the fitted head than this are not of this head model."""
 
 
-@dataclass(frozen=True)
-class FittedMeshes:
-    """What was found, by frame number."""
-
-    identity: Float[np.ndarray, "_"]
-    theta: dict[int, dict[str, Float[np.ndarray, "_"]]]
-
-
 def fit_meshes(
     reading: Reading,
     arrays: HeadArrays,
     expressions: dict[int, Float[np.ndarray, "_"]],
     meshes: dict[int, Path],
-    progress: Progress | None = None,
-) -> FittedMeshes:
-    """Invert the head model: Gauss-Newton on vertices, expressions known.
+) -> tuple[Float[np.ndarray, "_"], dict[int, dict[str, Float[np.ndarray, "_"]]]]:
+    """Identity, and theta by frame number: Gauss-Newton on vertices, expressions known.
 
     Ours, because INSTA writes expressions and meshes, but neither shape nor jaw. The shape comes
     from a few frames together, then each frame by itself; the result is as exact as the meshes'
@@ -51,23 +41,21 @@ def fit_meshes(
     theta = torch.stack([fit.start(expressions[number]) for number in chosen])
     targets = []
     for number in chosen:
-        with reading.findings.frame(meshes[number].name):
+        with reading.report.frame(meshes[number].name):
             targets.append(read_mesh(meshes[number])[fit.kept])
-    reading.findings.settle(str(reading), reading.options.allow_partial)
+    reading.report.settle(str(reading), reading.options.allow_partial)
     if len(targets) < len(chosen):
         raise UserError(f"{reading} has damaged meshes.", "Export them again.")
     identity = fit.shape(theta, torch.stack(targets))
     found = {}
     worst = 0.0
-    for done, number in enumerate(expressions, 1):
-        with reading.findings.frame(meshes[number].name):
+    for number in reading.each(expressions, "fitting meshes"):
+        with reading.report.frame(meshes[number].name):
             target = read_mesh(meshes[number])[fit.kept]
             fitted, error = fit.pose(fit.start(expressions[number]), identity, target)
             worst = max(worst, error)
             parts = fit.head.layout.split(fitted)
             found[number] = {name: part.numpy() for name, part in parts.items()}
-        if progress is not None:
-            progress("fitting meshes", done, len(expressions))
     if worst > _WORST_M:
         raise UserError(
             f"{reading} has meshes that {arrays.name} cannot take on: up to {1000 * worst:.2f} mm "
@@ -75,7 +63,7 @@ def fit_meshes(
             "Name the FLAME model that the data was tracked with, with its eyelid offsets beside "
             "it, or add the tracker's checkpoint folder.",
         )
-    return FittedMeshes(identity.numpy(), found)
+    return identity.numpy(), found
 
 
 def read_mesh(path: Path) -> Float[Tensor, "V 3"]:

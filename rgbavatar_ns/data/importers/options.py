@@ -1,5 +1,6 @@
 """What can be chosen when another tracker's data is read."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -8,6 +9,8 @@ from rgbavatar_ns.errors import UserError
 
 HeadPose = Literal["source", "camera", "head", "neck"]
 Region = Literal["person", "head"]
+Progress = Callable[[str, int, int], None]
+"""Called with (stage, done, in all)."""
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,10 @@
 """The source that a format's records make up, checked and in one form."""
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -11,16 +12,17 @@ from jaxtyping import Float
 from torch import Tensor
 
 from rgbavatar_ns.data.importers.folder import Folder
-from rgbavatar_ns.data.importers.frame_images import Picture, PictureHeader, picture_header
+from rgbavatar_ns.data.importers.frame_images import FrameImage, ImageHeader, image_header
 from rgbavatar_ns.data.importers.frame_record import FrameRecord
 from rgbavatar_ns.data.importers.head_pose import all_is_the_cameras, place_head_pose
 from rgbavatar_ns.data.importers.import_report import ImportReport, UnusableFrameError
-from rgbavatar_ns.data.importers.options import HeadPose, ImportOptions
+from rgbavatar_ns.data.importers.options import HeadPose, ImportOptions, Progress
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadArrays, HeadModel, ThetaLayout
 from rgbavatar_ns.kernels.types import PinholeCameras
 
 _LARGEST_SIZE = 16384
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -33,12 +35,25 @@ class Split:
 
 @dataclass
 class Reading:
-    """A folder being read: where, with which options, and what was found odd."""
+    """A folder being read: where, with which options, who watches, and what was found odd."""
 
     format: str
     folder: Folder
     options: ImportOptions
-    findings: ImportReport = field(default_factory=ImportReport)
+    progress: Progress | None = None
+    report: ImportReport = field(default_factory=ImportReport)
+
+    def each(self, items: Collection[T], stage: str = "reading frames") -> Iterator[T]:
+        """The items one by one, each told to `progress` when it is done."""
+        for done, item in enumerate(items, 1):
+            yield item
+            if self.progress is not None:
+                self.progress(stage, done, len(items))
+
+    def no_frames(self) -> UserError:
+        """What to raise where no frame is left; raises about those left out if there are any."""
+        self.report.settle(str(self), False)
+        return UserError(f"{self} has no frames.", "Name the folder that holds the data.")
 
     def __str__(self) -> str:
         return f"The {self.format} data in {self.folder.root}"
@@ -54,7 +69,7 @@ class Source:
     layout: ThetaLayout
     identity: Float[Tensor, "I"]
     index: tuple[int, ...]
-    pictures: tuple[Picture, ...]
+    frame_images: tuple[FrameImage, ...]
     theta: Float[Tensor, "F H"]
     cameras: PinholeCameras
     test: frozenset[int]
@@ -76,7 +91,7 @@ def assemble(
     """Check records together and bring them into one form; raises UserError about what is odd."""
     records = _unique(reading, sorted(records, key=lambda record: record.index))
     size, records = _one_size(reading, records)
-    reading.findings.settle(str(reading), reading.options.allow_partial)
+    reading.report.settle(str(reading), reading.options.allow_partial)
     if not records:
         raise UserError(f"{reading} has no frame that can be used.", "Look at its files.")
     records = place_head_pose(records, arrays, identity, _head_pose(reading, records))
@@ -98,13 +113,13 @@ def assemble(
         layout=layout,
         identity=torch.from_numpy(identity).float(),
         index=tuple(record.index for record in records),
-        pictures=tuple(record.picture for record in records),
+        frame_images=tuple(record.frame_image for record in records),
         theta=theta.float(),
         cameras=cameras,
         test=test,
         camera_names=tuple(record.camera_name for record in records),
         timesteps=tuple(record.timestep for record in records),
-        notes=tuple(reading.findings.notes),
+        notes=tuple(reading.report.notes),
     )
 
 
@@ -114,7 +129,7 @@ def _head_pose(reading: Reading, records: Sequence[FrameRecord]) -> HeadPose:
         return chosen
     if not all_is_the_cameras(records):
         return "source"
-    reading.findings.note(
+    reading.report.note(
         "the format moves the camera about a still head; here the head moves before a still camera"
     )
     return "head"
@@ -132,7 +147,7 @@ def _column(records: Sequence[FrameRecord], name: str, size: int) -> Float[Tenso
 def _unique(reading: Reading, records: list[FrameRecord]) -> list[FrameRecord]:
     counts = Counter(record.index for record in records)
     twice = [str(number) for number, count in counts.items() if count > 1]
-    reading.findings.leave_out("frame numbers that occur more than once", twice)
+    reading.report.leave_out("frame numbers that occur more than once", twice)
     return [record for record in records if counts[record.index] == 1]
 
 
@@ -140,13 +155,12 @@ def _one_size(
     reading: Reading, records: list[FrameRecord]
 ) -> tuple[tuple[int, int], list[FrameRecord]]:
     """The size that most images have, and the records of that size that camera and image share."""
-    headers: dict[int, PictureHeader] = {}
+    headers: dict[int, ImageHeader] = {}
     for record in records:
-        with reading.findings.frame(record.picture.color.name):
-            headers[record.index] = picture_header(record.picture.color)
+        with reading.report.frame(record.frame_image.color.name):
+            headers[record.index] = image_header(record.frame_image.color)
     if not headers:
-        reading.findings.settle(str(reading), False)
-        raise UserError(f"{reading} has no frames.", "Name the folder that holds the data.")
+        raise reading.no_frames()
     sizes = Counter((header.width, header.height) for header in headers.values())
     size = sizes.most_common(1)[0][0]
     if max(size) > _LARGEST_SIZE:
@@ -154,14 +168,14 @@ def _one_size(
     kept = []
     for record in records:
         if record.index in headers:
-            with reading.findings.frame(record.picture.color.name):
+            with reading.report.frame(record.frame_image.color.name):
                 _check_header(record, headers[record.index], size, reading.options.allow_opaque)
                 kept.append(record)
     return size, kept
 
 
 def _check_header(
-    record: FrameRecord, header: PictureHeader, size: tuple[int, int], allow_opaque: bool
+    record: FrameRecord, header: ImageHeader, size: tuple[int, int], allow_opaque: bool
 ) -> None:
     found = f"{header.width} x {header.height}"
     if (header.width, header.height) != size:
@@ -171,7 +185,7 @@ def _check_header(
             f"cameras for images of {record.size[0]} x {record.size[1]} pixels, where the images "
             f"have {found}"
         )
-    if record.picture.alpha is None and not header.has_alpha and not allow_opaque:
+    if record.frame_image.alpha is None and not header.has_alpha and not allow_opaque:
         raise UnusableFrameError(
             "images without a matte (--allow-opaque takes them with their background)"
         )
@@ -200,7 +214,7 @@ def _held_out(reading: Reading, records: Sequence[FrameRecord], split: Split) ->
         last = split.last
         if last >= len(numbers):
             last = len(numbers) // 4
-            reading.findings.note(
+            reading.report.note(
                 f"the format holds out the last {split.last} frames, but there are only "
                 f"{len(numbers)}: the last {last} are held out"
             )

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from rgbavatar_ns.data.importers.folder import PICTURES, matrix, numbers, read_json
+from rgbavatar_ns.data.importers.folder import IMAGE_SUFFIXES, Folder, matrix, numbers, read_json
 from rgbavatar_ns.data.importers.frame_record import CameraRecord
 from rgbavatar_ns.data.importers.import_report import UnusableFrameError
 from rgbavatar_ns.data.importers.source import Reading
@@ -44,19 +44,20 @@ class Transforms:
     has_split: bool
 
 
-def has_transforms(root_has: Any) -> bool:
-    """Whether there is an index of all frames, or one of training frames. Takes `Folder.has`."""
-    return root_has(INDEX_FILE) or root_has(_file_of("train"))
+def first_frame(folder: Folder) -> Mapping[str, Any] | None:
+    """The first frame of the index, to tell formats apart; None where there is no index.
 
-
-def first_frame(reading_path: Any) -> Mapping[str, Any]:
-    """The first frame of the index, to tell formats apart; empty where there is none."""
-    try:
-        frames = read_json(reading_path).get("frames")
-    except UserError:
-        return {}
-    first = frames[0] if isinstance(frames, list) and frames else None
-    return first if isinstance(first, dict) else {}
+    Empty where the index, of all frames or else of those to train from, cannot be read.
+    """
+    for name in (INDEX_FILE, _file_of("train")):
+        if folder.has(name):
+            try:
+                frames = read_json(folder.root / name).get("frames")
+            except UserError:
+                return {}
+            first = frames[0] if isinstance(frames, list) and frames else None
+            return first if isinstance(first, dict) else {}
+    return None
 
 
 def read_transforms(reading: Reading) -> Transforms:
@@ -64,7 +65,7 @@ def read_transforms(reading: Reading) -> Transforms:
 
     Held out are frames of transforms_test.json and transforms_val.json that are not in
     transforms_train.json: INSTA's val is the end of train, VHAP's is the held-out camera. A frame
-    of transforms.json that no split names is a finding.
+    of transforms.json that no split names goes into the report.
     """
     splits = {
         split: _frames(reading, _file_of(split))
@@ -85,14 +86,14 @@ def read_transforms(reading: Reading) -> Transforms:
     held_out = {key for split in ("val", "test") for key in splits.get(split, ())} - train.keys()
     both = splits.get("test", {}).keys() & train.keys()
     if both:
-        reading.findings.note(
+        reading.report.note(
             f"{len(both)} frames stand both in {_file_of('train')} and {_file_of('test')}: they "
             "are trained on"
         )
     _tell_unnamed(reading, every.keys())
     if has_split:
         idle = every.keys() - train.keys() - held_out
-        reading.findings.leave_out("frames that no split names", sorted(idle))
+        reading.report.leave_out("frames that no split names", sorted(idle))
         every = {key: values for key, values in every.items() if key not in idle}
     entries = [Entry(values, key in held_out) for key, values in every.items()]
     return Transforms(entries, has_split)
@@ -102,9 +103,9 @@ def _tell_unnamed(reading: Reading, named: Iterable[str]) -> None:
     """Images that lie beside named ones, but that no entry names."""
     named = {os.path.normpath(name) for name in named}
     for parent in {os.path.dirname(name) for name in named} - {""}:
-        files = reading.folder.names(parent, PICTURES)
+        files = reading.folder.names(parent, IMAGE_SUFFIXES)
         left = [name for name in files if os.path.join(parent, name) not in named]
-        reading.findings.leave_out("images without a record", left)
+        reading.report.leave_out("images without a record", left)
 
 
 def _frames(reading: Reading, name: str) -> dict[str, dict[str, Any]]:
@@ -119,9 +120,9 @@ def _frames(reading: Reading, name: str) -> dict[str, dict[str, Any]]:
     for place, frame in enumerate(frames):
         label = f"frame {place} of {name}"
         if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
-            reading.findings.leave_out("entries without file_path", [label])
+            reading.report.leave_out("entries without file_path", [label])
         elif frame["file_path"] in found:
-            reading.findings.leave_out("images named more than once", [frame["file_path"]])
+            reading.report.leave_out("images named more than once", [frame["file_path"]])
         else:
             found[frame["file_path"]] = {**shared, **frame}
     return found

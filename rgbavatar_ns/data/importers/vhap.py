@@ -9,21 +9,17 @@ from jaxtyping import Float
 
 from rgbavatar_ns.data.importers.flame_parameters import flame_for, padded
 from rgbavatar_ns.data.importers.folder import Folder, finite, numbers, read_npz
-from rgbavatar_ns.data.importers.frame_files import Progress
-from rgbavatar_ns.data.importers.frame_images import Picture
+from rgbavatar_ns.data.importers.frame_images import FrameImage
 from rgbavatar_ns.data.importers.frame_record import FrameRecord
 from rgbavatar_ns.data.importers.import_report import UnusableFrameError
 from rgbavatar_ns.data.importers.source import Reading, Source, Split, assemble
 from rgbavatar_ns.data.importers.transforms import (
-    INDEX_FILE,
     Entry,
     camera_of,
     first_frame,
-    has_transforms,
     read_transforms,
     size_of,
 )
-from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadArrays
 from rgbavatar_ns.head.flame import FLAME_VERTICES
 
@@ -36,13 +32,10 @@ _MAX_INDEX = 10**7
 
 def is_vhap(folder: Folder) -> bool:
     """A transforms.json whose frames name FLAME parameters."""
-    if not has_transforms(folder.has):
-        return False
-    name = INDEX_FILE if folder.has(INDEX_FILE) else "transforms_train.json"
-    return "flame_param_path" in first_frame(folder.root / name)
+    return "flame_param_path" in (first_frame(folder) or {})
 
 
-def read_vhap(reading: Reading, progress: Progress | None = None) -> Source:
+def read_vhap(reading: Reading) -> Source:
     """VHAP's export of one camera or many; held out is what transforms_val and _test hold.
 
     With several cameras a frame's number is timestep x cameras + place of the camera.
@@ -50,15 +43,15 @@ def read_vhap(reading: Reading, progress: Progress | None = None) -> Source:
     transforms = read_transforms(reading)
     frames: list[tuple[Entry, tuple[int, int]]] = []
     for entry in transforms.entries:
-        with reading.findings.frame(entry.name):
+        with reading.report.frame(entry.name):
             place = (_index(entry.values, "timestep_index"), _index(entry.values, "camera_index"))
             frames.append((entry, place))
     cameras = sorted({camera for _, (_, camera) in frames})
     subject = VhapSubject(reading)
     records: list[FrameRecord] = []
     held_out = set()
-    for done, (entry, (timestep, camera)) in enumerate(frames, 1):
-        with reading.findings.frame(entry.name):
+    for entry, (timestep, camera) in reading.each(frames):
+        with reading.report.frame(entry.name):
             number = timestep * len(cameras) + cameras.index(camera)
             name = None
             if len(cameras) > 1:
@@ -69,7 +62,7 @@ def read_vhap(reading: Reading, progress: Progress | None = None) -> Source:
             records.append(
                 FrameRecord(
                     number,
-                    _picture(reading.folder, entry),
+                    _frame_image(reading.folder, entry),
                     subject.theta(reading.folder.path(path)),
                     camera_of(entry.values, opengl=True),
                     size_of(entry.values),
@@ -79,8 +72,6 @@ def read_vhap(reading: Reading, progress: Progress | None = None) -> Source:
             )
             if entry.held_out:
                 held_out.add(number)
-        if progress is not None:
-            progress("reading frames", done, len(frames))
     split = Split(numbers=frozenset(held_out)) if transforms.has_split else Split(0)
     return assemble(reading, records, subject.arrays, subject.identity, split)
 
@@ -92,13 +83,13 @@ def _index(values: dict[str, Any], name: str) -> int:
     return value
 
 
-def _picture(folder: Folder, entry: Entry) -> Picture:
+def _frame_image(folder: Folder, entry: Entry) -> FrameImage:
     mask = entry.values.get("fg_mask_path")
     if mask is None:
-        return Picture(folder.path(entry.name))
+        return FrameImage(folder.path(entry.name))
     if not isinstance(mask, str) or not folder.path(mask).is_file():
         raise UnusableFrameError("frames whose mask is missing")
-    return Picture(folder.path(entry.name), alpha=folder.path(mask))
+    return FrameImage(folder.path(entry.name), alpha=folder.path(mask))
 
 
 @dataclass
@@ -115,8 +106,7 @@ class VhapSubject:
     def arrays(self) -> HeadArrays:
         """FLAME with the subject's offsets; raises UserError where no frame could be read."""
         if self._arrays is None:
-            self.reading.findings.settle(str(self.reading), False)
-            raise UserError(f"{self.reading} has no frames.", "Name the folder of the export.")
+            raise self.reading.no_frames()
         return self._arrays
 
     @property

@@ -6,9 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from rgbavatar_ns.data.importers.folder import PICTURES, Folder, numbers, read_npz
-from rgbavatar_ns.data.importers.frame_files import Progress
-from rgbavatar_ns.data.importers.frame_images import Picture, picture_header
+from rgbavatar_ns.data.importers.folder import IMAGE_SUFFIXES, Folder, numbers, read_npz
+from rgbavatar_ns.data.importers.frame_images import FrameImage, image_header
 from rgbavatar_ns.data.importers.frame_record import CameraRecord, FrameRecord
 from rgbavatar_ns.data.importers.import_report import UnusableFrameError
 from rgbavatar_ns.data.importers.source import Reading, Source, Split, assemble
@@ -28,7 +27,7 @@ def is_vhap_raw(folder: Folder) -> bool:
     return any(_FILE.fullmatch(path.name) for path in folder.root.glob("tracked_flame_params*.npz"))
 
 
-def read_vhap_raw(reading: Reading, progress: Progress | None = None) -> Source:
+def read_vhap_raw(reading: Reading) -> Source:
     """The latest epoch's parameters with the images of the folder, or of the option `images`.
 
     The camera looks along -z from (0, 0, 1), as VHAP places it without calibration; its focal
@@ -41,13 +40,13 @@ def read_vhap_raw(reading: Reading, progress: Progress | None = None) -> Source:
     names = _names(path, values)
     images = _by_stem(reading, reading.options.images, ("images",))
     masks = _by_stem(reading, reading.options.masks, _MASKS)
-    reading.findings.leave_out(
+    reading.report.leave_out(
         "images without a record", [images[stem].name for stem in images if stem not in names]
     )
     subject = VhapSubject(reading)
     records = []
-    for moment, name in enumerate(names):
-        with reading.findings.frame(name):
+    for moment, name in enumerate(reading.each(names)):
+        with reading.report.frame(name):
             if name not in images:
                 raise UnusableFrameError("records without an image")
             if masks and name not in masks:
@@ -55,12 +54,10 @@ def read_vhap_raw(reading: Reading, progress: Progress | None = None) -> Source:
             own = {key: values[key][moment] for key in _PER_FRAME if key in values}
             own |= {key: values[key] for key in _SHARED if key in values}
             theta = subject.parse(own)
-            header = picture_header(images[name])
+            header = image_header(images[name])
             camera = _camera(values, header.width, header.height)
-            picture = Picture(images[name], masks.get(name))
-            records.append(FrameRecord(moment, picture, theta, camera))
-        if progress is not None:
-            progress("reading frames", moment + 1, len(names))
+            frame_image = FrameImage(images[name], masks.get(name))
+            records.append(FrameRecord(moment, frame_image, theta, camera))
     return assemble(reading, records, subject.arrays, subject.identity, Split(0))
 
 
@@ -107,7 +104,7 @@ def _by_stem(reading: Reading, given: Path | None, usual: tuple[str, ...]) -> di
     return {
         path.stem: place.path(path.name)
         for path in sorted(place.root.iterdir())
-        if path.suffix.lower() in PICTURES and not path.name.startswith(".")
+        if path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".")
     }
 
 

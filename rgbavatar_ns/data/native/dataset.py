@@ -21,7 +21,7 @@ from rgbavatar_ns.data.native.format import (
     cameras_from_json,
 )
 from rgbavatar_ns.data.png import png_size, read_png_rgba
-from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.errors import UserError, first_few
 from rgbavatar_ns.head import HeadArrays, HeadModel, ThetaLayout
 from rgbavatar_ns.kernels.types import PinholeCameras
 
@@ -220,7 +220,7 @@ def _read_frames(root: Path, index: dict[str, Any]) -> list[dict[str, Any]]:
     if twice:
         raise UserError(
             f"The dataset {root} has {len(twice)} frame numbers more than once "
-            f"({_first_few(twice)}).",
+            f"({first_few(twice)}).",
             "Give every frame a number of its own.",
         )
     return frames
@@ -243,7 +243,7 @@ def _read_theta(root: Path, layout: ThetaLayout, numbers: tuple[int, ...]) -> Fl
     if wrong:
         raise UserError(
             f"{path} holds NaN or infinite values in {len(wrong)} of {len(numbers)} frames "
-            f"({_first_few(wrong)}).",
+            f"({first_few(wrong)}).",
             "Track these frames again, or leave them out of the dataset.",
         )
     return torch.from_numpy(theta.astype(np.float32))
@@ -282,7 +282,7 @@ def _read_test(root: Path, index: dict[str, Any], numbers: tuple[int, ...]) -> t
     held_out = set(listed)
     unknown = sorted(held_out - set(numbers))
     if unknown or len(held_out) >= len(numbers):
-        what = f"{len(unknown)} that are not there ({_first_few(unknown)})" if unknown else "all"
+        what = f"{len(unknown)} that are not there ({first_few(unknown)})" if unknown else "all"
         raise UserError(
             f"The dataset {root} holds out {what} of its {len(numbers)} frames.",
             f"Mend the list `test` in {INDEX_FILE}: numbers of frames, but not of all.",
@@ -321,8 +321,3 @@ def _check_size(path: Path, size: tuple[int, int], expected: tuple[int, int]) ->
             f"{expected[0]} x {expected[1]} pixels.",
             "Bring all images to one size, or leave this frame out.",
         )
-
-
-def _first_few(numbers: list[int]) -> str:
-    shown = ", ".join(map(str, numbers[:5]))
-    return shown if len(numbers) <= 5 else f"{shown}, ..."

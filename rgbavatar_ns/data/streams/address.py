@@ -1,5 +1,6 @@
 """Where frames are sent to: a port of this machine."""
 
+import contextlib
 import ipaddress
 from typing import NamedTuple
 from urllib.parse import urlsplit
@@ -18,12 +19,11 @@ class StreamAddress(NamedTuple):
     @classmethod
     def parse(cls, text: str) -> "StreamAddress":
         """Read HOST:PORT; raises UserError for anything else."""
-        try:
+        parts = host = port = None
+        with contextlib.suppress(ValueError):
             parts = urlsplit(f"//{text}")
             host, port = parts.hostname, parts.port
-        except ValueError:
-            host = port = None
-        if not host or port is None or parts.netloc != text or parts.username is not None:
+        if parts is None or (parts.netloc, parts.username) != (text, None) or not host or not port:
             raise UserError(
                 f"'{text}' is no address for a stream.",
                 f"Give HOST:PORT, for example {DEFAULT_ADDRESS}.",

@@ -136,6 +136,8 @@ class StreamClient:
         try:
             connection.send(self._greeting)
             received = message_format.parse_answer(connection.recv(timeout=_ANSWER_S))
+            if not self._newest:  # Another client may have used the session before.
+                self._sent = received
             missing = max(0, self._sent - received)
             for message in list(self._newest)[max(0, len(self._newest) - missing) :]:
                 connection.send(message)

@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from rgbavatar_ns.data.check import unreadable_report
-from rgbavatar_ns.data.importers import ImportOptions, Source, frame_files, read_source
-from rgbavatar_ns.data.importers.frame_images import Picture, make_png, picture_header
+from rgbavatar_ns.data.importers import ImportOptions, Source, read_source
+from rgbavatar_ns.data.importers.frame_images import FrameImage, image_header, make_png
 from rgbavatar_ns.data.importers.import_report import UnusableFrameError
 from rgbavatar_ns.data.png import decode_png_rgba
 from rgbavatar_ns.errors import UserError
@@ -45,8 +45,8 @@ def read(folder: Path, flame: Path, **options) -> Source:
     source = read_source(folder, options)
     size = (source.cameras.width, source.cameras.height)
     try:
-        for picture in source.pictures:
-            make_png(picture, size)
+        for frame_image in source.frame_images:
+            make_png(frame_image, size)
     except UnusableFrameError as error:
         raise UserError(str(error), "") from None
     return source
@@ -61,8 +61,8 @@ def assert_same(one: Source, other: Source, positions: list[int] | None = None) 
         theirs = getattr(other.cameras, part)[kept]
         assert torch.allclose(getattr(one.cameras, part), theirs, atol=1e-4)
     size = (one.cameras.width, one.cameras.height)
-    for mine, k in zip(one.pictures, kept):
-        png, wanted = make_png(mine, size).encoded, make_png(other.pictures[k], size).encoded
+    for mine, k in zip(one.frame_images, kept):
+        png, wanted = make_png(mine, size).encoded, make_png(other.frame_images[k], size).encoded
         assert np.array_equal(decode_png_rgba(png, ""), decode_png_rgba(wanted, ""))
 
 
@@ -146,8 +146,8 @@ def test_with_consent_the_other_frames_are_read_and_the_loss_is_told(
     name, folders, flame_folder, tmp_path
 ):
     folder = shutil.copytree(folders[name], tmp_path / name)
-    pictures = {"metrical": "input", "vhap": "images", "imavatar": "image", "flashavatar": "imgs"}
-    first, second, *_ = files_of(folder / pictures[name])
+    images = {"metrical": "input", "vhap": "images", "imavatar": "image", "flashavatar": "imgs"}
+    first, second, *_ = files_of(folder / images[name])
     first.unlink()
     cv2.imwrite(str(second), np.zeros((HEIGHT, WIDTH + 1, 3), np.uint8))
     with pytest.raises(UserError, match=r"cannot be used.*: 1 \(.*: 1 \(") as caught:
@@ -254,29 +254,29 @@ def save(path: Path, image: np.ndarray) -> Path:
     return path
 
 
-def decoded(picture: Picture) -> np.ndarray:
-    header = picture_header(picture.color)
-    return decode_png_rgba(make_png(picture, (header.width, header.height)).encoded, "")
+def decoded(frame_image: FrameImage) -> np.ndarray:
+    header = image_header(frame_image.color)
+    return decode_png_rgba(make_png(frame_image, (header.width, header.height)).encoded, "")
 
 
 def test_all_kinds_of_pictures(tmp_path):
     grey = np.arange(48, dtype=np.uint8).reshape(6, 8) * 5
     color = np.stack([grey, grey[::-1], grey[:, ::-1]], -1)
     sixteen = save(tmp_path / "16.png", color.astype(np.uint16) * 257)
-    assert np.array_equal(decoded(Picture(sixteen))[..., :3], color[..., ::-1])
+    assert np.array_equal(decoded(FrameImage(sixteen))[..., :3], color[..., ::-1])
     one = save(tmp_path / "grey.png", grey)
-    assert np.array_equal(decoded(Picture(one))[..., :3], np.repeat(grey[..., None], 3, -1))
+    assert np.array_equal(decoded(FrameImage(one))[..., :3], np.repeat(grey[..., None], 3, -1))
     binary = save(tmp_path / "binary.png", (grey > 100).astype(np.uint8))
-    with_mask = decoded(Picture(sixteen, alpha=binary, regions=(one,)))
+    with_mask = decoded(FrameImage(sixteen, alpha=binary, regions=(one,)))
     assert np.array_equal(with_mask[..., 3], np.where(grey > 100, grey, 0))
     with pytest.raises(UnusableFrameError, match="coloured"):
-        decoded(Picture(one, alpha=sixteen))
+        decoded(FrameImage(one, alpha=sixteen))
     cmyk = tmp_path / "cmyk.jpg"
     Image.new("CMYK", (8, 6), (10, 20, 30, 40)).save(cmyk)
     with pytest.raises(UnusableFrameError, match="CMYK"):
-        decoded(Picture(cmyk))
+        decoded(FrameImage(cmyk))
     with pytest.raises(UnusableFrameError, match="differ in size"):
-        decoded(Picture(one, alpha=save(tmp_path / "other.png", grey[:4])))
+        decoded(FrameImage(one, alpha=save(tmp_path / "other.png", grey[:4])))
 
 
 def test_a_picture_cut_anywhere_is_told(tmp_path):
@@ -284,11 +284,11 @@ def test_a_picture_cut_anywhere_is_told(tmp_path):
     for name in ("whole.png", "whole.jpg"):
         path = save(tmp_path / name, color if name.endswith("png") else color[..., :3])
         whole = path.read_bytes()
-        decoded(Picture(path))
+        decoded(FrameImage(path))
         for kept in range(0, len(whole) - 1, 61):
             path.write_bytes(whole[:kept])
             with pytest.raises(UnusableFrameError):
-                decoded(Picture(path))
+                decoded(FrameImage(path))
 
 
 def test_nothing_known_says_what_lies_below(folders, tmp_path):
@@ -297,30 +297,3 @@ def test_nothing_known_says_what_lies_below(folders, tmp_path):
         read_source(tmp_path, ImportOptions())
     with pytest.raises(UserError, match="no format 'x'"):
         read_source(tmp_path, ImportOptions(format="x"))
-
-
-def test_many_processes_read_what_one_does(
-    folders, references, flame_folder, tmp_path, monkeypatch
-):
-    folder = shutil.copytree(folders["metrical"], tmp_path / "data")
-    monkeypatch.setattr(frame_files, "MANY_FILES", 1)
-    monkeypatch.setattr(frame_files, "_FILES_AT_ONCE", 2)
-    monkeypatch.setattr("os.cpu_count", lambda: 3)
-    own = frame_files._read
-
-    def tell_process(path: Path):
-        (tmp_path / f"process-{os.getpid()}").touch()
-        return own(path)
-
-    monkeypatch.setattr(frame_files, "_read", tell_process)
-    assert_same(read(folder, flame_folder), references["metrical"])
-    processes = {path.name for path in tmp_path.glob("process-*")}
-    assert processes
-    assert f"process-{os.getpid()}" not in processes
-    second, third = sorted((folder / "checkpoint").iterdir())[1:3]
-    second.write_bytes(second.read_bytes()[:500])
-    third.write_bytes(b"")
-    with pytest.raises(
-        UserError, match=rf"{second.name}, {third.name}|{second.name}.*{third.name}"
-    ):
-        read(folder, flame_folder)

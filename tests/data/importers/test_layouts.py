@@ -35,7 +35,7 @@ def frame_folder(tmp_path, takes) -> Path:
 
 
 def image(source, position: int) -> np.ndarray:
-    png = make_png(source.pictures[position], (WIDTH, HEIGHT)).encoded
+    png = make_png(source.frame_images[position], (WIDTH, HEIGHT)).encoded
     return decode_png_rgba(png, "")
 
 
@@ -91,7 +91,7 @@ def test_flashavatar_beside_its_tracker_and_from_above(tmp_path, options, takes)
         source = read_source(folder, options)
         assert source.format == "FlashAvatar"
         assert_same_views(take, frames, source)
-        assert source.pictures[0].color.name == f"{FIRST + 1:05d}.jpg"
+        assert source.frame_images[0].color.name == f"{FIRST + 1:05d}.jpg"
     (tmp_path / "dataset/other/imgs").mkdir(parents=True)
     with pytest.raises(UserError, match="2 subjects"):
         read_source(tmp_path, options)

@@ -11,7 +11,7 @@ import torch
 
 from rgbavatar_ns.data import TrackedDataset, load_dataset
 from rgbavatar_ns.data.importers import ImportOptions, Source, import_dataset, read_source
-from rgbavatar_ns.data.importers.frame_images import Picture
+from rgbavatar_ns.data.importers.frame_images import FrameImage
 from rgbavatar_ns.data.importers.frame_record import CameraRecord, FrameRecord
 from rgbavatar_ns.data.importers.head_pose import place_head_pose
 from rgbavatar_ns.head import HeadModel
@@ -156,7 +156,7 @@ def test_on_the_neck_the_head_stays_and_the_collar_does_not_turn(takes):
     records = [
         FrameRecord(
             frame.index,
-            Picture(Path("none.png")),
+            FrameImage(Path("none.png")),
             {name: part for name, part in frame.theta.items() if name != "eyelids"},
             CameraRecord(frame.camera.world_to_camera[0].double().numpy(), np.ones(2), np.zeros(2)),
         )

@@ -1,0 +1,206 @@
+"""How near the tracker comes to the truth on the procedural subject.
+
+    python benchmarks/quality/tracker.py --seeds 0 1 2 --sizes 256 512 --json tracker.json
+
+For each subject it renders a performance, finds landmarks on the images with mediapipe, fits the
+head model and prints: rotation error of the skull (mean, degrees; its constant part as pitch, yaw,
+roll), error across the image plane in percent of the distance, distance of vertices of the face
+and of the whole head in mm (position, depth and size of the head aligned: one camera does not
+tell them), correlation of the expression coefficients that are active (all of them pooled, and the
+median of each one's own), of jaw and of gaze, how much the fit's second differences shrink against
+a fit without smoothing, its lag in frames, and CPU time of the fit.
+"""
+
+import argparse
+import json
+import time
+from collections.abc import Sequence
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from rgbavatar_ns.head import HeadModel
+from rgbavatar_ns.head.rotations import matrix_to_axis_angle
+from rgbavatar_ns.synthetic import DemoConfig
+from rgbavatar_ns.synthetic.make import DemoPerson
+from rgbavatar_ns.synthetic.performer.performance import perform
+from rgbavatar_ns.tracking.config import TrackConfig
+from rgbavatar_ns.tracking.face.detector import FaceLandmarker
+from rgbavatar_ns.tracking.fit.subject import SubjectTracker
+
+FRAMES_PER_SECOND = 12.0
+FACE_FRONT_M = 0.02
+"""Vertices of the template in front of this are the face."""
+
+
+class Subject:
+    """A procedural person with its true parameters and the landmarks found on its images."""
+
+    def __init__(self, seed: int, size: int, frames: int, glasses: bool) -> None:
+        config = DemoConfig(
+            image_size=size,
+            num_frames=frames,
+            num_test_frames=frames // 4,
+            seed=seed,
+            frames_per_second=FRAMES_PER_SECOND,
+            glasses=glasses,
+            supersampling=2,
+        )
+        person = DemoPerson.of(config)
+        layout, names = person.head.layout, person.head.arrays.expression_names
+        acted = perform(layout, names, frames, frames // 4, FRAMES_PER_SECOND, seed)
+        self.size, self.camera = size, person.camera
+        self.identity = person.identity.double().numpy()
+        row, column = np.mgrid[:size, :size] / size
+        room = np.stack([90 + 60 * column, 110 + 40 * row, 130 - 30 * column], -1)
+        found: list[np.ndarray] = []
+        kept: list[int] = []
+        with closing(FaceLandmarker()) as landmarker:
+            images = person.draw(torch.from_numpy(acted.theta).float())
+            for number, image in enumerate(images):
+                alpha = image[..., 3:] / 255
+                picture = image[..., :3] * alpha + room * (1 - alpha)
+                points = landmarker(picture.round().astype(np.uint8))
+                if points is not None:
+                    found.append(points)
+                    kept.append(number)
+        self.theta = acted.theta[kept]
+        self.landmarks_px = np.array(found)
+        self.follows = [False, *(np.diff(kept) == 1).tolist()]
+        self.lost = frames - len(kept)
+
+
+def correlation(first: np.ndarray, second: np.ndarray) -> float:
+    """Of all entries; 0 where one of them never changes."""
+    if min(first.std(), second.std()) < 1e-9:
+        return 0.0
+    return float(np.corrcoef(first.ravel(), second.ravel())[0, 1])
+
+
+def lag_frames(found: Float[np.ndarray, "F"], true: Float[np.ndarray, "F"]) -> int:
+    """By how many frames `found` comes late: the shift of the best correlation, up to 3."""
+    shifts = range(-3, 4)
+    inner = slice(3, -3)
+    scores = [correlation(np.roll(found, -shift)[inner], true[inner]) for shift in shifts]
+    return shifts[int(np.argmax(scores))]
+
+
+def jitter(values: Float[np.ndarray, "F P"]) -> float:
+    """Mean square of second differences."""
+    return float(np.square(np.diff(values, 2, axis=0)).mean())
+
+
+def vertex_errors(
+    head: HeadModel,
+    found: tuple[np.ndarray, np.ndarray, float, float],
+    true: tuple[np.ndarray, np.ndarray, float, float, float],
+) -> dict[str, float]:
+    """Errors of position and shape; (theta, identity, focal_px, distance_m[, height_m]) each."""
+    theta, identity, focal_px, distance_m = found
+    true_theta, true_identity, true_focal_px, true_distance_m, height_m = true
+    with torch.no_grad():
+        ours = head(torch.from_numpy(theta), torch.from_numpy(identity)).numpy()
+        real = head(torch.from_numpy(true_theta), torch.from_numpy(true_identity)).numpy()
+    ours = ours - [0, 0, distance_m]
+    real = real - [0, height_m, true_distance_m]
+    face = head.arrays.v_template[:, 2] > FACE_FRONT_M
+    our_middle, real_middle = ours[:, face].mean(1), real[:, face].mean(1)
+    # The pixel of the face's middle, seen at its true depth through the true camera.
+    across = our_middle[:, :2] / our_middle[:, 2:] * (focal_px / true_focal_px)
+    across = across * real_middle[:, 2:]
+    away = np.linalg.norm(across - real_middle[:, :2], axis=1) / -real_middle[:, 2]
+    extent = [
+        np.linalg.norm(points[:, face] - middle[:, None], axis=-1).mean()
+        for points, middle in ((ours, our_middle), (real, real_middle))
+    ]
+    placed = np.concatenate([across, real_middle[:, 2:]], 1)
+    aligned = (ours - our_middle[:, None]) * (extent[1] / extent[0]) + placed[:, None]
+    error_mm = np.linalg.norm(aligned - real, axis=-1) * 1e3
+    return {
+        "translation_percent": float(100 * away.mean()),
+        "face_mm": float(error_mm[:, face].mean()),
+        "head_mm": float(error_mm.mean()),
+    }
+
+
+def measure(subject: Subject, head: HeadModel, *, known_focal: bool) -> dict[str, Any]:
+    """All figures of one subject."""
+    config = TrackConfig(focal_px=subject.camera.focal_px if known_focal else None)
+    tracker = SubjectTracker(head, config)
+    started = time.process_time()
+    fit = tracker.fit(subject.landmarks_px, subject.follows, subject.size, subject.size)
+    seconds = time.process_time() - started
+    rough = SubjectTracker(head, replace(config, temporal_weight=0.0))
+    unsmoothed = rough.fit(subject.landmarks_px, subject.follows, subject.size, subject.size)
+    theta, true, layout = tracker.thetas(fit), subject.theta, head.layout
+    turns = [np.array([tracker.mesh_landmarks.head_rotation(t) for t in x]) for x in (theta, true)]
+    off = matrix_to_axis_angle(torch.from_numpy(turns[0] @ turns[1].transpose(0, 2, 1))).numpy()
+    off_degrees = np.degrees(off)
+    expression = layout.slice("expression")
+    fitted_columns = set(tracker.cost.parameters.columns.tolist())
+    active = [
+        column
+        for column in range(expression.start, expression.stop)
+        if column in fitted_columns and true[:, column].std() > 0.05
+    ]
+    jaw, eye = layout.slice("jaw").start, layout.slice("left_eye").start + 1
+    camera, real = fit.subject.camera, subject.camera
+    yaw = [np.arctan2(turn[:, 0, 2], turn[:, 2, 2]) for turn in turns]
+    return {
+        "rotation_degrees": float(np.linalg.norm(off_degrees, axis=1).mean()),
+        "rotation_bias_degrees": off_degrees.mean(0).round(2).tolist(),
+        **vertex_errors(
+            head,
+            (theta, fit.subject.identity, camera.focal_px, camera.distance_m),
+            (true, subject.identity, real.focal_px, real.distance_m, real.height_m),
+        ),
+        "expression_pooled": correlation(theta[:, active], true[:, active]),
+        "expression_median": float(
+            np.median([correlation(theta[:, column], true[:, column]) for column in active])
+        ),
+        "jaw": correlation(theta[:, jaw], true[:, jaw]),
+        "gaze": correlation(theta[:, eye], true[:, eye]),
+        "jitter_ratio": jitter(fit.values) / jitter(unsmoothed.values),
+        "lag_frames": lag_frames(yaw[0], yaw[1]),
+        "fit_cpu_ms": 1e3 * seconds / len(true),
+        "lost_frames": subject.lost,
+    }
+
+
+def text(row: dict[str, Any]) -> str:
+    """One line of figures."""
+    return "  ".join(
+        f"{name} {value:.2f}" if isinstance(value, float) else f"{name} {value}"
+        for name, value in row.items()
+    )
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Print one row for each subject and size."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
+    parser.add_argument("--sizes", type=int, nargs="+", default=[256, 512])
+    parser.add_argument("--frames", type=int, default=72)
+    parser.add_argument("--glasses", action="store_true", help="the person wears glasses")
+    parser.add_argument("--json", type=Path, help="also write the figures here")
+    chosen = parser.parse_args(arguments)
+    head = HeadModel.embedded(dtype=torch.float64)
+    rows = []
+    for seed in chosen.seeds:
+        for size in chosen.sizes:
+            subject = Subject(seed, size, chosen.frames, chosen.glasses)
+            for known in (True, False):
+                row = {"seed": seed, "size": size, "focal_known": known}
+                rows.append(row | measure(subject, head, known_focal=known))
+                print(text(rows[-1]), flush=True)
+    if chosen.json:
+        chosen.json.write_text(json.dumps(rows, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,200 @@
+"""The recorded step, on the emulated CUDA backend: the same steps, and nothing that waits."""
+
+import pytest
+import torch
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from rgbavatar_ns import kernels
+from rgbavatar_ns.avatar.training import make_optimizer
+from rgbavatar_ns.avatar.training.batches import DeviceFrames
+from rgbavatar_ns.avatar.training.fused_step import FusedStep
+from rgbavatar_ns.avatar.training.optimizer_states import AdamStates
+from rgbavatar_ns.avatar.training.recorded_step import RecordedStep
+from tests.avatar.fused_scene import (
+    eager_step,
+    far_batch,
+    fused_step,
+    parting,
+    stir,
+)
+from tests.kernels.cuda import emulator
+
+pytestmark = pytest.mark.skipif(emulator.compiler() is None, reason="no g++ to emulate CUDA with")
+
+ORDER = [[0, 2], [1, 3], [3, 0], [2, 1], [0, 1], [3, 2]]
+
+
+@pytest.fixture
+def emulated(monkeypatch):
+    return emulator.install(monkeypatch)
+
+
+class Recorder:
+    """Repeats the work itself; what a graph would keep is looked at meanwhile."""
+
+    def __init__(self, watch=None) -> None:
+        self.records, self.replays, self.watch = 0, 0, watch
+
+    def __call__(self, work):
+        self.records += 1
+
+        def replay() -> None:
+            self.replays += 1
+            if self.watch is None:
+                work()
+            else:
+                with self.watch:
+                    work()
+
+        return replay
+
+
+class NothingWaits(TorchDispatchMode):
+    """Refuses what a recorded stream refuses: reading numbers, copies from the host."""
+
+    WAITING = ("_local_scalar_dense", "nonzero", "masked_select", "unique", "lift_fresh", "equal")
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        name = func.__name__.split(".")[0]
+        assert name not in self.WAITING, f"{name} waits for the device"
+        if name in ("index", "index_put", "index_put_"):
+            indices = [t for t in args[1] if t is not None]
+            assert all(t.dtype != torch.bool for t in indices), "a mask's size is not known"
+        return func(*args, **(kwargs or {}))
+
+
+def _frames(avatar, cameras: int = 1):
+    batch, background = far_batch(avatar, 4, 24, 24, cameras=cameras)
+    return DeviceFrames(batch.theta, batch.cameras, batch.images_rgba), background
+
+
+def _slow(optimizer):
+    for group in optimizer.param_groups:
+        group["lr"] *= 0.1
+    return optimizer
+
+
+@pytest.mark.parametrize("cameras", [1, 4])
+@pytest.mark.parametrize("changes", [{}, {"num_bases": 0}, {"weight_network": "linear"}], ids=str)
+def test_steps_equal_the_fused_ones(emulated, make_avatar, cameras, changes):
+    recorder, losses = Recorder(), []
+    graphed, fused = stir(make_avatar(**changes)), stir(make_avatar(**changes))
+    frames, background = _frames(graphed, cameras)
+    optimizer = _slow(make_optimizer(graphed))
+    step = RecordedStep(graphed, [optimizer], frames, 2, recorder=recorder)
+    for number, chosen in enumerate(ORDER):
+        if number == 4:  # a schedule's new rate reaches a step that was recorded before
+            optimizer.param_groups[0]["lr"] *= 0.5
+        losses.append(float(step(chosen, background[chosen])))
+    assert (recorder.records, recorder.replays) == (1, 3)
+    optimizer = _slow(make_optimizer(fused))
+    eager = FusedStep(fused, [optimizer])
+    for number, chosen in enumerate(ORDER):
+        if number == 4:
+            optimizer.param_groups[0]["lr"] *= 0.5
+        camera = frames.cameras.select(chosen) if cameras > 1 else frames.cameras
+        loss = eager(frames.theta[chosen], camera, frames.images_rgba[chosen], background[chosen])
+        assert losses[number] == pytest.approx(float(loss), rel=1e-5)
+    assert parting(graphed, fused) < 1e-4
+
+
+def test_nothing_in_a_recorded_step_waits_for_the_device(emulated, make_avatar, monkeypatch):
+    avatar = stir(make_avatar(scale_with_triangle=True))
+    frames, background = _frames(avatar, 4)
+    # These look at numbers on a CPU only, where looking costs nothing.
+    monkeypatch.setattr(avatar, "_checked", lambda theta: theta)
+    monkeypatch.setattr(kernels.morphed, "check_cameras", lambda _, cameras: len(cameras.focal_px))
+    recorder = Recorder(NothingWaits())
+    step = RecordedStep(avatar, [make_optimizer(avatar)], frames, 2, recorder=recorder)
+    reads = []
+    launcher = emulated.emulated
+    monkeypatch.setattr(launcher, "read_later", lambda numbers: reads.append(1) or (lambda: None))
+    for number, chosen in enumerate(ORDER):
+        if number == 3:
+            monkeypatch.setattr(launcher, "capturing", lambda: True)
+            before = len(reads)
+        step(chosen, background[chosen])
+    assert recorder.replays == 3
+    assert len(reads) == before
+
+
+def test_a_watch_that_sees_nothing_would_be_no_test():
+    with pytest.raises(AssertionError, match="waits"), NothingWaits():
+        torch.ones(3).sum().item()
+    with pytest.raises(AssertionError, match="waits"), NothingWaits():
+        torch.ones(3).new_tensor([1.0])
+    with pytest.raises(AssertionError, match="mask"), NothingWaits():
+        torch.ones(3)[torch.ones(3) > 0]
+
+
+def test_overflows_are_counted_and_the_step_is_recorded_with_more_room(
+    emulated, make_avatar, monkeypatch
+):
+    from rgbavatar_ns.avatar.training import recorded_step as graphed_step
+
+    monkeypatch.setattr(graphed_step, "_LOOK_EVERY", 5)
+    avatar, recorder = stir(make_avatar()), Recorder()
+    frames, background = _frames(avatar)
+    step = RecordedStep(avatar, [make_optimizer(avatar)], frames, 2, recorder=recorder)
+    for chosen in ORDER[:4]:
+        step(chosen, background[chosen])
+    key = (avatar.num_gaussians, 24, 24)
+    capacities = emulated.capacities(torch.device("cpu"))
+    assert capacities.per_image[key] > 5
+    capacities.per_image[key] = 5  # as if the head came nearer than ever before
+    before = avatar.blendshapes.position.clone()
+    step(ORDER[4], background[ORDER[4]])
+    assert torch.equal(before, avatar.blendshapes.position)
+    assert step.skipped_steps == 1
+    for chosen in ORDER * 2:
+        step(chosen, background[chosen])
+    assert capacities.per_image[key] > 5
+    assert not torch.equal(before, avatar.blendshapes.position)
+    assert recorder.records == 2
+
+
+def test_every_way_goes_on_from_the_others_counts(emulated, make_avatar):
+    """Adam's bias corrections hang on the number of steps, whoever has taken them."""
+    avatar, recorder = stir(make_avatar()), Recorder()
+    frames, background = _frames(avatar)
+    optimizer = make_optimizer(avatar)
+    graphed = RecordedStep(avatar, [optimizer], frames, 2, recorder=recorder)
+    for chosen in ORDER[:5]:
+        graphed(chosen, background[chosen])
+    batch, colors = far_batch(avatar, 2, 24, 24)
+    eager_step(avatar, optimizer, batch, colors)
+    fused_step(avatar, optimizer, batch, colors)
+    graphed(ORDER[5], background[ORDER[5]])
+    assert {float(state["step"]) for state in optimizer.state.values()} == {8.0}
+    states = AdamStates(avatar, [optimizer])
+    counts = [*states.next_of_gaussians().values(), *states.next_of_network()]
+    assert {parameter.step for parameter in counts} == {9}
+
+
+def test_a_checkpoint_that_was_loaded_is_recorded_anew(emulated, make_avatar):
+    avatar, recorder = stir(make_avatar()), Recorder()
+    frames, background = _frames(avatar)
+    optimizer = make_optimizer(avatar)
+    step = RecordedStep(avatar, [optimizer], frames, 2, recorder=recorder)
+    for chosen in ORDER[:5]:
+        step(chosen, background[chosen])
+    optimizer.load_state_dict(optimizer.state_dict())
+    for state in optimizer.state.values():
+        state["exp_avg"] = state["exp_avg"].clone()
+    step(ORDER[5], background[ORDER[5]])
+    assert recorder.records == 2
+
+
+def test_what_cannot_be_recorded_is_refused(make_avatar):
+    avatar = stir(make_avatar())
+    frames, _ = _frames(avatar)
+    with pytest.raises(ValueError, match="need the host"):
+        RecordedStep(avatar, [make_optimizer(avatar)], frames, 2)
+
+
+def test_another_number_of_frames_is_refused(emulated, make_avatar):
+    avatar = stir(make_avatar())
+    frames, background = _frames(avatar)
+    step = RecordedStep(avatar, [make_optimizer(avatar)], frames, 2, recorder=Recorder())
+    with pytest.raises(ValueError, match="3 frames"):
+        step([0, 1, 2], background[:3])

@@ -1,0 +1,385 @@
+"""Training on streams through nerfstudio's trainer: pools, ends, faults, resuming."""
+
+import dataclasses
+import json
+import signal
+import socket
+import threading
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from nerfstudio.configs.method_configs import all_methods
+from nerfstudio.utils.eval_utils import eval_setup
+
+from rgbavatar_ns import Avatar
+from rgbavatar_ns.data import TrackedFrame, load_dataset
+from rgbavatar_ns.data.streams import StreamClient, StreamSubject
+from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.plugin.methods import rgbavatar
+from rgbavatar_ns.plugin.online.methods import rgbavatar_online, rgbavatar_online_tiny
+from rgbavatar_ns.plugin.online.sources import SourceConfig
+from rgbavatar_ns.plugin.online.trainer import OnlineTrainer
+from rgbavatar_ns.plugin.training.checkpoints import list_checkpoints
+from tests.plugin.online_run import (
+    hold_back_after,
+    online_config,
+    online_trainer,
+)
+from tests.plugin.run import before_each_step, newest_state
+from tests.plugin.tiny import NUM_FRAMES, NUM_TEST, SIZE
+
+STREAMED = NUM_FRAMES - NUM_TEST
+
+
+def summary(trainer: OnlineTrainer) -> dict[str, Any]:
+    return json.loads((trainer.base_dir / "training.json").read_text())
+
+
+def stream_state(folder: Path) -> dict[str, Any]:
+    return newest_state(folder)["pipeline"]["datamanager._extra_state"]["stream"]
+
+
+def subject_and_frames(data: Path) -> tuple[StreamSubject, list[TrackedFrame]]:
+    dataset = load_dataset(data)
+    subject = StreamSubject(
+        dataset.arrays, dataset.identity, dataset.layout, dataset.width, dataset.height
+    )
+    frames = [
+        TrackedFrame(
+            i, dataset.theta[i], dataset.cameras.select([i]), np.array(dataset.read_image(i))
+        )
+        for i in dataset.train
+    ]
+    return subject, frames
+
+
+def test_a_replayed_stream_is_trained_on_to_its_end_and_a_little_longer(
+    tiny_data: Path, tmp_path: Path
+):
+    trainer = online_trainer(online_config(tmp_path, tiny_data, steps_after_stream=5))
+    steps_at_end = []
+    before_each_step(trainer, lambda step: steps_at_end.append(trainer.stream.ended_step))
+    trainer.train()
+    assert trainer.completed
+    # Five steps were taken after the end was noticed, and none after these.
+    ended = trainer.stream.ended_step
+    assert ended is not None
+    assert trainer.step + 1 == ended + 5
+    told = summary(trainer)
+    assert told["frames"] == told["stream"]["taken in"] == STREAMED
+    assert told["stream"]["dropped"] == 0
+    assert told["steps"] == ended + 5
+    assert told["images"] <= 4 * told["steps"]
+    assert list_checkpoints(trainer.checkpoint_dir)[-1][0] == trainer.step
+
+
+def test_after_the_stream_the_rates_fall_to_a_tenth_also_when_resumed(
+    tiny_data: Path, tmp_path: Path
+):
+    def rates(trainer: OnlineTrainer) -> dict[str, float]:
+        optimizers = trainer.optimizers.optimizers
+        return {name: each.param_groups[0]["lr"] for name, each in optimizers.items()}
+
+    config = online_config(tmp_path / "first", tiny_data, steps_after_stream=6)
+    trainer = online_trainer(config)
+    first, seen = rates(trainer), []
+
+    def look(step: int) -> None:
+        ended = trainer.stream.ended_step
+        if ended is None or step <= ended:
+            assert rates(trainer) == first
+        else:
+            seen.append(rates(trainer)["color"] / first["color"])
+        if len(seen) == 3:
+            trainer.shutdown()
+
+    before_each_step(trainer, look)
+    trainer.train()
+    # Three steps after the first one, half of the way down to a tenth.
+    assert seen == pytest.approx([10 ** (-step / 6) for step in (1, 2, 3)])
+    folder = trainer.checkpoint_dir
+    again = online_trainer(
+        online_config(tmp_path / "again", tiny_data, steps_after_stream=6, load_dir=folder)
+    )
+    again.train()
+    for name, rate in rates(again).items():
+        assert rate == pytest.approx(first[name] / 10)
+
+
+def test_after_the_stream_all_kept_frames_are_drawn_alike(tiny_data: Path, tmp_path: Path):
+    config = online_config(tmp_path, tiny_data, local_size=2, global_size=6, steps_after_stream=120)
+    config.pipeline.datamanager.local_share = 1.0
+    trainer = online_trainer(config)
+    drawn: Counter[int] = Counter()
+    plain = trainer.stream.next_train
+
+    def counted(step: int) -> Any:
+        cameras, batch = plain(step)
+        if trainer.stream.ended_step is not None:
+            drawn.update(batch["position"])
+        return cameras, batch
+
+    trainer.stream.next_train = counted  # type: ignore[method-assign]
+    trainer.train()
+    # Four of eight frames a step: each is in half of the batches.
+    assert len(drawn) == 8
+    assert all(40 < count < 80 for count in drawn.values()), drawn
+
+
+def test_the_streamed_avatar_learns_and_colours_its_gaussians(tiny_data: Path, tmp_path: Path):
+    trainer = online_trainer(online_config(tmp_path, tiny_data, steps_after_stream=40))
+    pipeline = trainer.pipeline
+
+    def held_out_loss() -> float:
+        with torch.no_grad():
+            return float(pipeline.get_eval_loss_dict(0)[1]["l1"])
+
+    before = held_out_loss()
+    trainer.train()
+    assert held_out_loss() < 0.5 * before
+    assert bool(pipeline.model.avatar.color_initialized.any())
+
+
+def test_training_begins_with_the_first_frame(
+    tiny_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    hold_back_after(1, monkeypatch)
+    trainer = online_trainer(online_config(tmp_path, tiny_data, max_num_iterations=2))
+    trainer.train()
+    assert trainer.stream.pools.num_added == 1
+    assert summary(trainer)["images"] == 2
+    first = load_dataset(tiny_data).theta[0]
+    assert torch.equal(trainer.pipeline.model.frame_theta[0], first)
+
+
+def test_the_newest_frame_drives_the_viewers_avatar(tiny_data: Path, tmp_path: Path):
+    trainer = online_trainer(online_config(tmp_path, tiny_data))
+    trainer.train()
+    dataset = load_dataset(tiny_data)
+    assert torch.equal(trainer.pipeline.model.frame_theta[0], dataset.theta[STREAMED - 1])
+    recent = trainer.stream.pools.recent(float("inf"), 1)
+    assert recent is not None
+    score, picture = trainer.pipeline.look_at(recent)
+    assert picture.shape == (SIZE, 2 * SIZE, 3)
+    rgba = np.array(dataset.read_image(STREAMED - 1)).astype(float) / 255
+    truth = rgba[..., :3] * rgba[..., 3:]
+    assert np.abs(picture[:, :SIZE].numpy() / 255 - truth).max() < 1 / 255
+    error = ((picture[:, SIZE:].numpy() / 255 - truth) ** 2).mean()
+    assert score == pytest.approx(-10 * np.log10(error), abs=0.1)
+
+
+def test_the_viewers_panel_knows_the_newest_frame_only(tiny_data: Path, tmp_path: Path):
+    pipeline = (trainer := online_trainer(online_config(tmp_path, tiny_data))).pipeline
+    assert (len(pipeline.model.frame_theta), pipeline.film) == (1, None)
+    trainer.train()
+    newest = load_dataset(tiny_data).theta[STREAMED - 1]
+    assert torch.equal(pipeline.viewer_panel.theta_shown(), newest)
+    pipeline.viewer_panel.show_neutral()
+    assert torch.equal(pipeline.viewer_panel.theta_shown(), newest)
+
+
+def test_ctrl_c_saves_and_leaves_exit_code_0(tiny_data: Path, tmp_path: Path):
+    trainer = online_trainer(online_config(tmp_path, tiny_data))
+
+    def interrupt(step: int) -> None:
+        if step == 2:
+            signal.raise_signal(signal.SIGINT)
+
+    before_each_step(trainer, interrupt)
+    trainer.train()  # no SystemExit
+    assert not trainer.completed
+    assert [step for step, _ in list_checkpoints(trainer.checkpoint_dir)] == [2]
+
+
+def test_sigterm_saves_and_is_told_by_the_exit_code(tiny_data: Path, tmp_path: Path):
+    trainer = online_trainer(online_config(tmp_path, tiny_data))
+    before_each_step(trainer, lambda step: signal.raise_signal(signal.SIGTERM))
+    with pytest.raises(SystemExit) as ended:
+        trainer.train()
+    assert ended.value.code == 143
+    assert [step for step, _ in list_checkpoints(trainer.checkpoint_dir)] == [0]
+
+
+def test_a_resumed_stream_goes_on_where_it_was(
+    tiny_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    sizes = {"local_size": 2, "global_size": 3}
+    trainer = online_trainer(online_config(tmp_path / "first", tiny_data, **sizes))
+    pools = trainer.stream.pools
+
+    def stop_in_the_middle(step: int) -> None:
+        if pools.num_added == 5:
+            trainer.shutdown()
+
+    before_each_step(trainer, stop_in_the_middle)
+    with monkeypatch.context() as patched:
+        hold_back_after(5, patched)
+        trainer.train()
+    state = stream_state(trainer.checkpoint_dir)
+
+    folder = trainer.checkpoint_dir
+    config = online_config(tmp_path / "second", tiny_data, load_dir=folder, **sizes)
+    again = online_trainer(config)
+    assert again.stream.pools.num_added == state["frames"]["added"] == 5
+    resumed = again.pipeline.state_dict()["datamanager._extra_state"]["stream"]["frames"]
+    for name in ("serial", "index", "theta", "world_to_camera"):
+        assert torch.equal(resumed[name], state["frames"][name])
+    assert resumed["pools"]["local"] == state["frames"]["pools"]["local"]
+    assert torch.equal(resumed["pools"]["generator"], state["frames"]["pools"]["generator"].cpu())
+    again.train()
+    told = summary(again)["stream"]
+    # Every frame once, over both runs.
+    assert told["taken in"] == told["arrived"] == STREAMED
+    assert again.stream.pools.num_added == STREAMED
+    folder = again.checkpoint_dir
+    finished = online_trainer(
+        online_config(tmp_path / "third", tiny_data, load_dir=folder, **sizes)
+    )
+    finished.train()
+    assert finished.step == again.step
+
+
+def test_frames_sent_over_a_socket_are_trained_on_and_kept(
+    tiny_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    subject, frames = subject_and_frames(tiny_data)
+    subject = dataclasses.replace(subject, session="mine")
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        address = f"127.0.0.1:{free.getsockname()[1]}"
+
+    def send() -> None:
+        client = StreamClient(subject, address)
+        for frame in frames[:5]:
+            client.send(frame)
+        client.close()  # lost; the training goes on, and another client too
+        with StreamClient(subject, address) as again:
+            for frame in frames[5:]:
+                again.send(frame)
+
+    def train(output: Path, **fields: Any) -> OnlineTrainer:
+        thread = threading.Thread(target=send, daemon=True)
+        thread.start()
+        config = online_config(output, **fields)
+        config.pipeline.datamanager.source = SourceConfig("socket", listen=address)
+        trainer = online_trainer(config)
+        trainer.train()
+        thread.join()
+        return trainer
+
+    trainer = train(tmp_path / "out")
+    told = summary(trainer)["stream"]
+    assert told["taken in"] == STREAMED
+    assert told["source lost"] == told["reconnects"] == 1
+    # The checkpoint is an avatar with the performance that the pools held.
+    loaded = Avatar.load(trainer.base_dir)
+    frames_saved = newest_state(trainer.checkpoint_dir)["pipeline"]["_model._extra_state"]["frames"]
+    assert torch.equal(frames_saved["theta"], load_dataset(tiny_data).theta[:STREAMED])
+    assert loaded.num_gaussians == trainer.pipeline.model.avatar.num_gaussians
+    # The run is complete in itself: it holds the frames, and other commands find them.
+    recorded = load_dataset(trainer.base_dir / "stream")
+    assert len(recorded) == STREAMED
+    assert torch.equal(recorded.theta, load_dataset(tiny_data).theta[:STREAMED])
+    assert np.array_equal(recorded.read_image(4), frames[4].image_rgba)
+    monkeypatch.setitem(all_methods, "rgbavatar-online-tiny", rgbavatar_online_tiny.config)
+    _, pipeline, _, step = eval_setup(trainer.base_dir / "config.yml")
+    assert step == trainer.step
+    assert len(pipeline.datamanager.train_dataset) == STREAMED
+    # A resumed run knows what has been there.
+    again = summary(train(tmp_path / "more", load_dir=trainer.checkpoint_dir))["stream"]
+    assert again["taken in"] == STREAMED
+    assert again["duplicate"] == STREAMED
+
+
+def test_a_fault_of_the_source_saves_and_is_told(tiny_data: Path, tmp_path: Path):
+    trainer = online_trainer(online_config(tmp_path, tiny_data))
+    pools = trainer.stream.pools
+
+    def lose_the_dataset(step: int) -> None:
+        if step == 1:
+            trainer.stream.ingest.failure = UserError("The disk is gone.", "Find it.")
+
+    before_each_step(trainer, lose_the_dataset)
+    with pytest.raises(UserError, match="disk is gone"):
+        trainer.train()
+    assert [step for step, _ in list_checkpoints(trainer.checkpoint_dir)] == [1]
+    assert pools.num_added > 0
+
+
+@pytest.mark.parametrize(
+    ("fields", "told"),
+    [
+        ({"local_share": 1.5}, "pools are impossible"),
+        ({"final_learning_rate_factor": 0.0}, "cannot fall to 0"),
+        ({"local_size": 0}, "pools are impossible"),
+        ({"batch_size": 0}, "batch of 0"),
+    ],
+)
+def test_impossible_flags_are_refused(
+    tiny_data: Path, tmp_path: Path, fields: dict[str, Any], told: str
+):
+    with pytest.raises(UserError, match=told):
+        online_trainer(online_config(tmp_path, tiny_data, **fields))
+
+
+@pytest.mark.parametrize(
+    ("kind", "told"), [("replay", "No dataset"), ("folder", "no longer"), ("video", "No video")]
+)
+def test_a_source_without_a_place_is_refused(tmp_path: Path, kind: Any, told: str):
+    config = online_config(tmp_path)
+    config.pipeline.datamanager.source.kind = kind
+    with pytest.raises(UserError, match=told):
+        online_trainer(config)
+
+
+def test_refinement_of_tracking_is_refused(tiny_data: Path, tmp_path: Path):
+    config = online_config(tmp_path, tiny_data)
+    config.pipeline.model.refine_tracking = True
+    with pytest.raises(UserError, match="refined frame by frame"):
+        online_trainer(config)
+
+
+def test_the_methods_have_the_papers_pools_and_sizes():
+    full, tiny = rgbavatar_online.config, rgbavatar_online_tiny.config
+    for config in (full, tiny):
+        manager = config.pipeline.datamanager
+        assert (manager.local_size, manager.global_size) == (150, 1000)
+        assert manager.strategy == "paper"
+        assert manager.batch_size == 10
+        assert manager.source.frames_per_second == 25
+    # On a CPU, with few steps a frame, old frames need the larger share.
+    assert full.pipeline.datamanager.local_share is None
+    assert tiny.pipeline.datamanager.local_share == 0.3
+    assert full.pipeline.model.avatar == rgbavatar.config.pipeline.model.avatar
+    assert tiny.pipeline.model.avatar.uv_resolution == 128
+
+
+class _Killed(BaseException):
+    """Ends a run in the middle of a step, as SIGKILL does: nothing more is saved."""
+
+
+def test_a_killed_run_goes_on_from_its_last_checkpoint(
+    tiny_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    trainer = online_trainer(online_config(tmp_path / "first", tiny_data, steps_per_save=1))
+
+    def kill(step: int) -> None:
+        if step == 3:
+            raise _Killed
+
+    before_each_step(trainer, kill)
+    with monkeypatch.context() as patched:
+        hold_back_after(5, patched)
+        with pytest.raises(_Killed):
+            trainer.train()
+    folder = trainer.checkpoint_dir
+    assert list_checkpoints(folder)[-1][0] == 2
+    state = stream_state(folder)
+    again = online_trainer(online_config(tmp_path / "again", tiny_data, load_dir=folder))
+    assert again.stream.pools.num_added == state["frames"]["added"] > 0
+    assert torch.equal(again.stream.pools.thetas()[0], state["frames"]["theta"])
+    again.train()
+    assert summary(again)["frames"] == STREAMED

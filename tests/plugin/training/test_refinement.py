@@ -1,0 +1,160 @@
+"""Refined tracking through nerfstudio's trainer: what is corrected, resumed, written, scored."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from rgbavatar_ns.avatar import AvatarConfig
+from rgbavatar_ns.avatar.refinement import FrameRefinement
+from rgbavatar_ns.avatar.refinement.corrections import RefinementConfig
+from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.kernels import available_backends
+from rgbavatar_ns.plugin.training.refinement import frame_refinement
+from rgbavatar_ns.plugin.training.trainer import RGBAvatarTrainer
+from tests.plugin.run import make_trainer, small_config, trained
+from tests.plugin.tiny import NUM_FRAMES, NUM_TEST
+
+START = 2
+TRAINED = NUM_FRAMES - NUM_TEST
+
+
+def _config(data: Path, output: Path, steps: int = 8, *, fast: bool = True, refine: bool = True):
+    config = small_config(data, output, max_num_iterations=steps)
+    config.learning_rate_steps = 8
+    config.pipeline.model.fast = fast
+    config.pipeline.model.refine_tracking = refine
+    config.pipeline.model.refinement = RefinementConfig(start_step=START, bases_start=0.0)
+    return config
+
+
+def refinement_of(trainer: RGBAvatarTrainer) -> FrameRefinement:
+    refinement = trainer.pipeline.model.refinement
+    assert refinement is not None
+    return refinement
+
+
+def _corrections(trainer: RGBAvatarTrainer) -> torch.Tensor:
+    return refinement_of(trainer).frames.correction
+
+
+@pytest.mark.parametrize("fast", [True, False], ids=["fused", "eager"])
+def test_training_frames_are_corrected_and_held_out_ones_calibrated(tiny_data, tmp_path, fast):
+    trainer = trained(_config(tiny_data, tmp_path, fast=fast))
+    model = trainer.pipeline.model
+    refined = np.load(trainer.base_dir / "theta_refined.npy", allow_pickle=False)
+    tracked = model.frame_theta.numpy()
+    assert refined.shape == tracked.shape
+    moved = refined != tracked
+    assert moved[:TRAINED].any(1).all()
+    model.eval()
+    drawn = model.driving_theta(list(range(TRAINED, NUM_FRAMES)))
+    assert refinement_of(trainer).frames.calibrated(model.frame_theta[TRAINED:]).equal(drawn)
+    np.testing.assert_array_equal(refined[TRAINED:], drawn.numpy())
+    # Of this subject only the head's turn about y and the jaw's opening move.
+    layout = model.avatar.layout
+    assert set(np.flatnonzero(moved.any(0))) == {
+        layout.slice("rotation").start + 1,
+        layout.slice("jaw").start,
+    }
+
+
+def test_both_ways_correct_alike(tiny_data, tmp_path):
+    """The first correction follows the same gradient, whichever way it was found."""
+    if "cpu" not in available_backends():
+        pytest.skip("not compiled")
+    fused, eager = (
+        trained(_config(tiny_data, tmp_path / str(fast), START + 1, fast=fast))
+        for fast in (True, False)
+    )
+    first, second = _corrections(fused), _corrections(eager)
+    assert float(second.norm()) > 0
+    assert float((first - second).norm()) < 0.05 * float(second.norm())
+
+
+def test_nothing_is_corrected_before_the_start(tiny_data, tmp_path):
+    plain = trained(_config(tiny_data, tmp_path / "plain", START, refine=False))
+    refined = trained(_config(tiny_data, tmp_path / "refined", START))
+    assert not bool(_corrections(refined).any())
+    for first, second in zip(
+        plain.pipeline.model.avatar.parameters(), refined.pipeline.model.avatar.parameters()
+    ):
+        torch.testing.assert_close(first, second, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("fast", [True, False], ids=["fused", "eager"])
+def test_bases_wait_for_corrections_and_then_learn(tiny_data, tmp_path, fast):
+    bases = {}
+    for steps in (4, 5):
+        config = _config(tiny_data, tmp_path / str(steps), steps, fast=fast)
+        config.pipeline.model.refinement = RefinementConfig(start_step=START, bases_start=0.5)
+        shapes = trained(config).pipeline.model.avatar.blendshapes
+        bases[steps] = [shapes.basis_position, shapes.basis_color_feature]
+    assert not any(bool(basis.any()) for basis in bases[4])
+    assert all(bool(basis.any()) for basis in bases[5])
+
+
+@pytest.mark.parametrize("share", [-0.1, 1.0])
+def test_bases_that_would_never_learn_are_refused(tiny_data, tmp_path, share):
+    config = _config(tiny_data, tmp_path)
+    config.pipeline.model.refinement = RefinementConfig(bases_start=share)
+    with pytest.raises(UserError, match="bases-start"):
+        make_trainer(config)
+
+
+@pytest.mark.parametrize("first_end", [3, 5], ids=["bases wait", "bases learn"])
+def test_resume_equals_uninterrupted_run(tiny_data, tmp_path, first_end):
+    def configured(name: str, steps: int):
+        config = _config(tiny_data, tmp_path / name, steps)
+        config.pipeline.model.refinement = RefinementConfig(start_step=START, bases_start=0.5)
+        return config
+
+    whole = trained(configured("whole", 8))
+    half = trained(configured("half", first_end))
+    config = configured("rest", 8)
+    config.load_dir = half.checkpoint_dir
+    rest = trained(config)
+    first, second = (t.pipeline.model.state_dict() for t in (whole, rest))
+    tensors = [name for name, value in first.items() if isinstance(value, torch.Tensor)]
+    assert any("correction" in name for name in tensors)
+    assert all(torch.equal(first[name], second[name]) for name in tensors)
+
+
+@pytest.mark.parametrize("saved", [True, False])
+def test_a_checkpoint_of_the_other_kind_is_refused(tiny_data, tmp_path, saved):
+    first = trained(_config(tiny_data, tmp_path / "first", 3, refine=saved))
+    config = _config(tiny_data, tmp_path / "second", 4, refine=not saved)
+    config.load_dir = first.checkpoint_dir
+    with pytest.raises(UserError, match=f"refine-tracking {saved}"):
+        make_trainer(config)
+
+
+def test_a_stream_is_refused(tiny_data, tmp_path):
+    """Its model knows one frame of many."""
+    trainer = make_trainer(_config(tiny_data, tmp_path, refine=False))
+    model = trainer.pipeline.model
+    streamed = dataclasses.replace(model.subject, theta=model.subject.theta[:1])
+    with pytest.raises(UserError, match="while frames arrive"):
+        frame_refinement(streamed, model.config.refinement)
+
+
+def test_held_out_frames_are_fitted_apart_from_the_plain_score(tiny_data, tmp_path):
+    """The plain score stays to the digit; fitting from a wrong theta raises the other one."""
+    avatar = AvatarConfig(uv_resolution=32, num_bases=0, scale_from_texel_spacing=True)
+    config = small_config(tiny_data, tmp_path, avatar, max_num_iterations=60)
+    trainer = trained(config)
+    pipeline = trainer.pipeline
+    pipeline.test_mode = "test"
+    plain = pipeline.get_average_eval_image_metrics()
+    assert not any(name.endswith("_refined") for name in plain)
+    model = pipeline.model
+    model.frame_theta[TRAINED:, model.avatar.layout.slice("rotation").start + 1] += 0.05
+    scores = {}
+    for steps in (1, 40):
+        pipeline.config.model.refine_held_out = steps
+        scores[steps] = pipeline.get_average_eval_image_metrics()
+        assert scores[steps]["psnr"] == plain["psnr"]
+        assert {"psnr_refined", "psnr_head_refined", "ssim_refined"} <= scores[steps].keys()
+    assert scores[40]["psnr_refined"] > scores[1]["psnr_refined"] + 0.3
