@@ -29,7 +29,7 @@ _ITERATIONS, _ITERATIONS_ANEW = 4, 25
 
 _Image = UInt8[np.ndarray, "H W 3"]
 _Landmarks = Float[np.ndarray, "478 2"]
-_Parameters = Float[np.ndarray, "P"]
+_Values = Float[np.ndarray, "P"]
 
 
 class LiveTracker:
@@ -177,13 +177,13 @@ class _CausalFit:
         head = tracker.cost.head.of_person(subject.identity)
         self._cost = replace(tracker.cost, head=head)
         self._weight = _CAUSAL_SHARE * tracker.config.temporal_weight
-        self._previous: _Parameters | None = None
+        self._previous: _Values | None = None
 
     def forget(self) -> None:
         """A gap: the next frame starts anew."""
         self._previous = None
 
-    def __call__(self, landmarks_px: _Landmarks) -> Float[np.ndarray, "P"] | None:
+    def __call__(self, landmarks_px: _Landmarks) -> _Values | None:
         """The frame's fitted entries of theta; None where no pose of the head explains it."""
         camera, before = self.subject.camera, self._previous
         target = self._tracker.targets(landmarks_px[None])[0]

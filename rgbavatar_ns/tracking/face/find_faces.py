@@ -23,14 +23,9 @@ BLOCK_FRAMES, _WARM_UP = 256, 8
 _AGREE_SHARE = 0.03
 _AHEAD = 4
 _SHARPNESS_PX = 96
-_NO_NUMBERS = np.zeros(0, np.int64)
+_NONE = np.zeros(0, np.int64)
 _NO_FRAMES = SeenFaces(
-    _NO_NUMBERS,
-    _NO_NUMBERS,
-    np.zeros(0),
-    np.zeros(0, bool),
-    np.zeros((0, 478, 2)),
-    np.zeros(0),
+    _NONE, _NONE, np.zeros(0), np.zeros(0, bool), np.zeros((0, 478, 2)), np.zeros(0)
 )
 
 
