@@ -59,16 +59,13 @@ def test_every_drawn_frame_brings_its_own_picture_theta_and_camera():
 def test_newest_and_recent_frames():
     clock = Clock()
     frames = pools(clock=clock)
-    assert frames.newest() is None
     assert frames.newest_theta() is None
     assert frames.recent(1.0, 2) is None
     assert not frames.wait(0.0)
     fill(frames, range(10))
     assert frames.wait(0.0)
-    newest, theta = frames.newest(), frames.newest_theta()
-    assert newest is not None
+    theta = frames.newest_theta()
     assert theta is not None
-    assert newest.serial == (9,)
     assert torch.equal(theta, tracked(9).theta)
     clock.now_s = 91.0
     recent = frames.recent(60.0, 2)

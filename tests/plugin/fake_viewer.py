@@ -12,7 +12,7 @@ FULL_SIZE = 64
 
 
 class FakeHandle:
-    """A control; `user_sets` and `user_clicks` do what a browser does, and wait for it."""
+    """A control; `user_sets` and `user_clicks` do what a browser does, and all that follows."""
 
     def __init__(self, label: str, value: Any, options: dict[str, Any]) -> None:
         self.label, self.value, self.options = label, value, options

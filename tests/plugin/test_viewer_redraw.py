@@ -1,4 +1,4 @@
-"""nerfstudio's render thread loses requests under load; each ends sharp all the same."""
+"""nerfstudio's render thread may lose a request; it ends in a sharp picture all the same."""
 
 import threading
 from collections.abc import Callable

@@ -23,9 +23,8 @@ class FrameQueue:
     """
 
     def __init__(self, capacity: int) -> None:
-        self.capacity = capacity
         self.dropped = 0
-        self._frames: deque[StreamedFrame] = deque()
+        self._frames: deque[StreamedFrame] = deque(maxlen=capacity)
         self._closed = False
         self._changed = threading.Condition()
 
@@ -36,14 +35,14 @@ class FrameQueue:
         """Append a frame; does nothing once the queue is closed."""
         with self._changed:
             if wait:
-                self._changed.wait_for(lambda: self._closed or len(self._frames) < self.capacity)
-            if self._closed:
-                return
-            if len(self._frames) >= self.capacity:
-                self._frames.popleft()
-                self.dropped += 1
-            self._frames.append(frame)
-            self._changed.notify_all()
+                self._changed.wait_for(lambda: self._closed or not self._is_full())
+            if not self._closed:
+                self.dropped += self._is_full()
+                self._frames.append(frame)
+                self._changed.notify_all()
+
+    def _is_full(self) -> bool:
+        return len(self._frames) == self._frames.maxlen
 
     def get(self) -> StreamedFrame | None:
         """Take the oldest frame, waiting for one; None once the queue is closed and empty."""

@@ -9,15 +9,15 @@ and an image or nothing:
      "camera": as in dataset.json}, then a PNG, RGBA with straight alpha
     {"type": "end"}
 
-The subject comes first and is answered by a text message, {"accepted": true, "received": how many
-messages of this session were had before} or {"refused": the reason}. A head other than the
+The subject comes first and is answered by a text message, "accepted N", where N messages of this
+session were had before, or "refused" and the reason. A head other than the
 embedded one follows its subject as safetensors of its arrays, and the object has its
-"num_identity" and "expression_names". The session tells a client that comes back from another.
+"num_identity" and "expression_names". Numbers begin anew with another session.
 """
 
 import json
 import struct
-from typing import Any
+from typing import Any, Literal
 
 import safetensors.numpy
 import torch
@@ -31,6 +31,7 @@ from rgbavatar_ns.data.streams.protocol import StreamedFrame, StreamSubject
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadArrays, HeadModel, ThetaLayout
 
+ACCEPTED, REFUSED = "accepted", "refused"
 LARGEST_MESSAGE = 64 << 20
 LARGEST_HEADER = 1 << 20
 LARGEST_SIDE = 8192
@@ -119,11 +120,14 @@ def parse_subject(message: bytes | str) -> StreamSubject:
         raise UserError(f"A stream's subject cannot be used: {reason}.", _CLIENT) from None
 
 
-def parse_frame(
-    header: Header, png: bytes, subject: StreamSubject, arrived_s: float
-) -> StreamedFrame:
-    """The frame of a message; raises UserError for anything that is none."""
+def parse_message(
+    message: bytes | str, subject: StreamSubject, arrived_s: float
+) -> StreamedFrame | Literal["end"]:
+    """The frame of a message that follows the subject, or "end"; raises UserError for others."""
+    header, png = decode(message)
     try:
+        if header["type"] == "end":
+            return "end"
         if header["type"] != "frame":
             raise ValueError("its type is not 'frame'")
         index, theta = _whole(header["index"]), _numbers(header["theta"])
@@ -134,32 +138,21 @@ def parse_frame(
     return StreamedFrame(index, theta, camera, arrived_s, subject.session, png=png)
 
 
-def accepted(received: int) -> str:
-    """The answer to a subject that is welcome."""
-    return json.dumps({"accepted": True, "received": received})
-
-
-def refused(reason: str) -> str:
-    """The answer to a client that is not."""
-    return json.dumps({"refused": reason})
-
-
 def parse_answer(answer: bytes | str) -> int:
     """How many messages of its session a client need not send again.
 
     Raises:
         UserError: the client is refused, or the answer is none.
     """
-    try:
-        fields = json.loads(answer)
-        if "refused" in fields:
-            raise UserError("The stream refuses this client.", str(fields["refused"]))
-        return _whole(fields["received"])
-    except (KeyError, TypeError, ValueError, RecursionError):
-        raise UserError(
-            "Something else than a stream of frames listens at this address.",
-            "Give the address at which `ns-train rgbavatar-online` waits for frames.",
-        ) from None
+    word, _, more = str(answer).partition(" ")
+    if word == ACCEPTED and more.isdecimal():
+        return int(more)
+    if word == REFUSED:
+        raise UserError("The stream refuses this client.", more)
+    raise UserError(
+        "Something else than a stream of frames listens at this address.",
+        "Give the address at which `ns-train rgbavatar-online` waits for frames.",
+    )
 
 
 def _whole(value: Any) -> int:

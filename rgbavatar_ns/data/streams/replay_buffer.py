@@ -20,6 +20,7 @@ from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.kernels.types import PinholeCameras
 
 _RECENT = 500
+_CAMERA_PARTS = ("world_to_camera", "focal_px", "principal_point_px")
 
 
 @dataclass(frozen=True)
@@ -33,21 +34,30 @@ class ReplayBatch:
 
 
 @dataclass
-class _Kept:
-    """What belongs to a frame beside its rows in the tables."""
+class _Held:
+    """A frame of the pools; its image as a PNG as it came, or as a checkpoint has encoded it."""
 
-    index: int
+    frame: TrackedFrame
     arrived_s: float
     png: bytes | None
-    """As it came, or as it was encoded for a checkpoint."""
+
+    def as_png(self) -> bytes:
+        if self.png is None:
+            self.png = encode_png_rgba(self.frame.image_rgba)
+        return self.png
+
+    def as_streamed(self) -> StreamedFrame:
+        frame = self.frame
+        return StreamedFrame(
+            frame.index, frame.theta, frame.camera, self.arrived_s, png=self.as_png()
+        )
 
 
 class ReplayBuffer:
     """Feeds `LocalGlobalPools` and keeps the frames that they hold, and no others.
 
     Safe to use from several threads: one adds, another draws; each waits for the other no longer
-    than a copy takes. Images are uint8 in one table of all places that the pools have, so that
-    memory is bounded and stays in one piece.
+    than a copy takes.
 
     Args:
         subject: whose frames these are.
@@ -66,17 +76,7 @@ class ReplayBuffer:
     ) -> None:
         self._subject, self._pools, self._save_images = subject, pools, save_images
         self._clock = clock
-        places = pools.local_size + pools.global_size
-        height, width = subject.height, subject.width
-        # The system gives memory to the places as they are first written to.
-        self._images = torch.empty((places, height, width, 4), dtype=torch.uint8)
-        self._theta = torch.empty((places, subject.layout.size))
-        self._world_to_camera = torch.empty((places, 4, 4))
-        self._focal_px = torch.empty((places, 2))
-        self._principal_point_px = torch.empty((places, 2))
-        self._free = list(range(places))[::-1]
-        self._place: dict[int, int] = {}
-        self._kept: dict[int, _Kept] = {}
+        self._held: dict[int, _Held] = {}
         self._waiting: dict[int, float] = {}  # arrival of frames that no batch has held
         self._latencies_s: deque[float] = deque(maxlen=_RECENT)
         self._added = 0
@@ -96,33 +96,24 @@ class ReplayBuffer:
 
     def add(self, frame: StreamedFrame) -> None:
         """Take in the next frame, decoded; raises UserError where its image is damaged."""
-        decoded = frame.decode()
+        held = self._decoded(frame)
         with self._changed:
             serial = self._added
             dropped = self._pools.add(serial)
             if dropped is not None:
-                self._forget(dropped)
-            self._hold(serial, decoded, frame)
+                del self._held[dropped]
+                self._waiting.pop(dropped, None)
+            self._held[serial] = held
             self._waiting[serial] = frame.arrived_s
             self._added += 1
             self._changed.notify_all()
 
-    def _hold(self, serial: int, frame: TrackedFrame, streamed: StreamedFrame) -> None:
-        place = self._free.pop()
-        self._place[serial] = place
-        png = streamed.png if self._save_images else None
-        self._kept[serial] = _Kept(frame.index, streamed.arrived_s, png)
-        self._images[place] = torch.from_numpy(frame.image_rgba)
-        self._theta[place] = frame.theta
-        camera = frame.camera
-        self._world_to_camera[place] = camera.world_to_camera[0]
-        self._focal_px[place] = camera.focal_px[0]
-        self._principal_point_px[place] = camera.principal_point_px[0]
-
-    def _forget(self, serial: int) -> None:
-        self._free.append(self._place.pop(serial))
-        del self._kept[serial]
-        self._waiting.pop(serial, None)
+    def _decoded(self, frame: StreamedFrame) -> _Held:
+        decoded = frame.decode()
+        # Who brings pixels may use their memory again.
+        image = decoded.image_rgba if frame.image_rgba is None else frame.image_rgba.copy()
+        own = TrackedFrame(frame.index, frame.theta.clone(), frame.camera, image)
+        return _Held(own, frame.arrived_s, frame.png if self._save_images else None)
 
     def wait(self, timeout_s: float) -> bool:
         """Wait for the first frame; say whether it has come."""
@@ -140,21 +131,15 @@ class ReplayBuffer:
                     self._latencies_s.append(now - arrived_s)
             return self._gather(serials)
 
-    def newest(self) -> ReplayBatch | None:
-        """The newest frame as a batch of one, without drawing; None before the first."""
-        with self._lock:
-            local = self._pools.local_frames
-            return self._gather(local[-1:]) if local else None
-
     def recent(self, seconds: float, most: int) -> ReplayBatch | None:
         """Up to `most` of the local pool's frames that arrived in the last seconds, evenly taken.
 
-        None where there are none.
+        The newest comes first. None where there are none.
         """
         with self._lock:
             since = self._clock() - seconds
             local = self._pools.local_frames
-            late = [serial for serial in local if self._kept[serial].arrived_s >= since]
+            late = [serial for serial in local if self._held[serial].arrived_s >= since]
             chosen = late[:: -max(1, -(-len(late) // most))]
             return self._gather(chosen) if chosen else None
 
@@ -162,76 +147,58 @@ class ReplayBuffer:
         """Theta of the newest frame; None before the first."""
         with self._lock:
             local = self._pools.local_frames
-            return self._theta[self._place[local[-1]]].clone() if local else None
+            return self._held[local[-1]].frame.theta.clone() if local else None
 
     def thetas(self) -> tuple[Float[Tensor, "F H"], tuple[int, ...]]:
         """Theta and serial of all that the pools hold, in the order of their arrival."""
         with self._lock:
-            serials = sorted(self._place)
-            return self._theta[[self._place[serial] for serial in serials]], tuple(serials)
+            serials = sorted(self._held)
+            theta = self._columns(serials)["theta"].reshape(-1, self._subject.layout.size)
+            return theta, tuple(serials)
 
     def held(self) -> list[tuple[int, StreamedFrame]]:
         """Serial and frame of all that the pools hold, in the order of their arrival."""
         with self._lock:
-            return [(serial, self._streamed(serial)) for serial in sorted(self._place)]
-
-    def _streamed(self, serial: int) -> StreamedFrame:
-        kept, batch = self._kept[serial], self._gather([serial])
-        return StreamedFrame(
-            kept.index, batch.theta[0], batch.cameras, kept.arrived_s, png=self._png(serial)
-        )
-
-    def _png(self, serial: int) -> bytes:
-        kept = self._kept[serial]
-        png = kept.png
-        if png is None:
-            png = encode_png_rgba(self._images[self._place[serial]].numpy())
-            if self._save_images:
-                kept.png = png  # The next checkpoint holds it too.
-        return png
-
-    def _gather(self, serials: Sequence[int]) -> ReplayBatch:
-        rows = torch.tensor([self._place[serial] for serial in serials])
-        cameras = PinholeCameras(
-            self._world_to_camera[rows],
-            self._focal_px[rows],
-            self._principal_point_px[rows],
-            self._subject.width,
-            self._subject.height,
-        )
-        return ReplayBatch(tuple(serials), self._theta[rows], cameras, self._images[rows])
+            held = sorted(self._held.items())
+        return [(serial, one.as_streamed()) for serial, one in held]
 
     def median_latency_s(self) -> float | None:
         """From arrival to first use in a batch, of the last 500 frames used first; None before."""
         with self._lock:
             return float(np.median(self._latencies_s)) if self._latencies_s else None
 
+    def _columns(self, serials: Sequence[int]) -> dict[str, Tensor]:
+        """Theta and the cameras' parts of frames, one row a frame."""
+        frames = [self._held[serial].frame for serial in serials]
+        parts = {"theta": [frame.theta[None] for frame in frames]}
+        for name in _CAMERA_PARTS:
+            parts[name] = [getattr(frame.camera, name) for frame in frames]
+        return {name: torch.cat(rows or [torch.empty(0)]) for name, rows in parts.items()}
+
+    def _gather(self, serials: Sequence[int]) -> ReplayBatch:
+        columns = self._columns(serials)
+        theta = columns.pop("theta")
+        cameras = PinholeCameras(**columns, width=self._subject.width, height=self._subject.height)
+        images = np.stack([self._held[serial].frame.image_rgba for serial in serials])
+        return ReplayBatch(tuple(serials), theta, cameras, torch.from_numpy(images))
+
     def state_dict(self) -> dict[str, Any]:
         """Pools and frames, safe for `torch.load(weights_only=True)`."""
         with self._lock:
-            serials = sorted(self._place)
-            rows = torch.tensor([self._place[serial] for serial in serials], dtype=torch.long)
-            kept = [self._kept[serial] for serial in serials]
+            serials = sorted(self._held)
+            held = [self._held[serial] for serial in serials]
             state = {
                 "pools": self._pools.state_dict(),
                 "added": self._added,
                 "serial": torch.tensor(serials, dtype=torch.long),
-                "index": torch.tensor([one.index for one in kept], dtype=torch.long),
-                **{name: table[rows] for name, table in self._tables().items()},
+                "index": torch.tensor([one.frame.index for one in held], dtype=torch.long),
+                **self._columns(serials),
             }
-            images = [self._png(serial) for serial in serials] if self._save_images else []
         if self._save_images:
+            images = [one.as_png() for one in held]
             state["png_bytes"] = torch.tensor([len(png) for png in images], dtype=torch.long)
             state["png"] = torch.from_numpy(np.frombuffer(b"".join(images), np.uint8).copy())
         return state
-
-    def _tables(self) -> dict[str, Tensor]:
-        return {
-            "theta": self._theta,
-            "world_to_camera": self._world_to_camera,
-            "focal_px": self._focal_px,
-            "principal_point_px": self._principal_point_px,
-        }
 
     def load_state_dict(self, state: dict[str, Any], stream: object = None) -> None:
         """Go on where `state_dict` was taken, before the first `add`.
@@ -239,7 +206,7 @@ class ReplayBuffer:
         Images that the state does not hold are asked for from `stream`. Raises UserError where
         there is no such stream, pools do not fit in, or images are damaged or of another size.
         """
-        images = self._saved_images(state, stream)
+        images = _saved_images(state, stream)
         size = self._subject.width, self._subject.height
         now = self._clock()
         with self._lock:
@@ -247,29 +214,28 @@ class ReplayBuffer:
             for row, (serial, index) in enumerate(
                 zip(state["serial"].tolist(), state["index"].tolist())
             ):
-                tables = {name: state[name][row : row + 1].cpu() for name in self._tables()}
-                theta = tables.pop("theta")[0]
-                camera = PinholeCameras(**tables, width=size[0], height=size[1])
+                parts = {name: state[name][row : row + 1].cpu() for name in _CAMERA_PARTS}
+                camera = PinholeCameras(**parts, width=size[0], height=size[1])
+                theta = state["theta"][row].cpu()
                 streamed = StreamedFrame(index, theta, camera, now, png=images[row])
-                frame = streamed.decode()
-                if frame.image_rgba.shape[1::-1] != size:
+                if streamed.image_size not in (size, None):
                     raise UserError(
                         f"The checkpoint's frames have another size than the stream's {size[0]} x "
                         f"{size[1]} pixels.",
                         "Resume with the stream that the run was started with.",
                     )
-                self._hold(serial, frame, streamed)
+                self._held[serial] = self._decoded(streamed)
             self._added = state["added"]
 
-    def _saved_images(self, state: dict[str, Any], stream: object) -> list[bytes]:
-        if "png" in state:
-            whole = state["png"].cpu().numpy().tobytes()
-            ends = np.cumsum(state["png_bytes"].tolist()).tolist()
-            return [whole[start:end] for start, end in zip([0, *ends], ends)]
-        if not isinstance(stream, Rereadable):
-            raise UserError(
-                "The checkpoint was made while a dataset was replayed and holds no images.",
-                "Resume with that dataset: --data FOLDER "
-                "--pipeline.datamanager.source.kind replay.",
-            )
-        return [stream.again(index).encoded() for index in state["index"].tolist()]
+
+def _saved_images(state: dict[str, Any], stream: object) -> list[bytes]:
+    if "png" in state:
+        whole = state["png"].cpu().numpy().tobytes()
+        ends = np.cumsum(state["png_bytes"].tolist()).tolist()
+        return [whole[start:end] for start, end in zip([0, *ends], ends)]
+    if not isinstance(stream, Rereadable):
+        raise UserError(
+            "The checkpoint was made while a dataset was replayed and holds no images.",
+            "Resume with that dataset: --data FOLDER --pipeline.datamanager.source.kind replay.",
+        )
+    return [stream.again(index).encoded() for index in state["index"].tolist()]

@@ -20,30 +20,21 @@ class SeenNumbers:
 
     def add(self, number: int) -> Verdict:
         """Note a frame's number (not negative) and judge it."""
-        if number > self._newest:
-            oldest_before = self._newest - _REMEMBERED
-            self._newest = number
-            self._seen.add(number)
-            self._forget(oldest_before)
-            return "new"
         if number <= self._newest - _REMEMBERED:
             return "too late"
         if number in self._seen:
             return "duplicate"
+        verdict: Verdict = "new" if number > self._newest else "late"
+        self._newest = max(number, self._newest)
         self._seen.add(number)
-        return "late"
+        if len(self._seen) > 2 * _REMEMBERED:
+            self._seen = {one for one in self._seen if one > self._newest - _REMEMBERED}
+        return verdict
 
     @property
     def newest(self) -> int:
         """The highest number so far; -1 before the first."""
         return self._newest
-
-    def _forget(self, oldest_before: int) -> None:
-        oldest = self._newest - _REMEMBERED
-        if oldest - oldest_before <= _REMEMBERED:
-            self._seen.difference_update(range(oldest_before, oldest + 1))
-        else:
-            self._seen = {number for number in self._seen if number > oldest}
 
     def state_dict(self) -> dict[str, Any]:
         """Plain values that `load_state_dict` goes on from."""

@@ -7,6 +7,7 @@ import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable
+from typing import Literal
 
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.server import Server, ServerConnection, serve
@@ -30,9 +31,9 @@ class SocketStream:
     """Listens for one client at a time, which sends messages as `message_format` describes them.
 
     While a client is connected a second one is refused, unless the first has been silent for
-    `silence_s`, or is the same one over a connection that was lost. One that hangs up may come
-    back, another may take its place, with the same head and image size. What is no message of a
-    stream is counted as "unreadable", and told once a client. Web pages are refused.
+    `silence_s`. One that hangs up may come back, another may take its place, with the same head
+    and image size. What is no message of a stream is counted as "unreadable", and told once a
+    client. Web pages are refused.
 
     Args:
         listen: HOST:PORT (port 0: any that is free, see `address`).
@@ -41,8 +42,8 @@ class SocketStream:
         tell: called, from a thread, with what a user should read at once.
         clock: in seconds.
         silence_s: also how long a client may take to send its subject.
-        grace_s: how long a second client waits before it is refused or takes over: what the first
-            has sent before it hung up may still have to be read.
+        grace_s: how long a second client waits before it is refused: what the first has sent
+            before it hung up may still have to be read.
 
     Raises:
         UserError: the address is none, is taken, or other machines can reach it unasked.
@@ -134,10 +135,10 @@ class SocketStream:
             except UserError as error:
                 with self._changed:
                     self._counts["refused clients"] += 1
-                connection.send(message_format.refused(_printable(error)))
+                connection.send(f"{message_format.REFUSED} {_printable(error)}")
                 return
             try:
-                connection.send(message_format.accepted(self._received))
+                connection.send(f"{message_format.ACCEPTED} {self._received}")
                 self._receive(connection, subject)
             finally:
                 self._release(connection)
@@ -145,20 +146,16 @@ class SocketStream:
     def _admit(self, connection: ServerConnection, subject: StreamSubject) -> None:
         """Make this the client; raises UserError if there is another, or its subject is."""
         with self._changed:
-            if self._subject is not None:
-                _check_same(subject, self._subject)
-            same = subject.session == self._session and subject.session != ""
-            had = self._received
             if not self._is_silent():
                 self._changed.wait_for(lambda: self._client is None or self._closed, self._grace_s)
             before = self._client
-            lost = self._is_silent() or (same and self._received == had)
-            if self._closed or (before is not None and not lost):
+            if self._closed or (before is not None and not self._is_silent()):
                 raise UserError("Another client is connected.", "End it first, or wait.")
-            self._client, self._listening_since_s = connection, self._clock()
             if self._subject is not None:
+                _check_same(subject, self._subject)
                 self._counts["reconnects"] += 1
-            if not same:
+            self._client, self._listening_since_s = connection, self._clock()
+            if subject.session == "" or subject.session != self._session:
                 self._session, self._received = subject.session, 0
             self._subject = self._subject or subject
             self._changed.notify_all()
@@ -173,20 +170,20 @@ class SocketStream:
         """Take this client's messages until it ends, or another has taken its place."""
         told = False
         while not self._end_seen:
-            message, frame, ends = connection.recv(), None, False
+            message, fault = connection.recv(), None
             try:
-                header, png = message_format.decode(message)
-                ends = header.get("type") == "end"
-                if not ends:
-                    frame = message_format.parse_frame(header, png, subject, self._clock())
+                parsed = message_format.parse_message(message, subject, self._clock())
             except UserError as error:
-                if not told:
-                    self._tell(f"A message from {self.address} is left out: {_printable(error)}")
-                told = True
-            if not self._take(connection, frame, ends):
+                parsed, fault = "unreadable", _printable(error)
+            if not self._take(connection, parsed):
                 return
+            if fault and not told:
+                self._tell(f"A message from {self.address} is left out: {fault}")
+                told = True
 
-    def _take(self, connection: ServerConnection, frame: StreamedFrame | None, ends: bool) -> bool:
+    def _take(
+        self, connection: ServerConnection, parsed: StreamedFrame | Literal["end", "unreadable"]
+    ) -> bool:
         """Count a message and queue its frame; False if this is the client no more."""
 
         def gone() -> bool:
@@ -200,11 +197,12 @@ class SocketStream:
                 return False
             self._listening_since_s = self._clock()
             self._received += 1
-            self._end_seen = ends
-            if frame is not None:
-                self._frames.append(frame)
-            elif not ends:
-                self._counts["unreadable"] += 1
+            if isinstance(parsed, StreamedFrame):
+                self._frames.append(parsed)
+            elif parsed == "end":
+                self._end_seen = True
+            else:
+                self._counts[parsed] += 1
             self._changed.notify_all()
             return True
 

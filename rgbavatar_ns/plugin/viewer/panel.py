@@ -140,7 +140,8 @@ class ViewerPanel(ViewerControl):
         drawn = report is not self._played or now_s > self._played_s + _PATIENCE_S
         if self.state.playing and drawn and now_s >= self._next_frame_s:
             frame_s = 1 / max(self.state.frames_per_second, 1e-3)
-            self._next_frame_s = max(self._next_frame_s + frame_s, now_s)
+            late = now_s > self._next_frame_s + frame_s
+            self._next_frame_s = frame_s + (now_s if late else self._next_frame_s)
             self._played, self._played_s = report, now_s
             self.advance()
         if self._widgets is None or self._redraw is None:

@@ -11,7 +11,7 @@ from contextlib import suppress
 from typing import Any
 from weakref import WeakKeyDictionary
 
-from nerfstudio.viewer.render_state_machine import RenderAction, RenderActions, RenderStateMachine
+from nerfstudio.viewer.render_state_machine import RenderAction, RenderActions
 
 _PATIENCE_S = 1.0
 _COARSE = 0
@@ -60,10 +60,11 @@ class Redraw:
             if machine.state == "high" and self._sharp.get(machine, _COARSE) < self._asked:
                 self._act(machine, "step")
 
-    def _machines(self) -> list[RenderStateMachine]:
+    def _machines(self) -> list[Any]:
+        """nerfstudio's `RenderStateMachine` of each browser, which is a thread."""
         return list(self._viewer.render_statemachines.values())
 
-    def _act(self, machine: RenderStateMachine, action: RenderActions) -> None:
+    def _act(self, machine: Any, action: RenderActions) -> None:
         # The thread may take the action away between two looks at it; then it draws in any case.
         with suppress(AttributeError):
             machine.action(RenderAction(action, self._viewer.get_camera_state(machine.client)))
