@@ -56,7 +56,7 @@ class RecordedStep:
         device = frames.theta.device
         self._network = avatar.parameter_groups().get("weight_network", [])
         rows = len(UPDATED_ATTRIBUTES) + 1
-        # One buffer, so that one copy brings all of a step's inputs: frames, backgrounds, Adam's numbers.
+        # One buffer, one copy of all inputs: frames, backgrounds, Adam's numbers.
         self._sizes = (batch_size, 3 * batch_size, rows * 2 * _NUMBERS)
         self._step_inputs = torch.zeros(sum(self._sizes), dtype=torch.float64, device=device)
         self._loss = torch.zeros((), device=device)
@@ -122,7 +122,7 @@ class RecordedStep:
         return [*numbers, *(0.0,) * _NUMBERS]
 
     def _work(self) -> None:
-        """One step, from `_step_inputs`: nothing here may wait for the device or copy from the host."""
+        """One step, from `_step_inputs`: nothing waits for the device or copies from the host."""
         chosen, background, numbers = self._step_inputs.split(self._sizes)
         rows = numbers.float().view(-1, 2 * _NUMBERS)
         index = chosen.long()
