@@ -2,7 +2,7 @@ import pytest
 import roma
 import torch
 
-from rgbavatar_ns.avatar import LEARNING_RATES, Avatar, AvatarConfig
+from rgbavatar_ns.avatar import AvatarConfig
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import ThetaField, ThetaLayout
 
@@ -10,7 +10,6 @@ from .small_head import (
     front_camera,
     random_theta,
     small_head,
-    small_identity,
 )
 
 VARIANTS = ("normalized", "raw", "orthonormal")
@@ -170,17 +169,6 @@ def test_without_bases_there_are_no_basis_groups(make_avatar):
     assert avatar.render(theta, front_camera(16)).image.shape == (2, 16, 16, 3)
 
 
-def test_learning_rates_are_the_papers(make_avatar):
-    assert set(make_avatar().parameter_groups()) == set(LEARNING_RATES)
-    assert LEARNING_RATES["opacity"] == 0.25
-    for basis, base, ratio in (
-        ("basis_position", "position", 0.05),
-        ("basis_rotation", "rotation", 0.5),
-        ("basis_color", "color", 0.5),
-    ):
-        assert LEARNING_RATES[basis] == pytest.approx(ratio * LEARNING_RATES[base])
-
-
 def test_building_depends_on_the_seed_alone(make_avatar):
     first = make_avatar(seed=3)
     torch.manual_seed(99)
@@ -235,10 +223,3 @@ def test_settings_out_of_range_are_refused(change):
     object.__setattr__(config, name, value)
     with pytest.raises(UserError, match=name):
         config.__post_init__()
-
-
-def test_float64_goes_through(make_avatar):
-    avatar = make_avatar(random=True, dtype=torch.float64)
-    theta = random_theta(avatar.layout, 1)
-    assert avatar.gaussians(theta).means.dtype == torch.float64
-    assert Avatar(small_head(), small_identity()).num_gaussians > 10_000

@@ -16,13 +16,6 @@ from tests.export.subject import avatar_of
 
 
 @pytest.fixture(scope="module")
-def bundle(tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("avatar") / "me"
-    avatar_of().save(folder)
-    return folder
-
-
-@pytest.fixture(scope="module")
 def data(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("data") / "own"
     small_dataset(folder, avatar_of().head)

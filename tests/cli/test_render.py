@@ -20,13 +20,6 @@ _SIZE, _FRAMES, _HELD_OUT = 32, 7, 3
 
 
 @pytest.fixture(scope="module")
-def bundle(tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("avatar") / "me"
-    avatar_of().save(folder)
-    return folder
-
-
-@pytest.fixture(scope="module")
 def data(tmp_path_factory) -> Path:
     """The avatar's own dataset: pictures of itself."""
     return _write_dataset(tmp_path_factory.mktemp("data") / "own", seed=0)

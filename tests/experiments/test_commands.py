@@ -11,7 +11,7 @@ from rgbavatar_ns.experiments import commands
     [
         ("exit 3", UserError, "exit code 3"),
         ("kill -KILL $$", UserError, "ns-train was killed by SIGKILL, probably out of memory"),
-        ("exit 130", KeyboardInterrupt, ""),
+        ("exit 130", KeyboardInterrupt, None),
     ],
 )
 def test_each_end_is_told(tmp_path, monkeypatch, ending, error, told):

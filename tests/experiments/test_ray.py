@@ -1,7 +1,9 @@
 """A Ray cluster of two nodes on this machine does what local processes do, also if one dies."""
 
+import socket
 import threading
 import time
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -27,7 +29,16 @@ variants:
   - name: no bases
     set: {pipeline.model.avatar.num_bases: 0}
 """
-_NODE = {"num_cpus": 1, "object_store_memory": 80 << 20}
+# A node that chooses its agents' ports itself gives up where they take 15 s to tell them.
+_AGENTS = ("dashboard_agent_listen", "metrics_agent", "metrics_export", "runtime_env_agent")
+
+
+def _node() -> dict[str, int]:
+    """What a node of one CPU is started with."""
+    with ExitStack() as held:
+        free = [held.enter_context(socket.create_server(("127.0.0.1", 0))) for _ in _AGENTS]
+        ports = {f"{name}_port": one.getsockname()[1] for name, one in zip(_AGENTS, free)}
+    return {"num_cpus": 1, "object_store_memory": 80 << 20, **ports}
 
 
 @pytest.fixture
@@ -37,7 +48,7 @@ def cluster(monkeypatch):
     from ray.cluster_utils import Cluster
 
     monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
-    started = Cluster(initialize_head=True, head_node_args={**_NODE, "include_dashboard": False})
+    started = Cluster(initialize_head=True, head_node_args={**_node(), "include_dashboard": False})
     yield started
     ray.shutdown()
     started.shutdown()
@@ -69,7 +80,7 @@ def test_a_cluster_that_loses_a_node_gives_the_table_of_local_processes(cluster,
     tiny_dataset(tmp_path / "data")
     (tmp_path / "cluster.yaml").write_text(TEXT)
     experiment = read_experiment(tmp_path / "cluster.yaml")
-    second = cluster.add_node(**_NODE)
+    second = cluster.add_node(**_node())
     out = tmp_path / "ray"
     engine = RayEngine(cluster.address, cpus=1.0, gpus=0.0)
     assert _alive() == 2

@@ -8,7 +8,6 @@ import torch
 
 from rgbavatar_ns.kernels import (
     GaussianSet,
-    PinholeCameras,
     available_backends,
     rasterize,
     registry,
@@ -144,15 +143,3 @@ def test_without_the_extension_the_reference_draws_and_the_reason_is_told(monkey
         rasterize(gaussians, cameras)
     with pytest.raises(ValueError, match="No module named '_native'"):
         rasterize(gaussians, cameras, backend="cpu")
-
-
-def test_cameras_of_one_size_are_shared_or_one_each():
-    gaussians, cameras = _small()
-    many = PinholeCameras(
-        cameras.world_to_camera.repeat(3, 1, 1),
-        cameras.focal_px.repeat(3, 1),
-        cameras.principal_point_px.repeat(3, 1),
-        cameras.width,
-        cameras.height,
-    )
-    assert torch.equal(rasterize(gaussians, many).image, rasterize(gaussians, cameras).image)

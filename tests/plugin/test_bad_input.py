@@ -8,11 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from PIL import Image
 
 from rgbavatar_ns.errors import UserError
 from tests.plugin.run import make_trainer, small_config
-from tests.plugin.tiny import SIZE, tiny_dataset
+from tests.plugin.tiny import tiny_dataset
 
 
 @pytest.fixture
@@ -30,35 +29,15 @@ def _truncate_image(data: Path) -> None:
     image.write_bytes(image.read_bytes()[:60])
 
 
-def _other_size(data: Path) -> None:
-    Image.new("RGBA", (SIZE + 8, SIZE)).save(data / "images" / "00002.png")
-
-
-def _nan_theta(data: Path) -> None:
-    theta = np.load(data / "theta.npy")
-    theta[3, 0] = np.nan
-    np.save(data / "theta.npy", theta)
-
-
-def _short_theta(data: Path) -> None:
-    np.save(data / "theta.npy", np.load(data / "theta.npy")[:, :-1])
-
-
-def _empty(data: Path) -> None:
-    shutil.rmtree(data)
-    data.mkdir()
-
-
-@pytest.mark.parametrize(
-    "damage", [shutil.rmtree, _empty, _truncate_image, _other_size, _nan_theta, _short_theta]
-)
+@pytest.mark.parametrize("damage", [shutil.rmtree, _truncate_image])
 def test_broken_dataset_is_a_user_error(data: Path, tmp_path: Path, damage: Callable[[Path], None]):
+    """Told as `load_dataset` tells it, before the first step or in the middle."""
     damage(data)
     with pytest.raises(UserError) as told:
         _train(data, tmp_path / "runs")
     assert told.value.cause
     assert told.value.remedy
-    named = "00002.png" if damage in (_truncate_image, _other_size) else str(data)
+    named = "00002.png" if damage is _truncate_image else str(data)
     assert named in told.value.cause
 
 

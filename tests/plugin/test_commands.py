@@ -16,34 +16,25 @@ from tests.plugin.tiny import NUM_TEST, SIZE
 pytestmark = pytest.mark.slow
 
 
+@pytest.fixture(scope="module")
+def config(tiny_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run's config.yml."""
+    folder = tmp_path_factory.mktemp("run")
+    return finished_run(tiny_data, folder, max_num_iterations=5, lpips_metric=True)
+
+
 def _has_no_traceback(text: str) -> bool:
     return "Traceback" not in text and "rgbavatar_ns/" not in text
 
 
 def test_train_takes_its_flags_in_any_order(tiny_data: Path, tmp_path: Path):
+    flags = "--pipeline.model.avatar.uv-resolution 16 --vis tensorboard --max-num-iterations 6"
+    more = "--pipeline.model.avatar.num-bases 2 --pipeline.datamanager.batch-size 3 --timestamp run"
     trained = run_command(
-        "ns-train",
-        "rgbavatar-tiny",
-        "--pipeline.model.avatar.uv-resolution",
-        "16",
-        "--vis",
-        "tensorboard",
-        "--pipeline.datamanager.dataparser.data",
-        tiny_data,
-        "--max-num-iterations",
-        "6",
-        "--pipeline.model.avatar.num-bases",
-        "2",
-        "--data",
-        tiny_data,
-        "--pipeline.datamanager.batch-size",
-        "3",
-        "--timestamp",
-        "run",
-        "--output-dir",
-        tmp_path,
-        "--optimizers.color.optimizer.lr",
-        "0.01",
+        *("ns-train", "rgbavatar-tiny", *flags.split()),
+        *("--pipeline.datamanager.dataparser.data", tiny_data, *more.split()),
+        *("--data", tiny_data, "--output-dir", tmp_path),
+        *("--optimizers.color.optimizer.lr", "0.01"),
     )
     assert trained.returncode == 0, trained.stdout + trained.stderr
     run_folder = tmp_path / "data" / "rgbavatar-tiny" / "run"
@@ -51,12 +42,11 @@ def test_train_takes_its_flags_in_any_order(tiny_data: Path, tmp_path: Path):
 
 
 def test_eval_writes_metrics_without_network(
-    tiny_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     # No address can be reached through this proxy: as on a machine without network.
     for name in ("http_proxy", "https_proxy"):
         monkeypatch.setenv(name, "http://127.0.0.1:9")
-    config = finished_run(tiny_data, tmp_path, max_num_iterations=5, lpips_metric=True)
     scores = tmp_path / "scores.json"
     ComputePSNR(config, scores, render_output_path=tmp_path / "pictures").main()
     results = json.loads(scores.read_text())["results"]
@@ -79,8 +69,7 @@ def test_a_users_mistake_is_told_without_a_traceback(tmp_path: Path):
     assert _has_no_traceback(ended.stdout + ended.stderr)
 
 
-def test_render_dataset(tiny_data: Path, tmp_path: Path):
-    config = finished_run(tiny_data, tmp_path, max_num_iterations=5)
+def test_render_dataset(config: Path, tmp_path: Path):
     names = ["rgb", "gt-rgb", "depth", "rgba"]
     DatasetRender(
         config,
@@ -95,13 +84,12 @@ def test_render_dataset(tiny_data: Path, tmp_path: Path):
 
 
 def test_render_camera_path_plays_the_performance(
-    tiny_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     # nerfstudio asks for ffmpeg, also where it writes single images.
     ffmpeg = pytest.importorskip("imageio_ffmpeg").get_ffmpeg_exe()
     (tmp_path / "ffmpeg").symlink_to(ffmpeg)
     monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
-    config = finished_run(tiny_data, tmp_path, max_num_iterations=5)
     path = tmp_path / "path.json"
     path.write_text(json.dumps(_camera_path(times=(0.0, 0.5, 1.0))))
     RenderCameraPath(

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from rgbavatar_ns.avatar.training.fused_step import FusedStep
+from rgbavatar_ns.avatar.training.losses import LPIPSLoss
 from rgbavatar_ns.kernels import available_backends
 from tests.plugin.run import make_trainer, newest_state, parameters_of, small_config, trained
 
@@ -44,19 +45,6 @@ def test_training_is_fused_and_can_be_told_not_to_be(
     assert len(fused_steps) == 4
 
 
-def test_both_ways_begin_alike(tiny_data: Path, tmp_path: Path):
-    """After one step, colour initialisation included; later steps part by rounding."""
-    fast = trained(_config(tiny_data, tmp_path / "fast", steps=1))
-    eager = trained(_config(tiny_data, tmp_path / "eager", fast=False, steps=1))
-    first, second = parameters_of(fast), parameters_of(eager)
-    # Adam's first step is the sign of the gradient: where that is zero up to rounding it may
-    # differ by two learning rates, which is why the norm is compared.
-    assert (first - second).norm() < 1e-2 * second.norm()
-    seen = [t.pipeline.model.avatar.color_initialized for t in (fast, eager)]
-    assert bool(seen[0].any())
-    assert (seen[0] == seen[1]).float().mean() > 0.98
-
-
 @pytest.mark.parametrize("reason", ["max_norm", "weight decay", "reference", "lpips"])
 def test_what_cannot_be_fused_goes_through_autograd(
     reason: str,
@@ -76,9 +64,7 @@ def test_what_cannot_be_fused_goes_through_autograd(
     trainer = make_trainer(config)
     if reason == "weight decay":
         trainer.optimizers.optimizers["color"].param_groups[0]["weight_decay"] = 0.01
-    monkeypatch.setattr(
-        trainer.pipeline.model, "lpips_loss", lambda image, target: (image - target).square().mean()
-    )
+    monkeypatch.setattr(LPIPSLoss, "__call__", lambda _, image, target: (image - target).norm())
     before = parameters_of(trainer)
     trainer.train()
     assert len(fused_steps) == (2 if reason == "lpips" else 0)
