@@ -15,6 +15,7 @@ gigabytes of memory and mediapipe 0.10.9. (Left out, 30 people leave .81 px an a
 
 import argparse
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import dataclass
 
 import numpy as np
@@ -136,7 +137,7 @@ def seen(seed: int) -> tuple[DemoPerson, np.ndarray, np.ndarray, np.ndarray]:
     theta = np.concatenate([script.theta[::8], made_faces(head, MADE, rng)])
     mirrored, room = seed % 2 == 1, rng.uniform(60, 190, 3)
     kept, points = [], []
-    with FaceLandmarker() as landmarker:
+    with closing(FaceLandmarker()) as landmarker:
         for number, image in enumerate(person.draw(torch.from_numpy(theta).float())):
             alpha = image[..., 3:] / 255
             picture = (image[..., :3] * alpha + room * (1 - alpha)).round().astype(np.uint8)

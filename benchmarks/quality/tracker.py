@@ -15,6 +15,7 @@ import argparse
 import json
 import time
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -59,7 +60,7 @@ class Subject:
         room = np.stack([90 + 60 * column, 110 + 40 * row, 130 - 30 * column], -1)
         found: list[np.ndarray] = []
         kept: list[int] = []
-        with FaceLandmarker() as landmarker:
+        with closing(FaceLandmarker()) as landmarker:
             images = person.draw(torch.from_numpy(acted.theta).float())
             for number, image in enumerate(images):
                 alpha = image[..., 3:] / 255

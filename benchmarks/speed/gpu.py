@@ -18,7 +18,7 @@ import time
 import types
 from collections import defaultdict
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -35,15 +35,10 @@ from torch.utils.benchmark import Measurement, Timer
 
 from rgbavatar_ns.avatar import Avatar, AvatarConfig
 from rgbavatar_ns.avatar.recorded_rendering import RecordedRendering
-from rgbavatar_ns.avatar.training import make_optimizer
-from rgbavatar_ns.avatar.training.fused_step import FusedStep
+from rgbavatar_ns.avatar.training import TrainingOptions, TrainingStep
+from rgbavatar_ns.avatar.training.batches import ChosenFrames, DeviceFrames
+from rgbavatar_ns.avatar.training.cuda_graph import Recorder, record_cuda_graph
 from rgbavatar_ns.avatar.training.losses import random_backgrounds
-from rgbavatar_ns.avatar.training.recorded_step import (
-    DeviceFrames,
-    RecordedStep,
-    Recorder,
-    record_cuda_graph,
-)
 from rgbavatar_ns.bench.machine import machine_facts
 from rgbavatar_ns.bench.pairs import count_pairs
 from rgbavatar_ns.bench.roofline import measure_speed, rasterizer_work, roofline_figures
@@ -108,35 +103,29 @@ class Training:
         self.frames = DeviceFrames(theta, cameras, images)
         self._order = torch.Generator().manual_seed(0)
         self._background = random_backgrounds(0, work.batch)
-        self._optimizer = make_optimizer(self.avatar)
+        self._options = TrainingOptions(color_init=None, backend="cuda")
 
-    def fused(self) -> Callable[[], Tensor]:
+    def fused(self) -> Callable[[], object]:
         """A step kernel by kernel, on frames drawn at random."""
-        step, frames = FusedStep(self.avatar, [self._optimizer], "cuda"), self.frames
-        background = self._background.to(self._work.device)
+        take = TrainingStep(self.avatar, options=self._options)
 
-        def take() -> Tensor:
-            chosen = self._chosen()
-            images = frames.images_rgba[chosen]
-            loss = step(frames.theta[chosen], frames.cameras, images, background)
-            return torch.as_tensor(loss)
+        def step() -> object:
+            batch = self.frames.batch(self._chosen())
+            return take(replace(batch, background=self._background), 0)
 
-        return take
+        return step
 
-    def recorded(self) -> Callable[[], Tensor]:
+    def recorded(self) -> Callable[[], object]:
         """The same as one CUDA graph."""
-        work = self._work
-        step = RecordedStep(
+        take = TrainingStep(
             self.avatar,
-            [self._optimizer],
-            self.frames,
-            work.batch,
-            backend="cuda",
-            recorder=work.recorder,
+            options=self._options,
+            frames=lambda: self.frames,
+            recorder=self._work.recorder,
         )
         for _ in range(5):
-            step(self._chosen(), self._background)
-        return lambda: step(self._chosen(), self._background)
+            take(ChosenFrames(self._chosen(), self._background), 0)
+        return lambda: take(ChosenFrames(self._chosen(), self._background), 0)
 
     def _chosen(self) -> list[int]:
         work = self._work

@@ -5,6 +5,7 @@ python benchmarks/speed/live_tracker.py me.mp4 --height-px 512 --frames 75
 
 import statistics
 import time
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -30,7 +31,7 @@ class Options:
 def main(options: Options) -> None:
     """Track the first frames and print the median time of one."""
     seconds: list[float] = []
-    with LiveTracker(TrackConfig(image_size=options.height_px)) as tracker:
+    with closing(LiveTracker(TrackConfig(image_size=options.height_px))) as tracker:
         for frame in FrameSource.open(options.video, options.frames):
             height, width = frame.image_rgb.shape[:2]
             size = (round(width * options.height_px / height), options.height_px)

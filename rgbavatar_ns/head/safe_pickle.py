@@ -26,7 +26,7 @@ MAX_FILE_BYTES = 512 * 2**20
 """FLAME's largest file has 53 MB, a tracker's frame 20 kB."""
 MAX_OPCODES = 500_000
 """Model files need thousands; this many take a second or two and 100 MB at most."""
-_MAX_NUMBER_BITS, _MAX_DIMENSIONS, _MAX_DEPTH = 512, 32, 100
+_MAX_NUMBER_BITS, _MAX_DIMENSIONS, _MAX_DEPTH = 512, 32, 50
 _UNUSED = ("EXT1", "EXT2", "EXT4", "INST", "OBJ", "NEWOBJ_EX", "NEXT_BUFFER", "READONLY_BUFFER")
 _PLAIN = {"str", "bytes", "bytes_or_str", "int", "int_or_bool", "bool", "float", "None"}
 """What pickletools calls the types that may be keys."""

@@ -1,6 +1,6 @@
 """Morphed Gaussians drawn and trained without intermediate tensors, where a backend can.
 
-The readable path is blending, frames and activation in torch, then `rasterize`; this one gives the
+The readable path is morphing, frames and activation in torch, then `rasterize`; this one gives the
 same numbers and is only faster.
 """
 

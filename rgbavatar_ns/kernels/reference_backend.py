@@ -55,7 +55,7 @@ class ReferenceBackend:
         vertices: Float[Tensor, "B V 3"],
         cameras: PinholeCameras,
     ) -> None:
-        """None: blending in torch and `rasterize` are the specification."""
+        """None: morphing in torch and `rasterize` are the specification."""
         return None
 
 

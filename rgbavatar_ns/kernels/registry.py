@@ -23,7 +23,7 @@ from rgbavatar_ns.kernels.types import (
 
 @runtime_checkable
 class MorphedRenderer(Protocol):
-    """B posed sets of the same blended Gaussians, projected and sorted; carries no autograd graph.
+    """B posed sets of the same morphed Gaussians, projected and sorted; carries no autograd graph.
 
     Neither Gaussians, weights nor vertices may change before `update`.
     """
@@ -51,7 +51,7 @@ class MorphedRenderer(Protocol):
     def backward_adam(
         self, parameters: Mapping[str, AdamParameter] | None, *, with_vertices: bool = False
     ) -> MorphedGradient:
-        """Take one step of Adam by the gradient of the last comparison, in place.
+        """Take one step of Adam by the gradient of the last forward_loss, in place.
 
         `parameters` holds one entry for each of the Gaussians' tensors, by its name; None leaves
         them all as they are. Returns the gradient of the weights and, if asked, of the vertices.
@@ -65,7 +65,7 @@ class DeviceRenderer(MorphedRenderer, Protocol):
 
     @property
     def overflowed(self) -> Int[Tensor, ""]:
-        """1 where the last comparison found no room and updates change nothing, else 0.
+        """1 where the last forward_loss found no room and updates change nothing, else 0.
 
         The same for `draw_at_once`, whose picture is then only background.
         """
@@ -84,7 +84,7 @@ class DeviceRenderer(MorphedRenderer, Protocol):
         """As `draw`, without waiting for the room that it needs."""
         ...
 
-    def compare_with(
+    def forward_loss_of(
         self,
         images_rgba: UInt8[Tensor, "F H W 4"],
         image_of: Int[Tensor, " B"],
@@ -93,10 +93,10 @@ class DeviceRenderer(MorphedRenderer, Protocol):
         """As `forward_loss`, with each set's image chosen by its number."""
         ...
 
-    def update_with(
+    def backward_adam_with(
         self, parameters: Mapping[str, AdamParameter], numbers: Float[Tensor, "A 10"]
     ) -> MorphedGradient:
-        """As `update`, with `AdamParameter.step_numbers` read on the device.
+        """As `backward_adam`, with `AdamParameter.step_numbers` read on the device.
 
         A row for each of UPDATED_ATTRIBUTES: the base's numbers, then its bases'.
         """
@@ -105,7 +105,7 @@ class DeviceRenderer(MorphedRenderer, Protocol):
     def update_parameter(
         self, parameter: AdamParameter, gradient: Tensor, numbers: Float[Tensor, "10"]
     ) -> None:
-        """Take the same step with any other parameter; none where the comparison overflowed."""
+        """Take the same step with any other parameter; none where it overflowed."""
         ...
 
 
@@ -142,7 +142,7 @@ class Backend(Protocol):
         vertices: Float[Tensor, "B V 3"],
         cameras: PinholeCameras,
     ) -> MorphedRenderer | None:
-        """As `blended.morphed_renderer`; None where this backend has none."""
+        """As `morphed.morphed_renderer`; None where this backend has none."""
         ...
 
 

@@ -133,12 +133,12 @@ UPDATED_ATTRIBUTES = (
     "log_scale",
     "opacity_logit",
 )
-"""What of blended Gaussians is trained; the first three have bases, named `basis_` and so."""
+"""What of morphed Gaussians is trained; the first three have bases, named `basis_` and so."""
 
 
 @dataclass(frozen=True)
 class MorphedGradient:
-    """The gradient of what poses blended Gaussians: `vertices` only when it was asked for."""
+    """The gradient of what poses morphed Gaussians: `vertices` only when it was asked for."""
 
     weights: Float[Tensor, "B K"]
     vertices: Float[Tensor, "B V 3"] | None = None

@@ -85,3 +85,10 @@ def from_nerfstudio(cameras: Cameras) -> PinholeCameras:
         width=int(flat.width.reshape(-1)[0]),
         height=int(flat.height.reshape(-1)[0]),
     )
+
+
+def filled_depth(
+    depth: Float[Tensor, "B H W 1"], alpha: Float[Tensor, "B H W 1"]
+) -> Float[Tensor, "B H W 1"]:
+    """Put what is not covered behind everything else, as nerfstudio's compositing expects."""
+    return torch.where(alpha > 0.5, depth, depth.amax())

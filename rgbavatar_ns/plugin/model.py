@@ -3,7 +3,7 @@
 # pyright: reportIncompatibleVariableOverride=false
 # nerfstudio's classes are used by narrowing their fields, which a strict type system forbids.
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -23,18 +23,13 @@ from rgbavatar_ns.avatar.training.step import Orthogonality, TrainingOptions
 from rgbavatar_ns.drawing.compositing import error_strip, straight_alpha
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadModel
-from rgbavatar_ns.plugin.cameras import from_nerfstudio, head_to_nerfstudio
+from rgbavatar_ns.kernels import PinholeCameras
+from rgbavatar_ns.plugin.cameras import filled_depth, from_nerfstudio
 from rgbavatar_ns.plugin.dataparser import Subject
 from rgbavatar_ns.plugin.training.checkpoint_state import model_state, require_same_layout
 from rgbavatar_ns.plugin.training.refinement import frame_refinement, require_same_refinement
-from rgbavatar_ns.plugin.viewer.panel import ViewerPanel, Viewpoint
-from rgbavatar_ns.plugin.viewer.render import filled_depth
-from rgbavatar_ns.plugin.viewer.viewer_state import Stage
 
 Outputs = dict[str, Tensor]
-
-# The viewer starts in front of the training cameras, whose frames it also draws.
-_NEARER = 0.9
 
 
 @dataclass
@@ -83,12 +78,14 @@ class RGBAvatarModelConfig(ModelConfig):
 class RGBAvatarModel(Model):
     """Draws the avatar for nerfstudio's cameras, which carry theta as metadata.
 
-    A camera without theta (the viewer's, a camera path's) shows the frame that the viewer panel
+    A camera without theta (the viewer's, a camera path's) shows what the pipeline's viewer panel
     has chosen.
     """
 
     config: RGBAvatarModelConfig
     frame_theta: Tensor
+    view: Callable[[PinholeCameras, float | None], Outputs] | None = None
+    """Draws a camera that brings no theta, at a time in [0, 1]; set by the pipeline."""
 
     def populate_modules(self) -> None:
         """Build the avatar of the dataset's subject."""
@@ -104,14 +101,6 @@ class RGBAvatarModel(Model):
         self.refinement = None
         if self.config.refine_tracking:
             self.refinement = frame_refinement(subject, self.config.refinement)
-        trained_on = list(subject.train) or [0]
-        stage = Stage(
-            self.avatar,
-            len(subject.theta),
-            theta_of=lambda position: self.driving_theta([position]),
-            training_theta=lambda: self.driving_theta(trained_on),
-        )
-        self.viewer_panel = ViewerPanel(stage, _viewpoint(self.avatar, subject))
         self.lpips_loss = LPIPSLoss()
         self.lpips_metric: LPIPSMetric | None = None
 
@@ -158,12 +147,13 @@ class RGBAvatarModel(Model):
     def get_outputs_for_camera(self, camera: Cameras, obb_box: Any = None) -> Outputs:
         """Draw one camera: [H W C] images. nerfstudio's crop box does not apply and is ignored.
 
-        A camera without theta shows what the viewer's panel asks for.
+        A camera without theta shows what `view` chooses.
         """
         camera = camera.to(self.device)
         if (camera.metadata or {}).get("theta") is None:
+            assert self.view is not None, "only a pipeline's model draws cameras without theta"
             time = None if camera.times is None else float(camera.times.reshape(-1)[0])
-            return self.viewer_panel.draw(from_nerfstudio(camera), time, self.config.rasterizer)
+            return self.view(from_nerfstudio(camera), time)
         return {name: image[0] for name, image in self._draw(camera).items()}
 
     def get_loss_dict(
@@ -236,13 +226,3 @@ class RGBAvatarModel(Model):
         require_same_layout(state_dict, self.avatar)
         require_same_refinement(state_dict, self.refinement)
         return super().load_state_dict(state_dict, strict=strict, assign=assign)
-
-
-@torch.no_grad()
-def _viewpoint(avatar: Avatar, subject: Subject) -> Viewpoint:
-    """From the first frame's camera, a little nearer than it, at the middle of the head."""
-    means = avatar.gaussians(subject.theta[:1]).means[0]
-    middle = (means.amin(0) + means.amax(0)) / 2
-    eye = torch.lerp(middle, subject.camera_center.to(middle), _NEARER)
-    ends = head_to_nerfstudio(torch.stack([eye, middle])).tolist()
-    return Viewpoint(eye=tuple(ends[0]), look_at=tuple(ends[1]))

@@ -20,10 +20,12 @@ from rgbavatar_ns.avatar.training.cuda_graph import Recorder, record_cuda_graph
 from rgbavatar_ns.avatar.training.orthogonality import orthogonality_error
 from rgbavatar_ns.avatar.training.step import StepKind, TrainingStep
 from rgbavatar_ns.avatar.training.theta_fit import fit_theta
+from rgbavatar_ns.data import TrackedDataset
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.plugin.cameras import from_nerfstudio
 from rgbavatar_ns.plugin.datamanager import RGBAvatarDataManager, RGBAvatarDataManagerConfig
 from rgbavatar_ns.plugin.model import RGBAvatarModel, RGBAvatarModelConfig
+from rgbavatar_ns.plugin.viewer.panel import ViewerPanel
 
 
 @dataclass
@@ -50,7 +52,8 @@ class RGBAvatarPipeline(VanillaPipeline):
         self, config: RGBAvatarPipelineConfig, device: str | torch.device, **more: Any
     ) -> None:
         super().__init__(config, str(device), **more)
-        self.model.viewer_panel.stage.film = self.datamanager.dataparser.tracked
+        self.viewer_panel = ViewerPanel(self.model, self.film)
+        self.model.view = self.viewer_panel.draw
 
     @property
     def model(self) -> RGBAvatarModel:
@@ -74,6 +77,11 @@ class RGBAvatarPipeline(VanillaPipeline):
             lpips=self.model.lpips_loss,
             recorder=self.recorder,
         )
+
+    @property
+    def film(self) -> TrackedDataset | None:
+        """What the viewer compares the avatar with."""
+        return self.datamanager.dataparser.tracked
 
     def training_batch(self, step: int, kind: StepKind) -> TrainingBatch | ChosenFrames:
         """What `step` is taken on; where steps are recorded, frames that lie on the device."""

@@ -23,7 +23,7 @@ class TrackConfig:
     keep_torso: bool = False
     """Keep neck and shoulders as the matte found them. By default the matte fades out below the
     neck of the fitted head, because the avatar's Gaussians ride on a mesh that ends there: a
-    torso in the picture would be explained by stretched Gaussians that swing with the head."""
+    torso in the image would be explained by stretched Gaussians that swing with the head."""
     mattes: Path | None = None
     """Your own mattes, in place of those that are found: a folder with one image a frame (named
     like the frames, or in the order of their numbers; white or opaque is the person), or a mask

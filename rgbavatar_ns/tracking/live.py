@@ -3,8 +3,8 @@
 from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
-from types import TracebackType
+from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -19,25 +19,16 @@ from rgbavatar_ns.tracking.face.detector import FaceLandmarker
 from rgbavatar_ns.tracking.fit.fit import ClipFit, SubjectFit, fit_frame, rigid_start
 from rgbavatar_ns.tracking.fit.own_head import read_own_head, subject_tracker
 from rgbavatar_ns.tracking.fit.subject import SubjectTracker
-from rgbavatar_ns.tracking.image.crop import SquareCrop
-from rgbavatar_ns.tracking.image.cut_out import HeadPicture, MattedCrop, cut_out
-from rgbavatar_ns.tracking.image.following_crop import FollowingCrop
-from rgbavatar_ns.tracking.image.frame_images import pinhole
+from rgbavatar_ns.tracking.image.crop import FollowingCrop, SquareCrop
+from rgbavatar_ns.tracking.image.cut_out import CutOut, MattedCrop
+from rgbavatar_ns.tracking.image.matting import PersonMatte
 
 # Share of a clip's pull to both neighbours: a stream has only the past, and must not lag.
 _CAUSAL_SHARE = 0.25
 _ITERATIONS, _ITERATIONS_ANEW = 4, 25
 
-_Values = Float[np.ndarray, "P"]
-
-
-@dataclass(frozen=True)
-class _Seen:
-    """A frame of the warm-up, kept until the subject is known."""
-
-    index: int
-    image_rgb: UInt8[np.ndarray, "H W 3"]
-    landmarks_px: Float[np.ndarray, "478 2"]
+_Image = UInt8[np.ndarray, "H W 3"]
+_Landmarks = Float[np.ndarray, "478 2"]
 
 
 class LiveTracker:
@@ -49,7 +40,7 @@ class LiveTracker:
     and drawn a little towards it. The square that is cut out stays where it is until the head
     leaves it; each frame carries its own camera. The result depends on the frames alone.
 
-    Use as a context manager, or call `close`. `counts` says how many frames were "tracked", had
+    Call `close` at the end. `counts` says how many frames were "tracked", had
     "no face", or a head that "does not fit".
     """
 
@@ -58,9 +49,10 @@ class LiveTracker:
         self._tracker = subject_tracker(self._config, read_own_head(self._config.flame))
         self.head = self._tracker.head
         self._landmarker = FaceLandmarker()
-        self._picture = HeadPicture(self.head.arrays, self._config.keep_torso)
+        self._matte = PersonMatte()
+        self._cut_out = CutOut(self.head.arrays, self._config.keep_torso)
         self._worker = ThreadPoolExecutor(1, "rgbavatar-matte")
-        self._warm_up: list[_Seen] = []
+        self._warm_up: list[tuple[int, _Image, _Landmarks]] = []
         self._backlog: list[TrackedFrame] = []
         self._fit: _CausalFit | None = None
         self._crop: FollowingCrop | None = None
@@ -69,22 +61,11 @@ class LiveTracker:
         self._next_index = 0
         self.counts: Counter[str] = Counter()
 
-    def __enter__(self) -> "LiveTracker":
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        value: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
-
     def close(self) -> None:
         """Free mediapipe's graphs and the worker thread."""
         self._worker.shutdown()
-        self._landmarker.__exit__(None, None, None)
-        self._picture.__exit__(None, None, None)
+        self._landmarker.close()
+        self._matte.close()
 
     @property
     def ready(self) -> bool:
@@ -103,9 +84,7 @@ class LiveTracker:
         taken, self._backlog = self._backlog, []
         return taken
 
-    def __call__(
-        self, image_rgb: UInt8[np.ndarray, "H W 3"], index: int | None = None
-    ) -> TrackedFrame | None:
+    def __call__(self, image_rgb: _Image, index: int | None = None) -> TrackedFrame | None:
         """Track one frame; None without a usable face, and during the warm-up.
 
         `index` numbers the frame; without it frames are counted from 0. Raises UserError when the
@@ -120,7 +99,7 @@ class LiveTracker:
                 self._collect(index, image_rgb)
                 return None
             square = self._crop.square
-            matted = self._worker.submit(self._picture.matted, image_rgb, square)
+            matted = self._worker.submit(self._matted, image_rgb, square)
             landmarks = self._landmarker(image_rgb)
             if landmarks is None:
                 self._fit.forget()
@@ -139,36 +118,38 @@ class LiveTracker:
             )
         self._size = (width, height)
 
-    def _collect(self, index: int, image_rgb: UInt8[np.ndarray, "H W 3"]) -> None:
+    def _collect(self, index: int, image_rgb: _Image) -> None:
         landmarks = self._landmarker(image_rgb)
         if landmarks is None:
             self.counts["no face"] += 1
             return
-        self._warm_up.append(_Seen(index, image_rgb.copy(), landmarks))
+        self._warm_up.append((index, image_rgb.copy(), landmarks))
         if len(self._warm_up) >= self._config.key_frames:
-            self._meet()
+            self._fit_subject()
 
-    def _meet(self) -> None:
+    def _fit_subject(self) -> None:
         """Fit the subject to the warm-up's frames, then track these."""
         seen, self._warm_up = self._warm_up, []
-        landmarks = np.stack([one.landmarks_px for one in seen])
-        height, width = seen[0].image_rgb.shape[:2]
+        landmarks = np.stack([one for _, _, one in seen])
+        height, width = seen[0][1].shape[:2]
         self._fit = _CausalFit(self._tracker, self._tracker.fit_subject(landmarks, width, height))
         self._crop = FollowingCrop.around(landmarks, width, height, self._config.image_size)
-        for one in seen:
-            square = self._crop.square
-            matted = self._picture.matted(one.image_rgb, square)
-            frame = self._tracked(
-                self._fit, one.index, one.landmarks_px, square, lambda matted=matted: matted
-            )
+        square = self._crop.square
+        for index, image, landmarks_px in seen:
+            matted = partial(self._matted, image, square)
+            frame = self._tracked(self._fit, index, landmarks_px, square, matted)
             if frame is not None:
                 self._backlog.append(frame)
+
+    def _matted(self, image_rgb: _Image, crop: SquareCrop) -> MattedCrop:
+        image, (height, width) = crop.apply(image_rgb), image_rgb.shape[:2]
+        return MattedCrop.of(image, self._matte(image), crop.inside(width, height))
 
     def _tracked(
         self,
         fit: "_CausalFit",
         index: int,
-        landmarks_px: Float[np.ndarray, "478 2"],
+        landmarks_px: _Landmarks,
         crop: SquareCrop,
         matted: Callable[[], MattedCrop],
     ) -> TrackedFrame | None:
@@ -179,12 +160,11 @@ class LiveTracker:
             self.counts["does not fit"] += 1
             return None
         one = ClipFit(fit.subject, values[None])
-        region = self._picture.region(crop, self._tracker.vertices_px(one, 0), landmarks_px)
-        rgba = cut_out(matted(), region)
-        camera = fit.subject.camera.cropped(crop.left, crop.top, crop.scale)
+        outline = self._cut_out.outline(crop, self._tracker.vertices_px(one, 0), landmarks_px)
+        rgba = self._cut_out(matted(), outline)
         theta = torch.from_numpy(self._tracker.thetas(one)[0]).float()
         self.counts["tracked"] += 1
-        return TrackedFrame(index, theta, pinhole(camera, crop.size), rgba)
+        return TrackedFrame(index, theta, crop.pinhole(fit.subject.camera), rgba)
 
 
 class _CausalFit:
@@ -196,13 +176,13 @@ class _CausalFit:
         head = tracker.cost.head.of_person(subject.identity)
         self._cost = replace(tracker.cost, head=head)
         self._weight = _CAUSAL_SHARE * tracker.config.temporal_weight
-        self._previous: _Values | None = None
+        self._previous: Float[np.ndarray, P] | None = None
 
     def forget(self) -> None:
         """A gap: the next frame starts anew."""
         self._previous = None
 
-    def __call__(self, landmarks_px: Float[np.ndarray, "478 2"]) -> Float[np.ndarray, "P"] | None:
+    def __call__(self, landmarks_px: _Landmarks) -> Float[np.ndarray, "P"] | None:
         """The frame's fitted entries of theta; None where no pose of the head explains it."""
         camera, before = self.subject.camera, self._previous
         target = self._tracker.targets(landmarks_px[None])[0]

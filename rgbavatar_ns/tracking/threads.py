@@ -4,8 +4,9 @@ import threading
 from collections import deque
 from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from queue import Empty, Full, Queue
-from typing import Generic, TypeVar
+from typing import Any, TypeVar
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -20,18 +21,44 @@ def in_background(items: Iterable[Item], ahead: int) -> Generator[Item, None, No
     An error in the making is raised here, after the items before it. Closing this iterator stops
     the thread.
     """
-    queue: Queue[Item | _End] = Queue(maxsize=max(1, ahead))
+    queue: Queue[tuple[bool, Any]] = Queue(maxsize=max(1, ahead))
     stopped = threading.Event()
-    thread = threading.Thread(target=_fill, args=(items, queue, stopped), daemon=True)
+
+    def put(is_item: bool, value: Any) -> bool:
+        while not stopped.is_set():
+            with suppress(Full):
+                queue.put((is_item, value), timeout=_POLL_S)
+                return True
+        return False
+
+    def fill() -> None:
+        iterator, error = iter(items), None
+        try:
+            for item in iterator:
+                if not put(True, item):
+                    break
+        except BaseException as raised:
+            error = raised
+        close = getattr(iterator, "close", None)
+        if close is not None:
+            close()
+        put(False, error)
+
+    thread = threading.Thread(target=fill, daemon=True)
     thread.start()
     try:
         while True:
-            item = _take(queue)
-            if isinstance(item, _End):
-                if item.error is not None:
-                    raise item.error
+            # In short steps, so that Ctrl-C is heard at once everywhere.
+            try:
+                is_item, value = queue.get(timeout=_POLL_S)
+            except Empty:
+                continue
+            if is_item:
+                yield value
+            elif value is None:
                 return
-            yield item
+            else:
+                raise value
     finally:
         stopped.set()
         thread.join(_LEAVE_S)
@@ -53,44 +80,3 @@ def map_in_order(
         finally:
             for future in pending:
                 future.cancel()
-
-
-class _End(Generic[Item]):
-    """Comes after the last item, with what went wrong."""
-
-    def __init__(self, error: BaseException | None = None) -> None:
-        self.error = error
-
-
-def _fill(items: Iterable[Item], queue: "Queue[Item | _End]", stopped: threading.Event) -> None:
-    iterator = iter(items)
-    end = _End()
-    try:
-        for item in iterator:
-            if not _put(queue, item, stopped):
-                break
-    except BaseException as error:
-        end = _End(error)
-    close = getattr(iterator, "close", None)
-    if close is not None:
-        close()
-    _put(queue, end, stopped)
-
-
-def _put(queue: "Queue[Item | _End]", item: "Item | _End", stopped: threading.Event) -> bool:
-    while not stopped.is_set():
-        try:
-            queue.put(item, timeout=_POLL_S)
-            return True
-        except Full:
-            continue
-    return False
-
-
-def _take(queue: "Queue[Item | _End]") -> "Item | _End":
-    """Wait in short steps, so that Ctrl-C is heard at once everywhere."""
-    while True:
-        try:
-            return queue.get(timeout=_POLL_S)
-        except Empty:
-            continue

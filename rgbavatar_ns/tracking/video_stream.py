@@ -4,66 +4,27 @@ import secrets
 import time
 from collections import Counter, deque
 from pathlib import Path
-from typing import Any, Protocol
-
-import numpy as np
-from jaxtyping import Float, UInt8
-from torch import Tensor
+from typing import Any
 
 from rgbavatar_ns.data import TrackedFrame
-from rgbavatar_ns.data.png import encode_png_rgba
 from rgbavatar_ns.data.streams import StreamedFrame, StreamSubject
 from rgbavatar_ns.errors import UserError
-from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.tracking.config import TrackConfig
-from rgbavatar_ns.tracking.input.capture import FilePictures, NewestPictures, Pictures
-
-_PNG_COMPRESSION = 1
-
-
-class Tracker(Protocol):
-    """What `LiveTracker` does."""
-
-    counts: Counter[str]
-    head: HeadModel
-
-    @property
-    def ready(self) -> bool:
-        """Whether the subject is known."""
-        ...
-
-    @property
-    def identity(self) -> Float[Tensor, "I"]:
-        """Of the subject, once it is known."""
-        ...
-
-    def backlog(self) -> list[TrackedFrame]:
-        """The frames that were there before the subject was known, once."""
-        ...
-
-    def __call__(
-        self, image_rgb: UInt8[np.ndarray, "H W 3"], index: int | None = None
-    ) -> TrackedFrame | None:
-        """Track one frame."""
-        ...
-
-    def close(self) -> None:
-        """Free what it holds."""
-        ...
+from rgbavatar_ns.tracking.input.capture import FileCapture, FrameCapture, LatestFrameCapture
 
 
 class VideoStream:
-    """Tracks pictures as they come; the tracker's first frames give the subject.
+    """Tracks frames as they come; the tracker's first ones give the subject.
 
     A file or a folder of images is tracked frame by frame, no faster than it plays. Of a camera
-    (its number), a device or a network address the newest picture is tracked, and what came
+    (its number), a device or a network address the latest frame is tracked, and what came
     meanwhile is skipped; where it is lost it is connected again.
 
     Args:
         source: what to open, see above.
         image_size: side of the tracked frames' images in pixels.
-        tracker: a `Tracker`, in place of a `LiveTracker`.
-        pictures: in place of what `source` names.
+        tracker: what does as `LiveTracker` does, in place of one.
+        capture: in place of what `source` names.
     """
 
     def __init__(
@@ -71,11 +32,11 @@ class VideoStream:
         source: str,
         image_size: int = 256,
         tracker: Any = None,
-        pictures: Pictures | None = None,
+        capture: FrameCapture | None = None,
     ) -> None:
-        self._pictures = _open(source) if pictures is None else pictures
-        self._tracker: Tracker = _live_tracker(image_size) if tracker is None else tracker
-        self.keeps_frames = self._pictures.keeps
+        self._capture = _open(source) if capture is None else capture
+        self._tracker = _live_tracker(image_size) if tracker is None else tracker
+        self.keeps_frames = self._capture.keeps_frames
         # A file's frames have the same numbers in the next run, a camera's begin anew.
         self._session = "" if self.keeps_frames else secrets.token_hex(8)
         self._counts: Counter[str] = Counter()
@@ -87,7 +48,7 @@ class VideoStream:
     @property
     def counts(self) -> Counter[str]:
         """Frames without a face, skipped, and losses of the source, by name."""
-        whole = self._counts + self._pictures.counts
+        whole = self._counts + self._capture.counts
         for name in ("no face", "does not fit"):
             whole[name] = self._tracker.counts[name]
         return whole
@@ -95,12 +56,12 @@ class VideoStream:
     @property
     def ended(self) -> bool:
         """Whether the file is at its end and every frame has been given."""
-        return self._closed or (self._pictures.ended and not self._ready)
+        return self._closed or (self._capture.ended and not self._ready)
 
     def subject(self, timeout_s: float) -> StreamSubject | None:
-        """The person, once enough pictures have shown the face."""
+        """The person, once enough frames have shown the face."""
         deadline = time.monotonic() + timeout_s
-        while self._subject is None and not self._pictures.ended:
+        while self._subject is None and not self._capture.ended:
             left = deadline - time.monotonic()
             if left <= 0:
                 break
@@ -127,31 +88,31 @@ class VideoStream:
         """Let go of source and tracker."""
         if not self._closed:
             self._closed = True
-            self._pictures.close()
+            self._capture.close()
             self._tracker.close()
 
     def _track(self, timeout_s: float) -> None:
-        """Track the next picture, if one comes in time."""
-        picture = self._pictures.next(timeout_s)
-        if picture is None or (self._tracker.ready and picture.index <= self._passed_over):
+        """Track the next frame, if one comes in time."""
+        captured = self._capture.next(timeout_s)
+        if captured is None or (self._tracker.ready and captured.index <= self._passed_over):
             return
         try:
-            frame = self._tracker(picture.image_rgb, picture.index)
+            frame = self._tracker(captured.image_rgb, captured.index)
         except UserError:
             self._counts["another resolution"] += 1
             return
         if self._subject is None and self._tracker.ready:
             backlog = self._tracker.backlog()
-            self._subject = self._meet(backlog)
+            self._subject = self._met(backlog)
             for one in backlog:
-                self._give(one, picture.seen_s)
+                self._give(one, captured.captured_s)
         if frame is not None:
-            self._give(frame, picture.seen_s)
+            self._give(frame, captured.captured_s)
 
-    def _meet(self, backlog: list[TrackedFrame]) -> StreamSubject:
+    def _met(self, backlog: list[TrackedFrame]) -> StreamSubject:
         if not backlog:
             raise UserError(
-                "The tracker met a face, but could fit the head to none of its first pictures.",
+                "The tracker met a face, but could fit the head to none of its first images.",
                 "Begin with the face seen from the front, well lit and near the camera.",
             )
         height, width = backlog[0].image_rgba.shape[:2]
@@ -160,19 +121,24 @@ class VideoStream:
             head.arrays, self._tracker.identity, head.layout, width, height, self._session
         )
 
-    def _give(self, frame: TrackedFrame, seen_s: float) -> None:
-        if frame.index <= self._passed_over:
-            return
-        png = encode_png_rgba(frame.image_rgba, _PNG_COMPRESSION)
-        self._ready.append(
-            StreamedFrame(frame.index, frame.theta, frame.camera, seen_s, self._session, png=png)
-        )
+    def _give(self, frame: TrackedFrame, captured_s: float) -> None:
+        if frame.index > self._passed_over:
+            self._ready.append(
+                StreamedFrame(
+                    frame.index,
+                    frame.theta,
+                    frame.camera,
+                    captured_s,
+                    self._session,
+                    image_rgba=frame.image_rgba,
+                )
+            )
 
 
-def _open(source: str) -> Pictures:
+def _open(source: str) -> FrameCapture:
     if source.isdecimal() or "://" in source or source.startswith("/dev/"):
-        return NewestPictures(source)
-    return FilePictures(Path(source))
+        return LatestFrameCapture(source)
+    return FileCapture(Path(source))
 
 
 def _live_tracker(image_size: int) -> Any:

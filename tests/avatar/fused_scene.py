@@ -28,6 +28,22 @@ AMOUNTS = {
 }
 
 
+ROUNDING = 3e-5
+AT_THE_CUT, MOST_AT_THE_CUT = 2e-3, 5
+VARIANTS = {
+    "paper": {},
+    "no bases": {"num_bases": 0},
+    "many bases": {"num_bases": 21},
+    "linear network": {"weight_network": "linear"},
+    "no pose": {"pose_input": False},
+    "raw": {"tangent_variant": "raw"},
+    "orthonormal": {"tangent_variant": "orthonormal"},
+    "scaled": {"scale_with_triangle": True},
+    "raw and scaled": {"tangent_variant": "raw", "scale_with_triangle": True},
+}
+"""Of avatars: each changes one thing that the step must know."""
+
+
 def stir(avatar: Avatar, seed: int = 0) -> Avatar:
     """Move every parameter a little; colours stay between .3 and .7."""
     generator = torch.Generator().manual_seed(seed)
@@ -128,6 +144,14 @@ def first_moments(avatar: Avatar, optimizer: torch.optim.Optimizer) -> dict[str,
     }
 
 
+def values_by_group(avatar: Avatar) -> dict[str, Tensor]:
+    """Each group's parameters as one vector."""
+    return {
+        name: torch.cat([p.detach().flatten() for p in parameters])
+        for name, parameters in avatar.parameter_groups().items()
+    }
+
+
 def relative_differences(first: dict[str, Tensor], second: dict[str, Tensor]) -> dict[str, float]:
     """Each group's relative L2 difference; the second is the right one."""
     assert first.keys() == second.keys()
@@ -135,6 +159,34 @@ def relative_differences(first: dict[str, Tensor], second: dict[str, Tensor]) ->
         name: float((first[name].double() - value.double()).norm() / value.double().norm())
         for name, value in second.items()
     }
+
+
+def parting(avatar: Avatar, expected: Avatar) -> float:
+    """The largest relative difference of a group's parameters."""
+    return max(relative_differences(values_by_group(avatar), values_by_group(expected)).values())
+
+
+def assert_gradients_agree(avatar, optimizer, expected, expected_optimizer) -> None:
+    """Each group's first moments within rounding; the second avatar's are right.
+
+    A (pixel, Gaussian) pair counts where alpha is at least 1/255. A pair that lies at that cut up
+    to rounding belongs to one way and not to the other; in a hundred thousand there may be one.
+    So a few Gaussians (its own and those behind it) may differ by more, yet not by much.
+    """
+    found = first_moments(avatar, optimizer)
+    right = first_moments(expected, expected_optimizer)
+    whole = relative_differences(found, right)
+    assert max(whole.values()) < AT_THE_CUT, whole
+    if max(whole.values()) < ROUNDING:
+        return
+    count = avatar.num_gaussians
+    for name, value in right.items():
+        if name == "weight_network":
+            continue
+        bases = avatar.config.num_bases if name.startswith("basis") else 1
+        error = (found[name].double() - value.double()).view(bases, count, -1)
+        squares = error.square().sum((0, 2)).sort().values[:-MOST_AT_THE_CUT]
+        assert squares.sum().sqrt() < ROUNDING * value.double().norm(), (name, whole)
 
 
 def double(avatar: Avatar) -> Avatar:

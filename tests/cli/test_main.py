@@ -1,7 +1,6 @@
 import pytest
 
 from rgbavatar_ns.cli import main as cli
-from rgbavatar_ns.errors import UserError
 
 
 def test_help_lists_every_command(capsys):
@@ -25,17 +24,6 @@ def test_a_users_mistake_is_told_in_one_line_without_a_traceback(capsys, tmp_pat
     assert "none.mp4" in told
     assert "Traceback" not in told
     assert len(told.strip().splitlines()) == 1
-
-
-def test_a_failed_nerfstudio_command_says_what_to_do(monkeypatch, tmp_path):
-    from rgbavatar_ns.experiments.commands import run_nerfstudio
-
-    program = tmp_path / "ns-train"
-    program.write_text("#!/bin/sh\nexit 3\n")
-    program.chmod(0o755)
-    monkeypatch.setattr("sys.executable", str(tmp_path / "python"))
-    with pytest.raises(UserError, match="exit code 3"):
-        run_nerfstudio("ns-train")
 
 
 @pytest.mark.parametrize("name", list(cli.COMMANDS))

@@ -11,7 +11,8 @@ import torch
 
 from rgbavatar_ns.data import TrackedDataset
 from rgbavatar_ns.data.check import check_dataset, quick_check, unreadable_report
-from rgbavatar_ns.data.check.sample import agreement, take_sample
+from rgbavatar_ns.data.check.sample import take_sample
+from rgbavatar_ns.data.check.silhouette import down_to_the_neck, silhouette_overlap
 from rgbavatar_ns.data.check.timing import longest_run, offset_agreement
 from rgbavatar_ns.errors import UserError
 
@@ -291,11 +292,11 @@ def test_overlap_of_squares_worked_by_hand():
     mesh, matte = np.zeros((10, 10), np.float32), np.zeros((10, 10), np.float32)
     mesh[2:6, 2:6] = 1
     matte[4:10, 2:6] = 1
-    found = agreement(mesh, matte)
+    found = silhouette_overlap(mesh, matte, down_to_the_neck(mesh))
     # 8 pixels in common; the matte below the mesh's last row does not count.
     assert found.iou == pytest.approx(8 / 16)
     assert found.covered == pytest.approx(8 / 16)
-    assert agreement(mesh * 0, matte).iou == 0
+    assert silhouette_overlap(mesh * 0, matte, down_to_the_neck(mesh * 0)).iou == 0
 
 
 def test_offset_agreement_is_one_at_the_true_offset():

@@ -10,7 +10,7 @@ import pytest
 
 from rgbavatar_ns.cli import main as cli
 from rgbavatar_ns.errors import UserError
-from rgbavatar_ns.experiments import commands, engines, read_experiment, runner
+from rgbavatar_ns.experiments import engines, read_experiment, runner
 from rgbavatar_ns.experiments import sweep as sweep_module
 from rgbavatar_ns.experiments.engines import LocalEngine
 from rgbavatar_ns.experiments.process_lock import alone_in, end_with_parent
@@ -74,15 +74,6 @@ def test_a_cell_without_memory_says_so_and_the_command_ends_with_1(sweep_of, tmp
     told = capsys.readouterr().out
     assert "MemoryError" in told
     assert "1 of 2 cells done" in told
-
-
-def test_a_command_killed_by_the_system_is_named(tmp_path, monkeypatch):
-    program = tmp_path / "ns-train"
-    program.write_text("#!/bin/sh\nkill -KILL $$\n")
-    program.chmod(0o755)
-    monkeypatch.setattr(commands.sys, "executable", str(tmp_path / "python"))
-    with pytest.raises(UserError, match="ns-train was killed by SIGKILL, probably out of memory"):
-        commands.run_nerfstudio("ns-train")
 
 
 @pytest.mark.parametrize("full", ["write_json", "write_cell", "make_demo_dataset"])

@@ -19,10 +19,9 @@ def posed(head: HeadModel, **values: float | list[float]) -> np.ndarray:
     """Vertices with these expressions (by name) and fields of theta."""
     theta = torch.zeros(head.layout.size, dtype=torch.float64)
     for name, value in values.items():
-        if name in head.layout:
-            theta[head.layout.slice(name)] = torch.tensor(value, dtype=torch.float64)
-        else:
-            theta[head.arrays.expression_names.index(name)] = value
+        known = head.arrays.expression_names
+        place = head.layout.slice(name) if name in head.layout else known.index(name)
+        theta[place] = torch.tensor(value, dtype=torch.float64)
     return head(theta).numpy()
 
 

@@ -103,9 +103,9 @@ def test_a_list_that_contains_itself_is_read(write):
     assert np.array_equal(read[0], np.ones(2))
 
 
+MADE_ARRAY = b"cnumpy.core.multiarray\n_reconstruct\n(cnumpy\nndarray\n(K\x00tU\x01btR"
 PYTHON_2_ARRAY = (
-    b"cnumpy.core.multiarray\n_reconstruct\n(cnumpy\nndarray\n(K\x00tU\x01btR"
-    b"(K\x01(K\x02tcnumpy\ndtype\n(U\x02f8K\x00K\x01tR(K\x03U\x01<NNNJ\xff\xff\xff\xff"
+    MADE_ARRAY + b"(K\x01(K\x02tcnumpy\ndtype\n(U\x02f8K\x00K\x01tR(K\x03U\x01<NNNJ\xff\xff\xff\xff"
     b"J\xff\xff\xff\xffK\x00tb\x89U\x10" + struct.pack("<2d", -1.5, 2.25) + b"tb"
 )
 
@@ -190,40 +190,48 @@ def _dtype() -> bytes:
 
 BOMBS = {
     "array header": (
-        b"cnumpy.core.multiarray\n_reconstruct\n(cnumpy\nndarray\n(K\x00tU\x01btR(K\x01(\x8a\x06"
-        + (2**40 - 1).to_bytes(6, "little")
-        + b"t"
-        + _dtype()
-        + b"\x89C\x08"
-        + bytes(8)
-        + b"tb."
+        (
+            MADE_ARRAY
+            + b"(K\x01(\x8a\x06"
+            + (2**40 - 1).to_bytes(6, "little")
+            + b"t"
+            + _dtype()
+            + b"\x89C\x08"
+            + bytes(8)
+            + b"tb."
+        ),
+        "claims an array of",
     ),
-    "text length": b"\x8d" + struct.pack("<Q", 2**62) + b"x.",
-    "bytes length": b"\x8e" + struct.pack("<Q", 2**40) + b"x.",
-    "bytearray length": b"\x96" + struct.pack("<Q", 2**40) + b"x.",
-    "negative text length": b"T\xff\xff\xff\xffx.",
-    "long number": b"\x8b" + struct.pack("<i", 2**30) + b"x.",
-    "many digits": b"L" + b"9" * 10**6 + b"L\n.",
-    "memo number": b"]r\xff\xff\xff\xff0j\xff\xff\xff\xfe.",
-    "deep nesting": b"]" * 5_000 + b"a" * 4_999 + b".",
-    "endless hash": b")" + b"q\x000h\x00h\x00\x86" * 60 + b"q\x000}h\x00Ns.",
-    "missing mark": b"NNu.",
-    "registered class": b"\x82\x01.",
-    "state of a class": b"cnumpy\ndtype\nN}U\x07convertNs\x86b.",
-    "state that holds itself": PYTHON_2_ARRAY[:62] + b"q\x00(h\x00h\x00h\x00h\x00tb.",
-    "number hashed often": b"\x8b" + struct.pack("<i", 1000) + bytes(999) + b"x.",
-    "data outside": b"K\x01Q.",
-    "buffer outside": b"\x97.",
-    "empty": b"",
-    "no end": b"]",
+    "text length": (b"\x8d" + struct.pack("<Q", 2**62) + b"x.", "damaged"),
+    "bytes length": (b"\x8e" + struct.pack("<Q", 2**40) + b"x.", "damaged"),
+    "bytearray length": (b"\x96" + struct.pack("<Q", 2**40) + b"x.", "damaged"),
+    "negative text length": (b"T\xff\xff\xff\xffx.", "damaged"),
+    "long number": (b"\x8b" + struct.pack("<i", 2**30) + b"x.", "damaged"),
+    "many digits": (b"L" + b"9" * 10**6 + b"L\n.", "damaged"),
+    "memo number": (b"]r\xff\xff\xff\xff0j\xff\xff\xff\xfe.", "remembers more"),
+    "deep nesting": (b"]" * 5_000 + b"a" * 4_999 + b".", "nested too deeply"),
+    "endless hash": (b")" + b"q\x000h\x00h\x00\x86" * 60 + b"q\x000}h\x00Ns.", "tuple as a key"),
+    "missing mark": (b"NNu.", "damaged"),
+    "registered class": (b"\x82\x01.", "EXT1"),
+    "state of a class": (b"cnumpy\ndtype\nN}U\x07convertNs\x86b.", "damaged .TypeError"),
+    "state that holds itself": (MADE_ARRAY + b"q\x00(h\x00h\x00h\x00h\x00tb.", "nested too deeply"),
+    "number hashed often": (
+        b"\x8b" + struct.pack("<i", 1000) + bytes(999) + b"x.",
+        "too many digits",
+    ),
+    "data outside": (b"K\x01Q.", "outside of it"),
+    "buffer outside": (b"\x97.", "NEXT_BUFFER"),
+    "empty": (b"", "damaged"),
+    "no end": (b"]", "damaged"),
 }
 
 
 @pytest.mark.parametrize("name", BOMBS)
 def test_bombs_are_refused_in_bounded_memory(write, name):
-    path = write(BOMBS[name])
+    bomb, told = BOMBS[name]
+    path = write(bomb)
     tracemalloc.start()
-    with pytest.raises(UserError):
+    with pytest.raises(UserError, match=told):
         read_pickle(path)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
@@ -241,7 +249,8 @@ def test_shared_bytes_do_not_multiply(write):
     """A hundred arrays over the same megabyte are a hundred megabytes when they are made."""
     raw = pickle.dumps(b"x" * _MB, 3)[2:-1]
     array = (
-        b"cnumpy.core.multiarray\n_reconstruct\n(cnumpy\nndarray\n(K\x00tU\x01btR(K\x01("
+        MADE_ARRAY
+        + b"(K\x01("
         + pickle.dumps(_MB, 3)[2:-1]
         + b"t"
         + b"cnumpy\ndtype\n(U\x02u1K\x00K\x01tR\x89j\x00\x01\x00\x00tb"

@@ -26,8 +26,8 @@ TESTS = (
     "kernels/test_laws.py",
     "kernels/test_sizes.py",
     "kernels/test_weighted_colors.py",
-    "avatar/test_fused_step.py",
-    "avatar/test_refinement_gradient.py",
+    "avatar/training/test_fused_step.py",
+    "avatar/refinement/test_refinement_gradient.py",
 )
 # A pytest plugin that puts the module built here where the package looks for its own.
 PLUGIN = """

@@ -2,12 +2,10 @@
 
 import copy
 import threading
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
-from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 
 from rgbavatar_ns.data.streams import ReplayStream, StreamedFrame
 from rgbavatar_ns.plugin.online.methods import rgbavatar_online_tiny
@@ -45,12 +43,6 @@ def online_trainer(config: OnlineTrainerConfig) -> OnlineTrainer:
     trainer = make_trainer(config)
     assert isinstance(trainer, OnlineTrainer)
     return trainer
-
-
-def before_each_step(trainer: OnlineTrainer, work: Callable[[int], None]) -> None:
-    """Call `work` with the step's number."""
-    where = [TrainingCallbackLocation.BEFORE_TRAIN_ITERATION]
-    trainer.callbacks.append(TrainingCallback(where, lambda step: work(step)))
 
 
 def hold_back_after(count: int, monkeypatch: pytest.MonkeyPatch) -> None:

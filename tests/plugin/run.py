@@ -4,15 +4,18 @@ import copy
 import os
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+import torch
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.scripts.train import _set_random_seed
 from nerfstudio.utils import writer
 
 from rgbavatar_ns.avatar import AvatarConfig
 from rgbavatar_ns.plugin.methods import rgbavatar_tiny
+from rgbavatar_ns.plugin.training.checkpoints import list_checkpoints, read_checkpoint
 from rgbavatar_ns.plugin.training.trainer import RGBAvatarTrainer, RGBAvatarTrainerConfig
 
 SMALL = AvatarConfig(uv_resolution=16, num_bases=3, hidden_width=16, scale_from_texel_spacing=True)
@@ -60,11 +63,32 @@ def make_trainer(config: RGBAvatarTrainerConfig) -> RGBAvatarTrainer:
     return trainer
 
 
+def before_each_step(trainer: RGBAvatarTrainer, work: Callable[[int], None]) -> None:
+    """Call `work` with the step's number."""
+    where = [TrainingCallbackLocation.BEFORE_TRAIN_ITERATION]
+    trainer.callbacks.append(TrainingCallback(where, lambda step: work(step)))
+
+
+def trained(config: RGBAvatarTrainerConfig) -> RGBAvatarTrainer:
+    """Train in this process, to the end."""
+    trainer = make_trainer(config)
+    trainer.train()
+    return trainer
+
+
 def finished_run(data: Path, output: Path, **fields: Any) -> Path:
     """Train in this process; the path of the run's config.yml."""
-    trainer = make_trainer(small_config(data, output, **fields))
-    trainer.train()
-    return trainer.base_dir / "config.yml"
+    return trained(small_config(data, output, **fields)).base_dir / "config.yml"
+
+
+def newest_state(folder: Path) -> dict[str, Any]:
+    """What the newest checkpoint in a folder holds."""
+    return read_checkpoint(list_checkpoints(folder)[-1][1])
+
+
+def parameters_of(trainer: RGBAvatarTrainer) -> torch.Tensor:
+    """All of the avatar's, as one vector."""
+    return torch.cat([p.detach().flatten() for p in trainer.pipeline.model.avatar.parameters()])
 
 
 def program(name: str) -> str:

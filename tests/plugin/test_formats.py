@@ -7,7 +7,7 @@ import pytest
 from rgbavatar_ns.data import load_dataset
 from rgbavatar_ns.synthetic import DemoConfig
 from rgbavatar_ns.synthetic.exporters import DEMO_FORMATS, FLAME_FOLDER, FlameFilm, NativeWriter
-from tests.plugin.run import make_trainer, small_config
+from tests.plugin.run import small_config, trained
 
 STEPS = 60
 CONFIG = DemoConfig(image_size=32, num_frames=16, num_test_frames=4, supersampling=1)
@@ -33,8 +33,7 @@ def both(request, tmp_path_factory) -> tuple[Path, Path, Path]:
 
 
 def held_out_psnr(data: Path, output: Path) -> float:
-    trainer = make_trainer(small_config(data, output, max_num_iterations=STEPS))
-    trainer.train()
+    trainer = trained(small_config(data, output, max_num_iterations=STEPS))
     metrics = trainer.pipeline.get_average_eval_image_metrics(step=STEPS)
     return float(metrics["psnr"])
 

@@ -7,7 +7,7 @@ import shutil
 import subprocess
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +34,10 @@ _FLAGS = [
 _WIDTH, _HEIGHT = 900, 950
 _PANEL_WIDTH = 330
 _SECONDS_UNTIL_DRAWN = 120.0
-_SAME_PICTURES = 4
+_LOOK_MS = 250
+_SAME_PICTURES = 3
+_SHARP_PX = 512
+_SIZE = re.compile(r"Resolution: \d+x\d+px")
 _SAME = 1e-4
 
 pytestmark = [
@@ -99,26 +102,28 @@ def _colored(picture: Picture) -> float:
     return float((spread > 25).mean())
 
 
-def _wait_for(page: Any, wanted: Any, same_pictures: int = _SAME_PICTURES) -> Picture:
-    """The first picture of the 3D view that stays and for which `wanted` holds.
+def _wait_for(page: Any, wanted: Callable[[Picture], bool]) -> Picture:
+    """The first sharp picture that stays and for which `wanted` holds.
 
-    The viewer draws coarsely first and finely once nothing has moved for a while.
+    The viewer draws coarsely first and, once nothing has moved for a while, sharply. On a busy
+    machine a coarse one stays for long, but nerfstudio names the size of the last that it sent.
     """
     deadline = time.monotonic() + _SECONDS_UNTIL_DRAWN
-    picture, same = _canvas(page), 0
+    picture, same, size = _canvas(page), 0, ""
     while time.monotonic() < deadline:
-        time.sleep(0.5 if same_pictures else 0.1)
+        page.wait_for_timeout(_LOOK_MS)
         before, picture = picture, _canvas(page)
-        same = same + 1 if np.array_equal(before, picture) else 0
-        if same >= same_pictures and wanted(picture):
+        size = page.get_by_text(_SIZE).first.inner_text()
+        sharp = max(map(int, re.findall(r"\d+", size.partition("Resolution")[2]))) >= _SHARP_PX
+        same = same + 1 if sharp and np.array_equal(before, picture) else 0
+        if same >= _SAME_PICTURES and wanted(picture):
             return picture
     Image.fromarray(picture).save(seen := Path(tempfile.gettempdir()) / "rgbavatar-viewer.png")
-    raise AssertionError(f"the viewer did not show what was awaited, but {seen}")
+    raise AssertionError(f"the viewer did not show what was awaited, but {seen} ({size})")
 
 
 def _wait_until_back(page: Any, first: Picture) -> None:
-    """The viewer shows a fine picture again that it has shown before: nothing more can come."""
-    _wait_for(page, lambda picture: _difference(picture, first) < _SAME, same_pictures=0)
+    _wait_for(page, lambda picture: _difference(picture, first) < _SAME)
 
 
 def test_controls_change_the_picture_of_the_head_and_back(page: Any):

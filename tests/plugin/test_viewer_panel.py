@@ -1,7 +1,5 @@
-"""The panel: what its controls do to the picture, on a real viser server without a browser."""
+"""The panel: what its controls do to the picture, without a browser."""
 
-import time
-from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -10,14 +8,18 @@ import pytest
 import torch
 import viser
 from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.viewer.utils import parse_object
+from nerfstudio.viewer.viewer_elements import ViewerControl
 from nerfstudio.viewer_legacy.server.viewer_utils import IOChangeException
 
 from rgbavatar_ns import Avatar
 from rgbavatar_ns.plugin.cameras import from_nerfstudio
 from rgbavatar_ns.plugin.model import RGBAvatarModel
 from rgbavatar_ns.plugin.pipeline import RGBAvatarPipeline
+from rgbavatar_ns.plugin.viewer.driving import training_statistics
 from rgbavatar_ns.plugin.viewer.panel import ViewerPanel
-from rgbavatar_ns.plugin.viewer.widgets import Widgets
+from rgbavatar_ns.plugin.viewer.viewpoint import Viewpoint
+from tests.plugin.fake_viewer import FakeViewer
 from tests.plugin.run import make_trainer, small_config
 from tests.plugin.tiny import NUM_FRAMES, SIZE, tiny_dataset
 
@@ -32,64 +34,44 @@ def pipeline(tiny_data: Path, tmp_path_factory: pytest.TempPathFactory) -> RGBAv
     return trainer.pipeline
 
 
-@pytest.fixture(scope="module")
-def server() -> Iterator[viser.ViserServer]:
-    server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
-    yield server
-    server.stop()
-
-
 class Desk:
-    """A panel with its widgets; `do` waits until what follows from it has been done."""
+    """A panel with its controls, in a viewer whose time passes when it is told to."""
 
-    def __init__(self, model: RGBAvatarModel, server: viser.ViserServer) -> None:
-        server.gui.reset()
-        self.model = model
-        self.panel = ViewerPanel(model.viewer_panel.stage, model.viewer_panel._viewpoint)
-        self.rerenders = 0
-        self.viewer = SimpleNamespace(
-            viser_server=server,
-            render_tab_state=SimpleNamespace(preview_render=False),
-            include_time=True,
-            control_panel=SimpleNamespace(time=0.0),
-            _trigger_rerender=self._count,
-        )
-        self.panel._setup(self.viewer)
-        assert self.panel._widgets is not None
-        self.widgets: Widgets = self.panel._widgets
+    def __init__(self, pipeline: RGBAvatarPipeline) -> None:
+        self.model: RGBAvatarModel = pipeline.model
+        self.cameras = pipeline.datamanager.train_dataset.cameras
+        self.now_s = 0.0
+        self.panel = ViewerPanel(self.model, pipeline.film, clock=lambda: self.now_s)
+        self.viewer, self.asked = FakeViewer(), []
+        browser = SimpleNamespace(state="low_static", client=None, action=self.asked.append)
+        self.viewer.render_statemachines[0] = browser
+        self.panel.attach(self.viewer)
 
-    def _count(self) -> None:
-        self.rerenders += 1
+    def set(self, label: str, value: Any) -> None:
+        self.viewer.gui[label].user_sets(value)
 
-    def control(self, label: str) -> Any:
-        handles = self.viewer.viser_server.gui._gui_input_handle_from_id.values()
-        return [handle for handle in handles if handle._impl.label == label][-1]
-
-    def set(self, label: str, value: Any, until: Callable[[], bool]) -> None:
-        """Do what a user does: the value comes from outside, then callbacks run in threads."""
-        self.control(label).value = value
-        self.wait(until)
-
-    def wait(self, until: Callable[[], bool]) -> None:
-        deadline = time.monotonic() + 20
-        while not until():
-            assert time.monotonic() < deadline, self.panel.wishes
-            time.sleep(0.01)
-
-    def picture(self, camera: Cameras | None = None) -> torch.Tensor:
+    def picture(self, camera: Cameras | None = None, time: float | None = None) -> torch.Tensor:
         camera = self.camera() if camera is None else camera
-        return self.panel.draw(from_nerfstudio(camera), None)["rgb"]
+        return self.panel.draw(from_nerfstudio(camera), time)["rgb"]
+
+    def told(self) -> str:
+        """What stands in the panel after a while."""
+        self.pass_time(1.0)
+        return "\n".join(self.viewer.gui.texts())
+
+    def pass_time(self, seconds: float) -> None:
+        self.now_s += seconds
+        self.panel.tick()
 
     def camera(self) -> Cameras:
-        camera = self.model.kwargs["camera"][0:1]
+        camera = self.cameras[0:1]
         camera.metadata = {}
         return camera
 
 
 @pytest.fixture
-def desk(pipeline: RGBAvatarPipeline, server: viser.ViserServer) -> Desk:
-    pipeline.model.kwargs["camera"] = pipeline.datamanager.train_dataset.cameras
-    return Desk(pipeline.model, server)
+def desk(pipeline: RGBAvatarPipeline) -> Desk:
+    return Desk(pipeline)
 
 
 @torch.no_grad()
@@ -119,46 +101,46 @@ def test_a_cameras_own_theta_comes_before_the_panel(pipeline: RGBAvatarPipeline)
     assert torch.equal(drawn.clamp(0, 1), expected)
 
 
-def test_frame_slider_shows_that_frame_over_the_backdrop(desk: Desk):
-    desk.set("Frame", 7, lambda: desk.panel.wishes.frame == 7)
+def test_frame_slider_shows_that_frame_over_the_background(desk: Desk):
+    desk.set("Frame", 7)
     theta = desk.model.frame_theta[7:8]
     assert torch.equal(
         desk.picture(), _rendered(desk.model.avatar, theta, desk.camera(), white=True)
     )
-    assert desk.rerenders == 1
-    desk.set("Backdrop", (255, 51, 0), lambda: desk.panel.wishes.backdrop == (1.0, 0.2, 0.0))
+    assert len(desk.asked) == 1
+    desk.set("Background", (255, 51, 0))
     assert torch.allclose(desk.picture()[0, 0], torch.tensor([1.0, 0.2, 0.0]), atol=1e-6)
 
 
 def test_moving_a_face_slider_drives_by_hand_from_what_is_shown_and_back(desk: Desk):
-    desk.set("Frame", 5, lambda: desk.panel.wishes.frame == 5)
+    desk.set("Frame", 5)
     before = desk.picture()
-    desk.set("jaw x (deg)", 20.0, lambda: desk.panel.wishes.driven_by == "by hand")
+    desk.set("jaw x (deg)", 20.0)
     expected = desk.model.frame_theta[5].clone()
     expected[desk.model.avatar.layout.slice("jaw").start] = torch.pi / 9
-    assert torch.allclose(desk.panel.wishes.theta_by_hand, expected, atol=1e-6)
+    assert torch.allclose(desk.panel.state.theta_by_hand, expected, atol=1e-6)
     assert (desk.picture() - before).abs().max() > 0.01
     # The other sliders now stand where the frame has its numbers.
     turned = desk.model.frame_theta[5, desk.model.avatar.layout.slice("rotation")][1]
-    desk.wait(lambda: desk.control("rotation y (deg)").value == pytest.approx(turned.rad2deg()))
-    desk.set("Driven by", "dataset frame", lambda: desk.panel.wishes.driven_by == "dataset frame")
+    assert desk.viewer.gui["rotation y (deg)"].value == pytest.approx(turned.rad2deg().item())
+    desk.set("Driven by", "dataset frame")
     assert torch.equal(desk.picture(), before)
 
 
 def test_echoes_of_moved_sliders_change_nothing(desk: Desk):
-    desk.panel.rest()
-    time.sleep(0.3)  # All echoes have come.
-    assert torch.equal(desk.panel.wishes.theta_by_hand, desk.panel.stage.statistics().theta_neutral)
-    assert desk.rerenders == 1
+    desk.viewer.gui["Neutral"].user_clicks()
+    neutral = training_statistics(desk.model).theta_neutral
+    assert torch.equal(desk.panel.state.theta_by_hand, neutral)
+    assert len(desk.asked) == 1
 
 
 def test_random_expressions_stay_within_what_was_seen(desk: Desk):
-    seen, layout = desk.panel.stage.statistics(), desk.model.avatar.layout
-    pose = desk.panel._theta_now()[layout.slice("rotation")]
+    seen, layout = training_statistics(desk.model), desk.model.avatar.layout
+    pose = desk.panel.theta_shown()[layout.slice("rotation")]
     drawn = []
     for _ in range(20):
-        desk.panel.surprise()
-        drawn.append(desk.panel.wishes.theta_by_hand)
+        desk.viewer.gui["Random expression"].user_clicks()
+        drawn.append(desk.panel.state.theta_by_hand)
     angles = torch.stack(drawn)[:, layout.slice("jaw").start]
     # Only the jaw moves in this film, so its range is the whole of it.
     low, high = seen.theta_min, seen.theta_max
@@ -186,15 +168,15 @@ def test_a_weight_slider_overrides_the_network_until_it_is_given_back(desk: Desk
     before = desk.picture()
     theta = desk.model.frame_theta[0:1]
     psi = desk.model.avatar.weights(theta).detach()
-    desk.set("psi 1", 0.9, lambda: desk.panel.wishes.psi_by_hand is not None)
+    desk.set("psi 1", 0.9)
     psi[0, 1] = 0.9
-    assert torch.allclose(desk.panel.wishes.psi_by_hand, psi[0])
+    assert torch.allclose(desk.panel.state.psi_by_hand, psi[0])
     expected = desk.model.avatar.render(
         theta, from_nerfstudio(desk.camera()), torch.ones(3), psi=psi
     )
     assert torch.allclose(desk.picture(), expected.image[0].clamp(0, 1), atol=1e-5)
     assert (desk.picture() - before).abs().max() > 0.005
-    desk.set("Weights by hand", False, lambda: desk.panel.wishes.psi_by_hand is None)
+    desk.set("Weights by hand", False)
     assert torch.equal(desk.picture(), before)
 
 
@@ -202,28 +184,28 @@ def test_bases_used_counts_the_first_ones(desk: Desk):
     avatar = desk.model.avatar
     theta = desk.model.frame_theta[0:1]
     psi = avatar.weights(theta).detach()
-    desk.set("Bases used", 1, lambda: desk.panel.wishes.bases_used == 1)
+    desk.set("Bases used", 1)
     psi[:, 1:] = 0
     expected = avatar.render(theta, from_nerfstudio(desk.camera()), torch.ones(3), psi=psi)
     assert torch.allclose(desk.picture(), expected.image[0].clamp(0, 1), atol=1e-5)
 
 
 def test_one_basis_alone_is_base_and_basis_on_the_neutral_frame(desk: Desk):
-    avatar, seen = desk.model.avatar, desk.panel.stage.statistics()
+    avatar, seen = desk.model.avatar, training_statistics(desk.model)
     extreme = torch.where(seen.psi_max >= -seen.psi_min, seen.psi_max, seen.psi_min)
-    desk.set("One basis alone", "2", lambda: desk.panel.wishes.basis_alone == 2)
+    desk.set("One basis alone", "2")
     psi = torch.zeros(1, avatar.config.num_bases)
     psi[0, 2] = 1.5 * extreme[2]
     camera = from_nerfstudio(desk.camera())
     expected = avatar.render(seen.theta_neutral[None], camera, torch.ones(3), psi=psi)
     assert torch.allclose(desk.picture(), expected.image[0].clamp(0, 1), atol=1e-5)
-    desk.set("One basis alone", "none", lambda: desk.panel.wishes.basis_alone is None)
+    desk.set("One basis alone", "none")
     theta = desk.model.frame_theta[0:1]
     assert torch.equal(desk.picture(), _rendered(avatar, theta, desk.camera(), white=True))
 
 
 def test_film_avatar_and_error_stand_in_a_row(desk: Desk, pipeline: RGBAvatarPipeline):
-    desk.panel.change(frame=4, picture="beside the film", backdrop=(0.0, 0.0, 0.0))
+    desk.panel.change(frame=4, picture="beside the film", background=(0.0, 0.0, 0.0))
     wide = desk.camera()
     wide.width, wide.height = (torch.full_like(wide.width, s * SIZE) for s in (3, 1))
     row = desk.picture(wide)
@@ -237,13 +219,13 @@ def test_film_avatar_and_error_stand_in_a_row(desk: Desk, pipeline: RGBAvatarPip
     error, difference = row[:, 2 * SIZE :].sum(-1), (avatar - truth).abs().mean(-1)
     assert error[difference > 0.2].min() > error[difference < 0.01].max()
     psnr = -10 * (avatar.clamp(0, 1) - truth).square().mean().log10()
-    assert f"PSNR of this frame {psnr:.2f} dB" in desk.widgets._report.content
+    assert f"PSNR of this frame {psnr:.2f} dB" in desk.told()
 
 
 @pytest.mark.parametrize("picture", ["alpha", "depth", "error"])
 def test_other_pictures_are_drawn(desk: Desk, picture: str):
     plain = desk.picture()
-    desk.set("Picture", picture, lambda: desk.panel.wishes.picture == picture)
+    desk.set("Picture", picture)
     image = desk.picture()
     assert image.shape == plain.shape
     assert (image - plain).abs().max() > 0.1
@@ -253,8 +235,7 @@ def test_other_pictures_are_drawn(desk: Desk, picture: str):
 @pytest.mark.parametrize("label", ["Mesh", "Gaussian centres"])
 def test_overlays_lie_on_the_head(desk: Desk, label: str):
     plain = desk.picture()
-    desk.control(label).value = True
-    desk.wait(lambda: desk.panel.wishes.mesh or desk.panel.wishes.centres)
+    desk.set(label, True)
     alpha = desk.panel.draw(from_nerfstudio(desk.camera()), None)["accumulation"]
     changed = (desk.picture() - plain).abs().amax(-1) > 0.05
     assert 0.02 < changed.float().mean() < 0.95
@@ -264,47 +245,46 @@ def test_overlays_lie_on_the_head(desk: Desk, label: str):
 def test_a_driver_plays_on_this_avatar(desk: Desk, tmp_path: Path):
     other = tiny_dataset(tmp_path / "other", frames=6, test=1)
     desk.panel.load_driver(str(tmp_path / "other"), "off")
-    wishes = desk.panel.wishes
-    assert (wishes.driven_by, len(wishes.sequence)) == ("driving sequence", 6)
+    state = desk.panel.state
+    assert (state.driven_by, len(state.sequence)) == ("driving sequence", 6)
     jaw = desk.model.avatar.layout.slice("jaw")
-    assert torch.allclose(wishes.sequence[:, jaw], other.theta[:, jaw])
+    assert torch.allclose(state.sequence[:, jaw], other.theta[:, jaw])
     first = desk.picture()
-    desk.set("Driver's frame", 3, lambda: desk.panel.wishes.sequence_frame == 3)
+    desk.set("Driver's frame", 3)
     assert (desk.picture() - first).abs().max() > 0.01
-    assert desk.panel.advance()
-    assert desk.panel.wishes.sequence_frame == 4
+    desk.panel.advance()
+    assert desk.panel.state.sequence_frame == 4
     # Its pictures are another person's: there is nothing to compare with.
     desk.panel.change(picture="error")
     assert desk.picture().shape == first.shape
-    assert "no film to compare" in desk.widgets._said.content
+    assert "no film to compare" in desk.told()
 
 
 @pytest.mark.parametrize("folder", ["", "/nowhere/at/all"])
 def test_a_driver_that_is_none_is_told_in_the_panel(desk: Desk, folder: str):
     desk.panel.load_driver(folder, "neutral")
-    assert desk.panel.wishes.driven_by == "dataset frame"
-    assert "Cannot be shown" in desk.widgets._said.content
-    assert desk.widgets._said.visible
+    assert desk.panel.state.driven_by == "dataset frame"
+    assert "Cannot be shown" in desk.told()
 
 
 def test_the_sequence_cannot_be_chosen_before_it_is_there(desk: Desk):
-    desk.control("Driven by").value = "driving sequence"
-    desk.wait(lambda: "Load a driver" in desk.widgets._said.content)
-    desk.wait(lambda: desk.control("Driven by").value == "dataset frame")
+    desk.set("Driven by", "driving sequence")
+    assert "Load a driver" in desk.told()
+    assert desk.viewer.gui["Driven by"].value == "dataset frame"
 
 
 def test_trouble_is_told_and_the_plain_avatar_drawn(desk: Desk):
     plain = desk.picture()
     desk.panel.change(psi_by_hand=torch.zeros(99))
     assert torch.equal(desk.picture(), plain)
-    assert "Cannot be shown" in desk.widgets._said.content
+    assert "Cannot be shown" in desk.told()
 
 
 def test_the_viewers_own_interruption_passes(desk: Desk, monkeypatch: pytest.MonkeyPatch):
     def interrupted(*_: Any, **__: Any) -> None:
         raise IOChangeException
 
-    monkeypatch.setattr(desk.panel.stage.avatar, "renderer", interrupted)
+    monkeypatch.setattr(desk.model.avatar, "renderer", interrupted)
     with pytest.raises(IOChangeException):
         desk.picture()
 
@@ -313,35 +293,64 @@ def test_playing_goes_round(desk: Desk):
     desk.panel.change(frame=NUM_FRAMES - 2)
     seen = []
     for _ in range(3):
-        assert desk.panel.advance()
-        seen.append(desk.panel.wishes.frame)
+        desk.panel.advance()
+        seen.append(desk.panel.state.frame)
     assert seen == [NUM_FRAMES - 1, 0, 1]
-    desk.panel.rest()
-    assert not desk.panel.advance()
+    desk.panel.show_neutral()
+    before = desk.panel.state
+    desk.panel.advance()
+    assert desk.panel.state is before
 
 
 def test_play_moves_on_once_a_picture_was_drawn(desk: Desk):
-    desk.set("Frames a second", 60, lambda: desk.panel.frames_per_second == 60)
-    desk.set("Play", True, lambda: desk.panel.wishes.frame == 1)
-    time.sleep(0.2)
-    assert desk.panel.wishes.frame == 1
+    desk.set("Frames per second", 10)
+    desk.set("Play", True)
     desk.picture()
-    desk.wait(lambda: desk.panel.wishes.frame == 2)
-    desk.set("Play", False, lambda: not desk.panel.playing)
+    desk.pass_time(0.1)
+    assert desk.panel.state.frame == 1
+    desk.pass_time(0.2)
+    assert desk.panel.state.frame == 1  # it has not been seen yet
+    desk.picture()
+    desk.pass_time(0.01)
+    assert desk.panel.state.frame == 2
+    desk.picture()
+    desk.pass_time(0.05)
+    assert desk.panel.state.frame == 2  # ten a second
+    desk.pass_time(10.0)
+    assert desk.panel.state.frame == 3
+    desk.pass_time(10.0)
+    assert desk.panel.state.frame == 4  # nobody draws, which does not stop it for ever
+    desk.set("Play", False)
+    desk.pass_time(10.0)
+    assert desk.panel.state.frame == 4
 
 
 def test_previewing_a_camera_path_follows_its_time(desk: Desk):
     desk.panel.change(frame=7, mesh=True)
     desk.viewer.render_tab_state.preview_render = True
-    drawn = desk.panel.draw(from_nerfstudio(desk.camera()), 0.9)["rgb"]
     theta = desk.model.frame_theta[12:13]
-    assert torch.equal(drawn, _rendered(desk.model.avatar, theta, desk.camera(), white=True))
+    expected = _rendered(desk.model.avatar, theta, desk.camera(), white=True)
+    assert torch.equal(desk.picture(time=0.9), expected)
 
 
-def test_viewer_starts_before_the_face_and_nearer_than_the_camera(pipeline: RGBAvatarPipeline):
-    start = pipeline.model.viewer_panel._viewpoint
+def test_viewer_starts_before_the_face_and_nearer_than_the_camera(desk: Desk):
+    start = Viewpoint.before(desk.model.avatar, desk.model.subject)
     eye, look_at = torch.tensor(start.eye), torch.tensor(start.look_at)
     # The tiny dataset's camera stands one metre before the head, on the face's side: -y.
     offset = eye - look_at
     assert -1.0 < offset[1] < -0.7
     assert offset[[0, 2]].norm() < 0.1
+
+
+def test_nerfstudio_finds_the_panel_and_viser_shows_it(pipeline: RGBAvatarPipeline):
+    ((_, panel),) = parse_object(pipeline, ViewerControl, "Custom Elements")
+    assert pipeline.model.view == panel.draw
+    panel = ViewerPanel(pipeline.model, pipeline.film)
+    viewer = FakeViewer()
+    viewer.viser_server = server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+    try:
+        panel.attach(viewer)
+        panel.show_neutral()
+        panel.tell("shown")
+    finally:
+        server.stop()

@@ -5,15 +5,12 @@ import pytest
 import torch
 
 from rgbavatar_ns.head import HeadModel
-from rgbavatar_ns.head.rotations import axis_angle_to_matrix
 from rgbavatar_ns.tracking.config import TrackConfig
-from rgbavatar_ns.tracking.fit.camera import StillCamera
 from rgbavatar_ns.tracking.fit.fit import fit_clip, key_frame_positions
 from rgbavatar_ns.tracking.fit.subject import SubjectTracker
 from rgbavatar_ns.tracking.verify.report import fit_quality
 
-CAMERA = StillCamera(700.0, (160.0, 120.0), 0.8)
-ACTIVE = ("mouthSmileLeft", "mouthPucker", "browInnerUp", "eyeBlinkLeft", "eyeBlinkRight")
+from .acting import ACTIVE, CAMERA, degrees_apart, observed, performance, skulls
 
 
 @pytest.fixture(scope="module")
@@ -21,53 +18,16 @@ def head() -> HeadModel:
     return HeadModel.embedded(dtype=torch.float64)
 
 
-def _performance(head: HeadModel, frames: int) -> tuple[np.ndarray, np.ndarray]:
-    """Smooth theta [F, H] with turns, jaw, gaze, blinks and expressions, and an identity."""
-    random = np.random.default_rng(11)
-    layout, names = head.layout, list(head.arrays.expression_names)
-    theta = np.zeros((frames, layout.size))
-    time = np.linspace(0, 2 * np.pi, frames)
-    turns = [0.12 * np.sin(time), 0.25 * np.sin(2 * time + 1), 0.08 * np.cos(time)]
-    theta[:, layout.slice("rotation")] = np.stack(turns, axis=1)
-    theta[:, layout.slice("translation")] = 0.015 * np.stack(
-        [np.sin(time + k) for k in range(3)], 1
-    )
-    theta[:, layout.slice("jaw").start] = 0.12 * (1 - np.cos(2 * time))
-    for eye in ("left_eye", "right_eye"):
-        theta[:, layout.slice(eye).start + 1] = 0.2 * np.sin(time + 2)
-    for number, name in enumerate(ACTIVE):
-        wave = 0.5 + 0.5 * np.sin((1 + number % 3) * time + number)
-        theta[:, layout.slice("expression").start + names.index(name)] = 0.8 * wave
-    identity = np.zeros(head.num_identity)
-    identity[:10] = 0.5 * random.normal(size=10)
-    return theta, identity
-
-
-def _observed(tracker: SubjectTracker, theta: np.ndarray, identity: np.ndarray) -> np.ndarray:
-    points = np.zeros((len(theta), 478, 2))
-    for frame, row in enumerate(theta):
-        projected = CAMERA.project(tracker.cost.head.points(row, identity, CAMERA.eye_m))
-        points[frame, tracker.facemesh_index] = projected
-    return points
-
-
-def _angles_deg(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    a, b = (axis_angle_to_matrix(torch.from_numpy(part)) for part in (first, second))
-    trace = (a * b).sum((-1, -2)).numpy()
-    return np.degrees(np.arccos(np.clip((trace - 1) / 2, -1, 1)))
-
-
 def test_known_performance_is_recovered_from_its_own_landmarks(head: HeadModel) -> None:
     tracker = SubjectTracker(head, TrackConfig(focal_px=CAMERA.focal_px, key_frames=6))
-    theta, identity = _performance(head, 16)
-    observed = _observed(tracker, theta, identity)
-    noisy = observed + np.random.default_rng(0).normal(size=observed.shape) * 0.3
+    theta, identity = performance(head, 16)
+    noisy = observed(tracker, theta, identity)
+    noisy += np.random.default_rng(0).normal(size=noisy.shape) * 0.3
     fit = tracker.fit(noisy, [False] + [True] * 15, 320, 240)
     found = tracker.thetas(fit)
     layout = head.layout
 
-    rotation = layout.slice("rotation")
-    assert _angles_deg(found[:, rotation], theta[:, rotation]).mean() < 1.5
+    assert degrees_apart(skulls(tracker, found), skulls(tracker, theta)).mean() < 1.5
     jaw = layout.slice("jaw").start
     assert np.corrcoef(found[:, jaw], theta[:, jaw])[0, 1] > 0.9
     gaze = layout.slice("left_eye").start + 1
@@ -97,15 +57,15 @@ def test_known_performance_is_recovered_from_its_own_landmarks(head: HeadModel) 
 
 def test_the_same_landmarks_give_the_same_fit_and_a_gap_is_not_bridged(head: HeadModel) -> None:
     config = TrackConfig(focal_px=CAMERA.focal_px, key_frames=3, identity_components=5)
-    theta, identity = _performance(head, 6)
-    observed = _observed(SubjectTracker(head, config), theta, identity)
+    theta, identity = performance(head, 6)
+    points = observed(SubjectTracker(head, config), theta, identity)
     follows = [False, True, True, False, True, True]
     trackers = [SubjectTracker(head, config) for _ in range(2)]
-    runs = [tracker.fit(observed, follows, 320, 240) for tracker in trackers]
+    runs = [tracker.fit(points, follows, 320, 240) for tracker in trackers]
     np.testing.assert_array_equal(runs[0].values, runs[1].values)
     # What comes after the gap changes nothing before it.
     tracker, subject = trackers[0], runs[0].subject
-    targets = tracker.targets(observed)
+    targets = tracker.targets(points)
     whole = fit_clip(tracker.cost, subject, targets, follows, 1.0).values
     alone = fit_clip(tracker.cost, subject, targets[:3], follows[:3], 1.0).values
     np.testing.assert_array_equal(whole[:3], alone)
@@ -113,9 +73,9 @@ def test_the_same_landmarks_give_the_same_fit_and_a_gap_is_not_bridged(head: Hea
 
 def test_smoothing_lowers_jitter_without_lag(head: HeadModel) -> None:
     config = TrackConfig(focal_px=CAMERA.focal_px, key_frames=3, identity_components=3)
-    theta, identity = _performance(head, 12)
+    theta, identity = performance(head, 12)
     tracker = SubjectTracker(head, config)
-    noisy = _observed(tracker, theta, identity)
+    noisy = observed(tracker, theta, identity)
     noisy = noisy + np.random.default_rng(3).normal(size=noisy.shape) * 1.0
     follows = [False] + [True] * 11
     smooth = tracker.fit(noisy, follows, 320, 240)
@@ -135,11 +95,10 @@ def test_smoothing_lowers_jitter_without_lag(head: HeadModel) -> None:
 
 def test_landmarks_that_no_head_explains_are_rejected(head: HeadModel) -> None:
     config = TrackConfig(focal_px=CAMERA.focal_px, key_frames=3, identity_components=3)
-    theta, identity = _performance(head, 4)
+    theta, identity = performance(head, 4)
     tracker = SubjectTracker(head, config)
-    observed = _observed(tracker, theta, identity)
-    fit = tracker.fit(observed, [False, True, True, True], 320, 240)
-    broken = observed.copy()
+    broken = observed(tracker, theta, identity)
+    fit = tracker.fit(broken, [False, True, True, True], 320, 240)
     random = np.random.default_rng(1)
     broken[2, 30:] += random.normal(size=(448, 2)) * 15
     assert tracker.rejected(fit, broken) == [2]

@@ -1,5 +1,7 @@
 """Which face is followed: laws over drawn boxes, and real faces that cross in one picture."""
 
+from contextlib import closing
+
 import cv2
 import numpy as np
 import pytest
@@ -151,7 +153,7 @@ def test_real_faces_that_cross_in_a_picture() -> None:
     other = np.clip(portrait[:, ::-1].astype(int)[..., ::-1] * 0.9, 0, 255).astype(np.uint8)
     alone = np.full((240, 640, 3), 128, np.uint8)
     alone[20:220, 220:420] = portrait
-    with FaceLandmarker() as landmarker:
+    with closing(FaceLandmarker()) as landmarker:
         truth = landmarker(alone)
         assert truth is not None
         assert landmarker(alone) is not None

@@ -10,11 +10,13 @@ from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.head.landmarks import LandmarkNoise, facemesh_noise
 from rgbavatar_ns.tracking.config import TrackConfig
 from rgbavatar_ns.tracking.fit.camera import StillCamera
-from rgbavatar_ns.tracking.fit.landmark_cost import FrameCost, Target
+from rgbavatar_ns.tracking.fit.landmark_cost import FrameCost, FrameTerms, Target
 from rgbavatar_ns.tracking.fit.parameters import FitParameters
 from rgbavatar_ns.tracking.fit.subject import SubjectTracker
 
-CAMERA, FACE_PX = StillCamera(700.0, (160.0, 120.0), 0.8), 150.0
+from .acting import CAMERA
+
+FACE_PX = 150.0
 
 
 @pytest.fixture(scope="module")
@@ -33,13 +35,16 @@ def _with_noise(cost: FrameCost, seed: int, modes: int = 3) -> FrameCost:
 def _pose(tracker: SubjectTracker, seed: int) -> np.ndarray:
     random, bounds = np.random.default_rng(seed), tracker.cost.parameters
     values = random.uniform(0.2, 0.6, len(bounds.columns)) * np.minimum(bounds.upper, 0.3)
-    return tracker.cost.theta(values, np.zeros(tracker.head.layout.size))
+    return tracker.cost.theta(values)
 
 
-def _seen(cost: FrameCost, theta: np.ndarray, away_share: np.ndarray) -> Target:
+def _seen(
+    cost: FrameCost, theta: np.ndarray, away_share: np.ndarray, redescending: bool = False
+) -> FrameTerms:
     """The head's points, each as many shares of the face's height away."""
     points = CAMERA.project(cost.head.points(theta, np.zeros(30), CAMERA.eye_m))
-    return Target(points - away_share * FACE_PX, FACE_PX, np.eye(2))
+    target = Target(points - away_share * FACE_PX, FACE_PX, np.eye(2))
+    return FrameTerms(target, CAMERA, redescending)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -49,7 +54,7 @@ def test_small_errors_cost_what_their_covariance_says(tracker: SubjectTracker, s
     modes = cost.noise.modes.reshape(-1, 3)
     covariance = np.diag(np.repeat(cost.noise.own_share**2, 2)) + modes @ modes.T
     expected = 0.5 * away.reshape(-1) @ np.linalg.solve(covariance, away.reshape(-1))
-    found = cost.value(theta, np.zeros(30), CAMERA, _seen(cost, theta, away))
+    found = cost.data_cost(theta, np.zeros(30), _seen(cost, theta, away))
     np.testing.assert_allclose(found, expected, rtol=1e-9)
 
 
@@ -58,7 +63,7 @@ def test_what_all_points_err_in_common_costs_little_and_alone_much(tracker: Subj
     mode = cost.noise.modes[..., 0]
     others = mode[np.random.default_rng(1).permutation(len(mode))]
     common, mixed = (
-        cost.value(theta, np.zeros(30), CAMERA, _seen(cost, theta, away)) for away in (mode, others)
+        cost.data_cost(theta, np.zeros(30), _seen(cost, theta, away)) for away in (mode, others)
     )
     assert common < 0.55, "one standard deviation of one number"
     assert mixed > 20 * common
@@ -69,11 +74,11 @@ def test_the_gradient_is_the_costs_derivative(tracker: SubjectTracker, redescend
     cost, theta = _with_noise(tracker.cost, 2), _pose(tracker, 2)
     random = np.random.default_rng(3)
     away = 0.006 * random.normal(size=(cost.head.num_landmarks, 2))
-    target = _seen(cost, theta, away)
-    found = cost.linearize(theta, np.zeros(30), CAMERA, target, redescending=redescending)
+    frame = _seen(cost, theta, away, redescending)
+    found = cost.data_model(theta, np.zeros(30), frame)
 
     def value(theta: np.ndarray) -> float:
-        return cost.value(theta, np.zeros(30), CAMERA, target, redescending=redescending)
+        return cost.data_cost(theta, np.zeros(30), frame)
 
     translation = set(range(*cost.head.layout.slice("translation").indices(len(theta))))
     for place, column in enumerate(cost.parameters.columns):
@@ -104,7 +109,9 @@ def test_a_picture_turned_by_a_quarter_costs_the_same(tracker: SubjectTracker) -
     wanted = np.stack([upright[:, 1], -upright[:, 0], upright[:, 2]], 1)
     lying[shift] += (wanted - moved).mean(0)
     costs = [
-        tracker.cost.value(pose, np.zeros(30), camera, tracker.targets(points[None])[0])
+        tracker.cost.data_cost(
+            pose, np.zeros(30), FrameTerms(tracker.targets(points[None])[0], camera)
+        )
         for pose, points in ((theta, seen), (lying, turned))
     ]
     np.testing.assert_allclose(costs[0], costs[1], rtol=0.02)  # the view's slides change a little

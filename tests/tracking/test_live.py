@@ -1,5 +1,7 @@
 """The tracker for a stream, on a still that is moved in known ways, and on a real clip."""
 
+from contextlib import closing
+
 import cv2
 import numpy as np
 import pytest
@@ -7,7 +9,7 @@ import torch
 
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.tracking import TrackConfig
-from rgbavatar_ns.tracking.image.following_crop import FollowingCrop
+from rgbavatar_ns.tracking.image.crop import FollowingCrop
 from rgbavatar_ns.tracking.input.video import FrameSource
 
 from .clips import REAL_CLIPS, astronaut
@@ -33,7 +35,7 @@ def _moved(image: np.ndarray, degrees: float = 0.0, right_px: float = 0.0) -> np
 
 
 def test_roll_and_shift_of_a_still_come_back_as_rotation_and_translation(portrait):
-    with LiveTracker(CONFIG) as tracker:
+    with closing(LiveTracker(CONFIG)) as tracker:
         for k in range(3):
             assert tracker(_moved(portrait, k - 1.0)) is None
         assert tracker.ready
@@ -73,7 +75,7 @@ def _side(tracker: LiveTracker) -> int:
 
 def test_a_lost_face_is_counted_and_found_again(portrait):
     nothing = np.full((SIZE, SIZE, 3), 90, np.uint8)
-    with LiveTracker(CONFIG) as tracker:
+    with closing(LiveTracker(CONFIG)) as tracker:
         assert tracker(nothing) is None
         for _ in range(3):
             tracker(portrait)
@@ -86,7 +88,7 @@ def test_a_lost_face_is_counted_and_found_again(portrait):
 
 
 def test_another_size_is_refused_and_identity_waits_for_the_warm_up(portrait):
-    with LiveTracker(CONFIG) as tracker:
+    with closing(LiveTracker(CONFIG)) as tracker:
         tracker(portrait)
         with pytest.raises(RuntimeError, match="warm-up"):
             _ = tracker.identity
@@ -115,7 +117,8 @@ def test_a_real_clip_frame_by_frame_twice_the_same():
     images = [frame.image_rgb for frame in FrameSource.open(REAL_CLIPS / "grid_id2.mpg", 30)]
 
     def run():
-        with LiveTracker(TrackConfig(image_size=128, key_frames=6, focal_px=576.0)) as tracker:
+        config = TrackConfig(image_size=128, key_frames=6, focal_px=576.0)
+        with closing(LiveTracker(config)) as tracker:
             return [tracker(image) for image in images], tracker.identity, dict(tracker.counts)
 
     (frames, identity, counts), (again, same, _) = run(), run()

@@ -1,6 +1,7 @@
 """Frames that were exposed while the head moved: followed, and noted as blurred."""
 
 from collections.abc import Sequence
+from contextlib import closing
 
 import cv2
 import numpy as np
@@ -13,10 +14,10 @@ from rgbavatar_ns.synthetic.make import DemoPerson
 from rgbavatar_ns.tracking.config import TrackConfig
 from rgbavatar_ns.tracking.face.clip import ClipLandmarks, SeenFaces, followed_face
 from rgbavatar_ns.tracking.face.detector import FaceLandmarker
-from rgbavatar_ns.tracking.find_faces import sharpness
+from rgbavatar_ns.tracking.face.find_faces import sharpness
 from rgbavatar_ns.tracking.fit.own_head import subject_tracker
-from rgbavatar_ns.tracking.fit.subject import SubjectTracker
 
+from .acting import degrees_apart, skulls
 from .clips import astronaut
 
 pytest.importorskip("mediapipe", reason="the tracker's optional extra is not installed")
@@ -26,7 +27,7 @@ def follow(pictures: Sequence[np.ndarray]) -> ClipLandmarks:
     """The face as `rgbavatar track` sees it, frame after frame."""
     height, width = pictures[0].shape[:2]
     points, found, sharp = [], [], []
-    with FaceLandmarker() as landmarker:
+    with closing(FaceLandmarker()) as landmarker:
         for picture in pictures:
             faces = landmarker.faces(picture)
             found.append(len(faces))
@@ -42,15 +43,6 @@ def follow(pictures: Sequence[np.ndarray]) -> ClipLandmarks:
         np.array(sharp),
     )
     return followed_face(seen, width, height)
-
-
-def degrees_apart(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    cosine = (np.einsum("fij,fij->f", first, second) - 1) / 2
-    return np.degrees(np.arccos(np.clip(cosine, -1, 1)))
-
-
-def rotations(tracker: SubjectTracker, theta: np.ndarray) -> np.ndarray:
-    return np.array([tracker.mesh_landmarks.head_rotation(row) for row in theta])
 
 
 def test_a_face_swept_through_the_picture_is_found_and_noted_as_blurred() -> None:
@@ -113,7 +105,7 @@ def test_a_swinging_head_is_followed_through_frames_exposed_for_half_their_time(
     fit = tracker.fit(clip.points_px, clip.follows(), SIZE, SIZE)
     assert tracker.rejected(fit, clip.points_px) == []
     true = _swinging(layout, np.arange(FRAMES, dtype=float))
-    away = degrees_apart(rotations(tracker, tracker.thetas(fit)), rotations(tracker, true))
+    away = degrees_apart(skulls(tracker, tracker.thetas(fit)), skulls(tracker, true))
     fast = np.zeros(FRAMES, bool)
     fast[_FAST] = True
     print(f"degrees: still {away[~fast].mean():.2f}, moving {away[fast].mean():.2f}", clip.blurred)

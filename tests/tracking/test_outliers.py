@@ -7,12 +7,12 @@ import torch
 from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.tracking.config import TrackConfig
 from rgbavatar_ns.tracking.face.detector import face_height_px
-from rgbavatar_ns.tracking.fit.camera import StillCamera
 from rgbavatar_ns.tracking.fit.fit import fit_frame
 from rgbavatar_ns.tracking.fit.landmark_cost import Target
 from rgbavatar_ns.tracking.fit.subject import SubjectTracker
 
-CAMERA = StillCamera(700.0, (160.0, 120.0), 0.8)
+from .acting import CAMERA, degrees_apart, skulls
+
 Spoil = Callable[[np.ndarray, float, np.random.Generator], np.ndarray]
 
 
@@ -49,11 +49,9 @@ def test_a_pose_stays_right_when_landmarks_go_wrong(spoil: Spoil, seed: int) -> 
     start = np.zeros(len(tracker.cost.parameters.columns))
     target = Target(spoil(points, face_px, random), face_px, np.eye(2))
     values = fit_frame(tracker.cost, CAMERA, target, start, None, 0.0, 12)
-    found = tracker.cost.theta(values, np.zeros(layout.size))
+    found = tracker.cost.theta(values)
 
-    turned = tracker.mesh_landmarks.head_rotation(found)
-    turned = turned @ tracker.mesh_landmarks.head_rotation(theta).T
-    angle = np.degrees(np.arccos(np.clip((np.trace(turned) - 1) / 2, -1, 1)))
+    (angle,) = degrees_apart(skulls(tracker, found[None]), skulls(tracker, theta[None]))
     assert angle < 1.5
     shift = found[layout.slice("translation")] - theta[layout.slice("translation")]
     assert np.linalg.norm(shift[:2]) < 0.01 * CAMERA.distance_m

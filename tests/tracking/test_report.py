@@ -1,6 +1,5 @@
 """The figures and words of the report, worked by hand."""
 
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -9,16 +8,17 @@ import pytest
 from rich.console import Console
 
 from rgbavatar_ns.cli.track import summary_table
-from rgbavatar_ns.tracking.image.head_mask import height_above_chin, mesh_silhouette
-from rgbavatar_ns.tracking.image.silhouette import silhouette_agreement
-from rgbavatar_ns.tracking.verify.contact_sheet import sheet_frames
-from rgbavatar_ns.tracking.verify.overlay import OverlayTile, write_contact_sheet
+from rgbavatar_ns.data.check.problems import verdict
+from rgbavatar_ns.drawing.wireframe import mesh_silhouette
+from rgbavatar_ns.tracking.image.head_mask import HeadOutline, height_above_chin
+from rgbavatar_ns.tracking.verify.contact_sheet import draw_tile, sheet_frames
 from rgbavatar_ns.tracking.verify.report import (
     closed_eyes,
     count_blinks,
     gap_correlation,
+    silhouette_shares,
     silhouette_summary,
-    verdict,
+    tracking_findings,
 )
 
 GOOD: dict[str, Any] = {
@@ -75,12 +75,12 @@ def test_correlation_of_openings() -> None:
     ],
 )
 def test_the_verdict_says_what_is_amiss(changes: dict[str, Any], words: str) -> None:
-    assert verdict(GOOD | changes) == words
+    assert verdict(tracking_findings(GOOD | changes)) == words
 
 
 def test_grave_words_come_before_mild_ones() -> None:
     both = GOOD | {"mesh_reprojection_error_share": 0.02, "silhouette_coverage": 0.5}
-    assert verdict(both) == (
+    assert verdict(tracking_findings(both)) == (
         "look at it: the matte misses part of the head; the mesh lies off the face"
     )
 
@@ -98,24 +98,21 @@ def test_silhouettes_compared_by_hand() -> None:
     # Rows 0 to 99, chin at row 80, forehead at row 0: above_chin falls from 1 to -.25.
     above = height_above_chin(np.array([50.0, 0.0]), np.array([50.0, 80.0]), 100)
     assert above[0, 0] == pytest.approx(1 - 0.5 / 80)
-    mesh = np.zeros((100, 100), np.float32)
+    mesh, seen = np.zeros((100, 100), np.float32), np.ones((100, 100), np.float32)
     mesh[10:95, 30:70] = 1
-    hair = mesh.copy()
+    outline = HeadOutline(mesh, above, 80.0, None)
+    hair, wider, half = mesh.copy(), mesh.copy(), mesh.copy()
     hair[:30, 20:80] = 1
-    seen = np.ones_like(mesh)
-    with_hair = silhouette_agreement(mesh, hair, seen, above, 80.0)
-    assert (with_hair.coverage, with_hair.face_iou) == (1, 1), "hair on top costs nothing"
-    wider = mesh.copy()
+    with_hair = silhouette_shares(outline, hair, seen)
+    assert with_hair == {"coverage": 1, "face_iou": 1}, "hair on top costs nothing"
     wider[:, 65:75] = 1
-    assert silhouette_agreement(mesh, wider, seen, above, 80.0).face_iou == pytest.approx(40 / 45)
-    half = mesh.copy()
+    assert silhouette_shares(outline, wider, seen)["face_iou"] == pytest.approx(40 / 45)
     half[:, :50] = 0
-    agreement = silhouette_agreement(mesh, half, seen, above, 80.0)
-    assert agreement.coverage == pytest.approx(0.5)
-    assert agreement.face_iou == pytest.approx(0.5)
-    outside = silhouette_agreement(mesh, half, np.zeros_like(mesh), above, 80.0)
-    assert (outside.coverage, outside.face_iou) == (None, None)
-    summary = silhouette_summary([agreement.to_json(), outside.to_json(), with_hair.to_json()])
+    halved = silhouette_shares(outline, half, seen)
+    assert halved == pytest.approx({"coverage": 0.5, "face_iou": 0.5})
+    outside = silhouette_shares(outline, half, 0 * seen)
+    assert outside == {"coverage": None, "face_iou": None}
+    summary = silhouette_summary([halved, outside, with_hair])
     assert summary["silhouette_coverage"] == pytest.approx(0.75)
     assert summary["worst_silhouette_coverage"] == pytest.approx(0.5)
 
@@ -162,14 +159,12 @@ def test_the_sheet_shows_the_frames_that_are_most_likely_wrong() -> None:
     assert max(np.diff(list(shown))) < 45, "the rest lies evenly between"
 
 
-def test_a_sheet_of_one_frame(tmp_path: Path) -> None:
+def test_a_sheet_of_one_frame() -> None:
     shown = sheet_frames(_landmarks(1), np.ones(1))
     assert list(shown) == [0]
     image = np.full((64, 64, 4), 255, np.uint8)
     corners = np.array([[10.0, 10], [50, 10], [30, 50]])
-    tile = OverlayTile(shown[0], image, corners, corners, corners + 3)
-    write_contact_sheet(tmp_path / "sheet.png", [tile], np.array([[0, 2, 1]]))
-    sheet = cv2.imread(str(tmp_path / "sheet.png"))
+    sheet = draw_tile(shown[0], image, corners, np.array([[0, 2, 1]]), corners, corners + 3)
     assert sheet.shape[1] == 2 * sheet.shape[0]
-    assert sheet[:, : sheet.shape[0]][40:].min() == 255, "left: the picture as it is"
+    assert sheet[:, : sheet.shape[0]][40:].min() == 255, "left: the image as it is"
     assert sheet[:, sheet.shape[0] :].min() < 200, "right: with the mesh"

@@ -1,5 +1,7 @@
 """What FaceMesh's measured response is worth on a person whose truth is known."""
 
+from contextlib import closing
+
 import numpy as np
 import pytest
 import torch
@@ -12,6 +14,8 @@ from rgbavatar_ns.synthetic.performer.performance import perform
 from rgbavatar_ns.tracking.config import TrackConfig
 from rgbavatar_ns.tracking.face.detector import FaceLandmarker
 from rgbavatar_ns.tracking.fit.subject import SubjectTracker
+
+from .acting import degrees_apart, skulls
 
 pytest.importorskip("mediapipe", reason="the tracker needs mediapipe")
 # Not among the people on whom the response was measured.
@@ -27,7 +31,7 @@ def test_head_jaw_and_expressions_come_nearer_to_the_truth() -> None:
     names, layout = person.head.arrays.expression_names, person.head.layout
     theta = perform(layout, names, 4 * FRAMES, FRAMES, 8.0, SEED).theta[::4]
     found, kept = [], []
-    with FaceLandmarker() as landmarker:
+    with closing(FaceLandmarker()) as landmarker:
         for number, image in enumerate(person.draw(torch.from_numpy(theta).float())):
             alpha = image[..., 3:] / 255
             picture = (image[..., :3] * alpha + 120 * (1 - alpha)).round().astype(np.uint8)
@@ -45,13 +49,7 @@ def test_head_jaw_and_expressions_come_nearer_to_the_truth() -> None:
         tracker = SubjectTracker(head, camera, response=response)
         fit = tracker.fit(np.array(found), [False] * len(found), 192, 192)
         fitted = tracker.thetas(fit)
-        turns = [
-            tracker.mesh_landmarks.head_rotation(ours)
-            @ tracker.mesh_landmarks.head_rotation(real).T
-            for ours, real in zip(fitted, true)
-        ]
-        cosine = [(np.trace(turn) - 1) / 2 for turn in turns]
-        degrees = np.degrees(np.arccos(np.clip(cosine, -1, 1))).mean()
+        degrees = degrees_apart(skulls(tracker, fitted), skulls(tracker, true)).mean()
         expression = layout.slice("expression")
         active = [
             column

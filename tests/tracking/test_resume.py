@@ -16,8 +16,8 @@ from rgbavatar_ns.data import load_dataset
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.tracking import TrackConfig, track_video
 from rgbavatar_ns.tracking import track as track_module
-from rgbavatar_ns.tracking.find_faces import find_faces
-from rgbavatar_ns.tracking.resumable_run import WORK_FOLDER, ResumableRun, fingerprint
+from rgbavatar_ns.tracking.face.find_faces import find_faces
+from rgbavatar_ns.tracking.resumable_run import WORK_FOLDER, ResumableRun
 
 from .clips import astronaut, gradient_images, write_clip
 
@@ -126,7 +126,7 @@ def test_other_options_or_another_video_are_refused_in_words_or_start_anew(
     assert track_video(changed, dst, small).width == 48
 
 
-def test_a_finished_dataset_stands_until_the_new_ones_pictures_begin(
+def test_a_finished_dataset_stands_until_the_new_ones_images_begin(
     clip: Path, tmp_path: Path
 ) -> None:
     dst = tmp_path / "set"
@@ -141,23 +141,23 @@ def test_a_finished_dataset_stands_until_the_new_ones_pictures_begin(
     assert track_video(clip, dst, again).width == 32
 
 
-def test_a_torn_line_and_a_torn_picture_are_made_again(tmp_path: Path) -> None:
+def test_a_torn_line_and_a_torn_image_are_made_again(tmp_path: Path) -> None:
     run = ResumableRun.open(tmp_path / "set", {"a": 1}, overwrite=False)
     images = tmp_path / "set" / "images"
     images.mkdir()
-    assert run.pictures("fit") == {}
+    assert run.noted_images("fit") == {}
     for frame in range(3):
         cv2.imwrite(str(images / f"{frame:05d}.png"), np.zeros((4, 4, 4), np.uint8))
-        run.note_picture(frame, {"coverage": None})
+        run.note_image(frame, {"coverage": None})
     whole = (images / "00001.png").read_bytes()
     (images / "00001.png").write_bytes(whole[:-6])
-    with (tmp_path / "set" / WORK_FOLDER / "pictures.jsonl").open("a") as file:
+    with (tmp_path / "set" / WORK_FOLDER / "images.jsonl").open("a") as file:
         file.write('{"frame": 2, "cov')
-    assert sorted(run.pictures("fit")) == [0, 2]
-    run.note_picture(7, {})
+    assert sorted(run.noted_images("fit")) == [0, 2]
+    run.note_image(7, {})
     cv2.imwrite(str(images / "00007.png"), np.zeros((4, 4, 4), np.uint8))
-    assert sorted(run.pictures("fit")) == [0, 2, 7]
-    assert run.pictures("another fit") == {}
+    assert sorted(run.noted_images("fit")) == [0, 2, 7]
+    assert run.noted_images("another fit") == {}
 
 
 def test_ctrl_c_ends_with_one_line_and_code_130(
@@ -188,6 +188,8 @@ def test_a_destination_that_is_a_file_is_refused(clip: Path, tmp_path: Path) -> 
     with pytest.raises(UserError, match="is a file"):
         track_video(clip, tmp_path / "set")
     assert (tmp_path / "set").read_text() == "mine"
+    with pytest.raises(UserError, match="not empty"):
+        track_video(clip, tmp_path)
 
 
 def _failing(code: int, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -202,14 +204,12 @@ def _failing(code: int, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "replace", replace)
 
 
-@pytest.mark.parametrize(
-    ("code", "told"), [(errno.EROFS, "cannot be written"), (errno.EACCES, "cannot be written")]
-)
+@pytest.mark.parametrize("code", [errno.EROFS, errno.EACCES])
 def test_a_destination_that_cannot_be_written_is_told_before_the_work(
-    clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int, told: str
+    clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int
 ) -> None:
     _failing(code, "run.json", monkeypatch)
-    with pytest.raises(UserError, match=told):
+    with pytest.raises(UserError, match=r"Cannot write .*run\.json"):
         track_video(clip, tmp_path / "set", CONFIG, _interrupting("faces", 0))
 
 
@@ -218,20 +218,9 @@ def test_after_a_full_disk_the_same_command_goes_on(
     clip: Path, tmp_path: Path, uninterrupted: Path, place: str
 ) -> None:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(track_module, "find_faces", partial(find_faces, block_frames=BLOCK))
         _failing(errno.ENOSPC, place, patch)
         with pytest.raises(UserError, match="no space left"):
             track_video(clip, tmp_path / "set", CONFIG)
     assert (tmp_path / "set" / WORK_FOLDER).is_dir()
-    if place == "00005.png":
-        track_video(clip, tmp_path / "set", CONFIG)
-        assert _files(tmp_path / "set") == _files(uninterrupted)
-
-
-def test_a_source_is_known_by_its_content(tmp_path: Path) -> None:
-    first, second = tmp_path / "a", tmp_path / "b"
-    first.write_bytes(b"x" * 9_000_000)
-    second.write_bytes(b"x" * 9_000_000)
-    assert fingerprint(first) == fingerprint(second)
-    second.write_bytes(b"x" * 8_999_999 + b"y")
-    assert fingerprint(first) != fingerprint(second)
+    track_video(clip, tmp_path / "set", CONFIG)
+    assert _files(tmp_path / "set") == _files(uninterrupted)

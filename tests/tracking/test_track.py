@@ -5,7 +5,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rgbavatar_ns.data import load_dataset
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.tracking import TrackConfig, track_video
 
@@ -58,15 +57,6 @@ def test_a_written_clip_becomes_a_dataset_without_its_faceless_frames(
     assert (image[..., 3] > 0).mean() < 0.7
 
 
-def test_tracking_twice_gives_the_same_dataset(
-    portrait: tuple[Path, list[int]], tmp_path: Path
-) -> None:
-    config = TrackConfig(image_size=64, key_frames=2, max_frames=3, focal_px=500.0)
-    first, second = (track_video(portrait[0], tmp_path / name, config) for name in "ab")
-    np.testing.assert_array_equal(first.theta.numpy(), second.theta.numpy())
-    np.testing.assert_array_equal(first.read_image(1), second.read_image(1))
-
-
 def test_torso_is_kept_only_when_asked_for(
     portrait: tuple[Path, list[int]], tmp_path: Path
 ) -> None:
@@ -79,13 +69,6 @@ def test_torso_is_kept_only_when_asked_for(
         shares.append(dataset.read_image(0)[-8:, :, 3].mean() / 255)
     assert shares[0] < 0.05
     assert shares[1] > 0.3
-
-
-def test_no_face_anywhere_is_told_and_leaves_no_dataset(tmp_path: Path) -> None:
-    clip = write_clip(tmp_path / "grey.mp4", gradient_images(3, 96, 96))
-    with pytest.raises(UserError, match="No face"):
-        track_video(clip, tmp_path / "set")
-    assert not (tmp_path / "set" / "dataset.json").exists()
 
 
 def test_missing_mediapipe_is_told_with_the_command_that_installs_it(
@@ -104,26 +87,6 @@ def test_missing_mediapipe_is_told_with_the_command_that_installs_it(
     clip = write_clip(tmp_path / "grey.mp4", gradient_images(2, 96, 96))
     with pytest.raises(UserError, match=r"--no-deps mediapipe==0\.10\.9"):
         track_video(clip, tmp_path / "set")
-
-
-def test_an_existing_dataset_is_not_overwritten_unasked(
-    portrait: tuple[Path, list[int]], tmp_path: Path
-) -> None:
-    (tmp_path / "note.txt").write_text("mine")
-    with pytest.raises(UserError, match="not empty"):
-        track_video(portrait[0], tmp_path, TrackConfig(max_frames=2))
-
-
-def test_interruption_leaves_no_dataset(portrait: tuple[Path, list[int]], tmp_path: Path) -> None:
-    def interrupt(stage: str, done: int, total: int | None) -> None:
-        if stage == "pictures" and done == 1:
-            raise KeyboardInterrupt
-
-    config = TrackConfig(max_frames=2, key_frames=1, image_size=64, focal_px=500.0)
-    with pytest.raises(KeyboardInterrupt):
-        track_video(portrait[0], tmp_path / "set", config, interrupt)
-    with pytest.raises(UserError):
-        load_dataset(tmp_path / "set")
 
 
 def test_a_face_in_one_frame_only_gives_one_frame_and_a_warning(tmp_path: Path) -> None:

@@ -1,8 +1,10 @@
 """Videos and cameras as streams, with a tracker that only counts, and with the real one."""
 
+import threading
 import time
 from collections import Counter
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +15,7 @@ from rgbavatar_ns.data.streams import Backoff, StreamedFrame
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.kernels import PinholeCameras
-from rgbavatar_ns.tracking.input.capture import FilePictures, NewestPictures
+from rgbavatar_ns.tracking.input.capture import CapturedFrame, FileCapture, LatestFrameCapture
 from rgbavatar_ns.tracking.video_stream import VideoStream
 
 from .clips import REAL_CLIPS, gradient_images, write_clip
@@ -106,68 +108,90 @@ def test_a_file_goes_on_in_its_middle_with_the_same_subject(clip: Path):
 
 def test_a_missing_file_is_refused(tmp_path: Path):
     with pytest.raises(UserError, match="no video"):
-        FilePictures(tmp_path / "absent.mp4")
+        FileCapture(tmp_path / "absent.mp4")
 
 
 class FakeCamera:
-    """Gives some pictures, then nothing; None stands for a picture that did not come."""
+    """Gives some images, one for each of `steps`, then nothing."""
 
-    def __init__(self, pictures: list[np.ndarray | None], opened: bool = True) -> None:
-        self._pictures, self._opened, self.released = pictures, opened, False
+    def __init__(
+        self, images: list[np.ndarray], steps: threading.Semaphore, opened: bool = True
+    ) -> None:
+        self._images, self._steps, self._opened = images, steps, opened
+        self.released, self.waits = False, threading.Event()
 
     def isOpened(self) -> bool:
         return self._opened
 
     def read(self) -> tuple[bool, np.ndarray | None]:
-        time.sleep(0.02)
-        picture = self._pictures.pop(0) if self._pictures else None
-        return picture is not None, picture
+        if not self._images:
+            return False, None
+        if not self._steps.acquire(blocking=False):
+            self.waits.set()
+            assert self._steps.acquire(timeout=DEADLINE_S)
+        return True, self._images.pop(0)
 
     def release(self) -> None:
         self.released = True
+
+
+class SteppedCapture(LatestFrameCapture):
+    """Lets its camera go on when a frame was taken, so that none is skipped."""
+
+    def __init__(self, steps: threading.Semaphore, *given: Any) -> None:
+        self._steps = steps
+        super().__init__("0", *given)
+
+    def next(self, timeout_s: float) -> CapturedFrame | None:
+        frame = super().next(timeout_s)
+        if frame is not None:
+            self._steps.release()
+        return frame
 
 
 def lit(level: int, side: int = 4) -> np.ndarray:
     return np.full((side, side, 3), level, np.uint8)
 
 
-def test_a_lost_camera_is_opened_again_and_faceless_pictures_are_counted():
+def test_a_lost_camera_is_opened_again_and_faceless_images_are_counted():
+    steps = threading.Semaphore(1)
     cameras = [
-        FakeCamera([lit(50), lit(60), lit(70), lit(0)]),
-        FakeCamera([], opened=False),
-        FakeCamera([lit(80), lit(90, side=6), lit(100), *[lit(110)] * 1000]),
+        FakeCamera([lit(50), lit(60), lit(70), lit(0)], steps),
+        FakeCamera([], steps, opened=False),
+        FakeCamera([lit(80), lit(90, side=6), lit(100), *[lit(110)] * 9], steps),
     ]
     opened = iter(cameras)
-    pictures = NewestPictures("0", lambda _: next(opened), Backoff(0.01, 0.02))
-    stream = VideoStream("0", tracker=CountingTracker(), pictures=pictures)
+    capture = SteppedCapture(steps, lambda _: next(opened), Backoff(0.01, 0.02))
+    stream = VideoStream("0", tracker=CountingTracker(), capture=capture)
     frames = take(stream, 6)
-    indices = [frame.index for frame in frames]
-    assert indices == sorted(set(indices))
-    assert indices[0] == 0
-    assert indices[-1] >= 7
+    assert [frame.index for frame in frames] == [0, 1, 2, 4, 6, 7]
     counts = stream.counts
     assert counts["source lost"] == counts["reconnects"] == counts["failed openings"] == 1
-    assert counts["no face"] + counts["another resolution"] + counts["skipped"] >= 2
+    assert (counts["no face"], counts["another resolution"], counts["skipped"]) == (1, 1, 0)
     assert not stream.keeps_frames
     assert len({frame.session for frame in frames}) == 1
     assert frames[0].session
+    steps.release()
     stream.close()
     assert stream.ended
     assert all(camera.released for camera in cameras)
 
 
-def test_a_slow_tracker_gets_the_newest_picture():
-    camera = FakeCamera([lit(10 + i) for i in range(200)])
-    pictures = NewestPictures("0", lambda _: camera)
-    time.sleep(0.3)
-    first = pictures.next(1.0)
-    time.sleep(0.3)
-    second = pictures.next(1.0)
-    pictures.close()
+def test_a_slow_tracker_gets_the_latest_frame():
+    steps = threading.Semaphore(5)
+    camera = FakeCamera([lit(10 + i) for i in range(20)], steps)
+    capture = LatestFrameCapture("0", lambda _: camera)
+    assert camera.waits.wait(DEADLINE_S)
+    first = capture.next(1.0)
+    camera.waits.clear()
+    steps.release(5)
+    assert camera.waits.wait(DEADLINE_S)
+    second = capture.next(1.0)
+    steps.release(20)
+    capture.close()
     assert first is not None
     assert second is not None
-    assert second.index > first.index + 1
-    assert pictures.counts["skipped"] >= second.index - 2
+    assert (first.index, second.index, capture.counts["skipped"]) == (4, 9, 8)
     assert int(second.image_rgb[0, 0, 0]) == 10 + second.index
 
 

@@ -1,7 +1,7 @@
 """The optimiser step without autograd, for what the eager step spends its time on.
 
-Blending, tangent frames, rasterisation, L1 and Adam of all Gaussian parameters run in the backend's
-own loops; torch keeps the weight network. Agrees with `training_step`'s eager path up to rounding.
+Morphing, tangent frames, rasterisation, L1 and Adam of all Gaussian parameters run in the backend's
+own loops; torch keeps the weight network. Agrees with the eager step up to rounding.
 """
 
 from collections.abc import Iterable
@@ -65,7 +65,7 @@ class FusedStep:
     def update_gaussians(
         self, renderer: MorphedRenderer, *, with_vertices: bool = False
     ) -> MorphedGradient:
-        """Step by the renderer's last comparison and return the gradient of what posed it."""
+        """Step by the renderer's last forward_loss and return the gradient of what posed it."""
         parameters = self._states.next_of_gaussians()
         gradient = renderer.backward_adam(parameters, with_vertices=with_vertices)
         self._states.count_gaussians()

@@ -1,7 +1,7 @@
 """The whole optimiser step as one CUDA graph: the host says which frames, and waits for nothing.
 
 Frames lie on the device as 8-bit images. A replay takes what changes from step to step (frames,
-backgrounds, Adam's numbers) from one small buffer; blending, drawing, loss, gradients, Adam and the
+backgrounds, Adam's numbers) from one small buffer; morphing, drawing, loss, gradients, Adam and the
 weight network with its own gradients and Adam are in the graph.
 """
 
@@ -56,7 +56,7 @@ class RecordedStep:
         device = frames.theta.device
         self._network = avatar.parameter_groups().get("weight_network", [])
         rows = len(UPDATED_ATTRIBUTES) + 1
-        # One buffer, so that one copy brings a step's news: frames, backgrounds, Adam's numbers.
+        # One buffer, so that one copy brings all of a step's inputs: frames, backgrounds, Adam's numbers.
         self._sizes = (batch_size, 3 * batch_size, rows * 2 * _NUMBERS)
         self._step_inputs = torch.zeros(sum(self._sizes), dtype=torch.float64, device=device)
         self._loss = torch.zeros((), device=device)
@@ -122,16 +122,16 @@ class RecordedStep:
         return [*numbers, *(0.0,) * _NUMBERS]
 
     def _work(self) -> None:
-        """One step, from the news: nothing here may wait for the device or copy from the host."""
+        """One step, from `_step_inputs`: nothing here may wait for the device or copy from the host."""
         chosen, background, numbers = self._step_inputs.split(self._sizes)
         rows = numbers.float().view(-1, 2 * _NUMBERS)
         index = chosen.long()
         renderer, psi = self._renderer(index)
         assert isinstance(renderer, DeviceRenderer)
         self._loss.copy_(
-            renderer.compare_with(self.frames.images_rgba, index, background.float().view(-1, 3))
+            renderer.forward_loss_of(self.frames.images_rgba, index, background.float().view(-1, 3))
         )
-        gradient = renderer.update_with(self._gaussian_states, rows[:-1])
+        gradient = renderer.backward_adam_with(self._gaussian_states, rows[:-1])
         if self._network:
             grads = torch.autograd.grad(psi, self._network, gradient.weights)
             for state, grad in zip(self._network_states, grads):

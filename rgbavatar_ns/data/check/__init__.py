@@ -1,4 +1,4 @@
-"""Whether a dataset can be trained: the whole check with a picture, and a quick one."""
+"""Whether a dataset can be trained: the whole check with an image, and a quick one."""
 
 from rgbavatar_ns.data.check.problems import Problem
 from rgbavatar_ns.data.check.report import (

@@ -11,10 +11,9 @@ from jaxtyping import Float, Int, Shaped
 
 from rgbavatar_ns.data.check.problems import Problem, Severity
 from rgbavatar_ns.data.check.sample import (
-    Projection,
     Sample,
-    agreement,
     inside_share,
+    overlaps,
     projected,
     silhouettes,
 )
@@ -46,7 +45,7 @@ class Fit:
     iou: float
     covered: float
     up: float
-    """Cosine of the head's up and the picture's up."""
+    """Cosine of the head's up and the image's up."""
     facing: float
     """Cosine of where the head looks and where the camera is."""
     mattes: bool
@@ -81,23 +80,16 @@ class _Trial:
     """In score, for it to be believed of data that is not hopeless."""
 
 
-def measure_fit(sample: Sample, projection: Projection | None = None) -> Fit:
+def measure_fit(sample: Sample) -> Fit:
     """Compare all frames of a sample."""
-    projection = projected(sample) if projection is None else projection
-    inside = float(inside_share(sample, projection).mean())
-    up, facing = _orientation(sample)
-    if not sample.has_mattes:
-        return Fit(inside, 0.0, 0.0, up, facing, False)
-    drawn = silhouettes(sample, projection)
-    found = [agreement(mesh, matte) for mesh, matte in zip(drawn, sample.alpha)]
-    return Fit(
-        inside,
-        float(np.mean([one.iou for one in found])),
-        float(np.mean([one.covered for one in found])),
-        up,
-        facing,
-        True,
+    projection = projected(sample)
+    found = overlaps(sample, projection)
+    iou, covered = (
+        float(np.mean([getattr(one, name) for one in found])) if found else 0.0
+        for name in ("iou", "covered")
     )
+    inside = float(inside_share(sample, projection).mean())
+    return Fit(inside, iou, covered, *_orientation(sample), sample.has_mattes)
 
 
 def _orientation(sample: Sample) -> tuple[float, float]:

@@ -1,6 +1,7 @@
-"""What is wrong with a dataset, in words and for programs."""
+"""What is wrong with a dataset, in words and for programs, and the verdict on it."""
 
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 from rgbavatar_ns.data.importers.flame_parameters import FlameVersionError
@@ -11,17 +12,23 @@ _SHOWN = 5
 
 
 @dataclass(frozen=True)
-class Problem:
-    """One finding; an error makes the data unusable, a warning asks to look.
+class Finding:
+    """Something amiss: an error spoils the data, a warning asks to look.
 
     kind: a stable word for programs: "unreadable", "axes", "focal length", "principal point",
     "mirrored", "frame offset", "outside", "misfit", "FLAME version", "parameters", "cameras",
-    "mattes".
+    "mattes", "landmarks", "faces".
     """
 
     kind: str
     severity: Severity
     cause: str
+
+
+@dataclass(frozen=True)
+class Problem(Finding):
+    """A finding with what a user can do about it."""
+
     remedy: str
     frames: tuple[int, ...] = ()
     """Numbers of the frames that it is about; none: all."""
@@ -38,13 +45,21 @@ class Problem:
 
     def to_json(self) -> dict[str, Any]:
         """Plain values."""
-        return {
-            "kind": self.kind,
-            "severity": self.severity,
-            "cause": self.cause,
-            "remedy": self.remedy,
-            "frames": list(self.frames),
-        }
+        return {**asdict(self), "frames": list(self.frames)}
+
+
+def usable(findings: Iterable[Finding]) -> bool:
+    """Whether nothing that was found is an error."""
+    return not any(finding.severity == "error" for finding in findings)
+
+
+def verdict(findings: Iterable[Finding]) -> str:
+    """The findings in words, errors first: "good", "usable: ..." or "look at it: ..."."""
+    ordered = sorted(findings, key=lambda finding: finding.severity)
+    if not ordered:
+        return "good"
+    causes = "; ".join(finding.cause for finding in ordered)
+    return f"{'usable' if usable(ordered) else 'look at it'}: {causes}"
 
 
 def first_few(numbers: tuple[int, ...]) -> str:

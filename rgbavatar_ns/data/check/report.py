@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from rgbavatar_ns.data.check.contact_sheet import MAX_TILES, write_check_sheet
 from rgbavatar_ns.data.check.parameters import (
     FieldRange,
     camera_problems,
@@ -15,17 +16,16 @@ from rgbavatar_ns.data.check.parameters import (
     version_problem,
 )
 from rgbavatar_ns.data.check.placement import mirrored_problem, placement_problem
-from rgbavatar_ns.data.check.problems import Problem, first_few
+from rgbavatar_ns.data.check.problems import Problem, first_few, usable
 from rgbavatar_ns.data.check.sample import (
-    Agreement,
     Sample,
-    agreement,
     inside_share,
+    overlaps,
     projected,
-    silhouettes,
+    spread,
     take_sample,
 )
-from rgbavatar_ns.data.check.sheet import MAX_TILES, spread, write_sheet
+from rgbavatar_ns.data.check.silhouette import SilhouetteOverlap
 from rgbavatar_ns.data.check.timing import frame_offset_problem, longest_run
 from rgbavatar_ns.data.importers import find_format
 from rgbavatar_ns.data.native.dataset import TrackedDataset
@@ -62,7 +62,7 @@ class CheckReport:
     @property
     def usable(self) -> bool:
         """Whether training can go on."""
-        return not any(problem.severity == "error" for problem in self.problems)
+        return usable(self.problems)
 
     def to_json(self) -> dict[str, Any]:
         """For programs: `format`, `frames`, `usable`, `problems`, and the figures behind them."""
@@ -120,14 +120,14 @@ def check_dataset(
     positions = spread(len(dataset), max_frames).tolist()
     problems = [*parameter_problems(dataset), *camera_problems(dataset)]
     problems += [one for one in [version_problem(dataset)] if one is not None]
-    agreements: list[Agreement] = []
+    found_overlaps: list[SilhouetteOverlap] = []
     try:
         sample = take_sample(dataset, positions, progress)
-        agreements = _agreements(sample)
-        found = _picture_problems(dataset, sample, agreements)
+        found_overlaps = overlaps(sample, projected(sample))
+        found = _image_problems(dataset, sample, found_overlaps)
         if sheet is not None:
-            sheet.parent.mkdir(parents=True, exist_ok=True)
-            write_sheet(sheet, dataset, sample, agreements, spread(len(sample), MAX_TILES).tolist())
+            shown = spread(len(sample), MAX_TILES).tolist()
+            write_check_sheet(sheet, dataset, sample, found_overlaps, shown)
     except UserError as error:
         found, sheet = [Problem.of_error(error)], None
     problems = sorted([*found, *problems], key=lambda problem: problem.severity)
@@ -150,21 +150,13 @@ def check_dataset(
         (float(focal.min()), float(focal.max())),
         field_ranges(dataset),
         tuple(map(str, dataset.source.get("notes", ()))),
-        {dataset.frame_index[p]: a.iou for p, a in zip(positions, agreements)},
+        {dataset.frame_index[p]: one.iou for p, one in zip(positions, found_overlaps)},
         sheet,
     )
 
 
-def _agreements(sample: Sample) -> list[Agreement]:
-    """Of every frame; none where the images have no mattes."""
-    if not sample.has_mattes:
-        return []
-    drawn = silhouettes(sample, projected(sample))
-    return [agreement(mesh, matte) for mesh, matte in zip(drawn, sample.alpha)]
-
-
-def _picture_problems(
-    dataset: TrackedDataset, sample: Sample, agreements: list[Agreement]
+def _image_problems(
+    dataset: TrackedDataset, sample: Sample, found_overlaps: list[SilhouetteOverlap]
 ) -> list[Problem]:
     problems: list[Problem | None] = []
     few = sample.select(spread(len(sample), _FEW_SPREAD).tolist())
@@ -173,7 +165,7 @@ def _picture_problems(
     if placement is None or placement.severity == "warning":
         problems.append(mirrored_problem(sample))
         problems.append(frame_offset_problem(take_sample(dataset, longest_run(dataset))))
-        problems += [_outside(dataset, sample), _worse_than_others(dataset, sample, agreements)]
+        problems += _odd_frames(dataset, sample, found_overlaps)
     problems.append(_mattes(sample))
     if len(dataset.train) < _FEW_FRAMES:
         problems.append(
@@ -187,41 +179,31 @@ def _picture_problems(
     return [problem for problem in problems if problem is not None]
 
 
-def _outside(dataset: TrackedDataset, sample: Sample) -> Problem | None:
-    """Single frames whose head is not in the image, where most are."""
-    odd = inside_share(sample, projected(sample)) < _HALF
-    frames = tuple(dataset.frame_index[p] for p, bad in zip(sample.positions, odd) if bad)
-    if not frames:
-        return None
-    return Problem(
-        "outside",
-        "warning",
-        f"In {len(frames)} of {len(sample)} frames the projected head lies outside of the image "
-        f"({first_few(frames)}).",
-        "Leave these frames out: the tracker lost the face there.",
-        frames,
-    )
-
-
-def _worse_than_others(
-    dataset: TrackedDataset, sample: Sample, agreements: list[Agreement]
-) -> Problem | None:
-    """Frames whose mesh leaves the matte far more than the others do."""
-    if not agreements:
-        return None
-    covered = np.array([one.covered for one in agreements])
-    odd = covered < _LOW_OF_MEDIAN * np.median(covered)
-    frames = tuple(dataset.frame_index[p] for p, bad in zip(sample.positions, odd) if bad)
-    if not frames:
-        return None
-    return Problem(
-        "misfit",
-        "warning",
-        f"In {len(frames)} of {len(sample)} frames the mesh leaves the person far more than in "
-        f"the others ({first_few(frames)}).",
-        "Look at these frames; leave them out if the tracker lost the face.",
-        frames,
-    )
+def _odd_frames(
+    dataset: TrackedDataset, sample: Sample, found_overlaps: list[SilhouetteOverlap]
+) -> list[Problem]:
+    """Single frames whose head is not in the image or leaves the matte, where most are right."""
+    covered = np.array([one.covered for one in found_overlaps])
+    found = []
+    for kind, odd, what, remedy in (
+        (
+            "outside",
+            inside_share(sample, projected(sample)) < _HALF,
+            "the projected head lies outside of the image",
+            "Leave these frames out: the tracker lost the face there.",
+        ),
+        (
+            "misfit",
+            covered < _LOW_OF_MEDIAN * np.median(covered) if found_overlaps else covered,
+            "the mesh leaves the person far more than in the others",
+            "Look at these frames; leave them out if the tracker lost the face.",
+        ),
+    ):
+        frames = tuple(dataset.frame_index[p] for p, bad in zip(sample.positions, odd) if bad)
+        if frames:
+            cause = f"In {len(frames)} of {len(sample)} frames {what} ({first_few(frames)})."
+            found.append(Problem(kind, "warning", cause, remedy, frames))
+    return found
 
 
 def _mattes(sample: Sample) -> Problem | None:

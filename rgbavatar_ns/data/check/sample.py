@@ -8,12 +8,17 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 
+from rgbavatar_ns.data.check.silhouette import (
+    SilhouetteOverlap,
+    down_to_the_neck,
+    silhouette_overlap,
+)
 from rgbavatar_ns.data.native.dataset import TrackedDataset
 from rgbavatar_ns.drawing.wireframe import mesh_silhouette
 from rgbavatar_ns.head import HeadModel
 
 SMALL_PX = 96
-"""Longer side of the pictures that silhouettes are compared in."""
+"""Longer side of the images that silhouettes are compared in."""
 _CHUNK = 16
 _NEAREST_M = 1e-3
 _OPAQUE, _MATTED_SHARE = 0.5, 0.98
@@ -72,14 +77,9 @@ class Projection:
     seen: Bool[np.ndarray, "F V"]
 
 
-@dataclass(frozen=True)
-class Agreement:
-    """How one frame's head mesh and matte fit, in shares of pixels."""
-
-    iou: float
-    """Of mesh and matte, without the matte below the mesh (the shoulders)."""
-    covered: float
-    """Share of the mesh that lies on the matte."""
+def spread(count: int, wanted: int) -> Int[np.ndarray, "n"]:
+    """At most `wanted` places of `count`, evenly from the first to the last."""
+    return np.unique(np.linspace(0, count - 1, min(count, wanted)).round().astype(np.int64))
 
 
 def take_sample(
@@ -168,25 +168,22 @@ def inside_share(sample: Sample, projection: Projection) -> Float[np.ndarray, "F
     return (inside & projection.seen).mean(1)
 
 
-def silhouettes(
-    sample: Sample, projection: Projection, frames: Sequence[int] | None = None
-) -> Float[np.ndarray, "N h w"]:
-    """The mesh's silhouette in these of the sample's frames (all by default)."""
+def silhouettes(sample: Sample, projection: Projection) -> Float[np.ndarray, "F h w"]:
+    """The mesh's silhouette in the sample's frames."""
     height, width = sample.alpha.shape[1:]
     drawn = []
-    for frame in range(len(projection.points_px)) if frames is None else frames:
-        faces = sample.faces[projection.seen[frame][sample.faces].all(1)]
-        mask = mesh_silhouette(projection.points_px[frame], faces, max(height, width))
-        drawn.append(mask[:height, :width])
+    for points_px, seen in zip(projection.points_px, projection.seen):
+        faces = sample.faces[seen[sample.faces].all(1)]
+        drawn.append(mesh_silhouette(points_px, faces, max(height, width))[:height, :width])
     return np.stack(drawn)
 
 
-def agreement(silhouette: Float[np.ndarray, "h w"], alpha: Float[np.ndarray, "h w"]) -> Agreement:
-    """Compare a silhouette with a matte, down to the silhouette's lowest row."""
-    mesh, matte = silhouette > 0.5, alpha > _OPAQUE
-    rows = np.flatnonzero(mesh.any(1))
-    if not len(rows):
-        return Agreement(0.0, 0.0)
-    both = int((mesh & matte).sum())
-    either = int((mesh | matte)[: rows[-1] + 1].sum())
-    return Agreement(both / either, both / int(mesh.sum()))
+def overlaps(sample: Sample, projection: Projection) -> list[SilhouetteOverlap]:
+    """How mesh and matte fit in each frame; none where the images have no mattes."""
+    if not sample.has_mattes:
+        return []
+    drawn = silhouettes(sample, projection)
+    return [
+        silhouette_overlap(mesh, matte, down_to_the_neck(mesh))
+        for mesh, matte in zip(drawn, sample.alpha)
+    ]

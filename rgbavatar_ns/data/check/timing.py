@@ -42,7 +42,7 @@ def longest_run(dataset: TrackedDataset) -> tuple[int, ...]:
 def frame_offset_problem(run: Sample) -> Problem | None:
     """Compare when the images move with when the head does, for offsets of up to two frames.
 
-    How much a picture changes from frame to frame goes up and down with how far the head's
+    How much an image changes from frame to frame goes up and down with how far the head's
     vertices move in it; the offset at which both agree best is where the pairing is right.
     """
     if len(run) < _LEAST_FRAMES:

@@ -91,12 +91,9 @@ def _read(path: Path) -> Any:
     try:
         return read_torch_file(path)
     except UserError as error:
-        raise UnusableFrameError(f"records that cannot be read ({_cause(error, path)})") from None
-
-
-def _cause(error: UserError, path: Path) -> str:
-    """What is wrong, without the file's name, so that equal faults are counted together."""
-    return error.cause.replace(str(path), "the file").rstrip(".")
+        # Without the file's name, so that equal faults are counted together.
+        cause = error.cause.replace(str(path), "the file").rstrip(".")
+        raise UnusableFrameError(f"records that cannot be read ({cause})") from None
 
 
 def parse_frame(content: Any, arrays: HeadArrays) -> TrackedHead:

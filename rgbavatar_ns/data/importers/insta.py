@@ -23,7 +23,6 @@ from rgbavatar_ns.data.importers.transforms import (
     read_transforms,
     size_of,
 )
-from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadArrays
 from rgbavatar_ns.head.flame import EXPRESSIONS
 
@@ -127,8 +126,7 @@ def _from_meshes(reading: Reading, entries: dict[int, Entry]) -> _Parameters:
                 raise UnusableFrameError("frames with neither a .frame file nor a mesh")
             meshes[number] = folder.path(mesh)
     if not meshes:
-        report.settle(str(reading), False)
-        raise UserError(f"{reading} has no frames.", "Name the folder that holds the data.")
+        raise reading.no_frames()
     report.note(
         f"there are no .frame files: head shape, jaw, eyes and eyelids are fitted to "
         f"{len(meshes)} meshes"

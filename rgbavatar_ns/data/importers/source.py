@@ -50,6 +50,11 @@ class Reading:
             if self.progress is not None:
                 self.progress(stage, done, len(items))
 
+    def no_frames(self) -> UserError:
+        """What to raise where no frame is left; raises about those left out if there are any."""
+        self.report.settle(str(self), False)
+        return UserError(f"{self} has no frames.", "Name the folder that holds the data.")
+
     def __str__(self) -> str:
         return f"The {self.format} data in {self.folder.root}"
 
@@ -155,8 +160,7 @@ def _one_size(
         with reading.report.frame(record.frame_image.color.name):
             headers[record.index] = image_header(record.frame_image.color)
     if not headers:
-        reading.report.settle(str(reading), False)
-        raise UserError(f"{reading} has no frames.", "Name the folder that holds the data.")
+        raise reading.no_frames()
     sizes = Counter((header.width, header.height) for header in headers.values())
     size = sizes.most_common(1)[0][0]
     if max(size) > _LARGEST_SIZE:

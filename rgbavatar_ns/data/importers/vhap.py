@@ -20,7 +20,6 @@ from rgbavatar_ns.data.importers.transforms import (
     read_transforms,
     size_of,
 )
-from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadArrays
 from rgbavatar_ns.head.flame import FLAME_VERTICES
 
@@ -107,8 +106,7 @@ class VhapSubject:
     def arrays(self) -> HeadArrays:
         """FLAME with the subject's offsets; raises UserError where no frame could be read."""
         if self._arrays is None:
-            self.reading.report.settle(str(self.reading), False)
-            raise UserError(f"{self.reading} has no frames.", "Name the folder of the export.")
+            raise self.reading.no_frames()
         return self._arrays
 
     @property

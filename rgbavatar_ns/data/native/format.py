@@ -10,6 +10,7 @@ came from (`source`). What needs none of them is written as version 1.
 """
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -27,6 +28,11 @@ HEAD_FILE = "head.npz"
 IMAGE_FOLDER = "images"
 
 _CAMERA_SHAPES = {"world_to_camera": (4, 4), "focal_px": (2,), "principal_point_px": (2,)}
+
+
+def image_path(dataset: Path, index: int) -> Path:
+    """Where a frame's image lies in a dataset's folder."""
+    return dataset / IMAGE_FOLDER / f"{index:05d}.png"
 
 
 def camera_to_json(cameras: PinholeCameras, position: int) -> dict[str, Any]:

@@ -17,6 +17,7 @@ from rgbavatar_ns.data.native.format import (
     INDEX_FILE,
     THETA_FILE,
     camera_to_json,
+    image_path,
 )
 from rgbavatar_ns.data.native.frame import TrackedFrame
 from rgbavatar_ns.data.png import encode_png_rgba
@@ -138,7 +139,7 @@ class DatasetWriter:
 
     def image_path(self, index: int) -> Path:
         """Where a frame's image lies."""
-        return self._root / IMAGE_FOLDER / f"{index:05d}.png"
+        return image_path(self._root, index)
 
     def write_image(self, index: int, png: bytes) -> None:
         """Put a PNG into its place ahead of `add_encoded`; several threads may do so."""

@@ -23,13 +23,7 @@ class StreamAddress(NamedTuple):
         with contextlib.suppress(ValueError):
             parts = urlsplit(f"//{text}")
             host, port = parts.hostname, parts.port
-        if (
-            parts is None
-            or not host
-            or port is None
-            or parts.netloc != text
-            or parts.username is not None
-        ):
+        if parts is None or (parts.netloc, parts.username) != (text, None) or not host or not port:
             raise UserError(
                 f"'{text}' is no address for a stream.",
                 f"Give HOST:PORT, for example {DEFAULT_ADDRESS}.",

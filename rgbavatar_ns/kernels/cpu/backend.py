@@ -149,7 +149,7 @@ class CpuBackend:
         vertices: Float[Tensor, "B V 3"],
         cameras: PinholeCameras,
     ) -> CpuMorphedRenderer:
-        """As `blended.morphed_renderer`."""
+        """As `morphed.morphed_renderer`."""
         return CpuMorphedRenderer(gaussians, weights, vertices, cameras)
 
 

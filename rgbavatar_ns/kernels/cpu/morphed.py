@@ -1,4 +1,4 @@
-"""The compiled loops for blended Gaussians."""
+"""The compiled loops for morphed Gaussians."""
 
 import os
 from collections.abc import Mapping
@@ -41,7 +41,7 @@ class CpuMorphedRenderer:
         self._cameras, self._count = cameras, len(gaussians.position)
         self._weights = weights.detach().contiguous()
         self._vertices = vertices.detach().contiguous()
-        self._compared = False
+        self._has_gradient = False
         tensors: dict[str, Any] = {
             name: None if value is None else value.detach().contiguous()
             for name, value in vars(gaussians).items()
@@ -95,7 +95,7 @@ class CpuMorphedRenderer:
         """The mean absolute difference to straight-alpha images over the background."""
         check_target_images(images_rgba, len(self._weights), self._cameras)
         background = checked_background(self._weights, background, len(self._weights))
-        self._compared = True
+        self._has_gradient = True
         loss = self._session.forward_loss(
             images_rgba.contiguous(), background.detach().contiguous()
         )
@@ -104,10 +104,10 @@ class CpuMorphedRenderer:
     def backward_adam(
         self, parameters: Mapping[str, AdamParameter] | None, *, with_vertices: bool = False
     ) -> MorphedGradient:
-        """Take one step of Adam, or none, by the gradient of the last comparison."""
-        if not self._compared:
+        """Take one step of Adam, or none, by the gradient of the last forward_loss."""
+        if not self._has_gradient:
             raise ValueError("There is no gradient yet. Call forward_loss() first.")
-        self._compared = False  # the parameters are others now
+        self._has_gradient = False  # the parameters are others now
         names = _BASE + (_BASES if self._weights.shape[1] else ())
         groups = [] if parameters is None else [_arrays(parameters[name]) for name in names]
         weights = torch.empty_like(self._weights)

@@ -171,7 +171,7 @@ class CudaBackend:
         vertices: Float[Tensor, "B V 3"],
         cameras: PinholeCameras,
     ) -> CudaMorphedRenderer:
-        """As `blended.morphed_renderer`."""
+        """As `morphed.morphed_renderer`."""
         device = weights.device
         return CudaMorphedRenderer(
             self.launcher(device), self.capacities(device), gaussians, weights, vertices, cameras

@@ -83,7 +83,7 @@ class CudaMorphedRenderer:
 
     @property
     def overflowed(self) -> Int[Tensor, ""]:
-        """1 where the last comparison found no room and updates change nothing, else 0."""
+        """1 where the last forward_loss found no room and updates change nothing, else 0."""
         return self._tiles.bins.status[constants()["kOverflow"]]
 
     @property
@@ -129,7 +129,7 @@ class CudaMorphedRenderer:
         loss, self._slots = self._tiles.train(images_rgba.contiguous(), None, background.detach())
         return loss
 
-    def compare_with(
+    def forward_loss_of(
         self,
         images_rgba: UInt8[Tensor, "F H W 4"],
         image_of: Int[Tensor, " B"],
@@ -142,7 +142,7 @@ class CudaMorphedRenderer:
     def backward_adam(
         self, parameters: Mapping[str, AdamParameter] | None, *, with_vertices: bool = False
     ) -> MorphedGradient:
-        """Take one step of Adam, or none, by the gradient of the last comparison."""
+        """Take one step of Adam, or none, by the gradient of the last forward_loss."""
         numbers = None
         if parameters is not None:
             rows = [
@@ -152,16 +152,16 @@ class CudaMorphedRenderer:
             numbers = torch.tensor(rows).to(self._launcher.device, non_blocking=True)
         return self._updated(parameters, numbers, with_vertices)
 
-    def update_with(
+    def backward_adam_with(
         self, parameters: Mapping[str, AdamParameter], numbers: Float[Tensor, "A 10"]
     ) -> MorphedGradient:
-        """As `update`, with `AdamParameter.step_numbers` read on the device."""
+        """As `backward_adam`, with `AdamParameter.step_numbers` read on the device."""
         return self._updated(parameters, numbers, False)
 
     def update_parameter(
         self, parameter: AdamParameter, gradient: Tensor, numbers: Float[Tensor, "10"]
     ) -> None:
-        """Take the same step with any other parameter; none where the comparison overflowed."""
+        """Take the same step with any other parameter; none where it overflowed."""
         flat = gradient.reshape(1, -1).contiguous()
         self._update_columns(flat, None, parameter, None, numbers)
 

@@ -1,4 +1,4 @@
-"""What is done with tiles' lists, for world-space and for blended Gaussians alike."""
+"""What is done with tiles' lists, for world-space and for morphed Gaussians alike."""
 
 from typing import Any
 

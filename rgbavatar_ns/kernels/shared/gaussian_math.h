@@ -1,8 +1,9 @@
-// The formulas of the rasterizer, once, for scalars and SIMD vectors, meant for CUDA as well.
+// The formulas of the rasterizer, once, for both compiled backends: kernels/cpu and kernels/cuda.
 //
-// F is a floating-point type: float, or a vector of lanes that each hold another Gaussian
-// (projection) or another pixel (blending). It needs + - * /, comparisons that give a mask, and
-// select(mask, a, b), min_of, max_of, square_root, inverse_root_of, log2_of and reciprocal_of.
+// F is a floating-point type: float (in CUDA a thread's), or a vector of lanes that each hold
+// another Gaussian (projection) or another pixel (blending). It needs + - * /, comparisons that give
+// a mask, and select(mask, a, b), min_of, max_of, square_root, inverse_root_of, log2_of and
+// reciprocal_of.
 // Define RGBAVATAR_FUNCTION before including, e.g. as "__device__ __forceinline__", and include
 // inside a namespace of its own for every instruction set.
 //

@@ -1,4 +1,4 @@
-// The formulas that carry blended Gaussians from tangent space to the world, once, like those of
+// The formulas that carry morphed Gaussians from tangent space to the world, once, like those of
 // gaussian_math.h, which must be included before.
 //
 // A triangle with corner c and edges e1, e2 has the tangent frame M = [T B N] (paper, Alg. 1) and

@@ -40,7 +40,11 @@ class OnlinePipeline(RGBAvatarPipeline):
     ) -> None:
         super().__init__(config, device, **more)
         self.status_panel = StatusPanel("Stream")
-        self.model.viewer_panel.stage.film = None  # Of a stream only the newest frame is shown.
+
+    @property
+    def film(self) -> None:
+        """None: of a stream only the newest frame is shown."""
+        return None
 
     @torch.no_grad()
     def look_at(self, newest_first: ReplayBatch) -> tuple[float, UInt8[Tensor, "H W 3"]]:

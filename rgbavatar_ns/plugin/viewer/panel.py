@@ -1,9 +1,10 @@
-"""The avatar's panel in nerfstudio's viewer: what its controls do, apart from how they look."""
+"""The avatar's panel in nerfstudio's viewer: its state, what changes it, and the playing clock."""
 
-import math
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,106 +14,160 @@ from nerfstudio.viewer.viewer_elements import ViewerControl
 from nerfstudio.viewer_legacy.server.viewer_utils import IOChangeException
 from torch import Tensor
 
-from rgbavatar_ns.data import load_dataset
+from rgbavatar_ns.data import TrackedDataset, load_dataset
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.export import dataset_folder
-from rgbavatar_ns.export.driving import DrivingOptions
+from rgbavatar_ns.export.driving import DrivingOptions, ThetaNames
 from rgbavatar_ns.export.scenes import driven_by
 from rgbavatar_ns.kernels import PinholeCameras
-from rgbavatar_ns.plugin.viewer.render import ViewerPicture, viewer_picture
-from rgbavatar_ns.plugin.viewer.viewer_state import Stage, ViewerState, random_expression
-from rgbavatar_ns.plugin.viewer.widgets import Widgets
+from rgbavatar_ns.plugin.model import RGBAvatarModel
+from rgbavatar_ns.plugin.viewer.driving import (
+    driving_signal,
+    random_expression,
+    training_statistics,
+)
+from rgbavatar_ns.plugin.viewer.redraw import Redraw
+from rgbavatar_ns.plugin.viewer.render import ViewerRender, viewer_render
+from rgbavatar_ns.plugin.viewer.sliders import number_sliders
+from rgbavatar_ns.plugin.viewer.viewer_state import DrivenBy, ViewerState
+from rgbavatar_ns.plugin.viewer.viewpoint import Viewpoint
+from rgbavatar_ns.plugin.viewer.widgets import Actions, Widgets
 
-# nerfstudio shows its world ten times as large in viser.
-_VISER_PER_METRE = 10.0
-_VISIBLE_HEIGHT_M = 0.45
+_TICK_S = 0.01
 _PATIENCE_S = 5.0
 _TOLD_EVERY_S = 0.3
-
-Point = tuple[float, float, float]
+_ALL_BASES: dict[str, Any] = {"basis_alone": None, "bases_used": None}
 
 
 @dataclass(frozen=True)
-class Viewpoint:
-    """Where the viewer's camera starts, in nerfstudio's world, metres."""
+class _Report:
+    """What is told about a picture."""
 
-    eye: Point
-    look_at: Point
+    camera: PinholeCameras
+    seconds: float
+    psnr: float | None
+    trouble: str
+
+    def text(self) -> str:
+        size = f"{self.camera.width} x {self.camera.height}"
+        rate = f"{1 / max(self.seconds, 1e-6):.0f} frames/s"
+        psnr = "" if self.psnr is None else f"  \nPSNR of this frame {self.psnr:.2f} dB"
+        return f"{size} in {1e3 * self.seconds:.0f} ms: {rate}{psnr}"
 
 
 class ViewerPanel(ViewerControl):
-    """Draws what the panel's controls ask for where a camera brings no theta of its own.
+    """Draws what its controls ask for, where a camera brings no theta of its own.
 
-    Without a viewer (`ns-render`) the camera's time chooses the frame, over black.
+    Without a viewer (`ns-render`) the camera's time chooses the frame, over black. `film` is what
+    pictures are compared with, if there is anything; `clock` counts seconds.
     """
 
-    def __init__(self, stage: Stage, viewpoint: Viewpoint) -> None:
-        self.stage = stage
-        self.wishes = ViewerState(driven_by="viewer's time")
-        self.playing = False
-        self.frames_per_second = 25.0
-        self._viewpoint = viewpoint
+    def __init__(
+        self,
+        model: RGBAvatarModel,
+        film: TrackedDataset | None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.state = ViewerState(driven_by="viewer's time")
+        self._model, self._film, self._clock = model, film, clock
         self._viewer: Any = None
         self._widgets: Widgets | None = None
-        self._drawn = threading.Event()
-        self._next_told_s, self._told_size = 0.0, (0, 0)
+        self._redraw: Redraw | None = None
+        self._changing = threading.RLock()
+        self._report: _Report | None = None
+        self._told = self._played = self._report
+        self._next_told_s = self._next_frame_s = self._played_s = 0.0
 
     def _setup(self, viewer: Any) -> None:
+        """Called by nerfstudio's viewer."""
         super()._setup(viewer)
-        self._viewer = viewer
-        self.wishes = ViewerState(backdrop=(1.0, 1.0, 1.0))
-        self._widgets = Widgets(viewer.viser_server.gui, self)
-        viewer.viser_server.scene.set_up_direction("+z")
-        viewer.viser_server.on_client_connect(self._place_camera)
-        threading.Thread(target=self._play, name="viewer playback", daemon=True).start()
+        self.attach(viewer)
+        threading.Thread(target=self._tick_forever, name="viewer panel", daemon=True).start()
 
-    def draw(
-        self, camera: PinholeCameras, time_share: float | None, backend: str = "auto"
-    ) -> dict[str, Tensor]:
+    def attach(self, viewer: Any) -> None:
+        """Add the controls to nerfstudio's viewer; from now on `tick` is due all the time."""
+        self._viewer, self._redraw = viewer, Redraw(viewer)
+        self.state = ViewerState(background=(1.0, 1.0, 1.0))
+        arrays, statistics = self._model.avatar.head.arrays, training_statistics(self._model)
+        sliders = number_sliders(ThetaNames.of(self._model.avatar.layout, arrays), statistics)
+        gui = viewer.viser_server.gui
+        self._widgets = Widgets(gui, self._actions(), sliders, statistics, self._num_frames)
+        viewpoint = Viewpoint.before(self._model.avatar, self._model.subject)
+        viewer.viser_server.scene.set_up_direction("+z")
+        viewer.viser_server.on_client_connect(viewpoint.place)
+
+    def _actions(self) -> Actions:
+        return Actions(
+            self.change,
+            self.drive_by,
+            self.set_theta_number,
+            self.show_neutral,
+            self.show_random_expression,
+            self.set_weight,
+            self.hold_weights,
+            self.load_driver,
+        )
+
+    def draw(self, camera: PinholeCameras, time_share: float | None) -> dict[str, Tensor]:
         """The picture for one camera (C = 1): rgb, accumulation, depth [H W C].
 
         What cannot be shown is told in the panel, and the plain avatar stands in its place:
-        nothing here may end the viewer's thread, or training.
+        nothing here may end the viewer's thread, or training. That thread may be interrupted at
+        each line, so that nothing here takes locks or speaks to browsers.
         """
-        wishes = self._present()
-        began = time.perf_counter()
+        state, began_s = self._present(), self._clock()
+        answered = self._redraw.began(began_s) if self._redraw is not None else 0
+        trouble = ""
         try:
-            picture = viewer_picture(self.stage, wishes, camera, time_share, backend=backend)
-            trouble = ""
+            drawn = self._drawn(state, camera, time_share)
         except IOChangeException:  # The viewer's own: the user has moved on.
             raise
         except Exception as error:
             if self._widgets is None:
                 raise
             trouble = _in_words(error)
-            plain = ViewerState(
-                driven_by=wishes.driven_by, frame=wishes.frame, backdrop=wishes.backdrop
-            )
-            picture = viewer_picture(self.stage, plain, camera, time_share, backend=backend)
-        self._tell(picture, camera, time.perf_counter() - began, trouble)
-        self._drawn.set()
-        return picture.outputs()
+            plain = ViewerState(state.driven_by, state.frame, background=state.background)
+            drawn = self._drawn(plain, camera, time_share)
+        self._report = _Report(camera, self._clock() - began_s, drawn.psnr, trouble)
+        if self._redraw is not None:
+            thread = threading.current_thread()
+            self._redraw.drew(thread, answered, camera.width, camera.height)
+        return drawn.outputs()
+
+    def tick(self) -> None:
+        """What time brings: the next frame, a picture that was lost, how the last was drawn."""
+        now_s, report = self._clock(), self._report
+        drawn = report is not self._played or now_s > self._played_s + _PATIENCE_S
+        if self.state.playing and drawn and now_s >= self._next_frame_s:
+            frame_s = 1 / max(self.state.frames_per_second, 1e-3)
+            late = now_s > self._next_frame_s + frame_s
+            self._next_frame_s = frame_s + (now_s if late else self._next_frame_s)
+            self._played, self._played_s = report, now_s
+            self.advance()
+        if self._widgets is None or self._redraw is None:
+            return
+        self._redraw.insist(now_s)
+        if report is not None and report is not self._told and now_s >= self._next_told_s:
+            self._told, self._next_told_s = report, now_s + _TOLD_EVERY_S
+            self._widgets.report(report.text())
+            if report.trouble:
+                self._widgets.tell(report.trouble)
 
     def change(self, **values: Any) -> None:
-        """Replace wishes by name and draw anew, if any is another than before."""
-        if all(_same(getattr(self.wishes, name), value) for name, value in values.items()):
-            return
-        self.wishes = replace(self.wishes, **values)
-        self.refresh()
+        """Replace parts of the state by name and draw anew, if any is another than before."""
+        with self._changing:
+            if all(_same(getattr(self.state, name), value) for name, value in values.items()):
+                return
+            self.state = replace(self.state, **values)
+        self._refresh()
 
-    def refresh(self) -> None:
-        """Show the state in the controls and draw anew; does nothing without a viewer."""
-        if self._widgets is not None:
-            self._widgets.follow(self.wishes)
-            self._viewer._trigger_rerender()
-
-    def drive_by(self, driven_by: str) -> None:
+    def drive_by(self, driven_by: DrivenBy) -> None:
         """Choose what drives; by hand starts from what is shown."""
         if driven_by == "by hand":
-            self.set_theta(self._theta_now())
-        elif driven_by == "driving sequence" and self.wishes.sequence is None:
+            self.set_theta(self.theta_shown())
+        elif driven_by == "driving sequence" and self.state.sequence is None:
             self.tell("Load a driver first: a dataset or a run, in the folder 'Driver'.")
-            self.refresh()
+            self._refresh()
         else:
             self.change(driven_by=driven_by)
 
@@ -120,29 +175,29 @@ class ViewerPanel(ViewerControl):
         """Drive by hand with these numbers."""
         self.change(driven_by="by hand", theta_by_hand=theta.clone())
 
-    def set_number(self, place: int, value: float) -> None:
+    def set_theta_number(self, place: int, value: float) -> None:
         """Drive by hand, with one number of theta changed from what is shown."""
-        theta = self._theta_now().clone()
+        theta = self.theta_shown().clone()
         theta[place] = value
         self.set_theta(theta)
 
-    def rest(self) -> None:
+    def show_neutral(self) -> None:
         """Drive by hand: the frame with the most neutral expression."""
-        self.set_theta(self.stage.statistics().theta_neutral)
+        self.set_theta(training_statistics(self._model).theta_neutral)
 
-    def surprise(self) -> None:
+    def show_random_expression(self) -> None:
         """Drive by hand: a random expression within what was seen, on the pose shown."""
-        self.set_theta(random_expression(self.stage.statistics(), self._theta_now()))
+        self.set_theta(random_expression(training_statistics(self._model), self.theta_shown()))
 
     def set_weight(self, basis: int, value: float) -> None:
         """Set one weight by hand; the others stay what the network or the hand gave them."""
-        psi = self._psi_now().clone()
+        psi = self._psi_shown().clone()
         psi[basis] = value
         self.change(psi_by_hand=psi, basis_alone=None)
 
-    def override_weights(self, by_hand: bool) -> None:
+    def hold_weights(self, by_hand: bool) -> None:
         """Hold the weights where they are, or give them back to the network."""
-        self.change(psi_by_hand=self._psi_now().clone() if by_hand else None)
+        self.change(psi_by_hand=self._psi_shown() if by_hand else None)
 
     def load_driver(self, folder: str, relative: str) -> None:
         """Read another person's performance and play it; what is wrong is told in the panel."""
@@ -152,11 +207,11 @@ class ViewerPanel(ViewerControl):
                 raise UserError("No driver is named.", "Type the folder of a dataset or run.")
             driver = load_dataset(dataset_folder(Path(folder.strip()).expanduser()))
             mapped = driven_by(
-                self.stage.avatar,
+                self._model.avatar,
                 driver,
                 range(len(driver)),
-                self.stage.statistics(),
-                self.frames_per_second,
+                training_statistics(self._model),
+                self.state.frames_per_second,
                 DrivingOptions(relative=relative),  # type: ignore[arg-type]
             )
         except Exception as error:  # In one of the viewer's threads nobody would see it.
@@ -170,81 +225,63 @@ class ViewerPanel(ViewerControl):
         )
         self.change(driven_by="driving sequence", sequence=mapped.theta, sequence_frame=0)
 
-    def advance(self) -> bool:
-        """Show the next frame, after the last the first; False where nothing can be played."""
-        wishes = self.wishes
-        if wishes.driven_by == "driving sequence" and wishes.sequence is not None:
-            self.change(sequence_frame=(wishes.sequence_frame + 1) % len(wishes.sequence))
-        elif wishes.driven_by == "dataset frame" and self.stage.num_frames > 1:
-            self.change(frame=(wishes.frame + 1) % self.stage.num_frames)
-        else:
-            return False
-        return True
+    def advance(self) -> None:
+        """Show the next frame, after the last the first, where frames drive."""
+        state = self.state
+        if state.driven_by == "driving sequence" and state.sequence is not None:
+            self.change(sequence_frame=(state.sequence_frame + 1) % len(state.sequence))
+        elif state.driven_by == "dataset frame":
+            self.change(frame=(state.frame + 1) % self._num_frames)
 
     def tell(self, text: str) -> None:
         """Put a line into the panel; without a viewer nobody reads it."""
         if self._widgets is not None:
             self._widgets.tell(text)
 
-    def _present(self) -> ViewerState:
-        """The wishes, but a camera path that is previewed shows what `ns-render` will."""
-        if self._viewer is not None and self._viewer.render_tab_state.preview_render:
-            return ViewerState(driven_by="viewer's time", backdrop=self.wishes.backdrop)
-        return self.wishes
+    def theta_shown(self) -> Float[Tensor, "H"]:
+        """What drives now, on the CPU."""
+        state = replace(self.state, basis_alone=None)
+        return driving_signal(self._model, state, self._time_now()).theta[0].cpu()
 
-    def _theta_now(self) -> Float[Tensor, "H"]:
-        plain = replace(self.wishes, basis_alone=None)
-        return self.stage.shown(plain, self._time_now()).theta[0].cpu()
-
-    def _psi_now(self) -> Float[Tensor, "K"]:
-        plain = replace(self.wishes, basis_alone=None, bases_used=None)
-        shown = self.stage.shown(plain, self._time_now())
+    def _psi_shown(self) -> Float[Tensor, "K"]:
+        state = replace(self.state, **_ALL_BASES)
+        signal = driving_signal(self._model, state, self._time_now())
         with torch.no_grad():
-            psi = self.stage.avatar.weights(shown.theta) if shown.psi is None else shown.psi
+            psi = self._model.avatar.weights(signal.theta) if signal.psi is None else signal.psi
         return psi[0].cpu()
+
+    def _drawn(
+        self, state: ViewerState, camera: PinholeCameras, time_share: float | None
+    ) -> ViewerRender:
+        signal = driving_signal(self._model, state, time_share)
+        render = partial(viewer_render, film=self._film, backend=self._model.config.rasterizer)
+        return render(self._model.avatar, signal, state, camera)
+
+    def _present(self) -> ViewerState:
+        """The state, but a camera path that is previewed shows what `ns-render` will."""
+        if self._viewer is not None and self._viewer.render_tab_state.preview_render:
+            return ViewerState(driven_by="viewer's time", background=self.state.background)
+        return self.state
 
     def _time_now(self) -> float | None:
         if self._viewer is None or not self._viewer.include_time:
             return None
         return float(self._viewer.control_panel.time)
 
-    def _tell(
-        self, picture: ViewerPicture, camera: PinholeCameras, seconds: float, trouble: str
-    ) -> None:
-        now, size = time.monotonic(), (camera.width, camera.height)
-        known = now < self._next_told_s and size == self._told_size and not trouble
-        if self._widgets is None or known:
-            return
-        self._next_told_s, self._told_size = now + _TOLD_EVERY_S, size
-        lines = [
-            f"{camera.width} x {camera.height} in {1e3 * seconds:.0f} ms: "
-            f"{1 / max(seconds, 1e-6):.0f} frames/s"
-        ]
-        if picture.psnr is not None:
-            lines.append(f"PSNR of this frame {picture.psnr:.2f} dB")
-        self._widgets.report("  \n".join(lines))
-        if trouble:
-            self._widgets.tell(trouble)
+    @property
+    def _num_frames(self) -> int:
+        return len(self._model.frame_theta)
 
-    def _place_camera(self, client: Any) -> None:
-        eye, look_at = self._viewpoint.eye, self._viewpoint.look_at
-        distance = math.dist(eye, look_at)
-        with client.atomic():
-            client.camera.up_direction = (0.0, 0.0, 1.0)
-            client.camera.position = tuple(_VISER_PER_METRE * x for x in eye)
-            client.camera.look_at = tuple(_VISER_PER_METRE * x for x in look_at)
-            client.camera.fov = 2 * math.atan2(_VISIBLE_HEIGHT_M / 2, distance)
+    def _refresh(self) -> None:
+        """Show the state in the controls and draw anew; does nothing without a viewer."""
+        if self._widgets is not None and self._redraw is not None:
+            self._widgets.follow(self.state)
+            self._redraw.ask(self._clock())
 
-    def _play(self) -> None:
-        """Move on at the wished rate, but not before the last picture has been drawn."""
-        due = time.monotonic()
+    def _tick_forever(self) -> None:
         while True:
-            due = max(due + 1 / max(self.frames_per_second, 1e-3), time.monotonic())
-            time.sleep(max(due - time.monotonic(), 0.0))
-            if self.playing:
-                self._drawn.clear()
-                if self.advance():
-                    self._drawn.wait(_PATIENCE_S)
+            time.sleep(_TICK_S)
+            self.tick()
 
 
 def _same(old: Any, new: Any) -> bool:

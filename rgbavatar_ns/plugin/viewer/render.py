@@ -1,4 +1,4 @@
-"""Pictures for the viewer: the avatar, what helps to judge it, and the film beside it."""
+"""Images for the viewer: the avatar, what helps to judge it, and the film beside it."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,13 +10,17 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from rgbavatar_ns.avatar import Avatar
 from rgbavatar_ns.avatar.metrics import psnr
+from rgbavatar_ns.data import TrackedDataset
 from rgbavatar_ns.data.check.sample import project
 from rgbavatar_ns.drawing.compositing import composite, rgba_to_float, shown_error
 from rgbavatar_ns.drawing.wireframe import with_wireframe
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.kernels import PinholeCameras, RenderedBatch
-from rgbavatar_ns.plugin.viewer.viewer_state import Shown, Stage, ViewerState
+from rgbavatar_ns.plugin.cameras import filled_depth
+from rgbavatar_ns.plugin.viewer.driving import DrivingSignal
+from rgbavatar_ns.plugin.viewer.viewer_state import ViewerState
 
 _SEEN = 0.02
 _CENTRE_RGB = (60, 255, 120)
@@ -26,8 +30,8 @@ _Image = Float[Tensor, "H W 3"]
 
 
 @dataclass(frozen=True)
-class ViewerPicture:
-    """One picture, and what nerfstudio wants beside it."""
+class ViewerRender:
+    """One image, and what nerfstudio wants beside it."""
 
     image: _Image
     alpha: Float[Tensor, "H W 1"]
@@ -42,97 +46,85 @@ class ViewerPicture:
 
 
 @torch.no_grad()
-def viewer_picture(
-    stage: Stage,
-    wishes: ViewerState,
+def viewer_render(
+    avatar: Avatar,
+    signal: DrivingSignal,
+    state: ViewerState,
     camera: PinholeCameras,
-    time: float | None = None,
     *,
+    film: TrackedDataset | None = None,
     backend: str = "auto",
-) -> ViewerPicture:
-    """Draw what is wished for from one camera (C = 1); pictures beside the film from its own.
+) -> ViewerRender:
+    """Draw what the state asks for from one camera (C = 1); images beside the film from its own.
 
     Raises UserError where there is no film to compare with.
     """
-    shown = stage.shown(wishes, time)
-    if wishes.picture in ("beside the film", "error"):
-        return _beside_film(stage, wishes, shown, camera, backend)
-    drawn = _draw(stage, shown, wishes, camera, backend)
+    if state.picture in ("beside the film", "error"):
+        return _beside_film(avatar, signal, state, camera, film, backend)
+    drawn = _draw(avatar, signal, state, camera, backend)
     assert drawn.depth is not None
     alpha, depth = drawn.alpha[0], filled_depth(drawn.depth, drawn.alpha)[0]
     # nerfstudio's viewer makes bytes of it, where 1.01 would be black.
     image = drawn.image[0].clamp(0, 1)
-    if wishes.picture == "alpha":
+    if state.picture == "alpha":
         image = alpha.expand(-1, -1, 3)
-    elif wishes.picture == "depth":
+    elif state.picture == "depth":
         image = _depth_colors(depth, alpha)
-    image = _with_overlays(image, stage, shown, wishes, camera, drawn.visibility)
-    return ViewerPicture(image, alpha, depth)
-
-
-def filled_depth(
-    depth: Float[Tensor, "B H W 1"], alpha: Float[Tensor, "B H W 1"]
-) -> Float[Tensor, "B H W 1"]:
-    """Put what is not covered behind everything else, as the viewer's compositing expects."""
-    return torch.where(alpha > 0.5, depth, depth.amax())
+    image = _with_overlays(image, avatar, signal, state, camera, drawn.visibility)
+    return ViewerRender(image, alpha, depth)
 
 
 def _draw(
-    stage: Stage, shown: Shown, wishes: ViewerState, camera: PinholeCameras, backend: str
+    avatar: Avatar, signal: DrivingSignal, state: ViewerState, camera: PinholeCameras, backend: str
 ) -> RenderedBatch:
-    return stage.avatar.render(
-        shown.theta,
+    return avatar.render(
+        signal.theta,
         camera,
-        shown.theta.new_tensor(wishes.backdrop),
-        psi=shown.psi,
+        signal.theta.new_tensor(state.background),
+        psi=signal.psi,
         backend=backend,
         with_depth=True,
-        with_visibility=wishes.centres,
+        with_visibility=state.centres,
     )
 
 
 def _beside_film(
-    stage: Stage, wishes: ViewerState, shown: Shown, camera: PinholeCameras, backend: str
-) -> ViewerPicture:
+    avatar: Avatar,
+    signal: DrivingSignal,
+    state: ViewerState,
+    camera: PinholeCameras,
+    film: TrackedDataset | None,
+    backend: str,
+) -> ViewerRender:
     """Film, avatar and error in a row, or the error alone, scaled to fit the viewer's window."""
-    film = stage.film
-    if film is None or shown.position is None:
+    if film is None or signal.frame is None:
         raise UserError(
             "There is no film to compare this with.",
             "Choose another picture, or drive the avatar by a dataset frame.",
         )
-    own = film.cameras.select([shown.position])
-    device = shown.theta.device
-    own = PinholeCameras(
-        own.world_to_camera.to(device),
-        own.focal_px.to(device),
-        own.principal_point_px.to(device),
-        own.width,
-        own.height,
-    )
-    drawn = _draw(stage, shown, wishes, own, backend)
-    rgba = rgba_to_float(torch.from_numpy(film.read_image(shown.position)).to(device))
-    truth = composite(rgba, rgba.new_tensor(wishes.backdrop))
-    avatar = drawn.image[0].clamp(0, 1)
-    quality_db = float(psnr(avatar[None], truth[None]).clamp(max=100))
-    error = _colored(shown_error(avatar, truth).mean(-1), cv2.COLORMAP_INFERNO)
-    tiles = [error]
-    if wishes.picture == "beside the film":
-        avatar = _with_overlays(avatar, stage, shown, wishes, own, drawn.visibility)
-        tiles = [truth, avatar, error]
-    image = _fitted(torch.cat(tiles, 1), camera, wishes.backdrop)
+    own = film.cameras.select([signal.frame]).to(signal.theta.device)
+    drawn = _draw(avatar, signal, state, own, backend)
+    rgba = torch.from_numpy(film.read_image(signal.frame)).to(signal.theta.device)
+    truth = composite(rgba_to_float(rgba), signal.theta.new_tensor(state.background))
+    image = drawn.image[0].clamp(0, 1)
+    quality_db = float(psnr(image[None], truth[None]).clamp(max=100))
+    tiles = [_colored(shown_error(image, truth).mean(-1), cv2.COLORMAP_INFERNO)]
+    if state.picture == "beside the film":
+        overlaid = _with_overlays(image, avatar, signal, state, own, drawn.visibility)
+        tiles = [truth, overlaid, *tiles]
+    image = _fitted(torch.cat(tiles, 1), camera, state.background)
     covered = image.new_ones(camera.height, camera.width, 1)
-    return ViewerPicture(image, covered, covered, quality_db)
+    return ViewerRender(image, covered, covered, quality_db)
 
 
-def _fitted(row: _Image, camera: PinholeCameras, backdrop: tuple[float, float, float]) -> _Image:
+def _fitted(row: _Image, camera: PinholeCameras, background: tuple[float, float, float]) -> _Image:
     """The row in the middle of a picture of the camera's size, as large as it fits."""
     height, width = row.shape[:2]
     zoom = min(camera.height / height, camera.width / width)
     size = max(1, int(width * zoom)), max(1, int(height * zoom))
     smooth = cv2.INTER_AREA if zoom < 1 else cv2.INTER_LINEAR
     scaled = torch.from_numpy(cv2.resize(row.cpu().numpy(), size, interpolation=smooth))
-    image = row.new_tensor(backdrop).expand(camera.height, camera.width, 3).clone()
+    image = row.new_tensor(background).expand(camera.height, camera.width, 3).clone()
     top, left = (camera.height - size[1]) // 2, (camera.width - size[0]) // 2
     image[top : top + size[1], left : left + size[0]] = scaled.to(image)
     return image
@@ -156,18 +148,18 @@ def _colored(values: Float[Tensor, "H W"], color_map: int) -> _Image:
 
 def _with_overlays(
     image: _Image,
-    stage: Stage,
-    shown: Shown,
-    wishes: ViewerState,
+    avatar: Avatar,
+    signal: DrivingSignal,
+    state: ViewerState,
     camera: PinholeCameras,
     visibility: Tensor | None,
 ) -> _Image:
-    if wishes.centres and visibility is not None:
-        means = stage.avatar.gaussians(shown.theta, shown.psi).means[0, visibility[0] > _SEEN]
+    if state.centres and visibility is not None:
+        means = avatar.gaussians(signal.theta, signal.psi).means[0, visibility[0] > _SEEN]
         image = _over(image, lambda picture: _with_points(picture, _pixels(means, camera)))
-    if wishes.mesh:
-        vertices = stage.avatar.carrier_vertices(shown.theta)[0]
-        points, faces = _pixels(vertices, camera), stage.avatar.head.arrays.faces
+    if state.mesh:
+        vertices = avatar.carrier_vertices(signal.theta)[0]
+        points, faces = _pixels(vertices, camera), avatar.head.arrays.faces
         # The drawing's colours are OpenCV's: blue first.
         image = _over(
             image, lambda rgb: with_wireframe(rgb[..., ::-1].copy(), points, faces)[..., ::-1]

@@ -1,15 +1,12 @@
-"""How the avatar's panel looks in viser; it shows the panel's state and passes on what is done."""
+"""How the avatar's panel looks in viser; it shows a state and passes on what the user does."""
 
-from collections import Counter
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, get_args
+from dataclasses import dataclass
+from typing import Any, get_args
 
-from rgbavatar_ns.export.driving import ThetaNames
-from rgbavatar_ns.plugin.viewer.sliders import TITLES, NumberSlider, number_sliders
+from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
+from rgbavatar_ns.plugin.viewer.sliders import TITLES, NumberSlider
 from rgbavatar_ns.plugin.viewer.viewer_state import DrivenBy, PictureKind, ViewerState
-
-if TYPE_CHECKING:
-    from rgbavatar_ns.plugin.viewer.panel import ViewerPanel
 
 _TOPMOST = -1.0
 _STRONGEST = 12
@@ -18,12 +15,34 @@ _NO_BASIS = "none"
 _Number = int | float
 
 
+@dataclass(frozen=True)
+class Actions:
+    """What the controls call."""
+
+    change: Callable[..., None]
+    """Replaces parts of the viewer's state by name."""
+    drive_by: Callable[[DrivenBy], None]
+    set_theta_number: Callable[[int, float], None]
+    show_neutral: Callable[[], None]
+    show_random_expression: Callable[[], None]
+    set_weight: Callable[[int, float], None]
+    hold_weights: Callable[[bool], None]
+    load_driver: Callable[[str, str], None]
+    """Takes a folder, and what its numbers are relative to."""
+
+
 class Widgets:
     """The controls of one panel, made once when the viewer starts."""
 
-    def __init__(self, gui: Any, panel: "ViewerPanel") -> None:
-        self._gui, self._panel = gui, panel
-        self._echoes: Counter[str] = Counter()
+    def __init__(
+        self,
+        gui: Any,
+        actions: Actions,
+        sliders: list[NumberSlider],
+        statistics: TrainingStatistics,
+        num_frames: int,
+    ) -> None:
+        self._gui, self._do = gui, actions
         self._numbers: list[tuple[NumberSlider, Any]] = []
         self._weights: list[Any] = []
         with gui.add_folder("Avatar", order=_TOPMOST):
@@ -31,30 +50,30 @@ class Widgets:
             self._said = gui.add_markdown("", visible=False)
             tabs = gui.add_tab_group()
             with tabs.add_tab("Drive"):
-                self._add_driving()
+                self._add_driving(num_frames)
             with tabs.add_tab("Face"):
-                self._add_numbers()
+                self._add_numbers(sliders)
             with tabs.add_tab("Bases"):
-                self._add_bases()
+                self._add_bases(statistics)
             with tabs.add_tab("Look"):
                 self._add_looks()
 
-    def follow(self, wishes: ViewerState) -> None:
+    def follow(self, state: ViewerState) -> None:
         """Bring the controls to the panel's state."""
-        self._put(self._driven_by, wishes.driven_by)
-        self._put(self._frame, wishes.frame)
+        _put(self._driven_by, state.driven_by)
+        _put(self._frame, state.frame)
         if self._sequence_frame is not None:
-            self._put(self._sequence_frame, wishes.sequence_frame)
-        if wishes.driven_by == "by hand" and wishes.theta_by_hand is not None:
+            _put(self._sequence_frame, state.sequence_frame)
+        if state.driven_by == "by hand" and state.theta_by_hand is not None:
             for slider, handle in self._numbers:
-                shown = float(wishes.theta_by_hand[slider.place]) * slider.shown_per_unit
-                self._put(handle, min(max(shown, slider.low), slider.high))
-        self._put(self._by_hand, wishes.psi_by_hand is not None)
-        if wishes.psi_by_hand is not None:
-            for handle, weight in zip(self._weights, wishes.psi_by_hand.tolist()):
-                self._put(handle, weight)
-        alone = wishes.basis_alone
-        self._put(self._alone, _NO_BASIS if alone is None else str(alone))
+                shown = float(state.theta_by_hand[slider.place]) * slider.shown_per_unit
+                _put(handle, min(max(shown, slider.low), slider.high))
+        _put(self._by_hand, state.psi_by_hand is not None)
+        if state.psi_by_hand is not None:
+            for handle, weight in zip(self._weights, state.psi_by_hand.tolist()):
+                _put(handle, weight)
+        alone = state.basis_alone
+        _put(self._alone, _NO_BASIS if alone is None else str(alone))
 
     def offer_sequence(self, num_frames: int) -> None:
         """Make a slider for a driver's frames, in place of the last driver's."""
@@ -65,7 +84,7 @@ class Widgets:
                 "Driver's frame",
                 (0, max(1, num_frames - 1), 1),
                 0,
-                lambda value: self._panel.change(sequence_frame=int(value)),
+                lambda value: self._do.change(sequence_frame=int(value)),
             )
 
     def report(self, text: str) -> None:
@@ -77,46 +96,42 @@ class Widgets:
         self._said.content = text
         self._said.visible = bool(text)
 
-    def _add_driving(self) -> None:
-        gui, panel = self._gui, self._panel
-        last = max(1, panel.stage.num_frames - 1)
-        self._driven_by = gui.add_dropdown(
-            "Driven by",
-            get_args(DrivenBy),
-            hint="What chooses expression and pose; moving a slider of the face does it by hand",
-        )
-        self._on(self._driven_by, panel.drive_by)
+    def _add_driving(self, num_frames: int) -> None:
+        gui, do = self._gui, self._do
+        hint = "What chooses expression and pose; moving a slider of the face does it by hand"
+        driven_by = gui.add_dropdown("Driven by", get_args(DrivenBy), hint=hint)
+        self._driven_by = _on(driven_by, do.drive_by)
         self._frame = self._slider(
             "Frame",
-            (0, last, 1),
+            (0, max(1, num_frames - 1), 1),
             0,
-            lambda value: panel.change(frame=int(value), driven_by="dataset frame"),
+            lambda value: do.change(frame=int(value), driven_by="dataset frame"),
         )
         play = gui.add_checkbox("Play", False, hint="Move on by itself, round and round")
-        self._on(play, lambda value: setattr(panel, "playing", value))
-        rate = gui.add_slider("Frames a second", 1, 60, 1, round(panel.frames_per_second))
-        self._on(rate, lambda value: setattr(panel, "frames_per_second", float(value)))
-        self._button("Neutral", panel.rest, "Drive by hand from the most neutral frame")
-        self._button("Random expression", panel.surprise, "Within what was seen in training")
+        _on(play, lambda value: do.change(playing=value))
+        rate = round(ViewerState.frames_per_second)
+        self._slider(
+            "Frames per second",
+            (1, 60, 1),
+            rate,
+            lambda value: do.change(frames_per_second=float(value)),
+        )
+        self._button("Neutral", do.show_neutral, "Drive by hand from the most neutral frame")
+        hint = "Within what was seen in training"
+        self._button("Random expression", do.show_random_expression, hint)
         self._sequence_frame: Any = None
         self._driver_folder = gui.add_folder("Driver", expand_by_default=False)
         with self._driver_folder:
             folder = gui.add_text("Folder", "", hint="Another person's dataset, or a run")
-            relative = gui.add_dropdown(
-                "Relative to",
-                ("neutral", "mean", "off"),
-                hint="What of the driver's is replaced by the avatar's own",
-            )
+            hint = "What of the driver's is replaced by the avatar's own"
+            relative = gui.add_dropdown("Relative to", ("neutral", "mean", "off"), hint=hint)
             self._button(
                 "Load driver",
-                lambda: panel.load_driver(folder.value, relative.value),
+                lambda: do.load_driver(folder.value, relative.value),
                 "Play that performance on this avatar",
             )
 
-    def _add_numbers(self) -> None:
-        avatar = self._panel.stage.avatar
-        names = ThetaNames.of(avatar.layout, avatar.head.arrays)
-        sliders = number_sliders(names, self._panel.stage.statistics())
+    def _add_numbers(self, sliders: list[NumberSlider]) -> None:
         expressions = [slider for slider in sliders if slider.field == "expression"]
         for slider in expressions[:_STRONGEST]:
             self._add_number(slider)
@@ -138,32 +153,27 @@ class Widgets:
             slider.label,
             (slider.low, slider.high, slider.step),
             0.0,
-            lambda value: self._panel.set_number(slider.place, value / slider.shown_per_unit),
+            lambda value: self._do.set_theta_number(slider.place, value / slider.shown_per_unit),
         )
         self._numbers.append((slider, handle))
 
-    def _add_bases(self) -> None:
-        gui, panel = self._gui, self._panel
-        count = panel.stage.avatar.config.num_bases
-        self._by_hand = gui.add_checkbox(
-            "Weights by hand", False, hint="Hold psi, in place of the network's answer"
-        )
-        self._on(self._by_hand, panel.override_weights)
-        if count == 0:
-            self._by_hand.disabled = True
+    def _add_bases(self, seen: TrainingStatistics) -> None:
+        gui, do, count = self._gui, self._do, len(seen.psi_max)
+        hint = "Hold psi, in place of the network's answer"
+        by_hand = gui.add_checkbox("Weights by hand", False, hint=hint, disabled=count == 0)
+        self._by_hand = _on(by_hand, do.hold_weights)
         used = gui.add_slider("Bases used", 0, max(1, count), 1, count, disabled=count == 0)
-        self._on(used, lambda value: panel.change(bases_used=int(value)))
-        self._alone = gui.add_dropdown(
+        _on(used, lambda value: do.change(bases_used=int(value)))
+        alone = gui.add_dropdown(
             "One basis alone",
             (_NO_BASIS, *map(str, range(count))),
             hint="Base and this basis at its largest weight in training, on the neutral frame",
         )
-        self._on(
-            self._alone,
-            lambda value: panel.change(basis_alone=None if value == _NO_BASIS else int(value)),
+        self._alone = _on(
+            alone,
+            lambda value: do.change(basis_alone=None if value == _NO_BASIS else int(value)),
         )
-        self._slider("Exaggerated by", (0, 5, 0.1), 1.5, lambda v: panel.change(gain=float(v)))
-        seen = panel.stage.statistics()
+        self._slider("Exaggerated by", (0, 5, 0.1), 1.5, lambda v: do.change(gain=float(v)))
         for basis in range(count):
             reach = 1.5 * max(float(seen.psi_max[basis]), -float(seen.psi_min[basis]))
             reach = max(_LEAST_WEIGHT, reach)
@@ -171,50 +181,38 @@ class Widgets:
                 f"psi {basis}",
                 (-reach, reach, 0.01),
                 0.0,
-                lambda value, basis=basis: panel.set_weight(basis, value),
+                lambda value, basis=basis: do.set_weight(basis, value),
             )
             self._weights.append(handle)
 
     def _add_looks(self) -> None:
-        gui, panel = self._gui, self._panel
-        picture = gui.add_dropdown(
-            "Picture",
-            get_args(PictureKind),
-            hint="Beside the film: frame, avatar and error times 4, from the film's camera",
-        )
-        self._on(picture, lambda value: panel.change(picture=value))
+        gui, do = self._gui, self._do
+        hint = "Beside the film: frame, avatar and error times 4, from the film's camera"
+        picture = gui.add_dropdown("Picture", get_args(PictureKind), hint=hint)
+        _on(picture, lambda value: do.change(picture=value))
         mesh = gui.add_checkbox("Mesh", False, hint="The head mesh that carries the Gaussians")
-        self._on(mesh, lambda value: panel.change(mesh=value))
+        _on(mesh, lambda value: do.change(mesh=value))
         centres = gui.add_checkbox("Gaussian centres", False, hint="Of those that can be seen")
-        self._on(centres, lambda value: panel.change(centres=value))
-        backdrop = gui.add_rgb("Backdrop", (255, 255, 255), hint="Colour behind the head")
-        self._on(
-            backdrop,
-            lambda rgb: panel.change(backdrop=tuple(channel / 255 for channel in rgb)),
-        )
+        _on(centres, lambda value: do.change(centres=value))
+        background = gui.add_rgb("Background", (255, 255, 255), hint="Colour behind the head")
+        _on(background, lambda rgb: do.change(background=tuple(part / 255 for part in rgb)))
 
     def _slider(
         self, label: str, limits: tuple[_Number, ...], value: _Number, done: Callable[..., Any]
     ) -> Any:
-        handle = self._gui.add_slider(label, *limits, min(max(value, limits[0]), limits[1]))
-        self._on(handle, done)
-        return handle
+        value = min(max(value, limits[0]), limits[1])
+        return _on(self._gui.add_slider(label, *limits, value), done)
 
     def _button(self, label: str, done: Callable[[], None], hint: str) -> None:
         self._gui.add_button(label, hint=hint).on_click(lambda _: done())
 
-    def _on(self, handle: Any, done: Callable[[Any], None]) -> None:
-        """Pass on what the user does with a control, but not the echo of what `_put` did."""
 
-        def updated(_: Any) -> None:
-            if self._echoes[handle._impl.id] > 0:
-                self._echoes[handle._impl.id] -= 1
-            else:
-                done(handle.value)
+def _on(handle: Any, done: Callable[[Any], None]) -> Any:
+    """Pass on what a user does with a control; what `_put` does brings no client."""
+    handle.on_update(lambda event: None if event.client is None else done(handle.value))
+    return handle
 
-        handle.on_update(updated)
 
-    def _put(self, handle: Any, value: Any) -> None:
-        if handle.value != value:
-            self._echoes[handle._impl.id] += 1
-            handle.value = value
+def _put(handle: Any, value: Any) -> None:
+    if handle.value != value:
+        handle.value = value

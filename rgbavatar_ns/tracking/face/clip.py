@@ -1,7 +1,8 @@
 """The landmarks of the followed face over a whole clip, and which frames have none."""
 
 from collections.abc import Collection
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -41,8 +42,14 @@ class SeenFaces:
     @classmethod
     def joined(cls, parts: "Collection[SeenFaces]") -> "SeenFaces":
         """One after the other."""
-        names = ("count", "clip", "time_s", "has_alpha", "points", "sharpness")
+        names = [item.name for item in fields(cls)]
         return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+
+    @classmethod
+    def load(cls, path: Path) -> "SeenFaces":
+        """What `np.savez(path, **vars(faces))` wrote."""
+        with np.load(path, allow_pickle=False) as file:
+            return cls(**file)
 
 
 @dataclass(frozen=True)

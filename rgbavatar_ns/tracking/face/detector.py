@@ -2,7 +2,7 @@
 
 import importlib
 import os
-from types import ModuleType, TracebackType
+from types import ModuleType
 
 import cv2
 import numpy as np
@@ -25,7 +25,7 @@ LIP_PAIRS = ((13, 14), (82, 87), (312, 317), (81, 178), (311, 402), (80, 88), (3
 LID_PAIRS = ((159, 145), (158, 153), (160, 144), (386, 374), (385, 380), (387, 373))
 """Pairs of points whose distance says how far lips and lids are open."""
 MAX_SIDE_PX = 1280
-"""Pictures that are larger are made smaller before faces are looked for."""
+"""Images that are larger are made smaller before faces are looked for."""
 _MOST_FACES = 3
 
 
@@ -56,15 +56,8 @@ class FaceLandmarker:
         hand_over_bytes(self._mesh)
         self._follower = FaceFollower()
 
-    def __enter__(self) -> "FaceLandmarker":
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        value: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def close(self) -> None:
+        """Free mediapipe's graph."""
         self._mesh.close()
 
     def __call__(self, image_rgb: UInt8[np.ndarray, "H W 3"]) -> Float[np.ndarray, "478 2"] | None:
@@ -75,7 +68,7 @@ class FaceLandmarker:
         return None if followed is None else faces[followed]
 
     def faces(self, image_rgb: UInt8[np.ndarray, "H W 3"]) -> Float[np.ndarray, "N 478 2"]:
-        """Every face's landmarks as shares of the picture's width and height."""
+        """Every face's landmarks as shares of the image's width and height."""
         height, width = image_rgb.shape[:2]
         small = fitted_size(width, height, MAX_SIDE_PX)
         if small != (width, height):

@@ -19,7 +19,7 @@ from rgbavatar_ns.head.landmarks import (
     facemesh_response,
 )
 from rgbavatar_ns.tracking.face.registration import Registration, register, similarity_slopes
-from rgbavatar_ns.tracking.face.surface import SkinPoints, SkinSurface, is_skin, vertex_normals
+from rgbavatar_ns.tracking.face.surface import SkinSurface, is_skin, skin_points
 
 _JAW, _EYES = 2, (3, 4)
 # Landmark displacements are told apart to this much; coefficients are of the order of one.
@@ -76,7 +76,7 @@ def carried_landmarks(
     corners = embedded.faces[marks.triangle]
     eye_share = _at(marks, embedded, embedded.skinning_weights.astype(np.float64))[:, _EYES]
     on_skin = np.flatnonzero(eye_share.max(1) < 0.5)
-    points = _placed_points(embedded, registration.placed, corners, marks.barycentric)
+    points = skin_points(embedded, registration.placed).between(corners, marks.barycentric)
     places = SkinSurface(head).nearest(points.select(on_skin))
     triangle[on_skin], barycentric[on_skin] = places.triangle, places.barycentric
     spread_m = marks.spread_m.copy()
@@ -138,13 +138,9 @@ def carried_blinks(head: HeadArrays, registration: Registration) -> Float[np.nda
     """Offsets that close the left and the right eye of another head, as the embedded one's do."""
     embedded = HeadArrays.embedded()
     skin = np.flatnonzero(is_skin(head))
-    faces = head.faces[is_skin(head)[head.faces].all(1)].astype(np.int64)
-    vertices = head.v_template.astype(np.float64)
-    jaw = head.skinning_weights[skin, _JAW].astype(np.float64)
-    points = SkinPoints(vertices[skin], vertex_normals(vertices, faces)[skin], jaw)
     placed = replace(embedded, v_template=registration.placed.astype(np.float32))
-    places = SkinSurface(placed).nearest(points)
-    lids = np.zeros((len(vertices), 3, 2), dtype=np.float32)
+    places = SkinSurface(placed).nearest(skin_points(head).select(skin))
+    lids = np.zeros((len(head.v_template), 3, 2), dtype=np.float32)
     corners = embedded.faces[places.triangle]
     to_head = registration.pose.scale * registration.pose.turn
     for column, side in enumerate(("Left", "Right")):
@@ -244,19 +240,3 @@ def _at(
 ) -> Float[np.ndarray, "L *rest"]:
     """Values of vertices at the landmarks."""
     return np.einsum("lk,lk...->l...", marks.barycentric, values[head.faces[marks.triangle]])
-
-
-def _placed_points(
-    embedded: HeadArrays,
-    placed: Float[np.ndarray, "V 3"],
-    corners: Int[np.ndarray, "L 3"],
-    barycentric: Float[np.ndarray, "L 3"],
-) -> SkinPoints:
-    faces = embedded.faces[is_skin(embedded)[embedded.faces].all(1)].astype(np.int64)
-    normals = vertex_normals(placed, faces)
-    jaw = embedded.skinning_weights[:, _JAW].astype(np.float64)
-    return SkinPoints(
-        np.einsum("lk,lkx->lx", barycentric, placed[corners]),
-        np.einsum("lk,lkx->lx", barycentric, normals[corners]),
-        np.einsum("lk,lk->l", barycentric, jaw[corners]),
-    )

@@ -12,9 +12,9 @@ from scipy.spatial.transform import Rotation
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head.arrays import HeadArrays
 from rgbavatar_ns.head.landmarks import facemesh_landmarks
-from rgbavatar_ns.tracking.face.surface import SkinPoints, SkinSurface, is_skin, vertex_normals
+from rgbavatar_ns.tracking.face.surface import SkinPoints, SkinSurface, is_skin, skin_points
 
-_JAW, _EYES = 2, [3, 4]
+_EYES = [3, 4]
 # What lies this near to a landmark is the face; a rim around it counts as little.
 _FACE_M, _RIM_M, _RIM_WEIGHT = 0.02, 0.04, 0.05
 # How unlike a point and its nearest place may be before they count less, step by step.
@@ -98,7 +98,7 @@ class _Face:
     """The part of the embedded head that is laid over another one."""
 
     def __init__(self) -> None:
-        arrays = HeadArrays.embedded()
+        self._arrays = arrays = HeadArrays.embedded()
         self._template = arrays.v_template.astype(np.float64)
         directions = arrays.shapedirs[..., : arrays.num_identity].astype(np.float64)
         self._all_directions = directions
@@ -112,7 +112,6 @@ class _Face:
         self.rows = np.flatnonzero(skin & (away_m < _RIM_M))
         self.weight = np.where(away_m[self.rows] < _FACE_M, 1.0, _RIM_WEIGHT)
         self.directions = directions[self.rows]
-        self._jaw = arrays.skinning_weights[self.rows, _JAW].astype(np.float64)
         self._skin_faces = arrays.faces[skin[arrays.faces].all(1)].astype(np.int64)
 
     def vertices(self, identity: Float[np.ndarray, "I"]) -> Float[np.ndarray, "V 3"]:
@@ -121,8 +120,7 @@ class _Face:
 
     def points(self, placed: Float[np.ndarray, "V 3"]) -> SkinPoints:
         """The face's vertices, where the head's are placed."""
-        normals = vertex_normals(placed, self._skin_faces)
-        return SkinPoints(placed[self.rows], normals[self.rows], self._jaw)
+        return skin_points(self._arrays, placed).select(self.rows)
 
     def bending(self) -> sparse.csc_matrix:
         """How far each vertex moves unlike its neighbours, squared: the graph's Laplacian."""

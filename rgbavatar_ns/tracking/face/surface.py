@@ -1,6 +1,6 @@
 """Nearest places on a head's skin, among those that look the same way and move alike."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import trimesh
@@ -40,6 +40,16 @@ class SkinPoints:
         """These points, in this order."""
         return SkinPoints(self.points[rows], self.normals[rows], self.jaw[rows])
 
+    def between(
+        self, corners: Int[np.ndarray, "M 3"], barycentric: Float[np.ndarray, "M 3"]
+    ) -> "SkinPoints":
+        """Points within triangles of these points; their normals are not made of length 1."""
+        return SkinPoints(
+            np.einsum("nk,nkx->nx", barycentric, self.points[corners]),
+            np.einsum("nk,nkx->nx", barycentric, self.normals[corners]),
+            np.einsum("nk,nk->n", barycentric, self.jaw[corners]),
+        )
+
 
 @dataclass(frozen=True)
 class SkinPlaces:
@@ -58,9 +68,7 @@ class SkinSurface:
     def __init__(self, arrays: HeadArrays) -> None:
         self._triangles = np.flatnonzero(is_skin(arrays)[arrays.faces].all(1))
         self._faces = arrays.faces[self._triangles].astype(np.int64)
-        self._vertices = arrays.v_template.astype(np.float64)
-        self._normals = vertex_normals(self._vertices, self._faces)
-        self._jaw = arrays.skinning_weights[:, _JAW].astype(np.float64)
+        self._points = skin_points(arrays)
         splits = int(np.sqrt(2 * _SAMPLES / max(len(self._faces), 1)))
         splits = min(max(splits, 1), _MOST_SPLITS)
         steps = range(splits)
@@ -79,7 +87,7 @@ class SkinSurface:
         """The place of the surface that is most like each point."""
         _, samples = self._tree.query(points.features(), k=_CANDIDATES)
         rows = self._owners[samples].reshape(-1)
-        corners = self._vertices[self._faces[rows]]
+        corners = self._points.points[self._faces[rows]]
         closest = trimesh.triangles.closest_point(
             corners, np.repeat(points.points, _CANDIDATES, axis=0)
         )
@@ -94,13 +102,9 @@ class SkinSurface:
         return SkinPlaces(triangles, places[best], candidates.select(best), unlike_m.min(1))
 
     def _at(self, rows: Int[np.ndarray, "N"], places: Float[np.ndarray, "N 3"]) -> SkinPoints:
-        corners = self._faces[rows]
-        normals = np.einsum("nk,nkx->nx", places, self._normals[corners])
-        return SkinPoints(
-            np.einsum("nk,nkx->nx", places, self._vertices[corners]),
-            normals / (np.linalg.norm(normals, axis=1, keepdims=True) + 1e-12),
-            np.einsum("nk,nk->n", places, self._jaw[corners]),
-        )
+        found = self._points.between(self._faces[rows], places)
+        length = np.linalg.norm(found.normals, axis=1, keepdims=True) + 1e-12
+        return replace(found, normals=found.normals / length)
 
 
 def is_skin(arrays: HeadArrays) -> Bool[np.ndarray, "V"]:
@@ -110,6 +114,14 @@ def is_skin(arrays: HeadArrays) -> Bool[np.ndarray, "V"]:
     skin = np.zeros(len(arrays.v_template), dtype=bool)
     skin[arrays.vertex_groups["skin"]] = True
     return skin
+
+
+def skin_points(arrays: HeadArrays, placed: Float[np.ndarray, "V 3"] | None = None) -> SkinPoints:
+    """All vertices of a head at rest, or as `placed`, with the normals of its skin."""
+    vertices = arrays.v_template.astype(np.float64) if placed is None else placed
+    faces = arrays.faces[is_skin(arrays)[arrays.faces].all(1)].astype(np.int64)
+    jaw = arrays.skinning_weights[:, _JAW].astype(np.float64)
+    return SkinPoints(vertices, vertex_normals(vertices, faces), jaw)
 
 
 def vertex_normals(

@@ -46,8 +46,3 @@ class StillCamera:
         result[:, 0] = across[:, None] * derivative[0] + towards[:, :1] * derivative[2]
         result[:, 1] = -across[:, None] * derivative[1] - towards[:, 1:] * derivative[2]
         return result
-
-    def cropped(self, left: int, top: int, scale: float) -> "StillCamera":
-        """The same camera for a crop of the image that starts at (left, top), then scaled."""
-        center = ((self.center_px[0] - left) * scale, (self.center_px[1] - top) * scale)
-        return StillCamera(self.focal_px * scale, center, self.distance_m)

@@ -2,13 +2,17 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float
 
 from rgbavatar_ns.tracking.fit.camera import StillCamera
-from rgbavatar_ns.tracking.fit.landmark_cost import FrameCost, Target
+from rgbavatar_ns.tracking.fit.landmark_cost import FrameCost, FrameTerms, Target
 from rgbavatar_ns.tracking.fit.levenberg_marquardt import QuadraticModel, levenberg_marquardt
+
+_Values = Float[np.ndarray, "P"]
+_Packed = Float[np.ndarray, "Q"]
 
 # Focal lengths tried, as multiples of the frame's longer side (38 to 17 degrees of view), and
 # the width of the prior around a usual camera: a face's landmarks say little about it.
@@ -86,10 +90,10 @@ def initial_camera(
     return StillCamera(focal_px, center_px, focal_px * _HEAD_HEIGHT_M / face)
 
 
-def rigid_start(cost: FrameCost, camera: StillCamera, target: Target) -> Float[np.ndarray, "P"]:
+def rigid_start(cost: FrameCost, camera: StillCamera, target: Target) -> _Values:
     """Frontal pose whose landmarks' centre lies on the observed one."""
-    base, identity = blank(cost)
-    points = cost.head.points(base, identity, camera.eye_m)
+    base = np.zeros(cost.head.layout.size)
+    points = cost.head.points(base, np.zeros(cost.head.num_identity), camera.eye_m)
     depth = camera.distance_m - points[:, 2].mean()
     wanted = (target.points_px.mean(0) - camera.center_px) * depth / camera.focal_px
     shift = np.array([wanted[0], -wanted[1]]) - points[:, :2].mean(0)
@@ -98,45 +102,27 @@ def rigid_start(cost: FrameCost, camera: StillCamera, target: Target) -> Float[n
     return base[cost.parameters.columns]
 
 
-def blank(cost: FrameCost) -> tuple[Float[np.ndarray, "H"], Float[np.ndarray, "I"]]:
-    """theta and identity of the template."""
-    return np.zeros(cost.head.layout.size), np.zeros(cost.head.num_identity)
-
-
 def fit_frame(
     cost: FrameCost,
     camera: StillCamera,
     target: Target,
-    start: Float[np.ndarray, "P"],
-    neighbours: Float[np.ndarray, "P"] | None,
+    start: _Values,
+    neighbours: _Values | None,
     temporal_weight: float,
     iterations: int,
-) -> Float[np.ndarray, "P"]:
+) -> _Values:
     """One frame's bounded fit from `start`, drawn towards `neighbours` if given.
 
     The last third of at most `iterations` steps, and no fewer than `_ROBUST_STEPS`, let go of
     landmarks that are far off.
     """
-    base, identity = blank(cost)
+    identity = np.zeros(cost.head.num_identity)
     values, robust = start, max(_ROBUST_STEPS, iterations // 3)
     for steps, redescending in ((iterations - robust, False), (robust, True)):
-
-        def cost_at(values: Float[np.ndarray, "P"], redescending: bool = redescending) -> float:
-            theta = cost.theta(values, base)
-            data = cost.value(theta, identity, camera, target, redescending=redescending)
-            return data + cost.prior_value(values, neighbours, temporal_weight)
-
-        def model_at(
-            values: Float[np.ndarray, "P"], redescending: bool = redescending
-        ) -> QuadraticModel:
-            theta = cost.theta(values, base)
-            data = cost.linearize(theta, identity, camera, target, redescending=redescending)
-            model = QuadraticModel(data.cost, data.gradient, data.hessian)
-            return cost.add_priors(values, model, neighbours, temporal_weight)
-
+        frame = FrameTerms(target, camera, redescending, neighbours, temporal_weight)
         values, _ = levenberg_marquardt(
-            cost_at,
-            model_at,
+            partial(cost.value, identity=identity, frame=frame),
+            partial(cost.model, identity=identity, frame=frame),
             values,
             cost.parameters.lower,
             cost.parameters.upper,
@@ -191,10 +177,9 @@ def subject_offsets(
     FaceMesh's idea of a point and the mesh's differ from subject to subject by a little; what is
     the same in all key frames is no expression. The median over key frames, shrunk.
     """
-    base, _ = blank(cost)
     found = []
     for values, target in zip(subject.key_values, keys):
-        theta = cost.theta(values, base)
+        theta = cost.theta(values)
         points = cost.head.points(theta, subject.identity, subject.camera.eye_m)
         residual = subject.camera.project(points) - target.points_px
         depth = subject.camera.distance_m - points[:, 2]
@@ -212,7 +197,6 @@ def _fit_keys(
     iterations: int,
     starts: Float[np.ndarray, "K P"] | None = None,
 ) -> tuple[float, SubjectFit]:
-    base, identity = blank(cost)
     if starts is None:
         starts = np.array(
             [
@@ -220,50 +204,44 @@ def _fit_keys(
                 for key in keys
             ]
         )
+    terms = [FrameTerms(key, camera) for key in keys]
     frames, size = len(keys), len(cost.parameters.columns)
-    shared = min(identity_components, len(identity))
+    shared = min(identity_components, cost.head.num_identity)
     joint = replace(cost, identity_columns=shared)
     precision = _IDENTITY_WIDTH**-2.0
     lower = np.concatenate([np.tile(cost.parameters.lower, frames), np.full(shared, -3.0)])
     upper = np.concatenate([np.tile(cost.parameters.upper, frames), np.full(shared, 3.0)])
+    common = slice(frames * size, frames * size + shared)
 
-    def model_at(packed: Float[np.ndarray, "Q"]) -> QuadraticModel:
-        person = identity.copy()
-        person[:shared] = packed[frames * size :]
-        pull = precision * person[:shared]
-        total = 0.5 * float(pull @ person[:shared])
+    def unpacked(packed: _Packed) -> tuple[np.ndarray, np.ndarray]:
+        """Each frame's values, and the person."""
+        person = np.zeros(cost.head.num_identity)
+        person[:shared] = packed[common]
+        return packed[: common.start].reshape(frames, size), person
+
+    def model_at(packed: _Packed) -> QuadraticModel:
+        values, person = unpacked(packed)
+        pull = precision * packed[common]
+        total = 0.5 * float(pull @ packed[common])
         gradient, hessian = np.zeros(len(packed)), np.zeros((len(packed), len(packed)))
-        common = slice(frames * size, len(packed))
         gradient[common] = pull
         hessian[common, common] = precision * np.eye(shared)
-        for number, key in enumerate(keys):
+        for number, frame in enumerate(terms):
             own = slice(number * size, (number + 1) * size)
-            values = packed[own]
-            data = joint.linearize(cost.theta(values, base), person, camera, key)
-            frame = cost.add_priors(
-                values,
-                QuadraticModel(data.cost, data.gradient[:size], data.hessian[:size, :size]),
-                None,
-                0.0,
-            )
-            total += frame.cost
-            gradient[own] = frame.gradient
-            gradient[common] += data.gradient[size:]
-            hessian[own, own] = frame.hessian
-            hessian[own, common] = data.hessian[:size, size:]
-            hessian[common, own] = data.hessian[size:, :size]
-            hessian[common, common] += data.hessian[size:, size:]
+            model = joint.model(values[number], person, frame)
+            total += model.cost
+            gradient[own] = model.gradient[:size]
+            gradient[common] += model.gradient[size:]
+            hessian[own, own] = model.hessian[:size, :size]
+            hessian[own, common] = model.hessian[:size, size:]
+            hessian[common, own] = model.hessian[size:, :size]
+            hessian[common, common] += model.hessian[size:, size:]
         return QuadraticModel(total, gradient, hessian)
 
-    def cost_at(packed: Float[np.ndarray, "Q"]) -> float:
-        person = identity.copy()
-        person[:shared] = packed[frames * size :]
-        total = 0.5 * precision * float(person[:shared] @ person[:shared])
-        for number, key in enumerate(keys):
-            values = packed[number * size : (number + 1) * size]
-            total += joint.value(cost.theta(values, base), person, camera, key)
-            total += cost.prior_value(values, None, 0.0)
-        return total
+    def cost_at(packed: _Packed) -> float:
+        values, person = unpacked(packed)
+        total = 0.5 * precision * float(packed[common] @ packed[common])
+        return total + sum(joint.value(own, person, frame) for own, frame in zip(values, terms))
 
     packed, total = levenberg_marquardt(
         cost_at,
@@ -274,8 +252,7 @@ def _fit_keys(
         iterations=iterations,
         tolerance=1e-3,
     )
-    identity[:shared] = packed[frames * size :]
-    values = packed[: frames * size].reshape(frames, size)
+    values, identity = unpacked(packed)
     return total, SubjectFit(identity, camera, values)
 
 

@@ -21,6 +21,11 @@ from rgbavatar_ns.tracking.fit.pose_chain import (
     signal_slope,
 )
 
+_Theta = Float[np.ndarray, "H"]
+_Identity = Float[np.ndarray, "I"]
+_Point = Float[np.ndarray, "3"]
+_Coefficients = Float[np.ndarray, "C"]
+
 POSE_FIELDS = ("rotation", "neck", "jaw", "left_eye", "right_eye")
 
 
@@ -135,7 +140,7 @@ class LandmarkHead:
         self._joint_dirs = np.concatenate([joint_dirs, np.zeros((5, *lids.shape[1:]))], axis=2)
         self._parents = [int(parent) for parent in arrays.parents]
 
-    def of_person(self, identity: Float[np.ndarray, "I"]) -> "LandmarkHead":
+    def of_person(self, identity: _Identity) -> "LandmarkHead":
         """The same head with this identity folded in: smaller, and its identity has size 0."""
         count = self.num_identity
         person = copy(self)
@@ -216,26 +221,19 @@ class LandmarkHead:
         )
 
     def points(
-        self,
-        theta: Float[np.ndarray, "H"],
-        identity: Float[np.ndarray, "I"],
-        eye_m: Float[np.ndarray, "3"] | None = None,
+        self, theta: _Theta, identity: _Identity, eye_m: _Point | None = None
     ) -> Float[np.ndarray, "L 3"]:
         """Landmarks in world space, metres; a response sees them from `eye_m` (far off in z)."""
         coefficients = self._coefficients(theta, identity)
         view = self._view(theta, coefficients, eye_m)
         return sum(self._carried(view, coefficients), np.zeros((3, self.num_landmarks))).T
 
-    def head_rotation(self, theta: Float[np.ndarray, "H"]) -> Float[np.ndarray, "3 3"]:
+    def head_rotation(self, theta: _Theta) -> Float[np.ndarray, "3 3"]:
         """World rotation of the skull: global rotation, then neck."""
         return self._chain(theta, np.zeros(self._joint_dirs.shape[-1])).turned[SKULL]
 
     def jacobian(
-        self,
-        theta: Float[np.ndarray, "H"],
-        identity: Float[np.ndarray, "I"],
-        unknowns: Unknowns,
-        eye_m: Float[np.ndarray, "3"] | None = None,
+        self, theta: _Theta, identity: _Identity, unknowns: Unknowns, eye_m: _Point | None = None
     ) -> LandmarkJacobian:
         """Landmarks with their derivatives to `unknowns` of this head.
 
@@ -260,16 +258,14 @@ class LandmarkHead:
                     derivative[..., places] += slid @ np.stack(slopes, axis=-1)
         return LandmarkJacobian(sum(carried, np.zeros((3, self.num_landmarks))).T, derivative)
 
-    def _coefficients(
-        self, theta: Float[np.ndarray, "H"], identity: Float[np.ndarray, "I"]
-    ) -> Float[np.ndarray, "C"]:
+    def _coefficients(self, theta: _Theta, identity: _Identity) -> _Coefficients:
         parts = [identity, theta[self.layout.slice("expression")]]
         if "eyelids" in self.layout:
             parts.append(theta[self.layout.slice("eyelids")])
         return np.concatenate(parts)
 
     def _carried(
-        self, view: PoseView, coefficients: Float[np.ndarray, "C"]
+        self, view: PoseView, coefficients: _Coefficients
     ) -> list[Float[np.ndarray, "3 L"]]:
         """What each part of `_moments` adds to the landmarks in the world."""
         found, chain = [], view.chain
@@ -341,12 +337,7 @@ class LandmarkHead:
             joint = self._parents[joint]
         return joint == ancestor
 
-    def response_terms(
-        self,
-        theta: Float[np.ndarray, "H"],
-        identity: Float[np.ndarray, "I"],
-        eye_m: Float[np.ndarray, "3"],
-    ) -> ResponseTerms:
+    def response_terms(self, theta: _Theta, identity: _Identity, eye_m: _Point) -> ResponseTerms:
         """What `with_response` would multiply a response with; for those who measure one."""
         coefficients = self._coefficients(theta, identity)
         view = self._view(theta, coefficients, eye_m)
@@ -358,12 +349,7 @@ class LandmarkHead:
         points = sum(self._carried(view, coefficients), np.zeros((3, self.num_landmarks))).T
         return ResponseTerms(np.concatenate(terms), points, turned)
 
-    def _view(
-        self,
-        theta: Float[np.ndarray, "H"],
-        coefficients: Float[np.ndarray, "C"],
-        eye_m: Float[np.ndarray, "3"] | None,
-    ) -> PoseView:
+    def _view(self, theta: _Theta, coefficients: _Coefficients, eye_m: _Point | None) -> PoseView:
         chain = self._chain(theta, coefficients)
         towards = np.array([0.0, 0.0, 1.0]) if eye_m is None else eye_m - chain.placed[SKULL]
         towards = towards / np.linalg.norm(towards)
@@ -376,9 +362,7 @@ class LandmarkHead:
         signals = np.array([x, y, x * x, y * y, x * y, sines[0, 0], *sines[1:].mean(0)])
         return PoseView(chain, towards, np.cos(angles), signals)
 
-    def _chain(
-        self, theta: Float[np.ndarray, "H"], coefficients: Float[np.ndarray, "C"]
-    ) -> PoseChain:
+    def _chain(self, theta: _Theta, coefficients: _Coefficients) -> PoseChain:
         poses = np.zeros((5, 3))
         for joint, name in enumerate(POSE_FIELDS):
             if name in self.layout:

@@ -1,9 +1,7 @@
 """The tracker with the user's own head model in place of the embedded one."""
 
-import hashlib
 from pathlib import Path
 
-import numpy as np
 import torch
 
 from rgbavatar_ns.errors import UserError
@@ -44,15 +42,3 @@ def read_own_head(path: Path | None) -> HeadArrays | None:
             "it the embedded head is used.",
         )
     return HeadArrays.load(path)
-
-
-def head_digest(head: HeadArrays | None) -> str | None:
-    """What tells one head model from another; None for the embedded one."""
-    if head is None:
-        return None
-    digest = hashlib.sha256(head.name.encode())
-    for values in (head.v_template, head.shapedirs, head.skinning_weights, head.eyelid_dirs):
-        if values is not None:
-            digest.update(np.ascontiguousarray(values).tobytes())
-    digest.update(np.ascontiguousarray(head.faces, dtype=np.int64).tobytes())
-    return digest.hexdigest()

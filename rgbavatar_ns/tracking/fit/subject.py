@@ -37,7 +37,6 @@ from rgbavatar_ns.tracking.fit.fit import (
 )
 from rgbavatar_ns.tracking.fit.landmark_cost import FrameCost, Target
 from rgbavatar_ns.tracking.fit.landmark_head import LandmarkHead
-from rgbavatar_ns.tracking.fit.own_parameters import with_signed_expressions
 from rgbavatar_ns.tracking.fit.parameters import fit_parameters
 
 # Lips, lids, brows, nose and irises are seen; cheeks and forehead are interpolated by FaceMesh,
@@ -70,7 +69,6 @@ class SubjectTracker:
         size_m = self.mesh_landmarks.expression_size_m()
         names, layout = self.head.arrays.expression_names, self.head.layout
         parameters = fit_parameters(layout, names, size_m)
-        parameters = with_signed_expressions(parameters, layout, names, size_m)
         seen = self.mesh_landmarks
         if self.response is not None:
             seen = seen.with_response(self.response.select(rows))
@@ -117,10 +115,7 @@ class SubjectTracker:
 
     def thetas(self, fit: ClipFit) -> Float[np.ndarray, "F H"]:
         """theta of every frame."""
-        return np.array([self._theta(fit, position) for position in range(len(fit.values))])
-
-    def _theta(self, fit: ClipFit, position: int) -> Float[np.ndarray, "H"]:
-        return self.cost.theta(fit.values[position], np.zeros(self.head.layout.size))
+        return np.array([self.cost.theta(values) for values in fit.values])
 
     def fitted_px(self, fit: ClipFit, *, with_offsets: bool = True) -> Float[np.ndarray, "F L 2"]:
         """Where the fitted head's landmarks are detected, source pixels, with or without offsets.
@@ -128,19 +123,13 @@ class SubjectTracker:
         The offsets are the subject's own; the detector's response is in both.
         """
         head = self.cost.head if with_offsets else self._seen
-        identity = fit.subject.identity
-        camera = fit.subject.camera
+        identity, camera = fit.subject.identity, fit.subject.camera
         return np.array(
             [
                 camera.project(head.points(theta, identity, camera.eye_m))
                 for theta in self.thetas(fit)
             ]
         )
-
-    def frame_px(self, fit: ClipFit, position: int) -> Float[np.ndarray, "L 2"]:
-        """One frame's landmarks without the subject's offsets, source pixels."""
-        theta, camera = self._theta(fit, position), fit.subject.camera
-        return camera.project(self._seen.points(theta, fit.subject.identity, camera.eye_m))
 
     def rejected(self, fit: ClipFit, landmarks_px: Float[np.ndarray, "F 478 2"]) -> list[int]:
         """Positions whose landmarks no pose of the head explains."""
@@ -150,7 +139,7 @@ class SubjectTracker:
 
     def vertices_px(self, fit: ClipFit, position: int) -> Float[np.ndarray, "V 2"]:
         """The full mesh of one frame in source pixels."""
-        theta = torch.from_numpy(self._theta(fit, position))
+        theta = torch.from_numpy(self.cost.theta(fit.values[position]))
         with torch.no_grad():
             vertices = self.head(theta, torch.from_numpy(fit.subject.identity))
         return fit.subject.camera.project(vertices.numpy())

@@ -1,14 +1,21 @@
-"""One square crop that holds head and neck in every frame of a clip."""
+"""Square crops that hold head and neck: one for a whole clip, or one that follows a stream."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+import torch
 from jaxtyping import Float, UInt8
+
+from rgbavatar_ns.kernels.types import PinholeCameras
+from rgbavatar_ns.tracking.face.detector import face_height_px
+from rgbavatar_ns.tracking.fit.camera import StillCamera
 
 # Shares of the face's height (forehead to chin) around the landmarks' box: room for hair above,
 # for ears and hair at the sides, for the neck below.
 _ABOVE, _SIDES, _BELOW = 0.6, 0.3, 0.35
+# How much larger than the head's own square a following crop is: so much may the head move.
+_ROOM = 1.25
 
 
 @dataclass(frozen=True)
@@ -31,7 +38,7 @@ class SquareCrop:
     def apply(
         self, image: UInt8[np.ndarray, "H W *channels"]
     ) -> UInt8[np.ndarray, "size size *channels"]:
-        """The square part of the frame (of a picture or a mask) at the output size."""
+        """The square part of the frame (of an image or a mask) at the output size."""
         height, width = image.shape[:2]
         top, bottom = _within(self.top, self.side, height)
         left, right = _within(self.left, self.side, width)
@@ -58,6 +65,17 @@ class SquareCrop:
         """Points of the source frame in pixels of the crop."""
         return (points_px - (self.left, self.top)) * self.scale
 
+    def pinhole(self, camera: StillCamera) -> PinholeCameras:
+        """The source frame's camera, as the rasterizer takes it, for the crop."""
+        focal_px = camera.focal_px * self.scale
+        return PinholeCameras(
+            torch.from_numpy(camera.world_to_camera).float()[None],
+            torch.tensor([[focal_px, focal_px]], dtype=torch.float32),
+            torch.tensor([self.points(np.array(camera.center_px)).tolist()], dtype=torch.float32),
+            self.size,
+            self.size,
+        )
+
 
 def _within(start: int, side: int, span: int) -> tuple[int, int]:
     """The part of start .. start + side that lies in 0 .. span, at least one pixel of it."""
@@ -73,7 +91,7 @@ def steady_crop(
     It is pushed inside the frame where it fits. One crop for the clip, so that the camera
     stands still and only the head moves.
     """
-    face = float(np.median(np.linalg.norm(landmarks_px[:, 10] - landmarks_px[:, 152], axis=-1)))
+    face = float(np.median(face_height_px(landmarks_px)))
     low, high = landmarks_px.min((0, 1)), landmarks_px.max((0, 1))
     low = low - face * np.array([_SIDES, _ABOVE])
     high = high + face * np.array([_SIDES, _BELOW])
@@ -87,3 +105,49 @@ def _push_inside(start: float, side: int, span: int) -> int:
     if side > span:
         return round((span - side) / 2) if start < 0 and start + side > span else round(start)
     return round(min(max(start, 0), span - side))
+
+
+@dataclass
+class FollowingCrop:
+    """`square` holds the head with room around; `follow` moves it, as little as that needs.
+
+    Its side stays, so that a moved square is the same camera with another principal point.
+    """
+
+    square: SquareCrop
+    width: int
+    height: int
+
+    @classmethod
+    def around(
+        cls, landmarks_px: Float[np.ndarray, "F 478 2"], width: int, height: int, size: int
+    ) -> "FollowingCrop":
+        """A crop with room around the head of these frames, images of `size` pixels."""
+        tight = steady_crop(landmarks_px, width, height, size)
+        side = round(tight.side * _ROOM)
+        grown = (side - tight.side) // 2
+        left = _inside(tight.left - grown, side, width)
+        top = _inside(tight.top - grown, side, height)
+        return cls(SquareCrop(left, top, side, size), width, height)
+
+    def follow(self, landmarks_px: Float[np.ndarray, "478 2"]) -> None:
+        """Move the square if the head of this frame, with hair and neck, is not within it."""
+        head = steady_crop(landmarks_px[None], self.width, self.height, self.square.size)
+        left = _moved(self.square.left, self.square.side, head.left, head.side)
+        top = _moved(self.square.top, self.square.side, head.top, head.side)
+        if (left, top) != (self.square.left, self.square.top):
+            self.square = replace(self.square, left=left, top=top)
+
+
+def _moved(start: int, side: int, head_start: int, head_side: int) -> int:
+    """The start of a span of `side` that holds the head's, near the present one.
+
+    When it must move it moves to where the head is in its middle, so that it soon stands again.
+    """
+    if start <= head_start and head_start + head_side <= start + side:
+        return start
+    return head_start + (head_side - side) // 2
+
+
+def _inside(start: int, side: int, span: int) -> int:
+    return min(max(start, 0), max(span - side, 0)) if side <= span else start

@@ -3,29 +3,20 @@
 from collections import deque
 from collections.abc import Collection, Generator, Iterable, Iterator
 from contextlib import ExitStack, closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-import torch
 from jaxtyping import Float, UInt8
 
 from rgbavatar_ns.data.png import encode_png_rgba
-from rgbavatar_ns.kernels.types import PinholeCameras
 from rgbavatar_ns.tracking.face.clip import ClipLandmarks
-from rgbavatar_ns.tracking.face.detector import CHIN, FOREHEAD
-from rgbavatar_ns.tracking.fit.camera import StillCamera
 from rgbavatar_ns.tracking.fit.fit import ClipFit
 from rgbavatar_ns.tracking.fit.subject import SubjectTracker
 from rgbavatar_ns.tracking.image.crop import SquareCrop
-from rgbavatar_ns.tracking.image.head_mask import REGION_PX, HeadMask, height_above_chin
-from rgbavatar_ns.tracking.image.matting import (
-    PersonMatte,
-    foreground_color,
-    refined_matte,
-    straight_rgba,
-)
-from rgbavatar_ns.tracking.image.silhouette import SilhouetteAgreement, silhouette_agreement
+from rgbavatar_ns.tracking.image.cut_out import CutOut, MattedCrop
+from rgbavatar_ns.tracking.image.head_mask import HeadOutline
+from rgbavatar_ns.tracking.image.matting import PersonMatte, refined_matte
 from rgbavatar_ns.tracking.image.steady_matte import NEIGHBOURS, CoarseMatte, head_motion, steadied
 from rgbavatar_ns.tracking.input.mattes import UserMattes
 from rgbavatar_ns.tracking.input.video import FrameSource
@@ -37,12 +28,16 @@ _PNG_LEVEL = 1
 
 
 @dataclass(frozen=True)
-class TrackedPicture:
-    """One tracked frame's picture as a PNG file's bytes; `position` counts tracked frames."""
+class FrameImage:
+    """One tracked frame's image as a PNG file's bytes; `position` counts tracked frames."""
 
     position: int
     png: bytes
-    agreement: SilhouetteAgreement
+    outline: HeadOutline
+    matte: Float[np.ndarray, "s s"]
+    """What the matte holds of the whole person, as small as the outline."""
+    inside: Float[np.ndarray, "s s"]
+    """1 where the crop shows the frame."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +47,7 @@ class _Cropped:
     position: int
     image_rgb: UInt8[np.ndarray, "S S 3"]
     alpha: Float[np.ndarray, "S S"] | None
-    color_is_clean: bool
+    color_is_clean: bool = False
     coarse: Float[np.ndarray, "S S"] | None = None
     small: CoarseMatte | None = None
 
@@ -60,12 +55,12 @@ class _Cropped:
 _Window = tuple[_Cropped, tuple[_Cropped, ...]]
 
 
-class TrackedPictures:
-    """Makes tracked frames' pictures: crop, matte, colour at soft edges, fade-out at the neck.
+class FrameImages:
+    """Makes tracked frames' images: crop, matte, colour at soft edges, fade-out at the neck.
 
     Mattes are the user's own (`mattes`), or the alpha channel of the source where
     `source_alpha`, or found. Reading, segmentation and the rest run in threads of their own; a
-    few frames are in memory at a time. Each picture depends on the clip and the fit alone.
+    few frames are in memory at a time. Each image depends on the clip and the fit alone.
     """
 
     def __init__(
@@ -78,21 +73,16 @@ class TrackedPictures:
         mattes: UserMattes | None = None,
         source_alpha: bool = False,
     ) -> None:
-        arrays = tracker.head.arrays
         self._tracker, self._fit, self._found, self._crop = tracker, fit, found, crop
-        self._keep_torso = keep_torso
         self._mattes, self._source_alpha = mattes, source_alpha
-        self._region = HeadMask(arrays.faces, arrays.skinning_weights)
+        self._cut_out = CutOut(tracker.head.arrays, keep_torso)
         self._inside = crop.inside(found.width, found.height)
         self._follows = found.follows()
-        self.camera = pinhole(
-            fit.subject.camera.cropped(crop.left, crop.top, crop.scale), crop.size
-        )
 
-    def pictures(
+    def __call__(
         self, source: FrameSource, without: Collection[int] = ()
-    ) -> Generator[TrackedPicture, None, None]:
-        """The picture of every tracked frame, in order, but for the positions in `without`."""
+    ) -> Generator[FrameImage, None, None]:
+        """The image of every tracked frame, in order, but for the positions in `without`."""
         wanted = [k for k in range(len(self._found)) if k not in set(without)]
         read = sorted({near for k in wanted for near in self._window(k)})
         if not wanted:
@@ -154,10 +144,10 @@ class TrackedPictures:
                 matte = matte or PersonMatte()
                 coarse = matte.coarse(crop.image_rgb)
                 small = CoarseMatte.of(crop.image_rgb, coarse)
-                yield _Cropped(crop.position, crop.image_rgb, None, False, coarse, small)
+                yield replace(crop, coarse=coarse, small=small)
         finally:
             if matte is not None:
-                matte.__exit__(None, None, None)
+                matte.close()
 
     def _windows(self, crops: Iterable[_Cropped], wanted: frozenset[int]) -> Iterator[_Window]:
         """Each wanted crop with those around it, as soon as the last of them is there."""
@@ -176,28 +166,22 @@ class TrackedPictures:
             while held and held[0].position < needed:
                 held.popleft()
 
-    def _finish(self, window: _Window) -> TrackedPicture:
+    def _finish(self, window: _Window) -> FrameImage:
         crop, around = window
-        position = crop.position
-        alpha = self._alpha(crop, around) * self._inside
-        color = crop.image_rgb if crop.color_is_clean else foreground_color(crop.image_rgb, alpha)
-        few = min(self._crop.size, REGION_PX)
-        shrink = few / self._crop.size
-        vertices = shrink * self._crop.points(self._tracker.vertices_px(self._fit, position))
-        ends = shrink * self._crop.points(self._found.points_px[position][[FOREHEAD, CHIN]])
-        silhouette = self._region.silhouette(vertices, few)
-        agreement = silhouette_agreement(
-            silhouette,
-            cv2.resize(alpha, (few, few), interpolation=cv2.INTER_AREA),
-            cv2.resize(self._inside, (few, few), interpolation=cv2.INTER_AREA),
-            height_above_chin(ends[0], ends[1], few),
-            float(np.linalg.norm(ends[0] - ends[1])),
+        matted = MattedCrop.of(
+            crop.image_rgb, self._alpha(crop, around), self._inside, crop.color_is_clean
         )
-        if not self._keep_torso:
-            region = self._region.of_silhouette(silhouette, vertices, ends[0], ends[1])
-            alpha = alpha * cv2.resize(region, alpha.shape)
-        png = encode_png_rgba(straight_rgba(color, alpha), _PNG_LEVEL)
-        return TrackedPicture(position, png, agreement)
+        outline = self._cut_out.outline(
+            self._crop,
+            self._tracker.vertices_px(self._fit, crop.position),
+            self._found.points_px[crop.position],
+        )
+        small = (
+            cv2.resize(part, outline.silhouette.shape, interpolation=cv2.INTER_AREA)
+            for part in (matted.alpha, self._inside)
+        )
+        png = encode_png_rgba(self._cut_out(matted, outline), _PNG_LEVEL)
+        return FrameImage(crop.position, png, outline, *small)
 
     def _alpha(self, crop: _Cropped, around: tuple[_Cropped, ...]) -> Float[np.ndarray, "S S"]:
         if crop.alpha is not None:
@@ -212,14 +196,3 @@ class TrackedPictures:
             if other.small is not None and other.position != crop.position
         ]
         return refined_matte(crop.image_rgb, steadied(crop.coarse, crop.small, near))
-
-
-def pinhole(camera: StillCamera, size: int) -> PinholeCameras:
-    """The rasterizer's form of the still camera, for a square image."""
-    return PinholeCameras(
-        torch.from_numpy(camera.world_to_camera).float()[None],
-        torch.tensor([[camera.focal_px, camera.focal_px]], dtype=torch.float32),
-        torch.tensor([camera.center_px], dtype=torch.float32),
-        size,
-        size,
-    )

@@ -1,4 +1,6 @@
-"""Which part of the picture the head mesh can explain: the matte fades out below its neck."""
+"""Which part of the image the head mesh can explain: the matte fades out below its neck."""
+
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -10,8 +12,21 @@ from rgbavatar_ns.drawing.wireframe import mesh_silhouette
 # skin may lie beside the fitted mesh, over what length the neck fades out, and how far below the
 # chin nothing is cut.
 _HAIR, _MARGIN, _FADE, _BELOW_CHIN = 0.4, 0.05, 0.12, 0.08
-REGION_PX = 128
-"""Size at which the region is made: all its edges are soft."""
+_OUTLINE_PX = 128
+
+
+@dataclass(frozen=True)
+class HeadOutline:
+    """Where the fitted head lies in an image, at 128 pixels at most: no edge needs more."""
+
+    silhouette: Float[np.ndarray, "s s"]
+    """1 on the head and its neck, without shoulders, elsewhere 0."""
+    above_chin: Float[np.ndarray, "s s"]
+    """How far up the face each pixel lies: 0 at the chin, 1 at the forehead."""
+    face_height_px: float
+    """From forehead to chin, in pixels of the outline."""
+    neck_end: float | None
+    """How far up the face the mesh's lower border lies; None where it has none."""
 
 
 def neck_ring(faces: Int[np.ndarray, "T 3"]) -> Int[np.ndarray, "R"]:
@@ -35,7 +50,7 @@ def neck_ring(faces: Int[np.ndarray, "T 3"]) -> Int[np.ndarray, "R"]:
 
 
 class HeadMask:
-    """Soft mask of the part of the picture that the head (and not the shoulders) explains.
+    """Soft mask of the part of the image that the head (and not the shoulders) explains.
 
     The head is the part of the mesh that follows the neck joint more than the root. Above the
     chin its silhouette grows by the hair's margin; below it only by a little, and it fades out
@@ -49,57 +64,45 @@ class HeadMask:
         self._faces = faces[with_head[faces].all(1)]
         self._ring = neck_ring(self._faces)
 
-    def __call__(
+    def outline(
         self,
         vertices_px: Float[np.ndarray, "V 2"],
         forehead_px: Float[np.ndarray, "2"],
         chin_px: Float[np.ndarray, "2"],
         size: int,
-    ) -> Float[np.ndarray, "size size"]:
-        """1 on head and neck, 0 below, for a square image of `size` pixels.
-
-        Made at `REGION_PX` at most, then enlarged.
-        """
-        few = min(size, REGION_PX)
-        shrink = few / size
-        region = self.of_silhouette(
-            self.silhouette(vertices_px * shrink, few),
-            vertices_px * shrink,
-            forehead_px * shrink,
-            chin_px * shrink,
+    ) -> HeadOutline:
+        """The outline in a square image of `size` pixels, in whose pixels points are given."""
+        few = min(size, _OUTLINE_PX)
+        vertices, forehead, chin = (
+            few / size * points for points in (vertices_px, forehead_px, chin_px)
         )
-        return cv2.resize(region, (size, size)) if few < size else region
+        face = float(np.linalg.norm(forehead - chin))
+        end = None
+        if len(self._ring):
+            up = (forehead - chin) / face
+            end = float(np.percentile((vertices[self._ring] - chin) @ up, 10)) / face
+        return HeadOutline(
+            mesh_silhouette(vertices, self._faces, few),
+            height_above_chin(forehead, chin, few),
+            face,
+            end,
+        )
 
-    def silhouette(
-        self, vertices_px: Float[np.ndarray, "V 2"], size: int
-    ) -> Float[np.ndarray, "size size"]:
-        """Where the head and its neck are, without shoulders: 1, elsewhere 0."""
-        return mesh_silhouette(vertices_px, self._faces, size)
-
-    def of_silhouette(
-        self,
-        silhouette: Float[np.ndarray, "size size"],
-        vertices_px: Float[np.ndarray, "V 2"],
-        forehead_px: Float[np.ndarray, "2"],
-        chin_px: Float[np.ndarray, "2"],
-    ) -> Float[np.ndarray, "size size"]:
-        """The region around a silhouette that was drawn before."""
-        size = len(silhouette)
-        face = float(np.linalg.norm(forehead_px - chin_px))
+    def __call__(self, outline: HeadOutline, size: int) -> Float[np.ndarray, "size size"]:
+        """1 on head and neck, 0 below."""
+        face, height = outline.face_height_px, outline.above_chin
         distance = cv2.distanceTransform(
-            (silhouette < 0.5).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5
+            (outline.silhouette < 0.5).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5
         )
         wide = cv2.GaussianBlur(_grown(distance, _HAIR * face), (0, 0), 0.04 * face)
         narrow = cv2.GaussianBlur(_grown(distance, _MARGIN * face), (0, 0), 0.02 * face)
-        height = height_above_chin(forehead_px, chin_px, size)
         skull = _smooth_step(height, 0.12, 0.4)
-        if len(self._ring):
-            up = (forehead_px - chin_px) / face
-            ends = float(np.percentile((vertices_px[self._ring] - chin_px) @ up, 10)) / face
+        if outline.neck_end is not None:
             # A ring that slants or a chin on the chest must not cut the face itself.
-            low = min(ends, -_BELOW_CHIN - _FADE)
+            low = min(outline.neck_end, -_BELOW_CHIN - _FADE)
             narrow = narrow * _smooth_step(height, low, low + _FADE)
-        return (skull * wide + (1 - skull) * narrow).astype(np.float32)
+        mask = (skull * wide + (1 - skull) * narrow).astype(np.float32)
+        return cv2.resize(mask, (size, size))
 
 
 def height_above_chin(

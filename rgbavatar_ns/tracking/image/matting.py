@@ -1,12 +1,14 @@
-"""A soft matte of the person: selfie segmentation, sharpened along the picture's edges."""
-
-from types import TracebackType
+"""A soft matte of the person: selfie segmentation, sharpened along the image's edges."""
 
 import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
 from rgbavatar_ns.tracking.face.detector import load_mediapipe
+
+_Image = UInt8[np.ndarray, "H W 3"]
+_Colors = Float[np.ndarray, "H W 3"]
+_Alpha = Float[np.ndarray, "H W"]
 
 _GUIDE_EPSILON = 1e-4 * 255**2
 _FINE_SIDE_PX = 512
@@ -15,38 +17,29 @@ _FINE_SIDE_PX = 512
 class PersonMatte:
     """mediapipe's selfie segmentation, refined by a guided filter.
 
-    Each frame by itself: the result depends on one picture alone.
+    Each frame by itself: the result depends on one image alone.
     """
 
     def __init__(self) -> None:
         selfie = load_mediapipe().solutions.selfie_segmentation
         self._segmenter = selfie.SelfieSegmentation(model_selection=0)
 
-    def __enter__(self) -> "PersonMatte":
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        value: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def close(self) -> None:
+        """Free mediapipe's graph."""
         self._segmenter.close()
 
-    def __call__(self, image_rgb: UInt8[np.ndarray, "H W 3"]) -> Float[np.ndarray, "H W"]:
+    def __call__(self, image_rgb: _Image) -> _Alpha:
         """Alpha in [0, 1], float32: 1 on the person, soft at hair."""
         return refined_matte(image_rgb, self.coarse(image_rgb))
 
-    def coarse(self, image_rgb: UInt8[np.ndarray, "H W 3"]) -> Float[np.ndarray, "H W"]:
+    def coarse(self, image_rgb: _Image) -> _Alpha:
         """The segmentation alone, which knows no more than about 256 x 256 pixels."""
         found = self._segmenter.process(np.ascontiguousarray(image_rgb)).segmentation_mask
         return found.astype(np.float32)
 
 
-def refined_matte(
-    image_rgb: UInt8[np.ndarray, "H W 3"], coarse: Float[np.ndarray, "H W"]
-) -> Float[np.ndarray, "H W"]:
-    """The coarse matte drawn to the picture's own edges by a guided filter (He 2010)."""
+def refined_matte(image_rgb: _Image, coarse: _Alpha) -> _Alpha:
+    """The coarse matte drawn to the image's own edges by a guided filter (He 2010)."""
     longer = max(image_rgb.shape[:2])
     radius = max(2, round(longer / 45))
     # The filter's coefficients at half the size, where that is still finer than the segmentation: a
@@ -57,24 +50,20 @@ def refined_matte(
     return np.clip((fine - 0.06) / 0.88, 0, 1).astype(np.float32)
 
 
-def straight_rgba(
-    color: UInt8[np.ndarray, "H W 3"], alpha: Float[np.ndarray, "H W"]
-) -> UInt8[np.ndarray, "H W 4"]:
-    """Colour and alpha as a picture; colour under zero alpha is black, which compresses well."""
+def straight_rgba(color: _Image, alpha: _Alpha) -> UInt8[np.ndarray, "H W 4"]:
+    """Colour and alpha as an image; colour under zero alpha is black, which compresses well."""
     levels = cv2.convertScaleAbs(np.ascontiguousarray(alpha), alpha=255)
     seen = cv2.bitwise_and(color, color, mask=levels)
     return cv2.merge([*cv2.split(seen), levels])
 
 
-def foreground_color(
-    image_rgb: UInt8[np.ndarray, "H W 3"], alpha: Float[np.ndarray, "H W"]
-) -> UInt8[np.ndarray, "H W 3"]:
+def foreground_color(image_rgb: _Image, alpha: _Alpha) -> _Image:
     """Straight-alpha colour: what the person's own colour is where the background shines through.
 
     Blurred-fusion estimate (Forte 2021, "Approximate fast foreground colour estimation") from
     coarse to fine: at a quarter of the size, at half of it, and the last correction at full size
     where both shine through; without it hair edges keep a fringe of the background's colour. Under
-    zero alpha the picture stays as it is.
+    zero alpha the image stays as it is.
     """
     height, width = alpha.shape
     longer = max(height, width)
@@ -92,7 +81,7 @@ def foreground_color(
     mixed = np.flatnonzero((weight > 0) & (weight < 1))
     found = image_rgb.copy()
     if mixed.size:
-        # As a picture of one row, which is what OpenCV's arithmetic takes.
+        # As an image of one row, which is what OpenCV's arithmetic takes.
         image, near, far = (
             part.reshape(-1, 3)[mixed][None].astype(np.float32, copy=False)
             for part in (image_rgb, *(cv2.resize(part, (width, height)) for part in (near, far)))
@@ -103,12 +92,8 @@ def foreground_color(
 
 
 def _fuse(
-    image: Float[np.ndarray, "H W 3"],
-    foreground: Float[np.ndarray, "H W 3"],
-    background: Float[np.ndarray, "H W 3"],
-    alpha: Float[np.ndarray, "H W"],
-    diameter: int,
-) -> tuple[Float[np.ndarray, "H W 3"], Float[np.ndarray, "H W 3"]]:
+    image: _Colors, foreground: _Colors, background: _Colors, alpha: _Alpha, diameter: int
+) -> tuple[_Colors, _Colors]:
     beyond = 1 - alpha
     # Cubed weights trust the solid parts: the mixed ones are what is to be explained.
     solid = alpha * alpha * alpha + 1e-4 * alpha
@@ -118,13 +103,8 @@ def _fuse(
     return _explained(image, near, far, alpha), far
 
 
-def _explained(
-    image: Float[np.ndarray, "H W 3"],
-    foreground: Float[np.ndarray, "H W 3"],
-    background: Float[np.ndarray, "H W 3"],
-    alpha: Float[np.ndarray, "H W"],
-) -> Float[np.ndarray, "H W 3"]:
-    """The foreground, changed as far as alpha goes so that both together give the picture."""
+def _explained(image: _Colors, foreground: _Colors, background: _Colors, alpha: _Alpha) -> _Colors:
+    """The foreground, changed as far as alpha goes so that both together give the image."""
     mixed = cv2.merge([alpha, alpha, alpha])
     changed = cv2.multiply(mixed, cv2.subtract(foreground, background))
     cv2.add(changed, background, dst=changed)
@@ -134,9 +114,7 @@ def _explained(
     return np.clip(changed, 0, 255, out=changed)
 
 
-def _weighted_blur(
-    values: Float[np.ndarray, "H W 3"], weight: Float[np.ndarray, "H W"], diameter: int
-) -> Float[np.ndarray, "H W 3"]:
+def _weighted_blur(values: _Colors, weight: _Alpha, diameter: int) -> _Colors:
     box = (diameter, diameter)
     total = cv2.blur(weight, box) + 1e-7
     return cv2.blur(values * weight[..., None], box) / total[..., None]

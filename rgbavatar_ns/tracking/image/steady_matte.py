@@ -1,4 +1,4 @@
-"""A matte that does not flicker: coarse mattes averaged over time where the picture agrees."""
+"""A matte that does not flicker: coarse mattes averaged over time where the image agrees."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ _AGREE_WINDOW_PX = 5
 
 @dataclass(frozen=True)
 class CoarseMatte:
-    """A frame's coarse matte with a thumbnail of its picture, both small and of one size."""
+    """A frame's coarse matte with a thumbnail of its image, both small and of one size."""
 
     mask: Float[np.ndarray, "T T"]
     thumbnail: UInt8[np.ndarray, "T T 3"]
@@ -39,9 +39,9 @@ def steadied(
     now: CoarseMatte,
     near: Sequence[tuple[CoarseMatte, Float[np.ndarray, "2 3"]]],
 ) -> Float[np.ndarray, "S S"]:
-    """This frame's coarse matte, drawn to the mean with its neighbours' where pictures agree.
+    """This frame's coarse matte, drawn to the mean with its neighbours' where images agree.
 
-    A neighbour counts where its picture looks as this one does; elsewhere it is tried once more
+    A neighbour counts where its image looks as this one does; elsewhere it is tried once more
     moved along with the head, of whose motion from its crop to this one (pixels of the crop) each
     neighbour comes with. What moves otherwise, and what was hidden, is left alone, so nothing is
     dragged along. As many frames after as before are meant to be given: then there is no lag.
@@ -65,7 +65,7 @@ def steadied(
 def _agreement(
     a: UInt8[np.ndarray, "T T 3"], b: UInt8[np.ndarray, "T T 3"]
 ) -> Float[np.ndarray, "T T"]:
-    """1 where two pictures have the same colours, towards 0 where they differ."""
+    """1 where two images have the same colours, towards 0 where they differ."""
     red, green, blue = cv2.split(cv2.absdiff(a, b))
     differs = cv2.max(cv2.max(red, green), blue).astype(np.float32)
     differs = cv2.blur(differs, (_AGREE_WINDOW_PX, _AGREE_WINDOW_PX)) / _AGREE_LEVELS
@@ -86,7 +86,7 @@ def head_motion(
 
 
 def _scaled(motion: Float[np.ndarray, "2 3"], scale: float) -> Float[np.ndarray, "2 3"]:
-    """The same motion where the picture is `scale` as large.
+    """The same motion where the image is `scale` as large.
 
     Pixel centres lie at whole numbers for OpenCV and at halves for landmarks.
     """

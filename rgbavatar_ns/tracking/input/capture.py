@@ -1,4 +1,4 @@
-"""Pictures as time passes: a file at its own speed, a camera's newest, over lost connections."""
+"""Frames as time passes: a file at its own speed, a camera's latest, over lost connections."""
 
 import threading
 import time
@@ -6,7 +6,6 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol, runtime_checkable
 
 import cv2
 import numpy as np
@@ -21,54 +20,31 @@ _TIMEOUT_MS = 5000
 
 
 @dataclass(frozen=True)
-class Picture:
-    """A picture, its number in the source and when it was there, by time.monotonic()."""
+class CapturedFrame:
+    """An image, its number in the source and when it was there, by time.monotonic()."""
 
     index: int
     image_rgb: UInt8[np.ndarray, "H W 3"]
-    seen_s: float
+    captured_s: float
 
 
-@runtime_checkable
-class Pictures(Protocol):
-    """Gives one picture after the other."""
-
-    keeps: bool
-    """Whether pictures wait until they are taken."""
-    counts: Counter[str]
-    """What went wrong, by name."""
-
-    @property
-    def ended(self) -> bool:
-        """Whether no picture will come any more."""
-        ...
-
-    def next(self, timeout_s: float) -> Picture | None:
-        """The next picture; None if none has come after `timeout_s`."""
-        ...
-
-    def close(self) -> None:
-        """Let go of file or device."""
-        ...
-
-
-class FilePictures:
+class FileCapture:
     """Every frame of a video file or a folder of images, none before its time.
 
     Raises UserError where there is none, and from `next` where it cannot be read.
     """
 
-    keeps = True
+    keeps_frames = True
 
     def __init__(self, path: Path) -> None:
         self.counts: Counter[str] = Counter()
         self._frames = iter(FrameSource.open(path))
-        self._waiting: Picture | None = None
+        self._waiting: CapturedFrame | None = None
         self._due_s = 0.0
         self._began: tuple[float, float] | None = None  # by our clock, by the file's
         self.ended = False
 
-    def next(self, timeout_s: float) -> Picture | None:
+    def next(self, timeout_s: float) -> CapturedFrame | None:
         """The next frame, once it is due by the file's clock."""
         if self._waiting is None and not self._read():
             return None
@@ -79,7 +55,7 @@ class FilePictures:
                 return None
         due, self._waiting = self._waiting, None
         assert due is not None
-        return Picture(due.index, due.image_rgb, time.monotonic())
+        return CapturedFrame(due.index, due.image_rgb, time.monotonic())
 
     def _read(self) -> bool:
         frame = None if self.ended else next(self._frames, None)
@@ -91,7 +67,7 @@ class FilePictures:
         if self._began is None:
             self._began = now, clock_s
         self._due_s = self._began[0] + clock_s - self._began[1]
-        self._waiting = Picture(frame.index, frame.image_rgb, now)
+        self._waiting = CapturedFrame(frame.index, frame.image_rgb, now)
         return True
 
     def close(self) -> None:
@@ -99,24 +75,7 @@ class FilePictures:
         self.ended = True
 
 
-@runtime_checkable
-class Capture(Protocol):
-    """What OpenCV's VideoCapture does."""
-
-    def isOpened(self) -> bool:
-        """Whether there is a connection."""
-        ...
-
-    def read(self) -> tuple[bool, UInt8[np.ndarray, "H W 3"] | None]:
-        """Whether a picture came, and the picture, blue first."""
-        ...
-
-    def release(self) -> None:
-        """Let go."""
-        ...
-
-
-def open_capture(source: str) -> Capture:
+def open_capture(source: str) -> cv2.VideoCapture:
     """A camera by its number, a device or a network address."""
     if source.isdecimal():
         return cv2.VideoCapture(int(source))
@@ -127,38 +86,38 @@ def open_capture(source: str) -> Capture:
     return cv2.VideoCapture(source, cv2.CAP_FFMPEG, timeouts)
 
 
-class NewestPictures:
-    """The newest picture of a camera, read in a thread of its own; what is older is skipped.
+class LatestFrameCapture:
+    """The latest frame of a camera, read in a thread of its own; what is older is skipped.
 
     Where the camera is lost it is opened again, with growing pauses, for ever. `counts` says how
-    many pictures were "skipped", and how often there was "source lost", "failed openings" and
+    many frames were "skipped", and how often there was "source lost", "failed openings" and
     "reconnects".
     """
 
-    keeps = False
+    keeps_frames = False
     ended = False
 
     def __init__(
         self,
         source: str,
-        opener: Callable[[str], Capture] = open_capture,
+        opener: Callable[[str], cv2.VideoCapture] = open_capture,
         backoff: Backoff | None = None,
     ) -> None:
         self.counts: Counter[str] = Counter()
         self._source, self._open = source, opener
         self._backoff = backoff or Backoff()
-        self._newest: Picture | None = None
+        self._latest: CapturedFrame | None = None
         self._changed = threading.Condition()
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._grab, name="rgbavatar camera", daemon=True)
         self._thread.start()
 
-    def next(self, timeout_s: float) -> Picture | None:
-        """The newest picture that has not been given yet."""
+    def next(self, timeout_s: float) -> CapturedFrame | None:
+        """The latest frame that has not been given yet; None if none comes in `timeout_s`."""
         with self._changed:
-            self._changed.wait_for(lambda: self._newest is not None or self.ended, timeout_s)
-            newest, self._newest = self._newest, None
-            return newest
+            self._changed.wait_for(lambda: self._latest is not None or self.ended, timeout_s)
+            latest, self._latest = self._latest, None
+            return latest
 
     def close(self) -> None:
         """Let go of the camera."""
@@ -181,7 +140,7 @@ class NewestPictures:
                     came, image_bgr = capture.read()
                     if not came or image_bgr is None:
                         break
-                    self._put(Picture(index, _rgb(image_bgr), time.monotonic()))
+                    self._put(CapturedFrame(index, _rgb(image_bgr), time.monotonic()))
                     self._backoff.reset()
                     index, had_one = index + 1, True
                 else:
@@ -192,13 +151,16 @@ class NewestPictures:
                 if not self._closed.is_set():
                     self._closed.wait(self._backoff.pause_s())
 
-    def _put(self, picture: Picture) -> None:
+    def _put(self, frame: CapturedFrame) -> None:
         with self._changed:
-            if self._newest is not None:
+            if self._latest is not None:
                 self.counts["skipped"] += 1
-            self._newest = picture
+            self._latest = frame
             self._changed.notify_all()
 
 
 def _rgb(image_bgr: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:
     return cv2.cvtColor(image_bgr, cv2.COLOR_BGR2RGB)
+
+
+FrameCapture = FileCapture | LatestFrameCapture

@@ -1,4 +1,4 @@
-"""Pictures of a folder, in the order of their numbers, whatever depth and channels they have."""
+"""Images of a folder, in the order of their numbers, whatever depth and channels they have."""
 
 import re
 from pathlib import Path
@@ -9,13 +9,14 @@ from jaxtyping import UInt8
 
 from rgbavatar_ns.data.png import read_png_rgba
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.files import digest, digest_of_file
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff")
 _NEVER_ALPHA = (".jpg", ".jpeg", ".bmp")
 
 
 def image_files(folder: Path) -> list[Path]:
-    """The folder's pictures, 2 before 10; other files and hidden ones are passed over."""
+    """The folder's images, 2 before 10; other files and hidden ones are passed over."""
     return sorted(
         (
             path
@@ -36,8 +37,17 @@ def require_image_files(folder: Path) -> list[Path]:
     return files
 
 
+def source_digest(path: Path) -> str:
+    """What tells one source from another: of a file its size and samples of its content, of a
+    folder its images' names, sizes and times."""
+    if not path.is_dir():
+        return digest_of_file(path)
+    facts = [(image.name, image.stat()) for image in image_files(path)]
+    return digest(f"{name}|{stat.st_size}|{stat.st_mtime_ns}\n" for name, stat in facts)
+
+
 def read_image_rgba(path: Path) -> UInt8[np.ndarray, "H W 4"]:
-    """Decode a picture, turned as its EXIF data asks; opaque where it has no alpha.
+    """Decode an image, turned as its EXIF data asks; opaque where it has no alpha.
 
     Grey becomes RGB, 16 bit become 8. Raises UserError for what is damaged or floating point.
     """
@@ -57,7 +67,7 @@ def read_image_rgba(path: Path) -> UInt8[np.ndarray, "H W 4"]:
         raise UserError(f"{path} cannot be decoded as an image.", "Remove or replace it.")
     if decoded.dtype not in (np.uint8, np.uint16):
         raise UserError(
-            f"{path} holds {decoded.dtype} values.", "Store pictures with 8 or 16 bits a channel."
+            f"{path} holds {decoded.dtype} values.", "Store images with 8 or 16 bits a channel."
         )
     turn = cv2.COLOR_BGRA2RGBA if decoded.shape[2] == 4 else cv2.COLOR_BGR2RGBA
     rgba = cv2.cvtColor(decoded, turn)

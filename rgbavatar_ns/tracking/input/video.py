@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
+from functools import partial
 from pathlib import Path
 
 import av
@@ -28,7 +29,7 @@ from rgbavatar_ns.tracking.input.image_files import (
 class SourceFrame:
     """One frame: `index` runs over all clips together, `clip` says which one it is from.
 
-    `width` and `height` are the whole frame's; the picture may have been read smaller.
+    `width` and `height` are the whole frame's; the image may have been read smaller.
     `alpha` is None where everything is opaque; `time_s` where the source has no clock.
     """
 
@@ -43,11 +44,11 @@ class SourceFrame:
 
 @dataclass(frozen=True)
 class _Undecoded:
-    """A frame whose picture is made when it is wanted; at most `max_side` pixels long."""
+    """A frame whose image is made when it is wanted; at most `max_side` pixels long."""
 
     size: tuple[int, int]
     time_s: float | None
-    picture: Callable[[int | None], UInt8[np.ndarray, "h w *C"]]
+    image: Callable[[int | None], UInt8[np.ndarray, "h w *C"]]
 
 
 @dataclass
@@ -89,7 +90,7 @@ class FrameSource:
         wanted: Callable[[int], bool] = lambda index: True,
         max_side: int | None = None,
     ) -> Iterator[SourceFrame]:
-        """The wanted frames, their pictures no longer than `max_side`; the others cost little."""
+        """The wanted frames, their images no longer than `max_side`; the others cost little."""
         self.notes.clear()
         index, size = 0, None
         for clip, path in enumerate(self.paths):
@@ -104,7 +105,7 @@ class FrameSource:
                     )
                 size = frame.size
                 if wanted(index):
-                    image = frame.picture(max_side)
+                    image = frame.image(max_side)
                     alpha = np.ascontiguousarray(image[..., 3]) if image.shape[2] == 4 else None
                     if alpha is not None and alpha.min() == 255:
                         alpha = None
@@ -123,21 +124,17 @@ class FrameSource:
         return total if self.max_frames is None else min(total, self.max_frames)
 
     def _folder(self, folder: Path) -> Iterator[_Undecoded]:
-        size = None
-        for path in require_image_files(folder):
-            # The first picture's size is enough for those that are passed over unread.
-            picture = _FolderPicture(path)
-            if size is None:
-                height, width = picture(None).shape[:2]
-                size = (width, height)
-            picture.expected = size
-            yield _Undecoded(size, None, picture)
+        files = require_image_files(folder)
+        # The first image's size is enough for those that are passed over unread.
+        height, width = read_image_rgba(files[0]).shape[:2]
+        for path in files:
+            yield _Undecoded((width, height), None, partial(_image_of_size, path, width, height))
 
     def _video(self, path: Path) -> Iterator[_Undecoded]:
         decoded, damaged, broken = 0, 0, None
         try:
             with av.open(str(path)) as container:
-                stream = _picture_stream(container, path)
+                stream = _image_stream(container, path)
                 stream.thread_type = "AUTO"
                 aspect = stream.sample_aspect_ratio or Fraction(1)
                 for packet in container.demux(stream):
@@ -166,34 +163,28 @@ class FrameSource:
             self.notes.append(f"{path.name} holds {decoded} of the {declared} frames it announces")
 
 
-class _FolderPicture:
-    """Reads one picture of a folder and holds it to the size of the first."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self.expected: tuple[int, int] | None = None
-
-    def __call__(self, max_side: int | None) -> UInt8[np.ndarray, "h w 4"]:
-        image = read_image_rgba(self._path)
-        height, width = image.shape[:2]
-        if self.expected is not None and (width, height) != self.expected:
-            raise UserError(
-                f"{self._path} has {width} x {height} pixels, the images before it "
-                f"{self.expected[0]} x {self.expected[1]}.",
-                "Bring all images to one size; they share one camera.",
-            )
-        smaller = fitted_size(width, height, max_side)
-        if smaller == (width, height):
-            return image
-        return cv2.resize(image, smaller, interpolation=cv2.INTER_AREA)
+def _image_of_size(
+    path: Path, width: int, height: int, max_side: int | None
+) -> UInt8[np.ndarray, "h w 4"]:
+    image = read_image_rgba(path)
+    if image.shape[:2] != (height, width):
+        raise UserError(
+            f"{path} has {image.shape[1]} x {image.shape[0]} pixels, the images before it "
+            f"{width} x {height}.",
+            "Bring all images to one size; they share one camera.",
+        )
+    smaller = fitted_size(width, height, max_side)
+    if smaller == (width, height):
+        return image
+    return cv2.resize(image, smaller, interpolation=cv2.INTER_AREA)
 
 
-def _picture_stream(container: InputContainer, path: Path) -> VideoStream:
-    """The first stream of pictures; a cover image in a sound file is none."""
+def _image_stream(container: InputContainer, path: Path) -> VideoStream:
+    """The first stream of images; a cover image in a sound file is none."""
     for stream in container.streams.video:
         if not stream.disposition & Disposition.attached_pic:
             return stream
-    raise UserError(f"{path} holds no video stream.", "Give a file with pictures.")
+    raise UserError(f"{path} holds no video stream.", "Give a file with images.")
 
 
 def _upright(frame: av.VideoFrame, aspect: Fraction) -> _Undecoded:
@@ -203,19 +194,19 @@ def _upright(frame: av.VideoFrame, aspect: Fraction) -> _Undecoded:
     turns = round(frame.rotation / 90) % 4
     has_alpha = any(part.is_alpha for part in frame.format.components)
 
-    def picture(max_side: int | None) -> UInt8[np.ndarray, "h w *C"]:
+    def image(max_side: int | None) -> UInt8[np.ndarray, "h w *C"]:
         layout = "rgba" if has_alpha else "rgb24"
         wide, high = fitted_size(*stored, max_side)
         if (wide, high) == (frame.width, frame.height):
-            image = frame.to_ndarray(format=layout)
+            pixels = frame.to_ndarray(format=layout)
         else:
-            image = frame.reformat(
+            pixels = frame.reformat(
                 wide, high, format=layout, interpolation=Interpolation.AREA
             ).to_ndarray()
-        return np.ascontiguousarray(np.rot90(image, turns))
+        return np.ascontiguousarray(np.rot90(pixels, turns))
 
     size = (frame.height, width) if turns % 2 else stored
-    return _Undecoded(size, frame.time, picture)
+    return _Undecoded(size, frame.time, image)
 
 
 def _unreadable(path: Path, error: Exception) -> UserError:
@@ -228,7 +219,7 @@ def _unreadable(path: Path, error: Exception) -> UserError:
 def _declared_frames(path: Path) -> int:
     try:
         with av.open(str(path)) as container:
-            stream = _picture_stream(container, path)
+            stream = _image_stream(container, path)
             if stream.frames:
                 return stream.frames
             if stream.average_rate is None or container.duration is None:

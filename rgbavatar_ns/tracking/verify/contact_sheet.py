@@ -1,46 +1,69 @@
-"""Which frames the contact sheet shows: those most likely to be wrong, and some of the rest."""
+"""The contact sheet of a tracked clip: frames most likely to be wrong, and some of the rest."""
 
 from pathlib import Path
 
+import cv2
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int, UInt8
 
+from rgbavatar_ns.data.check.contact_sheet import write_contact_sheet
+from rgbavatar_ns.data.native.format import image_path
 from rgbavatar_ns.data.png import read_png_rgba
+from rgbavatar_ns.drawing.contact_sheet import labelled, over_gray_bgr
+from rgbavatar_ns.drawing.wireframe import fixed_point, with_wireframe
 from rgbavatar_ns.tracking.face.clip import ClipLandmarks
 from rgbavatar_ns.tracking.face.detector import LID_PAIRS, LIP_PAIRS, face_height_px
 from rgbavatar_ns.tracking.fit.fit import ClipFit
 from rgbavatar_ns.tracking.fit.subject import SubjectTracker
 from rgbavatar_ns.tracking.image.crop import SquareCrop
-from rgbavatar_ns.tracking.resumable_run import picture_path
-from rgbavatar_ns.tracking.verify.overlay import OverlayTile, write_contact_sheet
 from rgbavatar_ns.tracking.verify.report import mean_gap
 
-_TILES = 12
+_TILES, _TILE_PX = 12, 384
+_FOUND_BGR, _FITTED_BGR = (80, 255, 80), (60, 60, 255)
 # FaceMesh points at the face's sides and the tip of the nose: they tell how far it is turned.
 _SIDES, _NOSE_TIP = (234, 454), 4
 
 
-def write_sheet(
+def write_tracking_sheet(
     dst: Path, tracker: SubjectTracker, fit: ClipFit, found: ClipLandmarks, crop: SquareCrop
 ) -> None:
-    """`overlay.png` beside the pictures, which are read back from the destination."""
-    error = np.linalg.norm(
-        tracker.fitted_px(fit, with_offsets=False) - found.points_px[:, tracker.facemesh_index],
-        axis=-1,
-    ).mean(1)
+    """`overlay.png` in the dataset `dst`, whose images are there."""
+    found_px = found.points_px[:, tracker.facemesh_index]
+    fitted_px = tracker.fitted_px(fit, with_offsets=False)
+    error = np.linalg.norm(fitted_px - found_px, axis=-1).mean(1)
     tiles = []
     for position, why in sheet_frames(found.points_px, error).items():
         index = found.frame_index[position]
         tiles.append(
-            OverlayTile(
+            draw_tile(
                 f"{index} {why}".strip(),
-                read_png_rgba(picture_path(dst, index)),
+                read_png_rgba(image_path(dst, index)),
                 crop.points(tracker.vertices_px(fit, position)),
-                crop.points(found.points_px[position][tracker.facemesh_index]),
-                crop.points(tracker.frame_px(fit, position)),
+                tracker.head.arrays.faces,
+                crop.points(found_px[position]),
+                crop.points(fitted_px[position]),
             )
         )
-    write_contact_sheet(dst / "overlay.png", tiles, tracker.head.arrays.faces)
+    write_contact_sheet(dst / "overlay.png", tiles)
+
+
+def draw_tile(
+    label: str,
+    image_rgba: UInt8[np.ndarray, "S S 4"],
+    vertices_px: Float[np.ndarray, "V 2"],
+    faces: Int[np.ndarray, "T 3"],
+    found_px: Float[np.ndarray, "L 2"],
+    fitted_px: Float[np.ndarray, "L 2"],
+) -> UInt8[np.ndarray, "h w 3"]:
+    """The matted image, and beside it the same with the mesh (blue), found (green) and fitted
+    (red) landmarks; blue first."""
+    zoom = _TILE_PX / image_rgba.shape[0]
+    image = over_gray_bgr(image_rgba, zoom)
+    drawn = with_wireframe(image, vertices_px * zoom, faces)
+    for points, bgr in ((found_px, _FOUND_BGR), (fitted_px, _FITTED_BGR)):
+        for x, y in fixed_point(points * zoom).tolist():
+            cv2.circle(drawn, (x, y), 20, bgr, -1, cv2.LINE_AA, shift=4)
+    return np.hstack([image, labelled(drawn, label)])
 
 
 def sheet_frames(

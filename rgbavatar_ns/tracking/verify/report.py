@@ -1,16 +1,17 @@
 """The numbers that tell whether a clip was tracked well, and what they mean in words."""
 
-import json
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from rgbavatar_ns.data.check.problems import Finding, Severity
+from rgbavatar_ns.data.check.silhouette import silhouette_overlap
 from rgbavatar_ns.tracking.face.detector import LID_PAIRS, LIP_PAIRS, face_height_px
 from rgbavatar_ns.tracking.fit.fit import ClipFit
 from rgbavatar_ns.tracking.fit.subject import SubjectTracker
+from rgbavatar_ns.tracking.image.head_mask import HeadOutline
 
 # An eye is closed where its lids' gap is below this share of the clip's widely open ones.
 _CLOSED_SHARE = 0.5
@@ -20,6 +21,9 @@ _FITTED_ERROR, _MESH_ERROR = (0.01, 0.02), (0.015, 0.03)
 _CORRELATION, _COVERAGE = (0.85, 0.6), (0.95, 0.85)
 _REJECTED, _BLURRED = (0.05, 0.25), (0.1, 0.3)
 _FACE_PX, _FRAMES = (100.0, 50.0), (100, 25)
+# The part of the face whose outline is skin: from a little above the chin to the eyes, as shares
+# of the height from chin to forehead; and how far beside the head the matte is looked at.
+_FACE_FROM, _FACE_TO, _BESIDE = 0.1, 0.6, 0.2
 
 
 def fit_quality(
@@ -86,10 +90,35 @@ def count_blinks(gap: Float[np.ndarray, "F"]) -> int:
     return int(closed[0]) + int(np.count_nonzero(closed[1:] & ~closed[:-1]))
 
 
-def silhouette_summary(noted: Sequence[Mapping[str, float | None]]) -> dict[str, float | None]:
-    """Means over all frames' `SilhouetteAgreement`, and the lowest coverage."""
-    coverage = [one["coverage"] for one in noted if one["coverage"] is not None]
-    face_iou = [one["face_iou"] for one in noted if one["face_iou"] is not None]
+def silhouette_shares(
+    outline: HeadOutline, matte: Float[np.ndarray, "s s"], inside: Float[np.ndarray, "s s"]
+) -> dict[str, float | None]:
+    """How well mesh and matte of a frame agree; None where the head is outside of the image.
+
+    `coverage`: the share of the mesh above the chin that the matte holds. `face_iou`: intersection
+    over union of both between chin and eyes, up to a fifth of the face's height beside the mesh:
+    there the outline is skin, unless hair hangs down beside the cheeks, which lowers it. `inside`
+    is 1 where the image is.
+    """
+    seen, height = inside > 0.5, outline.above_chin
+    head = silhouette_overlap(outline.silhouette, matte, seen & (height > 0))
+    skin = seen & (height > _FACE_FROM) & (height < _FACE_TO)
+    columns = np.flatnonzero(((outline.silhouette > 0.5) & skin).any(0))
+    if columns.size:
+        beside = round(_BESIDE * outline.face_height_px)
+        skin[:, : max(0, columns[0] - beside)] = False
+        skin[:, columns[-1] + 1 + beside :] = False
+    face = silhouette_overlap(outline.silhouette, matte, skin)
+    return {
+        "coverage": head.covered if head.mesh else None,
+        "face_iou": face.iou if face.either else None,
+    }
+
+
+def silhouette_summary(shares: Sequence[Mapping[str, float | None]]) -> dict[str, float | None]:
+    """Means over all frames' `silhouette_shares`, and the lowest coverage."""
+    coverage = [one["coverage"] for one in shares if one["coverage"] is not None]
+    face_iou = [one["face_iou"] for one in shares if one["face_iou"] is not None]
     return {
         "silhouette_coverage": float(np.mean(coverage)) if coverage else None,
         "worst_silhouette_coverage": float(np.min(coverage)) if coverage else None,
@@ -97,42 +126,29 @@ def silhouette_summary(noted: Sequence[Mapping[str, float | None]]) -> dict[str,
     }
 
 
-def verdict(report: Mapping[str, Any]) -> str:
-    """The report in words: "good", "usable: ..." or "look at it: ..." with what is amiss."""
-    tracked, read = report["frames_tracked"], report["frames_read"]
-    checks = [
-        ("the fit leaves the landmarks", report["reprojection_error_share"], _FITTED_ERROR, 1),
-        ("the mesh lies off the face", report["mesh_reprojection_error_share"], _MESH_ERROR, 1),
-        ("the mouth is not followed", report["mouth_opening_correlation"], _CORRELATION, -1),
-        ("the eyelids are not followed", report["eyelid_opening_correlation"], _CORRELATION, -1),
-        ("the matte misses part of the head", report["silhouette_coverage"], _COVERAGE, -1),
-        (f"{read - tracked} of {read} frames are left out", 1 - tracked / read, _REJECTED, 1),
-        (
-            f"{len(report['blurred'])} frames are blurred",
-            len(report["blurred"]) / tracked,
-            _BLURRED,
-            1,
-        ),
-        (
-            f"the face is only {report['face_height_px']:.0f} pixels high",
-            report["face_height_px"],
-            _FACE_PX,
-            -1,
-        ),
-        (f"there are only {tracked} frames", tracked, _FRAMES, -1),
-    ]
-    mild, grave = [], []
-    for words, value, (first, second), sign in checks:
-        if value is None or sign * (value - first) <= 0:
-            continue
-        (grave if sign * (value - second) > 0 else mild).append(words)
-    if report["other_faces"]:
-        grave.append(f"another face is seen in {len(report['other_faces'])} frames")
-    if grave:
-        return f"look at it: {'; '.join(grave + mild)}"
-    return f"usable: {'; '.join(mild)}" if mild else "good"
-
-
-def write_report(path: Path, report: Mapping[str, Any]) -> None:
-    """`tracking.json`, readable by people."""
-    path.write_text(json.dumps(report, indent=2) + "\n")
+def tracking_findings(report: Mapping[str, Any]) -> list[Finding]:
+    """What is amiss in a clip's figures: beyond a limit to be looked at, or to be known."""
+    tracked, read, blurred = report["frames_tracked"], report["frames_read"], report["blurred"]
+    height = report["face_height_px"]
+    fitted, mesh = (report[f"{one}reprojection_error_share"] for one in ("", "mesh_"))
+    mouth, lids = (report[f"{one}_opening_correlation"] for one in ("mouth", "eyelid"))
+    found = []
+    for kind, cause, value, (mild, grave) in (
+        ("landmarks", "the fit leaves the landmarks", fitted, _FITTED_ERROR),
+        ("misfit", "the mesh lies off the face", mesh, _MESH_ERROR),
+        ("landmarks", "the mouth is not followed", mouth, _CORRELATION),
+        ("landmarks", "the eyelids are not followed", lids, _CORRELATION),
+        ("mattes", "the matte misses part of the head", report["silhouette_coverage"], _COVERAGE),
+        ("faces", f"{read - tracked} of {read} frames are left out", 1 - tracked / read, _REJECTED),
+        ("faces", f"{len(blurred)} frames are blurred", len(blurred) / tracked, _BLURRED),
+        ("faces", f"the face is only {height:.0f} pixels high", height, _FACE_PX),
+        ("faces", f"there are only {tracked} frames", tracked, _FRAMES),
+    ):
+        sign = 1 if grave > mild else -1
+        if value is not None and sign * (value - mild) > 0:
+            severity: Severity = "error" if sign * (value - grave) > 0 else "warning"
+            found.append(Finding(kind, severity, cause))
+    others = len(report["other_faces"])
+    if others:
+        found.append(Finding("faces", "error", f"another face is seen in {others} frames"))
+    return found

@@ -23,6 +23,7 @@ from rgbavatar_ns.bench.scenes import ellipsoid_scene, leaf_gaussians, on_device
 from rgbavatar_ns.kernels import rasterize
 from rgbavatar_ns.kernels.registry import choose
 from tests.avatar.fused_scene import (
+    VARIANTS,
     double,
     eager_step,
     far_batch,
@@ -33,7 +34,6 @@ from tests.avatar.fused_scene import (
     stir,
 )
 from tests.avatar.small_head import front_camera, random_theta
-from tests.avatar.test_fused_step import VARIANTS
 from tests.kernels.agreement import assert_agrees, expect
 from tests.kernels.cuda import emulator
 from tests.kernels.scenes import random_scene, to

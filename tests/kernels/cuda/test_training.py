@@ -6,14 +6,16 @@ import torch
 from rgbavatar_ns.avatar.training import make_optimizer
 from rgbavatar_ns.avatar.training.fused_step import FusedStep
 from tests.avatar.fused_scene import (
+    VARIANTS,
+    assert_gradients_agree,
     eager_step,
     far_batch,
     first_moments,
     fused_step,
     relative_differences,
     stir,
+    values_by_group,
 )
-from tests.avatar.test_fused_step import VARIANTS, assert_gradients_agree
 from tests.kernels.cuda import emulator
 
 pytestmark = pytest.mark.skipif(emulator.compiler() is None, reason="no g++ to emulate CUDA with")
@@ -69,12 +71,7 @@ def test_parameters_after_some_steps(emulated, make_avatar):
             group["lr"] *= 0.1
         for _ in range(8):
             step(avatar, optimizer, batch, background)
-        ends.append(
-            {
-                n: torch.cat([p.detach().flatten() for p in ps])
-                for n, ps in avatar.parameter_groups().items()
-            }
-        )
+        ends.append(values_by_group(avatar))
     assert max(relative_differences(*ends).values()) < 1e-3
 
 

@@ -1,4 +1,4 @@
-// Blending of one tile: Gaussian by Gaussian, each over the blocks that it touches.
+// Blending of one tile: block by block, the block's Gaussians from front to back.
 #pragma once
 
 #include "formulas.h"

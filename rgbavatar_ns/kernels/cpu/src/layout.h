@@ -128,7 +128,7 @@ struct alignas(64) TileScratch {
 // Position, rotation and colour: what the bases change.
 constexpr int kMorphedKinds = 3;
 constexpr int kMorphedWidth[kMorphedKinds] = {3, 4, 3};
-// Gaussians that are blended at a time: many, because each basis is a stretch of memory of its own,
+// Gaussians that are morphed at a time: many, because each basis is a stretch of memory of its own,
 // which a processor has to find first; the columns of a batch still fit the second cache.
 constexpr int kBlendChunk = 1024;
 constexpr int kBlendColumns = kBlendChunk * 4;
@@ -167,7 +167,7 @@ struct MorphedOptimizer {
 
 // Scratch memory of one thread for a chunk of Gaussians.
 struct BlendScratch {
-  float* tangent[kMorphedKinds];   // [B, kBlendChunk * width]: blended, or the gradient of that
+  float* tangent[kMorphedKinds];   // [B, kBlendChunk * width]: morphed, or the gradient of that
   float* weight_sums;              // [B, K, 16]
   float gradient[kBlendColumns];
   float scale[3][kBlendChunk], opacity[kBlendChunk];
@@ -197,7 +197,7 @@ struct Kernels {
                            const ImageSlots&, const SceneGradient&);
   // Fills the frames [begin, end) of an image.
   void (*fill_frames)(const MorphedScene&, int image, int begin, int end);
-  // Blends and projects Gaussians [begin, end), at most kBlendChunk, of all images. `cameras` and
+  // Morphs and projects Gaussians [begin, end), at most kBlendChunk, of all images. `cameras` and
   // `images` hold one entry an image.
   void (*project_morphed)(const MorphedScene&, const float* cameras, int begin, int end,
                           BlendScratch&, const Projected* images);

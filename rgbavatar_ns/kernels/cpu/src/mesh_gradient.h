@@ -1,4 +1,4 @@
-// From the gradients of blended Gaussians to that of the mesh that carries them.
+// From the gradients of morphed Gaussians to that of the mesh that carries them.
 #pragma once
 
 #include "morphed.h"

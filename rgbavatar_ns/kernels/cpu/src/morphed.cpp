@@ -1,4 +1,4 @@
-// The driver for blended Gaussians.
+// The driver for morphed Gaussians.
 #include <algorithm>
 
 #include "raster.h"

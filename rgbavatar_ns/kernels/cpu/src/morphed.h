@@ -76,7 +76,7 @@ static RGBAVATAR_MEMBER FrameLanes load_frames(const MorphedScene& scene, int im
           c[22]};
 }
 
-// ---- Blending -----------------------------------------------------------------------------------
+// ---- Morphing -----------------------------------------------------------------------------------
 
 constexpr int kBlendImages = 5;  // images whose sums stay in registers together
 
@@ -172,7 +172,7 @@ struct WorldLanes {
   FrameLanes frame;
 };
 
-// Sixteen blended Gaussians of an image, in the world. `first` counts from the chunk's begin.
+// Sixteen morphed Gaussians of an image, in the world. `first` counts from the chunk's begin.
 static RGBAVATAR_MEMBER WorldLanes world_lanes(const MorphedScene& scene, int image, int begin,
                                                int first, int lanes, const BlendScratch& scratch) {
   const auto tangent = [&](int kind) __attribute__((always_inline)) {
@@ -237,7 +237,7 @@ static void carry(const WorldLanes& world, const GaussianGradient<Wide>& d, cons
     store_columns(columns + k, [&](int i) { return out.data + i * kCarriedFloats + k; });
 }
 
-// Turns the chunk's blended numbers into their gradients, of all images, and sums those of scales
+// Turns the chunk's morphed numbers into their gradients, of all images, and sums those of scales
 // and opacities.
 static void differentiate_chunk(const MorphedScene& scene, const float* cameras, int begin,
                                 int count, BlendScratch& scratch, const ImageSlots* images,

@@ -67,7 +67,7 @@ struct Workspace {
   Buffer<uint32_t> part_start;     // [B, parts, tiles + 1]: where a part's next entry of a tile goes
   Buffer<size_t> part_slots;       // [B, parts]: (Gaussian, tile) pairs
   Buffer<uint64_t> sort_keys;      // [threads, most entries of a tile]
-  // Of blended Gaussians.
+  // Of morphed Gaussians.
   Buffer<float> frames;            // [B, U, kFrameFloats]
   Buffer<BlendScratch> blending;   // [threads]
   Buffer<float> blending_columns;  // [threads, ...]: what the scratch memory points to
@@ -130,17 +130,17 @@ class Rendering {
   void fill_part(int image, int part);
 };
 
-// A Rendering of blended Gaussians, which can train them. The scene's memory is not kept.
+// A Rendering of morphed Gaussians, which can train them. The scene's memory is not kept.
 class MorphedRendering : public Rendering {
  public:
   MorphedRendering(MorphedScene scene, const Cameras& cameras, const std::string& instruction_set,
                    int threads);
 
   // The mean absolute difference to images [B, H, W, 4] of 8 bits over backgrounds [B or 1, 3];
-  // keeps what `update` needs.
+  // keeps what `backward_adam` needs.
   double forward_loss(const uint8_t* images, const Attribute& background, int threads);
 
-  // One step of Adam by the gradient of the last comparison, or none without an optimizer; writes
+  // One step of Adam by the gradient of the last forward_loss, or none without an optimizer; writes
   // the gradients of the weights, [B, K], and, unless it is null, of the vertices, [B, V, 3].
   void backward_adam(MorphedScene scene, const MorphedOptimizer* optimizer, float* weight_gradient,
               float* vertex_gradient, int threads);

@@ -65,7 +65,7 @@ RGBAVATAR_KERNEL(project_backward, ProjectBackwardArguments, kBlendThreads) {
   put_vec3(color, a.colors, row);
 }
 
-// The gradient of one blended Gaussian in one image.
+// The gradient of one morphed Gaussian in one image.
 RGBAVATAR_FUNCTION void morphed_gradient(const BlendBackwardArguments& a, int image, int gaussian,
                                          const Carried& c) {
   const int64_t row = int64_t(image) * a.frame.count + gaussian;

@@ -149,7 +149,7 @@ RGBAVATAR_FUNCTION void blend_attribute(const float* base, const float* basis, i
   }
 }
 
-// `weights` are those of the images that the block blends, [kBlendImages, K].
+// `weights` are those of the images that the block morphs, [kBlendImages, K].
 RGBAVATAR_FUNCTION void blend_gaussian(const Morphed& b, const Frame& frame, const float* weights,
                                        int gaussian, Tangent& out) {
   const int count = frame.count, bases = b.bases;
@@ -168,7 +168,7 @@ RGBAVATAR_FUNCTION void load_weights(const Morphed& b, const Frame& frame, int f
   __syncthreads();
 }
 
-// A blended Gaussian in the world of one image, and what carries it.
+// A morphed Gaussian in the world of one image, and what carries it.
 struct Carried {
   Vec3<float> row0, row1, row2;  // of the frame's matrix
   float frame_quat[4], ratio;
@@ -211,7 +211,7 @@ RGBAVATAR_FUNCTION Carried carry(const Morphed& b, int image, int gaussian,
   return out;
 }
 
-// Blends and projects. Blocks of 128 Gaussians, by groups of kBlendImages images.
+// Morphs and projects. Blocks of 128 Gaussians, by groups of kBlendImages images.
 RGBAVATAR_KERNEL(blend, BlendArguments, kBlendThreads) {
   RGBAVATAR_DYNAMIC_SHARED(float, weights);
   const int first_image = int(blockIdx.y) * kBlendImages;

@@ -5,7 +5,7 @@ import torch
 
 from rgbavatar_ns.avatar.recorded_rendering import RecordedRendering
 from tests.avatar.fused_scene import far_batch, stir
-from tests.avatar.test_graphed_step import Recorder
+from tests.avatar.training.test_recorded_step import Recorder
 from tests.kernels.cuda import emulator
 
 pytestmark = pytest.mark.skipif(emulator.compiler() is None, reason="no g++ to emulate CUDA with")

@@ -1,8 +1,7 @@
 import torch
 
 from rgbavatar_ns.avatar import WeightNetwork
-
-from .small_head import random_theta
+from tests.avatar.small_head import random_theta
 
 
 def test_mlp_is_three_layers_with_relu_between():

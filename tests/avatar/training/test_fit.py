@@ -18,8 +18,7 @@ from rgbavatar_ns.avatar.training.batches import ChosenFrames
 from rgbavatar_ns.avatar.training.color_init import ColorInitSchedule
 from rgbavatar_ns.avatar.training.losses import random_backgrounds
 from rgbavatar_ns.errors import UserError
-
-from .small_head import front_camera, random_theta
+from tests.avatar.small_head import front_camera, random_theta
 
 SIZE, FRAMES = 24, 6
 

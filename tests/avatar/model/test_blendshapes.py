@@ -37,15 +37,6 @@ def test_blend_is_base_plus_weighted_residuals(num_gaussians, num_bases, batch, 
         np.testing.assert_allclose(getattr(blended, name).detach().numpy(), expected, atol=1e-12)
 
 
-def test_zero_psi_gives_the_base():
-    shapes = filled(5, 3)
-    blended = shapes.morph(torch.zeros(2, 3, dtype=torch.float64))
-    for name in ("position", "rotation_wxyz", "color_feature"):
-        torch.testing.assert_close(
-            getattr(blended, name), getattr(shapes, name).expand(2, -1, -1), rtol=0, atol=0
-        )
-
-
 def test_opacity_and_scale_have_no_residuals():
     shapes = GaussianBlendshapes(5, 3)
     assert {name for name, _ in shapes.named_parameters() if name.startswith("basis")} == {

@@ -10,26 +10,30 @@ from typing import Any
 
 import pytest
 import torch
-from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 
 from rgbavatar_ns import Avatar
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.plugin.methods import rgbavatar
-from rgbavatar_ns.plugin.training.checkpoints import list_checkpoints, read_checkpoint
+from rgbavatar_ns.plugin.training.checkpoints import list_checkpoints
 from rgbavatar_ns.plugin.training.trainer import RGBAvatarTrainer, RGBAvatarTrainerConfig
-from tests.plugin.run import SMALL, make_trainer, small_config
+from tests.plugin.run import (
+    SMALL,
+    before_each_step,
+    make_trainer,
+    newest_state,
+    small_config,
+    trained,
+)
 
 STEPS = 12
 
 
 def _train(data: Path, output: Path, **fields: Any) -> RGBAvatarTrainer:
-    trainer = make_trainer(small_config(data, output, **fields))
-    trainer.train()
-    return trainer
+    return trained(small_config(data, output, **fields))
 
 
 def _newest(trainer: RGBAvatarTrainer) -> dict[str, Any]:
-    return read_checkpoint(list_checkpoints(trainer.checkpoint_dir)[-1][1])
+    return newest_state(trainer.checkpoint_dir)
 
 
 @pytest.fixture(scope="module")
@@ -78,8 +82,7 @@ def test_a_run_equals_itself_and_not_one_of_another_seed(
     _assert_equal_runs(again, uninterrupted)
     config = small_config(tiny_data, tmp_path / "other", **_FALLING)
     config.machine.seed = 7
-    trainer = make_trainer(config)
-    trainer.train()
+    trainer = trained(config)
     assert _differences(_newest(trainer)["pipeline"], uninterrupted["pipeline"])
 
 
@@ -103,8 +106,7 @@ def test_interrupted_run_saves_and_goes_on_as_if_nothing_had_been(
         if step == 4:
             signal.raise_signal(number)
 
-    where = [TrainingCallbackLocation.BEFORE_TRAIN_ITERATION]
-    trainer.callbacks.append(TrainingCallback(where, interrupt))
+    before_each_step(trainer, interrupt)
     with pytest.raises(SystemExit) as ended:
         trainer.train()
     assert ended.value.code == 128 + number

@@ -7,8 +7,7 @@ import torch
 from rgbavatar_ns import Avatar
 from rgbavatar_ns.avatar.storage import bundle
 from rgbavatar_ns.errors import UserError
-
-from .small_head import front_camera, random_theta
+from tests.avatar.small_head import front_camera, random_theta
 
 
 def assert_renders_the_same(first: Avatar, second: Avatar) -> None:

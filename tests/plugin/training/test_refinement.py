@@ -14,7 +14,7 @@ from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.kernels import available_backends
 from rgbavatar_ns.plugin.training.refinement import frame_refinement
 from rgbavatar_ns.plugin.training.trainer import RGBAvatarTrainer
-from tests.plugin.run import make_trainer, small_config
+from tests.plugin.run import make_trainer, small_config, trained
 from tests.plugin.tiny import NUM_FRAMES, NUM_TEST
 
 START = 2
@@ -30,12 +30,6 @@ def _config(data: Path, output: Path, steps: int = 8, *, fast: bool = True, refi
     return config
 
 
-def _train(config) -> RGBAvatarTrainer:
-    trainer = make_trainer(config)
-    trainer.train()
-    return trainer
-
-
 def refinement_of(trainer: RGBAvatarTrainer) -> FrameRefinement:
     refinement = trainer.pipeline.model.refinement
     assert refinement is not None
@@ -48,7 +42,7 @@ def _corrections(trainer: RGBAvatarTrainer) -> torch.Tensor:
 
 @pytest.mark.parametrize("fast", [True, False], ids=["fused", "eager"])
 def test_training_frames_are_corrected_and_held_out_ones_calibrated(tiny_data, tmp_path, fast):
-    trainer = _train(_config(tiny_data, tmp_path, fast=fast))
+    trainer = trained(_config(tiny_data, tmp_path, fast=fast))
     model = trainer.pipeline.model
     refined = np.load(trainer.base_dir / "theta_refined.npy", allow_pickle=False)
     tracked = model.frame_theta.numpy()
@@ -72,7 +66,7 @@ def test_both_ways_correct_alike(tiny_data, tmp_path):
     if "cpu" not in available_backends():
         pytest.skip("not compiled")
     fused, eager = (
-        _train(_config(tiny_data, tmp_path / str(fast), START + 1, fast=fast))
+        trained(_config(tiny_data, tmp_path / str(fast), START + 1, fast=fast))
         for fast in (True, False)
     )
     first, second = _corrections(fused), _corrections(eager)
@@ -81,8 +75,8 @@ def test_both_ways_correct_alike(tiny_data, tmp_path):
 
 
 def test_nothing_is_corrected_before_the_start(tiny_data, tmp_path):
-    plain = _train(_config(tiny_data, tmp_path / "plain", START, refine=False))
-    refined = _train(_config(tiny_data, tmp_path / "refined", START))
+    plain = trained(_config(tiny_data, tmp_path / "plain", START, refine=False))
+    refined = trained(_config(tiny_data, tmp_path / "refined", START))
     assert not bool(_corrections(refined).any())
     for first, second in zip(
         plain.pipeline.model.avatar.parameters(), refined.pipeline.model.avatar.parameters()
@@ -96,8 +90,8 @@ def test_bases_wait_for_corrections_and_then_learn(tiny_data, tmp_path, fast):
     for steps in (4, 5):
         config = _config(tiny_data, tmp_path / str(steps), steps, fast=fast)
         config.pipeline.model.refinement = RefinementConfig(start_step=START, bases_start=0.5)
-        trained = _train(config).pipeline.model.avatar.blendshapes
-        bases[steps] = [trained.basis_position, trained.basis_color_feature]
+        shapes = trained(config).pipeline.model.avatar.blendshapes
+        bases[steps] = [shapes.basis_position, shapes.basis_color_feature]
     assert not any(bool(basis.any()) for basis in bases[4])
     assert all(bool(basis.any()) for basis in bases[5])
 
@@ -117,11 +111,11 @@ def test_resume_equals_uninterrupted_run(tiny_data, tmp_path, first_end):
         config.pipeline.model.refinement = RefinementConfig(start_step=START, bases_start=0.5)
         return config
 
-    whole = _train(configured("whole", 8))
-    half = _train(configured("half", first_end))
+    whole = trained(configured("whole", 8))
+    half = trained(configured("half", first_end))
     config = configured("rest", 8)
     config.load_dir = half.checkpoint_dir
-    rest = _train(config)
+    rest = trained(config)
     first, second = (t.pipeline.model.state_dict() for t in (whole, rest))
     tensors = [name for name, value in first.items() if isinstance(value, torch.Tensor)]
     assert any("correction" in name for name in tensors)
@@ -130,7 +124,7 @@ def test_resume_equals_uninterrupted_run(tiny_data, tmp_path, first_end):
 
 @pytest.mark.parametrize("saved", [True, False])
 def test_a_checkpoint_of_the_other_kind_is_refused(tiny_data, tmp_path, saved):
-    first = _train(_config(tiny_data, tmp_path / "first", 3, refine=saved))
+    first = trained(_config(tiny_data, tmp_path / "first", 3, refine=saved))
     config = _config(tiny_data, tmp_path / "second", 4, refine=not saved)
     config.load_dir = first.checkpoint_dir
     with pytest.raises(UserError, match=f"refine-tracking {saved}"):
@@ -150,7 +144,7 @@ def test_held_out_frames_are_fitted_apart_from_the_plain_score(tiny_data, tmp_pa
     """The plain score stays to the digit; fitting from a wrong theta raises the other one."""
     avatar = AvatarConfig(uv_resolution=32, num_bases=0, scale_from_texel_spacing=True)
     config = small_config(tiny_data, tmp_path, avatar, max_num_iterations=60)
-    trainer = _train(config)
+    trainer = trained(config)
     pipeline = trainer.pipeline
     pipeline.test_mode = "test"
     plain = pipeline.get_average_eval_image_metrics()

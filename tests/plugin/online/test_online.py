@@ -23,13 +23,13 @@ from rgbavatar_ns.plugin.methods import rgbavatar
 from rgbavatar_ns.plugin.online.methods import rgbavatar_online, rgbavatar_online_tiny
 from rgbavatar_ns.plugin.online.sources import SourceConfig
 from rgbavatar_ns.plugin.online.trainer import OnlineTrainer
-from rgbavatar_ns.plugin.training.checkpoints import list_checkpoints, read_checkpoint
+from rgbavatar_ns.plugin.training.checkpoints import list_checkpoints
 from tests.plugin.online_run import (
-    before_each_step,
     hold_back_after,
     online_config,
     online_trainer,
 )
+from tests.plugin.run import before_each_step, newest_state
 from tests.plugin.tiny import NUM_FRAMES, NUM_TEST, SIZE
 
 STREAMED = NUM_FRAMES - NUM_TEST
@@ -39,12 +39,8 @@ def summary(trainer: OnlineTrainer) -> dict[str, Any]:
     return json.loads((trainer.base_dir / "training.json").read_text())
 
 
-def newest(folder: Path) -> dict[str, Any]:
-    return read_checkpoint(list_checkpoints(folder)[-1][1])
-
-
 def stream_state(folder: Path) -> dict[str, Any]:
-    return newest(folder)["pipeline"]["datamanager._extra_state"]["stream"]
+    return newest_state(folder)["pipeline"]["datamanager._extra_state"]["stream"]
 
 
 def subject_and_frames(data: Path) -> tuple[StreamSubject, list[TrackedFrame]]:
@@ -177,13 +173,13 @@ def test_the_newest_frame_drives_the_viewers_avatar(tiny_data: Path, tmp_path: P
 
 
 def test_the_viewers_panel_knows_the_newest_frame_only(tiny_data: Path, tmp_path: Path):
-    trainer = online_trainer(online_config(tmp_path, tiny_data))
-    stage = trainer.pipeline.model.viewer_panel.stage
-    assert (stage.num_frames, stage.film) == (1, None)
-    assert stage.statistics().num_frames == 1
+    pipeline = (trainer := online_trainer(online_config(tmp_path, tiny_data))).pipeline
+    assert (len(pipeline.model.frame_theta), pipeline.film) == (1, None)
     trainer.train()
     newest = load_dataset(tiny_data).theta[STREAMED - 1]
-    assert torch.equal(stage.statistics().theta_neutral, newest)
+    assert torch.equal(pipeline.viewer_panel.theta_shown(), newest)
+    pipeline.viewer_panel.show_neutral()
+    assert torch.equal(pipeline.viewer_panel.theta_shown(), newest)
 
 
 def test_ctrl_c_saves_and_leaves_exit_code_0(tiny_data: Path, tmp_path: Path):
@@ -280,7 +276,7 @@ def test_frames_sent_over_a_socket_are_trained_on_and_kept(
     assert told["source lost"] == told["reconnects"] == 1
     # The checkpoint is an avatar with the performance that the pools held.
     loaded = Avatar.load(trainer.base_dir)
-    frames_saved = newest(trainer.checkpoint_dir)["pipeline"]["_model._extra_state"]["frames"]
+    frames_saved = newest_state(trainer.checkpoint_dir)["pipeline"]["_model._extra_state"]["frames"]
     assert torch.equal(frames_saved["theta"], load_dataset(tiny_data).theta[:STREAMED])
     assert loaded.num_gaussians == trainer.pipeline.model.avatar.num_gaussians
     # The run is complete in itself: it holds the frames, and other commands find them.

@@ -10,7 +10,7 @@ from rgbavatar_ns.avatar.training.recorded_step import RecordedStep
 from rgbavatar_ns.plugin.pipeline import RGBAvatarPipeline
 from rgbavatar_ns.plugin.training.trainer import RGBAvatarTrainer
 from tests.kernels.cuda import emulator
-from tests.plugin.run import make_trainer, small_config
+from tests.plugin.run import make_trainer, parameters_of, small_config
 
 pytestmark = pytest.mark.skipif(emulator.compiler() is None, reason="no g++ to emulate CUDA with")
 
@@ -46,16 +46,12 @@ def _train(data: Path, output: Path, *, steps: int = 5, load=None, **settings) -
     return trainer
 
 
-def _parameters(trainer: RGBAvatarTrainer) -> torch.Tensor:
-    return torch.cat([p.detach().flatten() for p in trainer.pipeline.model.avatar.parameters()])
-
-
 def test_runs_are_alike_with_and_without(recorded, tiny_data: Path, tmp_path: Path):
     with_it = _train(tiny_data, tmp_path / "with", steps=2)
     assert len(recorded) == 2
     without = _train(tiny_data, tmp_path / "without", steps=2, device_mib=0)
     assert len(recorded) == 2
-    first, second = _parameters(with_it), _parameters(without)
+    first, second = parameters_of(with_it), parameters_of(without)
     assert (first - second).norm() < 1e-2 * second.norm()
     seen = [t.pipeline.model.avatar.color_initialized for t in (with_it, without)]
     assert bool(seen[0].any())
@@ -67,7 +63,7 @@ def test_a_run_in_two_pieces_is_the_run_in_one(recorded, tiny_data: Path, tmp_pa
     first = _train(tiny_data, tmp_path / "parts", steps=3)
     second = _train(tiny_data, tmp_path / "parts", load=first.checkpoint_dir)
     assert len(recorded) == 10
-    assert torch.equal(_parameters(whole), _parameters(second))
+    assert torch.equal(parameters_of(whole), parameters_of(second))
 
 
 def test_a_refined_run_goes_another_way(recorded, tiny_data: Path, tmp_path: Path):

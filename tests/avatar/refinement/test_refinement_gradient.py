@@ -8,9 +8,7 @@ from rgbavatar_ns.avatar.training.fused_step import FusedStep
 from rgbavatar_ns.avatar.training.losses import l1_loss
 from rgbavatar_ns.drawing.compositing import composite, rgba_to_float
 from rgbavatar_ns.kernels import available_backends
-
-from .fused_scene import double, far_batch, in_double, stir
-from .test_fused_step import AT_THE_CUT, VARIANTS
+from tests.avatar.fused_scene import AT_THE_CUT, VARIANTS, double, far_batch, in_double, stir
 
 compiled = pytest.mark.skipif("cpu" not in available_backends(), reason="not compiled")
 

@@ -19,36 +19,25 @@ from rgbavatar_ns.avatar.training.optimizer_states import unsupported_reason
 from rgbavatar_ns.drawing.compositing import rgba_to_float
 from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.kernels import available_backends
-
-from .conftest import SMALL_CONFIG
-from .fused_scene import (
+from tests.avatar.conftest import SMALL_CONFIG
+from tests.avatar.fused_scene import (
+    VARIANTS,
+    assert_gradients_agree,
     double,
     eager_step,
     far_batch,
     first_moments,
     fused_step,
     in_double,
+    parting,
     relative_differences,
     reordered,
     stir,
+    values_by_group,
 )
-from .small_head import front_camera, small_head, small_head_arrays, small_identity
+from tests.avatar.small_head import front_camera, small_head, small_head_arrays, small_identity
 
 pytestmark = pytest.mark.skipif("cpu" not in available_backends(), reason="not compiled")
-
-ROUNDING = 3e-5
-AT_THE_CUT, MOST_AT_THE_CUT = 2e-3, 5
-VARIANTS = {
-    "paper": {},
-    "no bases": {"num_bases": 0},
-    "many bases": {"num_bases": 21},
-    "linear network": {"weight_network": "linear"},
-    "no pose": {"pose_input": False},
-    "raw": {"tangent_variant": "raw"},
-    "orthonormal": {"tangent_variant": "orthonormal"},
-    "scaled": {"scale_with_triangle": True},
-    "raw and scaled": {"tangent_variant": "raw", "scale_with_triangle": True},
-}
 
 
 def _instruction_sets() -> tuple[str, ...]:
@@ -62,29 +51,6 @@ def _instruction_sets() -> tuple[str, ...]:
 @pytest.fixture
 def stirred(make_avatar):
     return lambda **changes: stir(make_avatar(**changes))
-
-
-def assert_gradients_agree(avatar, optimizer, expected, expected_optimizer) -> None:
-    """Each group's first moments within rounding; the second avatar's are right.
-
-    A (pixel, Gaussian) pair counts where alpha is at least 1/255. A pair that lies at that cut up
-    to rounding belongs to one way and not to the other; in a hundred thousand there may be one.
-    So a few Gaussians (its own and those behind it) may differ by more, yet not by much.
-    """
-    found = first_moments(avatar, optimizer)
-    right = first_moments(expected, expected_optimizer)
-    whole = relative_differences(found, right)
-    assert max(whole.values()) < AT_THE_CUT, whole
-    if max(whole.values()) < ROUNDING:
-        return
-    count = avatar.num_gaussians
-    for name, value in right.items():
-        if name == "weight_network":
-            continue
-        bases = avatar.config.num_bases if name.startswith("basis") else 1
-        error = (found[name].double() - value.double()).view(bases, count, -1)
-        squares = error.square().sum((0, 2)).sort().values[:-MOST_AT_THE_CUT]
-        assert squares.sum().sqrt() < ROUNDING * value.double().norm(), (name, whole)
 
 
 def _compare(build, batch, background, *, reference: bool = False) -> None:
@@ -142,14 +108,7 @@ def _after_steps(step, avatar, order, *, rate: float = 1.0, steps: int = 100):
     batch, background = far_batch(avatar, len(order), 32, 32)
     for number in range(steps):
         step(avatar, optimizer, *reordered(batch, background.roll(number, 0), order))
-    return _values(avatar)
-
-
-def _values(avatar):
-    return {
-        name: torch.cat([p.detach().flatten() for p in parameters])
-        for name, parameters in avatar.parameter_groups().items()
-    }
+    return values_by_group(avatar)
 
 
 def test_parameters_after_a_hundred_small_steps(stirred):
@@ -197,7 +156,7 @@ def test_either_way_goes_on_from_the_others_optimiser(stirred):
             step(mixed, own, batch, background)
         state = own.state_dict()
     assert all(float(saved["step"]) == 9 for saved in state["state"].values())
-    assert max(relative_differences(_values(mixed), _values(eager)).values()) < 1e-3
+    assert parting(mixed, eager) < 1e-3
     moments = [first_moments(eager, optimizer), first_moments(mixed, own)]
     assert max(relative_differences(moments[1], moments[0]).values()) < 1e-2
 
@@ -212,7 +171,7 @@ def test_gradients_left_by_an_eager_step_do_not_count(stirred):
             for parameter in avatar.parameters():
                 parameter.grad = torch.ones_like(parameter)
         fused_step(avatar, optimizer, batch, background)
-        results.append(_values(avatar))
+        results.append(values_by_group(avatar))
     assert all(torch.equal(results[0][name], results[1][name]) for name in results[0])
 
 
@@ -332,7 +291,8 @@ def test_the_training_step_is_the_fused_one_for_8_bit_images(stirred, floating):
     step = eager_step if floating else fused_step
     assert float(loss) == float(step(expected, optimizers[1], batch, background))
     assert all(
-        torch.equal(value, _values(expected)[name]) for name, value in _values(avatar).items()
+        torch.equal(value, values_by_group(expected)[name])
+        for name, value in values_by_group(avatar).items()
     )
 
 

@@ -10,9 +10,8 @@ from rgbavatar_ns.avatar.training.losses import l1_loss
 from rgbavatar_ns.avatar.training.theta_fit import fit_theta, frame_gradients
 from rgbavatar_ns.drawing.compositing import composite, rgba_to_float
 from rgbavatar_ns.head import ThetaField, ThetaLayout
-
-from .fused_scene import far_batch, stir
-from .small_head import front_camera, random_theta
+from tests.avatar.fused_scene import far_batch, stir
+from tests.avatar.small_head import front_camera, random_theta
 
 LAYOUT = ThetaLayout(
     (

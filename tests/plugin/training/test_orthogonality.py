@@ -6,15 +6,13 @@ import pytest
 
 from rgbavatar_ns.avatar.training import step as step_module
 from rgbavatar_ns.avatar.training.orthogonality import orthogonality_error
-from tests.plugin.run import make_trainer, small_config
+from tests.plugin.run import small_config, trained
 
 
 def _trained(data: Path, output: Path, kind: str, steps: int = 8):
     config = small_config(data, output, max_num_iterations=steps)
     config.pipeline.model.orthogonality = kind
-    trainer = make_trainer(config)
-    trainer.train()
-    return trainer.pipeline.model
+    return trained(config).pipeline.model
 
 
 @pytest.mark.parametrize("kind", ["qr", "gram_schmidt"])
@@ -32,8 +30,7 @@ def test_the_loss_counts_and_needs_the_readable_path(tiny_data: Path, tmp_path: 
     free = _trained(tiny_data, tmp_path / "free", "free", steps=20)
     config = small_config(tiny_data, tmp_path / "loss", max_num_iterations=20)
     config.pipeline.model.orthogonality = "loss"
-    trainer = make_trainer(config)
-    trainer.train()
+    trainer = trained(config)
     pipeline = trainer.pipeline
     step = pipeline.training_step(trainer.optimizers)
     assert (step.kind, "orthogonal" in step.reason) == ("eager", True)

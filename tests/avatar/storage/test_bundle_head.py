@@ -7,8 +7,7 @@ from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadArrays, HeadModel
 from rgbavatar_ns.head.flame import load_flame
 from rgbavatar_ns.synthetic.flame import write_synthetic_flame
-
-from .small_head import front_camera, random_theta
+from tests.avatar.small_head import front_camera, random_theta
 
 
 @pytest.fixture(autouse=True)

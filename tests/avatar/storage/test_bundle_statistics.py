@@ -8,8 +8,7 @@ from rgbavatar_ns.avatar.storage.bundle import load_statistics
 from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import ThetaLayout
-
-from .small_head import random_theta
+from tests.avatar.small_head import random_theta
 
 
 def _statistics(avatar: Avatar, count: int = 12) -> TrainingStatistics:

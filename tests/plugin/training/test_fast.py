@@ -9,9 +9,7 @@ import torch
 
 from rgbavatar_ns.avatar.training.fused_step import FusedStep
 from rgbavatar_ns.kernels import available_backends
-from rgbavatar_ns.plugin.training.checkpoints import list_checkpoints, read_checkpoint
-from rgbavatar_ns.plugin.training.trainer import RGBAvatarTrainer, RGBAvatarTrainerConfig
-from tests.plugin.run import make_trainer, small_config
+from tests.plugin.run import make_trainer, newest_state, parameters_of, small_config, trained
 
 pytestmark = pytest.mark.skipif("cpu" not in available_backends(), reason="not compiled")
 
@@ -37,31 +35,20 @@ def _config(data: Path, output: Path, *, fast: bool = True, steps: int = 4):
     return config
 
 
-def _train(config: RGBAvatarTrainerConfig) -> RGBAvatarTrainer:
-    trainer = make_trainer(config)
-    trainer.train()
-    return trainer
-
-
-def _parameters(trainer: RGBAvatarTrainer) -> torch.Tensor:
-    values = [p.detach().flatten() for p in trainer.pipeline.model.avatar.parameters()]
-    return torch.cat(values)
-
-
 def test_training_is_fused_and_can_be_told_not_to_be(
     tiny_data: Path, tmp_path: Path, fused_steps: list[bool]
 ):
-    _train(_config(tiny_data, tmp_path / "fast"))
+    trained(_config(tiny_data, tmp_path / "fast"))
     assert fused_steps == [True] * 4
-    _train(_config(tiny_data, tmp_path / "eager", fast=False))
+    trained(_config(tiny_data, tmp_path / "eager", fast=False))
     assert len(fused_steps) == 4
 
 
 def test_both_ways_begin_alike(tiny_data: Path, tmp_path: Path):
     """After one step, colour initialisation included; later steps part by rounding."""
-    fast = _train(_config(tiny_data, tmp_path / "fast", steps=1))
-    eager = _train(_config(tiny_data, tmp_path / "eager", fast=False, steps=1))
-    first, second = _parameters(fast), _parameters(eager)
+    fast = trained(_config(tiny_data, tmp_path / "fast", steps=1))
+    eager = trained(_config(tiny_data, tmp_path / "eager", fast=False, steps=1))
+    first, second = parameters_of(fast), parameters_of(eager)
     # Adam's first step is the sign of the gradient: where that is zero up to rounding it may
     # differ by two learning rates, which is why the norm is compared.
     assert (first - second).norm() < 1e-2 * second.norm()
@@ -92,10 +79,10 @@ def test_what_cannot_be_fused_goes_through_autograd(
     monkeypatch.setattr(
         trainer.pipeline.model, "lpips_loss", lambda image, target: (image - target).square().mean()
     )
-    before = _parameters(trainer)
+    before = parameters_of(trainer)
     trainer.train()
     assert len(fused_steps) == (2 if reason == "lpips" else 0)
-    assert not torch.equal(_parameters(trainer), before)
+    assert not torch.equal(parameters_of(trainer), before)
 
 
 def test_a_run_changes_its_way_on_resume(tiny_data: Path, tmp_path: Path):
@@ -108,9 +95,9 @@ def test_a_run_changes_its_way_on_resume(tiny_data: Path, tmp_path: Path):
         with warnings.catch_warnings():
             # torch warns where a schedule's step comes before its optimiser's.
             warnings.filterwarnings("error", message=".*lr_scheduler.step.*")
-            trainer = _train(config)
+            trainer = trained(config)
         folder = trainer.checkpoint_dir
-    state = read_checkpoint(list_checkpoints(trainer.checkpoint_dir)[-1][1])
+    state = newest_state(trainer.checkpoint_dir)
     for name, saved in state["optimizers"].items():
         assert {float(each["step"]) for each in saved["state"].values()} == {6.0}, name
         assert saved["param_groups"][0]["lr"] == pytest.approx(

@@ -1,0 +1,77 @@
+"""Which theta and psi a viewer's state means on a model."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
+from rgbavatar_ns.export.bases import basis_weights
+from rgbavatar_ns.plugin.model import RGBAvatarModel
+from rgbavatar_ns.plugin.viewer.viewer_state import ViewerState
+
+
+@dataclass(frozen=True)
+class DrivingSignal:
+    """What drives one picture; `psi` is None where the weight network decides."""
+
+    theta: Float[Tensor, "1 H"]
+    psi: Float[Tensor, "1 K"] | None = None
+    frame: int | None = None
+    """The frame of the dataset that it can be compared with, if there is one."""
+
+
+@torch.no_grad()
+def training_statistics(model: RGBAvatarModel) -> TrainingStatistics:
+    """What the avatar has seen, with the weights that its network gives now."""
+    theta = model.driving_theta(list(model.subject.train) or [0])
+    psi = model.avatar.weights(theta.to(model.avatar.identity))
+    return TrainingStatistics.of(theta.cpu(), psi.cpu(), model.avatar.layout)
+
+
+@torch.no_grad()
+def driving_signal(
+    model: RGBAvatarModel, state: ViewerState, time: float | None = None
+) -> DrivingSignal:
+    """What drives the picture; `time` in [0, 1] counts where the state asks for it."""
+    avatar = model.avatar
+    alone, used = state.basis_alone, state.bases_used
+    if alone is not None and alone < avatar.config.num_bases:
+        statistics = training_statistics(model)
+        theta, frame = statistics.theta_neutral, None
+        psi = basis_weights(statistics, state.gain)[alone + 1]
+    else:
+        theta, frame = _theta(model, state, time)
+        psi = state.psi_by_hand
+        if used is not None and used < avatar.config.num_bases:
+            psi = avatar.weights(theta[None].to(avatar.identity))[0] if psi is None else psi
+            psi = torch.where(torch.arange(len(psi), device=psi.device) < used, psi, 0.0)
+    like = avatar.identity
+    return DrivingSignal(theta[None].to(like), None if psi is None else psi[None].to(like), frame)
+
+
+def _theta(
+    model: RGBAvatarModel, state: ViewerState, time: float | None
+) -> tuple[Float[Tensor, "H"], int | None]:
+    last = len(model.frame_theta) - 1
+    if state.driven_by == "by hand" and state.theta_by_hand is not None:
+        return state.theta_by_hand, min(state.frame, last)
+    if state.driven_by == "driving sequence" and state.sequence is not None:
+        return state.sequence[min(max(state.sequence_frame, 0), len(state.sequence) - 1)], None
+    frame = state.frame
+    if state.driven_by == "viewer's time" and time is not None:
+        frame = round(time * last)
+    frame = min(max(frame, 0), last)
+    return model.driving_theta([frame])[0], frame
+
+
+def random_expression(
+    statistics: TrainingStatistics, theta: Float[Tensor, "H"]
+) -> Float[Tensor, "H"]:
+    """A random expression within what was seen in training, on the pose of `theta`."""
+    low, high = statistics.component_min, statistics.component_max
+    drawn = statistics.theta_mean + (low + (high - low) * torch.rand(len(low))) @ (
+        statistics.components
+    )
+    return torch.where(statistics.expressive, drawn.to(theta), theta)

@@ -1,0 +1,23 @@
+"""nerfstudio's commands as child processes: how each way to end is told."""
+
+import pytest
+
+from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.experiments import commands
+
+
+@pytest.mark.parametrize(
+    ("ending", "error", "told"),
+    [
+        ("exit 3", UserError, "exit code 3"),
+        ("kill -KILL $$", UserError, "ns-train was killed by SIGKILL, probably out of memory"),
+        ("exit 130", KeyboardInterrupt, ""),
+    ],
+)
+def test_each_end_is_told(tmp_path, monkeypatch, ending, error, told):
+    program = tmp_path / "ns-train"
+    program.write_text(f"#!/bin/sh\n{ending}\n")
+    program.chmod(0o755)
+    monkeypatch.setattr(commands.sys, "executable", str(tmp_path / "python"))
+    with pytest.raises(error, match=told):
+        commands.run_nerfstudio("ns-train")
