@@ -1,6 +1,5 @@
 """`rgbavatar demo`: from nothing (or from a video) to a trained avatar, through nerfstudio."""
 
-import json
 import shutil
 import sys
 import time
@@ -12,7 +11,7 @@ from rich.console import Console
 
 from rgbavatar_ns.cli.progress import progress_bar, stage_bars
 from rgbavatar_ns.errors import UserError
-from rgbavatar_ns.experiments.commands import run_nerfstudio
+from rgbavatar_ns.experiments import commands
 from rgbavatar_ns.files import Stages, write_json
 
 Result = dict[str, Any]
@@ -66,7 +65,9 @@ def run(
         lambda key: _train(folder, output, key, steps, seed, refine_tracking=bool(video)),
     )
     run_folder = Path(trained["run"])
-    scores = stages.run("evaluate", {}, lambda key: _evaluate(run_folder, output / "eval.json"))
+    scores = stages.run(
+        "evaluate", {}, lambda key: commands.evaluate(run_folder, output / "eval.json")
+    )
     shown = stages.run("film", {}, lambda key: _film(run_folder, folder, output))
     summary = {
         "psnr": scores["psnr"],
@@ -122,30 +123,18 @@ def _train(
     data: Path, output: Path, key: str, steps: int | None, seed: int, *, refine_tracking: bool
 ) -> Result:
     run_folder = output / "runs" / "demo" / METHOD / key
-    options: list[str | Path] = ["--data", data, "--output-dir", output / "runs"]
-    options += ["--experiment-name", "demo", "--timestamp", key, "--vis", "tensorboard"]
-    options += ["--machine.seed", str(seed)]
+    options: list[str] = []
     if refine_tracking:
         options += ["--pipeline.model.refine-tracking", "True"]
         options += ["--pipeline.model.refine-held-out", str(HELD_OUT_STEPS)]
     if steps is not None:
         options += ["--max-num-iterations", str(steps)]
-    if any(run_folder.glob("nerfstudio_models/*.ckpt")):
-        options += ["--load-dir", run_folder / "nerfstudio_models"]
-    run_nerfstudio("ns-train", METHOD, *options)
-    facts = json.loads((run_folder / "training.json").read_text())
+    facts = commands.train(METHOD, data, run_folder, seed, options)
     return {
         "run": str(run_folder),
         "train_seconds": facts["train_seconds"],
         "images_per_second": facts["images_per_second"],
     }
-
-
-def _evaluate(run_folder: Path, destination: Path) -> Result:
-    run_nerfstudio(
-        "ns-eval", "--load-config", run_folder / "config.yml", "--output-path", destination
-    )
-    return json.loads(destination.read_text())["results"]
 
 
 def _film(run_folder: Path, data: Path, output: Path) -> Result:

@@ -38,6 +38,13 @@ def to_uint8(image: Float[Tensor, "*batch H W C"]) -> UInt8[np.ndarray, "*batch 
     return (image.clamp(0, 1) * 255 + 0.5).to(torch.uint8).cpu().numpy()
 
 
+def composite_bytes(
+    rgba: UInt8[np.ndarray, "H W 4"], background: tuple[float, float, float]
+) -> UInt8[np.ndarray, "H W 3"]:
+    """`composite` of a picture's bytes over a colour in [0, 1]."""
+    return to_uint8(composite(rgba_to_float(torch.from_numpy(rgba)), torch.tensor(background)))
+
+
 def shown_error(
     image: Float[Tensor, "*batch H W 3"], truth: Float[Tensor, "*batch H W 3"]
 ) -> Float[Tensor, "*batch H W 3"]:

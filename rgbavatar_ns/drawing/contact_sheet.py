@@ -4,10 +4,9 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
-import torch
 from jaxtyping import UInt8
 
-from rgbavatar_ns.drawing.compositing import composite, rgba_to_float, to_uint8
+from rgbavatar_ns.drawing.compositing import composite_bytes
 
 _GRAY = 128 / 255
 _LABEL_SCALE = 1 / 640
@@ -44,5 +43,5 @@ def over_gray_bgr(
     image_rgba: UInt8[np.ndarray, "h w 4"], zoom: float
 ) -> UInt8[np.ndarray, "H W 3"]:
     """A matted picture over grey, `zoom` times as large, blue first."""
-    rgb = composite(rgba_to_float(torch.from_numpy(image_rgba)), torch.full((3,), _GRAY))
-    return scaled(np.ascontiguousarray(to_uint8(rgb)[..., ::-1]), zoom)
+    rgb = composite_bytes(image_rgba, (_GRAY, _GRAY, _GRAY))
+    return scaled(np.ascontiguousarray(rgb[..., ::-1]), zoom)

@@ -1,10 +1,13 @@
 """nerfstudio's commands as child processes of this environment."""
 
+import json
 import os
 import signal
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from rgbavatar_ns.errors import UserError
 
@@ -44,6 +47,31 @@ def run_nerfstudio(*command: str | Path) -> None:
             f"{command[0]} ended with exit code {code}; its last lines above say why.",
             "Once that is mended, run the same command again: finished stages are kept.",
         )
+
+
+def train(
+    method: str, data: Path, run_folder: Path, seed: int, options: Sequence[str | Path] = ()
+) -> dict[str, Any]:
+    """Train by `ns-train`, going on from the newest checkpoint; return what training.json tells.
+
+    `run_folder` is OUTPUT/EXPERIMENT/METHOD/TIMESTAMP. Raises as `run_nerfstudio`.
+    """
+    experiment = run_folder.parent.parent
+    flags: list[str | Path] = ["--data", data, "--output-dir", experiment.parent]
+    flags += ["--experiment-name", experiment.name, "--timestamp", run_folder.name]
+    flags += ["--vis", "tensorboard", "--machine.seed", str(seed), *options]
+    if any(run_folder.glob("nerfstudio_models/*.ckpt")):
+        flags += ["--load-dir", run_folder / "nerfstudio_models"]
+    run_nerfstudio("ns-train", method, *flags)
+    return json.loads((run_folder / "training.json").read_text())
+
+
+def evaluate(run_folder: Path, destination: Path) -> dict[str, Any]:
+    """Evaluate a run by `ns-eval`, which writes the JSON file; return its results."""
+    run_nerfstudio(
+        "ns-eval", "--load-config", run_folder / "config.yml", "--output-path", destination
+    )
+    return json.loads(destination.read_text())["results"]
 
 
 def killed_by(code: int) -> str:

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from rgbavatar_ns.avatar import Avatar
 from rgbavatar_ns.data import TrackedDataset
+from rgbavatar_ns.drawing.compositing import composite_bytes
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.export import DrivingOptions, pictures, statistics_of
 from rgbavatar_ns.export.scenes import driven_by
@@ -203,5 +204,4 @@ def reenactment_scores(
 
 
 def _over_black(dataset: TrackedDataset, position: int) -> _Picture:
-    rgba = dataset.read_image(position).astype(np.float32)
-    return np.round(rgba[..., :3] * (rgba[..., 3:] / 255)).astype(np.uint8)
+    return composite_bytes(dataset.read_image(position), (0.0, 0.0, 0.0))

@@ -14,8 +14,8 @@ from typing import Any
 from rgbavatar_ns.avatar import Avatar
 from rgbavatar_ns.data import load_dataset
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.experiments import commands
 from rgbavatar_ns.experiments.cells import Cell
-from rgbavatar_ns.experiments.commands import run_nerfstudio
 from rgbavatar_ns.experiments.overrides import as_flags
 from rgbavatar_ns.experiments.process_lock import alone_in, end_with_parent
 from rgbavatar_ns.experiments.reenactment import (
@@ -48,13 +48,8 @@ def run_cell(folder: Path) -> dict[str, Any]:
     data, driver = Path(described.pop("data")), described.pop("driver_data")
     cell = Cell.from_json(described)
     run_folder = folder / _RUN / "cell" / cell.preset / "run"
-    run_nerfstudio("ns-train", cell.preset, *_training_flags(cell, data, folder, run_folder))
-    evaluation = folder / _EVALUATION
-    run_nerfstudio(
-        "ns-eval", "--load-config", run_folder / "config.yml", "--output-path", evaluation
-    )
-    scores = json.loads(evaluation.read_text())["results"]
-    training = json.loads((run_folder / "training.json").read_text())
+    training = commands.train(cell.preset, data, run_folder, cell.seed, as_flags(cell.overrides))
+    scores = commands.evaluate(run_folder, folder / _EVALUATION)
     numbers = {
         name: value
         for name, value in {**training, **scores}.items()
@@ -87,15 +82,6 @@ def _reenact(
     return reenactment_scores(
         avatar, load_dataset(data), load_dataset(driver), tracker, recognition
     )
-
-
-def _training_flags(cell: Cell, data: Path, folder: Path, run_folder: Path) -> list[str | Path]:
-    flags: list[str | Path] = ["--data", data, "--output-dir", folder / _RUN]
-    flags += ["--experiment-name", "cell", "--timestamp", "run", "--vis", "tensorboard"]
-    flags += ["--machine.seed", str(cell.seed), *as_flags(cell.overrides)]
-    if any(run_folder.glob("nerfstudio_models/*.ckpt")):
-        flags += ["--load-dir", run_folder / "nerfstudio_models"]
-    return flags
 
 
 def main() -> None:

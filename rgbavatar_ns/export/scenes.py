@@ -5,14 +5,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from rgbavatar_ns.avatar.avatar import Avatar
 from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
 from rgbavatar_ns.data.native.dataset import TrackedDataset
-from rgbavatar_ns.drawing.compositing import composite, rgba_to_float, to_uint8
+from rgbavatar_ns.drawing.compositing import composite_bytes
 from rgbavatar_ns.drawing.contact_sheet import scaled
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.export.drawing import Color, Picture, pictures
@@ -133,9 +132,7 @@ def beside_driver(
     avatar: Avatar, scene: Scene, driver: TrackedDataset, chosen: Sequence[int], background: Color
 ) -> Iterator[Picture]:
     """The driver's frame, brought to the scene's height, and the avatar beside it."""
-    ground = torch.tensor(background)
     drawn = pictures(avatar, scene.theta, scene.cameras, background)
     for position, picture in zip(chosen, drawn):
-        rgba = rgba_to_float(torch.from_numpy(driver.read_image(position)))
-        seen = to_uint8(composite(rgba, ground))
+        seen = composite_bytes(driver.read_image(position), background)
         yield np.concatenate([scaled(seen, len(picture) / len(seen)), picture], axis=1)

@@ -118,7 +118,7 @@ def test_a_lost_data_set_is_named_by_the_cell(tmp_path, monkeypatch, sweep_of):
         told.append(command)
         raise UserError("There is no dataset.", "")
 
-    monkeypatch.setattr(runner, "run_nerfstudio", refuse)
+    monkeypatch.setattr(commands, "run_nerfstudio", refuse)
     with pytest.raises(UserError):
         run_cell(tmp_path)
     assert told[0][:4] == ("ns-train", "rgbavatar-tiny", "--data", tmp_path / "gone")

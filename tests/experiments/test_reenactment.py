@@ -221,7 +221,7 @@ def test_the_runner_scores_and_the_table_says_what_is_not_available(tmp_path, mo
     run.mkdir(parents=True)
     (run / "training.json").write_text('{"steps": 1}')
     (tmp_path / "eval.json").write_text('{"results": {"psnr": 30.0}}')
-    monkeypatch.setattr(runner, "run_nerfstudio", lambda *command: None)
+    monkeypatch.setattr(runner.commands, "run_nerfstudio", lambda *command: None)
     tiny_dataset(tmp_path / "own")
     tiny_dataset(tmp_path / "driver")
     own = runner.load_dataset(tmp_path / "own")

@@ -10,6 +10,7 @@ import torch
 
 from rgbavatar_ns.plugin.online.progress import OnlineProgress, StreamReport
 from rgbavatar_ns.plugin.viewer.status_panel import StatusPanel
+from tests.plugin.fake_viewer import FakeViewer
 
 REPORT = StreamReport(
     step=40,
@@ -67,14 +68,15 @@ def test_rate_is_that_of_the_last_second(monkeypatch: pytest.MonkeyPatch):
 def test_note_shows_the_picture_and_keeps_it():
     note = StatusPanel("Stream")
     note.show(["before the viewer"], None)
-    note._handle = SimpleNamespace(content="")
+    note._setup(viewer := FakeViewer())
+    shown_note = viewer.gui["markdown"]
     rng = np.random.default_rng(0)
     picture = cv2.resize(rng.integers(0, 256, (4, 8, 3), dtype=np.uint8), (64, 32))
     note.show(["frame 1", "loss 2"], torch.from_numpy(picture))
-    first, *lines = note._handle.content.split("  \n")
+    first, *lines = shown_note.content.split("  \n")
     assert lines == ["frame 1", "loss 2"]
     jpeg = base64.b64decode(first.removeprefix("![](data:image/jpeg;base64,").removesuffix(")"))
     shown = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
     assert np.abs(shown.astype(int) - picture).mean() < 6
     note.show(["frame 2"], None)
-    assert note._handle.content == "  \n".join([first, "frame 2"])
+    assert shown_note.content == "  \n".join([first, "frame 2"])

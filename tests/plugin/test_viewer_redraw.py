@@ -41,15 +41,15 @@ class Browser:
         self.viewer, self.shown, self.value = FakeViewer(), [], "first"
         self.redraw = Redraw(self.viewer)
         self.now_s, self.insisting = 0.0, True
-        self.viewer.get_model = lambda: SimpleNamespace(  # type: ignore[attr-defined]
+        self.viewer.get_model = lambda: SimpleNamespace(
             device=torch.device("cpu"),
             training=False,
             eval=lambda: None,
             get_outputs_for_camera=self.draw,
         )
-        self.machine = RenderStateMachine(self.viewer, 10.0, SimpleNamespace())  # type: ignore[arg-type]
+        self.machine = RenderStateMachine(self.viewer, 10.0, SimpleNamespace())
         self.machine.render_trigger = Trigger(self.idle)
-        self.machine._send_output_to_viewer = lambda outputs, **_: self.shown.append(outputs)  # type: ignore[method-assign]
+        self.machine._send_output_to_viewer = lambda outputs, **_: self.shown.append(outputs)
         self.viewer.render_statemachines[0] = self.machine
 
     def draw(self, camera: Cameras, obb_box: Any = None) -> Any:
@@ -97,10 +97,10 @@ def lose_the_request(browser: Browser) -> None:
     """A change comes while the thread at rest takes up its own "static"."""
 
     def come() -> None:
-        browser.machine.render_trigger.on_clear = lambda: None  # type: ignore[attr-defined]
+        browser.machine.render_trigger.on_clear = lambda: None
         browser.change("second")
 
-    browser.machine.render_trigger.on_clear = come  # type: ignore[attr-defined]
+    browser.machine.render_trigger.on_clear = come
 
 
 def interrupt_late(browser: Browser) -> None:
@@ -109,11 +109,11 @@ def interrupt_late(browser: Browser) -> None:
 
     def come() -> None:
         if browser.machine.state == "low_static":
-            trigger.on_clear = lambda: None  # type: ignore[attr-defined]
+            trigger.on_clear = lambda: None
             browser.machine.interrupt_render_flag = True
 
     browser.change("second")
-    trigger.on_clear = come  # type: ignore[attr-defined]
+    trigger.on_clear = come
 
 
 @pytest.mark.parametrize(
