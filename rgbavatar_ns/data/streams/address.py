@@ -19,11 +19,12 @@ class StreamAddress(NamedTuple):
     @classmethod
     def parse(cls, text: str) -> "StreamAddress":
         """Read HOST:PORT; raises UserError for anything else."""
-        parts = host = port = None
+        host = port = None
         with contextlib.suppress(ValueError):
             parts = urlsplit(f"//{text}")
-            host, port = parts.hostname, parts.port
-        if parts is None or (parts.netloc, parts.username) != (text, None) or not host or not port:
+            if parts.netloc == text and parts.username is None:
+                host, port = parts.hostname, parts.port
+        if not host or port is None:  # port 0 is any that is free
             raise UserError(
                 f"'{text}' is no address for a stream.",
                 f"Give HOST:PORT, for example {DEFAULT_ADDRESS}.",

@@ -105,7 +105,7 @@ class FrameStream(Protocol):
 
     @property
     def counts(self) -> Counter[str]:
-        """What went wrong, by name: "garbage bytes", "reconnects", "no face" ..."""
+        """What went wrong, by name: "unreadable", "reconnects", "no face" ..."""
         ...
 
     @property
