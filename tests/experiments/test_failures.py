@@ -10,7 +10,7 @@ import pytest
 
 from rgbavatar_ns.cli import main as cli
 from rgbavatar_ns.errors import UserError
-from rgbavatar_ns.experiments import engines, read_experiment, runner
+from rgbavatar_ns.experiments import commands, engines, read_experiment, runner
 from rgbavatar_ns.experiments import sweep as sweep_module
 from rgbavatar_ns.experiments.engines import LocalEngine
 from rgbavatar_ns.experiments.process_lock import alone_in, end_with_parent
