@@ -84,23 +84,9 @@ class LandmarkMap:
     spread_m: Float[np.ndarray, "L"]
     """How far single renders put the point from this place (median, metres): small is sure."""
 
-    def select(self, facemesh_indices: tuple[int, ...]) -> "LandmarkMap":
-        """These points, in this order; raises KeyError for a point that is not in the map."""
-        places = {int(index): place for place, index in enumerate(self.facemesh_index)}
-        return self.select_rows(np.array([places[index] for index in facemesh_indices], np.int64))
-
     def select_rows(self, rows: Int[np.ndarray, "K"]) -> "LandmarkMap":
         """The same of these rows."""
         return LandmarkMap(*(getattr(self, field.name)[rows] for field in fields(self)))
-
-    def as_dict(self) -> dict[int, tuple[int, tuple[float, float, float]]]:
-        """FaceMesh index -> (triangle, barycentric coordinates)."""
-        return {
-            int(index): (int(triangle), (float(weights[0]), float(weights[1]), float(weights[2])))
-            for index, triangle, weights in zip(
-                self.facemesh_index, self.triangle, self.barycentric
-            )
-        }
 
 
 @cache

@@ -3,6 +3,7 @@
 import secrets
 import time
 from collections import Counter, deque
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -60,22 +61,12 @@ class VideoStream:
 
     def subject(self, timeout_s: float) -> StreamSubject | None:
         """The person, once enough frames have shown the face."""
-        deadline = time.monotonic() + timeout_s
-        while self._subject is None and not self._capture.ended:
-            left = deadline - time.monotonic()
-            if left <= 0:
-                break
-            self._track(left)
+        self._track_until(lambda: self._subject is not None or self._capture.ended, timeout_s)
         return self._subject
 
     def next(self, timeout_s: float) -> StreamedFrame | None:
         """The next tracked frame; tracking one may take longer than `timeout_s`."""
-        deadline = time.monotonic() + timeout_s
-        while not self._ready and not self.ended:
-            left = deadline - time.monotonic()
-            if left <= 0:
-                break
-            self._track(left)
+        self._track_until(lambda: bool(self._ready) or self.ended, timeout_s)
         return self._ready.popleft() if self._ready and not self._closed else None
 
     def go_on_after(self, index: int) -> None:
@@ -90,6 +81,11 @@ class VideoStream:
             self._closed = True
             self._capture.close()
             self._tracker.close()
+
+    def _track_until(self, done: Callable[[], bool], timeout_s: float) -> None:
+        deadline = time.monotonic() + timeout_s
+        while not done() and (left := deadline - time.monotonic()) > 0:
+            self._track(left)
 
     def _track(self, timeout_s: float) -> None:
         """Track the next frame, if one comes in time."""

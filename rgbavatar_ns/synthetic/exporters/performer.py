@@ -15,9 +15,7 @@ from rgbavatar_ns.synthetic.exporters.folders import (
     VhapWriter,
 )
 from rgbavatar_ns.synthetic.exporters.take import FlameFilm, Take
-
-Progress = Callable[[int, int], None]
-"""Called with (frames done, frames in all)."""
+from rgbavatar_ns.synthetic.make import Progress
 
 
 @dataclass(frozen=True)

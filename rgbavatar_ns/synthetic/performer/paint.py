@@ -217,8 +217,8 @@ def _hair(
     shade = np.clip(1 + 0.38 * strands + 0.32 * locks, 0.25, 2.2)
     color = _mix(color, _HAIR * shade, hair)
     strand_gloss = 0.30 + 0.25 * strands[:, 0]
-    relief = _mix1(relief, 2.2e-4 * (strands + 0.8 * locks)[:, 0], hair)
-    return color, _mix1(gloss, strand_gloss, hair), relief
+    relief = relief + (2.2e-4 * (strands + 0.8 * locks)[:, 0] - relief) * hair
+    return color, gloss + (strand_gloss - gloss) * hair, relief
 
 
 def _teeth(p: Points) -> tuple[np.ndarray, np.ndarray]:
@@ -262,7 +262,3 @@ def paint_eye(p: Points) -> tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, "N
 
 def _mix(first: np.ndarray, second: np.ndarray, share: np.ndarray) -> np.ndarray:
     return first + (second - first) * share[:, None]
-
-
-def _mix1(first: np.ndarray, second: np.ndarray, share: np.ndarray) -> np.ndarray:
-    return first + (second - first) * share

@@ -1,6 +1,5 @@
 """How badly a pose of the head explains one frame's landmarks, with derivatives."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,9 +21,6 @@ _Distances = Float[np.ndarray, "R"]
 # count ever less: Geman and McClure's loss. Sigmas are of a landmark's own error.
 _HUBER_SIGMAS = 2.5
 _REDESCENDING_SIGMAS = 3.0
-
-
-RobustLoss = Callable[[_Distances], tuple[_Distances, _Distances]]
 
 
 @dataclass(frozen=True)
@@ -117,9 +113,9 @@ class FrameCost:
     def data_model(self, theta: _Theta, identity: _Identity, frame: FrameTerms) -> QuadraticModel:
         """What the landmarks cost around theta."""
         camera, target = frame.camera, frame.target
-        derivatives = self.head.jacobian(theta, identity, self._unknowns, camera.eye_m)
-        jacobian = camera.image_derivative(derivatives.points, derivatives.derivative)
-        found = self._explained(derivatives.points, frame)
+        points, derivative = self.head.jacobian(theta, identity, self._unknowns, camera.eye_m)
+        jacobian = camera.image_derivative(points, derivative)
+        found = self._explained(points, frame)
         turn = target.to_upright / (target.face_height_px * self.noise.own_share[:, None, None])
         rows = (turn @ jacobian).reshape(len(found.pull), -1)
         weighted = rows * found.weight[:, None]
@@ -165,5 +161,5 @@ def _geman_mcclure(distance: _Distances) -> tuple[_Distances, _Distances]:
     return 0.5 * distance**2 * share, share**2
 
 
-_FROM_AFAR: tuple[RobustLoss, ...] = (_huber,) * 3
-_REDESCENDING: tuple[RobustLoss, ...] = (_huber, _huber, *(_geman_mcclure,) * 3)
+_FROM_AFAR = (_huber,) * 3
+_REDESCENDING = (_huber, _huber, *(_geman_mcclure,) * 3)
