@@ -72,11 +72,8 @@ def _dot(a: _Planes, b: _Planes) -> Tensor:
 
 
 def _cross(a: _Planes, b: _Planes) -> _Planes:
-    return (
-        a[1] * b[2] - a[2] * b[1],
-        a[2] * b[0] - a[0] * b[2],
-        a[0] * b[1] - a[1] * b[0],
-    )
+    (ax, ay, az), (bx, by, bz) = a, b
+    return ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
 
 
 def _scaled_to_one(a: _Planes) -> _Planes:

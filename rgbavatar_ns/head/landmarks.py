@@ -3,6 +3,7 @@
 from dataclasses import dataclass, fields
 from functools import cache
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -23,8 +24,20 @@ SPARSE_51 = (
 """FaceMesh indices of the usual 68 points without the jaw line: brows, nose, eyes, mouth."""
 
 
+_Kind = TypeVar("_Kind", bound="_Rows")
+
+
 @dataclass(frozen=True)
-class LandmarkResponse:
+class _Rows:
+    """Arrays with a row for each landmark."""
+
+    def select(self: _Kind, rows: Int[np.ndarray, "K"]) -> _Kind:
+        """The same of these rows."""
+        return type(self)(*(getattr(self, field.name)[rows] for field in fields(self)))
+
+
+@dataclass(frozen=True)
+class LandmarkResponse(_Rows):
     """Where a detector puts L points apart from the skin they lie on, in the skull's frame, metres.
 
     Detectors follow faces incompletely: they round off expressions, and points of the outline
@@ -43,13 +56,9 @@ class LandmarkResponse:
     gaze: Float[np.ndarray, "L 3 2"]
     identity: Float[np.ndarray, "L 3 I"]
 
-    def select(self, rows: Int[np.ndarray, "K"]) -> "LandmarkResponse":
-        """The same of these rows."""
-        return LandmarkResponse(*(getattr(self, field.name)[rows] for field in fields(self)))
-
 
 @dataclass(frozen=True)
-class LandmarkNoise:
+class LandmarkNoise(_Rows):
     """How a detector's points err together: what remains when their response is known.
 
     A landmark's error in an upright face, as a share of the face's height, is taken for the sum of
@@ -64,13 +73,9 @@ class LandmarkNoise:
     modes: Float[np.ndarray, "L 2 K"]
     own_share: Float[np.ndarray, "L"]
 
-    def select(self, rows: Int[np.ndarray, "N"]) -> "LandmarkNoise":
-        """The same of these rows."""
-        return LandmarkNoise(self.modes[rows], self.own_share[rows])
-
 
 @dataclass(frozen=True)
-class LandmarkMap:
+class LandmarkMap(_Rows):
     """L FaceMesh points as places on triangles of the embedded head, by FaceMesh index.
 
     Made by scripts/build_landmark_map.py, which looks at renders of the head with FaceMesh.
@@ -83,10 +88,6 @@ class LandmarkMap:
     """FaceMesh index of the point on the other side of the face; a middle point is its own."""
     spread_m: Float[np.ndarray, "L"]
     """How far single renders put the point from this place (median, metres): small is sure."""
-
-    def select_rows(self, rows: Int[np.ndarray, "K"]) -> "LandmarkMap":
-        """The same of these rows."""
-        return LandmarkMap(*(getattr(self, field.name)[rows] for field in fields(self)))
 
 
 @cache

@@ -40,18 +40,9 @@ class _Row:
     behind: bool
 
 
-_STRIP_ROWS = (
-    _Row(True, True, False),
-    _Row(False, True, False),
-    _Row(True, False, False),
-    _Row(False, False, False),
-)
-_BACK_ROWS = (
-    _Row(True, True, True),
-    _Row(True, False, True),
-    _Row(False, True, True),
-    _Row(False, False, True),
-)
+_ENDS = (True, False)
+_STRIP_ROWS = tuple(_Row(upper, root, behind=False) for root in _ENDS for upper in _ENDS)
+_BACK_ROWS = tuple(_Row(upper, root, behind=True) for upper in _ENDS for root in _ENDS)
 _STRIPS = ((0, 2), (3, 1))
 """Rows above and below of each strip that is seen from the front."""
 _BLOCKS = (*_STRIPS, (5, 4), (6, 7), (2, 5), (7, 3))

@@ -60,7 +60,9 @@ class DemoPerson:
     def of(cls, config: DemoConfig) -> "DemoPerson":
         """Model, paint and light the person; a few seconds."""
         head = HeadModel.embedded()
-        identity = _identity(head.num_identity, config.seed)
+        # Looks of their own, but no caricature.
+        drawn = np.random.default_rng([config.seed, 0]).standard_normal(head.num_identity)
+        identity = torch.from_numpy(np.clip(0.6 * drawn, -1.2, 1.2)).float()
         surface = TrueSurface(head.arrays, config.seed, config.wrinkles)
         resolution = min(max(256, 2 ** int(np.ceil(np.log2(2 * config.image_size)))), 2048)
         paint = paint_head(head.arrays, resolution, config.seed, config.wrinkles)
@@ -196,9 +198,3 @@ def make_demo_dataset(
         if progress is not None:
             progress(frame.index + 1, config.num_frames)
     return writer.finish(config.num_test_frames)
-
-
-def _identity(count: int, seed: int) -> Float[Tensor, "I"]:
-    """Looks of their own, but no caricature."""
-    drawn = np.random.default_rng([seed, 0]).standard_normal(count)
-    return torch.from_numpy(np.clip(0.6 * drawn, -1.2, 1.2)).float()

@@ -21,11 +21,8 @@ class VideoStream:
     (its number), a device or a network address the latest frame is tracked, and what came
     meanwhile is skipped; where it is lost it is connected again.
 
-    Args:
-        source: what to open, see above.
-        image_size: side of the tracked frames' images in pixels.
-        tracker: what does as `LiveTracker` does, in place of one.
-        capture: in place of what `source` names.
+    `image_size` is the side of the tracked frames' images in pixels. `tracker` serves in place of a
+    `LiveTracker`, `capture` in place of what `source` names.
     """
 
     def __init__(

@@ -26,12 +26,8 @@ def wrinkle_heights_m(p: Points) -> Float[np.ndarray, "N W"]:
 class Paint:
     """Textures over the head's UV map (row 0 at v = 1): colour, gloss, and how the surface tilts.
 
-    Args:
-        color: linear colour and gloss.
-        relief_m: fixed heights: pores and strands of hair.
-        wrinkles_m: heights of each fully folded group of wrinkles.
-        cheeks: where blood shows, in [0, 1].
-        metres_per_texel: length of one texel to the right and upwards.
+    `relief_m` are fixed heights (pores, hair), `wrinkles_m` those of each fully folded group;
+    `cheeks` is where blood shows; `metres_per_texel` goes to the right and upwards.
     """
 
     def __init__(

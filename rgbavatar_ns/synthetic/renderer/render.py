@@ -51,11 +51,8 @@ class Moment:
 class DemoRenderer:
     """Renders moments of one person; may be used by several threads.
 
-    Args:
-        surface, paint, glasses: the person (None: no glasses).
-        at_rest, jaw_open: head-model vertices at rest with closed and with wide open mouth, from
-            which it is found how much of the room each point sees.
-        camera, supersampling: of the images.
+    `at_rest` and `jaw_open` are the head model's vertices with closed and with wide open mouth:
+    from them it is found how much of the room each point sees.
     """
 
     def __init__(

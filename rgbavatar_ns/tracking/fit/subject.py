@@ -62,7 +62,7 @@ class SubjectTracker:
 
     def __post_init__(self) -> None:
         rows = _chosen_rows(self.landmarks)
-        marks = self.landmarks.select_rows(rows)
+        marks = self.landmarks.select(rows)
         self.facemesh_index = marks.facemesh_index
         vertex_ids = self.head.arrays.faces[marks.triangle].astype(np.int64)
         self.mesh_landmarks = LandmarkHead(self.head, vertex_ids, marks.barycentric)
