@@ -94,13 +94,10 @@ class LandmarkMap(_Rows):
 def facemesh_landmarks() -> LandmarkMap:
     """All FaceMesh points that have a place on the embedded head, irises (468-477) included."""
     with np.load(LANDMARK_FILE, allow_pickle=False) as file:
-        return LandmarkMap(
-            file["facemesh_index"].astype(np.int64),
-            file["triangle"].astype(np.int64),
-            file["barycentric"].astype(np.float64),
-            file["mirror"].astype(np.int64),
-            file["spread_m"].astype(np.float64),
-        )
+        arrays = [file[field.name] for field in fields(LandmarkMap)]
+    return LandmarkMap(
+        *(one.astype(np.int64 if one.dtype.kind in "iu" else np.float64) for one in arrays)
+    )
 
 
 @cache

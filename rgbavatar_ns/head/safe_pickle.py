@@ -1,9 +1,8 @@
 """Pickles of others, read as plain arrays: nothing in them is ever run.
 
-FLAME's models are pickles, which by design may call any function. Python's own `pickle.Unpickler`
-reads them, but its `find_class` gives inert stand-ins for the few names that arrays need and
-refuses every other. A stand-in only holds what it is given; when the whole file is read,
-`Resolver` makes the arrays. What the Unpickler could not refuse alone, `_vet` refuses first.
+Python's own `pickle.Unpickler` reads them, but its `find_class` gives inert stand-ins for the few
+names that arrays need and refuses every other. A stand-in only holds what it is given; `Resolver`
+makes the arrays in the end. What the Unpickler could not refuse alone, `_vet` refuses first.
 """
 
 import io
@@ -161,12 +160,11 @@ class _Unpickler(pickle.Unpickler):
 
 
 def _vet(file: io.BytesIO) -> None:
-    """Walk over one pickle's opcodes and refuse what the Unpickler alone could not.
+    """Refuse in one pickle's opcodes what the Unpickler alone could not.
 
     That is: lengths beyond the file's end and high memo numbers, for which it takes memory at once;
-    numbers of a million digits; steps without end; classes that others registered (EXT); and
-    tuples as keys, since a few nested ones can take for ever to hash. For these the types on the
-    stack are followed, as pickletools describes them.
+    numbers of a million digits; steps without end; classes that others registered (EXT); and, as
+    the types on the stack tell, tuples as keys: a few nested ones can take for ever to hash.
     """
     stack: list[Any] = []
     memo: dict[int, Any] = {}

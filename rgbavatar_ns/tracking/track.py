@@ -58,8 +58,7 @@ def track_video(
     listed. The head is the embedded one or `config.flame`, which the dataset then holds, as an
     imported one does. The result is the same on every run. An interrupted call leaves what it has
     done in `dst`; the same call goes on from there and ends with the same dataset. Raises
-    UserError for unreadable input, no face, no mediapipe, a head model that is none, or a
-    destination that cannot be used.
+    UserError for unreadable input, no face, no mediapipe, or an unusable head or destination.
     """
     config = config or TrackConfig()
     own_head = read_own_head(config.flame)
@@ -107,15 +106,12 @@ class _Tracking:
                 self.mattes.require_count(seen.frames_read, config.max_frames is not None)
             clock.begin("fit", len(seen))
             tracker = subject_tracker(config, self.own_head)
-            # Each frame goes through two passes.
-            passes = count(1)
-            fit = tracker.fit(
-                seen.points_px,
-                seen.follows(),
-                width,
-                height,
-                lambda: clock.done(next(passes) // 2),
-            )
+            calls = count(1)  # two for each frame
+
+            def half_done() -> None:
+                clock.done(next(calls) // 2)
+
+            fit = tracker.fit(seen.points_px, seen.follows(), width, height, half_done)
             lost = tracker.rejected(fit, seen.points_px)
             found, fit = seen.without(lost), fit.without(lost)
             clock.done(len(seen))

@@ -33,7 +33,12 @@ class VideoStream:
         capture: FrameCapture | None = None,
     ) -> None:
         self._capture = _open(source) if capture is None else capture
-        self._tracker = _live_tracker(image_size) if tracker is None else tracker
+        if tracker is None:
+            # Imports mediapipe, which who brings a tracker need not have.
+            from rgbavatar_ns.tracking.live import LiveTracker
+
+            tracker = LiveTracker(TrackConfig(image_size=image_size))
+        self._tracker = tracker
         self.keeps_frames = self._capture.keeps_frames
         # A file's frames have the same numbers in the next run, a camera's begin anew.
         self._session = "" if self.keeps_frames else secrets.token_hex(8)
@@ -132,10 +137,3 @@ def _open(source: str) -> FrameCapture:
     if source.isdecimal() or "://" in source or source.startswith("/dev/"):
         return LatestFrameCapture(source)
     return FileCapture(Path(source))
-
-
-def _live_tracker(image_size: int) -> Any:
-    # Imports mediapipe, which who brings a tracker need not have.
-    from rgbavatar_ns.tracking.live import LiveTracker
-
-    return LiveTracker(TrackConfig(image_size=image_size))

@@ -9,10 +9,13 @@ import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 
+from rgbavatar_ns.data.native.frame import TrackedFrame
+from rgbavatar_ns.data.native.writer import DatasetWriter
 from rgbavatar_ns.data.png import encode_png_rgba
 from rgbavatar_ns.files import write_json
 from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.head.rotations import axis_angle_to_matrix, matrix_to_6d_rows
+from rgbavatar_ns.head.teeth import with_teeth
 from rgbavatar_ns.synthetic.exporters.take import Take, TakeFrame
 
 _OPENGL_ROWS = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -36,6 +39,27 @@ class TakeWriter:
 
     def finish(self) -> None:
         """Write the index, where the format has one."""
+
+
+class NativeWriter(TakeWriter):
+    """The project's own format, to measure others against: FLAME with teeth, theta as it is."""
+
+    def __init__(self, dst: Path, take: Take) -> None:
+        super().__init__(dst, take)
+        arrays = with_teeth(take.arrays)
+        self._layout = HeadModel(arrays).layout
+        identity = torch.from_numpy(take.identity).float()
+        self._writer = DatasetWriter(dst, arrays, identity, self._layout, take.width, take.height)
+
+    def add(self, frame: TakeFrame) -> None:
+        """One frame's image, theta and camera."""
+        parts = {name: torch.from_numpy(part).float() for name, part in frame.theta.items()}
+        theta = self._layout.join(parts)
+        self._writer.add(TrackedFrame(frame.index, theta, frame.camera, frame.image_rgba))
+
+    def finish(self) -> None:
+        """dataset.json."""
+        self._writer.finish(self._take.num_test_frames)
 
 
 class MetricalWriter(TakeWriter):

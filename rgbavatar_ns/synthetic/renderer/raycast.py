@@ -7,7 +7,7 @@ import numpy as np
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore import EmbreeDevice
 from embreex.rtcore_scene import EmbreeScene
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 _EDGE_DEPTH_M = 0.015
 
@@ -49,18 +49,6 @@ class RayScene:
         if self._kept is not None:
             triangle = self._kept[triangle]
         return Hits(triangle, weights, found["tfar"])
-
-    def is_free(
-        self,
-        origins: Float[np.ndarray, "N 3"],
-        directions: Float[np.ndarray, "N 3"],
-        reach_m: float = np.inf,
-    ) -> Bool[np.ndarray, "N"]:
-        """Whether each ray (unit directions) meets nothing within `reach_m`."""
-        if not len(origins):
-            return np.zeros(0, bool)
-        hits = self.cast(origins, directions)
-        return (hits.triangle < 0) | (hits.distance > reach_m)
 
 
 @dataclass(frozen=True)

@@ -94,7 +94,8 @@ class DemoRenderer:
         start = (posed.vertices + 8e-4 * n).astype(np.float32)
         for x, y, z in local:
             direction = (x * first + y * second + z * n).astype(np.float32)
-            free += scene.is_free(start, direction, _AMBIENT_REACH_M)
+            hits = scene.cast(start, direction)
+            free += (hits.triangle < 0) | (hits.distance > _AMBIENT_REACH_M)
         return free / _AMBIENT_RAYS
 
     def render(self, moment: Moment) -> UInt8[np.ndarray, "S S 4"]:
