@@ -77,13 +77,11 @@ def refusals_told(path: Path) -> Iterator[None]:
     """Whatever goes wrong within becomes a UserError about this file."""
     try:
         yield
-    except RefusedPickleError as error:
-        raise UserError(f"{path} was not read: {error}.", _REMEDY) from None
     except Exception as error:
         # Bytes of others can provoke nearly any error in pickle, zipfile, numpy and scipy.
-        raise UserError(
-            f"{path} was not read: it is damaged ({type(error).__name__}).", _REMEDY
-        ) from None
+        refused = isinstance(error, RefusedPickleError)
+        why = error if refused else f"it is damaged ({type(error).__name__})"
+        raise UserError(f"{path} was not read: {why}.", _REMEDY) from None
 
 
 class StandIn:
@@ -142,8 +140,7 @@ class _Unpickler(pickle.Unpickler):
         names: Mapping[str, type[StandIn]],
         persistent: Callable[[Any], StandIn] | None,
     ) -> None:
-        # Python 2 strings are read as Latin-1, one character a byte.
-        super().__init__(file, encoding="latin1")
+        super().__init__(file, encoding="latin1")  # Python 2's text: one character a byte
         self._names = names
         self._persistent = persistent
 

@@ -168,7 +168,10 @@ def _dress(
     color, gloss = _mix(color, lip_color, lips), gloss + 0.35 * lips
     relief = relief + 6e-5 * creases * lips
     mouth = smooth(p[:, 2], 0.047, 0.040) * bump(p[:, 1], -0.037, 0.012)
-    mouth *= smooth(np.abs(p[:, 0]), 0.030, 0.024) * (p[:, 2] > -0.03) * _inside_mouth(p)
+    # Skin behind the lips rather than the cheeks beside them: far from the face's front.
+    front = 0.0505 - 22.0 * p[:, 0] ** 2
+    behind = smooth(p[:, 2], front - 0.002, front - 0.006)
+    mouth *= smooth(np.abs(p[:, 0]), 0.030, 0.024) * (p[:, 2] > -0.03) * behind
     color = _mix(color, np.array([0.16, 0.035, 0.035]), mouth)
     lashes = regions.near_lid_edge(p, 0.0154)
     color = _mix(color, np.array([0.045, 0.028, 0.022]), 0.9 * lashes)
@@ -188,12 +191,6 @@ def _dress(
         (gloss * (1 - shirt)).astype(np.float32),
         (relief * (1 - shirt)).astype(np.float32),
     )
-
-
-def _inside_mouth(p: Points) -> np.ndarray:
-    """Skin behind the lips rather than the cheeks beside them: far from the face's front."""
-    front = 0.0505 - 22.0 * p[:, 0] ** 2
-    return smooth(p[:, 2], front - 0.002, front - 0.006)
 
 
 def _hair(

@@ -139,10 +139,6 @@ def sharpness(image_rgb: UInt8[np.ndarray, "H W 3"], face: Float[np.ndarray, "47
 
 def _agree(a: Float[np.ndarray, "N 478 2"], b: Float[np.ndarray, "M 478 2"]) -> bool:
     """Whether both see the same faces, in any order."""
-    if len(a) != len(b):
-        return False
-    for face in a:
-        away = np.abs(b - face).max((1, 2))
-        if not (away < _AGREE_SHARE * np.ptp(face[:, 1])).any():
-            return False
-    return True
+    return len(a) == len(b) and all(
+        (np.abs(b - face).max((1, 2)) < _AGREE_SHARE * np.ptp(face[:, 1])).any() for face in a
+    )

@@ -87,17 +87,14 @@ class UserMattes:
     def _mattes(self, frames: frozenset[int]) -> Iterator[tuple[int, UInt8[np.ndarray, "H W"]]]:
         if self.files is not None:
             for index in sorted(frames.intersection(range(len(self.files)))):
-                yield index, _level(read_image_rgba(self.files[index]))
+                rgba = read_image_rgba(self.files[index])
+                opaque = rgba[..., 3].min() == 255
+                level = cv2.cvtColor(rgba, cv2.COLOR_RGBA2GRAY) if opaque else rgba[..., 3]
+                yield index, np.ascontiguousarray(level)
             return
         for frame in FrameSource.open(self.path).read(frames.__contains__):
             grey = cv2.cvtColor(frame.image_rgb, cv2.COLOR_RGB2GRAY)
             yield frame.index, grey if frame.alpha is None else frame.alpha
-
-
-def _level(rgba: UInt8[np.ndarray, "H W 4"]) -> UInt8[np.ndarray, "H W"]:
-    if rgba[..., 3].min() < 255:
-        return np.ascontiguousarray(rgba[..., 3])
-    return cv2.cvtColor(rgba, cv2.COLOR_RGBA2GRAY)
 
 
 def _by_name(mattes: list[Path], images: list[Path]) -> tuple[Path, ...] | None:
