@@ -134,7 +134,7 @@ def seen(seed: int) -> tuple[DemoPerson, np.ndarray, np.ndarray, np.ndarray]:
     person = DemoPerson.of(config)
     head, rng = person.head, np.random.default_rng(seed)
     script = perform(head.layout, head.arrays.expression_names, 8 * ACTED, 60, 12.0, seed)
-    theta = np.concatenate([script.theta[::8], made_faces(head, MADE, rng)])
+    theta = np.concatenate([script[::8], made_faces(head, MADE, rng)])
     mirrored, room = seed % 2 == 1, rng.uniform(60, 190, 3)
     kept, points = [], []
     with closing(FaceLandmarker()) as landmarker:
@@ -151,6 +151,22 @@ def seen(seed: int) -> tuple[DemoPerson, np.ndarray, np.ndarray, np.ndarray]:
     return person, theta, np.array(points), np.array(kept) < ACTED
 
 
+def response_terms(
+    landmarks: LandmarkHead, theta: np.ndarray, identity: np.ndarray, eye_m: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """What a response is linear in, in one pose, and what turns it into the world [L, 3, 3].
+
+    Terms [K]: 1, then `LandmarkResponse`'s other factors in its order.
+    """
+    view = landmarks._view(theta, landmarks._coefficients(theta, identity), eye_m)
+    turned = np.zeros((landmarks.num_landmarks, 3, 3))
+    for part in landmarks._moments:
+        turned[part.rows] += part.share[:, None, None] * view.chain.turned[part.joint]
+    expression = theta[landmarks.layout.slice("expression")]
+    terms = [np.ones(1), view.signals[:5], expression, view.signals[5:], identity]
+    return np.concatenate(terms), turned
+
+
 def observations(landmarks: LandmarkHead, index: np.ndarray, seeds: range) -> Iterator[Observation]:
     """Every picture of every person."""
     for seed in seeds:
@@ -162,8 +178,8 @@ def observations(landmarks: LandmarkHead, index: np.ndarray, seeds: range) -> It
         eye = np.array([0.0, camera.height_m, camera.distance_m])
         print(f"person {seed}: {len(thetas)} of {ACTED + MADE} pictures", flush=True)
         for theta, points_px, is_acted in zip(thetas, found, acted):
-            response = landmarks.response_terms(theta, identity, eye)
-            away = response.points - eye
+            terms, turned = response_terms(landmarks, theta, identity, eye)
+            away = landmarks.points(theta, identity, eye) - eye
             across = camera.focal_px / -away[:, 2]
             image = np.zeros((len(away), 2, 3))
             image[:, 0, 0], image[:, 1, 1] = across, -across
@@ -172,8 +188,8 @@ def observations(landmarks: LandmarkHead, index: np.ndarray, seeds: range) -> It
             yield Observation(
                 seed,
                 is_acted,
-                response.terms,
-                (image @ response.turned).astype(np.float32),
+                terms,
+                (image @ turned).astype(np.float32),
                 points_px[index] - expected,
                 upright_turn(points_px) / face_height_px(points_px),
             )

@@ -61,7 +61,7 @@ class Subject:
         found: list[np.ndarray] = []
         kept: list[int] = []
         with closing(FaceLandmarker()) as landmarker:
-            images = person.draw(torch.from_numpy(acted.theta).float())
+            images = person.draw(torch.from_numpy(acted).float())
             for number, image in enumerate(images):
                 alpha = image[..., 3:] / 255
                 picture = image[..., :3] * alpha + room * (1 - alpha)
@@ -69,7 +69,7 @@ class Subject:
                 if points is not None:
                     found.append(points)
                     kept.append(number)
-        self.theta = acted.theta[kept]
+        self.theta = acted[kept]
         self.landmarks_px = np.array(found)
         self.follows = [False, *(np.diff(kept) == 1).tolist()]
         self.lost = frames - len(kept)

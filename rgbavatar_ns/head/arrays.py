@@ -95,15 +95,14 @@ class HeadArrays:
         return len(self.expression_names)
 
     @classmethod
+    @cache
     def embedded(cls) -> "HeadArrays":
         """The CC0 MakeHuman head that ships with the package (assets/LICENSE)."""
-        return _load_embedded()
+        return cls.load(EMBEDDED_HEAD)
 
     def save(self, path: Path) -> None:
         """Write one npz without pickles; offsets go as float16 where that loses nothing."""
-        arrays = {}
-        for name, value in self._items():
-            arrays[name] = np.array(value)
+        arrays = {name: np.array(value) for name, value in self._items()}
         with atomic_write(Path(path)) as partial, partial.open("wb") as file:
             np.savez_compressed(file, **arrays)
 
@@ -179,8 +178,3 @@ class HeadArrays:
             if name.startswith(_GROUP)
         }
         return cls(**values, vertex_groups=groups)
-
-
-@cache
-def _load_embedded() -> HeadArrays:
-    return HeadArrays.load(EMBEDDED_HEAD)

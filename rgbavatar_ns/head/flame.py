@@ -50,15 +50,13 @@ def load_flame(
 ) -> HeadArrays:
     """FLAME 2017 to 2023 Open as a head model named after its version, such as "FLAME 2020".
 
-    path: the pickle, or a folder that is searched for it; None takes the environment variable
-    RGBAVATAR_FLAME. The pickle is read without being run (`safe_pickle`).
-    uv: npz or template OBJ with the UV map; None looks beside the pickle, and where there is none
-    makes a map of its own with a warning.
+    path: the pickle, or a folder that is searched for it; None takes RGBAVATAR_FLAME's.
+    uv: npz or template OBJ; None looks beside the pickle, and else makes a map with a warning.
     eyelids: folder with l_eyelid.npy and r_eyelid.npy; None looks beside the pickle, and where
     they are absent the model has none.
     teeth, teeth_form: whether teeth are added and how (`head.teeth`).
-    version: one of `VERSIONS`; None reads it off the file's or its folder's name. In a folder of
-    several models it says which one is wanted.
+    version: one of `VERSIONS`, which in a folder says which model is wanted; None reads it off the
+    file's or its folder's name.
     num_identity, num_expressions: how many directions are kept, from the first.
     Raises UserError where something is missing, damaged or of another form.
     """

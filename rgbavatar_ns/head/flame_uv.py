@@ -32,11 +32,8 @@ _ROOM_FOR_TEETH = 0.95
 
 def find_uv_file(folders: Iterable[Path]) -> Path | None:
     """The first file in these folders that usually carries FLAME's UV map."""
-    for folder in folders:
-        for name in FILE_NAMES:
-            if (folder / name).is_file():
-                return folder / name
-    return None
+    files = (folder / name for folder in folders for name in FILE_NAMES)
+    return next(filter(Path.is_file, files), None)
 
 
 def read_uv_map(path: Path, faces: Int[np.ndarray, "F 3"]) -> UVMap:

@@ -72,11 +72,8 @@ def _dot(a: _Planes, b: _Planes) -> Tensor:
 
 
 def _cross(a: _Planes, b: _Planes) -> _Planes:
-    return (
-        a[1] * b[2] - a[2] * b[1],
-        a[2] * b[0] - a[0] * b[2],
-        a[0] * b[1] - a[1] * b[0],
-    )
+    (ax, ay, az), (bx, by, bz) = a, b
+    return ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
 
 
 def _scaled_to_one(a: _Planes) -> _Planes:
@@ -115,12 +112,11 @@ def edges_to_frame(
 def frame_quats_wxyz(frames: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 4"]:
     """Unit quaternions (real part first) of the proper rotation nearest a tangent frame keeping N.
 
-    T and B of `normalized` and `raw` frames are not orthogonal, so the frame is no rotation. A
-    Gaussian needs one: the normal stays, since Gaussians lie on the surface, and within the
-    surface's plane the rotation is taken whose axes are nearest to T and B in the least-squares
-    sense (both weighted by their length), so that neither direction of the map is preferred. For
-    an orthonormal frame it is the frame itself. Where the UV map is mirrored, B is negated first.
-    Ours; the paper (sec. 3.1) writes q_D = R q_T without saying how R becomes a rotation.
+    T and B of `normalized` and `raw` frames are not orthogonal, but a Gaussian needs a rotation:
+    the normal stays, and within the surface's plane the axes are taken that are nearest to T and B
+    in the least-squares sense, weighted by their length. An orthonormal frame is its own. Where the
+    UV map is mirrored, B is negated first. Ours; the paper (sec. 3.1) does not say how q_D = R q_T
+    is meant where R is no rotation.
     """
     entries = frames.flatten(-2).movedim(-1, 0).contiguous().unbind(0)
     tangent, bitangent, normal = entries[0::3], entries[1::3], entries[2::3]

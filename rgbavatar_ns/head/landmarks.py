@@ -3,6 +3,7 @@
 from dataclasses import dataclass, fields
 from functools import cache
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -23,8 +24,20 @@ SPARSE_51 = (
 """FaceMesh indices of the usual 68 points without the jaw line: brows, nose, eyes, mouth."""
 
 
+_Kind = TypeVar("_Kind", bound="_Rows")
+
+
 @dataclass(frozen=True)
-class LandmarkResponse:
+class _Rows:
+    """Arrays with a row for each landmark."""
+
+    def select(self: _Kind, rows: Int[np.ndarray, "K"]) -> _Kind:
+        """The same of these rows."""
+        return type(self)(*(getattr(self, field.name)[rows] for field in fields(self)))
+
+
+@dataclass(frozen=True)
+class LandmarkResponse(_Rows):
     """Where a detector puts L points apart from the skin they lie on, in the skull's frame, metres.
 
     Detectors follow faces incompletely: they round off expressions, and points of the outline
@@ -43,13 +56,9 @@ class LandmarkResponse:
     gaze: Float[np.ndarray, "L 3 2"]
     identity: Float[np.ndarray, "L 3 I"]
 
-    def select(self, rows: Int[np.ndarray, "K"]) -> "LandmarkResponse":
-        """The same of these rows."""
-        return LandmarkResponse(*(getattr(self, field.name)[rows] for field in fields(self)))
-
 
 @dataclass(frozen=True)
-class LandmarkNoise:
+class LandmarkNoise(_Rows):
     """How a detector's points err together: what remains when their response is known.
 
     A landmark's error in an upright face, as a share of the face's height, is taken for the sum of
@@ -64,13 +73,9 @@ class LandmarkNoise:
     modes: Float[np.ndarray, "L 2 K"]
     own_share: Float[np.ndarray, "L"]
 
-    def select(self, rows: Int[np.ndarray, "N"]) -> "LandmarkNoise":
-        """The same of these rows."""
-        return LandmarkNoise(self.modes[rows], self.own_share[rows])
-
 
 @dataclass(frozen=True)
-class LandmarkMap:
+class LandmarkMap(_Rows):
     """L FaceMesh points as places on triangles of the embedded head, by FaceMesh index.
 
     Made by scripts/build_landmark_map.py, which looks at renders of the head with FaceMesh.
@@ -84,36 +89,15 @@ class LandmarkMap:
     spread_m: Float[np.ndarray, "L"]
     """How far single renders put the point from this place (median, metres): small is sure."""
 
-    def select(self, facemesh_indices: tuple[int, ...]) -> "LandmarkMap":
-        """These points, in this order; raises KeyError for a point that is not in the map."""
-        places = {int(index): place for place, index in enumerate(self.facemesh_index)}
-        return self.select_rows(np.array([places[index] for index in facemesh_indices], np.int64))
-
-    def select_rows(self, rows: Int[np.ndarray, "K"]) -> "LandmarkMap":
-        """The same of these rows."""
-        return LandmarkMap(*(getattr(self, field.name)[rows] for field in fields(self)))
-
-    def as_dict(self) -> dict[int, tuple[int, tuple[float, float, float]]]:
-        """FaceMesh index -> (triangle, barycentric coordinates)."""
-        return {
-            int(index): (int(triangle), (float(weights[0]), float(weights[1]), float(weights[2])))
-            for index, triangle, weights in zip(
-                self.facemesh_index, self.triangle, self.barycentric
-            )
-        }
-
 
 @cache
 def facemesh_landmarks() -> LandmarkMap:
     """All FaceMesh points that have a place on the embedded head, irises (468-477) included."""
     with np.load(LANDMARK_FILE, allow_pickle=False) as file:
-        return LandmarkMap(
-            file["facemesh_index"].astype(np.int64),
-            file["triangle"].astype(np.int64),
-            file["barycentric"].astype(np.float64),
-            file["mirror"].astype(np.int64),
-            file["spread_m"].astype(np.float64),
-        )
+        arrays = [file[field.name] for field in fields(LandmarkMap)]
+    return LandmarkMap(
+        *(one.astype(np.int64 if one.dtype.kind in "iu" else np.float64) for one in arrays)
+    )
 
 
 @cache

@@ -130,12 +130,8 @@ class ThetaLayout:
 
     def feature_size(self, include_pose: bool = True, include_translation: bool = False) -> int:
         """How many numbers `network_features` gives."""
-        sizes = {
-            "linear": lambda field: field.size,
-            "axis_angle": lambda field: 6 if include_pose else 0,
-            "translation": lambda field: field.size if include_translation else 0,
-        }
-        return sum(sizes[field.form](field) for field in self.fields)
+        theta = torch.zeros(self.size)
+        return self.network_features(theta, include_pose, include_translation).shape[-1]
 
     def network_features(
         self,

@@ -11,19 +11,18 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-_CROSS_PRODUCT = (
-    (0.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 1.0, 0.0),
-    (0.0, 0.0, 1.0, 0.0, 0.0, 0.0, -1.0, 0.0, 0.0),
-    (0.0, -1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0),
-)
-"""What each component of v adds to the matrix of v x, row by row."""
-
 
 @functools.cache
 def _cross_product(dtype: torch.dtype, device: torch.device) -> Float[Tensor, "3 9"]:
-    """Copied to a device once: a copy in each call would keep a step out of a CUDA graph."""
+    """What each component of v adds to the matrix of v x, row by row.
+
+    Copied to a device once: a copy in each call would keep a step out of a CUDA graph.
+    """
+    x = (0, 0, 0, 0, 0, -1, 0, 1, 0)
+    y = (0, 0, 1, 0, 0, 0, -1, 0, 0)
+    z = (0, -1, 0, 1, 0, 0, 0, 0, 0)
     with torch.inference_mode(False):
-        return torch.tensor(_CROSS_PRODUCT, dtype=dtype, device=device)
+        return torch.tensor([x, y, z], dtype=dtype, device=device)
 
 
 def axis_angle_to_matrix(axis_angle: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:

@@ -1,9 +1,8 @@
 """Pickles of others, read as plain arrays: nothing in them is ever run.
 
-FLAME's models are pickles, which by design may call any function. Python's own `pickle.Unpickler`
-reads them, but its `find_class` gives inert stand-ins for the few names that arrays need and
-refuses every other. A stand-in only holds what it is given; when the whole file is read,
-`Resolver` makes the arrays. What the Unpickler could not refuse alone, `_vet` refuses first.
+Python's own `pickle.Unpickler` reads them, but its `find_class` gives inert stand-ins for the few
+names that arrays need and refuses every other. A stand-in only holds what it is given; `Resolver`
+makes the arrays in the end. What the Unpickler could not refuse alone, `_vet` refuses first.
 """
 
 import io
@@ -78,13 +77,11 @@ def refusals_told(path: Path) -> Iterator[None]:
     """Whatever goes wrong within becomes a UserError about this file."""
     try:
         yield
-    except RefusedPickleError as error:
-        raise UserError(f"{path} was not read: {error}.", _REMEDY) from None
     except Exception as error:
         # Bytes of others can provoke nearly any error in pickle, zipfile, numpy and scipy.
-        raise UserError(
-            f"{path} was not read: it is damaged ({type(error).__name__}).", _REMEDY
-        ) from None
+        refused = isinstance(error, RefusedPickleError)
+        why = error if refused else f"it is damaged ({type(error).__name__})"
+        raise UserError(f"{path} was not read: {why}.", _REMEDY) from None
 
 
 class StandIn:
@@ -143,8 +140,7 @@ class _Unpickler(pickle.Unpickler):
         names: Mapping[str, type[StandIn]],
         persistent: Callable[[Any], StandIn] | None,
     ) -> None:
-        # Python 2 strings are read as Latin-1, one character a byte.
-        super().__init__(file, encoding="latin1")
+        super().__init__(file, encoding="latin1")  # Python 2's text: one character a byte
         self._names = names
         self._persistent = persistent
 
@@ -161,12 +157,11 @@ class _Unpickler(pickle.Unpickler):
 
 
 def _vet(file: io.BytesIO) -> None:
-    """Walk over one pickle's opcodes and refuse what the Unpickler alone could not.
+    """Refuse in one pickle's opcodes what the Unpickler alone could not.
 
     That is: lengths beyond the file's end and high memo numbers, for which it takes memory at once;
-    numbers of a million digits; steps without end; classes that others registered (EXT); and
-    tuples as keys, since a few nested ones can take for ever to hash. For these the types on the
-    stack are followed, as pickletools describes them.
+    numbers of a million digits; steps without end; classes that others registered (EXT); and, as
+    the types on the stack tell, tuples as keys: a few nested ones can take for ever to hash.
     """
     stack: list[Any] = []
     memo: dict[int, Any] = {}

@@ -40,18 +40,9 @@ class _Row:
     behind: bool
 
 
-_STRIP_ROWS = (
-    _Row(True, True, False),
-    _Row(False, True, False),
-    _Row(True, False, False),
-    _Row(False, False, False),
-)
-_BACK_ROWS = (
-    _Row(True, True, True),
-    _Row(True, False, True),
-    _Row(False, True, True),
-    _Row(False, False, True),
-)
+_ENDS = (True, False)
+_STRIP_ROWS = tuple(_Row(upper, root, behind=False) for root in _ENDS for upper in _ENDS)
+_BACK_ROWS = tuple(_Row(upper, root, behind=True) for upper in _ENDS for root in _ENDS)
 _STRIPS = ((0, 2), (3, 1))
 """Rows above and below of each strip that is seen from the front."""
 _BLOCKS = (*_STRIPS, (5, 4), (6, 7), (2, 5), (7, 3))
@@ -81,7 +72,8 @@ def with_teeth(arrays: HeadArrays, form: TeethForm = "strips") -> HeadArrays:
     triangles = _strip_triangles(
         bool(arrays.v_template[upper[0], 0] > arrays.v_template[upper[-1], 0])
     )
-    faces = _faces(strips, triangles)
+    below, column = np.divmod(triangles, _COLUMNS)
+    faces = np.concatenate([np.array(strip)[below] * _COLUMNS + column for strip in strips])
     uv, uv_faces = _uv_strips(len(strips), triangles)
     places = vertices + np.arange(count)
     groups = dict(arrays.vertex_groups)
@@ -133,14 +125,6 @@ def _strip_triangles(from_left: bool) -> Int[np.ndarray, "28 3"]:
     b, c, d = a + 1, a + _COLUMNS, a + _COLUMNS + 1
     triangles = np.concatenate([np.stack([a, b, d], 1), np.stack([a, d, c], 1)])
     return triangles if from_left else triangles[:, ::-1]
-
-
-def _faces(
-    strips: tuple[tuple[int, int], ...], triangles: Int[np.ndarray, "28 3"]
-) -> Int[np.ndarray, "F 3"]:
-    """The triangles of all strips, by row above and row below."""
-    below, column = np.divmod(triangles, _COLUMNS)
-    return np.concatenate([np.array(rows)[below] * _COLUMNS + column for rows in strips])
 
 
 def _uv_strips(

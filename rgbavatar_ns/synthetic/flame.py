@@ -97,13 +97,13 @@ def _flame_many(head: HeadArrays, triangles: Int[np.ndarray, "F"]) -> Int[np.nda
 
 def _with_lips_in_place(head: HeadArrays, inside: Int[np.ndarray, "V"]) -> Int[np.ndarray, "V"]:
     """The vertices' order, so that the lips' outlines have the numbers that they have in FLAME."""
-    points = facemesh_landmarks().as_dict()
+    marks = facemesh_landmarks()
+    corners = head.v_template[head.faces[marks.triangle]]
+    points = dict(zip(marks.facemesh_index.tolist(), zip(marks.barycentric, corners)))
     order = inside.copy()
     taken: set[int] = set()
     for numbers, landmarks in ((UPPER_LIP, _UPPER_FACEMESH), (LOWER_LIP, _LOWER_FACEMESH)):
-        line = np.stack(
-            [points[i][1] @ head.v_template[head.faces[points[i][0]]] for i in landmarks]
-        )
+        line = np.stack([weights @ place for weights, place in (points[i] for i in landmarks)])
         along = np.linspace(0.5, len(line) - 1.5, len(numbers))
         outline = np.stack([np.interp(along, np.arange(len(line)), c) for c in line.T], 1)
         for number, place in zip(numbers, outline):

@@ -37,12 +37,6 @@ _CAMERA_DISTANCE_M = 1.1
 _HALF_VIEW_M = 0.153
 
 
-def demo_camera(size: int) -> StillCamera:
-    """The camera in front of the person, which never moves."""
-    focal_px = 0.5 * size * _CAMERA_DISTANCE_M / _HALF_VIEW_M
-    return StillCamera(_CAMERA_HEIGHT_M, _CAMERA_DISTANCE_M, focal_px, size)
-
-
 def as_pinhole(camera: StillCamera) -> PinholeCameras:
     """The same camera in OpenCV's axes."""
     world_to_camera = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))[None]
@@ -66,7 +60,9 @@ class DemoPerson:
     def of(cls, config: DemoConfig) -> "DemoPerson":
         """Model, paint and light the person; a few seconds."""
         head = HeadModel.embedded()
-        identity = _identity(head.num_identity, config.seed)
+        # Looks of their own, but no caricature.
+        drawn = np.random.default_rng([config.seed, 0]).standard_normal(head.num_identity)
+        identity = torch.from_numpy(np.clip(0.6 * drawn, -1.2, 1.2)).float()
         surface = TrueSurface(head.arrays, config.seed, config.wrinkles)
         resolution = min(max(256, 2 ** int(np.ceil(np.log2(2 * config.image_size)))), 2048)
         paint = paint_head(head.arrays, resolution, config.seed, config.wrinkles)
@@ -79,7 +75,8 @@ class DemoPerson:
             bridge = np.abs(at_rest[:, 0]) < 0.012
             bridge &= np.abs(at_rest[:, 1] - eyes[:, 1].mean()) < 0.008
             glasses = make_glasses(eyes[0], eyes[1], float(at_rest[bridge, 2].max()))
-        camera = demo_camera(config.image_size)
+        focal_px = 0.5 * config.image_size * _CAMERA_DISTANCE_M / _HALF_VIEW_M
+        camera = StillCamera(_CAMERA_HEIGHT_M, _CAMERA_DISTANCE_M, focal_px, config.image_size)
         renderer = DemoRenderer(
             surface, paint, glasses, at_rest, jaw_open, camera, config.supersampling
         )
@@ -93,10 +90,8 @@ class DemoPerson:
         vertices = np.zeros((0, 0, 3), np.float32)
         activations = wrinkle_activations(expression, names)
         jaw = theta[:, layout.slice("jaw").start].double().numpy() / WIDE_OPEN_RAD
-        smile = 0.5 * (
-            expression[:, names.index("mouthSmileLeft")]
-            + expression[:, names.index("mouthSmileRight")]
-        )
+        left, right = (expression[:, names.index(f"mouthSmile{s}")] for s in ("Left", "Right"))
+        smile = 0.5 * (left + right)
         for k in range(len(theta)):
             if k % _CHUNK == 0:
                 vertices = self.head(theta[k : k + _CHUNK], self.identity).numpy()
@@ -169,7 +164,7 @@ def film_demo(config: DemoConfig, stiff_neck: bool = False) -> DemoFilm:
     """
     person = DemoPerson.of(config)
     layout = person.head.layout
-    performance = perform(
+    acted = perform(
         layout,
         person.head.arrays.expression_names,
         config.num_frames,
@@ -177,8 +172,8 @@ def film_demo(config: DemoConfig, stiff_neck: bool = False) -> DemoFilm:
         config.frames_per_second,
         config.seed,
     )
-    tracked = with_tracker_noise(performance.theta, layout, config.theta_noise, config.seed)
-    found, true = (torch.from_numpy(theta).float() for theta in (tracked, performance.theta))
+    tracked = with_tracker_noise(acted, layout, config.theta_noise, config.seed)
+    found, true = (torch.from_numpy(theta).float() for theta in (tracked, acted))
     if stiff_neck:
         found, true = person.with_stiff_neck(found), person.with_stiff_neck(true)
     return DemoFilm(person, found, true, as_pinhole(person.camera))
@@ -203,9 +198,3 @@ def make_demo_dataset(
         if progress is not None:
             progress(frame.index + 1, config.num_frames)
     return writer.finish(config.num_test_frames)
-
-
-def _identity(count: int, seed: int) -> Float[Tensor, "I"]:
-    """Looks of their own, but no caricature."""
-    drawn = np.random.default_rng([seed, 0]).standard_normal(count)
-    return torch.from_numpy(np.clip(0.6 * drawn, -1.2, 1.2)).float()

@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -57,8 +58,7 @@ def track_video(
     listed. The head is the embedded one or `config.flame`, which the dataset then holds, as an
     imported one does. The result is the same on every run. An interrupted call leaves what it has
     done in `dst`; the same call goes on from there and ends with the same dataset. Raises
-    UserError for unreadable input, no face, no mediapipe, a head model that is none, or a
-    destination that cannot be used.
+    UserError for unreadable input, no face, no mediapipe, or an unusable head or destination.
     """
     config = config or TrackConfig()
     own_head = read_own_head(config.flame)
@@ -106,7 +106,12 @@ class _Tracking:
                 self.mattes.require_count(seen.frames_read, config.max_frames is not None)
             clock.begin("fit", len(seen))
             tracker = subject_tracker(config, self.own_head)
-            fit = tracker.fit(seen.points_px, seen.follows(), width, height, clock.half_done)
+            calls = count(1)  # two for each frame
+
+            def half_done() -> None:
+                clock.done(next(calls) // 2)
+
+            fit = tracker.fit(seen.points_px, seen.follows(), width, height, half_done)
             lost = tracker.rejected(fit, seen.points_px)
             found, fit = seen.without(lost), fit.without(lost)
             clock.done(len(seen))
@@ -161,7 +166,8 @@ class _Tracking:
         camera = crop.pinhole(clip.fit.subject.camera)
         ready = [k for k, index in enumerate(found.frame_index) if index in noted]
         self.clock.begin("pictures", len(found))
-        self.clock.done(len(ready))
+        done = len(ready)
+        self.clock.done(done)
         with closing(images(self.source, ready)) as made:
             for index, theta in zip(found.frame_index, thetas):
                 image = None if index in noted else next(made)
@@ -170,7 +176,8 @@ class _Tracking:
                 if image is not None:
                     noted[index] = silhouette_shares(image.outline, image.matte, image.inside)
                     self.run.note_image(index, noted[index])
-                    self.clock.step()
+                    done += 1
+                    self.clock.done(done)
         self.clock.end()
 
     def _report(self, clip: _FittedClip, shares: Sequence[dict[str, Any]]) -> dict[str, Any]:
@@ -253,13 +260,12 @@ class _StageClock:
     _total: int | None = None
     _first: int | None = None
     _now: int = 0
-    _halves: int = 0
     _began: float = 0.0
 
     def begin(self, name: str, total: int | None) -> None:
         """End the stage before."""
         self.end()
-        self._name, self._total, self._first, self._halves = name, total, None, 0
+        self._name, self._total, self._first = name, total, None
         self._began = time.perf_counter()
 
     def done(self, frames: int) -> None:
@@ -269,15 +275,6 @@ class _StageClock:
         if self.progress is not None:
             total = None if self._total is None else max(self._total, frames)
             self.progress(self._name, frames, total)
-
-    def step(self) -> None:
-        """One frame more is done."""
-        self.done(self._now + 1)
-
-    def half_done(self) -> None:
-        """A frame has gone through one of two passes."""
-        self._halves += 1
-        self.done(self._halves // 2)
 
     def end(self) -> None:
         """Note down the stage's time."""

@@ -3,6 +3,7 @@
 import secrets
 import time
 from collections import Counter, deque
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,11 +21,8 @@ class VideoStream:
     (its number), a device or a network address the latest frame is tracked, and what came
     meanwhile is skipped; where it is lost it is connected again.
 
-    Args:
-        source: what to open, see above.
-        image_size: side of the tracked frames' images in pixels.
-        tracker: what does as `LiveTracker` does, in place of one.
-        capture: in place of what `source` names.
+    `image_size` is the side of the tracked frames' images in pixels. `tracker` serves in place of a
+    `LiveTracker`, `capture` in place of what `source` names.
     """
 
     def __init__(
@@ -35,7 +33,12 @@ class VideoStream:
         capture: FrameCapture | None = None,
     ) -> None:
         self._capture = _open(source) if capture is None else capture
-        self._tracker = _live_tracker(image_size) if tracker is None else tracker
+        if tracker is None:
+            # Imports mediapipe, which who brings a tracker need not have.
+            from rgbavatar_ns.tracking.live import LiveTracker
+
+            tracker = LiveTracker(TrackConfig(image_size=image_size))
+        self._tracker = tracker
         self.keeps_frames = self._capture.keeps_frames
         # A file's frames have the same numbers in the next run, a camera's begin anew.
         self._session = "" if self.keeps_frames else secrets.token_hex(8)
@@ -60,22 +63,12 @@ class VideoStream:
 
     def subject(self, timeout_s: float) -> StreamSubject | None:
         """The person, once enough frames have shown the face."""
-        deadline = time.monotonic() + timeout_s
-        while self._subject is None and not self._capture.ended:
-            left = deadline - time.monotonic()
-            if left <= 0:
-                break
-            self._track(left)
+        self._track_until(lambda: self._subject is not None or self._capture.ended, timeout_s)
         return self._subject
 
     def next(self, timeout_s: float) -> StreamedFrame | None:
         """The next tracked frame; tracking one may take longer than `timeout_s`."""
-        deadline = time.monotonic() + timeout_s
-        while not self._ready and not self.ended:
-            left = deadline - time.monotonic()
-            if left <= 0:
-                break
-            self._track(left)
+        self._track_until(lambda: bool(self._ready) or self.ended, timeout_s)
         return self._ready.popleft() if self._ready and not self._closed else None
 
     def go_on_after(self, index: int) -> None:
@@ -90,6 +83,11 @@ class VideoStream:
             self._closed = True
             self._capture.close()
             self._tracker.close()
+
+    def _track_until(self, done: Callable[[], bool], timeout_s: float) -> None:
+        deadline = time.monotonic() + timeout_s
+        while not done() and (left := deadline - time.monotonic()) > 0:
+            self._track(left)
 
     def _track(self, timeout_s: float) -> None:
         """Track the next frame, if one comes in time."""
@@ -139,10 +137,3 @@ def _open(source: str) -> FrameCapture:
     if source.isdecimal() or "://" in source or source.startswith("/dev/"):
         return LatestFrameCapture(source)
     return FileCapture(Path(source))
-
-
-def _live_tracker(image_size: int) -> Any:
-    # Imports mediapipe, which who brings a tracker need not have.
-    from rgbavatar_ns.tracking.live import LiveTracker
-
-    return LiveTracker(TrackConfig(image_size=image_size))

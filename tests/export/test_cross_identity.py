@@ -28,7 +28,7 @@ def _performance(person: DemoPerson, seed: int) -> torch.Tensor:
     """A performance that begins with the head at rest."""
     names = person.head.arrays.expression_names
     played = perform(person.head.layout, names, _FRAMES, 6, 8.0, seed)
-    theta = torch.from_numpy(played.theta).float()
+    theta = torch.from_numpy(played).float()
     theta[0] = 0
     return theta
 

@@ -129,7 +129,8 @@ def test_flame_without_eyelid_files_gets_eyelids_that_close(flame_folder: Path) 
     lids = found.arrays.eyelid_dirs
     assert lids is not None
     assert found.response.expression.shape[-1] == found.arrays.num_expressions + 2
-    upper, lower = (found.landmarks.select((index,)) for index in (386, 374))
+    marks = found.landmarks
+    upper, lower = (marks.select(np.flatnonzero(marks.facemesh_index == i)) for i in (386, 374))
     for left, right in ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0)):
         vertices = found.arrays.v_template + lids @ np.array([left, right], np.float32)
         gap_m = places(found.arrays, upper, vertices) - places(found.arrays, lower, vertices)

@@ -29,7 +29,7 @@ def test_head_jaw_and_expressions_come_nearer_to_the_truth() -> None:
     )
     person = DemoPerson.of(config)
     names, layout = person.head.arrays.expression_names, person.head.layout
-    theta = perform(layout, names, 4 * FRAMES, FRAMES, 8.0, SEED).theta[::4]
+    theta = perform(layout, names, 4 * FRAMES, FRAMES, 8.0, SEED)[::4]
     found, kept = [], []
     with closing(FaceLandmarker()) as landmarker:
         for number, image in enumerate(person.draw(torch.from_numpy(theta).float())):

@@ -2,101 +2,109 @@
 
 import math
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
+import cv2
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 
+from rgbavatar_ns.data.native.frame import TrackedFrame
+from rgbavatar_ns.data.native.writer import DatasetWriter
+from rgbavatar_ns.data.png import encode_png_rgba
 from rgbavatar_ns.files import write_json
 from rgbavatar_ns.head import HeadModel
-from rgbavatar_ns.synthetic.exporters.frame_images import write_color, write_grey, write_rgba
-from rgbavatar_ns.synthetic.exporters.frame_writer import FrameWriter
-from rgbavatar_ns.synthetic.exporters.take import (
-    Take,
-    TakeFrame,
-    focal_px,
-    principal_point_px,
-    world_to_camera,
-)
+from rgbavatar_ns.head.rotations import axis_angle_to_matrix, matrix_to_6d_rows
+from rgbavatar_ns.head.teeth import with_teeth
+from rgbavatar_ns.synthetic.exporters.take import Take, TakeFrame
 
 _OPENGL_ROWS = np.diag([1.0, -1.0, -1.0, 1.0])
 _IMAVATAR_SCALE = 4.0
 _VALIDATION = 20
 _VHAP_VERTICES = 5023 + 120
+_TEXTURE = 140
+_JPEG_QUALITY = 98
 
 
-class TakeWriter(Protocol):
+class TakeWriter:
     """Writes frame after frame, then what tells of them all."""
-
-    def add(self, frame: TakeFrame) -> None:
-        """Write one frame."""
-        ...
-
-    def finish(self) -> None:
-        """Write the index, where the format has one."""
-        ...
-
-
-class MetricalWriter:
-    """metrical-tracker's output; mattes lie beside it in `alpha`, since it has none."""
-
-    def __init__(self, dst: Path, take: Take) -> None:
-        self._dst = dst
-        self._frames = FrameWriter(dst, take)
-
-    def add(self, frame: TakeFrame) -> None:
-        """One frame's files."""
-        self._frames.write(frame)
-        write_color(self._dst / f"input/{frame.index:05d}.png", frame.image_rgba)
-        write_grey(self._dst / f"alpha/{frame.index:05d}.png", frame.image_rgba[..., 3])
-
-    def finish(self) -> None:
-        """There is no index."""
-
-
-class FlashAvatarWriter:
-    """FlashAvatar: JPEG files whose number is the frame's plus one."""
-
-    def __init__(self, dst: Path, take: Take) -> None:
-        self._dst = dst
-        output = dst / "metrical-tracker" / "output" / dst.resolve().name
-        self._frames = FrameWriter(output, take)
-
-    def add(self, frame: TakeFrame) -> None:
-        """One frame's files; the parsing masks are the matte's lower and upper half."""
-        self._frames.write(frame)
-        number = frame.index + 1
-        alpha = frame.image_rgba[..., 3]
-        write_color(self._dst / f"imgs/{number:05d}.jpg", frame.image_rgba)
-        write_grey(self._dst / f"alpha/{number:05d}.jpg", alpha)
-        face = np.where(alpha > 127, 255, 0).astype(np.uint8)
-        mouth = face.copy()
-        mouth[: len(mouth) // 2] = 0
-        write_grey(self._dst / f"parsing/{number:05d}_neckhead.png", face)
-        write_grey(self._dst / f"parsing/{number:05d}_mouth.png", mouth)
-
-    def finish(self) -> None:
-        """There is no index."""
-
-
-class InstaWriter:
-    """INSTA: OpenCV cameras in transforms.json, `.frame` files, meshes and expressions."""
 
     def __init__(self, dst: Path, take: Take) -> None:
         self._dst, self._take = dst, take
-        self._tracker = FrameWriter(dst, take)
-        self._head = HeadModel(take.arrays, torch.float64)
         self._frames: list[dict[str, Any]] = []
+
+    def add(self, frame: TakeFrame) -> None:
+        """Write one frame's files, and note its entry of the index."""
+        raise NotImplementedError
+
+    def finish(self) -> None:
+        """Write the index, where the format has one."""
+
+
+class NativeWriter(TakeWriter):
+    """The project's own format, to measure others against: FLAME with teeth, theta as it is."""
+
+    def __init__(self, dst: Path, take: Take) -> None:
+        super().__init__(dst, take)
+        arrays = with_teeth(take.arrays)
+        self._layout = HeadModel(arrays).layout
+        identity = torch.from_numpy(take.identity).float()
+        self._writer = DatasetWriter(dst, arrays, identity, self._layout, take.width, take.height)
+
+    def add(self, frame: TakeFrame) -> None:
+        """One frame's image, theta and camera."""
+        parts = {name: torch.from_numpy(part).float() for name, part in frame.theta.items()}
+        theta = self._layout.join(parts)
+        self._writer.add(TrackedFrame(frame.index, theta, frame.camera, frame.image_rgba))
+
+    def finish(self) -> None:
+        """dataset.json."""
+        self._writer.finish(self._take.num_test_frames)
+
+
+class MetricalWriter(TakeWriter):
+    """metrical-tracker's output; mattes lie beside it in `alpha`, since it has none."""
+
+    def add(self, frame: TakeFrame) -> None:
+        """One frame's files."""
+        _write_checkpoint(self._dst, self._take, frame)
+        _write_color(self._dst / f"input/{frame.index:05d}.png", frame)
+        _write_image(self._dst / f"alpha/{frame.index:05d}.png", frame.image_rgba[..., 3])
+
+
+class FlashAvatarWriter(TakeWriter):
+    """FlashAvatar: JPEG files whose number is the frame's plus one."""
+
+    def add(self, frame: TakeFrame) -> None:
+        """One frame's files; the parsing masks are the matte's lower and upper half."""
+        output = self._dst / "metrical-tracker" / "output" / self._dst.resolve().name
+        _write_checkpoint(output, self._take, frame)
+        number = frame.index + 1
+        alpha = frame.image_rgba[..., 3]
+        _write_color(self._dst / f"imgs/{number:05d}.jpg", frame)
+        _write_image(self._dst / f"alpha/{number:05d}.jpg", alpha)
+        face = np.where(alpha > 127, 255, 0).astype(np.uint8)
+        mouth = face.copy()
+        mouth[: len(mouth) // 2] = 0
+        _write_image(self._dst / f"parsing/{number:05d}_neckhead.png", face)
+        _write_image(self._dst / f"parsing/{number:05d}_mouth.png", mouth)
+
+
+class InstaWriter(TakeWriter):
+    """INSTA: OpenCV cameras in transforms.json, `.frame` files, meshes and expressions."""
+
+    def __init__(self, dst: Path, take: Take) -> None:
+        super().__init__(dst, take)
+        self._head = HeadModel(take.arrays, torch.float64)
         self._shared: dict[str, Any] = {}
-        for name in ("flame/exp", "meshes"):
+        for name in ("images", "flame/exp", "meshes"):
             (dst / name).mkdir(parents=True, exist_ok=True)
 
     def add(self, frame: TakeFrame) -> None:
         """One frame's files and its entry."""
         number = f"{frame.index:05d}"
-        self._tracker.write(frame)
-        write_rgba(self._dst / f"images/{number}.png", frame.image_rgba)
+        _write_checkpoint(self._dst, self._take, frame)
+        (self._dst / f"images/{number}.png").write_bytes(encode_png_rgba(frame.image_rgba))
         expression = "\n".join(f"{value:.9g}" for value in frame.theta["expression"])
         (self._dst / f"flame/exp/{number}.txt").write_text(expression + "\n")
         (self._dst / f"meshes/{number}.obj").write_text(self._mesh(frame))
@@ -106,7 +114,7 @@ class InstaWriter:
                 "file_path": f"images/{number}.png",
                 "mesh_path": f"meshes/{number}.obj",
                 "exp_path": f"flame/exp/{number}.txt",
-                "transform_matrix": np.linalg.inv(self._tracker.camera(frame)).tolist(),
+                "transform_matrix": np.linalg.inv(_rigid_camera(self._take, frame)).tolist(),
             }
         )
 
@@ -132,12 +140,11 @@ class InstaWriter:
             write_json(path, {**self._shared, "frames": frames})
 
 
-class VhapWriter:
+class VhapWriter(TakeWriter):
     """VHAP's export of one camera: OpenGL, masks beside images, parameters as npz."""
 
     def __init__(self, dst: Path, take: Take) -> None:
-        self._dst, self._take = dst, take
-        self._frames: list[dict[str, Any]] = []
+        super().__init__(dst, take)
         (dst / "flame_param").mkdir(parents=True, exist_ok=True)
 
     def add(self, frame: TakeFrame) -> None:
@@ -145,10 +152,10 @@ class VhapWriter:
         number, theta = f"{frame.index:05d}", frame.theta
         image = f"images/{number}_00.png"
         mask, parameters = f"fg_masks/{number}_00.png", f"flame_param/{number}.npz"
-        write_color(self._dst / image, frame.image_rgba)
-        write_grey(self._dst / mask, frame.image_rgba[..., 3])
+        _write_color(self._dst / image, frame)
+        _write_image(self._dst / mask, frame.image_rgba[..., 3])
         np.savez(self._dst / parameters, **self._parameters(theta))
-        camera_to_world = np.linalg.inv(_OPENGL_ROWS @ world_to_camera(frame))
+        camera_to_world = np.linalg.inv(_OPENGL_ROWS @ frame.world_to_camera)
         self._frames.append(
             {
                 "timestep_index": frame.index,
@@ -196,27 +203,26 @@ class VhapWriter:
         np.savez(self._dst / "canonical_flame_param.npz", **canonical)
 
 
-class IMAvatarWriter:
+class IMAvatarWriter(TakeWriter):
     """IMAvatar: one JSON of all frames, a world four times as large, OpenGL rows."""
 
     def __init__(self, dst: Path, take: Take) -> None:
-        self._dst, self._take = dst, take
-        self._frames: list[dict[str, Any]] = []
+        super().__init__(dst, take)
         self._intrinsics: list[float] = []
 
     def add(self, frame: TakeFrame) -> None:
         """One frame's files and its entry; the head's shift goes into the camera."""
         theta, name = frame.theta, f"{frame.index:05d}"
-        write_color(self._dst / f"image/{name}.png", frame.image_rgba)
-        write_grey(self._dst / f"mask/{name}.png", frame.image_rgba[..., 3])
-        matrix = world_to_camera(frame).copy()
+        _write_color(self._dst / f"image/{name}.png", frame)
+        _write_image(self._dst / f"mask/{name}.png", frame.image_rgba[..., 3])
+        matrix = frame.world_to_camera.copy()
         matrix[:3, 3] += matrix[:3, :3] @ theta["translation"]
         matrix[:3, 3] *= _IMAVATAR_SCALE
         pose = [theta[part] for part in ("rotation", "neck", "jaw", "left_eye", "right_eye")]
         size = np.array([self._take.width, self._take.height])
         self._intrinsics = [
-            *(focal_px(frame) / size * [-1, 1]).tolist(),
-            *(principal_point_px(frame) / size).tolist(),
+            *(frame.focal_px / size * [-1, 1]).tolist(),
+            *(frame.principal_point_px / size).tolist(),
         ]
         self._frames.append(
             {
@@ -243,7 +249,7 @@ class IMAvatarWriter:
 
 def _intrinsics(frame: TakeFrame, take: Take) -> dict[str, Any]:
     """As transforms.json has them: pixels, and angles of view in radians."""
-    (focal_x, focal_y), (cx, cy) = focal_px(frame).tolist(), principal_point_px(frame).tolist()
+    (focal_x, focal_y), (cx, cy) = frame.focal_px.tolist(), frame.principal_point_px.tolist()
     return {
         "cx": cx,
         "cy": cy,
@@ -254,3 +260,62 @@ def _intrinsics(frame: TakeFrame, take: Take) -> dict[str, Any]:
         "camera_angle_x": 2 * math.atan(0.5 * take.width / focal_x),
         "camera_angle_y": 2 * math.atan(0.5 * take.height / focal_y),
     }
+
+
+def _write_checkpoint(folder: Path, take: Take, frame: TakeFrame) -> None:
+    """metrical-tracker's `checkpoint/%05d.frame`: the head stands still and the camera moves."""
+    theta, matrix = frame.theta, _rigid_camera(take, frame)
+    intrinsics = np.diag([*frame.focal_px, 1.0])
+    intrinsics[:2, 2] = frame.principal_point_px
+    flame = {
+        "exp": theta["expression"],
+        "shape": take.identity,
+        "tex": np.zeros(_TEXTURE),
+        "eyes": np.concatenate([_rows(theta["left_eye"]), _rows(theta["right_eye"])]),
+        "eyelids": theta["eyelids"],
+        "jaw": _rows(theta["jaw"]),
+    }
+    content = {
+        "flame": {
+            **{name: value[None].astype(np.float32) for name, value in flame.items()},
+            "sh": np.zeros((1, 9, 3), np.float32),
+        },
+        "opencv": {
+            "R": matrix[None, :3, :3].astype(np.float32),
+            "t": matrix[None, :3, 3].astype(np.float32),
+            "K": intrinsics[None].astype(np.float32),
+        },
+        "img_size": np.array([take.height, take.width]),
+        "frame_id": f"{frame.index:05d}",
+        "global_step": frame.index,
+    }
+    path = folder / f"checkpoint/{frame.index:05d}.frame"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    torch.save(content, path)
+
+
+def _rows(axis_angle: Float[np.ndarray, "3"]) -> Float[np.ndarray, "6"]:
+    return matrix_to_6d_rows(axis_angle_to_matrix(torch.from_numpy(axis_angle))).numpy()
+
+
+def _rigid_camera(take: Take, frame: TakeFrame) -> Float[np.ndarray, "4 4"]:
+    """World-to-camera of a head that neither turns nor moves: all motion is the camera's."""
+    arrays = take.arrays
+    coefficients = np.concatenate([take.identity, frame.theta["expression"]])
+    vertices = arrays.v_template + arrays.shapedirs.astype(np.float64) @ coefficients
+    root = arrays.joint_regressor[0].astype(np.float64) @ vertices
+    turn = axis_angle_to_matrix(torch.from_numpy(frame.theta["rotation"])).numpy()
+    motion = np.eye(4)
+    motion[:3, :3] = turn
+    motion[:3, 3] = root - turn @ root + frame.theta["translation"]
+    return frame.world_to_camera @ motion
+
+
+def _write_color(path: Path, frame: TakeFrame) -> None:
+    """Colour without alpha; PNG or JPEG after the name."""
+    _write_image(path, cv2.cvtColor(frame.image_rgba, cv2.COLOR_RGBA2BGR))
+
+
+def _write_image(path: Path, image: UInt8[np.ndarray, "height width *channels"]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    cv2.imwrite(str(path), image, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])

@@ -15,21 +15,17 @@ from rgbavatar_ns.synthetic.exporters.folders import (
     VhapWriter,
 )
 from rgbavatar_ns.synthetic.exporters.take import FlameFilm, Take
-
-Progress = Callable[[int, int], None]
-"""Called with (frames done, frames in all)."""
+from rgbavatar_ns.synthetic.make import Progress
 
 
 @dataclass(frozen=True)
 class DemoFormat:
-    """How the subject is filmed for a format, and who writes it.
-
-    stiff_neck: the format knows no neck.
-    """
+    """How the subject is filmed for a format, and who writes it."""
 
     writer: Callable[[Path, Take], TakeWriter]
     version: str
     stiff_neck: bool
+    """Whether the format knows no neck."""
 
 
 DEMO_FORMATS = {

@@ -5,13 +5,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import torch
 from jaxtyping import Float, Int, UInt8
 from scipy.spatial import KDTree
 
 from rgbavatar_ns.head import HeadArrays
 from rgbavatar_ns.head.flame import EXPRESSIONS, FLAME_VERTICES, IDENTITIES, load_flame
-from rgbavatar_ns.head.rotations import axis_angle_to_matrix
 from rgbavatar_ns.kernels.types import PinholeCameras
 from rgbavatar_ns.synthetic import DemoConfig, DemoFilm, film_demo
 from rgbavatar_ns.synthetic.flame import write_synthetic_flame
@@ -29,6 +27,21 @@ class TakeFrame:
     theta: dict[str, Float[np.ndarray, "_"]]
     camera: PinholeCameras
     image_rgba: UInt8[np.ndarray, "height width 4"]
+
+    @property
+    def world_to_camera(self) -> Float[np.ndarray, "4 4"]:
+        """The camera in OpenCV axes."""
+        return self.camera.world_to_camera[0].double().numpy()
+
+    @property
+    def focal_px(self) -> Float[np.ndarray, "2"]:
+        """Focal lengths of x and y."""
+        return self.camera.focal_px[0].double().numpy()
+
+    @property
+    def principal_point_px(self) -> Float[np.ndarray, "2"]:
+        """Where the optical axis meets the image."""
+        return self.camera.principal_point_px[0].double().numpy()
 
 
 @dataclass(frozen=True)
@@ -90,36 +103,3 @@ def _same_directions(embedded: HeadArrays, flame: HeadArrays) -> Int[np.ndarray,
     if distance.max() > _SAME or squares.min(1).max() > 3 * FLAME_VERTICES * _SAME**2:
         raise RuntimeError("The synthetic FLAME is not the embedded head.")
     return squares.argmin(1)
-
-
-def rigid_camera(frame: TakeFrame, root: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4 4"]:
-    """World-to-camera of a head that neither turns nor moves: all motion is the camera's."""
-    turn = axis_angle_to_matrix(torch.from_numpy(frame.theta["rotation"])).numpy()
-    motion = np.eye(4)
-    motion[:3, :3] = turn
-    motion[:3, 3] = root - turn @ root + frame.theta["translation"]
-    return world_to_camera(frame) @ motion
-
-
-def world_to_camera(frame: TakeFrame) -> Float[np.ndarray, "4 4"]:
-    """The frame's camera in OpenCV axes."""
-    return frame.camera.world_to_camera[0].double().numpy()
-
-
-def focal_px(frame: TakeFrame) -> Float[np.ndarray, "2"]:
-    """The frame's focal lengths."""
-    return frame.camera.focal_px[0].double().numpy()
-
-
-def principal_point_px(frame: TakeFrame) -> Float[np.ndarray, "2"]:
-    """The frame's principal point."""
-    return frame.camera.principal_point_px[0].double().numpy()
-
-
-def root_joint(
-    arrays: HeadArrays, identity: Float[np.ndarray, "_"], expression: Float[np.ndarray, "_"]
-) -> Float[np.ndarray, "3"]:
-    """Where the head turns about: the root joint of a person with an expression."""
-    coefficients = np.concatenate([identity, expression])
-    vertices = arrays.v_template + arrays.shapedirs.astype(np.float64) @ coefficients
-    return arrays.joint_regressor[0].astype(np.float64) @ vertices

@@ -26,12 +26,8 @@ def wrinkle_heights_m(p: Points) -> Float[np.ndarray, "N W"]:
 class Paint:
     """Textures over the head's UV map (row 0 at v = 1): colour, gloss, and how the surface tilts.
 
-    Args:
-        color: linear colour and gloss.
-        relief_m: fixed heights: pores and strands of hair.
-        wrinkles_m: heights of each fully folded group of wrinkles.
-        cheeks: where blood shows, in [0, 1].
-        metres_per_texel: length of one texel to the right and upwards.
+    `relief_m` are fixed heights (pores, hair), `wrinkles_m` those of each fully folded group;
+    `cheeks` is where blood shows; `metres_per_texel` goes to the right and upwards.
     """
 
     def __init__(
@@ -172,7 +168,10 @@ def _dress(
     color, gloss = _mix(color, lip_color, lips), gloss + 0.35 * lips
     relief = relief + 6e-5 * creases * lips
     mouth = smooth(p[:, 2], 0.047, 0.040) * bump(p[:, 1], -0.037, 0.012)
-    mouth *= smooth(np.abs(p[:, 0]), 0.030, 0.024) * (p[:, 2] > -0.03) * _inside_mouth(p)
+    # Skin behind the lips rather than the cheeks beside them: far from the face's front.
+    front = 0.0505 - 22.0 * p[:, 0] ** 2
+    behind = smooth(p[:, 2], front - 0.002, front - 0.006)
+    mouth *= smooth(np.abs(p[:, 0]), 0.030, 0.024) * (p[:, 2] > -0.03) * behind
     color = _mix(color, np.array([0.16, 0.035, 0.035]), mouth)
     lashes = regions.near_lid_edge(p, 0.0154)
     color = _mix(color, np.array([0.045, 0.028, 0.022]), 0.9 * lashes)
@@ -194,12 +193,6 @@ def _dress(
     )
 
 
-def _inside_mouth(p: Points) -> np.ndarray:
-    """Skin behind the lips rather than the cheeks beside them: far from the face's front."""
-    front = 0.0505 - 22.0 * p[:, 0] ** 2
-    return smooth(p[:, 2], front - 0.002, front - 0.006)
-
-
 def _hair(
     p: Points, seed: int, color: np.ndarray, gloss: np.ndarray, relief: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -217,8 +210,8 @@ def _hair(
     shade = np.clip(1 + 0.38 * strands + 0.32 * locks, 0.25, 2.2)
     color = _mix(color, _HAIR * shade, hair)
     strand_gloss = 0.30 + 0.25 * strands[:, 0]
-    relief = _mix1(relief, 2.2e-4 * (strands + 0.8 * locks)[:, 0], hair)
-    return color, _mix1(gloss, strand_gloss, hair), relief
+    relief = relief + (2.2e-4 * (strands + 0.8 * locks)[:, 0] - relief) * hair
+    return color, gloss + (strand_gloss - gloss) * hair, relief
 
 
 def _teeth(p: Points) -> tuple[np.ndarray, np.ndarray]:
@@ -262,7 +255,3 @@ def paint_eye(p: Points) -> tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, "N
 
 def _mix(first: np.ndarray, second: np.ndarray, share: np.ndarray) -> np.ndarray:
     return first + (second - first) * share[:, None]
-
-
-def _mix1(first: np.ndarray, second: np.ndarray, share: np.ndarray) -> np.ndarray:
-    return first + (second - first) * share

@@ -40,14 +40,6 @@ EARLY_ONLY = ("sneer", "puff")
 """Moods of the first third of training, not seen again before the held-out frames."""
 
 
-@dataclass(frozen=True)
-class Performance:
-    """A performance of F frames: what really happens, frame by frame."""
-
-    theta: Float[np.ndarray, "F H"]
-    seconds: Float[np.ndarray, "F"]
-
-
 def perform(
     layout: ThetaLayout,
     expression_names: Sequence[str],
@@ -55,7 +47,7 @@ def perform(
     num_test_frames: int,
     frames_per_second: float,
     seed: int,
-) -> Performance:
+) -> Float[np.ndarray, "F H"]:
     """Script a performance whose held-out end combines what training showed apart.
 
     Early in training the head looks to its left, and there are moods that only come back in the
@@ -88,7 +80,7 @@ def perform(
     gaze = _gaze(rng, seconds)
     _lids(rng, seconds, gaze, expression)
     head = _head_turns(rng, seconds, early_end, train_end)
-    return Performance(_join(layout, expression, gaze, head), seconds)
+    return _join(layout, expression, gaze, head)
 
 
 def with_tracker_noise(

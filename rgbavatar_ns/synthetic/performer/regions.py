@@ -16,10 +16,8 @@ EYE_CENTRE_M = np.array([0.0289, 0.0300, 0.0300])
 MOUTH_CORNER_M = np.array([0.0225, -0.0377])
 
 # Hairline on the head's side, as heights y over depths z.
-_HAIRLINE_Z = np.array(
-    [-0.14, -0.085, -0.066, -0.060, -0.030, -0.024, -0.012, -0.004, 0.018, 0.032]
-)
-_HAIRLINE_Y = np.array([-0.050, -0.048, -0.020, 0.043, 0.043, -0.004, 0.000, 0.036, 0.060, 0.076])
+_HAIR_Z = (-0.14, -0.085, -0.066, -0.06, -0.03, -0.024, -0.012, -0.004, 0.018, 0.032, 0.052, 0.08)
+_HAIR_Y = (-0.05, -0.048, -0.02, 0.043, 0.043, -0.004, 0, 0.036, 0.06, 0.076, 0.09, 0.094)
 
 
 def smooth(value: np.ndarray, start: Level, end: Level) -> np.ndarray:
@@ -35,9 +33,7 @@ def bump(value: np.ndarray, centre: Level, width: float) -> np.ndarray:
 
 def above_hairline_m(p: Points) -> Values:
     """Height above the hairline in metres, negative below it."""
-    z = np.append(_HAIRLINE_Z, [0.052, 0.08])
-    y = np.append(_HAIRLINE_Y, [0.090, 0.094])
-    return p[:, 1] - np.interp(p[:, 2], z, y)
+    return p[:, 1] - np.interp(p[:, 2], _HAIR_Z, _HAIR_Y)
 
 
 def lips(p: Points) -> Values:
@@ -72,11 +68,8 @@ def stubble(p: Points) -> Values:
 
 def cheeks(p: Points) -> Values:
     """The apples of both cheeks."""
-    return (
-        bump(np.abs(p[:, 0]), 0.040, 0.014)
-        * bump(p[:, 1], -0.004, 0.014)
-        * smooth(p[:, 2], 0, 0.02)
-    )
+    middle = bump(np.abs(p[:, 0]), 0.040, 0.014) * bump(p[:, 1], -0.004, 0.014)
+    return middle * smooth(p[:, 2], 0, 0.02)
 
 
 def shirt(p: Points) -> Values:

@@ -12,23 +12,14 @@ WRINKLES = ("forehead", "crows_feet", "nasolabial", "glabella", "nose", "chin")
 """The groups of wrinkles; each comes and goes as one."""
 
 _DRIVERS: dict[str, dict[str, float]] = {
-    "forehead": {"browInnerUp": 0.7, "browOuterUpLeft": 0.4, "browOuterUpRight": 0.4},
-    "crows_feet": {
-        "mouthSmileLeft": 0.3,
-        "mouthSmileRight": 0.3,
-        "cheekSquintLeft": 0.5,
-        "cheekSquintRight": 0.5,
-    },
-    "nasolabial": {
-        "mouthSmileLeft": 0.5,
-        "mouthSmileRight": 0.5,
-        "noseSneerLeft": 0.25,
-        "noseSneerRight": 0.25,
-    },
-    "glabella": {"browDownLeft": 0.6, "browDownRight": 0.6},
-    "nose": {"noseSneerLeft": 0.6, "noseSneerRight": 0.6},
-    "chin": {"mouthShrugLower": 0.7, "mouthFrownLeft": 0.3, "mouthFrownRight": 0.3},
+    "forehead": {"browInnerUp": 0.7, "browOuterUp*": 0.4},
+    "crows_feet": {"mouthSmile*": 0.3, "cheekSquint*": 0.5},
+    "nasolabial": {"mouthSmile*": 0.5, "noseSneer*": 0.25},
+    "glabella": {"browDown*": 0.6},
+    "nose": {"noseSneer*": 0.6},
+    "chin": {"mouthShrugLower": 0.7, "mouthFrown*": 0.3},
 }
+"""What folds them, by how much; "*" stands for both sides."""
 
 
 def wrinkle_activations(
@@ -42,7 +33,8 @@ def wrinkle_activations(
     for group in WRINKLES:
         weights = np.zeros(len(names))
         for name, weight in _DRIVERS[group].items():
-            weights[list(names).index(name)] = weight
+            for side in ("Left", "Right") if name.endswith("*") else ("",):
+                weights[list(names).index(name.removesuffix("*") + side)] = weight
         columns.append(smooth(expression @ weights, 0.15, 0.85))
     return np.stack(columns, -1)
 

@@ -7,7 +7,7 @@ import numpy as np
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore import EmbreeDevice
 from embreex.rtcore_scene import EmbreeScene
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 _EDGE_DEPTH_M = 0.015
 
@@ -49,18 +49,6 @@ class RayScene:
         if self._kept is not None:
             triangle = self._kept[triangle]
         return Hits(triangle, weights, found["tfar"])
-
-    def is_free(
-        self,
-        origins: Float[np.ndarray, "N 3"],
-        directions: Float[np.ndarray, "N 3"],
-        reach_m: float = np.inf,
-    ) -> Bool[np.ndarray, "N"]:
-        """Whether each ray (unit directions) meets nothing within `reach_m`."""
-        if not len(origins):
-            return np.zeros(0, bool)
-        hits = self.cast(origins, directions)
-        return (hits.triangle < 0) | (hits.distance > reach_m)
 
 
 @dataclass(frozen=True)
@@ -122,52 +110,42 @@ def cast_pixels(
     pixel = (rows * camera.size + columns).ravel()
     diagonal = np.array([0.25, 0.75])
     coarse = _cast_pattern(scene, camera, pixel, diagonal, diagonal)
-    edge = _has_edge(coarse[3], material, (bottom - top, right - left))
+    edge = _has_edge(coarse[3], coarse[5], material, (bottom - top, right - left))
     places = (np.arange(supersampling) + 0.5) / supersampling
     across, down = np.meshgrid(places, places)
     fine = _cast_pattern(scene, camera, pixel[edge], across.ravel(), down.ravel())
     rays_per_pixel = np.full(camera.size**2, len(diagonal))
     rays_per_pixel[pixel[edge]] = supersampling**2
-    coarse = _chosen(coarse, np.repeat(~edge, len(diagonal)) & (coarse[3].triangle >= 0))
-    fine = _chosen(fine, fine[3].triangle >= 0)
-    hits = [coarse[3], fine[3]]
-    return PixelRays(
-        pixel=np.concatenate([coarse[0], fine[0]]),
-        pattern=np.concatenate([coarse[1], fine[1]]),
-        directions=np.concatenate([coarse[2], fine[2]]),
-        hits=Hits(
-            np.concatenate([part.triangle for part in hits]),
-            np.concatenate([part.weights for part in hits]),
-            np.concatenate([part.distance for part in hits]),
-        ),
-        rays_per_pixel=rays_per_pixel,
-    )
-
-
-_Pattern = tuple[np.ndarray, np.ndarray, np.ndarray, Hits]
+    wanted = np.repeat(~edge, len(diagonal)), np.ones(len(fine[0]), bool)
+    chosen = []
+    for part, mask in zip((coarse, fine), wanted):
+        met = mask & (part[3] >= 0)
+        chosen.append([values[met] for values in part])
+    pixel, pattern, directions, *hits = map(np.concatenate, zip(*chosen))
+    return PixelRays(pixel, pattern, directions, Hits(*hits), rays_per_pixel)
 
 
 def _cast_pattern(
     scene: RayScene, camera: StillCamera, pixel: np.ndarray, across: np.ndarray, down: np.ndarray
-) -> _Pattern:
-    """Pixel, place in the pattern, direction and hit of rays at the same places of each pixel."""
+) -> tuple[np.ndarray, ...]:
+    """Of rays at the same places of each pixel: pixel, place in the pattern, direction, and the
+    triangle, weights and distance of the hit.
+    """
     column = (pixel[:, None] % camera.size + across).ravel()
     row = (pixel[:, None] // camera.size + down).ravel()
     directions = camera.directions(column, row)
     origins = np.broadcast_to(camera.centre, directions.shape).copy()
     number = np.tile(np.arange(len(across)), len(pixel))
-    return np.repeat(pixel, len(across)), number, directions, scene.cast(origins, directions)
+    hits = scene.cast(origins, directions)
+    owner = np.repeat(pixel, len(across))
+    return owner, number, directions, hits.triangle, hits.weights, hits.distance
 
 
-def _chosen(part: _Pattern, mask: np.ndarray) -> _Pattern:
-    pixel, number, directions, hits = part
-    chosen = Hits(hits.triangle[mask], hits.weights[mask], hits.distance[mask])
-    return pixel[mask], number[mask], directions[mask], chosen
-
-
-def _has_edge(hits: Hits, material: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+def _has_edge(
+    triangle: np.ndarray, distance: np.ndarray, material: np.ndarray, shape: tuple[int, int]
+) -> np.ndarray:
     """Pixels whose rays, or those of their four neighbours, met other materials or depths."""
-    met = hits.triangle >= 0
+    met = triangle >= 0
     cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
 
     def spread(values: np.ndarray) -> np.ndarray:
@@ -175,6 +153,6 @@ def _has_edge(hits: Hits, material: np.ndarray, shape: tuple[int, int]) -> np.nd
         highest, lowest = np.maximum(first, second), np.minimum(first, second)
         return cv2.dilate(highest, cross) - cv2.erode(lowest, cross)
 
-    kind = spread(np.where(met, material[hits.triangle], -1))
-    depth = spread(np.where(met, hits.distance, 0))
+    kind = spread(np.where(met, material[triangle], -1))
+    depth = spread(np.where(met, distance, 0))
     return ((kind > 0) | (depth > _EDGE_DEPTH_M)).ravel()

@@ -51,11 +51,8 @@ class Moment:
 class DemoRenderer:
     """Renders moments of one person; may be used by several threads.
 
-    Args:
-        surface, paint, glasses: the person (None: no glasses).
-        at_rest, jaw_open: head-model vertices at rest with closed and with wide open mouth, from
-            which it is found how much of the room each point sees.
-        camera, supersampling: of the images.
+    `at_rest` and `jaw_open` are the head model's vertices with closed and with wide open mouth:
+    from them it is found how much of the room each point sees.
     """
 
     def __init__(
@@ -97,7 +94,8 @@ class DemoRenderer:
         start = (posed.vertices + 8e-4 * n).astype(np.float32)
         for x, y, z in local:
             direction = (x * first + y * second + z * n).astype(np.float32)
-            free += scene.is_free(start, direction, _AMBIENT_REACH_M)
+            hits = scene.cast(start, direction)
+            free += (hits.triangle < 0) | (hits.distance > _AMBIENT_REACH_M)
         return free / _AMBIENT_RAYS
 
     def render(self, moment: Moment) -> UInt8[np.ndarray, "S S 4"]:

@@ -111,7 +111,7 @@ def followed_face(seen: SeenFaces, width: int, height: int) -> ClipLandmarks:
     points: list[Float[np.ndarray, "478 2"]] = []
     sharpness: list[float] = []
     index: list[int] = []
-    jumps: set[int] = set()
+    jumps: list[int] = []
     others: list[int] = []
     for frame in range(len(seen)):
         rows = slice(int(first_face[frame]), int(first_face[frame + 1]))
@@ -124,7 +124,7 @@ def followed_face(seen: SeenFaces, width: int, height: int) -> ClipLandmarks:
             sharpness.append(float(seen.sharpness[rows][sighting.position]))
             index.append(frame)
             if sighting.jumped:
-                jumps.add(frame)
+                jumps.append(frame)
     if not points:
         raise UserError(
             f"No face was found in any of the {len(seen)} frames.",
@@ -149,7 +149,7 @@ def _segments(
     points_px: Float[np.ndarray, "F 478 2"],
     index: Int[np.ndarray, "F"],
     seen: SeenFaces,
-    jumps: Collection[int],
+    jumps: list[int],
 ) -> tuple[int, ...]:
     height = face_height_px(points_px) + 1e-9
     center = points_px.mean(1)
@@ -157,7 +157,7 @@ def _segments(
     grown = np.maximum(height[1:], height[:-1]) / np.minimum(height[1:], height[:-1])
     breaks = (moved > _JUMP_SHARE) | (grown > _JUMP_SIZE) | (np.diff(index) > 1)
     breaks |= np.diff(seen.clip[index]) != 0
-    breaks |= np.isin(index[1:], sorted(jumps))
+    breaks |= np.isin(index[1:], jumps)
     steps = np.diff(seen.time_s)
     if np.isfinite(steps).any():
         usual = float(np.nanmedian(steps))

@@ -1,7 +1,6 @@
 """The first reading of a clip: every face in every frame, kept on disk as the reading goes on."""
 
 from collections.abc import Callable, Generator
-from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -23,6 +22,8 @@ BLOCK_FRAMES, _WARM_UP = 256, 8
 _AGREE_SHARE = 0.03
 _AHEAD = 4
 _SHARPNESS_PX = 96
+_Block = tuple[SeenFaces, tuple[int, int] | None]
+"""Some frames' faces; the last block tells the frames' width and height."""
 _NONE = np.zeros(0, np.int64)
 _NO_FRAMES = SeenFaces(
     _NONE, _NONE, np.zeros(0), np.zeros(0, bool), np.zeros((0, 478, 2)), np.zeros(0)
@@ -49,11 +50,12 @@ def find_faces(
         if found is None:
             advance(start)
             found = _blocks(source, start, advance, block_frames)
-        block, path = next(found), run.folder / f"faces_{start:08d}.npz"
+        faces, size = next(found)
+        path = run.folder / f"faces_{start:08d}.npz"
         with atomic_write(path, remedy=GO_ON) as partial:
-            np.savez(partial, **vars(block.faces))
-        notes = [] if block.size is None else list(source.notes)
-        return {"file": path.name, "frames": len(block.faces), "size": block.size, "notes": notes}
+            np.savez(partial, **vars(faces))
+        notes = [] if size is None else list(source.notes)
+        return {"file": path.name, "frames": len(faces), "size": size, "notes": notes}
 
     try:
         while not blocks or blocks[-1]["size"] is None:
@@ -66,14 +68,6 @@ def find_faces(
     advance(start)
     faces = SeenFaces.joined([SeenFaces.load(run.folder / block["file"]) for block in blocks])
     return faces, *blocks[-1]["size"]
-
-
-@dataclass(frozen=True)
-class _Block:
-    """Some frames' faces; the last block tells the frames' width and height."""
-
-    faces: SeenFaces
-    size: tuple[int, int] | None = None
 
 
 def _blocks(
@@ -100,13 +94,13 @@ def _blocks(
             again = fresh.faces(frame.image_rgb)
             if frame.index == border - 1:
                 if _agree(faces, again):
-                    yield _Block(SeenFaces.joined(seen))
+                    yield SeenFaces.joined(seen), None
                     landmarker.close()
                     landmarker, seen = fresh, []
                 else:
                     fresh.close()
                 fresh, border = None, border + block_frames
-        yield _Block(SeenFaces.joined([_NO_FRAMES, *seen]), size)
+        yield SeenFaces.joined([_NO_FRAMES, *seen]), size
     finally:
         frames.close()
         landmarker.close()
@@ -145,10 +139,6 @@ def sharpness(image_rgb: UInt8[np.ndarray, "H W 3"], face: Float[np.ndarray, "47
 
 def _agree(a: Float[np.ndarray, "N 478 2"], b: Float[np.ndarray, "M 478 2"]) -> bool:
     """Whether both see the same faces, in any order."""
-    if len(a) != len(b):
-        return False
-    for face in a:
-        away = np.abs(b - face).max((1, 2))
-        if not (away < _AGREE_SHARE * np.ptp(face[:, 1])).any():
-            return False
-    return True
+    return len(a) == len(b) and all(
+        (np.abs(b - face).max((1, 2)) < _AGREE_SHARE * np.ptp(face[:, 1])).any() for face in a
+    )

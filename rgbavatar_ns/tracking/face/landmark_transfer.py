@@ -49,16 +49,12 @@ def fitted_head(head: HeadArrays) -> FittedHead:
     """
     eyeballs = [_eyeball(head, joint) for joint in _EYES]
     registration = register(head)
-    if head.eyelid_dirs is None and not has_blinks(head):
+    blinks = any(name.startswith("eyeBlink") for name in head.expression_names)
+    if head.eyelid_dirs is None and not blinks:
         head = replace(head, eyelid_dirs=carried_blinks(head, registration))
     landmarks = carried_landmarks(head, eyeballs, registration)
     response = carried_response(head, landmarks, registration)
     return FittedHead(head, landmarks, response, carried_noise(landmarks))
-
-
-def has_blinks(head: HeadArrays) -> bool:
-    """Whether the head's expressions have a name for closing the eyes."""
-    return any(name.startswith("eyeBlink") for name in head.expression_names)
 
 
 def carried_landmarks(

@@ -199,12 +199,9 @@ def _close_the_rest(
         pull = np.einsum("vx,vy->vxy", normals, normals) + _ALONG * np.eye(3)
         pull *= weight[:, None, None]
         wanted = np.einsum("vxy,vy->vx", pull, places.found.points - start).reshape(-1)
-        system = (_block_diagonal(pull) + stiffness * bending).tocsc()
+        places_in = np.arange(len(pull) + 1)
+        blocks = sparse.csc_matrix(sparse.bsr_matrix((pull, places_in[:-1], places_in)))
+        system = (blocks + stiffness * bending).tocsc()
         factors = splu(system, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
         placed[face.rows] = start + factors.solve(wanted).reshape(-1, 3)
     return placed
-
-
-def _block_diagonal(blocks: Float[np.ndarray, "N 3 3"]) -> sparse.csc_matrix:
-    count = len(blocks)
-    return sparse.csc_matrix(sparse.bsr_matrix((blocks, np.arange(count), np.arange(count + 1))))

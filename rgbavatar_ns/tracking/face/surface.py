@@ -121,16 +121,11 @@ def skin_points(arrays: HeadArrays, placed: Float[np.ndarray, "V 3"] | None = No
     vertices = arrays.v_template.astype(np.float64) if placed is None else placed
     faces = arrays.faces[is_skin(arrays)[arrays.faces].all(1)].astype(np.int64)
     jaw = arrays.skinning_weights[:, _JAW].astype(np.float64)
-    return SkinPoints(vertices, vertex_normals(vertices, faces), jaw)
-
-
-def vertex_normals(
-    vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]
-) -> Float[np.ndarray, "V 3"]:
-    """Unit normals, the mean of the triangles around weighed by area; 0 where there is none."""
+    # Of the triangles around, weighed by area; 0 where there is none.
     a, b, c = vertices[faces].transpose(1, 0, 2)
     areas = np.cross(b - a, c - a)
     normals = np.zeros_like(vertices)
     for corner in range(3):
         np.add.at(normals, faces[:, corner], areas)
-    return normals / (np.linalg.norm(normals, axis=1, keepdims=True) + 1e-12)
+    normals = normals / (np.linalg.norm(normals, axis=1, keepdims=True) + 1e-12)
+    return SkinPoints(vertices, normals, jaw)

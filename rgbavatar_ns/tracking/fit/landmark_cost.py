@@ -1,6 +1,5 @@
 """How badly a pose of the head explains one frame's landmarks, with derivatives."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,9 +21,6 @@ _Distances = Float[np.ndarray, "R"]
 # count ever less: Geman and McClure's loss. Sigmas are of a landmark's own error.
 _HUBER_SIGMAS = 2.5
 _REDESCENDING_SIGMAS = 3.0
-
-
-RobustLoss = Callable[[_Distances], tuple[_Distances, _Distances]]
 
 
 @dataclass(frozen=True)
@@ -50,17 +46,6 @@ class FrameTerms:
     redescending: bool = False
     neighbours: _Values | None = None
     temporal_weight: float = 0.0
-
-
-@dataclass(frozen=True)
-class _Explained:
-    """Residuals taken apart: cost, its gradient `pull` to them, weights of their coordinates, and
-    the factor of I + modes' weights modes."""
-
-    cost: float
-    pull: Float[np.ndarray, "R"]
-    weight: Float[np.ndarray, "R"]
-    factor: tuple[Float[np.ndarray, "K K"], bool]
 
 
 @dataclass
@@ -112,24 +97,27 @@ class FrameCost:
     def data_cost(self, theta: _Theta, identity: _Identity, frame: FrameTerms) -> float:
         """What the landmarks cost."""
         points = self.head.points(theta, identity, frame.camera.eye_m)
-        return self._explained(points, frame).cost
+        return self._explained(points, frame)[0]
 
     def data_model(self, theta: _Theta, identity: _Identity, frame: FrameTerms) -> QuadraticModel:
         """What the landmarks cost around theta."""
         camera, target = frame.camera, frame.target
-        derivatives = self.head.jacobian(theta, identity, self._unknowns, camera.eye_m)
-        jacobian = camera.image_derivative(derivatives.points, derivatives.derivative)
-        found = self._explained(derivatives.points, frame)
+        points, derivative = self.head.jacobian(theta, identity, self._unknowns, camera.eye_m)
+        jacobian = camera.image_derivative(points, derivative)
+        cost, pull, weight, factor = self._explained(points, frame)
         turn = target.to_upright / (target.face_height_px * self.noise.own_share[:, None, None])
-        rows = (turn @ jacobian).reshape(len(found.pull), -1)
-        weighted = rows * found.weight[:, None]
+        rows = (turn @ jacobian).reshape(len(pull), -1)
+        weighted = rows * weight[:, None]
         shared = self._modes.T @ weighted
-        hessian = rows.T @ weighted - shared.T @ cho_solve(found.factor, shared)
-        return QuadraticModel(found.cost, rows.T @ found.pull, hessian)
+        hessian = rows.T @ weighted - shared.T @ cho_solve(factor, shared)
+        return QuadraticModel(cost, rows.T @ pull, hessian)
 
-    def _explained(self, points: Float[np.ndarray, "L 3"], frame: FrameTerms) -> _Explained:
+    def _explained(
+        self, points: Float[np.ndarray, "L 3"], frame: FrameTerms
+    ) -> tuple[float, _Distances, _Distances, tuple[Float[np.ndarray, "K K"], bool]]:
         """The cheapest explanation: modes of the detector's noise, and what is left robustly.
 
+        Cost, its gradient to the residuals, their weights, the factor of I + modes' weights modes.
         Found by reweighting, from Huber's loss on, since the other one has many minima. Residuals
         are in the upright face, in standard deviations of a landmark's own error.
         """
@@ -149,7 +137,7 @@ class FrameCost:
         left = residual - (self._modes @ amounts).reshape(-1, 2)
         loss, soften = losses[-1](np.linalg.norm(left, axis=1))
         cost = float(loss.sum() + 0.5 * amounts @ amounts)
-        return _Explained(cost, (left * soften[:, None]).reshape(-1), weight, factor)
+        return cost, (left * soften[:, None]).reshape(-1), weight, factor
 
 
 def _huber(distance: _Distances) -> tuple[_Distances, _Distances]:
@@ -165,5 +153,5 @@ def _geman_mcclure(distance: _Distances) -> tuple[_Distances, _Distances]:
     return 0.5 * distance**2 * share, share**2
 
 
-_FROM_AFAR: tuple[RobustLoss, ...] = (_huber,) * 3
-_REDESCENDING: tuple[RobustLoss, ...] = (_huber, _huber, *(_geman_mcclure,) * 3)
+_FROM_AFAR = (_huber,) * 3
+_REDESCENDING = (_huber, _huber, *(_geman_mcclure,) * 3)

@@ -30,14 +30,6 @@ POSE_FIELDS = ("rotation", "neck", "jaw", "left_eye", "right_eye")
 
 
 @dataclass(frozen=True)
-class LandmarkJacobian:
-    """Landmarks [L, 3] in metres with their derivatives [3, L, Q] to the unknowns asked for."""
-
-    points: Float[np.ndarray, "L 3"]
-    derivative: Float[np.ndarray, "3 L Q"]
-
-
-@dataclass(frozen=True)
 class _JointMoments:
     """What one joint carries: `rows` are the landmarks with any weight on it.
 
@@ -53,19 +45,6 @@ class _JointMoments:
     dirs: Float[np.ndarray, "3 R C"]
     pose_dirs: Float[np.ndarray, "3 R 36"] | None
     slides: Float[np.ndarray, "3 R 8"] | None = None
-
-
-@dataclass(frozen=True)
-class ResponseTerms:
-    """What a detector's response is a linear function of, in one pose.
-
-    terms [K]: 1, then `LandmarkResponse`'s other factors in its order; points [L, 3] where the
-    mesh has them, metres; turned [L, 3, 3] takes an offset at rest to the world.
-    """
-
-    terms: Float[np.ndarray, "K"]
-    points: Float[np.ndarray, "L 3"]
-    turned: Float[np.ndarray, "L 3 3"]
 
 
 @dataclass(frozen=True)
@@ -234,8 +213,8 @@ class LandmarkHead:
 
     def jacobian(
         self, theta: _Theta, identity: _Identity, unknowns: Unknowns, eye_m: _Point | None = None
-    ) -> LandmarkJacobian:
-        """Landmarks with their derivatives to `unknowns` of this head.
+    ) -> tuple[Float[np.ndarray, "L 3"], Float[np.ndarray, "3 L Q"]]:
+        """Landmarks in metres, with their derivatives to `unknowns` of this head.
 
         Exact but for the direction to the camera, which counts as fixed while the head moves
         sideways.
@@ -256,7 +235,7 @@ class LandmarkHead:
                 if slid is not None:
                     slopes = [signal_slope(view, joint, axis) for axis in axes]
                     derivative[..., places] += slid @ np.stack(slopes, axis=-1)
-        return LandmarkJacobian(sum(carried, np.zeros((3, self.num_landmarks))).T, derivative)
+        return sum(carried, np.zeros((3, self.num_landmarks))).T, derivative
 
     def _coefficients(self, theta: _Theta, identity: _Identity) -> _Coefficients:
         parts = [identity, theta[self.layout.slice("expression")]]
@@ -336,18 +315,6 @@ class LandmarkHead:
         while joint != ancestor and joint >= 0:
             joint = self._parents[joint]
         return joint == ancestor
-
-    def response_terms(self, theta: _Theta, identity: _Identity, eye_m: _Point) -> ResponseTerms:
-        """What `with_response` would multiply a response with; for those who measure one."""
-        coefficients = self._coefficients(theta, identity)
-        view = self._view(theta, coefficients, eye_m)
-        turned = np.zeros((self.num_landmarks, 3, 3))
-        for part in self._moments:
-            turned[part.rows] += part.share[:, None, None] * view.chain.turned[part.joint]
-        expression = theta[self.layout.slice("expression")]
-        terms = [np.ones(1), view.signals[:5], expression, view.signals[5:], identity]
-        points = sum(self._carried(view, coefficients), np.zeros((3, self.num_landmarks))).T
-        return ResponseTerms(np.concatenate(terms), points, turned)
 
     def _view(self, theta: _Theta, coefficients: _Coefficients, eye_m: _Point | None) -> PoseView:
         chain = self._chain(theta, coefficients)

@@ -13,6 +13,7 @@ from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 Vector = Float[np.ndarray, "P"]
 Matrix = Float[np.ndarray, "P P"]
+_BOX_STEPS = 50
 
 
 @dataclass(frozen=True)
@@ -25,7 +26,7 @@ class QuadraticModel:
 
 
 def minimize_box_quadratic(
-    hessian: Matrix, gradient: Vector, lower: Vector, upper: Vector, max_iterations: int = 50
+    hessian: Matrix, gradient: Vector, lower: Vector, upper: Vector
 ) -> Vector:
     """Minimum of 1/2 d'Hd + g'd over lower <= d <= upper, H positive definite, 0 inside.
 
@@ -34,7 +35,7 @@ def minimize_box_quadratic(
     """
     step = np.zeros_like(gradient)
     value = 0.0
-    for _ in range(max_iterations):
+    for _ in range(_BOX_STEPS):
         slope = gradient + hessian @ step
         held = ((step <= lower) & (slope > 0)) | ((step >= upper) & (slope < 0))
         free = np.flatnonzero(~held)

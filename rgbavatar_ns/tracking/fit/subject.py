@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from threadpoolctl import threadpool_limits
 
 from rgbavatar_ns.head import HeadModel
@@ -42,7 +42,8 @@ from rgbavatar_ns.tracking.fit.parameters import fit_parameters
 # Lips, lids, brows, nose and irises are seen; cheeks and forehead are interpolated by FaceMesh,
 # so every fourth of those points does. The outline slides over the skin as the head turns, but
 # without it the pitch of the head is badly known: on renders the error halves with it.
-_FEATURES = frozenset(SPARSE_51) | {index for pair in LIP_PAIRS + LID_PAIRS for index in pair}
+_SEEN = {*SPARSE_51, *FACE_OVAL, *IRIS_CENTERS, *range(0, IRIS_CENTERS[0], 4)}
+_SEEN |= {index for pair in LIP_PAIRS + LID_PAIRS for index in pair}
 # A frame whose landmarks the head cannot follow to this share of the face's height is left out.
 _REJECT_SHARE = 0.06
 
@@ -61,8 +62,8 @@ class SubjectTracker:
     """How they err beside; rows are FaceMesh indices."""
 
     def __post_init__(self) -> None:
-        rows = _chosen_rows(self.landmarks)
-        marks = self.landmarks.select_rows(rows)
+        rows = np.flatnonzero(np.isin(self.landmarks.facemesh_index, sorted(_SEEN)))
+        marks = self.landmarks.select(rows)
         self.facemesh_index = marks.facemesh_index
         vertex_ids = self.head.arrays.faces[marks.triangle].astype(np.int64)
         self.mesh_landmarks = LandmarkHead(self.head, vertex_ids, marks.barycentric)
@@ -143,12 +144,3 @@ class SubjectTracker:
         with torch.no_grad():
             vertices = self.head(theta, torch.from_numpy(fit.subject.identity))
         return fit.subject.camera.project(vertices.numpy())
-
-
-def _chosen_rows(marks: LandmarkMap) -> Int[np.ndarray, "L"]:
-    kept = []
-    for row, index in enumerate(map(int, marks.facemesh_index)):
-        wanted = index in _FEATURES or index in IRIS_CENTERS or index in FACE_OVAL
-        if wanted or (index < IRIS_CENTERS[0] and index % 4 == 0):
-            kept.append(row)
-    return np.array(kept, dtype=np.int64)

@@ -50,7 +50,9 @@ def steadied(
     total, weights = now.mask.copy(), np.ones_like(now.mask)
     for other, motion in near:
         still = _agreement(other.thumbnail, now.thumbnail)
-        small = _scaled(motion, few / size)
+        # Pixel centres lie at whole numbers for OpenCV and at halves for landmarks.
+        linear, shift = motion[:, :2], motion[:, 2] * (few / size)
+        small = np.column_stack([linear, shift + linear @ (0.5, 0.5) - 0.5])
         moved = [
             cv2.warpAffine(image, small, (few, few), borderMode=cv2.BORDER_REPLICATE)
             for image in (other.mask, other.thumbnail)
@@ -83,13 +85,3 @@ def head_motion(
     return np.array(
         [[turn.real, -turn.imag, shift.real], [turn.imag, turn.real, shift.imag]], dtype=np.float64
     )
-
-
-def _scaled(motion: Float[np.ndarray, "2 3"], scale: float) -> Float[np.ndarray, "2 3"]:
-    """The same motion where the image is `scale` as large.
-
-    Pixel centres lie at whole numbers for OpenCV and at halves for landmarks.
-    """
-    linear = motion[:, :2]
-    shift = motion[:, 2] * scale + linear @ (0.5, 0.5) - 0.5
-    return np.concatenate([linear, shift[:, None]], axis=1)

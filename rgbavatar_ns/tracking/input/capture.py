@@ -140,7 +140,8 @@ class LatestFrameCapture:
                     came, image_bgr = capture.read()
                     if not came or image_bgr is None:
                         break
-                    self._put(CapturedFrame(index, _rgb(image_bgr), time.monotonic()))
+                    image_rgb = cv2.cvtColor(image_bgr, cv2.COLOR_BGR2RGB)
+                    self._put(CapturedFrame(index, image_rgb, time.monotonic()))
                     self._backoff.reset()
                     index, had_one = index + 1, True
                 else:
@@ -157,10 +158,6 @@ class LatestFrameCapture:
                 self.counts["skipped"] += 1
             self._latest = frame
             self._changed.notify_all()
-
-
-def _rgb(image_bgr: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:
-    return cv2.cvtColor(image_bgr, cv2.COLOR_BGR2RGB)
 
 
 FrameCapture = FileCapture | LatestFrameCapture

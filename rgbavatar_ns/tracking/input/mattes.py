@@ -70,7 +70,7 @@ class UserMattes:
         UserError where one is missing or has another size than the video.
         """
         last = -1
-        for index, matte in self._matte_files(frames) if self.files else self._matte_video(frames):
+        for index, matte in self._mattes(frames):
             if matte.shape != (height, width):
                 raise UserError(
                     f"The matte of frame {index} in {self.path} has {matte.shape[1]} x "
@@ -84,25 +84,17 @@ class UserMattes:
                 f"{self.path} ends before frame {max(frames)} of the video has a matte.", _AS_MANY
             )
 
-    def _matte_files(
-        self, frames: frozenset[int]
-    ) -> Iterator[tuple[int, UInt8[np.ndarray, "H W"]]]:
-        for index, file in enumerate(self.files or ()):
-            if index in frames:
-                yield index, _level(read_image_rgba(file))
-
-    def _matte_video(
-        self, frames: frozenset[int]
-    ) -> Iterator[tuple[int, UInt8[np.ndarray, "H W"]]]:
-        for frame in FrameSource.open(self.path).read(lambda index: index in frames):
+    def _mattes(self, frames: frozenset[int]) -> Iterator[tuple[int, UInt8[np.ndarray, "H W"]]]:
+        if self.files is not None:
+            for index in sorted(frames.intersection(range(len(self.files)))):
+                rgba = read_image_rgba(self.files[index])
+                opaque = rgba[..., 3].min() == 255
+                level = cv2.cvtColor(rgba, cv2.COLOR_RGBA2GRAY) if opaque else rgba[..., 3]
+                yield index, np.ascontiguousarray(level)
+            return
+        for frame in FrameSource.open(self.path).read(frames.__contains__):
             grey = cv2.cvtColor(frame.image_rgb, cv2.COLOR_RGB2GRAY)
             yield frame.index, grey if frame.alpha is None else frame.alpha
-
-
-def _level(rgba: UInt8[np.ndarray, "H W 4"]) -> UInt8[np.ndarray, "H W"]:
-    if rgba[..., 3].min() < 255:
-        return np.ascontiguousarray(rgba[..., 3])
-    return cv2.cvtColor(rgba, cv2.COLOR_RGBA2GRAY)
 
 
 def _by_name(mattes: list[Path], images: list[Path]) -> tuple[Path, ...] | None:
