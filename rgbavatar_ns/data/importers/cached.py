@@ -63,12 +63,8 @@ def open_foreign(
 def _places(src: Path, name: str) -> list[Path]:
     """Where an import of this name may lie: in the data, or in the user's cache."""
     subject = glob.escape(src.resolve().name) if name.endswith("*") else src.resolve().name
-    return [src / CACHE_FOLDER / name, _user_cache() / f"{subject}-{name}"]
-
-
-def _user_cache() -> Path:
-    base = os.environ.get("XDG_CACHE_HOME")
-    return (Path(base) if base else Path.home() / ".cache") / "rgbavatar" / "imports"
+    user = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    return [src / CACHE_FOLDER / name, user / "rgbavatar" / "imports" / f"{subject}-{name}"]
 
 
 def _can_be_made(place: Path) -> bool:

@@ -6,7 +6,7 @@ from pathlib import Path
 from rgbavatar_ns.data.importers.folder import IMAGE_SUFFIXES, Folder
 from rgbavatar_ns.data.importers.frame_files import read_frame_files
 from rgbavatar_ns.data.importers.frame_folders import CHECKPOINTS, pair, require_one
-from rgbavatar_ns.data.importers.source import Reading, Source, Split, assemble
+from rgbavatar_ns.data.importers.source import Reading, Source, assemble
 from rgbavatar_ns.errors import UserError
 
 IMAGE_MINUS_FRAME = 1
@@ -16,9 +16,7 @@ _REGIONS = ("_neckhead", "_mouth")
 
 def is_flashavatar(folder: Folder) -> bool:
     """`imgs` and `alpha`, or the folder above that holds such data and the tracker's."""
-    if folder.has("imgs", "alpha"):
-        return True
-    return folder.has("dataset", "metrical-tracker/output")
+    return folder.has("imgs", "alpha") or folder.has("dataset", "metrical-tracker/output")
 
 
 def read_flashavatar(reading: Reading) -> Source:
@@ -47,7 +45,7 @@ def read_flashavatar(reading: Reading) -> Source:
         regions = {n: (neckhead[n], mouth[n]) for n in neckhead.keys() & mouth.keys()}
     tracked = read_frame_files(reading, files)
     records = pair(reading, tracked, images, masks, regions)
-    return assemble(reading, records, tracked.arrays, tracked.identity, Split(_HELD_OUT))
+    return assemble(reading, records, tracked.arrays, tracked.identity, _HELD_OUT)
 
 
 def _of_frames(numbered: dict[int, Path]) -> dict[int, Path]:

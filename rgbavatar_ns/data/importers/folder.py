@@ -33,7 +33,8 @@ class Folder:
         if "\0" in text:
             raise UserError(f"A path in {self.root} holds a zero byte.", "Mend the data.")
         path = self.root / text
-        if not self.allow_outside and not _is_within(path, self.root):
+        real, top = Path(os.path.realpath(path)), os.path.realpath(self.root)
+        if not self.allow_outside and not real.is_relative_to(top):
             raise UserError(
                 f"'{text}' leads out of the folder {self.root}.",
                 "Put the files into the folder, or consent with --allow-outside.",
@@ -77,11 +78,6 @@ class Folder:
                 "Keep one of each, or put the others elsewhere.",
             )
         return dict(sorted(found.items()))
-
-
-def _is_within(path: Path, root: Path) -> bool:
-    real, top = os.path.realpath(path), os.path.realpath(root)
-    return real == top or real.startswith(top.rstrip(os.sep) + os.sep)
 
 
 def number_of(path: str) -> int | None:

@@ -17,7 +17,7 @@ from rgbavatar_ns.data.importers.folder import (
 from rgbavatar_ns.data.importers.frame_images import FrameImage, image_header
 from rgbavatar_ns.data.importers.frame_record import CameraRecord, FrameRecord
 from rgbavatar_ns.data.importers.import_report import UnusableFrameError
-from rgbavatar_ns.data.importers.source import Reading, Source, Split, assemble
+from rgbavatar_ns.data.importers.source import Reading, Source, assemble
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadArrays
 
@@ -65,13 +65,16 @@ def read_imavatar(reading: Reading) -> Source:
             if isinstance(frame.get("expression"), list):
                 lengths.add(len(frame["expression"]))
             records.append(_record(reading.folder, frame, image, masks, intrinsics, arrays))
-    _tell_unnamed(reading, named)
+    for folder in _IMAGES:
+        files = reading.folder.names(folder, IMAGE_SUFFIXES)
+        left = [image for image in files if image not in named]
+        reading.report.leave_out("images without a record", left)
     if len(lengths) > 1:
         raise UserError(
             f"{reading} has expressions of {', '.join(map(str, sorted(lengths)))} numbers.",
             "All frames need the same coefficients: export the data again.",
         )
-    return assemble(reading, records, arrays, identity, Split(_HELD_OUT))
+    return assemble(reading, records, arrays, identity, _HELD_OUT)
 
 
 def _record(
@@ -132,9 +135,3 @@ def _frame_image(folder: Folder, image: Path, masks: str | None) -> FrameImage:
         if candidate.is_file():
             return FrameImage(image, alpha=candidate)
     raise UnusableFrameError("images without a matte")
-
-
-def _tell_unnamed(reading: Reading, named: set[str]) -> None:
-    for name in _IMAGES:
-        left = [image for image in reading.folder.names(name, IMAGE_SUFFIXES) if image not in named]
-        reading.report.leave_out("images without a record", left)

@@ -272,8 +272,13 @@ def _camera_records(
 def _read_test(root: Path, index: dict[str, Any], numbers: tuple[int, ...]) -> tuple[int, ...]:
     """Positions of held-out frames: `test` names them, `test_frames` counts them from the end."""
     if "test" not in index:
-        count = _read_test_frames(root, index, len(numbers))
-        return tuple(range(len(numbers) - count, len(numbers)))
+        num_frames, count = len(numbers), index.get("test_frames")
+        if not isinstance(count, int) or not 0 <= count < num_frames:
+            raise UserError(
+                f"The dataset {root} holds out {count!r} of {num_frames} frames.",
+                f"Set test_frames in {INDEX_FILE} to a number from 0 to {num_frames - 1}.",
+            )
+        return tuple(range(num_frames - count, num_frames))
     listed = index["test"]
     if not isinstance(listed, list) or not {type(number) for number in listed} <= {int}:
         raise UserError(
@@ -288,16 +293,6 @@ def _read_test(root: Path, index: dict[str, Any], numbers: tuple[int, ...]) -> t
             f"Mend the list `test` in {INDEX_FILE}: numbers of frames, but not of all.",
         )
     return tuple(place for place, number in enumerate(numbers) if number in held_out)
-
-
-def _read_test_frames(root: Path, index: dict[str, Any], num_frames: int) -> int:
-    count = index.get("test_frames")
-    if not isinstance(count, int) or not 0 <= count < num_frames:
-        raise UserError(
-            f"The dataset {root} holds out {count!r} of {num_frames} frames.",
-            f"Set test_frames in {INDEX_FILE} to a number from 0 to {num_frames - 1}.",
-        )
-    return count
 
 
 def _column(root: Path, frames: list[dict[str, Any]], name: str, kind: type) -> tuple[Any, ...]:

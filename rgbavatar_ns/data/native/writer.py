@@ -31,11 +31,7 @@ class DatasetWriter:
     """Writes the project's own format; `dataset.json` comes last and whole.
 
     Args:
-        dst: folder to write to; made where missing.
         arrays: the head model, or the embedded one's name ("makehuman").
-        identity: the person's identity coefficients.
-        layout: what theta holds.
-        width, height: of every image, in pixels.
         overwrite: replace a dataset that is there; else a folder with anything in it is refused.
         keep_images: go on with an unfinished dataset: images that are there stay, for
             `add_encoded`. Implies overwrite.
@@ -124,12 +120,11 @@ class DatasetWriter:
         if not np.isfinite(values).all():
             raise UserError(f"theta of {name} holds NaN or infinity.", "Leave this frame out.")
         self._require_size(index, camera.width, camera.height)
-        path = self.image_path(index)
         if png is not None:
             self.write_image(index, png)
         self._numbers.add(index)
         self._theta.append(values.copy())
-        relative = path.relative_to(self._root).as_posix()
+        relative = self.image_path(index).relative_to(self._root).as_posix()
         entry = {"index": index, "image": relative, "camera": camera_to_json(camera, 0)}
         if camera_name is not None:
             entry["camera_name"] = camera_name

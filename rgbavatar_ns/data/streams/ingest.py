@@ -62,15 +62,8 @@ class FrameQueue:
 class Ingest:
     """Two threads: one listens to the stream, one checks and decodes frames and fills the pools.
 
-    Listening begins with `listen`, so that nothing is lost while an avatar is being built, the
-    pools are filled from `start` on. Frames that cannot be used are left out and counted.
-
-    Args:
-        stream: closed by `close`.
-        subject: the stream's.
-        pools: where the frames go.
-        queue_frames: most frames that wait to be decoded.
-        tell: called, from the threads, with what a user should read at once.
+    Frames that cannot be used are left out and counted. At most `queue_frames` wait to be decoded;
+    `tell` is called, from the threads, with what a user should read at once.
     """
 
     def __init__(

@@ -139,11 +139,7 @@ def parse_message(
 
 
 def parse_answer(answer: bytes | str) -> int:
-    """How many messages of its session a client need not send again.
-
-    Raises:
-        UserError: the client is refused, or the answer is none.
-    """
+    """How many messages of its session a client need not send again; UserError if refused."""
     word, _, more = str(answer).partition(" ")
     if word == ACCEPTED and more.isdecimal():
         return int(more)
@@ -156,7 +152,7 @@ def parse_answer(answer: bytes | str) -> int:
 
 
 def _whole(value: Any) -> int:
-    if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < 1 << 62:
+    if type(value) is not int or not 0 <= value < 1 << 62:
         raise ValueError(f"{str(value)[:40]} is no whole number that is not negative")
     return value
 
