@@ -49,9 +49,6 @@ class Avatar(nn.Module):
     Everything that a picture needs is inside: head model, identity, anchors and Gaussians.
 
     Args:
-        head: the head model, whose layout names what theta holds.
-        identity: the subject's identity coefficients, fixed.
-        config: sizes, variants and initial values.
         seed: of the weight network's initial values; nothing else is random.
         anchors: places of the Gaussians; by default every covered texel of the head's UV map.
     """
@@ -90,7 +87,14 @@ class Avatar(nn.Module):
         )
         self.weight_network = None
         if config.weight_network == "none":
-            self._require_expressions(config.num_bases)
+            part = self.layout.slice("expression")
+            known = part.stop - part.start
+            if config.num_bases > known:
+                raise UserError(
+                    f"{config.num_bases} bases without a weight network need as many expression "
+                    f"coefficients; the head '{self.head.arrays.name}' has {known}.",
+                    "Use fewer bases, or the weight network mlp or linear.",
+                )
         elif config.num_bases > 0:
             self.weight_network = WeightNetwork(
                 self.layout.feature_size(config.pose_input, config.translation_input),
@@ -159,9 +163,8 @@ class Avatar(nn.Module):
     ) -> RenderedBatch:
         """Draw a batch of theta; `psi` replaces the weight network's answer.
 
-        The other options are those of `rgbavatar_ns.kernels.rasterize`. The picture carries no
-        graph, unless it is to be `differentiable` in the parameters, theta and psi: then it goes
-        through autograd, to the same numbers in several times as long.
+        Other options are those of `kernels.rasterize`. The picture carries no graph, unless it is
+        to be `differentiable`: the same numbers through autograd, in several times as long.
         """
         options = {"with_depth": with_depth, "with_visibility": with_visibility}
         if differentiable:
@@ -295,15 +298,6 @@ class Avatar(nn.Module):
             AvatarConfig.from_json(state["config"]),
             anchors=anchors,
         )
-
-    def _require_expressions(self, num_bases: int) -> None:
-        known = self.layout.slice("expression")
-        if num_bases > known.stop - known.start:
-            raise UserError(
-                f"{num_bases} bases without a weight network need as many expression "
-                f"coefficients; the head '{self.head.arrays.name}' has {known.stop - known.start}.",
-                "Use fewer bases, or the weight network mlp or linear.",
-            )
 
     def _checked(self, theta: Float[Tensor, "B H"]) -> Float[Tensor, "B H"]:
         """Return theta in the parameters' dtype, or raise UserError with the reason."""

@@ -66,9 +66,8 @@ def read_png_rgba(path: Path) -> UInt8[np.ndarray, "height width 4"]:
 def decode_png_rgba(encoded: bytes, name: str) -> UInt8[np.ndarray, "height width 4"]:
     """Decode a PNG to RGBA; grey becomes RGB, a missing alpha becomes opaque.
 
-    Raises UserError, calling the image `name`, where it is truncated or damaged: OpenCV alone
-    would hand back a partial picture without a word, so the chunks' lengths and checksums are
-    checked.
+    Raises UserError, calling the image `name`, where a chunk's length or checksum is wrong:
+    OpenCV alone would hand back a partial picture without a word.
     """
     damage = png_damage(encoded)
     if damage is not None:

@@ -11,13 +11,9 @@ from rgbavatar_ns.head import ThetaLayout
 
 
 class FrameRefinement(nn.Module):
-    """Corrects training frames; of others it takes away what all training frames had wrong.
+    """Corrects training frames (positions `train` of the F tracked ones).
 
-    Args:
-        theta: of all F frames, as tracked.
-        train: positions of the training frames.
-        layout: theta's fields.
-        config: when and how far to correct.
+    From others it takes away what all training frames had wrong.
     """
 
     _row_of: Tensor

@@ -48,7 +48,8 @@ def save_bundle(
     else than a bundle or an empty directory, or the disk refuses it.
     """
     path = path.absolute()
-    if path.exists() and not _replaceable(path):
+    ours = (path / MANIFEST_NAME).exists()
+    if path.exists() and not (path.is_dir() and (ours or not any(path.iterdir()))):
         raise UserError(
             f"{path} exists and is not an avatar bundle.", "Give another path or remove it."
         )
@@ -115,11 +116,12 @@ def _load_bundle(path: Path) -> AvatarState:
     state = _join_tensors(manifest["state"], tensors)
     if is_reference(state["head"]):
         state["head"] = resolve(state["head"], path)
-    prefix = "parameters/"
-    parameters = {
-        name[len(prefix) :]: value for name, value in tensors.items() if name.startswith(prefix)
-    }
-    return state, parameters
+    return state, _below("parameters/", tensors)
+
+
+def _below(prefix: str, tensors: dict[str, Any]) -> dict[str, Any]:
+    """Those whose names begin with `prefix`, without it."""
+    return {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}
 
 
 def _read_bundle(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
@@ -183,12 +185,7 @@ def _load_checkpoint(path: Path) -> AvatarState:
             f"The checkpoint {path} holds no avatar.",
             "Give a checkpoint of a run of ns-train rgbavatar.",
         )
-    parameters = {
-        name[len(CHECKPOINT_PREFIX) :]: value
-        for name, value in (pipeline or {}).items()
-        if name.startswith(CHECKPOINT_PREFIX)
-    }
-    return extra["avatar"], parameters
+    return extra["avatar"], _below(CHECKPOINT_PREFIX, pipeline or {})
 
 
 def _split_off_tensors(value: Any, name: str, tensors: dict[str, Tensor]) -> Any:
@@ -212,7 +209,3 @@ def _join_tensors(value: Any, tensors: dict[str, Tensor]) -> Any:
     if isinstance(value, list):
         return [_join_tensors(v, tensors) for v in value]
     return value
-
-
-def _replaceable(path: Path) -> bool:
-    return path.is_dir() and ((path / MANIFEST_NAME).exists() or not any(path.iterdir()))

@@ -19,10 +19,8 @@ from rgbavatar_ns.kernels import MorphedGradient, MorphedRenderer, PinholeCamera
 class FusedStep:
     """Trains an avatar with torch's Adam optimisers, whose state and learning rates it uses.
 
-    The optimisers' checkpoints are those of the eager path: a run can change between the two.
-
-    Raises:
-        ValueError: `unsupported_reason` gives a reason for these optimisers.
+    A run can change between this and the eager path. Raises ValueError where `unsupported_reason`
+    gives a reason for these optimisers.
     """
 
     def __init__(

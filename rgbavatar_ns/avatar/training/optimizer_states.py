@@ -26,11 +26,7 @@ _PLAIN_ADAM = {"weight_decay": 0, "amsgrad": False, "maximize": False, "differen
 
 
 class AdamStates:
-    """Every parameter's next update; checkpoints stay those of the optimisers.
-
-    Raises:
-        ValueError: `unsupported_reason` gives a reason for these optimisers.
-    """
+    """Every parameter's next update; ValueError where `unsupported_reason` gives a reason."""
 
     def __init__(self, avatar: Avatar, optimizers: Iterable[torch.optim.Optimizer]) -> None:
         self.optimizers = list(optimizers)

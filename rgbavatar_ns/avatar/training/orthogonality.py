@@ -36,9 +36,8 @@ def orthogonality_loss(shapes: GaussianBlendshapes) -> Float[Tensor, ""]:
 def orthogonalize(shapes: GaussianBlendshapes, method: Literal["qr", "gram_schmidt"]) -> None:
     """Replace the K bases by orthogonal ones of the same lengths, in place.
 
-    "qr" takes the orthogonal factor by Householder reflections, its signs those of the bases;
-    "gram_schmidt" subtracts from each basis what it has of those before it. Both give the same
-    up to rounding, which the second one accumulates. Bases that are 0 stay 0.
+    Both methods give the same up to rounding, which "gram_schmidt" accumulates. Bases that are 0
+    stay 0.
     """
     bases = _rows(shapes)
     length = bases.norm(dim=1, keepdim=True)

@@ -114,8 +114,7 @@ def check_dataset(
 ) -> CheckReport:
     """Look at up to `max_frames` frames, evenly spread, and at a run of frames one after another.
 
-    sheet: where the contact sheet goes (PNG); None writes none. Images that cannot be decoded
-    become problems of the report.
+    sheet: where the contact sheet goes (PNG). Images that cannot be decoded become problems.
     """
     positions = spread(len(dataset), max_frames).tolist()
     problems = [*parameter_problems(dataset), *camera_problems(dataset)]

@@ -28,8 +28,7 @@ def open_foreign(
     """Open a folder of another system through its import, made now if need be.
 
     The import lies in the folder itself (`.rgbavatar/`) where that may be written to, else in the
-    user's cache directory; its name is a hash of the files and options that it depends on. One
-    line on stderr says what happens.
+    user's cache directory; its name is a hash of the files and options that it depends on.
     """
     name = fingerprint(src, options)
     places = _places(src, name)

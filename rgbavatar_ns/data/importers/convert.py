@@ -38,10 +38,9 @@ def import_dataset(
 ) -> TrackedDataset:
     """Write a folder of another system to `dst` in the project's own format.
 
-    An interrupted import goes on where it was when the same is asked for again; a finished one is
-    opened. `link` shares the bytes of images that need no change where the disk allows it.
-    `progress` is called with (stage, done, in all). Raises UserError where something cannot be
-    used, or where `dst` holds something else and `overwrite` is not given.
+    An interrupted import goes on where it was; a finished one is opened. `link` shares the bytes
+    of images that need no change. Raises UserError where something cannot be used, or `dst` holds
+    something else and `overwrite` is not given.
     """
     src, dst, options = Path(src), Path(dst), options or ImportOptions()
     key = fingerprint(src, options)

@@ -31,9 +31,8 @@ def flame_for(
 ) -> HeadArrays:
     """The user's FLAME of the version that the data was tracked with, with teeth if wanted.
 
-    static_offset: what is added to the subject's vertices at rest: FLAME's 5,023, or with the 120
-    of VHAP's teeth after them. Raises FlameVersionError where the version is another one:
-    expression and identity coefficients of one version say nothing in another.
+    static_offset: of the subject's vertices at rest: FLAME's 5,023, or with the 120 of VHAP's
+    teeth after them. Raises FlameVersionError where the version is another one.
     """
     options = reading.options
     wanted = options.flame_version or usual_version

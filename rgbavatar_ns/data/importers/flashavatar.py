@@ -61,11 +61,7 @@ def _subject(folder: Folder) -> Folder:
 
 
 def tracker_folder(folder: Folder) -> Path:
-    """The tracker's output that belongs to the subject's pictures.
-
-    FlashAvatar keeps it beside its folder of subjects, so it may lie outside of the folder given.
-    Raises UserError where there is none.
-    """
+    """The tracker's output for the subject, maybe outside of the folder; UserError if none."""
     subject = _subject(folder).root
     name = subject.resolve().name
     output = Path("metrical-tracker") / "output"

@@ -57,10 +57,9 @@ class Folder:
     def numbered(
         self, subfolder: str, suffixes: tuple[str, ...], ending: str = ""
     ) -> dict[int, Path]:
-        """Files of a subfolder by the number at the end of their name, in its order.
+        """Files of a subfolder by the number before `ending` (as of 00001_mouth.png), in its order.
 
-        `ending` is what follows the number: "_mouth" finds 00001_mouth.png. Hidden files and
-        those without a number are passed over. Raises UserError where two have one number.
+        Files without a number are passed over. Raises UserError where two have one number.
         """
         found: dict[int, Path] = {}
         twice: list[str] = []

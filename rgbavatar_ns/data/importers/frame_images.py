@@ -22,11 +22,9 @@ _PNG_HEADER_BYTES, _JPEG_HEADER_BYTES = 33, 1 << 16
 
 @dataclass(frozen=True)
 class FrameImage:
-    """Files of one image, all of one size.
+    """Files of one image, all of one size: colour, a grey matte (else colour's own alpha).
 
-    color: PNG or JPEG; its own alpha counts where there is no `alpha`.
-    alpha: grey picture that is the matte.
-    regions: grey pictures; the matte is kept only where one of them is white.
+    The matte is kept only where one of the grey `regions` is white.
     """
 
     color: Path

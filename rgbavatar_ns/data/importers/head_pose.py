@@ -40,12 +40,9 @@ def place_head_pose(
 ) -> list[FrameRecord]:
     """The same pictures with the head's rigid motion elsewhere.
 
-    camera and head are exact: every vertex stays where it was in every image. neck is exact for
-    what follows the neck alone; the collar takes part in the shift, but not in the rotation, and
-    the neck's pose correctives act (method of RGBAvatar's release: one camera from the first
-    frame, the rotation on the neck joint).
-
-    Raises UserError where several cameras move, so that no still one can stand for them.
+    camera and head are exact: every vertex stays where it was in every image. neck (method of
+    RGBAvatar's release) is exact for what follows the neck alone; the collar takes part in the
+    shift only. Raises UserError where several cameras move.
     """
     if head_pose == "source":
         return list(records)

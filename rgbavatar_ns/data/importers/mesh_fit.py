@@ -31,9 +31,8 @@ def fit_meshes(
 ) -> tuple[Float[np.ndarray, "_"], dict[int, dict[str, Float[np.ndarray, "_"]]]]:
     """Identity, and theta by frame number: Gauss-Newton on vertices, expressions known.
 
-    Ours, because INSTA writes expressions and meshes, but neither shape nor jaw. The shape comes
-    from a few frames together, then each frame by itself; the result is as exact as the meshes'
-    digits. Raises UserError where no head of this model gives the meshes.
+    Ours. The shape comes from a few frames together, then each frame by itself. Raises UserError
+    where no head of this model gives the meshes.
     """
     fit = _Fit(arrays)
     first = list(expressions)

@@ -56,8 +56,7 @@ def read_transforms(reading: Reading) -> tuple[list[Entry], bool]:
     """Every frame that the files name, once, and whether they tell which are held out.
 
     Held out are frames of transforms_test.json and transforms_val.json that are not in
-    transforms_train.json: INSTA's val is the end of train, VHAP's is the held-out camera. A frame
-    of transforms.json that no split names goes into the report.
+    transforms_train.json: INSTA's val is the end of train, VHAP's is the held-out camera.
     """
     splits = {
         split: _frames(reading, _file_of(split))

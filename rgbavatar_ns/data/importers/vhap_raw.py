@@ -30,8 +30,8 @@ def is_vhap_raw(folder: Folder) -> bool:
 def read_vhap_raw(reading: Reading) -> Source:
     """The latest epoch's parameters with the images of the folder, or of the option `images`.
 
-    The camera looks along -z from (0, 0, 1), as VHAP places it without calibration; its focal
-    length is focal_length times the longer side. Nothing is held out by the format.
+    The camera looks along -z from (0, 0, 1); its focal length is focal_length times the longer
+    side. Nothing is held out by the format.
     """
     found = {path: _FILE.fullmatch(path.name) for path in reading.folder.root.glob("*.npz")}
     epochs = {int(match[1] or 0): path for path, match in found.items() if match}

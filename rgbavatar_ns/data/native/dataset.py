@@ -85,9 +85,7 @@ class TrackedDataset:
 def load_native(path: str | Path) -> TrackedDataset:
     """Read a folder in the project's own format; pixels are read and checked when decoded.
 
-    Raises UserError for a missing or empty folder, another format or version, theta that holds
-    NaN or does not fit the head, cameras that are none, images that are missing, cut short or
-    of different sizes.
+    Raises UserError for whatever else is wrong with it: folder, version, theta, cameras, images.
     """
     root = Path(path)
     index = _read_index(root)

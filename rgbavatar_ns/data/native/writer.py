@@ -83,11 +83,7 @@ class DatasetWriter:
             ) from None
 
     def add(self, frame: TrackedFrame) -> None:
-        """Write a frame's image now; the rest follows at the end.
-
-        Raises UserError where its number was used before, theta does not fit the layout or is
-        not finite, or the image has another size.
-        """
+        """Write a frame's image now, the rest at the end; UserError where it does not fit."""
         height, width = frame.image_rgba.shape[:2]
         self._require_size(frame.index, width, height)
         png = encode_png_rgba(frame.image_rgba)
@@ -152,8 +148,7 @@ class DatasetWriter:
     def finish(self, test: int | Collection[int]) -> TrackedDataset:
         """Write theta, the head if it is not the embedded one, and the index; load the result.
 
-        test: how many of the last frames are held out, or the numbers of those that are; at least
-        one frame must remain.
+        test: how many of the last frames are held out, or their numbers; one frame must remain.
         """
         held_out = test if isinstance(test, int) else len(set(test) & self._numbers)
         if not 0 <= held_out < len(self._frames):
@@ -161,10 +156,15 @@ class DatasetWriter:
                 f"{held_out} of {len(self._frames)} frames cannot be held out.",
                 "Hold out fewer frames, or write more.",
             )
+        head = self._arrays
+        if not isinstance(head, str):
+            if head.digest() != HeadArrays.embedded().digest():
+                head.save(self._root / HEAD_FILE)
+            head = head.name
         index: dict[str, Any] = {
             "format": FORMAT,
             "version": 1,
-            "head": self._write_head(),
+            "head": head,
             "identity": self._identity.tolist(),
             "layout": self._layout.to_json(),
             "width": self._width,
@@ -206,10 +206,3 @@ class DatasetWriter:
             if named.setdefault(frame["camera_name"], frame["camera"]) == frame["camera"]:
                 frame["camera"] = frame["camera_name"]
         return {"cameras": named}
-
-    def _write_head(self) -> str:
-        if isinstance(self._arrays, str):
-            return self._arrays
-        if self._arrays.digest() != HeadArrays.embedded().digest():
-            self._arrays.save(self._root / HEAD_FILE)
-        return self._arrays.name

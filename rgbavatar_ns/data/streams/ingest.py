@@ -16,11 +16,7 @@ _PATIENCE_S = 0.1
 
 
 class FrameQueue:
-    """Frames between the source and the decoder, at most `capacity` of them.
-
-    When it is full, `put` drops the oldest frame, for a stream is about now; or it waits, where
-    the source keeps what is not taken.
-    """
+    """Frames between source and decoder; when full, `put` drops the oldest one, or waits."""
 
     def __init__(self, capacity: int) -> None:
         self.dropped = 0

@@ -120,10 +120,7 @@ class ReplayBuffer:
             return self._gather(serials)
 
     def recent(self, seconds: float, most: int) -> ReplayBatch | None:
-        """Up to `most` of the local pool's frames that arrived in the last seconds, evenly taken.
-
-        The newest comes first. None where there are none.
-        """
+        """Up to `most` of the local pool's frames of the last seconds, newest first; None: none."""
         with self._lock:
             since = self._clock() - seconds
             local = self._pools.local_frames
@@ -192,10 +189,9 @@ class ReplayBuffer:
         return state
 
     def load_state_dict(self, state: dict[str, Any], stream: object = None) -> None:
-        """Go on where `state_dict` was taken, before the first `add`.
+        """Go on where `state_dict` was taken, before the first `add`; images may be `stream`'s.
 
-        Images that the state does not hold are asked for from `stream`. Raises UserError where
-        there is no such stream, pools do not fit in, or images are damaged or of another size.
+        Raises UserError where pools do not fit in, or images are not to be had or damaged.
         """
         images = _saved_images(state, stream)
         size = self._subject.width, self._subject.height

@@ -8,10 +8,9 @@ Verdict = Literal["new", "late", "duplicate", "too late"]
 
 
 class SeenNumbers:
-    """Tells new frames from those that come late or twice.
+    """Tells new frames from those that come late (after a higher number) or twice.
 
-    "late": new, but a frame with a higher number came before it. "too late": so far behind the
-    highest number (4,096) that it is not known any more whether it came before.
+    "too late": so far behind the highest number that it is not known whether it came before.
     """
 
     def __init__(self) -> None:
