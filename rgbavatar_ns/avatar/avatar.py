@@ -1,5 +1,6 @@
 """The avatar: the one composition from a head model's parameters theta to Gaussians and images."""
 
+from contextlib import nullcontext
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -138,10 +139,9 @@ class Avatar(nn.Module):
     def gaussians(
         self, theta: Float[Tensor, "B H"], psi: Float[Tensor, "B K"] | None = None
     ) -> GaussianSet:
-        """Return the world-space Gaussians of a batch of theta, world as the head model's.
+        """Return the Gaussians of a batch of theta in the head model's world; differentiable.
 
-        `psi` replaces the weight network's answer. Differentiable in the parameters, theta and
-        psi. Raises UserError where theta has another size or holds NaN.
+        `psi` replaces the weight network's answer. Raises UserError where theta is unfit.
         """
         theta = self._checked(theta)
         tangent = self.blendshapes.morph(self.weights(theta) if psi is None else psi)
@@ -167,11 +167,10 @@ class Avatar(nn.Module):
         to be `differentiable`: the same numbers through autograd, in several times as long.
         """
         options = {"with_depth": with_depth, "with_visibility": with_visibility}
-        if differentiable:
-            gaussians = self.gaussians(theta, psi)
-            return rasterize(gaussians, cameras, background, backend=backend, **options)
-        with torch.no_grad():
-            renderer = self.renderer(theta, cameras, psi, backend=backend)
+        with nullcontext() if differentiable else torch.no_grad():
+            renderer = None
+            if not differentiable:
+                renderer = self.renderer(theta, cameras, psi, backend=backend)
             if renderer is None:
                 gaussians = self.gaussians(theta, psi)
                 return rasterize(gaussians, cameras, background, backend=backend, **options)
@@ -240,8 +239,7 @@ class Avatar(nn.Module):
     ) -> None:
         """Write a bundle (a directory of avatar.safetensors and avatar.json), atomically.
 
-        Without `with_head` it only names its head model, as the licence of FLAME asks where the
-        bundle is passed on; `load` then wants the file (RGBAVATAR_HEAD).
+        Without `with_head` it only names its head model (FLAME's licence); `load` then wants it.
         """
         state = self.to_state()
         if not with_head:

@@ -19,10 +19,7 @@ _REPAIR = "Copy or export the file again, or leave the frame out of the dataset.
 
 
 def png_size(path: Path) -> tuple[int, int]:
-    """Return (width, height) from a PNG's first bytes, checking its last ones; decodes nothing.
-
-    Raises UserError where the file is missing, empty, not a PNG or cut short.
-    """
+    """(width, height) from a PNG's first bytes; UserError where it is none, or cut short."""
     with _file_errors(path), path.open("rb") as file:
         head = file.read(_HEADER_BYTES)
         end = file.seek(0, 2)

@@ -44,8 +44,7 @@ def save_bundle(
 ) -> None:
     """Write a bundle directory: complete or not at all; an older bundle there is replaced.
 
-    The layout says to other programs what theta holds. Raises UserError where `path` is something
-    else than a bundle or an empty directory, or the disk refuses it.
+    Raises UserError where `path` is neither that nor an empty directory, or the disk refuses it.
     """
     path = path.absolute()
     ours = (path / MANIFEST_NAME).exists()
@@ -99,10 +98,7 @@ def load_any(path: Path) -> AvatarState:
 
 
 def load_statistics(path: Path) -> TrainingStatistics | None:
-    """What the avatar of a bundle saw in training; None where that is not kept.
-
-    Raises UserError where a bundle is damaged or of another version.
-    """
+    """What the avatar of a bundle saw in training, if kept; raises UserError as `load_any`."""
     if not (path / MANIFEST_NAME).exists():
         return None
     manifest, tensors = _read_bundle(path)

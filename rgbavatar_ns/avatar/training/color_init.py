@@ -23,7 +23,6 @@ from rgbavatar_ns.kernels import (
 
 WEIGHT_THRESHOLD = 0.1
 """The blending weight that a Gaussian must exceed in some pixel (paper: .1; its release: .01)."""
-
 _SMALLEST_MATTE_SUM = 1e-3
 """Below this sum of weight times alpha a Gaussian saw background only."""
 

@@ -125,10 +125,7 @@ def camera_problems(dataset: TrackedDataset) -> list[Problem]:
 
 
 def version_problem(dataset: TrackedDataset) -> Problem | None:
-    """Whether the head is another FLAME than that which the data's system tracks with.
-
-    A warning where the system can be told so, or the user has said so (`--flame-version`).
-    """
+    """Whether the head is another FLAME than the data's; a warning where it was asked for."""
     told = str(dataset.source.get("format", ""))
     usual, name = "2023" if told in _FLAME_2023 else "2020", dataset.arrays.name
     version = name.removeprefix("FLAME ").removesuffix(" female").removesuffix(" male")

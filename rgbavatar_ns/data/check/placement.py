@@ -109,7 +109,7 @@ def _orientation(sample: Sample) -> tuple[float, float]:
 def placement_problem(sample: Sample, only_hopeless: bool = False) -> Problem | None:
     """The likely cause of a head that is not where the images show it; None where it fits.
 
-    only_hopeless: leave alone what could still be trained, however odd.
+    With `only_hopeless` only of what cannot be trained.
     """
     fit = measure_fit(sample)
     if fit.hopeless:
@@ -228,15 +228,13 @@ def _zoom_trials(sample: Sample) -> Iterator[_Trial]:
 
 def _perhaps_too_small(sample: Sample, fit: Fit) -> Problem | None:
     """A mesh so much smaller than the person that only an eye can tell whether it is hair."""
-    score, best = max(
-        (
-            (measure_fit(replace(sample, focal_px=sample.focal_px * zoom)).score, zoom)
-            for zoom in _ZOOMS
-            if _MAYBE_SHORT <= zoom < _TOO_SHORT
-        ),
-        key=lambda pair: pair[0],
-    )
-    if score < fit.score + _GAIN_MAYBE:
+    scores = {
+        zoom: measure_fit(replace(sample, focal_px=sample.focal_px * zoom)).score
+        for zoom in _ZOOMS
+        if _MAYBE_SHORT <= zoom < _TOO_SHORT
+    }
+    best = max(scores, key=lambda zoom: scores[zoom])
+    if scores[best] < fit.score + _GAIN_MAYBE:
         return None
     focal = float(np.median(sample.focal_px)) / sample.scale
     return Problem(
@@ -283,10 +281,7 @@ def _shift_trials(sample: Sample) -> Iterator[_Trial]:
 
 
 def mirrored_problem(sample: Sample) -> Problem | None:
-    """Whether the head moves to one side while the person moves to the other.
-
-    Needs frames that follow one another or are spread over a clip, and some motion.
-    """
+    """Whether the head moves to one side while the person, in motion, moves to the other."""
     if not sample.has_mattes or len(sample) < 4:
         return None
     drawn, mattes = silhouettes(sample, projected(sample)) > 0.5, sample.alpha > 0.5

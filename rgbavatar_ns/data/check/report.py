@@ -95,10 +95,7 @@ def unreadable_report(path: Path, error: UserError) -> CheckReport:
 
 
 def quick_check(dataset: TrackedDataset) -> list[Problem]:
-    """What can be told from a few frames in a second: errors only, for use before training.
-
-    Raises UserError naming an image that cannot be decoded.
-    """
+    """Errors that a few frames tell in a second; raises UserError naming a damaged image."""
     train = dataset.train
     positions = [train[place] for place in spread(len(train), _FEW_SPREAD)]
     problem = placement_problem(take_sample(dataset, positions), only_hopeless=True)

@@ -83,10 +83,7 @@ def take_sample(
     positions: Sequence[int],
     progress: Callable[[int, int], None] | None = None,
 ) -> Sample:
-    """Decode these frames and pose the head for them; one full image in memory at a time.
-
-    Raises UserError naming an image that cannot be decoded.
-    """
+    """Decode these frames and pose the head; raises UserError naming an image that is damaged."""
     scale = SMALL_PX / max(dataset.width, dataset.height)
     size = (max(1, round(dataset.width * scale)), max(1, round(dataset.height * scale)))
     alphas, grays = [], []

@@ -5,9 +5,9 @@ from pathlib import Path
 
 from rgbavatar_ns.data.importers.folder import IMAGE_SUFFIXES, Folder
 from rgbavatar_ns.data.importers.frame_files import read_frame_files
-from rgbavatar_ns.data.importers.frame_folders import CHECKPOINTS, pair, require_one
+from rgbavatar_ns.data.importers.frame_folders import CHECKPOINTS, pair
 from rgbavatar_ns.data.importers.source import Reading, Source, assemble
-from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.errors import UserError, first_few
 
 IMAGE_MINUS_FRAME = 1
 _HELD_OUT = 500
@@ -57,7 +57,12 @@ def _subject(folder: Folder) -> Folder:
     if folder.has("imgs"):
         return folder
     named = sorted(path.parent for path in (folder.root / "dataset").glob("*/imgs"))
-    return replace(folder, root=require_one(named, "subjects", folder.root))
+    if len(named) != 1:
+        names = first_few(named) if named else "none"
+        raise UserError(
+            f"{folder.root} holds {len(named)} subjects: {names}.", "Name the one that is meant."
+        )
+    return replace(folder, root=named[0])
 
 
 def tracker_folder(folder: Folder) -> Path:

@@ -20,10 +20,7 @@ from rgbavatar_ns.errors import UserError
 
 @dataclass(frozen=True)
 class Format:
-    """One system's layout of a folder.
-
-    key: what a command calls it; name: what people call it.
-    """
+    """One system's layout of a folder; commands call it by `key`, people by `name`."""
 
     key: str
     name: str
@@ -78,12 +75,6 @@ def read_source(root: Path, options: ImportOptions, progress: Progress | None = 
 
     Raises UserError where no format is recognised, or about what cannot be used in it.
     """
-    found = _require_format(root, options)
-    folder = Folder(root, options.allow_outside)
-    return found.read(Reading(found.name, folder, options, progress))
-
-
-def _require_format(root: Path, options: ImportOptions) -> Format:
     if not root.is_dir():
         raise UserError(f"There is no folder {root}.", "Name the folder that holds the data.")
     found = find_format(root, options)
@@ -96,4 +87,4 @@ def _require_format(root: Path, options: ImportOptions) -> Format:
             f"{root} is in none of the formats {', '.join(known.name for known in FORMATS)}.{hint}",
             "docs/dataset_format.md tells what each is known by; --format chooses one.",
         )
-    return found
+    return found.read(Reading(found.name, Folder(root, options.allow_outside), options, progress))

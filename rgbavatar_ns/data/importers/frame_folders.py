@@ -9,7 +9,6 @@ from rgbavatar_ns.data.importers.frame_files import TrackedHeads, read_frame_fil
 from rgbavatar_ns.data.importers.frame_images import FrameImage
 from rgbavatar_ns.data.importers.frame_record import FrameRecord
 from rgbavatar_ns.data.importers.source import Reading, Source, assemble
-from rgbavatar_ns.errors import UserError, first_few
 
 CHECKPOINTS = "checkpoint"
 _MATTES = ("alpha", "matted", "mask", "masks", "matte", "seg_mask", "image_mask")
@@ -119,11 +118,3 @@ def pair(
             frame_image = replace(frame_image, regions=regions[number])
         records.append(FrameRecord(number, frame_image, head.theta, head.camera, head.size))
     return records
-
-
-def require_one(found: list[Path], what: str, root: Path) -> Path:
-    """The only one of several candidates; raises UserError naming them."""
-    if len(found) == 1:
-        return found[0]
-    names = first_few([str(path) for path in found]) if found else "none"
-    raise UserError(f"{root} holds {len(found)} {what}: {names}.", "Name the one that is meant.")

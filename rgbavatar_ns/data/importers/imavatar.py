@@ -97,16 +97,13 @@ def _record(
     size = np.array([header.width, header.height])
     # Some exporters write the first focal length with the wrong sign.
     camera = CameraRecord(world_to_camera, np.abs(intrinsics[:2]) * size, intrinsics[2:] * size)
-    pose = numbers(frame.get("pose"), 15, "pose").reshape(5, 3)
+    theta = dict(zip(_POSE, numbers(frame.get("pose"), 15, "pose").reshape(5, 3)))
     try:
         expression = np.asarray(frame.get("expression", ()))
     except (TypeError, ValueError, OverflowError):
         raise UnusableFrameError("expression that is no list of numbers") from None
-    count = arrays.num_expressions
-    theta = {"expression": padded(expression, count, "expression", arrays.name)}
-    return FrameRecord(
-        number, _frame_image(folder, image, masks), theta | dict(zip(_POSE, pose)), camera
-    )
+    theta["expression"] = padded(expression, arrays.num_expressions, "expression", arrays.name)
+    return FrameRecord(number, _frame_image(folder, image, masks), theta, camera)
 
 
 def _three_rows(world_mat: Any) -> Any:

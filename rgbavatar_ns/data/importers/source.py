@@ -91,7 +91,11 @@ def assemble(
         raise UserError(f"{reading} has no frame that can be used.", "Look at its files.")
     records = place_head_pose(records, arrays, identity, _head_pose(reading, records))
     layout = HeadModel(arrays).layout
-    theta = layout.join({f.name: _column(records, f.name, f.size) for f in layout.fields})
+    columns = {
+        field.name: np.stack([r.theta.get(field.name, np.zeros(field.size)) for r in records])
+        for field in layout.fields
+    }
+    theta = layout.join({name: torch.from_numpy(column) for name, column in columns.items()})
     width, height = size
     cameras = PinholeCameras(
         _stack([record.camera.world_to_camera for record in records]),
@@ -131,11 +135,6 @@ def _head_pose(reading: Reading, records: Sequence[FrameRecord]) -> HeadPose:
 
 def _stack(values: Sequence[np.ndarray]) -> Float[Tensor, "F *shape"]:
     return torch.from_numpy(np.stack(values)).float()
-
-
-def _column(records: Sequence[FrameRecord], name: str, size: int) -> Float[Tensor, "F _"]:
-    zero = np.zeros(size)
-    return torch.from_numpy(np.stack([record.theta.get(name, zero) for record in records]))
 
 
 def _unique(reading: Reading, records: list[FrameRecord]) -> list[FrameRecord]:

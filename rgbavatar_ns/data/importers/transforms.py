@@ -37,10 +37,7 @@ class Entry:
 
 
 def first_frame(folder: Folder) -> Mapping[str, Any] | None:
-    """The first frame of the index, to tell formats apart; None where there is no index.
-
-    Empty where the index, of all frames or else of those to train from, cannot be read.
-    """
+    """The index's first frame, to tell formats apart; None: no index, empty: it cannot be read."""
     for name in (INDEX_FILE, _file_of("train")):
         if folder.has(name):
             try:

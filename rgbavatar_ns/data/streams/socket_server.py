@@ -218,7 +218,6 @@ def _printable(error: UserError) -> str:
 
 
 def _check_same(subject: StreamSubject, first: StreamSubject) -> None:
-    """Raise UserError where a client's images or head are not those of the first."""
     if (subject.width, subject.height) != (first.width, first.height):
         raise UserError(
             f"The stream began with images of {first.width} x {first.height} pixels, this "
