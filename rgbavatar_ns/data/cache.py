@@ -22,13 +22,16 @@ class ImageSource(Protocol):
     @property
     def width(self) -> int:
         """Of every image, in pixels."""
+        ...
 
     @property
     def height(self) -> int:
         """Of every image, in pixels."""
+        ...
 
     def read_image(self, position: int) -> Image:
         """Decode one image; called from background threads."""
+        ...
 
 
 class ImageCache:

@@ -102,6 +102,7 @@ class FrameStream(Protocol):
     @property
     def counts(self) -> Counter[str]:
         """What went wrong, by name: "unreadable", "reconnects", "no face" ..."""
+        ...
 
     @property
     def keeps_frames(self) -> bool:
@@ -109,19 +110,24 @@ class FrameStream(Protocol):
 
         Else they are dropped when the queue behind it is full.
         """
+        ...
 
     def subject(self, timeout_s: float) -> StreamSubject | None:
         """Who is filmed; None if that is not known after `timeout_s`."""
+        ...
 
     def next(self, timeout_s: float) -> StreamedFrame | None:
         """The next frame; None if none has come after `timeout_s`, or the stream has ended."""
+        ...
 
     @property
     def ended(self) -> bool:
         """Whether no frame will come any more."""
+        ...
 
     def close(self) -> None:
         """Let go of files, sockets and devices; `next` returns None from now on."""
+        ...
 
 
 @runtime_checkable
@@ -130,3 +136,4 @@ class Rewindable(Protocol):
 
     def go_on_after(self, index: int) -> None:
         """Begin behind the frame with this number; before the first `next`."""
+        ...
