@@ -139,10 +139,7 @@ class Avatar(nn.Module):
     def gaussians(
         self, theta: Float[Tensor, "B H"], psi: Float[Tensor, "B K"] | None = None
     ) -> GaussianSet:
-        """Return the Gaussians of a batch of theta in the head model's world; differentiable.
-
-        `psi` replaces the weight network's answer. Raises UserError where theta is unfit.
-        """
+        """Return theta's Gaussians in the head's world; `psi` replaces the network's answer."""
         theta = self._checked(theta)
         tangent = self.blendshapes.morph(self.weights(theta) if psi is None else psi)
         vertices = self.carrier_vertices(theta)
@@ -248,10 +245,7 @@ class Avatar(nn.Module):
 
     @classmethod
     def load(cls, path: str | Path) -> "Avatar":
-        """Load a bundle, a nerfstudio checkpoint (.ckpt) or the newest one of a run's folder.
-
-        Needs no nerfstudio. Raises UserError where there is none or it cannot be read.
-        """
+        """Load a bundle, a nerfstudio checkpoint or a run's newest; UserError if there is none."""
         state, tensors = load_any(Path(path))
         avatar = cls.from_state(state)
         own = set(avatar._own_state_dict())

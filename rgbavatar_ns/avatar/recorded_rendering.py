@@ -49,11 +49,7 @@ class RecordedRendering:
         cameras: PinholeCameras | None = None,
         background: Float[Tensor, "3"] | Float[Tensor, "B 3"] | None = None,
     ) -> RenderedBatch:
-        """Draw theta [B, H]; without cameras, the last ones'. Waits until it is drawn.
-
-        The tensors are used again by the next call. Raises ValueError for other sizes than at the
-        start.
-        """
+        """Draw theta, without cameras by the last ones'; the next call uses the tensors again."""
         self._take(theta, cameras, background)
         if self._pictures < _EAGER_PICTURES:
             self._pictures += 1

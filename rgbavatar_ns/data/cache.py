@@ -60,11 +60,7 @@ class ImageCache:
         return len(self._images) * self._image_bytes
 
     def get(self, positions: Sequence[int]) -> UInt8[Tensor, "B height width 4"]:
-        """Return these frames' images as one new tensor, waiting for what is not decoded yet.
-
-        A background thread's error, a UserError naming the file, is raised here; the image is
-        tried again at the next call.
-        """
+        """Return these frames' images as one new tensor; raises what a decoding thread raised."""
         with self._lock:
             waited_for = [self._request(position) for position in positions]
         try:

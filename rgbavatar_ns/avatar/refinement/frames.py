@@ -11,10 +11,7 @@ from rgbavatar_ns.head import ThetaLayout
 
 
 class FrameRefinement(nn.Module):
-    """Corrects training frames (positions `train` of the F tracked ones).
-
-    From others it takes away what all training frames had wrong.
-    """
+    """Corrects training frames; from others it takes what all training frames had wrong."""
 
     _row_of: Tensor
 

@@ -71,10 +71,7 @@ def save_bundle(
 
 
 def load_any(path: Path) -> AvatarState:
-    """Read a bundle, a .ckpt file or the newest readable checkpoint of a run's folder.
-
-    Raises UserError where the path is missing, none of these, damaged or of another version.
-    """
+    """Read a bundle, a .ckpt file or a run folder's newest; UserError if missing or damaged."""
     if not path.exists():
         raise UserError(f"There is no {path}.", "Give a bundle, a .ckpt file or a run's folder.")
     if path.is_file():

@@ -21,10 +21,7 @@ def require_images_of(images_rgba: Tensor, count: int, cameras: PinholeCameras) 
 
 
 def random_backgrounds(step: int, batch: int, seed: int = 0) -> Float[Tensor, "batch 3"]:
-    """Return one uniformly random colour an image (paper, sec. 3.2), float32 on the CPU.
-
-    A pure function of its arguments, so that a resumed run needs no stored random state.
-    """
+    """Return one random colour an image (paper, sec. 3.2), a pure function of the arguments."""
     counter = np.random.Philox(key=np.array([seed, step], dtype=np.uint64))
     return torch.from_numpy(np.random.Generator(counter).random((batch, 3), dtype=np.float32))
 
@@ -41,10 +38,7 @@ def image_losses(
     lpips: "LPIPSLoss | None" = None,
     lpips_weight: float = 0.0,
 ) -> dict[str, Float[Tensor, ""]]:
-    """The parts of the loss between drawn images and filmed ones over the same backgrounds.
-
-    "l1" and, where it is given, "lpips" times its weight (paper, sec. 3.2).
-    """
+    """ "l1" of drawn and filmed images over the same backgrounds; "lpips" times its weight."""
     target = composite(rgba_to_float(images_rgba, image.dtype), background)
     losses = {"l1": l1_loss(image, target)}
     if lpips is not None:

@@ -67,10 +67,7 @@ class RecordedStep:
     def __call__(
         self, chosen: Sequence[int], background: Float[Tensor, "B 3"]
     ) -> Float[Tensor, ""]:
-        """Take one step on the frames `chosen`, backgrounds in main memory; returns its loss.
-
-        Raises ValueError for another number of frames than `batch_size`.
-        """
+        """Take one step on `chosen`, backgrounds in main memory; ValueError for another size."""
         if len(chosen) != self._sizes[0] or len(background) != len(chosen):
             raise ValueError(f"{len(chosen)} frames in a step recorded for {self._sizes[0]}.")
         self._gaussian_states = self._states.next_of_gaussians()

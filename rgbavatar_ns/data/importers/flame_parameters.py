@@ -76,10 +76,7 @@ def _moved(arrays: HeadArrays, offset: Float[np.ndarray, "V 3"]) -> HeadArrays:
 def padded(
     coefficients: np.ndarray, count: int, what: str, head_name: str
 ) -> Float[np.ndarray, "_"]:
-    """Coefficients brought to the head model's number: zeros are added, or taken away.
-
-    Raises UnusableFrameError where there are none, or where others than zeros would go.
-    """
+    """Coefficients in the head model's number; UnusableFrameError if none, or not only zeros go."""
     values = np.asarray(coefficients)
     if values.dtype.kind not in "iuf" or values.size != max(values.shape, default=0):
         raise UnusableFrameError(f"{what} that is no list of numbers")

@@ -53,10 +53,7 @@ FORMATS = (
 
 
 def find_format(root: Path, options: ImportOptions | None = None) -> Format | None:
-    """The format of a folder, from what lies in it or from the option; None: none of these.
-
-    Raises UserError for an option that names none.
-    """
+    """The format of a folder or of the option; None: none of these. UserError: unknown option."""
     options = options or ImportOptions()
     if options.format is not None:
         for known in FORMATS:
@@ -71,10 +68,7 @@ def find_format(root: Path, options: ImportOptions | None = None) -> Format | No
 
 
 def read_source(root: Path, options: ImportOptions, progress: Progress | None = None) -> Source:
-    """All records of a folder of another system, without its pixels.
-
-    Raises UserError where no format is recognised, or about what cannot be used in it.
-    """
+    """All records of a folder of another system without its pixels; UserError if it has faults."""
     if not root.is_dir():
         raise UserError(f"There is no folder {root}.", "Name the folder that holds the data.")
     found = find_format(root, options)

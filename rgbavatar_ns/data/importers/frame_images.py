@@ -72,10 +72,7 @@ class EncodedImage:
 
 
 def make_png(frame_image: FrameImage, size: tuple[int, int]) -> EncodedImage:
-    """The frame image as an RGBA PNG, straight alpha; a file that is one already stays as it is.
-
-    size: (width, height) that every part must have. Raises UnusableFrameError.
-    """
+    """The frame image as an RGBA PNG of this (width, height); UnusableFrameError if it is not."""
     encoded = _read(frame_image.color)
     plain = frame_image.alpha is None and not frame_image.regions
     # Colour type 6 at depth 8 is RGBA of bytes.

@@ -79,10 +79,7 @@ def read_mesh(path: Path) -> Float[Tensor, "V 3"]:
 
 
 class _Fit:
-    """Gauss-Newton with differences; few parameters, many vertices.
-
-    Every sixth vertex is compared; of the others only those are kept that joints depend on.
-    """
+    """Gauss-Newton on every sixth vertex; of the others only those are kept that joints need."""
 
     def __init__(self, arrays: HeadArrays) -> None:
         self.kept = np.flatnonzero(

@@ -71,10 +71,7 @@ class TrackedDataset:
         return tuple(position for position in range(len(self)) if position not in held_out)
 
     def read_image(self, position: int) -> UInt8[np.ndarray, "height width 4"]:
-        """Decode one frame to RGBA with straight alpha.
-
-        Raises UserError naming the file where it is missing, damaged or of another size.
-        """
+        """Decode one frame to RGBA, straight alpha; UserError if it is missing, damaged or odd."""
         path = self.image_paths[position]
         image = read_png_rgba(path)
         height, width = image.shape[:2]
@@ -83,10 +80,7 @@ class TrackedDataset:
 
 
 def load_native(path: str | Path) -> TrackedDataset:
-    """Read a folder in the project's own format; pixels are read and checked when decoded.
-
-    Raises UserError for whatever else is wrong with it: folder, version, theta, cameras, images.
-    """
+    """Read a folder in the project's own format, pixels when decoded; UserError about any fault."""
     root = Path(path)
     index = _read_index(root)
     width, height = _whole(index, "width"), _whole(index, "height")

@@ -100,10 +100,7 @@ class DatasetWriter:
         camera_name: str | None = None,
         timestep: int | None = None,
     ) -> None:
-        """As `add`, with the image as a PNG file's bytes; None where it is in its place already.
-
-        The image's own size is taken on trust.
-        """
+        """As `add`, with a PNG file's bytes, its size trusted; None: it is in its place already."""
         name = f"frame {index}"
         if index in self._numbers:
             raise UserError(f"There are two frames {index}.", "Number frames once each.")

@@ -18,10 +18,7 @@ from rgbavatar_ns.kernels.types import PinholeCameras
 
 @dataclass(frozen=True)
 class StreamSubject:
-    """Who is filmed: known before the first frame, the same for all of them.
-
-    Raises UserError where layout or identity do not fit the head.
-    """
+    """Who is filmed, the same for all frames; UserError where layout or identity do not fit."""
 
     arrays: HeadArrays
     identity: Float[Tensor, "I"]
