@@ -97,7 +97,8 @@ def _record(
     size = np.array([header.width, header.height])
     # Some exporters write the first focal length with the wrong sign.
     camera = CameraRecord(world_to_camera, np.abs(intrinsics[:2]) * size, intrinsics[2:] * size)
-    theta = dict(zip(_POSE, numbers(frame.get("pose"), 15, "pose").reshape(5, 3)))
+    pose = numbers(frame.get("pose"), 15, "pose").reshape(5, 3)
+    theta: dict[str, np.ndarray] = dict(zip(_POSE, pose))
     try:
         expression = np.asarray(frame.get("expression", ()))
     except (TypeError, ValueError, OverflowError):
