@@ -182,11 +182,9 @@ class Stages:
     done again. What JSON cannot hold, a stage writes to files that its result names.
 
     Args:
-        folder: where the file lies; made where missing.
         made_from: what all stages depend on, as JSON or anything with a text of its own.
         fresh: forget what was done.
-        tell: called with a stage's name as it begins, and with None or, where it was done before,
-            the seconds it took.
+        tell: called with a stage's name as it begins, and the seconds where it was done before.
     """
 
     def __init__(

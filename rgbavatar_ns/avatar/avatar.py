@@ -1,5 +1,6 @@
 """The avatar: the one composition from a head model's parameters theta to Gaussians and images."""
 
+from contextlib import nullcontext
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -49,9 +50,6 @@ class Avatar(nn.Module):
     Everything that a picture needs is inside: head model, identity, anchors and Gaussians.
 
     Args:
-        head: the head model, whose layout names what theta holds.
-        identity: the subject's identity coefficients, fixed.
-        config: sizes, variants and initial values.
         seed: of the weight network's initial values; nothing else is random.
         anchors: places of the Gaussians; by default every covered texel of the head's UV map.
     """
@@ -90,7 +88,14 @@ class Avatar(nn.Module):
         )
         self.weight_network = None
         if config.weight_network == "none":
-            self._require_expressions(config.num_bases)
+            part = self.layout.slice("expression")
+            known = part.stop - part.start
+            if config.num_bases > known:
+                raise UserError(
+                    f"{config.num_bases} bases without a weight network need as many expression "
+                    f"coefficients; the head '{self.head.arrays.name}' has {known}.",
+                    "Use fewer bases, or the weight network mlp or linear.",
+                )
         elif config.num_bases > 0:
             self.weight_network = WeightNetwork(
                 self.layout.feature_size(config.pose_input, config.translation_input),
@@ -134,11 +139,7 @@ class Avatar(nn.Module):
     def gaussians(
         self, theta: Float[Tensor, "B H"], psi: Float[Tensor, "B K"] | None = None
     ) -> GaussianSet:
-        """Return the world-space Gaussians of a batch of theta, world as the head model's.
-
-        `psi` replaces the weight network's answer. Differentiable in the parameters, theta and
-        psi. Raises UserError where theta has another size or holds NaN.
-        """
+        """Return theta's Gaussians in the head's world; `psi` replaces the network's answer."""
         theta = self._checked(theta)
         tangent = self.blendshapes.morph(self.weights(theta) if psi is None else psi)
         vertices = self.carrier_vertices(theta)
@@ -159,16 +160,14 @@ class Avatar(nn.Module):
     ) -> RenderedBatch:
         """Draw a batch of theta; `psi` replaces the weight network's answer.
 
-        The other options are those of `rgbavatar_ns.kernels.rasterize`. The picture carries no
-        graph, unless it is to be `differentiable` in the parameters, theta and psi: then it goes
-        through autograd, to the same numbers in several times as long.
+        Other options are those of `kernels.rasterize`. The picture carries no graph, unless it is
+        to be `differentiable`: the same numbers through autograd, in several times as long.
         """
         options = {"with_depth": with_depth, "with_visibility": with_visibility}
-        if differentiable:
-            gaussians = self.gaussians(theta, psi)
-            return rasterize(gaussians, cameras, background, backend=backend, **options)
-        with torch.no_grad():
-            renderer = self.renderer(theta, cameras, psi, backend=backend)
+        with nullcontext() if differentiable else torch.no_grad():
+            renderer = None
+            if not differentiable:
+                renderer = self.renderer(theta, cameras, psi, backend=backend)
             if renderer is None:
                 gaussians = self.gaussians(theta, psi)
                 return rasterize(gaussians, cameras, background, backend=backend, **options)
@@ -237,8 +236,7 @@ class Avatar(nn.Module):
     ) -> None:
         """Write a bundle (a directory of avatar.safetensors and avatar.json), atomically.
 
-        Without `with_head` it only names its head model, as the licence of FLAME asks where the
-        bundle is passed on; `load` then wants the file (RGBAVATAR_HEAD).
+        Without `with_head` it only names its head model (FLAME's licence); `load` then wants it.
         """
         state = self.to_state()
         if not with_head:
@@ -247,10 +245,7 @@ class Avatar(nn.Module):
 
     @classmethod
     def load(cls, path: str | Path) -> "Avatar":
-        """Load a bundle, a nerfstudio checkpoint (.ckpt) or the newest one of a run's folder.
-
-        Needs no nerfstudio. Raises UserError where there is none or it cannot be read.
-        """
+        """Load a bundle, a nerfstudio checkpoint or a run's newest; UserError if there is none."""
         state, tensors = load_any(Path(path))
         avatar = cls.from_state(state)
         own = set(avatar._own_state_dict())
@@ -295,15 +290,6 @@ class Avatar(nn.Module):
             AvatarConfig.from_json(state["config"]),
             anchors=anchors,
         )
-
-    def _require_expressions(self, num_bases: int) -> None:
-        known = self.layout.slice("expression")
-        if num_bases > known.stop - known.start:
-            raise UserError(
-                f"{num_bases} bases without a weight network need as many expression "
-                f"coefficients; the head '{self.head.arrays.name}' has {known.stop - known.start}.",
-                "Use fewer bases, or the weight network mlp or linear.",
-            )
 
     def _checked(self, theta: Float[Tensor, "B H"]) -> Float[Tensor, "B H"]:
         """Return theta in the parameters' dtype, or raise UserError with the reason."""

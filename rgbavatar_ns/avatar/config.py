@@ -42,38 +42,24 @@ class AvatarConfig:
     def __post_init__(self) -> None:
         """Refuse values that cannot make an avatar."""
         problems = [
-            (self.num_bases < 0, f"num_bases is {self.num_bases}", "0 or more"),
-            (self.uv_resolution < 1, f"uv_resolution is {self.uv_resolution}", "1 or more"),
-            (self.hidden_width < 1, f"hidden_width is {self.hidden_width}", "1 or more"),
-            (
-                self.weight_network not in ("mlp", "linear", "none"),
-                f"weight_network is {self.weight_network!r}",
-                "'mlp', 'linear' or 'none'",
-            ),
-            (
-                self.carrier not in ("mesh", "joints"),
-                f"carrier is {self.carrier!r}",
-                "'mesh' or 'joints'",
-            ),
-            (
-                self.tangent_variant not in ("normalized", "raw", "orthonormal"),
-                f"tangent_variant is {self.tangent_variant!r}",
-                "'normalized', 'raw' or 'orthonormal'",
-            ),
-            (
-                not self.initial_scale_m > 0,
-                f"initial_scale_m is {self.initial_scale_m}",
-                "a length above 0",
-            ),
-            (
-                not 0 < self.initial_opacity < 1,
-                f"initial_opacity is {self.initial_opacity}",
-                "a value between 0 and 1",
-            ),
+            (self.num_bases < 0, "num_bases", "0 or more"),
+            (self.uv_resolution < 1, "uv_resolution", "1 or more"),
+            (self.hidden_width < 1, "hidden_width", "1 or more"),
+            (not self.initial_scale_m > 0, "initial_scale_m", "a length above 0"),
+            (not 0 < self.initial_opacity < 1, "initial_opacity", "a value between 0 and 1"),
         ]
-        for wrong, cause, wanted in problems:
+        for name, choices in (
+            ("weight_network", ("mlp", "linear", "none")),
+            ("carrier", ("mesh", "joints")),
+            ("tangent_variant", ("normalized", "raw", "orthonormal")),
+        ):
+            *others, last = map(repr, choices)
+            wanted = f"{', '.join(others)} or {last}"
+            problems.append((getattr(self, name) not in choices, name, wanted))
+        for wrong, name, wanted in problems:
             if wrong:
-                raise UserError(f"The avatar's {cause}.", f"Give {wanted}.")
+                value = getattr(self, name)
+                raise UserError(f"The avatar's {name} is {value!r}.", f"Give {wanted}.")
 
     def to_json(self) -> dict[str, Any]:
         """Return the fields as plain values."""

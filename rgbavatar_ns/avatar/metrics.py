@@ -1,10 +1,8 @@
 """Image metrics under one protocol: full frame, black background, soft alpha, means over images.
 
-The protocol is that of the paper's comparisons: predictions are rendered over black and clamped
-to [0, 1], targets are laid over black by their matte, and no mask or crop is applied. One more
-number, `psnr_head`, takes only the pixels that the target's matte gives to the person (alpha above
-.5): black surroundings, which every avatar gets right, raise the full frame's PSNR by as much as
-the person is small in it.
+It is that of the paper's comparisons: predictions are rendered over black and clamped to [0, 1],
+targets are laid over black by their matte. `psnr_head` takes only the person's pixels (alpha above
+.5): black surroundings, which every avatar gets right, raise the full frame's PSNR.
 """
 
 from typing import Literal
@@ -75,9 +73,8 @@ def evaluate_images(
 ) -> dict[str, float | str | None]:
     """Compare images rendered over black with their targets, under the module's protocol.
 
-    Returns `psnr` and `psnr_head` (dB), `ssim` and, where `lpips` was given, `lpips_<network>`:
-    None where it is unavailable, with the reason as `lpips_unavailable`. To average over a data
-    set, call it on one image at a time or on equal batches: every number is a mean over the images.
+    Returns means over the images: `psnr` and `psnr_head` (dB), `ssim` and, where `lpips` was given,
+    `lpips_<network>`: None where it is unavailable, with the reason as `lpips_unavailable`.
     """
     image = image.clamp(0, 1)
     rgba = rgba_to_float(target_rgba, image.dtype)

@@ -1,6 +1,7 @@
 """Theta to image as one CUDA graph, for pictures one after another."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import torch
 from jaxtyping import Float
@@ -12,16 +13,14 @@ from rgbavatar_ns.kernels import DeviceRenderer, PinholeCameras, RenderedBatch
 
 _EAGER_PICTURES = 2
 """Pictures before the recording: libraries make their handles, and the lists' room is measured."""
+_CAMERA_PARTS = ("world_to_camera", "focal_px", "principal_point_px")
 
 
 class RecordedRendering:
     """Draws an avatar on its device for batches and images of one size.
 
-    Head model, weight network, blending and rasterizer are in the graph; the avatar may be trained
-    meanwhile. A picture that finds no room is drawn again in the ordinary way: nothing is missing.
-
-    Raises:
-        ValueError: the backend has no renderer that works without the host (`recording.supports`).
+    The avatar may be trained meanwhile. A picture that finds no room is drawn again in the
+    ordinary way. Raises ValueError where the backend needs the host (`cuda_graph.supports`).
     """
 
     def __init__(
@@ -37,13 +36,8 @@ class RecordedRendering:
             raise ValueError("This backend's pictures need the host. Use Avatar.render.")
         self._avatar, self._backend, self._recorder = avatar, backend, recorder
         self._theta = theta.detach().clone()
-        self._cameras = PinholeCameras(
-            cameras.world_to_camera.clone(),
-            cameras.focal_px.clone(),
-            cameras.principal_point_px.clone(),
-            cameras.width,
-            cameras.height,
-        )
+        own = {name: getattr(cameras, name).clone() for name in _CAMERA_PARTS}
+        self._cameras = replace(cameras, **own)
         self._background = torch.zeros(len(theta), 3, device=theta.device)
         self._replay: Callable[[], None] | None = None
         self._pictures = 0
@@ -55,11 +49,7 @@ class RecordedRendering:
         cameras: PinholeCameras | None = None,
         background: Float[Tensor, "3"] | Float[Tensor, "B 3"] | None = None,
     ) -> RenderedBatch:
-        """Draw theta [B, H]; without cameras, the last ones'. Waits until it is drawn.
-
-        The tensors are used again by the next call. Raises ValueError for other sizes than at the
-        start.
-        """
+        """Draw theta, without cameras by the last ones'; the next call uses the tensors again."""
         self._take(theta, cameras, background)
         if self._pictures < _EAGER_PICTURES:
             self._pictures += 1
@@ -84,9 +74,8 @@ class RecordedRendering:
             raise ValueError("Another batch or image size than at the start. Make a new one.")
         self._theta.copy_(theta, non_blocking=True)
         if cameras is not None:
-            own.world_to_camera.copy_(cameras.world_to_camera, non_blocking=True)
-            own.focal_px.copy_(cameras.focal_px, non_blocking=True)
-            own.principal_point_px.copy_(cameras.principal_point_px, non_blocking=True)
+            for name in _CAMERA_PARTS:
+                getattr(own, name).copy_(getattr(cameras, name), non_blocking=True)
         if background is None:
             self._background.zero_()
         else:

@@ -39,11 +39,6 @@ class ImageCache:
 
     Safe to use from several threads. A batch that `get` hands out is the caller's own and does
     not count; everything the cache holds, images still being decoded included, does.
-
-    Args:
-        dataset: where `read_image` finds the pictures.
-        budget_bytes: most that the cache may hold; 0 keeps nothing and decodes every time.
-        num_workers: background threads, at least 1.
     """
 
     def __init__(self, dataset: ImageSource, budget_bytes: int, num_workers: int = 2) -> None:
@@ -65,11 +60,7 @@ class ImageCache:
         return len(self._images) * self._image_bytes
 
     def get(self, positions: Sequence[int]) -> UInt8[Tensor, "B height width 4"]:
-        """Return these frames' images as one new tensor, waiting for what is not decoded yet.
-
-        A background thread's error, a UserError naming the file, is raised here; the image is
-        tried again at the next call.
-        """
+        """Return these frames' images as one new tensor; raises what a decoding thread raised."""
         with self._lock:
             waited_for = [self._request(position) for position in positions]
         try:
@@ -124,11 +115,7 @@ class ImageCache:
         return True
 
     def _forget_failures(self) -> None:
-        failed = [
-            position
-            for position, future in self._images.items()
-            if future.cancelled() or (future.done() and future.exception() is not None)
-        ]
-        for position in failed:
-            del self._images[position]
-            self._unread.discard(position)
+        for position, future in list(self._images.items()):
+            if future.cancelled() or (future.done() and future.exception() is not None):
+                del self._images[position]
+                self._unread.discard(position)

@@ -17,14 +17,10 @@ from rgbavatar_ns.data.native.format import INDEX_FILE
 def load_dataset(
     path: str | Path, options: ImportOptions | None = None, progress: Progress | None = None
 ) -> TrackedDataset:
-    """Read a dataset folder and check all of it but the pixels, which are checked when decoded.
+    """Read a dataset folder and check all of it but the pixels; raises UserError as `load_native`.
 
     A folder of another system is imported once, into a cache, and opened from there; `options`
     say how, and `progress` is called with (stage, done, in all) instead of bars being shown.
-
-    Raises UserError for a missing or empty folder, another format or version, theta that holds
-    NaN or does not fit the head, cameras that are none, images that are missing, cut short or
-    of different sizes.
     """
     root, options = Path(path), options or ImportOptions()
     own = (root / INDEX_FILE).exists() and options.format is None

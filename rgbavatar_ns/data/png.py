@@ -2,6 +2,8 @@
 
 import struct
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import cv2
@@ -17,29 +19,20 @@ _REPAIR = "Copy or export the file again, or leave the frame out of the dataset.
 
 
 def png_size(path: Path) -> tuple[int, int]:
-    """Return (width, height) from a PNG's first bytes, checking its last ones; decodes nothing.
-
-    Raises UserError where the file is missing, empty, not a PNG or cut short.
-    """
-    try:
-        with path.open("rb") as file:
-            head = file.read(_HEADER_BYTES)
-            file.seek(0, 2)
-            size = file.tell()
-            file.seek(max(0, size - len(_END_CHUNK)))
-            tail = file.read()
-    except FileNotFoundError:
-        raise UserError(f"The image {path} is missing.", _REPAIR) from None
-    except OSError as error:
-        raise UserError(f"The image {path} cannot be read: {error.strerror}.", _REPAIR) from None
+    """(width, height) from a PNG's first bytes; UserError where it is none, or cut short."""
+    with _file_errors(path), path.open("rb") as file:
+        head = file.read(_HEADER_BYTES)
+        end = file.seek(0, 2)
+        file.seek(max(0, end - len(_END_CHUNK)))
+        tail = file.read()
     if not head:
         raise UserError(f"The image {path} is empty.", _REPAIR)
     if head[:8] != _SIGNATURE[: len(head)] or head[12:16] != b"IHDR"[: max(0, len(head) - 12)]:
         raise UserError(f"{path} is not a PNG image.", "Store images as PNG files.")
-    if len(head) < _HEADER_BYTES or tail != _END_CHUNK:
+    size = png_header_size(head)
+    if size is None or tail != _END_CHUNK:
         raise UserError(f"The image {path} is truncated.", _REPAIR)
-    width, height = struct.unpack(">II", head[16:24])
-    return width, height
+    return size
 
 
 def png_header_size(encoded: bytes) -> tuple[int, int] | None:
@@ -50,23 +43,28 @@ def png_header_size(encoded: bytes) -> tuple[int, int] | None:
     return width, height
 
 
-def read_png_rgba(path: Path) -> UInt8[np.ndarray, "height width 4"]:
-    """Decode a PNG file to RGBA, see `decode_png_rgba`; raises UserError naming the file."""
+@contextmanager
+def _file_errors(path: Path) -> Iterator[None]:
     try:
-        encoded = path.read_bytes()
+        yield
     except FileNotFoundError:
         raise UserError(f"The image {path} is missing.", _REPAIR) from None
     except OSError as error:
         raise UserError(f"The image {path} cannot be read: {error.strerror}.", _REPAIR) from None
+
+
+def read_png_rgba(path: Path) -> UInt8[np.ndarray, "height width 4"]:
+    """Decode a PNG file to RGBA, see `decode_png_rgba`; raises UserError naming the file."""
+    with _file_errors(path):
+        encoded = path.read_bytes()
     return decode_png_rgba(encoded, str(path))
 
 
 def decode_png_rgba(encoded: bytes, name: str) -> UInt8[np.ndarray, "height width 4"]:
     """Decode a PNG to RGBA; grey becomes RGB, a missing alpha becomes opaque.
 
-    Raises UserError, calling the image `name`, where it is truncated or damaged: OpenCV alone
-    would hand back a partial picture without a word, so the chunks' lengths and checksums are
-    checked.
+    Raises UserError, calling the image `name`, where a chunk's length or checksum is wrong:
+    OpenCV alone would hand back a partial picture without a word.
     """
     damage = png_damage(encoded)
     if damage is not None:
@@ -78,9 +76,8 @@ def decode_png_rgba(encoded: bytes, name: str) -> UInt8[np.ndarray, "height widt
         decoded = ((decoded.astype(np.uint32) + 128) // 257).astype(np.uint8)
     if decoded.ndim == 2:
         return cv2.cvtColor(decoded, cv2.COLOR_GRAY2RGBA)
-    if decoded.shape[2] == 3:
-        return cv2.cvtColor(decoded, cv2.COLOR_BGR2RGBA)
-    return cv2.cvtColor(decoded, cv2.COLOR_BGRA2RGBA)
+    opaque = decoded.shape[2] == 3
+    return cv2.cvtColor(decoded, cv2.COLOR_BGR2RGBA if opaque else cv2.COLOR_BGRA2RGBA)
 
 
 def encode_png_rgba(image_rgba: UInt8[np.ndarray, "height width 4"], compression: int = 3) -> bytes:

@@ -30,11 +30,6 @@ class OfflineOrder:
     A batch is a pure function of (seed, step), so that resuming needs no state. Frames of one
     batch are all different, also where the batch spans two epochs: there the next epoch's order
     gives way just enough. Ours; the paper only says that batches are drawn from all frames.
-
-    Args:
-        positions: frames to draw from, e.g. `TrackedDataset.train`; not empty.
-        batch_size: frames a batch, at most as many as there are positions.
-        seed: not negative.
     """
 
     def __init__(self, positions: Sequence[int], batch_size: int, seed: int) -> None:
@@ -91,15 +86,11 @@ class LocalGlobalPools:
     New frames enter a local pool, first in, first out; each frame that leaves it is offered to
     a global pool by reservoir sampling, which keeps every frame of the past equally likely
     (RGBAvatar, sec. 3.3 and supplement, algorithm 2). Frames are known by their number; who
-    feeds the pools keeps the images of `frames` and drops what `add` returns.
+    feeds the pools keeps their images and drops what `add` returns.
 
     Args:
-        local_size: frames in the local pool (paper: 150).
-        global_size: frames in the global pool (paper: 1000); 0 leaves it out.
-        local_share: the paper's eta, the part of a batch from the local pool (paper: .7; see
-            `DEFAULT_LOCAL_SHARE`).
-        seed: of every draw.
-        strategy: how a batch is divided and drawn, see `PoolStrategy`.
+        local_size, global_size: frames in the pools (paper: 150 and 1000).
+        local_share: the paper's eta, the part of a batch from the local pool.
         new_first: let local frames that no batch has held yet fill up to half of the local part,
             the newest first. Ours: by chance alone a frame may wait for seconds.
     """
@@ -162,7 +153,7 @@ class LocalGlobalPools:
         if len(self._global) < self.global_size:
             self._global.append(frame)
             return None
-        slot = self._draw_integer(self._departed)
+        slot = int(torch.randint(self._departed, (), generator=self._generator))
         if slot >= self.global_size:
             return frame
         self._global[slot], dropped = frame, self._global[slot]
@@ -191,13 +182,9 @@ class LocalGlobalPools:
         return 1.0 - (1.0 - self.local_share) * min(1.0, self._arrived / _RAMP_FRAMES)
 
     def _draw_local(self, count: int) -> list[int]:
-        new: list[int] = []
-        if self.new_first:
-            new = list(self._undrawn)[::-1][: math.ceil(count / 2)]
-        others = list(self._local)
-        if new:
-            taken = set(new)
-            others = [frame for frame in others if frame not in taken]
+        new = list(self._undrawn)[::-1][: math.ceil(count / 2)] if self.new_first else []
+        taken = set(new)
+        others = [frame for frame in self._local if frame not in taken]
         drawn = new + self._draw(others, count - len(new), self.strategy == "release")
         for frame in drawn:
             self._undrawn.pop(frame, None)
@@ -211,9 +198,6 @@ class LocalGlobalPools:
         else:
             order = torch.randperm(len(pool), generator=self._generator)[:count]
         return [pool[i] for i in order.tolist()]
-
-    def _draw_integer(self, end: int) -> int:
-        return int(torch.randint(end, (), generator=self._generator))
 
     def state_dict(self) -> dict[str, Any]:
         """All that the next draws depend on, safe for `torch.load(weights_only=True)`."""

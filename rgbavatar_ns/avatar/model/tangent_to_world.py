@@ -14,10 +14,8 @@ from rgbavatar_ns.kernels import GaussianSet
 def tangent_to_world(tangent: TangentGaussians, frames: AnchorFrames) -> GaussianSet:
     """Activate blended Gaussians and put them into the world.
 
-    Positions go through the frame as it is, rotations through the proper rotation that belongs
-    to it and keeps the normal. Quaternions are left unnormalised, since the rasterizer normalises
-    them and the frame's are unit, so the result is the same as normalising before. Opacities and
-    scales are shared by the batch (leading 1), unless scales follow the triangles.
+    Quaternions are left unnormalised, since the rasterizer normalises them. Opacities and scales
+    are shared by the batch (leading 1), unless scales follow the triangles.
     """
     scales = tangent.log_scale.exp()[None]
     if frames.length_ratio is not None:
@@ -34,9 +32,8 @@ def tangent_to_world(tangent: TangentGaussians, frames: AnchorFrames) -> Gaussia
 class _BatchedProduct(torch.autograd.Function):
     """Hamilton product of B x N quaternion pairs, wxyz, with its gradient written out.
 
-    A quaternion is a pair of complex numbers, q = (w + x i) + (y + z i) j, with j c = conj(c) j.
-    That makes four products out of sixteen, and the gradient a product again: on a CPU a quarter
-    of the time of the sixteen through autograd, which took a fifth of a training step.
+    A quaternion is a pair of complex numbers, q = (w + x i) + (y + z i) j, with j c = conj(c) j:
+    on a CPU a quarter of the time of the sixteen products through autograd.
     """
 
     @staticmethod

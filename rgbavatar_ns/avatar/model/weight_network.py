@@ -11,9 +11,8 @@ from torch import Tensor, nn
 class WeightNetwork(nn.Module):
     """Three linear layers with ReLU between them, or a single one; no output activation.
 
-    Paper, supplement: three layers, 128 wide; "linear" is its ablation. The initial values are
-    those of `torch.nn.Linear`, drawn from `generator`, so that building an avatar neither reads
-    nor moves the global random state.
+    Paper, supplement: three layers, 128 wide; "linear" is its ablation. Initial values are those of
+    `torch.nn.Linear`, drawn from `generator`.
     """
 
     def __init__(

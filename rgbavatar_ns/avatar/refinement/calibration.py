@@ -13,8 +13,7 @@ def fit_ridge(inputs: Float[Tensor, "F M"], outputs: Float[Tensor, "F H"]) -> Fl
     """The linear map from inputs to outputs, each output's ridge chosen by what it predicts.
 
     Both are thought to be centred. A ridge is judged on five blocks of successive frames, each
-    predicted from the others: neighbours are too much alike to tell a law from a chance. An output
-    that no ridge predicts better than zero gets zero.
+    predicted from the others. An output that no ridge predicts better than zero gets zero.
     """
     ridges = inputs.new_tensor(_RIDGES) * len(inputs)
     error = outputs.new_zeros(len(ridges) + 1, outputs.shape[1])

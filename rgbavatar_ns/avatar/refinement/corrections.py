@@ -54,9 +54,6 @@ class TrackingRefinement(nn.Module):
     would miss them in new frames. Linear fields stay in the range that the tracker used.
 
     Args:
-        tracked: the theta to correct.
-        layout: its fields.
-        config: widths, rate and prior.
         centered: keep each number's mean correction at zero, so that an avatar trained with the
             corrected frames fits a tracker's new ones.
         reference: theta that says which numbers move, and in which range; by default `tracked`.
@@ -170,11 +167,9 @@ def _widths(
         "axis_angle": config.joint_sigma_rad,
         "translation": config.translation_sigma_m,
     }
-    sigma, place = [], []
-    for number, field in enumerate(layout.fields):
-        width = of_form[field.form]
-        if field.name == _HEAD_POSE:
-            width = config.rotation_sigma_rad
-        sigma += [width] * field.size
-        place += [number] * field.size
-    return torch.tensor(sigma), torch.tensor(place)
+    widths = [
+        config.rotation_sigma_rad if field.name == _HEAD_POSE else of_form[field.form]
+        for field in layout.fields
+    ]
+    place = torch.cat([torch.full((f.size,), n) for n, f in enumerate(layout.fields)])
+    return torch.tensor(widths)[place], place

@@ -11,14 +11,7 @@ from rgbavatar_ns.head import ThetaLayout
 
 
 class FrameRefinement(nn.Module):
-    """Corrects training frames; of others it takes away what all training frames had wrong.
-
-    Args:
-        theta: of all F frames, as tracked.
-        train: positions of the training frames.
-        layout: theta's fields.
-        config: when and how far to correct.
-    """
+    """Corrects training frames; from others it takes what all training frames had wrong."""
 
     _row_of: Tensor
 

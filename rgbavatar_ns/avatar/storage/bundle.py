@@ -44,11 +44,11 @@ def save_bundle(
 ) -> None:
     """Write a bundle directory: complete or not at all; an older bundle there is replaced.
 
-    The layout says to other programs what theta holds. Raises UserError where `path` is something
-    else than a bundle or an empty directory, or the disk refuses it.
+    Raises UserError where `path` is neither that nor an empty directory, or the disk refuses it.
     """
     path = path.absolute()
-    if path.exists() and not _replaceable(path):
+    ours = (path / MANIFEST_NAME).exists()
+    if path.exists() and not (path.is_dir() and (ours or not any(path.iterdir()))):
         raise UserError(
             f"{path} exists and is not an avatar bundle.", "Give another path or remove it."
         )
@@ -71,10 +71,7 @@ def save_bundle(
 
 
 def load_any(path: Path) -> AvatarState:
-    """Read a bundle, a .ckpt file or the newest readable checkpoint of a run's folder.
-
-    Raises UserError where the path is missing, none of these, damaged or of another version.
-    """
+    """Read a bundle, a .ckpt file or a run folder's newest; UserError if missing or damaged."""
     if not path.exists():
         raise UserError(f"There is no {path}.", "Give a bundle, a .ckpt file or a run's folder.")
     if path.is_file():
@@ -98,10 +95,7 @@ def load_any(path: Path) -> AvatarState:
 
 
 def load_statistics(path: Path) -> TrainingStatistics | None:
-    """What the avatar of a bundle saw in training; None where that is not kept.
-
-    Raises UserError where a bundle is damaged or of another version.
-    """
+    """What the avatar of a bundle saw in training, if kept; raises UserError as `load_any`."""
     if not (path / MANIFEST_NAME).exists():
         return None
     manifest, tensors = _read_bundle(path)
@@ -115,11 +109,12 @@ def _load_bundle(path: Path) -> AvatarState:
     state = _join_tensors(manifest["state"], tensors)
     if is_reference(state["head"]):
         state["head"] = resolve(state["head"], path)
-    prefix = "parameters/"
-    parameters = {
-        name[len(prefix) :]: value for name, value in tensors.items() if name.startswith(prefix)
-    }
-    return state, parameters
+    return state, _below("parameters/", tensors)
+
+
+def _below(prefix: str, tensors: dict[str, Any]) -> dict[str, Any]:
+    """Those whose names begin with `prefix`, without it."""
+    return {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}
 
 
 def _read_bundle(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
@@ -183,12 +178,7 @@ def _load_checkpoint(path: Path) -> AvatarState:
             f"The checkpoint {path} holds no avatar.",
             "Give a checkpoint of a run of ns-train rgbavatar.",
         )
-    parameters = {
-        name[len(CHECKPOINT_PREFIX) :]: value
-        for name, value in (pipeline or {}).items()
-        if name.startswith(CHECKPOINT_PREFIX)
-    }
-    return extra["avatar"], parameters
+    return extra["avatar"], _below(CHECKPOINT_PREFIX, pipeline or {})
 
 
 def _split_off_tensors(value: Any, name: str, tensors: dict[str, Tensor]) -> Any:
@@ -212,7 +202,3 @@ def _join_tensors(value: Any, tensors: dict[str, Tensor]) -> Any:
     if isinstance(value, list):
         return [_join_tensors(v, tensors) for v in value]
     return value
-
-
-def _replaceable(path: Path) -> bool:
-    return path.is_dir() and ((path / MANIFEST_NAME).exists() or not any(path.iterdir()))

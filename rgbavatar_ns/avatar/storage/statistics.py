@@ -72,10 +72,7 @@ class TrainingStatistics:
         )
 
     def project(self, theta: Float[Tensor, "F H"]) -> Float[Tensor, "F H"]:
-        """The nearest expression in the span and range of those seen; rigid motion stays.
-
-        Ranges are those along each principal component.
-        """
+        """The nearest expression in the span and range of the components; rigid motion stays."""
         along = (theta - self.theta_mean) @ self.components.T
         held = torch.minimum(torch.maximum(along, self.component_min), self.component_max)
         return torch.where(self.expressive, self.theta_mean + held @ self.components, theta)
@@ -105,8 +102,5 @@ def expressive_numbers(layout: ThetaLayout) -> Bool[Tensor, "H"]:
 
 
 def neutral_frame(theta: Float[Tensor, "F H"], layout: ThetaLayout) -> Float[Tensor, "H"]:
-    """The frame whose expression is nearest to rest: the smallest sum of absolute values.
-
-    Without names that say more: at rest, blend weights and joint angles of the face are zero.
-    """
+    """The frame whose expression is nearest to rest: the smallest sum of absolute values."""
     return theta[theta[:, expressive_numbers(layout)].abs().sum(1).argmin()]

@@ -23,7 +23,6 @@ from rgbavatar_ns.kernels import (
 
 WEIGHT_THRESHOLD = 0.1
 """The blending weight that a Gaussian must exceed in some pixel (paper: .1; its release: .01)."""
-
 _SMALLEST_MATTE_SUM = 1e-3
 """Below this sum of weight times alpha a Gaussian saw background only."""
 
@@ -40,12 +39,9 @@ class ColorEstimate:
 class ColorInitSchedule:
     """After which optimiser steps colours are initialised.
 
-    The estimate costs about as much as a training step. Nearly all Gaussians that the data shows
-    are seen in the first steps, so it runs after each of the first `every_step_until` steps, then
+    After each of the first `every_step_until` steps, in which nearly all Gaussians are seen, then
     after every `interval`-th one up to step `regular_until`, and from there at intervals that
-    double (steps 200, 400, 800 ...): 29 times in 5000 steps, less than 1 % of their time. What is
-    first seen that late has mostly learnt its colour by gradients, which the mean would only set
-    back. Once every Gaussian has its colour it stops. Ours: the paper does not say how often.
+    double (steps 200, 400, 800 ...). Ours: the paper does not say how often.
     """
 
     every_step_until: int = 20
@@ -68,10 +64,7 @@ def estimate_colors(
     cameras: PinholeCameras,
     images_rgba: UInt8[Tensor, "B H W 4"] | Float[Tensor, "B H W 4"],
 ) -> ColorEstimate:
-    """Average the straight-alpha images under each Gaussian, summed over the batch.
-
-    See `color_estimate` for what is averaged.
-    """
+    """Average the straight-alpha images under each Gaussian as `color_estimate`, over the batch."""
     images = premultiplied(images_rgba, gaussians.means.dtype)
     return color_estimate(weighted_color_average(gaussians, cameras, images))
 
@@ -90,9 +83,8 @@ def premultiplied(
 def color_estimate(sums: WeightedColors) -> ColorEstimate:
     """Return the colours that follow from the sums over premultiplied RGBA images.
 
-    Each pixel also counts by its matte alpha: c = sum w a I / sum w a. Ours, because a pixel of
-    the matted-out background has no colour of the head; what stands there (black, or a random
-    colour in training) would tint the silhouette. With alpha 1 everywhere it is the paper's sum.
+    Each pixel also counts by its matte alpha: c = sum w a I / sum w a. Ours, because what stands in
+    the matted-out background would tint the silhouette. With alpha 1 it is the paper's sum.
     """
     total = sums.weighted_sum.sum(0)
     matte_sum = total[:, 3:]
@@ -114,9 +106,8 @@ def initialize_colors(
 ) -> int:
     """Give Gaussians seen well for the first time the mean colour under them; return how many.
 
-    Paper, sec. 3.2. The images' colour is straight (not multiplied by alpha). Only base colours
-    change, and each Gaussian's only once: bases and optimiser state stay, and the avatar's
-    `color_initialized` remembers.
+    Paper, sec. 3.2. Only base colours change, and each Gaussian's only once, which the avatar's
+    `color_initialized` remembers; optimiser state stays.
     """
     require_images_of(images_rgba, len(theta), cameras)
     images = premultiplied(images_rgba, avatar.blendshapes.position.dtype)

@@ -17,13 +17,7 @@ from rgbavatar_ns.kernels import MorphedGradient, MorphedRenderer, PinholeCamera
 
 
 class FusedStep:
-    """Trains an avatar with torch's Adam optimisers, whose state and learning rates it uses.
-
-    The optimisers' checkpoints are those of the eager path: a run can change between the two.
-
-    Raises:
-        ValueError: `unsupported_reason` gives a reason for these optimisers.
-    """
+    """Trains with torch's Adam optimisers; ValueError where `unsupported_reason` has a reason."""
 
     def __init__(
         self, avatar: Avatar, optimizers: Iterable[torch.optim.Optimizer], backend: str = "auto"

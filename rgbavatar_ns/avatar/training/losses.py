@@ -21,11 +21,7 @@ def require_images_of(images_rgba: Tensor, count: int, cameras: PinholeCameras) 
 
 
 def random_backgrounds(step: int, batch: int, seed: int = 0) -> Float[Tensor, "batch 3"]:
-    """Return one uniformly random colour an image (paper, sec. 3.2), float32 on the CPU.
-
-    A pure function of its arguments, drawn from a counter-based generator, so that a resumed run
-    sees the backgrounds of the uninterrupted one without any stored random state.
-    """
+    """Return one random colour an image (paper, sec. 3.2), a pure function of the arguments."""
     counter = np.random.Philox(key=np.array([seed, step], dtype=np.uint64))
     return torch.from_numpy(np.random.Generator(counter).random((batch, 3), dtype=np.float32))
 
@@ -42,10 +38,7 @@ def image_losses(
     lpips: "LPIPSLoss | None" = None,
     lpips_weight: float = 0.0,
 ) -> dict[str, Float[Tensor, ""]]:
-    """The parts of the loss between drawn images and filmed ones over the same backgrounds.
-
-    "l1" and, where it is given, "lpips" times its weight (paper, sec. 3.2).
-    """
+    """ "l1" of drawn and filmed images over the same backgrounds; "lpips" times its weight."""
     target = composite(rgba_to_float(images_rgba, image.dtype), background)
     losses = {"l1": l1_loss(image, target)}
     if lpips is not None:
@@ -74,10 +67,9 @@ class LPIPSLoss:
 
     def network(self) -> nn.Module:
         """Return the network, building it the first time; raises UserError when it cannot be."""
-        network = self._network
-        if network is None:
-            network = self._network = _build_lpips_network(self.net)
-        return network
+        if self._network is None:
+            self._network = _build_lpips_network(self.net)
+        return self._network
 
 
 def _build_lpips_network(net: Literal["vgg", "alex", "squeeze"]) -> nn.Module:
@@ -87,8 +79,7 @@ def _build_lpips_network(net: Literal["vgg", "alex", "squeeze"]) -> nn.Module:
         from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
 
         metric = LearnedPerceptualImagePatchSimilarity(net_type=net)
-    # Without a network, a disk or a working torchvision this fails in many ways: URLError,
-    # OSError, RuntimeError (operator torchvision::nms), ModuleNotFoundError.
+    # Without a network, a disk or a working torchvision this fails in many ways.
     except Exception as error:
         raise UserError(
             f"LPIPS ({net}) is unavailable: {type(error).__name__}: {error}.",

@@ -26,11 +26,7 @@ _PLAIN_ADAM = {"weight_decay": 0, "amsgrad": False, "maximize": False, "differen
 
 
 class AdamStates:
-    """Every parameter's next update; checkpoints stay those of the optimisers.
-
-    Raises:
-        ValueError: `unsupported_reason` gives a reason for these optimisers.
-    """
+    """Every parameter's next update; ValueError where `unsupported_reason` gives a reason."""
 
     def __init__(self, avatar: Avatar, optimizers: Iterable[torch.optim.Optimizer]) -> None:
         self.optimizers = list(optimizers)
@@ -73,7 +69,7 @@ class AdamStates:
 
     def _recount(self, values: Iterable[Tensor]) -> None:
         for value, step in zip(values, self._steps(values)):
-            known = _counts(self._homes[value][0])
+            known = _COUNTS[self._homes[value][0]]
             known[value] = _Count(step, step._version, known[value].number + 1)
 
     def _next(self, value: Tensor) -> AdamParameter:
@@ -85,7 +81,7 @@ class AdamStates:
             state["step"] = torch.zeros((), dtype=torch.float32, device=place)
             state["exp_avg"] = torch.zeros_like(value)
             state["exp_avg_sq"] = torch.zeros_like(value)
-        known, step = _counts(optimizer), state["step"]
+        known, step = _COUNTS.setdefault(optimizer, {}), state["step"]
         count = known.get(value)
         if count is None or count.step is not step or count.version != step._version:
             # Others have counted, or a checkpoint was loaded: look, which waits for a device.
@@ -117,10 +113,6 @@ _COUNTS: WeakKeyDictionary[torch.optim.Optimizer, dict[Tensor, _Count]] = WeakKe
 def _add_one(steps: list[Tensor]) -> None:
     """In one launch for all of them."""
     torch._foreach_add_(steps, 1)  # pyright: ignore[reportPrivateImportUsage]
-
-
-def _counts(optimizer: torch.optim.Optimizer) -> dict[Tensor, _Count]:
-    return _COUNTS.setdefault(optimizer, {})
 
 
 def unsupported_reason(avatar: Avatar, optimizers: Iterable[torch.optim.Optimizer]) -> str | None:

@@ -18,10 +18,7 @@ _BASES = ("basis_position", "basis_rotation_wxyz", "basis_color_feature")
 
 
 def orthogonality_error(shapes: GaussianBlendshapes) -> Float[Tensor, ""]:
-    """Return e_orth = ||V V^T - I||_2, rows of V the K bases at unit length; 0 where K = 0.
-
-    The norm is the spectral one, as the paper writes it. Differentiable.
-    """
+    """Return ||V V^T - I||_2 (spectral), rows of V the K bases at unit length; 0 if K = 0."""
     if shapes.num_bases == 0:
         return shapes.position.new_zeros(())
     return torch.linalg.matrix_norm(_gram_error(shapes), ord=2)
@@ -34,12 +31,7 @@ def orthogonality_loss(shapes: GaussianBlendshapes) -> Float[Tensor, ""]:
 
 @torch.no_grad()
 def orthogonalize(shapes: GaussianBlendshapes, method: Literal["qr", "gram_schmidt"]) -> None:
-    """Replace the K bases by orthogonal ones of the same lengths, in place.
-
-    "qr" takes the orthogonal factor by Householder reflections, its signs those of the bases;
-    "gram_schmidt" subtracts from each basis what it has of those before it. Both give the same
-    up to rounding, which the second one accumulates. Bases that are 0 stay 0.
-    """
+    """Replace the K bases by orthogonal ones of the same lengths, in place; bases of 0 stay 0."""
     bases = _rows(shapes)
     length = bases.norm(dim=1, keepdim=True)
     used = length[:, 0] > 0

@@ -6,6 +6,7 @@ weight network with its own gradients and Adam are in the graph.
 """
 
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -16,7 +17,7 @@ from rgbavatar_ns.avatar.avatar import Avatar
 from rgbavatar_ns.avatar.training.batches import DeviceFrames
 from rgbavatar_ns.avatar.training.cuda_graph import Recorder, record_cuda_graph, supports
 from rgbavatar_ns.avatar.training.optimizer_states import AdamStates
-from rgbavatar_ns.kernels import UPDATED_ATTRIBUTES, DeviceRenderer, PinholeCameras
+from rgbavatar_ns.kernels import UPDATED_ATTRIBUTES, DeviceRenderer
 
 _NUMBERS = 5
 _EAGER_STEPS = 3
@@ -30,11 +31,8 @@ class RecordedStep:
 
     The first steps run kernel by kernel, then the step is recorded. A step whose tiles' lists do
     not fit changes no Gaussian; `skipped_steps` counts them, and the step is recorded anew with
-    more room.
-
-    Raises:
-        ValueError: the optimisers cannot be used (`unsupported_reason`), or the frames' backend has
-            no renderer that works without the host (`supports`).
+    more room. Raises ValueError where the optimisers cannot be used (`unsupported_reason`), or the
+    backend needs the host (`supports`).
     """
 
     def __init__(
@@ -69,11 +67,7 @@ class RecordedStep:
     def __call__(
         self, chosen: Sequence[int], background: Float[Tensor, "B 3"]
     ) -> Float[Tensor, ""]:
-        """Take one step on the frames `chosen`; returns its loss, on the device.
-
-        The backgrounds come from main memory. Raises ValueError for another number of frames than
-        `batch_size`.
-        """
+        """Take one step on `chosen`, backgrounds in main memory; ValueError for another size."""
         if len(chosen) != self._sizes[0] or len(background) != len(chosen):
             raise ValueError(f"{len(chosen)} frames in a step recorded for {self._sizes[0]}.")
         self._gaussian_states = self._states.next_of_gaussians()
@@ -145,13 +139,9 @@ class RecordedStep:
         frames = self.frames
         theta, cameras = frames.theta.index_select(0, index), frames.cameras
         if len(cameras.focal_px) > 1:
-            cameras = PinholeCameras(
-                cameras.world_to_camera.index_select(0, index),
-                cameras.focal_px.index_select(0, index),
-                cameras.principal_point_px.index_select(0, index),
-                cameras.width,
-                cameras.height,
-            )
+            parts = ("world_to_camera", "focal_px", "principal_point_px")
+            chosen = {name: getattr(cameras, name).index_select(0, index) for name in parts}
+            cameras = replace(cameras, **chosen)
         with torch.enable_grad():
             psi = self._avatar.weights(theta)
         with torch.no_grad():
@@ -163,10 +153,8 @@ class RecordedStep:
 
     def _look(self) -> None:
         """Where steps overflowed: count them, make room, and record the step anew."""
-        overflows = int(self._overflows)
-        if overflows == 0:
-            return
-        self.skipped_steps += overflows
-        self._overflows.zero_()
-        self._renderer_of_last_step.make_room(int(self._needed))
-        self._replay, self._steps = None, 0
+        if overflows := int(self._overflows):
+            self.skipped_steps += overflows
+            self._overflows.zero_()
+            self._renderer_of_last_step.make_room(int(self._needed))
+            self._replay, self._steps = None, 0

@@ -49,11 +49,7 @@ def fit_theta(
     reference: Float[Tensor, "R H"] | None = None,
     backend: str = "auto",
 ) -> Float[Tensor, "B H"]:
-    """Correct theta of frames that the avatar has not seen, which itself stays as it is.
-
-    `reference` is the theta of the avatar's training frames, see `TrackingRefinement`. Each step
-    looks at all frames, over random backgrounds.
-    """
+    """Correct theta of unseen frames, the avatar frozen; `reference`: see `TrackingRefinement`."""
     frames = TrackingRefinement(theta, avatar.layout, config, centered=False, reference=reference)
     rows = torch.arange(len(theta), device=theta.device)
     for step in range(steps):

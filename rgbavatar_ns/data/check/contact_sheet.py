@@ -24,10 +24,7 @@ def write_check_sheet(
     overlaps: Sequence[SilhouetteOverlap],
     chosen: Sequence[int],
 ) -> None:
-    """Draw these of the sample's frames beside one another; an existing file is replaced.
-
-    Labels give the frame's number and IoU.
-    """
+    """Draw these of the sample's frames with number and IoU; an existing file is replaced."""
     points = projected(sample)
     tiles = []
     for place in chosen:

@@ -5,26 +5,16 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from rgbavatar_ns.data.check.problems import Problem, first_few
+from rgbavatar_ns.data.check.problems import Problem
+from rgbavatar_ns.data.importers.formats import FORMATS
 from rgbavatar_ns.data.native.dataset import TrackedDataset
+from rgbavatar_ns.errors import first_few
 
 _LARGEST_COEFFICIENT, _LARGEST_TURN_RAD = 12.0, np.pi + 0.01
 _NARROWEST_DEGREES, _WIDEST_DEGREES = 3.0, 120.0
 _NEAREST_M, _FARTHEST_M = 0.1, 20.0
-_USUAL_FLAME = {
-    "VHAP": "2023",
-    "raw VHAP": "2023",
-    "IMAvatar": "2020",
-    "INSTA": "2020",
-    "FlashAvatar": "2020",
-    "NeRFBlendShape": "2020",
-    "GaussianBlendshapes": "2020",
-    "RGBAvatar": "2020",
-    "metrical-tracker": "2020",
-}
-"""The version of FLAME that each system's data is tracked with."""
-_ALSO_OTHERS = ("VHAP", "raw VHAP")
-"""Systems that can be told to use another version."""
+_FLAME_2023 = ("VHAP", "raw VHAP")
+"""Systems that track with this version, and can be told to use another; all others use 2020."""
 
 
 @dataclass(frozen=True)
@@ -135,18 +125,15 @@ def camera_problems(dataset: TrackedDataset) -> list[Problem]:
 
 
 def version_problem(dataset: TrackedDataset) -> Problem | None:
-    """Whether the head is another FLAME than that which the data's system tracks with.
-
-    A warning where the system can be told so, or the user has said so (`--flame-version`).
-    """
+    """Whether the head is another FLAME than the data's; a warning where it was asked for."""
     told = str(dataset.source.get("format", ""))
-    usual, name = _USUAL_FLAME.get(told), dataset.arrays.name
+    usual, name = "2023" if told in _FLAME_2023 else "2020", dataset.arrays.name
     version = name.removeprefix("FLAME ").removesuffix(" female").removesuffix(" male")
-    if usual is None or version == usual:
+    if told not in (known.name for known in FORMATS) or version == usual:
         return None
     options = dataset.source.get("options")
     said = isinstance(options, dict) and options.get("flame_version") == version
-    possible = name.startswith("FLAME") and (said or told in _ALSO_OTHERS)
+    possible = name.startswith("FLAME") and (said or told in _FLAME_2023)
     return Problem(
         "FLAME version",
         "warning" if possible else "error",

@@ -84,10 +84,8 @@ def measure_fit(sample: Sample) -> Fit:
     """Compare all frames of a sample."""
     projection = projected(sample)
     found = overlaps(sample, projection)
-    iou, covered = (
-        float(np.mean([getattr(one, name) for one in found])) if found else 0.0
-        for name in ("iou", "covered")
-    )
+    iou = float(np.mean([one.iou for one in found])) if found else 0.0
+    covered = float(np.mean([one.covered for one in found])) if found else 0.0
     inside = float(inside_share(sample, projection).mean())
     return Fit(inside, iou, covered, *_orientation(sample), sample.has_mattes)
 
@@ -111,7 +109,7 @@ def _orientation(sample: Sample) -> tuple[float, float]:
 def placement_problem(sample: Sample, only_hopeless: bool = False) -> Problem | None:
     """The likely cause of a head that is not where the images show it; None where it fits.
 
-    only_hopeless: leave alone what could still be trained, however odd.
+    With `only_hopeless` only of what cannot be trained.
     """
     fit = measure_fit(sample)
     if fit.hopeless:
@@ -124,17 +122,18 @@ def placement_problem(sample: Sample, only_hopeless: bool = False) -> Problem | 
         return _likeliest(_tried(_axes_trials(sample))) or _unoriented(fit)
     if only_hopeless or not fit.mattes:
         return None
-    tried = [
-        (trial, mended)
-        for trial, mended in _tried([*_telling_zooms(sample), *_shift_trials(sample)])
-        if mended.score >= fit.score + trial.least_gain
+    # Zooms so far off that hair could not explain them.
+    zooms = [
+        trial
+        for zoom, trial in zip(_ZOOMS, _zoom_trials(sample))
+        if zoom <= _TOO_LONG or zoom >= _TOO_SHORT
     ]
-    found = _likeliest(tried)
+    tried = _tried([*zooms, *_shift_trials(sample)])
+    found = _likeliest([one for one in tried if one[1].score >= fit.score + one[0].least_gain])
     if found is None and fit.covered < _GOOD_COVERED:
-        tried = [
-            pair for pair in _tried(_axes_trials(sample)) if pair[1].score > fit.score + _GAIN_AXES
-        ]
-        found = _likeliest(tried) or _misfit(fit, "warning")
+        tried = _tried(_axes_trials(sample))
+        found = _likeliest([one for one in tried if one[1].score > fit.score + _GAIN_AXES])
+        found = found or _misfit(fit, "warning")
     return found or _perhaps_too_small(sample, fit)
 
 
@@ -193,10 +192,9 @@ def _axes_trials(sample: Sample) -> Iterator[_Trial]:
     }
     causes: dict[str, np.ndarray] = {f"have {name}": flip @ given for name, flip in flips.items()}
     causes |= {f"belong to a world with {name}": given @ flip for name, flip in flips.items()}
-    causes["go from camera to world"] = inverse
-    causes |= {
-        f"go from camera to world and have {name}": flip @ inverse for name, flip in flips.items()
-    }
+    back = "go from camera to world"
+    causes |= {back: inverse}
+    causes |= {f"{back} and have {name}": flip @ inverse for name, flip in flips.items()}
     # Where a reader has taken such a matrix for one from camera to world.
     opengl = flips["y and z flipped, as in OpenGL"]
     causes["go from world to camera where camera to world is meant"] = opengl @ inverse @ opengl
@@ -230,11 +228,12 @@ def _zoom_trials(sample: Sample) -> Iterator[_Trial]:
 
 def _perhaps_too_small(sample: Sample, fit: Fit) -> Problem | None:
     """A mesh so much smaller than the person that only an eye can tell whether it is hair."""
-    zooms = [zoom for zoom in _ZOOMS if _MAYBE_SHORT <= zoom < _TOO_SHORT]
     scores = {
-        zoom: measure_fit(replace(sample, focal_px=sample.focal_px * zoom)).score for zoom in zooms
+        zoom: measure_fit(replace(sample, focal_px=sample.focal_px * zoom)).score
+        for zoom in _ZOOMS
+        if _MAYBE_SHORT <= zoom < _TOO_SHORT
     }
-    best = max(zooms, key=lambda zoom: scores[zoom])
+    best = max(scores, key=lambda zoom: scores[zoom])
     if scores[best] < fit.score + _GAIN_MAYBE:
         return None
     focal = float(np.median(sample.focal_px)) / sample.scale
@@ -247,13 +246,6 @@ def _perhaps_too_small(sample: Sample, fit: Fit) -> Problem | None:
         "Look at the contact sheet of `rgbavatar check DATA`: where the mesh's eyes and mouth lie "
         "on the person's, it is the hair, and all is well.",
     )
-
-
-def _telling_zooms(sample: Sample) -> Iterator[_Trial]:
-    """Focal lengths so far off that hair could not explain it."""
-    for zoom, trial in zip(_ZOOMS, _zoom_trials(sample)):
-        if zoom <= _TOO_LONG or zoom >= _TOO_SHORT:
-            yield trial
 
 
 def _shift_trials(sample: Sample) -> Iterator[_Trial]:
@@ -289,10 +281,7 @@ def _shift_trials(sample: Sample) -> Iterator[_Trial]:
 
 
 def mirrored_problem(sample: Sample) -> Problem | None:
-    """Whether the head moves to one side while the person moves to the other.
-
-    Needs frames that follow one another or are spread over a clip, and some motion.
-    """
+    """Whether the head moves to one side while the person, in motion, moves to the other."""
     if not sample.has_mattes or len(sample) < 4:
         return None
     drawn, mattes = silhouettes(sample, projected(sample)) > 0.5, sample.alpha > 0.5

@@ -8,7 +8,6 @@ from rgbavatar_ns.data.importers.flame_parameters import FlameVersionError
 from rgbavatar_ns.errors import UserError
 
 Severity = Literal["error", "warning"]
-_SHOWN = 5
 
 
 @dataclass(frozen=True)
@@ -60,9 +59,3 @@ def verdict(findings: Iterable[Finding]) -> str:
         return "good"
     causes = "; ".join(finding.cause for finding in ordered)
     return f"{'usable' if usable(ordered) else 'look at it'}: {causes}"
-
-
-def first_few(numbers: tuple[int, ...]) -> str:
-    """The first numbers, and that there are more."""
-    shown = ", ".join(map(str, numbers[:_SHOWN]))
-    return shown if len(numbers) <= _SHOWN else f"{shown}, ..."

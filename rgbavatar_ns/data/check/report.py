@@ -16,7 +16,7 @@ from rgbavatar_ns.data.check.parameters import (
     version_problem,
 )
 from rgbavatar_ns.data.check.placement import mirrored_problem, placement_problem
-from rgbavatar_ns.data.check.problems import Problem, first_few, usable
+from rgbavatar_ns.data.check.problems import Problem, usable
 from rgbavatar_ns.data.check.sample import (
     Sample,
     inside_share,
@@ -30,7 +30,7 @@ from rgbavatar_ns.data.check.timing import frame_offset_problem, longest_run
 from rgbavatar_ns.data.importers import find_format
 from rgbavatar_ns.data.native.dataset import TrackedDataset
 from rgbavatar_ns.data.native.format import FORMAT, INDEX_FILE
-from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.errors import UserError, first_few
 
 _FEW_SPREAD = 4
 """Frames that are enough to see whether the head is where the images show it."""
@@ -95,10 +95,7 @@ def unreadable_report(path: Path, error: UserError) -> CheckReport:
 
 
 def quick_check(dataset: TrackedDataset) -> list[Problem]:
-    """What can be told from a few frames in a second: errors only, for use before training.
-
-    Raises UserError naming an image that cannot be decoded.
-    """
+    """Errors that a few frames tell in a second; raises UserError naming a damaged image."""
     train = dataset.train
     positions = [train[place] for place in spread(len(train), _FEW_SPREAD)]
     problem = placement_problem(take_sample(dataset, positions), only_hopeless=True)
@@ -114,13 +111,12 @@ def check_dataset(
 ) -> CheckReport:
     """Look at up to `max_frames` frames, evenly spread, and at a run of frames one after another.
 
-    sheet: where the contact sheet goes (PNG); None writes none. Images that cannot be decoded
-    become problems of the report.
+    sheet: where the contact sheet goes (PNG). Images that cannot be decoded become problems.
     """
     positions = spread(len(dataset), max_frames).tolist()
     problems = [*parameter_problems(dataset), *camera_problems(dataset)]
     problems += [one for one in [version_problem(dataset)] if one is not None]
-    found_overlaps: list[SilhouetteOverlap] = []
+    found_overlaps = []
     try:
         sample = take_sample(dataset, positions, progress)
         found_overlaps = overlaps(sample, projected(sample))
@@ -158,10 +154,8 @@ def check_dataset(
 def _image_problems(
     dataset: TrackedDataset, sample: Sample, found_overlaps: list[SilhouetteOverlap]
 ) -> list[Problem]:
-    problems: list[Problem | None] = []
-    few = sample.select(spread(len(sample), _FEW_SPREAD).tolist())
-    placement = placement_problem(few)
-    problems.append(placement)
+    placement = placement_problem(sample.select(spread(len(sample), _FEW_SPREAD).tolist()))
+    problems: list[Problem | None] = [placement]
     if placement is None or placement.severity == "warning":
         problems.append(mirrored_problem(sample))
         problems.append(frame_offset_problem(take_sample(dataset, longest_run(dataset))))
@@ -207,19 +201,19 @@ def _odd_frames(
 
 
 def _mattes(sample: Sample) -> Problem | None:
-    if sample.has_mattes:
-        empty = (sample.alpha > _HALF).mean() < 0.005
-        if not empty:
-            return None
+    if not sample.has_mattes:
         return Problem(
             "mattes",
-            "error",
-            "The images are empty: their alpha is zero nearly everywhere.",
-            "Check the mattes; alpha 255 is the person, 0 the background.",
+            "warning",
+            "The images are opaque: the person is not cut out, so that no silhouette can be "
+            "compared.",
+            "Cut the person out (alpha 255 is the person), or the background is learned too.",
         )
+    if (sample.alpha > _HALF).mean() >= 0.005:
+        return None
     return Problem(
         "mattes",
-        "warning",
-        "The images are opaque: the person is not cut out, so that no silhouette can be compared.",
-        "Cut the person out (alpha 255 is the person), or the background is learned too.",
+        "error",
+        "The images are empty: their alpha is zero nearly everywhere.",
+        "Check the mattes; alpha 255 is the person, 0 the background.",
     )

@@ -22,6 +22,10 @@ SMALL_PX = 96
 _CHUNK = 16
 _NEAREST_M = 1e-3
 _OPAQUE, _MATTED_SHARE = 0.5, 0.98
+_OF_FRAMES = (
+    *("alpha", "gray", "vertices"),
+    *("world_to_camera", "focal_px", "principal_point_px"),
+)
 
 
 @dataclass(frozen=True)
@@ -57,16 +61,8 @@ class Sample:
     def select(self, places: Sequence[int]) -> "Sample":
         """Some of the frames, by their place in this sample."""
         chosen = list(places)
-        return replace(
-            self,
-            positions=tuple(self.positions[place] for place in chosen),
-            alpha=self.alpha[chosen],
-            gray=self.gray[chosen],
-            vertices=self.vertices[chosen],
-            world_to_camera=self.world_to_camera[chosen],
-            focal_px=self.focal_px[chosen],
-            principal_point_px=self.principal_point_px[chosen],
-        )
+        arrays = {name: getattr(self, name)[chosen] for name in _OF_FRAMES}
+        return replace(self, positions=tuple(self.positions[place] for place in chosen), **arrays)
 
 
 @dataclass(frozen=True)
@@ -87,10 +83,7 @@ def take_sample(
     positions: Sequence[int],
     progress: Callable[[int, int], None] | None = None,
 ) -> Sample:
-    """Decode these frames and pose the head for them; one full image in memory at a time.
-
-    Raises UserError naming an image that cannot be decoded.
-    """
+    """Decode these frames and pose the head; raises UserError naming an image that is damaged."""
     scale = SMALL_PX / max(dataset.width, dataset.height)
     size = (max(1, round(dataset.width * scale)), max(1, round(dataset.height * scale)))
     alphas, grays = [], []

@@ -40,11 +40,7 @@ def longest_run(dataset: TrackedDataset) -> tuple[int, ...]:
 
 
 def frame_offset_problem(run: Sample) -> Problem | None:
-    """Compare when the images move with when the head does, for offsets of up to two frames.
-
-    How much an image changes from frame to frame goes up and down with how far the head's
-    vertices move in it; the offset at which both agree best is where the pairing is right.
-    """
+    """Compare when the images move with when the head's vertices do, for offsets of two frames."""
     if len(run) < _LEAST_FRAMES:
         return None
     motion = np.linalg.norm(np.diff(projected(run).points_px, axis=0), axis=-1).mean(1)

@@ -28,8 +28,7 @@ def open_foreign(
     """Open a folder of another system through its import, made now if need be.
 
     The import lies in the folder itself (`.rgbavatar/`) where that may be written to, else in the
-    user's cache directory; its name is a hash of the files and options that it depends on. One
-    line on stderr says what happens.
+    user's cache directory; its name is a hash of the files and options that it depends on.
     """
     name = fingerprint(src, options)
     places = _places(src, name)
@@ -63,12 +62,8 @@ def open_foreign(
 def _places(src: Path, name: str) -> list[Path]:
     """Where an import of this name may lie: in the data, or in the user's cache."""
     subject = glob.escape(src.resolve().name) if name.endswith("*") else src.resolve().name
-    return [src / CACHE_FOLDER / name, _user_cache() / f"{subject}-{name}"]
-
-
-def _user_cache() -> Path:
-    base = os.environ.get("XDG_CACHE_HOME")
-    return (Path(base) if base else Path.home() / ".cache") / "rgbavatar" / "imports"
+    user = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    return [src / CACHE_FOLDER / name, user / "rgbavatar" / "imports" / f"{subject}-{name}"]
 
 
 def _can_be_made(place: Path) -> bool:

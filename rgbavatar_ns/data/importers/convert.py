@@ -5,7 +5,6 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
 
 from rgbavatar_ns.data.importers.flashavatar import tracker_folder
 from rgbavatar_ns.data.importers.folder import Folder
@@ -39,20 +38,20 @@ def import_dataset(
 ) -> TrackedDataset:
     """Write a folder of another system to `dst` in the project's own format.
 
-    An interrupted import goes on where it was when the same is asked for again; a finished one is
-    opened. `link` shares the bytes of images that need no change where the disk allows it.
-    `progress` is called with (stage, done, in all). Raises UserError where something cannot be
-    used, or where `dst` holds something else and `overwrite` is not given.
+    An interrupted import goes on where it was; a finished one is opened. `link` shares the bytes
+    of images that need no change. Raises UserError where something cannot be used, or `dst` holds
+    something else and `overwrite` is not given.
     """
     src, dst, options = Path(src), Path(dst), options or ImportOptions()
     key = fingerprint(src, options)
-    state = _state(dst)
-    resumed = state is not None and state.get("key") == key
+    state = read_json(dst / _STATE_FILE)
+    resumed = isinstance(state, dict) and state.get("key") == key
     if resumed and (dst / INDEX_FILE).exists():
         return load_native(dst)
-    _refuse_nested(src, dst)
+    if src.resolve() == dst.resolve():
+        raise UserError(f"{dst} is the data itself.", "Name another folder to write to.")
     source = read_source(src, options, progress)
-    unfinished = state is not None and not (dst / INDEX_FILE).exists()
+    unfinished = isinstance(state, dict) and not (dst / INDEX_FILE).exists()
     writer = DatasetWriter(
         dst,
         source.arrays,
@@ -71,7 +70,12 @@ def import_dataset(
     )
     write_json(dst / _STATE_FILE, {"key": key, "source": str(src.resolve())})
     unusable = _write_images(source, writer, link, progress)
-    _settle(source, unusable, options.allow_partial)
+    report = ImportReport()
+    for position, reason in sorted(unusable.items()):
+        report.leave_out(reason, [source.frame_images[position].color.name])
+    report.settle(f"The {source.format} data in {source.root}", options.allow_partial)
+    if len(unusable) == len(source):
+        raise UserError(f"No image of {source.root} can be used.", "Look at its files.")
     for position, index in enumerate(source.index):
         if position not in unusable:
             writer.add_encoded(
@@ -83,17 +87,6 @@ def import_dataset(
                 source.timesteps[position],
             )
     return writer.finish(source.test - {source.index[position] for position in unusable})
-
-
-def _refuse_nested(src: Path, dst: Path) -> None:
-    if src.resolve() == dst.resolve():
-        raise UserError(f"{dst} is the data itself.", "Name another folder to write to.")
-
-
-def _state(dst: Path) -> dict[str, Any] | None:
-    """What an earlier import into this folder noted; None where there was none."""
-    state = read_json(dst / _STATE_FILE)
-    return state if isinstance(state, dict) else None
 
 
 def _write_images(
@@ -134,15 +127,6 @@ def _write_image(source: Source, writer: DatasetWriter, position: int, link: boo
         else:
             return
     writer.write_image(index, png.encoded)
-
-
-def _settle(source: Source, unusable: dict[int, str], allow_partial: bool) -> None:
-    report = ImportReport()
-    for position, reason in sorted(unusable.items()):
-        report.leave_out(reason, [source.frame_images[position].color.name])
-    report.settle(f"The {source.format} data in {source.root}", allow_partial)
-    if len(unusable) == len(source):
-        raise UserError(f"No image of {source.root} can be used.", "Look at its files.")
 
 
 def fingerprint(src: Path, options: ImportOptions) -> str:

@@ -31,9 +31,8 @@ def flame_for(
 ) -> HeadArrays:
     """The user's FLAME of the version that the data was tracked with, with teeth if wanted.
 
-    static_offset: what is added to the subject's vertices at rest: FLAME's 5,023, or with the 120
-    of VHAP's teeth after them. Raises FlameVersionError where the version is another one:
-    expression and identity coefficients of one version say nothing in another.
+    static_offset: of the subject's vertices at rest: FLAME's 5,023, or with the 120 of VHAP's
+    teeth after them. Raises FlameVersionError where the version is another one.
     """
     options = reading.options
     wanted = options.flame_version or usual_version
@@ -77,10 +76,7 @@ def _moved(arrays: HeadArrays, offset: Float[np.ndarray, "V 3"]) -> HeadArrays:
 def padded(
     coefficients: np.ndarray, count: int, what: str, head_name: str
 ) -> Float[np.ndarray, "_"]:
-    """Coefficients brought to the head model's number: zeros are added, or taken away.
-
-    Raises UnusableFrameError where there are none, or where others than zeros would go.
-    """
+    """Coefficients in the head model's number; UnusableFrameError if none, or not only zeros go."""
     values = np.asarray(coefficients)
     if values.dtype.kind not in "iuf" or values.size != max(values.shape, default=0):
         raise UnusableFrameError(f"{what} that is no list of numbers")

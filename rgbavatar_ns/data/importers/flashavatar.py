@@ -5,9 +5,9 @@ from pathlib import Path
 
 from rgbavatar_ns.data.importers.folder import IMAGE_SUFFIXES, Folder
 from rgbavatar_ns.data.importers.frame_files import read_frame_files
-from rgbavatar_ns.data.importers.frame_folders import CHECKPOINTS, pair, require_one
-from rgbavatar_ns.data.importers.source import Reading, Source, Split, assemble
-from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.data.importers.frame_folders import CHECKPOINTS, pair
+from rgbavatar_ns.data.importers.source import Reading, Source, assemble
+from rgbavatar_ns.errors import UserError, first_few
 
 IMAGE_MINUS_FRAME = 1
 _HELD_OUT = 500
@@ -16,9 +16,7 @@ _REGIONS = ("_neckhead", "_mouth")
 
 def is_flashavatar(folder: Folder) -> bool:
     """`imgs` and `alpha`, or the folder above that holds such data and the tracker's."""
-    if folder.has("imgs", "alpha"):
-        return True
-    return folder.has("dataset", "metrical-tracker/output")
+    return folder.has("imgs", "alpha") or folder.has("dataset", "metrical-tracker/output")
 
 
 def read_flashavatar(reading: Reading) -> Source:
@@ -47,7 +45,7 @@ def read_flashavatar(reading: Reading) -> Source:
         regions = {n: (neckhead[n], mouth[n]) for n in neckhead.keys() & mouth.keys()}
     tracked = read_frame_files(reading, files)
     records = pair(reading, tracked, images, masks, regions)
-    return assemble(reading, records, tracked.arrays, tracked.identity, Split(_HELD_OUT))
+    return assemble(reading, records, tracked.arrays, tracked.identity, _HELD_OUT)
 
 
 def _of_frames(numbered: dict[int, Path]) -> dict[int, Path]:
@@ -59,15 +57,16 @@ def _subject(folder: Folder) -> Folder:
     if folder.has("imgs"):
         return folder
     named = sorted(path.parent for path in (folder.root / "dataset").glob("*/imgs"))
-    return replace(folder, root=require_one(named, "subjects", folder.root))
+    if len(named) != 1:
+        names = first_few(named) if named else "none"
+        raise UserError(
+            f"{folder.root} holds {len(named)} subjects: {names}.", "Name the one that is meant."
+        )
+    return replace(folder, root=named[0])
 
 
 def tracker_folder(folder: Folder) -> Path:
-    """The tracker's output that belongs to the subject's pictures.
-
-    FlashAvatar keeps it beside its folder of subjects, so it may lie outside of the folder given.
-    Raises UserError where there is none.
-    """
+    """The tracker's output for the subject, maybe outside of the folder; UserError if none."""
     subject = _subject(folder).root
     name = subject.resolve().name
     output = Path("metrical-tracker") / "output"

@@ -33,7 +33,8 @@ class Folder:
         if "\0" in text:
             raise UserError(f"A path in {self.root} holds a zero byte.", "Mend the data.")
         path = self.root / text
-        if not self.allow_outside and not _is_within(path, self.root):
+        real, top = Path(os.path.realpath(path)), os.path.realpath(self.root)
+        if not self.allow_outside and not real.is_relative_to(top):
             raise UserError(
                 f"'{text}' leads out of the folder {self.root}.",
                 "Put the files into the folder, or consent with --allow-outside.",
@@ -56,10 +57,9 @@ class Folder:
     def numbered(
         self, subfolder: str, suffixes: tuple[str, ...], ending: str = ""
     ) -> dict[int, Path]:
-        """Files of a subfolder by the number at the end of their name, in its order.
+        """Files of a subfolder by the number before `ending` (as of 00001_mouth.png), in its order.
 
-        `ending` is what follows the number: "_mouth" finds 00001_mouth.png. Hidden files and
-        those without a number are passed over. Raises UserError where two have one number.
+        Files without a number are passed over. Raises UserError where two have one number.
         """
         found: dict[int, Path] = {}
         twice: list[str] = []
@@ -77,11 +77,6 @@ class Folder:
                 "Keep one of each, or put the others elsewhere.",
             )
         return dict(sorted(found.items()))
-
-
-def _is_within(path: Path, root: Path) -> bool:
-    real, top = os.path.realpath(path), os.path.realpath(root)
-    return real == top or real.startswith(top.rstrip(os.sep) + os.sep)
 
 
 def number_of(path: str) -> int | None:

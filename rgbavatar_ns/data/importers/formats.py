@@ -20,10 +20,7 @@ from rgbavatar_ns.errors import UserError
 
 @dataclass(frozen=True)
 class Format:
-    """One system's layout of a folder.
-
-    key: what a command calls it; name: what people call it.
-    """
+    """One system's layout of a folder; commands call it by `key`, people by `name`."""
 
     key: str
     name: str
@@ -56,10 +53,7 @@ FORMATS = (
 
 
 def find_format(root: Path, options: ImportOptions | None = None) -> Format | None:
-    """The format of a folder, from what lies in it or from the option; None: none of these.
-
-    Raises UserError for an option that names none.
-    """
+    """The format of a folder or of the option; None: none of these. UserError: unknown option."""
     options = options or ImportOptions()
     if options.format is not None:
         for known in FORMATS:
@@ -74,16 +68,7 @@ def find_format(root: Path, options: ImportOptions | None = None) -> Format | No
 
 
 def read_source(root: Path, options: ImportOptions, progress: Progress | None = None) -> Source:
-    """All records of a folder of another system, without its pixels.
-
-    Raises UserError where no format is recognised, or about what cannot be used in it.
-    """
-    found = _require_format(root, options)
-    folder = Folder(root, options.allow_outside)
-    return found.read(Reading(found.name, folder, options, progress))
-
-
-def _require_format(root: Path, options: ImportOptions) -> Format:
+    """All records of a folder of another system without its pixels; UserError if it has faults."""
     if not root.is_dir():
         raise UserError(f"There is no folder {root}.", "Name the folder that holds the data.")
     found = find_format(root, options)
@@ -96,4 +81,4 @@ def _require_format(root: Path, options: ImportOptions) -> Format:
             f"{root} is in none of the formats {', '.join(known.name for known in FORMATS)}.{hint}",
             "docs/dataset_format.md tells what each is known by; --format chooses one.",
         )
-    return found
+    return found.read(Reading(found.name, Folder(root, options.allow_outside), options, progress))

@@ -22,17 +22,13 @@ from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadArrays
 
 FLAME_VERSION = "2020"
-_SHAPE_TOLERANCE = 1e-3
-_SKEW_TOLERANCE = 1e-3
+_SHAPE_TOLERANCE = _SKEW_TOLERANCE = 1e-3
 _TURNS = ("jaw", "left_eye", "right_eye")
 
 
 @dataclass(frozen=True)
 class TrackedHead:
-    """One `.frame` file: the head stands still, the camera moves about it.
-
-    theta: expression, jaw, eyes and eyelids by field; `shape` is the identity.
-    """
+    """One `.frame` file: the head stands still, the camera moves about it; `shape`: identity."""
 
     shape: Float[np.ndarray, "_"]
     theta: dict[str, Float[np.ndarray, "_"]]
@@ -97,10 +93,7 @@ def _read(path: Path) -> Any:
 
 
 def parse_frame(content: Any, arrays: HeadArrays) -> TrackedHead:
-    """One file's dict, its turns as the first two rows of matrices.
-
-    Raises UnusableFrameError where it lacks something or is not finite.
-    """
+    """One file's dict, its turns as the first two rows of matrices; UnusableFrameError if unfit."""
     if not isinstance(content, dict):
         raise UnusableFrameError("records that are no dict")
     flame, opencv = content.get("flame"), content.get("opencv")
@@ -118,12 +111,12 @@ def parse_frame(content: Any, arrays: HeadArrays) -> TrackedHead:
     }
     if arrays.eyelid_dirs is not None and "eyelids" in flame:
         theta["eyelids"] = numbers(flame["eyelids"], 2, "eyelids")
-    return TrackedHead(
-        shape=padded(shape, arrays.num_identity, "shape", arrays.name),
-        theta=theta,
-        camera=_camera(opencv),
-        size=_size(content.get("img_size")),
-    )
+    shape = padded(shape, arrays.num_identity, "shape", arrays.name)
+    camera, size = _camera(opencv), None
+    if content.get("img_size") is not None:
+        height, width = numbers(content["img_size"], 2, "img_size")
+        size = int(width), int(height)
+    return TrackedHead(shape, theta, camera, size)
 
 
 def _camera(opencv: dict[str, Any]) -> CameraRecord:
@@ -135,11 +128,3 @@ def _camera(opencv: dict[str, Any]) -> CameraRecord:
     if max(abs(intrinsics[0, 1]), abs(intrinsics[1, 0]), last_row) > _SKEW_TOLERANCE:
         raise UnusableFrameError("cameras whose K is no pinhole in pixels")
     return CameraRecord(world_to_camera, np.diag(intrinsics)[:2].copy(), intrinsics[:2, 2].copy())
-
-
-def _size(img_size: Any) -> tuple[int, int] | None:
-    """(width, height) of (h, w)."""
-    if img_size is None:
-        return None
-    height, width = numbers(img_size, 2, "img_size")
-    return int(width), int(height)

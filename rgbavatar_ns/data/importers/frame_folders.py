@@ -1,34 +1,18 @@
 """Folders of metrical-tracker's `.frame` files beside images, as four systems lay them out."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 from rgbavatar_ns.data.importers.folder import IMAGE_SUFFIXES, Folder
 from rgbavatar_ns.data.importers.frame_files import TrackedHeads, read_frame_files
 from rgbavatar_ns.data.importers.frame_images import FrameImage
 from rgbavatar_ns.data.importers.frame_record import FrameRecord
-from rgbavatar_ns.data.importers.source import Reading, Source, Split, assemble
-from rgbavatar_ns.errors import UserError, first_few
+from rgbavatar_ns.data.importers.source import Reading, Source, assemble
 
 CHECKPOINTS = "checkpoint"
 _MATTES = ("alpha", "matted", "mask", "masks", "matte", "seg_mask", "image_mask")
 _IMAGES = ("images", "input", "imgs", "image")
-
-
-@dataclass(frozen=True)
-class Layout:
-    """How a system lays out its folder.
-
-    images, masks: subfolders (no masks: the images' own alpha).
-    last: how many frames it holds out.
-    by_order: frames and images belong together by their order, not by their numbers.
-    """
-
-    images: str
-    masks: str | None
-    last: int
-    by_order: bool = False
 
 
 def is_metrical(folder: Folder) -> bool:
@@ -63,36 +47,44 @@ def read_metrical(reading: Reading) -> Source:
     if options.images is not None or options.masks is not None:
         images = str(options.images or images)
         masks = None if options.masks is None else str(options.masks)
-    return _read(reading, Layout(images, masks, last=350))
+    return _read(reading, images, masks)
 
 
 def read_gaussian_blendshapes(reading: Reading) -> Source:
     """GaussianBlendshapes: the last 350 frames are held out."""
-    return _read(reading, Layout("images", None, last=350))
+    return _read(reading, "images")
 
 
 def read_nerf_blend_shape(reading: Reading) -> Source:
     """NeRFBlendShape: mattes in image_mask, the last 500 frames are held out."""
     masks = "image_mask" if reading.folder.has("image_mask") else None
-    return _read(reading, Layout("images", masks, last=500))
+    return _read(reading, "images", masks, last=500)
 
 
 def read_rgbavatar(reading: Reading) -> Source:
     """RGBAvatar's own: frames and images belong together in the order of their names."""
-    return _read(reading, Layout("images", None, last=350, by_order=True))
+    return _read(reading, "images", by_order=True)
 
 
-def _read(reading: Reading, layout: Layout) -> Source:
+def _read(
+    reading: Reading,
+    image_folder: str,
+    mask_folder: str | None = None,
+    *,
+    last: int = 350,
+    by_order: bool = False,
+) -> Source:
+    """Images of one subfolder, mattes of another (or the images' own alpha), `.frame` files."""
     folder = reading.folder
     files = folder.numbered(CHECKPOINTS, (".frame",))
-    images = folder.numbered(layout.images, IMAGE_SUFFIXES)
-    if layout.by_order and len(files) == len(images) and list(files) != list(images):
+    images = folder.numbered(image_folder, IMAGE_SUFFIXES)
+    if by_order and len(files) == len(images) and list(files) != list(images):
         reading.report.note("frames and images have other numbers: paired in order")
         images = dict(zip(files, images.values()))
-    masks = None if layout.masks is None else folder.numbered(layout.masks, IMAGE_SUFFIXES)
+    masks = None if mask_folder is None else folder.numbered(mask_folder, IMAGE_SUFFIXES)
     tracked = read_frame_files(reading, files)
     records = pair(reading, tracked, images, masks)
-    return assemble(reading, records, tracked.arrays, tracked.identity, Split(layout.last))
+    return assemble(reading, records, tracked.arrays, tracked.identity, last)
 
 
 def pair(
@@ -126,11 +118,3 @@ def pair(
             frame_image = replace(frame_image, regions=regions[number])
         records.append(FrameRecord(number, frame_image, head.theta, head.camera, head.size))
     return records
-
-
-def require_one(found: list[Path], what: str, root: Path) -> Path:
-    """The only one of several candidates; raises UserError naming them."""
-    if len(found) == 1:
-        return found[0]
-    names = first_few([str(path) for path in found]) if found else "none"
-    raise UserError(f"{root} holds {len(found)} {what}: {names}.", "Name the one that is meant.")

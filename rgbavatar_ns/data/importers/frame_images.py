@@ -22,11 +22,9 @@ _PNG_HEADER_BYTES, _JPEG_HEADER_BYTES = 33, 1 << 16
 
 @dataclass(frozen=True)
 class FrameImage:
-    """Files of one image, all of one size.
+    """Files of one image, all of one size: colour, a grey matte (else colour's own alpha).
 
-    color: PNG or JPEG; its own alpha counts where there is no `alpha`.
-    alpha: grey picture that is the matte.
-    regions: grey pictures; the matte is kept only where one of them is white.
+    The matte is kept only where one of the grey `regions` is white.
     """
 
     color: Path
@@ -74,10 +72,7 @@ class EncodedImage:
 
 
 def make_png(frame_image: FrameImage, size: tuple[int, int]) -> EncodedImage:
-    """The frame image as an RGBA PNG, straight alpha; a file that is one already stays as it is.
-
-    size: (width, height) that every part must have. Raises UnusableFrameError.
-    """
+    """The frame image as an RGBA PNG of this (width, height); UnusableFrameError if it is not."""
     encoded = _read(frame_image.color)
     plain = frame_image.alpha is None and not frame_image.regions
     # Colour type 6 at depth 8 is RGBA of bytes.

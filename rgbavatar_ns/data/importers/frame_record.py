@@ -33,7 +33,6 @@ class CameraRecord:
 class FrameRecord:
     """What a format says of one image; the pixels stay in their files.
 
-    index: number of the frame, unique and in the order of time.
     theta: head parameters by field of the head model's layout; a missing one is zero.
     size: (width, height) that the camera is meant for, where the format says it.
     """

@@ -40,12 +40,9 @@ def place_head_pose(
 ) -> list[FrameRecord]:
     """The same pictures with the head's rigid motion elsewhere.
 
-    camera and head are exact: every vertex stays where it was in every image. neck is exact for
-    what follows the neck alone; the collar takes part in the shift, but not in the rotation, and
-    the neck's pose correctives act (method of RGBAvatar's release: one camera from the first
-    frame, the rotation on the neck joint).
-
-    Raises UserError where several cameras move, so that no still one can stand for them.
+    camera and head are exact: every vertex stays where it was in every image. neck (method of
+    RGBAvatar's release) is exact for what follows the neck alone; the collar takes part in the
+    shift only. Raises UserError where several cameras move.
     """
     if head_pose == "source":
         return list(records)
@@ -60,8 +57,14 @@ def place_head_pose(
         else:
             matrix = still[record.camera_name]
             motion = np.linalg.inv(matrix) @ record.camera.world_to_camera @ motion
-            put = _on_root if head_pose == "head" else _on_neck
-            moved = put(record, motion, root if head_pose == "head" else neck)
+            turn, shift = motion[:3, :3], motion[:3, 3]
+            if head_pose == "head":
+                joint, moved = root, {"rotation": _axis_angle(turn)}
+            else:
+                # The neck turns first and then the body: together R_body R_neck.
+                own = _matrix(record.theta.get("neck", np.zeros(3)))
+                joint, moved = neck, {"rotation": np.zeros(3), "neck": _axis_angle(turn @ own)}
+            moved["translation"] = shift + turn @ joint - joint
         camera = replace(record.camera, world_to_camera=matrix)
         placed.append(replace(record, theta={**record.theta, **moved}, camera=camera))
     return placed
@@ -75,26 +78,6 @@ def _body_motion(record: FrameRecord, root: Float[np.ndarray, "3"]) -> Rigid:
     motion[:3, :3] = turn
     motion[:3, 3] = root - turn @ root + record.theta.get("translation", zero)
     return motion
-
-
-def _on_root(
-    record: FrameRecord, motion: Rigid, root: Float[np.ndarray, "3"]
-) -> dict[str, np.ndarray]:
-    turn, shift = motion[:3, :3], motion[:3, 3]
-    return {"rotation": _axis_angle(turn), "translation": shift + turn @ root - root}
-
-
-def _on_neck(
-    record: FrameRecord, motion: Rigid, neck: Float[np.ndarray, "3"]
-) -> dict[str, np.ndarray]:
-    """The neck turns first and then the body: together R_body R_neck, now the neck's alone."""
-    turn, shift = motion[:3, :3], motion[:3, 3]
-    own = _matrix(record.theta.get("neck", np.zeros(3)))
-    return {
-        "rotation": np.zeros(3),
-        "neck": _axis_angle(turn @ own),
-        "translation": shift + turn @ neck - neck,
-    }
 
 
 def _still_cameras(records: Sequence[FrameRecord]) -> dict[str | None, Rigid]:

@@ -17,7 +17,7 @@ from rgbavatar_ns.data.importers.folder import (
 from rgbavatar_ns.data.importers.frame_images import FrameImage, image_header
 from rgbavatar_ns.data.importers.frame_record import CameraRecord, FrameRecord
 from rgbavatar_ns.data.importers.import_report import UnusableFrameError
-from rgbavatar_ns.data.importers.source import Reading, Source, Split, assemble
+from rgbavatar_ns.data.importers.source import Reading, Source, assemble
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadArrays
 
@@ -65,13 +65,16 @@ def read_imavatar(reading: Reading) -> Source:
             if isinstance(frame.get("expression"), list):
                 lengths.add(len(frame["expression"]))
             records.append(_record(reading.folder, frame, image, masks, intrinsics, arrays))
-    _tell_unnamed(reading, named)
+    for folder in _IMAGES:
+        files = reading.folder.names(folder, IMAGE_SUFFIXES)
+        left = [image for image in files if image not in named]
+        reading.report.leave_out("images without a record", left)
     if len(lengths) > 1:
         raise UserError(
             f"{reading} has expressions of {', '.join(map(str, sorted(lengths)))} numbers.",
             "All frames need the same coefficients: export the data again.",
         )
-    return assemble(reading, records, arrays, identity, Split(_HELD_OUT))
+    return assemble(reading, records, arrays, identity, _HELD_OUT)
 
 
 def _record(
@@ -95,15 +98,13 @@ def _record(
     # Some exporters write the first focal length with the wrong sign.
     camera = CameraRecord(world_to_camera, np.abs(intrinsics[:2]) * size, intrinsics[2:] * size)
     pose = numbers(frame.get("pose"), 15, "pose").reshape(5, 3)
+    theta: dict[str, np.ndarray] = dict(zip(_POSE, pose))
     try:
         expression = np.asarray(frame.get("expression", ()))
     except (TypeError, ValueError, OverflowError):
         raise UnusableFrameError("expression that is no list of numbers") from None
-    count = arrays.num_expressions
-    theta = {"expression": padded(expression, count, "expression", arrays.name)}
-    return FrameRecord(
-        number, _frame_image(folder, image, masks), theta | dict(zip(_POSE, pose)), camera
-    )
+    theta["expression"] = padded(expression, arrays.num_expressions, "expression", arrays.name)
+    return FrameRecord(number, _frame_image(folder, image, masks), theta, camera)
 
 
 def _three_rows(world_mat: Any) -> Any:
@@ -132,9 +133,3 @@ def _frame_image(folder: Folder, image: Path, masks: str | None) -> FrameImage:
         if candidate.is_file():
             return FrameImage(image, alpha=candidate)
     raise UnusableFrameError("images without a matte")
-
-
-def _tell_unnamed(reading: Reading, named: set[str]) -> None:
-    for name in _IMAGES:
-        left = [image for image in reading.folder.names(name, IMAGE_SUFFIXES) if image not in named]
-        reading.report.leave_out("images without a record", left)

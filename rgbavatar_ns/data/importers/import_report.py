@@ -38,10 +38,7 @@ class ImportReport:
             self.leave_out(str(error), [name])
 
     def settle(self, what: str, allow_partial: bool) -> None:
-        """Raise UserError about all frames left out, or note them where that is allowed.
-
-        `what` names the data. Called again, it tells only of what came since.
-        """
+        """Raise UserError about all frames left out since, or note them where that is allowed."""
         if not self._left_out:
             return
         told = "; ".join(

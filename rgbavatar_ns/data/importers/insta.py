@@ -1,6 +1,5 @@
 """INSTA: transforms.json with OpenCV cameras, and what metrical-tracker knew or its meshes tell."""
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +13,7 @@ from rgbavatar_ns.data.importers.frame_images import FrameImage
 from rgbavatar_ns.data.importers.frame_record import FrameRecord
 from rgbavatar_ns.data.importers.import_report import UnusableFrameError
 from rgbavatar_ns.data.importers.mesh_fit import fit_meshes
-from rgbavatar_ns.data.importers.source import Reading, Source, Split, assemble
+from rgbavatar_ns.data.importers.source import Reading, Source, assemble
 from rgbavatar_ns.data.importers.transforms import (
     INDEX_FILE,
     Entry,
@@ -31,13 +30,10 @@ _CAMERA_TOLERANCE = 1e-3
 _EXPRESSION_BYTES = 1 << 20
 
 
-@dataclass(frozen=True)
-class _Parameters:
-    """Head parameters by frame number."""
-
-    arrays: HeadArrays
-    identity: Float[np.ndarray, "_"]
-    theta: dict[int, dict[str, Float[np.ndarray, "_"]]]
+_Parameters = tuple[
+    HeadArrays, Float[np.ndarray, "_"], dict[int, dict[str, Float[np.ndarray, "_"]]]
+]
+"""Head model, identity, and theta by frame number."""
 
 
 def is_insta(folder: Folder) -> bool:
@@ -53,9 +49,9 @@ def read_insta(reading: Reading) -> Source:
 
     Images are RGBA with soft alpha. The last 350 frames are held out where no file tells.
     """
-    transforms = read_transforms(reading)
+    listed, has_split = read_transforms(reading)
     entries: dict[int, Entry] = {}
-    for entry in transforms.entries:
+    for entry in listed:
         with reading.report.frame(entry.name):
             number = number_of(entry.name)
             if number is None:
@@ -64,24 +60,19 @@ def read_insta(reading: Reading) -> Source:
                 raise UnusableFrameError("images of the same number")
             entries[number] = entry
     files = reading.folder.numbered(CHECKPOINTS, (".frame",))
-    parameters = _from_frames(reading, entries, files) if files else _from_meshes(reading, entries)
+    arrays, identity, theta = (
+        _from_frames(reading, entries, files) if files else _from_meshes(reading, entries)
+    )
     records = []
     for number, entry in entries.items():
         with reading.report.frame(entry.name):
-            if number in parameters.theta:
-                records.append(_record(reading, number, entry, parameters.theta[number]))
-    split = Split(last=_HELD_OUT)
-    if transforms.has_split:
-        split = Split(numbers=frozenset(n for n, entry in entries.items() if entry.held_out))
-    return assemble(reading, records, parameters.arrays, parameters.identity, split)
-
-
-def _record(
-    reading: Reading, number: int, entry: Entry, theta: dict[str, Float[np.ndarray, "_"]]
-) -> FrameRecord:
-    frame_image = FrameImage(reading.folder.path(entry.name))
-    camera = camera_of(entry.values, opengl=False)
-    return FrameRecord(number, frame_image, theta, camera, size_of(entry.values))
+            if number in theta:
+                frame_image = FrameImage(reading.folder.path(entry.name))
+                camera = camera_of(entry.values, opengl=False)
+                size = size_of(entry.values)
+                records.append(FrameRecord(number, frame_image, theta[number], camera, size))
+    held_out = {number for number, entry in entries.items() if entry.held_out}
+    return assemble(reading, records, arrays, identity, held_out if has_split else _HELD_OUT)
 
 
 def _from_frames(
@@ -96,7 +87,7 @@ def _from_frames(
         with report.frame(entries[number].name):
             _require_same(entries[number], head.camera.world_to_camera)
     theta = {number: head.theta for number, head in tracked.frames.items()}
-    return _Parameters(tracked.arrays, tracked.identity, theta)
+    return tracked.arrays, tracked.identity, theta
 
 
 def _require_same(entry: Entry, tracked: Float[np.ndarray, "4 4"]) -> None:
@@ -131,8 +122,7 @@ def _from_meshes(reading: Reading, entries: dict[int, Entry]) -> _Parameters:
         f"there are no .frame files: head shape, jaw, eyes and eyelids are fitted to "
         f"{len(meshes)} meshes"
     )
-    fitted = fit_meshes(reading, arrays, {n: expressions[n] for n in meshes}, meshes)
-    return _Parameters(arrays, *fitted)
+    return arrays, *fit_meshes(reading, arrays, {n: expressions[n] for n in meshes}, meshes)
 
 
 def _expression(folder: Folder, entry: Entry, arrays: HeadArrays) -> Float[np.ndarray, "_"]:

@@ -1,6 +1,5 @@
 """Head shape, jaw, eyes and eyelids from meshes that a tracker wrote, where nothing else tells."""
 
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -23,6 +22,7 @@ _WORST_M = 3e-4
 """Meshes farther from the fitted head than this are not of this head model."""
 
 
+@torch.no_grad()
 def fit_meshes(
     reading: Reading,
     arrays: HeadArrays,
@@ -31,9 +31,8 @@ def fit_meshes(
 ) -> tuple[Float[np.ndarray, "_"], dict[int, dict[str, Float[np.ndarray, "_"]]]]:
     """Identity, and theta by frame number: Gauss-Newton on vertices, expressions known.
 
-    Ours, because INSTA writes expressions and meshes, but neither shape nor jaw. The shape comes
-    from a few frames together, then each frame by itself; the result is as exact as the meshes'
-    digits. Raises UserError where no head of this model gives the meshes.
+    Ours. The shape comes from a few frames together, then each frame by itself. Raises UserError
+    where no head of this model gives the meshes.
     """
     fit = _Fit(arrays)
     first = list(expressions)
@@ -80,10 +79,7 @@ def read_mesh(path: Path) -> Float[Tensor, "V 3"]:
 
 
 class _Fit:
-    """Gauss-Newton with differences; few parameters, many vertices.
-
-    Every sixth vertex is compared; of the others only those are kept that joints depend on.
-    """
+    """Gauss-Newton on every sixth vertex; of the others only those are kept that joints need."""
 
     def __init__(self, arrays: HeadArrays) -> None:
         self.kept = np.flatnonzero(
@@ -99,12 +95,6 @@ class _Fit:
         """Theta with this expression, the rest at rest."""
         return self.head.layout.join({"expression": torch.from_numpy(expression)})
 
-    def _vertices(
-        self, theta: Float[Tensor, "*batch H"], identity: Float[Tensor, "*_"]
-    ) -> Float[Tensor, "*batch V 3"]:
-        with torch.no_grad():
-            return self.head(theta, identity)
-
     def shape(
         self, theta: Float[Tensor, "N H"], targets: Float[Tensor, "N V 3"]
     ) -> Float[Tensor, "I"]:
@@ -114,9 +104,9 @@ class _Fit:
         for _ in range(_ITERATIONS):
             blocks, residuals = [], []
             for k in frames:
-                at = self._vertices(theta[k], identity)
+                at = self.head(theta[k], identity)
                 # With a pose held, vertices are linear in the identity.
-                of_shape = self._vertices(
+                of_shape = self.head(
                     theta[k].expand(count, -1), identity + torch.eye(count, dtype=torch.float64)
                 )
                 of_pose = self._derivatives(theta[k], identity)
@@ -136,13 +126,13 @@ class _Fit:
         self, theta: Float[Tensor, "H"], identity: Float[Tensor, "I"], target: Float[Tensor, "V 3"]
     ) -> tuple[Float[Tensor, "H"], float]:
         """Theta whose vertices are the target's, and the largest distance left in metres."""
-        residual = target - self._vertices(theta, identity)
+        residual = target - self.head(theta, identity)
         for _ in range(_ITERATIONS):
             derivatives = self._derivatives(theta, identity)
             step = _solve(derivatives.flatten(1).T, residual.flatten())
             theta = theta.clone()
             theta[self._free] += step
-            residual = target - self._vertices(theta, identity)
+            residual = target - self.head(theta, identity)
             if float(step.abs().max()) < _CONVERGED:
                 break
         return theta, float(residual.norm(dim=-1).max())
@@ -153,16 +143,13 @@ class _Fit:
         """Of the vertices by each free parameter, by central differences."""
         steps = torch.zeros(len(self._free), len(theta), dtype=torch.float64)
         steps[range(len(self._free)), self._free] = _STEP
-        ends: Sequence[Tensor] = [
-            self._vertices(theta + sign * steps, identity) for sign in (1, -1)
-        ]
-        return (ends[0] - ends[1]) / (2 * _STEP)
+        ahead, behind = (self.head(theta + sign * steps, identity) for sign in (1, -1))
+        return (ahead - behind) / (2 * _STEP)
 
 
 def _part_of(arrays: HeadArrays, kept: Int[np.ndarray, "K"]) -> HeadArrays:
     """A head of these vertices alone; all that joints depend on must be among them."""
-    none = np.zeros((0, 3), np.int64)
-    eyelids = arrays.eyelid_dirs
+    none, eyelids = np.zeros((0, 3), np.int64), arrays.eyelid_dirs
     return replace(
         arrays,
         v_template=arrays.v_template[kept],

@@ -1,7 +1,7 @@
 """The source that a format's records make up, checked and in one form."""
 
 from collections import Counter
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence, Set
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
@@ -23,14 +23,6 @@ from rgbavatar_ns.kernels.types import PinholeCameras
 
 _LARGEST_SIZE = 16384
 T = TypeVar("T")
-
-
-@dataclass(frozen=True)
-class Split:
-    """Which frames a format holds out: the last ones, those of some numbers, or both None: none."""
-
-    last: int = 0
-    numbers: frozenset[int] | None = None
 
 
 @dataclass
@@ -86,9 +78,12 @@ def assemble(
     records: Sequence[FrameRecord],
     arrays: HeadArrays,
     identity: Float[np.ndarray, "_"],
-    split: Split,
+    hold_out: int | Set[int],
 ) -> Source:
-    """Check records together and bring them into one form; raises UserError about what is odd."""
+    """Check records together and bring them into one form; raises UserError about what is odd.
+
+    hold_out: how many of the last frames the format holds out, or the numbers of those.
+    """
     records = _unique(reading, sorted(records, key=lambda record: record.index))
     size, records = _one_size(reading, records)
     reading.report.settle(str(reading), reading.options.allow_partial)
@@ -96,7 +91,11 @@ def assemble(
         raise UserError(f"{reading} has no frame that can be used.", "Look at its files.")
     records = place_head_pose(records, arrays, identity, _head_pose(reading, records))
     layout = HeadModel(arrays).layout
-    theta = layout.join({f.name: _column(records, f.name, f.size) for f in layout.fields})
+    columns = {
+        field.name: np.stack([r.theta.get(field.name, np.zeros(field.size)) for r in records])
+        for field in layout.fields
+    }
+    theta = layout.join({name: torch.from_numpy(column) for name, column in columns.items()})
     width, height = size
     cameras = PinholeCameras(
         _stack([record.camera.world_to_camera for record in records]),
@@ -105,7 +104,6 @@ def assemble(
         width,
         height,
     )
-    test = _held_out(reading, records, split)
     return Source(
         format=reading.format,
         root=reading.folder.root,
@@ -116,7 +114,7 @@ def assemble(
         frame_images=tuple(record.frame_image for record in records),
         theta=theta.float(),
         cameras=cameras,
-        test=test,
+        test=_held_out(reading, records, hold_out),
         camera_names=tuple(record.camera_name for record in records),
         timesteps=tuple(record.timestep for record in records),
         notes=tuple(reading.report.notes),
@@ -137,11 +135,6 @@ def _head_pose(reading: Reading, records: Sequence[FrameRecord]) -> HeadPose:
 
 def _stack(values: Sequence[np.ndarray]) -> Float[Tensor, "F *shape"]:
     return torch.from_numpy(np.stack(values)).float()
-
-
-def _column(records: Sequence[FrameRecord], name: str, size: int) -> Float[Tensor, "F _"]:
-    zero = np.zeros(size)
-    return torch.from_numpy(np.stack([record.theta.get(name, zero) for record in records]))
 
 
 def _unique(reading: Reading, records: list[FrameRecord]) -> list[FrameRecord]:
@@ -191,7 +184,9 @@ def _check_header(
         )
 
 
-def _held_out(reading: Reading, records: Sequence[FrameRecord], split: Split) -> frozenset[int]:
+def _held_out(
+    reading: Reading, records: Sequence[FrameRecord], by_format: int | Set[int]
+) -> frozenset[int]:
     """Numbers of the frames to hold out, after the options and the format's own rule."""
     options, numbers = reading.options, [record.index for record in records]
     if options.test_cameras:
@@ -203,19 +198,19 @@ def _held_out(reading: Reading, records: Sequence[FrameRecord], split: Split) ->
                 f"{reading} has {len(numbers)} frames, of which {last} cannot be held out.",
                 "Name a smaller --test-frames.",
             )
-    elif split.numbers is not None:
-        held_out = split.numbers & set(numbers)
+    elif not isinstance(by_format, int):
+        held_out = frozenset(by_format & set(numbers))
         if len(held_out) == len(numbers):
             raise UserError(
                 f"{reading} holds out all of its frames.", "Name another count by --test-frames."
             )
-        return frozenset(held_out)
+        return held_out
     else:
-        last = split.last
+        last = by_format
         if last >= len(numbers):
             last = len(numbers) // 4
             reading.report.note(
-                f"the format holds out the last {split.last} frames, but there are only "
+                f"the format holds out the last {by_format} frames, but there are only "
                 f"{len(numbers)}: the last {last} are held out"
             )
     return frozenset(numbers[len(numbers) - last :])

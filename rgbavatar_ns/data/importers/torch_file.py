@@ -45,9 +45,8 @@ _NUMBERS = {
 def read_torch_file(path: Path, max_bytes: int = MAX_FILE_BYTES) -> Any:
     """Containers, numpy arrays and dense CPU tensors of torch's zip form or the older one.
 
-    For metrical-tracker's `.frame` files, under the rules of `head.safe_pickle.read_pickle`.
-    Compressed zip members are refused: torch writes none, and only they can unpack to more than
-    the file holds.
+    Under the rules of `head.safe_pickle.read_pickle`. Compressed zip members, which can unpack to
+    more than the file holds, are refused.
     """
     data = read_bytes(path, max_bytes)
     load = _load_zip if data.startswith(b"PK\x03\x04") else _load_legacy

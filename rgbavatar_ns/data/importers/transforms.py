@@ -36,19 +36,8 @@ class Entry:
         return str(self.values.get("file_path", "a frame without file_path"))
 
 
-@dataclass(frozen=True)
-class Transforms:
-    """All frames of a folder; `has_split` says whether files tell which are held out."""
-
-    entries: list[Entry]
-    has_split: bool
-
-
 def first_frame(folder: Folder) -> Mapping[str, Any] | None:
-    """The first frame of the index, to tell formats apart; None where there is no index.
-
-    Empty where the index, of all frames or else of those to train from, cannot be read.
-    """
+    """The index's first frame, to tell formats apart; None: no index, empty: it cannot be read."""
     for name in (INDEX_FILE, _file_of("train")):
         if folder.has(name):
             try:
@@ -60,12 +49,11 @@ def first_frame(folder: Folder) -> Mapping[str, Any] | None:
     return None
 
 
-def read_transforms(reading: Reading) -> Transforms:
-    """Every frame that the files name, once.
+def read_transforms(reading: Reading) -> tuple[list[Entry], bool]:
+    """Every frame that the files name, once, and whether they tell which are held out.
 
     Held out are frames of transforms_test.json and transforms_val.json that are not in
-    transforms_train.json: INSTA's val is the end of train, VHAP's is the held-out camera. A frame
-    of transforms.json that no split names goes into the report.
+    transforms_train.json: INSTA's val is the end of train, VHAP's is the held-out camera.
     """
     splits = {
         split: _frames(reading, _file_of(split))
@@ -95,8 +83,7 @@ def read_transforms(reading: Reading) -> Transforms:
         idle = every.keys() - train.keys() - held_out
         reading.report.leave_out("frames that no split names", sorted(idle))
         every = {key: values for key, values in every.items() if key not in idle}
-    entries = [Entry(values, key in held_out) for key, values in every.items()]
-    return Transforms(entries, has_split)
+    return [Entry(values, key in held_out) for key, values in every.items()], has_split
 
 
 def _tell_unnamed(reading: Reading, named: Iterable[str]) -> None:

@@ -12,7 +12,7 @@ from rgbavatar_ns.data.importers.folder import Folder, finite, numbers, read_npz
 from rgbavatar_ns.data.importers.frame_images import FrameImage
 from rgbavatar_ns.data.importers.frame_record import FrameRecord
 from rgbavatar_ns.data.importers.import_report import UnusableFrameError
-from rgbavatar_ns.data.importers.source import Reading, Source, Split, assemble
+from rgbavatar_ns.data.importers.source import Reading, Source, assemble
 from rgbavatar_ns.data.importers.transforms import (
     Entry,
     camera_of,
@@ -40,9 +40,9 @@ def read_vhap(reading: Reading) -> Source:
 
     With several cameras a frame's number is timestep x cameras + place of the camera.
     """
-    transforms = read_transforms(reading)
+    entries, has_split = read_transforms(reading)
     frames: list[tuple[Entry, tuple[int, int]]] = []
-    for entry in transforms.entries:
+    for entry in entries:
         with reading.report.frame(entry.name):
             place = (_index(entry.values, "timestep_index"), _index(entry.values, "camera_index"))
             frames.append((entry, place))
@@ -53,9 +53,7 @@ def read_vhap(reading: Reading) -> Source:
     for entry, (timestep, camera) in reading.each(frames):
         with reading.report.frame(entry.name):
             number = timestep * len(cameras) + cameras.index(camera)
-            name = None
-            if len(cameras) > 1:
-                name = str(entry.values.get("camera_id", camera))
+            several = len(cameras) > 1
             path = entry.values.get("flame_param_path")
             if not isinstance(path, str):
                 raise UnusableFrameError("frames without flame_param_path")
@@ -66,14 +64,14 @@ def read_vhap(reading: Reading) -> Source:
                     subject.theta(reading.folder.path(path)),
                     camera_of(entry.values, opengl=True),
                     size_of(entry.values),
-                    name,
-                    timestep if name is not None else None,
+                    str(entry.values.get("camera_id", camera)) if several else None,
+                    timestep if several else None,
                 )
             )
             if entry.held_out:
                 held_out.add(number)
-    split = Split(numbers=frozenset(held_out)) if transforms.has_split else Split(0)
-    return assemble(reading, records, subject.arrays, subject.identity, split)
+    hold_out = held_out if has_split else 0
+    return assemble(reading, records, subject.arrays, subject.identity, hold_out)
 
 
 def _index(values: dict[str, Any], name: str) -> int:
@@ -97,8 +95,9 @@ class VhapSubject:
     """The head model with the subject's own offsets, made of the first parameters that are read."""
 
     reading: Reading
+    identity: Float[np.ndarray, "_"] = field(default_factory=lambda: np.zeros(0))
+    """The subject's shape."""
     _arrays: HeadArrays | None = None
-    _shape: Float[np.ndarray, "_"] = field(default_factory=lambda: np.zeros(0))
     _offset: Float[np.ndarray, "_ 3"] | None = None
     _known: dict[Path, dict[str, Float[np.ndarray, "_"]]] = field(default_factory=dict)
 
@@ -108,11 +107,6 @@ class VhapSubject:
         if self._arrays is None:
             raise self.reading.no_frames()
         return self._arrays
-
-    @property
-    def identity(self) -> Float[np.ndarray, "_"]:
-        """The subject's shape."""
-        return self._shape
 
     def theta(self, path: Path) -> dict[str, Float[np.ndarray, "_"]]:
         """Head parameters of a file, which several cameras may share."""
@@ -136,18 +130,16 @@ class VhapSubject:
         }
         if self._arrays is None:
             self._arrays = flame_for(self.reading, FLAME_VERSION, offset)
-            self._shape = self._identity_of(values, self._arrays)
+            self.identity = padded(
+                values["shape"], self._arrays.num_identity, "shape", self._arrays.name
+            )
             self._offset = offset
-        shape = self._identity_of(values, self._arrays)
-        if np.abs(shape - self._shape).max() > _SHAPE_TOLERANCE or not self._same_offset(offset):
+        arrays = self._arrays
+        shape = padded(values["shape"], arrays.num_identity, "shape", arrays.name)
+        if np.abs(shape - self.identity).max() > _SHAPE_TOLERANCE or not self._same_offset(offset):
             raise UnusableFrameError("records of another head shape than the first")
-        count, name = self._arrays.num_expressions, self._arrays.name
-        return {"expression": padded(values["expr"], count, "expr", name), **theta}
-
-    def _identity_of(
-        self, values: dict[str, np.ndarray], arrays: HeadArrays
-    ) -> Float[np.ndarray, "_"]:
-        return padded(values["shape"], arrays.num_identity, "shape", arrays.name)
+        expression = padded(values["expr"], arrays.num_expressions, "expr", arrays.name)
+        return {"expression": expression, **theta}
 
     def _same_offset(self, offset: Float[np.ndarray, "_ 3"] | None) -> bool:
         if offset is None or self._offset is None:

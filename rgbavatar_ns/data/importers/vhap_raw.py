@@ -10,7 +10,7 @@ from rgbavatar_ns.data.importers.folder import IMAGE_SUFFIXES, Folder, numbers, 
 from rgbavatar_ns.data.importers.frame_images import FrameImage, image_header
 from rgbavatar_ns.data.importers.frame_record import CameraRecord, FrameRecord
 from rgbavatar_ns.data.importers.import_report import UnusableFrameError
-from rgbavatar_ns.data.importers.source import Reading, Source, Split, assemble
+from rgbavatar_ns.data.importers.source import Reading, Source, assemble
 from rgbavatar_ns.data.importers.vhap import VhapSubject
 from rgbavatar_ns.errors import UserError
 
@@ -30,14 +30,16 @@ def is_vhap_raw(folder: Folder) -> bool:
 def read_vhap_raw(reading: Reading) -> Source:
     """The latest epoch's parameters with the images of the folder, or of the option `images`.
 
-    The camera looks along -z from (0, 0, 1), as VHAP places it without calibration; its focal
-    length is focal_length times the longer side. Nothing is held out by the format.
+    The camera looks along -z from (0, 0, 1); its focal length is focal_length times the longer
+    side. Nothing is held out by the format.
     """
     found = {path: _FILE.fullmatch(path.name) for path in reading.folder.root.glob("*.npz")}
     epochs = {int(match[1] or 0): path for path, match in found.items() if match}
     path = reading.folder.path(epochs[max(epochs)].name)
     values = _values(reading, path)
-    names = _names(path, values)
+    names = [str(name) for name in np.atleast_1d(values["timestep_id"]).tolist()]
+    if len(set(names)) < len(names):
+        raise UserError(f"{path} names a moment twice.", _EXPORT)
     images = _by_stem(reading, reading.options.images, ("images",))
     masks = _by_stem(reading, reading.options.masks, _MASKS)
     reading.report.leave_out(
@@ -58,7 +60,7 @@ def read_vhap_raw(reading: Reading) -> Source:
             camera = _camera(values, header.width, header.height)
             frame_image = FrameImage(images[name], masks.get(name))
             records.append(FrameRecord(moment, frame_image, theta, camera))
-    return assemble(reading, records, subject.arrays, subject.identity, Split(0))
+    return assemble(reading, records, subject.arrays, subject.identity, 0)
 
 
 def _values(reading: Reading, path: Path) -> dict[str, np.ndarray]:
@@ -80,14 +82,6 @@ def _values(reading: Reading, path: Path) -> dict[str, np.ndarray]:
                 f"{path} has {name} of shape {values[name].shape} for {moments} moments.", _EXPORT
             )
     return values
-
-
-def _names(path: Path, values: dict[str, np.ndarray]) -> list[str]:
-    """Each moment's name, which is its image's."""
-    names = [str(name) for name in np.atleast_1d(values["timestep_id"]).tolist()]
-    if len(set(names)) < len(names):
-        raise UserError(f"{path} names a moment twice.", _EXPORT)
-    return names
 
 
 def _by_stem(reading: Reading, given: Path | None, usual: tuple[str, ...]) -> dict[str, Path]:

@@ -71,10 +71,7 @@ class TrackedDataset:
         return tuple(position for position in range(len(self)) if position not in held_out)
 
     def read_image(self, position: int) -> UInt8[np.ndarray, "height width 4"]:
-        """Decode one frame to RGBA with straight alpha.
-
-        Raises UserError naming the file where it is missing, damaged or of another size.
-        """
+        """Decode one frame to RGBA, straight alpha; UserError if it is missing, damaged or odd."""
         path = self.image_paths[position]
         image = read_png_rgba(path)
         height, width = image.shape[:2]
@@ -83,12 +80,7 @@ class TrackedDataset:
 
 
 def load_native(path: str | Path) -> TrackedDataset:
-    """Read a folder in the project's own format; pixels are read and checked when decoded.
-
-    Raises UserError for a missing or empty folder, another format or version, theta that holds
-    NaN or does not fit the head, cameras that are none, images that are missing, cut short or
-    of different sizes.
-    """
+    """Read a folder in the project's own format, pixels when decoded; UserError about any fault."""
     root = Path(path)
     index = _read_index(root)
     width, height = _whole(index, "width"), _whole(index, "height")
@@ -272,8 +264,13 @@ def _camera_records(
 def _read_test(root: Path, index: dict[str, Any], numbers: tuple[int, ...]) -> tuple[int, ...]:
     """Positions of held-out frames: `test` names them, `test_frames` counts them from the end."""
     if "test" not in index:
-        count = _read_test_frames(root, index, len(numbers))
-        return tuple(range(len(numbers) - count, len(numbers)))
+        num_frames, count = len(numbers), index.get("test_frames")
+        if not isinstance(count, int) or not 0 <= count < num_frames:
+            raise UserError(
+                f"The dataset {root} holds out {count!r} of {num_frames} frames.",
+                f"Set test_frames in {INDEX_FILE} to a number from 0 to {num_frames - 1}.",
+            )
+        return tuple(range(num_frames - count, num_frames))
     listed = index["test"]
     if not isinstance(listed, list) or not {type(number) for number in listed} <= {int}:
         raise UserError(
@@ -288,16 +285,6 @@ def _read_test(root: Path, index: dict[str, Any], numbers: tuple[int, ...]) -> t
             f"Mend the list `test` in {INDEX_FILE}: numbers of frames, but not of all.",
         )
     return tuple(place for place, number in enumerate(numbers) if number in held_out)
-
-
-def _read_test_frames(root: Path, index: dict[str, Any], num_frames: int) -> int:
-    count = index.get("test_frames")
-    if not isinstance(count, int) or not 0 <= count < num_frames:
-        raise UserError(
-            f"The dataset {root} holds out {count!r} of {num_frames} frames.",
-            f"Set test_frames in {INDEX_FILE} to a number from 0 to {num_frames - 1}.",
-        )
-    return count
 
 
 def _column(root: Path, frames: list[dict[str, Any]], name: str, kind: type) -> tuple[Any, ...]:

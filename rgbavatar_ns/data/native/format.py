@@ -1,12 +1,7 @@
 """The project's own dataset format, versions 1 and 2: names, and JSON in both directions.
 
-A folder holds `dataset.json` (written last, so its presence means that the rest is whole),
-`theta.npy` [F, H] float32, `images/%05d.png` RGBA with straight alpha, and `head.npz` only where
-the head model is not the embedded one. docs/dataset_format.md describes every field.
-
-Version 2 adds to version 1: held-out frames by number (`test`), cameras by name (`cameras`, a
-frame's `camera` may be such a name), a frame's `camera_name` and `timestep`, and where the frames
-came from (`source`). What needs none of them is written as version 1.
+docs/dataset_format.md describes every field. `dataset.json` is written last, so its presence means
+that the rest is whole. What needs nothing of version 2 is written as version 1.
 """
 
 from collections.abc import Sequence

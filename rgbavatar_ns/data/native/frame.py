@@ -11,12 +11,10 @@ from rgbavatar_ns.kernels.types import PinholeCameras
 
 @dataclass(frozen=True)
 class TrackedFrame:
-    """An image, what the head did in it, and the camera that saw it.
+    """An image (straight alpha), what the head did in it (radians, metres), and who saw it.
 
     index: number of the frame in its source, unique in a dataset.
-    theta: head parameters in the order of the dataset's layout (radians, metres).
-    camera: exactly one camera (C = 1), of the image's size.
-    image_rgba: straight (not premultiplied) alpha, red first.
+    camera: exactly one (C = 1), of the image's size.
     camera_name, timestep: which of several cameras saw it, and the moment that they share.
     """
 

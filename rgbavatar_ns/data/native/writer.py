@@ -31,11 +31,7 @@ class DatasetWriter:
     """Writes the project's own format; `dataset.json` comes last and whole.
 
     Args:
-        dst: folder to write to; made where missing.
         arrays: the head model, or the embedded one's name ("makehuman").
-        identity: the person's identity coefficients.
-        layout: what theta holds.
-        width, height: of every image, in pixels.
         overwrite: replace a dataset that is there; else a folder with anything in it is refused.
         keep_images: go on with an unfinished dataset: images that are there stay, for
             `add_encoded`. Implies overwrite.
@@ -87,11 +83,7 @@ class DatasetWriter:
             ) from None
 
     def add(self, frame: TrackedFrame) -> None:
-        """Write a frame's image now; the rest follows at the end.
-
-        Raises UserError where its number was used before, theta does not fit the layout or is
-        not finite, or the image has another size.
-        """
+        """Write a frame's image now, the rest at the end; UserError where it does not fit."""
         height, width = frame.image_rgba.shape[:2]
         self._require_size(frame.index, width, height)
         png = encode_png_rgba(frame.image_rgba)
@@ -108,10 +100,7 @@ class DatasetWriter:
         camera_name: str | None = None,
         timestep: int | None = None,
     ) -> None:
-        """As `add`, with the image as a PNG file's bytes; None where it is in its place already.
-
-        The image's own size is taken on trust.
-        """
+        """As `add`, with a PNG file's bytes, its size trusted; None: it is in its place already."""
         name = f"frame {index}"
         if index in self._numbers:
             raise UserError(f"There are two frames {index}.", "Number frames once each.")
@@ -124,12 +113,11 @@ class DatasetWriter:
         if not np.isfinite(values).all():
             raise UserError(f"theta of {name} holds NaN or infinity.", "Leave this frame out.")
         self._require_size(index, camera.width, camera.height)
-        path = self.image_path(index)
         if png is not None:
             self.write_image(index, png)
         self._numbers.add(index)
         self._theta.append(values.copy())
-        relative = path.relative_to(self._root).as_posix()
+        relative = self.image_path(index).relative_to(self._root).as_posix()
         entry = {"index": index, "image": relative, "camera": camera_to_json(camera, 0)}
         if camera_name is not None:
             entry["camera_name"] = camera_name
@@ -157,8 +145,7 @@ class DatasetWriter:
     def finish(self, test: int | Collection[int]) -> TrackedDataset:
         """Write theta, the head if it is not the embedded one, and the index; load the result.
 
-        test: how many of the last frames are held out, or the numbers of those that are; at least
-        one frame must remain.
+        test: how many of the last frames are held out, or their numbers; one frame must remain.
         """
         held_out = test if isinstance(test, int) else len(set(test) & self._numbers)
         if not 0 <= held_out < len(self._frames):
@@ -166,10 +153,15 @@ class DatasetWriter:
                 f"{held_out} of {len(self._frames)} frames cannot be held out.",
                 "Hold out fewer frames, or write more.",
             )
+        head = self._arrays
+        if not isinstance(head, str):
+            if head.digest() != HeadArrays.embedded().digest():
+                head.save(self._root / HEAD_FILE)
+            head = head.name
         index: dict[str, Any] = {
             "format": FORMAT,
             "version": 1,
-            "head": self._write_head(),
+            "head": head,
             "identity": self._identity.tolist(),
             "layout": self._layout.to_json(),
             "width": self._width,
@@ -211,10 +203,3 @@ class DatasetWriter:
             if named.setdefault(frame["camera_name"], frame["camera"]) == frame["camera"]:
                 frame["camera"] = frame["camera_name"]
         return {"cameras": named}
-
-    def _write_head(self) -> str:
-        if isinstance(self._arrays, str):
-            return self._arrays
-        if self._arrays.digest() != HeadArrays.embedded().digest():
-            self._arrays.save(self._root / HEAD_FILE)
-        return self._arrays.name

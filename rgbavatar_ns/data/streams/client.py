@@ -32,17 +32,9 @@ class StreamClient:
                 client.send(TrackedFrame(index, theta, camera, image_rgba))
 
     Leaving the `with` block ends the stream; an exception in it does not, and another client may
-    go on. Where the connection is lost it is made again, with growing pauses, and the frames that
-    had been on their way are sent once more.
-
-    Args:
-        subject: who is filmed; its session is made up where it is empty.
-        address: HOST:PORT.
-        patience_s: how long to try before giving up.
-        clock, sleep: in seconds.
-
-    Raises:
-        UserError: nobody listens, or the client is refused.
+    go on. A lost connection is made again for `patience_s`, with growing pauses, and the frames
+    that had been on their way are sent once more. Raises UserError where nobody listens, or the
+    client is refused.
     """
 
     def __init__(

@@ -16,11 +16,7 @@ _PATIENCE_S = 0.1
 
 
 class FrameQueue:
-    """Frames between the source and the decoder, at most `capacity` of them.
-
-    When it is full, `put` drops the oldest frame, for a stream is about now; or it waits, where
-    the source keeps what is not taken.
-    """
+    """Frames between source and decoder; when full, `put` drops the oldest one, or waits."""
 
     def __init__(self, capacity: int) -> None:
         self.dropped = 0
@@ -62,15 +58,8 @@ class FrameQueue:
 class Ingest:
     """Two threads: one listens to the stream, one checks and decodes frames and fills the pools.
 
-    Listening begins with `listen`, so that nothing is lost while an avatar is being built, the
-    pools are filled from `start` on. Frames that cannot be used are left out and counted.
-
-    Args:
-        stream: closed by `close`.
-        subject: the stream's.
-        pools: where the frames go.
-        queue_frames: most frames that wait to be decoded.
-        tell: called, from the threads, with what a user should read at once.
+    Frames that cannot be used are left out and counted. At most `queue_frames` wait to be decoded;
+    `tell` is called, from the threads, with what a user should read at once.
     """
 
     def __init__(

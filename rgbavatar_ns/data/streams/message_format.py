@@ -1,18 +1,8 @@
-"""Frames as messages: what one binary WebSocket message holds.
+"""Frames as messages, as docs/online.md describes them for other programs.
 
-A message is the number of bytes of a JSON object (uint32, little-endian), the object in UTF-8,
-and an image or nothing:
-
-    {"type": "subject", "head": its name, "identity": [I numbers], "layout": as in dataset.json,
-     "width": ..., "height": ..., "session": any text}
-    {"type": "frame", "index": a whole number, unique within the session, "theta": [H numbers],
-     "camera": as in dataset.json}, then a PNG, RGBA with straight alpha
-    {"type": "end"}
-
-The subject comes first and is answered by a text message, "accepted N", where N messages of this
-session were had before, or "refused" and the reason. A head other than the
-embedded one follows its subject as safetensors of its arrays, and the object has its
-"num_identity" and "expression_names". Numbers begin anew with another session.
+A binary message is the number of bytes of a JSON object (uint32, little-endian), the object in
+UTF-8, and an image, a head's arrays or nothing. The subject comes first and is answered by a text,
+"accepted N", where N messages of this session were had before, or "refused" and the reason.
 """
 
 import json
@@ -37,7 +27,6 @@ LARGEST_HEADER = 1 << 20
 LARGEST_SIDE = 8192
 """Of an image, in pixels."""
 _LONGEST_SESSION = 200
-_PNG_COMPRESSION = 1
 _SIZE = struct.Struct("<I")
 _HEAD_FIELDS = ("num_identity", "expression_names")
 _CLIENT = "Send what `rgbavatar_ns.data.streams.StreamClient` sends; docs/online.md describes it."
@@ -74,9 +63,7 @@ def subject_message(subject: StreamSubject) -> bytes:
         "head": subject.arrays.name,
         "identity": subject.identity.tolist(),
         "layout": subject.layout.to_json(),
-        "width": subject.width,
-        "height": subject.height,
-        "session": subject.session,
+        **{name: getattr(subject, name) for name in ("width", "height", "session")},
     }
     if subject.arrays is HeadArrays.embedded():
         return encode(header)
@@ -88,7 +75,7 @@ def subject_message(subject: StreamSubject) -> bytes:
 
 def frame_message(frame: TrackedFrame, png: bytes | None = None) -> bytes:
     """The message of a frame; `png` is its image where that is encoded already."""
-    png = encode_png_rgba(frame.image_rgba, _PNG_COMPRESSION) if png is None else png
+    png = encode_png_rgba(frame.image_rgba, compression=1) if png is None else png
     theta, camera = frame.theta.tolist(), camera_to_json(frame.camera, 0)
     return encode({"type": "frame", "index": frame.index, "theta": theta, "camera": camera}, png)
 
@@ -139,11 +126,7 @@ def parse_message(
 
 
 def parse_answer(answer: bytes | str) -> int:
-    """How many messages of its session a client need not send again.
-
-    Raises:
-        UserError: the client is refused, or the answer is none.
-    """
+    """How many messages of its session a client need not send again; UserError if refused."""
     word, _, more = str(answer).partition(" ")
     if word == ACCEPTED and more.isdecimal():
         return int(more)
@@ -156,7 +139,7 @@ def parse_answer(answer: bytes | str) -> int:
 
 
 def _whole(value: Any) -> int:
-    if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < 1 << 62:
+    if type(value) is not int or not 0 <= value < 1 << 62:
         raise ValueError(f"{str(value)[:40]} is no whole number that is not negative")
     return value
 

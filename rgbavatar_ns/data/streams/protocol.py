@@ -18,10 +18,7 @@ from rgbavatar_ns.kernels.types import PinholeCameras
 
 @dataclass(frozen=True)
 class StreamSubject:
-    """Who is filmed: known before the first frame, the same for all of them.
-
-    Raises UserError where layout or identity do not fit the head.
-    """
+    """Who is filmed, the same for all frames; UserError where layout or identity do not fit."""
 
     arrays: HeadArrays
     identity: Float[Tensor, "I"]
@@ -55,14 +52,10 @@ class StreamSubject:
 
 @dataclass(frozen=True)
 class StreamedFrame:
-    """A tracked frame with its image as it came: encoded, or as pixels; exactly one of the two.
+    """A tracked frame as it came, not checked yet; its image a PNG or pixels, straight alpha.
 
-    index: number of the frame in its source.
-    theta: head parameters in the order of the subject's layout; not checked yet.
-    camera: exactly one camera (C = 1), of the subject's image size.
-    arrived_s: when it arrived, by the source's clock (time.monotonic()).
-    png: the image as a PNG, RGBA with straight alpha; not checked yet.
-    image_rgba: the image's pixels, straight alpha.
+    camera: exactly one (C = 1), of the subject's image size.
+    arrived_s: by the source's clock (time.monotonic()).
     """
 
     index: int
@@ -140,13 +133,4 @@ class Rewindable(Protocol):
 
     def go_on_after(self, index: int) -> None:
         """Begin behind the frame with this number; before the first `next`."""
-        ...
-
-
-@runtime_checkable
-class Rereadable(Protocol):
-    """A stream whose frames can be had again, so that checkpoints need not hold their images."""
-
-    def again(self, index: int) -> StreamedFrame:
-        """The frame with this number, without the stream going on."""
         ...

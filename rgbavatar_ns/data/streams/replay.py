@@ -11,10 +11,9 @@ from rgbavatar_ns.errors import UserError
 
 
 class ReplayStream:
-    """The training frames of a dataset in order, `frames_per_second` of them a second.
+    """The training frames of a dataset in order, `frames_per_second` from the first `next` on.
 
-    The clock starts with the first call of `next`. A frame counts as arrived at its time, also
-    where it is taken later; frames that are overdue come at once.
+    A frame counts as arrived at its time; frames that are overdue come at once.
     """
 
     keeps_frames = False

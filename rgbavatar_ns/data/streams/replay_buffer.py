@@ -15,7 +15,8 @@ from torch import Tensor
 from rgbavatar_ns.data.native.frame import TrackedFrame
 from rgbavatar_ns.data.png import encode_png_rgba
 from rgbavatar_ns.data.sampling import LocalGlobalPools
-from rgbavatar_ns.data.streams.protocol import Rereadable, StreamedFrame, StreamSubject
+from rgbavatar_ns.data.streams.protocol import StreamedFrame, StreamSubject
+from rgbavatar_ns.data.streams.replay import ReplayStream
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.kernels.types import PinholeCameras
 
@@ -46,25 +47,12 @@ class _Held:
             self.png = encode_png_rgba(self.frame.image_rgba)
         return self.png
 
-    def as_streamed(self) -> StreamedFrame:
-        frame = self.frame
-        return StreamedFrame(
-            frame.index, frame.theta, frame.camera, self.arrived_s, png=self.as_png()
-        )
-
 
 class ReplayBuffer:
     """Feeds `LocalGlobalPools` and keeps the frames that they hold, and no others.
 
-    Safe to use from several threads: one adds, another draws; each waits for the other no longer
-    than a copy takes.
-
-    Args:
-        subject: whose frames these are.
-        pools: the sampling; nobody else must use it.
-        save_images: whether `state_dict` holds the images. Those that came as pixels are encoded
-            when it is called.
-        clock: in seconds, the source's.
+    Safe to use from several threads: one adds, another draws. `pools` are this buffer's alone;
+    `clock` is the source's, in seconds. With `save_images` `state_dict` holds the images.
     """
 
     def __init__(
@@ -132,10 +120,7 @@ class ReplayBuffer:
             return self._gather(serials)
 
     def recent(self, seconds: float, most: int) -> ReplayBatch | None:
-        """Up to `most` of the local pool's frames that arrived in the last seconds, evenly taken.
-
-        The newest comes first. None where there are none.
-        """
+        """Up to `most` of the local pool's frames of the last seconds, newest first; None: none."""
         with self._lock:
             since = self._clock() - seconds
             local = self._pools.local_frames
@@ -159,8 +144,11 @@ class ReplayBuffer:
     def held(self) -> list[tuple[int, StreamedFrame]]:
         """Serial and frame of all that the pools hold, in the order of their arrival."""
         with self._lock:
-            held = sorted(self._held.items())
-        return [(serial, one.as_streamed()) for serial, one in held]
+            held = [(serial, one, one.frame) for serial, one in sorted(self._held.items())]
+        return [
+            (n, StreamedFrame(f.index, f.theta, f.camera, one.arrived_s, png=one.as_png()))
+            for n, one, f in held
+        ]
 
     def median_latency_s(self) -> float | None:
         """From arrival to first use in a batch, of the last 500 frames used first; None before."""
@@ -201,10 +189,9 @@ class ReplayBuffer:
         return state
 
     def load_state_dict(self, state: dict[str, Any], stream: object = None) -> None:
-        """Go on where `state_dict` was taken, before the first `add`.
+        """Go on where `state_dict` was taken, before the first `add`; images may be `stream`'s.
 
-        Images that the state does not hold are asked for from `stream`. Raises UserError where
-        there is no such stream, pools do not fit in, or images are damaged or of another size.
+        Raises UserError where pools do not fit in, or images are not to be had or damaged.
         """
         images = _saved_images(state, stream)
         size = self._subject.width, self._subject.height
@@ -233,7 +220,7 @@ def _saved_images(state: dict[str, Any], stream: object) -> list[bytes]:
         whole = state["png"].cpu().numpy().tobytes()
         ends = np.cumsum(state["png_bytes"].tolist()).tolist()
         return [whole[start:end] for start, end in zip([0, *ends], ends)]
-    if not isinstance(stream, Rereadable):
+    if not isinstance(stream, ReplayStream):
         raise UserError(
             "The checkpoint was made while a dataset was replayed and holds no images.",
             "Resume with that dataset: --data FOLDER --pipeline.datamanager.source.kind replay.",

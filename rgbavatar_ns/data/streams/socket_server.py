@@ -37,16 +37,13 @@ class SocketStream:
 
     Args:
         listen: HOST:PORT (port 0: any that is free, see `address`).
-        allow_remote: listen also where other machines can reach it. Whoever can, can send
-            frames: nothing is encrypted or signed.
+        allow_remote: whether other machines may reach it: nothing is encrypted or signed.
         tell: called, from a thread, with what a user should read at once.
-        clock: in seconds.
         silence_s: also how long a client may take to send its subject.
         grace_s: how long a second client waits before it is refused: what the first has sent
             before it hung up may still have to be read.
 
-    Raises:
-        UserError: the address is none, is taken, or other machines can reach it unasked.
+    Raises UserError where the address is none, is taken, or other machines can reach it unasked.
     """
 
     keeps_frames = False
@@ -221,7 +218,6 @@ def _printable(error: UserError) -> str:
 
 
 def _check_same(subject: StreamSubject, first: StreamSubject) -> None:
-    """Raise UserError where a client's images or head are not those of the first."""
     if (subject.width, subject.height) != (first.width, first.height):
         raise UserError(
             f"The stream began with images of {first.width} x {first.height} pixels, this "

@@ -17,7 +17,6 @@ from rgbavatar_ns.avatar.training.losses import random_backgrounds
 from rgbavatar_ns.data import DatasetWriter, LocalGlobalPools
 from rgbavatar_ns.data.sampling import PoolStrategy
 from rgbavatar_ns.data.streams import FrameStream, Ingest, ReplayBuffer, ReplayStream, Rewindable
-from rgbavatar_ns.data.streams.protocol import Rereadable
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.plugin.cameras import to_nerfstudio
 from rgbavatar_ns.plugin.datamanager import RGBAvatarDataManager, RGBAvatarDataManagerConfig
@@ -108,7 +107,7 @@ class OnlineDataManager(RGBAvatarDataManager):
             subject, self._first = await_subject(stream, _tell)
             _record(config, subject, [(0, self._first)])
         assert subject is not None
-        self.pools = ReplayBuffer(subject, pools, save_images=not isinstance(stream, Rereadable))
+        self.pools = ReplayBuffer(subject, pools, save_images=not isinstance(stream, ReplayStream))
         self._ingest = Ingest(stream, subject, self.pools, config.queue_frames, _tell)
         self._subject, self._stream = subject, stream
         self._resumed = False
