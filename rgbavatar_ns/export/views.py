@@ -20,7 +20,7 @@ FOUR_VIEWS_DEGREES = ((-40.0, 0.0), (40.0, 0.0), (0.0, -20.0), (0.0, 20.0))
 paper shows four without saying which."""
 
 # nerfstudio's world has z up: (x, y, z) of the head's world is (x, -z, y) there.
-_HEAD_TO_NERFSTUDIO = ((1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0))
+HEAD_TO_NERFSTUDIO = ((1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0))
 _DISTANCE_M = 1.1
 _SEEN_M = 0.34
 
@@ -121,7 +121,7 @@ def read_camera_path(path: Path) -> tuple[PinholeCameras, float]:
         )
     # The field of view is the vertical one.
     focal_px = 0.5 * height / torch.tan(0.5 * fov)
-    to_head = torch.tensor(_HEAD_TO_NERFSTUDIO).T
+    to_head = torch.tensor(HEAD_TO_NERFSTUDIO).T
     axes = to_head @ opengl[:, :3, :3] * torch.tensor([1.0, -1.0, -1.0])
     centre = to_head @ opengl[:, :3, 3:]
     world_to_camera = torch.eye(4).repeat(len(fov), 1, 1)

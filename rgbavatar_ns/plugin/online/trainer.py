@@ -7,7 +7,6 @@ RGBAvatar, sec. 3.3. The stream runs in its own threads; a step takes what the p
 # nerfstudio's classes are used by narrowing their fields, which a strict type system forbids.
 
 import dataclasses
-import json
 import signal
 import time
 from collections.abc import Iterator
@@ -27,9 +26,9 @@ from rgbavatar_ns.plugin.online.progress import OnlineProgress, StreamReport
 from rgbavatar_ns.plugin.training.errors import install_user_error_hook
 from rgbavatar_ns.plugin.training.interruption import StopRequest
 from rgbavatar_ns.plugin.training.trainer import (
-    SUMMARY_NAME,
     RGBAvatarTrainer,
     RGBAvatarTrainerConfig,
+    say,
 )
 
 _LOOK_INTERVAL_S = 1.0
@@ -179,10 +178,9 @@ class OnlineTrainer(RGBAvatarTrainer):
             raise ingest.failure
         if ingest.finished and self.stream.ended_step is None:
             self.stream.ended_step = step
-            CONSOLE.print(
+            say(
                 f"The stream has ended after {self.stream.pools.num_added} frames; "
-                f"{self.config.steps_after_stream} more steps follow.",
-                highlight=False,
+                f"{self.config.steps_after_stream} more steps follow."
             )
 
     def _settle(self) -> None:
@@ -247,36 +245,16 @@ class OnlineTrainer(RGBAvatarTrainer):
         super()._after_train()
 
     def _tell_end(self, completed: bool) -> None:
-        summary = self._write_summary()
-        frames, steps, rate = summary["frames"], summary["steps"], summary["images_per_second"]
-        CONSOLE.print(
-            f"{'Trained' if completed else 'Stopped after'} {steps} steps on {frames} frames, "
-            f"{rate:.1f} images/s.",
-            highlight=False,
+        frames, latency = self.stream.pools.num_added, self.stream.pools.median_latency_s()
+        summary = self._write_summary(
+            self.stream.images_drawn,
+            frames=frames,
+            **({} if latency is None else {"median_latency_s": latency}),
+            stream=dict(self.stream.ingest.counts()),
         )
+        steps, rate = summary["steps"], summary["images_per_second"]
+        how = "Trained" if completed else "Stopped after"
+        say(f"{how} {steps} steps on {frames} frames, {rate:.1f} images/s.")
         if not completed:
-            CONSOLE.print(
-                f"Go on with the same command and --load-dir {self.checkpoint_dir}",
-                highlight=False,
-                soft_wrap=True,
-            )
-        CONSOLE.print(f"Config: {self.base_dir / 'config.yml'}", highlight=False, soft_wrap=True)
-
-    def _write_summary(self) -> dict[str, int | float]:
-        """The run's length and speed, and what the stream brought, as training.json."""
-        seconds, images = self._train_seconds, self.stream.images_drawn
-        latency = self.stream.pools.median_latency_s()
-        summary: dict[str, int | float] = {
-            "steps": self.step + 1,
-            "images": images,
-            "train_seconds": seconds,
-            "images_per_second": images / seconds if seconds > 0 else 0.0,
-            "frames": self.stream.pools.num_added,
-        }
-        if latency is not None:
-            summary["median_latency_s"] = latency
-        counts = self.stream.ingest.counts()
-        path = self.base_dir / SUMMARY_NAME
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps({**summary, "stream": dict(counts)}, indent=2) + "\n")
-        return summary
+            say(f"Go on with the same command and --load-dir {self.checkpoint_dir}")
+        say(f"Config: {self.base_dir / 'config.yml'}")

@@ -4,7 +4,6 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +30,7 @@ from rgbavatar_ns.plugin.viewer.render import ViewerRender, viewer_render
 from rgbavatar_ns.plugin.viewer.sliders import number_sliders
 from rgbavatar_ns.plugin.viewer.viewer_state import DrivenBy, ViewerState
 from rgbavatar_ns.plugin.viewer.viewpoint import Viewpoint
-from rgbavatar_ns.plugin.viewer.widgets import Actions, Widgets
+from rgbavatar_ns.plugin.viewer.widgets import Widgets
 
 _TICK_S = 0.01
 _PATIENCE_S = 5.0
@@ -91,22 +90,10 @@ class ViewerPanel(ViewerControl):
         arrays, statistics = self._model.avatar.head.arrays, training_statistics(self._model)
         sliders = number_sliders(ThetaNames.of(self._model.avatar.layout, arrays), statistics)
         gui = viewer.viser_server.gui
-        self._widgets = Widgets(gui, self._actions(), sliders, statistics, self._num_frames)
+        self._widgets = Widgets(gui, self, sliders, statistics, self._num_frames)
         viewpoint = Viewpoint.before(self._model.avatar, self._model.subject)
         viewer.viser_server.scene.set_up_direction("+z")
         viewer.viser_server.on_client_connect(viewpoint.place)
-
-    def _actions(self) -> Actions:
-        return Actions(
-            self.change,
-            self.drive_by,
-            self.set_theta_number,
-            self.show_neutral,
-            self.show_random_expression,
-            self.set_weight,
-            self.hold_weights,
-            self.load_driver,
-        )
 
     def draw(self, camera: PinholeCameras, time_share: float | None) -> dict[str, Tensor]:
         """The picture for one camera (C = 1): rgb, accumulation, depth [H W C].
@@ -219,10 +206,9 @@ class ViewerPanel(ViewerControl):
             return
         if self._widgets is not None:
             self._widgets.offer_sequence(len(mapped.theta))
-        unmapped = f", not known to the avatar: {', '.join(mapped.unmapped)}"
-        self.tell(
-            f"{len(mapped.theta)} frames of {driver.root}{unmapped if mapped.unmapped else ''}"
-        )
+        unknown = ", ".join(mapped.unmapped)
+        left_out = f", not known to the avatar: {unknown}" if unknown else ""
+        self.tell(f"{len(mapped.theta)} frames of {driver.root}{left_out}")
         self.change(driven_by="driving sequence", sequence=mapped.theta, sequence_frame=0)
 
     def advance(self) -> None:
@@ -253,9 +239,9 @@ class ViewerPanel(ViewerControl):
     def _drawn(
         self, state: ViewerState, camera: PinholeCameras, time_share: float | None
     ) -> ViewerRender:
-        signal = driving_signal(self._model, state, time_share)
-        render = partial(viewer_render, film=self._film, backend=self._model.config.rasterizer)
-        return render(self._model.avatar, signal, state, camera)
+        model, signal = self._model, driving_signal(self._model, state, time_share)
+        backend = model.config.rasterizer
+        return viewer_render(model.avatar, signal, state, camera, film=self._film, backend=backend)
 
     def _present(self) -> ViewerState:
         """The state, but a camera path that is previewed shows what `ns-render` will."""

@@ -1,12 +1,14 @@
 """How the avatar's panel looks in viser; it shows a state and passes on what the user does."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any, get_args
+from typing import TYPE_CHECKING, Any, get_args
 
 from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
 from rgbavatar_ns.plugin.viewer.sliders import TITLES, NumberSlider
 from rgbavatar_ns.plugin.viewer.viewer_state import DrivenBy, PictureKind, ViewerState
+
+if TYPE_CHECKING:
+    from rgbavatar_ns.plugin.viewer.panel import ViewerPanel
 
 _TOPMOST = -1.0
 _STRONGEST = 12
@@ -15,34 +17,18 @@ _NO_BASIS = "none"
 _Number = int | float
 
 
-@dataclass(frozen=True)
-class Actions:
-    """What the controls call."""
-
-    change: Callable[..., None]
-    """Replaces parts of the viewer's state by name."""
-    drive_by: Callable[[DrivenBy], None]
-    set_theta_number: Callable[[int, float], None]
-    show_neutral: Callable[[], None]
-    show_random_expression: Callable[[], None]
-    set_weight: Callable[[int, float], None]
-    hold_weights: Callable[[bool], None]
-    load_driver: Callable[[str, str], None]
-    """Takes a folder, and what its numbers are relative to."""
-
-
 class Widgets:
     """The controls of one panel, made once when the viewer starts."""
 
     def __init__(
         self,
         gui: Any,
-        actions: Actions,
+        panel: "ViewerPanel",
         sliders: list[NumberSlider],
         statistics: TrainingStatistics,
         num_frames: int,
     ) -> None:
-        self._gui, self._do = gui, actions
+        self._gui, self._do = gui, panel
         self._numbers: list[tuple[NumberSlider, Any]] = []
         self._weights: list[Any] = []
         with gui.add_folder("Avatar", order=_TOPMOST):
