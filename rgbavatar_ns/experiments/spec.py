@@ -2,7 +2,7 @@
 
 import difflib
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -11,20 +11,21 @@ import yaml
 
 from rgbavatar_ns.errors import UserError
 
-METRICS = (
-    "psnr",
-    "ssim",
-    "lpips_vgg",
-    "l1_streamed",
-    "e_orth",
-    "images_per_second",
-    "train_seconds",
-    "aed",
-    "apd",
-    "csim",
-)
-"""What a table may show; the first three are of the held-out frames, `l1_streamed` is of the frames
-that a stream brought, after its end; the last three need `cross_identity`."""
+METRICS = {
+    "psnr": ("PSNR", 2),
+    "ssim": ("SSIM", 4),
+    "lpips_vgg": ("LPIPS (VGG)", 4),
+    "l1_streamed": ("L1, streamed frames", 4),
+    "e_orth": ("e_orth", 4),
+    "images_per_second": ("images/s", 1),
+    "train_seconds": ("training, s", 0),
+    "aed": ("AED", 4),
+    "apd": ("APD", 4),
+    "csim": ("CSIM", 4),
+}
+"""Heading and digits of what a table may show; the first three are of the held-out frames,
+`l1_streamed` is of the frames that a stream brought, after its end; the last three need
+`cross_identity`."""
 
 _CROSS_IDENTITY = ("driver", "tracker", "face_recognition")
 
@@ -133,7 +134,7 @@ _SAID = {str: "text", list: "a list", dict: "a mapping"}
 
 def _experiment(path: Path, content: Mapping[str, Any]) -> Experiment:
     where = path.name
-    _require_known(where, content, tuple(_KINDS))
+    _require_known(where, content, _KINDS)
     for key, value in content.items():
         if value is not None and not isinstance(value, _KINDS[key]):
             raise _refusal(where, f"has {key}: {value!r}", f"Give {_SAID[_KINDS[key][0]]} there.")
@@ -154,7 +155,7 @@ def _experiment(path: Path, content: Mapping[str, Any]) -> Experiment:
             raise _refusal(where, f"has {key}: {given[key]!r}", "Give a list of texts.")
     if any(not isinstance(seed, int) or seed < 0 for seed in given.get("seeds", ())):
         raise _refusal(where, f"has seeds: {given['seeds']!r}", "Give whole numbers, 0 or more.")
-    _require_known(f"{where}, metrics", dict.fromkeys(given.get("metrics", ())), METRICS)
+    _require_known(f"{where}, metrics", given.get("metrics", ()), METRICS)
     _check_cross_identity(where, given.get("cross_identity"), given.get("metrics", ()))
     lists = {key: tuple(value) for key, value in given.items() if isinstance(value, list)}
     return replace(experiment, **{**given, **lists})
@@ -216,13 +217,13 @@ def _variant(where: str, entry: Any) -> Variant:
     return Variant(entry["name"], dict(overrides), {key: float(v) for key, v in paper.items()})
 
 
-def _require_known(where: str, given: Mapping[str, Any], known: Sequence[str]) -> None:
+def _require_known(where: str, given: Collection[Any], known: Collection[str]) -> None:
     for key in given:
         if key not in known:
             raise _refusal(where, f"has the unknown key {key!r}", nearest(str(key), known))
 
 
-def nearest(key: str, known: Sequence[str]) -> str:
+def nearest(key: str, known: Collection[str]) -> str:
     """A remedy for a misspelt key: the nearest known one, or all of them."""
     close = difflib.get_close_matches(key, known, n=1, cutoff=0.5)
     return f"Did you mean {close[0]!r}?" if close else f"Known are {', '.join(sorted(known))}."
