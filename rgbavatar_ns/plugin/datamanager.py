@@ -1,8 +1,5 @@
 """Batches of whole frames for nerfstudio's pipeline, decoded in the background."""
 
-# pyright: reportIncompatibleVariableOverride=false
-# nerfstudio's classes are used by narrowing their fields, which a strict type system forbids.
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property

@@ -1,8 +1,5 @@
 """Batches from the pools of a running stream."""
 
-# pyright: reportIncompatibleVariableOverride=false
-# nerfstudio's classes are used by narrowing their fields, which a strict type system forbids.
-
 import dataclasses
 from dataclasses import dataclass, field
 from pathlib import Path

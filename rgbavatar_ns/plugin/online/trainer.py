@@ -3,9 +3,6 @@
 RGBAvatar, sec. 3.3. The stream runs in its own threads; a step takes what the pools hold.
 """
 
-# pyright: reportIncompatibleVariableOverride=false
-# nerfstudio's classes are used by narrowing their fields, which a strict type system forbids.
-
 import dataclasses
 import signal
 import time
@@ -144,9 +141,12 @@ class OnlineTrainer(RGBAvatarTrainer):
         return True
 
     def after_step(self, step: int, losses: Losses, seconds: float) -> None:
-        """As offline, and look at what has just arrived."""
+        """As offline, and let the newest frame drive the viewer's avatar."""
         self._settle()
-        self._follow_newest()
+        theta = self.stream.pools.newest_theta()
+        if theta is not None:
+            with self.train_lock:
+                self.pipeline.model.frame_theta[0] = theta.to(self.pipeline.device)
         super().after_step(step, losses, seconds)
 
     def _tell_step(self, step: int, losses: Losses, seconds: float) -> None:
@@ -208,13 +208,6 @@ class OnlineTrainer(RGBAvatarTrainer):
             loss=loss,
             counts=dict(self.stream.ingest.counts()),
         )
-
-    def _follow_newest(self) -> None:
-        """Let the newest frame drive the viewer's avatar."""
-        theta = self.stream.pools.newest_theta()
-        if theta is not None:
-            with self.train_lock:
-                self.pipeline.model.frame_theta[0] = theta.to(self.pipeline.device)
 
     def _look_at_newest(self, losses: Losses, progress: OnlineProgress) -> None:
         """About once a second: score the newest frames and tell how things stand."""

@@ -1,8 +1,5 @@
 """nerfstudio's trainer with checkpoints, resuming and interruption that can be relied on."""
 
-# pyright: reportIncompatibleVariableOverride=false
-# nerfstudio's classes are used by narrowing their fields, which a strict type system forbids.
-
 import math
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -10,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 from nerfstudio.engine.callbacks import TrainingCallbackLocation
 from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
@@ -30,7 +28,7 @@ from rgbavatar_ns.plugin.training.errors import device_errors_told, install_user
 from rgbavatar_ns.plugin.training.interruption import StopRequest
 from rgbavatar_ns.plugin.training.optimizers import ExponentialConfig
 from rgbavatar_ns.plugin.training.progress import TrainingProgress
-from rgbavatar_ns.plugin.training.refinement import REFINED_NAME, save_refined
+from rgbavatar_ns.plugin.training.refinement import REFINED_NAME
 
 SUMMARY_NAME = "training.json"
 
@@ -252,10 +250,11 @@ class RGBAvatarTrainer(Trainer, FitHooks):
         say(f"Checkpoints: {self.checkpoint_dir}")
 
     def _save_refined(self) -> None:
-        """Write what refinement made of the frames' theta beside the config."""
+        """Write theta of all frames, corrected or calibrated, as float32 [F, H]."""
         model = self.pipeline.model
         if model.refinement is not None:
-            save_refined(self.base_dir / REFINED_NAME, model.refinement, model.frame_theta)
+            theta = model.refinement.all_frames(model.frame_theta).cpu().numpy()
+            np.save(self.base_dir / REFINED_NAME, theta.astype(np.float32))
 
     def _write_summary(self, images: int, **more: Any) -> dict[str, Any]:
         """The run's length and speed over all its sessions, and `more`, as training.json."""

@@ -42,16 +42,8 @@ _ALL_BASES: dict[str, Any] = {"basis_alone": None, "bases_used": None}
 class _Report:
     """What is told about a picture."""
 
-    camera: PinholeCameras
-    seconds: float
-    psnr: float | None
+    text: str
     trouble: str
-
-    def text(self) -> str:
-        size = f"{self.camera.width} x {self.camera.height}"
-        rate = f"{1 / max(self.seconds, 1e-6):.0f} frames/s"
-        psnr = "" if self.psnr is None else f"  \nPSNR of this frame {self.psnr:.2f} dB"
-        return f"{size} in {1e3 * self.seconds:.0f} ms: {rate}{psnr}"
 
 
 class ViewerPanel(ViewerControl):
@@ -115,7 +107,11 @@ class ViewerPanel(ViewerControl):
             trouble = _in_words(error)
             plain = ViewerState(state.driven_by, state.frame, background=state.background)
             drawn = self._drawn(plain, camera, time_share)
-        self._report = _Report(camera, self._clock() - began_s, drawn.psnr, trouble)
+        seconds = self._clock() - began_s
+        size = f"{camera.width} x {camera.height}"
+        rate = f"{1 / max(seconds, 1e-6):.0f} frames/s"
+        psnr = "" if drawn.psnr is None else f"  \nPSNR of this frame {drawn.psnr:.2f} dB"
+        self._report = _Report(f"{size} in {1e3 * seconds:.0f} ms: {rate}{psnr}", trouble)
         if self._redraw is not None:
             thread = threading.current_thread()
             self._redraw.drew(thread, answered, camera.width, camera.height)
@@ -136,7 +132,7 @@ class ViewerPanel(ViewerControl):
         self._redraw.insist(now_s)
         if report is not None and report is not self._told and now_s >= self._next_told_s:
             self._told, self._next_told_s = report, now_s + _TOLD_EVERY_S
-            self._widgets.report(report.text())
+            self._widgets.report(report.text)
             if report.trouble:
                 self._widgets.tell(report.trouble)
 
