@@ -10,8 +10,7 @@ from typing import Any
 import torch
 
 from rgbavatar_ns.errors import UserError
-from rgbavatar_ns.kernels import available_backends
-from rgbavatar_ns.kernels.cuda import backend as cuda_backend
+from rgbavatar_ns.kernels import available_backends, unavailable_backends
 
 
 def machine_facts() -> dict[str, Any]:
@@ -38,7 +37,7 @@ def chosen_device(name: str | None, backend: str = "auto") -> torch.device:
 
     Raises UserError where the GPU is named and cannot be used, or another one than the backend's.
     """
-    reason = _unsupported_reason()
+    reason = unavailable_backends().get("cuda")
     if name is None:
         name = "cuda" if reason is None and backend in ("auto", "cuda") else "cpu"
     if name == "cuda" and reason is not None:
@@ -51,15 +50,6 @@ def chosen_device(name: str | None, backend: str = "auto") -> torch.device:
             f"Pass --device {backend}, or another --backend.",
         )
     return torch.device(name)
-
-
-def _unsupported_reason() -> str | None:
-    """Why the rasterizer cannot use a GPU here; None where it can."""
-    try:
-        cuda_backend.load()
-    except ImportError as error:
-        return str(error)
-    return None
 
 
 def require_backend(name: str = "auto", device: torch.device | None = None) -> str:

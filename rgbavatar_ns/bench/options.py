@@ -6,6 +6,9 @@ from typing import Literal
 
 from rgbavatar_ns.errors import UserError
 
+_COUNTS = ("size", "threads", "count", "batch", "frames", "repetitions", "peer_repetitions")
+_COUNTS += ("trainer_steps",)
+
 
 @dataclass(frozen=True)
 class CommonOptions:
@@ -26,10 +29,10 @@ class CommonOptions:
 
     def __post_init__(self) -> None:
         """Refuse what cannot be measured."""
-        for name in ("size", "threads"):
-            value = getattr(self, name)
-            if value is not None:
-                require_positive(name, value)
+        for name in _COUNTS:
+            value = getattr(self, name, None)
+            if value is not None and value < 1:
+                raise UserError(f"--{name.replace('_', '-')} is {value}.", "Give 1 or more.")
 
 
 @dataclass(frozen=True)
@@ -59,10 +62,6 @@ class RasterizerOptions(CommonOptions):
     def __post_init__(self) -> None:
         """Refuse what cannot be measured or would be ignored."""
         super().__post_init__()
-        for name in ("batch", "repetitions", "peer_repetitions"):
-            require_positive(name, getattr(self, name))
-        if self.count is not None:
-            require_positive("count", self.count)
         if self.avatar is None and self.data is not None:
             raise UserError(
                 "--data drives an avatar, but none is named.", "Pass --avatar too, or neither."
@@ -110,12 +109,6 @@ class StepOptions(AvatarOptions):
     trainer_steps: int = 100
     """Steps of that training."""
 
-    def __post_init__(self) -> None:
-        """Refuse what cannot be measured."""
-        super().__post_init__()
-        for name in ("batch", "repetitions", "trainer_steps"):
-            require_positive(name, getattr(self, name))
-
 
 @dataclass(frozen=True)
 class RenderOptions(AvatarOptions):
@@ -125,16 +118,3 @@ class RenderOptions(AvatarOptions):
     """Different theta that are drawn in turn."""
     repetitions: int = 50
     """Timings of each kind, after a warm-up."""
-
-    def __post_init__(self) -> None:
-        """Refuse what cannot be measured."""
-        super().__post_init__()
-        for name in ("frames", "repetitions"):
-            require_positive(name, getattr(self, name))
-
-
-def require_positive(name: str, value: int) -> None:
-    """Raise UserError where an option is below 1."""
-    if value < 1:
-        flag = name.replace("_", "-")
-        raise UserError(f"--{flag} is {value}.", "Give 1 or more.")

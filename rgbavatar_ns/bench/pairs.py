@@ -1,5 +1,7 @@
 """The (pixel, Gaussian) pairs of an image: the unit of a rasterizer's work."""
 
+from dataclasses import replace
+
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -33,13 +35,8 @@ def count_pairs(gaussians: GaussianSet, cameras: PinholeCameras) -> int:
     """
     exact = {"device": "cpu", "dtype": torch.float64}
     gaussians = GaussianSet(**{n: value.to(**exact) for n, value in vars(gaussians).items()})
-    cameras = PinholeCameras(
-        cameras.world_to_camera.to(**exact),
-        cameras.focal_px.to(**exact),
-        cameras.principal_point_px.to(**exact),
-        cameras.width,
-        cameras.height,
-    )
+    shared = {n: v.to(**exact) for n, v in vars(cameras).items() if isinstance(v, Tensor)}
+    cameras = replace(cameras, **shared)
     batch = max(len(cameras.focal_px), *(len(value) for value in vars(gaussians).values()))
     images = (one_image(gaussians, cameras, position) for position in range(batch))
     return sum(len(pixel_pairs(*image)[0]) for image in images)

@@ -50,17 +50,17 @@ def bench_render(options: RenderOptions, progress: Progress | None = None) -> Re
         growth_bytes = peak_growth_bytes(frame, device)
         whole = stopwatch.time(WHOLE_FRAME, frame)
         spread = {WHOLE_FRAME: whole} | _time_parts(workload, stopwatch)
-        spread[EAGER_FRAME] = _time_eager(workload, stopwatch)
+        avatar, theta = workload.avatar, workload.batch.theta[:1]
+        camera = one_camera(workload.batch.cameras, 0)
+        spread[EAGER_FRAME] = stopwatch.time(
+            EAGER_FRAME, lambda: rasterize(avatar.gaussians(theta), camera)
+        )
         return _report(workload, facts, spread, growth_bytes)
 
 
 def _frames_in_turn(avatar: Avatar, batch: TrainingBatch) -> Callable[[], Any]:
-    frames = cycle(
-        [
-            (batch.theta[position : position + 1], one_camera(batch.cameras, position))
-            for position in range(len(batch.theta))
-        ]
-    )
+    thetas = batch.theta.split(1)
+    frames = cycle([(one, one_camera(batch.cameras, k)) for k, one in enumerate(thetas)])
     theta, camera = next(frames)
     # Where a device can take whole pictures by itself, that is how they are drawn in a row.
     recorded = supports(avatar, theta, camera)
@@ -87,13 +87,6 @@ def _time_parts(workload: AvatarWorkload, stopwatch: Stopwatch) -> dict[str, Spr
     parts = stopwatch.laps("parts", once)
     del parts[WHOLE]
     return parts
-
-
-def _time_eager(workload: AvatarWorkload, stopwatch: Stopwatch) -> Spread:
-    """The readable path, frame after frame as the whole one."""
-    avatar, theta = workload.avatar, workload.batch.theta[:1]
-    camera = one_camera(workload.batch.cameras, 0)
-    return stopwatch.time(EAGER_FRAME, lambda: rasterize(avatar.gaussians(theta), camera))
 
 
 def _report(

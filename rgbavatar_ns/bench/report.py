@@ -4,7 +4,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from rich.console import Console
-from rich.table import Table
+from rich.table import Column, Table
 
 from rgbavatar_ns.bench.machine import machine_facts
 from rgbavatar_ns.bench.timing import Spread
@@ -61,10 +61,12 @@ def _facts(facts: dict[str, Any]) -> str:
     return ", ".join(f"{name} {value}" for name, value in facts.items() if value is not None)
 
 
+def _table(first: str, *figures: str) -> Table:
+    return Table(first, *(Column(heading, justify="right") for heading in figures))
+
+
 def _times(report: Report, images: int) -> Table:
-    table = Table("part", "ms a batch", "quartiles", "ms an image")
-    for column in table.columns[1:]:
-        column.justify = "right"
+    table = _table("part", "ms a batch", "quartiles", "ms an image")
     for name, spread in report.spread.items():
         table.add_row(
             name,
@@ -108,9 +110,7 @@ def _figures(report: Report) -> list[str]:
 
 
 def _peers(peers: dict[str, Any]) -> Table:
-    table = Table("beside it", "forward ms", "backward ms", "whole ms", "times ours")
-    for column in table.columns[1:]:
-        column.justify = "right"
+    table = _table("beside it", "forward ms", "backward ms", "whole ms", "times ours")
     for name, figures in peers.items():
         if "unavailable" in figures:
             table.add_row(name, f"unavailable: {figures['unavailable']}")

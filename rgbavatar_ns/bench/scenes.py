@@ -1,6 +1,6 @@
 """Synthetic Gaussians and cameras to measure with; imports nothing that reads data."""
 
-from dataclasses import fields
+from dataclasses import replace
 from typing import TypeVar
 
 import torch
@@ -22,13 +22,8 @@ _Record = TypeVar("_Record", GaussianSet, PinholeCameras, TrainingBatch)
 
 def on_device(record: _Record, device: torch.device) -> _Record:
     """The same dataclass with its tensors there."""
-    values = {field.name: getattr(record, field.name) for field in fields(record)}
-    for name, value in values.items():
-        if isinstance(value, Tensor):
-            values[name] = value.to(device)
-        elif isinstance(value, PinholeCameras):
-            values[name] = on_device(value, device)
-    return type(record)(**values)
+    movable = {n: v for n, v in vars(record).items() if isinstance(v, Tensor | PinholeCameras)}
+    return replace(record, **{name: value.to(device) for name, value in movable.items()})
 
 
 def leaf_gaussians(gaussians: GaussianSet) -> GaussianSet:

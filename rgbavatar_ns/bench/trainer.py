@@ -21,7 +21,6 @@ from rgbavatar_ns.data import OfflineOrder, TrackedDataset, load_dataset
 from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.synthetic import DemoConfig, make_demo_dataset
 
-_NUM_FRAMES, _NUM_TEST_FRAMES = 22, 2
 _SEED = 0
 
 
@@ -36,12 +35,8 @@ def bench_trainer(
     tell = progress or (lambda what, done, total: None)
     with tempfile.TemporaryDirectory(prefix="rgbavatar-bench-") as folder:
         if options.data is None:
-            demo = DemoConfig(
-                image_size=options.size or DEFAULT_SIZE_PX,
-                num_frames=_NUM_FRAMES,
-                num_test_frames=_NUM_TEST_FRAMES,
-                seed=_SEED,
-            )
+            size = options.size or DEFAULT_SIZE_PX
+            demo = DemoConfig(image_size=size, num_frames=22, num_test_frames=2, seed=_SEED)
             dataset = make_demo_dataset(
                 Path(folder) / "data", demo, lambda done, total: tell("demo subject", done, total)
             )

@@ -106,9 +106,8 @@ def _batch(
         return TrainingBatch(theta, cameras, images)
     # Spread over all frames; a dataset of fewer frames gives some of them twice.
     positions = [index * len(dataset) // count for index in range(count)]
-    images = torch.zeros(count, 0, 0, 4, dtype=torch.uint8)
-    if with_images:
-        images = read_images(dataset, positions)
+    empty = torch.zeros(count, 0, 0, 4, dtype=torch.uint8)
+    images = read_images(dataset, positions) if with_images else empty
     return TrainingBatch(dataset.theta[positions], dataset.cameras.select(positions), images)
 
 

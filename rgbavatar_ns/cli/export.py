@@ -131,10 +131,7 @@ def _write_page(
         camera, theta = front_camera(avatar, 512, 512), torch.zeros(0, avatar.layout.size)
     else:
         chosen = chosen_frames(len(dataset), frames, range(len(dataset)))
-        camera, theta = (
-            dataset.cameras.select([chosen[0]]),
-            dataset.theta[chosen[0] : chosen[-1] + 1],
-        )
+        camera, theta = dataset.cameras.select([chosen[0]]), dataset.theta[list(chosen)]
     options = PageOptions(title, frames_per_second)
     size = write_web_page(avatar, destination, camera, theta, options)
     print(f"{destination}: {size / 1e6:.1f} MB; open it in a browser")

@@ -250,17 +250,14 @@ def _write(
 ) -> None:
     from rgbavatar_ns.export import write_gif, write_pngs, write_video
 
+    place = output / (show if kind == "png" else f"{show}.{kind}")
     with progress_bar(show) as update:
         counted = _counted(drawn, total, update)
         if kind == "png":
-            place = output / show
             count = write_pngs(place, counted)
-        elif kind == "gif":
-            place = output / f"{show}.gif"
-            count = write_gif(place, counted, frames_per_second)
         else:
-            place = output / f"{show}.mp4"
-            count = write_video(place, counted, frames_per_second)
+            write_film = write_gif if kind == "gif" else write_video
+            count = write_film(place, counted, frames_per_second)
     print(f"{count} pictures: {place}")
 
 

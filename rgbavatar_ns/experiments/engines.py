@@ -7,10 +7,9 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from pathlib import Path
 from types import ModuleType
-from typing import Protocol, runtime_checkable
 
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.experiments.runner import LOG_FILE
@@ -20,15 +19,6 @@ _RUNNER = (sys.executable, "-m", "rgbavatar_ns.experiments.runner")
 
 Finished = Callable[[Path, int], None]
 """Called in the sweep's thread with a cell's folder and its exit code."""
-
-
-@runtime_checkable
-class Engine(Protocol):
-    """Runs cells that are described in folders, some at a time."""
-
-    def run(self, folders: Sequence[Path], finished: Finished) -> None:
-        """Return when all have ended; Ctrl-C lets those that run save, and ends."""
-        ...
 
 
 class LocalEngine:
@@ -43,11 +33,12 @@ class LocalEngine:
         self._stopped = False
 
     def run(self, folders: Sequence[Path], finished: Finished) -> None:
-        """As `Engine.run`."""
+        """Return when all have ended; Ctrl-C lets those that run save, and ends."""
         with ThreadPoolExecutor(self._at_once) as workers:
             waiting = {workers.submit(self._run_one, folder): folder for folder in folders}
             try:
-                _gather(waiting, finished)
+                for future in as_completed(waiting):
+                    finished(waiting[future], future.result())
             except BaseException:
                 self._stop(list(waiting))
                 raise
@@ -109,7 +100,7 @@ class RayEngine:
         self._resources = {"num_cpus": cpus, "num_gpus": gpus}
 
     def run(self, folders: Sequence[Path], finished: Finished) -> None:
-        """As `Engine.run`."""
+        """As `LocalEngine.run`."""
         # A node that dies ends the task, not the cell's exit code: Ray starts it anew elsewhere.
         task = self._ray.remote(max_retries=3, **self._resources)(_run_on_node)
         waiting = {task.remote(str(folder)): folder for folder in folders}
@@ -130,6 +121,10 @@ class RayEngine:
             return 1
 
 
+Engine = LocalEngine | RayEngine
+"""Runs cells that are described in folders, some at a time."""
+
+
 def _run_on_node(folder: str) -> int:
     with (Path(folder) / LOG_FILE).open("ab") as log:
         process = start_cell(Path(folder), log.fileno())
@@ -148,11 +143,3 @@ def _load_ray() -> ModuleType:
             f"The engine `ray` needs Ray, which cannot be imported ({error}).",
             "Install it (pip install 'ray>=2.9'), or use --engine local.",
         ) from error
-
-
-def _gather(waiting: dict[Future[int], Path], finished: Finished) -> None:
-    open_ = set(waiting)
-    while open_:
-        done, open_ = wait(open_, return_when=FIRST_COMPLETED)
-        for future in done:
-            finished(waiting[future], future.result())

@@ -52,16 +52,13 @@ def _require_field(part: Any, name: str, key: str, walked: list[str], where: str
 
 def _as_config(value: Any, hint: Any) -> Any:
     """YAML's lists where the config has tuples, its whole numbers where that has floats."""
-    options = typing.get_args(hint) if _is_union(hint) else (hint,)
+    union = typing.get_origin(hint) in (typing.Union, types.UnionType)
+    options = typing.get_args(hint) if union else (hint,)
     if isinstance(value, list) and any(typing.get_origin(option) is tuple for option in options):
         return tuple(value)
     if isinstance(value, int) and not isinstance(value, bool) and float in options:
         return value if int in options else float(value)
     return value
-
-
-def _is_union(hint: Any) -> bool:
-    return typing.get_origin(hint) in (typing.Union, types.UnionType)
 
 
 def _told(hint: Any) -> str:

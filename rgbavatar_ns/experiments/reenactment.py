@@ -1,7 +1,7 @@
 """Cross-identity reenactment, where no truth is there: AED, APD and CSIM (paper, supplement)."""
 
 import importlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
@@ -43,13 +43,9 @@ class PictureTracker(Protocol):
         ...
 
 
-@runtime_checkable
-class FaceRecognition(Protocol):
-    """Whose face it is, as a vector that is alike for pictures of one person."""
-
-    def __call__(self, face_rgb: _Face) -> _Embedding:
-        """Of unit length, of a face of 112 x 112 pixels with the eyes at ArcFace's places."""
-        ...
+FaceRecognition = Callable[[_Face], _Embedding]
+"""Whose face it is: a vector of unit length that is alike for pictures of one person, of a face
+with the eyes at ArcFace's places."""
 
 
 class OnnxFaceRecognition:
@@ -70,7 +66,7 @@ class OnnxFaceRecognition:
             ) from None
 
     def __call__(self, face_rgb: _Face) -> _Embedding:
-        """As `FaceRecognition`."""
+        """The face as a vector, see `FaceRecognition`."""
         blob = cv2.dnn.blobFromImage(face_rgb, 1 / 127.5, (_SIDE_PX, _SIDE_PX), (127.5,) * 3)
         self._network.setInput(blob)
         vector = self._network.forward().reshape(-1).astype(np.float64)
@@ -193,9 +189,8 @@ def reenactment_scores(
         return values, missing
     train = list(own.train)
     references = train[:: max(1, len(train) // _REFERENCES)][:_REFERENCES]
-    at = eyes_px(
-        avatar.head, avatar.identity, own.theta[references], own.cameras.select(references)
-    )
+    cameras = own.cameras.select(references)
+    at = eyes_px(avatar.head, avatar.identity, own.theta[references], cameras)
     faces = [aligned_face(_over_black(own, k), eyes) for k, eyes in zip(references, at)]
     at = eyes_px(avatar.head, avatar.identity, theta, camera)
     reenacted = [aligned_face(picture, eyes) for picture, eyes in zip(drawn, at)]

@@ -36,15 +36,10 @@ def write_report(experiment: Experiment, folder: Path, *, plots: bool = True) ->
     table = result_table(experiment, statuses)
     out = folder / "report"
     out.mkdir(parents=True, exist_ok=True)
-    paths = []
-    for suffix, text in (
-        (".md", table.to_markdown()),
-        (".csv", table.to_csv()),
-        (".tex", table.to_latex()),
-    ):
-        path = out / f"{experiment.name}{suffix}"
+    texts = {".md": table.to_markdown(), ".csv": table.to_csv(), ".tex": table.to_latex()}
+    paths = [out / f"{experiment.name}{suffix}" for suffix in texts]
+    for path, text in zip(paths, texts.values()):
         path.write_text(text, encoding="utf-8")
-        paths.append(path)
     drawn = []
     if plots:
         drawn = write_plots(experiment, table, out, experiment.name)

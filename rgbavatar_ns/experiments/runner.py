@@ -50,11 +50,8 @@ def run_cell(folder: Path) -> dict[str, Any]:
     run_folder = folder / _RUN / "cell" / cell.preset / "run"
     training = commands.train(cell.preset, data, run_folder, cell.seed, as_flags(cell.overrides))
     scores = commands.evaluate(run_folder, folder / _EVALUATION)
-    numbers = {
-        name: value
-        for name, value in {**training, **scores}.items()
-        if isinstance(value, int | float)
-    }
+    found = {**training, **scores}
+    numbers = {name: value for name, value in found.items() if isinstance(value, int | float)}
     if "stream" in training:
         avatar, dataset = Avatar.load(run_folder), load_dataset(data)
         numbers["l1_streamed"] = write_streamed(avatar, dataset, folder)
@@ -78,10 +75,8 @@ def _reenact(
     tracker = load_tracker(named["tracker"]) if "tracker" in named else None
     file = named.get("face_recognition")
     recognition = None if file is None else OnnxFaceRecognition(Path(file))
-    avatar = Avatar.load(run_folder)
-    return reenactment_scores(
-        avatar, load_dataset(data), load_dataset(driver), tracker, recognition
-    )
+    avatar, own = Avatar.load(run_folder), load_dataset(data)
+    return reenactment_scores(avatar, own, load_dataset(driver), tracker, recognition)
 
 
 def main() -> None:

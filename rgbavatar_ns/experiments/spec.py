@@ -2,8 +2,8 @@
 
 import difflib
 import itertools
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -11,20 +11,21 @@ import yaml
 
 from rgbavatar_ns.errors import UserError
 
-METRICS = (
-    "psnr",
-    "ssim",
-    "lpips_vgg",
-    "l1_streamed",
-    "e_orth",
-    "images_per_second",
-    "train_seconds",
-    "aed",
-    "apd",
-    "csim",
-)
-"""What a table may show; the first three are of the held-out frames, `l1_streamed` is of the frames
-that a stream brought, after its end; the last three need `cross_identity`."""
+METRICS = {
+    "psnr": ("PSNR", 2),
+    "ssim": ("SSIM", 4),
+    "lpips_vgg": ("LPIPS (VGG)", 4),
+    "l1_streamed": ("L1, streamed frames", 4),
+    "e_orth": ("e_orth", 4),
+    "images_per_second": ("images/s", 1),
+    "train_seconds": ("training, s", 0),
+    "aed": ("AED", 4),
+    "apd": ("APD", 4),
+    "csim": ("CSIM", 4),
+}
+"""Heading and digits of what a table may show; the first three are of the held-out frames,
+`l1_streamed` is of the frames that a stream brought, after its end; the last three need
+`cross_identity`."""
 
 _CROSS_IDENTITY = ("driver", "tracker", "face_recognition")
 
@@ -71,19 +72,14 @@ class Experiment:
     folder: Path = Path()
 
     def __post_init__(self) -> None:
-        for what, values in (
-            ("variants", self.variants),
-            ("subjects", self.subjects),
-            ("seeds", self.seeds),
-        ):
-            if not values:
+        for what in ("variants", "subjects", "seeds"):
+            if not getattr(self, what):
                 raise _refusal(self.name, f"has no {what}", f"List at least one under `{what}`.")
         names = [variant.name for variant in self.variants]
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
-            raise _refusal(
-                self.name, f"has two variants named {twice[0]!r}", "Give each its own name."
-            )
+            cause = f"has two variants named {twice[0]!r}"
+            raise _refusal(self.name, cause, "Give each its own name.")
 
 
 def read_experiment(path: Path, *, tiny: bool = False) -> Experiment:
@@ -97,67 +93,48 @@ def read_experiment(path: Path, *, tiny: bool = False) -> Experiment:
     try:
         content = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise UserError(
-            f"{path} cannot be read: {error}.", "Check the path and its YAML."
-        ) from None
+        cause = f"{path} cannot be read: {error}."
+        raise UserError(cause, "Check the path and its YAML.") from None
     if not isinstance(content, dict):
         raise _refusal(path.name, "is no mapping", "Begin with `title: ...` and `preset: ...`.")
     scale = content.pop("tiny", None)
     if tiny:
         if not isinstance(scale, dict):
             raise _refusal(path.name, "has no section `tiny`", "Leave out --tiny, or add one.")
-        content = {
-            **content,
-            **scale,
-            "base": {**(content.get("base") or {}), **(scale.get("base") or {})},
-        }
+        base = {**(content.get("base") or {}), **(scale.get("base") or {})}
+        content = {**content, **scale, "base": base}
     return _experiment(path, content)
 
 
-_KINDS: dict[str, tuple[type, ...]] = {
-    "name": (str,),
-    "title": (str,),
-    "preset": (str,),
-    "variants": (list,),
-    "grid": (dict,),
-    "subjects": (list,),
-    "seeds": (list,),
-    "base": (dict,),
-    "metrics": (list,),
-    "plot": (str,),
-    "paper_data": (str,),
-    "cross_identity": (dict,),
+_KINDS: dict[str, type] = {
+    **dict.fromkeys(("name", "title", "preset", "plot", "paper_data"), str),
+    **dict.fromkeys(("variants", "subjects", "seeds", "metrics"), list),
+    **dict.fromkeys(("grid", "base", "cross_identity"), dict),
 }
 _SAID = {str: "text", list: "a list", dict: "a mapping"}
 
 
 def _experiment(path: Path, content: Mapping[str, Any]) -> Experiment:
     where = path.name
-    _require_known(where, content, tuple(_KINDS))
+    _require_known(where, content, _KINDS)
     for key, value in content.items():
         if value is not None and not isinstance(value, _KINDS[key]):
-            raise _refusal(where, f"has {key}: {value!r}", f"Give {_SAID[_KINDS[key][0]]} there.")
+            raise _refusal(where, f"has {key}: {value!r}", f"Give {_SAID[_KINDS[key]]} there.")
     given = {key: value for key, value in content.items() if value is not None}
     for key in ("title", "preset"):
         if key not in given:
             raise _refusal(where, f"lacks `{key}`", f"Add `{key}: ...`.")
+    given.setdefault("name", path.stem)
     variants = _variants(where, given.pop("variants", None), given.pop("grid", None))
-    experiment = Experiment(
-        name=given.pop("name", path.stem),
-        variants=variants,
-        folder=path.parent.resolve(),
-        title=given.pop("title"),
-        preset=given.pop("preset"),
-    )
     for key in ("subjects", "metrics"):
         if key in given and not all(isinstance(item, str) for item in given[key]):
             raise _refusal(where, f"has {key}: {given[key]!r}", "Give a list of texts.")
     if any(not isinstance(seed, int) or seed < 0 for seed in given.get("seeds", ())):
         raise _refusal(where, f"has seeds: {given['seeds']!r}", "Give whole numbers, 0 or more.")
-    _require_known(f"{where}, metrics", dict.fromkeys(given.get("metrics", ())), METRICS)
+    _require_known(f"{where}, metrics", given.get("metrics", ()), METRICS)
     _check_cross_identity(where, given.get("cross_identity"), given.get("metrics", ()))
     lists = {key: tuple(value) for key, value in given.items() if isinstance(value, list)}
-    return replace(experiment, **{**given, **lists})
+    return Experiment(variants=variants, folder=path.parent.resolve(), **{**given, **lists})
 
 
 def _check_cross_identity(
@@ -165,15 +142,13 @@ def _check_cross_identity(
 ) -> None:
     if named is None:
         if {"aed", "apd", "csim"} & set(metrics):
-            raise _refusal(
-                where, "lists cross-identity metrics", "Name a driver: `cross_identity: {driver:`."
-            )
+            remedy = "Name a driver: `cross_identity: {driver:`."
+            raise _refusal(where, "lists cross-identity metrics", remedy)
         return
     _require_known(f"{where}, cross_identity", named, _CROSS_IDENTITY)
     if "driver" not in named or not all(isinstance(value, str) for value in named.values()):
-        raise _refusal(
-            where, f"has cross_identity: {dict(named)!r}", "Give texts, with a `driver`."
-        )
+        cause = f"has cross_identity: {dict(named)!r}"
+        raise _refusal(where, cause, "Give texts, with a `driver`.")
 
 
 def _variants(
@@ -207,22 +182,19 @@ def _variant(where: str, entry: Any) -> Variant:
     _require_known(f"{where}, variant {entry['name']!r}", entry, ("name", "set", "paper"))
     overrides, paper = entry.get("set") or {}, entry.get("paper") or {}
     if not isinstance(overrides, dict) or not isinstance(paper, dict):
-        raise _refusal(
-            where,
-            f"has the variant {entry['name']!r} with no mapping",
-            "`set` and `paper` are mappings.",
-        )
+        cause = f"has the variant {entry['name']!r} with no mapping"
+        raise _refusal(where, cause, "`set` and `paper` are mappings.")
     _require_known(f"{where}, paper of {entry['name']!r}", paper, METRICS)
     return Variant(entry["name"], dict(overrides), {key: float(v) for key, v in paper.items()})
 
 
-def _require_known(where: str, given: Mapping[str, Any], known: Sequence[str]) -> None:
+def _require_known(where: str, given: Collection[Any], known: Collection[str]) -> None:
     for key in given:
         if key not in known:
             raise _refusal(where, f"has the unknown key {key!r}", nearest(str(key), known))
 
 
-def nearest(key: str, known: Sequence[str]) -> str:
+def nearest(key: str, known: Collection[str]) -> str:
     """A remedy for a misspelt key: the nearest known one, or all of them."""
     close = difflib.get_close_matches(key, known, n=1, cutoff=0.5)
     return f"Did you mean {close[0]!r}?" if close else f"Known are {', '.join(sorted(known))}."

@@ -5,35 +5,12 @@ import io
 import math
 import statistics
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 
-from rgbavatar_ns.experiments.spec import Experiment
+from rgbavatar_ns.experiments.spec import METRICS, Experiment
 from rgbavatar_ns.experiments.sweep import CellStatus
 
-HEADINGS = {
-    "psnr": "PSNR",
-    "ssim": "SSIM",
-    "lpips_vgg": "LPIPS (VGG)",
-    "l1_streamed": "L1, streamed frames",
-    "e_orth": "e_orth",
-    "images_per_second": "images/s",
-    "train_seconds": "training, s",
-    "aed": "AED",
-    "apd": "APD",
-    "csim": "CSIM",
-}
-_DIGITS = {
-    "psnr": 2,
-    "ssim": 4,
-    "lpips_vgg": 4,
-    "l1_streamed": 4,
-    "e_orth": 4,
-    "images_per_second": 1,
-    "train_seconds": 0,
-    "aed": 4,
-    "apd": 4,
-    "csim": 4,
-}
+HEADINGS = {metric: heading for metric, (heading, _) in METRICS.items()}
 _MISSING = "-"
 
 
@@ -71,28 +48,21 @@ class ResultTable:
         """With the title above and notes below."""
         heading = "| " + " | ".join(self._heading()) + " |"
         rule = "| --- |" + " ---: |" * (len(self._heading()) - 1)
-        lines = ["| " + " | ".join(cells) + " |" for cells in self._lines("±")]
+        lines = ["| " + " | ".join(cells) + " |" for cells in self._lines()]
         notes = [f"- {note}" for note in self.notes]
-        return (
-            "\n".join([f"### {self.title}", "", heading, rule, *lines, "", *notes]).rstrip() + "\n"
-        )
+        text = "\n".join([f"### {self.title}", "", heading, rule, *lines, "", *notes])
+        return text.rstrip() + "\n"
 
     def to_csv(self) -> str:
         """Every figure in full precision: mean, spread and count in columns of their own."""
         text = io.StringIO()
         writer = csv.writer(text, lineterminator="\n")
-        columns = [(metric, part) for metric in self.metrics for part in ("mean", "std", "count")]
-        paper = [metric for metric in self.metrics if self.paper_heading]
-        writer.writerow(
-            [
-                "variant",
-                *("_".join(column) for column in columns),
-                *(f"paper_{m}" for m in paper),
-                "cells",
-            ]
-        )
+        paper = self.metrics if self.paper_heading else ()
+        named = [f"{m}_{part}" for m in self.metrics for part in ("mean", "std", "count")]
+        writer.writerow(["variant", *named, *(f"paper_{m}" for m in paper), "cells"])
         for row in self.rows:
-            parts = [_part(row.entries.get(metric), part) for metric, part in columns]
+            entries = [row.entries.get(metric) for metric in self.metrics]
+            parts = [part for e in entries for part in (astuple(e) if e else ("", "", ""))]
             published = [row.paper.get(metric, "") for metric in paper]
             writer.writerow([row.name, *parts, *published, " ".join(row.cells)])
         return text.getvalue()
@@ -100,20 +70,10 @@ class ResultTable:
     def to_latex(self) -> str:
         """A booktabs tabular, as the paper's tables."""
         heading = " & ".join(_escaped(cell) for cell in self._heading())
-        lines = [" & ".join(_escaped(c) for c in cells) + r" \\" for cells in self._lines("±")]
+        lines = [" & ".join(_escaped(c) for c in cells) + r" \\" for cells in self._lines()]
         columns = "l|" + "c" * (len(self._heading()) - 1)
-        return "\n".join(
-            [
-                rf"\begin{{tabular}}{{{columns}}}",
-                r"\toprule",
-                heading + r" \\",
-                r"\midrule",
-                *lines,
-                r"\bottomrule",
-                r"\end{tabular}",
-                "",
-            ]
-        )
+        begin = [rf"\begin{{tabular}}{{{columns}}}", r"\toprule", heading + r" \\", r"\midrule"]
+        return "\n".join([*begin, *lines, r"\bottomrule", r"\end{tabular}", ""])
 
     def _heading(self) -> list[str]:
         ours = [HEADINGS[metric] for metric in self.metrics]
@@ -121,10 +81,10 @@ class ResultTable:
             return ["Method", *ours]
         return ["Method", *ours, *(f"{name}, {self.paper_heading}" for name in ours)]
 
-    def _lines(self, plus_minus: str) -> list[list[str]]:
+    def _lines(self) -> list[list[str]]:
         lines = []
         for row in self.rows:
-            cells = [_told(metric, row.entries.get(metric), plus_minus) for metric in self.metrics]
+            cells = [_told(metric, row.entries.get(metric)) for metric in self.metrics]
             if self.paper_heading is not None:
                 cells += [_number(metric, row.paper.get(metric)) for metric in self.metrics]
             lines.append([row.name, *cells])
@@ -177,25 +137,18 @@ def _entry(values: Sequence[float]) -> Entry:
     return Entry(statistics.fmean(values), spread, len(values))
 
 
-def _told(metric: str, entry: Entry | None, plus_minus: str) -> str:
+def _told(metric: str, entry: Entry | None) -> str:
     if entry is None:
         return _MISSING
     mean = _number(metric, entry.mean)
-    return f"{mean} {plus_minus} {_number(metric, entry.spread)}" if entry.count > 1 else mean
+    return f"{mean} ± {_number(metric, entry.spread)}" if entry.count > 1 else mean
 
 
 def _number(metric: str, value: float | None) -> str:
     if value is None or not math.isfinite(value):
         return _MISSING
-    if 0 < abs(value) < 10.0 ** -_DIGITS[metric]:
-        return f"{value:.1e}"
-    return f"{value:.{_DIGITS[metric]}f}"
-
-
-def _part(entry: Entry | None, part: str) -> float | int | str:
-    if entry is None:
-        return ""
-    return {"mean": entry.mean, "std": entry.spread, "count": entry.count}[part]
+    _, digits = METRICS[metric]
+    return f"{value:.1e}" if 0 < abs(value) < 10.0**-digits else f"{value:.{digits}f}"
 
 
 def _escaped(text: str) -> str:

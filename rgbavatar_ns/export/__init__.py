@@ -2,8 +2,8 @@
 
 from rgbavatar_ns.export.bases import basis_grid
 from rgbavatar_ns.export.comparison import comparison_frames, write_comparison
-from rgbavatar_ns.export.drawing import Color, Picture, draw, pictures
-from rgbavatar_ns.export.driving import DrivingOptions, MappedTheta, ThetaNames, drive
+from rgbavatar_ns.export.drawing import draw, pictures
+from rgbavatar_ns.export.driving import DrivingOptions, ThetaNames, drive
 from rgbavatar_ns.export.one_euro import OneEuroOptions, one_euro
 from rgbavatar_ns.export.ply import write_ply
 from rgbavatar_ns.export.run_data import dataset_folder, statistics_of
@@ -20,12 +20,9 @@ from rgbavatar_ns.export.views import (
 from rgbavatar_ns.export.web_page import PageOptions, write_web_page
 
 __all__ = [
-    "Color",
     "DrivingOptions",
-    "MappedTheta",
     "OneEuroOptions",
     "PageOptions",
-    "Picture",
     "ThetaNames",
     "basis_grid",
     "comparison_frames",

@@ -1,6 +1,6 @@
 """Another's performance for an avatar: mapped by name, made relative, held to what was seen."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import torch
@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics, neutral_frame
-from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.errors import UserError, first_few
 from rgbavatar_ns.export.one_euro import OneEuroOptions, one_euro
 from rgbavatar_ns.head import HeadArrays, ThetaLayout
 from rgbavatar_ns.head.rotations import axis_angle_to_matrix, matrix_to_axis_angle
@@ -82,22 +82,20 @@ def map_by_name(theta: Float[Tensor, "F G"], driver: ThetaNames, avatar: ThetaNa
     if not set(driver.expression_names) & set(avatar.expression_names):
         raise UserError(
             "The driver has no expression that the avatar knows: the driver's are "
-            f"{_some(driver.expression_names)}, the avatar's {_some(avatar.expression_names)}.",
+            f"{first_few(driver.expression_names, 4)}, the avatar's "
+            f"{first_few(avatar.expression_names, 4)}.",
             "Track the driver's video with the avatar's head model.",
         )
     place_of = {name: place for place, name in enumerate(driver.numbers)}
     result = theta.new_zeros(len(theta), avatar.layout.size)
-    known = torch.zeros(avatar.layout.size, dtype=torch.bool)
-    for place, name in enumerate(avatar.numbers):
-        if name in place_of:
-            result[:, place] = theta[:, place_of[name]]
-            known[place] = True
-    wanted = set(avatar.numbers)
+    wanted = avatar.numbers
+    known = torch.tensor([name in place_of for name in wanted])
+    result[:, known] = theta[:, [place_of[name] for name in wanted if name in place_of]]
     return MappedTheta(
         result,
         known,
         unmapped=tuple(name for name in driver.numbers if name not in wanted),
-        missing=tuple(name for name in avatar.numbers if name not in place_of),
+        missing=tuple(name for name in wanted if name not in place_of),
     )
 
 
@@ -146,7 +144,7 @@ def drive(
         result = torch.where(own.expressive, result, own.theta_mean)
     if options.project:
         result = own.project(result)
-    return MappedTheta(result, mapped.known, mapped.unmapped, mapped.missing)
+    return replace(mapped, theta=result)
 
 
 def _references(
@@ -167,7 +165,3 @@ def _references(
     pose = mean if options.pose == "relative" else (nothing, nothing)
     driver, avatar = (torch.where(own.expressive, e, p) for e, p in zip(expression, pose))
     return driver, avatar
-
-
-def _some(names: tuple[str, ...]) -> str:
-    return ", ".join(names[:4]) + (", ..." if len(names) > 4 else "")

@@ -43,10 +43,6 @@ class Scene:
             )
         return replace(self, theta=self.theta[frame].expand(count, -1))
 
-    def first_camera(self) -> PinholeCameras:
-        """The camera that the others are turned from."""
-        return self.cameras.select([0])
-
 
 def chosen_frames(
     count: int, frames: tuple[int, int] | None, default: Sequence[int]
@@ -95,7 +91,7 @@ def orbiting(avatar: Avatar, scene: Scene) -> Scene:
     yaw = swing(len(scene), sideways)
     pitch = [upwards * angle / sideways for angle in swing(len(scene), sideways)]
     pitch = pitch[len(pitch) // 4 :] + pitch[: len(pitch) // 4]
-    cameras = orbit(scene.first_camera(), head_centre(avatar), yaw, pitch)
+    cameras = orbit(scene.cameras, head_centre(avatar), yaw, pitch)
     return replace(scene, cameras=cameras)
 
 
@@ -108,7 +104,7 @@ def turntable(avatar: Avatar, scene: Scene, arc_degrees: float) -> Scene:
         yaw = [360.0 * frame / len(scene) for frame in range(len(scene))]
     else:
         yaw = swing(len(scene), arc_degrees / 2)
-    cameras = orbit(scene.first_camera(), head_centre(avatar), yaw, [0.0] * len(scene))
+    cameras = orbit(scene.cameras, head_centre(avatar), yaw, [0.0] * len(scene))
     return replace(scene, cameras=cameras)
 
 
@@ -122,7 +118,7 @@ def along_path(path: Path, scene: Scene) -> Scene:
 
 def side_by_side(avatar: Avatar, scene: Scene, background: Color | None) -> Iterator[Picture]:
     """Four views of each frame in a row."""
-    views = four_views(scene.first_camera(), head_centre(avatar))
+    views = four_views(scene.cameras, head_centre(avatar))
     for theta in scene.theta:
         same = theta.expand(len(views.world_to_camera), -1)
         yield np.concatenate(list(pictures(avatar, same, views, background)), axis=1)

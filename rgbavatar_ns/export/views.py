@@ -3,8 +3,8 @@
 import json
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -20,7 +20,7 @@ FOUR_VIEWS_DEGREES = ((-40.0, 0.0), (40.0, 0.0), (0.0, -20.0), (0.0, 20.0))
 paper shows four without saying which."""
 
 # nerfstudio's world has z up: (x, y, z) of the head's world is (x, -z, y) there.
-_HEAD_TO_NERFSTUDIO = ((1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0))
+HEAD_TO_NERFSTUDIO = ((1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0))
 _DISTANCE_M = 1.1
 _SEEN_M = 0.34
 
@@ -37,14 +37,9 @@ def front_camera(avatar: Avatar, width: int, height: int) -> PinholeCameras:
     x, y, z = head_centre(avatar).tolist()
     world_to_camera = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))[None]
     world_to_camera[0, :3, 3] = torch.tensor([-x, y, z + _DISTANCE_M])
-    focal_px = min(width, height) * _DISTANCE_M / _SEEN_M
-    return PinholeCameras(
-        world_to_camera,
-        torch.full((1, 2), focal_px),
-        torch.tensor([[width / 2, height / 2]]),
-        width,
-        height,
-    )
+    focal_px = torch.full((1, 2), min(width, height) * _DISTANCE_M / _SEEN_M)
+    centre_px = torch.tensor([[width / 2, height / 2]])
+    return PinholeCameras(world_to_camera, focal_px, centre_px, width, height)
 
 
 def orbit(
@@ -53,7 +48,7 @@ def orbit(
     yaw_degrees: Sequence[float],
     pitch_degrees: Sequence[float],
 ) -> PinholeCameras:
-    """One camera (C = 1) carried around a point, at the same distance: a view for each angle.
+    """The first camera carried around a point, at the same distance: a view for each angle.
 
     Positive yaw shows the head's left side, positive pitch looks from below. Angles of zero give
     the camera itself.
@@ -67,17 +62,12 @@ def orbit(
     turned = rotation @ about_x @ about_y
     world_to_camera[:, :3, 3] = translation + (rotation - turned) @ centre
     world_to_camera[:, :3, :3] = turned
-    return PinholeCameras(
-        world_to_camera,
-        camera.focal_px[:1].expand(len(yaw), 2),
-        camera.principal_point_px[:1].expand(len(yaw), 2),
-        camera.width,
-        camera.height,
-    )
+    cameras = camera.select([0] * len(yaw))
+    return replace(cameras, world_to_camera=world_to_camera)
 
 
 def four_views(camera: PinholeCameras, centre: Float[Tensor, "3"]) -> PinholeCameras:
-    """The four fixed views around a camera (C = 1)."""
+    """The four fixed views around the first camera."""
     yaw, pitch = zip(*FOUR_VIEWS_DEGREES)
     return orbit(camera, centre, yaw, pitch)
 
@@ -87,12 +77,9 @@ def resized(cameras: PinholeCameras, width: int, height: int) -> PinholeCameras:
     zoom = min(width / cameras.width, height / cameras.height)
     old = torch.tensor([cameras.width, cameras.height]).to(cameras.focal_px)
     new = torch.tensor([width, height]).to(cameras.focal_px)
+    principal_px = new / 2 + (cameras.principal_point_px - old / 2) * zoom
     return PinholeCameras(
-        cameras.world_to_camera,
-        cameras.focal_px * zoom,
-        new / 2 + (cameras.principal_point_px - old / 2) * zoom,
-        width,
-        height,
+        cameras.world_to_camera, cameras.focal_px * zoom, principal_px, width, height
     )
 
 
@@ -108,7 +95,9 @@ def read_camera_path(path: Path) -> tuple[PinholeCameras, float]:
         poses = [entry["camera_to_world"] for entry in described["camera_path"]]
         opengl = torch.tensor(poses, dtype=torch.float32).reshape(-1, 4, 4)
         fov = torch.tensor([float(entry["fov"]) for entry in described["camera_path"]]).deg2rad()
-        frames_per_second = _rate(described, len(fov))
+        # A path without a rate says how long it is.
+        length_s = None if "fps" in described else max(float(described["seconds"]), 1e-3)
+        frames_per_second = len(fov) / length_s if length_s else float(described["fps"])
     except (OSError, ValueError, KeyError, TypeError, RuntimeError) as error:
         raise UserError(
             f"{path} is no camera path of nerfstudio's viewer: {error!r}.",
@@ -121,7 +110,7 @@ def read_camera_path(path: Path) -> tuple[PinholeCameras, float]:
         )
     # The field of view is the vertical one.
     focal_px = 0.5 * height / torch.tan(0.5 * fov)
-    to_head = torch.tensor(_HEAD_TO_NERFSTUDIO).T
+    to_head = torch.tensor(HEAD_TO_NERFSTUDIO).T
     axes = to_head @ opengl[:, :3, :3] * torch.tensor([1.0, -1.0, -1.0])
     centre = to_head @ opengl[:, :3, 3:]
     world_to_camera = torch.eye(4).repeat(len(fov), 1, 1)
@@ -132,13 +121,6 @@ def read_camera_path(path: Path) -> tuple[PinholeCameras, float]:
         world_to_camera, focal_px[:, None].expand(-1, 2), principal, width, height
     )
     return cameras, frames_per_second
-
-
-def _rate(described: dict[str, Any], count: int) -> float:
-    """Frames per second, from the path's length where it is not written."""
-    if "fps" in described:
-        return float(described["fps"])
-    return count / max(float(described["seconds"]), 1e-3)
 
 
 def swing(num_frames: int, reach_degrees: float) -> list[float]:

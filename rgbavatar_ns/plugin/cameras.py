@@ -11,16 +11,15 @@ from nerfstudio.cameras.cameras import Cameras, CameraType
 from torch import Tensor
 
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.export.views import HEAD_TO_NERFSTUDIO
 from rgbavatar_ns.kernels import PinholeCameras
 
-# Rows are the axes of nerfstudio's world in the head's: (x, y, z) -> (x, -z, y).
-_HEAD_TO_NERFSTUDIO = ((1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0))
 _OPENCV_TO_OPENGL = (1.0, -1.0, -1.0)
 
 
 def head_to_nerfstudio(points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
     """Points of the head's world in nerfstudio's world, both in metres."""
-    return points @ points.new_tensor(_HEAD_TO_NERFSTUDIO).T
+    return points @ points.new_tensor(HEAD_TO_NERFSTUDIO).T
 
 
 def to_nerfstudio(
@@ -36,7 +35,7 @@ def to_nerfstudio(
     """
     world_to_camera = cameras.world_to_camera.expand(len(theta), 4, 4)
     camera_to_head = world_to_camera[:, :3, :3].transpose(1, 2)
-    turn = world_to_camera.new_tensor(_HEAD_TO_NERFSTUDIO)
+    turn = world_to_camera.new_tensor(HEAD_TO_NERFSTUDIO)
     centre = -(camera_to_head @ world_to_camera[:, :3, 3:])
     axes = camera_to_head * world_to_camera.new_tensor(_OPENCV_TO_OPENGL)
     return Cameras(
@@ -70,7 +69,7 @@ def from_nerfstudio(cameras: Cameras) -> PinholeCameras:
             "The cameras of one batch differ in image size.",
             "Bring all images of a dataset to one size before training.",
         )
-    turn = flat.camera_to_worlds.new_tensor(_HEAD_TO_NERFSTUDIO)
+    turn = flat.camera_to_worlds.new_tensor(HEAD_TO_NERFSTUDIO)
     camera_to_head = turn.T @ flat.camera_to_worlds
     axes = camera_to_head[:, :, :3] * turn.new_tensor(_OPENCV_TO_OPENGL)
     rotation = axes.transpose(1, 2)

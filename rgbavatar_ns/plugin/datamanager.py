@@ -1,13 +1,10 @@
 """Batches of whole frames for nerfstudio's pipeline, decoded in the background."""
 
-# pyright: reportIncompatibleVariableOverride=false
-# nerfstudio's classes are used by narrowing their fields, which a strict type system forbids.
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import Any, Literal
 
 import torch
 import tyro
@@ -34,15 +31,6 @@ from rgbavatar_ns.plugin.training.errors import install_user_error_hook
 
 _MIB = 1 << 20
 _DECODED_TOGETHER = 32
-
-
-@runtime_checkable
-class FrameSampler(Protocol):
-    """Which frames a training step sees."""
-
-    def batch(self, step: int) -> list[int]:
-        """The frames of `step`, counted among the training frames."""
-        ...
 
 
 @dataclass
@@ -87,24 +75,13 @@ class RGBAvatarDataManagerConfig(FullImageDatamanagerConfig):
     fps_reset_every: tyro.conf.Suppress[int] = 100
 
 
-def frame_sampler(
-    config: RGBAvatarDataManagerConfig, rows: tuple[int, ...], seed: int
-) -> FrameSampler:
-    """The order of the training frames: a fresh permutation of all of them every epoch.
-
-    The place for every strategy. This one is a pure function of (seed, step), so resuming needs
-    no state; local and global pools (`rgbavatar_ns.data.LocalGlobalPools`) are fed by a stream of
-    frames and keep their own.
-
-    Raises:
-        UserError: the batch size is not positive.
-    """
-    if config.batch_size < 1:
+def require_batch(size: int) -> None:
+    """Raise UserError where a batch of so many frames is impossible."""
+    if size < 1:
         raise UserError(
-            f"A batch of {config.batch_size} frames is impossible.",
+            f"A batch of {size} frames is impossible.",
             "Pass --pipeline.datamanager.batch-size with 1 or more.",
         )
-    return OfflineOrder(rows, min(config.batch_size, len(rows)), seed)
 
 
 class RGBAvatarDataManager(DataManager):
@@ -154,9 +131,10 @@ class RGBAvatarDataManager(DataManager):
         return FrameDataset(outputs, self.dataparser.tracked, self.dataparser.positions(split))
 
     def setup_train(self) -> None:
-        """Put the frame order in place; images are decoded when the first step asks."""
-        rows = tuple(range(len(self.train_dataset)))
-        self._train_order = frame_sampler(self.config, rows, self.seed)
+        """Put the frame order in place, a function of seed and step: resuming needs no state."""
+        require_batch(self.config.batch_size)
+        rows = range(len(self.train_dataset))
+        self._train_order = OfflineOrder(rows, min(self.config.batch_size, len(rows)), self.seed)
         self._train_cameras = self.train_dataset.cameras.to(self.device)
 
     def setup_eval(self) -> None:
@@ -226,12 +204,7 @@ class RGBAvatarDataManager(DataManager):
         chosen = cameras[torch.tensor(rows, device=self.device)]
         background = random_backgrounds(step, len(rows), self.seed).to(self.device)
         chosen.metadata = {**(chosen.metadata or {}), "background": background}
-        batch = {
-            "image": images,
-            "position": positions,
-            "step": step,
-        }
-        return chosen, batch
+        return chosen, {"image": images, "position": positions, "step": step}
 
     def next_eval_image(self, step: int) -> tuple[Cameras, dict[str, Any]]:
         """One held-out frame: its camera, and its picture over black [H, W, 3]."""

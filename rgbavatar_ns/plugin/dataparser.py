@@ -1,8 +1,5 @@
 """nerfstudio's view of a dataset: the project's own, or another system's."""
 
-# pyright: reportIncompatibleVariableOverride=false
-# nerfstudio's classes are used by narrowing their fields, which a strict type system forbids.
-
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any

@@ -1,8 +1,5 @@
 """nerfstudio's model around an `Avatar`; everything that is the method happens there."""
 
-# pyright: reportIncompatibleVariableOverride=false
-# nerfstudio's classes are used by narrowing their fields, which a strict type system forbids.
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any

@@ -1,8 +1,5 @@
 """nerfstudio's pipeline with this method's data and model, and LPIPS at evaluation."""
 
-# pyright: reportIncompatibleVariableOverride=false
-# nerfstudio's classes are used by narrowing their fields, which a strict type system forbids.
-
 import statistics
 from collections import defaultdict
 from dataclasses import dataclass, field, replace

@@ -1,8 +1,5 @@
 """Batches from the pools of a running stream."""
 
-# pyright: reportIncompatibleVariableOverride=false
-# nerfstudio's classes are used by narrowing their fields, which a strict type system forbids.
-
 import dataclasses
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,7 +16,11 @@ from rgbavatar_ns.data.sampling import PoolStrategy
 from rgbavatar_ns.data.streams import FrameStream, Ingest, ReplayBuffer, ReplayStream, Rewindable
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.plugin.cameras import to_nerfstudio
-from rgbavatar_ns.plugin.datamanager import RGBAvatarDataManager, RGBAvatarDataManagerConfig
+from rgbavatar_ns.plugin.datamanager import (
+    RGBAvatarDataManager,
+    RGBAvatarDataManagerConfig,
+    require_batch,
+)
 from rgbavatar_ns.plugin.dataparser import Subject
 from rgbavatar_ns.plugin.online.sources import SourceConfig, await_subject, open_source
 
@@ -72,17 +73,15 @@ class OnlineDataManager(RGBAvatarDataManager):
         self.ended_step: int | None = None
         """Step before which the stream ended; None while it goes on."""
         replayed = config.source.kind == "replay"
+        if test_mode == "val" and not replayed:
+            # Then --data is no dataset; the first frame makes one.
+            self._open(config)
+        super().__init__(_of_dataset(config, replayed), device, test_mode, **more)
         if test_mode == "val":
-            if not replayed:
-                # Then --data is no dataset; the first frame makes one.
-                self._open(config)
-            super().__init__(_of_dataset(config, replayed), device, test_mode, **more)
             if replayed:
                 self._open(config)
             self.config = config
             self._show_first_frame_only()
-        else:
-            super().__init__(_of_dataset(config, replayed), device, test_mode, **more)
 
     @property
     def ingest(self) -> Ingest:
@@ -189,11 +188,7 @@ class OnlineDataManager(RGBAvatarDataManager):
 
 
 def _pools(config: OnlineDataManagerConfig, seed: int) -> LocalGlobalPools:
-    if config.batch_size < 1:
-        raise UserError(
-            f"A batch of {config.batch_size} frames is impossible.",
-            "Pass --pipeline.datamanager.batch-size with 1 or more.",
-        )
+    require_batch(config.batch_size)
     try:
         return LocalGlobalPools(
             config.local_size,

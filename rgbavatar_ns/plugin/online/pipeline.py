@@ -1,8 +1,5 @@
 """nerfstudio's pipeline of an online run: it also looks at what has just arrived."""
 
-# pyright: reportIncompatibleVariableOverride=false
-# nerfstudio's classes are used by narrowing their fields, which a strict type system forbids.
-
 from dataclasses import dataclass, field
 from typing import Any
 

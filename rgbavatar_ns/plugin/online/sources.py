@@ -87,15 +87,28 @@ def await_subject(
     Raises:
         UserError: the stream ends before.
     """
-    waiting = _Waiting(tell, stream, clock)
-    subject = stream.subject(_PATIENCE_S)
-    while subject is None:
-        waiting.go_on("a subject")
-        subject = stream.subject(_PATIENCE_S)
+    silent_since_s: float | None = clock()
+
+    def go_on(what: str) -> None:
+        nonlocal silent_since_s
+        if stream.ended:
+            raise UserError(
+                f"The stream ended before {what} came.",
+                "Check the source: nothing in it could be used.",
+            )
+        if silent_since_s is not None and clock() - silent_since_s > _SILENT_S:
+            silent_since_s = None
+            place = f" at {stream.address}" if isinstance(stream, SocketStream) else ""
+            troubles = ", ".join(f"{name}: {count}" for name, count in (+stream.counts).items())
+            told = f" ({troubles})" if troubles else ""
+            tell(f"Waiting for frames{place}{told}; Ctrl-C ends.")
+
+    while (subject := stream.subject(_PATIENCE_S)) is None:
+        go_on("a subject")
     while True:
         frame = stream.next(_PATIENCE_S)
         if frame is None:
-            waiting.go_on("a frame")
+            go_on("a frame")
         elif _usable(frame, subject):
             return subject, frame
 
@@ -109,27 +122,3 @@ def _usable(frame: StreamedFrame, subject: StreamSubject) -> bool:
     except UserError:
         return False
     return True
-
-
-class _Waiting:
-    """Says once what is waited for, if that takes long."""
-
-    def __init__(
-        self, tell: Callable[[str], None], stream: FrameStream, clock: Callable[[], float]
-    ) -> None:
-        self._tell, self._stream, self._clock = tell, stream, clock
-        self._since_s: float | None = clock()
-
-    def go_on(self, what: str) -> None:
-        stream = self._stream
-        if stream.ended:
-            raise UserError(
-                f"The stream ended before {what} came.",
-                "Check the source: nothing in it could be used.",
-            )
-        if self._since_s is not None and self._clock() - self._since_s > _SILENT_S:
-            self._since_s = None
-            place = f" at {stream.address}" if isinstance(stream, SocketStream) else ""
-            troubles = ", ".join(f"{name}: {count}" for name, count in (+stream.counts).items())
-            told = f" ({troubles})" if troubles else ""
-            self._tell(f"Waiting for frames{place}{told}; Ctrl-C ends.")

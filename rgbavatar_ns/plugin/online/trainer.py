@@ -3,11 +3,7 @@
 RGBAvatar, sec. 3.3. The stream runs in its own threads; a step takes what the pools hold.
 """
 
-# pyright: reportIncompatibleVariableOverride=false
-# nerfstudio's classes are used by narrowing their fields, which a strict type system forbids.
-
 import dataclasses
-import json
 import signal
 import time
 from collections.abc import Iterator
@@ -27,9 +23,9 @@ from rgbavatar_ns.plugin.online.progress import OnlineProgress, StreamReport
 from rgbavatar_ns.plugin.training.errors import install_user_error_hook
 from rgbavatar_ns.plugin.training.interruption import StopRequest
 from rgbavatar_ns.plugin.training.trainer import (
-    SUMMARY_NAME,
     RGBAvatarTrainer,
     RGBAvatarTrainerConfig,
+    say,
 )
 
 _LOOK_INTERVAL_S = 1.0
@@ -145,9 +141,12 @@ class OnlineTrainer(RGBAvatarTrainer):
         return True
 
     def after_step(self, step: int, losses: Losses, seconds: float) -> None:
-        """As offline, and look at what has just arrived."""
+        """As offline, and let the newest frame drive the viewer's avatar."""
         self._settle()
-        self._follow_newest()
+        theta = self.stream.pools.newest_theta()
+        if theta is not None:
+            with self.train_lock:
+                self.pipeline.model.frame_theta[0] = theta.to(self.pipeline.device)
         super().after_step(step, losses, seconds)
 
     def _tell_step(self, step: int, losses: Losses, seconds: float) -> None:
@@ -179,10 +178,9 @@ class OnlineTrainer(RGBAvatarTrainer):
             raise ingest.failure
         if ingest.finished and self.stream.ended_step is None:
             self.stream.ended_step = step
-            CONSOLE.print(
+            say(
                 f"The stream has ended after {self.stream.pools.num_added} frames; "
-                f"{self.config.steps_after_stream} more steps follow.",
-                highlight=False,
+                f"{self.config.steps_after_stream} more steps follow."
             )
 
     def _settle(self) -> None:
@@ -210,13 +208,6 @@ class OnlineTrainer(RGBAvatarTrainer):
             loss=loss,
             counts=dict(self.stream.ingest.counts()),
         )
-
-    def _follow_newest(self) -> None:
-        """Let the newest frame drive the viewer's avatar."""
-        theta = self.stream.pools.newest_theta()
-        if theta is not None:
-            with self.train_lock:
-                self.pipeline.model.frame_theta[0] = theta.to(self.pipeline.device)
 
     def _look_at_newest(self, losses: Losses, progress: OnlineProgress) -> None:
         """About once a second: score the newest frames and tell how things stand."""
@@ -247,36 +238,16 @@ class OnlineTrainer(RGBAvatarTrainer):
         super()._after_train()
 
     def _tell_end(self, completed: bool) -> None:
-        summary = self._write_summary()
-        frames, steps, rate = summary["frames"], summary["steps"], summary["images_per_second"]
-        CONSOLE.print(
-            f"{'Trained' if completed else 'Stopped after'} {steps} steps on {frames} frames, "
-            f"{rate:.1f} images/s.",
-            highlight=False,
+        frames, latency = self.stream.pools.num_added, self.stream.pools.median_latency_s()
+        summary = self._write_summary(
+            self.stream.images_drawn,
+            frames=frames,
+            **({} if latency is None else {"median_latency_s": latency}),
+            stream=dict(self.stream.ingest.counts()),
         )
+        steps, rate = summary["steps"], summary["images_per_second"]
+        how = "Trained" if completed else "Stopped after"
+        say(f"{how} {steps} steps on {frames} frames, {rate:.1f} images/s.")
         if not completed:
-            CONSOLE.print(
-                f"Go on with the same command and --load-dir {self.checkpoint_dir}",
-                highlight=False,
-                soft_wrap=True,
-            )
-        CONSOLE.print(f"Config: {self.base_dir / 'config.yml'}", highlight=False, soft_wrap=True)
-
-    def _write_summary(self) -> dict[str, int | float]:
-        """The run's length and speed, and what the stream brought, as training.json."""
-        seconds, images = self._train_seconds, self.stream.images_drawn
-        latency = self.stream.pools.median_latency_s()
-        summary: dict[str, int | float] = {
-            "steps": self.step + 1,
-            "images": images,
-            "train_seconds": seconds,
-            "images_per_second": images / seconds if seconds > 0 else 0.0,
-            "frames": self.stream.pools.num_added,
-        }
-        if latency is not None:
-            summary["median_latency_s"] = latency
-        counts = self.stream.ingest.counts()
-        path = self.base_dir / SUMMARY_NAME
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps({**summary, "stream": dict(counts)}, indent=2) + "\n")
-        return summary
+            say(f"Go on with the same command and --load-dir {self.checkpoint_dir}")
+        say(f"Config: {self.base_dir / 'config.yml'}")

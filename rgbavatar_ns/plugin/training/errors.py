@@ -20,16 +20,10 @@ _DeviceFailure: type[Exception] = getattr(torch, "AcceleratorError", DeviceError
 Hook = Callable[[type[BaseException], BaseException, TracebackType | None], object]
 
 
-def tell_user_error(error: UserError | DeviceError) -> None:
-    """Write cause and remedy to stderr, in two lines."""
-    print(f"\nError: {error.cause}\n{error.remedy}", file=sys.stderr, flush=True)
-
-
 def install_user_error_hook() -> None:
     """Let an uncaught `UserError` or `DeviceError` end the process with its message and code 1.
 
-    nerfstudio's commands have no place for such errors, so this is Python's own hook; every
-    other exception goes to the hook that was there before. Installing twice changes nothing.
+    Every other exception goes to the hook that was there before. Installing twice changes nothing.
     """
     if isinstance(sys.excepthook, _UserErrorHook):
         return
@@ -62,6 +56,6 @@ class _UserErrorHook:
         self, kind: type[BaseException], error: BaseException, trace: TracebackType | None
     ) -> None:
         if isinstance(error, (UserError, DeviceError)):
-            tell_user_error(error)
+            print(f"\nError: {error.cause}\n{error.remedy}", file=sys.stderr, flush=True)
         else:
             self.before(kind, error, trace)

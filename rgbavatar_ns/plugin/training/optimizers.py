@@ -1,8 +1,5 @@
 """Adam and learning-rate schedules whose checkpoints hold nothing but tensors and numbers."""
 
-# pyright: reportIncompatibleVariableOverride=false
-# nerfstudio's classes are used by narrowing their fields, which a strict type system forbids.
-
 import math
 from dataclasses import dataclass, field
 from typing import Any

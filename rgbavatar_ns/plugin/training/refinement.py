@@ -1,12 +1,9 @@
 """Refined tracking under nerfstudio: whether a run can have it, and the file that it leaves."""
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
-import numpy as np
-from jaxtyping import Float
-from torch import Tensor, nn
+from torch import nn
 
 from rgbavatar_ns.avatar.refinement.corrections import RefinementConfig
 from rgbavatar_ns.avatar.refinement.frames import FrameRefinement
@@ -36,11 +33,6 @@ def frame_refinement(subject: Subject, config: RefinementConfig) -> FrameRefinem
             "Pass such a number, or leave it out.",
         )
     return FrameRefinement(subject.theta, subject.train, subject.layout, config)
-
-
-def save_refined(path: Path, refinement: FrameRefinement, tracked: Float[Tensor, "F H"]) -> None:
-    """Write theta of all frames, corrected or calibrated, as float32 [F, H]."""
-    np.save(path, refinement.all_frames(tracked).cpu().numpy().astype(np.float32))
 
 
 def require_same_refinement(state_dict: Mapping[str, Any], refinement: nn.Module | None) -> None:

@@ -1,9 +1,5 @@
 """nerfstudio's trainer with checkpoints, resuming and interruption that can be relied on."""
 
-# pyright: reportIncompatibleVariableOverride=false
-# nerfstudio's classes are used by narrowing their fields, which a strict type system forbids.
-
-import json
 import math
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -11,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 from nerfstudio.engine.callbacks import TrainingCallbackLocation
 from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
@@ -24,15 +21,21 @@ from rgbavatar_ns.avatar.training.batches import ChosenFrames, TrainingBatch
 from rgbavatar_ns.avatar.training.loop import FitHooks, fit
 from rgbavatar_ns.avatar.training.step import Losses
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.files import write_json
 from rgbavatar_ns.plugin.pipeline import RGBAvatarPipeline, RGBAvatarPipelineConfig
 from rgbavatar_ns.plugin.training.checkpoints import load_newest, read_checkpoint, save_checkpoint
 from rgbavatar_ns.plugin.training.errors import device_errors_told, install_user_error_hook
 from rgbavatar_ns.plugin.training.interruption import StopRequest
 from rgbavatar_ns.plugin.training.optimizers import ExponentialConfig
 from rgbavatar_ns.plugin.training.progress import TrainingProgress
-from rgbavatar_ns.plugin.training.refinement import REFINED_NAME, save_refined
+from rgbavatar_ns.plugin.training.refinement import REFINED_NAME
 
 SUMMARY_NAME = "training.json"
+
+
+def say(line: str) -> None:
+    """Print a line as it is, however long."""
+    CONSOLE.print(line, highlight=False, soft_wrap=True)
 
 
 @dataclass
@@ -234,38 +237,36 @@ class RGBAvatarTrainer(Trainer, FitHooks):
             self._train_complete_viewer()
 
     def _tell_end(self, completed: bool) -> None:
-        summary = self._write_summary()
+        summary = self._write_summary((self.step + 1) * self._images_per_step)
         steps, rate = summary["steps"], summary["images_per_second"]
         if completed:
             CONSOLE.print(f"Trained {steps} steps, {rate:.1f} images/s.", highlight=False)
         else:
-            CONSOLE.print(
+            say(
                 f"Stopped after {steps} of {self.config.max_num_iterations} steps; resume with "
-                f"the same command and --load-dir {self.checkpoint_dir}",
-                highlight=False,
-                soft_wrap=True,
+                f"the same command and --load-dir {self.checkpoint_dir}"
             )
-        CONSOLE.print(f"Config: {self.base_dir / 'config.yml'}", highlight=False, soft_wrap=True)
-        CONSOLE.print(f"Checkpoints: {self.checkpoint_dir}", highlight=False, soft_wrap=True)
+        say(f"Config: {self.base_dir / 'config.yml'}")
+        say(f"Checkpoints: {self.checkpoint_dir}")
 
     def _save_refined(self) -> None:
-        """Write what refinement made of the frames' theta beside the config."""
+        """Write theta of all frames, corrected or calibrated, as float32 [F, H]."""
         model = self.pipeline.model
         if model.refinement is not None:
-            save_refined(self.base_dir / REFINED_NAME, model.refinement, model.frame_theta)
+            theta = model.refinement.all_frames(model.frame_theta).cpu().numpy()
+            np.save(self.base_dir / REFINED_NAME, theta.astype(np.float32))
 
-    def _write_summary(self) -> dict[str, int | float]:
-        """The run's length and speed over all its sessions, as training.json."""
-        steps, batch, seconds = self.step + 1, self._images_per_step, self._train_seconds
+    def _write_summary(self, images: int, **more: Any) -> dict[str, Any]:
+        """The run's length and speed over all its sessions, and `more`, as training.json."""
+        seconds = self._train_seconds
         summary = {
-            "steps": steps,
-            "images": steps * batch,
+            "steps": self.step + 1,
+            "images": images,
             "train_seconds": seconds,
-            "images_per_second": steps * batch / seconds if seconds > 0 else 0.0,
+            "images_per_second": images / seconds if seconds > 0 else 0.0,
+            **more,
         }
-        path = self.base_dir / SUMMARY_NAME
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(summary, indent=2) + "\n")
+        write_json(self.base_dir / SUMMARY_NAME, summary)
         return summary
 
     def _train_complete_viewer(self) -> None:
@@ -298,9 +299,7 @@ class RGBAvatarTrainer(Trainer, FitHooks):
             self.optimizers.load_schedulers(
                 {name: saved for name, saved in state["schedulers"].items() if name in known}
             )
-        CONSOLE.print(
-            f"Resuming after step {state['step']} from {path}", highlight=False, soft_wrap=True
-        )
+        say(f"Resuming after step {state['step']} from {path}")
 
     def _choose(self, folder: Path) -> tuple[dict[str, Any], Path]:
         if self.config.load_step is not None:

@@ -4,7 +4,6 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +30,7 @@ from rgbavatar_ns.plugin.viewer.render import ViewerRender, viewer_render
 from rgbavatar_ns.plugin.viewer.sliders import number_sliders
 from rgbavatar_ns.plugin.viewer.viewer_state import DrivenBy, ViewerState
 from rgbavatar_ns.plugin.viewer.viewpoint import Viewpoint
-from rgbavatar_ns.plugin.viewer.widgets import Actions, Widgets
+from rgbavatar_ns.plugin.viewer.widgets import Widgets
 
 _TICK_S = 0.01
 _PATIENCE_S = 5.0
@@ -43,16 +42,8 @@ _ALL_BASES: dict[str, Any] = {"basis_alone": None, "bases_used": None}
 class _Report:
     """What is told about a picture."""
 
-    camera: PinholeCameras
-    seconds: float
-    psnr: float | None
+    text: str
     trouble: str
-
-    def text(self) -> str:
-        size = f"{self.camera.width} x {self.camera.height}"
-        rate = f"{1 / max(self.seconds, 1e-6):.0f} frames/s"
-        psnr = "" if self.psnr is None else f"  \nPSNR of this frame {self.psnr:.2f} dB"
-        return f"{size} in {1e3 * self.seconds:.0f} ms: {rate}{psnr}"
 
 
 class ViewerPanel(ViewerControl):
@@ -91,22 +82,10 @@ class ViewerPanel(ViewerControl):
         arrays, statistics = self._model.avatar.head.arrays, training_statistics(self._model)
         sliders = number_sliders(ThetaNames.of(self._model.avatar.layout, arrays), statistics)
         gui = viewer.viser_server.gui
-        self._widgets = Widgets(gui, self._actions(), sliders, statistics, self._num_frames)
+        self._widgets = Widgets(gui, self, sliders, statistics, self._num_frames)
         viewpoint = Viewpoint.before(self._model.avatar, self._model.subject)
         viewer.viser_server.scene.set_up_direction("+z")
         viewer.viser_server.on_client_connect(viewpoint.place)
-
-    def _actions(self) -> Actions:
-        return Actions(
-            self.change,
-            self.drive_by,
-            self.set_theta_number,
-            self.show_neutral,
-            self.show_random_expression,
-            self.set_weight,
-            self.hold_weights,
-            self.load_driver,
-        )
 
     def draw(self, camera: PinholeCameras, time_share: float | None) -> dict[str, Tensor]:
         """The picture for one camera (C = 1): rgb, accumulation, depth [H W C].
@@ -128,7 +107,11 @@ class ViewerPanel(ViewerControl):
             trouble = _in_words(error)
             plain = ViewerState(state.driven_by, state.frame, background=state.background)
             drawn = self._drawn(plain, camera, time_share)
-        self._report = _Report(camera, self._clock() - began_s, drawn.psnr, trouble)
+        seconds = self._clock() - began_s
+        size = f"{camera.width} x {camera.height}"
+        rate = f"{1 / max(seconds, 1e-6):.0f} frames/s"
+        psnr = "" if drawn.psnr is None else f"  \nPSNR of this frame {drawn.psnr:.2f} dB"
+        self._report = _Report(f"{size} in {1e3 * seconds:.0f} ms: {rate}{psnr}", trouble)
         if self._redraw is not None:
             thread = threading.current_thread()
             self._redraw.drew(thread, answered, camera.width, camera.height)
@@ -149,7 +132,7 @@ class ViewerPanel(ViewerControl):
         self._redraw.insist(now_s)
         if report is not None and report is not self._told and now_s >= self._next_told_s:
             self._told, self._next_told_s = report, now_s + _TOLD_EVERY_S
-            self._widgets.report(report.text())
+            self._widgets.report(report.text)
             if report.trouble:
                 self._widgets.tell(report.trouble)
 
@@ -219,10 +202,9 @@ class ViewerPanel(ViewerControl):
             return
         if self._widgets is not None:
             self._widgets.offer_sequence(len(mapped.theta))
-        unmapped = f", not known to the avatar: {', '.join(mapped.unmapped)}"
-        self.tell(
-            f"{len(mapped.theta)} frames of {driver.root}{unmapped if mapped.unmapped else ''}"
-        )
+        unknown = ", ".join(mapped.unmapped)
+        left_out = f", not known to the avatar: {unknown}" if unknown else ""
+        self.tell(f"{len(mapped.theta)} frames of {driver.root}{left_out}")
         self.change(driven_by="driving sequence", sequence=mapped.theta, sequence_frame=0)
 
     def advance(self) -> None:
@@ -253,9 +235,9 @@ class ViewerPanel(ViewerControl):
     def _drawn(
         self, state: ViewerState, camera: PinholeCameras, time_share: float | None
     ) -> ViewerRender:
-        signal = driving_signal(self._model, state, time_share)
-        render = partial(viewer_render, film=self._film, backend=self._model.config.rasterizer)
-        return render(self._model.avatar, signal, state, camera)
+        model, signal = self._model, driving_signal(self._model, state, time_share)
+        backend = model.config.rasterizer
+        return viewer_render(model.avatar, signal, state, camera, film=self._film, backend=backend)
 
     def _present(self) -> ViewerState:
         """The state, but a camera path that is previewed shows what `ns-render` will."""

@@ -14,7 +14,7 @@ from rgbavatar_ns.avatar import Avatar
 from rgbavatar_ns.avatar.metrics import psnr
 from rgbavatar_ns.data import TrackedDataset
 from rgbavatar_ns.data.check.sample import project
-from rgbavatar_ns.drawing.compositing import composite, rgba_to_float, shown_error
+from rgbavatar_ns.drawing.compositing import composite, rgba_to_float, shown_error, to_uint8
 from rgbavatar_ns.drawing.wireframe import with_wireframe
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.kernels import PinholeCameras, RenderedBatch
@@ -108,7 +108,7 @@ def _beside_film(
     truth = composite(rgba_to_float(rgba), signal.theta.new_tensor(state.background))
     image = drawn.image[0].clamp(0, 1)
     quality_db = float(psnr(image[None], truth[None]).clamp(max=100))
-    tiles = [_colored(shown_error(image, truth).mean(-1), cv2.COLORMAP_INFERNO)]
+    tiles = [_colored(shown_error(image, truth).mean(-1, keepdim=True), cv2.COLORMAP_INFERNO)]
     if state.picture == "beside the film":
         overlaid = _with_overlays(image, avatar, signal, state, own, drawn.visibility)
         tiles = [truth, overlaid, *tiles]
@@ -137,13 +137,12 @@ def _depth_colors(depth: Float[Tensor, "H W 1"], alpha: Float[Tensor, "H W 1"]) 
         return torch.zeros_like(depth).expand(-1, -1, 3)
     near, far = depth[covered].aminmax()
     closeness = (far - depth) / (far - near).clamp(min=1e-6)
-    return _colored(closeness[..., 0], cv2.COLORMAP_VIRIDIS) * covered
+    return _colored(closeness, cv2.COLORMAP_VIRIDIS) * covered
 
 
-def _colored(values: Float[Tensor, "H W"], color_map: int) -> _Image:
+def _colored(values: Float[Tensor, "H W 1"], color_map: int) -> _Image:
     """Values in [0, 1] by one of OpenCV's colour maps."""
-    coded = (values.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
-    return _as_image(cv2.applyColorMap(coded, color_map)[..., ::-1], values)
+    return _as_image(cv2.applyColorMap(to_uint8(values), color_map)[..., ::-1], values)
 
 
 def _with_overlays(
@@ -183,8 +182,7 @@ def _with_points(picture: _Bytes, points_px: Float[np.ndarray, "P 2"]) -> _Bytes
 
 def _over(image: _Image, drawing: Callable[[Any], Any]) -> _Image:
     """The image after something was drawn into its bytes."""
-    coded = (image.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
-    return _as_image(drawing(coded), image)
+    return _as_image(drawing(to_uint8(image)), image)
 
 
 def _as_image(coded: Any, like: Tensor) -> _Image:

@@ -1,12 +1,15 @@
 """How the avatar's panel looks in viser; it shows a state and passes on what the user does."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any, get_args
+from functools import partial
+from typing import TYPE_CHECKING, Any, get_args
 
 from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
 from rgbavatar_ns.plugin.viewer.sliders import TITLES, NumberSlider
 from rgbavatar_ns.plugin.viewer.viewer_state import DrivenBy, PictureKind, ViewerState
+
+if TYPE_CHECKING:
+    from rgbavatar_ns.plugin.viewer.panel import ViewerPanel
 
 _TOPMOST = -1.0
 _STRONGEST = 12
@@ -15,34 +18,18 @@ _NO_BASIS = "none"
 _Number = int | float
 
 
-@dataclass(frozen=True)
-class Actions:
-    """What the controls call."""
-
-    change: Callable[..., None]
-    """Replaces parts of the viewer's state by name."""
-    drive_by: Callable[[DrivenBy], None]
-    set_theta_number: Callable[[int, float], None]
-    show_neutral: Callable[[], None]
-    show_random_expression: Callable[[], None]
-    set_weight: Callable[[int, float], None]
-    hold_weights: Callable[[bool], None]
-    load_driver: Callable[[str, str], None]
-    """Takes a folder, and what its numbers are relative to."""
-
-
 class Widgets:
     """The controls of one panel, made once when the viewer starts."""
 
     def __init__(
         self,
         gui: Any,
-        actions: Actions,
+        panel: "ViewerPanel",
         sliders: list[NumberSlider],
         statistics: TrainingStatistics,
         num_frames: int,
     ) -> None:
-        self._gui, self._do = gui, actions
+        self._gui, self._do = gui, panel
         self._numbers: list[tuple[NumberSlider, Any]] = []
         self._weights: list[Any] = []
         with gui.add_folder("Avatar", order=_TOPMOST):
@@ -79,12 +66,10 @@ class Widgets:
         """Make a slider for a driver's frames, in place of the last driver's."""
         if self._sequence_frame is not None:
             self._sequence_frame.remove()
+        ends = (0, max(1, num_frames - 1), 1)
         with self._driver_folder:
             self._sequence_frame = self._slider(
-                "Driver's frame",
-                (0, max(1, num_frames - 1), 1),
-                0,
-                lambda value: self._do.change(sequence_frame=int(value)),
+                "Driver's frame", ends, 0, lambda v: self._do.change(sequence_frame=int(v))
             )
 
     def report(self, text: str) -> None:
@@ -101,20 +86,15 @@ class Widgets:
         hint = "What chooses expression and pose; moving a slider of the face does it by hand"
         driven_by = gui.add_dropdown("Driven by", get_args(DrivenBy), hint=hint)
         self._driven_by = _on(driven_by, do.drive_by)
+        ends = (0, max(1, num_frames - 1), 1)
         self._frame = self._slider(
-            "Frame",
-            (0, max(1, num_frames - 1), 1),
-            0,
-            lambda value: do.change(frame=int(value), driven_by="dataset frame"),
+            "Frame", ends, 0, lambda v: do.change(frame=int(v), driven_by="dataset frame")
         )
         play = gui.add_checkbox("Play", False, hint="Move on by itself, round and round")
         _on(play, lambda value: do.change(playing=value))
         rate = round(ViewerState.frames_per_second)
         self._slider(
-            "Frames per second",
-            (1, 60, 1),
-            rate,
-            lambda value: do.change(frames_per_second=float(value)),
+            "Frames per second", (1, 60, 1), rate, lambda v: do.change(frames_per_second=float(v))
         )
         self._button("Neutral", do.show_neutral, "Drive by hand from the most neutral frame")
         hint = "Within what was seen in training"
@@ -177,13 +157,8 @@ class Widgets:
         for basis in range(count):
             reach = 1.5 * max(float(seen.psi_max[basis]), -float(seen.psi_min[basis]))
             reach = max(_LEAST_WEIGHT, reach)
-            handle = self._slider(
-                f"psi {basis}",
-                (-reach, reach, 0.01),
-                0.0,
-                lambda value, basis=basis: do.set_weight(basis, value),
-            )
-            self._weights.append(handle)
+            ends, set_this = (-reach, reach, 0.01), partial(do.set_weight, basis)
+            self._weights.append(self._slider(f"psi {basis}", ends, 0.0, set_this))
 
     def _add_looks(self) -> None:
         gui, do = self._gui, self._do
