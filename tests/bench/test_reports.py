@@ -4,7 +4,6 @@ from pathlib import Path
 import pytest
 import torch
 
-from rgbavatar_ns.avatar import Avatar, AvatarConfig
 from rgbavatar_ns.bench import machine, step
 from rgbavatar_ns.bench.options import RasterizerOptions, RenderOptions, StepOptions
 from rgbavatar_ns.bench.rasterizer import bench_rasterizer
@@ -16,8 +15,8 @@ from rgbavatar_ns.bench.timing import CPU, Stopwatch
 from rgbavatar_ns.bench.trainer import bench_trainer
 from rgbavatar_ns.bench.workloads import avatar_workload, parameters_of
 from rgbavatar_ns.errors import UserError
-from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.kernels import rasterize
+from tests.export.subject import avatar_of
 from tests.kernels.cuda import emulator
 from tests.plugin.tiny import SIZE, tiny_dataset
 
@@ -53,11 +52,8 @@ def dataset(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def bundle(tmp_path_factory):
-    head = HeadModel.embedded()
-    config = AvatarConfig(num_bases=2, uv_resolution=24)
-    avatar = Avatar(head, torch.zeros(head.num_identity), config)
     path = tmp_path_factory.mktemp("avatar") / "bundle"
-    avatar.save(path)
+    avatar_of(num_bases=2, uv_resolution=24).save(path)
     return path
 
 
@@ -99,10 +95,14 @@ def test_rasterizer_of_an_avatar(bundle, dataset):
     assert figures["workload"]["width_px"] == SIZE
 
 
-def test_step_report():
+def test_a_step_has_its_parts_and_is_compared_with_the_eager_one():
     figures = checked_json(bench_step(StepOptions(**TINY, batch=2, repetitions=1)))
-    assert figures["images_per_second"] == pytest.approx(2e3 / figures["parts"]["whole step"])
+    eager, parts = figures["peers"]["whole step, eager"], figures["parts"]
+    assert figures["images_per_second"] == pytest.approx(2e3 / parts["whole step"])
     assert figures["trainer"] is None
+    assert eager["ratio"] == pytest.approx(parts["whole step, eager"] / parts["whole step"])
+    assert eager["images_per_second"] == pytest.approx(2e3 / parts["whole step, eager"])
+    assert {"network", "head", "prepare", "forward and loss", "backward and Adam"} < set(parts)
 
 
 def test_step_of_a_trained_avatar_on_its_pictures(bundle, dataset):
@@ -110,14 +110,6 @@ def test_step_of_a_trained_avatar_on_its_pictures(bundle, dataset):
     figures = checked_json(bench_step(options))
     assert figures["workload"]["uv_resolution"] == 24
     assert figures["workload"]["height_px"] == SIZE
-
-
-def test_a_step_has_its_parts_and_is_compared_with_the_eager_one():
-    report = bench_step(StepOptions(**TINY, batch=2, repetitions=1))
-    eager, parts = report.peers["whole step, eager"], report.parts
-    assert eager["ratio"] == pytest.approx(parts["whole step, eager"] / parts["whole step"])
-    assert eager["images_per_second"] == pytest.approx(2e3 / parts["whole step, eager"])
-    assert {"network", "head", "prepare", "forward and loss", "backward and Adam"} < set(parts)
 
 
 def test_timing_parts_leaves_the_avatar_as_it_was():
@@ -224,15 +216,26 @@ def test_another_size_or_head_than_the_datasets_is_refused(tmp_path, bundle, dat
         bench_render(RenderOptions(avatar=bundle, data=other.root, repetitions=1))
 
 
-def test_without_a_compiled_backend_the_remedy_is_told(monkeypatch):
+@pytest.fixture(
+    params=[
+        lambda **options: bench_rasterizer(RasterizerOptions(count=10, size=8, **options)),
+        lambda **options: bench_step(StepOptions(**TINY, **options)),
+        lambda **options: bench_render(RenderOptions(**TINY, **options)),
+    ]
+)
+def run(request):
+    """Each benchmark with options of one's own."""
+    return request.param
+
+
+def test_without_a_compiled_backend_the_remedy_is_told(run, monkeypatch):
     monkeypatch.setattr(machine, "available_backends", lambda: ("reference",))
-    for run in (
-        lambda: bench_rasterizer(RasterizerOptions(count=10, size=8)),
-        lambda: bench_step(StepOptions(**TINY)),
-        lambda: bench_render(RenderOptions(**TINY)),
-    ):
-        with pytest.raises(UserError, match=r"'cpu' cannot be used here.*C\+\+17"):
-            run()
+    with pytest.raises(UserError, match=r"'cpu' cannot be used here.*C\+\+17"):
+        run()
+
+
+def test_the_readable_backend_is_measured_where_it_is_asked_for(monkeypatch):
+    monkeypatch.setattr(machine, "available_backends", lambda: ("reference",))
     small = RasterizerOptions(
         count=50, size=16, batch=1, repetitions=1, backend="reference", peers=False
     )
@@ -240,17 +243,9 @@ def test_without_a_compiled_backend_the_remedy_is_told(monkeypatch):
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
-@pytest.mark.parametrize(
-    "run",
-    [
-        lambda: bench_step(StepOptions(**TINY, device="cuda")),
-        lambda: bench_render(RenderOptions(**TINY, device="cuda")),
-        lambda: bench_rasterizer(RasterizerOptions(count=10, size=8, device="cuda")),
-    ],
-)
 def test_a_gpu_that_is_not_there_is_refused_with_the_reason(run):
     with pytest.raises(UserError, match=r"no GPU to measure on: .*(torch|bindings)"):
-        run()
+        run(device="cuda")
 
 
 def test_the_gpu_is_taken_where_it_can_be_used(monkeypatch):

@@ -2,19 +2,7 @@ import pytest
 import torch
 
 from rgbavatar_ns.bench.timing import WHOLE, Spread, Stopwatch, peak_growth_bytes, using_threads
-
-
-class Clock:
-    """Stands still but where a test moves it."""
-
-    def __init__(self) -> None:
-        self.seconds = 100.0
-
-    def __call__(self) -> float:
-        return self.seconds
-
-    def move(self, seconds: float) -> None:
-        self.seconds += seconds
+from tests.data.streaming import Clock
 
 
 def test_spread_is_median_and_quartiles():
@@ -29,9 +17,9 @@ def test_the_warm_up_and_what_is_prepared_are_outside_of_the_time():
 
     def call():
         calls.append("call")
-        clock.move(9.0 if len(calls) == 1 else 0.002)
+        clock.sleep(9.0 if len(calls) == 1 else 0.002)
 
-    spread = Stopwatch(3, clock=clock).time("nothing", call, lambda: clock.move(5.0))
+    spread = Stopwatch(3, clock=clock).time("nothing", call, lambda: clock.sleep(5.0))
     assert len(calls) == 4
     assert spread.repetitions == 3
     assert (spread.lower_ms, spread.upper_ms) == pytest.approx((2, 2))
@@ -43,11 +31,11 @@ def test_laps_share_out_the_whole():
     clock = Clock()
 
     def call(lap):
-        clock.move(0.02)
+        clock.sleep(0.02)
         lap("first")
-        clock.move(0.04)
+        clock.sleep(0.04)
         lap("second")
-        clock.move(0.01)
+        clock.sleep(0.01)
 
     laps = Stopwatch(2, clock=clock).laps("two", call)
     found = [laps[name].median_ms for name in ("first", "second", WHOLE)]

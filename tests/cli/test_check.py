@@ -93,8 +93,5 @@ def test_what_the_reader_refuses_is_reported_too(data, capsys, spoilt):
 @pytest.mark.parametrize(
     ("arguments", "told"), [(["--sheet", "x.jpg"], "no PNG"), (["--max-frames", "0"], "is 0")]
 )
-def test_wrong_options_are_told(good, capsys, arguments, told):
-    with pytest.raises(SystemExit) as ended:
-        main(["check", str(good.root), *arguments])
-    assert ended.value.code == 1
-    assert told in capsys.readouterr().err
+def test_wrong_options_are_told(good, refused, arguments, told):
+    assert told in refused("check", good.root, *arguments)

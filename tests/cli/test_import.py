@@ -65,23 +65,16 @@ def test_import_tells_what_it_found_and_goes_on_after_an_interruption(
     assert len(load_dataset(tmp_path / "set").arrays.v_template) == 5023 + 120
 
 
-def test_another_source_does_not_go_into_a_full_folder(vhap, tmp_path, capsys):
+def test_another_source_does_not_go_into_a_full_folder(vhap, tmp_path, refused):
     data, flame = vhap
     (tmp_path / "something").write_text("else")
-    with pytest.raises(SystemExit) as ended:
-        cli.main(["import", str(data), str(tmp_path), "--flame", str(flame)])
-    assert ended.value.code == 1
-    assert "not empty" in capsys.readouterr().err
-    with pytest.raises(SystemExit):
-        cli.main(["import", str(tmp_path), str(tmp_path / "set")])
-    assert "in none of the formats" in capsys.readouterr().err
+    assert "not empty" in refused("import", data, tmp_path, "--flame", flame)
+    assert "in none of the formats" in refused("import", tmp_path, tmp_path / "set")
 
 
-def test_without_flame_it_says_where_to_get_it(vhap, tmp_path, capsys, monkeypatch):
+def test_without_flame_it_says_where_to_get_it(vhap, tmp_path, refused, monkeypatch):
     monkeypatch.delenv("RGBAVATAR_FLAME", raising=False)
-    with pytest.raises(SystemExit):
-        cli.main(["import", str(vhap[0]), str(tmp_path / "set")])
-    told = capsys.readouterr().err
+    told = refused("import", vhap[0], tmp_path / "set")
     assert "--flame" in told
     assert "RGBAVATAR_FLAME" in told
 

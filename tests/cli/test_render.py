@@ -14,7 +14,7 @@ from rgbavatar_ns.data import DatasetWriter, TrackedFrame
 from rgbavatar_ns.data.png import read_png_rgba
 from rgbavatar_ns.export import front_camera, pictures
 from rgbavatar_ns.synthetic.flame import write_synthetic_flame
-from tests.export.subject import avatar_of, lively_theta
+from tests.export.subject import avatar_of, camera_path, lively_theta
 
 _SIZE, _FRAMES, _HELD_OUT = 32, 7, 3
 
@@ -38,15 +38,6 @@ def _write_dataset(folder: Path, seed: int) -> Path:
 
 def _render(*words: object) -> None:
     cli.main(["render", *map(str, words)])
-
-
-def _told(capsys, *words: object) -> str:
-    with pytest.raises(SystemExit) as ended:
-        _render(*words)
-    assert ended.value.code == 1
-    told = capsys.readouterr().err
-    assert "Traceback" not in told
-    return told
 
 
 def _film(path: Path) -> list[np.ndarray]:
@@ -100,10 +91,9 @@ def test_views_orbit_and_turntable(bundle, data, tmp_path):
 def test_a_camera_path_sets_size_rate_and_length(bundle, data, tmp_path):
     pose = torch.eye(4)
     pose[:3, 3] = torch.tensor([0.0, 0.0, 1.0])
-    poses = [{"camera_to_world": pose.flatten().tolist(), "fov": 30, "aspect": 1}] * 5
-    described = {"render_height": 20, "render_width": 30, "fps": 12, "seconds": 1}
+    described = camera_path(pose.expand(5, 4, 4), render_height=20, render_width=30, fps=12)
     path = tmp_path / "path.json"
-    path.write_text(json.dumps(described | {"camera_path": poses}))
+    path.write_text(json.dumps(described))
     words = ["--data", data, "--show", "camera-path", "--camera-path", path]
     _render(bundle, tmp_path, *words)
     film = _film(tmp_path / "camera-path.mp4")
@@ -126,7 +116,7 @@ def test_another_person_drives_the_avatar_and_is_shown_beside(bundle, data, tmp_
     assert "left out" not in capsys.readouterr().out
 
 
-def test_a_bundle_with_statistics_needs_no_dataset(bundle, data, tmp_path, capsys):
+def test_a_bundle_with_statistics_needs_no_dataset(bundle, data, tmp_path, refused):
     cli.main(["export", str(bundle), str(tmp_path / "me"), "--data", str(data)])
     words = ["--show", "views", "--kind", "png", "--width", 20, "--height", 20]
     _render(tmp_path / "me", tmp_path, *words)
@@ -135,25 +125,23 @@ def test_a_bundle_with_statistics_needs_no_dataset(bundle, data, tmp_path, capsy
     assert views[..., :3].std() > 20
     _render(tmp_path / "me", tmp_path, "--driver", data, "--frames", 0, 2)
     assert len(_film(tmp_path / "performance.mp4")) == 2
-    assert "own dataset" in _told(capsys, tmp_path / "me", tmp_path)
+    assert "own dataset" in refused("render", tmp_path / "me", tmp_path)
 
 
-def test_mistakes_are_told(bundle, data, tmp_path, capsys):
-    assert "does not name its dataset" in _told(capsys, bundle, tmp_path)
-    transparent = [bundle, tmp_path, "--data", data, "--show", "orbit", "--transparent"]
-    assert "--kind png" in _told(capsys, *transparent)
-    frames = [bundle, tmp_path, "--data", data, "--frames", 5, 9]
-    assert "no frames 5 to 9" in _told(capsys, *frames)
-    hold = [bundle, tmp_path, "--data", data, "--show", "views", "--hold", 7]
-    assert "no frame 7 to hold" in _told(capsys, *hold)
-    path = [bundle, tmp_path, "--data", data, "--show", "camera-path"]
-    assert "--camera-path" in _told(capsys, *path)
-    size = [bundle, tmp_path, "--data", data, "--width", 0]
-    assert "must be positive" in _told(capsys, *size)
+def test_mistakes_are_told(bundle, data, tmp_path, refused):
+    assert "does not name its dataset" in refused("render", bundle, tmp_path)
+    for words, told in (
+        ("--show orbit --transparent", "--kind png"),
+        ("--frames 5 9", "no frames 5 to 9"),
+        ("--show views --hold 7", "no frame 7 to hold"),
+        ("--show camera-path", "--camera-path"),
+        ("--width 0", "must be positive"),
+    ):
+        assert told in refused("render", bundle, tmp_path, "--data", data, *words.split())
 
 
 def test_a_driver_of_another_head_without_a_common_expression_is_refused(
-    bundle, data, tmp_path, capsys
+    bundle, data, tmp_path, refused
 ):
     from rgbavatar_ns.head import HeadModel
     from rgbavatar_ns.head.flame import load_flame
@@ -167,6 +155,6 @@ def test_a_driver_of_another_head_without_a_common_expression_is_refused(
     writer.add(TrackedFrame(0, torch.zeros(head.layout.size), camera, image))
     writer.finish(0)
     words = ["--data", data, "--show", "performance", "--driver", driver]
-    told = _told(capsys, bundle, tmp_path / "out", *words)
+    told = refused("render", bundle, tmp_path / "out", *words)
     assert "expression_0" in told
     assert "browDownLeft" in told

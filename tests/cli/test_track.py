@@ -1,5 +1,6 @@
 """`rgbavatar track` takes its paths and options in any order, and says which path is missing."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -36,12 +37,11 @@ def test_options_may_come_before_and_after_the_paths(
 
 
 def test_a_head_model_that_is_not_there_is_told_before_the_video_is_read(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, refused: Callable[..., str]
 ) -> None:
-    nowhere = str(tmp_path / "flame2023.pkl")
-    with pytest.raises(SystemExit):
-        main(["track", "a.mp4", str(tmp_path / "set"), "--flame", nowhere])
-    assert f"no FLAME model at {nowhere}" in " ".join(capsys.readouterr().err.split())
+    nowhere = tmp_path / "flame2023.pkl"
+    told = refused("track", "a.mp4", tmp_path / "set", "--flame", nowhere)
+    assert f"no FLAME model at {nowhere}" in " ".join(told.split())
     assert not (tmp_path / "set").exists()
 
 

@@ -1,5 +1,7 @@
 """AED, APD and CSIM against trackers and networks whose answer is known."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -23,6 +25,9 @@ from rgbavatar_ns.head import HeadModel, ThetaLayout
 from rgbavatar_ns.head.layout import ThetaField
 from tests.plugin.run import SMALL
 from tests.plugin.tiny import NUM_TEST, tiny_dataset
+
+# One GlobalAveragePool: the mean of each channel, [1, 3, 112, 112] to [1, 3, 1, 1].
+MEAN_NETWORK = Path(__file__).with_name("mean.onnx")
 
 
 class Ruler:
@@ -105,37 +110,8 @@ def test_eyes_are_found_where_the_head_has_them(tmp_path):
     assert right_px[0] < left_px[0]
 
 
-def _field(number: int, payload: bytes) -> bytes:
-    return bytes([number << 3 | 2]) + _varint(len(payload)) + payload
-
-
-def _varint(value: int) -> bytes:
-    low, rest = value & 127, value >> 7
-    return bytes([low]) if not rest else bytes([low | 128]) + _varint(rest)
-
-
-def _number(number: int, value: int) -> bytes:
-    return bytes([number << 3]) + _varint(value)
-
-
-def write_mean_network(path):
-    """An ONNX file written by hand: the mean of each channel, [1, 3, 112, 112] to [1, 3, 1, 1]."""
-
-    def value(name: str, shape: tuple[int, ...]) -> bytes:
-        sides = b"".join(_field(1, _number(1, side)) for side in shape)
-        tensor = _number(1, 1) + _field(2, sides)
-        return _field(1, name.encode()) + _field(2, _field(1, tensor))
-
-    node = _field(1, b"in") + _field(2, b"out") + _field(3, b"n") + _field(4, b"GlobalAveragePool")
-    graph = _field(1, node) + _field(2, b"g")
-    graph += _field(11, value("in", (1, 3, 112, 112))) + _field(12, value("out", (1, 3, 1, 1)))
-    opset = _field(8, _field(1, b"") + _number(2, 11))
-    path.write_bytes(_number(1, 6) + _field(7, graph) + opset)
-
-
-def test_a_network_of_a_file_sees_rgb_around_zero(tmp_path):
-    write_mean_network(tmp_path / "mean.onnx")
-    recognise = OnnxFaceRecognition(tmp_path / "mean.onnx")
+def test_a_network_of_a_file_sees_rgb_around_zero():
+    recognise = OnnxFaceRecognition(MEAN_NETWORK)
     face = np.zeros((112, 112, 3), np.uint8)
     face[..., 0] = 255
     # Red 1, green and blue -1, brought to unit length.
@@ -179,8 +155,7 @@ def test_an_avatar_is_scored_on_its_drivers_held_out_frames(tmp_path, monkeypatc
         return tracked_distances(seen, tracker)
 
     monkeypatch.setattr(reenactment, "tracked_distances", count)
-    write_mean_network(tmp_path / "mean.onnx")
-    recognise = OnnxFaceRecognition(tmp_path / "mean.onnx")
+    recognise = OnnxFaceRecognition(MEAN_NETWORK)
     values, missing = reenactment_scores(avatar, own, driver, _Anywhere(), recognise)
     assert len(seen) == NUM_TEST
     assert set(values) == {"aed", "apd", "csim"}

@@ -29,16 +29,6 @@ variants: [{{name: three bases, set: {{pipeline.model.avatar.num_bases: 3}}}}]
 """
 
 
-def _arguments(file, out):
-    return ["sweep", str(file), "--output", str(out)]
-
-
-def _sweep(file, out):
-    command = "import sys; from rgbavatar_ns.cli.main import main; main(sys.argv[1:])"
-    command = [sys.executable, "-c", command, *_arguments(file, out)]
-    return subprocess.Popen(command, stdout=subprocess.DEVNULL)
-
-
 def _checkpoints(out):
     return sorted(out.glob("cells/*/run/**/step-*.ckpt"))
 
@@ -47,7 +37,10 @@ def test_an_interrupted_sweep_ends_in_the_table_of_an_uninterrupted_one(tmp_path
     tiny_dataset(tmp_path / "data")
     file = tmp_path / "interrupted.yaml"
     file.write_text(TEXT)
-    with _sweep(file, tmp_path / "resumed") as process:
+    program = "import sys; from rgbavatar_ns.cli.main import main; main(sys.argv[1:])"
+    sweep = ["sweep", str(file), "--output"]
+    command = [sys.executable, "-c", program, *sweep, str(tmp_path / "resumed")]
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL) as process:
         end = time.monotonic() + 300
         while not _checkpoints(tmp_path / "resumed"):
             assert process.poll() is None
@@ -59,7 +52,7 @@ def test_an_interrupted_sweep_ends_in_the_table_of_an_uninterrupted_one(tmp_path
     assert 0 < int(kept.removeprefix("step-").removesuffix(".ckpt")) < STEPS - 1
     for out in ("resumed", "whole"):
         # The same command in this process, which need not load nerfstudio again.
-        main(_arguments(file, tmp_path / out))
+        main([*sweep, str(tmp_path / out)])
     (log,) = (tmp_path / "resumed").glob("cells/*/log.txt")
     assert "Resuming after step" in log.read_text()
     resumed, whole = (

@@ -2,63 +2,14 @@
 
 import csv
 import sys
-from pathlib import Path
 
 import pytest
 
 from rgbavatar_ns.cli import main as cli
 from rgbavatar_ns.errors import UserError
-from rgbavatar_ns.experiments import engines, read_experiment
 from rgbavatar_ns.experiments.engines import LocalEngine, RayEngine
 from rgbavatar_ns.experiments.report import write_report
 from rgbavatar_ns.experiments.sweep import sweep
-
-FAKE_RUNNER = """
-import json, pathlib, sys, time
-folder = pathlib.Path(sys.argv[1])
-cell = json.loads((folder / "cell.json").read_text())
-with (folder / "calls.txt").open("a") as calls:
-    calls.write("x")
-print("training", cell["variant"], flush=True)
-if cell["variant"] == "broken":
-    sys.exit("CUDA out of memory, so to speak")
-if cell["variant"] == "shaky" and (folder / "calls.txt").read_text() == "x":
-    sys.exit("once only")
-if cell["variant"] == "slow":
-    time.sleep(60)
-psnr = 30 + cell["overrides"]["pipeline.model.avatar.num_bases"] / 10 + cell["seed"]
-result = {"metrics": {"psnr": psnr, "ssim": 0.9}, "unavailable": {"lpips_vgg": "no weights"}}
-(folder / "result.json").write_text(json.dumps(result))
-"""
-
-TEXT = """
-title: Bases & more
-preset: rgbavatar-tiny
-paper_data: INSTA
-subjects: [{data}]
-seeds: [0, 2]
-variants:
-{variants}
-"""
-
-
-@pytest.fixture
-def experiment_of(tmp_path, monkeypatch):
-    runner = tmp_path / "fake_runner.py"
-    runner.write_text(FAKE_RUNNER)
-    monkeypatch.setattr(engines, "_RUNNER", (sys.executable, str(runner)))
-    (tmp_path / "data").mkdir()
-
-    def build(*names: str, paper: str = ""):
-        rows = [
-            f"  - name: {name}\n    set: {{pipeline.model.avatar.num_bases: {count}}}\n{paper}"
-            for name, count in zip(names, range(10, 100, 10))
-        ]
-        path = tmp_path / "bases.yaml"
-        path.write_text(TEXT.format(data="data", variants="".join(rows)))
-        return read_experiment(path)
-
-    return build
 
 
 def _calls(statuses):
@@ -86,7 +37,7 @@ def test_a_failed_cell_is_tried_once_more_and_stops_nobody(experiment_of, tmp_pa
 
 
 def test_an_interruption_ends_the_cells_and_is_gone_on_from(experiment_of, tmp_path):
-    experiment = experiment_of("fine", "slow")
+    experiment = experiment_of("fine", "broken", break_="time.sleep(60)")
 
     def stop(statuses):
         if sum(status.state == "done" for status in statuses) == 2:
@@ -94,8 +45,7 @@ def test_an_interruption_ends_the_cells_and_is_gone_on_from(experiment_of, tmp_p
 
     with pytest.raises(KeyboardInterrupt):
         sweep(experiment, tmp_path / "out", LocalEngine(1), stop)
-    runner = Path(engines._RUNNER[1])
-    runner.write_text(FAKE_RUNNER.replace("time.sleep(60)", "pass"))
+    experiment = experiment_of("fine", "broken", break_="pass")
     statuses = sweep(experiment, tmp_path / "out", LocalEngine(2))
     assert [status.state for status in statuses] == ["done"] * 4
     assert _calls(statuses)[:2] == ["x", "x"]
@@ -126,13 +76,13 @@ def test_the_report_has_means_spreads_and_the_papers_figures(experiment_of, tmp_
 
 
 def test_the_command_says_what_failed_and_ends_with_1(experiment_of, tmp_path, capsys):
-    experiment_of("broken")
+    experiment_of("fine", "broken")
     arguments = ["sweep", str(tmp_path / "bases.yaml"), "--output", str(tmp_path / "out")]
     with pytest.raises(SystemExit) as ended:
         cli.main(arguments)
     assert ended.value.code == 1
     told = capsys.readouterr().out
-    assert "0 of 2 cells done" in told
+    assert "2 of 4 cells done" in told
     assert "CUDA out of memory, so to speak" in told
     assert "rgbavatar report" in told
     cli.main(["report", str(tmp_path / "out"), "--file", str(tmp_path / "bases.yaml")])

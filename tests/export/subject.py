@@ -1,5 +1,7 @@
 """A small avatar on the embedded head, every Gaussian moved, for tests of what leaves it."""
 
+from typing import Any
+
 import numpy as np
 import torch
 
@@ -35,6 +37,13 @@ def lively_theta(avatar: Avatar, count: int, seed: int = 0) -> torch.Tensor:
         scale = {"linear": 0.6, "axis_angle": 0.3, "translation": 0.02}[field.form]
         parts[field.name] = scale * (drawn if field.form == "linear" else drawn - 0.5)
     return avatar.layout.join(parts)
+
+
+def camera_path(poses: torch.Tensor, **changes: Any) -> dict[str, Any]:
+    """nerfstudio's export of a path of cameras [C, 4, 4], 64 x 48 pixels."""
+    frames = [{"camera_to_world": p.flatten().tolist(), "fov": 40.0, "aspect": 1} for p in poses]
+    described = {"camera_type": "perspective", "render_height": 48, "render_width": 64}
+    return described | {"camera_path": frames, "fps": 24, "seconds": 2.0} | changes
 
 
 def psnr(first: np.ndarray, second: np.ndarray) -> float:

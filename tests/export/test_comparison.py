@@ -3,37 +3,29 @@ import numpy as np
 import pytest
 import torch
 
-from rgbavatar_ns import Avatar
-from rgbavatar_ns.avatar import AvatarConfig
 from rgbavatar_ns.data import DatasetWriter, TrackedFrame
-from rgbavatar_ns.export import comparison_frames, write_comparison
-from rgbavatar_ns.head import HeadModel
-from rgbavatar_ns.kernels import PinholeCameras
+from rgbavatar_ns.export import comparison_frames, front_camera, write_comparison
+
+from .subject import avatar_of
 
 SIZE = 32
 
 
 @pytest.fixture(scope="module")
 def avatar():
-    head = HeadModel.embedded()
-    config = AvatarConfig(num_bases=0, uv_resolution=24, scale_from_texel_spacing=True)
-    return Avatar(head, torch.zeros(head.num_identity), config)
+    return avatar_of(num_bases=0, uv_resolution=24)
 
 
 @pytest.fixture(scope="module")
 def dataset(avatar, tmp_path_factory):
     """Three frames whose matte is half transparent red on the left, nothing on the right."""
-    view = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))[None]
-    view[0, 2, 3] = 1.0
-    focal_px, centre_px = torch.full((1, 2), 2.0 * SIZE), torch.full((1, 2), SIZE / 2)
-    camera = PinholeCameras(view, focal_px, centre_px, SIZE, SIZE)
+    camera = front_camera(avatar, SIZE, SIZE)
     image = np.zeros((SIZE, SIZE, 4), dtype=np.uint8)
     image[:, : SIZE // 2] = (255, 0, 0, 128)
     folder = tmp_path_factory.mktemp("comparison") / "data"
-    head = avatar.head
-    writer = DatasetWriter(folder, "makehuman", avatar.identity, head.layout, SIZE, SIZE)
+    writer = DatasetWriter(folder, "makehuman", avatar.identity, avatar.layout, SIZE, SIZE)
     for index in range(3):
-        writer.add(TrackedFrame(index, torch.zeros(head.layout.size), camera, image))
+        writer.add(TrackedFrame(index, torch.zeros(avatar.layout.size), camera, image))
     return writer.finish(2)
 
 

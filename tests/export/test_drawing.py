@@ -32,12 +32,6 @@ def camera(avatar):
     return front_camera(avatar, 48, 40)
 
 
-def _statistics(avatar) -> TrainingStatistics:
-    theta = lively_theta(avatar, 20)
-    with torch.no_grad():
-        return TrainingStatistics.of(theta, avatar.weights(theta), avatar.layout)
-
-
 def test_straight_alpha_laid_over_a_colour_is_the_picture_on_that_colour(avatar, camera):
     theta = lively_theta(avatar, 2)
     for color in ((1.0, 1.0, 1.0), (0.1, 0.7, 0.3)):
@@ -90,7 +84,9 @@ def test_each_basis_is_shown_alone_at_its_largest_weight():
 
 
 def test_the_grid_holds_the_base_and_every_basis(avatar, camera):
-    seen = _statistics(avatar)
+    theta = lively_theta(avatar, 20)
+    with torch.no_grad():
+        seen = TrainingStatistics.of(theta, avatar.weights(theta), avatar.layout)
     grid = basis_grid(avatar, seen, camera, gain=20.0, columns=3)
     assert grid.shape == (2 * 40, 3 * 48, 3)
     base = grid[15:40, :48]

@@ -1,4 +1,5 @@
 import math
+from typing import Any
 
 import pytest
 import torch
@@ -38,6 +39,10 @@ def _theta(names: ThetaNames, count: int, seed: int = 0) -> torch.Tensor:
 
 def _statistics(theta: torch.Tensor, names: ThetaNames = _OURS) -> TrainingStatistics:
     return TrainingStatistics.of(theta, torch.zeros(len(theta), 1), names.layout)
+
+
+def _driven(theta: torch.Tensor, own: TrainingStatistics, **options: Any) -> torch.Tensor:
+    return drive(theta, _OURS, _OURS, own, 25.0, DrivingOptions(**options)).theta
 
 
 def test_numbers_go_to_the_same_name_and_what_has_none_is_listed():
@@ -96,32 +101,24 @@ def test_a_driver_with_its_own_neutral_shows_ours_at_rest():
     bias[:3] = torch.tensor([0.4, 0.0, 0.2])
     theta = torch.cat([torch.zeros(1, 15), _theta(_OURS, 5).abs() + 0.1]) + bias
     for relative, size in (("neutral", 0.0), ("off", 0.6)):
-        driven = drive(
-            theta, _OURS, _OURS, own, 25.0, DrivingOptions(relative=relative, pose="absolute")
-        )
-        driven = driven.theta
+        driven = _driven(theta, own, relative=relative, pose="absolute")
         assert driven[0].abs().sum().item() == pytest.approx(size, abs=1e-5)
 
 
 def test_mean_driving_has_our_mean_and_the_pose_is_as_asked():
     own = _statistics(_theta(_OURS, 30, seed=3))
     theta = _theta(_OURS, 40, seed=4)
-    driven = drive(theta, _OURS, _OURS, own, 25.0, DrivingOptions(relative="mean")).theta
+    driven = _driven(theta, own, relative="mean")
     linear = slice(0, 3)
     assert torch.allclose(driven[:, linear].mean(0), own.theta_mean[linear], atol=1e-6)
-    pose = ("rotation", "neck", "translation")
-    for name in pose:
+    for name in ("rotation", "neck", "translation"):
         numbers = _OURS.layout.slice(name)
         if name == "translation":
             assert torch.allclose(driven[:, numbers].mean(0), own.theta_mean[numbers], atol=1e-6)
-        kept, taken = (
-            drive(theta, _OURS, _OURS, own, 25.0, DrivingOptions(pose=way)).theta[:, numbers]
-            for way in ("keep", "absolute")
-        )
+        kept, taken = (_driven(theta, own, pose=way)[:, numbers] for way in ("keep", "absolute"))
         assert torch.equal(kept, own.theta_mean[numbers].expand(40, 3))
         assert torch.allclose(taken, theta[:, numbers], atol=1e-5)
-    still = drive(theta, _OURS, _OURS, own, 25.0, DrivingOptions(pose="keep")).theta
-    assert still[:, _OURS.layout.slice("jaw")].std(0).min() > 0.05
+    assert _driven(theta, own, pose="keep")[:, _OURS.layout.slice("jaw")].std(0).min() > 0.05
 
 
 def test_projection_holds_expressions_to_those_seen_and_leaves_the_pose():
@@ -149,8 +146,7 @@ def test_smoothing_takes_jitter_from_a_performance():
     calm = torch.sin(torch.arange(200) / 25 * math.pi)[:, None] * torch.full((15,), 0.2)
     noisy = calm + 0.02 * torch.randn(200, 15, generator=torch.Generator().manual_seed(6))
     plain, smooth = (
-        drive(noisy, _OURS, _OURS, own, 25.0, DrivingOptions("off", "absolute", smooth=on)).theta
-        for on in (False, True)
+        _driven(noisy, own, relative="off", pose="absolute", smooth=on) for on in (False, True)
     )
 
     def jitter(theta):

@@ -16,7 +16,7 @@ from rgbavatar_ns.export import (
 from rgbavatar_ns.kernels import PinholeCameras
 from tests.avatar.small_head import front_camera as odd_camera
 
-from .subject import avatar_of
+from .subject import avatar_of, camera_path
 
 
 def _seen(cameras: PinholeCameras, point: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -90,12 +90,6 @@ def test_a_swing_begins_and_ends_in_the_middle_and_reaches_its_angle():
     assert abs(angles[-1] - angles[0]) == pytest.approx(step), "the loop closes"
 
 
-def _camera_path(poses: torch.Tensor, **changes) -> dict:
-    frames = [{"camera_to_world": p.flatten().tolist(), "fov": 40.0, "aspect": 1} for p in poses]
-    described = {"camera_type": "perspective", "render_height": 48, "render_width": 64}
-    return described | {"camera_path": frames, "fps": 24, "seconds": 2.0} | changes
-
-
 def test_a_camera_path_gives_the_cameras_that_nerfstudio_would_render(tmp_path):
     from nerfstudio.cameras.camera_paths import get_path_from_json
 
@@ -106,7 +100,7 @@ def test_a_camera_path_gives_the_cameras_that_nerfstudio_would_render(tmp_path):
     poses = torch.eye(4).repeat(2, 1, 1)
     poses[:, :3, :3], poses[:, :3, 3] = turn, torch.tensor([[0.1, -1.0, 0.2], [0.3, 0.4, -0.5]])
     path = tmp_path / "path.json"
-    path.write_text(json.dumps(_camera_path(poses)))
+    path.write_text(json.dumps(camera_path(poses)))
     cameras, rate = read_camera_path(path)
     expected = from_nerfstudio(get_path_from_json(json.loads(path.read_text())))
     assert rate == 24
@@ -119,13 +113,12 @@ def test_what_is_no_camera_path_is_refused(tmp_path):
     path = tmp_path / "path.json"
     with pytest.raises(UserError, match="no camera path"):
         read_camera_path(path)
-    path.write_text("{}")
-    with pytest.raises(UserError, match="no camera path"):
-        read_camera_path(path)
     one = torch.eye(4)[None]
-    path.write_text(json.dumps(_camera_path(one, camera_type="fisheye")))
-    with pytest.raises(UserError, match="fisheye"):
-        read_camera_path(path)
-    path.write_text(json.dumps(_camera_path(one, camera_path=[])))
-    with pytest.raises(UserError, match="0 cameras"):
-        read_camera_path(path)
+    for described, told in (
+        ({}, "no camera path"),
+        (camera_path(one, camera_type="fisheye"), "fisheye"),
+        (camera_path(one, camera_path=[]), "0 cameras"),
+    ):
+        path.write_text(json.dumps(described))
+        with pytest.raises(UserError, match=told):
+            read_camera_path(path)

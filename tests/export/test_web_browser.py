@@ -1,9 +1,6 @@
 """The exported page in a real browser: the same picture as ours, and controls that answer."""
 
 import base64
-import io
-import os
-import shutil
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -12,39 +9,24 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from PIL import Image
 
 from rgbavatar_ns.avatar import Avatar
 from rgbavatar_ns.export import PageOptions, front_camera, pictures, write_web_page
 from rgbavatar_ns.head import HeadArrays
 from tests.avatar.small_head import small_head_arrays
+from tests.browser import IN_BROWSER, chromium, picture_of
 
 from .subject import avatar_of, lively_theta, psnr
 
-CHROMIUM = os.environ.get("RGBAVATAR_CHROMIUM") or shutil.which("chromium")
-_FLAGS = [
-    "--no-sandbox",
-    "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader",
-    "--ignore-gpu-blocklist",
-    "--disable-background-networking",
-]
 _SIZE = 96
 
-pytestmark = [
-    pytest.mark.browser,
-    pytest.mark.slow,
-    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium; set RGBAVATAR_CHROMIUM to its path"),
-]
+pytestmark = IN_BROWSER
 
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
-    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-    with playwright.sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=CHROMIUM, args=_FLAGS)
+    with chromium() as browser:
         yield browser
-        browser.close()
 
 
 @pytest.fixture
@@ -76,8 +58,7 @@ def open_page(browser: Any, tmp_path: Path) -> Iterator[Any]:
 def _shown(page: Any) -> np.ndarray:
     """The canvas [H, W, 3] in [0, 1], drawn now."""
     text = page.evaluate("() => { app.draw(); return app.canvas.toDataURL('image/png'); }")
-    picture = Image.open(io.BytesIO(base64.b64decode(text.split(",")[1]))).convert("RGB")
-    return np.asarray(picture).astype(np.float32) / 255
+    return picture_of(base64.b64decode(text.split(",")[1])).astype(np.float32) / 255
 
 
 def _ours(avatar: Avatar, theta: torch.Tensor) -> np.ndarray:
@@ -131,9 +112,7 @@ def test_sliders_change_the_picture_and_bring_it_back(open_page):
     changed = _shown(page)
     assert np.abs(changed - before).max() > 0.2
     theta = torch.zeros(1, avatar.layout.size)
-    theta[0, avatar.layout.slice("jaw").start] = 0.3
-    at = float(jaw.input_value())
-    theta[0, avatar.layout.slice("jaw").start] = at
+    theta[0, avatar.layout.slice("jaw").start] = float(jaw.input_value())
     assert psnr(changed, _ours(avatar, theta)) > 45
     page.get_by_role("group").filter(has_text="Jaw and eyes").get_by_text("Reset").click()
     assert np.array_equal(_shown(page), before)

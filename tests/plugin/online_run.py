@@ -10,31 +10,17 @@ import pytest
 from rgbavatar_ns.data.streams import ReplayStream, StreamedFrame
 from rgbavatar_ns.plugin.online.methods import rgbavatar_online_tiny
 from rgbavatar_ns.plugin.online.trainer import OnlineTrainer, OnlineTrainerConfig
-from tests.plugin.run import SMALL, make_trainer
+from tests.plugin.run import SMALL, make_trainer, set_up
 
 
 def online_config(output: Path, data: Path | None = None, **fields: Any) -> OnlineTrainerConfig:
-    """rgbavatar-online-tiny with fewer Gaussians; replays `data` at 200 frames/s.
-
-    `fields` are the trainer's, or where it has none the data manager's.
-    """
+    """rgbavatar-online-tiny with fewer Gaussians; replays `data` at 200 frames/s."""
     config = copy.deepcopy(rgbavatar_online_tiny.config)
     assert isinstance(config, OnlineTrainerConfig)
-    config.output_dir = output
-    config.experiment_name = "tiny"
-    config.timestamp = "run"
-    config.vis = "tensorboard"
-    config.machine.device_type = "cpu"
-    config.steps_after_stream = 3
-    config.pipeline.model.avatar = SMALL
-    manager = config.pipeline.datamanager
-    manager.data = data
-    manager.batch_size = 4
-    manager.source.frames_per_second = 200.0
-    for name, value in fields.items():
-        owner = config if hasattr(config, name) else manager
-        assert hasattr(owner, name)
-        setattr(owner, name, value)
+    config.pipeline.datamanager.data = data
+    config.pipeline.datamanager.source.frames_per_second = 200.0
+    small = {"steps_after_stream": 3, "batch_size": 4, "avatar": SMALL}
+    set_up(config, output, **small | fields)
     return config
 
 

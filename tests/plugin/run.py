@@ -26,30 +26,27 @@ _METHODS = (
 )
 
 
-def small_config(
-    data: Path,
-    output: Path,
-    avatar: AvatarConfig = SMALL,
-    lpips_metric: bool = False,
-    **fields: Any,
-) -> RGBAvatarTrainerConfig:
-    """rgbavatar-tiny with fewer Gaussians and steps, writing to `output`."""
+def small_config(data: Path, output: Path, **fields: Any) -> RGBAvatarTrainerConfig:
+    """rgbavatar-tiny with fewer Gaussians and steps, set up with `fields`."""
     config = copy.deepcopy(rgbavatar_tiny.config)
     assert isinstance(config, RGBAvatarTrainerConfig)
-    config.output_dir = output
-    config.experiment_name = "tiny"
-    config.timestamp = "run"
-    config.vis = "tensorboard"
-    config.max_num_iterations = 20
-    config.machine.device_type = "cpu"
     config.pipeline.datamanager.data = data
-    config.pipeline.datamanager.batch_size = 4
-    config.pipeline.model.avatar = avatar
-    config.pipeline.model.lpips_metric = lpips_metric
-    for name, value in fields.items():
-        assert hasattr(config, name)
-        setattr(config, name, value)
+    small = {"max_num_iterations": 20, "batch_size": 4, "avatar": SMALL, "lpips_metric": False}
+    set_up(config, output, **small | fields)
     return config
+
+
+def set_up(config: RGBAvatarTrainerConfig, output: Path, **fields: Any) -> None:
+    """Train on the CPU, without a viewer, in output/tiny/METHOD/run.
+
+    `fields` are the trainer's, or where it has none the data manager's or the model's.
+    """
+    config.machine.device_type = "cpu"
+    where = {"output_dir": output, "experiment_name": "tiny", "timestamp": "run"}
+    parts = (config, config.pipeline.datamanager, config.pipeline.model)
+    for name, value in (where | {"vis": "tensorboard"} | fields).items():
+        owner = next(part for part in parts if hasattr(part, name))
+        setattr(owner, name, value)
 
 
 def make_trainer(config: RGBAvatarTrainerConfig) -> RGBAvatarTrainer:
@@ -67,6 +64,25 @@ def before_each_step(trainer: RGBAvatarTrainer, work: Callable[[int], None]) -> 
     """Call `work` with the step's number."""
     where = [TrainingCallbackLocation.BEFORE_TRAIN_ITERATION]
     trainer.callbacks.append(TrainingCallback(where, lambda step: work(step)))
+
+
+def before_step(number: int, trainer: RGBAvatarTrainer, work: Callable[[], object]) -> None:
+    """Call `work` before one step."""
+    before_each_step(trainer, lambda step: work() if step == number else None)
+
+
+def assert_learns(trainer: RGBAvatarTrainer) -> None:
+    """Training halves the loss of held-out frames and gives Gaussians their colours."""
+    pipeline = trainer.pipeline
+
+    def loss() -> float:
+        with torch.no_grad():
+            return float(pipeline.get_eval_loss_dict(0)[1]["l1"])
+
+    before = loss()
+    trainer.train()
+    assert loss() < 0.5 * before
+    assert bool(pipeline.model.avatar.color_initialized.any())
 
 
 def trained(config: RGBAvatarTrainerConfig) -> RGBAvatarTrainer:
@@ -96,26 +112,21 @@ def program(name: str) -> str:
     return str(Path(sys.executable).with_name(name))
 
 
-def environment(**changes: str) -> Mapping[str, str]:
+def environment() -> Mapping[str, str]:
     """For a command: the methods are known, whether the package is installed or not."""
     here = str(Path(sys.executable).parent)
-    own = {
-        "NERFSTUDIO_METHOD_CONFIGS": _METHODS,
-        "COLUMNS": "200",
-        "PATH": here + os.pathsep + os.environ.get("PATH", ""),
-    }
-    return {**os.environ, **own, **changes}
+    path = here + os.pathsep + os.environ.get("PATH", "")
+    own = {"NERFSTUDIO_METHOD_CONFIGS": _METHODS, "COLUMNS": "200", "PATH": path}
+    return {**os.environ, **own}
 
 
-def run_command(
-    *command: str | Path, timeout_s: float = 600, **changes: str
-) -> "subprocess.CompletedProcess[str]":
+def run_command(*command: str | Path) -> "subprocess.CompletedProcess[str]":
     """Run one of nerfstudio's commands to its end."""
     return subprocess.run(
         [program(str(command[0])), *map(str, command[1:])],
         capture_output=True,
         text=True,
         check=False,
-        timeout=timeout_s,
-        env=environment(**changes),
+        timeout=600,
+        env=environment(),
     )

@@ -6,10 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from nerfstudio.scripts.eval import ComputePSNR
 from nerfstudio.scripts.render import DatasetRender, RenderCameraPath
 from PIL import Image
 
+from tests.export.subject import camera_path
 from tests.plugin.run import finished_run, run_command
 from tests.plugin.tiny import NUM_TEST, SIZE
 
@@ -21,10 +23,6 @@ def config(tiny_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished run's config.yml."""
     folder = tmp_path_factory.mktemp("run")
     return finished_run(tiny_data, folder, max_num_iterations=5, lpips_metric=True)
-
-
-def _has_no_traceback(text: str) -> bool:
-    return "Traceback" not in text and "rgbavatar_ns/" not in text
 
 
 def test_train_takes_its_flags_in_any_order(tiny_data: Path, tmp_path: Path):
@@ -66,7 +64,9 @@ def test_a_users_mistake_is_told_without_a_traceback(tmp_path: Path):
     assert ended.returncode == 1
     assert "Error: " in ended.stderr
     assert "absent" in ended.stderr
-    assert _has_no_traceback(ended.stdout + ended.stderr)
+    told = ended.stdout + ended.stderr
+    assert "Traceback" not in told
+    assert "rgbavatar_ns/" not in told
 
 
 def test_render_dataset(config: Path, tmp_path: Path):
@@ -90,8 +90,13 @@ def test_render_camera_path_plays_the_performance(
     ffmpeg = pytest.importorskip("imageio_ffmpeg").get_ffmpeg_exe()
     (tmp_path / "ffmpeg").symlink_to(ffmpeg)
     monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
+    # The camera looks at the face along +y, z up.
+    pose = torch.tensor([[1.0, 0, 0, 0], [0, 0, -1, -0.9], [0, 1, 0, 0], [0, 0, 0, 1]])
+    described = camera_path(pose.expand(3, 4, 4), fps=3, seconds=1)
+    for frame, time in zip(described["camera_path"], (0.0, 0.5, 1.0)):
+        frame["render_time"] = time
     path = tmp_path / "path.json"
-    path.write_text(json.dumps(_camera_path(times=(0.0, 0.5, 1.0))))
+    path.write_text(json.dumps(described))
     RenderCameraPath(
         config,
         output_path=tmp_path / "film.mp4",
@@ -104,20 +109,3 @@ def test_render_camera_path_plays_the_performance(
     # One camera, three frames of the performance.
     assert all(image.max() > 30 for image in images)
     assert np.abs(images[0] - images[1]).max() > 10
-
-
-def _camera_path(times: tuple[float, ...]) -> dict[str, object]:
-    """The viewer's export of a camera that looks at the face along +y, z up."""
-    camera_to_world = [1.0, 0, 0, 0, 0, 0, -1, -0.9, 0, 1, 0, 0, 0, 0, 0, 1]
-    cameras = [
-        {"camera_to_world": camera_to_world, "fov": 40, "aspect": 4 / 3, "render_time": time}
-        for time in times
-    ]
-    return {
-        "camera_type": "perspective",
-        "render_height": 48,
-        "render_width": 64,
-        "camera_path": cameras,
-        "fps": 3,
-        "seconds": 1,
-    }

@@ -10,6 +10,7 @@ import torch
 
 from rgbavatar_ns.plugin.online.progress import OnlineProgress, StreamReport
 from rgbavatar_ns.plugin.viewer.status_panel import StatusPanel
+from tests.data.streaming import Clock
 from tests.plugin.fake_viewer import FakeViewer
 
 REPORT = StreamReport(
@@ -50,18 +51,18 @@ def test_log_has_a_line_now_and_then(capsys: pytest.CaptureFixture[str]):
 
 
 def test_rate_is_that_of_the_last_second(monkeypatch: pytest.MonkeyPatch):
-    clock = SimpleNamespace(now=100.0)
+    clock = Clock()
     monkeypatch.setattr(
         "rgbavatar_ns.plugin.online.progress.time",
-        SimpleNamespace(monotonic=lambda: clock.now),
+        SimpleNamespace(monotonic=clock),
     )
     progress = OnlineProgress()
     assert progress.images_per_second(50) == 0.0
-    clock.now += 2.0
+    clock.sleep(2.0)
     assert progress.images_per_second(250) == 100.0
-    clock.now += 0.5
+    clock.sleep(0.5)
     assert progress.images_per_second(300) == 100.0
-    clock.now += 0.5
+    clock.sleep(0.5)
     assert progress.images_per_second(260) == 10.0
 
 

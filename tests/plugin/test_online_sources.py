@@ -65,8 +65,8 @@ def test_ctrl_c_while_waiting_ends_with_exit_code_0(
         raise KeyboardInterrupt
 
     monkeypatch.setattr("rgbavatar_ns.plugin.online.datamanager.await_subject", interrupted)
-    config = online_config(tmp_path / "out", tmp_path / "live")
-    config.pipeline.datamanager.source = SourceConfig("socket", listen="127.0.0.1:0")
+    source = SourceConfig("socket", listen="127.0.0.1:0")
+    config = online_config(tmp_path / "out", tmp_path / "live", source=source)
     with pytest.raises(SystemExit) as ended:
         online_trainer(config)
     assert ended.value.code == 0

@@ -1,9 +1,6 @@
 """ns-viewer in a real browser: the head is seen, and each control changes it and back."""
 
-import io
-import os
 import re
-import shutil
 import subprocess
 import tempfile
 import time
@@ -17,20 +14,9 @@ import pytest
 from PIL import Image
 
 from rgbavatar_ns.avatar import AvatarConfig
+from tests.browser import IN_BROWSER, chromium, picture_of
 from tests.plugin.run import environment, finished_run, program
 
-CHROMIUM = os.environ.get("RGBAVATAR_CHROMIUM") or shutil.which("chromium")
-_FLAGS = [
-    "--no-sandbox",
-    "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader",
-    "--ignore-gpu-blocklist",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-]
 _WIDTH, _HEIGHT = 900, 950
 _PANEL_WIDTH = 330
 _SECONDS_UNTIL_DRAWN = 120.0
@@ -40,11 +26,7 @@ _SHARP_PX = 512
 _SIZE = re.compile(r"Resolution: \d+x\d+px")
 _SAME = 1e-4
 
-pytestmark = [
-    pytest.mark.browser,
-    pytest.mark.slow,
-    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium; set RGBAVATAR_CHROMIUM to its path"),
-]
+pytestmark = IN_BROWSER
 
 Picture = npt.NDArray[np.uint8]
 
@@ -81,19 +63,15 @@ def _address(process: "subprocess.Popen[bytes]", log: Path) -> str:
 @pytest.fixture
 def page(viewer_address: str) -> Iterator[Any]:
     """The viewer's page in a headless browser."""
-    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-    with playwright.sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=CHROMIUM, args=_FLAGS)
+    with chromium() as browser:
         page = browser.new_page(viewport={"width": _WIDTH, "height": _HEIGHT})
         page.goto(viewer_address)
         yield page
-        browser.close()
 
 
 def _canvas(page: Any) -> Picture:
     """The 3D view, left of the control panel, below the title and above the axes."""
-    image = Image.open(io.BytesIO(page.screenshot())).convert("RGB")
-    return np.asarray(image)[80 : _HEIGHT - 80, : _WIDTH - _PANEL_WIDTH]
+    return picture_of(page.screenshot())[80 : _HEIGHT - 80, : _WIDTH - _PANEL_WIDTH]
 
 
 def _colored(picture: Picture) -> float:

@@ -20,18 +20,14 @@ from rgbavatar_ns.plugin.viewer.driving import training_statistics
 from rgbavatar_ns.plugin.viewer.panel import ViewerPanel
 from rgbavatar_ns.plugin.viewer.viewpoint import Viewpoint
 from tests.plugin.fake_viewer import FakeViewer
-from tests.plugin.run import make_trainer, small_config
+from tests.plugin.run import small_config, trained
 from tests.plugin.tiny import NUM_FRAMES, SIZE, tiny_dataset
 
 
 @pytest.fixture(scope="module")
 def pipeline(tiny_data: Path, tmp_path_factory: pytest.TempPathFactory) -> RGBAvatarPipeline:
-    trainer = make_trainer(
-        small_config(tiny_data, tmp_path_factory.mktemp("run"), max_num_iterations=30)
-    )
-    trainer.train()
-    trainer.pipeline.eval()
-    return trainer.pipeline
+    config = small_config(tiny_data, tmp_path_factory.mktemp("run"), max_num_iterations=30)
+    return trained(config).pipeline.eval()
 
 
 class Desk:
@@ -59,6 +55,10 @@ class Desk:
         self.pass_time(1.0)
         return "\n".join(self.viewer.gui.texts())
 
+    def white(self, theta: torch.Tensor, psi: torch.Tensor | None = None) -> torch.Tensor:
+        """The avatar drawn without the panel, over the panel's background."""
+        return _rendered(self.model.avatar, theta, self.camera(), white=True, psi=psi)
+
     def pass_time(self, seconds: float) -> None:
         self.now_s += seconds
         self.panel.tick()
@@ -75,9 +75,9 @@ def desk(pipeline: RGBAvatarPipeline) -> Desk:
 
 
 @torch.no_grad()
-def _rendered(avatar: Avatar, theta: torch.Tensor, camera: Cameras, white: bool = False):
+def _rendered(avatar: Avatar, theta: torch.Tensor, camera: Cameras, white=False, psi=None):
     ground = torch.ones(3) if white else torch.zeros(3)
-    return avatar.render(theta, from_nerfstudio(camera), ground).image[0].clamp(0, 1)
+    return avatar.render(theta, from_nerfstudio(camera), ground, psi=psi).image[0].clamp(0, 1)
 
 
 def test_without_a_viewer_the_cameras_time_chooses_and_the_ground_is_black(
@@ -103,10 +103,7 @@ def test_a_cameras_own_theta_comes_before_the_panel(pipeline: RGBAvatarPipeline)
 
 def test_frame_slider_shows_that_frame_over_the_background(desk: Desk):
     desk.set("Frame", 7)
-    theta = desk.model.frame_theta[7:8]
-    assert torch.equal(
-        desk.picture(), _rendered(desk.model.avatar, theta, desk.camera(), white=True)
-    )
+    assert torch.equal(desk.picture(), desk.white(desk.model.frame_theta[7:8]))
     assert len(desk.asked) == 1
     desk.set("Background", (255, 51, 0))
     assert torch.allclose(desk.picture()[0, 0], torch.tensor([1.0, 0.2, 0.0]), atol=1e-6)
@@ -171,37 +168,29 @@ def test_a_weight_slider_overrides_the_network_until_it_is_given_back(desk: Desk
     desk.set("psi 1", 0.9)
     psi[0, 1] = 0.9
     assert torch.allclose(desk.panel.state.psi_by_hand, psi[0])
-    expected = desk.model.avatar.render(
-        theta, from_nerfstudio(desk.camera()), torch.ones(3), psi=psi
-    )
-    assert torch.allclose(desk.picture(), expected.image[0].clamp(0, 1), atol=1e-5)
+    assert torch.allclose(desk.picture(), desk.white(theta, psi), atol=1e-5)
     assert (desk.picture() - before).abs().max() > 0.005
     desk.set("Weights by hand", False)
     assert torch.equal(desk.picture(), before)
 
 
 def test_bases_used_counts_the_first_ones(desk: Desk):
-    avatar = desk.model.avatar
     theta = desk.model.frame_theta[0:1]
-    psi = avatar.weights(theta).detach()
+    psi = desk.model.avatar.weights(theta).detach()
     desk.set("Bases used", 1)
     psi[:, 1:] = 0
-    expected = avatar.render(theta, from_nerfstudio(desk.camera()), torch.ones(3), psi=psi)
-    assert torch.allclose(desk.picture(), expected.image[0].clamp(0, 1), atol=1e-5)
+    assert torch.allclose(desk.picture(), desk.white(theta, psi), atol=1e-5)
 
 
 def test_one_basis_alone_is_base_and_basis_on_the_neutral_frame(desk: Desk):
-    avatar, seen = desk.model.avatar, training_statistics(desk.model)
+    seen = training_statistics(desk.model)
     extreme = torch.where(seen.psi_max >= -seen.psi_min, seen.psi_max, seen.psi_min)
     desk.set("One basis alone", "2")
-    psi = torch.zeros(1, avatar.config.num_bases)
+    psi = torch.zeros(1, len(extreme))
     psi[0, 2] = 1.5 * extreme[2]
-    camera = from_nerfstudio(desk.camera())
-    expected = avatar.render(seen.theta_neutral[None], camera, torch.ones(3), psi=psi)
-    assert torch.allclose(desk.picture(), expected.image[0].clamp(0, 1), atol=1e-5)
+    assert torch.allclose(desk.picture(), desk.white(seen.theta_neutral[None], psi), atol=1e-5)
     desk.set("One basis alone", "none")
-    theta = desk.model.frame_theta[0:1]
-    assert torch.equal(desk.picture(), _rendered(avatar, theta, desk.camera(), white=True))
+    assert torch.equal(desk.picture(), desk.white(desk.model.frame_theta[0:1]))
 
 
 def test_film_avatar_and_error_stand_in_a_row(desk: Desk, pipeline: RGBAvatarPipeline):
@@ -328,9 +317,7 @@ def test_play_moves_on_once_a_picture_was_drawn(desk: Desk):
 def test_previewing_a_camera_path_follows_its_time(desk: Desk):
     desk.panel.change(frame=7, mesh=True)
     desk.viewer.render_tab_state.preview_render = True
-    theta = desk.model.frame_theta[12:13]
-    expected = _rendered(desk.model.avatar, theta, desk.camera(), white=True)
-    assert torch.equal(desk.picture(time=0.9), expected)
+    assert torch.equal(desk.picture(time=0.9), desk.white(desk.model.frame_theta[12:13]))
 
 
 def test_viewer_starts_before_the_face_and_nearer_than_the_camera(desk: Desk):

@@ -6,6 +6,7 @@ import signal
 import socket
 import threading
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -24,15 +25,20 @@ from rgbavatar_ns.plugin.online.methods import rgbavatar_online, rgbavatar_onlin
 from rgbavatar_ns.plugin.online.sources import SourceConfig
 from rgbavatar_ns.plugin.online.trainer import OnlineTrainer
 from rgbavatar_ns.plugin.training.checkpoints import list_checkpoints
-from tests.plugin.online_run import (
-    hold_back_after,
-    online_config,
-    online_trainer,
-)
-from tests.plugin.run import before_each_step, newest_state
+from tests.plugin.online_run import hold_back_after, online_config, online_trainer
+from tests.plugin.run import assert_learns, before_each_step, before_step, newest_state
 from tests.plugin.tiny import NUM_FRAMES, NUM_TEST, SIZE
 
 STREAMED = NUM_FRAMES - NUM_TEST
+Online = Callable[..., OnlineTrainer]
+
+
+@pytest.fixture
+def online(tiny_data: Path, tmp_path: Path) -> Online:
+    """A trainer that replays the tiny dataset and writes to a folder of the given name."""
+    return lambda name="run", **fields: online_trainer(
+        online_config(tmp_path / name, tiny_data, **fields)
+    )
 
 
 def summary(trainer: OnlineTrainer) -> dict[str, Any]:
@@ -57,10 +63,8 @@ def subject_and_frames(data: Path) -> tuple[StreamSubject, list[TrackedFrame]]:
     return subject, frames
 
 
-def test_a_replayed_stream_is_trained_on_to_its_end_and_a_little_longer(
-    tiny_data: Path, tmp_path: Path
-):
-    trainer = online_trainer(online_config(tmp_path, tiny_data, steps_after_stream=5))
+def test_a_replayed_stream_is_trained_on_to_its_end_and_a_little_longer(online: Online):
+    trainer = online(steps_after_stream=5)
     steps_at_end = []
     before_each_step(trainer, lambda step: steps_at_end.append(trainer.stream.ended_step))
     trainer.train()
@@ -77,15 +81,12 @@ def test_a_replayed_stream_is_trained_on_to_its_end_and_a_little_longer(
     assert list_checkpoints(trainer.checkpoint_dir)[-1][0] == trainer.step
 
 
-def test_after_the_stream_the_rates_fall_to_a_tenth_also_when_resumed(
-    tiny_data: Path, tmp_path: Path
-):
+def test_after_the_stream_the_rates_fall_to_a_tenth_also_when_resumed(online: Online):
     def rates(trainer: OnlineTrainer) -> dict[str, float]:
         optimizers = trainer.optimizers.optimizers
         return {name: each.param_groups[0]["lr"] for name, each in optimizers.items()}
 
-    config = online_config(tmp_path / "first", tiny_data, steps_after_stream=6)
-    trainer = online_trainer(config)
+    trainer = online("first", steps_after_stream=6)
     first, seen = rates(trainer), []
 
     def look(step: int) -> None:
@@ -101,19 +102,14 @@ def test_after_the_stream_the_rates_fall_to_a_tenth_also_when_resumed(
     trainer.train()
     # Three steps after the first one, half of the way down to a tenth.
     assert seen == pytest.approx([10 ** (-step / 6) for step in (1, 2, 3)])
-    folder = trainer.checkpoint_dir
-    again = online_trainer(
-        online_config(tmp_path / "again", tiny_data, steps_after_stream=6, load_dir=folder)
-    )
+    again = online("again", steps_after_stream=6, load_dir=trainer.checkpoint_dir)
     again.train()
     for name, rate in rates(again).items():
         assert rate == pytest.approx(first[name] / 10)
 
 
-def test_after_the_stream_all_kept_frames_are_drawn_alike(tiny_data: Path, tmp_path: Path):
-    config = online_config(tmp_path, tiny_data, local_size=2, global_size=6, steps_after_stream=120)
-    config.pipeline.datamanager.local_share = 1.0
-    trainer = online_trainer(config)
+def test_after_the_stream_all_kept_frames_are_drawn_alike(online: Online):
+    trainer = online(local_size=2, global_size=6, local_share=1.0, steps_after_stream=120)
     drawn: Counter[int] = Counter()
     plain = trainer.stream.next_train
 
@@ -130,25 +126,15 @@ def test_after_the_stream_all_kept_frames_are_drawn_alike(tiny_data: Path, tmp_p
     assert all(40 < count < 80 for count in drawn.values()), drawn
 
 
-def test_the_streamed_avatar_learns_and_colours_its_gaussians(tiny_data: Path, tmp_path: Path):
-    trainer = online_trainer(online_config(tmp_path, tiny_data, steps_after_stream=40))
-    pipeline = trainer.pipeline
-
-    def held_out_loss() -> float:
-        with torch.no_grad():
-            return float(pipeline.get_eval_loss_dict(0)[1]["l1"])
-
-    before = held_out_loss()
-    trainer.train()
-    assert held_out_loss() < 0.5 * before
-    assert bool(pipeline.model.avatar.color_initialized.any())
+def test_the_streamed_avatar_learns_and_colours_its_gaussians(online: Online):
+    assert_learns(online(steps_after_stream=40))
 
 
 def test_training_begins_with_the_first_frame(
-    tiny_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    online: Online, tiny_data: Path, monkeypatch: pytest.MonkeyPatch
 ):
     hold_back_after(1, monkeypatch)
-    trainer = online_trainer(online_config(tmp_path, tiny_data, max_num_iterations=2))
+    trainer = online(max_num_iterations=2)
     trainer.train()
     assert trainer.stream.pools.num_added == 1
     assert summary(trainer)["images"] == 2
@@ -156,14 +142,19 @@ def test_training_begins_with_the_first_frame(
     assert torch.equal(trainer.pipeline.model.frame_theta[0], first)
 
 
-def test_the_newest_frame_drives_the_viewers_avatar(tiny_data: Path, tmp_path: Path):
-    trainer = online_trainer(online_config(tmp_path, tiny_data))
+def test_the_viewer_knows_the_newest_frame_only(online: Online, tiny_data: Path):
+    pipeline = (trainer := online()).pipeline
+    assert (len(pipeline.model.frame_theta), pipeline.film) == (1, None)
     trainer.train()
     dataset = load_dataset(tiny_data)
-    assert torch.equal(trainer.pipeline.model.frame_theta[0], dataset.theta[STREAMED - 1])
+    newest = dataset.theta[STREAMED - 1]
+    assert torch.equal(pipeline.model.frame_theta[0], newest)
+    assert torch.equal(pipeline.viewer_panel.theta_shown(), newest)
+    pipeline.viewer_panel.show_neutral()
+    assert torch.equal(pipeline.viewer_panel.theta_shown(), newest)
     recent = trainer.stream.pools.recent(float("inf"), 1)
     assert recent is not None
-    score, picture = trainer.pipeline.look_at(recent)
+    score, picture = pipeline.look_at(recent)
     assert picture.shape == (SIZE, 2 * SIZE, 3)
     rgba = np.array(dataset.read_image(STREAMED - 1)).astype(float) / 255
     truth = rgba[..., :3] * rgba[..., 3:]
@@ -172,31 +163,16 @@ def test_the_newest_frame_drives_the_viewers_avatar(tiny_data: Path, tmp_path: P
     assert score == pytest.approx(-10 * np.log10(error), abs=0.1)
 
 
-def test_the_viewers_panel_knows_the_newest_frame_only(tiny_data: Path, tmp_path: Path):
-    pipeline = (trainer := online_trainer(online_config(tmp_path, tiny_data))).pipeline
-    assert (len(pipeline.model.frame_theta), pipeline.film) == (1, None)
-    trainer.train()
-    newest = load_dataset(tiny_data).theta[STREAMED - 1]
-    assert torch.equal(pipeline.viewer_panel.theta_shown(), newest)
-    pipeline.viewer_panel.show_neutral()
-    assert torch.equal(pipeline.viewer_panel.theta_shown(), newest)
-
-
-def test_ctrl_c_saves_and_leaves_exit_code_0(tiny_data: Path, tmp_path: Path):
-    trainer = online_trainer(online_config(tmp_path, tiny_data))
-
-    def interrupt(step: int) -> None:
-        if step == 2:
-            signal.raise_signal(signal.SIGINT)
-
-    before_each_step(trainer, interrupt)
+def test_ctrl_c_saves_and_leaves_exit_code_0(online: Online):
+    trainer = online()
+    before_step(2, trainer, lambda: signal.raise_signal(signal.SIGINT))
     trainer.train()  # no SystemExit
     assert not trainer.completed
     assert [step for step, _ in list_checkpoints(trainer.checkpoint_dir)] == [2]
 
 
-def test_sigterm_saves_and_is_told_by_the_exit_code(tiny_data: Path, tmp_path: Path):
-    trainer = online_trainer(online_config(tmp_path, tiny_data))
+def test_sigterm_saves_and_is_told_by_the_exit_code(online: Online):
+    trainer = online()
     before_each_step(trainer, lambda step: signal.raise_signal(signal.SIGTERM))
     with pytest.raises(SystemExit) as ended:
         trainer.train()
@@ -204,11 +180,9 @@ def test_sigterm_saves_and_is_told_by_the_exit_code(tiny_data: Path, tmp_path: P
     assert [step for step, _ in list_checkpoints(trainer.checkpoint_dir)] == [0]
 
 
-def test_a_resumed_stream_goes_on_where_it_was(
-    tiny_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_a_resumed_stream_goes_on_where_it_was(online: Online, monkeypatch: pytest.MonkeyPatch):
     sizes = {"local_size": 2, "global_size": 3}
-    trainer = online_trainer(online_config(tmp_path / "first", tiny_data, **sizes))
+    trainer = online("first", **sizes)
     pools = trainer.stream.pools
 
     def stop_in_the_middle(step: int) -> None:
@@ -220,10 +194,7 @@ def test_a_resumed_stream_goes_on_where_it_was(
         hold_back_after(5, patched)
         trainer.train()
     state = stream_state(trainer.checkpoint_dir)
-
-    folder = trainer.checkpoint_dir
-    config = online_config(tmp_path / "second", tiny_data, load_dir=folder, **sizes)
-    again = online_trainer(config)
+    again = online("second", load_dir=trainer.checkpoint_dir, **sizes)
     assert again.stream.pools.num_added == state["frames"]["added"] == 5
     resumed = again.pipeline.state_dict()["datamanager._extra_state"]["stream"]["frames"]
     for name in ("serial", "index", "theta", "world_to_camera"):
@@ -235,10 +206,7 @@ def test_a_resumed_stream_goes_on_where_it_was(
     # Every frame once, over both runs.
     assert told["taken in"] == told["arrived"] == STREAMED
     assert again.stream.pools.num_added == STREAMED
-    folder = again.checkpoint_dir
-    finished = online_trainer(
-        online_config(tmp_path / "third", tiny_data, load_dir=folder, **sizes)
-    )
+    finished = online("third", load_dir=again.checkpoint_dir, **sizes)
     finished.train()
     assert finished.step == again.step
 
@@ -263,9 +231,8 @@ def test_frames_sent_over_a_socket_are_trained_on_and_kept(
     def train(output: Path, **fields: Any) -> OnlineTrainer:
         thread = threading.Thread(target=send, daemon=True)
         thread.start()
-        config = online_config(output, **fields)
-        config.pipeline.datamanager.source = SourceConfig("socket", listen=address)
-        trainer = online_trainer(config)
+        source = SourceConfig("socket", listen=address)
+        trainer = online_trainer(online_config(output, source=source, **fields))
         trainer.train()
         thread.join()
         return trainer
@@ -294,19 +261,14 @@ def test_frames_sent_over_a_socket_are_trained_on_and_kept(
     assert again["duplicate"] == STREAMED
 
 
-def test_a_fault_of_the_source_saves_and_is_told(tiny_data: Path, tmp_path: Path):
-    trainer = online_trainer(online_config(tmp_path, tiny_data))
-    pools = trainer.stream.pools
-
-    def lose_the_dataset(step: int) -> None:
-        if step == 1:
-            trainer.stream.ingest.failure = UserError("The disk is gone.", "Find it.")
-
-    before_each_step(trainer, lose_the_dataset)
+def test_a_fault_of_the_source_saves_and_is_told(online: Online):
+    trainer = online()
+    fault = UserError("The disk is gone.", "Find it.")
+    before_step(1, trainer, lambda: setattr(trainer.stream.ingest, "failure", fault))
     with pytest.raises(UserError, match="disk is gone"):
         trainer.train()
     assert [step for step, _ in list_checkpoints(trainer.checkpoint_dir)] == [1]
-    assert pools.num_added > 0
+    assert trainer.stream.pools.num_added > 0
 
 
 @pytest.mark.parametrize(
@@ -316,13 +278,12 @@ def test_a_fault_of_the_source_saves_and_is_told(tiny_data: Path, tmp_path: Path
         ({"final_learning_rate_factor": 0.0}, "cannot fall to 0"),
         ({"local_size": 0}, "pools are impossible"),
         ({"batch_size": 0}, "batch of 0"),
+        ({"refine_tracking": True}, "refined frame by frame"),
     ],
 )
-def test_impossible_flags_are_refused(
-    tiny_data: Path, tmp_path: Path, fields: dict[str, Any], told: str
-):
+def test_impossible_flags_are_refused(online: Online, fields: dict[str, Any], told: str):
     with pytest.raises(UserError, match=told):
-        online_trainer(online_config(tmp_path, tiny_data, **fields))
+        online(**fields)
 
 
 @pytest.mark.parametrize(
@@ -332,13 +293,6 @@ def test_a_source_without_a_place_is_refused(tmp_path: Path, kind: Any, told: st
     config = online_config(tmp_path)
     config.pipeline.datamanager.source.kind = kind
     with pytest.raises(UserError, match=told):
-        online_trainer(config)
-
-
-def test_refinement_of_tracking_is_refused(tiny_data: Path, tmp_path: Path):
-    config = online_config(tmp_path, tiny_data)
-    config.pipeline.model.refine_tracking = True
-    with pytest.raises(UserError, match="refined frame by frame"):
         online_trainer(config)
 
 
@@ -362,15 +316,14 @@ class _Killed(BaseException):
 
 
 def test_a_killed_run_goes_on_from_its_last_checkpoint(
-    tiny_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    online: Online, monkeypatch: pytest.MonkeyPatch
 ):
-    trainer = online_trainer(online_config(tmp_path / "first", tiny_data, steps_per_save=1))
+    trainer = online("first", steps_per_save=1)
 
-    def kill(step: int) -> None:
-        if step == 3:
-            raise _Killed
+    def kill() -> None:
+        raise _Killed
 
-    before_each_step(trainer, kill)
+    before_step(3, trainer, kill)
     with monkeypatch.context() as patched:
         hold_back_after(5, patched)
         with pytest.raises(_Killed):
@@ -378,7 +331,7 @@ def test_a_killed_run_goes_on_from_its_last_checkpoint(
     folder = trainer.checkpoint_dir
     assert list_checkpoints(folder)[-1][0] == 2
     state = stream_state(folder)
-    again = online_trainer(online_config(tmp_path / "again", tiny_data, load_dir=folder))
+    again = online("again", load_dir=folder)
     assert again.stream.pools.num_added == state["frames"]["added"] > 0
     assert torch.equal(again.stream.pools.thetas()[0], state["frames"]["theta"])
     again.train()

@@ -1,6 +1,6 @@
 """What a GPU cannot do ends training with cause and remedy; the checkpoints stay whole."""
 
-from pathlib import Path
+from collections.abc import Callable
 
 import pytest
 import torch
@@ -8,7 +8,8 @@ import torch
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.kernels import DeviceError
 from rgbavatar_ns.plugin.training.checkpoints import list_checkpoints, read_checkpoint
-from tests.plugin.run import make_trainer, small_config
+from rgbavatar_ns.plugin.training.trainer import RGBAvatarTrainerConfig
+from tests.plugin.run import make_trainer
 
 ERRORS = {
     "out of memory": (
@@ -30,12 +31,10 @@ if hasattr(torch, "AcceleratorError"):
 
 @pytest.mark.parametrize("name", ERRORS)
 def test_the_reason_is_told_and_checkpoints_stay(
-    name: str, tiny_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    name: str, config_of: Callable[..., RGBAvatarTrainerConfig], monkeypatch: pytest.MonkeyPatch
 ):
     error, message = ERRORS[name]
-    trainer = make_trainer(
-        small_config(tiny_data, tmp_path, max_num_iterations=9, steps_per_save=2)
-    )
+    trainer = make_trainer(config_of(max_num_iterations=9, steps_per_save=2))
     batch = trainer.pipeline.training_batch
 
     def fails_later(step, kind):

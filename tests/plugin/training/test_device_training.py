@@ -1,7 +1,7 @@
 """nerfstudio's trainer with the recorded step, on the emulated CUDA backend."""
 
-import warnings
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -10,9 +10,13 @@ from rgbavatar_ns.avatar.training.recorded_step import RecordedStep
 from rgbavatar_ns.plugin.pipeline import RGBAvatarPipeline
 from rgbavatar_ns.plugin.training.trainer import RGBAvatarTrainer
 from tests.kernels.cuda import emulator
-from tests.plugin.run import make_trainer, parameters_of, small_config
+from tests.plugin.run import parameters_of, small_config, trained
 
-pytestmark = pytest.mark.skipif(emulator.compiler() is None, reason="no g++ to emulate CUDA with")
+pytestmark = [
+    pytest.mark.skipif(emulator.compiler() is None, reason="no g++ to emulate CUDA with"),
+    # torch warns where a schedule's step comes before its optimiser's.
+    pytest.mark.filterwarnings("error:.*lr_scheduler.step"),
+]
 
 
 @pytest.fixture
@@ -31,19 +35,9 @@ def recorded(monkeypatch) -> list[int]:
     return steps
 
 
-def _train(data: Path, output: Path, *, steps: int = 5, load=None, **settings) -> RGBAvatarTrainer:
-    config = small_config(data, output, max_num_iterations=steps)
-    config.load_dir = load
-    config.learning_rate_factor, config.learning_rate_steps = 0.5, 5
-    for name, value in settings.items():
-        part = config.pipeline.model if name == "refine_tracking" else config.pipeline.datamanager
-        setattr(part, name, value)
-    trainer = make_trainer(config)
-    with warnings.catch_warnings():
-        # torch warns where a schedule's step comes before its optimiser's.
-        warnings.filterwarnings("error", message=".*lr_scheduler.step.*")
-        trainer.train()
-    return trainer
+def _train(data: Path, output: Path, *, steps: int = 5, **fields: Any) -> RGBAvatarTrainer:
+    falling = {"learning_rate_factor": 0.5, "learning_rate_steps": 5}
+    return trained(small_config(data, output, max_num_iterations=steps, **falling, **fields))
 
 
 def test_runs_are_alike_with_and_without(recorded, tiny_data: Path, tmp_path: Path):
@@ -61,7 +55,7 @@ def test_runs_are_alike_with_and_without(recorded, tiny_data: Path, tmp_path: Pa
 def test_a_run_in_two_pieces_is_the_run_in_one(recorded, tiny_data: Path, tmp_path: Path):
     whole = _train(tiny_data, tmp_path / "whole")
     first = _train(tiny_data, tmp_path / "parts", steps=3)
-    second = _train(tiny_data, tmp_path / "parts", load=first.checkpoint_dir)
+    second = _train(tiny_data, tmp_path / "parts", load_dir=first.checkpoint_dir)
     assert len(recorded) == 10
     assert torch.equal(parameters_of(whole), parameters_of(second))
 

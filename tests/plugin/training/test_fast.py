@@ -1,6 +1,6 @@
 """Steps without autograd through nerfstudio's trainer: when they are taken, and what they give."""
 
-import warnings
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -10,9 +10,11 @@ import torch
 from rgbavatar_ns.avatar.training.fused_step import FusedStep
 from rgbavatar_ns.avatar.training.losses import LPIPSLoss
 from rgbavatar_ns.kernels import available_backends
-from tests.plugin.run import make_trainer, newest_state, parameters_of, small_config, trained
+from rgbavatar_ns.plugin.training.trainer import RGBAvatarTrainer, RGBAvatarTrainerConfig
+from tests.plugin.run import make_trainer, newest_state, parameters_of
 
 pytestmark = pytest.mark.skipif("cpu" not in available_backends(), reason="not compiled")
+Train = Callable[..., RGBAvatarTrainer]
 
 
 @pytest.fixture
@@ -30,30 +32,21 @@ def fused_steps(monkeypatch: pytest.MonkeyPatch) -> list[bool]:
     return seen
 
 
-def _config(data: Path, output: Path, *, fast: bool = True, steps: int = 4):
-    config = small_config(data, output, max_num_iterations=steps)
-    config.pipeline.model.fast = fast
-    return config
-
-
-def test_training_is_fused_and_can_be_told_not_to_be(
-    tiny_data: Path, tmp_path: Path, fused_steps: list[bool]
-):
-    trained(_config(tiny_data, tmp_path / "fast"))
+def test_training_is_fused_and_can_be_told_not_to_be(train: Train, fused_steps: list[bool]):
+    train("fast", max_num_iterations=4)
     assert fused_steps == [True] * 4
-    trained(_config(tiny_data, tmp_path / "eager", fast=False))
+    train("eager", max_num_iterations=4, fast=False)
     assert len(fused_steps) == 4
 
 
 @pytest.mark.parametrize("reason", ["max_norm", "weight decay", "reference", "lpips"])
 def test_what_cannot_be_fused_goes_through_autograd(
     reason: str,
-    tiny_data: Path,
-    tmp_path: Path,
+    config_of: Callable[..., RGBAvatarTrainerConfig],
     fused_steps: list[bool],
     monkeypatch: pytest.MonkeyPatch,
 ):
-    config = _config(tiny_data, tmp_path, steps=3)
+    config = config_of(max_num_iterations=3)
     if reason == "max_norm":
         config.optimizers["color"]["optimizer"].max_norm = 1.0
     elif reason == "reference":
@@ -71,21 +64,18 @@ def test_what_cannot_be_fused_goes_through_autograd(
     assert not torch.equal(parameters_of(trainer), before)
 
 
-def test_a_run_changes_its_way_on_resume(tiny_data: Path, tmp_path: Path):
+# torch warns where a schedule's step comes before its optimiser's.
+@pytest.mark.filterwarnings("error:.*lr_scheduler.step")
+def test_a_run_changes_its_way_on_resume(train: Train):
     """Fused, eager, fused: every optimiser's count and the schedules go on."""
     folder: Path | None = None
+    falling = {"learning_rate_factor": 0.1, "learning_rate_steps": 6}
     for steps, fast in ((2, True), (4, False), (6, True)):
-        config = _config(tiny_data, tmp_path, fast=fast, steps=steps)
-        config.load_dir, config.learning_rate_factor = folder, 0.1
-        config.learning_rate_steps = 6
-        with warnings.catch_warnings():
-            # torch warns where a schedule's step comes before its optimiser's.
-            warnings.filterwarnings("error", message=".*lr_scheduler.step.*")
-            trainer = trained(config)
+        trainer = train(max_num_iterations=steps, fast=fast, load_dir=folder, **falling)
         folder = trainer.checkpoint_dir
     state = newest_state(trainer.checkpoint_dir)
     for name, saved in state["optimizers"].items():
         assert {float(each["step"]) for each in saved["state"].values()} == {6.0}, name
         assert saved["param_groups"][0]["lr"] == pytest.approx(
-            0.1 * config.optimizers[name]["optimizer"].lr
+            0.1 * trainer.config.optimizers[name]["optimizer"].lr
         )

@@ -1,40 +1,35 @@
 """Orthogonal bases as an option of the method."""
 
-from pathlib import Path
+from collections.abc import Callable
 
 import pytest
 
 from rgbavatar_ns.avatar.training import step as step_module
 from rgbavatar_ns.avatar.training.orthogonality import orthogonality_error
-from tests.plugin.run import small_config, trained
+from rgbavatar_ns.plugin.training.trainer import RGBAvatarTrainer
 
 
-def _trained(data: Path, output: Path, kind: str, steps: int = 8):
-    config = small_config(data, output, max_num_iterations=steps)
-    config.pipeline.model.orthogonality = kind
-    return trained(config).pipeline.model
+def _error(trainer: RGBAvatarTrainer) -> float:
+    return orthogonality_error(trainer.pipeline.model.avatar.blendshapes).item()
 
 
 @pytest.mark.parametrize("kind", ["qr", "gram_schmidt"])
 def test_bases_are_made_orthogonal_at_the_interval(
-    tiny_data: Path, tmp_path: Path, kind: str, monkeypatch: pytest.MonkeyPatch
+    train: Callable[..., RGBAvatarTrainer], kind: str, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr(step_module, "ORTHOGONALIZE_EVERY", 4)
-    at_the_interval = _trained(tiny_data, tmp_path / "a", kind)
-    assert orthogonality_error(at_the_interval.avatar.blendshapes) < 1e-5
-    beyond = _trained(tiny_data, tmp_path / "b", kind, steps=10)
-    assert orthogonality_error(beyond.avatar.blendshapes) > 1e-5
+    at_the_interval, beyond = (
+        train(str(steps), orthogonality=kind, max_num_iterations=steps) for steps in (8, 10)
+    )
+    assert _error(at_the_interval) < 1e-5
+    assert _error(beyond) > 1e-5
 
 
-def test_the_loss_counts_and_needs_the_readable_path(tiny_data: Path, tmp_path: Path):
-    free = _trained(tiny_data, tmp_path / "free", "free", steps=20)
-    config = small_config(tiny_data, tmp_path / "loss", max_num_iterations=20)
-    config.pipeline.model.orthogonality = "loss"
-    trainer = trained(config)
+def test_the_loss_counts_and_needs_the_readable_path(train: Callable[..., RGBAvatarTrainer]):
+    free = train("free", orthogonality="free")
+    trainer = train("loss", orthogonality="loss")
     pipeline = trainer.pipeline
     step = pipeline.training_step(trainer.optimizers)
     assert (step.kind, "orthogonal" in step.reason) == ("eager", True)
     assert set(step(pipeline.training_batch(20, step.kind), 20)) == {"l1", "orthogonality"}
-    bound = pipeline.model
-    errors = [orthogonality_error(model.avatar.blendshapes).item() for model in (free, bound)]
-    assert errors[1] < errors[0]
+    assert _error(trainer) < _error(free)

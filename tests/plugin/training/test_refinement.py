@@ -2,18 +2,18 @@
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
 from rgbavatar_ns.avatar import AvatarConfig
-from rgbavatar_ns.avatar.refinement import FrameRefinement
 from rgbavatar_ns.avatar.refinement.corrections import RefinementConfig
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.kernels import available_backends
 from rgbavatar_ns.plugin.training.refinement import frame_refinement
-from rgbavatar_ns.plugin.training.trainer import RGBAvatarTrainer
+from rgbavatar_ns.plugin.training.trainer import RGBAvatarTrainer, RGBAvatarTrainerConfig
 from tests.plugin.run import make_trainer, small_config, trained
 from tests.plugin.tiny import NUM_FRAMES, NUM_TEST
 
@@ -21,23 +21,21 @@ START = 2
 TRAINED = NUM_FRAMES - NUM_TEST
 
 
-def _config(data: Path, output: Path, steps: int = 8, *, fast: bool = True, refine: bool = True):
-    config = small_config(data, output, max_num_iterations=steps)
-    config.learning_rate_steps = 8
-    config.pipeline.model.fast = fast
-    config.pipeline.model.refine_tracking = refine
-    config.pipeline.model.refinement = RefinementConfig(start_step=START, bases_start=0.0)
-    return config
-
-
-def refinement_of(trainer: RGBAvatarTrainer) -> FrameRefinement:
-    refinement = trainer.pipeline.model.refinement
-    assert refinement is not None
-    return refinement
+def _config(
+    data: Path, output: Path, steps: int = 8, *, refine=True, bases_start=0.0, **fields: Any
+) -> RGBAvatarTrainerConfig:
+    refined = {
+        "refine_tracking": refine,
+        "refinement": RefinementConfig(start_step=START, bases_start=bases_start),
+    }
+    steps_to = {"max_num_iterations": steps, "learning_rate_steps": 8}
+    return small_config(data, output, **steps_to, **refined, **fields)
 
 
 def _corrections(trainer: RGBAvatarTrainer) -> torch.Tensor:
-    return refinement_of(trainer).frames.correction
+    refinement = trainer.pipeline.model.refinement
+    assert refinement is not None
+    return refinement.frames.correction
 
 
 @pytest.mark.parametrize("fast", [True, False], ids=["fused", "eager"])
@@ -51,7 +49,8 @@ def test_training_frames_are_corrected_and_held_out_ones_calibrated(tiny_data, t
     assert moved[:TRAINED].any(1).all()
     model.eval()
     drawn = model.driving_theta(list(range(TRAINED, NUM_FRAMES)))
-    assert refinement_of(trainer).frames.calibrated(model.frame_theta[TRAINED:]).equal(drawn)
+    assert model.refinement is not None
+    assert model.refinement.frames.calibrated(model.frame_theta[TRAINED:]).equal(drawn)
     np.testing.assert_array_equal(refined[TRAINED:], drawn.numpy())
     # Of this subject only the head's turn about y and the jaw's opening move.
     layout = model.avatar.layout
@@ -88,8 +87,7 @@ def test_nothing_is_corrected_before_the_start(tiny_data, tmp_path):
 def test_bases_wait_for_corrections_and_then_learn(tiny_data, tmp_path, fast):
     bases = {}
     for steps in (4, 5):
-        config = _config(tiny_data, tmp_path / str(steps), steps, fast=fast)
-        config.pipeline.model.refinement = RefinementConfig(start_step=START, bases_start=0.5)
+        config = _config(tiny_data, tmp_path / str(steps), steps, fast=fast, bases_start=0.5)
         shapes = trained(config).pipeline.model.avatar.blendshapes
         bases[steps] = [shapes.basis_position, shapes.basis_color_feature]
     assert not any(bool(basis.any()) for basis in bases[4])
@@ -98,24 +96,18 @@ def test_bases_wait_for_corrections_and_then_learn(tiny_data, tmp_path, fast):
 
 @pytest.mark.parametrize("share", [-0.1, 1.0])
 def test_bases_that_would_never_learn_are_refused(tiny_data, tmp_path, share):
-    config = _config(tiny_data, tmp_path)
-    config.pipeline.model.refinement = RefinementConfig(bases_start=share)
     with pytest.raises(UserError, match="bases-start"):
-        make_trainer(config)
+        make_trainer(_config(tiny_data, tmp_path, bases_start=share))
 
 
 @pytest.mark.parametrize("first_end", [3, 5], ids=["bases wait", "bases learn"])
 def test_resume_equals_uninterrupted_run(tiny_data, tmp_path, first_end):
-    def configured(name: str, steps: int):
-        config = _config(tiny_data, tmp_path / name, steps)
-        config.pipeline.model.refinement = RefinementConfig(start_step=START, bases_start=0.5)
-        return config
+    def train(name: str, steps: int, load_dir: Path | None = None) -> RGBAvatarTrainer:
+        output = tmp_path / name
+        return trained(_config(tiny_data, output, steps, bases_start=0.5, load_dir=load_dir))
 
-    whole = trained(configured("whole", 8))
-    half = trained(configured("half", first_end))
-    config = configured("rest", 8)
-    config.load_dir = half.checkpoint_dir
-    rest = trained(config)
+    whole = train("whole", 8)
+    rest = train("rest", 8, train("half", first_end).checkpoint_dir)
     first, second = (t.pipeline.model.state_dict() for t in (whole, rest))
     tensors = [name for name, value in first.items() if isinstance(value, torch.Tensor)]
     assert any("correction" in name for name in tensors)
@@ -125,8 +117,8 @@ def test_resume_equals_uninterrupted_run(tiny_data, tmp_path, first_end):
 @pytest.mark.parametrize("saved", [True, False])
 def test_a_checkpoint_of_the_other_kind_is_refused(tiny_data, tmp_path, saved):
     first = trained(_config(tiny_data, tmp_path / "first", 3, refine=saved))
-    config = _config(tiny_data, tmp_path / "second", 4, refine=not saved)
-    config.load_dir = first.checkpoint_dir
+    folder = first.checkpoint_dir
+    config = _config(tiny_data, tmp_path / "second", 4, refine=not saved, load_dir=folder)
     with pytest.raises(UserError, match=f"refine-tracking {saved}"):
         make_trainer(config)
 
@@ -143,9 +135,9 @@ def test_a_stream_is_refused(tiny_data, tmp_path):
 def test_held_out_frames_are_fitted_apart_from_the_plain_score(tiny_data, tmp_path):
     """The plain score stays to the digit; fitting from a wrong theta raises the other one."""
     avatar = AvatarConfig(uv_resolution=32, num_bases=0, scale_from_texel_spacing=True)
-    config = small_config(tiny_data, tmp_path, avatar, max_num_iterations=60)
-    trainer = trained(config)
-    pipeline = trainer.pipeline
+    pipeline = trained(
+        small_config(tiny_data, tmp_path, avatar=avatar, max_num_iterations=60)
+    ).pipeline
     pipeline.test_mode = "test"
     plain = pipeline.get_average_eval_image_metrics()
     assert not any(name.endswith("_refined") for name in plain)

@@ -5,11 +5,13 @@ import json
 import math
 import shutil
 import signal
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from torch.utils._pytree import keystr, tree_flatten_with_path
 
 from rgbavatar_ns import Avatar
 from rgbavatar_ns.errors import UserError
@@ -18,7 +20,8 @@ from rgbavatar_ns.plugin.training.checkpoints import list_checkpoints
 from rgbavatar_ns.plugin.training.trainer import RGBAvatarTrainer, RGBAvatarTrainerConfig
 from tests.plugin.run import (
     SMALL,
-    before_each_step,
+    assert_learns,
+    before_step,
     make_trainer,
     newest_state,
     small_config,
@@ -26,10 +29,8 @@ from tests.plugin.run import (
 )
 
 STEPS = 12
-
-
-def _train(data: Path, output: Path, **fields: Any) -> RGBAvatarTrainer:
-    return trained(small_config(data, output, **fields))
+Train = Callable[..., RGBAvatarTrainer]
+ConfigOf = Callable[..., RGBAvatarTrainerConfig]
 
 
 def _newest(trainer: RGBAvatarTrainer) -> dict[str, Any]:
@@ -39,7 +40,7 @@ def _newest(trainer: RGBAvatarTrainer) -> dict[str, Any]:
 @pytest.fixture(scope="module")
 def uninterrupted(tiny_data: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     """The last checkpoint of a run from step 0 to STEPS in one go, with falling rates."""
-    return _newest(_train(tiny_data, tmp_path_factory.mktemp("whole"), **_FALLING))
+    return _newest(trained(small_config(tiny_data, tmp_path_factory.mktemp("whole"), **_FALLING)))
 
 
 _FALLING = {
@@ -50,93 +51,77 @@ _FALLING = {
 }
 
 
-def _differences(first: Any, second: Any, place: str = "") -> list[str]:
-    """Where two nested states differ in any bit."""
+def _same(first: Any, second: Any) -> bool:
     if isinstance(first, torch.Tensor):
-        same = first.dtype == second.dtype and torch.equal(first, second)
-        return [] if same else [place]
-    if isinstance(first, dict):
-        if first.keys() != second.keys():
-            return [f"{place}: {sorted(map(str, first.keys() ^ second.keys()))}"]
-        return [d for k in first for d in _differences(first[k], second[k], f"{place}/{k}")]
-    if isinstance(first, list | tuple):
-        if len(first) != len(second):
-            return [place]
-        return [
-            d
-            for i, (a, b) in enumerate(zip(first, second))
-            for d in _differences(a, b, f"{place}/{i}")
-        ]
-    return [] if first == second else [f"{place}: {first} {second}"]
+        return first.dtype == second.dtype and torch.equal(first, second)
+    return first == second
+
+
+def _differences(first: Any, second: Any) -> list[str]:
+    """Where two states of the same nesting differ in any bit."""
+    leaves, tree = tree_flatten_with_path(first)
+    others, other_tree = tree_flatten_with_path(second)
+    assert tree == other_tree
+    return [keystr(path) for (path, a), (_, b) in zip(leaves, others) if not _same(a, b)]
 
 
 def _assert_equal_runs(first: dict[str, Any], second: dict[str, Any]) -> None:
     for name in ("step", "pipeline", "optimizers", "schedulers"):
-        assert _differences(first[name], second[name], name) == []
+        assert _differences(first[name], second[name]) == []
 
 
 def test_a_run_equals_itself_and_not_one_of_another_seed(
-    tiny_data: Path, tmp_path: Path, uninterrupted: dict[str, Any]
+    train: Train, config_of: ConfigOf, uninterrupted: dict[str, Any]
 ):
-    again = _newest(_train(tiny_data, tmp_path / "again", **_FALLING))
+    again = _newest(train("again", **_FALLING))
     _assert_equal_runs(again, uninterrupted)
-    config = small_config(tiny_data, tmp_path / "other", **_FALLING)
+    config = config_of("other", **_FALLING)
     config.machine.seed = 7
     trainer = trained(config)
     assert _differences(_newest(trainer)["pipeline"], uninterrupted["pipeline"])
 
 
-def test_resume_equals_uninterrupted_run(
-    tiny_data: Path, tmp_path: Path, uninterrupted: dict[str, Any]
-):
+def test_resume_equals_uninterrupted_run(train: Train, uninterrupted: dict[str, Any]):
     half = {**_FALLING, "max_num_iterations": STEPS // 2}
-    first = _train(tiny_data, tmp_path / "half", **half)
+    first = train("half", **half)
     assert [step for step, _ in list_checkpoints(first.checkpoint_dir)] == [STEPS // 2 - 1]
-    second = _train(tiny_data, tmp_path / "rest", load_dir=first.checkpoint_dir, **_FALLING)
+    second = train("rest", load_dir=first.checkpoint_dir, **_FALLING)
     _assert_equal_runs(_newest(second), uninterrupted)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=["SIGINT", "SIGTERM"])
 def test_interrupted_run_saves_and_goes_on_as_if_nothing_had_been(
-    tiny_data: Path, tmp_path: Path, uninterrupted: dict[str, Any], number: signal.Signals
+    train: Train, config_of: ConfigOf, uninterrupted: dict[str, Any], number: signal.Signals
 ):
-    trainer = make_trainer(small_config(tiny_data, tmp_path, **_FALLING))
-
-    def interrupt(step: int) -> None:
-        if step == 4:
-            signal.raise_signal(number)
-
-    before_each_step(trainer, interrupt)
+    trainer = make_trainer(config_of(**_FALLING))
+    before_step(4, trainer, lambda: signal.raise_signal(number))
     with pytest.raises(SystemExit) as ended:
         trainer.train()
     assert ended.value.code == 128 + number
     # The step in which the signal came is finished, saved, and not done again.
     assert [step for step, _ in list_checkpoints(trainer.checkpoint_dir)] == [4]
-    resumed = _train(tiny_data, tmp_path, load_dir=trainer.checkpoint_dir, **_FALLING)
+    resumed = train(load_dir=trainer.checkpoint_dir, **_FALLING)
     _assert_equal_runs(_newest(resumed), uninterrupted)
 
 
 def test_damaged_newest_checkpoint_is_passed_over_on_resume(
-    tiny_data: Path,
-    tmp_path: Path,
-    uninterrupted: dict[str, Any],
-    capsys: pytest.CaptureFixture[str],
+    train: Train, uninterrupted: dict[str, Any], capsys: pytest.CaptureFixture[str]
 ):
-    trainer = _train(tiny_data, tmp_path, steps_per_save=8, **_FALLING)
+    trainer = train(steps_per_save=8, **_FALLING)
     (_, older), (_, newest) = list_checkpoints(trainer.checkpoint_dir)
     newest.write_bytes(newest.read_bytes()[:-1000])
     capsys.readouterr()
-    resumed = _train(tiny_data, tmp_path, load_dir=trainer.checkpoint_dir, **_FALLING)
+    resumed = train(load_dir=trainer.checkpoint_dir, **_FALLING)
     told = capsys.readouterr().out
     assert newest.name in told
     assert older.name in told
     _assert_equal_runs(_newest(resumed), uninterrupted)
 
 
-def test_finished_run_trains_no_further_on_resume(tiny_data: Path, tmp_path: Path):
-    first = _train(tiny_data, tmp_path, max_num_iterations=3)
+def test_finished_run_trains_no_further_on_resume(train: Train):
+    first = train(max_num_iterations=3)
     before = list_checkpoints(first.checkpoint_dir)[-1][1].read_bytes()
-    again = _train(tiny_data, tmp_path, max_num_iterations=3, load_dir=first.checkpoint_dir)
+    again = train(max_num_iterations=3, load_dir=first.checkpoint_dir)
     assert [step for step, _ in list_checkpoints(again.checkpoint_dir)] == [2]
     assert list_checkpoints(again.checkpoint_dir)[-1][1].read_bytes() == before
     summary = json.loads((again.base_dir / "training.json").read_text())
@@ -154,13 +139,11 @@ def test_learning_rates_fall_as_asked(uninterrupted: dict[str, Any]):
     assert all(type(rate(group)) is float for group in uninterrupted["optimizers"])
 
 
-def test_the_papers_method_has_its_constant_rates(tiny_data: Path, tmp_path: Path):
+def test_the_papers_method_has_its_constant_rates(config_of: ConfigOf):
     constant = rgbavatar.config
     assert isinstance(constant, RGBAvatarTrainerConfig)
     fields = ("position_lr_final", "learning_rate_factor", "learning_rate_steps")
-    trainer = make_trainer(
-        small_config(tiny_data, tmp_path, **{name: getattr(constant, name) for name in fields})
-    )
+    trainer = make_trainer(config_of(**{name: getattr(constant, name) for name in fields}))
     assert trainer.optimizers.schedulers == {}
     rates = {}
     for group, optimizer in trainer.optimizers.optimizers.items():
@@ -185,23 +168,12 @@ def test_the_papers_method_has_its_constant_rates(tiny_data: Path, tmp_path: Pat
     assert constant.pipeline.model.avatar.uv_resolution == 256
 
 
-def test_training_lowers_the_loss_and_colors_gaussians(tiny_data: Path, tmp_path: Path):
-    trainer = make_trainer(small_config(tiny_data, tmp_path, max_num_iterations=40))
-    pipeline = trainer.pipeline
-
-    def loss() -> float:
-        with torch.no_grad():
-            _, losses, _ = pipeline.get_eval_loss_dict(0)
-        return float(losses["l1"])
-
-    before = loss()
-    trainer.train()
-    assert loss() < 0.5 * before
-    assert bool(pipeline.model.avatar.color_initialized.any())
+def test_training_lowers_the_loss_and_colors_gaussians(config_of: ConfigOf):
+    assert_learns(make_trainer(config_of(max_num_iterations=40)))
 
 
-def test_checkpoint_is_an_avatar_without_nerfstudio(tiny_data: Path, tmp_path: Path):
-    trainer = _train(tiny_data, tmp_path, max_num_iterations=3)
+def test_checkpoint_is_an_avatar_without_nerfstudio(train: Train):
+    trainer = train(max_num_iterations=3)
     loaded = Avatar.load(trainer.base_dir)
     model = trainer.pipeline.model
     theta = model.frame_theta[:2]
@@ -212,30 +184,30 @@ def test_checkpoint_is_an_avatar_without_nerfstudio(tiny_data: Path, tmp_path: P
 
 
 def test_full_disk_at_a_checkpoint_is_a_user_error_and_the_old_one_survives(
-    tiny_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    train: Train, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    trainer = _train(tiny_data, tmp_path, max_num_iterations=3)
+    trainer = train(max_num_iterations=3)
     usage = shutil.disk_usage(tmp_path)._replace(free=100)
     monkeypatch.setattr(
         "rgbavatar_ns.plugin.training.checkpoints.shutil.disk_usage", lambda _: usage
     )
     with pytest.raises(UserError, match="does not fit"):
-        _train(tiny_data, tmp_path, max_num_iterations=6, load_dir=trainer.checkpoint_dir)
+        train(max_num_iterations=6, load_dir=trainer.checkpoint_dir)
     assert _newest(trainer)["step"] == 2
 
 
-def test_checkpoint_of_another_make_is_refused_with_the_flags(tiny_data: Path, tmp_path: Path):
-    first = _train(tiny_data, tmp_path, max_num_iterations=2)
+def test_checkpoint_of_another_make_is_refused_with_the_flags(train: Train, config_of: ConfigOf):
+    first = train(max_num_iterations=2)
     other = dataclasses.replace(SMALL, num_bases=5)
-    config = small_config(tiny_data, tmp_path / "other", other, load_dir=first.checkpoint_dir)
+    config = config_of("other", avatar=other, load_dir=first.checkpoint_dir)
     with pytest.raises(UserError, match="num_bases 3, not 5") as refused:
         make_trainer(config)
     assert "--pipeline.model.avatar.num-bases 3" in refused.value.remedy
 
 
-def test_scalars_are_written_every_steps_per_log_only(tiny_data: Path, tmp_path: Path):
+def test_scalars_are_written_every_steps_per_log_only(train: Train):
     accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
-    trainer = _train(tiny_data, tmp_path)
+    trainer = train()
     events = accumulator.EventAccumulator(str(trainer.base_dir))
     events.Reload()
     for name in ("Train Loss", "Train Images / Sec"):

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from rgbavatar_ns.avatar import Avatar
-from tests.plugin.run import make_trainer, small_config
+from tests.plugin.run import make_trainer, small_config, trained
 
 
 @pytest.fixture
@@ -25,11 +25,8 @@ def drawn(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 def _gradients(data: Path, output: Path, *, batch_parallel: bool) -> dict[str, torch.Tensor]:
     """Of the second step, where the bases are no longer zero; that of theta too."""
-    config = small_config(data, output)
-    config.pipeline.model.batch_parallel = batch_parallel
-    config.pipeline.model.refine_tracking = True
-    config.pipeline.model.fast = False
-    trainer = make_trainer(config)
+    fields = {"batch_parallel": batch_parallel, "refine_tracking": True, "fast": False}
+    trainer = make_trainer(small_config(data, output, **fields))
     model = trainer.pipeline.model
     # The same place for both, away from where everything begins.
     generator = torch.Generator().manual_seed(5)
@@ -66,10 +63,8 @@ def test_a_naive_batch_has_the_gradients_of_the_parallel_one(
 def test_a_naive_batch_is_never_fused_and_only_slower_in_training(
     tiny_data: Path, tmp_path: Path, drawn: list[int]
 ):
-    config = small_config(tiny_data, tmp_path, max_num_iterations=2)
-    config.pipeline.model.batch_parallel = False
-    trainer = make_trainer(config)
-    trainer.train()
+    fields = {"batch_parallel": False, "max_num_iterations": 2}
+    trainer = trained(small_config(tiny_data, tmp_path, **fields))
     assert drawn[:4] == [1] * 4
     drawn.clear()
     model = trainer.pipeline.model.eval()
