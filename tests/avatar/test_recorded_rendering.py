@@ -6,14 +6,6 @@ import torch
 from rgbavatar_ns.avatar.recorded_rendering import RecordedRendering
 from tests.avatar.fused_scene import far_batch, stir
 from tests.avatar.training.test_recorded_step import Recorder
-from tests.kernels.cuda import emulator
-
-pytestmark = pytest.mark.skipif(emulator.compiler() is None, reason="no g++ to emulate CUDA with")
-
-
-@pytest.fixture
-def emulated(monkeypatch):
-    return emulator.install(monkeypatch)
 
 
 def _rendering(avatar, cameras=1):

@@ -8,8 +8,8 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from rgbavatar_ns.kernels import GaussianSet, available_backends
-from tests.kernels.scenes import ATTRIBUTES, random_scene, render_and_differentiate
+from rgbavatar_ns.kernels import available_backends
+from tests.kernels.scenes import ATTRIBUTES, changed, random_scene, render_and_differentiate
 
 pytestmark = [
     pytest.mark.usefixtures("instruction_set"),
@@ -20,9 +20,7 @@ NOT_FINITE = [math.nan, math.inf, -math.inf]
 EXTREME = [0.0, -0.0, 1e-40, -1e-40, 1e-30, 1e-20, 1e20, -1e20, 1e30, 3.4e38, -3.4e38, -1.0]
 # The instruction set is a fixture of a function that hypothesis calls many times; it is constant.
 drawn = settings(
-    max_examples=25,
-    deadline=None,
-    suppress_health_check=[HealthCheck.function_scoped_fixture],
+    max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 
 
@@ -50,12 +48,7 @@ def _with(scene, changes):
     for name, index, component, value in changes:
         row = rows[name][component % len(rows[name]), index].view(-1)
         row[component % len(row)] = value
-    return replace(scene, gaussians=GaussianSet(**rows))
-
-
-def _without(scene, keep):
-    rows = {name: value[:, keep] for name, value in vars(scene.gaussians).items()}
-    return replace(scene, gaussians=GaussianSet(**rows))
+    return changed(scene, **rows)
 
 
 def _assert_in_range(rendered) -> None:
@@ -94,7 +87,9 @@ def test_gaussians_that_are_not_finite_might_as_well_be_absent(changes, seed, sh
     ]
     keep = [index for index in range(COUNT) if index not in indices]
     rendered, grads = _draw(_with(scene, everywhere))
-    alone, alone_grads = _draw(_without(scene, keep))
+    alone, alone_grads = _draw(
+        changed(scene, **{name: row[:, keep] for name, row in vars(scene.gaussians).items()})
+    )
     for name in ("image", "alpha", "depth"):
         assert torch.equal(getattr(rendered, name), getattr(alone, name)), name
     assert (rendered.visibility[:, indices] == 0).all()

@@ -7,7 +7,7 @@ import torch
 
 from rgbavatar_ns.kernels import GaussianSet, PinholeCameras, available_backends, rasterize
 from rgbavatar_ns.kernels.reference import BlendingRules, project, rasterize_reference
-from tests.kernels.scenes import random_scene
+from tests.kernels.scenes import changed, random_scene
 
 DTYPES = {"reference": torch.float64, "cpu": torch.float32}
 
@@ -128,8 +128,8 @@ def test_gradients_match_finite_differences_through_a_smooth_cutoff():
 def test_projection_agrees_with_gsplat():
     torch_impl = pytest.importorskip("gsplat.cuda._torch_impl")
     scene = random_scene(11, batch=1, count=300, extremes=False)
+    scene = changed(scene, means=scene.gaussians.means * 2)  # some outside
     gaussians, cameras = scene.gaussians, scene.cameras
-    gaussians = GaussianSet(**{**vars(gaussians), "means": gaussians.means * 2})  # some outside
     projected = project(gaussians, cameras)
     covariances, _ = torch_impl._quat_scale_to_covar_preci(
         gaussians.quats_wxyz[0], gaussians.scales[0], compute_preci=False

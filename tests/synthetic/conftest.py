@@ -1,5 +1,3 @@
-from functools import partial
-
 import pytest
 import torch
 
@@ -25,15 +23,14 @@ def person_without_wrinkles() -> DemoPerson:
 
 @pytest.fixture(scope="session")
 def theta_of(person):
-    return partial(_theta, person)
-
-
-def _theta(person: DemoPerson, expression: dict[str, float] | None = None, **fields):
     """Theta from expression coefficients by name and other fields as lists."""
     layout, names = person.head.layout, person.head.arrays.expression_names
-    theta = torch.zeros(layout.size)
-    for name, value in (expression or {}).items():
-        theta[names.index(name)] = value
-    for name, values in fields.items():
-        theta[layout.slice(name)] = torch.tensor(values)
-    return theta
+
+    def make(expression: dict[str, float] | None = None, **fields: list[float]) -> torch.Tensor:
+        theta = layout.join({name: torch.tensor(value) for name, value in fields.items()} | zero)
+        for name, value in (expression or {}).items():
+            theta[names.index(name)] = value
+        return theta
+
+    zero = {"expression": torch.zeros(len(names))}
+    return make

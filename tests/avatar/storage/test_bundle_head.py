@@ -43,10 +43,13 @@ def test_a_bundle_without_its_head_wants_the_very_file(make_avatar, tmp_path, mo
         Avatar.load(tmp_path / "me")
 
 
-def test_the_embedded_head_is_always_there(tmp_path):
-    head = HeadModel.embedded()
+def _avatar(head: HeadModel) -> Avatar:
     config = AvatarConfig(num_bases=0, uv_resolution=12)
-    avatar = Avatar(head, torch.zeros(head.num_identity), config)
+    return Avatar(head, torch.zeros(head.num_identity), config)
+
+
+def test_the_embedded_head_is_always_there(tmp_path):
+    avatar = _avatar(HeadModel.embedded())
     avatar.save(tmp_path / "me", with_head=False)
     assert torch.equal(_picture(Avatar.load(tmp_path / "me")), _picture(avatar))
 
@@ -54,10 +57,7 @@ def test_the_embedded_head_is_always_there(tmp_path):
 def test_flame_is_found_by_its_version_and_form(tmp_path, monkeypatch):
     pickle = write_synthetic_flame(tmp_path / "models")
     sizes = {"num_identity": 3, "num_expressions": 5}
-    arrays = load_flame(pickle, teeth_form="blocks", **sizes)
-    head = HeadModel(arrays)
-    config = AvatarConfig(num_bases=0, uv_resolution=12)
-    avatar = Avatar(head, torch.zeros(head.num_identity), config)
+    avatar = _avatar(HeadModel(load_flame(pickle, teeth_form="blocks", **sizes)))
     avatar.save(tmp_path / "me", with_head=False)
     with pytest.raises(UserError, match=r"FLAME 2020.*RGBAVATAR_FLAME"):
         Avatar.load(tmp_path / "me")
