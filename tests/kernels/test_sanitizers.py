@@ -151,7 +151,8 @@ def test_kernel_tests_are_clean(sanitized, which):
     chosen = _chosen(which)
     # The emulated GPU is another library, whose own build traps.
     others = {*instruction_sets(), "reference", "emulated"} - {chosen}
-    command = [sys.executable, "-m", "pytest", "-x", "-v", "--capture=sys", "-m", "not slow"]
+    command = [sys.executable, "-m", "pytest", "-x", "-v", "--capture=sys"]
+    command += ["-m", "not slow and not nightly"]
     command += ["-p", "sanitized_native", "-p", "no:cacheprovider", "-o", "addopts="]
     command += ["-k", " and ".join(f"not [{name}" for name in others)]
     command += [str(ROOT / "tests" / name) for name in TESTS]

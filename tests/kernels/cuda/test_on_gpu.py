@@ -1,7 +1,6 @@
-"""The CUDA backend on a GPU: what the emulation, which the other tests use, cannot show.
+"""The CUDA backend on a GPU: its own rounding, races, CUDA graphs and waits.
 
-The GPU's own rounding, races, CUDA graphs and waits. Questions that need no GPU are also asked of
-the emulation, so that they are known to be asked rightly.
+Questions that need no GPU are also asked of the emulation.
 """
 
 from collections.abc import Callable
@@ -93,10 +92,8 @@ def test_a_fused_step_has_the_reference_s_gradients(place, make_avatar, name):
     avatar = stir(make_avatar(**changes))
     expected = double(avatar)
     batch, background = far_batch(expected, count, 36, 41, cameras)
-    optimizer, expected_optimizer = (
-        make_optimizer(avatar.to(place.device)),
-        make_optimizer(expected),
-    )
+    avatar.to(place.device)
+    optimizer, expected_optimizer = make_optimizer(avatar), make_optimizer(expected)
     there = on_device(batch, place.device), background.to(place.device)
     loss = fused_step(avatar, optimizer, *there)
     right = eager_step(
@@ -139,11 +136,7 @@ def step_of(place: Place, avatar, optimizer, frames: DeviceFrames, size: int, ki
 
 
 def test_every_kernel_sees_the_same_lists(place, make_avatar, monkeypatch):
-    """Counting, scattering and summing each decide anew which tiles a Gaussian touches.
-
-    A compiler may round in another way in each; a tile that one counts and another leaves out is a
-    hole in a list or in the sums. Sums that are not written are made NaN.
-    """
+    """A tile that one counts and another leaves out is a hole in a list or sum, here a NaN."""
     launcher = place.backend.launcher(place.device)
     launch, lists = launcher.launch, []
 
