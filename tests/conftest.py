@@ -17,6 +17,16 @@ if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
 _NOT_OF_PACKAGES = re.compile(r"there is a GPU|no clips? |the clip ")
 
 
+@pytest.fixture
+def emulated(monkeypatch: pytest.MonkeyPatch):
+    """The CUDA backend on the processor, in the place of the GPU's."""
+    from tests.kernels.cuda import emulator  # here, for the types' checks to come before it
+
+    if emulator.compiler() is None:
+        pytest.skip("no g++ to emulate CUDA with")
+    return emulator.install(monkeypatch)
+
+
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
         "--fail-on-missing",

@@ -1,7 +1,6 @@
 """Steps to compare: avatars whose every gradient lives, and targets far from what they show."""
 
 import dataclasses
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -11,9 +10,9 @@ from rgbavatar_ns.avatar.training import TrainingBatch
 from rgbavatar_ns.avatar.training.fused_step import FusedStep
 from rgbavatar_ns.avatar.training.losses import l1_loss
 from rgbavatar_ns.drawing.compositing import composite, rgba_to_float
-from rgbavatar_ns.kernels import PinholeCameras
+from tests.kernels.scenes import to
 
-from .small_head import front_camera, random_theta
+from .small_head import front_camera, random_theta, randomize
 
 AMOUNTS = {
     "position": 2e-3,
@@ -46,22 +45,12 @@ VARIANTS = {
 
 def stir(avatar: Avatar, seed: int = 0) -> Avatar:
     """Move every parameter a little; colours stay between .3 and .7."""
-    generator = torch.Generator().manual_seed(seed)
-    with torch.no_grad():
-        for name, parameters in avatar.parameter_groups().items():
-            for parameter in parameters:
-                noise = torch.randn(parameter.shape, generator=generator, dtype=torch.float64)
-                parameter.add_(AMOUNTS[name] * noise.clamp(-2, 2).to(parameter.dtype))
+    randomize(avatar, seed, AMOUNTS, most=2.0)
     return avatar
 
 
 def far_batch(
-    avatar: Avatar,
-    count: int,
-    width: int = 40,
-    height: int = 40,
-    cameras: int = 1,
-    dtype: torch.dtype = torch.float32,
+    avatar: Avatar, count: int, width: int = 40, height: int = 40, cameras: int = 1
 ) -> tuple[TrainingBatch, Tensor]:
     """Frames whose pixels are much darker or much brighter than the avatar, and backgrounds.
 
@@ -69,44 +58,19 @@ def far_batch(
     rounding. Here all differences are above .1, so that two ways to compute must agree.
     """
     generator = torch.Generator().manual_seed(5)
-    theta = random_theta(avatar.layout, count, dtype=dtype)
+    theta = random_theta(avatar.layout, count)
     rows, columns = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
     bright = (torch.sin(0.7 * rows + 0.3 * columns) > 0)[None, :, :, None]
     images = torch.full((count, height, width, 4), 210, dtype=torch.uint8)
     images[..., :3] = 255 * bright.to(torch.uint8)
     images[..., 3] += (20 * torch.rand(count, height, width, generator=generator)).to(torch.uint8)
     background = 0.4 + 0.2 * torch.rand(count, 3, generator=generator)
-    camera = _cameras(cameras, width, height, generator, dtype)
-    return TrainingBatch(theta, camera, images), background.to(dtype)
-
-
-def _cameras(
-    count: int, width: int, height: int, generator: torch.Generator, dtype: torch.dtype
-) -> PinholeCameras:
-    """The front camera, for more than one each moved a little."""
-    one = front_camera(max(width, height), dtype)
-    world_to_camera = one.world_to_camera.repeat(count, 1, 1)
-    if count > 1:
-        shift = 0.01 * torch.randn(count, 3, generator=generator)
-        world_to_camera[:, :3, 3] += shift.to(dtype)
-    return PinholeCameras(
-        world_to_camera,
-        one.focal_px.repeat(count, 1),
-        torch.tensor([[width / 2, height / 2]], dtype=dtype).repeat(count, 1),
-        width,
-        height,
-    )
-
-
-def reordered(
-    batch: TrainingBatch, background: Tensor, order: list[int]
-) -> tuple[TrainingBatch, Tensor]:
-    """The same images in another order: the same step but for the order of summation."""
-    cameras = batch.cameras
-    if len(cameras.focal_px) > 1:
-        cameras = cameras.select(order)
-    mixed = TrainingBatch(batch.theta[order], cameras, batch.images_rgba[order])
-    return mixed, background[order]
+    camera = front_camera(max(width, height)).select([0] * cameras)
+    if cameras > 1:  # each moved a little
+        camera.world_to_camera[:, :3, 3] += 0.01 * torch.randn(cameras, 3, generator=generator)
+    centre = torch.tensor([[width / 2, height / 2]]).repeat(cameras, 1)
+    camera = dataclasses.replace(camera, principal_point_px=centre, width=width, height=height)
+    return TrainingBatch(theta, camera, images), background
 
 
 def fused_step(
@@ -139,7 +103,7 @@ def eager_step(
 def first_moments(avatar: Avatar, optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
     """Adam's first moment of each group as one vector: the gradient, but for a factor."""
     return {
-        name: torch.cat([optimizer.state[p]["exp_avg"].flatten() for p in parameters])
+        name: torch.cat([optimizer.state[p]["exp_avg"].flatten() for p in parameters]).cpu()
         for name, parameters in avatar.parameter_groups().items()
     }
 
@@ -173,8 +137,7 @@ def assert_gradients_agree(avatar, optimizer, expected, expected_optimizer) -> N
     to rounding belongs to one way and not to the other; in a hundred thousand there may be one.
     So a few Gaussians (its own and those behind it) may differ by more, yet not by much.
     """
-    found = first_moments(avatar, optimizer)
-    right = first_moments(expected, expected_optimizer)
+    found, right = first_moments(avatar, optimizer), first_moments(expected, expected_optimizer)
     whole = relative_differences(found, right)
     assert max(whole.values()) < AT_THE_CUT, whole
     if max(whole.values()) < ROUNDING:
@@ -198,8 +161,5 @@ def double(avatar: Avatar) -> Avatar:
 
 def in_double(batch: TrainingBatch) -> TrainingBatch:
     """The batch for it."""
-    values: dict[str, Any] = {
-        name: value.double() if isinstance(value, Tensor) else value
-        for name, value in vars(batch.cameras).items()
-    }
-    return dataclasses.replace(batch, theta=batch.theta.double(), cameras=PinholeCameras(**values))
+    cameras = to(batch.cameras, torch.float64)
+    return dataclasses.replace(batch, theta=batch.theta.double(), cameras=cameras)

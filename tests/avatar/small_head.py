@@ -5,6 +5,7 @@ import torch
 
 from rgbavatar_ns.head import HeadArrays, HeadModel
 from rgbavatar_ns.kernels import PinholeCameras
+from tests.head.synthetic_head import grid_faces
 
 SIDE = 9
 NUM_IDENTITY, NUM_EXPRESSION = 2, 4
@@ -16,13 +17,7 @@ def small_head_arrays() -> HeadArrays:
     axis = np.linspace(-1, 1, SIDE)
     x, y = (grid.ravel() for grid in np.meshgrid(axis, axis))
     v_template = np.stack([0.08 * x, 0.08 * y, 0.04 * (1 - 0.5 * (x**2 + y**2))], 1)
-    corner = (np.arange(SIDE - 1)[:, None] * SIDE + np.arange(SIDE - 1)).ravel()
-    faces = np.concatenate(
-        [
-            np.stack([corner, corner + 1, corner + SIDE + 1], 1),
-            np.stack([corner, corner + SIDE + 1, corner + SIDE], 1),
-        ]
-    )
+    faces = grid_faces(SIDE)
     num_vertices = len(v_template)
     waves = [np.sin((k + 1) * x + k) * np.cos((k + 2) * y) for k in range(6)]
     shapedirs = np.stack([w[:, None] * [0.2, 0.3, 1.0] for w in waves], 2) * 0.01
@@ -34,14 +29,12 @@ def small_head_arrays() -> HeadArrays:
         shapedirs=shapedirs.astype(np.float32),
         num_identity=NUM_IDENTITY,
         posedirs=(1e-4 * rng.normal(size=(num_vertices, 3, 36))).astype(np.float32),
-        joint_regressor=(joint_regressor / joint_regressor.sum(1, keepdims=True)).astype(
-            np.float32
-        ),
+        joint_regressor=np.float32(joint_regressor / joint_regressor.sum(1, keepdims=True)),
         parents=np.array([-1, 0, 1, 1, 1], dtype=np.int64),
         skinning_weights=(shares / shares.sum(1, keepdims=True)).astype(np.float32),
-        faces=faces.astype(np.int64),
+        faces=faces,
         uv=uv.astype(np.float32),
-        uv_faces=faces.astype(np.int64),
+        uv_faces=faces,
         expression_names=tuple(f"wave{k}" for k in range(NUM_EXPRESSION)),
         eyelid_dirs=None,
         vertex_groups={"skin": np.arange(num_vertices)},
@@ -82,21 +75,24 @@ def random_theta(layout, batch: int, seed: int = 0, dtype: torch.dtype = torch.f
     return layout.join(parts)
 
 
-def randomize(avatar, seed: int = 0) -> None:
-    """Move every Gaussian off its initial values, bases included."""
+RANDOM_AMOUNTS = {
+    "position": 3e-3,
+    "rotation": 0.4,
+    "log_scale": 0.4,
+    "opacity": 1.0,
+    "color": 1.0,
+    "basis_position": 2e-3,
+    "basis_rotation": 0.2,
+    "basis_color": 0.5,
+}
+
+
+def randomize(avatar, seed: int = 0, amounts=RANDOM_AMOUNTS, most: float = torch.inf) -> None:
+    """Move every Gaussian off its initial values, bases included, by up to `most` amounts."""
     generator = torch.Generator().manual_seed(seed)
-    amounts = {
-        "position": 3e-3,
-        "rotation": 0.4,
-        "log_scale": 0.4,
-        "opacity": 1.0,
-        "color": 1.0,
-        "basis_position": 2e-3,
-        "basis_rotation": 0.2,
-        "basis_color": 0.5,
-    }
     with torch.no_grad():
         for name, parameters in avatar.parameter_groups().items():
             for parameter in parameters:
                 noise = torch.randn(parameter.shape, generator=generator, dtype=torch.float64)
-                parameter.add_(amounts.get(name, 0.0) * noise.to(parameter.dtype))
+                noise = noise.clamp(-most, most).to(parameter.dtype)
+                parameter.add_(amounts.get(name, 0.0) * noise)

@@ -2,15 +2,13 @@ import pytest
 import roma
 import torch
 
-from rgbavatar_ns.avatar import AvatarConfig
+from rgbavatar_ns.avatar import Avatar, AvatarConfig
+from rgbavatar_ns.avatar.training.fused_step import FusedStep
+from rgbavatar_ns.avatar.training.optimizer_states import unsupported_reason
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import ThetaField, ThetaLayout
 
-from .small_head import (
-    front_camera,
-    random_theta,
-    small_head,
-)
+from .small_head import NUM_EXPRESSION, front_camera, random_theta, small_head, small_identity
 
 VARIANTS = ("normalized", "raw", "orthonormal")
 
@@ -19,11 +17,8 @@ def covariances(gaussians):
     """R diag(s^2) R^T of every Gaussian, by another library (roma, xyzw)."""
     quats_xyzw = gaussians.quats_wxyz.roll(-1, -1)
     rotation = roma.unitquat_to_rotmat(quats_xyzw / quats_xyzw.norm(dim=-1, keepdim=True))
-    return (
-        rotation
-        @ torch.diag_embed(gaussians.scales.expand_as(gaussians.means) ** 2)
-        @ (rotation.transpose(-1, -2))
-    )
+    scaled = rotation * gaussians.scales[..., None, :]
+    return scaled @ scaled.mT
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
@@ -62,10 +57,8 @@ def test_untrained_gaussians_lie_on_the_mesh(make_avatar):
     # A position residual along the frame's third axis leaves the surface along its normal.
     with torch.no_grad():
         avatar.blendshapes.position[:, 2] = 1e-3
-    normal = torch.linalg.cross(
-        corners[:, :, 1] - corners[:, :, 0], corners[:, :, 2] - corners[:, :, 0], dim=-1
-    )
-    normal = normal / normal.norm(dim=-1, keepdim=True)
+    a, b, c = corners.unbind(2)
+    normal = torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a, dim=-1), dim=-1)
     torch.testing.assert_close(avatar.gaussians(theta).means, expected + 1e-3 * normal)
 
 
@@ -99,10 +92,8 @@ def test_scale_follows_the_triangle_only_when_asked(make_avatar):
     bent = random_theta(fixed.layout, 1, dtype=torch.float64)
     ratio = following.gaussians(bent).scales / fixed.gaussians(bent).scales
     vertices = [following.head(theta, following.identity)[0] for theta in (rest, bent)]
-    areas = []
-    for posed in vertices:
-        a, b, c = posed[following.head.faces.long()].unbind(1)
-        areas.append(torch.linalg.cross(b - a, c - a, dim=-1).norm(dim=-1))
+    corners = [posed[following.head.faces].unbind(1) for posed in vertices]
+    areas = [torch.linalg.cross(b - a, c - a, dim=-1).norm(dim=-1) for a, b, c in corners]
     expected = (areas[1] / areas[0]).sqrt()[following.anchors.triangle_index]
     torch.testing.assert_close(ratio, expected[None, :, None].expand_as(ratio))
 
@@ -151,19 +142,15 @@ def test_gradients_match_finite_differences(make_avatar):
         gaussians = avatar.gaussians(theta)
         return gaussians.means, gaussians.quats_wxyz, gaussians.colors, gaussians.scales
 
-    inputs = (theta, shapes.position, shapes.rotation_wxyz, shapes.basis_position)
-    assert torch.autograd.gradcheck(attributes, (*inputs, shapes.log_scale), atol=1e-6)
+    inputs = (theta, shapes.position, shapes.rotation_wxyz, shapes.log_scale)
+    bases = (shapes.basis_position, shapes.basis_rotation_wxyz)
+    assert torch.autograd.gradcheck(attributes, (*inputs, *bases), atol=1e-6)
 
 
 def test_without_bases_there_are_no_basis_groups(make_avatar):
     avatar = make_avatar(num_bases=0)
-    assert set(avatar.parameter_groups()) == {
-        "position",
-        "rotation",
-        "log_scale",
-        "opacity",
-        "color",
-    }
+    groups = {"position", "rotation", "log_scale", "opacity", "color"}
+    assert set(avatar.parameter_groups()) == groups
     theta = random_theta(avatar.layout, 2)
     assert avatar.weights(theta).shape == (2, 0)
     assert avatar.render(theta, front_camera(16)).image.shape == (2, 16, 16, 3)
@@ -186,13 +173,13 @@ def test_theta_of_another_size_is_refused_with_the_layout(make_avatar):
         avatar.weights(torch.zeros(1, 5))
 
 
-@pytest.mark.parametrize("value", [float("nan"), float("inf")])
-def test_theta_that_is_not_finite_is_refused(make_avatar, value):
+def test_theta_that_is_not_finite_is_refused(make_avatar):
     avatar = make_avatar()
     theta = torch.zeros(2, avatar.layout.size)
-    theta[1, 3] = value
-    with pytest.raises(UserError, match="NaN or infinite"):
-        avatar.render(theta, front_camera(8))
+    for value in (torch.nan, torch.inf):
+        theta[1, 3] = value
+        with pytest.raises(UserError, match="NaN or infinite"):
+            avatar.render(theta, front_camera(8))
 
 
 def test_another_layout_is_refused_naming_both(make_avatar):
@@ -223,3 +210,79 @@ def test_settings_out_of_range_are_refused(change):
     object.__setattr__(config, name, value)
     with pytest.raises(UserError, match=name):
         config.__post_init__()
+
+
+# Everything that a step reads goes with the avatar to its device; "meta" stands for any other.
+
+
+def test_all_tensors_go_along(make_avatar):
+    avatar = make_avatar(scale_with_triangle=True).to("meta")
+    gaussians = vars(avatar._morphed_gaussians())
+    places = {name: v.device.type for name, v in gaussians.items() if isinstance(v, torch.Tensor)}
+    assert set(places.values()) == {"meta"}, places
+    assert len(places) == len(gaussians) - 1  # all but the variant's name
+
+
+def test_nothing_of_another_device_takes_part(make_avatar):
+    """Mixing devices raises; a copy from main memory in each step would wait for the device."""
+    for changes in ({}, {"carrier": "joints"}, {"pose_input": False}):
+        avatar = make_avatar(**changes).to("meta")
+        theta = torch.zeros(2, avatar.layout.size, device="meta")
+        assert avatar.weights(theta).device.type == "meta"
+        assert avatar.carrier_vertices(theta).device.type == "meta"
+
+
+def _changed(layout, theta, name):
+    other = theta.clone()
+    other[:, layout.slice(name)] += 0.3
+    return other
+
+
+def test_joints_carry_gaussians_past_expressions_but_not_past_the_jaw(make_avatar):
+    avatar = make_avatar(random=True, dtype=torch.float64, carrier="joints")
+    mesh = make_avatar(random=True, dtype=torch.float64)
+    theta = random_theta(avatar.layout, 2, dtype=torch.float64)
+    psi = torch.randn(2, 3, dtype=torch.float64)
+    means = avatar.gaussians(theta, psi).means
+    smiling = _changed(avatar.layout, theta, "expression")
+    torch.testing.assert_close(avatar.gaussians(smiling, psi).means, means, rtol=0, atol=0)
+    for name in ("jaw", "rotation", "translation"):
+        moved = avatar.gaussians(_changed(avatar.layout, theta, name), psi).means
+        assert not torch.allclose(moved, means)
+    neutral = theta.clone()
+    neutral[:, avatar.layout.slice("expression")] = 0
+    same = mesh.gaussians(neutral, psi).means
+    torch.testing.assert_close(avatar.gaussians(neutral, psi).means, same)
+    assert not torch.allclose(mesh.gaussians(smiling, psi).means, mesh.gaussians(theta, psi).means)
+
+
+def test_without_a_network_the_first_expressions_are_the_weights(make_avatar):
+    avatar = make_avatar(random=True, weight_network="none", num_bases=3)
+    theta = random_theta(avatar.layout, 4)
+    expressions = theta[:, avatar.layout.slice("expression")]
+    torch.testing.assert_close(avatar.weights(theta), expressions[:, :3], rtol=0, atol=0)
+    groups = avatar.parameter_groups()
+    assert "weight_network" not in groups
+    assert groups["basis_color"][0].shape[0] == 3
+
+
+def test_more_bases_than_expressions_need_a_network():
+    config = AvatarConfig(num_bases=NUM_EXPRESSION + 1, weight_network="none", uv_resolution=8)
+    with pytest.raises(UserError, match=f"has {NUM_EXPRESSION}"):
+        Avatar(small_head(), small_identity(), config)
+
+
+def test_the_fused_step_trains_both(make_avatar):
+    for variant in ({"carrier": "joints"}, {"weight_network": "none"}):
+        avatar = make_avatar(random=True, **variant)
+        before = {name: p.detach().clone() for name, p in avatar.named_parameters()}
+        parameters = [p for group in avatar.parameter_groups().values() for p in group]
+        optimizer = torch.optim.Adam(parameters, lr=1e-2)
+        assert unsupported_reason(avatar, [optimizer]) is None
+        images = torch.randint(0, 256, (2, 16, 16, 4), dtype=torch.uint8)
+        step = FusedStep(avatar, [optimizer])
+        loss = step(random_theta(avatar.layout, 2), front_camera(16), images, torch.zeros(2, 3))
+        if loss is None:
+            pytest.skip("no compiled extension")
+        moved = [n for n, p in avatar.named_parameters() if not torch.equal(p, before[n])]
+        assert {"blendshapes.position", "blendshapes.basis_color_feature"} <= set(moved)

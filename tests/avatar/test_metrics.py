@@ -38,19 +38,10 @@ def test_psnr_and_ssim_equal_scikit_images(pair):
     np.testing.assert_allclose(values.numpy(), expected, rtol=1e-6)
     similarity = ssim(torch.from_numpy(image), torch.from_numpy(target))
     # The full frame's mean; black margins make libraries agree, whose borders are padded unlike.
-    expected = [
-        structural_similarity(
-            t,
-            i,
-            data_range=1,
-            channel_axis=-1,
-            gaussian_weights=True,
-            sigma=1.5,
-            use_sample_covariance=False,
-            full=True,
-        )[1].mean()
-        for i, t in zip(image, target)
-    ]
+    options = {"data_range": 1, "channel_axis": -1, "gaussian_weights": True, "sigma": 1.5}
+    options |= {"use_sample_covariance": False, "full": True}
+    pairs = zip(target, image)
+    expected = [structural_similarity(*pair, **options)[1].mean() for pair in pairs]
     np.testing.assert_allclose(similarity.numpy(), expected, rtol=1e-4)
 
 

@@ -5,17 +5,22 @@ import numpy as np
 from rgbavatar_ns.head import HeadArrays
 
 
+def grid_faces(side: int) -> np.ndarray:
+    """Two triangles for each square of a grid of side x side vertices, row by row."""
+    row, column = np.divmod(np.arange((side - 1) ** 2), side - 1)
+    corner = row * side + column
+    lower = np.stack([corner, corner + 1, corner + side + 1], 1)
+    upper = np.stack([corner, corner + side + 1, corner + side], 1)
+    return np.concatenate([lower, upper])
+
+
 def flame_shaped_arrays(seed: int = 0, num_vertices: int = 36) -> HeadArrays:
     side = int(num_vertices**0.5)
     assert side * side == num_vertices
     generator = np.random.default_rng(seed)
     regressor = generator.uniform(0, 1, (5, num_vertices))
     weights = generator.uniform(0, 1, (num_vertices, 5))
-    row, column = np.divmod(np.arange((side - 1) ** 2), side - 1)
-    corner = row * side + column
-    lower = np.stack([corner, corner + 1, corner + side + 1], 1)
-    upper = np.stack([corner, corner + side + 1, corner + side], 1)
-    faces = np.concatenate([lower, upper])
+    faces = grid_faces(side)
     # FLAME's UV map has triangles without area: the last one gets two equal corners.
     uv_faces = faces.copy()
     uv_faces[-1, 2] = uv_faces[-1, 1]

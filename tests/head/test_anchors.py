@@ -2,14 +2,8 @@ import numpy as np
 import pytest
 import torch
 
-from rgbavatar_ns.head import HeadModel, UVAnchors, uv_anchors
+from rgbavatar_ns.head import HeadModel, uv_anchors
 from tests.head.synthetic_head import flame_shaped_arrays
-
-
-def texel_centres(anchors: UVAnchors) -> torch.Tensor:
-    row, column = anchors.texel_row_col.double().unbind(1)
-    size = anchors.resolution
-    return torch.stack([(column + 0.5) / size, 1 - (row + 0.5) / size], 1)
 
 
 def covering_triangles(uv: np.ndarray, uv_faces: np.ndarray, point: np.ndarray) -> list[int]:
@@ -54,7 +48,8 @@ def test_barycentrics_of_the_embedded_head_give_the_texel_centres(resolution: in
     anchors = uv_anchors(head.uv, head.uv_faces, resolution)
     corners = head.uv.double()[head.uv_faces[anchors.triangle_index]]
     found = (anchors.barycentric.double()[..., None] * corners).sum(1)
-    torch.testing.assert_close(found, texel_centres(anchors), atol=2e-7, rtol=0)
+    row, column = (anchors.texel_row_col.double().T + 0.5) / resolution
+    torch.testing.assert_close(found, torch.stack([column, 1 - row], 1), atol=2e-7, rtol=0)
     assert anchors.barycentric.min() >= 0
     torch.testing.assert_close(anchors.barycentric.sum(1), torch.ones(len(found)))
     texels = anchors.texel_row_col[:, 0] * resolution + anchors.texel_row_col[:, 1]

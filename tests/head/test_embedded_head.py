@@ -150,8 +150,7 @@ def test_the_uv_map_is_one_to_one_and_denser_on_the_face(head: HeadModel) -> Non
     assert area[face].sum() / surface[face].sum() > 2 * area[skull].sum() / surface[skull].sum()
 
 
-def test_t_and_b_are_continuous_inside_a_chart(head: HeadModel) -> None:
-    """Across an edge that is shared in UV too, T seldom turns much in the map's own surface."""
+def test_nearly_every_edge_lies_inside_a_chart(head: HeadModel) -> None:
     arrays = head.arrays
     owner: dict[tuple[int, int], int] = {}
     shared = 0
@@ -160,7 +159,7 @@ def test_t_and_b_are_continuous_inside_a_chart(head: HeadModel) -> None:
             assert edge not in owner, "neighbours run along their edge in opposite directions"
             owner[edge] = index
             shared += edge[::-1] in owner
-    assert shared > 1.4 * len(arrays.uv_faces), "nearly every edge lies inside a chart"
+    assert shared > 1.4 * len(arrays.uv_faces)
 
 
 def test_landmarks_are_symmetric_and_on_the_right_parts(head: HeadModel) -> None:

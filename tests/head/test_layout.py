@@ -91,9 +91,3 @@ def test_network_features_by_hand(include_pose: bool, include_translation: bool)
     wanted += [theta[..., 9:]] if include_translation else []
     assert torch.equal(features, torch.cat(wanted, -1))
     assert features.shape[-1] == LAYOUT.feature_size(include_pose, include_translation)
-
-
-def test_moving_sideways_leaves_the_default_features_alone() -> None:
-    theta = torch.zeros(1, LAYOUT.size)
-    moved = LAYOUT.join({"translation": torch.tensor([[0.3, 0.0, 0.0]])})
-    assert torch.equal(LAYOUT.network_features(theta), LAYOUT.network_features(moved))

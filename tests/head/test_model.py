@@ -4,7 +4,6 @@ import torch
 
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadArrays, HeadModel
-from rgbavatar_ns.head.rotations import axis_angle_to_matrix
 from tests.head.synthetic_head import flame_shaped_arrays
 
 
@@ -87,22 +86,6 @@ def test_agrees_with_the_equations_by_hand(head: HeadModel) -> None:
         np.testing.assert_allclose(vertices[row], wanted, atol=1e-7)
 
 
-def test_global_motion_is_rigid(head: HeadModel) -> None:
-    theta, identity = random_theta(head), random_identity(head)
-    still, moved = theta.clone(), theta.clone()
-    still[head.layout.slice("rotation")] = 0
-    still[head.layout.slice("translation")] = 0
-    # About the root joint of the shaped head: expressions shape it too.
-    arrays = head.arrays
-    coefficients = torch.cat([identity, theta[head.layout.slice("expression")]]).numpy()
-    root = arrays.joint_regressor[0] @ (arrays.v_template + arrays.shapedirs @ coefficients)
-    turn = axis_angle_to_matrix(theta[head.layout.slice("rotation")])
-    about = torch.from_numpy(np.asarray(root, dtype=np.float64))
-    wanted = (head(still, identity) - about) @ turn.T + about
-    wanted = wanted + theta[head.layout.slice("translation")]
-    torch.testing.assert_close(head(moved, identity), wanted, atol=1e-7, rtol=0)
-
-
 @pytest.mark.parametrize("batch", [(), (3,), (2, 2), (0,)])
 def test_batch_equals_loop(synthetic: HeadModel, batch: tuple[int, ...]) -> None:
     theta, identity = random_theta(synthetic, *batch), random_identity(synthetic, *batch)
@@ -139,16 +122,6 @@ def test_float32_stays_near_float64() -> None:
     error = single(theta.float()).double() - double(theta)
     assert single(theta.float()).dtype == torch.float32
     assert error.abs().max() < 2e-6
-
-
-def test_eyelids_close_before_skinning(synthetic: HeadModel) -> None:
-    layout, arrays = synthetic.layout, synthetic.arrays
-    assert arrays.eyelid_dirs is not None
-    turn = {"rotation": torch.tensor([0.2, -0.4, 0.3], dtype=torch.float64)}
-    closed = layout.join({**turn, "eyelids": torch.tensor([1.0, 0.5], dtype=torch.float64)})
-    offset = synthetic(closed) - synthetic(layout.join(turn))
-    lids = torch.from_numpy(arrays.eyelid_dirs @ np.array([1.0, 0.5]))
-    torch.testing.assert_close(offset, lids @ axis_angle_to_matrix(turn["rotation"]).T)
 
 
 def test_wrong_sizes_are_refused(synthetic: HeadModel) -> None:

@@ -6,6 +6,7 @@ import os
 import pickle
 import struct
 import tracemalloc
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -117,6 +118,11 @@ def test_python_2_text_is_latin_1_and_holds_array_bytes(write):
     assert read_pickle(write(b"S'a\\xe9\\'b'\np0\n.")) == "aé'b"
 
 
+def _part(value, protocol: int = 2) -> bytes:
+    """A value's pickle without its head and its end, to stand inside of another."""
+    return pickle.dumps(value, protocol)[2:-1]
+
+
 def _chumpy(name: bytes, state: bytes) -> bytes:
     return b"ccopy_reg\n_reconstructor\n(" + name + b"c__builtin__\nobject\nNtR}(" + state + b"ub"
 
@@ -126,10 +132,8 @@ CHUMPY_ARRAY = _chumpy(b"cchumpy.ch\nCh\n", b"U\x01x" + PYTHON_2_ARRAY)
 
 def test_chumpy_arrays_are_read_without_chumpy(write):
     assert np.array_equal(read_pickle(write(b"\x80\x02" + CHUMPY_ARRAY + b".")), [-1.5, 2.25])
-    chosen = pickle.dumps(np.array([1, 1, 0]), 2)[2:-1]
-    selected = _chumpy(
-        b"cchumpy.reordering\nSelect\n", b"U\x01a" + CHUMPY_ARRAY + b"U\x04idxs" + chosen
-    )
+    state = b"U\x01a" + CHUMPY_ARRAY + b"U\x04idxs" + _part(np.array([1, 1, 0]))
+    selected = _chumpy(b"cchumpy.reordering\nSelect\n", state)
     assert np.array_equal(read_pickle(write(b"\x80\x02" + selected + b".")), [2.25, 2.25, -1.5])
 
 
@@ -184,22 +188,12 @@ def test_what_is_not_on_the_list_is_refused_by_name(write, name, protocol):
     assert not CALLED
 
 
-def _dtype() -> bytes:
-    return pickle.dumps(np.dtype("f8"), 2)[2:-1]
-
-
 BOMBS = {
     "array header": (
-        (
-            MADE_ARRAY
-            + b"(K\x01(\x8a\x06"
-            + (2**40 - 1).to_bytes(6, "little")
-            + b"t"
-            + _dtype()
-            + b"\x89C\x08"
-            + bytes(8)
-            + b"tb."
-        ),
+        MADE_ARRAY
+        + b"(K\x01(%bt%b\x89C\x08" % (_part(2**40 - 1), _part(np.dtype("f8")))
+        + bytes(8)
+        + b"tb.",
         "claims an array of",
     ),
     "text length": (b"\x8d" + struct.pack("<Q", 2**62) + b"x.", "damaged"),
@@ -226,16 +220,21 @@ BOMBS = {
 }
 
 
+@contextlib.contextmanager
+def _at_most(num_bytes: int) -> Iterator[None]:
+    tracemalloc.start()
+    yield
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < num_bytes
+
+
 @pytest.mark.parametrize("name", BOMBS)
 def test_bombs_are_refused_in_bounded_memory(write, name):
     bomb, told = BOMBS[name]
     path = write(bomb)
-    tracemalloc.start()
-    with pytest.raises(UserError, match=told):
+    with _at_most(100 * _MB), pytest.raises(UserError, match=told):
         read_pickle(path)
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert peak < 100 * _MB
 
 
 def test_more_steps_than_a_model_file_needs_are_refused(write, monkeypatch):
@@ -247,20 +246,15 @@ def test_more_steps_than_a_model_file_needs_are_refused(write, monkeypatch):
 
 def test_shared_bytes_do_not_multiply(write):
     """A hundred arrays over the same megabyte are a hundred megabytes when they are made."""
-    raw = pickle.dumps(b"x" * _MB, 3)[2:-1]
+    raw = _part(b"x" * _MB, 3)
     array = (
         MADE_ARRAY
-        + b"(K\x01("
-        + pickle.dumps(_MB, 3)[2:-1]
-        + b"t"
+        + b"(K\x01(%bt" % _part(_MB, 3)
         + b"cnumpy\ndtype\n(U\x02u1K\x00K\x01tR\x89j\x00\x01\x00\x00tb"
     )
     path = write(b"\x80\x03" + raw + b"r\x00\x01\x00\x000](" + array * 100 + b"e.")
-    tracemalloc.start()
-    with pytest.raises(UserError, match="more memory"):
+    with _at_most(100 * _MB), pytest.raises(UserError, match="more memory"):
         read_pickle(path, max_bytes=50 * _MB)
-    assert tracemalloc.get_traced_memory()[1] < 100 * _MB
-    tracemalloc.stop()
 
 
 def test_a_long_or_missing_file_is_refused(write, tmp_path):
@@ -277,7 +271,7 @@ REAL_FORM = (
     + b"U\x01v"
     + CHUMPY_ARRAY
     + b"".join(
-        pickle.dumps(part, 2)[2:-1]
+        _part(part)
         for part in ("J", scipy.sparse.csc_matrix(np.eye(2)), "f", np.float32(2), "t", ["x", 1.5])
     )
     + b"u."
@@ -285,9 +279,7 @@ REAL_FORM = (
 
 
 @settings(
-    max_examples=300,
-    deadline=None,
-    suppress_health_check=[HealthCheck.function_scoped_fixture],
+    max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 @given(
     st.lists(st.tuples(st.integers(0, len(REAL_FORM) - 1), st.integers(0, 255)), max_size=4),
@@ -298,8 +290,5 @@ def test_damaged_bytes_end_in_a_value_or_an_error_in_bounded_memory(write, chang
     data = bytearray(REAL_FORM)
     for place, value in changes:
         data[place] = value
-    tracemalloc.start()
-    with contextlib.suppress(UserError):
+    with _at_most(20 * _MB), contextlib.suppress(UserError):
         read_pickle(write(bytes(data[:end]) + tail), max_bytes=_MB)
-    assert tracemalloc.get_traced_memory()[1] < 20 * _MB
-    tracemalloc.stop()

@@ -6,12 +6,7 @@ import torch
 from torch import Tensor
 
 from rgbavatar_ns.kernels import RenderedBatch
-from tests.kernels.scenes import (
-    ATTRIBUTES,
-    Scene,
-    render_and_differentiate,
-    settled_pixels,
-)
+from tests.kernels.scenes import ATTRIBUTES, Scene, render_and_differentiate, settled_pixels
 
 
 @dataclass(frozen=True)

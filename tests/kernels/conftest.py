@@ -3,33 +3,31 @@
 import pytest
 
 from rgbavatar_ns.kernels import available_backends
-from tests.kernels.cuda import emulator
 
 
-def _variants() -> list[str]:
+def instruction_sets() -> tuple[str, ...]:
+    """Those that this processor's compiled backend has, the fastest first."""
     if "cpu" not in available_backends():
-        return []
-    from rgbavatar_ns.kernels.cpu.backend import instruction_sets
+        return ()
+    from rgbavatar_ns.kernels.cpu import backend
 
-    return list(instruction_sets())
+    return backend.instruction_sets()
 
 
-@pytest.fixture(params=_variants())
+@pytest.fixture(params=instruction_sets())
 def instruction_set(request, monkeypatch) -> str:
     """Instruction sets of the compiled backend, which is made to use them."""
     monkeypatch.setenv("RGBAVATAR_INSTRUCTION_SET", request.param)
     return request.param
 
 
-@pytest.fixture(params=[*_variants(), "reference32", "emulated"])
+@pytest.fixture(params=[*instruction_sets(), "reference32", "emulated"])
 def fast_backend(request, monkeypatch) -> str:
     """Names of float32 backends; "cpu" is given once per instruction set, "cuda" emulated."""
     if request.param == "reference32":
         return "reference"
     if request.param == "emulated":
-        if emulator.compiler() is None:
-            pytest.skip("no g++ to emulate CUDA with")
-        emulator.install(monkeypatch)
+        request.getfixturevalue("emulated")
         return "cuda"
     monkeypatch.setenv("RGBAVATAR_INSTRUCTION_SET", request.param)
     return "cpu"

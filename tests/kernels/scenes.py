@@ -1,6 +1,6 @@
 """Random scenes, and what the tests ask of a rendering."""
 
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass, replace
 
 import torch
 from torch import Tensor
@@ -30,6 +30,16 @@ def to(value, like):
     if not is_dataclass(value):
         return value
     return type(value)(**{f.name: to(getattr(value, f.name), like) for f in fields(value)})
+
+
+def changed(scene: Scene, **attributes: Tensor) -> Scene:
+    """The scene with these attributes of its Gaussians."""
+    return replace(scene, gaussians=replace(scene.gaussians, **attributes))
+
+
+def in_float32(scene: Scene) -> tuple[GaussianSet, PinholeCameras]:
+    """What is drawn, as the fast backends take it."""
+    return to(scene.gaussians, torch.float32), to(scene.cameras, torch.float32)
 
 
 def random_cameras(generator, count: int, width: int, height: int, distance_m: float = 2.3):

@@ -6,39 +6,17 @@ import warnings
 import pytest
 import torch
 
-from rgbavatar_ns.kernels import (
-    GaussianSet,
-    available_backends,
-    rasterize,
-    registry,
-    weighted_color_average,
+from rgbavatar_ns.kernels import available_backends, rasterize, registry, weighted_color_average
+from tests.kernels.scenes import (
+    ATTRIBUTES,
+    changed,
+    in_float32,
+    random_scene,
+    render_and_differentiate,
+    to,
 )
-from tests.kernels.scenes import ATTRIBUTES, random_scene, render_and_differentiate, to
 
 DTYPES = {"reference": torch.float64, "cpu": torch.float32}
-COUNT = 60
-
-
-def _changed(scene, gaussians):
-    return type(scene)(**{**vars(scene), "gaussians": GaussianSet(**gaussians)})
-
-
-def _without(scene, indices):
-    """The scene with these Gaussians fully transparent and ordinary otherwise."""
-    opacities = scene.gaussians.opacities.clone()
-    opacities[:, indices] = 0
-    return _changed(scene, {**vars(scene.gaussians), "opacities": opacities})
-
-
-def _assert_isolated(scene, broken, indices, backend):
-    rendered, grads = render_and_differentiate(broken, DTYPES[backend], backend)
-    expected, expected_grads = render_and_differentiate(
-        _without(scene, indices), DTYPES[backend], backend
-    )
-    assert torch.equal(rendered.image, expected.image)
-    for name in ATTRIBUTES:
-        assert torch.equal(grads[name], expected_grads[name])
-        assert (grads[name][:, indices] == 0).all()
 
 
 @pytest.mark.parametrize("backend", available_backends())
@@ -53,15 +31,21 @@ def _assert_isolated(scene, broken, indices, backend):
     ],
 )
 def test_degenerate_gaussians_contribute_nothing(backend, name, value):
-    scene = random_scene(0, count=COUNT, batch=1, width=9, height=10, extremes=False)
-    values = {key: tensor.clone() for key, tensor in vars(scene.gaussians).items()}
-    values[name][:, 7] = value
-    _assert_isolated(scene, _changed(scene, values), [7], backend)
+    scene = random_scene(0, count=60, batch=1, width=9, height=10, extremes=False)
+    broken, absent = getattr(scene.gaussians, name).clone(), scene.gaussians.opacities.clone()
+    broken[:, 7], absent[:, 7] = value, 0
+    (rendered, grads), (expected, expected_grads) = (
+        render_and_differentiate(each, DTYPES[backend], backend)
+        for each in (changed(scene, **{name: broken}), changed(scene, opacities=absent))
+    )
+    assert torch.equal(rendered.image, expected.image)
+    for attribute in ATTRIBUTES:
+        assert torch.equal(grads[attribute], expected_grads[attribute])
+        assert (grads[attribute][:, 7] == 0).all()
 
 
 def _small():
-    scene = random_scene(0, count=4, extremes=False)
-    return to(scene.gaussians, torch.float32), to(scene.cameras, torch.float32)
+    return in_float32(random_scene(0, count=4, extremes=False))
 
 
 def _replaced(value, **changes):
@@ -73,34 +57,24 @@ def _replaced(value, **changes):
 
 
 @pytest.mark.parametrize(
-    ("changes", "message"),
+    ("part", "changes", "message"),
     [
-        ({"means": torch.zeros(4, 3)}, r"means are \[4, 3\]. Pass \[B or 1, N, 3\]"),
-        ({"scales": torch.ones(1, 5, 3)}, r"scales are \[1, 5, 3\]. Pass \[B or 1, 4, 3\]"),
-        ({"colors": torch.ones(2, 4, 3)}, "colors: leading dimension 2 in a batch of 3"),
-        ({"opacities": torch.ones(1, 4).double()}, "opacities: torch.float64"),
-        ({"means": torch.zeros(1, 4, 3, dtype=torch.int64)}, "floating-point"),
+        (0, {"means": torch.zeros(4, 3)}, r"means are \[4, 3\]. Pass \[B or 1, N, 3\]"),
+        (0, {"scales": torch.ones(1, 5, 3)}, r"scales are \[1, 5, 3\]. Pass \[B or 1, 4, 3\]"),
+        (0, {"colors": torch.ones(2, 4, 3)}, "colors: leading dimension 2 in a batch of 3"),
+        (0, {"opacities": torch.ones(1, 4).double()}, "opacities: torch.float64"),
+        (0, {"means": torch.zeros(1, 4, 3, dtype=torch.int64)}, "floating-point"),
+        (1, {"focal_px": torch.tensor([[-1.0, 1.0]])}, "must be positive"),
+        (1, {"focal_px": torch.ones(2, 2)}, r"focal_px is \[2, 2\]"),
+        (1, {"world_to_camera": torch.full((1, 4, 4), math.nan)}, "NaN or infinity"),
+        (1, {"width": 0}, "width is 0"),
     ],
 )
-def test_gaussians_that_do_not_fit_are_refused(changes, message):
-    gaussians, cameras = _small()
+def test_gaussians_and_cameras_that_do_not_fit_are_refused(part, changes, message):
+    drawn = list(_small())
+    drawn[part] = _replaced(drawn[part], **changes)
     with pytest.raises(ValueError, match=message):
-        rasterize(_replaced(gaussians, **changes), cameras)
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"focal_px": torch.tensor([[-1.0, 1.0]])}, "must be positive"),
-        ({"focal_px": torch.ones(2, 2)}, r"focal_px is \[2, 2\]"),
-        ({"world_to_camera": torch.full((1, 4, 4), math.nan)}, "NaN or infinity"),
-        ({"width": 0}, "width is 0"),
-    ],
-)
-def test_cameras_that_do_not_fit_are_refused(changes, message):
-    gaussians, cameras = _small()
-    with pytest.raises(ValueError, match=message):
-        rasterize(gaussians, _replaced(cameras, **changes))
+        rasterize(*drawn)
 
 
 def test_other_arguments_that_do_not_fit_are_refused():

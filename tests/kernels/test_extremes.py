@@ -10,7 +10,7 @@ from torch import Tensor
 from rgbavatar_ns.kernels import GaussianSet, PinholeCameras
 from rgbavatar_ns.kernels.constants import MAX_ALPHA, MIN_ALPHA, NEAR_PLANE_M
 from tests.kernels.agreement import assert_agrees, expect
-from tests.kernels.scenes import ATTRIBUTES, Scene, random_scene, to
+from tests.kernels.scenes import ATTRIBUTES, Scene, changed, random_scene, to
 
 WIDTH, HEIGHT, FOCAL = 45, 38, 40.0
 
@@ -49,7 +49,7 @@ def _scene(means, scales, opacities, quats=None, colors=None, camera=None, seed:
     return Scene(gaussians, camera, random(3), random(*size, 3) - 0.5, random(*size, 1) - 0.5)
 
 
-def _at_pixels(x, y, depth_m, camera: PinholeCameras | None = None) -> Tensor:
+def _at_pixels(x, y, depth_m) -> Tensor:
     """Means whose images lie `x`, `y` pixels from the camera's axis."""
     x, y, depth_m = (torch.as_tensor(value, dtype=torch.float64) for value in (x, y, depth_m))
     x, y, depth_m = torch.broadcast_tensors(x, y, depth_m)
@@ -62,19 +62,21 @@ def _uniform(low: float, high: float, count: int, seed: int) -> Tensor:
 
 
 def _joined(*scenes: Scene) -> Scene:
-    rows = {
-        name: torch.cat([getattr(scene.gaussians, name) for scene in scenes], 1)
-        for name in ATTRIBUTES
-    }
-    return Scene(**{**vars(scenes[0]), "gaussians": GaussianSet(**rows)})
+    parts = {name: [getattr(each.gaussians, name) for each in scenes] for name in ATTRIBUTES}
+    return changed(scenes[0], **{name: torch.cat(rows, 1) for name, rows in parts.items()})
 
 
-def _ordinary(count: int, seed: int, depth_m: tuple[float, float] = (1.5, 3.0)) -> Scene:
-    means = _at_pixels(
-        _uniform(-24, 24, count, seed),
-        _uniform(-20, 20, count, seed + 1),
-        _uniform(*depth_m, count, seed + 2),
+def _spread(right_px: float, down_px: float, count: int, seed: int) -> Tensor:
+    """Means on both sides of the camera's axis, up to so many pixels from it."""
+    return _at_pixels(
+        _uniform(-right_px, right_px, count, seed),
+        _uniform(-down_px, down_px, count, seed + 1),
+        _uniform(1.5, 3.0, count, seed + 2),
     )
+
+
+def _ordinary(count: int, seed: int) -> Scene:
+    means = _spread(24, 20, count, seed)
     scales = torch.stack([_uniform(0.02, 0.2, count, seed + k) for k in (3, 4, 5)], -1)
     return _scene(means, scales, _uniform(0.1, 0.9, count, seed + 6), seed=seed)
 
@@ -96,9 +98,7 @@ def _needles() -> Scene:
 
 def _stacked() -> Scene:
     count = 3000
-    means = _at_pixels(
-        _uniform(-0.3, 0.3, count, 1), _uniform(-0.3, 0.3, count, 2), _uniform(1.5, 3, count, 3)
-    )
+    means = _spread(0.3, 0.3, count, seed=1)
     scales = torch.stack([_uniform(0.01, 0.06, count, k) for k in (3, 4, 5)], -1)
     return _scene(means, scales, _uniform(0.004, 0.03, count, 6), camera=_camera(9, 7))
 
@@ -114,12 +114,7 @@ def _opacities() -> Scene:
 
 def _scattered(scales: Tensor, seed: int) -> Scene:
     count = len(scales)
-    means = _at_pixels(
-        _uniform(-20, 20, count, seed),
-        _uniform(-15, 15, count, seed + 1),
-        _uniform(1.5, 3, count, seed + 2),
-    )
-    return _scene(means, scales, _uniform(0.1, 0.3, count, seed + 3))
+    return _scene(_spread(20, 15, count, seed), scales, _uniform(0.1, 0.3, count, seed + 3))
 
 
 def _scales() -> Scene:

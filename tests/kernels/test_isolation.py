@@ -1,15 +1,15 @@
 """What is broken in one Gaussian, one image or one pixel stays there: drawn by hypothesis."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from torch import Tensor
 
-from rgbavatar_ns.kernels import GaussianSet, available_backends, rasterize
-from tests.kernels.scenes import ATTRIBUTES, random_scene, to
+from rgbavatar_ns.kernels import available_backends
+from tests.kernels.scenes import ATTRIBUTES, changed, random_scene, render_and_differentiate
 
 pytestmark = [
     pytest.mark.usefixtures("instruction_set"),
@@ -20,9 +20,7 @@ NOT_FINITE = [math.nan, math.inf, -math.inf]
 EXTREME = [0.0, -0.0, 1e-40, -1e-40, 1e-30, 1e-20, 1e20, -1e20, 1e30, 3.4e38, -3.4e38, -1.0]
 # The instruction set is a fixture of a function that hypothesis calls many times; it is constant.
 drawn = settings(
-    max_examples=25,
-    deadline=None,
-    suppress_health_check=[HealthCheck.function_scoped_fixture],
+    max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 
 
@@ -39,40 +37,23 @@ def _scene(seed: int, shared: tuple[str, ...] = ()):
     )
 
 
-def _rows(scene) -> dict[str, Tensor]:
-    return {name: value.float() for name, value in vars(scene.gaussians).items()}
+def _draw(scene):
+    """Rendering and gradients as float32 has them, to the bit."""
+    return render_and_differentiate(scene, torch.float32, "cpu")
 
 
-def _draw(rows, scene, background=None, image_grad=None, cameras=None):
-    """Image, alpha and the gradients of all attributes."""
-    leaves = {name: value.clone().requires_grad_() for name, value in rows.items()}
-    background = scene.background.float() if background is None else background
-    rendered = rasterize(
-        GaussianSet(**leaves),
-        cameras or to(scene.cameras, torch.float32),
-        background,
-        backend="cpu",
-        with_depth=True,
-        with_visibility=True,
-    )
-    image_grad = scene.image_grad.float() if image_grad is None else image_grad
-    torch.autograd.backward(
-        [rendered.image, rendered.alpha], [image_grad, scene.alpha_grad.float()]
-    )
-    return rendered, {name: torch.as_tensor(leaf.grad) for name, leaf in leaves.items()}
-
-
-def _with(rows, changes):
+def _with(scene, changes):
     """A copy in which `name`'s row of one image and Gaussian holds `value` (at one component)."""
-    changed = {name: value.clone() for name, value in rows.items()}
+    rows = {name: value.clone() for name, value in vars(scene.gaussians).items()}
     for name, index, component, value in changes:
-        tensor = changed[name]
-        row = tensor[component % len(tensor), index]
-        if row.ndim:
-            row[component % len(row)] = value
-        else:
-            tensor[component % len(tensor), index] = value
-    return changed
+        row = rows[name][component % len(rows[name]), index].view(-1)
+        row[component % len(row)] = value
+    return changed(scene, **rows)
+
+
+def _assert_in_range(rendered) -> None:
+    assert 0 <= rendered.alpha.min() <= rendered.alpha.max() <= 1
+    assert -1e-6 <= rendered.image.min() <= rendered.image.max() <= 1 + 1e-5
 
 
 def _assert_others_untouched(drawn, expected) -> None:
@@ -105,13 +86,13 @@ def test_gaussians_that_are_not_finite_might_as_well_be_absent(changes, seed, sh
         for image in range(BATCH)
     ]
     keep = [index for index in range(COUNT) if index not in indices]
-    rows = _rows(scene)
-    rendered, grads = _draw(_with(rows, everywhere), scene)
-    alone, alone_grads = _draw({name: row[:, keep] for name, row in rows.items()}, scene)
-    assert torch.equal(rendered.image, alone.image)
-    assert torch.equal(rendered.alpha, alone.alpha)
-    assert torch.equal(torch.as_tensor(rendered.depth), torch.as_tensor(alone.depth))
-    assert (torch.as_tensor(rendered.visibility)[:, indices] == 0).all()
+    rendered, grads = _draw(_with(scene, everywhere))
+    alone, alone_grads = _draw(
+        changed(scene, **{name: row[:, keep] for name, row in vars(scene.gaussians).items()})
+    )
+    for name in ("image", "alpha", "depth"):
+        assert torch.equal(getattr(rendered, name), getattr(alone, name)), name
+    assert (rendered.visibility[:, indices] == 0).all()
     for name in ATTRIBUTES:
         assert torch.equal(grads[name][:, keep], alone_grads[name]), name
         assert (grads[name][:, indices] == 0).all()
@@ -121,10 +102,9 @@ def test_gaussians_that_are_not_finite_might_as_well_be_absent(changes, seed, sh
 @given(change=_changes(NOT_FINITE + EXTREME), seed=st.integers(0, 3))
 def test_what_is_broken_in_one_image_is_not_seen_in_another(change, seed):
     scene = _scene(seed)
-    rows = _rows(scene)
     # The middle image's rows are 1 modulo the batch's size.
     middle = [(name, index, 3 * component + 1, value) for name, index, component, value in change]
-    _assert_others_untouched(_draw(_with(rows, middle), scene), _draw(rows, scene))
+    _assert_others_untouched(_draw(_with(scene, middle)), _draw(scene))
 
 
 @drawn
@@ -132,65 +112,58 @@ def test_what_is_broken_in_one_image_is_not_seen_in_another(change, seed):
 def test_extreme_shapes_and_opacities_leave_images_in_range(changes, seed):
     scene = _scene(seed)
     changes = [change for change in changes if change[0] != "colors"]
-    rendered, grads = _draw(_with(_rows(scene), changes), scene)
+    rendered, grads = _draw(_with(scene, changes))
     touched = {index for _, index, _, _ in changes}
     others = [index for index in range(COUNT) if index not in touched]
-    assert 0 <= rendered.alpha.min() <= rendered.alpha.max() <= 1
-    assert -1e-6 <= rendered.image.min() <= rendered.image.max() <= 1 + 1e-5
+    _assert_in_range(rendered)
     for name in ATTRIBUTES:
         assert torch.isfinite(grads[name][:, others]).all(), name
 
 
+def _camera_changes(values) -> dict[str, st.SearchStrategy]:
+    return {
+        "name": st.sampled_from(["world_to_camera", "focal_px", "principal_point_px"]),
+        "position": st.integers(0, 100),
+        "value": st.sampled_from(values),
+    }
+
+
 @drawn
-@given(
-    name=st.sampled_from(["world_to_camera", "focal_px", "principal_point_px"]),
-    position=st.integers(0, 100),
-    value=st.sampled_from(NOT_FINITE),
-)
+@given(**_camera_changes(NOT_FINITE))
 def test_cameras_that_are_not_finite_are_refused(name, position, value):
     scene = _scene(0)
-    cameras = to(scene.cameras, torch.float32)
-    flat = getattr(cameras, name).view(-1)
+    flat = getattr(scene.cameras, name).view(-1)
     flat[position % len(flat)] = value
     with pytest.raises(ValueError, match=f"{name} holds NaN or infinity"):
-        _draw(_rows(scene), scene, cameras=cameras)
+        _draw(scene)
 
 
 @drawn
-@given(
-    name=st.sampled_from(["world_to_camera", "focal_px", "principal_point_px"]),
-    position=st.integers(0, 100),
-    value=st.sampled_from(EXTREME),
-)
+@given(**_camera_changes(EXTREME))
 def test_extreme_cameras_are_refused_or_leave_images_in_range(name, position, value):
     scene = _scene(1)
-    cameras = to(scene.cameras, torch.float32)
-    values = getattr(cameras, name)
-    values[1].view(-1)[position % values[1].numel()] = value
+    values = getattr(scene.cameras, name)[1].view(-1)
+    values[position % len(values)] = value
     if name == "focal_px" and value <= 0:
         with pytest.raises(ValueError, match="focal_px must be positive"):
-            _draw(_rows(scene), scene, cameras=cameras)
+            _draw(scene)
         return
-    rendered, grads = _draw(_rows(scene), scene, cameras=cameras)
-    expected, expected_grads = _draw(_rows(scene), scene)
-    assert 0 <= rendered.alpha.min() <= rendered.alpha.max() <= 1
-    assert -1e-6 <= rendered.image.min() <= rendered.image.max() <= 1 + 1e-5
-    _assert_others_untouched((rendered, grads), (expected, expected_grads))
+    found = _draw(scene)
+    _assert_in_range(found[0])
+    _assert_others_untouched(found, _draw(_scene(1)))
 
 
 @drawn
 @given(channel=st.integers(0, 2), value=st.sampled_from(NOT_FINITE + EXTREME))
 def test_a_strange_background_stays_in_its_image_and_channel(channel, value):
-    scene = _scene(2)
-    plain = scene.background.float().repeat(BATCH, 1)
-    broken = plain.clone()
-    broken[1, channel] = value
-    if value in NOT_FINITE or value != value:
+    plain = replace(_scene(2), background=_scene(2).background.repeat(BATCH, 1))
+    broken = replace(plain, background=plain.background.clone())
+    broken.background[1, channel] = value
+    if not math.isfinite(value):
         with pytest.raises(ValueError, match="background holds NaN or infinity"):
-            _draw(_rows(scene), scene, broken)
+            _draw(broken)
         return
-    rendered, grads = _draw(_rows(scene), scene, broken)
-    expected, expected_grads = _draw(_rows(scene), scene, plain)
+    (rendered, grads), (expected, expected_grads) = _draw(broken), _draw(plain)
     assert torch.equal(rendered.alpha, expected.alpha)
     others = [k for k in range(3) if k != channel]
     assert torch.equal(rendered.image[..., others], expected.image[..., others])
@@ -206,26 +179,17 @@ def test_a_strange_background_stays_in_its_image_and_channel(channel, value):
 )
 def test_a_broken_gradient_of_a_pixel_stays_with_the_gaussians_of_its_image(row, column, value):
     scene = _scene(3)
-    image_grad = scene.image_grad.float()
-    image_grad[1, row, column, 1] = value
-    _assert_others_untouched(
-        _draw(_rows(scene), scene, image_grad=image_grad), _draw(_rows(scene), scene)
-    )
+    scene.image_grad[1, row, column, 1] = value
+    _assert_others_untouched(_draw(scene), _draw(_scene(3)))
 
 
 @pytest.mark.parametrize("value", [1e3, -1e3])
 def test_a_glaring_gaussian_leaves_its_neighbours_gradients(value):
     """What lies behind it has a gradient in which its colour does not occur."""
-    scene = _scene(0)
+    scene = random_scene(0, batch=1, count=COUNT, width=WIDTH, height=HEIGHT, extremes=False)
     nearest = (scene.gaussians.means[0] @ scene.cameras.world_to_camera[0, 2, :3]).argmin()
-    rows = {name: row[:1] for name, row in _rows(scene).items()}
-    camera = to(scene.cameras, torch.float32).select([0])
-    one = type(scene)(
-        scene.gaussians, camera, scene.background, scene.image_grad[:1], scene.alpha_grad[:1]
-    )
-    glaring = _with(rows, [("colors", int(nearest), k, value) for k in range(3)])
-    _, grads = _draw(glaring, one, cameras=camera)
-    _, expected = _draw(rows, one, cameras=camera)
+    glaring = _with(scene, [("colors", int(nearest), k, value) for k in range(3)])
+    (_, grads), (_, expected) = _draw(glaring), _draw(scene)
     others = torch.arange(COUNT) != nearest
     for name in ATTRIBUTES:
         error = (grads[name] - expected[name])[:, others].norm()

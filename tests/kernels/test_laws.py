@@ -1,45 +1,42 @@
 """What holds for every rendering, whatever draws it."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
-from rgbavatar_ns.kernels import GaussianSet, PinholeCameras, rasterize
+from rgbavatar_ns.kernels import GaussianSet, rasterize
 from tests.kernels.scenes import (
     ATTRIBUTES,
+    changed,
+    in_float32,
     random_scene,
     relative_l2,
     render_and_differentiate,
-    to,
 )
 
 
 def _image(scene, backend, background=None):
-    gaussians, cameras = to(scene.gaussians, torch.float32), to(scene.cameras, torch.float32)
-    return rasterize(gaussians, cameras, background, backend=backend)
+    return rasterize(*in_float32(scene), background, backend=backend)
 
 
 def test_batched_render_equals_loop(fast_backend):
     scene = random_scene(1, num_cameras=3, shared=("scales",))
-    gaussians, cameras = to(scene.gaussians, torch.float32), to(scene.cameras, torch.float32)
+    gaussians, cameras = in_float32(scene)
     together = rasterize(gaussians, cameras, backend=fast_backend, with_depth=True)
     for i in range(3):
         one = GaussianSet(
             **{k: v[i : i + 1] if len(v) > 1 else v for k, v in vars(gaussians).items()}
         )
         alone = rasterize(one, cameras.select([i]), backend=fast_backend, with_depth=True)
-        assert torch.equal(alone.image[0], together.image[i])
-        assert torch.equal(alone.alpha[0], together.alpha[i])
-        assert alone.depth is not None
-        assert together.depth is not None
-        assert torch.equal(alone.depth[0], together.depth[i])
+        for name in ("image", "alpha", "depth"):
+            assert torch.equal(getattr(alone, name)[0], getattr(together, name)[i]), name
 
 
 def test_gradients_of_shared_attributes_are_sums(fast_backend):
     shared = random_scene(2, batch=3, shared=ATTRIBUTES, num_cameras=3)
-    gaussians = GaussianSet(
-        **{k: v.expand(3, *v.shape[1:]) for k, v in vars(shared.gaussians).items()}
-    )
-    apart = type(shared)(**{**vars(shared), "gaussians": gaussians})
+    rows = {k: v.expand(3, *v.shape[1:]) for k, v in vars(shared.gaussians).items()}
+    apart = changed(shared, **rows)
     _, summed = render_and_differentiate(shared, torch.float32, fast_backend)
     _, single = render_and_differentiate(apart, torch.float32, fast_backend)
     for name in ATTRIBUTES:
@@ -49,8 +46,7 @@ def test_gradients_of_shared_attributes_are_sums(fast_backend):
 def test_order_in_memory_does_not_matter(fast_backend):
     scene = random_scene(3)
     order = torch.randperm(200, generator=torch.Generator().manual_seed(0))
-    gaussians = GaussianSet(**{k: v[:, order] for k, v in vars(scene.gaussians).items()})
-    shuffled = type(scene)(**{**vars(scene), "gaussians": gaussians})
+    shuffled = changed(scene, **{k: v[:, order] for k, v in vars(scene.gaussians).items()})
     before, grads = render_and_differentiate(scene, torch.float32, fast_backend)
     after, shuffled_grads = render_and_differentiate(shuffled, torch.float32, fast_backend)
     torch.testing.assert_close(after.image, before.image, atol=1e-6, rtol=0)
@@ -73,7 +69,7 @@ def test_background_shows_through_what_is_not_covered(fast_backend):
 def test_only_wanted_gradients_are_given(fast_backend, wanted):
     scene = random_scene(6)
     _, expected = render_and_differentiate(scene, torch.float32, fast_backend)
-    gaussians, cameras = to(scene.gaussians, torch.float32), to(scene.cameras, torch.float32)
+    gaussians, cameras = in_float32(scene)
     background = scene.background.float().requires_grad_("background" in wanted)
     for name in ATTRIBUTES:
         getattr(gaussians, name).requires_grad_(name in wanted)
@@ -89,9 +85,9 @@ def test_only_wanted_gradients_are_given(fast_backend, wanted):
 
 def test_alpha_alone_has_gradients(fast_backend):
     scene = random_scene(7, extremes=False)
-    silent = type(scene)(**{**vars(scene), "image_grad": torch.zeros_like(scene.image_grad)})
+    silent = replace(scene, image_grad=torch.zeros_like(scene.image_grad))
     _, expected = render_and_differentiate(silent, torch.float32, fast_backend)
-    gaussians, cameras = to(scene.gaussians, torch.float32), to(scene.cameras, torch.float32)
+    gaussians, cameras = in_float32(scene)
     gaussians.opacities.requires_grad_()
     alpha = rasterize(gaussians, cameras, backend=fast_backend).alpha
     (alpha * scene.alpha_grad).sum().backward()
@@ -106,12 +102,11 @@ def test_rigid_motion_of_world_and_camera_changes_nothing(fast_backend):
     # A quarter turn about z is (1, 0, 0, 1) / sqrt 2 from the left.
     turned = torch.stack([w - z, x - y, x + y, w + z], -1)
     moved_means = scene.gaussians.means @ quarter.T + shift
-    gaussians = GaussianSet(**{**vars(scene.gaussians), "means": moved_means, "quats_wxyz": turned})
     world_to_camera = scene.cameras.world_to_camera.clone()
     world_to_camera[:, :3, :3] = world_to_camera[:, :3, :3] @ quarter.T
     world_to_camera[:, :3, 3] -= (world_to_camera[:, :3, :3] @ shift[:, None])[..., 0]
-    cameras = PinholeCameras(**{**vars(scene.cameras), "world_to_camera": world_to_camera})
-    moved = type(scene)(**{**vars(scene), "gaussians": gaussians, "cameras": cameras})
+    moved = changed(scene, means=moved_means, quats_wxyz=turned)
+    moved = replace(moved, cameras=replace(scene.cameras, world_to_camera=world_to_camera))
     difference = (_image(moved, fast_backend).image - _image(scene, fast_backend).image).abs()
     # Rounding may move single alphas over the cut of 1 / 255.
     assert difference.max() < 5e-3

@@ -7,21 +7,20 @@ import torch
 
 from rgbavatar_ns.kernels import GaussianSet, PinholeCameras, available_backends, rasterize
 from rgbavatar_ns.kernels.reference import BlendingRules, project, rasterize_reference
-from tests.kernels.scenes import random_scene
+from tests.kernels.scenes import changed, random_scene
 
 DTYPES = {"reference": torch.float64, "cpu": torch.float32}
 
 
-def _camera(size: int, dtype: torch.dtype, focal: float = 8.0) -> PinholeCameras:
-    half = torch.full((1, 2), size / 2, dtype=dtype)
-    world_to_camera = torch.eye(4, dtype=dtype)[None]
-    return PinholeCameras(world_to_camera, torch.full((1, 2), focal, dtype=dtype), half, size, size)
+def _camera(size: int, dtype: torch.dtype) -> PinholeCameras:
+    focal, half = (torch.full((1, 2), value, dtype=dtype) for value in (8.0, size / 2))
+    return PinholeCameras(torch.eye(4, dtype=dtype)[None], focal, half, size, size)
 
 
-def _gaussians(dtype, depth_m, opacity, color, sigma_m=0.25, offset_m=(0.0, 0.0)) -> GaussianSet:
-    """Round Gaussians, one per depth, at the same offset from the optical axis."""
+def _gaussians(dtype, depth_m, opacity, color, sigma_m=0.25) -> GaussianSet:
+    """Round Gaussians on the optical axis, one per depth."""
     count = len(depth_m)
-    means = torch.tensor([[[*offset_m, z] for z in depth_m]], dtype=dtype)
+    means = torch.tensor([[[0.0, 0.0, z] for z in depth_m]], dtype=dtype)
     quats = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=dtype).expand(1, count, 4)
     scales = torch.full((1, count, 3), sigma_m, dtype=dtype)
     opacities = torch.tensor([opacity], dtype=dtype)
@@ -86,14 +85,11 @@ def test_alphas_are_capped_and_cut(backend):
 def test_a_block_ends_when_all_of_its_pixels_are_opaque(backend):
     dtype = DTYPES[backend]
     # Alphas of .98: T is 1, .02, 4e-4, 8e-6; the fourth Gaussian finds T < 1e-4 and is dropped.
-    wall = _gaussians(
-        dtype, [2.0, 2.1, 2.2, 2.3], [0.98] * 4, [[0.0] * 3] * 3 + [[1e5] * 3], sigma_m=1e4
-    )
+    four = ([2.0, 2.1, 2.2, 2.3], [0.98] * 4, [[0.0] * 3] * 3 + [[1e5] * 3])
+    wall = _gaussians(dtype, *four, sigma_m=1e4)
     assert rasterize(wall, _camera(4, dtype), backend=backend).image.max() == 0
     # One pixel of the block is hardly covered by the wall: then all of the block goes on.
-    hole = _gaussians(
-        dtype, [2.0, 2.1, 2.2, 2.3], [0.98] * 4, [[0.0] * 3] * 3 + [[1e5] * 3], sigma_m=0.6
-    )
+    hole = _gaussians(dtype, *four, sigma_m=0.6)
     image = rasterize(hole, _camera(4, dtype), backend=backend).image
     full = rasterize_reference(
         hole, _camera(4, dtype), hole.colors.new_zeros(1, 3), rules=BlendingRules(False, False)
@@ -128,8 +124,8 @@ def test_gradients_match_finite_differences_through_a_smooth_cutoff():
 def test_projection_agrees_with_gsplat():
     torch_impl = pytest.importorskip("gsplat.cuda._torch_impl")
     scene = random_scene(11, batch=1, count=300, extremes=False)
+    scene = changed(scene, means=scene.gaussians.means * 2)  # some outside
     gaussians, cameras = scene.gaussians, scene.cameras
-    gaussians = GaussianSet(**{**vars(gaussians), "means": gaussians.means * 2})  # some outside
     projected = project(gaussians, cameras)
     covariances, _ = torch_impl._quat_scale_to_covar_preci(
         gaussians.quats_wxyz[0], gaussians.scales[0], compute_preci=False

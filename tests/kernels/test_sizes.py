@@ -1,9 +1,15 @@
 """Large images, many Gaussians and many threads, by laws and by crops that the reference draws."""
 
+import dataclasses
+import subprocess
+import sys
+from pathlib import Path
+
 import pytest
 import torch
 from torch import Tensor
 
+from rgbavatar_ns.bench.scenes import leaf_gaussians
 from rgbavatar_ns.kernels import (
     GaussianSet,
     PinholeCameras,
@@ -15,6 +21,7 @@ from tests.kernels.agreement import assert_agrees, expect
 from tests.kernels.scenes import (
     ATTRIBUTES,
     Scene,
+    in_float32,
     random_scene,
     relative_l2,
     render_and_differentiate,
@@ -52,27 +59,12 @@ def _plane_scene(
     return gaussians, cameras
 
 
-def _crop(cameras: PinholeCameras, left: int, top: int, width: int, height: int):
-    """The cameras of a part of the image."""
-    shift = torch.tensor([[left, top]]).to(cameras.principal_point_px)
-    return PinholeCameras(
-        cameras.world_to_camera,
-        cameras.focal_px,
-        cameras.principal_point_px - shift,
-        width,
-        height,
-    )
-
-
-def _gradients(gaussians, cameras, image_grad: Tensor, alpha_grad: Tensor | None = None):
-    """The rendering and the gradients of all attributes, in float32."""
-    leaves = {name: value.clone().requires_grad_() for name, value in vars(gaussians).items()}
-    rendered = rasterize(
-        GaussianSet(**leaves), cameras, backend="cpu", with_depth=True, with_visibility=True
-    )
-    alpha_grad = torch.zeros_like(rendered.alpha) if alpha_grad is None else alpha_grad
-    torch.autograd.backward([rendered.image, rendered.alpha], [image_grad, alpha_grad])
-    return rendered, {name: torch.as_tensor(leaf.grad) for name, leaf in leaves.items()}
+def _gradients(gaussians, cameras, image_grad: Tensor):
+    """The rendering before black and the gradients of all attributes, in float32."""
+    leaves = leaf_gaussians(gaussians)
+    rendered = rasterize(leaves, cameras, backend="cpu", with_depth=True, with_visibility=True)
+    rendered.image.backward(image_grad)
+    return rendered, {name: torch.as_tensor(leaf.grad) for name, leaf in vars(leaves).items()}
 
 
 PART_PX, MARGIN_PX = 128, 32
@@ -106,9 +98,15 @@ def test_parts_of_large_images_match_reference(name):
     interior = _interior(top, part_height, height)[:, None] & _interior(left, part_width, width)
     shape = (1, part_height, part_width)
     generator = torch.Generator().manual_seed(0)
+    part_cameras = dataclasses.replace(
+        cameras,
+        principal_point_px=cameras.principal_point_px - torch.tensor([left, top]),
+        width=part_width,
+        height=part_height,
+    )
     part = Scene(
         to(GaussianSet(**{k: v[:, near] for k, v in vars(gaussians).items()}), torch.float64),
-        to(_crop(cameras, left, top, part_width, part_height), torch.float64),
+        to(part_cameras, torch.float64),
         torch.zeros(3, dtype=torch.float64),
         torch.randn(*shape, 3, generator=generator).double(),
         torch.zeros(*shape, 1, dtype=torch.float64),
@@ -137,7 +135,7 @@ def test_one_to_sixteen_threads_give_the_same_bits():
     scene = random_scene(
         4, width=203, height=141, batch=3, count=1200, num_cameras=3, shared=("opacities", "means")
     )
-    gaussians, cameras = to(scene.gaussians, torch.float32), to(scene.cameras, torch.float32)
+    gaussians, cameras = in_float32(scene)
     threads = torch.get_num_threads()
     results = []
     try:
@@ -178,11 +176,9 @@ def test_half_a_million_gaussians_obey_euler():
     scale = (image_grad.double() * rendered.image).abs().sum()
     assert (linear - loss).abs() < 1e-6 * scale
     # Seen from the origin, a Gaussian twice as large and twice as far is the same.
-    along = (grads["means"] * gaussians.means).sum(-1) + (grads["scales"] * gaussians.scales).sum(
-        -1
-    )
-    size = (grads["means"] * gaussians.means).norm(dim=-1)
-    size = size + (grads["scales"] * gaussians.scales).norm(dim=-1)
+    shares = [grads[name] * getattr(gaussians, name) for name in ("means", "scales")]
+    along = sum(share.sum(-1) for share in shares)
+    size = sum(share.norm(dim=-1) for share in shares)
     assert along.norm() < 1e-4 * size.norm()
     # The length of a quaternion has no meaning.
     along = (grads["quats_wxyz"] * gaussians.quats_wxyz).sum(-1)
@@ -238,3 +234,40 @@ def test_a_tile_fuller_than_what_is_kept_of_it_matches_reference(side_px, count,
     expected = expect(scene, least_settled=0.3)
     assert (1 - expected.rendered.alpha).amin() > 1e-3
     assert_agrees(expected, "cpu")
+
+
+BATCH, LIMIT_MB = 10, 40
+
+# The high-water mark is of this process's own memory; getrusage's would be at least the parent's.
+PROGRAM = f"""
+import torch
+
+from rgbavatar_ns.bench.scenes import ellipsoid_scene, leaf_gaussians
+from rgbavatar_ns.kernels import rasterize
+
+
+def resident_mb(which):
+    with open("/proc/self/status") as status:
+        return next(int(line.split()[1]) for line in status if line.startswith(which)) / 1024
+
+
+def draw(gaussians, cameras):
+    rasterize(leaf_gaussians(gaussians), cameras, backend="cpu").image.sum().backward()
+
+
+torch.set_num_threads(2)
+draw(*ellipsoid_scene(100, 16, {BATCH}))
+inputs = ellipsoid_scene(60_000, 512, {BATCH})
+before = resident_mb("VmRSS")
+draw(*inputs)
+print((resident_mb("VmHWM") - before) / {BATCH})
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="needs Linux's /proc")
+def test_an_image_and_its_gradients_take_less_than_40_mb():
+    output = subprocess.check_output([sys.executable, "-c", PROGRAM], text=True, timeout=120)
+    growth_mb = float(output)
+    # Outputs and gradients alone are 8 MB.
+    assert 8 < growth_mb < LIMIT_MB

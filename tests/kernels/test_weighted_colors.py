@@ -10,7 +10,7 @@ from rgbavatar_ns.kernels import (
     rasterize,
     weighted_color_average,
 )
-from tests.kernels.scenes import random_scene, settled_pixels, to
+from tests.kernels.scenes import in_float32, random_scene, settled_pixels
 
 DTYPES = {"reference": torch.float64, "cpu": torch.float32}
 
@@ -23,12 +23,7 @@ def test_matches_reference(fast_backend, channels, shared_image):
     size = (1 if shared_image else 3, 37, 70, channels)
     images = torch.rand(size, generator=generator, dtype=torch.float64)
     expected = weighted_color_average(scene.gaussians, scene.cameras, images, backend="reference")
-    got = weighted_color_average(
-        to(scene.gaussians, torch.float32),
-        to(scene.cameras, torch.float32),
-        images.float(),
-        backend=fast_backend,
-    )
+    got = weighted_color_average(*in_float32(scene), images.float(), backend=fast_backend)
     # Every pixel that rounding may cut adds at most the cut.
     slack = 1e-4 * expected.weight_sum + (~settled_pixels(scene)).sum() / 255 + 1e-5
     assert ((got.weight_sum - expected.weight_sum).abs() <= slack).all()
@@ -58,7 +53,7 @@ def test_two_walls_by_hand(backend):
 
 def test_sums_repeat_the_rendering(fast_backend):
     scene = random_scene(2)
-    gaussians, cameras = to(scene.gaussians, torch.float32), to(scene.cameras, torch.float32)
+    gaussians, cameras = in_float32(scene)
     rendered = rasterize(gaussians, cameras, backend=fast_backend, with_visibility=True)
     ones = torch.ones(3, cameras.height, cameras.width, 1)
     average = weighted_color_average(gaussians, cameras, ones, backend=fast_backend)
@@ -72,7 +67,7 @@ def test_sums_repeat_the_rendering(fast_backend):
 
 def test_carries_no_gradient(fast_backend):
     scene = random_scene(3)
-    gaussians, cameras = to(scene.gaussians, torch.float32), to(scene.cameras, torch.float32)
+    gaussians, cameras = in_float32(scene)
     gaussians.means.requires_grad_()
     images = torch.ones(3, cameras.height, cameras.width, 3)
     average = weighted_color_average(gaussians, cameras, images, backend=fast_backend)

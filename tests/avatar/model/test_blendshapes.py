@@ -75,18 +75,6 @@ def test_color_activation_is_the_zeroth_harmonic():
     torch.testing.assert_close(feature_from_color(color_from_feature(feature)), feature)
 
 
-def test_blend_has_right_gradients():
-    shapes = filled(2, 2)
-    psi = torch.randn(2, 2, dtype=torch.float64, requires_grad=True)
-    parameters = [shapes.position, shapes.basis_position, shapes.basis_rotation_wxyz]
-
-    def blend(psi, *_):
-        blended = shapes.morph(psi)
-        return blended.position, blended.rotation_wxyz
-
-    assert torch.autograd.gradcheck(blend, (psi, *parameters))
-
-
 @pytest.mark.parametrize("num_bases", [0, 2])
 def test_one_scale_a_gaussian_can_be_given(num_bases):
     scale_m = torch.tensor([1e-3, 2e-3, 4e-3])

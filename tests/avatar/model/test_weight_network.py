@@ -1,3 +1,4 @@
+import pytest
 import torch
 
 from rgbavatar_ns.avatar import WeightNetwork
@@ -36,21 +37,17 @@ def test_initial_values_follow_torchs_distribution_and_the_generator_alone():
     assert abs(weight.std().item() - 0.1 / 3**0.5) < 2e-3
 
 
-def test_psi_does_not_see_translation_by_default(make_avatar):
-    avatar = make_avatar()
-    theta = random_theta(avatar.layout, 2)
-    moved = theta.clone()
-    moved[:, avatar.layout.slice("translation")] += 0.3
-    assert torch.equal(avatar.weights(theta), avatar.weights(moved))
-    watching = make_avatar(translation_input=True)
-    assert not torch.equal(watching.weights(theta), watching.weights(moved))
-
-
-def test_psi_sees_rotations_unless_told_not_to(make_avatar):
-    avatar = make_avatar()
-    theta = random_theta(avatar.layout, 2)
-    turned = theta.clone()
-    turned[:, avatar.layout.slice("rotation")] += 0.3
-    assert not torch.equal(avatar.weights(theta), avatar.weights(turned))
-    blind = make_avatar(pose_input=False)
-    assert torch.equal(blind.weights(theta), blind.weights(turned))
+@pytest.mark.parametrize(
+    ("field", "blind", "watching"),
+    [
+        ("translation", {}, {"translation_input": True}),
+        ("rotation", {"pose_input": False}, {}),
+    ],
+)
+def test_psi_sees_rotations_but_not_translation_unless_told(make_avatar, field, blind, watching):
+    for changes, sees in ((blind, False), (watching, True)):
+        avatar = make_avatar(**changes)
+        theta = random_theta(avatar.layout, 2)
+        moved = theta.clone()
+        moved[:, avatar.layout.slice(field)] += 0.3
+        assert torch.equal(avatar.weights(theta), avatar.weights(moved)) is not sees

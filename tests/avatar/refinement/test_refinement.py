@@ -97,10 +97,7 @@ def test_what_the_tracker_leaves_constant_stays_and_linear_fields_keep_their_ran
 
 def test_the_prior_pulls_back():
     refinement = TrackingRefinement(
-        _tracked(4),
-        LAYOUT,
-        RefinementConfig(learning_rate=0.02, prior_weight=0.1),
-        centered=False,
+        _tracked(4), LAYOUT, RefinementConfig(learning_rate=0.02, prior_weight=0.1), centered=False
     )
     refinement.correction += 0.5
     for _ in range(200):

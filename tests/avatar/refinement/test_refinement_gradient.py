@@ -13,13 +13,15 @@ from tests.avatar.fused_scene import AT_THE_CUT, VARIANTS, double, far_batch, in
 compiled = pytest.mark.skipif("cpu" not in available_backends(), reason="not compiled")
 
 
-def _eager_gradient(avatar, theta, batch, background, backend="auto"):
-    theta = theta.clone().requires_grad_()
-    image = avatar.render(
-        theta, batch.cameras, background, backend=backend, differentiable=True
-    ).image
+def _eager_loss(avatar, theta, batch, background, backend="auto"):
+    drawn = avatar.render(theta, batch.cameras, background, backend=backend, differentiable=True)
     target = composite(rgba_to_float(batch.images_rgba, theta.dtype), background)
-    return torch.autograd.grad(l1_loss(image, target), theta)[0]
+    return l1_loss(drawn.image, target)
+
+
+def _eager_gradient(avatar, batch, background, backend="auto"):
+    theta = batch.theta.clone().requires_grad_()
+    return torch.autograd.grad(_eager_loss(avatar, theta, batch, background, backend), theta)[0]
 
 
 def test_gradient_of_theta_against_finite_differences(make_avatar):
@@ -27,24 +29,18 @@ def test_gradient_of_theta_against_finite_differences(make_avatar):
     avatar = double(stir(make_avatar(scale_with_triangle=True)))
     batch, background = far_batch(avatar, 2)
     batch, background = in_double(batch), background.double()
-    gradient = _eager_gradient(avatar, batch.theta, batch, background, "reference")
-
-    def loss(theta):
-        with torch.no_grad():
-            image = avatar.render(
-                theta, batch.cameras, background, backend="reference", differentiable=True
-            ).image
-            return l1_loss(
-                image, composite(rgba_to_float(batch.images_rgba, theta.dtype), background)
-            )
-
+    gradient = _eager_gradient(avatar, batch, background, "reference")
     generator = torch.Generator().manual_seed(3)
     step = 1e-8  # so small that hardly a pair of pixel and Gaussian crosses the cut of 1/255
     found, expected = [], []
     for _ in range(12):
         along = torch.randn(gradient.shape, generator=generator, dtype=torch.float64)
         found.append(float((gradient * along).sum()))
-        ahead, behind = loss(batch.theta + step * along), loss(batch.theta - step * along)
+        with torch.no_grad():
+            ahead, behind = (
+                _eager_loss(avatar, batch.theta + shift, batch, background, "reference")
+                for shift in (step * along, -step * along)
+            )
         expected.append(float(ahead - behind) / (2 * step))
     found, expected = torch.tensor(found), torch.tensor(expected)
     # One direction may meet the cut, where the loss jumps by up to 1/255 of a pixel.
@@ -57,7 +53,7 @@ def test_gradient_of_theta_against_finite_differences(make_avatar):
 def test_gradient_of_theta_without_autograd(make_avatar, variant):
     avatar = stir(make_avatar(**VARIANTS[variant]))
     batch, background = far_batch(avatar, 3, cameras=3)
-    expected = _eager_gradient(avatar, batch.theta, batch, background)
+    expected = _eager_gradient(avatar, batch, background)
     theta = batch.theta.clone().requires_grad_()
     step = FusedStep(avatar, [make_optimizer(avatar)])
     assert step(theta, batch.cameras, batch.images_rgba, background) is not None

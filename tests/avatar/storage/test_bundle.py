@@ -1,13 +1,26 @@
 import json
 import pickle
+from pathlib import Path
 
 import pytest
 import torch
 
 from rgbavatar_ns import Avatar
+from rgbavatar_ns.avatar import AvatarConfig
 from rgbavatar_ns.avatar.storage import bundle
+from rgbavatar_ns.avatar.storage.bundle import load_statistics
+from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.head import HeadArrays, HeadModel, ThetaLayout
+from rgbavatar_ns.head.flame import load_flame
+from rgbavatar_ns.synthetic.flame import write_synthetic_flame
 from tests.avatar.small_head import front_camera, random_theta
+
+
+@pytest.fixture(autouse=True)
+def no_heads_named(monkeypatch):
+    for name in ("RGBAVATAR_HEAD", "RGBAVATAR_FLAME"):
+        monkeypatch.delenv(name, raising=False)
 
 
 def assert_renders_the_same(first: Avatar, second: Avatar) -> None:
@@ -15,6 +28,10 @@ def assert_renders_the_same(first: Avatar, second: Avatar) -> None:
     one, other = (a.render(theta, front_camera(24), background) for a in (first, second))
     assert torch.equal(one.image, other.image)
     assert torch.equal(one.alpha, other.alpha)
+
+
+def names_in(folder: Path) -> set[str]:
+    return {path.name for path in folder.iterdir()}
 
 
 def checkpoint_of(avatar: Avatar) -> dict:
@@ -43,24 +60,15 @@ def test_a_bundle_renders_the_same_bits(make_avatar, tmp_path, changes):
     assert loaded.layout == avatar.layout
     assert torch.equal(loaded.color_initialized, avatar.color_initialized)
     assert_renders_the_same(avatar, loaded)
-    assert {path.name for path in tmp_path.iterdir()} == {"me"}
-    assert {path.name for path in (tmp_path / "me").iterdir()} == {
-        "avatar.safetensors",
-        "avatar.json",
-    }
+    assert names_in(tmp_path / "me") == {"avatar.safetensors", "avatar.json"}
 
 
-def test_saving_again_replaces_the_bundle(make_avatar, tmp_path):
+def test_saving_again_replaces_the_bundle_unless_it_fails(make_avatar, tmp_path, monkeypatch):
     make_avatar().save(tmp_path / "me")
     avatar = make_avatar(random=True)
     avatar.save(tmp_path / "me")
     assert_renders_the_same(avatar, Avatar.load(tmp_path / "me"))
-    assert {path.name for path in tmp_path.iterdir()} == {"me"}
-
-
-def test_a_save_that_fails_leaves_the_old_bundle(make_avatar, tmp_path, monkeypatch):
-    avatar = make_avatar(random=True)
-    avatar.save(tmp_path / "me")
+    assert names_in(tmp_path) == {"me"}
 
     def full(*_args, **_options):
         raise OSError(28, "No space left on device")
@@ -69,7 +77,7 @@ def test_a_save_that_fails_leaves_the_old_bundle(make_avatar, tmp_path, monkeypa
     with pytest.raises(UserError, match=r"no space left.*Free some space"):
         make_avatar().save(tmp_path / "me")
     assert_renders_the_same(avatar, Avatar.load(tmp_path / "me"))
-    assert {path.name for path in tmp_path.iterdir()} == {"me"}
+    assert names_in(tmp_path) == {"me"}
 
 
 def test_a_folder_of_something_else_is_not_overwritten(make_avatar, tmp_path):
@@ -126,19 +134,17 @@ def test_what_is_no_avatar_is_refused(make_avatar, tmp_path):
         Avatar.load(tmp_path / "other.ckpt")
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"version": 99}, "version 99.*version 1"),
-        ({"format": "something"}, "does not describe an avatar bundle"),
-    ],
-)
-def test_another_version_is_refused(make_avatar, tmp_path, change, message):
+def test_another_version_is_refused(make_avatar, tmp_path):
     make_avatar().save(tmp_path / "me")
     manifest = tmp_path / "me" / "avatar.json"
-    manifest.write_text(json.dumps(json.loads(manifest.read_text()) | change))
-    with pytest.raises(UserError, match=message):
-        Avatar.load(tmp_path / "me")
+    values = json.loads(manifest.read_text())
+    for change, message in (
+        ({"version": 99}, "version 99.*version 1"),
+        ({"format": "something"}, "does not describe an avatar bundle"),
+    ):
+        manifest.write_text(json.dumps(values | change))
+        with pytest.raises(UserError, match=message):
+            Avatar.load(tmp_path / "me")
 
 
 @pytest.mark.parametrize("name", ["avatar.safetensors", "avatar.json"])
@@ -159,3 +165,143 @@ def test_a_missing_part_is_named(make_avatar, tmp_path):
     torch.save(checkpoint, tmp_path / "a.ckpt")
     with pytest.raises(UserError, match=r"lacks.*blendshapes\.position"):
         Avatar.load(tmp_path / "a.ckpt")
+
+
+def _picture(avatar: Avatar) -> torch.Tensor:
+    with torch.no_grad():
+        return avatar.render(random_theta(avatar.layout, 1), front_camera(24)).image
+
+
+def test_a_bundle_without_its_head_wants_the_very_file(make_avatar, tmp_path, monkeypatch):
+    avatar = make_avatar(random=True)
+    avatar.save(tmp_path / "me", with_head=False)
+    held = (tmp_path / "me" / "avatar.safetensors").stat().st_size
+    avatar.save(tmp_path / "whole")
+    assert held < (tmp_path / "whole" / "avatar.safetensors").stat().st_size
+    with pytest.raises(UserError, match=r"does not hold its head model 'small'.*RGBAVATAR_HEAD"):
+        Avatar.load(tmp_path / "me")
+
+    avatar.head.arrays.save(tmp_path / "head.npz")
+    monkeypatch.setenv("RGBAVATAR_HEAD", str(tmp_path / "head.npz"))
+    assert torch.equal(_picture(Avatar.load(tmp_path / "me")), _picture(avatar))
+
+    monkeypatch.setenv("RGBAVATAR_HEAD", str(tmp_path / "gone.npz"))
+    with pytest.raises(UserError, match=r"gone\.npz"):
+        Avatar.load(tmp_path / "me")
+    HeadArrays.embedded().save(tmp_path / "other.npz")
+    monkeypatch.setenv("RGBAVATAR_HEAD", str(tmp_path / "other.npz"))
+    with pytest.raises(UserError, match="'makehuman' found here is not the 'small'"):
+        Avatar.load(tmp_path / "me")
+
+
+def _avatar(head: HeadModel) -> Avatar:
+    config = AvatarConfig(num_bases=0, uv_resolution=12)
+    return Avatar(head, torch.zeros(head.num_identity), config)
+
+
+def test_the_embedded_head_is_always_there(tmp_path):
+    avatar = _avatar(HeadModel.embedded())
+    avatar.save(tmp_path / "me", with_head=False)
+    assert torch.equal(_picture(Avatar.load(tmp_path / "me")), _picture(avatar))
+
+
+def test_flame_is_found_by_its_version_and_form(tmp_path, monkeypatch):
+    pickle = write_synthetic_flame(tmp_path / "models")
+    sizes = {"num_identity": 3, "num_expressions": 5}
+    avatar = _avatar(HeadModel(load_flame(pickle, teeth_form="blocks", **sizes)))
+    avatar.save(tmp_path / "me", with_head=False)
+    with pytest.raises(UserError, match=r"FLAME 2020.*RGBAVATAR_FLAME"):
+        Avatar.load(tmp_path / "me")
+    monkeypatch.setenv("RGBAVATAR_FLAME", str(tmp_path / "models"))
+    avatar.save(tmp_path / "whole")
+    found, held = Avatar.load(tmp_path / "me"), Avatar.load(tmp_path / "whole")
+    assert torch.equal(_picture(found), _picture(held))
+    assert torch.allclose(_picture(found), _picture(avatar), atol=1e-4)
+    monkeypatch.setenv("RGBAVATAR_FLAME", str(tmp_path / "nowhere"))
+    with pytest.raises(UserError, match="nowhere"):
+        Avatar.load(tmp_path / "me")
+
+
+def test_a_digest_knows_every_number_and_survives_the_file(make_avatar, tmp_path):
+    arrays = make_avatar().head.arrays
+    arrays.save(tmp_path / "head.npz")
+    assert HeadArrays.load(tmp_path / "head.npz").digest() == arrays.digest()
+    changed = dict(vars(arrays), v_template=arrays.v_template + 1e-6)
+    assert HeadArrays(**changed).digest() != arrays.digest()
+
+
+def test_a_head_has_the_digest_that_bundles_of_before_name():
+    assert HeadArrays.embedded().digest().startswith("e051afbf4dfe7848")
+
+
+def _statistics(avatar: Avatar, count: int = 12) -> TrainingStatistics:
+    theta = random_theta(avatar.layout, count)
+    with torch.no_grad():
+        return TrainingStatistics.of(theta, avatar.weights(theta), avatar.layout)
+
+
+def test_statistics_and_layout_are_inside_the_bundle(make_avatar, tmp_path):
+    avatar = make_avatar(random=True)
+    written = _statistics(avatar)
+    avatar.save(tmp_path / "me", statistics=written)
+    read = load_statistics(tmp_path / "me")
+    assert read is not None
+    for name, value in vars(written).items():
+        same = getattr(read, name)
+        assert torch.equal(same, value) if isinstance(value, torch.Tensor) else same == value
+    manifest = json.loads((tmp_path / "me" / "avatar.json").read_text())
+    assert ThetaLayout.from_json(manifest["layout"]) == avatar.layout
+    assert Avatar.load(tmp_path / "me").layout == avatar.layout
+
+
+def test_a_bundle_may_have_none_and_a_run_has_none(make_avatar, tmp_path):
+    make_avatar().save(tmp_path / "me")
+    assert load_statistics(tmp_path / "me") is None
+    assert load_statistics(tmp_path) is None
+
+
+def test_statistics_that_lack_a_part_are_refused(make_avatar, tmp_path):
+    avatar = make_avatar()
+    avatar.save(tmp_path / "me", statistics=_statistics(avatar))
+    path = tmp_path / "me" / "avatar.json"
+    manifest = json.loads(path.read_text())
+    del manifest["statistics"]["psi_max"]
+    path.write_text(json.dumps(manifest))
+    with pytest.raises(UserError, match="lack psi_max"):
+        load_statistics(tmp_path / "me")
+    del manifest["state"]["anchors"]
+    path.write_text(json.dumps(manifest))
+    with pytest.raises(UserError, match=r"damaged.*lacks anchors"):
+        Avatar.load(tmp_path / "me")
+
+
+def test_values_worked_by_hand(make_avatar):
+    avatar = make_avatar()
+    layout = avatar.layout
+    theta = torch.zeros(3, layout.size)
+    theta[:, 0] = torch.tensor([0.3, 0.9, 0.6])
+    theta[:, layout.slice("neck").start] = torch.tensor([9.0, 0.0, 3.0])
+    psi = torch.tensor([[1.0], [-2.0], [0.5]])
+    seen = TrainingStatistics.of(theta, psi, layout)
+    assert seen.num_frames == 3
+    assert seen.theta_mean[0].item() == pytest.approx(0.6)
+    assert seen.theta_std[0].item() == pytest.approx(0.06**0.5)
+    assert (seen.psi_min.item(), seen.psi_max.item()) == (-2.0, 1.0)
+    # The pose does not decide which frame is at rest, nor is it a component.
+    assert torch.equal(seen.theta_neutral, theta[0])
+    expected = torch.zeros(layout.size)
+    expected[0] = 1
+    assert len(seen.components) == 1
+    assert torch.allclose(seen.components[0].abs(), expected)
+    assert seen.component_max.item() == pytest.approx(0.3)
+
+
+def test_a_single_frame_and_none(make_avatar):
+    avatar = make_avatar()
+    theta = random_theta(avatar.layout, 1)
+    seen = TrainingStatistics.of(theta, torch.zeros(1, 2), avatar.layout)
+    other = random_theta(avatar.layout, 4, seed=1)
+    held = seen.project(other)
+    assert torch.allclose(held[:, seen.expressive], theta[:, seen.expressive].expand(4, -1))
+    with pytest.raises(UserError, match="no training frames"):
+        TrainingStatistics.of(theta[:0], torch.zeros(0, 2), avatar.layout)

@@ -2,23 +2,29 @@
 
 import copy
 import dataclasses
+import statistics
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
 
 from rgbavatar_ns.avatar import Avatar, AvatarConfig
+from rgbavatar_ns.avatar.metrics import psnr
 from rgbavatar_ns.avatar.training import (
+    TrainingBatch,
     TrainingOptions,
     TrainingStep,
+    fit,
     make_optimizer,
 )
 from rgbavatar_ns.avatar.training.fused_step import FusedStep
 from rgbavatar_ns.avatar.training.losses import random_backgrounds, require_images_of
 from rgbavatar_ns.avatar.training.optimizer_states import unsupported_reason
-from rgbavatar_ns.drawing.compositing import rgba_to_float
+from rgbavatar_ns.data import OfflineOrder
+from rgbavatar_ns.drawing.compositing import composite, rgba_to_float
 from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.kernels import available_backends
+from rgbavatar_ns.synthetic import DemoConfig, make_demo_dataset
 from tests.avatar.conftest import SMALL_CONFIG
 from tests.avatar.fused_scene import (
     VARIANTS,
@@ -31,21 +37,13 @@ from tests.avatar.fused_scene import (
     in_double,
     parting,
     relative_differences,
-    reordered,
     stir,
     values_by_group,
 )
-from tests.avatar.small_head import front_camera, small_head, small_head_arrays, small_identity
+from tests.avatar.small_head import front_camera, small_head_arrays, small_identity
+from tests.kernels.conftest import instruction_sets
 
 pytestmark = pytest.mark.skipif("cpu" not in available_backends(), reason="not compiled")
-
-
-def _instruction_sets() -> tuple[str, ...]:
-    if "cpu" not in available_backends():
-        return ()
-    from rgbavatar_ns.kernels.cpu.backend import instruction_sets
-
-    return instruction_sets()
 
 
 @pytest.fixture
@@ -75,22 +73,21 @@ def test_gradients_of_every_variant(stirred, variant):
     _compare(build, *far_batch(build(), 3))
 
 
-@pytest.mark.parametrize("count", [1, 3, 10, 13])
+@pytest.mark.parametrize(
+    ("count", "width", "height"),
+    [(n, 40, 40) for n in (1, 3, 10, 13)]
+    + [(3, *size) for size in ((1, 1), (7, 5), (37, 23), (65, 40), (16, 129))],
+)
 @pytest.mark.parametrize("own_cameras", [False, True], ids=["one camera", "one each"])
-def test_gradients_of_every_batch(stirred, count, own_cameras):
-    cameras = count if own_cameras else 1
-    _compare(stirred, *far_batch(stirred(), count, cameras=cameras))
-
-
-@pytest.mark.parametrize(("width", "height"), [(1, 1), (7, 5), (37, 23), (65, 40), (16, 129)])
-def test_gradients_of_every_image_size(stirred, width, height):
+def test_gradients_of_every_batch_and_image_size(stirred, count, width, height, own_cameras):
     def build():  # A single pixel sees something of large Gaussians only.
         return stirred(initial_scale_m=0.05 if width == 1 else 5e-3)
 
-    _compare(build, *far_batch(build(), 3, width, height))
+    cameras = count if own_cameras else 1
+    _compare(build, *far_batch(build(), count, width, height, cameras))
 
 
-@pytest.mark.parametrize("instruction_set", _instruction_sets())
+@pytest.mark.parametrize("instruction_set", instruction_sets())
 def test_gradients_against_float64_with_each_instruction_set(stirred, instruction_set, monkeypatch):
     monkeypatch.setenv("RGBAVATAR_INSTRUCTION_SET", instruction_set)
 
@@ -100,45 +97,17 @@ def test_gradients_against_float64_with_each_instruction_set(stirred, instructio
     _compare(build, *far_batch(build(), 3, 37, 29), reference=True)
 
 
-def _after_steps(step, avatar, order, *, rate: float = 1.0, steps: int = 100):
-    """The parameters of each group after steps over the same frames on changing backgrounds."""
-    optimizer = make_optimizer(avatar)
-    for group in optimizer.param_groups:
-        group["lr"] *= rate
-    batch, background = far_batch(avatar, len(order), 32, 32)
-    for number in range(steps):
-        step(avatar, optimizer, *reordered(batch, background.roll(number, 0), order))
-    return values_by_group(avatar)
-
-
 def test_parameters_after_a_hundred_small_steps(stirred):
     """At a tenth of the rates no pixel crosses its target: rounding is not blown up."""
-    order = [0, 1, 2, 3]
-    fused = _after_steps(fused_step, stirred(), order, rate=0.1)
-    eager = _after_steps(eager_step, stirred(), order, rate=0.1)
-    assert max(relative_differences(fused, eager).values()) < 1e-3
-
-
-@pytest.mark.nightly
-def test_parameters_after_a_hundred_steps_lie_within_the_eager_spread(stirred, monkeypatch):
-    """At full rates pixels reach their targets, where the sign of L1 is decided by rounding.
-
-    Eager runs that sum the same images in another order, or the same pixels in that of another
-    instruction set, then part by per cents, and so do a fused and an eager one: no further than
-    three times the largest of the former, since the parting grows exponentially and its beginning
-    is not the same.
-    """
-    orders = ([3, 2, 1, 0], [1, 3, 0, 2])
-    eager = _after_steps(eager_step, stirred(), [0, 1, 2, 3])
-    fused = relative_differences(_after_steps(fused_step, stirred(), [0, 1, 2, 3]), eager)
-    others = [_after_steps(eager_step, stirred(), order) for order in orders]
-    for instruction_set in _instruction_sets()[1:]:
-        monkeypatch.setenv("RGBAVATAR_INSTRUCTION_SET", instruction_set)
-        others.append(_after_steps(eager_step, stirred(), [0, 1, 2, 3]))
-    spreads = [relative_differences(other, eager) for other in others]
-    for name, difference in fused.items():
-        spread = max(other[name] for other in spreads)
-        assert difference < max(1e-3, 3 * spread), (name, difference, spread)
+    fused, eager = stirred(), stirred()
+    for step, avatar in ((fused_step, fused), (eager_step, eager)):
+        optimizer = make_optimizer(avatar)
+        for group in optimizer.param_groups:
+            group["lr"] *= 0.1
+        batch, background = far_batch(avatar, 4, 32, 32)
+        for number in range(100):
+            step(avatar, optimizer, batch, background.roll(number, 0))
+    assert parting(fused, eager) < 1e-3
 
 
 def test_either_way_goes_on_from_the_others_optimiser(stirred):
@@ -290,10 +259,7 @@ def test_the_training_step_is_the_fused_one_for_8_bit_images(stirred, floating):
     background = random_backgrounds(4, 3)
     step = eager_step if floating else fused_step
     assert float(loss) == float(step(expected, optimizers[1], batch, background))
-    assert all(
-        torch.equal(value, values_by_group(expected)[name])
-        for name, value in values_by_group(avatar).items()
-    )
+    assert parting(avatar, expected) == 0
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
@@ -347,16 +313,9 @@ def test_renderers_do_not_disturb_one_another(stirred):
 
 def test_rendering_without_gradients_refuses_what_rendering_refuses(stirred):
     avatar = stirred()
-    theta = torch.zeros(3, avatar.layout.size)
-    camera = front_camera(16)
-    two = dataclasses.replace(
-        camera,
-        world_to_camera=camera.world_to_camera.repeat(2, 1, 1),
-        focal_px=camera.focal_px.repeat(2, 1),
-        principal_point_px=camera.principal_point_px.repeat(2, 1),
-    )
+    theta, camera = torch.zeros(3, avatar.layout.size), front_camera(16)
     with pytest.raises(ValueError, match="cameras"):
-        avatar.render(theta, two)
+        avatar.render(theta, camera.select([0, 0]))
     with pytest.raises(ValueError, match="no backend"):
         avatar.render(theta, camera, backend="none")
 
@@ -387,14 +346,45 @@ def test_a_renderer_refuses_what_its_loops_would_read_wrongly(stirred):
         avatar.renderer(batch.theta, batch.cameras, torch.zeros(2, 1))
 
 
-def test_a_single_gaussian():
+def test_a_single_gaussian(stirred):
     """One Gaussian, one triangle: loops shorter than a register."""
-    config = AvatarConfig(uv_resolution=1)
-    avatar, expected = (stir(Avatar(small_head(), small_identity(), config)) for _ in range(2))
+    avatar, expected = stirred(uv_resolution=1), stirred(uv_resolution=1)
     assert avatar.num_gaussians == 1
-    batch, background = far_batch(avatar, 2)
-    optimizers = make_optimizer(avatar), make_optimizer(expected)
-    fused_step(avatar, optimizers[0], batch, background)
-    eager_step(expected, optimizers[1], batch, background)
+    batch, optimizers = far_batch(avatar, 2), (make_optimizer(avatar), make_optimizer(expected))
+    fused_step(avatar, optimizers[0], *batch)
+    eager_step(expected, optimizers[1], *batch)
     moments = first_moments(avatar, optimizers[0]), first_moments(expected, optimizers[1])
     assert max(relative_differences(*moments).values()) < 1e-3
+
+
+@pytest.mark.nightly
+def test_held_out_psnr_is_that_of_the_eager_path(tmp_path):
+    """Means over held-out frames of a small demo subject, five seeds, within a tenth of a dB.
+
+    The two runs of a seed part by about .05 dB either way, so that the means of five seeds part by
+    .02 dB. A third fewer steps would cost .3 dB.
+    """
+    config = DemoConfig(image_size=48, num_frames=20, num_test_frames=6, supersampling=1)
+    dataset = make_demo_dataset(tmp_path / "subject", config)
+    images = torch.stack([torch.as_tensor(dataset.read_image(i)) for i in range(len(dataset))])
+    order = OfflineOrder(dataset.train, 5, 0)
+
+    def batch(step: int) -> TrainingBatch:
+        chosen = order.batch(step)
+        return TrainingBatch(dataset.theta[chosen], dataset.cameras.select(chosen), images[chosen])
+
+    def score(fast: bool, seed: int) -> float:
+        settings = AvatarConfig(num_bases=6, uv_resolution=32, scale_from_texel_spacing=True)
+        avatar = Avatar(HeadModel(dataset.arrays), dataset.identity, settings, seed=seed)
+        step = TrainingStep(avatar, options=TrainingOptions(seed=seed, fast=fast))
+        fit(step, batch, range(120))
+        test = list(dataset.test)
+        with torch.no_grad():
+            drawn = avatar.render(dataset.theta[test], dataset.cameras.select(test)).image
+        truth = composite(rgba_to_float(images[test]), torch.zeros(3))
+        pairs = zip(drawn.clamp(0, 1).split(1), truth.split(1), strict=True)
+        return statistics.fmean(float(psnr(*pair)) for pair in pairs)
+
+    scores = {fast: [score(fast, seed) for seed in range(5)] for fast in (True, False)}
+    assert min(scores[False]) > 20
+    assert statistics.fmean(scores[True]) == pytest.approx(statistics.fmean(scores[False]), abs=0.1)

@@ -5,28 +5,15 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from rgbavatar_ns import kernels
+from rgbavatar_ns.avatar.recorded_rendering import RecordedRendering
 from rgbavatar_ns.avatar.training import make_optimizer
 from rgbavatar_ns.avatar.training.batches import DeviceFrames
 from rgbavatar_ns.avatar.training.fused_step import FusedStep
 from rgbavatar_ns.avatar.training.optimizer_states import AdamStates
 from rgbavatar_ns.avatar.training.recorded_step import RecordedStep
-from tests.avatar.fused_scene import (
-    eager_step,
-    far_batch,
-    fused_step,
-    parting,
-    stir,
-)
-from tests.kernels.cuda import emulator
-
-pytestmark = pytest.mark.skipif(emulator.compiler() is None, reason="no g++ to emulate CUDA with")
+from tests.avatar.fused_scene import eager_step, far_batch, fused_step, parting, stir
 
 ORDER = [[0, 2], [1, 3], [3, 0], [2, 1], [0, 1], [3, 2]]
-
-
-@pytest.fixture
-def emulated(monkeypatch):
-    return emulator.install(monkeypatch)
 
 
 class Recorder:
@@ -74,6 +61,14 @@ def _slow(optimizer):
     return optimizer
 
 
+def _recorded(avatar, cameras: int = 1, watch=None):
+    """A step on two of four frames that takes their numbers alone, and its parts."""
+    frames, background = _frames(avatar, cameras)
+    recorder, optimizer = Recorder(watch), make_optimizer(avatar)
+    step = RecordedStep(avatar, [optimizer], frames, 2, recorder=recorder)
+    return step, optimizer, recorder, lambda chosen: step(chosen, background[chosen])
+
+
 @pytest.mark.parametrize("cameras", [1, 4])
 @pytest.mark.parametrize("changes", [{}, {"num_bases": 0}, {"weight_network": "linear"}], ids=str)
 def test_steps_equal_the_fused_ones(emulated, make_avatar, cameras, changes):
@@ -100,12 +95,10 @@ def test_steps_equal_the_fused_ones(emulated, make_avatar, cameras, changes):
 
 def test_nothing_in_a_recorded_step_waits_for_the_device(emulated, make_avatar, monkeypatch):
     avatar = stir(make_avatar(scale_with_triangle=True))
-    frames, background = _frames(avatar, 4)
     # These look at numbers on a CPU only, where looking costs nothing.
     monkeypatch.setattr(avatar, "_checked", lambda theta: theta)
     monkeypatch.setattr(kernels.morphed, "check_cameras", lambda _, cameras: len(cameras.focal_px))
-    recorder = Recorder(NothingWaits())
-    step = RecordedStep(avatar, [make_optimizer(avatar)], frames, 2, recorder=recorder)
+    _, _, recorder, take = _recorded(avatar, 4, NothingWaits())
     reads = []
     launcher = emulated.emulated
     monkeypatch.setattr(launcher, "read_later", lambda numbers: reads.append(1) or (lambda: None))
@@ -113,7 +106,7 @@ def test_nothing_in_a_recorded_step_waits_for_the_device(emulated, make_avatar, 
         if number == 3:
             monkeypatch.setattr(launcher, "capturing", lambda: True)
             before = len(reads)
-        step(chosen, background[chosen])
+        take(chosen)
     assert recorder.replays == 3
     assert len(reads) == before
 
@@ -130,24 +123,21 @@ def test_a_watch_that_sees_nothing_would_be_no_test():
 def test_overflows_are_counted_and_the_step_is_recorded_with_more_room(
     emulated, make_avatar, monkeypatch
 ):
-    from rgbavatar_ns.avatar.training import recorded_step as graphed_step
-
-    monkeypatch.setattr(graphed_step, "_LOOK_EVERY", 5)
-    avatar, recorder = stir(make_avatar()), Recorder()
-    frames, background = _frames(avatar)
-    step = RecordedStep(avatar, [make_optimizer(avatar)], frames, 2, recorder=recorder)
+    monkeypatch.setattr("rgbavatar_ns.avatar.training.recorded_step._LOOK_EVERY", 5)
+    avatar = stir(make_avatar())
+    step, _, recorder, take = _recorded(avatar)
     for chosen in ORDER[:4]:
-        step(chosen, background[chosen])
+        take(chosen)
     key = (avatar.num_gaussians, 24, 24)
     capacities = emulated.capacities(torch.device("cpu"))
     assert capacities.per_image[key] > 5
     capacities.per_image[key] = 5  # as if the head came nearer than ever before
     before = avatar.blendshapes.position.clone()
-    step(ORDER[4], background[ORDER[4]])
+    take(ORDER[4])
     assert torch.equal(before, avatar.blendshapes.position)
     assert step.skipped_steps == 1
     for chosen in ORDER * 2:
-        step(chosen, background[chosen])
+        take(chosen)
     assert capacities.per_image[key] > 5
     assert not torch.equal(before, avatar.blendshapes.position)
     assert recorder.records == 2
@@ -155,16 +145,14 @@ def test_overflows_are_counted_and_the_step_is_recorded_with_more_room(
 
 def test_every_way_goes_on_from_the_others_counts(emulated, make_avatar):
     """Adam's bias corrections hang on the number of steps, whoever has taken them."""
-    avatar, recorder = stir(make_avatar()), Recorder()
-    frames, background = _frames(avatar)
-    optimizer = make_optimizer(avatar)
-    graphed = RecordedStep(avatar, [optimizer], frames, 2, recorder=recorder)
+    avatar = stir(make_avatar())
+    _, optimizer, _, take = _recorded(avatar)
     for chosen in ORDER[:5]:
-        graphed(chosen, background[chosen])
+        take(chosen)
     batch, colors = far_batch(avatar, 2, 24, 24)
     eager_step(avatar, optimizer, batch, colors)
     fused_step(avatar, optimizer, batch, colors)
-    graphed(ORDER[5], background[ORDER[5]])
+    take(ORDER[5])
     assert {float(state["step"]) for state in optimizer.state.values()} == {8.0}
     states = AdamStates(avatar, [optimizer])
     counts = [*states.next_of_gaussians().values(), *states.next_of_network()]
@@ -172,16 +160,13 @@ def test_every_way_goes_on_from_the_others_counts(emulated, make_avatar):
 
 
 def test_a_checkpoint_that_was_loaded_is_recorded_anew(emulated, make_avatar):
-    avatar, recorder = stir(make_avatar()), Recorder()
-    frames, background = _frames(avatar)
-    optimizer = make_optimizer(avatar)
-    step = RecordedStep(avatar, [optimizer], frames, 2, recorder=recorder)
+    _, optimizer, recorder, take = _recorded(stir(make_avatar()))
     for chosen in ORDER[:5]:
-        step(chosen, background[chosen])
+        take(chosen)
     optimizer.load_state_dict(optimizer.state_dict())
     for state in optimizer.state.values():
         state["exp_avg"] = state["exp_avg"].clone()
-    step(ORDER[5], background[ORDER[5]])
+    take(ORDER[5])
     assert recorder.records == 2
 
 
@@ -193,8 +178,51 @@ def test_what_cannot_be_recorded_is_refused(make_avatar):
 
 
 def test_another_number_of_frames_is_refused(emulated, make_avatar):
-    avatar = stir(make_avatar())
-    frames, background = _frames(avatar)
-    step = RecordedStep(avatar, [make_optimizer(avatar)], frames, 2, recorder=Recorder())
+    *_, take = _recorded(stir(make_avatar()))
     with pytest.raises(ValueError, match="3 frames"):
-        step([0, 1, 2], background[:3])
+        take([0, 1, 2])
+
+
+def _rendering(avatar, cameras=1):
+    batch, background = far_batch(avatar, 2, 30, 20, cameras=cameras)
+    recorder = Recorder()
+    rendering = RecordedRendering(avatar, batch.theta, batch.cameras, recorder=recorder)
+    return rendering, recorder, batch, background
+
+
+@pytest.mark.parametrize("cameras", [1, 2])
+def test_pictures_are_the_ordinary_ones(emulated, make_avatar, cameras):
+    avatar = stir(make_avatar())
+    rendering, recorder, batch, background = _rendering(avatar, cameras)
+    for number in range(5):
+        theta = batch.theta.roll(number, 0) * (1 - 0.1 * number)
+        if number == 4:  # training goes on in place
+            with torch.no_grad():
+                avatar.blendshapes.position.mul_(0.5)
+        found = rendering(theta, batch.cameras, background).image
+        expected = avatar.render(theta, batch.cameras, background, backend="reference").image
+        assert (found - expected).abs().max() < 1e-4
+    assert (recorder.records, recorder.replays) == (1, 3)
+    assert rendering(batch.theta).alpha.max() > 0.5
+
+
+def test_a_picture_without_room_is_drawn_again(emulated, make_avatar):
+    avatar = stir(make_avatar())
+    rendering, recorder, batch, _ = _rendering(avatar)
+    for _ in range(3):
+        expected = rendering(batch.theta).image.clone()
+    capacities = emulated.capacities(torch.device("cpu"))
+    capacities.per_image[(avatar.num_gaussians, 30, 20)] = 5
+    assert torch.equal(rendering(batch.theta).image, expected)
+    for _ in range(3):
+        assert torch.equal(rendering(batch.theta).image, expected)
+    assert recorder.records == 2
+
+
+def test_other_sizes_and_backends_are_refused(emulated, make_avatar):
+    avatar = stir(make_avatar())
+    rendering, _, batch, _ = _rendering(avatar)
+    with pytest.raises(ValueError, match="Another batch"):
+        rendering(batch.theta[:1])
+    with pytest.raises(ValueError, match="need the host"):
+        RecordedRendering(avatar, batch.theta, batch.cameras, backend="cpu")

@@ -54,8 +54,8 @@ class EmulatedLauncher:
 
     device = torch.device("cpu")
 
-    def __init__(self, seed: int = 0) -> None:
-        self.seed, self.launched, self.pending = seed, [], False
+    def __init__(self) -> None:
+        self.seed, self.launched, self.pending = 0, [], False
 
     def launch(
         self, kernel: str, grid: Sequence[int], shared_bytes: int = 0, **values: Any
@@ -78,9 +78,9 @@ class EmulatedLauncher:
 class EmulatedBackend(CudaBackend):
     """Takes what a GPU's backend takes, in main memory."""
 
-    def __init__(self, launcher: EmulatedLauncher | None = None) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        self.emulated = launcher or EmulatedLauncher()
+        self.emulated = EmulatedLauncher()
 
     def launcher(self, device: torch.device) -> Launcher:
         return self.emulated

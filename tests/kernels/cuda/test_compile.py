@@ -10,13 +10,12 @@ from rgbavatar_ns.kernels import DeviceError, constants
 from rgbavatar_ns.kernels.cuda import arguments, source
 from tests.kernels.cuda import emulator
 
-try:
-    from rgbavatar_ns.kernels.cuda import compiler
-except ImportError:
-    compiler = None
-
 ARCHITECTURES = ("sm_75", "sm_80", "sm_86", "sm_89", "sm_90", "sm_120")
-needs_nvrtc = pytest.mark.skipif(compiler is None, reason="cuda-bindings are not installed")
+
+
+@pytest.fixture
+def compiler():
+    return pytest.importorskip("rgbavatar_ns.kernels.cuda.compiler", exc_type=ImportError)
 
 
 @pytest.fixture
@@ -25,37 +24,29 @@ def own_cache(tmp_path, monkeypatch):
     return tmp_path / "cache"
 
 
-@needs_nvrtc
 @pytest.mark.parametrize("architecture", ARCHITECTURES)
-def test_compiles(architecture):
-    assert compiler is not None
+def test_compiles(compiler, architecture):
     code = compiler.compile_kernels(architecture, cache=False)
     assert code.startswith(b"\x7fELF")
     for kernel in source.kernels():
         assert f"{kernel}_kernel".encode() in code
 
 
-@needs_nvrtc
-def test_nothing_spills():
+def test_nothing_spills(compiler):
     """A value that leaves the registers costs more than what is computed with it."""
-    assert compiler is not None
     log = compiler.resource_report("sm_90")
     spills = re.findall(r"(\d+) bytes spill stores", log)
     assert len(spills) == len(source.kernels())
     assert set(spills) == {"0"}
 
 
-@needs_nvrtc
-def test_a_newer_gpu_gets_ptx_and_an_older_one_the_reason():
-    assert compiler is not None
+def test_a_newer_gpu_gets_ptx_and_an_older_one_the_reason(compiler):
     assert b".target sm_" in compiler.compile_kernels("sm_999", cache=False)
     with pytest.raises(DeviceError, match=r"sm_75 .*sm_61.*device-type cpu"):
         compiler.compile_kernels("sm_61")
 
 
-@needs_nvrtc
-def test_what_was_compiled_is_kept(own_cache, monkeypatch):
-    assert compiler is not None
+def test_what_was_compiled_is_kept(compiler, own_cache, monkeypatch):
     monkeypatch.setattr(compiler, "_compile", lambda target: target.encode())
     assert compiler.compile_kernels("sm_90") == b"sm_90"
     assert compiler.compile_kernels("sm_80") == b"sm_80"
@@ -67,17 +58,13 @@ def test_what_was_compiled_is_kept(own_cache, monkeypatch):
         compiler.compile_kernels("sm_90")
 
 
-@needs_nvrtc
-def test_a_cache_that_cannot_be_written_is_done_without(own_cache, monkeypatch):
-    assert compiler is not None
+def test_a_cache_that_cannot_be_written_is_done_without(compiler, own_cache, monkeypatch):
     own_cache.write_text("a file where the folder should be")
     monkeypatch.setattr(compiler, "_compile", lambda target: b"code")
     assert compiler.compile_kernels("sm_90") == b"code"
 
 
-@needs_nvrtc
-def test_a_failure_shows_nvrtc_s_log(own_cache, monkeypatch):
-    assert compiler is not None
+def test_a_failure_shows_nvrtc_s_log(compiler, own_cache, monkeypatch):
     broken = source.sources() | {"project.cuh": "int broken = ;"}
     monkeypatch.setattr(compiler, "sources", lambda: broken)
     with pytest.raises(DeviceError, match=r"(?s)project\.cuh.*expected an express"):

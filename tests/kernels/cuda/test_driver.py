@@ -66,11 +66,8 @@ def launcher(monkeypatch):
     monkeypatch.setattr(cuda, "get_device_capability", lambda device: (9, 0))
     monkeypatch.setattr(cuda, "device", lambda device: contextlib.nullcontext())
     monkeypatch.setattr(cuda, "current_stream", lambda device: SimpleNamespace(cuda_stream=77))
-    monkeypatch.setattr(
-        cuda,
-        "get_device_properties",
-        lambda device: SimpleNamespace(shared_memory_per_block_optin=99),
-    )
+    properties = SimpleNamespace(shared_memory_per_block_optin=99)
+    monkeypatch.setattr(cuda, "get_device_properties", lambda device: properties)
     return driver.CudaLauncher(CPU), fake
 
 

@@ -1,7 +1,6 @@
-"""The CUDA backend on a GPU: what the emulation, which the other tests use, cannot show.
+"""The CUDA backend on a GPU: its own rounding, races, CUDA graphs and waits.
 
-The GPU's own rounding, races, CUDA graphs and waits. Questions that need no GPU are also asked of
-the emulation, so that they are known to be asked rightly.
+Questions that need no GPU are also asked of the emulation.
 """
 
 from collections.abc import Callable
@@ -24,6 +23,7 @@ from rgbavatar_ns.kernels import rasterize
 from rgbavatar_ns.kernels.registry import choose
 from tests.avatar.fused_scene import (
     VARIANTS,
+    assert_gradients_agree,
     double,
     eager_step,
     far_batch,
@@ -35,7 +35,6 @@ from tests.avatar.fused_scene import (
 )
 from tests.avatar.small_head import front_camera, random_theta
 from tests.kernels.agreement import assert_agrees, expect
-from tests.kernels.cuda import emulator
 from tests.kernels.scenes import random_scene, to
 from tests.kernels.test_backends_agree import SCENES
 
@@ -45,10 +44,6 @@ GPU = pytest.param(
         pytest.mark.cuda,
         pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no NVIDIA GPU"),
     ],
-)
-EMULATED = pytest.param(
-    "emulated",
-    marks=pytest.mark.skipif(emulator.compiler() is None, reason="no g++ to emulate CUDA with"),
 )
 CASES = {name: (changes, 3, 1) for name, changes in VARIANTS.items()}
 CASES |= {f"{count} images": ({}, count, count) for count in (1, 10, 17)}
@@ -72,11 +67,11 @@ class Place:
             torch.cuda.synchronize(self.device)
 
 
-@pytest.fixture(params=[GPU, EMULATED])
-def place(request, monkeypatch) -> Place:
+@pytest.fixture(params=[GPU, "emulated"])
+def place(request) -> Place:
     if request.param == "emulated":
-        emulator.install(monkeypatch)
-    device = torch.device("cpu" if request.param == "emulated" else "cuda:0")
+        return Place(torch.device("cpu"), request.getfixturevalue("emulated"))
+    device = torch.device("cuda:0")
     return Place(device, choose("cuda", device, torch.float32))
 
 
@@ -92,20 +87,26 @@ def test_values_and_gradients_match_the_reference(gpu, name, seed):
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_a_fused_step_has_the_reference_s_gradients(gpu, make_avatar, name):
+def test_a_fused_step_has_the_reference_s_gradients(place, make_avatar, name):
     changes, count, cameras = CASES[name]
     avatar = stir(make_avatar(**changes))
     expected = double(avatar)
     batch, background = far_batch(expected, count, 36, 41, cameras)
-    optimizer, expected_optimizer = make_optimizer(avatar.to(gpu)), make_optimizer(expected)
-    loss = fused_step(avatar, optimizer, on_device(batch, gpu), background.to(gpu))
+    avatar.to(place.device)
+    optimizer, expected_optimizer = make_optimizer(avatar), make_optimizer(expected)
+    there = on_device(batch, place.device), background.to(place.device)
+    loss = fused_step(avatar, optimizer, *there)
     right = eager_step(
         expected, expected_optimizer, in_double(batch), background.double(), "reference"
     )
     assert float(torch.as_tensor(loss)) == pytest.approx(float(right), rel=1e-5)
-    found = {name: moment.cpu() for name, moment in first_moments(avatar, optimizer).items()}
-    differences = relative_differences(found, first_moments(expected, expected_optimizer))
-    assert max(differences.values()) < 1e-3, differences
+    if place.emulated:
+        assert "train" in place.backend.emulated.launched
+        assert_gradients_agree(avatar, optimizer, expected, expected_optimizer)
+    else:
+        moments = first_moments(avatar, optimizer), first_moments(expected, expected_optimizer)
+        differences = relative_differences(*moments)
+        assert max(differences.values()) < 1e-3, differences
 
 
 Step = Callable[[list[int], Tensor], Tensor]
@@ -135,11 +136,7 @@ def step_of(place: Place, avatar, optimizer, frames: DeviceFrames, size: int, ki
 
 
 def test_every_kernel_sees_the_same_lists(place, make_avatar, monkeypatch):
-    """Counting, scattering and summing each decide anew which tiles a Gaussian touches.
-
-    A compiler may round in another way in each; a tile that one counts and another leaves out is a
-    hole in a list or in the sums. Sums that are not written are made NaN.
-    """
+    """A tile that one counts and another leaves out is a hole in a list or sum, here a NaN."""
     launcher = place.backend.launcher(place.device)
     launch, lists = launcher.launch, []
 
