@@ -1,5 +1,4 @@
 import threading
-import time
 
 import numpy as np
 import pytest
@@ -8,6 +7,7 @@ import torch
 from rgbavatar_ns.data import ImageCache
 from rgbavatar_ns.errors import UserError
 from tests.data.small_dataset import HEIGHT, NUM_FRAMES, WIDTH, noise_image, small_dataset
+from tests.data.streaming import until
 
 IMAGE_BYTES = WIDTH * HEIGHT * 4
 
@@ -43,13 +43,6 @@ def make_cache():
     yield make
     for cache in caches:
         cache.close()
-
-
-def eventually(condition) -> None:
-    deadline = time.monotonic() + 5
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.002)
 
 
 def test_images_come_in_the_order_asked_for(tmp_path, head, make_cache):
@@ -101,7 +94,7 @@ def test_prefetching_decodes_in_the_background(make_cache):
     cache.prefetch([4, 5, 6])  # returns although no image can be decoded yet
     assert dataset.reads == []
     dataset.may_go_on.set()
-    eventually(lambda: sorted(dataset.reads) == [4, 5, 6])
+    until(lambda: sorted(dataset.reads) == [4, 5, 6])
     cache.get([4, 5, 6])
     assert len(dataset.reads) == 3
 
@@ -111,7 +104,7 @@ def test_images_asked_for_ahead_do_not_push_each_other_out(make_cache):
     cache = make_cache(dataset, 3)
     cache.get([0, 1])
     cache.prefetch([2, 3, 4, 5, 6])
-    eventually(lambda: len(dataset.reads) == 5)
+    until(lambda: len(dataset.reads) == 5)
     cache.get([2, 3, 4])
     assert sorted(dataset.reads) == [0, 1, 2, 3, 4]
 
@@ -161,4 +154,4 @@ def test_threads_end_with_the_cache():
     started = set(threading.enumerate()) - before
     assert started
     del cache
-    eventually(lambda: not any(thread.is_alive() for thread in started))
+    until(lambda: not any(thread.is_alive() for thread in started))

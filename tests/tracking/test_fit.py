@@ -1,7 +1,6 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 import torch
 
 from rgbavatar_ns.head import HeadModel
@@ -11,11 +10,6 @@ from rgbavatar_ns.tracking.fit.subject import SubjectTracker
 from rgbavatar_ns.tracking.verify.report import fit_quality
 
 from .acting import ACTIVE, CAMERA, degrees_apart, observed, performance, skulls
-
-
-@pytest.fixture(scope="module")
-def head() -> HeadModel:
-    return HeadModel.embedded(dtype=torch.float64)
 
 
 def test_known_performance_is_recovered_from_its_own_landmarks(head: HeadModel) -> None:

@@ -10,11 +10,6 @@ from rgbavatar_ns.head.rotations import axis_angle_to_matrix
 from rgbavatar_ns.tracking.fit.landmark_head import LandmarkHead
 
 
-@pytest.fixture(scope="module")
-def head() -> HeadModel:
-    return HeadModel.embedded(dtype=torch.float64)
-
-
 def _landmarks(head: HeadModel, count: int = 60) -> tuple[np.ndarray, np.ndarray]:
     random = np.random.default_rng(5)
     faces = head.arrays.faces

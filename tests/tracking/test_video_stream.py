@@ -11,16 +11,16 @@ import pytest
 import torch
 
 from rgbavatar_ns.data import TrackedFrame
-from rgbavatar_ns.data.streams import Backoff, StreamedFrame
+from rgbavatar_ns.data.streams import Backoff
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.kernels import PinholeCameras
-from rgbavatar_ns.tracking.input.capture import CapturedFrame, FileCapture, LatestFrameCapture
+from rgbavatar_ns.tracking.input.capture import CapturedFrame, LatestFrameCapture
 from rgbavatar_ns.tracking.video_stream import VideoStream
 
+from ..data.streaming import DEADLINE_S, take
 from .clips import REAL_CLIPS, gradient_images, write_clip
 
-DEADLINE_S = 30.0
 SIZE = 8
 
 
@@ -63,16 +63,6 @@ class CountingTracker:
         self.closed = True
 
 
-def take(stream: VideoStream, count: int) -> list[StreamedFrame]:
-    frames, deadline = [], time.monotonic() + DEADLINE_S
-    while len(frames) < count and not stream.ended:
-        assert time.monotonic() < deadline
-        one = stream.next(0.05)
-        if one is not None:
-            frames.append(one)
-    return frames
-
-
 @pytest.fixture
 def clip(tmp_path: Path) -> Path:
     return write_clip(tmp_path / "clip.mp4", gradient_images(8))
@@ -104,11 +94,6 @@ def test_a_file_goes_on_in_its_middle_with_the_same_subject(clip: Path):
     assert late.subject(DEADLINE_S) is not None
     late.go_on_after(1)
     assert [frame.index for frame in take(late, 100)] == [2, 3, 4, 5, 6, 7]
-
-
-def test_a_missing_file_is_refused(tmp_path: Path):
-    with pytest.raises(UserError, match="no video"):
-        FileCapture(tmp_path / "absent.mp4")
 
 
 class FakeCamera:
