@@ -11,6 +11,7 @@ from rgbavatar_ns.kernels import PinholeCameras
 
 WIDTH, HEIGHT = 12, 8
 NUM_FRAMES, NUM_TEST = 7, 2
+CAMERA_PARTS = ("world_to_camera", "focal_px", "principal_point_px")
 
 
 def noise_image(index: int) -> np.ndarray:

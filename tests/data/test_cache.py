@@ -6,7 +6,7 @@ import torch
 
 from rgbavatar_ns.data import ImageCache
 from rgbavatar_ns.errors import UserError
-from tests.data.small_dataset import HEIGHT, NUM_FRAMES, WIDTH, noise_image, small_dataset
+from tests.data.small_dataset import HEIGHT, WIDTH, noise_image, small_dataset
 from tests.data.streaming import until
 
 IMAGE_BYTES = WIDTH * HEIGHT * 4
@@ -53,14 +53,6 @@ def test_images_come_in_the_order_asked_for(tmp_path, head, make_cache):
     assert images.dtype == torch.uint8
     for image, index in zip(images, (3, 0, 3)):
         assert np.array_equal(image.numpy(), noise_image(index))
-
-
-def test_what_is_held_is_decoded_once(make_cache):
-    dataset = CountingDataset()
-    cache = make_cache(dataset, 3)
-    for _ in range(4):
-        cache.get([0, 1, 2])
-    assert sorted(dataset.reads) == [0, 1, 2]
 
 
 def test_the_least_recently_used_image_gives_way(make_cache):
@@ -118,15 +110,6 @@ def test_a_workers_error_is_raised_by_get_and_tried_again(make_cache):
             cache.get([1, 2])
     dataset.failing = None
     assert np.array_equal(cache.get([2])[0].numpy(), noise_image(2))
-
-
-def test_a_truncated_file_is_named_by_get(tmp_path, head, make_cache):
-    dataset = small_dataset(tmp_path, head)
-    path = dataset.image_paths[NUM_FRAMES - 1]
-    path.write_bytes(path.read_bytes()[:-20])
-    with pytest.raises(UserError, match=path.name) as caught:
-        make_cache(dataset, 10).get(range(NUM_FRAMES))
-    assert caught.value.remedy
 
 
 def test_several_threads_get_the_right_images(make_cache):

@@ -12,6 +12,7 @@ from rgbavatar_ns.data import DatasetWriter, load_dataset
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadModel
 from tests.data.small_dataset import (
+    CAMERA_PARTS,
     HEIGHT,
     NUM_FRAMES,
     NUM_TEST,
@@ -61,7 +62,7 @@ def test_what_is_written_is_read_bit_for_bit(tmp_path, head):
         expected = frame(head, position, per_frame_camera=True)
         assert dataset.frame_index[position] == position
         assert torch.equal(dataset.theta[position], expected.theta)
-        for part in ("world_to_camera", "focal_px", "principal_point_px"):
+        for part in CAMERA_PARTS:
             written, read = getattr(expected.camera, part)[0], getattr(dataset.cameras, part)
             assert torch.equal(read[position], written)
         assert np.array_equal(dataset.read_image(position), expected.image_rgba)
