@@ -1,4 +1,6 @@
 import threading
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, closing
 
 import numpy as np
 import pytest
@@ -33,16 +35,13 @@ class CountingDataset:
 
 @pytest.fixture
 def make_cache():
-    caches = []
+    with ExitStack() as opened:
 
-    def make(dataset, images: float, workers: int = 2) -> ImageCache:
-        cache = ImageCache(dataset, int(images * IMAGE_BYTES), workers)
-        caches.append(cache)
-        return cache
+        def make(dataset, images: float, workers: int = 2) -> ImageCache:
+            cache = ImageCache(dataset, int(images * IMAGE_BYTES), workers)
+            return opened.enter_context(closing(cache))
 
-    yield make
-    for cache in caches:
-        cache.close()
+        yield make
 
 
 def test_images_come_in_the_order_asked_for(tmp_path, head, make_cache):
@@ -114,19 +113,13 @@ def test_a_workers_error_is_raised_by_get_and_tried_again(make_cache):
 
 def test_several_threads_get_the_right_images(make_cache):
     cache = make_cache(CountingDataset(), 3, workers=3)
-    wrong = []
 
-    def ask(seed: int) -> None:
-        for position in np.random.default_rng(seed).integers(0, 8, 40).tolist():
-            if not np.array_equal(cache.get([position])[0].numpy(), noise_image(position)):
-                wrong.append(position)
+    def wrong(seed: int) -> list[int]:
+        asked = np.random.default_rng(seed).integers(0, 8, 40).tolist()
+        return [k for k in asked if not np.array_equal(cache.get([k])[0].numpy(), noise_image(k))]
 
-    threads = [threading.Thread(target=ask, args=(seed,)) for seed in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert wrong == []
+    with ThreadPoolExecutor(4) as threads:
+        assert list(threads.map(wrong, range(4))) == [[]] * 4
 
 
 def test_threads_end_with_the_cache():

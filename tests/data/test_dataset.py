@@ -1,4 +1,5 @@
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -202,9 +203,21 @@ def test_an_index_that_is_no_json(folder):
     assert "cannot be read" in error_of(folder).cause
 
 
-def test_a_missing_image(folder):
-    (folder / "images/00002.png").unlink()
-    assert "00002.png" in error_of(folder).cause
+@pytest.mark.parametrize(
+    ("damage", "cause"),
+    [
+        (Path.unlink, "00002.png"),
+        (lambda path: path.write_bytes(b"GIF89a" + bytes(100)), "not a PNG"),
+        (
+            lambda path: cv2.imwrite(str(path), np.zeros((HEIGHT, WIDTH * 2, 4), np.uint8)),
+            r"24 x 8.*12 x 8",
+        ),
+    ],
+    ids=["missing", "no PNG", "another size"],
+)
+def test_an_image_that_cannot_be_used(folder, damage, cause):
+    damage(folder / "images/00002.png")
+    assert re.search(cause, error_of(folder).cause)
 
 
 def test_a_truncated_image_is_found_when_loading(folder):
@@ -213,11 +226,6 @@ def test_a_truncated_image_is_found_when_loading(folder):
     for kept in (0, 5, 20, len(whole) // 2, len(whole) - 1):
         path.write_bytes(whole[:kept])
         assert "00002.png" in error_of(folder).cause
-
-
-def test_a_file_that_is_no_png(folder):
-    (folder / "images/00002.png").write_bytes(b"GIF89a" + bytes(100))
-    assert "not a PNG" in error_of(folder).cause
 
 
 def test_a_damaged_image_is_found_when_it_is_decoded(folder):
@@ -229,13 +237,6 @@ def test_a_damaged_image_is_found_when_it_is_decoded(folder):
     dataset.read_image(1)
     with pytest.raises(UserError, match=r"00002\.png is damaged"):
         dataset.read_image(2)
-
-
-def test_an_image_of_another_size(folder):
-    cv2.imwrite(str(folder / "images/00003.png"), np.zeros((HEIGHT, WIDTH * 2, 4), np.uint8))
-    error = error_of(folder)
-    assert "24 x 8" in error.cause
-    assert "12 x 8" in error.cause
 
 
 @pytest.mark.parametrize(
