@@ -22,6 +22,7 @@ from ..data.streaming import DEADLINE_S, take
 from .clips import REAL_CLIPS, gradient_images, write_clip
 
 SIZE = 8
+CAMERA = PinholeCameras(torch.eye(4)[None], torch.ones(1, 2), torch.zeros(1, 2), SIZE, SIZE)
 
 
 class CountingTracker:
@@ -47,12 +48,9 @@ class CountingTracker:
             self.counts["no face"] += 1
             return None
         assert index is not None
-        frame = TrackedFrame(
-            index,
-            torch.full((self.head.layout.size,), float(index)),
-            PinholeCameras(torch.eye(4)[None], torch.ones(1, 2), torch.zeros(1, 2), SIZE, SIZE),
-            np.full((SIZE, SIZE, 4), index, np.uint8),
-        )
+        theta = torch.full((self.head.layout.size,), float(index))
+        image = np.full((SIZE, SIZE, 4), index, np.uint8)
+        frame = TrackedFrame(index, theta, CAMERA, image)
         if self.ready:
             return frame
         self._warm_up.append(frame)
