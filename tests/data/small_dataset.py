@@ -11,6 +11,7 @@ from rgbavatar_ns.kernels import PinholeCameras
 
 WIDTH, HEIGHT = 12, 8
 NUM_FRAMES, NUM_TEST = 7, 2
+CAMERA_PARTS = ("world_to_camera", "focal_px", "principal_point_px")
 
 
 def noise_image(index: int) -> np.ndarray:
@@ -36,9 +37,13 @@ def frame(head: HeadModel, index: int, per_frame_camera: bool = False) -> Tracke
     return TrackedFrame(index, theta, camera, noise_image(index))
 
 
-def small_dataset(folder: Path, head: HeadModel, per_frame_camera: bool = False) -> TrackedDataset:
+def small_writer(folder: Path, head: HeadModel, **more: bool) -> DatasetWriter:
     identity = torch.linspace(-1, 1, head.num_identity) / 3
-    writer = DatasetWriter(folder, head.arrays, identity, head.layout, WIDTH, HEIGHT)
+    return DatasetWriter(folder, head.arrays, identity, head.layout, WIDTH, HEIGHT, **more)
+
+
+def small_dataset(folder: Path, head: HeadModel, per_frame_camera: bool = False) -> TrackedDataset:
+    writer = small_writer(folder, head)
     for index in range(NUM_FRAMES):
         writer.add(frame(head, index, per_frame_camera))
     return writer.finish(NUM_TEST)

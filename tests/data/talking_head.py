@@ -104,14 +104,18 @@ def with_cameras(dataset: TrackedDataset, **changes: torch.Tensor) -> TrackedDat
     return replace(dataset, cameras=replace(dataset.cameras, **changes))
 
 
+def selected(dataset: TrackedDataset, positions: list[int]) -> TrackedDataset:
+    return replace(
+        dataset,
+        theta=dataset.theta[positions],
+        cameras=dataset.cameras.select(positions),
+        image_paths=[dataset.image_paths[i] for i in positions],
+        frame_index=tuple(range(len(positions))),
+        test=(),
+    )
+
+
 def offset_by(dataset: TrackedDataset, frames: int) -> TrackedDataset:
     """Image i beside the parameters of frame i + frames."""
     kept = [i for i in range(len(dataset)) if 0 <= i + frames < len(dataset)]
-    return replace(
-        dataset,
-        theta=dataset.theta[[i + frames for i in kept]],
-        cameras=dataset.cameras.select(kept),
-        image_paths=[dataset.image_paths[i] for i in kept],
-        frame_index=tuple(range(len(kept))),
-        test=(),
-    )
+    return replace(selected(dataset, kept), theta=dataset.theta[[i + frames for i in kept]])

@@ -3,13 +3,14 @@
 import json
 import time
 import tracemalloc
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
-from rgbavatar_ns.data import load_dataset
-from rgbavatar_ns.data.png import encode_png_rgba
+from rgbavatar_ns.data import DatasetWriter, TrackedFrame, load_dataset
 from rgbavatar_ns.head import HeadModel
 from tests.data.small_dataset import odd_camera
 
@@ -21,34 +22,24 @@ SECONDS, BYTES = 5.0, 100 * 2**20
 @pytest.fixture(scope="module")
 def long_dataset(tmp_path_factory) -> Path:
     """5,000 frames with cameras of their own; the images are links to one."""
-    folder = tmp_path_factory.mktemp("long")
-    head = HeadModel.embedded()
-    (folder / "images").mkdir()
-    (folder / "images/00000.png").write_bytes(
-        encode_png_rgba(np.full((SIZE, SIZE, 4), 200, np.uint8))
-    )
-    index = {
-        "format": "rgbavatar native",
-        "version": 2,
-        "head": "makehuman",
-        "identity": [0.0] * head.num_identity,
-        "layout": head.layout.to_json(),
-        "width": SIZE,
-        "height": SIZE,
-        "test": list(range(FRAMES - 350, FRAMES)),
-    }
-    camera = {
-        "world_to_camera": odd_camera().world_to_camera[0].tolist(),
-        "focal_px": [700.1, 700.2],
-        "principal_point_px": [256.3, 255.9],
-    }
+    folder, head = tmp_path_factory.mktemp("long"), HeadModel.embedded()
+    identity = torch.zeros(head.num_identity)
+    writer = DatasetWriter(folder, "makehuman", identity, head.layout, SIZE, SIZE)
+    camera = replace(odd_camera(), width=SIZE, height=SIZE)
+    image = np.full((SIZE, SIZE, 4), 200, np.uint8)
+    writer.add(TrackedFrame(0, torch.zeros(head.layout.size), camera, image))
+    writer.finish(0)
+    index = json.loads((folder / "dataset.json").read_text())
+    camera, first = index.pop("camera"), folder / index["frames"][0]["image"]
     frames = []
     for number in range(FRAMES):
         path = folder / f"images/{number:05d}.png"
         if number:
-            path.hardlink_to(folder / "images/00000.png")
+            path.hardlink_to(first)
         frames.append({"index": number, "image": f"images/{number:05d}.png", "camera": camera})
-    (folder / "dataset.json").write_text(json.dumps({**index, "frames": frames}))
+    index |= {"version": 2, "frames": frames, "test": list(range(FRAMES - 350, FRAMES))}
+    del index["test_frames"]
+    (folder / "dataset.json").write_text(json.dumps(index))
     np.save(folder / "theta.npy", np.zeros((FRAMES, head.layout.size), np.float32))
     return folder
 

@@ -14,7 +14,7 @@ from rgbavatar_ns.data import LocalGlobalPools
 from rgbavatar_ns.data.png import decode_png_rgba
 from rgbavatar_ns.data.streams import ReplayBuffer, ReplayStream, StreamedFrame
 from rgbavatar_ns.errors import UserError
-from tests.data.small_dataset import small_dataset
+from tests.data.small_dataset import WIDTH, small_dataset
 from tests.data.streaming import HEAD, Clock, cheap, streamed, subject, tracked
 
 
@@ -25,14 +25,6 @@ def pools(local: int = 3, old: int = 4, seed: int = 0, **more: Any) -> ReplayBuf
 def fill(frames: ReplayBuffer, indices: range, encode: bool = True) -> None:
     for index in indices:
         frames.add(streamed(index, arrived_s=10.0 * index, encode=encode))
-
-
-def saved(state: dict[str, Any]) -> dict[str, Any]:
-    """As a checkpoint gives it back."""
-    file = io.BytesIO()
-    torch.save(state, file)
-    file.seek(0)
-    return torch.load(file, weights_only=True)
 
 
 def test_every_drawn_frame_brings_its_own_picture_theta_and_camera():
@@ -116,7 +108,10 @@ def test_pools_go_on_from_a_checkpoint_as_they_were(
     fill(whole, range(6), encode)
     whole.batch(3)
     assert ("png" in whole.state_dict()) is save_images
-    state = saved(whole.state_dict())
+    file = io.BytesIO()
+    torch.save(whole.state_dict(), file)
+    file.seek(0)
+    state = torch.load(file, weights_only=True)
     resumed = pools(2, 2, seed=99, save_images=save_images)
     resumed.load_state_dict(state, None if save_images else stream)
     assert resumed.num_added == 6
@@ -131,18 +126,14 @@ def test_pools_go_on_from_a_checkpoint_as_they_were(
     assert torch.equal(whole.thetas()[0], resumed.thetas()[0])
 
 
-def test_a_checkpoint_without_images_needs_its_stream():
-    whole = pools(save_images=False)
+@pytest.mark.parametrize(
+    ("save_images", "width", "told"), [(False, WIDTH, "holds no images"), (True, 24, "24 x 8")]
+)
+def test_a_checkpoint_without_images_or_of_another_size_is_refused(save_images, width, told):
+    whole = pools(save_images=save_images)
     fill(whole, range(3))
-    with pytest.raises(UserError, match="holds no images"):
-        pools().load_state_dict(whole.state_dict())
-
-
-def test_a_checkpoint_of_another_image_size_is_refused():
-    whole = pools()
-    fill(whole, range(3))
-    other = ReplayBuffer(subject(width=24), LocalGlobalPools(3, 4))
-    with pytest.raises(UserError, match="24 x 8"):
+    other = ReplayBuffer(subject(width=width), LocalGlobalPools(3, 4))
+    with pytest.raises(UserError, match=told):
         other.load_state_dict(whole.state_dict())
 
 

@@ -69,6 +69,12 @@ def test_an_order_of_nothing_or_with_impossible_batches_is_refused():
             OfflineOrder(range(3), batch_size, 0)
 
 
+def filled(pools: LocalGlobalPools, frames: int) -> LocalGlobalPools:
+    for frame in range(frames):
+        pools.add(frame)
+    return pools
+
+
 def test_local_pool_is_first_in_first_out():
     pools = LocalGlobalPools(local_size=3, global_size=100)
     for frame in range(8):
@@ -111,9 +117,7 @@ def test_every_streamed_frame_is_equally_likely_in_the_global_pool():
 
 
 def test_local_pool_of_the_papers_size_holds_exactly_the_last_150():
-    pools = LocalGlobalPools()
-    for frame in range(1400):
-        pools.add(frame)
+    pools = filled(LocalGlobalPools(), 1400)
     assert pools.local_frames == tuple(range(1250, 1400))
     assert len(pools.global_frames) == len(set(pools.global_frames)) == 1000
     assert max(pools.global_frames) < 1250
@@ -144,9 +148,7 @@ def test_release_strategy_favours_the_newest_as_exp_i_over_150():
 
 
 def test_new_frames_come_first_newest_first_and_take_half_of_the_local_part():
-    pools = LocalGlobalPools(100, 50, new_first=True)
-    for frame in range(120):
-        pools.add(frame)
+    pools = filled(LocalGlobalPools(100, 50, new_first=True), 120)
     drawn = pools.batch(10)  # seven local ones: four new first, the rest by chance
     assert drawn[:4] == [119, 118, 117, 116]
     assert len(set(drawn)) == 10
@@ -170,9 +172,7 @@ def test_without_new_first_a_frame_waits_for_chance():
     ("share", "batch", "local"), [(0.7, 10, 7), (0.5, 8, 4), (0.0, 4, 0), (1.0, 4, 4)]
 )
 def test_eta_is_the_local_share_of_a_batch(share, batch, local):
-    pools = LocalGlobalPools(20, 20, share)
-    for frame in range(40):
-        pools.add(frame)
+    pools = filled(LocalGlobalPools(20, 20, share), 40)
     for _ in range(20):
         drawn = pools.batch(batch)
         assert len(set(drawn)) == batch
@@ -191,18 +191,14 @@ def test_evenly_drawn_every_held_frame_is_as_likely():
 
 
 def test_one_pool_fills_up_for_the_other():
-    pools = LocalGlobalPools(local_size=10, global_size=5)
-    for frame in range(4):
-        pools.add(frame)
+    pools = filled(LocalGlobalPools(local_size=10, global_size=5), 4)
     assert sorted(pools.batch(10)) == [0, 1, 2, 3]
     for frame in range(4, 11):
         pools.add(frame)
     drawn = pools.batch(10)
     assert 0 in drawn  # the only frame in the global pool
     assert len(set(drawn)) == 10
-    few_local = LocalGlobalPools(local_size=2, global_size=50)
-    for frame in range(30):
-        few_local.add(frame)
+    few_local = filled(LocalGlobalPools(local_size=2, global_size=50), 30)
     drawn = few_local.batch(10)
     assert {28, 29} <= set(drawn)
     assert len(set(drawn)) == 10
@@ -237,9 +233,7 @@ def test_pools_go_on_from_their_state_as_if_uninterrupted(strategy, new_first):
 
 
 def test_state_of_larger_pools_is_refused():
-    large = LocalGlobalPools(5, 7)
-    for frame in range(20):
-        large.add(frame)
+    large = filled(LocalGlobalPools(5, 7), 20)
     with pytest.raises(UserError, match="5 and 7"):
         LocalGlobalPools(4, 7).load_state_dict(large.state_dict())
 

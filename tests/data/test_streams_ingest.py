@@ -1,7 +1,7 @@
 """The worker between stream and pools: nothing lost in silence, nobody made to wait."""
 
-import dataclasses
 import threading
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -21,15 +21,13 @@ def ingest_of(
     return Ingest(stream or GivenStream([]), subject(), frames, queue_frames, **more), frames
 
 
-def broken(frame: StreamedFrame, **fields) -> StreamedFrame:
-    return dataclasses.replace(frame, **fields)
+LARGE = np.zeros((16, 24, 4), np.uint8)
 
 
 @pytest.mark.parametrize("encode", [True, False])
 def test_what_cannot_be_used_is_left_out_and_counted_by_name(encode: bool):
     nan = streamed(3).theta.clone()
     nan[5] = torch.nan
-    large = np.zeros((16, 24, 4), np.uint8)
     told: list[str] = []
     ingest, frames = ingest_of(tell=told.append)
     for frame in (
@@ -37,12 +35,12 @@ def test_what_cannot_be_used_is_left_out_and_counted_by_name(encode: bool):
         streamed(2, encode=encode),
         streamed(1, encode=encode),  # late, but new
         streamed(2, encode=encode),
-        broken(streamed(3), theta=nan),
-        broken(streamed(4), theta=torch.zeros(3)),
-        streamed(5, image=large, encode=encode),
-        streamed(6, image=large, encode=encode),
-        broken(streamed(7), png=(streamed(7).png or b"")[:-20]),
-        broken(streamed(8), png=b"no picture"),
+        replace(streamed(3), theta=nan),
+        replace(streamed(4), theta=torch.zeros(3)),
+        streamed(5, image=LARGE, encode=encode),
+        streamed(6, image=LARGE, encode=encode),
+        replace(streamed(7), png=(streamed(7).png or b"")[:-20]),
+        replace(streamed(8), png=b"no picture"),
         streamed(10_000),
         streamed(9),
         streamed(0, session="again"),
@@ -72,7 +70,7 @@ def test_only_images_of_the_right_size_are_decoded(monkeypatch: pytest.MonkeyPat
 
     monkeypatch.setattr(StreamedFrame, "decode", decoded)
     ingest, _ = ingest_of()
-    ingest.take_in(streamed(0, image=np.zeros((16, 24, 4), np.uint8)))
+    ingest.take_in(streamed(0, image=LARGE))
     assert ingest.counts()["another resolution"] == 1
 
 
@@ -89,27 +87,17 @@ def test_a_burst_of_200_frames_is_taken_in_whole_while_nobody_draws():
     assert ingest.counts() == {"arrived": 200, "taken in": 200, "dropped": 0}
 
 
-def test_full_queue_drops_the_oldest_and_counts():
-    stream = GivenStream([streamed(index) for index in range(30)])
+@pytest.mark.parametrize(("keeps_frames", "arrived", "dropped"), [(False, 30, 22), (True, 9, 0)])
+def test_a_full_queue_drops_the_oldest_or_has_its_source_wait(keeps_frames, arrived, dropped):
+    stream = GivenStream([streamed(index) for index in range(30)], keeps_frames)
     ingest, frames = ingest_of(stream, queue_frames=8)
     ingest.listen()
-    until(lambda: ingest.counts()["arrived"] == 30)
+    until(lambda: ingest.counts()["arrived"] == arrived)  # the ninth may wait at the queue
     ingest.start()
     until(lambda: ingest.finished)
-    assert ingest.counts()["dropped"] == 22
-    assert frames.num_added == 8
-    assert [frame.index for _, frame in frames.held()] == list(range(22, 30))
-
-
-def test_a_source_that_keeps_its_frames_waits_instead():
-    stream = GivenStream([streamed(index) for index in range(30)], keeps_frames=True)
-    ingest, frames = ingest_of(stream, queue_frames=8)
-    ingest.listen()
-    until(lambda: ingest.counts()["arrived"] == 9)  # the ninth waits at the queue
-    ingest.start()
-    until(lambda: ingest.finished)
-    assert [frame.index for _, frame in frames.held()] == list(range(30))
-    assert ingest.counts()["dropped"] == 0
+    assert ingest.counts()["dropped"] == dropped
+    assert frames.num_added == 30 - dropped
+    assert [frame.index for _, frame in frames.held()] == list(range(dropped, 30))
 
 
 def test_training_goes_on_while_the_stream_stalls():
@@ -165,10 +153,9 @@ def test_queue_lets_nothing_in_once_closed():
     queue.put(streamed(0), wait=False)
     queue.close()
     queue.put(streamed(1), wait=True)
-    got = queue.get()
-    assert got is not None
-    assert got.index == 0
-    assert queue.get() is None
+    first, then = queue.get(), queue.get()
+    assert first is not None
+    assert (first.index, then) == (0, None)
 
 
 @pytest.mark.parametrize("last", [50, 20_000])

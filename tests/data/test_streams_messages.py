@@ -1,5 +1,6 @@
 """Messages: what goes in comes out, and whatever else comes is refused and no more."""
 
+import contextlib
 import dataclasses
 import json
 import struct
@@ -120,7 +121,7 @@ def test_an_unfit_frame_is_refused_with_the_reason(fields: dict[str, Any], told:
         parsed({**FRAME, **fields})
 
 
-@pytest.mark.parametrize("missing", ["type", "index", "theta", "camera"])
+@pytest.mark.parametrize("missing", FRAME)
 def test_an_incomplete_frame_is_refused(missing: str):
     with pytest.raises(UserError, match="incomplete"):
         parsed({name: value for name, value in FRAME.items() if name != missing})
@@ -193,11 +194,7 @@ ANY_JSON = st.recursive(
 def test_whatever_a_field_holds_nothing_but_a_refusal_comes_of_it(
     name: str, value: Any, payload: bytes
 ):
-    for header, parse in (
-        (FRAME, lambda header: parsed(header, payload)),
-        (SUBJECT, lambda header: messages.parse_subject(messages.encode(header, payload))),
-    ):
-        try:
-            parse({**header, name: value})
-        except UserError:
-            continue
+    with contextlib.suppress(UserError):
+        parsed({**FRAME, name: value}, payload)
+    with contextlib.suppress(UserError):
+        messages.parse_subject(messages.encode({**SUBJECT, name: value}, payload))

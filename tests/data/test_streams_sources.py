@@ -12,24 +12,15 @@ import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
-from rgbavatar_ns.data import TrackedDataset
+from rgbavatar_ns.data import TrackedDataset, TrackedFrame
 from rgbavatar_ns.data.png import encode_png_rgba
 from rgbavatar_ns.data.streams import ReplayStream, SocketStream, StreamClient, message_format
 from rgbavatar_ns.data.streams.address import StreamAddress
 from rgbavatar_ns.errors import UserError
 from tests.data.small_dataset import HEIGHT, NUM_FRAMES, NUM_TEST, WIDTH, small_dataset
-from tests.data.streaming import (
-    DEADLINE_S,
-    HEAD,
-    Clock,
-    same,
-    subject,
-    take,
-    tracked,
-    until,
-)
+from tests.data.streaming import DEADLINE_S, HEAD, Clock, same, subject, take, tracked, until
 
-ANY = "127.0.0.1:0"
+Opener = Callable[..., SocketStream]
 FRAME_BYTES = len(message_format.frame_message(tracked(0)))
 
 
@@ -39,10 +30,10 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> TrackedDataset:
 
 
 @pytest.fixture
-def open_stream() -> Iterator[Callable[..., SocketStream]]:
+def open_stream() -> Iterator[Opener]:
     with contextlib.ExitStack() as opened:
 
-        def opener(listen: str = ANY, **options) -> SocketStream:
+        def opener(listen: str = "127.0.0.1:0", **options) -> SocketStream:
             stream = SocketStream(listen, **options)
             opened.callback(stream.close)
             return stream
@@ -51,7 +42,7 @@ def open_stream() -> Iterator[Callable[..., SocketStream]]:
 
 
 @pytest.fixture
-def stream(open_stream: Callable[..., SocketStream]) -> SocketStream:
+def stream(open_stream: Opener) -> SocketStream:
     """One that waits for whoever is about to go."""
     return open_stream(grace_s=DEADLINE_S)
 
@@ -59,6 +50,22 @@ def stream(open_stream: Callable[..., SocketStream]) -> SocketStream:
 def stranger(stream: SocketStream, **options) -> ClientConnection:
     """A client of its own making."""
     return connect(f"ws://{stream.address}", proxy=None, **options).__enter__()
+
+
+@contextlib.contextmanager
+def sending(session: str, address: str, frames: range) -> Iterator[None]:
+    """While a client sends frames and ends its stream."""
+
+    def send() -> None:
+        with StreamClient(subject(session), address) as client:
+            for index in frames:
+                client.send(tracked(index))
+
+    sender = threading.Thread(target=send, daemon=True)
+    sender.start()
+    yield
+    sender.join(DEADLINE_S)
+    assert not sender.is_alive()
 
 
 def indices(stream: SocketStream, count: int) -> list[int]:
@@ -94,18 +101,10 @@ def test_replay_goes_on_in_the_middle_and_shows_frames_again(dataset: TrackedDat
 
 
 def test_a_client_is_heard_and_made_to_wait(stream: SocketStream):
-    def send() -> None:
-        with StreamClient(subject(), stream.address) as client:
-            for index in range(40):
-                client.send(tracked(index))
-
     assert stream.subject(0.0) is None
     assert stream.next(0.0) is None
-    sender = threading.Thread(target=send, daemon=True)
-    sender.start()
-    got = take(stream, 100)
-    sender.join(DEADLINE_S)
-    assert not sender.is_alive()
+    with sending("", stream.address, range(40)):
+        got = take(stream, 100)
     assert stream.subject(0.0) is not None
     assert [frame.index for frame in got] == list(range(40))
     assert all(same(tracked(frame.index), frame) for frame in got)
@@ -113,9 +112,7 @@ def test_a_client_is_heard_and_made_to_wait(stream: SocketStream):
     assert not stream.counts
 
 
-def test_a_second_client_is_refused_and_the_first_goes_on(
-    open_stream: Callable[..., SocketStream],
-):
+def test_a_second_client_is_refused_and_the_first_goes_on(open_stream: Opener):
     stream = open_stream(grace_s=0.05)
     first = StreamClient(subject("same name"), stream.address)
     first.send(tracked(0))
@@ -127,22 +124,18 @@ def test_a_second_client_is_refused_and_the_first_goes_on(
     assert stream.counts == {"refused clients": 1}
 
 
-def test_a_silent_client_is_replaced(open_stream: Callable[..., SocketStream]):
+def test_a_silent_client_is_replaced(open_stream: Opener):
     clock = Clock()
     stream = open_stream(clock=clock, grace_s=0.05)
     first = StreamClient(subject(), stream.address)
     first.send(tracked(0))
     assert indices(stream, 1) == [0]
     clock.now_s += 11.0
-
-    def send_on() -> None:
-        for index in range(2, 100):  # the first writes into a dead connection may seem to work
-            first.send(tracked(index))
-
     with StreamClient(subject(), stream.address) as second:
         second.send(tracked(1))
+        # The first writes into a dead connection may seem to work.
         with pytest.raises(UserError, match="Another client is connected"):
-            send_on()
+            list(map(first.send, map(tracked, range(2, 100))))
     assert indices(stream, 10) == [1]
 
 
@@ -179,17 +172,8 @@ def test_what_a_lost_connection_had_on_its_way_is_sent_again(stream: SocketStrea
         earlier.send(tracked(1))
     greeting = 400 + len(message_format.subject_message(subject("mine")))
     relay = Relay(stream.address, greeting + 3 * FRAME_BYTES, greeting + 5 * FRAME_BYTES)
-
-    def send() -> None:
-        with StreamClient(subject("mine"), relay.address) as client:
-            for index in range(2, 30):
-                client.send(tracked(index))
-
-    sender = threading.Thread(target=send, daemon=True)
-    sender.start()
-    assert indices(stream, 100) == list(range(30))
-    sender.join(DEADLINE_S)
-    assert not sender.is_alive()
+    with sending("mine", relay.address, range(2, 30)):
+        assert indices(stream, 100) == list(range(30))
     assert stream.counts == {"source lost": 3, "reconnects": 3}
 
 
@@ -205,9 +189,7 @@ def test_another_program_may_go_on(stream: SocketStream):
     assert stream.counts == {"source lost": 2, "reconnects": 2}
 
 
-def test_a_client_goes_on_with_a_stream_that_was_started_again(
-    open_stream: Callable[..., SocketStream],
-):
+def test_a_client_goes_on_with_a_stream_that_was_started_again(open_stream: Opener):
     stream = open_stream()
     client = StreamClient(subject(), stream.address)
     client.send(tracked(0))
@@ -233,7 +215,7 @@ def test_who_does_not_begin_with_a_subject_is_refused(stream: SocketStream, gree
     assert stream.counts == {"refused clients": 1}
 
 
-def test_a_subject_is_not_waited_for_for_ever(open_stream: Callable[..., SocketStream]):
+def test_a_subject_is_not_waited_for_for_ever(open_stream: Opener):
     stream = open_stream(silence_s=0.01)
     assert "No subject has come in time" in str(stranger(stream).recv(DEADLINE_S))
 
@@ -243,9 +225,7 @@ def test_web_pages_are_kept_out(stream: SocketStream):
         stranger(stream, origin="https://example.org")
 
 
-def test_bad_messages_are_counted_told_once_and_cost_nothing_else(
-    open_stream: Callable[..., SocketStream],
-):
+def test_bad_messages_are_counted_told_once_and_cost_nothing_else(open_stream: Opener):
     told: list[str] = []
     stream = open_stream(tell=told.append, grace_s=DEADLINE_S)
     client = stranger(stream)
@@ -268,7 +248,7 @@ def test_bad_messages_are_counted_told_once_and_cost_nothing_else(
 
 
 def test_too_large_a_message_costs_its_client_the_connection(
-    open_stream: Callable[..., SocketStream], monkeypatch: pytest.MonkeyPatch
+    open_stream: Opener, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr(message_format, "LARGEST_MESSAGE", 100_000)
     stream = open_stream(grace_s=DEADLINE_S)
@@ -286,14 +266,14 @@ def test_too_large_a_message_costs_its_client_the_connection(
     assert stream.counts == {"source lost": 1, "reconnects": 1}
 
 
+OTHER_ARRAYS = dataclasses.replace(HEAD.arrays, name="other")
+
+
 @pytest.mark.parametrize(
     ("other", "told"),
     [
         (subject(width=24), "12 x 8"),
-        (
-            dataclasses.replace(subject(), arrays=dataclasses.replace(HEAD.arrays, name="other")),
-            "head",
-        ),
+        (dataclasses.replace(subject(), arrays=OTHER_ARRAYS), "head"),
     ],
 )
 def test_another_size_or_head_is_refused_by_name(stream: SocketStream, other, told):
@@ -347,16 +327,14 @@ def test_the_senders_in_the_manual_work(stream: SocketStream, program: str):
     frames = [tracked(index) for index in range(5)]
     told = {"WIDTH": WIDTH, "HEIGHT": HEIGHT, "identity": subject().identity}
     told |= {"IDENTITY": subject().identity.tolist(), "LAYOUT": HEAD.layout.to_json()}
-    told["my_tracker"] = lambda: [
-        (one.theta, one.camera, one.image_rgba)
-        if own
-        else (
-            one.theta.tolist(),
-            message_format.camera_to_json(one.camera, 0),
-            encode_png_rgba(one.image_rgba),
-        )
-        for one in frames
-    ]
+
+    def given(one: TrackedFrame) -> tuple:
+        if own:
+            return one.theta, one.camera, one.image_rgba
+        camera = message_format.camera_to_json(one.camera, 0)
+        return one.theta.tolist(), camera, encode_png_rgba(one.image_rgba)
+
+    told["my_tracker"] = lambda: map(given, frames)
     exec(program.replace("127.0.0.1:7070", stream.address), told)
     got = take(stream, 10)
     assert len(got) == 5

@@ -4,6 +4,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rgbavatar_ns.head import HeadModel
+from rgbavatar_ns.tracking.config import TrackConfig
 from rgbavatar_ns.tracking.fit.camera import StillCamera
 from rgbavatar_ns.tracking.fit.subject import SubjectTracker
 
@@ -39,6 +40,15 @@ def observed(tracker: SubjectTracker, theta: np.ndarray, identity: np.ndarray) -
         projected = CAMERA.project(tracker.cost.head.points(row, identity, CAMERA.eye_m))
         points[frame, tracker.facemesh_index] = projected
     return points
+
+
+def acted(
+    head: HeadModel, frames: int, **options: float
+) -> tuple[SubjectTracker, np.ndarray, np.ndarray, np.ndarray]:
+    """A tracker of known focal length; theta, identity and landmarks of a performance."""
+    tracker = SubjectTracker(head, TrackConfig(focal_px=CAMERA.focal_px, **options))
+    theta, identity = performance(head, frames)
+    return tracker, theta, identity, observed(tracker, theta, identity)
 
 
 def degrees_apart(first: np.ndarray, second: np.ndarray) -> np.ndarray:

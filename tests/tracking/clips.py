@@ -34,10 +34,8 @@ def write_clip(
             frame = av.VideoFrame.from_ndarray(image, format=layout)
             if times_ms is not None:
                 frame.pts, frame.time_base = times_ms[number], Fraction(1, 1000)
-            for packet in stream.encode(frame):
-                container.mux(packet)
-        for packet in stream.encode():
-            container.mux(packet)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
     return path
 
 

@@ -1,37 +1,26 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 import torch
 
 from rgbavatar_ns.head import HeadModel
-from rgbavatar_ns.tracking.config import TrackConfig
 from rgbavatar_ns.tracking.fit.fit import fit_clip, key_frame_positions
 from rgbavatar_ns.tracking.fit.subject import SubjectTracker
 from rgbavatar_ns.tracking.verify.report import fit_quality
 
-from .acting import ACTIVE, CAMERA, degrees_apart, observed, performance, skulls
-
-
-@pytest.fixture(scope="module")
-def head() -> HeadModel:
-    return HeadModel.embedded(dtype=torch.float64)
+from .acting import ACTIVE, CAMERA, acted, degrees_apart, skulls
 
 
 def test_known_performance_is_recovered_from_its_own_landmarks(head: HeadModel) -> None:
-    tracker = SubjectTracker(head, TrackConfig(focal_px=CAMERA.focal_px, key_frames=6))
-    theta, identity = performance(head, 16)
-    noisy = observed(tracker, theta, identity)
+    tracker, theta, identity, noisy = acted(head, 16, key_frames=6)
     noisy += np.random.default_rng(0).normal(size=noisy.shape) * 0.3
     fit = tracker.fit(noisy, [False] + [True] * 15, 320, 240)
     found = tracker.thetas(fit)
     layout = head.layout
 
     assert degrees_apart(skulls(tracker, found), skulls(tracker, theta)).mean() < 1.5
-    jaw = layout.slice("jaw").start
-    assert np.corrcoef(found[:, jaw], theta[:, jaw])[0, 1] > 0.9
-    gaze = layout.slice("left_eye").start + 1
-    assert np.corrcoef(found[:, gaze], theta[:, gaze])[0, 1] > 0.9
+    for column in (layout.slice("jaw").start, layout.slice("left_eye").start + 1):
+        assert np.corrcoef(found[:, column], theta[:, column])[0, 1] > 0.9
     names, first = list(head.arrays.expression_names), layout.slice("expression").start
     active = [first + names.index(name) for name in ACTIVE]
     assert np.corrcoef(found[:, active].ravel(), theta[:, active].ravel())[0, 1] > 0.8
@@ -50,36 +39,30 @@ def test_known_performance_is_recovered_from_its_own_landmarks(head: HeadModel) 
     assert quality["mouth_opening_correlation"] > 0.95
     assert quality["eyelid_opening_correlation"] > 0.95
     assert tracker.rejected(fit, noisy) == []
-    lower, upper = tracker.cost.parameters.lower, tracker.cost.parameters.upper
-    assert (fit.values >= lower).all()
-    assert (fit.values <= upper).all()
+    bounds = tracker.cost.parameters
+    assert ((bounds.lower <= fit.values) & (fit.values <= bounds.upper)).all()
 
 
 def test_the_same_landmarks_give_the_same_fit_and_a_gap_is_not_bridged(head: HeadModel) -> None:
-    config = TrackConfig(focal_px=CAMERA.focal_px, key_frames=3, identity_components=5)
-    theta, identity = performance(head, 6)
-    points = observed(SubjectTracker(head, config), theta, identity)
+    tracker, _, _, points = acted(head, 6, key_frames=3, identity_components=5)
     follows = [False, True, True, False, True, True]
-    trackers = [SubjectTracker(head, config) for _ in range(2)]
-    runs = [tracker.fit(points, follows, 320, 240) for tracker in trackers]
+    again = SubjectTracker(head, tracker.config)
+    runs = [each.fit(points, follows, 320, 240) for each in (tracker, again)]
     np.testing.assert_array_equal(runs[0].values, runs[1].values)
     # What comes after the gap changes nothing before it.
-    tracker, subject = trackers[0], runs[0].subject
-    targets = tracker.targets(points)
+    subject, targets = runs[0].subject, tracker.targets(points)
     whole = fit_clip(tracker.cost, subject, targets, follows, 1.0).values
     alone = fit_clip(tracker.cost, subject, targets[:3], follows[:3], 1.0).values
     np.testing.assert_array_equal(whole[:3], alone)
 
 
 def test_smoothing_lowers_jitter_without_lag(head: HeadModel) -> None:
-    config = TrackConfig(focal_px=CAMERA.focal_px, key_frames=3, identity_components=3)
-    theta, identity = performance(head, 12)
-    tracker = SubjectTracker(head, config)
-    noisy = observed(tracker, theta, identity)
-    noisy = noisy + np.random.default_rng(3).normal(size=noisy.shape) * 1.0
+    tracker, theta, _, noisy = acted(head, 12, key_frames=3, identity_components=3)
+    noisy += np.random.default_rng(3).normal(size=noisy.shape)
     follows = [False] + [True] * 11
     smooth = tracker.fit(noisy, follows, 320, 240)
-    rough = SubjectTracker(head, replace(config, temporal_weight=0.0)).fit(noisy, follows, 320, 240)
+    unsmoothed = SubjectTracker(head, replace(tracker.config, temporal_weight=0.0))
+    rough = unsmoothed.fit(noisy, follows, 320, 240)
     yaw = tracker.cost.parameters.columns.tolist().index(head.layout.slice("rotation").start + 1)
     true = theta[:, head.layout.slice("rotation").start + 1]
 
@@ -87,17 +70,13 @@ def test_smoothing_lowers_jitter_without_lag(head: HeadModel) -> None:
         return float(np.square(np.diff(values, 2)).mean())
 
     assert jitter(smooth.values[:, yaw]) < jitter(rough.values[:, yaw])
-    shifted = [
-        np.abs(np.roll(smooth.values[:, yaw], -lag) - true)[2:-2].std() for lag in (-1, 0, 1)
-    ]
+    found = smooth.values[:, yaw]
+    shifted = [np.abs(np.roll(found, -lag) - true)[2:-2].std() for lag in (-1, 0, 1)]
     assert np.argmin(shifted) == 1
 
 
 def test_landmarks_that_no_head_explains_are_rejected(head: HeadModel) -> None:
-    config = TrackConfig(focal_px=CAMERA.focal_px, key_frames=3, identity_components=3)
-    theta, identity = performance(head, 4)
-    tracker = SubjectTracker(head, config)
-    broken = observed(tracker, theta, identity)
+    tracker, _, _, broken = acted(head, 4, key_frames=3, identity_components=3)
     fit = tracker.fit(broken, [False, True, True, True], 320, 240)
     random = np.random.default_rng(1)
     broken[2, 30:] += random.normal(size=(448, 2)) * 15

@@ -49,12 +49,11 @@ def test_crossing_faces_keep_their_names_whatever_order_they_come_in() -> None:
             # The followed one stands, another of the same size walks by; hidden, neither is seen.
             standing = _face(320 + random.normal(), 240 + random.normal())
             walking = _face(60 + 9 * frame, 250)
-            faces = [standing, walking]
-            if np.abs(walking - standing).max() < 45:
-                faces = [walking]
+            hidden = np.abs(walking - standing).max() < 45
+            faces = [walking] if hidden else [standing, walking]
             random.shuffle(faces)
             sighting = follower(np.array(faces), WIDTH, HEIGHT)
-            if len(faces) == 2:
+            if not hidden:
                 assert sighting.position is not None
                 assert faces[sighting.position] is standing, frame
             assert not sighting.jumped
@@ -92,12 +91,8 @@ def test_two_sets_of_landmarks_on_one_face_are_one_face() -> None:
 
 
 def test_frames_without_a_face_and_with_several() -> None:
-    assert _follow([[], [_face(320, 240)], [], [_face(325, 240)]]) == [
-        (None, 0),
-        (0, 0),
-        (None, 0),
-        (0, 0),
-    ]
+    frames = [[], [_face(320, 240)], [], [_face(325, 240)]]
+    assert _follow(frames) == [(None, 0), (0, 0), (None, 0), (0, 0)]
 
 
 def _seen(faces: list[np.ndarray | None], **changes: np.ndarray) -> SeenFaces:

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 
 from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.head.landmarks import LandmarkNoise, facemesh_noise
@@ -20,8 +19,8 @@ FACE_PX = 150.0
 
 
 @pytest.fixture(scope="module")
-def tracker() -> SubjectTracker:
-    return SubjectTracker(HeadModel.embedded(dtype=torch.float64), TrackConfig())
+def tracker(head: HeadModel) -> SubjectTracker:
+    return SubjectTracker(head, TrackConfig())
 
 
 def _with_noise(cost: FrameCost, seed: int, modes: int = 3) -> FrameCost:
@@ -131,17 +130,14 @@ def test_ties_draw_entries_together_and_leave_their_mean_to_the_widths() -> None
 
 def test_both_sides_of_a_face_are_tied_and_no_side_of_the_jaw(tracker: SubjectTracker) -> None:
     names, first = tracker.head.arrays.expression_names, tracker.head.layout.slice("expression")
-    tied = {frozenset(names[column - first.start] for column in pair) for pair in _ties(tracker)}
+    pairs = tracker.cost.parameters.ties.tolist()
+    tied = {frozenset(names[column - first.start] for column in pair) for pair in pairs}
     assert frozenset(("mouthSmileLeft", "mouthSmileRight")) in tied
     assert frozenset(("cheekSquintLeft", "mouthSmileLeft")) in tied
     assert frozenset(("browInnerUp", "browOuterUpRight")) in tied
     assert frozenset(("jawLeft", "jawRight")) not in tied
     assert frozenset(("mouthLeft", "mouthRight")) not in tied
     assert all(len(pair) == 2 for pair in tied)
-
-
-def _ties(tracker: SubjectTracker) -> list[list[int]]:
-    return tracker.cost.parameters.ties.tolist()
 
 
 def test_facemeshs_noise_is_one_for_each_landmark_and_moderate() -> None:

@@ -32,27 +32,22 @@ def test_cropped_camera_sees_cropped_points() -> None:
     crop = SquareCrop(left=-12, top=7, side=80, size=256)
     points = np.random.default_rng(1).normal(size=(5, 3)) * 0.1
     pinhole = crop.pinhole(camera)
-    seen = StillCamera(
-        pinhole.focal_px[0, 0].item(), tuple(pinhole.principal_point_px[0].tolist()), 1.5
-    )
+    center = tuple(pinhole.principal_point_px[0].tolist())
+    seen = StillCamera(pinhole.focal_px[0, 0].item(), center, 1.5)
     np.testing.assert_allclose(seen.project(points), crop.points(camera.project(points)), rtol=1e-5)
 
 
-def _face_box(low: tuple[float, float], high: tuple[float, float]) -> np.ndarray:
+def test_crop_holds_every_landmark_and_stays_inside_where_it_fits() -> None:
+    low, high = (90.0, 60.0), (150.0, 140.0)
     points = np.random.default_rng(2).uniform(low, high, (3, 478, 2))
     points[:, 0], points[:, 1] = low, high
-    points[:, 10] = ((low[0] + high[0]) / 2, low[1])
-    points[:, 152] = ((low[0] + high[0]) / 2, high[1])
-    return points
-
-
-def test_crop_holds_every_landmark_and_stays_inside_where_it_fits() -> None:
-    crop = steady_crop(_face_box((90, 60), (150, 140)), 320, 240, 128)
+    points[:, 10], points[:, 152] = (120.0, 60.0), (120.0, 140.0)
+    crop = steady_crop(points, 320, 240, 128)
     assert crop.left >= 0
     assert crop.top >= 0
     assert crop.left + crop.side <= 320
     assert crop.top + crop.side <= 240
-    inside = crop.points(np.array([[90.0, 60.0], [150.0, 140.0]]))
+    inside = crop.points(np.array([low, high]))
     assert inside.min() > 0
     assert inside.max() < 128
 

@@ -23,18 +23,6 @@ def test_box_quadratic_agrees_with_scipy(seed: int) -> None:
     np.testing.assert_allclose(step, expected, atol=1e-6)
 
 
-def test_correlated_unknowns_do_not_count_on_what_a_bound_cuts_off() -> None:
-    # min (x + y - 1)^2 + .01 (x - y)^2 with x <= .2: y must take up the rest. Clamping the free
-    # minimum (.5, .5) would leave y at .5.
-    rows = np.array([[1.0, 1.0], [0.1, -0.1]])
-    target = np.array([1.0, 0.0])
-    step = minimize_box_quadratic(
-        rows.T @ rows, -rows.T @ target, np.array([-5.0, -5.0]), np.array([0.2, 5.0])
-    )
-    assert step[0] == pytest.approx(0.2)
-    assert step[1] == pytest.approx((0.8 + 0.01 * 0.2) / 1.01)
-
-
 def test_levenberg_marquardt_finds_the_bounded_minimum_of_a_curved_valley() -> None:
     # Rosenbrock's valley cut at x <= .5: the minimum lies at (.5, .25) by hand.
     def model_at(point: np.ndarray) -> QuadraticModel:

@@ -1,5 +1,6 @@
 """The user's own mattes are taken as they are; ours do not flicker and drag nothing along."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -111,8 +112,7 @@ def test_flicker_sinks_where_the_picture_does_not_change() -> None:
         steadied(coarse[k], seen[k], [(seen[n], still) for n in range(k - 2, k + 3) if n != k])
         for k in range(2, 7)
     ]
-    before = np.abs(np.diff(coarse[2:7], axis=0)).mean()
-    after = np.abs(np.diff(steady, axis=0)).mean()
+    before, after = (np.abs(np.diff(mattes, axis=0)).mean() for mattes in (coarse[2:7], steady))
     assert after < 0.5 * before
 
 
@@ -152,22 +152,21 @@ def test_head_motion_recovers_a_similarity() -> None:
 
 def test_a_users_matte_and_an_alpha_channel_end_up_in_the_dataset(tmp_path: Path) -> None:
     pytest.importorskip("mediapipe", reason="the tracker's optional extra is not installed")
-    image = astronaut()[::2, ::2]
+    image = astronaut()[::2, ::2, ::-1]
     own = np.zeros(image.shape[:2], np.uint8)
     own[:, :100] = 255
-    clear = np.dstack([image[..., ::-1], own])
-    frames = _folder(tmp_path / "f", {f"{k}.png": image[..., ::-1] for k in range(2)})
-    masks = _folder(tmp_path / "m", {f"{k}.png": own for k in range(2)})
-    alphas = _folder(tmp_path / "a", {f"{k}.png": clear for k in range(2)})
-    by_mask = track_video(frames, tmp_path / "x", TrackConfig(**{**vars(CONFIG), "mattes": masks}))
+    frames, masks, alphas = (
+        _folder(tmp_path / name, {f"{k}.png": picture for k in range(2)})
+        for name, picture in (("f", image), ("m", own), ("a", np.dstack([image, own])))
+    )
+    by_mask = track_video(frames, tmp_path / "x", replace(CONFIG, mattes=masks))
     by_alpha = track_video(alphas, tmp_path / "y", CONFIG)
     for dataset in (by_mask, by_alpha):
         alpha = dataset.read_image(1)[..., 3]
         assert alpha[48, :20].min() == 255
         assert alpha[:, -20:].max() == 0
-    np.testing.assert_array_equal(
-        by_mask.read_image(0)[..., 3] > 127, by_alpha.read_image(0)[..., 3] > 127
-    )
+    solid = [dataset.read_image(0)[..., 3] > 127 for dataset in (by_mask, by_alpha)]
+    np.testing.assert_array_equal(*solid)
     short = _folder(tmp_path / "s", {"0.png": own})
     with pytest.raises(UserError, match="no matte named 1"):
-        track_video(frames, tmp_path / "z", TrackConfig(**{**vars(CONFIG), "mattes": short}))
+        track_video(frames, tmp_path / "z", replace(CONFIG, mattes=short))

@@ -11,17 +11,18 @@ import pytest
 import torch
 
 from rgbavatar_ns.data import TrackedFrame
-from rgbavatar_ns.data.streams import Backoff, StreamedFrame
+from rgbavatar_ns.data.streams import Backoff
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.kernels import PinholeCameras
-from rgbavatar_ns.tracking.input.capture import CapturedFrame, FileCapture, LatestFrameCapture
+from rgbavatar_ns.tracking.input.capture import CapturedFrame, LatestFrameCapture
 from rgbavatar_ns.tracking.video_stream import VideoStream
 
+from ..data.streaming import DEADLINE_S, take
 from .clips import REAL_CLIPS, gradient_images, write_clip
 
-DEADLINE_S = 30.0
 SIZE = 8
+CAMERA = PinholeCameras(torch.eye(4)[None], torch.ones(1, 2), torch.zeros(1, 2), SIZE, SIZE)
 
 
 class CountingTracker:
@@ -47,12 +48,9 @@ class CountingTracker:
             self.counts["no face"] += 1
             return None
         assert index is not None
-        frame = TrackedFrame(
-            index,
-            torch.full((self.head.layout.size,), float(index)),
-            PinholeCameras(torch.eye(4)[None], torch.ones(1, 2), torch.zeros(1, 2), SIZE, SIZE),
-            np.full((SIZE, SIZE, 4), index, np.uint8),
-        )
+        theta = torch.full((self.head.layout.size,), float(index))
+        image = np.full((SIZE, SIZE, 4), index, np.uint8)
+        frame = TrackedFrame(index, theta, CAMERA, image)
         if self.ready:
             return frame
         self._warm_up.append(frame)
@@ -61,16 +59,6 @@ class CountingTracker:
 
     def close(self) -> None:
         self.closed = True
-
-
-def take(stream: VideoStream, count: int) -> list[StreamedFrame]:
-    frames, deadline = [], time.monotonic() + DEADLINE_S
-    while len(frames) < count and not stream.ended:
-        assert time.monotonic() < deadline
-        one = stream.next(0.05)
-        if one is not None:
-            frames.append(one)
-    return frames
 
 
 @pytest.fixture
@@ -104,11 +92,6 @@ def test_a_file_goes_on_in_its_middle_with_the_same_subject(clip: Path):
     assert late.subject(DEADLINE_S) is not None
     late.go_on_after(1)
     assert [frame.index for frame in take(late, 100)] == [2, 3, 4, 5, 6, 7]
-
-
-def test_a_missing_file_is_refused(tmp_path: Path):
-    with pytest.raises(UserError, match="no video"):
-        FileCapture(tmp_path / "absent.mp4")
 
 
 class FakeCamera:

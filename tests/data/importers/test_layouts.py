@@ -109,14 +109,12 @@ def test_flashavatar_images_that_are_counted_as_frames_are_refused(tmp_path, opt
 def test_flashavatars_parsing_masks_cut_the_matte(tmp_path, options, takes):
     write(tmp_path / "data", "flashavatar", takes)
     mask = np.zeros((HEIGHT, WIDTH), np.uint8)
+    mask[:, : WIDTH // 2] = 255
     for number in range(FIRST + 1, FIRST + 1 + NUM_FRAMES):
-        mask[:, : WIDTH // 2] = 255
         cv2.imwrite(str(tmp_path / f"data/parsing/{number:05d}_neckhead.png"), mask)
         cv2.imwrite(str(tmp_path / f"data/parsing/{number:05d}_mouth.png"), np.zeros_like(mask))
     whole = read_source(tmp_path / "data", options)
-    head = read_source(
-        tmp_path / "data", ImportOptions(options.format, options.flame, region="head")
-    )
+    head = read_source(tmp_path / "data", ImportOptions(flame=options.flame, region="head"))
     alpha, cut = image(whole, 0)[..., 3], image(head, 0)[..., 3]
     assert np.array_equal(cut[:, : WIDTH // 2], alpha[:, : WIDTH // 2])
     assert not cut[:, WIDTH // 2 :].any()
@@ -186,26 +184,21 @@ def test_images_without_a_matte_need_consent(frame_folder, options):
     assert (image(read_source(frame_folder, opaque), 0)[..., 3] == 255).all()
 
 
-def test_a_camera_that_contradicts_the_trackers_is_told(tmp_path, options, takes):
+@pytest.mark.parametrize(
+    ("wrong", "told"),
+    [
+        (lambda m: m + 0.01 * np.eye(4, k=3), "differ from their .frame file's"),
+        (lambda m: m @ np.diag([1, -1, -1, 1]), "axes are OpenGL's, .*"),
+    ],
+)
+def test_insta_cameras_that_contradict_the_trackers_are_told(tmp_path, options, takes, wrong, told):
     write(tmp_path, "insta", takes)
     for path in tmp_path.glob("transforms*.json"):
         content = json.loads(path.read_text())
         for frame in content["frames"]:
-            frame["transform_matrix"][0][3] += 0.01
+            frame["transform_matrix"] = wrong(np.array(frame["transform_matrix"])).tolist()
         path.write_text(json.dumps(content))
-    with pytest.raises(UserError, match=f"differ from their .frame file's: {NUM_FRAMES}"):
-        read_source(tmp_path, options)
-
-
-def test_insta_cameras_in_opengl_axes_are_named(tmp_path, options, takes):
-    write(tmp_path, "insta", takes)
-    for path in tmp_path.glob("transforms*.json"):
-        content = json.loads(path.read_text())
-        for frame in content["frames"]:
-            matrix = np.array(frame["transform_matrix"]) @ np.diag([1, -1, -1, 1])
-            frame["transform_matrix"] = matrix.tolist()
-        path.write_text(json.dumps(content))
-    with pytest.raises(UserError, match=f"axes are OpenGL's, .*: {NUM_FRAMES}"):
+    with pytest.raises(UserError, match=f"{told}: {NUM_FRAMES}"):
         read_source(tmp_path, options)
 
 

@@ -44,10 +44,15 @@ FRAME = {
 }
 
 
+def saved(value: object, as_zip: bool = True) -> bytes:
+    file = io.BytesIO()
+    torch.save(value, file, _use_new_zipfile_serialization=as_zip)
+    return file.getvalue()
+
+
 @pytest.mark.parametrize("as_zip", [True, False])
-def test_torch_files_give_what_torch_gives(tmp_path, as_zip):
-    path = tmp_path / "00001.frame"
-    torch.save(FRAME, path, _use_new_zipfile_serialization=as_zip)
+def test_torch_files_give_what_torch_gives(write, as_zip):
+    path = write(saved(FRAME, as_zip))
     assert zipfile.is_zipfile(path) == as_zip
     read = read_torch_file(path)
     assert list(read) == list(FRAME)
@@ -85,9 +90,7 @@ def test_a_zip_bomb_is_refused_unopened(write):
 
 def _changed(tensor: torch.Tensor, **changes: int) -> bytes:
     """torch's own file, with numbers of the tensor's description replaced."""
-    file = io.BytesIO()
-    torch.save(tensor, file)
-    with zipfile.ZipFile(file) as archive:
+    with zipfile.ZipFile(io.BytesIO(saved(tensor))) as archive:
         members = {name: archive.read(name) for name in archive.namelist()}
     name = next(name for name in members if name.endswith("data.pkl"))
     for old, new in changes.items():
@@ -112,13 +115,6 @@ def test_other_zips_and_other_bytes_are_no_torch_files(write):
             read_torch_file(write(data))
 
 
-def _frame_bytes(as_zip: bool) -> bytes:
-    file = io.BytesIO()
-    frame = {"exp": np.arange(3.0), "t": torch.ones(2, 2)}
-    torch.save(frame, file, _use_new_zipfile_serialization=as_zip)
-    return file.getvalue()
-
-
 @settings(
     max_examples=120,
     deadline=None,
@@ -126,7 +122,7 @@ def _frame_bytes(as_zip: bool) -> bytes:
 )
 @given(st.booleans(), st.data())
 def test_mutated_torch_files_end_in_a_value_or_an_error(write, as_zip, data):
-    mutated = bytearray(_frame_bytes(as_zip))
+    mutated = bytearray(saved({"exp": np.arange(3.0), "t": torch.ones(2, 2)}, as_zip))
     for _ in range(data.draw(st.integers(0, 4))):
         mutated[data.draw(st.integers(0, len(mutated) - 1))] = data.draw(st.integers(0, 255))
     end = data.draw(st.just(len(mutated)) | st.integers(0, len(mutated)))
