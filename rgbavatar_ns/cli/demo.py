@@ -144,7 +144,7 @@ def _film(run_folder: Path, data: Path, output: Path) -> Result:
     from rgbavatar_ns import Avatar
     from rgbavatar_ns.data import load_dataset
     from rgbavatar_ns.export import write_comparison
-    from rgbavatar_ns.plugin.training.refinement import REFINED_NAME
+    from rgbavatar_ns.plugin.refinement import REFINED_NAME
 
     video, picture = output / "comparison.mp4", output / "comparison.png"
     dataset, refined = load_dataset(data), run_folder / REFINED_NAME

@@ -27,7 +27,7 @@ from rgbavatar_ns.plugin.dataparser import (
     RGBAvatarDataParser,
     RGBAvatarDataParserConfig,
 )
-from rgbavatar_ns.plugin.training.errors import install_user_error_hook
+from rgbavatar_ns.plugin.errors import install_user_error_hook
 
 _MIB = 1 << 20
 _DECODED_TOGETHER = 32

@@ -22,9 +22,9 @@ from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.kernels import PinholeCameras
 from rgbavatar_ns.plugin.cameras import filled_depth, from_nerfstudio
+from rgbavatar_ns.plugin.checkpoint_state import model_state, require_same_layout
 from rgbavatar_ns.plugin.dataparser import Subject
-from rgbavatar_ns.plugin.training.checkpoint_state import model_state, require_same_layout
-from rgbavatar_ns.plugin.training.refinement import frame_refinement, require_same_refinement
+from rgbavatar_ns.plugin.refinement import frame_refinement, require_same_refinement
 
 Outputs = dict[str, Tensor]
 

@@ -17,10 +17,10 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from rgbavatar_ns.avatar.training.step import Losses
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.plugin.errors import install_user_error_hook
 from rgbavatar_ns.plugin.online.datamanager import OnlineDataManager
 from rgbavatar_ns.plugin.online.pipeline import OnlinePipeline, OnlinePipelineConfig
 from rgbavatar_ns.plugin.online.progress import OnlineProgress, StreamReport
-from rgbavatar_ns.plugin.training.errors import install_user_error_hook
 from rgbavatar_ns.plugin.training.interruption import StopRequest
 from rgbavatar_ns.plugin.training.trainer import (
     RGBAvatarTrainer,

@@ -22,13 +22,13 @@ from rgbavatar_ns.avatar.training.loop import FitHooks, fit
 from rgbavatar_ns.avatar.training.step import Losses
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.files import write_json
+from rgbavatar_ns.plugin.errors import device_errors_told, install_user_error_hook
 from rgbavatar_ns.plugin.pipeline import RGBAvatarPipeline, RGBAvatarPipelineConfig
+from rgbavatar_ns.plugin.refinement import REFINED_NAME
 from rgbavatar_ns.plugin.training.checkpoints import load_newest, read_checkpoint, save_checkpoint
-from rgbavatar_ns.plugin.training.errors import device_errors_told, install_user_error_hook
 from rgbavatar_ns.plugin.training.interruption import StopRequest
 from rgbavatar_ns.plugin.training.optimizers import ExponentialConfig
 from rgbavatar_ns.plugin.training.progress import TrainingProgress
-from rgbavatar_ns.plugin.training.refinement import REFINED_NAME
 
 SUMMARY_NAME = "training.json"
 

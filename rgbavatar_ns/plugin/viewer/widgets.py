@@ -2,14 +2,11 @@
 
 from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING, Any, get_args
+from typing import Any, Protocol, get_args
 
 from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
 from rgbavatar_ns.plugin.viewer.sliders import TITLES, NumberSlider
 from rgbavatar_ns.plugin.viewer.viewer_state import DrivenBy, PictureKind, ViewerState
-
-if TYPE_CHECKING:
-    from rgbavatar_ns.plugin.viewer.panel import ViewerPanel
 
 _TOPMOST = -1.0
 _STRONGEST = 12
@@ -18,18 +15,31 @@ _NO_BASIS = "none"
 _Number = int | float
 
 
+class Actions(Protocol):
+    """What controls do; the panel's methods."""
+
+    def change(self, **values: Any) -> None: ...  # noqa: D102
+    def drive_by(self, driven_by: DrivenBy) -> None: ...  # noqa: D102
+    def set_theta_number(self, place: int, value: float) -> None: ...  # noqa: D102
+    def show_neutral(self) -> None: ...  # noqa: D102
+    def show_random_expression(self) -> None: ...  # noqa: D102
+    def set_weight(self, basis: int, value: float) -> None: ...  # noqa: D102
+    def hold_weights(self, by_hand: bool) -> None: ...  # noqa: D102
+    def load_driver(self, folder: str, relative: str) -> None: ...  # noqa: D102
+
+
 class Widgets:
     """The controls of one panel, made once when the viewer starts."""
 
     def __init__(
         self,
         gui: Any,
-        panel: "ViewerPanel",
+        actions: Actions,
         sliders: list[NumberSlider],
         statistics: TrainingStatistics,
         num_frames: int,
     ) -> None:
-        self._gui, self._do = gui, panel
+        self._gui, self._do = gui, actions
         self._numbers: list[tuple[NumberSlider, Any]] = []
         self._weights: list[Any] = []
         with gui.add_folder("Avatar", order=_TOPMOST):

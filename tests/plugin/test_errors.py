@@ -6,10 +6,10 @@ import sys
 import pytest
 
 from rgbavatar_ns.errors import UserError
-from rgbavatar_ns.plugin.training.errors import install_user_error_hook
+from rgbavatar_ns.plugin.errors import install_user_error_hook
 
 _PROGRAM = """
-from rgbavatar_ns.plugin.training.errors import install_user_error_hook
+from rgbavatar_ns.plugin.errors import install_user_error_hook
 install_user_error_hook()
 raise ValueError("a defect")
 """

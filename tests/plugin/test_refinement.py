@@ -12,7 +12,7 @@ from rgbavatar_ns.avatar import AvatarConfig
 from rgbavatar_ns.avatar.refinement.corrections import RefinementConfig
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.kernels import available_backends
-from rgbavatar_ns.plugin.training.refinement import frame_refinement
+from rgbavatar_ns.plugin.refinement import frame_refinement
 from rgbavatar_ns.plugin.training.trainer import RGBAvatarTrainer, RGBAvatarTrainerConfig
 from tests.plugin.run import make_trainer, small_config, trained
 from tests.plugin.tiny import NUM_FRAMES, NUM_TEST
