@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, Protocol, get_args
+from typing import Any, Protocol, get_args, runtime_checkable
 
 from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
 from rgbavatar_ns.plugin.viewer.sliders import TITLES, NumberSlider
@@ -15,6 +15,7 @@ _NO_BASIS = "none"
 _Number = int | float
 
 
+@runtime_checkable
 class Actions(Protocol):
     """What controls do; the panel's methods."""
 
