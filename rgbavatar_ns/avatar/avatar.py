@@ -50,6 +50,9 @@ class Avatar(nn.Module):
     Everything that a picture needs is inside: head model, identity, anchors and Gaussians.
 
     Args:
+        head: the head model, whose layout names what theta holds.
+        identity: the subject's identity coefficients, fixed.
+        config: sizes, variants and initial values.
         seed: of the weight network's initial values; nothing else is random.
         anchors: places of the Gaussians; by default every covered texel of the head's UV map.
     """
@@ -139,7 +142,11 @@ class Avatar(nn.Module):
     def gaussians(
         self, theta: Float[Tensor, "B H"], psi: Float[Tensor, "B K"] | None = None
     ) -> GaussianSet:
-        """Return theta's Gaussians in the head's world; `psi` replaces the network's answer."""
+        """Return theta's Gaussians in the head's world; `psi` replaces the network's answer.
+
+        Differentiable in the parameters, theta and psi. Raises UserError where theta has another
+        size or holds NaN.
+        """
         theta = self._checked(theta)
         tangent = self.blendshapes.morph(self.weights(theta) if psi is None else psi)
         vertices = self.carrier_vertices(theta)
@@ -236,7 +243,8 @@ class Avatar(nn.Module):
     ) -> None:
         """Write a bundle (a directory of avatar.safetensors and avatar.json), atomically.
 
-        Without `with_head` it only names its head model (FLAME's licence); `load` then wants it.
+        Without `with_head` it only names its head model, as the licence of FLAME asks where the
+        bundle is passed on; `load` then wants the file (RGBAVATAR_HEAD).
         """
         state = self.to_state()
         if not with_head:
@@ -245,7 +253,10 @@ class Avatar(nn.Module):
 
     @classmethod
     def load(cls, path: str | Path) -> "Avatar":
-        """Load a bundle, a nerfstudio checkpoint or a run's newest; UserError if there is none."""
+        """Load a bundle, a nerfstudio checkpoint (.ckpt) or the newest one of a run's folder.
+
+        Needs no nerfstudio. Raises UserError where there is none or it cannot be read.
+        """
         state, tensors = load_any(Path(path))
         avatar = cls.from_state(state)
         own = set(avatar._own_state_dict())

@@ -11,7 +11,10 @@ from rgbavatar_ns.head import ThetaLayout
 
 
 class FrameRefinement(nn.Module):
-    """Corrects training frames; from others it takes what all training frames had wrong."""
+    """Corrects training frames; from others it takes what all training frames had wrong.
+
+    `theta` is that of all F frames, as tracked; `train` are the positions of the training frames.
+    """
 
     _row_of: Tensor
 
