@@ -15,6 +15,7 @@ import numpy as np
 from filelock import FileLock, Timeout
 
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.reading import DamagedFileError, load_json
 
 ROOM_OR_PLACE = "Free some space or name another place."
 _SAMPLES, _SAMPLE_BYTES = 5, 1 << 20
@@ -137,8 +138,8 @@ def write_json(path: Path, content: Any) -> None:
 def read_json(path: Path) -> Any:
     """What `write_json` wrote; None where there is no such file or it holds something else."""
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        return load_json(path)
+    except DamagedFileError:
         return None
 
 
