@@ -1,6 +1,5 @@
 """`rgbavatar demo`: from nothing (or from a video) to a trained avatar, through nerfstudio."""
 
-import shutil
 import sys
 import time
 from dataclasses import replace
@@ -97,7 +96,6 @@ def _fingerprint(path: Path) -> tuple[str, int, float]:
 def _demo(destination: Path, settings: dict[str, Any]) -> Result:
     from rgbavatar_ns.synthetic import DemoConfig, make_demo_dataset
 
-    shutil.rmtree(destination, ignore_errors=True)
     config = DemoConfig(
         num_frames=settings["frames"],
         num_test_frames=max(1, settings["frames"] // 4),
@@ -105,7 +103,7 @@ def _demo(destination: Path, settings: dict[str, Any]) -> Result:
         seed=settings["seed"],
     )
     with progress_bar("demo subject") as update:
-        make_demo_dataset(destination, config, progress=update)
+        make_demo_dataset(destination, config, progress=update, overwrite=True)
     return {"data": str(destination)}
 
 

@@ -180,9 +180,15 @@ def film_demo(config: DemoConfig, stiff_neck: bool = False) -> DemoFilm:
 
 
 def make_demo_dataset(
-    dst: str | Path, config: DemoConfig | None = None, progress: Progress | None = None
+    dst: str | Path,
+    config: DemoConfig | None = None,
+    progress: Progress | None = None,
+    *,
+    overwrite: bool = False,
 ) -> TrackedDataset:
-    """Render the demo subject and write it to `dst`, replacing a dataset that is there.
+    """Render the demo subject and write it to `dst`, which is new, empty or left unfinished.
+
+    `overwrite` replaces a dataset that is there; anything else there is refused by UserError.
 
     The same config gives the same person, performance, noise and images on every run. Calls
     `progress(frames done, frames in all)` after each frame.
@@ -191,7 +197,7 @@ def make_demo_dataset(
     film = film_demo(config)
     head, size = film.person.head, config.image_size
     writer = DatasetWriter(
-        dst, head.arrays, film.person.identity, head.layout, size, size, overwrite=True
+        dst, head.arrays, film.person.identity, head.layout, size, size, overwrite=overwrite
     )
     for frame in film.frames():
         writer.add(frame)
