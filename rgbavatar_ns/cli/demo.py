@@ -4,7 +4,7 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from rich.console import Console
 
@@ -12,6 +12,7 @@ from rgbavatar_ns.cli.progress import progress_bar, stage_bars
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.experiments import commands
 from rgbavatar_ns.files import Stages, write_json
+from rgbavatar_ns.options import Between, Count, Seed
 
 Result = dict[str, Any]
 METHOD = "rgbavatar-tiny"
@@ -22,10 +23,10 @@ HELD_OUT_STEPS = 40
 def run(
     output: Path | None = None,
     video: tuple[Path, ...] = (),
-    frames: int = 240,
-    image_size: int = 256,
-    steps: int | None = None,
-    seed: int = 0,
+    frames: Annotated[int, Between(2, 100_000)] = 240,
+    image_size: Annotated[int, Between(16, 4096)] = 256,
+    steps: Count | None = None,
+    seed: Seed = 0,
     fresh: bool = False,
     started_at: float | None = None,
 ) -> None:
