@@ -13,7 +13,7 @@ from torch import Tensor
 
 from rgbavatar_ns.data.native.dataset import TrackedDataset
 from rgbavatar_ns.data.native.frame import TrackedFrame
-from rgbavatar_ns.data.native.writer import DatasetWriter
+from rgbavatar_ns.data.native.writer import DatasetWriter, make_room
 from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.head.rotations import axis_angle_to_matrix, matrix_to_axis_angle
 from rgbavatar_ns.kernels.types import PinholeCameras
@@ -194,6 +194,7 @@ def make_demo_dataset(
     `progress(frames done, frames in all)` after each frame.
     """
     config = config or DemoConfig()
+    make_room(Path(dst), overwrite)
     film = film_demo(config)
     head, size = film.person.head, config.image_size
     writer = DatasetWriter(

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from rgbavatar_ns.data.native.format import INDEX_FILE, image_path
-from rgbavatar_ns.data.native.writer import require_room
+from rgbavatar_ns.data.native.writer import make_room
 from rgbavatar_ns.data.png import png_size
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.files import DiskError, Stages, atomic_write, disk_errors, read_json, write_json
@@ -49,7 +49,7 @@ class ResumableRun:
                 "Repeat that command to go on with it, name another folder, or allow to "
                 "overwrite it (--overwrite) to start anew.",
             )
-        require_room(dst, overwrite)
+        make_room(dst, overwrite)
         shutil.rmtree(folder, ignore_errors=True)
         write_json(folder / _SETTINGS, wanted)
         return cls(dst)

@@ -33,15 +33,17 @@ _UNFINISHED = ".unfinished"
 _OWN_IMAGE = re.compile(r"\d{5,}\.png")
 
 
-def require_room(root: Path, overwrite: bool) -> None:
-    """Raise UserError where a dataset may not be written to a folder, or would not find room.
+def make_room(root: Path, overwrite: bool) -> None:
+    """Make the folder for a dataset; raises UserError where it cannot be made or may not be taken.
 
     It may be new, empty but for hidden files, or hold what an interrupted writer has left; with
     `overwrite` a dataset too, but never anything else: that would be lost.
     """
     if root.exists() and not root.is_dir():
         raise UserError(f"{root} is a file.", "Name a folder to write to.")
-    if not root.exists() or all(name.startswith(".") for name in os.listdir(root)):
+    with disk_errors(root, "Name a folder that you may write to."):
+        root.mkdir(parents=True, exist_ok=True)
+    if all(name.startswith(".") for name in os.listdir(root)):
         return
     index = read_json(root / INDEX_FILE)
     if index is None and (root / _UNFINISHED).exists():
@@ -99,7 +101,7 @@ class DatasetWriter:
         """Make room; the old index goes first, so that no mixture can be taken for a dataset."""
         root, mark = self._root, self._root / _UNFINISHED
         if not keep_images:
-            require_room(root, overwrite)
+            make_room(root, overwrite)
         with disk_errors(root, "Name a folder that you may write to."):
             (root / IMAGE_FOLDER).mkdir(parents=True, exist_ok=True)
             mark.touch()
