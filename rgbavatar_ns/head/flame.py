@@ -229,6 +229,8 @@ def _read_eyelid(path: Path) -> np.ndarray:
         offsets = load_array(path)
         if offsets.dtype.kind != "f" or offsets.size != FLAME_VERTICES * 3:
             raise DamagedFileError(f"it holds {offsets.dtype} of shape {offsets.shape}")
+        if not np.isfinite(offsets).all():
+            raise DamagedFileError("it holds NaN or infinity")
         return offsets.astype(np.float32).reshape(FLAME_VERTICES, 3)
     except DamagedFileError as error:
         raise UserError(

@@ -137,11 +137,14 @@ class ThetaLayout:
     def from_json(cls, values: Any) -> "ThetaLayout":
         """Inverse of `to_json`; raises UserError for anything else."""
         try:
-            fields = [dict(value) for value in values]
-            if any(set(field) != {"name", "size", "form"} for field in fields):
+            if not isinstance(values, list | tuple):
+                raise ValueError("it is no list of fields")
+            if any(not isinstance(f, dict) or set(f) != {"name", "size", "form"} for f in values):
                 raise ValueError("every field needs exactly name, size and form")
-            return cls(tuple(ThetaField(str(f["name"]), int(f["size"]), f["form"]) for f in fields))
-        except (TypeError, ValueError, OverflowError) as error:
+            if any(not isinstance(f["name"], str) or type(f["size"]) is not int for f in values):
+                raise ValueError("a name is no text, or a size no whole number")
+            return cls(tuple(ThetaField(f["name"], f["size"], f["form"]) for f in values))
+        except (TypeError, ValueError) as error:
             raise UserError(
                 f"This is not a theta layout: {error}.",
                 "Take the list of fields that ThetaLayout.to_json wrote.",

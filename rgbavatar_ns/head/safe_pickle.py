@@ -29,7 +29,7 @@ MAX_OPCODES = 200_000
 _MAX_NUMBER_BITS, _MAX_KEY_BITS, _MAX_DIMENSIONS, _MAX_DEPTH = 512, 60, 32, 50
 _MAX_PARTS = 64
 """Of one object's arguments or state; a sparse matrix has ten."""
-_SMALL_BYTES, _UNFOLDED_TIMES = 16 * 2**20, 8
+_SMALL_BYTES, _UNFOLDED_TIMES = 4 * 2**20, 8
 """What may come of any file, and of a longer one for each byte: sharing makes much of little."""
 _NODE_BYTES = 8
 _UNUSED = ("EXT1", "EXT2", "EXT4", "INST", "OBJ", "NEWOBJ_EX", "NEXT_BUFFER", "READONLY_BUFFER")

@@ -10,8 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from rgbavatar_ns.errors import UserError
-
 Case = tuple[str, Callable[[], object]]
 """What an attack is called, and the attack: UserError or nothing comes of it, else a fault."""
 
@@ -20,7 +18,15 @@ WRONG_VALUES: tuple[Any, ...] = (
     [True] * 3, ["1"], 0, -1, 1.5, 10**18, -(10**18), 1e300, -1e300, 1e5, float("nan"),
     float("inf"), {"a": {"b": [1]}}, [0.0] * 1000,
 )  # fmt: skip
-WRONG_TEXTS = (b"9" * 5000, b"[" * 3000, b"[" * 3000 + b"]" * 3000, b'"\\ud800"', b"1e999", b"-", b"")
+WRONG_TEXTS = (
+    b"9" * 5000,
+    b"[" * 3000,
+    b"[" * 3000 + b"]" * 3000,
+    b'"\\ud800"',
+    b"1e999",
+    b"-",
+    b"",
+)
 """In the place of a JSON value."""
 
 
@@ -92,14 +98,3 @@ def copied(folder: Path) -> Iterator[Path]:
         yield copy
     finally:
         shutil.rmtree(copy)
-
-
-def is_refused(action: Callable[[], object]) -> bool:
-    """Whether it ends in a UserError, with a cause and a remedy."""
-    try:
-        action()
-    except UserError as error:
-        assert error.cause
-        assert error.remedy
-        return True
-    return False

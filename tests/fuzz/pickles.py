@@ -23,6 +23,7 @@ from tests.head.synthetic_head import flame_shaped_arrays
 
 NAME = "pickles"
 MAX_SECONDS = 2.0
+_SOUP = b"](}N)0K\1(ted2asuqR\x85\x86\x87b\x94h"
 _ARRAY = b"cnumpy.core.multiarray\n_reconstruct\n(cnumpy\nndarray\n(K\0tU\1btR"
 
 
@@ -128,9 +129,7 @@ def _greedy(generator: np.random.Generator) -> tuple[str, bytes]:
         "itself": b"]" + _put(1) + _get(1) + b"a",
         "itself in a dict": b"}" + _put(1) + b"K\0(" + _get(1) + b"ts",
         "types": b"](" + (u1 + b"0" + u1) * 200 + b"e",
-        "soup": b"".join(
-            bytes([code]) for code in generator.choice(list(b"](}N)0K\1(ted2asuqR\x85\x86\x87b\x94h"), n)
-        ),
+        "soup": bytes(generator.choice(list(_SOUP), n).tolist()),
     }  # fmt: skip
     name = str(generator.choice(sorted(made)))
     return name, made[name]
