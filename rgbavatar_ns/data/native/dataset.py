@@ -5,7 +5,7 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 import torch
@@ -153,7 +153,7 @@ def _whole(index: dict[str, Any], name: str) -> int:
     return value
 
 
-def _is_whole(value: Any) -> bool:
+def _is_whole(value: Any) -> TypeGuard[int]:
     """A whole number within reason, and not true or false, which Python takes for 1 and 0."""
     return type(value) is int and 0 <= value <= _LARGEST_NUMBER
 
