@@ -13,7 +13,7 @@ import re
 import stat
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -28,6 +28,9 @@ MAX_ARRAYS_BYTES = 1 << 29
 _MAX_DEPTH = 64
 _MAX_DIGITS = 19
 _MAX_MEMBERS = 4096
+_MAX_DIRECTORY_BYTES = 1 << 20
+_ZIP_END, _ZIP64_END, _ZIP_END_BYTES = b"PK\5\6", b"PK\6\6", 22
+_LONGEST_COMMENT = 1 << 16
 _MAX_UNPACKED_TIMES = 200
 """Arrays of real heads shrink to a fifth; deflate cannot do better than to a thousandth."""
 _SMALL_BYTES = 16 << 20
@@ -64,21 +67,29 @@ def damage_told() -> Iterator[None]:
         raise DamagedFileError(f"{type(error).__name__} {first_line}".strip()) from None
 
 
-def read_file(path: Path, max_bytes: int) -> bytes:
-    """A regular file's content; raises DamagedFileError where it is none, unreadable or longer."""
+@contextmanager
+def regular_file(path: Path) -> Iterator[io.BufferedIOBase]:
+    """The file, opened to be read; DamagedFileError where it is none, unreadable or not regular."""
     with damage_told():
         # A FIFO without a writer would block here for ever.
         descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))
         with os.fdopen(descriptor, "rb") as file:
-            status = os.fstat(descriptor)
-            if not stat.S_ISREG(status.st_mode):
+            if not stat.S_ISREG(os.fstat(descriptor).st_mode):
                 raise DamagedFileError("it is no regular file")
-            if status.st_size > max_bytes:
-                raise DamagedFileError(f"it is longer than {max_bytes} bytes")
-            content = file.read(max_bytes + 1)
-            if len(content) > max_bytes:
-                raise DamagedFileError(f"it is longer than {max_bytes} bytes")
-            return content
+            yield file
+
+
+def read_file(path: Path, max_bytes: int) -> bytes:
+    """A regular file's content; raises DamagedFileError where it is none, unreadable or longer."""
+    with regular_file(path) as file:
+        too_long = DamagedFileError(f"it is longer than {max_bytes} bytes")
+        size = os.fstat(file.fileno()).st_size
+        if size > max_bytes:
+            raise too_long
+        content = file.read(size + 1)  # memory is taken for all of it at once
+        if len(content) > size:
+            raise DamagedFileError("it grows while it is read")
+        return content
 
 
 def parse_json(text: bytes | str) -> Any:
@@ -124,21 +135,21 @@ def load_array(path: Path, max_bytes: int = MAX_ARRAYS_BYTES) -> Shaped[np.ndarr
 
 
 def load_arrays(
-    path: Path, max_bytes: int = MAX_ARRAYS_BYTES
+    path: Path, max_bytes: int = MAX_ARRAYS_BYTES, names: Collection[str] | None = None
 ) -> dict[str, Shaped[np.ndarray, "..."]]:
-    """The arrays of an npz file by name, `max_bytes` altogether; raises DamagedFileError."""
-    content = read_file(path, max_bytes)
-    with damage_told(), zipfile.ZipFile(io.BytesIO(content)) as archive:
-        entries = archive.infolist()
-        if len(entries) > _MAX_MEMBERS or len({e.filename for e in entries}) < len(entries):
-            raise DamagedFileError("it has too many members, or two of one name")
-        claimed = sum(entry.file_size for entry in entries)
-        if claimed > min(max_bytes, _SMALL_BYTES + _MAX_UNPACKED_TIMES * len(content)):
+    """The arrays of an npz file by name, `max_bytes` altogether; raises DamagedFileError.
+
+    names: read those of them that there are, and nothing else of the file.
+    """
+    with regular_file(path) as file, open_archive(file) as archive:
+        entries = {entry.filename.removesuffix(".npy"): entry for entry in archive.infolist()}
+        if names is not None:
+            entries = {name: entries[name] for name in names if name in entries}
+        claimed = sum(entry.file_size for entry in entries.values())
+        packed = os.fstat(file.fileno()).st_size
+        if claimed > min(max_bytes, _SMALL_BYTES + _MAX_UNPACKED_TIMES * packed):
             raise DamagedFileError(f"its arrays claim {claimed} bytes")
-        return {
-            entry.filename.removesuffix(".npy"): parse_array(_member(archive, entry))
-            for entry in entries
-        }
+        return {name: parse_array(read_member(archive, e)) for name, e in entries.items()}
 
 
 def parse_array(content: bytes) -> Shaped[np.ndarray, "..."]:
@@ -164,8 +175,32 @@ def parse_array(content: bytes) -> Shaped[np.ndarray, "..."]:
         return flat.reshape(shape, order="F" if fortran else "C").copy(order="K")
 
 
-def _member(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> bytes:
-    """A member's bytes, no more than it claims, its checksum verified."""
+@contextmanager
+def open_archive(file: io.BufferedIOBase) -> Iterator[zipfile.ZipFile]:
+    """The zip in this file, of few members and none twice; raises DamagedFileError."""
+    with damage_told():
+        # A directory of millions takes long to read, so its end is looked at first.
+        size = file.seek(0, os.SEEK_END)
+        file.seek(max(0, size - 2 * _LONGEST_COMMENT))
+        tail = file.read(2 * _LONGEST_COMMENT)
+        uncommented = tail[-_ZIP_END_BYTES:]
+        place = tail.rfind(_ZIP_END)
+        if uncommented.startswith(_ZIP_END) and uncommented.endswith(b"\0\0"):
+            place = len(tail) - len(uncommented)
+        directory_bytes = int.from_bytes(tail[place + 12 : place + 16], "little")
+        if tail[max(0, place - 76) :].startswith(_ZIP64_END):
+            directory_bytes = int.from_bytes(tail[place - 36 : place - 28], "little")
+        if place < 0 or directory_bytes > _MAX_DIRECTORY_BYTES:
+            raise DamagedFileError("it is no zip, or one of too many members")
+        with zipfile.ZipFile(file) as archive:
+            names = archive.namelist()
+            if len(names) > _MAX_MEMBERS or len(set(names)) < len(names):
+                raise DamagedFileError("it has too many members, or two of one name")
+            yield archive
+
+
+def read_member(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> bytes:
+    """A member's bytes, no more than it claims, its checksum verified; DamagedFileError."""
     if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
         raise DamagedFileError(f"its member {entry.filename!a} is packed in an unusual way")
     if entry.flag_bits & 1:

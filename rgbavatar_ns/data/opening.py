@@ -1,5 +1,6 @@
 """The one entrance to datasets: the project's own folders, and those of other systems."""
 
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -23,8 +24,8 @@ def load_dataset(
     say how, and `progress` is called with (stage, done, in all) instead of bars being shown.
     """
     root, options = Path(path), options or ImportOptions()
-    own = (root / INDEX_FILE).exists() and options.format is None
-    if own or not root.is_dir() or find_format(root, options) is None:
+    own = os.path.exists(root / INDEX_FILE) and options.format is None
+    if own or not os.path.isdir(root) or find_format(root, options) is None:
         return load_native(root)
     if progress is not None:
         return open_foreign(root, options, progress)

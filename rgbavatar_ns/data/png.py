@@ -8,19 +8,22 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import UInt8, UInt16
 
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.reading import DamagedFileError, MissingFileError, read_file, regular_file
 
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _HEADER_BYTES = 33
+MAX_IMAGE_BYTES, MAX_PIXELS = 1 << 28, 1 << 26
+"""What is read of one image: 8192 x 8192 pixels take 256 MB."""
 _END_CHUNK = b"\x00\x00\x00\x00IEND\xaeB`\x82"
 _REPAIR = "Copy or export the file again, or leave the frame out of the dataset."
 
 
 def png_size(path: Path) -> tuple[int, int]:
     """(width, height) from a PNG's first bytes; UserError where it is none, or cut short."""
-    with _file_errors(path), path.open("rb") as file:
+    with _file_errors(path), regular_file(path) as file:
         head = file.read(_HEADER_BYTES)
         end = file.seek(0, 2)
         file.seek(max(0, end - len(_END_CHUNK)))
@@ -47,16 +50,16 @@ def png_header_size(encoded: bytes) -> tuple[int, int] | None:
 def _file_errors(path: Path) -> Iterator[None]:
     try:
         yield
-    except FileNotFoundError:
+    except MissingFileError:
         raise UserError(f"The image {path} is missing.", _REPAIR) from None
-    except OSError as error:
-        raise UserError(f"The image {path} cannot be read: {error.strerror}.", _REPAIR) from None
+    except DamagedFileError as error:
+        raise UserError(f"The image {path} cannot be read: {error}.", _REPAIR) from None
 
 
 def read_png_rgba(path: Path) -> UInt8[np.ndarray, "height width 4"]:
     """Decode a PNG file to RGBA, see `decode_png_rgba`; raises UserError naming the file."""
     with _file_errors(path):
-        encoded = path.read_bytes()
+        encoded = read_file(path, MAX_IMAGE_BYTES)
     return decode_png_rgba(encoded, str(path))
 
 
@@ -69,7 +72,7 @@ def decode_png_rgba(encoded: bytes, name: str) -> UInt8[np.ndarray, "height widt
     damage = png_damage(encoded)
     if damage is not None:
         raise UserError(f"The image {name} {damage}.", _REPAIR)
-    decoded = cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_UNCHANGED)
+    decoded = decode_bounded(encoded, cv2.IMREAD_UNCHANGED, png_header_size(encoded))
     if decoded is None:
         raise UserError(f"The image {name} cannot be decoded.", _REPAIR)
     if decoded.dtype == np.uint16:
@@ -78,6 +81,18 @@ def decode_png_rgba(encoded: bytes, name: str) -> UInt8[np.ndarray, "height widt
         return cv2.cvtColor(decoded, cv2.COLOR_GRAY2RGBA)
     opaque = decoded.shape[2] == 3
     return cv2.cvtColor(decoded, cv2.COLOR_BGR2RGBA if opaque else cv2.COLOR_BGRA2RGBA)
+
+
+def decode_bounded(
+    encoded: bytes, flags: int, size: tuple[int, ...] | None
+) -> UInt8[np.ndarray, "..."] | UInt16[np.ndarray, "..."] | None:
+    """OpenCV's picture, given the size that its header promises; None for none, or a huge one."""
+    if size is None or not 0 < size[0] * size[1] <= MAX_PIXELS:
+        return None
+    try:
+        return cv2.imdecode(np.frombuffer(encoded, np.uint8), flags)
+    except cv2.error:
+        return None
 
 
 def encode_png_rgba(image_rgba: UInt8[np.ndarray, "height width 4"], compression: int = 3) -> bytes:

@@ -1,7 +1,7 @@
 """Which dataset a run of ns-train was trained on, without nerfstudio, and what was seen in it."""
 
+import os
 from pathlib import Path
-from typing import Any
 
 import torch
 import yaml
@@ -10,23 +10,11 @@ from rgbavatar_ns.avatar.avatar import Avatar
 from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
 from rgbavatar_ns.data.native.dataset import TrackedDataset
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.reading import DamagedFileError, damage_told, read_file
 
 _CONFIG = "config.yml"
-
-
-class _PlainLoader(yaml.SafeLoader):
-    """Reads nerfstudio's config as plain lists and mappings; builds no Python object."""
-
-
-def _as_plain(loader: yaml.SafeLoader, _suffix: str, node: yaml.Node) -> Any:
-    if isinstance(node, yaml.MappingNode):
-        return loader.construct_mapping(node, deep=True)
-    if isinstance(node, yaml.SequenceNode):
-        return loader.construct_sequence(node, deep=True)
-    return node.value
-
-
-_PlainLoader.add_multi_constructor("tag:yaml.org,2002:python/", _as_plain)
+_MOST_BYTES = 1 << 18
+"""nerfstudio's has 10 kB, and a longer one takes seconds."""
 
 
 def dataset_folder(path: Path) -> Path:
@@ -34,23 +22,26 @@ def dataset_folder(path: Path) -> Path:
 
     Raises UserError where the path is neither.
     """
-    folder = path if path.is_dir() else path.parent
+    folder = path if os.path.isdir(path) else path.parent
     if folder.name == "nerfstudio_models":
         folder = folder.parent
     config = folder / _CONFIG
-    if not config.exists():
+    if not os.path.exists(config):
         return path
     try:
-        described = yaml.load(config.read_text(encoding="utf-8"), _PlainLoader)
-        manager = described["pipeline"]["datamanager"]
-        # Each may name it; the first that does is the one that was read.
-        for parts in (manager["dataparser"]["data"], manager["data"], described["data"]):
-            if parts:
-                return Path(*parts)
-        raise KeyError("data")
-    except (OSError, yaml.YAMLError, KeyError, TypeError) as error:
+        content = read_file(config, _MOST_BYTES)
+        with damage_told():
+            # The base loader knows no tags and no merging: plain lists, mappings and texts.
+            described = yaml.load(content, yaml.BaseLoader)
+            manager = described["pipeline"]["datamanager"]
+            # Each may name it; the first that does is the one that was read.
+            for parts in (manager["dataparser"]["data"], manager["data"], described["data"]):
+                if isinstance(parts, list) and parts and all(isinstance(p, str) for p in parts):
+                    return Path(*parts)
+            raise KeyError("data")
+    except DamagedFileError as error:
         raise UserError(
-            f"{config} does not say which dataset was trained on: {error!r}.",
+            f"{config} does not say which dataset was trained on: {error}.",
             "Name the dataset's folder instead.",
         ) from None
 

@@ -1,11 +1,11 @@
 """Cameras to look at an avatar with: fixed views, orbits, nerfstudio's camera paths."""
 
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -14,6 +14,7 @@ from rgbavatar_ns.avatar.avatar import Avatar
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head.rotations import axis_angle_to_matrix
 from rgbavatar_ns.kernels import PinholeCameras
+from rgbavatar_ns.reading import DamagedFileError, json_numbers, load_json
 
 FOUR_VIEWS_DEGREES = ((-40.0, 0.0), (40.0, 0.0), (0.0, -20.0), (0.0, 20.0))
 """(yaw, pitch) of the novel views: the head seen from its right, its left, above and below. The
@@ -23,6 +24,7 @@ paper shows four without saying which."""
 HEAD_TO_NERFSTUDIO = ((1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0))
 _DISTANCE_M = 1.1
 _SEEN_M = 0.34
+_MOST_CAMERAS, _LARGEST_SIDE, _MOST_FRAMES_PER_SECOND = 100_000, 16384, 1000.0
 
 
 @torch.no_grad()
@@ -89,25 +91,34 @@ def read_camera_path(path: Path) -> tuple[PinholeCameras, float]:
     Raises UserError where the file is none, or not of perspective cameras.
     """
     try:
-        described = json.loads(path.read_text(encoding="utf-8"))
-        width, height = int(described["render_width"]), int(described["render_height"])
+        described = load_json(path)
+        listed = described["camera_path"]
+        size = json_numbers([described["render_width"], described["render_height"]], (2,))
         kind = described.get("camera_type", "perspective")
-        poses = [entry["camera_to_world"] for entry in described["camera_path"]]
-        opengl = torch.tensor(poses, dtype=torch.float32).reshape(-1, 4, 4)
-        fov = torch.tensor([float(entry["fov"]) for entry in described["camera_path"]]).deg2rad()
+        poses = [json_numbers(entry["camera_to_world"], (16,)) for entry in listed]
+        fov_degrees = json_numbers([entry["fov"] for entry in listed], (len(listed),))
         # A path without a rate says how long it is.
-        length_s = None if "fps" in described else max(float(described["seconds"]), 1e-3)
-        frames_per_second = len(fov) / length_s if length_s else float(described["fps"])
-    except (OSError, ValueError, KeyError, TypeError, RuntimeError) as error:
+        (rate,) = json_numbers([described["fps" if "fps" in described else "seconds"]], (1,))
+        frames_per_second = rate if "fps" in described else len(listed) / max(rate, 1e-3)
+        if not all(1 <= side <= _LARGEST_SIDE for side in size) or len(listed) > _MOST_CAMERAS:
+            raise DamagedFileError(f"it is of {len(listed)} pictures of {size[0]:g} x {size[1]:g}")
+        if not 0 < frames_per_second <= _MOST_FRAMES_PER_SECOND:
+            raise DamagedFileError(f"it is of {frames_per_second:g} frames per second")
+        if not ((fov_degrees > 0) & (fov_degrees < 180)).all():
+            raise DamagedFileError("it has angles of view outside of 0 to 180 degrees")
+    except (DamagedFileError, KeyError, TypeError, AttributeError) as error:
         raise UserError(
             f"{path} is no camera path of nerfstudio's viewer: {error!r}.",
             "Save one with 'Generate Command' in the viewer's render panel.",
         ) from None
-    if kind != "perspective" or len(fov) == 0:
+    if kind != "perspective" or not listed:
         raise UserError(
-            f"The camera path {path} has {len(fov)} cameras of the type '{kind}'.",
+            f"The camera path {path} has {len(listed)} cameras of the type '{kind}'.",
             "Choose the type 'perspective' in the viewer's render panel and add cameras.",
         )
+    width, height = map(int, size)
+    opengl = torch.from_numpy(np.stack(poses)).float().reshape(-1, 4, 4)
+    fov = torch.from_numpy(fov_degrees).float().deg2rad()
     # The field of view is the vertical one.
     focal_px = 0.5 * height / torch.tan(0.5 * fov)
     to_head = torch.tensor(HEAD_TO_NERFSTUDIO).T
@@ -120,7 +131,7 @@ def read_camera_path(path: Path) -> tuple[PinholeCameras, float]:
     cameras = PinholeCameras(
         world_to_camera, focal_px[:, None].expand(-1, 2), principal, width, height
     )
-    return cameras, frames_per_second
+    return cameras, float(frames_per_second)
 
 
 def swing(num_frames: int, reach_degrees: float) -> list[float]:

@@ -1,6 +1,5 @@
 """A head model as plain arrays in FLAME's convention, and their file."""
 
-import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from functools import cache
@@ -14,15 +13,19 @@ from torch import Tensor
 
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.files import atomic_write, digest
+from rgbavatar_ns.reading import DamagedFileError, load_arrays
 
 EMBEDDED_HEAD = Path(__file__).parent / "assets" / "makehuman_head.npz"
 _GROUP = "group_"
 _MAY_BE_HALF = ("shapedirs", "posedirs", "eyelid_dirs")
+_WHOLE_NUMBERS = ("parents", "faces", "uv_faces")
+_MOST_ROWS, _MOST_DIRECTIONS, _LONGEST_NAME = 1 << 20, 4096, 200
+_FARTHEST_M = 100.0
 
 
 @dataclass(frozen=True)
 class HeadArrays:
-    """FLAME and the embedded head differ only in these; raises UserError where shapes disagree.
+    """FLAME and the embedded head differ only in these; raises UserError if they fit no head.
 
     Metres, y up, z forward, +x the subject's left; triangles are wound outward. Source: FLAME's
     model files; uv has u to the right and v up.
@@ -57,7 +60,9 @@ class HeadArrays:
         for item in fields(self):
             value = getattr(self, item.name)
             if isinstance(value, np.ndarray):
-                object.__setattr__(self, item.name, np.ascontiguousarray(value))
+                native = np.ascontiguousarray(value, value.dtype.newbyteorder("="))
+                object.__setattr__(self, item.name, native)
+        self._check_names()
         vertices = len(self.v_template)
         wanted: dict[str, tuple[int, ...]] = {
             "v_template": (vertices, 3),
@@ -73,19 +78,42 @@ class HeadArrays:
         if self.eyelid_dirs is not None:
             wanted["eyelid_dirs"] = (vertices, 3, 2)
         for name, shape in wanted.items():
-            if getattr(self, name).shape != shape:
-                raise self._refuse(f"{name} has shape {getattr(self, name).shape}, not {shape}")
+            self._check_numbers(name, getattr(self, name), shape)
+        parents = self.parents.tolist()
+        if parents[0] != -1 or any(not 0 <= p < k for k, p in enumerate(parents[1:], 1)):
+            raise self._refuse(f"its joints hang on {parents}, not each on an earlier one")
         for name, index, count in (
             ("faces", self.faces, vertices),
             ("uv_faces", self.uv_faces, len(self.uv)),
             *((name, group, vertices) for name, group in self.vertex_groups.items()),
         ):
+            if index.ndim == 0 or index.dtype.kind not in "iu":
+                raise self._refuse(f"{name} is no list of whole numbers")
             if index.size and (index.min() < 0 or index.max() >= count):
                 raise self._refuse(f"{name} points outside of its {count} vertices")
 
+    def _check_names(self) -> None:
+        names = (self.name, *self.expression_names)
+        if not all(isinstance(name, str) and len(name) <= _LONGEST_NAME for name in names):
+            raise self._refuse("it has names that are no short text")
+        if len(set(self.expression_names)) < len(self.expression_names):
+            raise self._refuse("two of its expressions have one name")
+        if not 0 <= self.num_identity <= _MOST_DIRECTIONS - self.num_expressions:
+            raise self._refuse(f"it claims {self.num_identity} identity directions")
+
+    def _check_numbers(self, name: str, value: Any, shape: tuple[int, ...]) -> None:
+        kind = "i" if name in _WHOLE_NUMBERS else "f"
+        if not isinstance(value, np.ndarray) or value.dtype.kind != kind or value.itemsize > 8:
+            raise self._refuse(f"{name} is {getattr(value, 'dtype', 'no array')}")
+        if value.shape != shape or max(shape) > _MOST_ROWS:
+            raise self._refuse(f"{name} has shape {value.shape}, not {shape}")
+        farthest = max(-value.min(), value.max()) if kind == "f" and value.size else 0.0
+        if not farthest <= _FARTHEST_M:  # nor is NaN
+            raise self._refuse(f"{name} holds NaN, or numbers beyond {_FARTHEST_M:g}")
+
     def _refuse(self, reason: str) -> UserError:
         return UserError(
-            f"The head model '{self.name}' does not fit together: {reason}.",
+            f"The head model '{str(self.name)[:_LONGEST_NAME]}' does not fit together: {reason}.",
             "Convert it again, or use the embedded head.",
         )
 
@@ -110,9 +138,8 @@ class HeadArrays:
     def load(cls, path: Path) -> "HeadArrays":
         """Read what `save` wrote; raises UserError for a missing or damaged file."""
         try:
-            with np.load(path, allow_pickle=False) as file:
-                return cls._from_items({name: file[name] for name in file.files})
-        except (OSError, EOFError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
+            return cls._from_items(load_arrays(path))
+        except (DamagedFileError, KeyError, TypeError, ValueError) as error:
             raise UserError(
                 f"{path} is no head model of this project: {error}.",
                 "Write it with HeadArrays.save, or use the embedded head.",

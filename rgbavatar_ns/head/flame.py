@@ -14,6 +14,7 @@ from rgbavatar_ns.head.arrays import HeadArrays
 from rgbavatar_ns.head.flame_uv import find_uv_file, make_uv_map, read_uv_map
 from rgbavatar_ns.head.safe_pickle import read_pickle
 from rgbavatar_ns.head.teeth import TeethForm, with_teeth
+from rgbavatar_ns.reading import DamagedFileError, load_array
 
 FLAME_VARIABLE = "RGBAVATAR_FLAME"
 FLAME_VERTICES, FLAME_TRIANGLES = 5023, 9976
@@ -106,14 +107,14 @@ def _given_path(path: Path | None) -> Path:
             raise UserError("A FLAME model is needed, and none is named.", _GET_FLAME)
         path = Path(named)
     path = Path(path).expanduser()
-    if not path.exists():
+    if not os.path.exists(path):
         raise UserError(f"There is no FLAME model at {path}.", _GET_FLAME)
     return path
 
 
 def _find_pickle(path: Path, version: str | None) -> Path:
     """The pickle itself, or the only suitable one in the folder or two levels below it."""
-    if path.is_file():
+    if not path.is_dir():
         return path
     found = sorted(
         candidate
@@ -216,7 +217,7 @@ def _eyelid_dirs(folder: Path | None, places: list[Path]) -> np.ndarray | None:
         places = [Path(folder)]
     for place in places:
         files = [place / name for name in _EYELIDS]
-        if all(file.is_file() for file in files):
+        if all(map(os.path.isfile, files)):
             return np.stack([_read_eyelid(file) for file in files], -1)
     if folder is not None:
         raise UserError(f"The folder {folder} lacks {' or '.join(_EYELIDS)}.", "Name another one.")
@@ -225,9 +226,13 @@ def _eyelid_dirs(folder: Path | None, places: list[Path]) -> np.ndarray | None:
 
 def _read_eyelid(path: Path) -> np.ndarray:
     try:
-        offsets = np.load(path, allow_pickle=False)
+        offsets = load_array(path)
+        if offsets.dtype.kind != "f" or offsets.size != FLAME_VERTICES * 3:
+            raise DamagedFileError(f"it holds {offsets.dtype} of shape {offsets.shape}")
+        if not np.isfinite(offsets).all():
+            raise DamagedFileError("it holds NaN or infinity")
         return offsets.astype(np.float32).reshape(FLAME_VERTICES, 3)
-    except (OSError, EOFError, ValueError) as error:
+    except DamagedFileError as error:
         raise UserError(
             f"{path} holds no eyelid offsets of {FLAME_VERTICES} vertices: {error}.",
             "Take it from metrical-tracker again, or remove it.",

@@ -1,6 +1,7 @@
 """FLAME's UV map, which its pickle lacks: read from the files that carry it, or made anew."""
 
-import zipfile
+import io
+import os
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.reading import DamagedFileError, damage_told, load_arrays, read_file
 
 UVMap = tuple[Float[np.ndarray, "VT 2"], Int[np.ndarray, "F 3"]]
 """UV coordinates, and which of them belong to the corners of each triangle."""
@@ -26,6 +28,8 @@ _FROM_FLAME = (
     "Take head_template.obj or FLAME_texture.npz from FLAME's site (https://flame.is.tue.mpg.de), "
     "and put it beside the model."
 )
+_MOST_BYTES, _MOST_ROWS = 1 << 26, 200_000
+"""FLAME's template has 1 MB and 10,000 triangles."""
 _ROOM_FOR_TEETH = 0.95
 """The upper rest of the map stays free, as in FLAME's own."""
 
@@ -33,7 +37,7 @@ _ROOM_FOR_TEETH = 0.95
 def find_uv_file(folders: Iterable[Path]) -> Path | None:
     """The first file in these folders that usually carries FLAME's UV map."""
     files = (folder / name for folder in folders for name in FILE_NAMES)
-    return next(filter(Path.is_file, files), None)
+    return next(filter(os.path.isfile, files), None)
 
 
 def read_uv_map(path: Path, faces: Int[np.ndarray, "F 3"]) -> UVMap:
@@ -42,20 +46,22 @@ def read_uv_map(path: Path, faces: Int[np.ndarray, "F 3"]) -> UVMap:
     Raises UserError where the file is damaged, has no UV map, or belongs to another mesh.
     """
     path = Path(path)
-    if not path.is_file():
+    if not os.path.exists(path):
         raise UserError(f"There is no UV map {path}.", _FROM_FLAME)
-    if path.suffix.lower() == ".npz":
-        uv, uv_faces = _read_npz(path)
-        order = None
-    else:
-        uv, uv_faces, order = _read_obj(path)
+    try:
+        is_npz = path.suffix.lower() == ".npz"
+        uv, uv_faces, order = (*_read_npz(path), None) if is_npz else _read_obj(path)
+    except DamagedFileError as error:
+        raise UserError(f"{path} cannot be read: {error}.", _FROM_FLAME) from None
     if len(uv_faces) != len(faces):
         raise UserError(
             f"{path} maps {len(uv_faces)} triangles, but the model has {len(faces)}.", _FROM_FLAME
         )
     if order is not None:
         uv_faces = _in_order_of(path, faces, order, uv_faces)
-    if not np.isfinite(uv).all() or uv_faces.min() < 0 or uv_faces.max() >= len(uv):
+    if not uv_faces.size or not np.isfinite(uv).all():
+        raise UserError(f"The UV map in {path} is damaged.", _FROM_FLAME)
+    if uv_faces.min() < 0 or uv_faces.max() >= len(uv):
         raise UserError(f"The UV map in {path} is damaged.", _FROM_FLAME)
     if uv.min() < -1e-3 or uv.max() > 1 + 1e-3:
         raise UserError(f"The UV map in {path} leaves the unit square.", _FROM_FLAME)
@@ -82,18 +88,16 @@ def make_uv_map(vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"
 
 
 def _read_npz(path: Path) -> UVMap:
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            uv = next(file[key] for key in _COORDINATE_KEYS if key in file.files)
-            uv_faces = next(file[key] for key in _TRIANGLE_KEYS if key in file.files)
-    except StopIteration:
-        raise UserError(f"{path} holds no UV map (vt and ft).", _FROM_FLAME) from None
-    except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile) as error:
-        raise UserError(f"{path} cannot be read: {error}.", _FROM_FLAME) from None
+    # FLAME_texture.npz holds a gigabyte of textures too.
+    arrays = load_arrays(path, _MOST_BYTES, {*_COORDINATE_KEYS, *_TRIANGLE_KEYS})
+    uv = next((arrays[key] for key in _COORDINATE_KEYS if key in arrays), None)
+    uv_faces = next((arrays[key] for key in _TRIANGLE_KEYS if key in arrays), None)
+    if uv is None or uv_faces is None:
+        raise DamagedFileError("it holds no UV map (vt and ft)")
     if uv.ndim != 2 or uv.shape[1] < 2 or uv_faces.ndim != 2 or uv_faces.shape[1] != 3:
-        raise UserError(
-            f"{path} holds UV arrays of the shapes {uv.shape}, {uv_faces.shape}.", _FROM_FLAME
-        )
+        raise DamagedFileError(f"it holds UV arrays of the shapes {uv.shape}, {uv_faces.shape}")
+    if uv.dtype.kind != "f" or uv_faces.dtype.kind not in "iu":
+        raise DamagedFileError(f"it holds UV arrays of {uv.dtype} and {uv_faces.dtype}")
     return uv[:, :2].astype(np.float64), uv_faces.astype(np.int64)
 
 
@@ -102,20 +106,21 @@ def _read_obj(
 ) -> tuple[Float[np.ndarray, "VT 2"], Int[np.ndarray, "F 3"], Int[np.ndarray, "F 3"]]:
     """UV coordinates, their triangles, and the triangles of vertices, all counted from 0."""
     coordinates, corners = [], []
-    try:
-        with path.open(encoding="utf-8", errors="replace") as file:
-            for line in file:
-                parts = line.split()
-                if line.startswith("vt "):
-                    coordinates.append([float(parts[1]), float(parts[2])])
-                elif line.startswith("f "):
-                    corners.append([[int(n) for n in part.split("/")[:2]] for part in parts[1:]])
-        triangles = np.array(corners, dtype=np.int64)
-    except (OSError, ValueError, IndexError) as error:
-        raise UserError(f"{path} cannot be read as an OBJ: {error}.", _FROM_FLAME) from None
-    if triangles.ndim != 3 or triangles.shape[1:] != (3, 2) or not coordinates:
-        raise UserError(f"{path} has no triangles with UV coordinates.", _FROM_FLAME)
-    return np.array(coordinates), triangles[..., 1] - 1, triangles[..., 0] - 1
+    content = read_file(path, _MOST_BYTES)
+    with damage_told():
+        for line in io.BytesIO(content):
+            if line.startswith(b"vt "):
+                coordinates.append([float(part) for part in line.split(None, 3)[1:3]])
+            elif line.startswith(b"f "):
+                # One more than are wanted, so that a larger face is none.
+                parts = line.split(None, 4)[1:]
+                corners.append([[int(n) for n in part.split(b"/", 2)[:2]] for part in parts[:4]])
+            if max(len(coordinates), len(corners)) > _MOST_ROWS:
+                raise DamagedFileError(f"it has more than {_MOST_ROWS} rows")
+        triangles, uv = np.array(corners, dtype=np.int64), np.array(coordinates, np.float64)
+    if triangles.ndim != 3 or triangles.shape[1:] != (3, 2) or uv.ndim != 2 or uv.shape[1] != 2:
+        raise DamagedFileError("it has no triangles with UV coordinates")
+    return uv, triangles[..., 1] - 1, triangles[..., 0] - 1
 
 
 def _in_order_of(

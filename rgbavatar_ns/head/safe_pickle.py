@@ -9,7 +9,7 @@ import io
 import pickle
 import pickletools
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from math import prod
 from pathlib import Path
@@ -20,13 +20,20 @@ import scipy.sparse
 from jaxtyping import Shaped
 
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.reading import DamagedFileError, read_file
 
 MAX_FILE_BYTES = 512 * 2**20
 """FLAME's largest file has 53 MB, a tracker's frame 20 kB."""
-MAX_OPCODES = 500_000
-"""Model files need thousands; this many take a second or two and 100 MB at most."""
-_MAX_NUMBER_BITS, _MAX_DIMENSIONS, _MAX_DEPTH = 512, 32, 50
+MAX_OPCODES = 200_000
+"""Model files need thousands; this many take half a second and 50 MB at most."""
+_MAX_NUMBER_BITS, _MAX_KEY_BITS, _MAX_DIMENSIONS, _MAX_DEPTH = 512, 60, 32, 50
+_MAX_PARTS = 64
+"""Of one object's arguments or state; a sparse matrix has ten."""
+_SMALL_BYTES, _UNFOLDED_TIMES = 4 * 2**20, 8
+"""What may come of any file, and of a longer one for each byte: sharing makes much of little."""
+_NODE_BYTES = 8
 _UNUSED = ("EXT1", "EXT2", "EXT4", "INST", "OBJ", "NEWOBJ_EX", "NEXT_BUFFER", "READONLY_BUFFER")
+_LONG_NUMBER = pickletools.StackObject("long number", int, "Numbers can be made that hash alike.")
 _PLAIN = {"str", "bytes", "bytes_or_str", "int", "int_or_bool", "bool", "float", "None"}
 """What pickletools calls the types that may be keys."""
 _KEYED = ("SETITEM", "SETITEMS", "DICT", "ADDITEMS", "FROZENSET")
@@ -39,7 +46,7 @@ _REMEDY = (
 )
 
 
-class RefusedPickleError(ValueError):
+class RefusedPickleError(DamagedFileError):
     """A pickle that is damaged or asks for something that is not on the list."""
 
 
@@ -48,28 +55,12 @@ def read_pickle(path: Path, max_bytes: int = MAX_FILE_BYTES) -> Any:
 
     numpy arrays and scipy.sparse matrices come as they are, chumpy arrays as numpy arrays.
     Raises UserError where the file is missing, longer than `max_bytes`, damaged, or asks for
-    anything that is not on the list; arrays may take `max_bytes` of memory altogether.
+    anything that is not on the list. Arrays, and the whole value unfolded as a tree, may take some
+    times the file's size, and `max_bytes` at most.
     """
-    file = io.BytesIO(read_bytes(path, max_bytes))
     with refusals_told(path):
-        return Resolver(max_bytes)(unpickle(file, ARRAY_NAMES))
-
-
-def read_bytes(path: Path, max_bytes: int) -> bytes:
-    """A file's content; raises UserError where it is missing, unreadable or longer."""
-    path = Path(path)
-    if not path.is_file():
-        raise UserError(f"There is no file {path}.", "Name an existing file.")
-    if path.stat().st_size > max_bytes:
-        raise UserError(
-            f"{path} is longer than {max_bytes} bytes.", "Check that it is the right file."
-        )
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise UserError(
-            f"{path} cannot be read: {error.strerror}.", "Name a file that you may read."
-        ) from None
+        content = read_file(path, max_bytes)
+        return Resolver(content, max_bytes)(unpickle(io.BytesIO(content), ARRAY_NAMES))
 
 
 @contextmanager
@@ -79,7 +70,7 @@ def refusals_told(path: Path) -> Iterator[None]:
         yield
     except Exception as error:
         # Bytes of others can provoke nearly any error in pickle, zipfile, numpy and scipy.
-        refused = isinstance(error, RefusedPickleError)
+        refused = isinstance(error, DamagedFileError)
         why = error if refused else f"it is damaged ({type(error).__name__})"
         raise UserError(f"{path} was not read: {why}.", _REMEDY) from None
 
@@ -97,12 +88,19 @@ class StandIn:
 
     def __new__(cls, *arguments: Any) -> "StandIn":
         """Not `__init__`, which pickle may pass over."""
+        _require_few(arguments)
         made = super().__new__(cls)
         made.arguments, made.state = arguments, None
         return made
 
     def __setstate__(self, state: Any) -> None:
+        _require_few(state)
         self.state = state
+
+
+def _require_few(parts: Any) -> None:
+    if isinstance(parts, tuple | list | dict) and len(parts) > _MAX_PARTS:
+        raise RefusedPickleError(f"it makes an object of more than {_MAX_PARTS} parts")
 
 
 Convert = Callable[[Any, "Resolver"], Any]
@@ -161,7 +159,8 @@ def _vet(file: io.BytesIO) -> None:
 
     That is: lengths beyond the file's end and high memo numbers, for which it takes memory at once;
     numbers of a million digits; steps without end; classes that others registered (EXT); and, as
-    the types on the stack tell, tuples as keys: a few nested ones can take for ever to hash.
+    the types on the stack tell, tuples and long numbers as keys: a few nested ones, or many that
+    hash alike, can take for ever.
     """
     stack: list[Any] = []
     memo: dict[int, Any] = {}
@@ -171,6 +170,8 @@ def _vet(file: io.BytesIO) -> None:
             raise RefusedPickleError(f"it holds the opcode {name}, not needed here")
         if isinstance(argument, int) and argument.bit_length() > _MAX_NUMBER_BITS:
             raise RefusedPickleError("it holds a number of too many digits")
+        if after and isinstance(argument, int) and argument.bit_length() > _MAX_KEY_BITS:
+            after = [_LONG_NUMBER]
         if "PUT" in name:
             if argument > MAX_OPCODES:
                 raise RefusedPickleError(f"it remembers more than {MAX_OPCODES} values")
@@ -210,12 +211,17 @@ def _opcodes(file: io.BytesIO) -> Iterator[tuple[pickletools.OpcodeInfo, Any]]:
 
 
 class Resolver:
-    """Replaces stand-ins by their values, each once; `max_bytes` bounds all arrays together."""
+    """Replaces a file's stand-ins by their values, each once.
 
-    def __init__(self, max_bytes: int) -> None:
-        self._left = max_bytes
+    What the arrays take together, and what the value takes where everything shared counts as often
+    as it is reached, is some times the length of `content` and `max_bytes` at most.
+    """
+
+    def __init__(self, content: bytes, max_bytes: int) -> None:
+        self._most = self._left = min(max_bytes, _SMALL_BYTES + _UNFOLDED_TIMES * len(content))
         self._depth = 0
         self._done: dict[int, tuple[Any, Any]] = {}
+        self._unfolded: dict[int, int] = {}
 
     def spend(self, count: int) -> None:
         """Raises RefusedPickleError once more bytes than allowed are asked for."""
@@ -234,20 +240,33 @@ class Resolver:
         if self._depth > _MAX_DEPTH:
             raise RefusedPickleError("it is nested too deeply")
         self._depth += 1
-        if isinstance(value, list | dict):
-            # Known before its items are: it may contain itself.
-            result: Any = type(value)()
-            self._done[id(value)] = value, result
-            if isinstance(value, list):
-                result.extend(map(self, value))
-            else:
-                result.update({key: self(item) for key, item in value.items()})
+        if isinstance(value, StandIn):
+            result = value.convert(self)
+        elif isinstance(value, dict):
+            result = {key: self(item) for key, item in value.items()}
+            self._unfold(result, [*result, *result.values()])
         else:
-            is_tuple = isinstance(value, tuple)
-            result = tuple(map(self, value)) if is_tuple else value.convert(self)
-            self._done[id(value)] = value, result
+            result = type(value)(map(self, value))
+            self._unfold(result, result)
+        self._done[id(value)] = value, result
         self._depth -= 1
         return result
+
+    def _unfold(self, result: Any, items: Iterable[Any]) -> None:
+        """Count a container as a tree: whoever copies or walks it meets shared parts each time."""
+        whole = _NODE_BYTES + sum(self._unfolded.get(id(i)) or _bytes_of(i) for i in items)
+        if whole > self._most:
+            raise RefusedPickleError("it repeats its parts without end")
+        self._unfolded[id(result)] = whole
+
+
+def _bytes_of(value: Any) -> int:
+    """What a value other than a list, tuple or dict takes."""
+    if isinstance(value, np.ndarray):
+        return value.nbytes
+    if isinstance(value, set | frozenset):
+        return _NODE_BYTES * (1 + len(value))
+    return _NODE_BYTES + (len(value) if isinstance(value, str | bytes | bytearray) else 0)
 
 
 def whole_numbers(shape: Any) -> tuple[int, ...]:
@@ -266,9 +285,10 @@ def _data_type(made: StandIn, resolve: Resolver) -> np.dtype:
     """numpy.dtype of plain numbers or short texts; never of Python objects or records."""
     name, state = resolve(made.arguments[0]), resolve(made.state)
     if isinstance(name, bytes):
-        name = name.decode("latin-1")
+        name = name[:40].decode("latin-1")
     if not isinstance(name, str) or not _DTYPE.fullmatch(name):
-        raise RefusedPickleError(f"it holds an array of {str(name)[:40]!r}, which are no numbers")
+        told = repr(name[:40]) if isinstance(name, str) else f"a {type(name).__name__}"
+        raise RefusedPickleError(f"it holds an array of {told}, which are no numbers")
     if state is None:
         return np.dtype(name)
     if len(state) < 5 or state[1] not in ("<", ">", "|", "="):
@@ -296,7 +316,7 @@ def _filled(
         raise RefusedPickleError(
             f"it claims an array of {claimed} bytes where there are {len(raw)}"
         )
-    resolve.spend(claimed)
+    resolve.spend(max(claimed, *shape, 0))  # one without numbers may have rows without end
     raw = raw.encode("latin-1") if isinstance(raw, str) else raw
     flat = np.frombuffer(raw, dtype) if claimed else np.zeros(0, dtype)
     return flat.reshape(shape, order="F" if fortran else "C").copy(order="K")
@@ -325,6 +345,8 @@ def _sparse(made: StandIn, resolve: Resolver) -> Any:
     arrays = tuple(parts[name] for name in ("data", "indices", "indptr"))
     if not all(isinstance(array, np.ndarray) and array.dtype.kind in "biuf" for array in arrays):
         raise RefusedPickleError("it holds a sparse matrix that is not of numbers")
+    # Who uses it makes it dense.
+    resolve.spend(prod(shape) * 8 + sum(array.nbytes for array in arrays))
     by_columns = made.name.rpartition(".")[2].startswith("csc")
     if len(arrays[2]) != shape[by_columns] + 1:
         raise RefusedPickleError("it holds a sparse matrix of the wrong size")
@@ -337,18 +359,19 @@ def _sparse(made: StandIn, resolve: Resolver) -> Any:
 def _chumpy(made: StandIn, resolve: Resolver) -> Shaped[np.ndarray, "..."]:
     """A chumpy array's numbers: `x`, or for a selection those entries of another array."""
     parts = _parts(made, resolve)
-    if "x" in parts:
-        value = np.asarray(parts["x"])
-    elif {"a", "idxs"} <= parts.keys():
-        chosen = np.asarray(parts["idxs"])
-        resolve.spend(chosen.size * 8)
-        shape = whole_numbers(parts.get("preferred_shape", chosen.shape))
-        value = np.asarray(parts["a"]).reshape(-1)[chosen].reshape(shape)
-    else:
+    value = parts.get("x", parts.get("a"))
+    if "x" not in parts and not {"a", "idxs"} <= parts.keys():
         raise RefusedPickleError(f"its {made.name} is computed from others by chumpy's code")
-    if value.dtype.kind not in "biuf":
+    if not isinstance(value, np.ndarray) or value.dtype.kind not in "biuf":
         raise RefusedPickleError(f"its {made.name} does not hold numbers")
-    return value
+    if "x" in parts:
+        return value
+    chosen = parts["idxs"]
+    if not isinstance(chosen, np.ndarray) or chosen.dtype.kind not in "iu":
+        raise RefusedPickleError(f"its {made.name} chooses by something other than numbers")
+    resolve.spend(value.nbytes + chosen.size * (8 + value.itemsize))
+    shape = whole_numbers(parts.get("preferred_shape", chosen.shape))
+    return value.reshape(-1)[chosen].reshape(shape)
 
 
 def _encoded(made: StandIn, resolve: Resolver) -> bytes:

@@ -1,4 +1,5 @@
 import json
+import os
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -160,6 +161,21 @@ def test_holding_out_every_frame_is_refused(writer):
         writer.finish(1)
 
 
+def test_paths_of_any_length_are_told(tmp_path, folder):
+    assert "does not exist" in error_of(tmp_path / ("n" * 5000)).cause
+    frames = json.loads((folder / "dataset.json").read_text())["frames"]
+    frames[1]["image"] = "n" * 5000
+    edit_index(folder, frames=frames)
+    assert "cannot be read" in error_of(folder).cause
+
+
+@pytest.mark.parametrize("name", ["images/00001.png", "theta.npy", "dataset.json"])
+def test_a_pipe_in_the_place_of_a_file_is_told(folder, name):
+    (folder / name).unlink()
+    os.mkfifo(folder / name)
+    assert "no regular file" in error_of(folder).cause
+
+
 def test_missing_or_empty_folder(tmp_path):
     assert "does not exist" in error_of(tmp_path / "none").cause
     assert "is empty" in error_of(tmp_path).cause
@@ -177,9 +193,10 @@ def with_nan(theta: np.ndarray) -> np.ndarray:
     [
         (with_nan, ["1 of 7 frames (4)"]),
         (lambda theta: theta[:, :5], ["(7, 5)", str(HeadModel.embedded().layout.size)]),
+        (lambda theta: theta + 1e5, ["no person can do in frame 0: expression"]),
         (lambda theta: np.array([{"a": 1}], dtype=object), ["theta.npy"]),
     ],
-    ids=["NaN", "another size", "needs pickle"],
+    ids=["NaN", "another size", "absurd", "needs pickle"],
 )
 def test_a_theta_that_cannot_be_used(folder, changed, causes):
     path = folder / "theta.npy"
@@ -196,6 +213,10 @@ def test_a_theta_that_cannot_be_used(folder, changed, causes):
         ({"format": "other"}, "format"),
         ({"head": "flame2020"}, "flame2020"),
         ({"test_frames": NUM_FRAMES}, "holds out"),
+        ({"test_frames": True}, "holds out"),
+        ({"version": True}, "version True"),
+        ({"width": 10**9}, "width"),
+        ({"identity": [True] * HeadModel.embedded().num_identity}, "identity"),
         ({"frames": []}, "no frames"),
     ],
 )

@@ -49,7 +49,15 @@ def test_nothing_in_a_config_is_run(tmp_path):
     assert not sign.exists()
 
 
-@pytest.mark.parametrize("text", ["data: [", "pipeline: 3", "!!python/none ''", "[]"])
+_BOMB = "a0: &a0 {x: y}\n" + "".join(
+    f"a{k}: &a{k} {{<<: [*a{k - 1}, *a{k - 1}]}}\n" for k in range(1, 40)
+)
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["data: [", "pipeline: 3", "!!python/none ''", "[]", "[" * 5000, "\0", "x" * 300_000, _BOMB],
+)
 def test_a_config_that_names_none_is_told(tmp_path, text):
     (tmp_path / "config.yml").write_text(text)
     with pytest.raises(UserError, match="does not say which dataset"):

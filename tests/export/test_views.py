@@ -118,6 +118,11 @@ def test_what_is_no_camera_path_is_refused(tmp_path):
         ({}, "no camera path"),
         (camera_path(one, camera_type="fisheye"), "fisheye"),
         (camera_path(one, camera_path=[]), "0 cameras"),
+        (camera_path(one, render_width=10**9), "1e\\+09"),
+        (camera_path(one, render_width=True), "finite numbers"),
+        (camera_path(one, fps=1e9), "frames per second"),
+        (camera_path(one, camera_path=[{"camera_to_world": [1.0] * 16, "fov": 200}]), "angles"),
+        (camera_path(one, camera_path=[{"camera_to_world": ["1"] * 16, "fov": 50}]), "finite"),
     ):
         path.write_text(json.dumps(described))
         with pytest.raises(UserError, match=told):

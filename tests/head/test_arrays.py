@@ -58,6 +58,40 @@ def test_missing_and_damaged_files_are_refused(tmp_path: Path) -> None:
         HeadArrays.from_state({"name": "other"})
 
 
+@pytest.mark.parametrize(
+    ("field", "changed", "told"),
+    [
+        ("v_template", lambda v: v * np.nan, "NaN"),
+        ("shapedirs", lambda v: v + 1e6, "beyond 100"),
+        ("uv", lambda v: np.where(v > 0, np.inf, v), "NaN, or numbers beyond"),
+        ("posedirs", lambda v: v.astype(np.complex128), "holds no head|complex128"),
+        ("joint_regressor", lambda v: v > 0, "holds no head|bool"),
+        ("skinning_weights", lambda v: v.astype(str), "holds no head|<U"),
+        ("faces", lambda v: v.astype(np.float32), "holds no head|float32"),
+        ("uv_faces", lambda v: v.astype(np.uint64), "holds no head|uint64"),
+        ("parents", lambda v: np.array([-1, 2, 1, 1, 1]), "hang on"),
+        ("parents", lambda v: np.array([-1, 0, 1, 1, 99]), "hang on"),
+        ("parents", lambda v: np.array([0, 0, 1, 1, 1]), "hang on"),
+        ("num_identity", lambda v: -5, "claims -5"),
+        ("num_identity", lambda v: 10**12, "claims 1000000000000"),
+        ("expression_names", lambda v: v[:-1] + v[:1], "one name"),
+        ("expression_names", lambda v: ("x" * 9999, *v[1:]), "short text"),
+        ("group_skin", lambda v: np.array(["x"]), "holds no head|skin is no list"),
+    ],
+)
+def test_what_is_no_head_is_refused(field, changed, told) -> None:
+    arrays = flame_shaped_arrays()
+    items = dict(arrays._items())
+    with pytest.raises(UserError, match=told):
+        HeadArrays.from_state({**items, field: changed(items[field])})
+
+
+def test_the_other_byte_order_is_turned() -> None:
+    arrays = flame_shaped_arrays()
+    turned = replace(arrays, v_template=arrays.v_template.astype(">f8"))
+    assert turned.digest() == arrays.digest()
+
+
 def test_arrays_that_do_not_fit_together_are_refused() -> None:
     arrays = flame_shaped_arrays()
     with pytest.raises(UserError, match="shapedirs"):

@@ -96,12 +96,11 @@ def test_shared_arrays_stay_shared_and_are_writable(write):
     assert second[0] == 1
 
 
-def test_a_list_that_contains_itself_is_read(write):
+def test_a_list_that_contains_itself_is_refused(write):
     loop: list = [np.ones(2)]
     loop.append(loop)
-    read = read_pickle(write(pickle.dumps(loop)))
-    assert read[1] is read
-    assert np.array_equal(read[0], np.ones(2))
+    with pytest.raises(UserError, match="nested too deeply"):
+        read_pickle(write(pickle.dumps(loop)))
 
 
 MADE_ARRAY = b"cnumpy.core.multiarray\n_reconstruct\n(cnumpy\nndarray\n(K\x00tU\x01btR"
@@ -260,9 +259,9 @@ def test_shared_bytes_do_not_multiply(write):
 def test_a_long_or_missing_file_is_refused(write, tmp_path):
     with pytest.raises(UserError, match="longer than 10 bytes"):
         read_pickle(write(pickle.dumps("x" * 20)), max_bytes=10)
-    with pytest.raises(UserError, match="no file"):
+    with pytest.raises(UserError, match="does not exist"):
         read_pickle(tmp_path / "nowhere")
-    with pytest.raises(UserError, match="no file"):
+    with pytest.raises(UserError, match="Is a directory"):
         read_pickle(tmp_path)
 
 

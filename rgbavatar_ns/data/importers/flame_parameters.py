@@ -3,12 +3,13 @@
 import os
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float
 
-from rgbavatar_ns.data.importers.folder import finite
+from rgbavatar_ns.data.importers.folder import as_array, finite
 from rgbavatar_ns.data.importers.import_report import UnusableFrameError
 from rgbavatar_ns.data.importers.source import Reading
 from rgbavatar_ns.errors import UserError
@@ -73,11 +74,9 @@ def _moved(arrays: HeadArrays, offset: Float[np.ndarray, "V 3"]) -> HeadArrays:
     return replace(arrays, v_template=arrays.v_template + offset.astype(np.float32))
 
 
-def padded(
-    coefficients: np.ndarray, count: int, what: str, head_name: str
-) -> Float[np.ndarray, "_"]:
+def padded(coefficients: Any, count: int, what: str, head_name: str) -> Float[np.ndarray, "_"]:
     """Coefficients in the head model's number; UnusableFrameError if none, or not only zeros go."""
-    values = np.asarray(coefficients)
+    values = as_array(coefficients, what)
     if values.dtype.kind not in "iuf" or values.size != max(values.shape, default=0):
         raise UnusableFrameError(f"{what} that is no list of numbers")
     values = finite(values.reshape(-1), what)

@@ -1,10 +1,7 @@
 """A folder of somebody else's files: nothing outside of it is read, and every file is checked."""
 
-import json
 import os
 import re
-import zipfile
-import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,10 +11,11 @@ from jaxtyping import Float
 
 from rgbavatar_ns.data.importers.import_report import UnusableFrameError
 from rgbavatar_ns.errors import UserError, first_few
+from rgbavatar_ns.reading import DamagedFileError, MissingFileError, load_arrays, load_json
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 _NUMBER = re.compile(r"(?:.*\D)?(\d{1,15})")
-_MAX_BYTES = 1 << 30
+_MAX_AXES = 4
 
 
 @dataclass(frozen=True)
@@ -43,14 +41,14 @@ class Folder:
 
     def has(self, *relative: str) -> bool:
         """Whether all of these exist, wherever links lead."""
-        return all((self.root / name).exists() for name in relative)
+        return all(os.path.exists(self.root / name) for name in relative)
 
     def names(self, subfolder: str, suffixes: tuple[str, ...]) -> list[str]:
         """Files of these suffixes in a subfolder, in order; hidden ones are passed over."""
         folder = self.path(subfolder)
         return [
             name
-            for name in (sorted(os.listdir(folder)) if folder.is_dir() else ())
+            for name in (sorted(os.listdir(folder)) if os.path.isdir(folder) else ())
             if not name.startswith(".") and os.path.splitext(name)[1].lower() in suffixes
         ]
 
@@ -88,10 +86,8 @@ def number_of(path: str) -> int | None:
 def read_json(path: Path) -> dict[str, Any]:
     """A JSON object; raises UserError for anything else."""
     try:
-        if path.stat().st_size > _MAX_BYTES:
-            raise ValueError("it is larger than any index of frames")
-        content = json.loads(path.read_text(encoding="utf-8-sig"))
-    except (OSError, ValueError, RecursionError) as error:
+        content = load_json(path)
+    except DamagedFileError as error:
         raise UserError(f"{path} cannot be read: {error}.", "Copy or export it again.") from None
     if not isinstance(content, dict):
         raise UserError(f"{path} holds no JSON object.", "Copy or export it again.")
@@ -101,25 +97,16 @@ def read_json(path: Path) -> dict[str, Any]:
 def read_npz(path: Path) -> dict[str, np.ndarray]:
     """The arrays of an npz file; raises UnusableFrameError where it is missing or damaged."""
     try:
-        with np.load(path, allow_pickle=False) as file:
-            if isinstance(file, np.ndarray):
-                raise ValueError("a single array")
-            promised = sum(entry.file_size for entry in file.zip.infolist())
-            if promised > _MAX_BYTES:
-                raise ValueError("arrays too large")
-            return {name: file[name] for name in file.files}
-    except FileNotFoundError:
+        return load_arrays(path)
+    except MissingFileError:
         raise UnusableFrameError("parameters that are missing") from None
-    except (
-        OSError, ValueError, EOFError, KeyError, SyntaxError, TypeError, RuntimeError, MemoryError,
-        NotImplementedError, OverflowError, zipfile.BadZipFile, zlib.error,
-    ):  # fmt: skip
+    except DamagedFileError:
         raise UnusableFrameError("parameters that cannot be read") from None
 
 
 def numbers(value: Any, count: int, what: str) -> Float[np.ndarray, "_"]:
     """`count` finite numbers, whatever batch axes of 1 they have; raises UnusableFrameError."""
-    array = _array(value, what)
+    array = as_array(value, what)
     if array.dtype.kind not in "iuf" or array.size != count or count not in (1, *array.shape):
         raise UnusableFrameError(f"{what} that is not {count} numbers")
     return finite(array.reshape(count), what)
@@ -127,7 +114,7 @@ def numbers(value: Any, count: int, what: str) -> Float[np.ndarray, "_"]:
 
 def matrix(value: Any, rows: int, columns: int, what: str) -> Float[np.ndarray, "R C"]:
     """A matrix of finite numbers, one batch axis of 1 allowed; raises UnusableFrameError."""
-    array = _array(value, what)
+    array = as_array(value, what)
     if array.ndim == 3 and len(array) == 1:
         array = array[0]
     if array.dtype.kind not in "iuf" or array.shape != (rows, columns):
@@ -135,14 +122,28 @@ def matrix(value: Any, rows: int, columns: int, what: str) -> Float[np.ndarray, 
     return finite(array, what)
 
 
-def _array(value: Any, what: str) -> np.ndarray:
-    """What is there as an array; of objects where it is none."""
+def as_array(value: Any, what: str) -> np.ndarray:
+    """An array, or nested lists of numbers as one; raises UnusableFrameError for anything else.
+
+    Neither text nor booleans are numbers, which numpy would take for some.
+    """
     if value is None:
         raise UnusableFrameError(f"no {what}")
+    if not _is_numeric(value):
+        raise UnusableFrameError(f"{what} that is no list of numbers")
     try:
         return np.asarray(value)
     except (TypeError, ValueError, OverflowError):
-        return np.empty(0, object)
+        raise UnusableFrameError(f"{what} that is no list of numbers") from None
+
+
+def _is_numeric(value: Any, axes: int = _MAX_AXES) -> bool:
+    if isinstance(value, list | tuple):
+        return axes > 0 and all(_is_numeric(item, axes - 1) for item in value)
+    if isinstance(value, np.ndarray):
+        return value.dtype.kind in "iuf"
+    number = isinstance(value, int | float | np.integer | np.floating)
+    return number and not isinstance(value, bool)
 
 
 def finite(array: np.ndarray, what: str) -> Float[np.ndarray, "*shape"]:

@@ -1,5 +1,6 @@
 """The formats that are known, and which of them a folder is in."""
 
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -69,7 +70,7 @@ def find_format(root: Path, options: ImportOptions | None = None) -> Format | No
 
 def read_source(root: Path, options: ImportOptions, progress: Progress | None = None) -> Source:
     """All records of a folder of another system without its pixels; UserError if it has faults."""
-    if not root.is_dir():
+    if not os.path.isdir(root):
         raise UserError(f"There is no folder {root}.", "Name the folder that holds the data.")
     found = find_format(root, options)
     if found is None:

@@ -23,6 +23,8 @@ from rgbavatar_ns.head import HeadArrays
 
 FLAME_VERSION = "2020"
 _SHAPE_TOLERANCE = _SKEW_TOLERANCE = 1e-3
+_MOST_BYTES = 1 << 26
+"""A tracker's frame has 20 kB."""
 _TURNS = ("jaw", "left_eye", "right_eye")
 
 
@@ -85,7 +87,7 @@ def _turned(frames: dict[int, TrackedHead]) -> dict[int, TrackedHead]:
 
 def _read(path: Path) -> Any:
     try:
-        return read_torch_file(path)
+        return read_torch_file(path, _MOST_BYTES)
     except UserError as error:
         # Without the file's name, so that equal faults are counted together.
         cause = error.cause.replace(str(path), "the file").rstrip(".")

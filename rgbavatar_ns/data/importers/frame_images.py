@@ -4,15 +4,25 @@ import struct
 from dataclasses import dataclass
 from pathlib import Path
 
+import av
+import av.error
 import cv2
 import numpy as np
 from jaxtyping import UInt8
 
 from rgbavatar_ns.data.importers.import_report import UnusableFrameError
-from rgbavatar_ns.data.png import decode_png_rgba, encode_png_rgba, png_damage, png_header_size
+from rgbavatar_ns.data.png import (
+    MAX_IMAGE_BYTES,
+    decode_bounded,
+    decode_png_rgba,
+    encode_png_rgba,
+    png_damage,
+    png_header_size,
+)
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.reading import DamagedFileError, MissingFileError, read_file, regular_file
 
-_JPEG_START, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
+_JPEG_START = b"\xff\xd8"
 _GREY_TOLERANCE = 24
 """JPEG files of grey pictures come out a little coloured."""
 _PNG_COMPRESSION = 1
@@ -44,20 +54,18 @@ class ImageHeader:
 def image_header(path: Path) -> ImageHeader:
     """Size and kind from a file's first bytes; raises UnusableFrameError."""
     try:
-        with path.open("rb") as file:
+        with regular_file(path) as file:
             head = file.read(_PNG_HEADER_BYTES)
             if head[:2] == _JPEG_START:
                 head += file.read(_JPEG_HEADER_BYTES)
                 # A long colour profile or thumbnail may come first.
-                found = _jpeg_header(head) or _jpeg_header(head + file.read())
+                found = _jpeg_header(head) or _jpeg_header(head + file.read(MAX_IMAGE_BYTES))
                 size, has_alpha = (None if found is None else found[:2]), False
             else:
                 # Colour types 4 and 6 are grey and RGB with alpha.
                 size, has_alpha = png_header_size(head), head[25:26] in (b"\x04", b"\x06")
-    except FileNotFoundError:
-        raise UnusableFrameError("images that are missing") from None
-    except OSError:
-        raise UnusableFrameError("images that cannot be read") from None
+    except DamagedFileError as error:
+        raise _unreadable(error) from None
     if not size or 0 in size:
         raise UnusableFrameError("images that are neither PNG nor JPEG, or damaged")
     return ImageHeader(*size, has_alpha)
@@ -101,11 +109,14 @@ def _compose(
 
 def _read(path: Path) -> bytes:
     try:
-        return path.read_bytes()
-    except FileNotFoundError:
-        raise UnusableFrameError("images that are missing") from None
-    except OSError:
-        raise UnusableFrameError("images that cannot be read") from None
+        return read_file(path, MAX_IMAGE_BYTES)
+    except DamagedFileError as error:
+        raise _unreadable(error) from None
+
+
+def _unreadable(error: DamagedFileError) -> UnusableFrameError:
+    missing = isinstance(error, MissingFileError)
+    return UnusableFrameError(f"images that {'are missing' if missing else 'cannot be read'}")
 
 
 def _require_size(found: tuple[int, ...] | None, size: tuple[int, int]) -> None:
@@ -121,12 +132,12 @@ def _decode(encoded: bytes) -> UInt8[np.ndarray, "height width 4"]:
         except UserError:
             raise UnusableFrameError("images that are damaged or cut short") from None
     header = _jpeg_header(encoded)
-    if header is None or encoded.rfind(_JPEG_END) < encoded.find(b"\xff\xda"):
+    if header is None or is_damaged_jpeg(encoded):
         raise UnusableFrameError("images that are damaged or cut short")
     if header[2] == 4:
         raise UnusableFrameError("CMYK JPEG images (convert them to RGB)")
     # As most trackers read it: turned as its EXIF orientation says.
-    decoded = cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_COLOR)
+    decoded = decode_bounded(encoded, cv2.IMREAD_COLOR, header[:2])
     if decoded is None:
         raise UnusableFrameError("images that are damaged or cut short")
     return cv2.cvtColor(decoded, cv2.COLOR_BGR2RGBA)
@@ -141,6 +152,24 @@ def _grey(path: Path, size: tuple[int, int]) -> UInt8[np.ndarray, "height width"
         raise UnusableFrameError("masks that are coloured")
     grey = color[..., 1]
     return grey * np.uint8(255) if grey.max() == 1 else grey
+
+
+def is_damaged_jpeg(encoded: bytes) -> bool:
+    """Whether a JPEG is cut short, or its bits are no code of it; the others' change is not seen.
+
+    OpenCV decodes those too, and tells on stderr at most; ffmpeg's decoder can be told to refuse.
+    JPEG has no checksums: most turned bits still are a picture, and nothing tells them.
+    """
+    if encoded.rfind(b"\xff\xd9") < encoded.find(b"\xff\xda"):
+        return True
+    decoder = av.CodecContext.create("mjpeg", "r")
+    decoder.options = {"err_detect": "explode"}
+    try:
+        return not decoder.decode(av.Packet(encoded))
+    except av.error.InvalidDataError:
+        return True
+    except av.error.FFmpegError:  # a rarer kind of JPEG, which OpenCV may know
+        return False
 
 
 def _jpeg_header(encoded: bytes) -> tuple[int, int, int] | None:

@@ -1,5 +1,6 @@
 """IMAvatar's flame_params.json, which SplattingAvatar, PointAvatar and MonoGaussianAvatar share."""
 
+import os
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -47,11 +48,9 @@ def read_imavatar(reading: Reading) -> Source:
         raise UserError(f"{path} has no list of frames.", "Export the data again.")
     arrays = flame_for(reading, FLAME_VERSION)
     try:
-        identity = padded(
-            np.asarray(content.get("shape_params", ())), arrays.num_identity, "shape", arrays.name
-        )
+        identity = padded(content.get("shape_params"), arrays.num_identity, "shape", arrays.name)
         intrinsics = numbers(content.get("intrinsics"), 4, "intrinsics")
-    except (UnusableFrameError, ValueError, OverflowError) as error:
+    except UnusableFrameError as error:
         raise UserError(f"{path} has {error}.", "Export the data again.") from None
     masks = "mask" if reading.folder.has("mask") else None
     records, named, lengths = [], set(), set()
@@ -99,10 +98,7 @@ def _record(
     camera = CameraRecord(world_to_camera, np.abs(intrinsics[:2]) * size, intrinsics[2:] * size)
     pose = numbers(frame.get("pose"), 15, "pose").reshape(5, 3)
     theta: dict[str, np.ndarray] = dict(zip(_POSE, pose))
-    try:
-        expression = np.asarray(frame.get("expression", ()))
-    except (TypeError, ValueError, OverflowError):
-        raise UnusableFrameError("expression that is no list of numbers") from None
+    expression = frame.get("expression")
     theta["expression"] = padded(expression, arrays.num_expressions, "expression", arrays.name)
     return FrameRecord(number, _frame_image(folder, image, masks), theta, camera)
 
@@ -120,7 +116,7 @@ def _image(folder: Folder, file_path: str) -> Path:
     for parent in parents:
         for suffix in ("", *IMAGE_SUFFIXES):
             candidate = folder.path(f"{parent / named.name}{suffix}")
-            if candidate.is_file():
+            if os.path.isfile(candidate):
                 return candidate
     raise UnusableFrameError("records without an image")
 
@@ -130,6 +126,6 @@ def _frame_image(folder: Folder, image: Path, masks: str | None) -> FrameImage:
         return FrameImage(image)
     for suffix in IMAGE_SUFFIXES:
         candidate = folder.path(f"{masks}/{image.stem}{suffix}")
-        if candidate.is_file():
+        if os.path.isfile(candidate):
             return FrameImage(image, alpha=candidate)
     raise UnusableFrameError("images without a matte")

@@ -1,5 +1,6 @@
 """INSTA: transforms.json with OpenCV cameras, and what metrical-tracker knew or its meshes tell."""
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +25,7 @@ from rgbavatar_ns.data.importers.transforms import (
 )
 from rgbavatar_ns.head import HeadArrays
 from rgbavatar_ns.head.flame import EXPRESSIONS
+from rgbavatar_ns.reading import read_file
 
 _HELD_OUT = 350
 _CAMERA_TOLERANCE = 1e-3
@@ -113,7 +115,7 @@ def _from_meshes(reading: Reading, entries: dict[int, Entry]) -> _Parameters:
         with report.frame(entry.name):
             expressions[number] = _expression(folder, entry, arrays)
             mesh = entry.values.get("mesh_path", f"meshes/{number:05d}.obj")
-            if not isinstance(mesh, str) or not folder.path(mesh).is_file():
+            if not isinstance(mesh, str) or not os.path.isfile(folder.path(mesh)):
                 raise UnusableFrameError("frames with neither a .frame file nor a mesh")
             meshes[number] = folder.path(mesh)
     if not meshes:
@@ -131,10 +133,9 @@ def _expression(folder: Folder, entry: Entry, arrays: HeadArrays) -> Float[np.nd
         raise UnusableFrameError("frames without exp_path")
     path = folder.path(name)
     try:
-        if path.stat().st_size > _EXPRESSION_BYTES:
-            raise ValueError
-        values = np.array([float(word) for word in path.read_text(encoding="utf-8").split()])
-    except (OSError, ValueError):
+        content = read_file(path, _EXPRESSION_BYTES)
+        values = np.array([float(word) for word in content.split()])
+    except ValueError:
         raise UnusableFrameError("expressions that cannot be read") from None
     if len(values) != EXPRESSIONS:
         raise UnusableFrameError(f"expressions that are not {EXPRESSIONS} numbers")

@@ -1,6 +1,8 @@
 """Head shape, jaw, eyes and eyelids from meshes that a tracker wrote, where nothing else tells."""
 
+import io
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -13,11 +15,13 @@ from rgbavatar_ns.data.importers.source import Reading
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadArrays, HeadModel
 from rgbavatar_ns.head.flame import FLAME_VERTICES
+from rgbavatar_ns.reading import read_file
 
 _ITERATIONS, _SHAPE_FRAMES, _EVERY = 8, 3, 6
 _CONVERGED = 1e-9
 _STEP = 1e-4
 _DAMPING = 1e-9
+_MOST_BYTES = 1 << 26
 _WORST_M = 3e-4
 """Meshes farther from the fitted head than this are not of this head model."""
 
@@ -68,10 +72,10 @@ def fit_meshes(
 def read_mesh(path: Path) -> Float[Tensor, "V 3"]:
     """FLAME's vertices from an OBJ file; raises UnusableFrameError."""
     try:
-        lines = path.read_text(encoding="utf-8", errors="strict").splitlines()
-        rows = [line.split()[1:4] for line in lines if line.startswith("v ")]
-        vertices = np.array(rows[:FLAME_VERTICES], dtype=np.float64)
-    except (OSError, ValueError):
+        lines = (line for line in io.BytesIO(read_file(path, _MOST_BYTES)) if line[:2] == b"v ")
+        rows = [line.split(None, 4)[1:4] for line in islice(lines, FLAME_VERTICES)]
+        vertices = np.array([[float(word) for word in row] for row in rows], dtype=np.float64)
+    except ValueError:
         raise UnusableFrameError("meshes that cannot be read") from None
     if vertices.shape != (FLAME_VERTICES, 3) or not np.isfinite(vertices).all():
         raise UnusableFrameError("meshes that are not FLAME's")

@@ -84,18 +84,16 @@ def assemble(
 
     hold_out: how many of the last frames the format holds out, or the numbers of those.
     """
+    layout = HeadModel(arrays).layout
     records = _unique(reading, sorted(records, key=lambda record: record.index))
-    size, records = _one_size(reading, records)
+    size, records = _one_size(reading, _possible(reading, records, layout))
     reading.report.settle(str(reading), reading.options.allow_partial)
     if not records:
         raise UserError(f"{reading} has no frame that can be used.", "Look at its files.")
     records = place_head_pose(records, arrays, identity, _head_pose(reading, records))
-    layout = HeadModel(arrays).layout
-    columns = {
-        field.name: np.stack([r.theta.get(field.name, np.zeros(field.size)) for r in records])
-        for field in layout.fields
-    }
-    theta = layout.join({name: torch.from_numpy(column) for name, column in columns.items()})
+    theta = _theta(records, layout)
+    if absurd := layout.absurd(theta):
+        raise UserError(f"{reading} moves a head as no person can: {absurd}.", "Look at its files.")
     width, height = size
     cameras = PinholeCameras(
         _stack([record.camera.world_to_camera for record in records]),
@@ -119,6 +117,29 @@ def assemble(
         timesteps=tuple(record.timestep for record in records),
         notes=tuple(reading.report.notes),
     )
+
+
+def _theta(records: Sequence[FrameRecord], layout: ThetaLayout) -> Float[Tensor, "F H"]:
+    columns = {
+        field.name: np.stack([r.theta.get(field.name, np.zeros(field.size)) for r in records])
+        for field in layout.fields
+    }
+    return layout.join({name: torch.from_numpy(column) for name, column in columns.items()})
+
+
+def _possible(
+    reading: Reading, records: list[FrameRecord], layout: ThetaLayout
+) -> list[FrameRecord]:
+    """The records of what a person can do; the others go into the report."""
+    if not records or layout.absurd(_theta(records, layout)) is None:
+        return records
+    kept = []
+    for record in records:
+        with reading.report.frame(record.frame_image.color.name):
+            if absurd := layout.absurd(_theta([record], layout)[0]):
+                raise UnusableFrameError(f"records of what no person can do ({absurd})")
+            kept.append(record)
+    return kept
 
 
 def _head_pose(reading: Reading, records: Sequence[FrameRecord]) -> HeadPose:

@@ -9,6 +9,7 @@ import io
 import zipfile
 from collections.abc import Callable
 from functools import cache
+from math import prod
 from pathlib import Path
 from typing import Any
 
@@ -21,12 +22,12 @@ from rgbavatar_ns.head.safe_pickle import (
     RefusedPickleError,
     Resolver,
     StandIn,
-    read_bytes,
     refusals_told,
     stand_in,
     unpickle,
     whole_numbers,
 )
+from rgbavatar_ns.reading import open_archive, read_file, read_member
 
 _LEGACY_MAGIC = 0x1950A86A20F9469CFC6C
 _NUMBERS = {
@@ -48,14 +49,14 @@ def read_torch_file(path: Path, max_bytes: int = MAX_FILE_BYTES) -> Any:
     Under the rules of `head.safe_pickle.read_pickle`. Compressed zip members, which can unpack to
     more than the file holds, are refused.
     """
-    data = read_bytes(path, max_bytes)
-    load = _load_zip if data.startswith(b"PK\x03\x04") else _load_legacy
     with refusals_told(path):
-        return load(data, Resolver(max_bytes))
+        data = read_file(path, max_bytes)
+        load = _load_zip if data.startswith(b"PK\x03\x04") else _load_legacy
+        return load(data, Resolver(data, max_bytes))
 
 
 def _load_zip(data: bytes, resolve: Resolver) -> Any:
-    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+    with open_archive(io.BytesIO(data)) as archive:
         members = {member.filename: member for member in archive.infolist()}
         pickles = [name for name in members if name.endswith("data.pkl")]
         if len(pickles) != 1:
@@ -68,7 +69,7 @@ def _load_zip(data: bytes, resolve: Resolver) -> Any:
             if info.compress_type != zipfile.ZIP_STORED or info.file_size > len(data):
                 raise RefusedPickleError(f"its part {info.filename[:80]!r} is compressed")
             resolve.spend(info.file_size)
-            return archive.read(info)
+            return read_member(archive, info)
 
         if folder + "byteorder" in members and member("byteorder") != b"little":
             raise RefusedPickleError("its numbers are stored in the other byte order")
@@ -139,11 +140,18 @@ def _tensor(made: StandIn, resolve: Resolver) -> Shaped[np.ndarray, "..."]:
     if len(shape) != len(steps) or (0 not in shape and last >= len(numbers)):
         raise RefusedPickleError("it holds a tensor that reaches beyond its storage")
     native = numbers.dtype.newbyteorder("=")
+    resolve.spend(max(prod(shape) * native.itemsize, *shape, 0))
     if 0 in shape:
         return np.zeros(shape, native)
-    resolve.spend(int(np.prod(shape, dtype=object)) * native.itemsize)
     strides = tuple(step * native.itemsize for step in steps)
     return np.lib.stride_tricks.as_strided(numbers[offset:], shape, strides).astype(native)
+
+
+def _parameter(made: StandIn, resolve: Resolver) -> Shaped[np.ndarray, "..."]:
+    value = resolve(made.arguments[0])
+    if not isinstance(value, np.ndarray):
+        raise RefusedPickleError("it holds a parameter that is no tensor")
+    return value
 
 
 def _no_value(made: StandIn, resolve: Resolver) -> Any:
@@ -154,7 +162,7 @@ _TORCH_NAMES = ARRAY_NAMES | {
     name: stand_in(name, convert)
     for name, convert in {
         "torch._utils._rebuild_tensor_v2": _tensor,
-        "torch._utils._rebuild_parameter": lambda made, resolve: resolve(made.arguments[0]),
+        "torch._utils._rebuild_parameter": _parameter,
         "torch.Size": lambda made, resolve: whole_numbers(resolve(made.arguments[0])),
         # A tensor's hooks, which nobody here asks for.
         "collections.OrderedDict": _no_value,

@@ -16,6 +16,8 @@ from rgbavatar_ns.data.importers.source import Reading
 from rgbavatar_ns.errors import UserError
 
 INDEX_FILE = "transforms.json"
+_MOST_SHARED = 100
+"""Each frame gets them; nerfstudio writes some twenty."""
 _OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
@@ -103,6 +105,8 @@ def _frames(reading: Reading, name: str) -> dict[str, dict[str, Any]]:
     if not isinstance(frames, list):
         raise UserError(f"{path} has no list of frames.", "Export the data again.")
     shared = {key: value for key, value in content.items() if key != "frames"}
+    if len(shared) > _MOST_SHARED:
+        raise UserError(f"{path} says {len(shared)} things of all frames.", "Export it again.")
     found: dict[str, dict[str, Any]] = {}
     for place, frame in enumerate(frames):
         label = f"frame {place} of {name}"
@@ -123,7 +127,7 @@ def camera_of(values: Mapping[str, Any], opengl: bool) -> CameraRecord:
     if opengl:
         camera_to_world = camera_to_world @ _OPENGL_TO_OPENCV
     width, height = size_of(values)
-    focal = [_focal(values, "x", width), _focal(values, "y", height)]
+    focal = [_focal(values, "x", (width, height)), _focal(values, "y", (width, height))]
     centre = [numbers(values.get(name), 1, name)[0] for name in ("cx", "cy")]
     return CameraRecord(inverse(camera_to_world), np.array(focal), np.array(centre))
 
@@ -144,14 +148,14 @@ def size_of(values: Mapping[str, Any]) -> tuple[int, int]:
     return int(width), int(height)
 
 
-def _focal(values: Mapping[str, Any], axis: str, pixels: int) -> float:
+def _focal(values: Mapping[str, Any], axis: str, size: tuple[int, int]) -> float:
     """In pixels: as it is written, else from the angle of view."""
     if f"fl_{axis}" in values:
         return float(numbers(values[f"fl_{axis}"], 1, f"fl_{axis}")[0])
     if f"camera_angle_{axis}" in values:
         angle = float(numbers(values[f"camera_angle_{axis}"], 1, f"camera_angle_{axis}")[0])
         if 0 < angle < math.pi:
-            return 0.5 * pixels / math.tan(0.5 * angle)
+            return 0.5 * size[axis == "y"] / math.tan(0.5 * angle)
     if axis == "y":
-        return _focal(values, "x", int(values["w"]))
+        return _focal(values, "x", size)
     raise UnusableFrameError("cameras without a focal length")

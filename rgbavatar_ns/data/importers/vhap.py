@@ -1,5 +1,6 @@
 """VHAP's export, as GaussianAvatars reads it: OpenGL cameras, axis-angle FLAME 2023 parameters."""
 
+import os
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -85,7 +86,7 @@ def _frame_image(folder: Folder, entry: Entry) -> FrameImage:
     mask = entry.values.get("fg_mask_path")
     if mask is None:
         return FrameImage(folder.path(entry.name))
-    if not isinstance(mask, str) or not folder.path(mask).is_file():
+    if not isinstance(mask, str) or not os.path.isfile(folder.path(mask)):
         raise UnusableFrameError("frames whose mask is missing")
     return FrameImage(folder.path(entry.name), alpha=folder.path(mask))
 

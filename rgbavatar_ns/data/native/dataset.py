@@ -1,11 +1,11 @@
 """A folder of tracked frames, read and checked: every fault is one error with its remedy."""
 
-import json
+import os
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 import torch
@@ -20,16 +20,19 @@ from rgbavatar_ns.data.native.format import (
     VERSIONS,
     cameras_from_json,
 )
-from rgbavatar_ns.data.png import png_size, read_png_rgba
+from rgbavatar_ns.data.png import MAX_PIXELS, png_size, read_png_rgba
 from rgbavatar_ns.errors import UserError, first_few
 from rgbavatar_ns.head import HeadArrays, HeadModel, ThetaLayout
 from rgbavatar_ns.kernels.types import PinholeCameras
+from rgbavatar_ns.reading import DamagedFileError, json_numbers, load_array, load_json
 
 _MAKE_ONE = (
     "Make a dataset with `rgbavatar demo-data FOLDER` or `rgbavatar track VIDEO FOLDER` and pass "
     "that folder, or pass another system's output as docs/dataset_format.md lists them."
 )
 _WRITE_AGAIN = "Write the dataset again, or mend this file."
+_LARGEST_NUMBER = 10**15
+_SHOWN = 200
 
 
 @dataclass(frozen=True)
@@ -114,7 +117,7 @@ def load_native(path: str | Path) -> TrackedDataset:
 
 
 def _read_index(root: Path) -> dict[str, Any]:
-    if not root.exists():
+    if not os.path.exists(root):
         raise UserError(f"The dataset folder {root} does not exist.", _MAKE_ONE)
     if not root.is_dir():
         raise UserError(f"{root} is a file, not a dataset folder.", _MAKE_ONE)
@@ -123,12 +126,12 @@ def _read_index(root: Path) -> dict[str, Any]:
         what = "is empty" if not any(root.iterdir()) else f"has no {INDEX_FILE}"
         raise UserError(f"The dataset folder {root} {what}.", _MAKE_ONE)
     try:
-        index = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+        index = load_json(path)
+    except DamagedFileError as error:
         raise UserError(f"{path} cannot be read: {error}.", _WRITE_AGAIN) from None
     if not isinstance(index, dict) or index.get("format") != FORMAT:
         raise UserError(f'{path} does not say "format": "{FORMAT}".', _MAKE_ONE)
-    if index.get("version") not in VERSIONS:
+    if not _is_whole(index.get("version")) or index["version"] not in VERSIONS:
         raise UserError(
             f"{path} has version {index.get('version')} of the format; versions "
             f"{', '.join(map(str, VERSIONS))} are known.",
@@ -142,22 +145,27 @@ def _read_index(root: Path) -> dict[str, Any]:
 
 def _whole(index: dict[str, Any], name: str) -> int:
     value = index.get(name)
-    if not isinstance(value, int) or value < 1:
+    if not _is_whole(value) or not 1 <= value <= MAX_PIXELS:
         raise UserError(
-            f"{INDEX_FILE} has {name} = {value!r}; a positive whole number is needed.",
+            f"{INDEX_FILE} has {name} = {str(value)[:_SHOWN]}; a positive whole number is needed.",
             _WRITE_AGAIN,
         )
     return value
 
 
+def _is_whole(value: Any) -> TypeGuard[int]:
+    """A whole number within reason, and not true or false, which Python takes for 1 and 0."""
+    return type(value) is int and 0 <= value <= _LARGEST_NUMBER
+
+
 def _read_head(root: Path, name: str) -> HeadArrays:
     path = root / HEAD_FILE
-    if path.exists():
+    if os.path.lexists(path):
         return HeadArrays.load(path)
     embedded = HeadArrays.embedded()
     if name != embedded.name:
         raise UserError(
-            f"The dataset {root} was made for the head '{name}', which is not known here.",
+            f"The dataset {root} was made for the head '{name[:_SHOWN]}', which is not known here.",
             f"Put its arrays beside it as {HEAD_FILE}, or track the video with the embedded head "
             f"'{embedded.name}'.",
         )
@@ -178,16 +186,13 @@ def _read_layout(root: Path, index: dict[str, Any], arrays: HeadArrays) -> Theta
 
 def _read_identity(root: Path, index: dict[str, Any], arrays: HeadArrays) -> Float[Tensor, "I"]:
     try:
-        identity = torch.tensor(index["identity"], dtype=torch.float32)
-    except (TypeError, ValueError):
-        identity = torch.full((1,), torch.nan)
-    if identity.shape != (arrays.num_identity,) or not torch.isfinite(identity).all():
+        return torch.from_numpy(json_numbers(index["identity"], (arrays.num_identity,))).float()
+    except DamagedFileError:
         raise UserError(
             f"The identity in {root / INDEX_FILE} is not a list of {arrays.num_identity} finite "
             f"numbers, which the head '{arrays.name}' takes.",
             _WRITE_AGAIN,
-        )
-    return identity
+        ) from None
 
 
 def _read_frames(root: Path, index: dict[str, Any]) -> list[dict[str, Any]]:
@@ -195,10 +200,11 @@ def _read_frames(root: Path, index: dict[str, Any]) -> list[dict[str, Any]]:
     if not isinstance(frames, list) or not frames:
         raise UserError(f"The dataset {root} lists no frames.", _MAKE_ONE)
     for frame in frames:
-        whole = isinstance(frame, dict) and isinstance(frame.get("index"), int)
+        whole = isinstance(frame, dict) and _is_whole(frame.get("index"))
         if not whole or not isinstance(frame.get("image"), str):
             raise UserError(
-                f"{root / INDEX_FILE} has a frame without a number or an image: {frame}.",
+                f"{root / INDEX_FILE} has a frame without a number or an image: "
+                f"{str(frame)[:_SHOWN]}.",
                 _WRITE_AGAIN,
             )
         relative = PurePosixPath(frame["image"])
@@ -221,8 +227,8 @@ def _read_frames(root: Path, index: dict[str, Any]) -> list[dict[str, Any]]:
 def _read_theta(root: Path, layout: ThetaLayout, numbers: tuple[int, ...]) -> Float[Tensor, "F H"]:
     path = root / THETA_FILE
     try:
-        theta = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
+        theta = load_array(path)
+    except DamagedFileError as error:
         raise UserError(f"{path} cannot be read: {error}.", _WRITE_AGAIN) from None
     expected = (len(numbers), layout.size)
     if theta.shape != expected or theta.dtype.kind != "f":
@@ -238,7 +244,14 @@ def _read_theta(root: Path, layout: ThetaLayout, numbers: tuple[int, ...]) -> Fl
             f"({first_few(wrong)}).",
             "Track these frames again, or leave them out of the dataset.",
         )
-    return torch.from_numpy(theta.astype(np.float32))
+    read = torch.from_numpy(theta.astype(np.float32))
+    for number, row in zip(numbers, read) if layout.absurd(read) else ():
+        if absurd := layout.absurd(row):
+            raise UserError(
+                f"{path} holds what no person can do in frame {number}: {absurd}.",
+                "Track this frame again, or leave it out of the dataset.",
+            )
+    return read
 
 
 def _camera_records(
@@ -252,8 +265,8 @@ def _camera_records(
         if isinstance(camera, str):
             if not isinstance(named, dict) or camera not in named:
                 raise UserError(
-                    f"{root / INDEX_FILE} names the camera '{camera}' in frame {frame['index']}, "
-                    "but does not describe it.",
+                    f"{root / INDEX_FILE} names the camera '{camera[:_SHOWN]}' in frame "
+                    f"{frame['index']}, but does not describe it.",
                     _WRITE_AGAIN,
                 )
             camera = named[camera]
@@ -265,9 +278,9 @@ def _read_test(root: Path, index: dict[str, Any], numbers: tuple[int, ...]) -> t
     """Positions of held-out frames: `test` names them, `test_frames` counts them from the end."""
     if "test" not in index:
         num_frames, count = len(numbers), index.get("test_frames")
-        if not isinstance(count, int) or not 0 <= count < num_frames:
+        if not _is_whole(count) or not count < num_frames:
             raise UserError(
-                f"The dataset {root} holds out {count!r} of {num_frames} frames.",
+                f"The dataset {root} holds out {str(count)[:_SHOWN]} of {num_frames} frames.",
                 f"Set test_frames in {INDEX_FILE} to a number from 0 to {num_frames - 1}.",
             )
         return tuple(range(num_frames - count, num_frames))
@@ -292,7 +305,7 @@ def _column(root: Path, frames: list[dict[str, Any]], name: str, kind: type) -> 
     values = tuple(frame.get(name) for frame in frames)
     if all(value is None for value in values):
         return ()
-    if not all(isinstance(value, kind) for value in values):
+    if not all(_is_whole(value) if kind is int else type(value) is kind for value in values):
         raise UserError(
             f"{root / INDEX_FILE} has a {name} for some frames only, or one that is no "
             f"{kind.__name__}.",

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.reading import DamagedFileError, load_arrays
 from rgbavatar_ns.tracking.face.detector import face_height_px
 from rgbavatar_ns.tracking.face.follow import FaceFollower
 
@@ -19,6 +20,8 @@ _PAUSE = 4.0
 # Sharpness below this share of the clip's sharp frames' (its 90th percentile: most frames may be
 # blurred) is noted as blur. Frames of a face that talks and keeps still are above .7.
 _BLURRED, _SHARP_PERCENT = 0.35, 90
+_MOST_BYTES = 1 << 32
+_PER_FRAME, _POINTS = ("count", "clip", "time_s", "has_alpha"), (478, 2)
 
 
 @dataclass(frozen=True)
@@ -47,9 +50,23 @@ class SeenFaces:
 
     @classmethod
     def load(cls, path: Path) -> "SeenFaces":
-        """What `np.savez(path, **vars(faces))` wrote."""
-        with np.load(path, allow_pickle=False) as file:
-            return cls(**file)
+        """What `np.savez(path, **vars(faces))` wrote; UserError where it holds anything else."""
+        try:
+            arrays = load_arrays(path, _MOST_BYTES)
+            faces = cls(*(arrays[item.name] for item in fields(cls)))
+            rows = [getattr(faces, name).shape for name in _PER_FRAME]
+            shown = (len(faces.sharpness), *_POINTS)
+            whole = faces.count.dtype.kind == "i" and (faces.count >= 0).all()
+            if rows != [(len(faces),)] * len(rows) or faces.points.shape != shown or not whole:
+                raise DamagedFileError("its arrays do not fit together")
+            if faces.count.sum() != len(faces.points):
+                raise DamagedFileError("it counts other faces than it holds")
+            return faces
+        except (DamagedFileError, KeyError, TypeError) as error:
+            raise UserError(
+                f"{path} holds no faces that were found: {error}.",
+                "Remove the folder's unfinished tracking, or track with --overwrite.",
+            ) from None
 
 
 @dataclass(frozen=True)

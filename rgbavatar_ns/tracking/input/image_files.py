@@ -7,9 +7,10 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from rgbavatar_ns.data.png import read_png_rgba
+from rgbavatar_ns.data.png import MAX_IMAGE_BYTES, read_png_rgba
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.files import digest, digest_of_file
+from rgbavatar_ns.reading import DamagedFileError, read_file
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff")
 _NEVER_ALPHA = (".jpg", ".jpeg", ".bmp")
@@ -54,9 +55,9 @@ def read_image_rgba(path: Path) -> UInt8[np.ndarray, "H W 4"]:
     if path.suffix.lower() == ".png":
         return read_png_rgba(path)
     try:
-        encoded = np.fromfile(path, np.uint8)
-    except OSError as error:
-        raise UserError(f"{path} cannot be read: {error.strerror}.", "Check the file.") from None
+        encoded = np.frombuffer(read_file(path, MAX_IMAGE_BYTES), np.uint8)
+    except DamagedFileError as error:
+        raise UserError(f"{path} cannot be read: {error}.", "Check the file.") from None
     decoded = None
     if encoded.size and path.suffix.lower() not in _NEVER_ALPHA:
         decoded = cv2.imdecode(encoded, cv2.IMREAD_UNCHANGED)

@@ -23,10 +23,10 @@ def make_take(flame: Path, version: str, stiff_neck: bool) -> tuple[Take, list[T
     take = Take(
         arrays, identity.astype(np.float32).astype(float), NUM_FRAMES, NUM_TEST, WIDTH, HEIGHT
     )
-    return take, [_frame(FIRST + k, generator, stiff_neck) for k in range(NUM_FRAMES)]
+    return take, [make_frame(FIRST + k, generator, stiff_neck) for k in range(NUM_FRAMES)]
 
 
-def _frame(index: int, generator: np.random.Generator, stiff_neck: bool) -> TakeFrame:
+def make_frame(index: int, generator: np.random.Generator, stiff_neck: bool) -> TakeFrame:
     turns = {
         name: generator.uniform(-0.4, 0.4, 3)
         for name in ("rotation", "neck", "jaw", "left_eye", "right_eye")

@@ -1,5 +1,6 @@
 """Whatever one file's damage is: a clear error or the very same import, never another one."""
 
+import io
 import json
 import os
 import shutil
@@ -15,12 +16,18 @@ from PIL import Image
 
 from rgbavatar_ns.data.check import unreadable_report
 from rgbavatar_ns.data.importers import ImportOptions, Source, read_source
-from rgbavatar_ns.data.importers.frame_images import FrameImage, image_header, make_png
+from rgbavatar_ns.data.importers.frame_images import (
+    FrameImage,
+    image_header,
+    is_damaged_jpeg,
+    make_png,
+)
 from rgbavatar_ns.data.importers.import_report import UnusableFrameError
 from rgbavatar_ns.data.png import decode_png_rgba
 from rgbavatar_ns.errors import UserError
 from tests.data.importers.takes import FIRST, HEIGHT, NUM_FRAMES, WIDTH
 from tests.data.importers.test_round_trips import FORMATS, write
+from tests.fuzz.attacks import turned
 
 BAD_VALUES = (float("nan"), float("inf"), None, "text", [], {}, [[1.0]], True, 10**400, -1e300)
 ODD_NAMES = ("日本語 ", "ü ñ", "two words", "%s{}")
@@ -289,6 +296,61 @@ def test_a_picture_cut_anywhere_is_told(tmp_path):
             path.write_bytes(whole[:kept])
             with pytest.raises(UnusableFrameError):
                 decoded(FrameImage(path))
+
+
+def _jpegs() -> dict[str, bytes]:
+    """A portrait's colours in the kinds of JPEG that there are."""
+    x, y = np.meshgrid(np.linspace(-1, 1, 96), np.linspace(-1, 1, 80))
+    noise = np.random.default_rng(0).normal(0, 6, (80, 96, 3))
+    color = np.stack([200 - 90 * x, 150 + 80 * y, 120 + 60 * np.hypot(x, y)], -1) + noise
+    image = Image.fromarray(color.clip(0, 255).astype(np.uint8))
+    exif = Image.Exif()
+    exif[0x0112] = 3
+    made = {
+        "usual": (image, {}),
+        "4:4:4": (image, {"subsampling": 0, "quality": 98}),
+        "4:2:2": (image, {"subsampling": 1}),
+        "progressive": (image, {"progressive": True}),
+        "optimised": (image, {"optimize": True}),
+        "restarts": (image, {"restart_marker_blocks": 4}),
+        "with EXIF and a profile": (image, {"exif": exif, "icc_profile": bytes(70_000)}),
+        "grey": (image.convert("L"), {}),
+        "tiny": (image.resize((1, 1)), {}),
+    }
+    encoded = {}
+    for name, (picture, options) in made.items():
+        file = io.BytesIO()
+        picture.save(file, "JPEG", **options)
+        encoded[name] = file.getvalue()
+    return encoded
+
+
+def test_whole_jpegs_of_all_kinds_pass_and_some_turned_bits_are_told():
+    told = 0
+    for name, whole in _jpegs().items():
+        assert not is_damaged_jpeg(whole), name
+        if name in ("usual", "progressive"):
+            generator = np.random.default_rng(1)
+            for _ in range(100):
+                told += is_damaged_jpeg(turned(whole, generator, bits=1))
+    # Without checksums most turned bits are another picture.
+    assert told > 40
+
+
+def test_what_no_person_can_do_is_left_out_with_the_reason(folders, flame_folder, tmp_path):
+    folder = shutil.copytree(folders["imavatar"], tmp_path / "data")
+    path = folder / "flame_params.json"
+    content = json.loads(path.read_text())
+    content["frames"][1]["expression"][7] = 100_000
+    path.write_text(json.dumps(content))
+    with pytest.raises(UserError, match=r"no person can do \(expression reaches 100000"):
+        read(folder, flame_folder)
+    source = read(folder, flame_folder, allow_partial=True)
+    assert len(source) == NUM_FRAMES - 1
+    content["frames"][1]["expression"][7] = True
+    path.write_text(json.dumps(content))
+    with pytest.raises(UserError, match="expression that is no list of numbers"):
+        read(folder, flame_folder)
 
 
 def test_nothing_known_says_what_lies_below(folders, tmp_path):
