@@ -85,17 +85,21 @@ def _configured(config: Any, random: np.random.Generator) -> tuple[str, Callable
         fields = [
             field.name
             for field in dataclasses.fields(owner)
-            if dataclasses.is_dataclass(value := getattr(owner, field.name))
+            if _is_group(value := getattr(owner, field.name))
             or (isinstance(value, int | float) and not isinstance(value, bool))
         ]
         if not fields:
             return f"{path} has no numbers", lambda: None
         name = str(random.choice(fields))
         value, path = getattr(owner, name), f"{path}.{name}"
-        if not dataclasses.is_dataclass(value):
+        if not _is_group(value):
             break
         owner = value
     absurd = random.choice([-3, 0, float("nan"), float("inf"), 10**12, -(10**30)])
     absurd = absurd if isinstance(value, float) or absurd != absurd else int(min(absurd, 10**30))
     object.__setattr__(owner, name, absurd)
     return f"config{path} = {absurd}", lambda: require_trainable(config)
+
+
+def _is_group(value: Any) -> bool:
+    return dataclasses.is_dataclass(value) and not isinstance(value, type)
