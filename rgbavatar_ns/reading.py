@@ -16,7 +16,7 @@ import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from jaxtyping import Shaped
@@ -64,8 +64,13 @@ def damage_told() -> Iterator[None]:
         raise DamagedFileError(f"{type(error).__name__} {first_line}".strip()) from None
 
 
-def read_file(path: Path, max_bytes: int) -> bytes:
-    """A regular file's content; raises DamagedFileError where it is none, unreadable or longer."""
+@contextmanager
+def open_regular(path: Path, max_bytes: int) -> Iterator[tuple[BinaryIO, int]]:
+    """A regular file, open for reading, and its size.
+
+    Raises DamagedFileError where it is none, unreadable or longer, and for all that goes wrong
+    while it is open.
+    """
     with damage_told():
         # A FIFO without a writer would block here for ever.
         descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))
@@ -75,10 +80,17 @@ def read_file(path: Path, max_bytes: int) -> bytes:
                 raise DamagedFileError("it is no regular file")
             if status.st_size > max_bytes:
                 raise DamagedFileError(f"it is longer than {max_bytes} bytes")
-            content = file.read(max_bytes + 1)
-            if len(content) > max_bytes:
-                raise DamagedFileError(f"it is longer than {max_bytes} bytes")
-            return content
+            yield file, status.st_size
+
+
+def read_file(path: Path, max_bytes: int) -> bytes:
+    """A regular file's content; raises DamagedFileError where it is none, unreadable or longer."""
+    with open_regular(path, max_bytes) as (file, size):
+        # Room for what is asked for is made at once: no more than there is.
+        content = file.read(size + 1)
+        if len(content) > size:
+            raise DamagedFileError("it grows while it is read")
+        return content
 
 
 def parse_json(text: bytes | str) -> Any:

@@ -5,6 +5,8 @@ from typing import Any, Literal
 
 from rgbavatar_ns.errors import UserError
 
+_ABSURD = 1 << 31
+
 
 @dataclass(frozen=True)
 class AvatarConfig:
@@ -67,11 +69,21 @@ class AvatarConfig:
 
     @classmethod
     def from_json(cls, values: dict[str, Any]) -> "AvatarConfig":
-        """Build from `to_json`; raises UserError on a field that this version does not know."""
-        unknown = sorted(set(values) - {field.name for field in fields(cls)})
+        """Build from `to_json`; raises UserError on a field unknown to this version or misfit."""
+        kinds: dict[str, Any] = {field.name: field.type for field in fields(cls)}
+        unknown = sorted(set(values) - set(kinds))
         if unknown:
             raise UserError(
                 f"The avatar's settings contain {', '.join(unknown)}, unknown to this version.",
                 "Update rgbavatar_ns to the version that wrote them.",
             )
+        for name, value in values.items():
+            kind = kinds[name] if isinstance(kinds[name], type) else str
+            # JSON writes 1.0 as it likes, and knows NaN.
+            fits = type(value) in (int, float) if kind is float else type(value) is kind
+            if not fits or (kind is not str and not abs(value) < _ABSURD):
+                raise UserError(
+                    f"The avatar's {name} is {value!r}, which is no {kind.__name__} of use.",
+                    "Save the avatar again, or use another copy.",
+                )
         return cls(**values)
