@@ -28,7 +28,8 @@ def model_state(avatar: Avatar, subject: Subject) -> dict[str, Any]:
 def require_same_layout(state_dict: Mapping[str, Any], avatar: Avatar) -> None:
     """Raise UserError where the checkpoint's theta is not laid out as `avatar` takes it."""
     extra = state_dict.get(_EXTRA_STATE)
-    make = extra.get("avatar") if isinstance(extra, dict) else None
+    extra = extra if isinstance(extra, dict) else {}
+    make = extra.get("avatar")
     config = make.get("config") if isinstance(make, dict) else None
     if not isinstance(config, dict):
         raise UserError(
