@@ -2,16 +2,17 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.options import Between, CheckedOptions, Count, Counted, Pixels
 
-_COUNTS = ("size", "threads", "count", "batch", "frames", "repetitions", "peer_repetitions")
-_COUNTS += ("trainer_steps",)
+_Threads = Annotated[int, Between(1, 4096)]
+_Batch = Annotated[int, Between(1, 4096)]
 
 
 @dataclass(frozen=True)
-class CommonOptions:
+class CommonOptions(CheckedOptions):
     """Choices of every benchmark."""
 
     json: Path | None = None
@@ -20,19 +21,12 @@ class CommonOptions:
     """Measure a trained avatar: a run's folder, a checkpoint or a bundle."""
     data: Path | None = None
     """Dataset whose theta and camera drive the avatar; without it small random theta."""
-    size: int | None = None
+    size: Pixels | None = None
     """Side of the images in pixels: 512, or the dataset's."""
-    threads: int | None = None
+    threads: _Threads | None = None
     """Threads to use; as many as torch takes by default."""
     device: Literal["cpu", "cuda"] | None = None
     """Where to measure; the GPU where it can be used, else the CPU."""
-
-    def __post_init__(self) -> None:
-        """Refuse what cannot be measured."""
-        for name in _COUNTS:
-            value = getattr(self, name, None)
-            if value is not None and value < 1:
-                raise UserError(f"--{name.replace('_', '-')} is {value}.", "Give 1 or more.")
 
 
 @dataclass(frozen=True)
@@ -44,19 +38,19 @@ class RasterizerOptions(CommonOptions):
     image, one camera, gradients to all attributes; or a trained avatar's Gaussians (--avatar).
     """
 
-    count: int | None = None
+    count: Count | None = None
     """Gaussians in a set of the synthetic workload: 60,000."""
-    batch: int = 10
+    batch: _Batch = 10
     """Sets, and images, at a time."""
     shared: bool = False
     """Share opacities and scales within the batch, as an avatar does."""
     backend: str = "auto"
     """Backend of the rasterizer."""
-    repetitions: int = 15
+    repetitions: Count = 15
     """Timings of each kind, after a warm-up."""
     peers: bool = True
     """Also measure the peers, on one image of the workload."""
-    peer_repetitions: int = 2
+    peer_repetitions: Count = 2
     """Timings of each peer, after a warm-up; they take seconds each."""
 
     def __post_init__(self) -> None:
@@ -77,9 +71,9 @@ class RasterizerOptions(CommonOptions):
 class AvatarOptions(CommonOptions):
     """Choices of the benchmarks that need a whole avatar."""
 
-    uv: int | None = None
+    uv: Annotated[int, Between(1, 4096)] | None = None
     """Side of the UV map of the avatar that is made for the benchmark: 256."""
-    bases: int | None = None
+    bases: Counted | None = None
     """Its number of blendshapes: 20."""
 
     def __post_init__(self) -> None:
@@ -100,13 +94,13 @@ class StepOptions(AvatarOptions):
     avatar (--avatar) and the pictures of its dataset (--data).
     """
 
-    batch: int = 10
+    batch: _Batch = 10
     """Images a step."""
-    repetitions: int = 15
+    repetitions: Count = 15
     """Timings of each kind, after a warm-up."""
     trainer: bool = False
     """Also train with nerfstudio's trainer, and say what share of the bare step's speed it has."""
-    trainer_steps: int = 100
+    trainer_steps: Count = 100
     """Steps of that training."""
 
 
@@ -114,7 +108,7 @@ class StepOptions(AvatarOptions):
 class RenderOptions(AvatarOptions):
     """From theta to the image, one image at a time, without gradients."""
 
-    frames: int = 10
+    frames: Count = 10
     """Different theta that are drawn in turn."""
-    repetitions: int = 50
+    repetitions: Count = 50
     """Timings of each kind, after a warm-up."""

@@ -12,12 +12,13 @@ from rgbavatar_ns.data import load_dataset
 from rgbavatar_ns.data.check import CheckReport, check_dataset, unreadable_report
 from rgbavatar_ns.data.importers import ImportOptions
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.options import Count
 
 
 def run(
     data: Annotated[Path, tyro.conf.Positional],
     sheet: Path | None = None,
-    max_frames: int = 200,
+    max_frames: Count = 200,
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False,
     options: Annotated[ImportOptions, tyro.conf.arg(name="")] = ImportOptions(),
 ) -> None:
@@ -31,8 +32,6 @@ def run(
         as_json: print the report as JSON (format, frames, usable, problems and more).
         options: how a folder of another system is read.
     """
-    if max_frames < 1:
-        raise UserError(f"--max-frames is {max_frames}.", "Name 1 or more.")
     try:
         dataset = load_dataset(data, options)
     except UserError as error:
@@ -74,6 +73,7 @@ def _in_words(data: Path, report: CheckReport) -> str:
             f"  {report.frames} frames ({report.train} to train on, {report.test} held out) of "
             f"{width} x {height} pixels, {shared}, focal length {focal} pixels",
             f"  head model {report.head}",
+            f"  {report.turns}",
             *(f"    {line}" for line in report.ranges),
             *(f"  note: {note}" for note in report.notes),
         ]

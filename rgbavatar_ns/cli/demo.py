@@ -1,11 +1,10 @@
 """`rgbavatar demo`: from nothing (or from a video) to a trained avatar, through nerfstudio."""
 
-import shutil
 import sys
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from rich.console import Console
 
@@ -13,6 +12,7 @@ from rgbavatar_ns.cli.progress import progress_bar, stage_bars
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.experiments import commands
 from rgbavatar_ns.files import Stages, write_json
+from rgbavatar_ns.options import Between, Count, Seed
 
 Result = dict[str, Any]
 METHOD = "rgbavatar-tiny"
@@ -23,10 +23,10 @@ HELD_OUT_STEPS = 40
 def run(
     output: Path | None = None,
     video: tuple[Path, ...] = (),
-    frames: int = 240,
-    image_size: int = 256,
-    steps: int | None = None,
-    seed: int = 0,
+    frames: Annotated[int, Between(2, 100_000)] = 240,
+    image_size: Annotated[int, Between(16, 4096)] = 256,
+    steps: Count | None = None,
+    seed: Seed = 0,
     fresh: bool = False,
     started_at: float | None = None,
 ) -> None:
@@ -97,7 +97,6 @@ def _fingerprint(path: Path) -> tuple[str, int, float]:
 def _demo(destination: Path, settings: dict[str, Any]) -> Result:
     from rgbavatar_ns.synthetic import DemoConfig, make_demo_dataset
 
-    shutil.rmtree(destination, ignore_errors=True)
     config = DemoConfig(
         num_frames=settings["frames"],
         num_test_frames=max(1, settings["frames"] // 4),
@@ -105,7 +104,7 @@ def _demo(destination: Path, settings: dict[str, Any]) -> Result:
         seed=settings["seed"],
     )
     with progress_bar("demo subject") as update:
-        make_demo_dataset(destination, config, progress=update)
+        make_demo_dataset(destination, config, progress=update, overwrite=True)
     return {"data": str(destination)}
 
 

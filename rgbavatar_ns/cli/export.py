@@ -7,6 +7,7 @@ import tyro
 
 from rgbavatar_ns.cli.progress import progress_bar
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.options import FrameRate
 
 if TYPE_CHECKING:
     from rgbavatar_ns.avatar import Avatar
@@ -23,13 +24,13 @@ def run(
     frame: int | None = None,
     frames: tuple[int, int] | None = None,
     head_inside: bool = True,
-    frames_per_second: float = 25.0,
+    frames_per_second: FrameRate = 25.0,
     title: str = "Avatar",
 ) -> None:
     """Write an avatar as a bundle, as Gaussians in PLY files or as a web page.
 
-    bundle: a folder that `Avatar.load` opens without nerfstudio; with --data it holds what the
-    avatar saw in training. ply: the Gaussians of one frame, as viewers of 3D Gaussian splatting
+    bundle: a folder that `Avatar.load` opens without nerfstudio, with what the avatar saw in
+    training. ply: the Gaussians of one frame, as viewers of 3D Gaussian splatting
     open them. ply-sequence: a folder of them. web: one HTML file that plays and drives the avatar
     in a browser, without a server or a network.
 
@@ -37,7 +38,7 @@ def run(
         run_folder: a run of ns-train, a checkpoint or an avatar bundle.
         destination: the folder (bundle, ply-sequence) or file (ply, web) to write.
         format: what to write.
-        data: the dataset whose frames are meant: the avatar's own.
+        data: the dataset whose frames are meant; by default the one that the run names.
         frame: for ply, the frame's place in the dataset; without it the head is at rest.
         frames: for ply-sequence and web, first frame and the frame after the last one.
         head_inside: for bundle, put the head model inside. Without it the bundle only names its
@@ -48,7 +49,7 @@ def run(
     from rgbavatar_ns import Avatar
 
     avatar = Avatar.load(run_folder)
-    dataset = _dataset(avatar, data)
+    dataset = _dataset(avatar, run_folder, data, needed=frame is not None or frames is not None)
     if format == "bundle":
         from rgbavatar_ns.avatar.storage.bundle import load_statistics
         from rgbavatar_ns.export import statistics_of
@@ -64,13 +65,26 @@ def run(
         _write_page(avatar, dataset, frames, destination, frames_per_second, title)
 
 
-def _dataset(avatar: "Avatar", data: Path | None) -> "TrackedDataset | None":
+def _dataset(
+    avatar: "Avatar", run_folder: Path, data: Path | None, *, needed: bool
+) -> "TrackedDataset | None":
+    """The named dataset, or the run's own; None where there is none and none is needed."""
     from rgbavatar_ns.data import load_dataset
+    from rgbavatar_ns.export import dataset_folder
 
-    if data is None:
+    folder = dataset_folder(run_folder) if data is None else data
+    if data is None and folder == run_folder:
+        if needed:
+            raise UserError("Frames are those of a dataset.", "Name it with --data.")
         return None
-    dataset = load_dataset(data)
-    avatar.require_layout(dataset.layout, f"The dataset {data}")
+    try:
+        dataset = load_dataset(folder)
+    except UserError as error:
+        if data is not None or needed:
+            raise
+        print(f"note: {error.cause} It goes without the frames of the run's own data.")
+        return None
+    avatar.require_layout(dataset.layout, f"The dataset {folder}")
     return dataset
 
 
@@ -84,8 +98,7 @@ def _write_frame(
 
     theta = torch.zeros(1, avatar.layout.size)
     if frame is not None:
-        if dataset is None:
-            raise UserError("--frame needs a dataset.", "Name it with --data.")
+        assert dataset is not None
         theta = dataset.theta[list(chosen_frames(len(dataset), (frame, frame + 1), ()))]
     with torch.no_grad():
         count = write_ply(destination, avatar.gaussians(theta))

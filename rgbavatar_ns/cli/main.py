@@ -1,10 +1,17 @@
 """The `rgbavatar` command: finds the sub-command and imports only what that one needs."""
 
+import functools
 import importlib
+import inspect
+import signal
 import sys
-from collections.abc import Sequence
+import threading
+from collections.abc import Callable, Sequence
+from types import FrameType
+from typing import Any
 
-from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.errors import UserError, told_as_user_error
+from rgbavatar_ns.options import check_options
 
 COMMANDS = {
     "demo": "demo subject (or your video) to a trained avatar, its metrics, a film and a picture",
@@ -34,7 +41,11 @@ def _help() -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run one sub-command; a mistake of the user's is told without a traceback (exit code 1)."""
+    """Run one sub-command; a mistake of the user's is told without a traceback (exit code 1).
+
+    So is what the system refuses: a full disk, a path, a right. SIGTERM ends like Ctrl-C, so that
+    nothing half-written is left behind.
+    """
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     name = arguments[0] if arguments else "--help"
     if name in ("--help", "-h"):
@@ -44,14 +55,40 @@ def main(arguments: Sequence[str] | None = None) -> None:
         print(f"There is no command {name!r}.\n\n{_help()}", file=sys.stderr)
         sys.exit(2)
     module_name = _MODULES.get(name, name.replace("-", "_"))
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, _terminate)
     try:
         import tyro
 
         module = importlib.import_module(f"rgbavatar_ns.cli.{module_name}")
-        tyro.cli(module.run, prog=f"rgbavatar {name}", args=arguments[1:])
+        tyro.cli(_checked(module.run), prog=f"rgbavatar {name}", args=arguments[1:])
     except UserError as error:
-        print(f"rgbavatar {name}: {error}", file=sys.stderr)
-        sys.exit(1)
+        _tell(name, error)
+    except OSError as error:
+        told = told_as_user_error(error)
+        if told is None:
+            raise
+        _tell(name, told)
     except KeyboardInterrupt:
         print(f"rgbavatar {name}: interrupted; run it again to go on.", file=sys.stderr)
         sys.exit(130)
+
+
+def _tell(name: str, error: UserError) -> None:
+    print(f"rgbavatar {name}: {error}", file=sys.stderr)
+    sys.exit(1)
+
+
+def _terminate(number: int, _frame: FrameType | None) -> None:
+    raise SystemExit(128 + number)
+
+
+def _checked(run: Callable[..., None]) -> Callable[..., None]:
+    """The command, which first looks whether its options lie within their ranges."""
+
+    @functools.wraps(run)
+    def checked(*values: Any, **named: Any) -> None:
+        check_options(run, inspect.signature(run).bind(*values, **named).arguments)
+        run(*values, **named)
+
+    return checked

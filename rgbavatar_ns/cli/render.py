@@ -10,6 +10,7 @@ import tyro
 from rgbavatar_ns.cli.progress import progress_bar
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.export.driving import DrivingOptions
+from rgbavatar_ns.options import Between, CheckedOptions, Counted, FrameRate, Pixels, Share, Weight
 
 if TYPE_CHECKING:
     import numpy as np
@@ -25,30 +26,21 @@ Kind = Literal["mp4", "png", "gif"]
 
 
 @dataclass(frozen=True)
-class PictureOptions:
+class PictureOptions(CheckedOptions):
     """Size, background and kind of what is written."""
 
     kind: Kind | None = None
     """mp4, png (numbered pictures) or gif; mp4 by default, gif for the turntable."""
-    width: int | None = None
+    width: Pixels | None = None
     """Width of the avatar's picture in pixels; the dataset's by default."""
-    height: int | None = None
+    height: Pixels | None = None
     """Height of the avatar's picture in pixels; the dataset's by default."""
-    background: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    background: tuple[Share, Share, Share] = (1.0, 1.0, 1.0)
     """Colour behind the head, red, green and blue in [0, 1]."""
     transparent: bool = False
     """No background: PNG files keep the alpha."""
-    frames_per_second: float = 25.0
+    frames_per_second: FrameRate = 25.0
     """Of the film, and of the performance for smoothing."""
-
-    def __post_init__(self) -> None:
-        """Refuse sizes and colours that are none."""
-        if any(side is not None and side < 1 for side in (self.width, self.height)):
-            raise UserError("The picture's width and height must be positive.", "Give pixels.")
-        if not all(0 <= channel <= 1 for channel in self.background):
-            raise UserError("The background's channels lie in [0, 1].", "Give three such numbers.")
-        if self.frames_per_second <= 0:
-            raise UserError("There must be more than 0 frames per second.", "Give a rate above 0.")
 
     def kind_for(self, show: Show) -> Kind:
         """What is written; raises UserError for a film that would lose its alpha."""
@@ -68,10 +60,10 @@ def run(
     show: Show = "comparison",
     driver: Path | None = None,
     frames: tuple[int, int] | None = None,
-    hold: int | None = None,
+    hold: Counted | None = None,
     camera_path: Path | None = None,
-    gain: float = 1.5,
-    arc: float = 360.0,
+    gain: Weight = 1.5,
+    arc: Annotated[float, Between(-360, 360)] = 360.0,
     picture: Annotated[PictureOptions, tyro.conf.arg(name="")] = _PICTURE,
     driving: Annotated[DrivingOptions, tyro.conf.arg(name="")] = _DRIVING,
 ) -> None:

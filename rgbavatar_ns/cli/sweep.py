@@ -13,6 +13,7 @@ from rich.table import Table
 from rgbavatar_ns.experiments import read_experiment
 from rgbavatar_ns.experiments.engines import Engine, LocalEngine, RayEngine
 from rgbavatar_ns.experiments.sweep import CellStatus, sweep
+from rgbavatar_ns.options import Between
 
 _STYLE = {"waiting": "dim", "running": "cyan", "done": "green", "failed": "bold red"}
 
@@ -22,10 +23,10 @@ def run(
     output: Path | None = None,
     tiny: bool = False,
     engine: Literal["local", "ray"] = "local",
-    at_once: int = 1,
+    at_once: Annotated[int, Between(1, 1024)] = 1,
     address: str | None = None,
-    cpus: float = 2.0,
-    gpus: float = 0.0,
+    cpus: Annotated[float, Between(0.01, 1e5)] = 2.0,
+    gpus: Annotated[float, Between(0, 1e5)] = 0.0,
 ) -> None:
     """Train and evaluate each variant on each subject with each seed; finished cells are kept.
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.plugin.training.interruption import PARENT_VARIABLE
 
 _QUIET = {
     # OpenMP's threads spin while they wait, which stalls training where other programs run too.
@@ -22,15 +23,21 @@ _QUIET = {
 def run_nerfstudio(*command: str | Path) -> None:
     """Run `ns-train`, `ns-eval` and the like; their output is shown as it comes.
 
-    On Ctrl-C the command is given the time to save what it has. Raises UserError where it ends
-    with another exit code than 0, KeyboardInterrupt where it was interrupted.
+    On Ctrl-C and SIGTERM the command is given the time to save what it has; it ends with this
+    process. Raises UserError where it ends with another exit code than 0, KeyboardInterrupt where
+    it was interrupted.
     """
     program = Path(sys.executable).with_name(str(command[0]))
-    environment = _QUIET | os.environ
+    environment = _QUIET | os.environ | {PARENT_VARIABLE: str(os.getpid())}
     with subprocess.Popen([program, *map(str, command[1:])], env=environment) as process:
         try:
             code = process.wait()
         except KeyboardInterrupt:
+            process.wait()
+            raise
+        except SystemExit:
+            # SIGTERM reaches this process alone, where Ctrl-C reaches both.
+            process.terminate()
             process.wait()
             raise
     if code == 130:

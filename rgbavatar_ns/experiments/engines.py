@@ -68,7 +68,7 @@ class LocalEngine:
 def start_cell(folder: Path, log: int) -> "subprocess.Popen[bytes]":
     """The cell's process, leader of a group of its own: a signal reaches ns-train once, from us."""
     return subprocess.Popen(
-        [*_RUNNER, str(folder)],
+        [*_RUNNER, str(folder), str(os.getpid())],
         stdin=subprocess.DEVNULL,
         stdout=log,
         stderr=log,

@@ -2,17 +2,16 @@
 
 import os
 import signal
-import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from rgbavatar_ns.files import hold_lock
+from rgbavatar_ns.plugin.training.interruption import when_parent_ends
 
 _LOCK_FILE = ".lock"
 _WAITING = "Another process still works on this cell; waiting for it."
-_WATCH_INTERVAL_S = 1.0
 _SECONDS_TO_SAVE = 60.0
 
 
@@ -28,19 +27,17 @@ def alone_in(
         yield
 
 
-def end_with_parent() -> None:
+def end_with_parent(parent_pid: int) -> None:
     """Interrupt this process's group, which it leads, once its parent is gone; later kill it.
 
-    A worker that a cluster or the system has killed can no longer end its cell.
+    A worker that a cluster or the system has killed can no longer end its cell. The parent names
+    itself: it may be gone before this process comes to ask.
     """
-    parent = os.getppid()
 
-    def watch() -> None:
-        while os.getppid() == parent:
-            time.sleep(_WATCH_INTERVAL_S)
+    def end() -> None:
         for number in (signal.SIGINT, signal.SIGKILL):
             os.killpg(0, number)
             time.sleep(_SECONDS_TO_SAVE)
 
     if os.getpgrp() == os.getpid():
-        threading.Thread(target=watch, daemon=True).start()
+        when_parent_ends(parent_pid, end)

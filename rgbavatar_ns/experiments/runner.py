@@ -1,4 +1,4 @@
-"""One cell in a process of its own: `python -m rgbavatar_ns.experiments.runner FOLDER`.
+"""One cell in a process of its own: `python -m rgbavatar_ns.experiments.runner FOLDER PARENT`.
 
 The folder holds cell.json (what to run, and on which data). ns-train and ns-eval write beside it;
 result.json comes last, so that its presence says that the cell is done. A cell that was
@@ -80,13 +80,13 @@ def _reenact(
 
 
 def main() -> None:
-    """Run the cell in the folder that is the only argument; exit code 1 tells of a failure.
+    """Run the cell in the folder that is the first argument; exit code 1 tells of a failure.
 
     Ends when the process that started it does, and waits for another one in the same folder, so
     that a cluster may start a lost cell anew.
     """
     folder = Path(sys.argv[1])
-    end_with_parent()
+    end_with_parent(int(sys.argv[2]))
     try:
         with alone_in(folder):
             if read_result(folder) is None:

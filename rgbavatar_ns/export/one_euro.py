@@ -7,27 +7,19 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.options import CheckedOptions, Positive, Weight
 
 
 @dataclass(frozen=True)
-class OneEuroOptions:
+class OneEuroOptions(CheckedOptions):
     """How much is smoothed; at 0 < speed the cutoff is min_cutoff_hz + beta * speed."""
 
-    min_cutoff_hz: float = 1.5
+    min_cutoff_hz: Positive = 1.5
     """Cutoff at rest: lower removes more jitter and lags more."""
-    beta: float = 2.0
+    beta: Weight = 2.0
     """How fast the cutoff rises with speed, in Hz for each unit (or radian) a second."""
-    derivative_cutoff_hz: float = 1.0
+    derivative_cutoff_hz: Positive = 1.0
     """Cutoff of the speed itself, as in the paper."""
-
-    def __post_init__(self) -> None:
-        """Refuse values that make no filter."""
-        if not (self.min_cutoff_hz > 0 and self.derivative_cutoff_hz > 0 and self.beta >= 0):
-            raise UserError(
-                "The smoothing filter's cutoffs must be above 0 and its beta not below.",
-                "Leave them at their defaults, or give such numbers.",
-            )
 
 
 def one_euro(

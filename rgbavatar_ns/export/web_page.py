@@ -4,6 +4,7 @@ import base64
 import gzip
 import html
 import json
+import re
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -122,22 +123,21 @@ def _manifest(
 
 
 def _assemble(manifest: dict[str, Any], block: bytes, title: str) -> str:
-    """Fill the page's template; data comes last, so that it cannot be taken for a placeholder."""
+    """Fill the page's template."""
     folder = resources.files("rgbavatar_ns.export") / "web"
     scripts = "\n".join(
         f"<script>\n{(folder / name).read_text(encoding='utf-8')}</script>" for name in SCRIPTS
     )
     packed = base64.b64encode(gzip.compress(block, compresslevel=6, mtime=0)).decode("ascii")
-    # Within a script element only "</" could end it.
-    described = json.dumps(manifest, allow_nan=False).replace("</", "<\\/")
-    page = (folder / "page.html").read_text(encoding="utf-8")
-    for name, text in {
+    # Within a script element "</script" and "<!--" have a meaning of their own.
+    described = json.dumps(manifest, allow_nan=False).replace("<", "\\u003c")
+    parts = {
         "title": html.escape(title),
         "style": (folder / "style.css").read_text(encoding="utf-8"),
         "scripts": scripts,
         "manifest": described,
         "payload": packed,
-    }.items():
-        before, after = page.split("{{" + name + "}}")
-        page = before + text + after
-    return page
+    }
+    page = (folder / "page.html").read_text(encoding="utf-8")
+    # In one pass: what is filled in is not looked at again.
+    return re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found[1]], page)

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import torch
 import tyro
@@ -21,6 +21,7 @@ from rgbavatar_ns.avatar.training.losses import random_backgrounds
 from rgbavatar_ns.data import ImageCache, OfflineOrder
 from rgbavatar_ns.data.check import quick_check
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.options import Between, Counted, Seed
 from rgbavatar_ns.plugin.cameras import from_nerfstudio
 from rgbavatar_ns.plugin.dataparser import (
     FrameDataset,
@@ -46,20 +47,20 @@ class RGBAvatarDataManagerConfig(FullImageDatamanagerConfig):
     """Dataset folder; `--data` sets it."""
     dataparser: RGBAvatarDataParserConfig = field(default_factory=RGBAvatarDataParserConfig)
     """How the folder is read."""
-    batch_size: int = 10
+    batch_size: Annotated[int, Between(1, 4096)] = 10
     """Frames a step, all different (paper: 10)."""
-    cache_mib: int = 1024
+    cache_mib: Counted = 1024
     """Budget for decoded images in MiB; what does not fit is decoded again when it is needed."""
-    decoding_threads: int = 2
+    decoding_threads: Annotated[int, Between(1, 256)] = 2
     """Background threads that decode images."""
-    prefetch_steps: int = 2
+    prefetch_steps: Annotated[int, Between(0, 1000)] = 2
     """Steps whose images are decoded ahead."""
-    device_mib: int = 16384
+    device_mib: Counted = 16384
     """Budget for training images on a GPU in MiB; where all fit, it takes whole steps by itself."""
     check_data: bool = True
     """Refuse data whose head is not where its images show it (`rgbavatar check`), before the first
     step."""
-    seed: int | None = None
+    seed: Seed | None = None
     """Seed of frame order and backgrounds; by default that of the run, `--machine.seed`."""
     masks_on_gpu: tyro.conf.Suppress[bool] = False
     images_on_gpu: tyro.conf.Suppress[bool] = False

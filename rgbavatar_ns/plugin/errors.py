@@ -8,7 +8,7 @@ from types import TracebackType
 
 import torch
 
-from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.errors import UserError, told_as_user_error
 from rgbavatar_ns.kernels import DeviceError
 
 _SMALLER = (
@@ -23,7 +23,8 @@ Hook = Callable[[type[BaseException], BaseException, TracebackType | None], obje
 def install_user_error_hook() -> None:
     """Let an uncaught `UserError` or `DeviceError` end the process with its message and code 1.
 
-    Every other exception goes to the hook that was there before. Installing twice changes nothing.
+    So does what the system refuses: a full disk, a path, a right. Every other exception goes to
+    the hook that was there before. Installing twice changes nothing.
     """
     if isinstance(sys.excepthook, _UserErrorHook):
         return
@@ -55,6 +56,8 @@ class _UserErrorHook:
     def __call__(
         self, kind: type[BaseException], error: BaseException, trace: TracebackType | None
     ) -> None:
+        if isinstance(error, OSError):
+            error = told_as_user_error(error) or error
         if isinstance(error, (UserError, DeviceError)):
             print(f"\nError: {error.cause}\n{error.remedy}", file=sys.stderr, flush=True)
         else:

@@ -21,6 +21,7 @@ from rgbavatar_ns.drawing.compositing import error_strip, straight_alpha
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.kernels import PinholeCameras
+from rgbavatar_ns.options import Counted, Seed, Weight
 from rgbavatar_ns.plugin.cameras import filled_depth, from_nerfstudio
 from rgbavatar_ns.plugin.checkpoint_state import misfits_told, model_state, require_same_layout
 from rgbavatar_ns.plugin.dataparser import Subject
@@ -38,9 +39,9 @@ class RGBAvatarModelConfig(ModelConfig):
     """Sizes, variants and initial values of the avatar."""
     initialize_colors: bool = True
     """Give each Gaussian the mean colour of the pixels it covers when it is first seen."""
-    lpips_weight: float = 0.0
+    lpips_weight: Weight = 0.0
     """Weight of the LPIPS loss (paper: 0, and 0.05 for its sharper variant)."""
-    lpips_start_step: int = 0
+    lpips_start_step: Counted = 0
     """Step from which the LPIPS loss counts."""
     lpips_metric: bool = True
     """Whether `ns-eval` computes LPIPS; its network is downloaded once (528 MB)."""
@@ -51,7 +52,7 @@ class RGBAvatarModelConfig(ModelConfig):
     """Correct each training frame's tracked pose, expression and translation a little, together
     with the avatar. Held-out frames take what a linear map learns from these corrections; their
     images are not looked at."""
-    refine_held_out: int = 0
+    refine_held_out: Counted = 0
     """Steps of fitting held-out frames to their images with the avatar frozen; `ns-eval` then
     reports psnr_refined and others beside the plain ones. 0 leaves it out."""
     refinement: RefinementConfig = field(default_factory=RefinementConfig)
@@ -66,7 +67,7 @@ class RGBAvatarModelConfig(ModelConfig):
     batch_parallel: bool = True
     """Draw the images of a training batch together. False draws one after another and sums their
     gradients (the paper's "naive batch", to measure against), without `fast`."""
-    seed: int | None = None
+    seed: Seed | None = None
     """Seed of the weight network's initial values; by default that of the run, `--machine.seed`."""
     enable_collider: bool = False
     """Part of nerfstudio's ray-based models; not used."""

@@ -1,43 +1,42 @@
 """What of the demo subject can be chosen."""
 
 from dataclasses import dataclass
+from typing import Annotated
 
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.options import Between, CheckedOptions, FrameRate, Seed
 
 
 @dataclass(frozen=True)
-class DemoConfig:
+class DemoConfig(CheckedOptions):
     """Size, length and difficulty of the demo subject's dataset."""
 
-    image_size: int = 256
+    image_size: Annotated[int, Between(8, 4096)] = 256
     """Width and height of the images in pixels."""
-    num_frames: int = 240
+    num_frames: Annotated[int, Between(1, 100_000)] = 240
     """Frames in all."""
-    num_test_frames: int = 60
+    num_test_frames: Annotated[int, Between(0, 100_000)] = 60
     """Held-out frames at the end; they combine expressions and poses as no other frame does."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of the person's looks, the performance and the tracker's noise."""
-    frames_per_second: float = 8.0
+    frames_per_second: FrameRate = 8.0
     """Frames per second of the performance; a second has some four syllables."""
-    theta_noise: float = 0.3
+    theta_noise: Annotated[float, Between(0, 100)] = 0.3
     """Strength of the tracker's noise: 1 is .01 on expression coefficients, .1 degrees on
     rotations (a third of a pixel at the crown of the default size) and .1 mm on translations; 0 is
     none. Images are never noisy."""
-    supersampling: int = 3
+    supersampling: Annotated[int, Between(1, 16)] = 3
     """Rays per pixel along each axis where something begins or ends; elsewhere two rays."""
-    wrinkles: float = 1.0
+    wrinkles: Annotated[float, Between(0, 10)] = 1.0
     """Depth of the wrinkles that come with expressions; 0 leaves them out."""
     glasses: bool = True
     """Whether the person wears glasses."""
 
     def __post_init__(self) -> None:
+        """Refuse values out of range, and more held-out frames than there are."""
+        super().__post_init__()
         if not 0 <= self.num_test_frames < self.num_frames:
             raise UserError(
                 f"{self.num_test_frames} of {self.num_frames} frames cannot be held out.",
                 "Ask for more frames, or hold out fewer.",
-            )
-        if self.image_size < 1 or self.supersampling < 1 or self.frames_per_second <= 0:
-            raise UserError(
-                "Image size, supersampling and frames per second must be positive.",
-                "Leave them at their defaults.",
             )

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from rgbavatar_ns.data.native.dataset import TrackedDataset
 from rgbavatar_ns.data.native.frame import TrackedFrame
-from rgbavatar_ns.data.native.writer import DatasetWriter
+from rgbavatar_ns.data.native.writer import DatasetWriter, make_room
 from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.head.rotations import axis_angle_to_matrix, matrix_to_axis_angle
 from rgbavatar_ns.kernels.types import PinholeCameras
@@ -180,18 +180,25 @@ def film_demo(config: DemoConfig, stiff_neck: bool = False) -> DemoFilm:
 
 
 def make_demo_dataset(
-    dst: str | Path, config: DemoConfig | None = None, progress: Progress | None = None
+    dst: str | Path,
+    config: DemoConfig | None = None,
+    progress: Progress | None = None,
+    *,
+    overwrite: bool = False,
 ) -> TrackedDataset:
-    """Render the demo subject and write it to `dst`, replacing a dataset that is there.
+    """Render the demo subject and write it to `dst`, which is new, empty or left unfinished.
+
+    `overwrite` replaces a dataset that is there; anything else there is refused by UserError.
 
     The same config gives the same person, performance, noise and images on every run. Calls
     `progress(frames done, frames in all)` after each frame.
     """
     config = config or DemoConfig()
+    make_room(Path(dst), overwrite)
     film = film_demo(config)
     head, size = film.person.head, config.image_size
     writer = DatasetWriter(
-        dst, head.arrays, film.person.identity, head.layout, size, size, overwrite=True
+        dst, head.arrays, film.person.identity, head.layout, size, size, overwrite=overwrite
     )
     for frame in film.frames():
         writer.add(frame)

@@ -2,23 +2,26 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
+
+from rgbavatar_ns.options import Between, CheckedOptions, Count, Counted
 
 
 @dataclass(frozen=True)
-class TrackConfig:
+class TrackConfig(CheckedOptions):
     """Options of `track_video`; the defaults suit a webcam or phone clip of one person."""
 
-    image_size: int = 256
+    image_size: Annotated[int, Between(16, 4096)] = 256
     """Side of the square images of the dataset, pixels."""
-    test_frames: int | None = None
+    test_frames: Counted | None = None
     """Last frames held out for evaluation; None holds out a fifth of the tracked frames."""
-    max_frames: int | None = None
+    max_frames: Count | None = None
     """Read at most so many frames in all; None reads everything."""
-    focal_px: float | None = None
+    focal_px: Annotated[float, Between(1, 1e6)] | None = None
     """Focal length in pixels of the source frame; None estimates it."""
-    identity_components: int = 30
+    identity_components: Annotated[int, Between(1, 1000)] = 30
     """How many identity components of the head model are fitted."""
-    key_frames: int = 12
+    key_frames: Annotated[int, Between(1, 1000)] = 12
     """Frames that identity and focal length are fitted on."""
     keep_torso: bool = False
     """Keep neck and shoulders as the matte found them. By default the matte fades out below the
@@ -32,7 +35,7 @@ class TrackConfig:
     """Track with your own FLAME (a pickle, or the folder that holds it) or with the head of a
     dataset (its npz file), in place of the embedded head. Where the face's landmarks lie on it is
     found by laying the embedded head over it."""
-    temporal_weight: float = 1.0
+    temporal_weight: Annotated[float, Between(0, 1e4)] = 1.0
     """How strongly each frame is drawn to the mean of its neighbours; 0 switches it off."""
     overwrite: bool = False
     """Replace an existing dataset, or an unfinished run of other options, at the destination."""

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from rgbavatar_ns.data.native.format import INDEX_FILE, image_path
+from rgbavatar_ns.data.native.writer import make_room
 from rgbavatar_ns.data.png import png_size
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.files import DiskError, Stages, atomic_write, disk_errors, read_json, write_json
@@ -35,12 +36,11 @@ class ResumableRun:
         `settings` (what JSON can hold) say what is being made of what. A folder with anything
         else in it is refused, unless `overwrite`.
         """
-        if dst.exists() and not dst.is_dir():
-            raise UserError(f"{dst} is a file.", "Name a folder to write to.")
         folder = dst / WORK_FOLDER
         wanted, begun = json.loads(json.dumps(settings)), read_json(folder / _SETTINGS)
         finished = (dst / INDEX_FILE).exists()
-        if begun == wanted and (overwrite or not finished):
+        if begun == wanted:
+            # With the dataset beside it, it was stopped before it could clean up.
             return cls(dst)
         if begun is not None and not finished and not overwrite:
             changed = [name for name in wanted if wanted[name] != begun.get(name)]
@@ -49,11 +49,7 @@ class ResumableRun:
                 "Repeat that command to go on with it, name another folder, or allow to "
                 "overwrite it (--overwrite) to start anew.",
             )
-        if not overwrite and dst.is_dir() and any(dst.iterdir()):
-            raise UserError(
-                f"The folder {dst} is not empty.",
-                "Name a new folder, or allow to overwrite the dataset in it (--overwrite).",
-            )
+        make_room(dst, overwrite)
         shutil.rmtree(folder, ignore_errors=True)
         write_json(folder / _SETTINGS, wanted)
         return cls(dst)

@@ -1,10 +1,13 @@
 """`rgbavatar export`: each format opens elsewhere, mistakes are told."""
 
+import re
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+import yaml
 from plyfile import PlyData
 
 from rgbavatar_ns import Avatar
@@ -69,11 +72,28 @@ def test_a_page_with_and_without_a_performance(bundle, data, tmp_path):
     assert '"theta": {"dtype": "float32"' in (tmp_path / "still.html").read_text()
 
 
+def test_the_runs_own_data_is_the_default(bundle, data, tmp_path, capsys):
+    run = Path(shutil.copytree(bundle, tmp_path / "run"))
+    manager = {"dataparser": {"data": None}, "data": [str(data)]}
+    described = {"data": None, "pipeline": {"datamanager": manager}}
+    (run / "config.yml").write_text(yaml.safe_dump(described))
+    _export(run, tmp_path / "film.html", "--format", "web", "--frames", 1, 4)
+    page = (tmp_path / "film.html").read_text()
+    size = load_dataset(data).theta.shape[1]
+    assert re.search(rf'"theta": {{"dtype": "float32", "offset": \d+, "length": {3 * size}}}', page)
+    manager["data"] = [str(tmp_path / "gone")]
+    (run / "config.yml").write_text(yaml.safe_dump(described))
+    _export(run, tmp_path / "still.html", "--format", "web")
+    assert "without the frames of the run's own data" in capsys.readouterr().out
+
+
 def test_mistakes_are_told(bundle, data, tmp_path, refused):
     for words, told in (
         ([tmp_path / "none", tmp_path / "out"], "There is no"),
         ([bundle, tmp_path / "a.ply", "--format", "ply", "--frame", 1], "--data"),
         ([bundle, tmp_path / "out", "--format", "ply-sequence"], "--data"),
+        ([bundle, tmp_path / "a.html", "--format", "web", "--frames", 0, 2], "--data"),
+        ([bundle, tmp_path / "a.html", "--format", "web", "--frames-per-second", "nan"], "is nan"),
         ([bundle, tmp_path / "a", "--format", "ply", "--data", data, "--frame", 99], "no frames"),
         ([bundle, data], "not an avatar bundle"),
     ):

@@ -135,7 +135,7 @@ def test_mistakes_are_told(bundle, data, tmp_path, refused):
         ("--frames 5 9", "no frames 5 to 9"),
         ("--show views --hold 7", "no frame 7 to hold"),
         ("--show camera-path", "--camera-path"),
-        ("--width 0", "must be positive"),
+        ("--width 0", "--width is 0"),
     ):
         assert told in refused("render", bundle, tmp_path, "--data", data, *words.split())
 

@@ -11,10 +11,12 @@ import torch
 
 from rgbavatar_ns.data import TrackedDataset
 from rgbavatar_ns.data.check import check_dataset, quick_check, unreadable_report
+from rgbavatar_ns.data.check.parameters import head_turns
 from rgbavatar_ns.data.check.sample import take_sample
 from rgbavatar_ns.data.check.silhouette import down_to_the_neck, silhouette_overlap
 from rgbavatar_ns.data.check.timing import longest_run, offset_agreement
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.head.rotations import axis_angle_to_matrix
 
 from .talking_head import (
     FOCAL_PX,
@@ -316,3 +318,22 @@ def test_one_frame_can_be_checked(good):
     single = selected(good, [0])
     assert quick_check(single) == []
     assert check_dataset(single).usable
+
+
+@pytest.mark.parametrize("mover", ["head", "neck", "camera"])
+def test_head_turns_are_what_the_camera_sees_whatever_moves(good, mover):
+    yaw = torch.linspace(-20, 20, len(good)).deg2rad()
+    turn = torch.zeros(len(good), 3)
+    turn[:, 1] = yaw
+    theta, cameras = torch.zeros_like(good.theta), good.cameras
+    if mover == "camera":
+        views = cameras.world_to_camera.clone()
+        views[:, :3, :3] = views[:, :3, :3] @ axis_angle_to_matrix(turn)
+        cameras = replace(cameras, world_to_camera=views)
+    else:
+        theta[:, good.layout.slice({"head": "rotation"}.get(mover, mover))] = turn
+    seen = head_turns(replace(good, theta=theta, cameras=cameras))
+    # Between the percentiles 2 and 98 of an even turn of 40 degrees.
+    assert seen.sideways == pytest.approx(0.96 * 40, abs=0.3)
+    assert seen.nodding == pytest.approx(0, abs=0.3)
+    assert "film 30" in str(seen)

@@ -111,6 +111,34 @@ def test_an_interrupted_overwriting_leaves_no_mixture(folder, head):
     load_dataset(folder)
     small_writer(folder, head, overwrite=True).add(frame(head, 0))
     assert "dataset.json" in error_of(folder).cause
+    writer = small_writer(folder, head)
+    writer.add(frame(head, 3))
+    assert writer.finish(0).frame_index == (3,)
+
+
+def test_overwriting_touches_only_what_a_writer_has_written(folder, head):
+    theirs = {"notes.txt": "mine", "images/me.png": "my picture", "images/1.png": "mine too"}
+    for name, text in theirs.items():
+        (folder / name).write_text(text)
+    writer = small_writer(folder, head, overwrite=True)
+    writer.add(frame(head, 0))
+    writer.finish(0)
+    assert {name: (folder / name).read_text() for name in theirs} == theirs
+    assert sorted(path.name for path in folder.glob("images/0*.png")) == ["00000.png"]
+
+
+@pytest.mark.parametrize("index", [None, "{}", '{"format": "INSTA"}', "damaged"])
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_a_folder_of_other_things_is_refused_and_stays(tmp_path, head, index, overwrite):
+    (tmp_path / "images").mkdir()
+    (tmp_path / "images" / "00000.png").write_text("my picture")
+    if index is not None:
+        (tmp_path / "dataset.json").write_text(index)
+    before = sorted(tmp_path.rglob("*"))
+    with pytest.raises(UserError, match="not empty"):
+        small_writer(tmp_path, head, overwrite=overwrite)
+    assert sorted(tmp_path.rglob("*")) == before
+    assert (tmp_path / "images" / "00000.png").read_text() == "my picture"
 
 
 @pytest.mark.parametrize(

@@ -66,7 +66,7 @@ def test_a_full_disk_leaves_no_half_written_result(tmp_path, monkeypatch, experi
     cell = cells_of(experiment_of("first"))[0]
     write_cell(tmp_path, cell, tmp_path / "data")
     monkeypatch.setattr(runner, "run_cell", _no_space)
-    monkeypatch.setattr(sys, "argv", ["runner", str(tmp_path)])
+    monkeypatch.setattr(sys, "argv", ["runner", str(tmp_path), str(os.getppid())])
     with pytest.raises(SystemExit) as ended:
         runner.main()
     assert ended.value.code == 1
@@ -94,7 +94,7 @@ def test_a_finished_cell_is_not_run_again_by_a_second_process(tmp_path, monkeypa
     """A cluster that lost sight of a cell starts it anew; the first may have ended well."""
     (tmp_path / "result.json").write_text('{"metrics": {}}')
     monkeypatch.setattr(runner, "run_cell", _no_space)
-    monkeypatch.setattr(sys, "argv", ["runner", str(tmp_path)])
+    monkeypatch.setattr(sys, "argv", ["runner", str(tmp_path), str(os.getppid())])
     runner.main()
 
 
@@ -134,7 +134,7 @@ def _work(pipe):
 
 def _work_on_a_cell(pipe):
     os.setsid()
-    end_with_parent()
+    end_with_parent(os.getppid())
     try:
         pipe.send("begun")
         signal.pause()

@@ -2,8 +2,10 @@
 
 import base64
 import gzip
+import html
 import json
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,8 +16,11 @@ from hypothesis import strategies as st
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.export import PageOptions, front_camera, write_web_page
 from rgbavatar_ns.export.web_arrays import head_arrays, pack, quantize
+from rgbavatar_ns.head import HeadArrays
 
 from .subject import avatar_of
+
+_NAMES = HeadArrays.embedded().expression_names
 
 
 @settings(max_examples=12, deadline=None)
@@ -88,6 +93,23 @@ def test_the_page_is_one_file_that_names_no_other_place(tmp_path):
     entry = described["arrays"]["theta"]
     assert entry["length"] == theta.numel()
     assert max(e["offset"] for e in described["arrays"].values()) <= len(block)
+
+
+def test_no_name_or_title_can_break_the_page(tmp_path):
+    hostile = "<!--<script>{{style}}</script> & \"'"
+    arrays = replace(HeadArrays.embedded(), expression_names=(hostile, *_NAMES[1:]))
+    avatar = avatar_of(arrays=arrays)
+    theta = torch.zeros(1, avatar.layout.size)
+    options = PageOptions(title=hostile)
+    write_web_page(avatar, tmp_path / "a.html", front_camera(avatar, 8, 8), theta, options)
+    page = (tmp_path / "a.html").read_text()
+    body = page.split("<body>")[1]
+    assert "<!--" not in body
+    described = re.search(r'id="manifest">(.*?)</script>', body, re.DOTALL)
+    assert described is not None
+    assert json.loads(described[1])["expression_names"][0] == hostile
+    assert f"<title>{html.escape(hostile)}</title>" in page
+    assert page.count("</style>") == 1
 
 
 def test_a_page_that_cannot_be_written_is_told(tmp_path):

@@ -42,6 +42,8 @@ def test_the_dataset_is_whole_and_valid(made):
     assert loaded.test == (4, 5)
     assert (loaded.width, loaded.height) == (48, 48)
     assert loaded.arrays.name == "makehuman"
+    with pytest.raises(UserError, match="not empty"):
+        make_demo_dataset(made[0], SMALL)
     assert 0.2 < (loaded.read_image(0)[..., 3] > 0).mean() < 0.9
 
 

@@ -141,6 +141,33 @@ def test_a_finished_dataset_stands_until_the_new_ones_images_begin(
     assert track_video(clip, dst, again).width == 32
 
 
+def test_stopped_between_the_dataset_and_cleaning_up_the_same_call_ends_well(
+    clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    dst = tmp_path / "set"
+    small = TrackConfig(image_size=48, key_frames=1, focal_px=500.0, max_frames=2)
+
+    def killed(run: ResumableRun) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as stopped:
+        stopped.setattr(ResumableRun, "close", killed)
+        with pytest.raises(KeyboardInterrupt):
+            track_video(clip, dst, small)
+    assert (dst / "dataset.json").exists()
+    assert len(track_video(clip, dst, small)) == 2
+    assert not (dst / WORK_FOLDER).exists()
+
+
+def test_with_overwrite_a_folder_of_other_things_is_refused_before_the_work(
+    clip: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(UserError, match="not empty"):
+        track_video(clip, tmp_path, TrackConfig(overwrite=True))
+    assert (tmp_path / "notes.txt").read_text() == "mine"
+
+
 def test_a_torn_line_and_a_torn_image_are_made_again(tmp_path: Path) -> None:
     run = ResumableRun.open(tmp_path / "set", {"a": 1}, overwrite=False)
     images = tmp_path / "set" / "images"

@@ -12,32 +12,33 @@ from torch import Tensor, nn
 
 from rgbavatar_ns.avatar.refinement.calibration import fit_ridge
 from rgbavatar_ns.head import ThetaLayout
+from rgbavatar_ns.options import CheckedOptions, Counted, Positive, Share, Weight
 
 _BETAS = (0.9, 0.99)
 _HEAD_POSE = "rotation"
 
 
 @dataclass(frozen=True)
-class RefinementConfig:
+class RefinementConfig(CheckedOptions):
     """How far tracked theta may be corrected, and how quickly."""
 
-    start_step: int = 50
+    start_step: Counted = 50
     """First training step that corrects; before, the avatar explains too little."""
-    bases_start: float = 0.45
+    bases_start: Share = 0.45
     """Share of training (of the steps over which learning rates fall) after which the bases of
     the blendshapes begin to learn. Sooner, they would learn the tracker's errors by heart, frame by
     frame, and leave nothing to correct."""
-    rotation_sigma_rad: float = 0.01
+    rotation_sigma_rad: Positive = 0.01
     """Expected error of the head's rotation, in radians about each axis."""
-    joint_sigma_rad: float = 0.01
+    joint_sigma_rad: Positive = 0.01
     """Expected error of neck, jaw and eyes, in radians about each axis."""
-    translation_sigma_m: float = 0.001
+    translation_sigma_m: Positive = 0.001
     """Expected error of the head's place in metres, along each axis."""
     expression_sigma: float = 0.05
     """Expected error of the coefficients of expressions and eyelids."""
-    learning_rate: float = 0.4
+    learning_rate: Positive = 0.4
     """Largest change in a step, in these standard deviations; falls as a frame is seen again."""
-    prior_weight: float = 1e-5
+    prior_weight: Weight = 1e-5
     """What a correction of one standard deviation in one number adds to the loss of its frame."""
 
     def first_step_of(self, group: str, steps: int) -> int:

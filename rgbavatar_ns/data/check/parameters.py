@@ -9,9 +9,11 @@ from rgbavatar_ns.data.check.problems import Problem
 from rgbavatar_ns.data.importers.formats import FORMATS
 from rgbavatar_ns.data.native.dataset import TrackedDataset
 from rgbavatar_ns.errors import first_few
+from rgbavatar_ns.head.rotations import axis_angle_to_matrix
 
 _LARGEST_COEFFICIENT, _LARGEST_TURN_RAD = 12.0, np.pi + 0.01
 _NARROWEST_DEGREES, _WIDEST_DEGREES = 3.0, 120.0
+_WISHED_TURN_DEGREES = 40.0
 _NEAREST_M, _FARTHEST_M = 0.1, 20.0
 _FLAME_2023 = ("VHAP", "raw VHAP")
 """Systems that track with this version, and can be told to use another; all others use 2020."""
@@ -26,11 +28,50 @@ class FieldRange:
     smallest: float
     largest: float
     changes: bool
+    is_angle: bool = False
+    """In radians."""
 
     def __str__(self) -> str:
-        """A line of the report."""
+        """A line of the report; angles in degrees."""
         still = "" if self.changes else ", the same in all frames"
-        return f"{self.name} ({self.size}): {self.smallest:.3g} to {self.largest:.3g}{still}"
+        low, high, unit = self.smallest, self.largest, ""
+        if self.is_angle:
+            low, high, unit = np.degrees(low), np.degrees(high), " degrees"
+        return f"{self.name} ({self.size}): {low:.3g} to {high:.3g}{unit}{still}"
+
+
+@dataclass(frozen=True)
+class HeadTurns:
+    """How far the head turns before the camera, in degrees between the 2nd and 98th percentile."""
+
+    sideways: float
+    nodding: float
+
+    def __str__(self) -> str:
+        """A line of the report: what is there, and what an avatar needs to be turned."""
+        told = f"the head turns {self.sideways:.0f} degrees sideways and nods {self.nodding:.0f}"
+        if self.sideways < _WISHED_TURN_DEGREES:
+            told += "; film 30 to each side if the avatar is to be seen from there"
+        return told
+
+
+def head_turns(dataset: TrackedDataset) -> HeadTurns:
+    """Where the face looks, as the camera sees it, whether head, neck or camera moves."""
+    parts = dataset.layout.split(dataset.theta)
+    seen = dataset.cameras.world_to_camera[:, :3, :3]
+    for name in ("rotation", "neck"):
+        if name in parts and parts[name].shape[1] == 3:
+            seen = seen @ axis_angle_to_matrix(parts[name])
+    right, down, ahead = seen[:, :, 2].double().unbind(1)
+    # The face looks along +z of the head, towards the camera; a median frame is its middle.
+    turned = (torch.atan2(right, -ahead), torch.atan2(down, torch.hypot(right, ahead)))
+    spread = []
+    for angle in turned:
+        away = angle - angle.median()
+        away = torch.atan2(away.sin(), away.cos())
+        low, high = np.percentile(away.numpy(), [2, 98])
+        spread.append(float(np.degrees(high - low)))
+    return HeadTurns(*spread)
 
 
 def field_ranges(dataset: TrackedDataset) -> tuple[FieldRange, ...]:
@@ -43,8 +84,10 @@ def field_ranges(dataset: TrackedDataset) -> tuple[FieldRange, ...]:
             float(part.min()),
             float(part.max()),
             bool((part != part[:1]).any()),
+            field.form == "axis_angle",
         )
-        for name, part in parts.items()
+        for field in dataset.layout.fields
+        for name, part in [(field.name, parts[field.name])]
         if part.numel()
     )
 

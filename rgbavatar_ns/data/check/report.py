@@ -1,7 +1,7 @@
 """The check of a dataset: what is in it, what is odd, and whether it can be trained."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +10,10 @@ import numpy as np
 from rgbavatar_ns.data.check.contact_sheet import MAX_TILES, write_check_sheet
 from rgbavatar_ns.data.check.parameters import (
     FieldRange,
+    HeadTurns,
     camera_problems,
     field_ranges,
+    head_turns,
     parameter_problems,
     version_problem,
 )
@@ -31,6 +33,7 @@ from rgbavatar_ns.data.importers import find_format
 from rgbavatar_ns.data.native.dataset import TrackedDataset
 from rgbavatar_ns.data.native.format import FORMAT, INDEX_FILE
 from rgbavatar_ns.errors import UserError, first_few
+from rgbavatar_ns.files import DiskError
 
 _FEW_SPREAD = 4
 """Frames that are enough to see whether the head is where the images show it."""
@@ -54,6 +57,7 @@ class CheckReport:
     """Whether a camera stands in several places or has several focal lengths."""
     focal_px: tuple[float, float] = (0.0, 0.0)
     ranges: tuple[FieldRange, ...] = ()
+    turns: HeadTurns | None = None
     notes: tuple[str, ...] = ()
     iou: dict[int, float] = field(default_factory=dict)
     """Overlap of head mesh and matte by frame number, of the frames that were looked at."""
@@ -78,6 +82,7 @@ class CheckReport:
             "cameras": self.num_cameras,
             "moving": self.moving,
             "focal_px": list(self.focal_px),
+            "head_turns_degrees": None if self.turns is None else asdict(self.turns),
             "parameters": {r.name: [r.smallest, r.largest] for r in self.ranges},
             "notes": list(self.notes),
             "iou": {str(number): round(value, 4) for number, value in self.iou.items()},
@@ -123,7 +128,11 @@ def check_dataset(
         found = _image_problems(dataset, sample, found_overlaps)
         if sheet is not None:
             shown = spread(len(sample), MAX_TILES).tolist()
-            write_check_sheet(sheet, dataset, sample, found_overlaps, shown)
+            try:
+                write_check_sheet(sheet, dataset, sample, found_overlaps, shown)
+            except DiskError as error:
+                found.append(_no_sheet(error))
+                sheet = None
     except UserError as error:
         found, sheet = [Problem.of_error(error)], None
     problems = sorted([*found, *problems], key=lambda problem: problem.severity)
@@ -145,10 +154,16 @@ def check_dataset(
         len(np.unique(views, axis=0)) > num_cameras,
         (float(focal.min()), float(focal.max())),
         field_ranges(dataset),
+        head_turns(dataset),
         tuple(map(str, dataset.source.get("notes", ()))),
         {dataset.frame_index[p]: one.iou for p, one in zip(positions, found_overlaps)},
         sheet,
     )
+
+
+def _no_sheet(error: DiskError) -> Problem:
+    remedy = "Name another place for the contact sheet with --sheet; the report is whole."
+    return Problem("sheet", "warning", error.cause, remedy)
 
 
 def _image_problems(

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Literal
 
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.options import CheckedOptions, Counted
 
 HeadPose = Literal["source", "camera", "head", "neck"]
 Region = Literal["person", "head"]
@@ -14,7 +15,7 @@ Progress = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True)
-class ImportOptions:
+class ImportOptions(CheckedOptions):
     """How a folder of another system is read; the defaults are as that system reads it."""
 
     format: str | None = None
@@ -43,7 +44,7 @@ class ImportOptions:
     """Folder of the images, where the data does not name it (VHAP's raw output)."""
     masks: Path | None = None
     """Folder of their mattes, likewise."""
-    test_frames: int | None = None
+    test_frames: Counted | None = None
     """Hold out this many frames at the end instead of those that the format holds out."""
     test_cameras: tuple[str, ...] = ()
     """Hold out these cameras instead of what the format holds out."""
@@ -55,10 +56,7 @@ class ImportOptions:
     """Follow links and paths that lead out of the folder."""
 
     def __post_init__(self) -> None:
-        if self.test_frames is not None and self.test_frames < 0:
-            raise UserError(
-                f"{self.test_frames} frames cannot be held out.", "Name a count from 0 up."
-            )
+        super().__post_init__()
         if self.test_frames is not None and self.test_cameras:
             raise UserError(
                 "Both a count of frames and cameras are named to be held out.", "Name one of them."

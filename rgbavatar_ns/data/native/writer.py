@@ -1,5 +1,7 @@
 """Write a dataset frame by frame; a reader sees all of it or nothing."""
 
+import os
+import re
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
@@ -22,17 +24,51 @@ from rgbavatar_ns.data.native.format import (
 from rgbavatar_ns.data.native.frame import TrackedFrame
 from rgbavatar_ns.data.png import encode_png_rgba
 from rgbavatar_ns.errors import UserError
-from rgbavatar_ns.files import atomic_write, write_json
+from rgbavatar_ns.files import atomic_write, disk_errors, read_json, write_json
 from rgbavatar_ns.head import HeadArrays, ThetaLayout
 from rgbavatar_ns.kernels.types import PinholeCameras
+
+_UNFINISHED = ".unfinished"
+"""Marks a folder whose files a writer has put there, until the index says so."""
+_OWN_IMAGE = re.compile(r"\d{5,}\.png")
+
+
+def make_room(root: Path, overwrite: bool) -> None:
+    """Make the folder for a dataset; raises UserError where it cannot be made or may not be taken.
+
+    It may be new, empty but for hidden files, or hold what an interrupted writer has left; with
+    `overwrite` a dataset too, but never anything else: that would be lost.
+    """
+    if root.exists() and not root.is_dir():
+        raise UserError(f"{root} is a file.", "Name a folder to write to.")
+    with disk_errors(root, "Name a folder that you may write to."):
+        root.mkdir(parents=True, exist_ok=True)
+    if all(name.startswith(".") for name in os.listdir(root)):
+        return
+    index = read_json(root / INDEX_FILE)
+    if index is None and (root / _UNFINISHED).exists():
+        return
+    if not isinstance(index, dict) or index.get("format") != FORMAT:
+        raise UserError(
+            f"The folder {root} is not empty, and holds no dataset that may be replaced.",
+            "Name a new folder.",
+        )
+    if not overwrite:
+        raise UserError(
+            f"The folder {root} is not empty.",
+            "Name a new folder, or allow to overwrite the dataset in it (--overwrite).",
+        )
 
 
 class DatasetWriter:
     """Writes the project's own format; `dataset.json` comes last and whole.
 
+    What an interrupted writer left in a folder is replaced by the next.
+
     Args:
         arrays: the head model, or the embedded one's name ("makehuman").
-        overwrite: replace a dataset that is there; else a folder with anything in it is refused.
+        overwrite: replace a dataset that is there; else a folder with anything in it is refused,
+            as one of other things always is.
         keep_images: go on with an unfinished dataset: images that are there stay, for
             `add_encoded`. Implies overwrite.
         source: where the frames came from, for people to read.
@@ -59,28 +95,21 @@ class DatasetWriter:
         self._frames: list[dict[str, Any]] = []
         self._numbers: set[int] = set()
         self._source = dict(source or {})
-        self._clear(overwrite or keep_images, keep_images)
+        self._clear(overwrite, keep_images)
 
     def _clear(self, overwrite: bool, keep_images: bool) -> None:
         """Make room; the old index goes first, so that no mixture can be taken for a dataset."""
-        if self._root.exists() and not self._root.is_dir():
-            raise UserError(f"{self._root} is a file.", "Name a folder to write to.")
-        if not overwrite and self._root.exists() and any(self._root.iterdir()):
-            raise UserError(
-                f"The folder {self._root} is not empty.",
-                "Name a new folder, or allow to overwrite the dataset in it.",
-            )
-        for name in (INDEX_FILE, THETA_FILE, HEAD_FILE):
-            (self._root / name).unlink(missing_ok=True)
-        for image in () if keep_images else (self._root / IMAGE_FOLDER).glob("*.png"):
-            image.unlink()
-        try:
-            (self._root / IMAGE_FOLDER).mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise UserError(
-                f"The folder {self._root} cannot be made: {error.strerror}.",
-                "Name a folder that you may write to.",
-            ) from None
+        root, mark = self._root, self._root / _UNFINISHED
+        if not keep_images:
+            make_room(root, overwrite)
+        with disk_errors(root, "Name a folder that you may write to."):
+            (root / IMAGE_FOLDER).mkdir(parents=True, exist_ok=True)
+            mark.touch()
+            for name in (INDEX_FILE, THETA_FILE, HEAD_FILE):
+                (root / name).unlink(missing_ok=True)
+            for image in () if keep_images else (root / IMAGE_FOLDER).iterdir():
+                if _OWN_IMAGE.fullmatch(image.name):
+                    image.unlink()
 
     def add(self, frame: TrackedFrame) -> None:
         """Write a frame's image now, the rest at the end; UserError where it does not fit."""
@@ -177,6 +206,7 @@ class DatasetWriter:
         with atomic_write(self._root / THETA_FILE) as partial:
             np.save(partial, np.stack(self._theta))
         write_json(self._root / INDEX_FILE, index)
+        (self._root / _UNFINISHED).unlink(missing_ok=True)
         return load_native(self._root)
 
     def _split(self, test: int | Collection[int]) -> dict[str, Any]:

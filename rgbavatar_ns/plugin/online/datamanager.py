@@ -3,7 +3,7 @@
 import dataclasses
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import torch
 import tyro
@@ -15,6 +15,7 @@ from rgbavatar_ns.data import DatasetWriter, LocalGlobalPools
 from rgbavatar_ns.data.sampling import PoolStrategy
 from rgbavatar_ns.data.streams import FrameStream, Ingest, ReplayBuffer, ReplayStream, Rewindable
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.options import Between, Share
 from rgbavatar_ns.plugin.cameras import to_nerfstudio
 from rgbavatar_ns.plugin.datamanager import (
     RGBAvatarDataManager,
@@ -35,17 +36,17 @@ class OnlineDataManagerConfig(RGBAvatarDataManagerConfig):
     strategy: PoolStrategy = "paper"
     """paper: a fixed share of each batch from the local pool; release: the global pool's share
     grows over the first 600 frames to .7, and local draws favour the newest."""
-    local_size: int = 150
+    local_size: Annotated[int, Between(1, 10**6)] = 150
     """Newest frames, which make up the local pool."""
-    global_size: int = 1000
+    global_size: Annotated[int, Between(0, 10**6)] = 1000
     """Frames of the whole past, each equally likely, in the global pool."""
-    local_share: float | None = None
+    local_share: Share | None = None
     """The paper's eta, the part of a batch from the local pool: by default .7, and .3 for the
     release's strategy, which begins with 1."""
     new_first: bool = True
     """Let frames that no batch has held yet fill up to half of the local part, so that none waits
     for chance. False draws from the local pool by chance alone, as in the paper."""
-    queue_frames: int = 256
+    queue_frames: Annotated[int, Between(1, 10**5)] = 256
     """Frames that may wait to be decoded; beyond, the oldest is dropped, or the source waits
     where it keeps them (a video file)."""
     recorded: tyro.conf.Suppress[Path | None] = None

@@ -16,6 +16,7 @@ from rgbavatar_ns.data.streams import (
 )
 from rgbavatar_ns.data.streams.address import DEFAULT_ADDRESS
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.options import FrameRate
 
 SourceKind = Literal["replay", "folder", "socket", "video"]
 _PATIENCE_S = 0.2
@@ -30,7 +31,7 @@ class SourceConfig:
     """replay: the dataset of --data in real time; socket: another program sends frames over a
     WebSocket; video: a video file, camera or network address, tracked as it comes. (folder is no
     more: its message says what to use.)"""
-    frames_per_second: float = 25.0
+    frames_per_second: FrameRate = 25.0
     """Rate of a replay (paper: 25)."""
     listen: str = DEFAULT_ADDRESS
     """Where a socket waits for frames: HOST:PORT."""

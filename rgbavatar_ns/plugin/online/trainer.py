@@ -9,7 +9,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Annotated, Literal
 
 from nerfstudio.utils import writer
 from nerfstudio.utils.misc import step_check
@@ -17,6 +17,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from rgbavatar_ns.avatar.training.step import Losses
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.options import Between, Count, Counted
 from rgbavatar_ns.plugin.errors import install_user_error_hook
 from rgbavatar_ns.plugin.online.datamanager import OnlineDataManager
 from rgbavatar_ns.plugin.online.pipeline import OnlinePipeline, OnlinePipelineConfig
@@ -41,11 +42,11 @@ class OnlineTrainerConfig(RGBAvatarTrainerConfig):
     _target: type = field(default_factory=lambda: OnlineTrainer)
     pipeline: OnlinePipelineConfig = field(default_factory=OnlinePipelineConfig)
     """Stream and model."""
-    max_num_iterations: int = 1_000_000_000
+    max_num_iterations: Count = 1_000_000_000
     """Steps in all, if the run is to end before the stream does."""
-    steps_after_stream: int = 500
+    steps_after_stream: Counted = 500
     """Steps on all that the pools hold, each frame as likely, once the stream has ended."""
-    final_learning_rate_factor: float = 0.1
+    final_learning_rate_factor: Annotated[float, Between(1e-9, 1e3)] = 0.1
     """What the learning rates fall to in these steps, times what they were; 1 keeps them."""
 
 

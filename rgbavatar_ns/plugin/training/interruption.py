@@ -1,8 +1,36 @@
-"""Ctrl-C and SIGTERM as a wish to stop after the present step."""
+"""Ctrl-C, SIGTERM and the end of the command that started us, as a wish to stop."""
 
+import os
 import signal
 import threading
+import time
+from collections.abc import Callable
 from types import FrameType
+
+PARENT_VARIABLE = "RGBAVATAR_PARENT_PID"
+"""Environment variable: the process that a command of ours belongs to, and ends with."""
+_WATCH_INTERVAL_S = 0.2
+
+
+def when_parent_ends(parent_pid: int, end: Callable[[], object]) -> None:
+    """Call `end`, from a thread, once the parent of this process is another: its own has ended.
+
+    A killed process can no longer end those that it started.
+    """
+
+    def watch() -> None:
+        while os.getppid() == parent_pid:
+            time.sleep(_WATCH_INTERVAL_S)
+        end()
+
+    threading.Thread(target=watch, name="rgbavatar parent", daemon=True).start()
+
+
+def stop_with_starter() -> None:
+    """Send this process SIGTERM, which saves, when the command of ours that started it is gone."""
+    starter = os.environ.get(PARENT_VARIABLE, "")
+    if starter == str(os.getppid()):
+        when_parent_ends(int(starter), lambda: os.kill(os.getpid(), signal.SIGTERM))
 
 
 class StopRequest:

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 from nerfstudio.engine.optimizers import OptimizerConfig
@@ -11,6 +11,7 @@ from nerfstudio.engine.schedulers import Scheduler, SchedulerConfig
 from torch.optim.lr_scheduler import LambdaLR
 
 from rgbavatar_ns.avatar import LEARNING_RATES
+from rgbavatar_ns.options import Between, Counted, Positive, Weight
 
 _MOMENTS = ("exp_avg", "exp_avg_sq")
 _MAX_STEP = 1 << 40
@@ -21,11 +22,11 @@ class AdamConfig(OptimizerConfig):
     """Adam with one pass over memory per step."""
 
     _target: type = torch.optim.Adam
-    lr: float = 1e-3
+    lr: Weight = 1e-3
     """Learning rate per step."""
-    eps: float = 1e-15
+    eps: Annotated[float, Between(0, 1)] = 1e-15
     """Added to the root of the second moment; tiny, as in Gaussian splatting."""
-    max_norm: float | None = None
+    max_norm: Positive | None = None
     """Largest norm of a group's gradient; unlimited by default."""
     fused: bool = True
     """Use PyTorch's fused kernel, on a CPU too."""
@@ -41,11 +42,11 @@ class ExponentialConfig(SchedulerConfig):
     """
 
     _target: type = field(default_factory=lambda: Exponential)
-    factor: float = 1.0
+    factor: Annotated[float, Between(1e-9, 1e3)] = 1.0
     """Final learning rate divided by the first one."""
-    steps: int = 5000
+    steps: Counted = 5000
     """Steps until the final rate is reached."""
-    start_step: int = 0
+    start_step: Counted = 0
     """First step with a rate that is not zero."""
 
 

@@ -6,9 +6,11 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
+import torch
+from nerfstudio.configs.base_config import LoggingConfig, MachineConfig, ViewerConfig
 from nerfstudio.engine.callbacks import TrainingCallbackLocation
 from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
@@ -23,7 +25,8 @@ from rgbavatar_ns.avatar.training.batches import ChosenFrames, TrainingBatch
 from rgbavatar_ns.avatar.training.loop import FitHooks, fit
 from rgbavatar_ns.avatar.training.step import Losses
 from rgbavatar_ns.errors import UserError
-from rgbavatar_ns.files import write_json
+from rgbavatar_ns.files import disk_errors, write_json
+from rgbavatar_ns.options import Between, Count, Positive, Ranges, check_options
 from rgbavatar_ns.plugin.errors import device_errors_told, install_user_error_hook
 from rgbavatar_ns.plugin.pipeline import RGBAvatarPipeline, RGBAvatarPipelineConfig
 from rgbavatar_ns.plugin.refinement import REFINED_NAME
@@ -34,7 +37,7 @@ from rgbavatar_ns.plugin.training.checkpoints import (
     readable_step,
     save_checkpoint,
 )
-from rgbavatar_ns.plugin.training.interruption import StopRequest
+from rgbavatar_ns.plugin.training.interruption import StopRequest, stop_with_starter
 from rgbavatar_ns.plugin.training.optimizers import ExponentialConfig, require_fitting_states
 from rgbavatar_ns.plugin.training.progress import TrainingProgress
 
@@ -53,16 +56,16 @@ class RGBAvatarTrainerConfig(TrainerConfig):
     _target: type = field(default_factory=lambda: RGBAvatarTrainer)
     pipeline: RGBAvatarPipelineConfig = field(default_factory=RGBAvatarPipelineConfig)
     """Data and model."""
-    max_num_iterations: int = 5000
+    max_num_iterations: Count = 5000
     """Steps in all, those before a resume included."""
-    position_lr_final: float | None = None
+    position_lr_final: Positive | None = None
     """Let the learning rate of positions fall exponentially to this (the release: 8e-6)."""
-    learning_rate_factor: float = 1.0
+    learning_rate_factor: Annotated[float, Between(1e-9, 1e3)] = 1.0
     """Let all other learning rates fall exponentially to this multiple of the first one."""
-    learning_rate_steps: int | None = None
+    learning_rate_steps: Count | None = None
     """Steps over which learning rates fall; by default max_num_iterations. Name it where a run
     is to be continued beyond its first end."""
-    keep_checkpoints: int = 2
+    keep_checkpoints: Count = 2
     """Newest checkpoints kept where save_only_latest_checkpoint is on: a second one, in case the
     newest is damaged."""
     mixed_precision: bool = False
@@ -81,8 +84,41 @@ class RGBAvatarTrainerConfig(TrainerConfig):
             self.load_step = readable_step(folder, self.load_step, say)
         return folder
 
+    def save_config(self) -> None:
+        """Write config.yml, the first file of a run; raises UserError where none can begin."""
+        install_user_error_hook()
+        require_trainable(self)
+        with disk_errors(self.get_base_dir(), "Free some space, or name another --output-dir."):
+            super().save_config()
+
 
 _IN_TRAINER = ContextVar("a trainer asks where to save", default=False)
+_HOST_RANGES: Ranges = {
+    RGBAvatarTrainerConfig: {
+        name: Between(1, 10**9)
+        for name in (
+            "steps_per_save",
+            "steps_per_eval_batch",
+            "steps_per_eval_image",
+            "steps_per_eval_all_images",
+        )
+    },
+    MachineConfig: {"seed": Between(0, 2**32 - 1), "num_devices": Between(1, 1)},
+    LoggingConfig: {"steps_per_log": Between(1, 10**9)},
+    ViewerConfig: {"websocket_port": Between(1, 65535), "jpeg_quality": Between(1, 100)},
+}
+"""Of what nerfstudio declares."""
+
+
+def require_trainable(config: RGBAvatarTrainerConfig) -> None:
+    """Raise UserError for an option out of its range, or a device that is not there."""
+    check_options(type(config), vars(config), more=_HOST_RANGES)
+    device = config.machine.device_type
+    if device == "mps" or (device == "cuda" and not torch.cuda.is_available()):
+        raise UserError(
+            f"PyTorch finds no device of the type '{device}' that this method runs on.",
+            "Leave out --machine.device-type, or install the driver and a PyTorch with CUDA.",
+        )
 
 
 class RGBAvatarTrainer(Trainer, FitHooks):
@@ -101,6 +137,8 @@ class RGBAvatarTrainer(Trainer, FitHooks):
         self, config: RGBAvatarTrainerConfig, local_rank: int = 0, world_size: int = 1
     ) -> None:
         install_user_error_hook()
+        stop_with_starter()
+        require_trainable(config)
         if world_size != 1:
             raise UserError("This method trains on one device.", "Leave out --machine.num-devices.")
         _use_run_seed(config)

@@ -1,0 +1,106 @@
+"""Ranges of options, written where an option is declared and checked in one place."""
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from typing import Annotated, Any, get_args, get_origin, get_type_hints
+
+from rgbavatar_ns.errors import UserError
+
+
+@dataclasses.dataclass(frozen=True)
+class Between:
+    """Bounds of a number, both allowed unless `open`; attached to a type by `Annotated`."""
+
+    low: int | float
+    high: int | float
+    open: bool = False
+
+    def holds(self, value: int | float) -> bool:
+        """Whether a value is one of them; NaN never is."""
+        if self.open:
+            return self.low < value < self.high
+        return self.low <= value <= self.high
+
+    def __str__(self) -> str:
+        kind = " (both excluded)" if self.open else ""
+        return f"from {_number(self.low)} to {_number(self.high)}{kind}"
+
+
+Ranges = Mapping[type, Mapping[str, Between]]
+"""Bounds by class and name."""
+Count = Annotated[int, Between(1, 10**9)]
+"""How many: at least one."""
+Counted = Annotated[int, Between(0, 10**9)]
+"""How many: zero too."""
+Pixels = Annotated[int, Between(1, 8192)]
+"""The side of an image."""
+Seed = Annotated[int, Between(0, 2**32 - 1)]
+"""As NumPy takes it."""
+FrameRate = Annotated[float, Between(0.01, 1000.0)]
+"""Frames per second."""
+Share = Annotated[float, Between(0.0, 1.0)]
+"""A part of a whole."""
+Weight = Annotated[float, Between(0.0, 1e6)]
+"""A factor; zero switches off."""
+Positive = Annotated[float, Between(1e-9, 1e9)]
+"""A length, a rate, a factor."""
+
+
+def check_options(
+    owner: Any, values: Mapping[str, Any], prefix: str = "", more: Ranges | None = None
+) -> None:
+    """Raise UserError for the first value that leaves the range of its annotation.
+
+    owner: the class or function whose annotations declare the options; `more` has ranges of
+    classes whose declarations are not ours. Tuples are checked item by item, dataclasses and
+    mappings within as well. prefix: of the options' names in an error.
+    """
+    hints = get_type_hints(owner, include_extras=True)
+    others = (more or {}).get(owner, {})
+    for name, value in values.items():
+        bounds = [others[name]] if name in others else _bounds(hints.get(name))
+        for item in value if isinstance(value, tuple | list) else (value,):
+            for bound in bounds:
+                _check(prefix + name, item, bound)
+            _check_within(item, f"{prefix}{name}.", more)
+
+
+def _check_within(value: Any, prefix: str, more: Ranges | None) -> None:
+    if isinstance(value, dict):
+        for key, item in value.items():
+            _check_within(item, f"{prefix}{key}.", more)
+    elif dataclasses.is_dataclass(value) and not isinstance(value, type):
+        check_options(type(value), vars(value), prefix, more)
+
+
+class CheckedOptions:
+    """Base of the dataclasses of options: refuses values out of range as they are made."""
+
+    def __post_init__(self) -> None:
+        """Raise UserError for a value that leaves its range."""
+        check_options(type(self), vars(self))
+
+
+def _bounds(hint: Any) -> list[Between]:
+    """The bounds anywhere in an annotation: of the number, its alternatives or its items."""
+    found = []
+    if get_origin(hint) is Annotated:
+        found += [extra for extra in get_args(hint)[1:] if isinstance(extra, Between)]
+    for part in get_args(hint):
+        if not isinstance(part, Between):
+            found += _bounds(part)
+    return found
+
+
+def _number(value: int | float) -> str:
+    return f"{int(value):,}" if value == int(value) else f"{value:g}"
+
+
+def _check(name: str, value: Any, bounds: Between) -> None:
+    if value is None or isinstance(value, str):
+        return
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    if not number or math.isnan(value) or not bounds.holds(value):
+        option = "--" + name.replace("_", "-")
+        raise UserError(f"{option} is {value!r}.", f"Give a number {bounds}.")
