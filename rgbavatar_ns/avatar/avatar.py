@@ -257,16 +257,13 @@ class Avatar(nn.Module):
 
         Needs no nerfstudio. Raises UserError where there is none or it cannot be read.
         """
-        state, tensors = load_any(Path(path))
-        avatar = cls.from_state(state)
-        own = set(avatar._own_state_dict())
-        avatar.load_state_dict({k: v for k, v in tensors.items() if k in own}, strict=False)
-        missing = sorted(own - set(tensors))
-        if missing:
-            raise UserError(
-                f"{path} lacks parts of the avatar: {', '.join(missing)}.",
-                "Use another checkpoint, or save the avatar again.",
-            )
+        stored = load_any(Path(path))
+        stored.check()
+        with stored.damage_told():
+            avatar = cls.from_state(stored.state)
+            own = avatar._own_state_dict()
+            stored.check_fits(own, avatar.layout.to_json())
+            avatar.load_state_dict({name: stored.parameters[name] for name in own}, strict=False)
         return avatar
 
     def _own_state_dict(self) -> dict[str, Tensor]:

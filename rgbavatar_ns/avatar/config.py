@@ -61,11 +61,19 @@ class AvatarConfig(CheckedOptions):
 
     @classmethod
     def from_json(cls, values: dict[str, Any]) -> "AvatarConfig":
-        """Build from `to_json`; raises UserError on a field that this version does not know."""
-        unknown = sorted(set(values) - {field.name for field in fields(cls)})
+        """Build from `to_json`; raises UserError on a field unknown to this version or misfit."""
+        kinds: dict[str, type] = {field.name: type(field.default) for field in fields(cls)}
+        unknown = sorted(set(values) - set(kinds))
         if unknown:
             raise UserError(
                 f"The avatar's settings contain {', '.join(unknown)}, unknown to this version.",
                 "Update rgbavatar_ns to the version that wrote them.",
             )
+        for name, value in values.items():
+            # JSON may write 1.0 as 1.
+            if type(value) is not kinds[name] and (type(value), kinds[name]) != (int, float):
+                raise UserError(
+                    f"The avatar's {name} is {value!r}, which is no {kinds[name].__name__}.",
+                    "Save the avatar again, or use another copy.",
+                )
         return cls(**values)

@@ -116,6 +116,7 @@ def unpickle(
     file: io.BytesIO,
     names: Mapping[str, type[StandIn]],
     persistent_load: Callable[[Any], StandIn] | None = None,
+    max_opcodes: int = MAX_OPCODES,
 ) -> Any:
     """The next pickle in the file, its stand-ins not yet resolved.
 
@@ -123,7 +124,7 @@ def unpickle(
     RefusedPickleError, and where the file is damaged whatever Python raises.
     """
     start = file.tell()
-    _vet(file)
+    _vet(file, max_opcodes)
     end = file.tell()
     file.seek(start)
     value = _Unpickler(file, names, persistent_load).load()
@@ -154,7 +155,7 @@ class _Unpickler(pickle.Unpickler):
         return self._persistent(pid)
 
 
-def _vet(file: io.BytesIO) -> None:
+def _vet(file: io.BytesIO, max_opcodes: int) -> None:
     """Refuse in one pickle's opcodes what the Unpickler alone could not.
 
     That is: lengths beyond the file's end and high memo numbers, for which it takes memory at once;
@@ -164,7 +165,7 @@ def _vet(file: io.BytesIO) -> None:
     """
     stack: list[Any] = []
     memo: dict[int, Any] = {}
-    for opcode, argument in _opcodes(file):
+    for opcode, argument in _opcodes(file, max_opcodes):
         name, before, after = opcode.name, opcode.stack_before, opcode.stack_after
         if name in _UNUSED:
             raise RefusedPickleError(f"it holds the opcode {name}, not needed here")
@@ -173,8 +174,8 @@ def _vet(file: io.BytesIO) -> None:
         if after and isinstance(argument, int) and argument.bit_length() > _MAX_KEY_BITS:
             after = [_LONG_NUMBER]
         if "PUT" in name:
-            if argument > MAX_OPCODES:
-                raise RefusedPickleError(f"it remembers more than {MAX_OPCODES} values")
+            if argument > max_opcodes:
+                raise RefusedPickleError(f"it remembers more than {max_opcodes} values")
             memo[argument] = stack[-1]
         elif name == "MEMOIZE":
             memo[len(memo)] = stack[-1]
@@ -195,9 +196,9 @@ def _vet(file: io.BytesIO) -> None:
         stack += after
 
 
-def _opcodes(file: io.BytesIO) -> Iterator[tuple[pickletools.OpcodeInfo, Any]]:
+def _opcodes(file: io.BytesIO, max_opcodes: int) -> Iterator[tuple[pickletools.OpcodeInfo, Any]]:
     """Opcodes with their arguments; unlike `pickletools.genops` takes Python 2's text as it is."""
-    for _ in range(MAX_OPCODES):
+    for _ in range(max_opcodes):
         opcode = _OPCODES[file.read(1)]
         argument = None
         if opcode.name == "STRING":
@@ -207,7 +208,7 @@ def _opcodes(file: io.BytesIO) -> Iterator[tuple[pickletools.OpcodeInfo, Any]]:
         yield opcode, argument
         if opcode.name == "STOP":
             return
-    raise RefusedPickleError(f"it has more than {MAX_OPCODES} steps")
+    raise RefusedPickleError(f"it has more than {max_opcodes} steps")
 
 
 class Resolver:

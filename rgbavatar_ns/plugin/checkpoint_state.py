@@ -1,6 +1,7 @@
 """What a checkpoint says about the avatar beside its parameters."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 from rgbavatar_ns.avatar import Avatar, describe_layout
@@ -27,12 +28,15 @@ def model_state(avatar: Avatar, subject: Subject) -> dict[str, Any]:
 def require_same_layout(state_dict: Mapping[str, Any], avatar: Avatar) -> None:
     """Raise UserError where the checkpoint's theta is not laid out as `avatar` takes it."""
     extra = state_dict.get(_EXTRA_STATE)
-    if extra is None:
+    extra = extra if isinstance(extra, dict) else {}
+    make = extra.get("avatar")
+    config = make.get("config") if isinstance(make, dict) else None
+    if not isinstance(config, dict):
         raise UserError(
             "The checkpoint holds no avatar of this method.",
             "Load a checkpoint that `ns-train rgbavatar` or `ns-train rgbavatar-tiny` wrote.",
         )
-    saved = ThetaLayout.from_json(extra["layout"])
+    saved = ThetaLayout.from_json(extra.get("layout"))
     if saved != avatar.layout:
         raise UserError(
             f"The checkpoint was trained with theta of {describe_layout(saved)}, but the dataset "
@@ -40,7 +44,23 @@ def require_same_layout(state_dict: Mapping[str, Any], avatar: Avatar) -> None:
             "Use the dataset that the checkpoint was trained with (--data), or another one "
             "tracked with the same head model.",
         )
-    _require_same_make(extra["avatar"]["config"], avatar)
+    _require_same_make(config, avatar)
+
+
+@contextmanager
+def misfits_told() -> Iterator[None]:
+    """Tell parameters that are missing or of another shape as a UserError.
+
+    nerfstudio would take what fits of them, and leave the others as they are.
+    """
+    try:
+        yield
+    except (RuntimeError, TypeError, AttributeError) as error:
+        lines = [line.strip().rstrip(".") for line in str(error).splitlines() if line.strip()]
+        raise UserError(
+            f"The checkpoint's parameters are not this model's: {'; '.join(lines)}.",
+            "Use another checkpoint, or the dataset that this one was trained with.",
+        ) from error
 
 
 def _require_same_make(saved: dict[str, Any], avatar: Avatar) -> None:

@@ -23,7 +23,7 @@ from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.kernels import PinholeCameras
 from rgbavatar_ns.options import Counted, Seed, Weight
 from rgbavatar_ns.plugin.cameras import filled_depth, from_nerfstudio
-from rgbavatar_ns.plugin.checkpoint_state import model_state, require_same_layout
+from rgbavatar_ns.plugin.checkpoint_state import misfits_told, model_state, require_same_layout
 from rgbavatar_ns.plugin.dataparser import Subject
 from rgbavatar_ns.plugin.refinement import frame_refinement, require_same_refinement
 
@@ -220,7 +220,8 @@ class RGBAvatarModel(Model):
     def load_state_dict(
         self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False
     ) -> Any:
-        """Load parameters; raises UserError if theta's layout or the refinement is another one."""
+        """Load parameters; raises UserError where they are not all those of this model's make."""
         require_same_layout(state_dict, self.avatar)
         require_same_refinement(state_dict, self.refinement)
-        return super().load_state_dict(state_dict, strict=strict, assign=assign)
+        with misfits_told():
+            return super().load_state_dict(state_dict, strict=strict, assign=assign)

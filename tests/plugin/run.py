@@ -14,8 +14,8 @@ from nerfstudio.scripts.train import _set_random_seed
 from nerfstudio.utils import writer
 
 from rgbavatar_ns.avatar import AvatarConfig
+from rgbavatar_ns.avatar.storage.checkpoint_file import list_checkpoints, read_checkpoint
 from rgbavatar_ns.plugin.methods import rgbavatar_tiny
-from rgbavatar_ns.plugin.training.checkpoints import list_checkpoints, read_checkpoint
 from rgbavatar_ns.plugin.training.trainer import RGBAvatarTrainer, RGBAvatarTrainerConfig
 
 SMALL = AvatarConfig(uv_resolution=16, num_bases=3, hidden_width=16, scale_from_texel_spacing=True)

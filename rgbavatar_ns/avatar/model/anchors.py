@@ -8,6 +8,7 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import (
     HeadModel,
     UVAnchors,
@@ -80,6 +81,12 @@ class GaussianAnchors(nn.Module):
     def _derive(self) -> None:
         """Recompute what follows from the triangles, at the start and after loading others."""
         used, frame_index = torch.unique(self.triangle_index, return_inverse=True)
+        # Sorted, so the ends say it of all.
+        if len(used) and not 0 <= int(used[0]) <= int(used[-1]) < len(self._faces):
+            raise UserError(
+                "A Gaussian's place points outside of the head's triangles.",
+                "Use another copy of the avatar or checkpoint.",
+            )
         self.register_buffer("_frame_index", frame_index, persistent=False)
         self.register_buffer("_used_faces", self._faces[used], persistent=False)
         self.register_buffer("_used_uv_faces", self._uv_faces[used], persistent=False)

@@ -2,20 +2,29 @@
 
 import json
 import logging
-import pickle
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors import SafetensorError
+from safetensors.torch import load, save_file
 from torch import Tensor
 
+from rgbavatar_ns.avatar.storage.checkpoint_file import (
+    MODELS_FOLDER,
+    checkpoints_of,
+    read_checkpoint,
+    read_newest,
+)
 from rgbavatar_ns.avatar.storage.head_reference import is_reference, resolve
 from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
+from rgbavatar_ns.avatar.storage.stored_avatar import StoredAvatar, damage_of
 from rgbavatar_ns.errors import UserError
-from rgbavatar_ns.files import atomic_folder
+from rgbavatar_ns.files import atomic_folder, digest
 from rgbavatar_ns.head import ThetaLayout
+from rgbavatar_ns.reading import DamagedFileError, damage_told, load_json, read_file
 
 BUNDLE_FORMAT = "rgbavatar-bundle"
 BUNDLE_VERSION = 1
@@ -29,10 +38,11 @@ CHECKPOINT_EXTRA_STATE = "_model._extra_state"
 
 _TENSOR_MARK = "$tensor"
 _STATE_PARTS = ("config", "head", "identity", "anchors")
+_CHECKSUMS = "sha256"
+_PARTS = ("format", "version", "layout", "state", "statistics", _CHECKSUMS)
+_MAX_MANIFEST_BYTES = 1 << 26
+_MAX_TENSORS_BYTES = 1 << 34
 _log = logging.getLogger(__name__)
-
-AvatarState = tuple[dict[str, Any], dict[str, Tensor]]
-"""`Avatar.to_state()` and the avatar's state dict."""
 
 
 def save_bundle(
@@ -67,14 +77,27 @@ def save_bundle(
     with atomic_folder(path, also=(SafetensorError,)) as partial:
         save_file(dense, partial / TENSORS_NAME)
         (partial / TENSORS_NAME).chmod(0o644)  # safetensors keeps its files to their owner.
+        manifest[_CHECKSUMS] = {
+            TENSORS_NAME: digest([(partial / TENSORS_NAME).read_bytes()]),
+            MANIFEST_NAME: _manifest_digest(manifest),
+        }
         (partial / MANIFEST_NAME).write_text(json.dumps(manifest, indent=1) + "\n")
 
 
-def load_any(path: Path) -> AvatarState:
-    """Read a bundle, a .ckpt file or a run folder's newest; UserError if missing or damaged."""
-    if not path.exists():
+def _manifest_digest(manifest: dict[str, Any]) -> str:
+    """SHA-256 of what a manifest says beside its checksums, as JSON in a form of its own."""
+    rest = {key: value for key, value in manifest.items() if key != _CHECKSUMS}
+    return digest([json.dumps(rest, sort_keys=True, separators=(",", ":"))])
+
+
+def load_any(path: Path) -> StoredAvatar:
+    """Read a bundle, a .ckpt file or a run folder's newest; UserError if missing or damaged.
+
+    What it gives is whole, yet may be a stranger's: `StoredAvatar.check` judges it.
+    """
+    if not os.path.exists(path):
         raise UserError(f"There is no {path}.", "Give a bundle, a .ckpt file or a run's folder.")
-    if path.is_file():
+    if not os.path.isdir(path):
         if path.suffix == ".ckpt":
             return _load_checkpoint(path)
         raise UserError(
@@ -84,32 +107,36 @@ def load_any(path: Path) -> AvatarState:
         )
     if (path / MANIFEST_NAME).exists():
         return _load_bundle(path)
-    for folder in (path / "nerfstudio_models", path):
-        checkpoints = sorted(folder.glob("step-*.ckpt"), reverse=True)
-        if checkpoints:
-            return _load_newest(checkpoints)
-    raise UserError(
-        f"{path} holds neither {MANIFEST_NAME} nor nerfstudio_models/step-*.ckpt.",
-        "Give an avatar bundle, or the folder of a run that has saved a checkpoint.",
-    )
+    checkpoints = checkpoints_of(path)
+    if not checkpoints:
+        raise UserError(
+            f"{path} holds neither {MANIFEST_NAME} nor {MODELS_FOLDER}/step-*.ckpt.",
+            "Give an avatar bundle, or the folder of a run that has saved a checkpoint.",
+        )
+    stored, chosen = read_newest(checkpoints, _load_checkpoint, _log.warning)
+    _log.info("Loaded %s.", chosen)
+    return stored
 
 
 def load_statistics(path: Path) -> TrainingStatistics | None:
     """What the avatar of a bundle saw in training, if kept; raises UserError as `load_any`."""
-    if not (path / MANIFEST_NAME).exists():
+    if not os.path.exists(path / MANIFEST_NAME):
         return None
-    manifest, tensors = _read_bundle(path)
+    manifest, _ = _read_bundle(path)
     if "statistics" not in manifest:
         return None
-    return TrainingStatistics.from_state(_join_tensors(manifest["statistics"], tensors))
+    return TrainingStatistics.from_state(
+        manifest["statistics"], ThetaLayout.from_json(manifest.get("layout"))
+    )
 
 
-def _load_bundle(path: Path) -> AvatarState:
+def _load_bundle(path: Path) -> StoredAvatar:
     manifest, tensors = _read_bundle(path)
-    state = _join_tensors(manifest["state"], tensors)
-    if is_reference(state["head"]):
-        state["head"] = resolve(state["head"], path)
-    return state, _below("parameters/", tensors)
+    state = manifest["state"]
+    with damage_of(path):
+        if is_reference(state["head"]):
+            state["head"] = resolve(state["head"], path)
+    return StoredAvatar(path, state, _below("parameters/", tensors), manifest.get("layout"))
 
 
 def _below(prefix: str, tensors: dict[str, Any]) -> dict[str, Any]:
@@ -118,13 +145,30 @@ def _below(prefix: str, tensors: dict[str, Any]) -> dict[str, Any]:
 
 
 def _read_bundle(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """Manifest and tensors, checked; raises UserError as `load_any`."""
-    damaged = f"The avatar bundle {path} is damaged"
-    remedy = "Save the avatar again, or use another copy."
-    try:
-        manifest = json.loads((path / MANIFEST_NAME).read_text())
-    except (OSError, ValueError) as error:
-        raise UserError(f"{damaged}: {MANIFEST_NAME}: {error}.", remedy) from error
+    """Manifest, its references replaced by their tensors, and all tensors."""
+    with _damage_of_part(path, MANIFEST_NAME):
+        manifest = load_json(path / MANIFEST_NAME, _MAX_MANIFEST_BYTES)
+    _require_known_kind(manifest, path)
+    with _damage_of_part(path, MANIFEST_NAME):
+        if unknown := sorted(set(manifest) - set(_PARTS)):
+            raise DamagedFileError(f"it has the unknown parts {', '.join(unknown)}")
+        # Bundles of before have no checksums.
+        written = manifest.get(_CHECKSUMS, {})
+        if written and written.get(MANIFEST_NAME) != _manifest_digest(manifest):
+            raise DamagedFileError("it is not as it was written")
+        state = manifest.get("state", {})
+        if missing := [name for name in _STATE_PARTS if name not in state]:
+            raise DamagedFileError(f"it lacks {', '.join(missing)}")
+    with _damage_of_part(path, TENSORS_NAME):
+        content = read_file(path / TENSORS_NAME, _MAX_TENSORS_BYTES)
+        if written and written.get(TENSORS_NAME) != digest([content]):
+            raise DamagedFileError("it is not as it was written")
+        tensors = load(content)
+        return _join_tensors(manifest, tensors), tensors
+
+
+def _require_known_kind(manifest: Any, path: Path) -> None:
+    """Raise UserError for a manifest of something else, or of another version."""
     if not isinstance(manifest, dict) or manifest.get("format") != BUNDLE_FORMAT:
         raise UserError(
             f"{path / MANIFEST_NAME} does not describe an avatar bundle.",
@@ -136,49 +180,32 @@ def _read_bundle(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
             f"version {BUNDLE_VERSION}.",
             "Install the version of rgbavatar_ns that wrote it.",
         )
-    missing = [name for name in _STATE_PARTS if name not in manifest.get("state", {})]
-    if missing:
-        raise UserError(f"{damaged}: {MANIFEST_NAME} lacks {', '.join(missing)}.", remedy)
+
+
+@contextmanager
+def _damage_of_part(path: Path, name: str) -> Iterator[None]:
+    """Tell all that goes wrong with a part of a bundle as a UserError."""
     try:
-        with safe_open(path / TENSORS_NAME, framework="pt") as file:
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-        _join_tensors(manifest, tensors)
-    except (OSError, SafetensorError, KeyError) as error:
-        raise UserError(f"{damaged}: {TENSORS_NAME}: {error}.", remedy) from error
-    return manifest, tensors
-
-
-def _load_newest(checkpoints: list[Path]) -> AvatarState:
-    """Read the first that can be read of checkpoints sorted newest first."""
-    errors = []
-    for checkpoint in checkpoints:
-        try:
-            loaded = _load_checkpoint(checkpoint)
-        except UserError as error:
-            errors.append(error)
-            _log.warning("%s Trying the one before.", error.cause)
-            continue
-        _log.info("Loaded %s.", checkpoint)
-        return loaded
-    raise errors[0]
-
-
-def _load_checkpoint(path: Path) -> AvatarState:
-    try:
-        checkpoint = torch.load(path, map_location="cpu", weights_only=True)
-    except (OSError, RuntimeError, EOFError, pickle.UnpicklingError, ValueError) as error:
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        with damage_told():
+            yield
+    except DamagedFileError as error:
         raise UserError(
-            f"The checkpoint {path} cannot be read: {reason}.", "Use an earlier one of the run."
+            f"The avatar bundle {path} is damaged: {name}: {error}.",
+            "Save the avatar again, or use another copy.",
         ) from error
-    pipeline = checkpoint.get("pipeline") if isinstance(checkpoint, dict) else None
-    extra = (pipeline or {}).get(CHECKPOINT_EXTRA_STATE)
-    if not isinstance(extra, dict) or "avatar" not in extra:
+
+
+def _load_checkpoint(path: Path) -> StoredAvatar:
+    pipeline = read_checkpoint(path).get("pipeline")
+    extra = pipeline.get(CHECKPOINT_EXTRA_STATE) if isinstance(pipeline, dict) else None
+    if not isinstance(extra, dict) or not isinstance(extra.get("avatar"), dict):
         raise UserError(
             f"The checkpoint {path} holds no avatar.",
             "Give a checkpoint of a run of ns-train rgbavatar.",
         )
-    return extra["avatar"], _below(CHECKPOINT_PREFIX, pipeline or {})
+    with damage_of(path):
+        parameters = _below(CHECKPOINT_PREFIX, pipeline or {})
+    return StoredAvatar(path, extra["avatar"], parameters, extra.get("layout"))
 
 
 def _split_off_tensors(value: Any, name: str, tensors: dict[str, Tensor]) -> Any:
@@ -197,7 +224,10 @@ def _join_tensors(value: Any, tensors: dict[str, Tensor]) -> Any:
     """Invert `_split_off_tensors`."""
     if isinstance(value, dict):
         if set(value) == {_TENSOR_MARK}:
-            return tensors[value[_TENSOR_MARK]]
+            name = value[_TENSOR_MARK]
+            if not isinstance(name, str) or name not in tensors:
+                raise DamagedFileError(f"it has no tensor {str(name)[:80]!a}")
+            return tensors[name]
         return {k: _join_tensors(v, tensors) for k, v in value.items()}
     if isinstance(value, list):
         return [_join_tensors(v, tensors) for v in value]

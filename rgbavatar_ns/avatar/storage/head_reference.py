@@ -9,11 +9,14 @@ from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadArrays
 from rgbavatar_ns.head.flame import FLAME_VARIABLE, FLAME_VERTICES, VERSIONS, load_flame
 from rgbavatar_ns.head.teeth import TeethForm
+from rgbavatar_ns.reading import DamagedFileError, damage_told
 
 HEAD_VARIABLE = "RGBAVATAR_HEAD"
 """Environment variable: the head model's file for bundles that only name it."""
 
 _MARK = "reference"
+_NUMBERS = ("num_identity", "num_expressions", "num_vertices")
+_KINDS = {"name": str, "sha256": str, **dict.fromkeys(_NUMBERS, int)}
 
 
 def reference_to(arrays: HeadArrays) -> dict[str, Any]:
@@ -28,18 +31,23 @@ def reference_to(arrays: HeadArrays) -> dict[str, Any]:
     return {_MARK: described}
 
 
-def is_reference(state: dict[str, Any]) -> bool:
+def is_reference(state: Any) -> bool:
     """Whether a head's state only names it."""
-    return set(state) == {_MARK}
+    return isinstance(state, dict) and set(state) == {_MARK}
 
 
 def resolve(state: dict[str, Any], bundle: Path) -> dict[str, Any]:
     """The state of the head that a reference names: the embedded one, or the user's own file.
 
     The file is RGBAVATAR_HEAD (written by HeadArrays.save) or, for FLAME, RGBAVATAR_FLAME. Raises
-    UserError where none is named, it cannot be read, or it holds another head.
+    UserError where none is named, it cannot be read, or it holds another head; DamagedFileError
+    for a reference that is none.
     """
     described = state[_MARK]
+    with damage_told():
+        kinds = {key: type(value) for key, value in described.items()}
+    if kinds != _KINDS:
+        raise DamagedFileError("its reference to a head model is none")
     name = described["name"]
     found: list[str] = []
     for arrays in _candidates(described):

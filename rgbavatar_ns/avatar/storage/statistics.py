@@ -12,6 +12,14 @@ from rgbavatar_ns.head import ThetaLayout
 
 _RIGID = ("rotation", "neck", "translation")
 """Fields that move the head as a whole; the others make the expression."""
+_AXES = {
+    **{f"theta_{kind}": "H" for kind in ("mean", "std", "min", "max", "neutral")},
+    **{f"psi_{kind}": "K" for kind in ("mean", "std", "min", "max")},
+    "expressive": "H",
+    "components": "CH",
+    "component_min": "C",
+    "component_max": "C",
+}
 _EXPLAINED = 0.999
 _NOTHING = 1e-8
 
@@ -82,14 +90,30 @@ class TrainingStatistics:
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
     @classmethod
-    def from_state(cls, state: dict[str, Any]) -> "TrainingStatistics":
-        """Inverse of `to_state`; raises UserError where a field is missing."""
+    def from_state(cls, state: Any, layout: ThetaLayout) -> "TrainingStatistics":
+        """Inverse of `to_state`; raises UserError where a field is missing, or is none of this."""
+        remedy = "Export the avatar again."
+        if not isinstance(state, dict):
+            raise UserError("The training statistics are none.", remedy)
         missing = [field.name for field in fields(cls) if field.name not in state]
         if missing:
-            raise UserError(
-                f"The training statistics lack {', '.join(missing)}.", "Export the avatar again."
-            )
-        return cls(**{field.name: state[field.name] for field in fields(cls)})
+            raise UserError(f"The training statistics lack {', '.join(missing)}.", remedy)
+        values = {field.name: state[field.name] for field in fields(cls)}
+        sizes = {"H": layout.size}
+        for name, axes in _AXES.items():
+            value = values[name]
+            fits = isinstance(value, Tensor) and value.ndim == len(axes)
+            if fits and name == "expressive":
+                fits = value.dtype == torch.bool
+            elif fits:
+                fits = value.is_floating_point()
+            if not fits or any(
+                sizes.setdefault(axis, size) != size for axis, size in zip(axes, value.shape)
+            ):
+                raise UserError(f"The training statistics' {name} does not fit in.", remedy)
+        if type(values["num_frames"]) is not int or values["num_frames"] < 1:
+            raise UserError("The training statistics are of no frames.", remedy)
+        return cls(**values)
 
 
 def expressive_numbers(layout: ThetaLayout) -> Bool[Tensor, "H"]:

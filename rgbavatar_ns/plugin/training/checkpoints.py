@@ -1,29 +1,24 @@
-"""Checkpoints that survive being killed: written whole or not at all, read from the newest good."""
+"""A trainer's checkpoints: written whole or not at all, and what it needs in order to go on."""
 
-import re
 import shutil
-import zipfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from rgbavatar_ns.avatar.storage.checkpoint_file import (
+    checkpoints_of,
+    list_checkpoints,
+    read_checkpoint,
+    read_newest,
+)
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.files import atomic_write
 
-_NAME = re.compile(r"step-(\d+)\.ckpt")
 _REQUIRED = frozenset({"step", "pipeline", "optimizers", "schedulers", "scalers"})
 # What a zip file's directory and small values may add to the tensors' bytes.
 _OVERHEAD_BYTES = 4 << 20
-
-
-def list_checkpoints(folder: Path) -> list[tuple[int, Path]]:
-    """Step and path of the checkpoints in `folder`, oldest first; empty if there is no folder."""
-    if not folder.is_dir():
-        return []
-    named = ((_NAME.fullmatch(path.name), path) for path in folder.iterdir())
-    return sorted((int(name.group(1)), path) for name, path in named if name)
 
 
 def save_checkpoint(state: dict[str, Any], folder: Path, step: int, keep: int) -> Path:
@@ -36,7 +31,7 @@ def save_checkpoint(state: dict[str, Any], folder: Path, step: int, keep: int) -
         UserError: there is too little space; older checkpoints are untouched.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    path = folder / f"step-{step:09d}.ckpt"
+    path = checkpoint_of_step(folder, step)
     beside = folder.parent / f".{folder.name}.partial"
     remedy = f"Free space and resume with --load-dir {folder}; the checkpoints there are untouched."
     _require_space(
@@ -52,51 +47,50 @@ def save_checkpoint(state: dict[str, Any], folder: Path, step: int, keep: int) -
     return path
 
 
-def load_newest(folder: Path, tell: Callable[[str], None]) -> tuple[dict[str, Any], Path]:
+def checkpoint_of_step(folder: Path, step: int) -> Path:
+    """Where a step's checkpoint lies, as nerfstudio names it."""
+    return folder / f"step-{step:09d}.ckpt"
+
+
+def load_newest(folder: Path, tell: Callable[[str], object]) -> tuple[dict[str, Any], Path]:
     """Read the newest checkpoint in `folder` that can be read, telling which were passed over.
 
-    `folder` may be a run's folder too.
-
-    Raises:
-        UserError: there is no readable checkpoint.
+    `folder` may be a run's folder too. Raises UserError where there is no readable one.
     """
-    inside = folder / "nerfstudio_models"
-    candidates = list_checkpoints(folder) or list_checkpoints(inside)
-    if not candidates:
+    checkpoints = checkpoints_of(folder)
+    if not checkpoints:
         raise UserError(
             f"There is no checkpoint in {folder}.",
-            "Give the folder that holds step-*.ckpt (a run's nerfstudio_models), or leave out "
-            "--load-dir to train from the start.",
+            "Give the folder that holds step-*.ckpt (a run's nerfstudio_models), or train from the "
+            "start.",
         )
-    for _, path in reversed(candidates):
-        try:
-            return read_checkpoint(path), path
-        except UserError as error:
-            tell(f"Passing over an unreadable checkpoint: {error.cause}")
-    raise UserError(
-        f"None of the {len(candidates)} checkpoints in {folder} can be read.",
-        "Leave out --load-dir to train from the start.",
-    )
+    return read_newest(checkpoints, read_training_state, tell)
 
 
-def read_checkpoint(path: Path) -> dict[str, Any]:
-    """Read one checkpoint on the CPU with safe loading; raises UserError if that fails."""
-    if not path.is_file():
-        raise UserError(f"There is no checkpoint {path}.", "Check --load-checkpoint/--load-step.")
-    try:
-        with zipfile.ZipFile(path) as archive:
-            damaged = archive.testzip()
-        if damaged is not None:
-            raise ValueError(f"{damaged} is damaged")
-        state = torch.load(path, map_location="cpu", weights_only=True)
-        missing = _REQUIRED - state.keys()
-        if missing:
-            raise ValueError(f"{', '.join(sorted(missing))} missing")
-    except Exception as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+def readable_step(folder: Path, asked: int | None, tell: Callable[[str], object]) -> int:
+    """The step that was asked for, if its checkpoint can be read; else that of `load_newest`."""
+    if asked is not None:
+        read_training_state(checkpoint_of_step(folder, asked))
+        return asked
+    _, path = load_newest(folder, tell)
+    return dict((path, step) for step, path in list_checkpoints(path.parent))[path]
+
+
+def read_training_state(path: Path) -> dict[str, Any]:
+    """A checkpoint with all that training goes on from; raises UserError where there is none."""
+    state = read_checkpoint(path)
+    missing = _REQUIRED - state.keys()
+    if missing:
         raise UserError(
-            f"{path} cannot be read ({reason}).", "Resume from an older checkpoint."
-        ) from error
+            f"The checkpoint {path} lacks {', '.join(sorted(missing))}.",
+            "Resume from another one of the run.",
+        )
+    for name in _REQUIRED:
+        if not isinstance(state[name], int if name == "step" else dict):
+            raise UserError(
+                f"The checkpoint {path} has something else as its {name}.",
+                "Resume from another one of the run.",
+            )
     return state
 
 

@@ -1,6 +1,7 @@
 """Adam and learning-rate schedules whose checkpoints hold nothing but tensors and numbers."""
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Annotated, Any
 
@@ -11,6 +12,9 @@ from torch.optim.lr_scheduler import LambdaLR
 
 from rgbavatar_ns.avatar import LEARNING_RATES
 from rgbavatar_ns.options import Between, Counted, Positive, Weight
+
+_MOMENTS = ("exp_avg", "exp_avg_sq")
+_MAX_STEP = 1 << 40
 
 
 @dataclass
@@ -68,3 +72,22 @@ def paper_optimizers() -> dict[str, Any]:
         name: {"optimizer": AdamConfig(lr=rate), "scheduler": None}
         for name, rate in LEARNING_RATES.items()
     }
+
+
+def require_fitting_states(optimizers: Iterable[torch.optim.Optimizer]) -> None:
+    """Raise ValueError where a loaded Adam's moments are none of its parameters'.
+
+    torch takes any; the kernels that step without autograd rely on their shapes.
+    """
+    for optimizer in optimizers:
+        if not isinstance(optimizer, torch.optim.Adam):
+            continue
+        for parameter, state in optimizer.state.items():
+            shapes = {"step": torch.Size(), **dict.fromkeys(_MOMENTS, parameter.shape)}
+            for name, shape in shapes.items():
+                value = state.get(name)
+                fits = isinstance(value, torch.Tensor) and value.is_floating_point()
+                if not fits or value.shape != shape or not value.is_contiguous():
+                    raise ValueError(f"an optimizer's {name} has not the shape {list(shape)}")
+            if not 0 <= state["step"] < _MAX_STEP:
+                raise ValueError("an optimizer has counted impossible steps")

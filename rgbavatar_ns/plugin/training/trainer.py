@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -19,6 +20,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from nerfstudio.utils.writer import EventName
 from nerfstudio.viewer.viewer import Viewer
 
+from rgbavatar_ns.avatar.storage.stored_avatar import damage_of
 from rgbavatar_ns.avatar.training.batches import ChosenFrames, TrainingBatch
 from rgbavatar_ns.avatar.training.loop import FitHooks, fit
 from rgbavatar_ns.avatar.training.step import Losses
@@ -28,17 +30,23 @@ from rgbavatar_ns.options import Between, Count, Positive, Ranges, check_options
 from rgbavatar_ns.plugin.errors import device_errors_told, install_user_error_hook
 from rgbavatar_ns.plugin.pipeline import RGBAvatarPipeline, RGBAvatarPipelineConfig
 from rgbavatar_ns.plugin.refinement import REFINED_NAME
-from rgbavatar_ns.plugin.training.checkpoints import load_newest, read_checkpoint, save_checkpoint
+from rgbavatar_ns.plugin.training.checkpoints import (
+    checkpoint_of_step,
+    load_newest,
+    read_training_state,
+    readable_step,
+    save_checkpoint,
+)
 from rgbavatar_ns.plugin.training.interruption import StopRequest, stop_with_starter
-from rgbavatar_ns.plugin.training.optimizers import ExponentialConfig
+from rgbavatar_ns.plugin.training.optimizers import ExponentialConfig, require_fitting_states
 from rgbavatar_ns.plugin.training.progress import TrainingProgress
 
 SUMMARY_NAME = "training.json"
 
 
 def say(line: str) -> None:
-    """Print a line as it is, however long."""
-    CONSOLE.print(line, highlight=False, soft_wrap=True)
+    """Print a line as it is, however long and with any brackets."""
+    CONSOLE.print(line, highlight=False, soft_wrap=True, markup=False)
 
 
 @dataclass
@@ -63,6 +71,19 @@ class RGBAvatarTrainerConfig(TrainerConfig):
     mixed_precision: bool = False
     """Half precision is not used: the rasterizer computes in float32."""
 
+    def get_checkpoint_dir(self) -> Path:
+        """Where the run's checkpoints are; for who loads one from there, `load_step` is set.
+
+        ns-eval, ns-viewer and ns-render ask for the folder and then load what is there of
+        `load_step`, or the newest, readable or not; so `load_step` becomes the newest that can be
+        read. Raises UserError where there is none, or not that of a `load_step` already set.
+        """
+        folder = super().get_checkpoint_dir()
+        if not _IN_TRAINER.get():
+            install_user_error_hook()
+            self.load_step = readable_step(folder, self.load_step, say)
+        return folder
+
     def save_config(self) -> None:
         """Write config.yml, the first file of a run; raises UserError where none can begin."""
         install_user_error_hook()
@@ -71,6 +92,7 @@ class RGBAvatarTrainerConfig(TrainerConfig):
             super().save_config()
 
 
+_IN_TRAINER = ContextVar("a trainer asks where to save", default=False)
 _HOST_RANGES: Ranges = {
     RGBAvatarTrainerConfig: {
         name: Between(1, 10**9)
@@ -120,7 +142,11 @@ class RGBAvatarTrainer(Trainer, FitHooks):
         if world_size != 1:
             raise UserError("This method trains on one device.", "Leave out --machine.num-devices.")
         _use_run_seed(config)
-        super().__init__(config, local_rank, world_size)
+        asks = _IN_TRAINER.set(True)
+        try:
+            super().__init__(config, local_rank, world_size)
+        finally:
+            _IN_TRAINER.reset(asks)
         self.stop = StopRequest()
         self.stop_training = False
         self._train_seconds = 0.0
@@ -325,27 +351,30 @@ class RGBAvatarTrainer(Trainer, FitHooks):
         if config.load_dir is not None:
             state, path = self._choose(config.load_dir)
         elif config.load_checkpoint is not None:
-            state, path = read_checkpoint(config.load_checkpoint), config.load_checkpoint
+            state, path = read_training_state(config.load_checkpoint), config.load_checkpoint
         else:
             CONSOLE.print("Training from the start.")
             return
-        self._start_step = int(state["step"]) + 1
-        self._saved_step = int(state["step"])
-        self._train_seconds = float(state.get("train_seconds", 0.0))
-        self.pipeline.load_pipeline(state["pipeline"], int(state["step"]))
-        self.optimizers.load_optimizers(state["optimizers"])
-        if config.load_scheduler:
-            known = self.optimizers.schedulers
-            self.optimizers.load_schedulers(
-                {name: saved for name, saved in state["schedulers"].items() if name in known}
-            )
+        with damage_of(path):
+            self._start_step = state["step"] + 1
+            self._saved_step = state["step"]
+            self._train_seconds = float(state.get("train_seconds", 0.0))
+        self.pipeline.load_pipeline(state["pipeline"], state["step"])
+        with damage_of(path):
+            self.optimizers.load_optimizers(state["optimizers"])
+            require_fitting_states(self.optimizers.optimizers.values())
+            if config.load_scheduler:
+                known = self.optimizers.schedulers
+                self.optimizers.load_schedulers(
+                    {name: saved for name, saved in state["schedulers"].items() if name in known}
+                )
         say(f"Resuming after step {state['step']} from {path}")
 
     def _choose(self, folder: Path) -> tuple[dict[str, Any], Path]:
         if self.config.load_step is not None:
-            path = folder / f"step-{self.config.load_step:09d}.ckpt"
-            return read_checkpoint(path), path
-        return load_newest(folder, lambda line: CONSOLE.print(line, soft_wrap=True))
+            path = checkpoint_of_step(folder, self.config.load_step)
+            return read_training_state(path), path
+        return load_newest(folder, say)
 
     def save_checkpoint(self, step: int) -> None:
         """Write a checkpoint atomically; raises UserError if it does not fit on the disk."""

@@ -17,6 +17,7 @@ from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.utils.eval_utils import eval_setup
 
 from rgbavatar_ns import Avatar
+from rgbavatar_ns.avatar.storage.checkpoint_file import list_checkpoints
 from rgbavatar_ns.data import TrackedFrame, load_dataset
 from rgbavatar_ns.data.streams import StreamClient, StreamSubject
 from rgbavatar_ns.errors import UserError
@@ -24,7 +25,6 @@ from rgbavatar_ns.plugin.methods import rgbavatar
 from rgbavatar_ns.plugin.online.methods import rgbavatar_online, rgbavatar_online_tiny
 from rgbavatar_ns.plugin.online.sources import SourceConfig
 from rgbavatar_ns.plugin.online.trainer import OnlineTrainer
-from rgbavatar_ns.plugin.training.checkpoints import list_checkpoints
 from tests.plugin.online_run import hold_back_after, online_config, online_trainer
 from tests.plugin.run import assert_learns, before_each_step, before_step, newest_state
 from tests.plugin.tiny import NUM_FRAMES, NUM_TEST, SIZE

@@ -11,13 +11,9 @@ from typing import Any
 import pytest
 import torch
 
+from rgbavatar_ns.avatar.storage.checkpoint_file import list_checkpoints, read_checkpoint
 from rgbavatar_ns.errors import UserError
-from rgbavatar_ns.plugin.training.checkpoints import (
-    list_checkpoints,
-    load_newest,
-    read_checkpoint,
-    save_checkpoint,
-)
+from rgbavatar_ns.plugin.training.checkpoints import load_newest, save_checkpoint
 
 
 def _state(step: int, size: int = 1000) -> dict[str, Any]:

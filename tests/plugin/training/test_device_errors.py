@@ -5,9 +5,9 @@ from collections.abc import Callable
 import pytest
 import torch
 
+from rgbavatar_ns.avatar.storage.checkpoint_file import list_checkpoints, read_checkpoint
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.kernels import DeviceError
-from rgbavatar_ns.plugin.training.checkpoints import list_checkpoints, read_checkpoint
 from rgbavatar_ns.plugin.training.trainer import RGBAvatarTrainerConfig
 from tests.plugin.run import make_trainer
 

@@ -14,9 +14,9 @@ import torch
 from torch.utils._pytree import keystr, tree_flatten_with_path
 
 from rgbavatar_ns import Avatar
+from rgbavatar_ns.avatar.storage.checkpoint_file import list_checkpoints
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.plugin.methods import rgbavatar
-from rgbavatar_ns.plugin.training.checkpoints import list_checkpoints
 from rgbavatar_ns.plugin.training.trainer import RGBAvatarTrainer, RGBAvatarTrainerConfig
 from tests.plugin.run import (
     SMALL,
