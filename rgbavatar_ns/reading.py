@@ -16,7 +16,7 @@ import zlib
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from jaxtyping import Shaped
@@ -68,7 +68,7 @@ def damage_told() -> Iterator[None]:
 
 
 @contextmanager
-def regular_file(path: Path) -> Iterator[io.BufferedIOBase]:
+def regular_file(path: Path) -> Iterator[BinaryIO]:
     """The file, opened to be read; DamagedFileError where it is none, unreadable or not regular."""
     with damage_told():
         # A FIFO without a writer would block here for ever.

@@ -11,7 +11,7 @@ import re
 import zipfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, BinaryIO, TypeVar
 
 import torch
 from torch import Tensor
@@ -92,7 +92,7 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
         ) from error
 
 
-def _verify(file: io.BufferedIOBase, size: int) -> None:
+def _verify(file: BinaryIO, size: int) -> None:
     """Raise an exception unless it is a zip of torch.save, whole, and plain by its pickle."""
     with zipfile.ZipFile(file) as archive:
         members = {member.filename: member for member in archive.infolist()}
