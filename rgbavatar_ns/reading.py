@@ -176,7 +176,7 @@ def parse_array(content: bytes) -> Shaped[np.ndarray, "..."]:
 
 
 @contextmanager
-def open_archive(file: io.BufferedIOBase) -> Iterator[zipfile.ZipFile]:
+def open_archive(file: BinaryIO | io.BytesIO) -> Iterator[zipfile.ZipFile]:
     """The zip in this file, of few members and none twice; raises DamagedFileError."""
     with damage_told():
         # A directory of millions takes long to read, so its end is looked at first.
