@@ -1,5 +1,6 @@
 """What the numbers of a theta vector mean: named fields with a size and a form."""
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
@@ -13,6 +14,12 @@ from rgbavatar_ns.head.rotations import axis_angle_to_matrix, matrix_to_6d_rows
 
 ThetaForm = Literal["linear", "axis_angle", "translation"]
 """linear: blend weights; axis_angle: radians times unit axis; translation: metres."""
+_LARGEST: dict[ThetaForm, tuple[float, str]] = {
+    "linear": (100.0, "the largest weight"),
+    "axis_angle": (4 * math.pi, "two turns, in radians"),
+    "translation": (100.0, "metres from the origin"),
+}
+"""No person does more; trackers that lose the face do, and one such frame destroys a training."""
 
 
 @dataclass(frozen=True)
@@ -108,6 +115,18 @@ class ThetaLayout:
         ]
         return torch.cat(pieces, dim=-1)
 
+    def absurd(self, theta: Float[Tensor, "*batch H"]) -> str | None:
+        """What no person can do, in words: a weight beyond 100, an angle beyond 4 pi, 100 m, NaN.
+
+        None where all is within reason; raises UserError where the size differs.
+        """
+        for field, part in zip(self.fields, self.split(theta).values()):
+            extents = part.abs() if field.form == "linear" else part.norm(dim=-1)
+            largest, what = _LARGEST[field.form]
+            if extents.numel() and not bool((extents <= largest).all()):
+                return f"{field.name} reaches {float(extents.max()):g} ({largest:.4g}: {what})"
+        return None
+
     def to_json(self) -> list[dict[str, Any]]:
         """The fields as plain values that JSON can hold."""
         return [
@@ -122,7 +141,7 @@ class ThetaLayout:
             if any(set(field) != {"name", "size", "form"} for field in fields):
                 raise ValueError("every field needs exactly name, size and form")
             return cls(tuple(ThetaField(str(f["name"]), int(f["size"]), f["form"]) for f in fields))
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, OverflowError) as error:
             raise UserError(
                 f"This is not a theta layout: {error}.",
                 "Take the list of fields that ThetaLayout.to_json wrote.",

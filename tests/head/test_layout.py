@@ -58,6 +58,7 @@ def test_layout_survives_json() -> None:
         [{"name": "jaw", "size": 3, "form": "euler"}],
         [{"name": "jaw", "size": 4, "form": "axis_angle"}],
         [{"name": "a", "size": 1, "form": "linear"}, {"name": "a", "size": 1, "form": "linear"}],
+        [{"name": "jaw", "size": float("inf"), "form": "linear"}],
         ["jaw"],
     ],
 )
@@ -77,6 +78,29 @@ def test_unknown_fields_and_wrong_sizes_are_refused_by_name() -> None:
         LAYOUT.split(torch.zeros(2, 13))
     with pytest.raises(UserError):
         LAYOUT.join({})
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "field"),
+    [
+        (0, 99.0, None),
+        (0, -101.0, "expression reaches 101"),
+        (8, 1e30, "eyelids"),
+        (4, 12.5, None),
+        (5, 12.6, "jaw"),
+        (6, -1e38, "jaw reaches"),
+        (11, 99.0, None),
+        (11, -101.0, "translation"),
+        (3, float("nan"), "expression reaches nan"),
+        (10, float("inf"), "translation"),
+    ],
+)
+def test_what_no_person_can_do_is_told(place: int, value: float, field: str | None) -> None:
+    theta = torch.zeros(2, LAYOUT.size)
+    theta[1, place] = value
+    for told in (LAYOUT.absurd(theta), LAYOUT.absurd(theta[1])):
+        assert told is None if field is None else (told or "").startswith(field)
+    assert LAYOUT.absurd(theta[:0]) is None
 
 
 @pytest.mark.parametrize("include_pose", [True, False])
