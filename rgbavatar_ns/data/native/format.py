@@ -14,6 +14,7 @@ from jaxtyping import Float
 
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.kernels.types import PinholeCameras
+from rgbavatar_ns.reading import DamagedFileError, json_numbers
 
 FORMAT = "rgbavatar native"
 VERSIONS = (1, 2)
@@ -55,16 +56,13 @@ def _camera_part(
     label: str, record: Any, name: str, shape: tuple[int, ...]
 ) -> Float[np.ndarray, "..."]:
     try:
-        value = np.array(record[name], dtype=np.float32)
-    except (KeyError, TypeError, ValueError, OverflowError):
-        value = None
-    if value is None or value.shape != shape or not np.isfinite(value).all():
+        return json_numbers(record[name], shape).astype(np.float32)
+    except (KeyError, TypeError, DamagedFileError):
         size = " x ".join(map(str, shape))
         raise UserError(
             f"The camera of {label} has no valid {name}: {size} finite numbers are needed.",
             "Write the dataset again with `DatasetWriter`, or mend its dataset.json.",
-        )
-    return value
+        ) from None
 
 
 def _check_cameras(

@@ -76,6 +76,7 @@ def test_a_replayed_stream_is_trained_on_to_its_end_and_a_little_longer(online: 
     told = summary(trainer)
     assert told["frames"] == told["stream"]["taken in"] == STREAMED
     assert told["stream"]["dropped"] == 0
+    assert told["ended"] == "completed"
     assert told["steps"] == ended + 5
     assert told["images"] <= 4 * told["steps"]
     assert list_checkpoints(trainer.checkpoint_dir)[-1][0] == trainer.step
@@ -178,6 +179,7 @@ def test_sigterm_saves_and_is_told_by_the_exit_code(online: Online):
         trainer.train()
     assert ended.value.code == 143
     assert [step for step, _ in list_checkpoints(trainer.checkpoint_dir)] == [0]
+    assert summary(trainer)["ended"] == "stopped"
 
 
 def test_a_resumed_stream_goes_on_where_it_was(online: Online, monkeypatch: pytest.MonkeyPatch):
@@ -269,6 +271,36 @@ def test_a_fault_of_the_source_saves_and_is_told(online: Online):
         trainer.train()
     assert [step for step, _ in list_checkpoints(trainer.checkpoint_dir)] == [1]
     assert trainer.stream.pools.num_added > 0
+    assert summary(trainer)["ended"] == "failed: UserError The disk is gone. Find it."
+    assert summary(trainer)["steps"] == 2
+
+
+@pytest.mark.parametrize("fault", [KeyboardInterrupt(), MemoryError("far too large"), OSError(28)])
+def test_whatever_ends_a_run_it_is_told(online: Online, fault: BaseException):
+    trainer = online()
+
+    def break_off() -> None:
+        raise fault
+
+    before_step(2, trainer, break_off)
+    with pytest.raises(type(fault)):
+        trainer.train()
+    told = summary(trainer)
+    assert told["ended"].startswith(f"failed: {type(fault).__name__}")
+    assert told["steps"] == 2
+    assert told["stream"]["taken in"] > 0
+
+
+def test_a_fault_before_the_first_frame_is_told(online: Online):
+    trainer = online()
+    trainer.stream.start = lambda: setattr(trainer.stream.ingest, "failure", OSError("gone"))  # type: ignore[method-assign]
+    with pytest.raises(OSError, match="gone"):
+        trainer.train()
+    assert summary(trainer) | {"stream": {}} == {
+        "ended": "failed: OSError gone",
+        **{"steps": 0, "train_seconds": 0.0, "images_per_second": 0.0, "images": 0, "frames": 0},
+        "stream": {},
+    }
 
 
 @pytest.mark.parametrize(
