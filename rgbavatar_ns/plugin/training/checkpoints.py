@@ -2,8 +2,10 @@
 
 import re
 import shutil
+import time
 import zipfile
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +18,7 @@ _NAME = re.compile(r"step-(\d+)\.ckpt")
 _REQUIRED = frozenset({"step", "pipeline", "optimizers", "schedulers", "scalers"})
 # What a zip file's directory and small values may add to the tensors' bytes.
 _OVERHEAD_BYTES = 4 << 20
+_STILL_S = 60.0
 
 
 def list_checkpoints(folder: Path) -> list[tuple[int, Path]]:
@@ -37,7 +40,7 @@ def save_checkpoint(state: dict[str, Any], folder: Path, step: int, keep: int) -
     """
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"step-{step:09d}.ckpt"
-    beside = folder.parent / f".{folder.name}.partial"
+    beside = _partial(folder)
     remedy = f"Free space and resume with --load-dir {folder}; the checkpoints there are untouched."
     _require_space(
         folder, sum(tensor.nbytes for tensor in _tensors(state)) + _OVERHEAD_BYTES, remedy
@@ -50,6 +53,21 @@ def save_checkpoint(state: dict[str, Any], folder: Path, step: int, keep: int) -
     for _, old in list_checkpoints(folder)[: -max(1, keep)]:
         old.unlink()
     return path
+
+
+def remove_leftover(folder: Path) -> None:
+    """Remove what a run that was killed while it saved has left beside its checkpoints.
+
+    A file that has just grown is left, for a run may be alive and saving.
+    """
+    leftover = _partial(folder)
+    with suppress(OSError):
+        if time.time() - leftover.stat().st_mtime > _STILL_S:
+            leftover.unlink()
+
+
+def _partial(folder: Path) -> Path:
+    return folder.parent / f".{folder.name}.partial"
 
 
 def load_newest(folder: Path, tell: Callable[[str], None]) -> tuple[dict[str, Any], Path]:

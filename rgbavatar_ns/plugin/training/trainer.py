@@ -25,7 +25,12 @@ from rgbavatar_ns.files import write_json
 from rgbavatar_ns.plugin.errors import device_errors_told, install_user_error_hook
 from rgbavatar_ns.plugin.pipeline import RGBAvatarPipeline, RGBAvatarPipelineConfig
 from rgbavatar_ns.plugin.refinement import REFINED_NAME
-from rgbavatar_ns.plugin.training.checkpoints import load_newest, read_checkpoint, save_checkpoint
+from rgbavatar_ns.plugin.training.checkpoints import (
+    load_newest,
+    read_checkpoint,
+    remove_leftover,
+    save_checkpoint,
+)
 from rgbavatar_ns.plugin.training.interruption import StopRequest
 from rgbavatar_ns.plugin.training.optimizers import ExponentialConfig
 from rgbavatar_ns.plugin.training.progress import TrainingProgress
@@ -307,6 +312,7 @@ class RGBAvatarTrainer(Trainer, FitHooks):
         else:
             CONSOLE.print("Training from the start.")
             return
+        remove_leftover(path.parent)
         self._start_step = int(state["step"]) + 1
         self._saved_step = int(state["step"])
         self._train_seconds = float(state.get("train_seconds", 0.0))

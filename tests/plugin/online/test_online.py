@@ -2,9 +2,13 @@
 
 import dataclasses
 import json
+import os
 import signal
 import socket
+import subprocess
+import sys
 import threading
+import time
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -341,6 +345,52 @@ def test_the_methods_have_the_papers_pools_and_sizes():
     assert tiny.pipeline.datamanager.local_share == 0.3
     assert full.pipeline.model.avatar == rgbavatar.config.pipeline.model.avatar
     assert tiny.pipeline.model.avatar.uv_resolution == 128
+
+
+def kill_while_it_runs(data: Path, output: Path, delay_s: float) -> Path:
+    """Train in a process of its own, and kill it so long after its first checkpoint; the folder."""
+    program = (
+        "import sys, threading; from pathlib import Path; import torch; torch.set_num_threads(1); "
+        "from tests.plugin.online_run import *; data, output = map(Path, sys.argv[1:]); "
+        "online_trainer(online_config(output, data, steps_per_save=1, "
+        "steps_after_stream=10**6)).train()"
+    )
+    command = [sys.executable, "-c", program, str(data), str(output)]
+    with (output.parent / f"{output.name}.log").open("w") as log:
+        run = subprocess.Popen(command, stdout=log, stderr=log)
+    folder = output / "tiny/rgbavatar-online-tiny/run/nerfstudio_models"
+    try:
+        deadline = time.monotonic() + 600.0  # Importing alone takes a minute on a busy machine.
+        while not list_checkpoints(folder):
+            assert run.poll() is None, "it ended by itself"
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+        time.sleep(delay_s)
+        assert run.poll() is None, "it ended by itself"
+    finally:
+        run.kill()
+        run.wait()
+    return folder
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(4))
+def test_a_run_that_is_killed_at_any_moment_goes_on(
+    online: Online, tiny_data: Path, tmp_path: Path, seed: int
+):
+    delay_s = float(np.random.default_rng(seed).uniform(0, 2))
+    folder = kill_while_it_runs(tiny_data, tmp_path / "killed", delay_s)
+    state = stream_state(folder)
+    saved = list_checkpoints(folder)[-1][0]
+    leftover = folder.parent / f".{folder.name}.partial"
+    if leftover.exists():
+        os.utime(leftover, (0, 0))  # It was killed long ago.
+    again = online("again", load_dir=folder)
+    assert again.stream.pools.num_added == state["frames"]["added"] > 0
+    again.train()
+    assert again.step > saved
+    assert summary(again)["frames"] == STREAMED
+    assert not [path for path in tmp_path.rglob(".*")]
 
 
 class _Killed(BaseException):
