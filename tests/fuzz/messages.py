@@ -26,9 +26,10 @@ MOST_SECONDS = 2.0
 _Random = np.random.Generator
 _Case = tuple[str, Callable[[], object]]
 
-_SUBJECT = messages.subject_message(subject("mine"))
+_WHO = subject("mine")
+_SUBJECT = messages.subject_message(_WHO)
 _OTHER = messages.subject_message(
-    dataclasses.replace(subject("mine"), arrays=dataclasses.replace(HEAD.arrays, name="other"))
+    dataclasses.replace(_WHO, arrays=dataclasses.replace(HEAD.arrays, name="other"))
 )
 _FRAME = messages.frame_message(tracked(0))
 _TRUE = {"subject": _SUBJECT, "head": _OTHER, "frame": _FRAME}
@@ -80,9 +81,8 @@ def _receive(message: bytes | str) -> None:
         messages.parse_subject(message)
     except UserError as refusal:
         refusals.append(refusal)
-    whom, pools = subject("mine"), LocalGlobalPools(4, 4)
-    frames = ReplayBuffer(whom, pools)
-    ingest = Ingest(GivenStream([]), whom, frames)
+    frames = ReplayBuffer(_WHO, LocalGlobalPools(4, 4))
+    ingest = Ingest(GivenStream([]), _WHO, frames)
     _take_in(ingest, messages.frame_message(tracked(0)))
     try:
         _take_in(ingest, message)
@@ -94,7 +94,7 @@ def _receive(message: bytes | str) -> None:
     assert ingest.counts()["taken in"] == taken_in + 2, ingest.counts()
     drawn = frames.batch(4)
     assert drawn.images_rgba.shape[1:] == (HEIGHT, WIDTH, 4)
-    assert bool(HEAD(drawn.theta, whom.identity).abs().max() < 1000)
+    assert bool(HEAD(drawn.theta, _WHO.identity).abs().max() < 1000)
     assert bool(drawn.cameras.world_to_camera.abs().max() < 1e4)
     assert bool(drawn.cameras.focal_px.max() < 1e6)
     assert bool(drawn.cameras.focal_px.min() > 1e-3)
@@ -103,7 +103,7 @@ def _receive(message: bytes | str) -> None:
 
 
 def _take_in(ingest: Ingest, message: bytes | str) -> None:
-    parsed = messages.parse_message(message, subject("mine"), 0.0)
+    parsed = messages.parse_message(message, _WHO, 0.0)
     if isinstance(parsed, StreamedFrame):
         ingest.take_in(parsed)
 

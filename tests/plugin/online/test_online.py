@@ -385,7 +385,7 @@ def test_a_run_that_is_killed_at_any_moment_goes_on(
     leftover = folder.parent / f".{folder.name}.partial"
     if leftover.exists():
         os.utime(leftover, (0, 0))  # It was killed long ago.
-    again = online("again", load_dir=folder)
+    again = online("again", load_dir=folder, steps_after_stream=saved + 5)
     assert again.stream.pools.num_added == state["frames"]["added"] > 0
     again.train()
     assert again.step > saved
