@@ -144,7 +144,7 @@ class ThetaLayout:
             if any(not isinstance(f["name"], str) or type(f["size"]) is not int for f in values):
                 raise ValueError("a name is no text, or a size no whole number")
             return cls(tuple(ThetaField(f["name"], f["size"], f["form"]) for f in values))
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, OverflowError) as error:
             raise UserError(
                 f"This is not a theta layout: {error}.",
                 "Take the list of fields that ThetaLayout.to_json wrote.",

@@ -12,6 +12,7 @@ from rgbavatar_ns.data.streams import FrameStream, Ingest, ReplayBuffer, Streame
 from rgbavatar_ns.data.streams.ingest import FrameQueue
 from rgbavatar_ns.data.streams.sequence_numbers import SeenNumbers
 from tests.data.streaming import DEADLINE_S, GivenStream, streamed, subject, until
+from tests.fuzz.messages import chunk
 
 
 def ingest_of(
@@ -28,6 +29,8 @@ LARGE = np.zeros((16, 24, 4), np.uint8)
 def test_what_cannot_be_used_is_left_out_and_counted_by_name(encode: bool):
     nan = streamed(3).theta.clone()
     nan[5] = torch.nan
+    near = replace(streamed(11).camera, focal_px=torch.full((1, 2), 1e9))
+    away = replace(streamed(12).camera, world_to_camera=streamed(12).camera.world_to_camera * 1e5)
     told: list[str] = []
     ingest, frames = ingest_of(tell=told.append)
     for frame in (
@@ -41,27 +44,41 @@ def test_what_cannot_be_used_is_left_out_and_counted_by_name(encode: bool):
         streamed(6, image=LARGE, encode=encode),
         replace(streamed(7), png=(streamed(7).png or b"")[:-20]),
         replace(streamed(8), png=b"no picture"),
-        streamed(10_000),
-        streamed(9),
+        replace(streamed(9), theta=streamed(9).theta * 1e5),
+        replace(streamed(10), theta=streamed(10).theta * 0 + 1e30),
+        replace(streamed(11), camera=near),
+        replace(streamed(12), camera=away),
+        replace(streamed(14), index=2**62 - 1),
+        streamed(13),
         streamed(0, session="again"),
     ):
         ingest.take_in(frame)
     assert ingest.counts() == {
         "arrived": 0,
-        "taken in": 5,
-        "out of order": 1,
+        "taken in": 6,
+        "out of order": 2,
         "duplicate": 1,
         "theta not finite": 1,
         "theta of another size": 1,
+        "theta absurd": 2,
+        "camera absurd": 2,
         "another resolution": 2,
         "unreadable": 2,
-        "too late": 1,
         "dropped": 0,
     }
-    assert frames.num_added == 5
-    assert len(told) == 1
-    assert "24 x 16" in told[0]
-    assert "12 x 8" in told[0]
+    assert frames.num_added == 6
+    # The first of each kind is told.
+    assert len(told) == 6
+    assert [line for line in told if "24 x 16" in line and "12 x 8" in line] == told[2:3]
+
+
+def test_a_png_is_not_longer_than_its_pixels():
+    ingest, frames = ingest_of()
+    png = streamed(0).png or b""
+    filled = png[:33] + chunk(b"teXt", bytes(1 << 17)) + png[33:]
+    replace(streamed(0), png=filled).decode()
+    ingest.take_in(replace(streamed(0), png=filled))
+    assert (ingest.counts()["unreadable"], frames.num_added) == (1, 0)
 
 
 def test_only_images_of_the_right_size_are_decoded(monkeypatch: pytest.MonkeyPatch):
@@ -168,9 +185,25 @@ def test_numbers_are_judged_within_bounded_memory(last: int):
     assert seen.add(last + 10) == "new"
     assert seen.add(last + 5) == "late"
     assert seen.add(last + 5) == "duplicate"
-    assert len(seen.state_dict()["seen"]) <= 2 * 4096
-    assert seen.add(last + 1_000_000) == "new"
-    assert seen.add(last + 5) == "too late"
+    assert len(seen.state_dict()["seen"]) <= 8192
     again = SeenNumbers()
     again.load_state_dict(seen.state_dict())
-    assert again.add(last + 1_000_000) == "duplicate"
+    assert again.newest == last + 10
+    assert again.add(last + 5) == "duplicate"
+    assert again.add(last + 6) == "new"
+
+
+@pytest.mark.parametrize("far", [2**62 - 1, 1_000_000])
+@pytest.mark.parametrize("before", [0, 1, 5])
+def test_a_number_far_ahead_costs_no_other_frame(before: int, far: int):
+    seen = SeenNumbers()
+    numbers = [*range(before), far, *range(before, before + 20)]
+    verdicts = [seen.add(number) for number in numbers]
+    assert "duplicate" not in verdicts
+    assert verdicts.count("late") == 1  # the one that follows it
+    assert seen.add(far) == "duplicate"
+
+
+def test_numbers_may_be_times():
+    seen = SeenNumbers()
+    assert {seen.add(1_700_000_000_000_000 + 40_000 * frame) for frame in range(50)} == {"new"}

@@ -102,16 +102,25 @@ def test_what_is_no_message_is_refused(message: bytes | str):
     [
         ({"type": "picture"}, "type"),
         ({"type": None}, "type"),
-        *(({"index": bad}, "whole number") for bad in (-1, True, "3", 1 << 70, 1.5, 10**400)),
+        *(({"index": bad}, "whole number") for bad in (-1, True, "3", 1 << 62, 1.5)),
         ({"index": float("inf")}, "whole number"),
-        *(({"theta": bad}, "incomplete") for bad in ("me", [[1.0]], ["1"], [10**400], [True])),
+        *(({name: 10**400}, "too many digits") for name in ("index", "theta", "camera", "more")),
+        *(({"theta": bad}, "incomplete") for bad in ("me", [[1.0]], ["1"], [1e30], [True])),
         ({"theta": {"0": 1}}, "incomplete"),
         ({"camera": None}, "streamed frame 0"),
         ({"camera": []}, "streamed frame 0"),
         *(
             ({"camera": {**FRAME["camera"], name: bad}}, name)
             for name in FRAME["camera"]
-            for bad in ("me", [10**400] * 2, [float("nan")] * 2, [1e300, 1e300], [[[1]]], {})
+            for bad in (
+                "me",
+                [True] * 2,
+                [float("nan")] * 2,
+                [1e300, 1e300],
+                [[[1]]],
+                {},
+                ["1"] * 2,
+            )
         ),
         ({"camera": {**FRAME["camera"], "focal_px": [-1.0, 1.0]}}, "positive focal"),
     ],
@@ -132,16 +141,17 @@ def test_an_incomplete_frame_is_refused(missing: str):
     [
         ({"type": "frame"}, "begins with its subject"),
         ({"identity": [1.0]}, "identity"),
-        ({"identity": [float("nan")] * HEAD.num_identity}, "identity"),
-        ({"identity": [1e300] * HEAD.num_identity}, "identity"),
-        ({"identity": [10**400] * HEAD.num_identity}, "cannot be used"),
+        ({"identity": [101.0] * HEAD.num_identity}, "within 100"),
+        ({"identity": [float("nan")] * HEAD.num_identity}, "finite numbers"),
+        ({"identity": [1e300] * HEAD.num_identity}, "finite numbers"),
+        ({"identity": [10**400] * HEAD.num_identity}, "too many digits"),
         ({"identity": "me"}, "cannot be used"),
         ({"width": 0}, "0 x 8"),
-        *(({"width": bad}, "cannot be used") for bad in (-3, "12", 10**400, float("inf"), 8193)),
+        *(({"width": bad}, "cannot be used") for bad in (-3, "12", True, float("inf"), 8193)),
         ({"layout": []}, "theta of 0"),
         ({"layout": 5}, "layout"),
-        ({"layout": [{"name": "a", "size": float("inf"), "form": "linear"}]}, "cannot be used"),
-        ({"layout": [{"name": "a", "size": 10**400, "form": "linear"}]}, "theta of 1000"),
+        ({"layout": [{"name": "a", "size": float("inf"), "form": "linear"}]}, "layout"),
+        ({"layout": [{"name": "a", "size": 10**18, "form": "linear"}]}, "theta of 1000"),
         ({"layout": [{"name": "a", "size": 3, "form": "round"}]}, "form"),
         ({"head": "flame"}, "not known here"),
         ({"head": None}, "not known here"),

@@ -2,14 +2,17 @@
 
 import contextlib
 import dataclasses
+import errno
 import socket
 import threading
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.frames import Frame, Opcode
 from websockets.sync.client import ClientConnection, connect
 
 from rgbavatar_ns.data import TrackedDataset, TrackedFrame
@@ -264,6 +267,108 @@ def test_too_large_a_message_costs_its_client_the_connection(
             other.send(tracked(1), png=bytes(200_000))
     assert indices(stream, 10) == [0]
     assert stream.counts == {"source lost": 1, "reconnects": 1}
+
+
+def raw(stream: SocketStream, *messages: bytes) -> socket.socket:
+    """A connection that has shaken hands and sent these; nothing reads what comes back."""
+    client = socket.create_connection(StreamAddress.parse(stream.address), DEADLINE_S)
+    client.sendall(HANDSHAKE)
+    assert b" 101 " in client.recv(4096)
+    for message in messages:
+        client.sendall(ws_frame(Opcode.BINARY, message))
+    return client
+
+
+def ws_frame(opcode: Opcode, data: bytes, fin: bool = True) -> bytes:
+    return Frame(opcode, data, fin).serialize(mask=True)
+
+
+HANDSHAKE = (
+    b"GET / HTTP/1.1\r\nHost: x\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+    b"Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\nSec-WebSocket-Version: 13\r\n\r\n"
+)
+GREETING = message_format.subject_message(subject())
+WHOLE = ws_frame(Opcode.BINARY, message_format.frame_message(tracked(0)))
+STALLING = {
+    "one frame byte by byte": [WHOLE[place : place + 1] for place in range(100)],
+    "fragments without end": [ws_frame(Opcode.BINARY, b"x", fin=False)]
+    + [ws_frame(Opcode.CONT, b"x", fin=False)] * 50,
+    "pings": [ws_frame(Opcode.PING, b"x")] * 50,
+    "nothing of use": [ws_frame(Opcode.BINARY, b"x"), ws_frame(Opcode.TEXT, b"x")] * 20,
+    "frames of no subject": [ws_frame(Opcode.BINARY, message_format.encode({"type": "frame"}))] * 9,
+}
+
+
+@pytest.mark.parametrize("how", STALLING)
+def test_only_whole_frames_keep_the_place(open_stream: Opener, how: str):
+    clock = Clock()
+    stream = open_stream(clock=clock, grace_s=0.05)
+    with raw(stream, GREETING) as stalling:
+        assert stream.subject(DEADLINE_S) is not None
+        for part in STALLING[how]:
+            stalling.sendall(part)
+            clock.now_s += 11.0 / len(STALLING[how])
+        if how not in ("one frame byte by byte", "fragments without end", "pings"):
+            until(lambda: stream.counts["unreadable"] == len(STALLING[how]))
+        clock.now_s += 1.0
+        with StreamClient(subject(), stream.address, patience_s=5.0) as second:
+            second.send(tracked(1))
+        assert indices(stream, 10) == [1]
+
+
+def test_who_sends_pings_and_reads_no_answer_stops_nobody(open_stream: Opener):
+    clock = Clock()
+    stream = open_stream(clock=clock, grace_s=0.05)
+    clients = []
+    for index in (0, 1):
+        clock.now_s += 11.0
+        client = raw(stream, GREETING, message_format.frame_message(tracked(index)))
+        clients.append(client)
+        assert indices(stream, 1) == [index]
+        client.settimeout(0.2)
+        flood = ws_frame(Opcode.PING, bytes(125)) * 1000
+        with contextlib.suppress(OSError):  # Until neither side's buffers take any more.
+            while True:
+                client.sendall(flood)
+    began_s = time.monotonic()
+    stream.close()
+    assert time.monotonic() - began_s < 10.0
+    for client in clients:
+        client.close()
+
+
+def test_connections_without_end_leave_room_for_a_client(stream: SocketStream):
+    threads = threading.active_count()
+    address = StreamAddress.parse(stream.address)
+    with contextlib.ExitStack() as opened:
+        with contextlib.closing(StreamClient(subject("mine"), stream.address)) as first:
+            for number in range(100):
+                idle = opened.enter_context(socket.create_connection(address, DEADLINE_S))
+                with contextlib.suppress(OSError):
+                    idle.sendall(HANDSHAKE[: (0, 30, len(HANDSHAKE))[number % 3]])
+            assert threading.active_count() - threads < 60
+            first.send(tracked(0))  # The client is not hung up on.
+        with StreamClient(subject("mine"), stream.address) as second:
+            second.send(tracked(1))
+    assert indices(stream, 10) == [0, 1]
+    assert stream.counts["reconnects"] == 1
+
+
+def test_a_listener_without_files_listens_again(
+    stream: SocketStream, monkeypatch: pytest.MonkeyPatch
+):
+    plain, failures = socket.socket.accept, []
+
+    def accept(self: socket.socket) -> tuple[socket.socket, object]:
+        if len(failures) < 3:
+            failures.append(1)
+            raise OSError(errno.EMFILE, "Too many open files")
+        return plain(self)
+
+    monkeypatch.setattr(socket.socket, "accept", accept)
+    with sending("", stream.address, range(3)):
+        assert indices(stream, 10) == [0, 1, 2]
+    assert len(failures) == 3
 
 
 OTHER_ARRAYS = dataclasses.replace(HEAD.arrays, name="other")

@@ -5,9 +5,13 @@ from collections import Counter, deque
 from collections.abc import Callable
 from typing import Any
 
-import torch
-
-from rgbavatar_ns.data.streams.protocol import FrameStream, Rewindable, StreamedFrame, StreamSubject
+from rgbavatar_ns.data.streams.protocol import (
+    Fault,
+    FrameStream,
+    Rewindable,
+    StreamedFrame,
+    StreamSubject,
+)
 from rgbavatar_ns.data.streams.replay_buffer import ReplayBuffer
 from rgbavatar_ns.data.streams.sequence_numbers import SeenNumbers
 from rgbavatar_ns.errors import UserError
@@ -149,37 +153,29 @@ class Ingest:
             self.take_in(frame)
 
     def take_in(self, frame: StreamedFrame) -> None:
-        """Put one frame into the pools, or count why it is left out."""
+        """Put one frame into the pools, or count why it is left out and tell the first such."""
         with self._between_frames:
-            fault = self._fault(frame)
-            if fault is None:
-                try:
-                    self._pools.add(frame)
-                except UserError:
-                    fault = "unreadable"
-            self._counts[fault or "taken in"] += 1
+            verdict = self._number(frame)
+            if verdict is None:
+                fault = self._subject.fault(frame) or self._added(frame)
+                verdict = "taken in" if fault is None else fault.name
+                if fault is not None and not self._counts[verdict]:
+                    self._tell(f"Frame {frame.index} is left out: {fault.reason}.")
+            self._counts[verdict] += 1
 
-    def _fault(self, frame: StreamedFrame) -> str | None:
-        """Why a frame is left out, found without decoding it; None if it is not."""
+    def _number(self, frame: StreamedFrame) -> str | None:
+        """Note the frame's number; why the frame is left out for it, or None."""
         if frame.session != self._session:
             self._session, self._seen = frame.session, SeenNumbers()
         verdict = self._seen.add(frame.index)
-        if verdict in ("duplicate", "too late"):
-            return verdict
-        if verdict == "late":
-            self._counts["out of order"] += 1
-        if frame.theta.shape != (self._subject.layout.size,):
-            return "theta of another size"
-        if not bool(torch.isfinite(frame.theta).all()):
-            return "theta not finite"
-        size, wanted = frame.image_size, (self._subject.width, self._subject.height)
-        if size is not None and size != wanted:
-            if not self._counts["another resolution"]:
-                self._tell(
-                    f"Frame {frame.index} has {size[0]} x {size[1]} pixels; the stream began with "
-                    f"{wanted[0]} x {wanted[1]}, and frames of another resolution are left out."
-                )
-            return "another resolution"
+        self._counts["out of order"] += verdict == "late"
+        return verdict if verdict == "duplicate" else None
+
+    def _added(self, frame: StreamedFrame) -> Fault | None:
+        try:
+            self._pools.add(frame)
+        except UserError as error:
+            return Fault("unreadable", error.cause.removesuffix("."))
         return None
 
     def state_dict(self) -> dict[str, Any]:

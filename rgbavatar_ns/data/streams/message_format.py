@@ -9,7 +9,7 @@ import json
 import struct
 from typing import Any, Literal
 
-import safetensors.numpy
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -18,17 +18,18 @@ from rgbavatar_ns.data.native.format import camera_to_json, cameras_from_json
 from rgbavatar_ns.data.native.frame import TrackedFrame
 from rgbavatar_ns.data.png import encode_png_rgba
 from rgbavatar_ns.data.streams.protocol import StreamedFrame, StreamSubject
+from rgbavatar_ns.data.streams.sent_head import HEAD_FIELDS, pack_head, unpack_head
 from rgbavatar_ns.errors import UserError
-from rgbavatar_ns.head import HeadArrays, HeadModel, ThetaLayout
+from rgbavatar_ns.head import HeadArrays, ThetaLayout
+from rgbavatar_ns.reading import DamagedFileError, damage_told, json_numbers, parse_json
 
 ACCEPTED, REFUSED = "accepted", "refused"
 LARGEST_MESSAGE = 64 << 20
-LARGEST_HEADER = 1 << 20
+LARGEST_HEADER = 1 << 18
 LARGEST_SIDE = 8192
 """Of an image, in pixels."""
-_LONGEST_SESSION = 200
+_LONGEST_SESSION = _LONGEST_NAME = 200
 _SIZE = struct.Struct("<I")
-_HEAD_FIELDS = ("num_identity", "expression_names")
 _CLIENT = "Send what `rgbavatar_ns.data.streams.StreamClient` sends; docs/online.md describes it."
 
 Header = dict[str, Any]
@@ -44,14 +45,16 @@ def decode(message: bytes | str) -> tuple[Header, bytes]:
     """A message's header and payload; raises UserError for anything else."""
     try:
         if isinstance(message, str):
-            raise ValueError("it is text")
+            raise DamagedFileError("it is text")
+        if len(message) < _SIZE.size:
+            raise DamagedFileError("it is too short")
         (size,) = _SIZE.unpack_from(message)
         if size > min(LARGEST_HEADER, len(message) - _SIZE.size):
-            raise ValueError(f"its header is said to have {size} bytes")
-        header = json.loads(message[_SIZE.size : _SIZE.size + size])
+            raise DamagedFileError(f"its header is said to have {size} bytes")
+        header = parse_json(message[_SIZE.size : _SIZE.size + size])
         if not isinstance(header, dict):
-            raise ValueError("its header is no JSON object")
-    except (ValueError, RecursionError, struct.error) as error:
+            raise DamagedFileError("its header is no JSON object")
+    except DamagedFileError as error:
         raise UserError(f"This is no message of a stream: {error}.", _CLIENT) from None
     return header, message[_SIZE.size + size :]
 
@@ -67,10 +70,8 @@ def subject_message(subject: StreamSubject) -> bytes:
     }
     if subject.arrays is HeadArrays.embedded():
         return encode(header)
-    state = subject.arrays.to_state()
-    header |= {name: state[name] for name in _HEAD_FIELDS}
-    arrays = {name: value.numpy() for name, value in state.items() if torch.is_tensor(value)}
-    return encode(header, safetensors.numpy.save(arrays))
+    fields, payload = pack_head(subject.arrays)
+    return encode(header | fields, payload)
 
 
 def frame_message(frame: TrackedFrame, png: bytes | None = None) -> bytes:
@@ -91,20 +92,18 @@ def parse_subject(message: bytes | str) -> StreamSubject:
     if header.get("type") != "subject":
         raise UserError("A stream begins with its subject.", "Send it first.")
     try:
-        width, height = _whole(header["width"]), _whole(header["height"])
-        if max(width, height) > LARGEST_SIDE:
-            raise ValueError(f"images of {width} x {height} pixels are too large")
-        session = header.get("session", "")
-        if not isinstance(session, str) or len(session) > _LONGEST_SESSION:
-            raise ValueError("its session is no short text")
-        arrays, identity = _head(header, payload), _numbers(header["identity"])
-        layout = ThetaLayout.from_json(header["layout"])
-        return StreamSubject(arrays, identity, layout, width, height, session)
-    except UserError:
-        raise
-    except Exception as error:  # What a stranger's numbers can break is not to be foreseen.
-        reason = f"{type(error).__name__}: {error}"
-        raise UserError(f"A stream's subject cannot be used: {reason}.", _CLIENT) from None
+        with damage_told():
+            width, height = _whole(header["width"]), _whole(header["height"])
+            if max(width, height) > LARGEST_SIDE:
+                raise DamagedFileError(f"images of {width} x {height} pixels are too large")
+            session = header.get("session", "")
+            if not isinstance(session, str) or len(session) > _LONGEST_SESSION:
+                raise DamagedFileError("its session is no short text")
+            identity, layout = _numbers(header["identity"]), header["layout"]
+            arrays = _head(header, payload, identity)
+    except DamagedFileError as error:
+        raise UserError(f"A stream's subject cannot be used: {error}.", _CLIENT) from None
+    return StreamSubject(arrays, identity, ThetaLayout.from_json(layout), width, height, session)
 
 
 def parse_message(
@@ -113,13 +112,14 @@ def parse_message(
     """The frame of a message that follows the subject, or "end"; raises UserError for others."""
     header, png = decode(message)
     try:
-        if header["type"] == "end":
-            return "end"
-        if header["type"] != "frame":
-            raise ValueError("its type is not 'frame'")
-        index, theta = _whole(header["index"]), _numbers(header["theta"])
-        named = [(f"streamed frame {index}", header["camera"])]
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        with damage_told():
+            if header["type"] == "end":
+                return "end"
+            if header["type"] != "frame":
+                raise DamagedFileError("its type is not 'frame'")
+            index, theta = _whole(header["index"]), _numbers(header["theta"])
+            named = [(f"streamed frame {index}", header["camera"])]
+    except DamagedFileError as error:
         raise UserError(f"A streamed frame is incomplete: {error}.", _CLIENT) from None
     camera = cameras_from_json(named, subject.width, subject.height)
     return StreamedFrame(index, theta, camera, arrived_s, subject.session, png=png)
@@ -140,32 +140,24 @@ def parse_answer(answer: bytes | str) -> int:
 
 def _whole(value: Any) -> int:
     if type(value) is not int or not 0 <= value < 1 << 62:
-        raise ValueError(f"{str(value)[:40]} is no whole number that is not negative")
+        raise DamagedFileError(f"{str(value)[:40]} is no whole number that is not negative")
     return value
 
 
 def _numbers(values: Any) -> Float[Tensor, "_"]:
-    if not isinstance(values, list) or not all(type(value) in (int, float) for value in values):
-        raise TypeError("theta and identity are lists of numbers")
-    return torch.tensor([float(value) for value in values], dtype=torch.float32)
+    if not isinstance(values, list):
+        raise DamagedFileError("theta and identity are lists of numbers")
+    return torch.from_numpy(json_numbers(values, (len(values),)).astype(np.float32))
 
 
-def _head(header: Header, payload: bytes) -> HeadArrays:
-    """The embedded head, or the one that is sent: posed once, for it must not end the run later."""
-    name, embedded = str(header["head"]), HeadArrays.embedded()
-    if not payload:
-        if name != embedded.name:
-            raise UserError(
-                f"The stream is of the head '{name}', which is not known here.",
-                f"Send its arrays with the subject, or use the embedded head '{embedded.name}'.",
-            )
-        return embedded
-    loaded = safetensors.numpy.load(payload)
-    state = {part: torch.from_numpy(value.copy()) for part, value in loaded.items()}
-    fields = {field: header[field] for field in _HEAD_FIELDS}
-    arrays = HeadArrays.from_state({**state, **fields, "name": name})
-    model = HeadModel(arrays)
-    posed = model(torch.full((1, model.layout.size), 0.1), torch.ones(model.num_identity))
-    if not (len(arrays.faces) and posed.numel() and bool(posed.isfinite().all())):
-        raise ValueError("its head has no surface")
-    return arrays
+def _head(header: Header, payload: bytes, identity: Float[Tensor, "I"]) -> HeadArrays:
+    """The embedded head, or the one that is sent."""
+    name, embedded = str(header["head"])[:_LONGEST_NAME], HeadArrays.embedded()
+    if payload:
+        return unpack_head(payload, {field: header[field] for field in HEAD_FIELDS}, name, identity)
+    if name != embedded.name:
+        raise DamagedFileError(
+            f"the head '{name}' is not known here: send its arrays with the subject, or use the "
+            f"embedded head '{embedded.name}'"
+        )
+    return embedded

@@ -2,7 +2,7 @@
 
 from collections import Counter
 from dataclasses import dataclass, field
-from typing import Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -14,6 +14,20 @@ from rgbavatar_ns.data.png import decode_png_rgba, encode_png_rgba, png_header_s
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadArrays, HeadModel, ThetaLayout
 from rgbavatar_ns.kernels.types import PinholeCameras
+
+_LARGEST_IDENTITY = 100.0
+_FARTHEST_CAMERA_M = 1000.0
+_FOCAL_SIDES = (0.01, 10_000.0)
+_FARTHEST_CENTRE_SIDES = 100.0
+"""Beyond these a camera is a tracker's fault; sides are the image's longer one, in pixels."""
+_PNG_SPARE_BYTES = 1 << 16
+
+
+class Fault(NamedTuple):
+    """Why a frame cannot be used: the name it is counted under, and what a user may read."""
+
+    name: str
+    reason: str
 
 
 @dataclass(frozen=True)
@@ -37,10 +51,10 @@ class StreamSubject:
                 "Send theta in the layout of the head that the stream names.",
             )
         fits = self.identity.shape == (self.arrays.num_identity,)
-        if not fits or not bool(torch.isfinite(self.identity).all()):
+        if not fits or not bool((self.identity.abs() <= _LARGEST_IDENTITY).all()):
             raise UserError(
-                f"The stream's identity is not {self.arrays.num_identity} finite numbers, which "
-                f"the head '{self.arrays.name}' takes.",
+                f"The stream's identity is not {self.arrays.num_identity} numbers within "
+                f"{_LARGEST_IDENTITY:g}, which the head '{self.arrays.name}' takes.",
                 "Send the identity coefficients of that head.",
             )
         if self.width < 1 or self.height < 1:
@@ -48,6 +62,42 @@ class StreamSubject:
                 f"The stream's images are said to be {self.width} x {self.height} pixels.",
                 "Send the size of the images.",
             )
+
+    def fault(self, frame: "StreamedFrame") -> Fault | None:
+        """Why the frame cannot be used, found without decoding its image; None if it can be."""
+        if frame.theta.shape != (self.layout.size,):
+            numbers = f"theta has {len(frame.theta)} numbers instead of {self.layout.size}"
+            return Fault("theta of another size", numbers)
+        if not bool(torch.isfinite(frame.theta).all()):
+            return Fault("theta not finite", "theta holds NaN or infinity")
+        absurd = self.layout.absurd(frame.theta)
+        if absurd is not None:
+            return Fault("theta absurd", f"theta's {absurd}")
+        if not _is_plausible(frame.camera):
+            return Fault("camera absurd", "its camera is too far away, or its lens impossible")
+        size = frame.image_size
+        if size is not None and size != (self.width, self.height):
+            told = f"it has {size[0]} x {size[1]} pixels; the stream began with"
+            return Fault("another resolution", f"{told} {self.width} x {self.height}")
+        if frame.png is not None and len(frame.png) > self._longest_png:
+            return Fault("unreadable", f"{len(frame.png)} bytes are too many for its image")
+        return None
+
+    @property
+    def _longest_png(self) -> int:
+        """16-bit RGBA that could not be packed; what is more would only fill the memory."""
+        return 9 * self.width * self.height + _PNG_SPARE_BYTES
+
+
+def _is_plausible(camera: PinholeCameras) -> bool:
+    side = max(camera.width, camera.height)
+    nearest, farthest = (share * side for share in _FOCAL_SIDES)
+    return bool(
+        (camera.world_to_camera[:, :3, 3].norm(dim=-1) <= _FARTHEST_CAMERA_M).all()
+        and (camera.focal_px >= nearest).all()
+        and (camera.focal_px <= farthest).all()
+        and (camera.principal_point_px.abs() <= _FARTHEST_CENTRE_SIDES * side).all()
+    )
 
 
 @dataclass(frozen=True)

@@ -2,12 +2,13 @@
 
 import contextlib
 import logging
+import os
 import socket
 import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable
-from typing import Literal
+from typing import Any, Literal
 
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.server import Server, ServerConnection, serve
@@ -21,6 +22,9 @@ _MOST_WAITING = 16
 """Frames that wait to be taken; a client that sends more is made to wait."""
 _OPEN_S, _CLOSE_S = 3.0, 1.0
 """For WebSocket's own greetings and farewells."""
+_MOST_CONNECTIONS = 8
+"""Each may fill memory with the largest message."""
+_RETRY_S = 0.02
 _LONGEST_TOLD = 400
 # Port scanners and browsers are no news to the user.
 _log = logging.getLogger(f"{__name__}.websockets")
@@ -30,10 +34,11 @@ _log.setLevel(logging.CRITICAL)
 class SocketStream:
     """Listens for one client at a time, which sends messages as `message_format` describes them.
 
-    While a client is connected a second one is refused, unless the first has been silent for
-    `silence_s`. One that hangs up may come back, another may take its place, with the same head
-    and image size. What is no message of a stream is counted as "unreadable", and told once a
-    client. Web pages are refused.
+    While a client is connected a second one is refused, unless the first has sent no whole frame
+    for `silence_s`. One that hangs up may come back, another may take its place, with the same
+    head and image size. What is no message of a stream is counted as "unreadable", and told once a
+    client. Web pages are refused. Of connections that are no client yet, the oldest makes room
+    where there are too many.
 
     Args:
         listen: HOST:PORT (port 0: any that is free, see `address`).
@@ -68,13 +73,14 @@ class SocketStream:
         self._frames: deque[StreamedFrame] = deque()
         self._end_seen = self._closed = False
         self._changed = threading.Condition()
+        self._one_greeting = threading.Lock()  # A head takes memory while it is looked at.
         wanted = StreamAddress.parse(listen)
         if not wanted.is_local and not allow_remote:
             raise UserError(
                 f"Other machines could send frames to {listen}.",
                 f"Listen at {DEFAULT_ADDRESS}, or allow remote clients on purpose.",
             )
-        self._server = _listen(wanted, self._serve_client)
+        self._server = self._listen(wanted)
         self.address = str(StreamAddress(*self._server.socket.getsockname()[:2]))
         # The threads of clients inherit that this one keeps no program alive.
         threading.Thread(
@@ -113,11 +119,31 @@ class SocketStream:
             if self._closed:
                 return
             self._closed = True
-            client = self._client
             self._changed.notify_all()
-        if client is not None:
-            client.close()
+        # Who does not read would be waited for without end by a farewell that WebSocket demands.
+        self._listener.hang_up_on_all()
         self._server.shutdown()
+
+    def _listen(self, address: StreamAddress) -> Server:
+        try:
+            self._listener = _Listener(address)
+        except OSError as error:
+            raise UserError(
+                f"Frames cannot be listened for at {address}: {error.strerror}.",
+                "Choose another address, or end the program that uses this one.",
+            ) from None
+        return serve(
+            self._serve_client,
+            sock=self._listener,
+            origins=[None],  # Only browsers name one.
+            compression=None,
+            open_timeout=_OPEN_S,
+            close_timeout=_CLOSE_S,
+            ping_interval=None,
+            max_size=message_format.LARGEST_MESSAGE,
+            max_queue=1,
+            logger=_log,
+        )
 
     def _serve_client(self, connection: ServerConnection) -> None:
         """Answer one client, in a thread of its own, until it has gone."""
@@ -127,7 +153,9 @@ class SocketStream:
                     greeting = connection.recv(timeout=self._silence_s)
                 except TimeoutError:
                     raise UserError("No subject has come in time.", "Send it first.") from None
-                subject = message_format.parse_subject(greeting)
+                with self._one_greeting:
+                    subject = message_format.parse_subject(greeting)
+                    del greeting
                 self._admit(connection, subject)
             except UserError as error:
                 with self._changed:
@@ -152,12 +180,13 @@ class SocketStream:
                 _check_same(subject, self._subject)
                 self._counts["reconnects"] += 1
             self._client, self._listening_since_s = connection, self._clock()
+            self._listener.keep(connection.socket)
             if subject.session == "" or subject.session != self._session:
                 self._session, self._received = subject.session, 0
             self._subject = self._subject or subject
             self._changed.notify_all()
         if before is not None:
-            before.close()
+            _hang_up(before.socket)
 
     def _is_silent(self) -> bool:
         since_s = self._listening_since_s
@@ -187,14 +216,16 @@ class SocketStream:
             return self._closed or self._client is not connection
 
         with self._changed:
+            since_s = self._listening_since_s
             if not gone():
                 self._listening_since_s = None
             self._changed.wait_for(lambda: gone() or len(self._frames) < _MOST_WAITING)
             if gone():
                 return False
-            self._listening_since_s = self._clock()
+            self._listening_since_s = since_s
             self._received += 1
             if isinstance(parsed, StreamedFrame):
+                self._listening_since_s = self._clock()
                 self._frames.append(parsed)
             elif parsed == "end":
                 self._end_seen = True
@@ -232,23 +263,57 @@ def _check_same(subject: StreamSubject, first: StreamSubject) -> None:
         )
 
 
-def _listen(address: StreamAddress, serve_client: Callable[[ServerConnection], None]) -> Server:
-    try:
-        return serve(
-            serve_client,
-            *address,
-            family=socket.AF_INET6 if ":" in address.host else socket.AF_INET,
-            origins=[None],  # Only browsers name one.
-            compression=None,
-            open_timeout=_OPEN_S,
-            close_timeout=_CLOSE_S,
-            ping_interval=None,
-            max_size=message_format.LARGEST_MESSAGE,
-            max_queue=1,
-            logger=_log,
-        )
-    except OSError as error:
-        raise UserError(
-            f"Frames cannot be listened for at {address}: {error.strerror}.",
-            "Choose another address, or end the program that uses this one.",
-        ) from None
+class _Listener(socket.socket):
+    """A listening socket that lives through floods: it holds a bounded number of connections."""
+
+    def __init__(self, address: StreamAddress) -> None:
+        super().__init__(socket.AF_INET6 if ":" in address.host else socket.AF_INET)
+        try:
+            if os.name == "posix":  # Elsewhere two programs could listen at one address.
+                self.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            self.bind(address)
+            self.listen()
+        except BaseException:
+            self.close()
+            raise
+        self._connections: list[socket.socket] = []
+        self._kept: socket.socket | None = None
+
+    def accept(self) -> tuple[socket.socket, Any]:
+        """The next connection; the oldest ones that are no client make room for it."""
+        while True:
+            try:
+                connection, peer = super().accept()
+            except OSError:
+                if self.fileno() < 0:
+                    raise
+                time.sleep(_RETRY_S)  # The process has no file left, or the other side has gone.
+                continue
+            self._make_room()
+            self._connections = [*self._open(), connection]
+            return connection, peer
+
+    def _make_room(self) -> None:
+        for waiting in [one for one in self._open() if one is not self._kept]:
+            if len(self._open()) < _MOST_CONNECTIONS:
+                return
+            _hang_up(waiting)
+            time.sleep(_RETRY_S)
+
+    def keep(self, connection: socket.socket) -> None:
+        """This is the client's: it is not hung up on to make room."""
+        self._kept = connection
+
+    def hang_up_on_all(self) -> None:
+        """End all connections at once."""
+        for connection in self._open():
+            _hang_up(connection)
+
+    def _open(self) -> list[socket.socket]:
+        return [one for one in self._connections if one.fileno() >= 0]
+
+
+def _hang_up(connection: socket.socket) -> None:
+    """End a connection for its own threads too, also where they wait for it."""
+    with contextlib.suppress(OSError):
+        connection.shutdown(socket.SHUT_RDWR)

@@ -15,6 +15,7 @@ from rgbavatar_ns.data import DatasetWriter, LocalGlobalPools
 from rgbavatar_ns.data.sampling import PoolStrategy
 from rgbavatar_ns.data.streams import FrameStream, Ingest, ReplayBuffer, ReplayStream, Rewindable
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.files import atomic_folder
 from rgbavatar_ns.options import Between, Share
 from rgbavatar_ns.plugin.cameras import to_nerfstudio
 from rgbavatar_ns.plugin.datamanager import (
@@ -221,18 +222,19 @@ def _of_dataset(config: OnlineDataManagerConfig, replayed: bool) -> OnlineDataMa
 
 def _record(config: OnlineDataManagerConfig, subject: Any, frames: Any) -> None:
     assert config.recorded is not None
-    writer = DatasetWriter(
-        config.recorded,
-        subject.arrays,
-        subject.identity,
-        subject.layout,
-        subject.width,
-        subject.height,
-        overwrite=True,
-    )
-    for serial, frame in frames:
-        writer.add_encoded(serial, frame.theta, frame.camera, frame.encoded())
-    writer.finish(0)
+    # As a whole, so that a killed run keeps what it recorded before.
+    with atomic_folder(config.recorded) as folder:
+        writer = DatasetWriter(
+            folder,
+            subject.arrays,
+            subject.identity,
+            subject.layout,
+            subject.width,
+            subject.height,
+        )
+        for serial, frame in frames:
+            writer.add_encoded(serial, frame.theta, frame.camera, frame.encoded())
+        writer.finish(0)
 
 
 def _tell(line: str) -> None:

@@ -115,8 +115,7 @@ def await_subject(
 
 
 def _usable(frame: StreamedFrame, subject: StreamSubject) -> bool:
-    fits = frame.theta.shape == (subject.layout.size,) and bool(frame.theta.isfinite().all())
-    if not fits or frame.image_size != (subject.width, subject.height):
+    if subject.fault(frame) is not None:
         return False
     try:
         frame.decode()

@@ -9,7 +9,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from nerfstudio.utils import writer
 from nerfstudio.utils.misc import step_check
@@ -174,6 +174,7 @@ class OnlineTrainer(RGBAvatarTrainer):
         """See whether the stream has ended; raises what ended it against its will, after saving."""
         ingest = self.stream.ingest
         if ingest.failure is not None:
+            self.stream.record()
             if self.step >= 0:
                 self.save_checkpoint(self.step)
             raise ingest.failure
@@ -234,21 +235,23 @@ class OnlineTrainer(RGBAvatarTrainer):
         model.subject = dataclasses.replace(model.subject, theta=theta, frame_index=index)
         super().save_checkpoint(step)
 
-    def _after_train(self) -> None:
+    def _save_end(self) -> None:
         self.stream.record()
-        super()._after_train()
+        super()._save_end()
 
-    def _tell_end(self, completed: bool) -> None:
-        frames, latency = self.stream.pools.num_added, self.stream.pools.median_latency_s()
-        summary = self._write_summary(
-            self.stream.images_drawn,
-            frames=frames,
+    def _totals(self) -> dict[str, Any]:
+        latency = self.stream.pools.median_latency_s()
+        return {
+            "images": self.stream.images_drawn,
+            "frames": self.stream.pools.num_added,
             **({} if latency is None else {"median_latency_s": latency}),
-            stream=dict(self.stream.ingest.counts()),
-        )
+            "stream": dict(self.stream.ingest.counts()),
+        }
+
+    def _tell_end(self, summary: dict[str, Any]) -> None:
         steps, rate = summary["steps"], summary["images_per_second"]
-        how = "Trained" if completed else "Stopped after"
-        say(f"{how} {steps} steps on {frames} frames, {rate:.1f} images/s.")
-        if not completed:
+        how = "Trained" if self.completed else "Stopped after"
+        say(f"{how} {steps} steps on {summary['frames']} frames, {rate:.1f} images/s.")
+        if not self.completed:
             say(f"Go on with the same command and --load-dir {self.checkpoint_dir}")
         say(f"Config: {self.base_dir / 'config.yml'}")

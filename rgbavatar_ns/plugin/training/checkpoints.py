@@ -1,7 +1,9 @@
 """A trainer's checkpoints: written whole or not at all, and what it needs in order to go on."""
 
 import shutil
+import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +21,7 @@ from rgbavatar_ns.files import atomic_write
 _REQUIRED = frozenset({"step", "pipeline", "optimizers", "schedulers", "scalers"})
 # What a zip file's directory and small values may add to the tensors' bytes.
 _OVERHEAD_BYTES = 4 << 20
+_STILL_S = 60.0
 
 
 def save_checkpoint(state: dict[str, Any], folder: Path, step: int, keep: int) -> Path:
@@ -32,7 +35,7 @@ def save_checkpoint(state: dict[str, Any], folder: Path, step: int, keep: int) -
     """
     folder.mkdir(parents=True, exist_ok=True)
     path = checkpoint_of_step(folder, step)
-    beside = folder.parent / f".{folder.name}.partial"
+    beside = _partial(folder)
     remedy = f"Free space and resume with --load-dir {folder}; the checkpoints there are untouched."
     _require_space(
         folder, sum(tensor.nbytes for tensor in _tensors(state)) + _OVERHEAD_BYTES, remedy
@@ -50,6 +53,21 @@ def save_checkpoint(state: dict[str, Any], folder: Path, step: int, keep: int) -
 def checkpoint_of_step(folder: Path, step: int) -> Path:
     """Where a step's checkpoint lies, as nerfstudio names it."""
     return folder / f"step-{step:09d}.ckpt"
+
+
+def remove_leftover(folder: Path) -> None:
+    """Remove what a run that was killed while it saved has left beside its checkpoints.
+
+    A file that has just grown is left, for a run may be alive and saving.
+    """
+    leftover = _partial(folder)
+    with suppress(OSError):
+        if time.time() - leftover.stat().st_mtime > _STILL_S:
+            leftover.unlink()
+
+
+def _partial(folder: Path) -> Path:
+    return folder.parent / f".{folder.name}.partial"
 
 
 def load_newest(folder: Path, tell: Callable[[str], object]) -> tuple[dict[str, Any], Path]:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -35,6 +35,7 @@ from rgbavatar_ns.plugin.training.checkpoints import (
     load_newest,
     read_training_state,
     readable_step,
+    remove_leftover,
     save_checkpoint,
 )
 from rgbavatar_ns.plugin.training.interruption import StopRequest, stop_with_starter
@@ -127,7 +128,7 @@ class RGBAvatarTrainer(Trainer, FitHooks):
     What differs: `max_num_iterations` counts all steps also after a resume; checkpoints are
     atomic and the newest readable one is loaded; SIGINT and SIGTERM save after the present step
     and exit with 130 and 143; scalars are written every `steps_per_log` steps only; the run's
-    speed is written to training.json.
+    speed, and how it ended, whatever ended it, is written to training.json.
     """
 
     config: RGBAvatarTrainerConfig
@@ -185,12 +186,14 @@ class RGBAvatarTrainer(Trainer, FitHooks):
         self._init_viewer_state()
         self.step = self._start_step - 1
         with self.stop:
-            with device_errors_told(self.checkpoint_dir):
-                self._take = self.pipeline.training_step(self.optimizers)
-            CONSOLE.print(f"Steps are {self._take.kind}: {self._take.reason}.", highlight=False)
-            with self._shown_progress():
-                fit(self._take, self._batch, self._steps(), self)
-            self._after_train()
+            with self._failure_written():
+                with device_errors_told(self.checkpoint_dir):
+                    self._take = self.pipeline.training_step(self.optimizers)
+                CONSOLE.print(f"Steps are {self._take.kind}: {self._take.reason}.", highlight=False)
+                with self._shown_progress():
+                    fit(self._take, self._batch, self._steps(), self)
+                self._save_end()
+            self._stay()
         if self.stop.exit_code:
             raise SystemExit(self.stop.exit_code)
 
@@ -289,23 +292,35 @@ class RGBAvatarTrainer(Trainer, FitHooks):
         """Whether all steps are done."""
         return self.step >= self.config.max_num_iterations - 1
 
-    def _after_train(self) -> None:
-        """Save, say how it went, and keep the viewer open if it is to stay."""
-        completed = self.completed
-        self.training_state = "completed" if completed else "paused"
+    @contextmanager
+    def _failure_written(self) -> Iterator[None]:
+        """Say in training.json what has ended the run against its will."""
+        try:
+            yield
+        except BaseException as error:
+            with suppress(UserError):  # A full disk may be what has ended it.
+                first_line = (str(error).splitlines() or [""])[0]
+                self._write_summary(f"failed: {type(error).__name__} {first_line}".strip())
+            raise
+
+    def _save_end(self) -> None:
+        """Save, and say how it went."""
+        self.training_state = "completed" if self.completed else "paused"
         if self.step >= 0 and self.step != self._saved_step:
             self.save_checkpoint(self.step)
         writer.write_out_storage()
         self._save_refined()
-        self._tell_end(completed)
+        self._tell_end(self._write_summary("completed" if self.completed else "stopped"))
+
+    def _stay(self) -> None:
+        """Keep the viewer open if it is to stay."""
         self._run_callbacks(self.step, TrainingCallbackLocation.AFTER_TRAIN)
-        if completed and not self.config.viewer.quit_on_train_completion:
+        if self.completed and not self.config.viewer.quit_on_train_completion:
             self._train_complete_viewer()
 
-    def _tell_end(self, completed: bool) -> None:
-        summary = self._write_summary((self.step + 1) * self._images_per_step)
+    def _tell_end(self, summary: dict[str, Any]) -> None:
         steps, rate = summary["steps"], summary["images_per_second"]
-        if completed:
+        if self.completed:
             CONSOLE.print(f"Trained {steps} steps, {rate:.1f} images/s.", highlight=False)
         else:
             say(
@@ -322,15 +337,19 @@ class RGBAvatarTrainer(Trainer, FitHooks):
             theta = model.refinement.all_frames(model.frame_theta).cpu().numpy()
             np.save(self.base_dir / REFINED_NAME, theta.astype(np.float32))
 
-    def _write_summary(self, images: int, **more: Any) -> dict[str, Any]:
-        """The run's length and speed over all its sessions, and `more`, as training.json."""
-        seconds = self._train_seconds
+    def _totals(self) -> dict[str, Any]:
+        """What the run has seen over all its sessions: "images", and more by other names."""
+        return {"images": (self.step + 1) * self._images_per_step}
+
+    def _write_summary(self, ended: str) -> dict[str, Any]:
+        """How the run ended, its length and speed over all its sessions, as training.json."""
+        seconds, totals = self._train_seconds, self._totals()
         summary = {
+            "ended": ended,
             "steps": self.step + 1,
-            "images": images,
             "train_seconds": seconds,
-            "images_per_second": images / seconds if seconds > 0 else 0.0,
-            **more,
+            "images_per_second": totals["images"] / seconds if seconds > 0 else 0.0,
+            **totals,
         }
         write_json(self.base_dir / SUMMARY_NAME, summary)
         return summary
@@ -355,6 +374,7 @@ class RGBAvatarTrainer(Trainer, FitHooks):
         else:
             CONSOLE.print("Training from the start.")
             return
+        remove_leftover(path.parent)
         with damage_of(path):
             self._start_step = state["step"] + 1
             self._saved_step = state["step"]

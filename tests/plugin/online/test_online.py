@@ -2,9 +2,13 @@
 
 import dataclasses
 import json
+import os
 import signal
 import socket
+import subprocess
+import sys
 import threading
+import time
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -76,6 +80,7 @@ def test_a_replayed_stream_is_trained_on_to_its_end_and_a_little_longer(online: 
     told = summary(trainer)
     assert told["frames"] == told["stream"]["taken in"] == STREAMED
     assert told["stream"]["dropped"] == 0
+    assert told["ended"] == "completed"
     assert told["steps"] == ended + 5
     assert told["images"] <= 4 * told["steps"]
     assert list_checkpoints(trainer.checkpoint_dir)[-1][0] == trainer.step
@@ -178,6 +183,7 @@ def test_sigterm_saves_and_is_told_by_the_exit_code(online: Online):
         trainer.train()
     assert ended.value.code == 143
     assert [step for step, _ in list_checkpoints(trainer.checkpoint_dir)] == [0]
+    assert summary(trainer)["ended"] == "stopped"
 
 
 def test_a_resumed_stream_goes_on_where_it_was(online: Online, monkeypatch: pytest.MonkeyPatch):
@@ -269,6 +275,36 @@ def test_a_fault_of_the_source_saves_and_is_told(online: Online):
         trainer.train()
     assert [step for step, _ in list_checkpoints(trainer.checkpoint_dir)] == [1]
     assert trainer.stream.pools.num_added > 0
+    assert summary(trainer)["ended"] == "failed: UserError The disk is gone. Find it."
+    assert summary(trainer)["steps"] == 2
+
+
+@pytest.mark.parametrize("fault", [KeyboardInterrupt(), MemoryError("far too large"), OSError(28)])
+def test_whatever_ends_a_run_it_is_told(online: Online, fault: BaseException):
+    trainer = online()
+
+    def break_off() -> None:
+        raise fault
+
+    before_step(2, trainer, break_off)
+    with pytest.raises(type(fault)):
+        trainer.train()
+    told = summary(trainer)
+    assert told["ended"].startswith(f"failed: {type(fault).__name__}")
+    assert told["steps"] == 2
+    assert told["stream"]["taken in"] > 0
+
+
+def test_a_fault_before_the_first_frame_is_told(online: Online):
+    trainer = online()
+    trainer.stream.start = lambda: setattr(trainer.stream.ingest, "failure", OSError("gone"))  # type: ignore[method-assign]
+    with pytest.raises(OSError, match="gone"):
+        trainer.train()
+    assert summary(trainer) | {"stream": {}} == {
+        "ended": "failed: OSError gone",
+        **{"steps": 0, "train_seconds": 0.0, "images_per_second": 0.0, "images": 0, "frames": 0},
+        "stream": {},
+    }
 
 
 @pytest.mark.parametrize(
@@ -309,6 +345,52 @@ def test_the_methods_have_the_papers_pools_and_sizes():
     assert tiny.pipeline.datamanager.local_share == 0.3
     assert full.pipeline.model.avatar == rgbavatar.config.pipeline.model.avatar
     assert tiny.pipeline.model.avatar.uv_resolution == 128
+
+
+def kill_while_it_runs(data: Path, output: Path, delay_s: float) -> Path:
+    """Train in a process of its own, and kill it so long after its first checkpoint; the folder."""
+    program = (
+        "import sys, threading; from pathlib import Path; import torch; torch.set_num_threads(1); "
+        "from tests.plugin.online_run import *; data, output = map(Path, sys.argv[1:]); "
+        "online_trainer(online_config(output, data, steps_per_save=1, "
+        "steps_after_stream=10**6)).train()"
+    )
+    command = [sys.executable, "-c", program, str(data), str(output)]
+    with (output.parent / f"{output.name}.log").open("w") as log:
+        run = subprocess.Popen(command, stdout=log, stderr=log)
+    folder = output / "tiny/rgbavatar-online-tiny/run/nerfstudio_models"
+    try:
+        deadline = time.monotonic() + 600.0  # Importing alone takes a minute on a busy machine.
+        while not list_checkpoints(folder):
+            assert run.poll() is None, "it ended by itself"
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+        time.sleep(delay_s)
+        assert run.poll() is None, "it ended by itself"
+    finally:
+        run.kill()
+        run.wait()
+    return folder
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(4))
+def test_a_run_that_is_killed_at_any_moment_goes_on(
+    online: Online, tiny_data: Path, tmp_path: Path, seed: int
+):
+    delay_s = float(np.random.default_rng(seed).uniform(0, 2))
+    folder = kill_while_it_runs(tiny_data, tmp_path / "killed", delay_s)
+    state = stream_state(folder)
+    saved = list_checkpoints(folder)[-1][0]
+    leftover = folder.parent / f".{folder.name}.partial"
+    if leftover.exists():
+        os.utime(leftover, (0, 0))  # It was killed long ago.
+    again = online("again", load_dir=folder, steps_after_stream=saved + 5)
+    assert again.stream.pools.num_added == state["frames"]["added"] > 0
+    again.train()
+    assert again.step > saved
+    assert summary(again)["frames"] == STREAMED
+    assert not [path for path in tmp_path.rglob(".*")]
 
 
 class _Killed(BaseException):

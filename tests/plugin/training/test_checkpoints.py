@@ -5,6 +5,7 @@ import resource
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,11 @@ import torch
 
 from rgbavatar_ns.avatar.storage.checkpoint_file import list_checkpoints, read_checkpoint
 from rgbavatar_ns.errors import UserError
-from rgbavatar_ns.plugin.training.checkpoints import load_newest, save_checkpoint
+from rgbavatar_ns.plugin.training.checkpoints import (
+    load_newest,
+    remove_leftover,
+    save_checkpoint,
+)
 
 
 def _state(step: int, size: int = 1000) -> dict[str, Any]:
@@ -137,3 +142,15 @@ def test_sigkill_while_writing_keeps_the_old_checkpoint(tmp_path: Path, moment: 
     save_checkpoint(_state(30), folder, 30, 1)
     assert os.listdir(folder.parent) == ["nerfstudio_models"]
     assert load_newest(folder, print)[0]["step"] == 30
+
+
+@pytest.mark.parametrize(("age_s", "stays"), [(0.0, True), (3600.0, False)])
+def test_what_a_killed_run_left_is_removed_unless_one_may_be_saving(
+    tmp_path: Path, age_s: float, stays: bool
+):
+    leftover = tmp_path / ".nerfstudio_models.partial"
+    leftover.write_bytes(b"half")
+    os.utime(leftover, (time.time() - age_s,) * 2)
+    for _ in range(2):
+        remove_leftover(tmp_path / "nerfstudio_models")
+        assert leftover.exists() == stays
