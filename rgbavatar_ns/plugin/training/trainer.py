@@ -1,6 +1,7 @@
 """nerfstudio's trainer with checkpoints, resuming and interruption that can be relied on."""
 
 import math
+import sys
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -29,6 +30,8 @@ from rgbavatar_ns.plugin.training.checkpoints import load_newest, read_checkpoin
 from rgbavatar_ns.plugin.training.interruption import StopRequest
 from rgbavatar_ns.plugin.training.optimizers import ExponentialConfig
 from rgbavatar_ns.plugin.training.progress import TrainingProgress
+from rgbavatar_ns.plugin.training.turns import TurnsLock
+from rgbavatar_ns.plugin.viewer.settings import is_of_ns_viewer, viewer_settings
 
 SUMMARY_NAME = "training.json"
 
@@ -60,6 +63,12 @@ class RGBAvatarTrainerConfig(TrainerConfig):
     mixed_precision: bool = False
     """Half precision is not used: the rasterizer computes in float32."""
 
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Where `ns-viewer` puts its own settings in place of the run's, keep these."""
+        if name == "viewer" and is_of_ns_viewer(value):
+            value = viewer_settings(self.viewer, value, sys.argv[1:])
+        super().__setattr__(name, value)
+
 
 class RGBAvatarTrainer(Trainer, FitHooks):
     """Trains with nerfstudio's parts around `fit`, whose hooks it is.
@@ -81,6 +90,7 @@ class RGBAvatarTrainer(Trainer, FitHooks):
             raise UserError("This method trains on one device.", "Leave out --machine.num-devices.")
         _use_run_seed(config)
         super().__init__(config, local_rank, world_size)
+        self.train_lock: Any = TurnsLock()
         self.stop = StopRequest()
         self.stop_training = False
         self._train_seconds = 0.0
