@@ -21,6 +21,11 @@ _SAME_PICTURES = 3
 _SHARP_PX = 512
 _SAME = 1e-4
 
+_COUNT_FRAMES = """
+window.frames_drawn = 0;
+(function count() { window.frames_drawn++; requestAnimationFrame(count); })();
+"""
+
 pytestmark = IN_BROWSER
 
 
@@ -72,6 +77,10 @@ def test_controls_change_the_picture_of_the_head_and_back(viewer: ViewerPage):
     assert _colored(middle) > 0.5
     assert _colored(first[:40, :40]) == 0
     assert viewer.page.get_by_text("Pause Training").count() == 0
+    # Where nothing happens the page hardly draws.
+    viewer.page.evaluate(_COUNT_FRAMES)
+    viewer.page.wait_for_timeout(2000)
+    assert 2 <= viewer.page.evaluate("window.frames_drawn") <= 12
 
     viewer.set_number("Frame", "4")
     second = _wait_for(viewer, lambda picture: _difference(picture, first) > 0.02)

@@ -8,6 +8,7 @@ import pytest
 import viser
 from viser import infra
 
+from rgbavatar_ns.plugin.viewer import client
 from rgbavatar_ns.plugin.viewer.client import SharpClient, serve_sharp_client
 
 _BUILD = Path(viser.__file__).parent / "client" / "build"
@@ -35,6 +36,9 @@ def test_browsers_get_the_installed_client_with_one_expression_changed():
     served = _served(script.relative_to(_BUILD).as_posix())
     plain = script.read_bytes()
     assert b"Setting DPR" in served
+    calm = (Path(client.__file__).parent / "calm_client.js").read_bytes()
+    assert served.startswith(calm)
+    served = served[len(calm) :]
     same = next(i for i, pair in enumerate(zip(served, plain)) if pair[0] != pair[1])
     assert plain[same - 30 : same + 60].count(b"window.devicePixelRatio*(.2+.8*") == 1
     changed = b"Math.min(window.devicePixelRatio,2)"
@@ -55,8 +59,7 @@ def test_an_unknown_client_is_sent_as_it_is_and_told(
     for script in tmp_path.glob("build/assets/*.js"):
         script.write_bytes(b"")
     script.write_bytes(expression * times)
-    client = SharpClient(tmp_path / "build")
-    assert not client.known
+    assert not SharpClient(tmp_path / "build").known
     server = infra.WebsockServer("127.0.0.1", 0, http_server_root=tmp_path / "build")
     assert server._http_server_root == tmp_path / "build"
     assert not isinstance(server._http_server_root, SharpClient)

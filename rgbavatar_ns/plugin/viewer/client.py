@@ -3,6 +3,10 @@
 viser 0.2.7, which nerfstudio 1.1.5 pins, draws on fewer and fewer pixels where a browser is slow,
 down to a fifth a side, and seldom returns; a setting against it came later (`?fixedDpr`, in viser's
 pull request 520). One expression of the installed client says so, and is sent changed.
+
+It also draws without end where nothing changes: without a graphics card, most of a core that
+training needs. Before it stands a script by which it draws a few times a second until something
+happens.
 """
 
 import re
@@ -16,6 +20,7 @@ _FEWER_PIXELS = re.compile(rb"window\.devicePixelRatio\*\(\.2\+\.8\*[\w$]+\)")
 # Beyond two pixels a point nothing is won; three.js's canvas begins with this, too.
 _ALL_PIXELS = b"Math.min(window.devicePixelRatio,2)"
 _SCRIPTS = "assets/*.js"
+_CALM = (Path(__file__).parent / "calm_client.js").read_bytes()
 
 
 class SharpClient(PosixPath):
@@ -24,7 +29,8 @@ class SharpClient(PosixPath):
     def read_bytes(self) -> bytes:
         """The file as browsers get it."""
         plain = super().read_bytes()
-        return _FEWER_PIXELS.sub(_ALL_PIXELS, plain) if self.match(_SCRIPTS) else plain
+        changed, count = _FEWER_PIXELS.subn(_ALL_PIXELS, plain)
+        return _CALM + changed if count else plain
 
     @property
     def known(self) -> bool:
