@@ -191,9 +191,11 @@ class ViewerPanel(ViewerControl):
         self.change(psi_by_hand=self._psi_shown() if by_hand else None)
 
     def play(self, on: bool) -> None:
-        """Move on by itself, or stay; by hand there is nothing to play, so that frames drive."""
-        by_hand = self.state.driven_by == "by hand"
-        driven_by = "dataset frame" if on and by_hand else self.state.driven_by
+        """Move on by itself, or stay; where nothing can be played, the film's frames are."""
+        played: tuple[DrivenBy, ...] = ("dataset frame", "driving sequence")
+        driven_by = self.state.driven_by
+        if on and driven_by not in played:
+            driven_by = "dataset frame"
         self.change(playing=on, driven_by=driven_by)
 
     def load_driver(self, folder: str, relative: str) -> None:
