@@ -2,7 +2,8 @@
 
     pytest -m nightly -s tests/plugin/test_viewer_sharpness.py
 
-The times hold for a machine that does nothing else.
+The times hold for a machine that does nothing else. While training runs, a sharp picture within the
+first tenth of a second may have been begun before the change.
 """
 
 from pathlib import Path
