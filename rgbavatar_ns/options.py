@@ -1,6 +1,7 @@
 """Ranges of options, written where an option is declared and checked in one place."""
 
 import dataclasses
+import inspect
 import math
 from collections.abc import Mapping
 from typing import Annotated, Any, get_args, get_origin, get_type_hints
@@ -57,7 +58,9 @@ def check_options(
     mappings within as well. prefix: of the options' names in an error.
     """
     hints = get_type_hints(owner, include_extras=True)
-    others = (more or {}).get(owner, {})
+    others: dict[str, Between] = {}
+    for kind in inspect.getmro(owner) if isinstance(owner, type) else ():
+        others.update((more or {}).get(kind, {}))
     for name, value in values.items():
         bounds = [others[name]] if name in others else _bounds(hints.get(name))
         for item in value if isinstance(value, tuple | list) else (value,):

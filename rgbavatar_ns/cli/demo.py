@@ -175,7 +175,7 @@ def _tell(summary: dict[str, Any], output: Path) -> None:
         "film": summary["video"],
         "figures": str(output / "summary.json"),
         "viewer": f"{Path(sys.executable).with_name('ns-viewer')} --load-config "
-        f"{Path(summary['run']) / 'config.yml'} --viewer.websocket-host 127.0.0.1",
+        f"{Path(summary['run']) / 'config.yml'}",
     }
     if summary["psnr_head_refined"] is not None:
         rows["head, fitted"] = f"{summary['psnr_head_refined']:.2f} dB, pose fitted to each image"

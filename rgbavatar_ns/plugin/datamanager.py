@@ -20,7 +20,6 @@ from rgbavatar_ns.avatar.training.batches import ChosenFrames, DeviceFrames
 from rgbavatar_ns.avatar.training.losses import random_backgrounds
 from rgbavatar_ns.data import ImageCache, OfflineOrder
 from rgbavatar_ns.data.check import quick_check
-from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.options import Between, Counted, Seed
 from rgbavatar_ns.plugin.cameras import from_nerfstudio
 from rgbavatar_ns.plugin.dataparser import (
@@ -76,15 +75,6 @@ class RGBAvatarDataManagerConfig(FullImageDatamanagerConfig):
     fps_reset_every: tyro.conf.Suppress[int] = 100
 
 
-def require_batch(size: int) -> None:
-    """Raise UserError where a batch of so many frames is impossible."""
-    if size < 1:
-        raise UserError(
-            f"A batch of {size} frames is impossible.",
-            "Pass --pipeline.datamanager.batch-size with 1 or more.",
-        )
-
-
 class RGBAvatarDataManager(DataManager):
     """Serves frames as (nerfstudio cameras with theta, uint8 RGBA images).
 
@@ -133,7 +123,6 @@ class RGBAvatarDataManager(DataManager):
 
     def setup_train(self) -> None:
         """Put the frame order in place, a function of seed and step: resuming needs no state."""
-        require_batch(self.config.batch_size)
         rows = range(len(self.train_dataset))
         self._train_order = OfflineOrder(rows, min(self.config.batch_size, len(rows)), self.seed)
         self._train_cameras = self.train_dataset.cameras.to(self.device)

@@ -43,7 +43,13 @@ def preset(kind: type[TrainerKind], method_name: str, **settings: Any) -> Traine
             steps_per_log=10, local_writer=LocalWriterConfig(enable=False), profiler="none"
         ),
         # A monocular video has one camera: many frusta would only hide each other.
-        viewer=ViewerConfig(websocket_host="127.0.0.1", max_num_display_images=1),
+        # Depth for what is drawn over the head costs more than the picture.
+        viewer=ViewerConfig(
+            websocket_host="127.0.0.1",
+            max_num_display_images=1,
+            default_composite_depth=False,
+            jpeg_quality=90,
+        ),
         vis="viewer+tensorboard",
         **settings,
     )

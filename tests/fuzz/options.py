@@ -14,7 +14,7 @@ from rgbavatar_ns.cli import main as cli
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.plugin.methods import rgbavatar
 from rgbavatar_ns.plugin.online.methods import rgbavatar_online
-from rgbavatar_ns.plugin.training.trainer import require_trainable
+from rgbavatar_ns.plugin.training.ranges import require_trainable
 
 NAME = "options"
 _ABSURD = ("-3", "0", "nan", "inf", "-inf", "1e400", str(10**12), str(10**30), "x", "", "-1e-30")

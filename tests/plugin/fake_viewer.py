@@ -14,6 +14,8 @@ FULL_SIZE = 64
 class FakeHandle:
     """A control; `user_sets` and `user_clicks` do what a browser does, and all that follows."""
 
+    kind, limits = "", ()
+
     def __init__(self, label: str, value: Any, options: dict[str, Any]) -> None:
         self.label, self.value, self.options = label, value, options
         self.content, self.visible = value, options.get("visible", True)
@@ -75,6 +77,8 @@ class FakeGui:
                 handle = FakeHandle(label, values[0][0], options)
             else:  # A slider's limits stand before its value.
                 handle = FakeHandle(label, values[-1] if values else None, options)
+                handle.limits = values
+            handle.kind = kind
             self.handles.append(handle)
             return handle
 
@@ -84,7 +88,7 @@ class FakeGui:
 class FakeViewer:
     """nerfstudio's viewer, whose state of all browsers' cameras is the same."""
 
-    def __init__(self) -> None:
+    def __init__(self, training: str | None = None) -> None:
         self.gui = FakeGui()
         self.viser_server = SimpleNamespace(
             gui=self.gui,
@@ -92,9 +96,19 @@ class FakeViewer:
             on_client_connect=lambda _: None,
         )
         self.render_tab_state = SimpleNamespace(preview_render=False)
+        self.trainer = training and SimpleNamespace(training_state=training)
+        buttons = [FakeHandle("button", None, {}) for _ in range(4)]
+        self.pause_train, self.resume_train, *self.steering = buttons
+        speed, share = (SimpleNamespace(gui_handle=handle) for handle in self.steering)
         self.control_panel = SimpleNamespace(
-            time=0.0, max_res=FULL_SIZE, crop_viewport=False, layer_depth=False
+            time=0.0,
+            max_res=FULL_SIZE,
+            layer_depth=False,
+            _max_res=SimpleNamespace(value=FULL_SIZE),
+            _train_speed=speed,
+            _train_util=share,
         )
+        self.last_move_time = 0.0
         self.include_time = self.ready = True
         self.render_statemachines: dict[int, Any] = {}
         self.train_lock, self.step = None, 0

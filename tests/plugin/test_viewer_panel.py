@@ -1,5 +1,6 @@
 """The panel: what its controls do to the picture, without a browser."""
 
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -10,7 +11,6 @@ import viser
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.viewer.utils import parse_object
 from nerfstudio.viewer.viewer_elements import ViewerControl
-from nerfstudio.viewer_legacy.server.viewer_utils import IOChangeException
 
 from rgbavatar_ns import Avatar
 from rgbavatar_ns.plugin.cameras import from_nerfstudio
@@ -18,6 +18,7 @@ from rgbavatar_ns.plugin.model import RGBAvatarModel
 from rgbavatar_ns.plugin.pipeline import RGBAvatarPipeline
 from rgbavatar_ns.plugin.viewer.driving import training_statistics
 from rgbavatar_ns.plugin.viewer.panel import ViewerPanel
+from rgbavatar_ns.plugin.viewer.sliders import on_step
 from rgbavatar_ns.plugin.viewer.viewpoint import Viewpoint
 from tests.plugin.fake_viewer import FakeViewer
 from tests.plugin.run import small_config, trained
@@ -39,9 +40,9 @@ class Desk:
         self.now_s = 0.0
         self.panel = ViewerPanel(self.model, pipeline.film, clock=lambda: self.now_s)
         self.viewer, self.asked = FakeViewer(), []
-        browser = SimpleNamespace(state="low_static", client=None, action=self.asked.append)
-        self.viewer.render_statemachines[0] = browser
         self.panel.attach(self.viewer)
+        browser = SimpleNamespace(client=None, action=self.asked.append)
+        self.viewer.render_statemachines[0] = browser
 
     def set(self, label: str, value: Any) -> None:
         self.viewer.gui[label].user_sets(value)
@@ -112,16 +113,96 @@ def test_frame_slider_shows_that_frame_over_the_background(desk: Desk):
 def test_moving_a_face_slider_drives_by_hand_from_what_is_shown_and_back(desk: Desk):
     desk.set("Frame", 5)
     before = desk.picture()
-    desk.set("jaw x (deg)", 20.0)
+    desk.set("Jaw opens (°)", 20.0)
     expected = desk.model.frame_theta[5].clone()
     expected[desk.model.avatar.layout.slice("jaw").start] = torch.pi / 9
     assert torch.allclose(desk.panel.state.theta_by_hand, expected, atol=1e-6)
     assert (desk.picture() - before).abs().max() > 0.01
-    # The other sliders now stand where the frame has its numbers.
-    turned = desk.model.frame_theta[5, desk.model.avatar.layout.slice("rotation")][1]
-    assert desk.viewer.gui["rotation y (deg)"].value == pytest.approx(turned.rad2deg().item())
     desk.set("Driven by", "dataset frame")
     assert torch.equal(desk.picture(), before)
+
+
+def test_sliders_stand_where_the_frame_that_drives_has_its_numbers(desk: Desk):
+    theta, layout = desk.model.frame_theta, desk.model.avatar.layout
+    for frame in (7, 2):
+        desk.set("Frame", frame)
+        desk.picture()
+        desk.pass_time(1.0)
+        gui, jaw = desk.viewer.gui, theta[frame, layout.slice("jaw")][0].rad2deg().item()
+        shown, (_, _, step, _) = gui["Jaw opens (°)"].value, gui["Jaw opens (°)"].limits
+        assert abs(shown - jaw) <= step / 2 + 1e-6
+        assert len(f"{shown:g}") <= 5
+        psi = desk.model.avatar.weights(theta[frame][None])[0, 1].item()
+        assert gui["Basis 2"].value == pytest.approx(psi, abs=0.02)
+    # Following is no change: the frame drives on.
+    assert desk.panel.state.driven_by == "dataset frame"
+    assert len(desk.asked) == 2
+
+
+def test_a_slider_that_a_user_moves_is_not_pushed_about(desk: Desk):
+    label = "Jaw opens (°)"
+    moved = desk.viewer.gui[label].limits[2] * 12.4
+    desk.set(label, moved)
+    desk.picture()
+    desk.pass_time(1.0)
+    assert desk.viewer.gui[label].value == moved
+
+
+def test_every_number_fits_its_field_and_every_label_wraps(desk: Desk):
+    for handle in desk.viewer.gui.handles:
+        if handle.kind == "slider":
+            low, high, step, _ = handle.limits
+            for end in (low + step, high - step, low, high):
+                assert len(f"{on_step(float(end), float(step)):g}") <= 5, handle.label
+            assert max(map(len, handle.label.split())) <= 12, handle.label
+    hints = [h.options.get("hint") for h in desk.viewer.gui.handles if h.label.startswith("Basis ")]
+    assert len(hints) == desk.model.avatar.config.num_bases
+    assert all("in training" in hint for hint in hints)
+
+
+def test_training_is_steered_only_while_it_runs(desk: Desk, pipeline: RGBAvatarPipeline):
+    viewer = FakeViewer(training="training")
+    panel = ViewerPanel(pipeline.model, pipeline.film, clock=lambda: 0.0)
+    panel.attach(viewer)
+    panel.tick()
+    assert viewer.pause_train.visible
+    viewer.trainer.training_state = "completed"
+    panel.tick()
+    desk.pass_time(0.0)  # ns-viewer's, without a trainer
+    for each in (viewer, desk.viewer):
+        for control in (each.pause_train, each.resume_train, *each.steering):
+            assert not control.visible
+
+
+def test_quick_pictures_become_finer_once(desk: Desk, monkeypatch: pytest.MonkeyPatch):
+    resolution = desk.viewer.control_panel._max_res
+    for seconds, shown in ((0.2, 512), (0.01, 1024)):
+        resolution.value = 512
+        camera = desk.camera()
+        camera.width, camera.height = (torch.full_like(camera.width, n) for n in (512, 256))
+        monkeypatch.setattr(desk.panel, "_clock", _ticking(desk, seconds))
+        desk.panel.draw(from_nerfstudio(camera), None)
+        monkeypatch.undo()
+        desk.pass_time(1.0)
+        assert resolution.value == shown
+    resolution.value = 512  # A user's choice stays.
+    desk.picture()
+    desk.pass_time(1.0)
+    assert resolution.value == 512
+
+
+def _ticking(desk: Desk, seconds: float) -> Callable[[], float]:
+    def clock() -> float:
+        desk.now_s += seconds
+        return desk.now_s
+
+    return clock
+
+
+def test_play_by_hand_plays_the_film(desk: Desk):
+    desk.set("Jaw opens (°)", 20.0)
+    desk.set("Play", True)
+    assert desk.panel.state.driven_by == "dataset frame"
 
 
 def test_echoes_of_moved_sliders_change_nothing(desk: Desk):
@@ -165,12 +246,12 @@ def test_a_weight_slider_overrides_the_network_until_it_is_given_back(desk: Desk
     before = desk.picture()
     theta = desk.model.frame_theta[0:1]
     psi = desk.model.avatar.weights(theta).detach()
-    desk.set("psi 1", 0.9)
+    desk.set("Basis 2", 0.9)
     psi[0, 1] = 0.9
     assert torch.allclose(desk.panel.state.psi_by_hand, psi[0])
     assert torch.allclose(desk.picture(), desk.white(theta, psi), atol=1e-5)
     assert (desk.picture() - before).abs().max() > 0.005
-    desk.set("Weights by hand", False)
+    desk.set("Hold weights", False)
     assert torch.equal(desk.picture(), before)
 
 
@@ -185,11 +266,11 @@ def test_bases_used_counts_the_first_ones(desk: Desk):
 def test_one_basis_alone_is_base_and_basis_on_the_neutral_frame(desk: Desk):
     seen = training_statistics(desk.model)
     extreme = torch.where(seen.psi_max >= -seen.psi_min, seen.psi_max, seen.psi_min)
-    desk.set("One basis alone", "2")
+    desk.set("Show one alone", "3")
     psi = torch.zeros(1, len(extreme))
     psi[0, 2] = 1.5 * extreme[2]
     assert torch.allclose(desk.picture(), desk.white(seen.theta_neutral[None], psi), atol=1e-5)
-    desk.set("One basis alone", "none")
+    desk.set("Show one alone", "none")
     assert torch.equal(desk.picture(), desk.white(desk.model.frame_theta[0:1]))
 
 
@@ -209,6 +290,27 @@ def test_film_avatar_and_error_stand_in_a_row(desk: Desk, pipeline: RGBAvatarPip
     assert error[difference > 0.2].min() > error[difference < 0.01].max()
     psnr = -10 * (avatar.clamp(0, 1) - truth).square().mean().log10()
     assert f"PSNR of this frame {psnr:.2f} dB" in desk.told()
+
+
+@pytest.mark.parametrize(
+    ("width", "height", "places"),
+    [
+        (3, 1, [(0, 0), (0, 1), (0, 2)]),
+        (1, 3, [(0, 0), (1, 0), (2, 0)]),
+        (2, 2, [(0, 0), (0, 1), (1, 0.5)]),
+    ],
+)
+def test_film_avatar_and_error_use_the_window(
+    desk: Desk, width: int, height: int, places: list[tuple[float, float]]
+):
+    desk.panel.change(frame=4, picture="beside the film", background=(0.0, 0.0, 1.0))
+    window = desk.camera()
+    window.width, window.height = (torch.full_like(window.width, s * SIZE) for s in (width, height))
+    image = desk.picture(window)
+    desk.panel.change(picture="error")
+    tile = desk.picture()
+    row, column = (round(SIZE * part) for part in places[2])
+    assert torch.equal(image[row : row + SIZE, column : column + SIZE], tile)
 
 
 @pytest.mark.parametrize("picture", ["alpha", "depth", "error"])
@@ -269,15 +371,6 @@ def test_trouble_is_told_and_the_plain_avatar_drawn(desk: Desk):
     assert "Cannot be shown" in desk.told()
 
 
-def test_the_viewers_own_interruption_passes(desk: Desk, monkeypatch: pytest.MonkeyPatch):
-    def interrupted(*_: Any, **__: Any) -> None:
-        raise IOChangeException
-
-    monkeypatch.setattr(desk.model.avatar, "renderer", interrupted)
-    with pytest.raises(IOChangeException):
-        desk.picture()
-
-
 def test_playing_goes_round(desk: Desk):
     desk.panel.change(frame=NUM_FRAMES - 2)
     seen = []
@@ -292,7 +385,7 @@ def test_playing_goes_round(desk: Desk):
 
 
 def test_play_moves_on_once_a_picture_was_drawn(desk: Desk):
-    desk.set("Frames per second", 10)
+    desk.set("Frames/s", 10)
     desk.set("Play", True)
     desk.picture()
     desk.pass_time(0.1)

@@ -21,7 +21,6 @@ from rgbavatar_ns.plugin.cameras import to_nerfstudio
 from rgbavatar_ns.plugin.datamanager import (
     RGBAvatarDataManager,
     RGBAvatarDataManagerConfig,
-    require_batch,
 )
 from rgbavatar_ns.plugin.dataparser import Subject
 from rgbavatar_ns.plugin.online.sources import SourceConfig, await_subject, open_source
@@ -190,21 +189,14 @@ class OnlineDataManager(RGBAvatarDataManager):
 
 
 def _pools(config: OnlineDataManagerConfig, seed: int) -> LocalGlobalPools:
-    require_batch(config.batch_size)
-    try:
-        return LocalGlobalPools(
-            config.local_size,
-            config.global_size,
-            config.local_share,
-            seed,
-            config.strategy,
-            config.new_first,
-        )
-    except ValueError as error:
-        raise UserError(
-            f"Such pools are impossible: {error}",
-            "Mend --pipeline.datamanager.local-size, global-size or local-share.",
-        ) from None
+    return LocalGlobalPools(
+        config.local_size,
+        config.global_size,
+        config.local_share,
+        seed,
+        config.strategy,
+        config.new_first,
+    )
 
 
 def _of_dataset(config: OnlineDataManagerConfig, replayed: bool) -> OnlineDataManagerConfig:

@@ -75,11 +75,6 @@ class OnlineTrainer(RGBAvatarTrainer):
                 "for.",
                 "Leave out --pipeline.model.refine-tracking, or train offline.",
             )
-        if config.final_learning_rate_factor <= 0:
-            raise UserError(
-                f"Learning rates cannot fall to {config.final_learning_rate_factor} of themselves.",
-                "Pass --final-learning-rate-factor above 0; 1 keeps them.",
-            )
         super().__init__(config, local_rank, world_size)
         self.stop = OnlineStop()
         config.pipeline.datamanager.recorded = config.get_base_dir() / "stream"

@@ -1,6 +1,7 @@
 """nerfstudio's trainer with checkpoints, resuming and interruption that can be relied on."""
 
 import math
+import sys
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
@@ -9,8 +10,6 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-import torch
-from nerfstudio.configs.base_config import LoggingConfig, MachineConfig, ViewerConfig
 from nerfstudio.engine.callbacks import TrainingCallbackLocation
 from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
@@ -26,7 +25,7 @@ from rgbavatar_ns.avatar.training.loop import FitHooks, fit
 from rgbavatar_ns.avatar.training.step import Losses
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.files import disk_errors, write_json
-from rgbavatar_ns.options import Between, Count, Positive, Ranges, check_options
+from rgbavatar_ns.options import Between, Count, Positive
 from rgbavatar_ns.plugin.errors import device_errors_told, install_user_error_hook
 from rgbavatar_ns.plugin.pipeline import RGBAvatarPipeline, RGBAvatarPipelineConfig
 from rgbavatar_ns.plugin.refinement import REFINED_NAME
@@ -41,6 +40,9 @@ from rgbavatar_ns.plugin.training.checkpoints import (
 from rgbavatar_ns.plugin.training.interruption import StopRequest, stop_with_starter
 from rgbavatar_ns.plugin.training.optimizers import ExponentialConfig, require_fitting_states
 from rgbavatar_ns.plugin.training.progress import TrainingProgress
+from rgbavatar_ns.plugin.training.ranges import require_trainable
+from rgbavatar_ns.plugin.training.turns import TurnsLock
+from rgbavatar_ns.plugin.viewer.settings import is_of_ns_viewer, viewer_settings
 
 SUMMARY_NAME = "training.json"
 
@@ -92,34 +94,14 @@ class RGBAvatarTrainerConfig(TrainerConfig):
         with disk_errors(self.get_base_dir(), "Free some space, or name another --output-dir."):
             super().save_config()
 
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Where `ns-viewer` puts its own settings in place of the run's, keep these."""
+        if name == "viewer" and is_of_ns_viewer(value):
+            value = viewer_settings(self.viewer, value, sys.argv[1:])
+        super().__setattr__(name, value)
+
 
 _IN_TRAINER = ContextVar("a trainer asks where to save", default=False)
-_HOST_RANGES: Ranges = {
-    RGBAvatarTrainerConfig: {
-        name: Between(1, 10**9)
-        for name in (
-            "steps_per_save",
-            "steps_per_eval_batch",
-            "steps_per_eval_image",
-            "steps_per_eval_all_images",
-        )
-    },
-    MachineConfig: {"seed": Between(0, 2**32 - 1), "num_devices": Between(1, 1)},
-    LoggingConfig: {"steps_per_log": Between(1, 10**9)},
-    ViewerConfig: {"websocket_port": Between(1, 65535), "jpeg_quality": Between(1, 100)},
-}
-"""Of what nerfstudio declares."""
-
-
-def require_trainable(config: RGBAvatarTrainerConfig) -> None:
-    """Raise UserError for an option out of its range, or a device that is not there."""
-    check_options(type(config), vars(config), more=_HOST_RANGES)
-    device = config.machine.device_type
-    if device == "mps" or (device == "cuda" and not torch.cuda.is_available()):
-        raise UserError(
-            f"PyTorch finds no device of the type '{device}' that this method runs on.",
-            "Leave out --machine.device-type, or install the driver and a PyTorch with CUDA.",
-        )
 
 
 class RGBAvatarTrainer(Trainer, FitHooks):
@@ -148,6 +130,7 @@ class RGBAvatarTrainer(Trainer, FitHooks):
             super().__init__(config, local_rank, world_size)
         finally:
             _IN_TRAINER.reset(asks)
+        self.train_lock: Any = TurnsLock()
         self.stop = StopRequest()
         self.stop_training = False
         self._train_seconds = 0.0

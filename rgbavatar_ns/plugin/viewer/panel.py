@@ -10,7 +10,6 @@ from typing import Any
 import torch
 from jaxtyping import Float
 from nerfstudio.viewer.viewer_elements import ViewerControl
-from nerfstudio.viewer_legacy.server.viewer_utils import IOChangeException
 from torch import Tensor
 
 from rgbavatar_ns.data import TrackedDataset, load_dataset
@@ -20,13 +19,15 @@ from rgbavatar_ns.export.driving import DrivingOptions, ThetaNames
 from rgbavatar_ns.export.scenes import driven_by
 from rgbavatar_ns.kernels import PinholeCameras
 from rgbavatar_ns.plugin.model import RGBAvatarModel
+from rgbavatar_ns.plugin.viewer.client import serve_sharp_client
 from rgbavatar_ns.plugin.viewer.driving import (
+    DrivingSignal,
     driving_signal,
     random_expression,
     training_statistics,
 )
-from rgbavatar_ns.plugin.viewer.redraw import Redraw
 from rgbavatar_ns.plugin.viewer.render import ViewerRender, viewer_render
+from rgbavatar_ns.plugin.viewer.render_thread import ask_for_pictures, draw_by_render_threads
 from rgbavatar_ns.plugin.viewer.sliders import number_sliders
 from rgbavatar_ns.plugin.viewer.viewer_state import DrivenBy, ViewerState
 from rgbavatar_ns.plugin.viewer.viewpoint import Viewpoint
@@ -35,6 +36,9 @@ from rgbavatar_ns.plugin.viewer.widgets import Widgets
 _TICK_S = 0.01
 _PATIENCE_S = 5.0
 _TOLD_EVERY_S = 0.3
+# nerfstudio's "Max res", and what a picture of that size takes where twice that is quick as well.
+_PLAIN_PX = 512
+_QUICK_S = 0.04
 _ALL_BASES: dict[str, Any] = {"basis_alone": None, "bases_used": None}
 
 
@@ -44,6 +48,10 @@ class _Report:
 
     text: str
     trouble: str
+    seconds: float
+    longer_side_px: int
+    theta: Float[Tensor, "H"]
+    psi: Float[Tensor, "K"]
 
 
 class ViewerPanel(ViewerControl):
@@ -63,11 +71,12 @@ class ViewerPanel(ViewerControl):
         self._model, self._film, self._clock = model, film, clock
         self._viewer: Any = None
         self._widgets: Widgets | None = None
-        self._redraw: Redraw | None = None
         self._changing = threading.RLock()
         self._report: _Report | None = None
         self._told = self._played = self._report
         self._next_told_s = self._next_frame_s = self._played_s = 0.0
+        self._may_refine = True
+        serve_sharp_client()
 
     def _setup(self, viewer: Any) -> None:
         """Called by nerfstudio's viewer."""
@@ -77,7 +86,8 @@ class ViewerPanel(ViewerControl):
 
     def attach(self, viewer: Any) -> None:
         """Add the controls to nerfstudio's viewer; from now on `tick` is due all the time."""
-        self._viewer, self._redraw = viewer, Redraw(viewer)
+        self._viewer = viewer
+        draw_by_render_threads(viewer)
         self.state = ViewerState(background=(1.0, 1.0, 1.0))
         arrays, statistics = self._model.avatar.head.arrays, training_statistics(self._model)
         sliders = number_sliders(ThetaNames.of(self._model.avatar.layout, arrays), statistics)
@@ -91,30 +101,26 @@ class ViewerPanel(ViewerControl):
         """The picture for one camera (C = 1): rgb, accumulation, depth [H W C].
 
         What cannot be shown is told in the panel, and the plain avatar stands in its place:
-        nothing here may end the viewer's thread, or training. That thread may be interrupted at
-        each line, so that nothing here takes locks or speaks to browsers.
+        nothing here may end the viewer's thread, or training.
         """
         state, began_s = self._present(), self._clock()
-        answered = self._redraw.began(began_s) if self._redraw is not None else 0
         trouble = ""
         try:
-            drawn = self._drawn(state, camera, time_share)
-        except IOChangeException:  # The viewer's own: the user has moved on.
-            raise
+            signal, drawn = self._drawn(state, camera, time_share)
         except Exception as error:
             if self._widgets is None:
                 raise
             trouble = _in_words(error)
             plain = ViewerState(state.driven_by, state.frame, background=state.background)
-            drawn = self._drawn(plain, camera, time_share)
+            signal, drawn = self._drawn(plain, camera, time_share)
         seconds = self._clock() - began_s
         size = f"{camera.width} x {camera.height}"
         rate = f"{1 / max(seconds, 1e-6):.0f} frames/s"
         psnr = "" if drawn.psnr is None else f"  \nPSNR of this frame {drawn.psnr:.2f} dB"
-        self._report = _Report(f"{size} in {1e3 * seconds:.0f} ms: {rate}{psnr}", trouble)
-        if self._redraw is not None:
-            thread = threading.current_thread()
-            self._redraw.drew(thread, answered, camera.width, camera.height)
+        text = f"{size} in {1e3 * seconds:.0f} ms: {rate}{psnr}"
+        theta, psi = (part[0].cpu() for part in (signal.theta, self._psi_of(signal)))
+        longer_px = max(camera.width, camera.height)
+        self._report = _Report(text, trouble, seconds, longer_px, theta, psi)
         return drawn.outputs()
 
     def tick(self) -> None:
@@ -127,12 +133,14 @@ class ViewerPanel(ViewerControl):
             self._next_frame_s = frame_s + (now_s if late else self._next_frame_s)
             self._played, self._played_s = report, now_s
             self.advance()
-        if self._widgets is None or self._redraw is None:
+        if self._widgets is None:
             return
-        self._redraw.insist(now_s)
+        self._hide_training()
         if report is not None and report is not self._told and now_s >= self._next_told_s:
             self._told, self._next_told_s = report, now_s + _TOLD_EVERY_S
             self._widgets.report(report.text)
+            self._widgets.show_driving(report.theta, report.psi)
+            self._refine(report)
             if report.trouble:
                 self._widgets.tell(report.trouble)
 
@@ -182,6 +190,14 @@ class ViewerPanel(ViewerControl):
         """Hold the weights where they are, or give them back to the network."""
         self.change(psi_by_hand=self._psi_shown() if by_hand else None)
 
+    def play(self, on: bool) -> None:
+        """Move on by itself, or stay; where nothing can be played, the film's frames are."""
+        played: tuple[DrivenBy, ...] = ("dataset frame", "driving sequence")
+        driven_by = self.state.driven_by
+        if on and driven_by not in played:
+            driven_by = "dataset frame"
+        self.change(playing=on, driven_by=driven_by)
+
     def load_driver(self, folder: str, relative: str) -> None:
         """Read another person's performance and play it; what is wrong is told in the panel."""
         self.tell(f"Reading {folder} ...")
@@ -227,17 +243,18 @@ class ViewerPanel(ViewerControl):
 
     def _psi_shown(self) -> Float[Tensor, "K"]:
         state = replace(self.state, **_ALL_BASES)
-        signal = driving_signal(self._model, state, self._time_now())
-        with torch.no_grad():
-            psi = self._model.avatar.weights(signal.theta) if signal.psi is None else signal.psi
-        return psi[0].cpu()
+        return self._psi_of(driving_signal(self._model, state, self._time_now()))[0].cpu()
+
+    @torch.no_grad()
+    def _psi_of(self, signal: DrivingSignal) -> Float[Tensor, "1 K"]:
+        return self._model.avatar.weights(signal.theta) if signal.psi is None else signal.psi
 
     def _drawn(
         self, state: ViewerState, camera: PinholeCameras, time_share: float | None
-    ) -> ViewerRender:
+    ) -> tuple[DrivingSignal, ViewerRender]:
         model, signal = self._model, driving_signal(self._model, state, time_share)
-        backend = model.config.rasterizer
-        return viewer_render(model.avatar, signal, state, camera, film=self._film, backend=backend)
+        options: dict[str, Any] = {"film": self._film, "backend": model.config.rasterizer}
+        return signal, viewer_render(model.avatar, signal, state, camera, **options)
 
     def _present(self) -> ViewerState:
         """The state, but a camera path that is previewed shows what `ns-render` will."""
@@ -256,9 +273,28 @@ class ViewerPanel(ViewerControl):
 
     def _refresh(self) -> None:
         """Show the state in the controls and draw anew; does nothing without a viewer."""
-        if self._widgets is not None and self._redraw is not None:
+        if self._widgets is not None:
             self._widgets.follow(self.state)
-            self._redraw.ask(self._clock())
+            ask_for_pictures(self._viewer, hold_training=not self.state.playing)
+
+    def _hide_training(self) -> None:
+        """Take away what steers training where there is none."""
+        viewer = self._viewer
+        if viewer.trainer is None or viewer.trainer.training_state == "completed":
+            panel = viewer.control_panel
+            steering = (panel._train_speed.gui_handle, panel._train_util.gui_handle)
+            for handle in (viewer.pause_train, viewer.resume_train, *steering):
+                if handle.visible:
+                    handle.visible = False
+
+    def _refine(self, report: _Report) -> None:
+        """Once a picture of nerfstudio's own size was quick, draw twice as fine."""
+        resolution = self._viewer.control_panel._max_res
+        if self._may_refine and report.longer_side_px == resolution.value:
+            quick = report.seconds < _QUICK_S
+            self._may_refine = not quick and resolution.value == _PLAIN_PX
+            if quick and resolution.value == _PLAIN_PX:
+                resolution.value = 2 * _PLAIN_PX
 
     def _tick_forever(self) -> None:
         while True:

@@ -1,5 +1,6 @@
 """Images for the viewer: the avatar, what helps to judge it, and the film beside it."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -96,7 +97,7 @@ def _beside_film(
     film: TrackedDataset | None,
     backend: str,
 ) -> ViewerRender:
-    """Film, avatar and error in a row, or the error alone, scaled to fit the viewer's window."""
+    """Film, avatar and error, or the error alone, as large as the viewer's window allows."""
     if film is None or signal.frame is None:
         raise UserError(
             "There is no film to compare this with.",
@@ -112,21 +113,36 @@ def _beside_film(
     if state.picture == "beside the film":
         overlaid = _with_overlays(image, avatar, signal, state, own, drawn.visibility)
         tiles = [truth, overlaid, *tiles]
-    image = _fitted(torch.cat(tiles, 1), camera, state.background)
+    image = _arranged(tiles, camera, state.background)
     covered = image.new_ones(camera.height, camera.width, 1)
     return ViewerRender(image, covered, covered, quality_db)
 
 
-def _fitted(row: _Image, camera: PinholeCameras, background: tuple[float, float, float]) -> _Image:
-    """The row in the middle of a picture of the camera's size, as large as it fits."""
-    height, width = row.shape[:2]
-    zoom = min(camera.height / height, camera.width / width)
+def _arranged(
+    tiles: list[_Image], camera: PinholeCameras, background: tuple[float, float, float]
+) -> Float[Tensor, "window_H window_W 3"]:
+    """Tiles of one size in the rows that show them largest in a picture of the camera's size."""
+    height, width = tiles[0].shape[:2]
+
+    def zoom_of(columns: int) -> float:
+        rows = math.ceil(len(tiles) / columns)
+        return min(camera.height / (rows * height), camera.width / (columns * width))
+
+    columns = max(range(1, len(tiles) + 1), key=zoom_of)
+    zoom, rows = zoom_of(columns), math.ceil(len(tiles) / columns)
     size = max(1, int(width * zoom)), max(1, int(height * zoom))
     smooth = cv2.INTER_AREA if zoom < 1 else cv2.INTER_LINEAR
-    scaled = torch.from_numpy(cv2.resize(row.cpu().numpy(), size, interpolation=smooth))
-    image = row.new_tensor(background).expand(camera.height, camera.width, 3).clone()
-    top, left = (camera.height - size[1]) // 2, (camera.width - size[0]) // 2
-    image[top : top + size[1], left : left + size[0]] = scaled.to(image)
+    image = tiles[0].new_tensor(background).expand(camera.height, camera.width, 3).clone()
+    for row in range(rows):
+        inside = tiles[row * columns : (row + 1) * columns]
+        top = (camera.height - rows * size[1]) // 2 + row * size[1]
+        left = (camera.width - len(inside) * size[0]) // 2
+        shown = cv2.resize(
+            torch.cat(inside, 1).cpu().numpy(),
+            (len(inside) * size[0], size[1]),
+            interpolation=smooth,
+        )
+        image[top : top + size[1], left : left + shown.shape[1]] = torch.from_numpy(shown).to(image)
     return image
 
 

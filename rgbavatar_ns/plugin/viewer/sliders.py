@@ -1,16 +1,16 @@
 """Sliders for theta's numbers: what each is called, how far it goes, and in which unit."""
 
 import math
+import re
 from dataclasses import dataclass
 
 from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
 from rgbavatar_ns.export.driving import ThetaNames
 
-_AXES = "xyz"
 _UNITS = {
-    "linear": ("", 1.0),
-    "axis_angle": (" (deg)", math.degrees(1)),
-    "translation": (" (mm)", 1e3),
+    "linear": ("", "as the tracker counts", 1.0),
+    "axis_angle": (" (°)", "degrees", math.degrees(1)),
+    "translation": (" (mm)", "millimetres", 1e3),
 }
 _LEAST_REACH = {"linear": 1.0, "axis_angle": math.radians(20), "translation": 0.05}
 _BEYOND = 0.25
@@ -27,6 +27,21 @@ TITLES = {
 }
 """The folder of each field; others stand under their own name."""
 
+# By field, what each number does; where + goes, as the person sees left and right.
+_TURN = (("nods", "down"), ("turns", "to the left"), ("tilts", "to the right shoulder"))
+_GAZE = (("up-down", "down"), ("sideways", "to the left"), ("rolls", "to the right shoulder"))
+_MEANINGS = {
+    "jaw": ("Jaw", (("opens", "opens"), ("sideways", "to the left"), ("twists", "to the right"))),
+    "left_eye": ("Left eye", _GAZE),
+    "right_eye": ("Right eye", _GAZE),
+    "neck": ("Neck", _TURN),
+    "rotation": ("Head", _TURN),
+    "translation": (
+        "Head",
+        (("sideways", "to the left"), ("up-down", "up"), ("forward", "towards the viewer")),
+    ),
+}
+
 
 @dataclass(frozen=True)
 class NumberSlider:
@@ -36,11 +51,16 @@ class NumberSlider:
     """Its place in theta."""
     field: str
     label: str
+    hint: str
     low: float
     high: float
     step: float
     shown_per_unit: float
     """The shown number is this times theta's."""
+
+    def shown(self, number: float) -> float:
+        """The slider's place for theta's number, in whole steps, so that it can be read."""
+        return on_step(min(max(number * self.shown_per_unit, self.low), self.high), self.step)
 
 
 def number_sliders(names: ThetaNames, statistics: TrainingStatistics) -> list[NumberSlider]:
@@ -55,28 +75,42 @@ def number_sliders(names: ThetaNames, statistics: TrainingStatistics) -> list[Nu
         if part.name == "expression":
             strength = statistics.theta_std.tolist()
             places.sort(key=lambda place: -strength[place])
-        unit, factor = _UNITS[part.form]
+        sign, unit, factor = _UNITS[part.form]
         for place in places:
-            seen_low = min(float(statistics.theta_min[place]), -_LEAST_REACH[part.form])
-            seen_high = max(float(statistics.theta_max[place]), _LEAST_REACH[part.form])
-            reach = _BEYOND * (seen_high - seen_low)
-            low, high = factor * (seen_low - reach), factor * (seen_high + reach)
-            label = _label(names, place, part.name, part.form, place - numbers.start)
-            step = _round_step((high - low) / _STEPS)
-            sliders.append(NumberSlider(place, part.name, label + unit, low, high, step, factor))
+            seen = statistics.theta_min[place], statistics.theta_max[place]
+            low = min(float(seen[0]), -_LEAST_REACH[part.form])
+            high = max(float(seen[1]), _LEAST_REACH[part.form])
+            reach = _BEYOND * (high - low)
+            low, high, step = slider_ends(factor * (low - reach), factor * (high + reach))
+            label, goes = _meaning(names, place, part.name, place - numbers.start)
+            shown = [f"{on_step(factor * float(end), step):g}" for end in seen]
+            hint = f"In {unit}{goes}; in training {shown[0]} to {shown[1]}"
+            sliders.append(
+                NumberSlider(place, part.name, label + sign, hint, low, high, step, factor)
+            )
     return sliders
 
 
-def _label(names: ThetaNames, place: int, field: str, form: str, number: int) -> str:
-    if field == "expression":
-        return names.numbers[place]
-    plain = field.replace("_", " ")
-    if form == "linear":
-        return f"{plain} {('left', 'right')[number] if field == 'eyelids' else number}"
-    return f"{plain} {_AXES[number]}"
+def slider_ends(low: float, high: float) -> tuple[float, float, float]:
+    """Ends of a slider in whole steps, and a step that is read at a glance, some 200 of them."""
+    power = 10.0 ** math.floor(math.log10((high - low) / _STEPS))
+    step = max(n * power for n in (1, 2, 5) if n * power <= (high - low) / _STEPS * 1.0001)
+    return on_step(low, step), on_step(high, step), step
 
 
-def _round_step(step: float) -> float:
-    """The next smaller of 1, 2 and 5 times a power of ten."""
-    power = 10.0 ** math.floor(math.log10(step))
-    return max(factor * power for factor in (1, 2, 5) if factor * power <= step * 1.0001)
+def on_step(value: float, step: float) -> float:
+    """The nearest whole number of steps, without the digits that floats leave behind."""
+    return round(round(value / step) * step, max(0, -math.floor(math.log10(step)))) + 0.0
+
+
+def _meaning(names: ThetaNames, place: int, field: str, number: int) -> tuple[str, str]:
+    """What a number is called, and where + goes."""
+    if field in _MEANINGS:
+        what, numbers = _MEANINGS[field]
+        return f"{what} {numbers[number][0]}", f", + {numbers[number][1]}"
+    if field == "eyelids":
+        return f"{('Left', 'Right')[number]} eyelid", ", + closes"
+    plain = names.numbers[place] if field == "expression" else f"{field} {number + 1}"
+    # A label of several words wraps where one long word would run under its slider.
+    words = re.sub(r"(?<=[a-z])(?=[A-Z0-9])|_", " ", plain).lower()
+    return words[:1].upper() + words[1:], ""

@@ -4,8 +4,11 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, Protocol, get_args, runtime_checkable
 
+from jaxtyping import Float
+from torch import Tensor
+
 from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
-from rgbavatar_ns.plugin.viewer.sliders import TITLES, NumberSlider
+from rgbavatar_ns.plugin.viewer.sliders import TITLES, NumberSlider, on_step, slider_ends
 from rgbavatar_ns.plugin.viewer.viewer_state import DrivenBy, PictureKind, ViewerState
 
 _TOPMOST = -1.0
@@ -22,6 +25,7 @@ class Actions(Protocol):
     def change(self, **values: Any) -> None: ...  # noqa: D102
     def drive_by(self, driven_by: DrivenBy) -> None: ...  # noqa: D102
     def set_theta_number(self, place: int, value: float) -> None: ...  # noqa: D102
+    def play(self, on: bool) -> None: ...  # noqa: D102
     def show_neutral(self) -> None: ...  # noqa: D102
     def show_random_expression(self) -> None: ...  # noqa: D102
     def set_weight(self, basis: int, value: float) -> None: ...  # noqa: D102
@@ -43,6 +47,7 @@ class Widgets:
         self._gui, self._do = gui, actions
         self._numbers: list[tuple[NumberSlider, Any]] = []
         self._weights: list[Any] = []
+        self._reach: list[tuple[float, float, float]] = []
         with gui.add_folder("Avatar", order=_TOPMOST):
             self._report = gui.add_markdown("")
             self._said = gui.add_markdown("", visible=False)
@@ -62,16 +67,16 @@ class Widgets:
         _put(self._frame, state.frame)
         if self._sequence_frame is not None:
             _put(self._sequence_frame, state.sequence_frame)
-        if state.driven_by == "by hand" and state.theta_by_hand is not None:
-            for slider, handle in self._numbers:
-                shown = float(state.theta_by_hand[slider.place]) * slider.shown_per_unit
-                _put(handle, min(max(shown, slider.low), slider.high))
         _put(self._by_hand, state.psi_by_hand is not None)
-        if state.psi_by_hand is not None:
-            for handle, weight in zip(self._weights, state.psi_by_hand.tolist()):
-                _put(handle, weight)
         alone = state.basis_alone
-        _put(self._alone, _NO_BASIS if alone is None else str(alone))
+        _put(self._alone, _NO_BASIS if alone is None else str(alone + 1))
+
+    def show_driving(self, theta: Float[Tensor, "H"], psi: Float[Tensor, "K"]) -> None:
+        """Bring the sliders of face and bases to the numbers that a picture was drawn with."""
+        for slider, handle in self._numbers:
+            _put(handle, slider.shown(float(theta[slider.place])), slider.step)
+        for (low, high, step), handle, weight in zip(self._reach, self._weights, psi.tolist()):
+            _put(handle, on_step(min(max(weight, low), high), step), step)
 
     def offer_sequence(self, num_frames: int) -> None:
         """Make a slider for a driver's frames, in place of the last driver's."""
@@ -101,12 +106,11 @@ class Widgets:
         self._frame = self._slider(
             "Frame", ends, 0, lambda v: do.change(frame=int(v), driven_by="dataset frame")
         )
-        play = gui.add_checkbox("Play", False, hint="Move on by itself, round and round")
-        _on(play, lambda value: do.change(playing=value))
+        hint = "Frames one after the other, round and round"
+        play = gui.add_checkbox("Play", False, hint=hint)
+        _on(play, do.play)
         rate = round(ViewerState.frames_per_second)
-        self._slider(
-            "Frames per second", (1, 60, 1), rate, lambda v: do.change(frames_per_second=float(v))
-        )
+        self._slider("Frames/s", (1, 60, 1), rate, lambda v: do.change(frames_per_second=float(v)))
         self._button("Neutral", do.show_neutral, "Drive by hand from the most neutral frame")
         hint = "Within what was seen in training"
         self._button("Random expression", do.show_random_expression, hint)
@@ -145,31 +149,44 @@ class Widgets:
             (slider.low, slider.high, slider.step),
             0.0,
             lambda value: self._do.set_theta_number(slider.place, value / slider.shown_per_unit),
+            slider.hint,
         )
         self._numbers.append((slider, handle))
 
     def _add_bases(self, seen: TrainingStatistics) -> None:
         gui, do, count = self._gui, self._do, len(seen.psi_max)
-        hint = "Hold psi, in place of the network's answer"
-        by_hand = gui.add_checkbox("Weights by hand", False, hint=hint, disabled=count == 0)
+        gui.add_markdown(
+            f"The head is a base and {count} learned changes of its Gaussians. A network weighs "
+            "these by expression and jaw."
+        )
+        hint = "Keep the weights as they stand, in place of the network's answer to each frame"
+        by_hand = gui.add_checkbox("Hold weights", False, hint=hint, disabled=count == 0)
         self._by_hand = _on(by_hand, do.hold_weights)
-        used = gui.add_slider("Bases used", 0, max(1, count), 1, count, disabled=count == 0)
+        hint = "Only the first so many count; the others weigh nothing"
+        used = gui.add_slider(
+            "Bases used", 0, max(1, count), 1, count, hint=hint, disabled=count == 0
+        )
         _on(used, lambda value: do.change(bases_used=int(value)))
         alone = gui.add_dropdown(
-            "One basis alone",
-            (_NO_BASIS, *map(str, range(count))),
+            "Show one alone",
+            (_NO_BASIS, *(str(1 + basis) for basis in range(count))),
             hint="Base and this basis at its largest weight in training, on the neutral frame",
         )
         self._alone = _on(
             alone,
-            lambda value: do.change(basis_alone=None if value == _NO_BASIS else int(value)),
+            lambda value: do.change(basis_alone=None if value == _NO_BASIS else int(value) - 1),
         )
-        self._slider("Exaggerated by", (0, 5, 0.1), 1.5, lambda v: do.change(gain=float(v)))
+        hint = "Times its largest weight in training, where a basis is shown alone"
+        self._slider("Exaggerate", (0, 5, 0.1), 1.5, lambda v: do.change(gain=float(v)), hint)
         for basis in range(count):
-            reach = 1.5 * max(float(seen.psi_max[basis]), -float(seen.psi_min[basis]))
-            reach = max(_LEAST_WEIGHT, reach)
-            ends, set_this = (-reach, reach, 0.01), partial(do.set_weight, basis)
-            self._weights.append(self._slider(f"psi {basis}", ends, 0.0, set_this))
+            low, high = float(seen.psi_min[basis]), float(seen.psi_max[basis])
+            reach = max(_LEAST_WEIGHT, 1.5 * max(high, -low))
+            ends = slider_ends(-reach, reach)
+            seen_ends = " to ".join(f"{on_step(end, ends[2]):g}" for end in (low, high))
+            hint = f"How much of this change is added (psi); in training {seen_ends}"
+            set_this = partial(do.set_weight, basis)
+            self._reach.append(ends)
+            self._weights.append(self._slider(f"Basis {basis + 1}", ends, 0.0, set_this, hint))
 
     def _add_looks(self) -> None:
         gui, do = self._gui, self._do
@@ -184,10 +201,15 @@ class Widgets:
         _on(background, lambda rgb: do.change(background=tuple(part / 255 for part in rgb)))
 
     def _slider(
-        self, label: str, limits: tuple[_Number, ...], value: _Number, done: Callable[..., Any]
+        self,
+        label: str,
+        limits: tuple[_Number, ...],
+        value: _Number,
+        done: Callable[..., Any],
+        hint: str | None = None,
     ) -> Any:
         value = min(max(value, limits[0]), limits[1])
-        return _on(self._gui.add_slider(label, *limits, value), done)
+        return _on(self._gui.add_slider(label, *limits, value, hint=hint), done)
 
     def _button(self, label: str, done: Callable[[], None], hint: str) -> None:
         self._gui.add_button(label, hint=hint).on_click(lambda _: done())
@@ -199,6 +221,7 @@ def _on(handle: Any, done: Callable[[Any], None]) -> Any:
     return handle
 
 
-def _put(handle: Any, value: Any) -> None:
-    if handle.value != value:
+def _put(handle: Any, value: Any, step: float = 0.0) -> None:
+    """Set a control that stands elsewhere, by more than half a step where it has steps."""
+    if abs(handle.value - value) > step / 2 if step else handle.value != value:
         handle.value = value

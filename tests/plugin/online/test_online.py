@@ -310,10 +310,10 @@ def test_a_fault_before_the_first_frame_is_told(online: Online):
 @pytest.mark.parametrize(
     ("fields", "told"),
     [
-        ({"local_share": 1.5}, "pools are impossible"),
-        ({"final_learning_rate_factor": 0.0}, "cannot fall to 0"),
-        ({"local_size": 0}, "pools are impossible"),
-        ({"batch_size": 0}, "batch of 0"),
+        ({"local_share": 1.5}, "local-share is 1.5"),
+        ({"final_learning_rate_factor": 0.0}, "learning-rate-factor is 0"),
+        ({"local_size": 0}, "local-size is 0"),
+        ({"batch_size": 0}, "batch-size is 0"),
         ({"refine_tracking": True}, "refined frame by frame"),
     ],
 )

@@ -1,0 +1,36 @@
+"""Which options a run can begin with, nerfstudio's included."""
+
+import torch
+from nerfstudio.configs.base_config import LoggingConfig, MachineConfig, ViewerConfig
+from nerfstudio.engine.trainer import TrainerConfig
+
+from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.options import Between, Ranges, check_options
+
+_OFTEN = Between(1, 10**9)
+_HOST_RANGES: Ranges = {
+    TrainerConfig: dict.fromkeys(
+        (
+            "steps_per_save",
+            "steps_per_eval_batch",
+            "steps_per_eval_image",
+            "steps_per_eval_all_images",
+        ),
+        _OFTEN,
+    ),
+    MachineConfig: {"seed": Between(0, 2**32 - 1), "num_devices": Between(1, 1)},
+    LoggingConfig: {"steps_per_log": _OFTEN},
+    ViewerConfig: {"websocket_port": Between(1, 65535), "jpeg_quality": Between(1, 100)},
+}
+"""Of what nerfstudio declares."""
+
+
+def require_trainable(config: TrainerConfig) -> None:
+    """Raise UserError for an option out of its range, or a device that is not there."""
+    check_options(type(config), vars(config), more=_HOST_RANGES)
+    device = config.machine.device_type
+    if device == "mps" or (device == "cuda" and not torch.cuda.is_available()):
+        raise UserError(
+            f"PyTorch finds no device of the type '{device}' that this method runs on.",
+            "Leave out --machine.device-type, or install the driver and a PyTorch with CUDA.",
+        )
