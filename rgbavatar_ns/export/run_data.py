@@ -7,6 +7,7 @@ import torch
 import yaml
 
 from rgbavatar_ns.avatar.avatar import Avatar
+from rgbavatar_ns.avatar.storage.checkpoint_file import newest_run
 from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
 from rgbavatar_ns.data.native.dataset import TrackedDataset
 from rgbavatar_ns.errors import UserError
@@ -20,9 +21,10 @@ _MOST_BYTES = 1 << 18
 def dataset_folder(path: Path) -> Path:
     """The dataset folder itself, or the one that a run's config names.
 
-    Raises UserError where the path is neither.
+    Of an experiment's folder its newest run counts. Raises UserError where the path is none of
+    these.
     """
-    folder = path if os.path.isdir(path) else path.parent
+    folder = newest_run(path) if os.path.isdir(path) else path.parent
     if folder.name == "nerfstudio_models":
         folder = folder.parent
     config = folder / _CONFIG

@@ -15,6 +15,7 @@ from torch import Tensor
 from rgbavatar_ns.avatar.storage.checkpoint_file import (
     MODELS_FOLDER,
     checkpoints_of,
+    newest_run,
     read_checkpoint,
     read_newest,
 )
@@ -107,11 +108,12 @@ def load_any(path: Path) -> StoredAvatar:
         )
     if (path / MANIFEST_NAME).exists():
         return _load_bundle(path)
-    checkpoints = checkpoints_of(path)
+    checkpoints = checkpoints_of(newest_run(path))
     if not checkpoints:
         raise UserError(
             f"{path} holds neither {MANIFEST_NAME} nor {MODELS_FOLDER}/step-*.ckpt.",
-            "Give an avatar bundle, or the folder of a run that has saved a checkpoint.",
+            "Give an avatar bundle, or the folder of a run that has saved a checkpoint, or of an "
+            "experiment with such a run.",
         )
     stored, chosen = read_newest(checkpoints, _load_checkpoint, _log.warning)
     _log.info("Loaded %s.", chosen)

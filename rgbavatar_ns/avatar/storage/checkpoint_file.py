@@ -51,6 +51,22 @@ def checkpoints_of(folder: Path) -> list[Path]:
     return [path for _, path in found]
 
 
+def newest_run(folder: Path) -> Path:
+    """The run that was saved last of those in an experiment's or a method's folder, or `folder`.
+
+    That is ns-train's OUTPUT/EXPERIMENT/METHOD/RUN, two levels deep at most.
+    """
+    if not os.path.isdir(folder) or checkpoints_of(folder):
+        return folder
+    found = [
+        (checkpoints[-1].stat().st_mtime_ns, models.parent)
+        for levels in ("*", "*/*")
+        for models in folder.glob(f"{levels}/{MODELS_FOLDER}")
+        if not models.parent.is_symlink() and (checkpoints := checkpoints_of(models))
+    ]
+    return max(found)[1] if found else folder
+
+
 def read_newest(
     checkpoints: Sequence[Path], read: Callable[[Path], Read], tell: Callable[[str], object]
 ) -> tuple[Read, Path]:

@@ -1,6 +1,7 @@
 """nerfstudio's trainer with checkpoints, resuming and interruption that can be relied on."""
 
 import math
+import os
 import sys
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -45,6 +46,7 @@ from rgbavatar_ns.plugin.training.turns import TurnsLock
 from rgbavatar_ns.plugin.viewer.settings import is_of_ns_viewer, viewer_settings
 
 SUMMARY_NAME = "training.json"
+LATEST = "latest"
 
 
 def say(line: str) -> None:
@@ -93,12 +95,23 @@ class RGBAvatarTrainerConfig(TrainerConfig):
         require_trainable(self)
         with disk_errors(self.get_base_dir(), "Free some space, or name another --output-dir."):
             super().save_config()
+        _link_latest(self.get_base_dir())
 
     def __setattr__(self, name: str, value: Any) -> None:
         """Where `ns-viewer` puts its own settings in place of the run's, keep these."""
         if name == "viewer" and is_of_ns_viewer(value):
             value = viewer_settings(self.viewer, value, sys.argv[1:])
         super().__setattr__(name, value)
+
+
+def _link_latest(run: Path) -> None:
+    """Let METHOD/latest lead to the newest run, for commands that take one run's config.yml."""
+    link, fresh = run.with_name(LATEST), run.with_name(f".{LATEST}.{os.getpid()}")
+    if run.name == LATEST or (link.exists() and not link.is_symlink()):
+        return
+    with suppress(OSError):  # a file system without links
+        fresh.symlink_to(run.name, target_is_directory=True)
+        fresh.replace(link)
 
 
 _IN_TRAINER = ContextVar("a trainer asks where to save", default=False)
