@@ -1,5 +1,6 @@
 """What a user can get wrong is told with cause and remedy, before or during training."""
 
+import copy
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -8,8 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+import yaml
 
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.plugin.training.trainer import RGBAvatarTrainerConfig
 from tests.plugin.run import make_trainer, small_config
 from tests.plugin.tiny import tiny_dataset
 
@@ -68,3 +71,68 @@ def test_foreign_checkpoint_is_refused(data: Path, tmp_path: Path):
     torch.save(state, folder / "step-000000000.ckpt")
     with pytest.raises(UserError, match="no avatar of this method"):
         _train(data, tmp_path / "runs", load_dir=folder)
+
+
+def _set(config: RGBAvatarTrainerConfig, path: str, value: Any) -> None:
+    *owners, name = path.split(".")
+    owner: Any = config
+    for part in owners:
+        owner = owner[part] if isinstance(owner, dict) else getattr(owner, part)
+    object.__setattr__(owner, name, value)
+
+
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [
+        ("max_num_iterations", -3),
+        ("steps_per_save", 0),
+        ("machine.seed", -1),
+        ("machine.num_devices", 2),
+        ("logging.steps_per_log", 0),
+        ("viewer.websocket_port", 10**6),
+        ("pipeline.model.avatar.num_bases", 10**9),
+        ("pipeline.model.avatar.uv_resolution", 0),
+        ("pipeline.datamanager.batch_size", 0),
+        ("optimizers.position.optimizer.lr", float("nan")),
+    ],
+)
+def test_options_out_of_range_are_told_by_their_name_before_a_file_is_written(
+    tiny_data: Path, tmp_path: Path, option: str, value: Any
+):
+    config = copy.deepcopy(small_config(tiny_data, tmp_path / "runs"))
+    _set(config, option, value)
+    with pytest.raises(UserError) as told:
+        config.save_config()
+    assert f"--{option.replace('_', '-')} is {value}" in told.value.cause
+    assert not (tmp_path / "runs").exists()
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_a_gpu_that_is_not_there_is_told(tiny_data: Path, tmp_path: Path):
+    config = small_config(tiny_data, tmp_path / "runs")
+    config.machine.device_type = "cuda"
+    with pytest.raises(UserError, match="no device of the type 'cuda'"):
+        config.save_config()
+
+
+def test_a_place_that_cannot_be_written_is_told_at_the_start(tiny_data: Path, tmp_path: Path):
+    (tmp_path / "file").write_text("mine")
+    config = small_config(tiny_data, tmp_path / "file" / "runs")
+    with pytest.raises(UserError, match="Cannot write"):
+        config.save_config()
+
+
+def test_latest_leads_to_the_run_begun_last(tiny_data: Path, tmp_path: Path):
+    for name in ("first", "second"):
+        config = small_config(tiny_data, tmp_path, timestamp=name)
+        config.save_config()
+    link = config.get_base_dir().with_name("latest")
+    assert link.resolve() == config.get_base_dir().resolve()
+    config.load_step = 7
+    config.save_config()
+    written = yaml.load((link / "config.yml").read_text(), yaml.Loader)
+    assert (written.load_step, config.load_step) == (None, 7)
+    link.unlink()
+    link.mkdir()
+    config.save_config()
+    assert not link.is_symlink()

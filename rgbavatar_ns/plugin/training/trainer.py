@@ -1,5 +1,6 @@
 """nerfstudio's trainer with checkpoints, resuming and interruption that can be relied on."""
 
+import copy
 import math
 import os
 import sys
@@ -90,11 +91,16 @@ class RGBAvatarTrainerConfig(TrainerConfig):
         return folder
 
     def save_config(self) -> None:
-        """Write config.yml, the first file of a run; raises UserError where none can begin."""
+        """Write config.yml, the first file of a run; raises UserError where none can begin.
+
+        The step that a run goes on from is left out: those who read the config want the newest.
+        """
         install_user_error_hook()
         require_trainable(self)
+        written = copy.copy(self)
+        written.load_step = None
         with disk_errors(self.get_base_dir(), "Free some space, or name another --output-dir."):
-            super().save_config()
+            TrainerConfig.save_config(written)
         _link_latest(self.get_base_dir())
 
     def __setattr__(self, name: str, value: Any) -> None:

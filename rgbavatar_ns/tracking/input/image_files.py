@@ -1,6 +1,7 @@
 """Images of a folder, in the order of their numbers, whatever depth and channels they have."""
 
 import re
+from contextlib import suppress
 from pathlib import Path
 
 import cv2
@@ -59,11 +60,13 @@ def read_image_rgba(path: Path) -> UInt8[np.ndarray, "H W 4"]:
     except DamagedFileError as error:
         raise UserError(f"{path} cannot be read: {error}.", "Check the file.") from None
     decoded = None
-    if encoded.size and path.suffix.lower() not in _NEVER_ALPHA:
-        decoded = cv2.imdecode(encoded, cv2.IMREAD_UNCHANGED)
-    if encoded.size and (decoded is None or decoded.ndim == 2 or decoded.shape[2] != 4):
-        # This way of reading drops alpha, but heeds the orientation that cameras note down.
-        decoded = cv2.imdecode(encoded, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
+    # OpenCV raises its own error for a few kinds of damage, and for sizes beyond its limit.
+    with suppress(cv2.error):
+        if path.suffix.lower() not in _NEVER_ALPHA:
+            decoded = cv2.imdecode(encoded, cv2.IMREAD_UNCHANGED)
+        if decoded is None or decoded.ndim == 2 or decoded.shape[2] != 4:
+            # This way of reading drops alpha, but heeds the orientation that cameras note down.
+            decoded = cv2.imdecode(encoded, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
     if decoded is None:
         raise UserError(f"{path} cannot be decoded as an image.", "Remove or replace it.")
     if decoded.dtype not in (np.uint8, np.uint16):

@@ -202,3 +202,18 @@ def test_nothing_is_built_of_a_size_that_is_not_there(
     monkeypatch.setattr(Avatar, "from_state", lambda state: pytest.fail("it is built"))
     with pytest.raises(UserError, match="has the shape"):
         Avatar.load(bundle)
+
+
+def test_of_an_experiments_folder_the_run_saved_last_counts(make_avatar, tmp_path: Path):
+    made = {name: make_avatar(random=True, seed=seed) for seed, name in enumerate("ab")}
+    for age, name in enumerate("ba"):
+        models = tmp_path / "me" / "rgbavatar-tiny" / name / "nerfstudio_models"
+        models.mkdir(parents=True)
+        torch.save(checkpoint_of(made[name]), models / _NEWEST)
+        os.utime(models / _NEWEST, ns=(0, 10**18 - age))
+    (tmp_path / "me" / "rgbavatar-tiny" / "latest").symlink_to("a")
+    for folder in (tmp_path / "me", tmp_path / "me" / "rgbavatar-tiny"):
+        loaded = Avatar.load(folder).state_dict()
+        assert all(torch.equal(loaded[k], v) for k, v in made["b"].state_dict().items())
+    with pytest.raises(UserError, match="neither"):
+        Avatar.load(tmp_path)
