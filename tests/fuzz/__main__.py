@@ -81,12 +81,17 @@ def run(names: list[str], seed: int, count: int) -> int:
         for kind in names:
             report = Path(folder) / f"{kind}.json"
             command = [sys.executable, "-m", "tests.fuzz", "--child", kind, str(report)]
-            code = subprocess.run(
-                [*command, "--seed", str(seed), "--count", str(each)], check=False
-            ).returncode
+            ended = subprocess.run(
+                [*command, "--seed", str(seed), "--count", str(each)],
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.PIPE,
+                text=True,
+                errors="replace",
+                check=False,
+            )
             told = json.loads(report.read_text()) if report.exists() else {"last": "the start"}
-            if code != 0:
-                told.setdefault("faults", []).append([told["last"], f"ended with code {code}"])
+            if ended.returncode != 0 or "Traceback" in ended.stderr:
+                told.setdefault("faults", []).append([told["last"], ended.stderr[-300:]])
             inputs = told.get("refused", 0) + told.get("unharmed", 0) + len(told["faults"])
             total += inputs
             print(

@@ -206,10 +206,13 @@ def _attack(path: Path, content: bytes, bare: bool, arrays, is_checked: bool) ->
         value = read_pickle(path) if bare else read_torch_file(path)
         _walk(value)
         head = parse_frame(value, arrays)
-    except (UserError, UnusableFrameError):
-        head = None
+        refusal = None
+    except (UserError, UnusableFrameError) as error:
+        head, refusal = None, error
     seconds = time.thread_time() - begun
     assert seconds < MAX_SECONDS, f"took {seconds:.1f} s"
+    if refusal is not None:
+        raise UserError(str(refusal), "") from None
     if head is not None:
         assert all(np.isfinite(part).all() for part in head.theta.values())
         if is_checked:
