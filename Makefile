@@ -31,7 +31,7 @@ test-fast: setup  ## The tests that take seconds
 test-nightly: setup  ## The tests of the night: sanitizers, a Ray cluster, many trainings, formats
 	@$(BIN)/python -m uv pip install -q --python $(BIN)/python -c requirements/constraints.txt ray
 	@$(PYTEST) -m "nightly and not browser"
-	@$(BIN)/python -m pytest -m "nightly and browser"
+	@$(PYTEST) -n 0 -m "nightly and browser"
 
 lint: setup  ## Format check, lint, import rules, types
 	@$(BIN)/ruff format --check .
