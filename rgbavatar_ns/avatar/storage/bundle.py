@@ -55,14 +55,17 @@ def save_bundle(
 ) -> None:
     """Write a bundle directory: complete or not at all; an older bundle there is replaced.
 
-    Raises UserError where `path` is neither that nor an empty directory, or the disk refuses it.
+    Raises UserError where `path` is neither that alone nor an empty directory, or the disk refuses
+    it.
     """
     path = path.absolute()
-    ours = (path / MANIFEST_NAME).exists()
-    if path.exists() and not (path.is_dir() and (ours or not any(path.iterdir()))):
-        raise UserError(
-            f"{path} exists and is not an avatar bundle.", "Give another path or remove it."
-        )
+    if path.exists():
+        there = set(os.listdir(path)) if path.is_dir() else {path.name}
+        if there and (MANIFEST_NAME not in there or there - {MANIFEST_NAME, TENSORS_NAME}):
+            raise UserError(
+                f"{path} exists and is not an avatar bundle, or holds other files too.",
+                "Give another path or remove it.",
+            )
     tensors = {f"parameters/{name}": value for name, value in parameters.items()}
     manifest = {
         "format": BUNDLE_FORMAT,

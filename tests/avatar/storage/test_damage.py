@@ -217,3 +217,11 @@ def test_of_an_experiments_folder_the_run_saved_last_counts(make_avatar, tmp_pat
         assert all(torch.equal(loaded[k], v) for k, v in made["b"].state_dict().items())
     with pytest.raises(UserError, match="neither"):
         Avatar.load(tmp_path)
+
+
+def test_a_bundle_with_files_of_others_in_it_is_not_replaced(make_avatar, bundle: Path):
+    make_avatar(random=True).save(bundle)
+    (bundle / "notes.txt").write_text("mine")
+    with pytest.raises(UserError, match="holds other files too"):
+        make_avatar(random=True).save(bundle)
+    assert (bundle / "notes.txt").read_text() == "mine"
