@@ -24,8 +24,9 @@ def _served(*paths: str) -> list[bytes]:
     server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
     try:
         host, port = server._websock_server._ws_server.sockets[0].getsockname()
-        address = f"http://{host}:{port}"
-        return [urllib.request.urlopen(f"{address}/{path}").read() for path in paths]
+        # urllib's own opener keeps the proxy of whichever test asked first.
+        direct = urllib.request.build_opener(urllib.request.ProxyHandler({}))
+        return [direct.open(f"http://{host}:{port}/{path}").read() for path in paths]
     finally:
         server.stop()
 
