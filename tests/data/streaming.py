@@ -1,20 +1,23 @@
 """Streams of small frames for tests: the frames say who they are by their pixels."""
 
+import contextlib
+import threading
 import time
 from collections import Counter, deque
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
 
 import numpy as np
 import torch
 
 from rgbavatar_ns.data import TrackedFrame
 from rgbavatar_ns.data.png import encode_png_rgba
-from rgbavatar_ns.data.streams import StreamedFrame, StreamSubject
+from rgbavatar_ns.data.streams import SocketStream, StreamClient, StreamedFrame, StreamSubject
 from rgbavatar_ns.head import HeadModel
 from tests.data.small_dataset import CAMERA_PARTS, HEIGHT, WIDTH, frame, odd_camera
 
 HEAD = HeadModel.embedded()
 DEADLINE_S = 60.0
+Opener = Callable[..., SocketStream]
 
 
 class Clock:
@@ -110,3 +113,23 @@ def same(sent: TrackedFrame, got: StreamedFrame) -> bool:
         and all(torch.equal(getattr(sent.camera, p), getattr(got.camera, p)) for p in CAMERA_PARTS)
         and np.array_equal(sent.image_rgba, image)
     )
+
+
+@contextlib.contextmanager
+def sending(session: str, address: str, frames: range) -> Iterator[None]:
+    """While a client sends frames and ends its stream."""
+
+    def send() -> None:
+        with StreamClient(subject(session), address) as client:
+            for index in frames:
+                client.send(tracked(index))
+
+    sender = threading.Thread(target=send, daemon=True)
+    sender.start()
+    yield
+    sender.join(DEADLINE_S)
+    assert not sender.is_alive()
+
+
+def indices(stream: SocketStream, count: int) -> list[int]:
+    return [frame.index for frame in take(stream, count)]
