@@ -1,7 +1,7 @@
 """What of the demo subject can be chosen."""
 
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Literal
 
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.options import Between, CheckedOptions, FrameRate, Seed
@@ -31,6 +31,9 @@ class DemoConfig(CheckedOptions):
     """Depth of the wrinkles that come with expressions; 0 leaves them out."""
     glasses: bool = True
     """Whether the person wears glasses."""
+    light: Literal["room", "head"] = "room"
+    """What the lamps are fixed to: the room, in which the head turns, or the head itself, so that
+    each point of it looks alike from everywhere but for highlights."""
 
     def __post_init__(self) -> None:
         """Refuse values out of range, and more held-out frames than there are."""

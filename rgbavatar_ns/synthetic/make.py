@@ -78,7 +78,14 @@ class DemoPerson:
         focal_px = 0.5 * config.image_size * _CAMERA_DISTANCE_M / _HALF_VIEW_M
         camera = StillCamera(_CAMERA_HEIGHT_M, _CAMERA_DISTANCE_M, focal_px, config.image_size)
         renderer = DemoRenderer(
-            surface, paint, glasses, at_rest, jaw_open, camera, config.supersampling
+            surface,
+            paint,
+            glasses,
+            at_rest,
+            jaw_open,
+            camera,
+            config.supersampling,
+            light_follows_head=config.light == "head",
         )
         return cls(head, identity, renderer, camera)
 

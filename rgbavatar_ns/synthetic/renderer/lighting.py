@@ -1,6 +1,6 @@
 """The room's light and how the person's materials answer it; everything linear."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -44,12 +44,15 @@ class Samples:
     """Share of the key lamp that a point sees."""
 
 
-def shade(samples: Samples) -> Vectors:
+def shade(samples: Samples, light_to_world: Float[np.ndarray, "3 3"]) -> Vectors:
     """Light that leaves the points towards the eye: wrapped Lambert plus Blinn-Phong.
 
     Ours: not physical, but with what makes a face hard for a fixed colour: light that stays in
-    the room while the head turns, cast shadows, highlights.
+    the room while the head turns, cast shadows, highlights. `light_to_world` turns the room.
     """
+    samples = replace(
+        samples, normals=samples.normals @ light_to_world, to_eye=samples.to_eye @ light_to_world
+    )
     n, openness = samples.normals, samples.openness[:, None]
     wrap = _WRAP * samples.translucency[:, None]
     key = (n @ KEY_DIRECTION)[:, None]

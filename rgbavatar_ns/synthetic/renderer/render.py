@@ -64,10 +64,13 @@ class DemoRenderer:
         jaw_open: Float[np.ndarray, "V 3"],
         camera: StillCamera,
         supersampling: int,
+        *,
+        light_follows_head: bool = False,
     ) -> None:
         self._device = EmbreeDevice()
         self._surface, self._paint, self._glasses = surface, paint, glasses
         self._camera, self._supersampling = camera, supersampling
+        self._light_follows_head = light_follows_head
         still = np.zeros(len(WRINKLES))
         self._openness = [
             self._ambient(surface.pose(vertices, still)) for vertices in (at_rest, jaw_open)
@@ -107,21 +110,26 @@ class DemoRenderer:
             frame = self._glasses.frame.moved(moment.head_rotation, moment.head_shift_m)
             vertices = np.concatenate([vertices, frame.vertices])
             normals = np.concatenate([normals, frame.normals])
-        kept = self._may_matter(vertices, normals)
+        still = np.eye(3, dtype=np.float32)
+        light_to_world = moment.head_rotation if self._light_follows_head else still
+        key = (light_to_world @ KEY_DIRECTION).astype(np.float32)
+        kept = self._may_matter(vertices, normals, key)
         scene = RayScene(self._device, vertices, self._faces, kept)
         rays = cast_pixels(scene, self._camera, vertices, self._material, self._supersampling)
-        light = shade(self._samples(moment, scene, vertices, normals, rays))
+        light = shade(self._samples(moment, scene, vertices, normals, rays, key), light_to_world)
         if self._glasses is not None:
             lenses = self._glasses.lenses.moved(moment.head_rotation, moment.head_shift_m)
             light = self._through_lenses(lenses, rays, light)
         return self._develop(rays, to_srgb(light))
 
-    def _may_matter(self, vertices: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    def _may_matter(
+        self, vertices: np.ndarray, normals: np.ndarray, key: np.ndarray
+    ) -> np.ndarray:
         """Triangles that face the camera or the key lamp, or are no skin; the rest of the head is
         hidden behind these and throws no shadow that they do not throw.
         """
         to_eye = unit(self._camera.centre - vertices)
-        facing = np.maximum((normals * to_eye).sum(1), normals @ KEY_DIRECTION) > -0.35
+        facing = np.maximum((normals * to_eye).sum(1), normals @ key) > -0.35
         return np.flatnonzero(facing[self._faces].any(1) | (self._material != 0))
 
     def _samples(
@@ -131,6 +139,7 @@ class DemoRenderer:
         vertices: np.ndarray,
         normals: np.ndarray,
         rays: PixelRays,
+        key: np.ndarray,
     ) -> Samples:
         hits = rays.hits
         material = self._material[hits.triangle]
@@ -165,7 +174,7 @@ class DemoRenderer:
             sharpness=_SHARPNESS[material],
             translucency=_TRANSLUCENCY[material],
             openness=openness,
-            lit=self._lit(scene, at, n, rays.pattern),
+            lit=self._lit(scene, at, n, rays.pattern, key),
         )
 
     def _brighten_teeth(
@@ -192,7 +201,7 @@ class DemoRenderer:
         return color, n - slope[:, :1] * right[coarse] - slope[:, 1:] * up[coarse]
 
     def _lit(
-        self, scene: RayScene, at: np.ndarray, n: np.ndarray, pattern: np.ndarray
+        self, scene: RayScene, at: np.ndarray, n: np.ndarray, pattern: np.ndarray, key: np.ndarray
     ) -> Float[np.ndarray, "N"]:
         """How far the key lamp is seen, each ray towards another place on it.
 
@@ -200,14 +209,14 @@ class DemoRenderer:
         """
         turn = 2.4 * pattern + 0.7
         radius = KEY_SPREAD * np.sqrt((0.37 + 0.618034 * pattern) % 1)
-        across = unit(np.cross(KEY_DIRECTION, [0.0, 1.0, 0.0]))
-        upwards = np.cross(across, KEY_DIRECTION)
+        across = unit(np.cross(key, [0.0, 1.0, 0.0]))
+        upwards = np.cross(across, key)
         offset = (radius * np.cos(turn))[:, None] * across
         offset = offset + (radius * np.sin(turn))[:, None] * upwards
-        direction = unit(KEY_DIRECTION + offset).astype(np.float32)
+        direction = unit(key + offset).astype(np.float32)
         lit = np.zeros(len(n), np.float32)
-        facing = np.flatnonzero(n @ KEY_DIRECTION > -0.25)
-        start = at[facing] + 6e-4 * n[facing] + 6e-4 * KEY_DIRECTION
+        facing = np.flatnonzero(n @ key > -0.25)
+        start = at[facing] + 6e-4 * n[facing] + 6e-4 * key
         blocked_by = scene.cast(start.astype(np.float32), direction[facing]).triangle
         shadow = np.where(self._material[blocked_by] == _FRAME_MATERIAL, _FRAME_SHADOW, _SHADOW)
         lit[facing] = np.where(blocked_by < 0, 1.0, 1.0 - shadow)
