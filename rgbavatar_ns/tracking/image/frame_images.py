@@ -7,9 +7,11 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+import torch
 from jaxtyping import Float, UInt8
 
 from rgbavatar_ns.data.png import encode_png_rgba
+from rgbavatar_ns.drawing.compositing import is_unfilmed
 from rgbavatar_ns.tracking.face.clip import ClipLandmarks
 from rgbavatar_ns.tracking.fit.fit import ClipFit
 from rgbavatar_ns.tracking.fit.subject import SubjectTracker
@@ -38,6 +40,8 @@ class FrameImage:
     """What the matte holds of the whole person, as small as the outline."""
     inside: Float[np.ndarray, "s s"]
     """1 where the crop shows the frame."""
+    unfilmed: float
+    """Share of the image that is marked: the crop reaches beyond the frame where the head may be."""
 
 
 @dataclass(frozen=True)
@@ -178,10 +182,13 @@ class FrameImages:
         )
         small = (
             cv2.resize(part, outline.silhouette.shape, interpolation=cv2.INTER_AREA)
-            for part in (matted.alpha, self._inside)
+            for part in (matted.alpha, self._inside.astype(np.float32))
         )
-        png = encode_png_rgba(self._cut_out(matted, outline), _PNG_LEVEL)
-        return FrameImage(crop.position, png, outline, *small)
+        image = self._cut_out(matted, outline)
+        unfilmed = float(is_unfilmed(torch.from_numpy(image)).float().mean())
+        return FrameImage(
+            crop.position, encode_png_rgba(image, _PNG_LEVEL), outline, *small, unfilmed
+        )
 
     def _alpha(self, crop: _Cropped, around: tuple[_Cropped, ...]) -> Float[np.ndarray, "S S"]:
         if crop.alpha is not None:
