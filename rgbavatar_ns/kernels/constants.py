@@ -1,6 +1,6 @@
-"""The numbers of blending and of its targets; `shared/gaussian_math.h` repeats them for compiled backends.
+"""The numbers of the blending rule and of its targets.
 
-A test compares the two lists.
+`shared/gaussian_math.h` repeats them for compiled backends; a test compares the two lists.
 """
 
 NEAR_PLANE_M = 0.01

@@ -60,6 +60,7 @@ def test_good_data_has_no_problem(good, tmp_path):
 
 def test_what_nobody_filmed_is_told_and_is_no_misfit(good, tmp_path):
     """The lower half is beyond the film; were it background, the mesh would leave the matte."""
+
     def below(value):
         def change(image):
             image[SIZE // 2 :] = value

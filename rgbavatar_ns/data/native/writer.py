@@ -139,7 +139,7 @@ class DatasetWriter:
     ) -> None:
         """As `add`, with a PNG file's bytes, its size trusted; None: it is in its place already.
 
-        has_unfilmed: whether `UNFILMED_RGBA` is a mark here; if it is of no frame, it is background.
+        has_unfilmed: whether `UNFILMED_RGBA` is a mark in it; else it may be background.
         """
         name = f"frame {index}"
         if index in self._numbers:

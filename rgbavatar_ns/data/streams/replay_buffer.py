@@ -205,9 +205,7 @@ class ReplayBuffer:
                 camera = PinholeCameras(**parts, width=size[0], height=size[1])
                 theta = state["theta"][row].cpu()
                 png, marks = images[row]
-                streamed = StreamedFrame(
-                    index, theta, camera, now, png=png, marks_unfilmed=marks
-                )
+                streamed = StreamedFrame(index, theta, camera, now, png=png, marks_unfilmed=marks)
                 if streamed.image_size not in (size, None):
                     raise UserError(
                         f"The checkpoint's frames have another size than the stream's {size[0]} x "

@@ -41,7 +41,7 @@ class FrameImage:
     inside: Float[np.ndarray, "s s"]
     """1 where the crop shows the frame."""
     unfilmed: float
-    """Share of the image that is marked: the crop reaches beyond the frame where the head may be."""
+    """Share of the image that is marked: beyond the frame, where the head may be."""
 
 
 @dataclass(frozen=True)
@@ -180,15 +180,14 @@ class FrameImages:
             self._tracker.vertices_px(self._fit, crop.position),
             self._found.points_px[crop.position],
         )
-        small = (
+        matte, inside = (
             cv2.resize(part, outline.silhouette.shape, interpolation=cv2.INTER_AREA)
             for part in (matted.alpha, self._inside.astype(np.float32))
         )
         image = self._cut_out(matted, outline)
         unfilmed = float(is_unfilmed(torch.from_numpy(image)).float().mean())
-        return FrameImage(
-            crop.position, encode_png_rgba(image, _PNG_LEVEL), outline, *small, unfilmed
-        )
+        png = encode_png_rgba(image, _PNG_LEVEL)
+        return FrameImage(crop.position, png, outline, matte, inside, unfilmed)
 
     def _alpha(self, crop: _Cropped, around: tuple[_Cropped, ...]) -> Float[np.ndarray, "S S"]:
         if crop.alpha is not None:

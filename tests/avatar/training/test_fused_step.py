@@ -104,10 +104,6 @@ def test_what_nobody_filmed_adds_nothing(stirred, instruction_set, monkeypatch):
     assert_unfilmed_adds_nothing(fused_step, stirred)
 
 
-def test_what_nobody_filmed_adds_nothing_to_the_eager_step(stirred):
-    assert_unfilmed_adds_nothing(eager_step, stirred)
-
-
 def test_parameters_after_a_hundred_small_steps(stirred):
     """At a tenth of the rates no pixel crosses its target: rounding is not blown up."""
     fused, eager = stirred(), stirred()

@@ -12,6 +12,7 @@ from rgbavatar_ns.avatar.training.losses import (
 )
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.kernels.constants import UNFILMED_RGBA
+from tests.avatar.fused_scene import assert_unfilmed_adds_nothing, eager_step, stir
 
 
 def test_l1_by_hand():
@@ -94,3 +95,7 @@ def test_perceptual_loss_sees_no_difference_where_nobody_filmed(monkeypatch):
     again = image_losses(image, rgba, torch.zeros(1, 3), LPIPSLoss(), 1.0)
     for name, value in found.items():
         assert value.item() == pytest.approx(again[name].item(), rel=1e-6)
+
+
+def test_what_nobody_filmed_adds_nothing(make_avatar):
+    assert_unfilmed_adds_nothing(eager_step, lambda: stir(make_avatar()))
