@@ -4,10 +4,9 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
-import torch
 from jaxtyping import UInt8
 
-from rgbavatar_ns.drawing.compositing import composite_bytes, is_unfilmed
+from rgbavatar_ns.drawing.compositing import composite_bytes, unfilmed_pixels
 
 _GRAY = 128 / 255
 _HATCH, _HATCH_TILES = 80, 24
@@ -49,5 +48,5 @@ def over_gray_bgr(
     height, width = rgb.shape[:2]
     diagonal = np.add.outer(np.arange(height), np.arange(width)) * _HATCH_TILES
     stripes = diagonal // max(height, width) % 2 == 0
-    rgb[stripes & is_unfilmed(torch.from_numpy(image_rgba)).numpy()] = _HATCH
+    rgb[stripes & unfilmed_pixels(image_rgba)] = _HATCH
     return scaled(np.ascontiguousarray(rgb[..., ::-1]), zoom)

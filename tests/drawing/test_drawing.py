@@ -11,6 +11,7 @@ from rgbavatar_ns.drawing.compositing import (
     rgba_to_float,
     straight_alpha,
     to_uint8,
+    unfilmed_pixels,
 )
 from rgbavatar_ns.drawing.contact_sheet import contact_sheet, labelled, over_gray_bgr, scaled
 from rgbavatar_ns.kernels.constants import UNFILMED_RGBA
@@ -67,8 +68,9 @@ def test_only_the_exact_mark_is_unfilmed(dtype):
     assert found.tolist() == [[False] * 4 + [True], [False] * 3 + [True] * 2]
     if dtype == torch.uint8:
         picture = rgba.numpy()
+        assert np.array_equal(unfilmed_pixels(picture), found.numpy())
         cleared = all_filmed(picture)
-        assert not is_unfilmed(torch.from_numpy(cleared)).any()
+        assert not unfilmed_pixels(cleared).any()
         assert np.array_equal(cleared[~found.numpy()], picture[~found.numpy()])
         assert not cleared[found.numpy()].any()
 

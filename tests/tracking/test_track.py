@@ -4,9 +4,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 
-from rgbavatar_ns.drawing.compositing import is_unfilmed
+from rgbavatar_ns.drawing.compositing import unfilmed_pixels
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.tracking import TrackConfig, track_video
 
@@ -100,7 +99,7 @@ def test_what_the_frame_cuts_off_is_marked_as_not_filmed(tmp_path: Path, keep_to
     dataset = track_video(clip, tmp_path / "set", config)
     report = json.loads((tmp_path / "set" / "tracking.json").read_text())
     image = dataset.read_image(0)
-    unfilmed = is_unfilmed(torch.from_numpy(image)).numpy()
+    unfilmed = unfilmed_pixels(image)
     crop = report["crop"]
     last = int((height - crop["top"]) * len(image) / crop["side"])
     assert last < len(image) - 4, "the crop reaches beyond"

@@ -14,7 +14,7 @@ from rgbavatar_ns.data.check.silhouette import (
     silhouette_overlap,
 )
 from rgbavatar_ns.data.native.dataset import TrackedDataset
-from rgbavatar_ns.drawing.compositing import all_filmed, is_unfilmed
+from rgbavatar_ns.drawing.compositing import all_filmed, unfilmed_pixels
 from rgbavatar_ns.drawing.wireframe import mesh_silhouette
 from rgbavatar_ns.head import HeadModel
 
@@ -92,7 +92,7 @@ def take_sample(
     alphas, grays, unfilmed = [], [], []
     for done, position in enumerate(positions):
         image = dataset.read_image(position)
-        marked = is_unfilmed(torch.from_numpy(image)).numpy().astype(np.float32)
+        marked = unfilmed_pixels(image).astype(np.float32)
         unfilmed.append(cv2.resize(marked, size, interpolation=cv2.INTER_AREA))
         image = all_filmed(image)  # a mark that is blended is a colour
         small = cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32) / 255

@@ -23,7 +23,7 @@ from rgbavatar_ns.data.native.format import (
 )
 from rgbavatar_ns.data.native.frame import TrackedFrame
 from rgbavatar_ns.data.png import encode_png_rgba
-from rgbavatar_ns.drawing.compositing import is_unfilmed
+from rgbavatar_ns.drawing.compositing import unfilmed_pixels
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.files import atomic_write, disk_errors, read_json, write_json
 from rgbavatar_ns.head import HeadArrays, ThetaLayout
@@ -124,7 +124,7 @@ class DatasetWriter:
             encode_png_rgba(frame.image_rgba),
             frame.camera_name,
             frame.timestep,
-            bool(is_unfilmed(torch.from_numpy(frame.image_rgba)).any()),
+            bool(unfilmed_pixels(frame.image_rgba).any()),
         )
 
     def add_encoded(

@@ -7,11 +7,10 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-import torch
 from jaxtyping import Float, UInt8
 
 from rgbavatar_ns.data.png import encode_png_rgba
-from rgbavatar_ns.drawing.compositing import is_unfilmed
+from rgbavatar_ns.drawing.compositing import unfilmed_pixels
 from rgbavatar_ns.tracking.face.clip import ClipLandmarks
 from rgbavatar_ns.tracking.fit.fit import ClipFit
 from rgbavatar_ns.tracking.fit.subject import SubjectTracker
@@ -185,7 +184,7 @@ class FrameImages:
             for part in (matted.alpha, self._inside.astype(np.float32))
         )
         image = self._cut_out(matted, outline)
-        unfilmed = float(is_unfilmed(torch.from_numpy(image)).float().mean())
+        unfilmed = float(unfilmed_pixels(image).mean())
         png = encode_png_rgba(image, _PNG_LEVEL)
         return FrameImage(crop.position, png, outline, matte, inside, unfilmed)
 
