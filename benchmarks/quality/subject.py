@@ -18,7 +18,7 @@ from rgbavatar_ns.avatar.metrics import psnr
 from rgbavatar_ns.avatar.training import TrainingBatch
 from rgbavatar_ns.bench.machine import machine_facts
 from rgbavatar_ns.data import OfflineOrder, TrackedDataset
-from rgbavatar_ns.drawing.compositing import composite, rgba_to_float
+from rgbavatar_ns.drawing.compositing import film_over
 from rgbavatar_ns.head import HeadModel
 
 BATCH_SIZE = 10
@@ -66,7 +66,7 @@ class Subject:
         batch = self.batch(positions)
         image = avatar.render(batch.theta, batch.cameras).image.clamp(0, 1)
         black = torch.zeros(len(positions), 3)
-        return image, composite(rgba_to_float(batch.images_rgba), black)
+        return image, film_over(batch.images_rgba, black, image)
 
     def psnr(self, avatar: Avatar, positions: Sequence[int]) -> float:
         """Mean PSNR in dB over these frames: full frame, black background."""

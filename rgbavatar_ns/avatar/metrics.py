@@ -2,7 +2,8 @@
 
 It is that of the paper's comparisons: predictions are rendered over black and clamped to [0, 1],
 targets are laid over black by their matte. `psnr_head` takes only the person's pixels (alpha above
-.5): black surroundings, which every avatar gets right, raise the full frame's PSNR.
+.5): black surroundings, which every avatar gets right, raise the full frame's PSNR. Pixels that
+nobody filmed do not count: PSNR leaves them out, SSIM and LPIPS see the prediction in both images.
 """
 
 from typing import Literal
@@ -12,7 +13,7 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from rgbavatar_ns.avatar.training.losses import LPIPSLoss
-from rgbavatar_ns.drawing.compositing import composite, rgba_to_float
+from rgbavatar_ns.drawing.compositing import film_over, is_unfilmed, rgba_to_float
 from rgbavatar_ns.errors import UserError
 
 
@@ -77,11 +78,11 @@ def evaluate_images(
     `lpips_<network>`: None where it is unavailable, with the reason as `lpips_unavailable`.
     """
     image = image.clamp(0, 1)
-    rgba = rgba_to_float(target_rgba, image.dtype)
-    target = composite(rgba, image.new_zeros(3))
+    target = film_over(target_rgba, image.new_zeros(3), image)
+    person = rgba_to_float(target_rgba, image.dtype)[..., 3] > 0.5
     values: dict[str, float | str | None] = {
-        "psnr": float(psnr(image, target).mean()),
-        "psnr_head": float(psnr(image, target, rgba[..., 3] > 0.5).mean()),
+        "psnr": float(psnr(image, target, ~is_unfilmed(target_rgba)).mean()),
+        "psnr_head": float(psnr(image, target, person).mean()),
         "ssim": float(ssim(image, target).mean()),
     }
     if lpips is not None:

@@ -77,6 +77,11 @@ def _in_words(data: Path, report: CheckReport) -> str:
             *(f"    {line}" for line in report.ranges),
             *(f"  note: {note}" for note in report.notes),
         ]
+    if report.unfilmed:
+        lines.append(
+            f"  {report.unfilmed:.1%} of the images were not filmed (hatched in the sheet): they "
+            "count neither in training nor in scores"
+        )
     if report.iou:
         values = sorted(report.iou.values())
         lines.append(

@@ -6,9 +6,10 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from rgbavatar_ns.drawing.compositing import composite_bytes
+from rgbavatar_ns.drawing.compositing import composite_bytes, unfilmed_pixels
 
 _GRAY = 128 / 255
+_HATCH, _HATCH_TILES = 80, 24
 _LABEL_SCALE = 1 / 640
 
 
@@ -42,6 +43,10 @@ def scaled(picture: UInt8[np.ndarray, "h w C"], zoom: float) -> UInt8[np.ndarray
 def over_gray_bgr(
     image_rgba: UInt8[np.ndarray, "h w 4"], zoom: float
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """A matted picture over grey, `zoom` times as large, blue first."""
+    """A matted picture over grey, `zoom` times as large, blue first; hatched where unfilmed."""
     rgb = composite_bytes(image_rgba, (_GRAY, _GRAY, _GRAY))
+    height, width = rgb.shape[:2]
+    diagonal = np.add.outer(np.arange(height), np.arange(width)) * _HATCH_TILES
+    stripes = diagonal // max(height, width) % 2 == 0
+    rgb[stripes & unfilmed_pixels(image_rgba)] = _HATCH
     return scaled(np.ascontiguousarray(rgb[..., ::-1]), zoom)

@@ -6,7 +6,7 @@ import torch
 
 from rgbavatar_ns.avatar import Avatar
 from rgbavatar_ns.data import TrackedDataset
-from rgbavatar_ns.drawing.compositing import composite, rgba_to_float
+from rgbavatar_ns.drawing.compositing import film_over
 from rgbavatar_ns.export import draw
 from rgbavatar_ns.files import read_json, write_json
 
@@ -27,8 +27,9 @@ def streamed_losses(avatar: Avatar, dataset: TrackedDataset) -> list[float]:
         chosen = frames[first : first + _BATCH]
         drawn = draw(avatar, dataset.theta[chosen], dataset.cameras.select(chosen)).image
         rgba = torch.stack([torch.from_numpy(dataset.read_image(frame)) for frame in chosen])
-        truth = composite(rgba_to_float(rgba.to(drawn.device)), drawn.new_zeros(3))
-        losses += (drawn.clamp(0, 1) - truth).abs().mean(dim=(1, 2, 3)).tolist()
+        shown = drawn.clamp(0, 1)
+        truth = film_over(rgba.to(drawn.device), drawn.new_zeros(3), shown)
+        losses += (shown - truth).abs().mean(dim=(1, 2, 3)).tolist()
     return losses
 
 

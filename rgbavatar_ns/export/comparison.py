@@ -8,7 +8,7 @@ import torch
 
 from rgbavatar_ns.avatar.avatar import Avatar
 from rgbavatar_ns.data.native.dataset import TrackedDataset
-from rgbavatar_ns.drawing.compositing import composite, error_strip, rgba_to_float, to_uint8
+from rgbavatar_ns.drawing.compositing import error_strip, to_uint8
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.export.drawing import draw
 from rgbavatar_ns.export.video import write_png, write_video
@@ -28,10 +28,9 @@ def comparison_frames(
     ground = torch.tensor(background, device=device)
     for position in positions:
         rgba = torch.from_numpy(dataset.read_image(position)).to(device)
-        truth = composite(rgba_to_float(rgba), ground)
         theta = dataset.theta[position : position + 1]
         image = draw(avatar, theta, dataset.cameras.select([position]), background).image[0]
-        yield to_uint8(error_strip(truth, image))
+        yield to_uint8(error_strip(rgba, image, ground))
 
 
 def write_comparison(

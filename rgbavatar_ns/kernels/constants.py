@@ -1,6 +1,6 @@
-"""The numbers of the blending rule; `shared/gaussian_math.h` repeats them for compiled backends.
+"""The numbers of the blending rule and of its targets.
 
-A test compares the two lists.
+`shared/gaussian_math.h` repeats them for compiled backends; a test compares the two lists.
 """
 
 NEAR_PLANE_M = 0.01
@@ -29,3 +29,10 @@ MIN_QUAT_NORM = 1e-12
 
 MAX_AVERAGE_CHANNELS = 8
 """Most channels `weighted_color_average` takes."""
+
+UNFILMED_RGBA = (254, 1, 253, 0)
+"""In an 8-bit image with straight alpha: nobody filmed this pixel, and it counts for nothing.
+
+Where alpha is 0 colour means nothing, so one is free to say this. Nearly magenta, for who drops
+alpha, but not magenta itself, by which pictures are keyed.
+"""

@@ -45,7 +45,10 @@ class MorphedRenderer(Protocol):
     def forward_loss(
         self, images_rgba: UInt8[Tensor, "B H W 4"], background: Float[Tensor, "#B 3"]
     ) -> Float[Tensor, ""]:
-        """The mean absolute difference to straight-alpha images over the background."""
+        """The mean absolute difference to straight-alpha images over the background.
+
+        Pixels that are marked `UNFILMED_RGBA` differ by 0; the divisor is that of all pixels.
+        """
         ...
 
     def backward_adam(

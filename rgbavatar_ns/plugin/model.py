@@ -195,11 +195,10 @@ class RGBAvatarModel(Model):
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
         """PSNR, SSIM and, if it is there, LPIPS of one image; truth, avatar, error x 4 in a row."""
         image = outputs["rgb"][None]
-        truth = batch["image"].to(self.device)[None]
         rgba = batch["image_rgba"].to(self.device)[None]
         scores = evaluate_images(image, rgba, self.lpips_metric)
         metrics = {name: value for name, value in scores.items() if isinstance(value, float)}
-        row = torch.cat([*error_strip(truth, image)], dim=2)[0]
+        row = torch.cat([*error_strip(rgba, image, image.new_zeros(3))], dim=2)[0]
         return metrics, {"truth_avatar_error": row}
 
     def get_rgba_image(self, outputs: Outputs, output_name: str = "rgb") -> Tensor:

@@ -19,6 +19,7 @@ from rgbavatar_ns.data.check.problems import verdict
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.files import digest, disk_errors, write_json
 from rgbavatar_ns.head import HeadArrays
+from rgbavatar_ns.kernels.constants import UNFILMED_RGBA
 from rgbavatar_ns.tracking.config import TrackConfig
 from rgbavatar_ns.tracking.face.clip import ClipLandmarks, followed_face
 from rgbavatar_ns.tracking.face.detector import load_mediapipe
@@ -171,10 +172,13 @@ class _Tracking:
         with closing(images(self.source, ready)) as made:
             for index, theta in zip(found.frame_index, thetas):
                 image = None if index in noted else next(made)
+                unfilmed = noted[index]["unfilmed"] if image is None else image.unfilmed
+                png = None if image is None else image.png
                 with disk_errors(self.run.dst, GO_ON):
-                    writer.add_encoded(index, theta, camera, None if image is None else image.png)
+                    writer.add_encoded(index, theta, camera, png, has_unfilmed=unfilmed > 0)
                 if image is not None:
-                    noted[index] = silhouette_shares(image.outline, image.matte, image.inside)
+                    shares = silhouette_shares(image.outline, image.matte, image.inside)
+                    noted[index] = {**shares, "unfilmed": unfilmed}
                     self.run.note_image(index, noted[index])
                     done += 1
                     self.clock.done(done)
@@ -202,6 +206,7 @@ class _Tracking:
             "notes": list(self.source.notes),
             **fit_quality(clip.tracker, clip.fit, found.points_px),
             **silhouette_summary(shares),
+            "unfilmed_share": sum(one["unfilmed"] for one in shares) / len(shares),
             "matte": given if own_mattes else "selfie segmentation",
             "stages": self.clock.stages,
             "frames_per_second": self.clock.frames_per_second(seen.frames_read),
@@ -214,7 +219,8 @@ def _digest_of_fit(
     clip: _FittedClip, thetas: Float[Tensor, "F H"], identity: Float[Tensor, "I"]
 ) -> str:
     """What an image depends on beside the settings, in short."""
-    fixed = repr((clip.crop, clip.fit.subject.camera, clip.found.frame_index))
+    camera = clip.fit.subject.camera
+    fixed = repr((clip.crop, camera, clip.found.frame_index, UNFILMED_RGBA))
     return digest([fixed, thetas.numpy(), identity.numpy()])
 
 

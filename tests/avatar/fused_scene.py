@@ -1,15 +1,18 @@
 """Steps to compare: avatars whose every gradient lives, and targets far from what they show."""
 
 import dataclasses
+from collections.abc import Callable
 
+import pytest
 import torch
 from torch import Tensor
 
 from rgbavatar_ns.avatar import Avatar
-from rgbavatar_ns.avatar.training import TrainingBatch
+from rgbavatar_ns.avatar.training import TrainingBatch, make_optimizer
 from rgbavatar_ns.avatar.training.fused_step import FusedStep
-from rgbavatar_ns.avatar.training.losses import l1_loss
+from rgbavatar_ns.avatar.training.losses import image_losses
 from rgbavatar_ns.drawing.compositing import composite, rgba_to_float
+from rgbavatar_ns.kernels.constants import UNFILMED_RGBA
 from tests.kernels.scenes import to
 
 from .small_head import front_camera, random_theta, randomize
@@ -73,6 +76,52 @@ def far_batch(
     return TrainingBatch(theta, camera, images), background
 
 
+def with_unfilmed_strip(batch: TrainingBatch) -> tuple[TrainingBatch, Tensor]:
+    """Rows and columns of the images that nobody filmed, and where they are [H, W]."""
+    images = torch.as_tensor(batch.images_rgba).clone()
+    height, width = images.shape[1:3]
+    unfilmed = torch.zeros(height, width, dtype=torch.bool)
+    unfilmed[2 * height // 3 :], unfilmed[:, : width // 5] = True, True
+    images[:, unfilmed] = torch.tensor(UNFILMED_RGBA, dtype=torch.uint8)
+    return dataclasses.replace(batch, images_rgba=images), unfilmed
+
+
+def step_of_filmed(
+    avatar: Avatar,
+    optimizer: torch.optim.Optimizer,
+    batch: TrainingBatch,
+    background: Tensor,
+    unfilmed: Tensor,
+) -> Tensor:
+    """By hand: the differences of filmed pixels alone are summed, over the number of all."""
+    optimizer.zero_grad(set_to_none=True)
+    image = avatar.render(batch.theta, batch.cameras, background, differentiable=True).image
+    film = composite(rgba_to_float(torch.as_tensor(batch.images_rgba)), background)
+    loss = (image - film)[:, ~unfilmed].abs().sum() / image.numel()
+    loss.backward()
+    optimizer.step()
+    return loss.detach()
+
+
+def assert_unfilmed_adds_nothing(
+    step: Callable[..., Tensor], make: Callable[[], Avatar], count: int = 3
+) -> None:
+    """Loss and gradients as of the filmed pixels; with nothing filmed, no loss and no gradient."""
+    avatar, expected = make(), make()
+    whole, background = far_batch(avatar, count, 37, 29)
+    batch, unfilmed = with_unfilmed_strip(whole)
+    optimizer, expected_optimizer = make_optimizer(avatar), make_optimizer(expected)
+    loss = step(avatar, optimizer, batch, background)
+    right = step_of_filmed(expected, expected_optimizer, whole, background, unfilmed)
+    assert float(loss) == pytest.approx(float(right), rel=1e-5)
+    assert_gradients_agree(avatar, optimizer, expected, expected_optimizer)
+    batch.images_rgba[:] = torch.tensor(UNFILMED_RGBA, dtype=torch.uint8)
+    idle = make()
+    optimizer = make_optimizer(idle)
+    assert float(step(idle, optimizer, batch, background)) == 0
+    assert not any(bool(one.any()) for one in first_moments(idle, optimizer).values())
+
+
 def fused_step(
     avatar: Avatar, optimizer: torch.optim.Optimizer, batch: TrainingBatch, background: Tensor
 ) -> Tensor:
@@ -90,11 +139,10 @@ def eager_step(
 ) -> Tensor:
     """The readable way, through autograd."""
     optimizer.zero_grad(set_to_none=True)
-    dtype = background.dtype
     image = avatar.render(
         batch.theta, batch.cameras, background, backend=backend, differentiable=True
     ).image
-    loss = l1_loss(image, composite(rgba_to_float(batch.images_rgba, dtype), background))
+    loss = image_losses(image, batch.images_rgba, background)["l1"]
     loss.backward()
     optimizer.step()
     return loss.detach()

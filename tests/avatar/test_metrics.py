@@ -11,6 +11,7 @@ from rgbavatar_ns.avatar import metrics
 from rgbavatar_ns.avatar.metrics import LPIPSMetric, evaluate_images, psnr, ssim
 from rgbavatar_ns.avatar.training.losses import LPIPSLoss
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.kernels.constants import UNFILMED_RGBA
 
 
 @pytest.fixture
@@ -102,3 +103,23 @@ def test_importing_the_avatar_loads_neither_torchmetrics_nor_torchvision():
         [sys.executable, "-c", code], capture_output=True, text=True, check=True
     )
     assert answer.stdout.strip() == "[]"
+
+
+def test_what_nobody_filmed_does_not_count():
+    """Whatever is drawn there; and PSNR is that of the filmed part as a picture of its own."""
+    generator = torch.Generator().manual_seed(0)
+    target = torch.randint(0, 256, (2, 40, 48, 4), generator=generator, dtype=torch.uint8)
+    target[..., 3] = 255
+    image = torch.rand(2, 40, 48, 3, generator=generator)
+    filmed = evaluate_images(image[:, :24], target[:, :24])
+    whole = evaluate_images(image, target)
+    target[:, 24:] = torch.tensor(UNFILMED_RGBA, dtype=torch.uint8)
+    values = evaluate_images(image, target)
+    assert values["psnr"] == pytest.approx(filmed["psnr"], abs=1e-4)
+    assert values["psnr_head"] == pytest.approx(filmed["psnr_head"], abs=1e-4)
+    assert values["ssim"] > whole["ssim"]
+    other = image.clone()
+    other[:, 24:] = 0.5
+    assert evaluate_images(other, target)["psnr"] == pytest.approx(values["psnr"], abs=1e-4)
+    target[:] = target[0, 24, 0]
+    assert evaluate_images(image, target)["ssim"] == pytest.approx(1)

@@ -17,6 +17,7 @@ from rgbavatar_ns.data.check.silhouette import down_to_the_neck, silhouette_over
 from rgbavatar_ns.data.check.timing import longest_run, offset_agreement
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head.rotations import axis_angle_to_matrix
+from rgbavatar_ns.kernels.constants import UNFILMED_RGBA
 
 from .talking_head import (
     FOCAL_PX,
@@ -55,6 +56,26 @@ def test_good_data_has_no_problem(good, tmp_path):
     assert report.focal_px == (FOCAL_PX, FOCAL_PX)
     assert list(report.iou) == list(range(NUM_FRAMES))
     assert min(report.iou.values()) > 0.75
+
+
+def test_what_nobody_filmed_is_told_and_is_no_misfit(good, tmp_path):
+    """The lower half is beyond the film; were it background, the mesh would leave the matte."""
+
+    def below(value):
+        def change(image):
+            image[SIZE // 2 :] = value
+            return image
+
+        return change
+
+    report = check_dataset(with_images(good, tmp_path / "marked", below(UNFILMED_RGBA)))
+    assert report.usable
+    assert report.unfilmed == pytest.approx(1 / 2)
+    covered = np.array(list(report.iou.values()))
+    empty = check_dataset(with_images(good, tmp_path / "empty", below(0)))
+    assert empty.unfilmed == 0
+    assert covered.min() > 0.75
+    assert (covered - np.array(list(empty.iou.values()))).min() > 0.05
 
 
 OPENGL = flip(1, -1, -1)

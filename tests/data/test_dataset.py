@@ -13,6 +13,7 @@ from PIL import Image
 from rgbavatar_ns.data import DatasetWriter, load_dataset
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadModel
+from rgbavatar_ns.kernels.constants import UNFILMED_RGBA
 from tests.data.small_dataset import (
     CAMERA_PARTS,
     HEIGHT,
@@ -68,6 +69,30 @@ def test_what_is_written_is_read_bit_for_bit(tmp_path, head):
             written, read = getattr(expected.camera, part)[0], getattr(dataset.cameras, part)
             assert torch.equal(read[position], written)
         assert np.array_equal(dataset.read_image(position), expected.image_rgba)
+
+
+def test_marks_of_what_nobody_filmed_come_back_and_older_versions_have_none(tmp_path, head):
+    """The same files, with an index of version 1: what looks like marks is background."""
+    writer = small_writer(tmp_path / "data", head)
+    frames = [frame(head, index) for index in range(3)]
+    frames[1].image_rgba[5:] = UNFILMED_RGBA
+    for one in frames:
+        writer.add(one)
+    dataset = writer.finish(1)
+    index = json.loads((tmp_path / "data/dataset.json").read_text())
+    assert (index["version"], index["unfilmed"]) == (3, True)
+    for position, one in enumerate(frames):
+        assert np.array_equal(dataset.read_image(position), one.image_rgba)
+    edit_index(tmp_path / "data", version=1)
+    older = load_dataset(tmp_path / "data").read_image(1)
+    assert not older[5:].any()
+    assert np.array_equal(older[:5], frames[1].image_rgba[:5])
+    assert np.array_equal(load_dataset(tmp_path / "data").read_image(0), frames[0].image_rgba)
+
+
+def test_without_marks_a_dataset_stays_of_the_version_that_it_was(folder):
+    index = json.loads((folder / "dataset.json").read_text())
+    assert (index["version"], "unfilmed" in index) == (1, False)
 
 
 def test_one_camera_for_all_frames_is_written_once_and_read_for_each(folder):

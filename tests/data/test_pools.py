@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 import torch
 
-from rgbavatar_ns.data import LocalGlobalPools
+from rgbavatar_ns.data import LocalGlobalPools, load_dataset
 from rgbavatar_ns.data.png import decode_png_rgba
 from rgbavatar_ns.data.streams import ReplayBuffer, ReplayStream, StreamedFrame
 from rgbavatar_ns.errors import UserError
-from tests.data.small_dataset import WIDTH, small_dataset
+from rgbavatar_ns.kernels.constants import UNFILMED_RGBA
+from tests.data.small_dataset import WIDTH, small_dataset, small_writer
 from tests.data.streaming import HEAD, Clock, cheap, streamed, subject, tracked
 
 
@@ -46,6 +47,39 @@ def test_every_drawn_frame_brings_its_own_picture_theta_and_camera():
     assert {27, 28, 29} <= drawn
     assert len(drawn) == 7
     assert frames.fill == (3, 4)
+
+
+@pytest.mark.parametrize("encode", [True, False], ids=["PNG", "pixels"])
+def test_marks_of_what_nobody_filmed_pass_through_pools_and_checkpoints(encode):
+    image = tracked(0).image_rgba
+    image[5:] = UNFILMED_RGBA
+    frames = pools()
+    frames.add(streamed(0, image=image, encode=encode))
+    later = pools()
+    later.load_state_dict(frames.state_dict())
+    for some in (frames, later):
+        assert np.array_equal(some.batch(1).images_rgba[0].numpy(), image)
+
+
+@pytest.mark.parametrize("version", [1, 3])
+def test_a_replayed_dataset_means_what_its_version_says(tmp_path, version):
+    """At once, and when a run goes on from a checkpoint without images."""
+    image = tracked(0).image_rgba
+    image[5:] = UNFILMED_RGBA
+    writer = small_writer(tmp_path, HEAD)
+    writer.add(dataclasses.replace(tracked(0), image_rgba=image))
+    writer.finish(0)
+    index = tmp_path / "dataset.json"
+    index.write_text(index.read_text().replace('"version": 3', f'"version": {version}'))
+    dataset = load_dataset(tmp_path)
+    frames = pools(save_images=False)
+    frames.add(ReplayStream(dataset).again(0))
+    later = pools(save_images=False)
+    later.load_state_dict(frames.state_dict(), ReplayStream(dataset))
+    if version < 3:
+        image[5:] = 0
+    for some in (frames, later):
+        assert np.array_equal(some.batch(1).images_rgba[0].numpy(), image)
 
 
 def test_newest_and_recent_frames():

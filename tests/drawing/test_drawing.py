@@ -3,13 +3,18 @@ import pytest
 import torch
 
 from rgbavatar_ns.drawing.compositing import (
+    all_filmed,
     composite,
     error_strip,
+    film_over,
+    is_unfilmed,
     rgba_to_float,
     straight_alpha,
     to_uint8,
+    unfilmed_pixels,
 )
 from rgbavatar_ns.drawing.contact_sheet import contact_sheet, labelled, over_gray_bgr, scaled
+from rgbavatar_ns.kernels.constants import UNFILMED_RGBA
 
 
 def test_composite_by_hand():
@@ -40,11 +45,55 @@ def test_bytes_and_values_are_each_others_inverse():
 
 
 def test_an_error_strip_shows_four_times_the_error():
-    truth = torch.full((1, 2, 3, 3), 0.5)
-    parts = error_strip(truth, truth - 0.1)
-    for part, value in zip(parts, (0.5, 0.4, 0.4)):
+    film = torch.ones(1, 2, 3, 4)
+    film[..., :3] = 0.5
+    truth, black = film[..., :3], torch.zeros(3)
+    for part, value in zip(error_strip(film, truth - 0.1, black), (0.5, 0.4, 0.4)):
         torch.testing.assert_close(part, torch.full_like(truth, value))
-    assert error_strip(truth, truth + 0.6).max() == 1
+    assert error_strip(film, truth + 0.6, black).max() == 1
+
+
+def marked(*shape: int) -> torch.Tensor:
+    return torch.tensor(UNFILMED_RGBA, dtype=torch.uint8).expand(*shape, 4)
+
+
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.float32, torch.float64])
+def test_only_the_exact_mark_is_unfilmed(dtype):
+    """Each neighbour by one level, and the same colour with any alpha, was filmed."""
+    near = marked(2, 4).int() + torch.stack([torch.eye(4), -torch.eye(4)]).int()
+    rgba = torch.cat([near.clamp(0, 255).to(torch.uint8), marked(2, 1)], 1)
+    given = rgba if dtype == torch.uint8 else rgba_to_float(rgba, dtype)
+    found = is_unfilmed(given)
+    # One below an alpha of 0 is 0 again.
+    assert found.tolist() == [[False] * 4 + [True], [False] * 3 + [True] * 2]
+    if dtype == torch.uint8:
+        picture = rgba.numpy()
+        assert np.array_equal(unfilmed_pixels(picture), found.numpy())
+        cleared = all_filmed(picture)
+        assert not unfilmed_pixels(cleared).any()
+        assert np.array_equal(cleared[~found.numpy()], picture[~found.numpy()])
+        assert not cleared[found.numpy()].any()
+
+
+def test_what_nobody_filmed_is_background_and_no_error():
+    rgba = torch.cat([marked(2, 1), torch.full((2, 2, 4), 255, dtype=torch.uint8)], 1)
+    image, sky = torch.full((2, 3, 3), 0.3), torch.tensor([0.2, 0.4, 0.6])
+    film, _, error = error_strip(rgba, image, sky)
+    torch.testing.assert_close(film[:, 0], sky.expand(2, 3))
+    assert not error[:, 0].any()
+    assert (error[:, 1:] == 1).all()
+    over = film_over(rgba, sky, image)
+    assert torch.equal(over[:, 0], image[:, 0])
+    assert torch.equal(over[:, 1:], torch.ones(2, 2, 3))
+
+
+def test_a_contact_sheet_hatches_what_nobody_filmed():
+    image = np.zeros((96, 96, 4), np.uint8)
+    image[48:] = UNFILMED_RGBA
+    drawn = over_gray_bgr(image, 1.0)
+    assert (drawn[:48] == 128).all()
+    assert set(np.unique(drawn[48:])) == {80, 128}
+    assert 0.4 < (drawn[48:] == 80).mean() < 0.6
 
 
 @pytest.mark.parametrize("channels", [3, 4])

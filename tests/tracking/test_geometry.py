@@ -63,6 +63,17 @@ def test_crop_beyond_the_frame_repeats_the_border_and_says_so() -> None:
     assert inside[:, :4].max() == 0
 
 
+def test_a_pixel_that_shows_the_frame_in_part_is_not_inside() -> None:
+    """Enlarged or made smaller, and by no whole factor: what is said to be inside lies there."""
+    for size in (5, 7, 16, 23, 40):
+        crop = SquareCrop(left=-3, top=2, side=16, size=size)
+        edges = np.arange(size + 1) * (16 / size)
+        columns = (edges[:-1] >= 3) & (edges[1:] <= 16)
+        rows = edges[1:] <= 9
+        assert not crop.inside(16, 11)[~(rows[:, None] & columns)].any()
+        assert crop.inside(16, 11).sum() >= (rows.sum() - 1) * (columns.sum() - 1)
+
+
 def test_foreground_color_removes_the_background_from_soft_edges() -> None:
     # A red disc over blue, its edge mixed by alpha: straight-alpha colour is red wherever alpha
     # counts, although the picture is purple there.

@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from rgbavatar_ns.drawing.compositing import unfilmed_pixels
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.tracking import TrackConfig, track_video
 
@@ -87,6 +88,32 @@ def test_missing_mediapipe_is_told_with_the_command_that_installs_it(
     clip = write_clip(tmp_path / "grey.mp4", gradient_images(2, 96, 96))
     with pytest.raises(UserError, match=r"--no-deps mediapipe==0\.10\.9"):
         track_video(clip, tmp_path / "set")
+
+
+@pytest.mark.parametrize("keep_torso", [False, True], ids=["head", "torso"])
+def test_what_the_frame_cuts_off_is_marked_as_not_filmed(tmp_path: Path, keep_torso: bool) -> None:
+    """The portrait ends above the chin: the crop reaches beyond, where the chin would be."""
+    height = 160
+    clip = write_clip(tmp_path / "cut.mp4", [astronaut()[:height]] * 2)
+    config = TrackConfig(image_size=96, focal_px=500.0, keep_torso=keep_torso)
+    dataset = track_video(clip, tmp_path / "set", config)
+    report = json.loads((tmp_path / "set" / "tracking.json").read_text())
+    image = dataset.read_image(0)
+    unfilmed = unfilmed_pixels(image)
+    crop = report["crop"]
+    last = int((height - crop["top"]) * len(image) / crop["side"])
+    assert last < len(image) - 4, "the crop reaches beyond"
+    assert not unfilmed[: last - 1].any()
+    assert image[last - 2, :, 3].max() > 200, "the face goes on to the edge"
+    assert not image[last:, :, 3].any()
+    chin = [one.mean() for one in np.nonzero(unfilmed)]
+    if keep_torso:
+        assert unfilmed[last:].all()
+    else:
+        assert last < chin[0] < last + 12
+        assert unfilmed[last:].mean() < 0.5, "what is below the neck is cut off anyway"
+    assert report["unfilmed_share"] == pytest.approx(unfilmed.mean(), rel=0.1)
+    assert json.loads((tmp_path / "set/dataset.json").read_text())["version"] == 3
 
 
 def test_a_face_in_one_frame_only_gives_one_frame_and_a_warning(tmp_path: Path) -> None:

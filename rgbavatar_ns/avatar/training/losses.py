@@ -8,7 +8,7 @@ import torch.nn.functional as F
 from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 
-from rgbavatar_ns.drawing.compositing import composite, rgba_to_float
+from rgbavatar_ns.drawing.compositing import film_over, is_unfilmed
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.kernels import PinholeCameras
 
@@ -38,11 +38,17 @@ def image_losses(
     lpips: "LPIPSLoss | None" = None,
     lpips_weight: float = 0.0,
 ) -> dict[str, Float[Tensor, ""]]:
-    """ "l1" of drawn and filmed images over the same backgrounds; "lpips" times its weight."""
-    target = composite(rgba_to_float(images_rgba, image.dtype), background)
+    """ "l1" of drawn and filmed images over the same backgrounds; "lpips" times its weight.
+
+    Pixels that nobody filmed add nothing and get no gradient; the mean is over all pixels, so that
+    those that were filmed count as much as in any other image.
+    """
+    target = film_over(images_rgba, background, image.detach())
     losses = {"l1": l1_loss(image, target)}
     if lpips is not None:
-        losses["lpips"] = lpips_weight * lpips(image, target)
+        # The network sees around each pixel: what nobody filmed is the same in both, and fixed.
+        seen = torch.where(is_unfilmed(images_rgba)[..., None], target, image)
+        losses["lpips"] = lpips_weight * lpips(seen, target)
     return losses
 
 

@@ -254,7 +254,12 @@ def _shift_trials(sample: Sample) -> Iterator[_Trial]:
         return
     height, width = sample.alpha.shape[1:]
     border = ((0, 0), (height, height), (width, width))
-    wide = replace(sample, alpha=np.pad(sample.alpha, border), gray=np.pad(sample.gray, border))
+    wide = replace(
+        sample,
+        alpha=np.pad(sample.alpha, border),
+        gray=np.pad(sample.gray, border),
+        filmed=np.pad(sample.filmed, border, constant_values=True),
+    )
     middle = np.array([width, height])
     # Drawn on a larger canvas, a head beside the image can be shifted back into it.
     drawn = silhouettes(
@@ -284,7 +289,8 @@ def mirrored_problem(sample: Sample) -> Problem | None:
     """Whether the head moves to one side while the person, in motion, moves to the other."""
     if not sample.has_mattes or len(sample) < 4:
         return None
-    drawn, mattes = silhouettes(sample, projected(sample)) > 0.5, sample.alpha > 0.5
+    drawn = (silhouettes(sample, projected(sample)) > 0.5) & sample.filmed
+    mattes = sample.alpha > 0.5
     height, width = sample.alpha.shape[1:]
     for axis, places, name in ((2, np.arange(width), "x"), (1, np.arange(height), "y")):
         other = 3 - axis

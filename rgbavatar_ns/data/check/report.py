@@ -62,6 +62,8 @@ class CheckReport:
     iou: dict[int, float] = field(default_factory=dict)
     """Overlap of head mesh and matte by frame number, of the frames that were looked at."""
     sheet: Path | None = None
+    unfilmed: float = 0.0
+    """Mean share of an image that nobody filmed, of the frames that were looked at."""
 
     @property
     def usable(self) -> bool:
@@ -86,6 +88,7 @@ class CheckReport:
             "parameters": {r.name: [r.smallest, r.largest] for r in self.ranges},
             "notes": list(self.notes),
             "iou": {str(number): round(value, 4) for number, value in self.iou.items()},
+            "unfilmed": round(self.unfilmed, 4),
             "sheet": None if self.sheet is None else str(self.sheet),
         }
 
@@ -121,9 +124,10 @@ def check_dataset(
     positions = spread(len(dataset), max_frames).tolist()
     problems = [*parameter_problems(dataset), *camera_problems(dataset)]
     problems += [one for one in [version_problem(dataset)] if one is not None]
-    found_overlaps = []
+    found_overlaps, unfilmed = [], 0.0
     try:
         sample = take_sample(dataset, positions, progress)
+        unfilmed = float(1 - sample.filmed.mean())
         found_overlaps = overlaps(sample, projected(sample))
         found = _image_problems(dataset, sample, found_overlaps)
         if sheet is not None:
@@ -158,6 +162,7 @@ def check_dataset(
         tuple(map(str, dataset.source.get("notes", ()))),
         {dataset.frame_index[p]: one.iou for p, one in zip(positions, found_overlaps)},
         sheet,
+        unfilmed,
     )
 
 

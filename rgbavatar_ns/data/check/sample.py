@@ -14,6 +14,7 @@ from rgbavatar_ns.data.check.silhouette import (
     silhouette_overlap,
 )
 from rgbavatar_ns.data.native.dataset import TrackedDataset
+from rgbavatar_ns.drawing.compositing import all_filmed, unfilmed_pixels
 from rgbavatar_ns.drawing.wireframe import mesh_silhouette
 from rgbavatar_ns.head import HeadModel
 
@@ -23,7 +24,7 @@ _CHUNK = 16
 _NEAREST_M = 1e-3
 _OPAQUE, _MATTED_SHARE = 0.5, 0.98
 _OF_FRAMES = (
-    *("alpha", "gray", "vertices"),
+    *("alpha", "gray", "filmed", "vertices"),
     *("world_to_camera", "focal_px", "principal_point_px"),
 )
 
@@ -39,6 +40,8 @@ class Sample:
     alpha: Float[np.ndarray, "F h w"]
     gray: Float[np.ndarray, "F h w"]
     """Luminance times alpha, in [0, 1]."""
+    filmed: Bool[np.ndarray, "F h w"]
+    """Where a frame shows nothing that nobody filmed."""
     vertices: Float[np.ndarray, "F V 3"]
     """In the head's world, metres."""
     faces: Int[np.ndarray, "T 3"]
@@ -53,7 +56,7 @@ class Sample:
     @property
     def has_mattes(self) -> bool:
         """Whether the images are cut out at all: opaque ones have no silhouette."""
-        return bool((self.alpha > _OPAQUE).mean() < _MATTED_SHARE)
+        return bool((self.alpha > _OPAQUE)[self.filmed].mean() < _MATTED_SHARE)
 
     def __len__(self) -> int:
         return len(self.positions)
@@ -86,9 +89,12 @@ def take_sample(
     """Decode these frames and pose the head; raises UserError naming an image that is damaged."""
     scale = SMALL_PX / max(dataset.width, dataset.height)
     size = (max(1, round(dataset.width * scale)), max(1, round(dataset.height * scale)))
-    alphas, grays = [], []
+    alphas, grays, unfilmed = [], [], []
     for done, position in enumerate(positions):
         image = dataset.read_image(position)
+        marked = unfilmed_pixels(image).astype(np.float32)
+        unfilmed.append(cv2.resize(marked, size, interpolation=cv2.INTER_AREA))
+        image = all_filmed(image)  # a mark that is blended is a colour
         small = cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32) / 255
         alphas.append(small[..., 3])
         grays.append(small[..., :3].mean(-1) * small[..., 3])
@@ -101,6 +107,7 @@ def take_sample(
         tuple(positions),
         np.stack(alphas),
         np.stack(grays),
+        np.stack(unfilmed) == 0,
         vertices,
         faces,
         chosen.world_to_camera.double().numpy(),
@@ -177,6 +184,6 @@ def overlaps(sample: Sample, projection: Projection) -> list[SilhouetteOverlap]:
         return []
     drawn = silhouettes(sample, projection)
     return [
-        silhouette_overlap(mesh, matte, down_to_the_neck(mesh))
-        for mesh, matte in zip(drawn, sample.alpha)
+        silhouette_overlap(mesh, matte, down_to_the_neck(mesh) & filmed)
+        for mesh, matte, filmed in zip(drawn, sample.alpha, sample.filmed)
     ]

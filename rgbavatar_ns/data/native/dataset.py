@@ -21,6 +21,7 @@ from rgbavatar_ns.data.native.format import (
     cameras_from_json,
 )
 from rgbavatar_ns.data.png import MAX_PIXELS, png_size, read_png_rgba
+from rgbavatar_ns.drawing.compositing import all_filmed
 from rgbavatar_ns.errors import UserError, first_few
 from rgbavatar_ns.head import HeadArrays, HeadModel, ThetaLayout
 from rgbavatar_ns.kernels.types import PinholeCameras
@@ -63,6 +64,8 @@ class TrackedDataset:
     """The moment of each frame, the same for all cameras; empty where each frame has its own."""
     source: Mapping[str, Any] = field(default_factory=dict)
     """Where an imported dataset came from: `format`, `path`, `notes`."""
+    marks_unfilmed: bool = False
+    """Whether `UNFILMED_RGBA` says something in its files; else it is background by chance."""
 
     def __len__(self) -> int:
         return len(self.image_paths)
@@ -74,12 +77,15 @@ class TrackedDataset:
         return tuple(position for position in range(len(self)) if position not in held_out)
 
     def read_image(self, position: int) -> UInt8[np.ndarray, "height width 4"]:
-        """Decode one frame to RGBA, straight alpha; UserError if it is missing, damaged or odd."""
+        """Decode one frame to RGBA, straight alpha, `UNFILMED_RGBA` where nobody filmed.
+
+        Raises UserError if it is missing, damaged or odd.
+        """
         path = self.image_paths[position]
         image = read_png_rgba(path)
         height, width = image.shape[:2]
         _check_size(path, (width, height), (self.width, self.height))
-        return image
+        return image if self.marks_unfilmed else all_filmed(image)
 
 
 def load_native(path: str | Path) -> TrackedDataset:
@@ -113,6 +119,7 @@ def load_native(path: str | Path) -> TrackedDataset:
         _column(root, frames, "camera_name", str),
         _column(root, frames, "timestep", int),
         source if isinstance(source, dict) else {},
+        index["version"] >= 3 and index.get("unfilmed") is True,
     )
 
 

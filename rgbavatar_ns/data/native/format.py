@@ -1,7 +1,7 @@
-"""The project's own dataset format, versions 1 and 2: names, and JSON in both directions.
+"""The project's own dataset format, versions 1 to 3: names, and JSON in both directions.
 
 docs/dataset_format.md describes every field. `dataset.json` is written last, so its presence means
-that the rest is whole. What needs nothing of version 2 is written as version 1.
+that the rest is whole. A dataset is written as the lowest version that has what it needs.
 """
 
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ from rgbavatar_ns.kernels.types import PinholeCameras
 from rgbavatar_ns.reading import DamagedFileError, json_numbers
 
 FORMAT = "rgbavatar native"
-VERSIONS = (1, 2)
+VERSIONS = (1, 2, 3)
 INDEX_FILE = "dataset.json"
 THETA_FILE = "theta.npy"
 HEAD_FILE = "head.npz"

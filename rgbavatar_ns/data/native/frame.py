@@ -11,7 +11,8 @@ from rgbavatar_ns.kernels.types import PinholeCameras
 
 @dataclass(frozen=True)
 class TrackedFrame:
-    """An image (straight alpha), what the head did in it (radians, metres), and who saw it.
+    """An image (straight alpha, `UNFILMED_RGBA` where nobody filmed), what the head did in it
+    (radians, metres), and who saw it.
 
     index: number of the frame in its source, unique in a dataset.
     camera: exactly one (C = 1), of the image's size.

@@ -23,6 +23,7 @@ from rgbavatar_ns.data.native.format import (
 )
 from rgbavatar_ns.data.native.frame import TrackedFrame
 from rgbavatar_ns.data.png import encode_png_rgba
+from rgbavatar_ns.drawing.compositing import unfilmed_pixels
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.files import atomic_write, disk_errors, read_json, write_json
 from rgbavatar_ns.head import HeadArrays, ThetaLayout
@@ -95,6 +96,7 @@ class DatasetWriter:
         self._frames: list[dict[str, Any]] = []
         self._numbers: set[int] = set()
         self._source = dict(source or {})
+        self._unfilmed = False
         self._clear(overwrite, keep_images)
 
     def _clear(self, overwrite: bool, keep_images: bool) -> None:
@@ -115,9 +117,14 @@ class DatasetWriter:
         """Write a frame's image now, the rest at the end; UserError where it does not fit."""
         height, width = frame.image_rgba.shape[:2]
         self._require_size(frame.index, width, height)
-        png = encode_png_rgba(frame.image_rgba)
         self.add_encoded(
-            frame.index, frame.theta, frame.camera, png, frame.camera_name, frame.timestep
+            frame.index,
+            frame.theta,
+            frame.camera,
+            encode_png_rgba(frame.image_rgba),
+            frame.camera_name,
+            frame.timestep,
+            bool(unfilmed_pixels(frame.image_rgba).any()),
         )
 
     def add_encoded(
@@ -128,8 +135,12 @@ class DatasetWriter:
         png: bytes | None,
         camera_name: str | None = None,
         timestep: int | None = None,
+        has_unfilmed: bool = False,
     ) -> None:
-        """As `add`, with a PNG file's bytes, its size trusted; None: it is in its place already."""
+        """As `add`, with a PNG file's bytes, its size trusted; None: it is in its place already.
+
+        has_unfilmed: whether `UNFILMED_RGBA` is a mark in it; else it may be background.
+        """
         name = f"frame {index}"
         if index in self._numbers:
             raise UserError(f"There are two frames {index}.", "Number frames once each.")
@@ -145,6 +156,7 @@ class DatasetWriter:
         if png is not None:
             self.write_image(index, png)
         self._numbers.add(index)
+        self._unfilmed |= has_unfilmed
         self._theta.append(values.copy())
         relative = self.image_path(index).relative_to(self._root).as_posix()
         entry = {"index": index, "image": relative, "camera": camera_to_json(camera, 0)}
@@ -202,6 +214,8 @@ class DatasetWriter:
         of_version_2 = {"test", "cameras", "source"} & index.keys()
         if of_version_2 or any(len(frame) > 3 for frame in self._frames):
             index["version"] = 2
+        if self._unfilmed:
+            index |= {"unfilmed": True, "version": 3}
         index["frames"] = self._frames
         with atomic_write(self._root / THETA_FILE) as partial:
             np.save(partial, np.stack(self._theta))

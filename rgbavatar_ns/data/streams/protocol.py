@@ -11,6 +11,7 @@ from torch import Tensor
 
 from rgbavatar_ns.data.native.frame import TrackedFrame
 from rgbavatar_ns.data.png import decode_png_rgba, encode_png_rgba, png_header_size
+from rgbavatar_ns.drawing.compositing import all_filmed
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadArrays, HeadModel, ThetaLayout
 from rgbavatar_ns.kernels.types import PinholeCameras
@@ -115,6 +116,8 @@ class StreamedFrame:
     session: str = ""
     png: bytes | None = field(default=None, kw_only=True)
     image_rgba: UInt8[np.ndarray, "height width 4"] | None = field(default=None, kw_only=True)
+    marks_unfilmed: bool = field(default=True, kw_only=True)
+    """Whether `UNFILMED_RGBA` says something in the PNG; an older dataset's is background."""
 
     def __post_init__(self) -> None:
         if (self.png is None) == (self.image_rgba is None):
@@ -132,6 +135,7 @@ class StreamedFrame:
         image = self.image_rgba
         if image is None:
             image = decode_png_rgba(self.png or b"", f"frame {self.index}")
+            image = image if self.marks_unfilmed else all_filmed(image)
         return TrackedFrame(self.index, self.theta, self.camera, image)
 
     def encoded(self) -> bytes:

@@ -94,4 +94,5 @@ class ReplayStream:
             ) from None
         camera = data.cameras.select([position])
         index = data.frame_index[position]
-        return StreamedFrame(index, data.theta[position], camera, arrived_s, png=png)
+        theta, marks = data.theta[position], data.marks_unfilmed
+        return StreamedFrame(index, theta, camera, arrived_s, png=png, marks_unfilmed=marks)

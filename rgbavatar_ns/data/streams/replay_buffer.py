@@ -204,7 +204,8 @@ class ReplayBuffer:
                 parts = {name: state[name][row : row + 1].cpu() for name in _CAMERA_PARTS}
                 camera = PinholeCameras(**parts, width=size[0], height=size[1])
                 theta = state["theta"][row].cpu()
-                streamed = StreamedFrame(index, theta, camera, now, png=images[row])
+                png, marks = images[row]
+                streamed = StreamedFrame(index, theta, camera, now, png=png, marks_unfilmed=marks)
                 if streamed.image_size not in (size, None):
                     raise UserError(
                         f"The checkpoint's frames have another size than the stream's {size[0]} x "
@@ -215,14 +216,16 @@ class ReplayBuffer:
             self._added = state["added"]
 
 
-def _saved_images(state: dict[str, Any], stream: object) -> list[bytes]:
+def _saved_images(state: dict[str, Any], stream: object) -> list[tuple[bytes, bool]]:
+    """Each frame's PNG, and whether marks in it count."""
     if "png" in state:
         whole = state["png"].cpu().numpy().tobytes()
         ends = np.cumsum(state["png_bytes"].tolist()).tolist()
-        return [whole[start:end] for start, end in zip([0, *ends], ends)]
+        return [(whole[start:end], True) for start, end in zip([0, *ends], ends)]
     if not isinstance(stream, ReplayStream):
         raise UserError(
             "The checkpoint was made while a dataset was replayed and holds no images.",
             "Resume with that dataset: --data FOLDER --pipeline.datamanager.source.kind replay.",
         )
-    return [stream.again(index).encoded() for index in state["index"].tolist()]
+    frames = [stream.again(index) for index in state["index"].tolist()]
+    return [(frame.encoded(), frame.marks_unfilmed) for frame in frames]

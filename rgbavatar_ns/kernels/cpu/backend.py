@@ -32,7 +32,7 @@ def instruction_sets() -> tuple[str, ...]:
     return tuple(_native.instruction_sets())
 
 
-def compiled_constants() -> dict[str, float]:
+def compiled_constants() -> dict[str, float | tuple[int, ...]]:
     """The numbers of `kernels/constants.py` as the compiled loops have them."""
     return _native.constants()
 

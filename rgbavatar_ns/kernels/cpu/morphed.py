@@ -92,7 +92,10 @@ class CpuMorphedRenderer:
     def forward_loss(
         self, images_rgba: UInt8[Tensor, "B H W 4"], background: Float[Tensor, "#B 3"]
     ) -> Float[Tensor, ""]:
-        """The mean absolute difference to straight-alpha images over the background."""
+        """The mean absolute difference to straight-alpha images over the background.
+
+        Pixels that are marked `UNFILMED_RGBA` differ by 0; the divisor is that of all pixels.
+        """
         check_target_images(images_rgba, len(self._weights), self._cameras)
         background = checked_background(self._weights, background, len(self._weights))
         self._has_gradient = True

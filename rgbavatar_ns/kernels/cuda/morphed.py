@@ -123,7 +123,10 @@ class CudaMorphedRenderer:
     def forward_loss(
         self, images_rgba: UInt8[Tensor, "B H W 4"], background: Float[Tensor, "#B 3"]
     ) -> Float[Tensor, ""]:
-        """The mean absolute difference to straight-alpha images over the background."""
+        """The mean absolute difference to straight-alpha images over the background.
+
+        Pixels that are marked `UNFILMED_RGBA` differ by 0; the divisor is that of all pixels.
+        """
         check_target_images(images_rgba, self._images.batch, self._cameras)
         background = checked_background(self._weights, background, self._images.batch)
         loss, self._slots = self._tiles.train(images_rgba.contiguous(), None, background.detach())

@@ -51,6 +51,7 @@ struct BlendingConstants {
   static constexpr float kMinQuatNorm = 1e-12f;
   static constexpr float kHalfLog2E = 0.7213475204444817f;
   static constexpr float kLn2 = 0.6931471805599453f;
+  static constexpr int32_t kUnfilmed = 0x00fd01fe;  // RGBA from the lowest byte on
 };
 
 template <class F>

@@ -9,7 +9,12 @@ from torch import Tensor
 
 from rgbavatar_ns.avatar.metrics import psnr
 from rgbavatar_ns.data.streams import ReplayBatch
-from rgbavatar_ns.drawing.compositing import composite, rgba_to_float
+from rgbavatar_ns.drawing.compositing import (
+    composite,
+    film_over,
+    is_unfilmed,
+    rgba_to_float,
+)
 from rgbavatar_ns.plugin.online.datamanager import OnlineDataManager, OnlineDataManagerConfig
 from rgbavatar_ns.plugin.pipeline import RGBAvatarPipeline, RGBAvatarPipelineConfig
 from rgbavatar_ns.plugin.viewer.status_panel import StatusPanel
@@ -55,7 +60,9 @@ class OnlinePipeline(RGBAvatarPipeline):
             backend=self.config.model.rasterizer,
         ).image.clamp(0, 1)
         black = drawn.new_zeros(len(drawn), 3)
-        truth = composite(rgba_to_float(newest_first.images_rgba.to(self.device)), black)
-        score = float(psnr(drawn, truth).clamp(max=_BEST_DB).mean())
-        pair = torch.cat([truth[0], drawn[0]], dim=1)
+        rgba = newest_first.images_rgba.to(self.device)
+        filmed = ~is_unfilmed(rgba)
+        truth = film_over(rgba, black, drawn)
+        score = float(psnr(drawn, truth, filmed).clamp(max=_BEST_DB).mean())
+        pair = torch.cat([composite(rgba_to_float(rgba[0]), black[0]), drawn[0]], dim=1)
         return score, (pair * 255).round().to(torch.uint8).cpu()

@@ -15,7 +15,14 @@ from rgbavatar_ns.avatar import Avatar
 from rgbavatar_ns.avatar.metrics import psnr
 from rgbavatar_ns.data import TrackedDataset
 from rgbavatar_ns.data.check.sample import project
-from rgbavatar_ns.drawing.compositing import composite, rgba_to_float, shown_error, to_uint8
+from rgbavatar_ns.drawing.compositing import (
+    composite,
+    film_over,
+    is_unfilmed,
+    rgba_to_float,
+    shown_error,
+    to_uint8,
+)
 from rgbavatar_ns.drawing.wireframe import with_wireframe
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.kernels import PinholeCameras, RenderedBatch
@@ -106,13 +113,15 @@ def _beside_film(
     own = film.cameras.select([signal.frame]).to(signal.theta.device)
     drawn = _draw(avatar, signal, state, own, backend)
     rgba = torch.from_numpy(film.read_image(signal.frame)).to(signal.theta.device)
-    truth = composite(rgba_to_float(rgba), signal.theta.new_tensor(state.background))
+    background = signal.theta.new_tensor(state.background)
     image = drawn.image[0].clamp(0, 1)
-    quality_db = float(psnr(image[None], truth[None]).clamp(max=100))
+    truth = film_over(rgba, background, image)
+    filmed = ~is_unfilmed(rgba)
+    quality_db = float(psnr(image[None], truth[None], filmed[None]).clamp(max=100))
     tiles = [_colored(shown_error(image, truth).mean(-1, keepdim=True), cv2.COLORMAP_INFERNO)]
     if state.picture == "beside the film":
         overlaid = _with_overlays(image, avatar, signal, state, own, drawn.visibility)
-        tiles = [truth, overlaid, *tiles]
+        tiles = [composite(rgba_to_float(rgba), background), overlaid, *tiles]
     image = _arranged(tiles, camera, state.background)
     covered = image.new_ones(camera.height, camera.width, 1)
     return ViewerRender(image, covered, covered, quality_db)

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 
 from rgbavatar_ns.kernels.types import PinholeCameras
 from rgbavatar_ns.tracking.face.detector import face_height_px
@@ -50,16 +50,17 @@ class SquareCrop:
         method = cv2.INTER_AREA if self.size <= self.side else cv2.INTER_CUBIC
         return cv2.resize(part, (self.size, self.size), interpolation=method)
 
-    def inside(self, width: int, height: int) -> Float[np.ndarray, "size size"]:
-        """1 where the square shows the frame, 0 where it reaches beyond."""
+    def inside(self, width: int, height: int) -> Bool[np.ndarray, "size size"]:
+        """Where a pixel shows nothing but the frame; elsewhere the square reaches beyond."""
         rows = np.arange(self.top, self.top + self.side)
         columns = np.arange(self.left, self.left + self.side)
         if rows[0] >= 0 and rows[-1] < height and columns[0] >= 0 and columns[-1] < width:
-            return np.ones((self.size, self.size), np.float32)
+            return np.ones((self.size, self.size), bool)
         within = ((rows >= 0) & (rows < height))[:, None] & ((columns >= 0) & (columns < width))
-        return cv2.resize(
-            within.astype(np.float32), (self.size, self.size), interpolation=cv2.INTER_AREA
+        beyond = cv2.resize(
+            (~within).astype(np.float32), (self.size, self.size), interpolation=cv2.INTER_AREA
         )
+        return beyond == 0
 
     def points(self, points_px: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
         """Points of the source frame in pixels of the crop."""

@@ -3,9 +3,10 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 
 from rgbavatar_ns.head import HeadArrays
+from rgbavatar_ns.kernels.constants import UNFILMED_RGBA
 from rgbavatar_ns.tracking.face.detector import CHIN, FOREHEAD
 from rgbavatar_ns.tracking.image.crop import SquareCrop
 from rgbavatar_ns.tracking.image.head_mask import HeadMask, HeadOutline
@@ -14,25 +15,26 @@ from rgbavatar_ns.tracking.image.matting import foreground_color, straight_rgba
 
 @dataclass(frozen=True)
 class MattedCrop:
-    """A crop of one frame: the person's own colour and alpha in [0, 1]."""
+    """A crop of one frame: the person's own colour and alpha in [0, 1].
+
+    Both go on, as the frame's border says, where `inside` is False: there nobody filmed.
+    """
 
     color: UInt8[np.ndarray, "S S 3"]
     alpha: Float[np.ndarray, "S S"]
+    inside: Bool[np.ndarray, "S S"]
 
     @classmethod
     def of(
         cls,
         image_rgb: UInt8[np.ndarray, "S S 3"],
         matte: Float[np.ndarray, "S S"],
-        inside: Float[np.ndarray, "S S"],
+        inside: Bool[np.ndarray, "S S"],
         color_is_clean: bool = False,
     ) -> "MattedCrop":
-        """The crop with its background's share taken out of the colour, unless that is clean.
-
-        `inside` is 1 where the crop shows the frame.
-        """
-        alpha = matte * inside
-        return cls(image_rgb if color_is_clean else foreground_color(image_rgb, alpha), alpha)
+        """The crop with its background's share taken out of the colour, unless that is clean."""
+        color = image_rgb if color_is_clean else foreground_color(image_rgb, matte)
+        return cls(color, matte, inside)
 
 
 class CutOut:
@@ -53,8 +55,16 @@ class CutOut:
         return self._mask.outline(crop.points(vertices_px), forehead, chin, crop.size)
 
     def __call__(self, matted: MattedCrop, outline: HeadOutline) -> UInt8[np.ndarray, "S S 4"]:
-        """Straight-alpha image of what the matte holds of the head."""
-        alpha = matted.alpha
+        """Straight-alpha image of what the matte holds of the head.
+
+        Beyond the frame it is `UNFILMED_RGBA` where the head may be; what is cut off anyway is
+        background there too.
+        """
+        alpha, may_be_head = matted.alpha, np.ones_like(matted.alpha)
         if not self._keep_torso:
-            alpha = alpha * self._mask(outline, len(alpha))
-        return straight_rgba(matted.color, alpha)
+            may_be_head = self._mask(outline, len(alpha))
+            alpha = alpha * may_be_head
+        image = straight_rgba(matted.color, alpha)
+        image[~matted.inside] = 0
+        image[~matted.inside & (may_be_head >= 0.5 / 255)] = UNFILMED_RGBA
+        return image

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from rgbavatar_ns.data.png import encode_png_rgba
+from rgbavatar_ns.drawing.compositing import unfilmed_pixels
 from rgbavatar_ns.tracking.face.clip import ClipLandmarks
 from rgbavatar_ns.tracking.fit.fit import ClipFit
 from rgbavatar_ns.tracking.fit.subject import SubjectTracker
@@ -38,6 +39,8 @@ class FrameImage:
     """What the matte holds of the whole person, as small as the outline."""
     inside: Float[np.ndarray, "s s"]
     """1 where the crop shows the frame."""
+    unfilmed: float
+    """Share of the image that is marked: beyond the frame, where the head may be."""
 
 
 @dataclass(frozen=True)
@@ -176,12 +179,14 @@ class FrameImages:
             self._tracker.vertices_px(self._fit, crop.position),
             self._found.points_px[crop.position],
         )
-        small = (
+        matte, inside = (
             cv2.resize(part, outline.silhouette.shape, interpolation=cv2.INTER_AREA)
-            for part in (matted.alpha, self._inside)
+            for part in (matted.alpha, self._inside.astype(np.float32))
         )
-        png = encode_png_rgba(self._cut_out(matted, outline), _PNG_LEVEL)
-        return FrameImage(crop.position, png, outline, *small)
+        image = self._cut_out(matted, outline)
+        unfilmed = float(unfilmed_pixels(image).mean())
+        png = encode_png_rgba(image, _PNG_LEVEL)
+        return FrameImage(crop.position, png, outline, matte, inside, unfilmed)
 
     def _alpha(self, crop: _Cropped, around: tuple[_Cropped, ...]) -> Float[np.ndarray, "S S"]:
         if crop.alpha is not None:

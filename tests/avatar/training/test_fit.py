@@ -1,3 +1,4 @@
+import dataclasses
 from contextlib import contextmanager
 
 import pytest
@@ -17,7 +18,9 @@ from rgbavatar_ns.avatar.training import (
 from rgbavatar_ns.avatar.training.batches import ChosenFrames
 from rgbavatar_ns.avatar.training.color_init import ColorInitSchedule
 from rgbavatar_ns.avatar.training.losses import random_backgrounds
+from rgbavatar_ns.drawing.compositing import composite, rgba_to_float
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.kernels.constants import UNFILMED_RGBA
 from tests.avatar.small_head import front_camera, random_theta
 
 SIZE, FRAMES = 24, 6
@@ -49,6 +52,36 @@ def losses_of(avatar, batch_at, steps: int, options: TrainingOptions | None = No
 def test_fit_lowers_the_loss(make_avatar, batch_at):
     losses = losses_of(make_avatar(), batch_at, 40)
     assert losses[-5:].mean() < 0.5 * losses[:1].mean()
+
+
+def test_a_chin_that_nobody_filmed_stays_and_an_empty_one_is_lost(make_avatar, batch_at):
+    """Of a film that ends above the chin; the rest of the face is not learnt worse."""
+    cut, everything = SIZE - SIZE // 3, batch_at(0)
+    person = everything.images_rgba[..., 3] > 127
+    above = torch.arange(SIZE)[:, None] < cut
+
+    def trained_on(below: tuple[int, ...]) -> tuple[float, float]:
+        def batch(step: int) -> TrainingBatch:
+            whole = batch_at(step)
+            images = whole.images_rgba.clone()
+            images[:, cut:] = torch.tensor(below, dtype=torch.uint8)
+            return dataclasses.replace(whole, images_rgba=images)
+
+        avatar = make_avatar()
+        losses_of(avatar, batch, 40)
+        with torch.no_grad():
+            drawn = avatar.render(everything.theta, everything.cameras)
+        truth = composite(rgba_to_float(everything.images_rgba), torch.zeros(3))
+        error = (drawn.image - truth).abs().mean(-1)
+        chin = drawn.alpha[..., 0][person & ~above]
+        return float(chin.mean()), float(error[:, :cut].mean())
+
+    (kept, error), (lost, error_beside_empty) = (
+        trained_on(below) for below in (UNFILMED_RGBA, (0, 0, 0, 0))
+    )
+    assert kept > 0.6
+    assert lost < 0.45
+    assert error < error_beside_empty
 
 
 def test_bases_help(make_avatar, batch_at):

@@ -29,6 +29,7 @@ from tests.avatar.conftest import SMALL_CONFIG
 from tests.avatar.fused_scene import (
     VARIANTS,
     assert_gradients_agree,
+    assert_unfilmed_adds_nothing,
     double,
     eager_step,
     far_batch,
@@ -95,6 +96,12 @@ def test_gradients_against_float64_with_each_instruction_set(stirred, instructio
         return stirred(scale_with_triangle=True)
 
     _compare(build, *far_batch(build(), 3, 37, 29), reference=True)
+
+
+@pytest.mark.parametrize("instruction_set", instruction_sets())
+def test_what_nobody_filmed_adds_nothing(stirred, instruction_set, monkeypatch):
+    monkeypatch.setenv("RGBAVATAR_INSTRUCTION_SET", instruction_set)
+    assert_unfilmed_adds_nothing(fused_step, stirred)
 
 
 def test_parameters_after_a_hundred_small_steps(stirred):

@@ -4,8 +4,15 @@ import torch
 from scipy import stats
 
 from rgbavatar_ns.avatar.training import losses
-from rgbavatar_ns.avatar.training.losses import LPIPSLoss, l1_loss, random_backgrounds
+from rgbavatar_ns.avatar.training.losses import (
+    LPIPSLoss,
+    image_losses,
+    l1_loss,
+    random_backgrounds,
+)
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.kernels.constants import UNFILMED_RGBA
+from tests.avatar.fused_scene import assert_unfilmed_adds_nothing, eager_step, stir
 
 
 def test_l1_by_hand():
@@ -64,3 +71,31 @@ def test_lpips_uses_its_network_on_unit_range_images(monkeypatch):
     value.backward()
     assert image.grad is not None
     torch.testing.assert_close(image.grad, torch.full_like(image, 1 / image.numel()))
+
+
+def test_perceptual_loss_sees_no_difference_where_nobody_filmed(monkeypatch):
+    """A network that looks five pixels far: gradients end at the film's border, values too."""
+
+    class Blurred(torch.nn.Module):
+        def forward(self, first, second, normalize):
+            blurred = torch.nn.functional.avg_pool2d(first - second, 5, 1, 2)
+            return blurred.square().mean((1, 2, 3))
+
+    monkeypatch.setattr(losses, "_build_lpips_network", lambda _: Blurred())
+    generator = torch.Generator().manual_seed(0)
+    rgba = torch.randint(0, 256, (1, 12, 9, 4), generator=generator, dtype=torch.uint8)
+    rgba[:, 8:] = torch.tensor(UNFILMED_RGBA, dtype=torch.uint8)
+    image = torch.rand(1, 12, 9, 3, generator=generator).requires_grad_()
+    found = image_losses(image, rgba, torch.zeros(1, 3), LPIPSLoss(), 1.0)
+    (gradient,) = torch.autograd.grad(found["l1"] + found["lpips"], image)
+    assert not gradient[:, 8:].any()
+    assert gradient[:, :8].all()
+    with torch.no_grad():
+        image[:, 8:] = 0.5
+    again = image_losses(image, rgba, torch.zeros(1, 3), LPIPSLoss(), 1.0)
+    for name, value in found.items():
+        assert value.item() == pytest.approx(again[name].item(), rel=1e-6)
+
+
+def test_what_nobody_filmed_adds_nothing(make_avatar):
+    assert_unfilmed_adds_nothing(eager_step, lambda: stir(make_avatar()))

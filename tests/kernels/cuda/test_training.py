@@ -7,6 +7,7 @@ import torch
 from rgbavatar_ns.avatar.training import make_optimizer
 from rgbavatar_ns.avatar.training.fused_step import FusedStep
 from tests.avatar.fused_scene import (
+    assert_unfilmed_adds_nothing,
     eager_step,
     far_batch,
     first_moments,
@@ -30,6 +31,10 @@ def test_parameters_after_some_steps(emulated, make_avatar):
             step(avatar, optimizer, batch, background)
         ends.append(values_by_group(avatar))
     assert max(relative_differences(*ends).values()) < 1e-3
+
+
+def test_what_nobody_filmed_adds_nothing(emulated, make_avatar):
+    assert_unfilmed_adds_nothing(fused_step, lambda: stir(make_avatar()), 2)
 
 
 def test_gradient_of_theta(emulated, make_avatar):

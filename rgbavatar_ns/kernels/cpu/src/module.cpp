@@ -210,6 +210,8 @@ nb::dict constants() {
   out["FRUSTUM_MARGIN"] = C::kFrustumMargin;
   out["MIN_QUAT_NORM"] = C::kMinQuatNorm;
   out["MAX_AVERAGE_CHANNELS"] = rgbavatar::kMaxChannels;
+  const auto byte = [](int k) { return C::kUnfilmed >> (8 * k) & 255; };
+  out["UNFILMED_RGBA"] = nb::make_tuple(byte(0), byte(1), byte(2), byte(3));
   return out;
 }
 

@@ -28,7 +28,8 @@ static Wide lanes_inside(const Tile& tile, const BlockPixels& pixels) {
 }
 
 // From the drawn rows to those of the backward pass: the channels become dL/dimage of the mean
-// absolute difference, and what is behind g . background. Returns the differences' sums.
+// absolute difference, and what is behind g . background; both are 0 where nobody filmed. Returns
+// the differences' sums.
 static Wide compare_block(const Tile& tile, const TrainingTarget& target, int block,
                           TileScratch& scratch) {
   float(*rows)[kBlockPixels] = block_rows<kBlendRows>(scratch, block);
@@ -36,13 +37,15 @@ static Wide compare_block(const Tile& tile, const TrainingTarget& target, int bl
   const WideInt rgba = load_rgba(tile, pixels, target.rgba);
   const Wide zero(0.0f), one(1.0f), t = load_wide(rows[kTransmittance]);
   const Wide inside = pixels.whole() ? one : lanes_inside(tile, pixels);
+  const Wide unlike = to_floats(rgba - WideInt(C::kUnfilmed));  // 0 for the mark alone
+  const Wide counts = select(unlike * unlike > zero, inside, zero);
   const Wide matte = to_floats((rgba >> 24) & 255) * (1.0f / 255.0f);
   Wide behind = zero, sum = zero;
   for (int k = 0; k < 3; ++k) {
     const Wide background(target.background[k]);
     const Wide color = to_floats((rgba >> (8 * k)) & 255) * (1.0f / 255.0f);
     const Wide image = load_wide(rows[kColor + k]) + t * background;
-    const Wide difference = (image - (background + matte * (color - background))) * inside;
+    const Wide difference = (image - (background + matte * (color - background))) * counts;
     const Wide sign = select(difference > zero, one, zero) - select(zero > difference, one, zero);
     const Wide g = sign * target.gradient;
     sum = sum + sign * difference;

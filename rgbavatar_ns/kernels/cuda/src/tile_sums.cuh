@@ -101,7 +101,7 @@ RGBAVATAR_KERNEL(differentiate, DifferentiateArguments, kTileThreads) {
 }
 
 // Forward pass, mean absolute difference to 8-bit images over a background, and backward pass in
-// one go: no image is written.
+// one go: no image is written. Pixels that nobody filmed add nothing.
 RGBAVATAR_KERNEL(train, TrainArguments, kTileThreads) {
   RGBAVATAR_SHARED Batch batch;
   RGBAVATAR_SHARED WarpSums<kMoments> shared;
@@ -117,12 +117,13 @@ RGBAVATAR_KERNEL(train, TrainArguments, kTileThreads) {
     const int64_t which = a.image_of ? a.image_of[image] : image;
     const int64_t at = which * a.frame.width * a.frame.height + pixel.index;
     const uint32_t rgba = reinterpret_cast<const uint32_t*>(a.images)[at];
+    const bool filmed = rgba != uint32_t(C::kUnfilmed);
     const float matte = float(rgba >> 24) * (1.0f / 255.0f);
     const Vec3<float> behind = background_of(a.background, a.background_shared);
     const auto channel = [&](float color, float back, int shift) {
       const float drawn = color + blend.transmittance * back;
       const float target = float(rgba >> shift & 255u) * (1.0f / 255.0f);
-      const float off = drawn - (back + matte * (target - back));
+      const float off = filmed ? drawn - (back + matte * (target - back)) : 0.0f;
       const float gradient = off > 0.0f ? a.gradient : off < 0.0f ? -a.gradient : 0.0f;
       difference += fabsf(off);
       remainder += gradient * drawn;
