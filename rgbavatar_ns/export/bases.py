@@ -14,9 +14,10 @@ from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.export.drawing import Color, Picture, pictures
 from rgbavatar_ns.kernels import PinholeCameras
 
-_CLEAR, _CLEAR_SHARE = 60, 0.01
+_CLEAR, _CLEAR_SHARE = 60, 0.02
 """A change is seen where it is so many of 255 steps, in so much of what the avatar covers."""
 _STRONGEST_GAIN = 64.0
+_CHANGE_GAIN = 2
 
 
 def basis_weights(statistics: TrainingStatistics, gain: float) -> Float[Tensor, "K1 K"]:
@@ -43,8 +44,8 @@ def basis_grid(
     """A grid: the base model, then base plus each basis alone and, beside it, what it changes.
 
     On the head's neutral frame, at `gain` times its largest weight in training; without one, at
-    the first of 1, 2, 4 ... 64 that shows it clearly. Changes are shown from grey: lighter where
-    the basis makes it lighter. Raises UserError where the avatar has no bases.
+    the first of 1, 2, 4 ... 64 that shows it clearly. Changes are shown twice as large, from grey:
+    lighter where the basis makes it lighter. Raises UserError where the avatar has no bases.
     """
     count = avatar.config.num_bases
     if count == 0:
@@ -77,6 +78,7 @@ def _is_clear(picture: Picture, base: Picture) -> bool:
 
 def _change(picture: Picture, base: Picture) -> Picture:
     """What was added, about a grey; opaque where there is an alpha."""
-    change = np.clip(128 + picture.astype(int) - base, 0, 255).astype(np.uint8)
+    added = _CHANGE_GAIN * (picture.astype(int) - base)
+    change = np.clip(128 + added, 0, 255).astype(np.uint8)
     change[..., 3:] = 255
     return change

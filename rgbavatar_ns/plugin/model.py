@@ -209,10 +209,14 @@ class RGBAvatarModel(Model):
 
     def get_extra_state(self) -> dict[str, Any]:
         """What rebuilds the avatar without this dataset: its make, and every frame's theta."""
-        subject = self.subject
-        if self.refinement is not None:
-            subject = replace(subject, theta=self.refinement.all_frames(subject.theta))
-        return model_state(self.avatar, subject)
+        return model_state(self.avatar, self.film())
+
+    def film(self) -> Subject:
+        """The subject with the theta that drives the avatar in each frame."""
+        if self.refinement is None:
+            return self.subject
+        theta = self.refinement.all_frames(self.subject.theta.to(self.device))
+        return replace(self.subject, theta=theta.cpu())
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Nothing to restore: `load_state_dict` has compared it with this dataset's subject."""

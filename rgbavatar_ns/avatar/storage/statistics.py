@@ -106,18 +106,26 @@ class TrainingStatistics:
         same = _SAME_SHARE * (self.theta_max - self.theta_min) + _SAME
         return self.theta_min - same, self.theta_max + same
 
+    def filmed_turns(self) -> tuple[Float[Tensor, "2"], Float[Tensor, "2"]]:
+        """Yaw and pitch in degrees that still count as seen, lowest and highest.
+
+        Without roll, since pictures can be turned.
+        """
+        return self.turn_low[:2] - _SAME_DEGREES, self.turn_high[:2] + _SAME_DEGREES
+
     def beyond(
         self, theta: Float[Tensor, "#F H"], turns_degrees: Float[Tensor, "#F 3"]
     ) -> tuple[Bool[Tensor, "#F H"], Bool[Tensor, "#F"]]:
         """Which numbers of the expression, and which views of the head, the film did not show.
 
-        turns_degrees: `turn_seen`; roll is no matter, since pictures can be turned.
+        turns_degrees: `turn_seen`.
         """
         low, high = self.film_range()
-        middle = ((self.turn_low + self.turn_high) / 2)[:2]
-        half = ((self.turn_high - self.turn_low) / 2)[:2] + _SAME_DEGREES
+        leftmost, rightmost = self.filmed_turns()
+        middle = (leftmost + rightmost) / 2
         away = ((turns_degrees[:, :2] - middle + 180) % 360 - 180).abs()
-        return ((theta < low) | (theta > high)) & self.expressive, (away > half).any(1)
+        outside = (away > rightmost - middle).any(1)
+        return ((theta < low) | (theta > high)) & self.expressive, outside
 
     def turn_reach(self) -> tuple[Float[Tensor, "2"], Float[Tensor, "2"]]:
         """Yaw and pitch in degrees, lowest and highest, from where an avatar is shown unasked.

@@ -51,6 +51,28 @@ class Head {
     this._frame();
   }
 
+  /** How the head is turned in the world: nine numbers, root and neck together. */
+  turn(theta) {
+    const [root, neck] = ["rotation", "neck"].map((name) => {
+      const [start] = this.slices[name];
+      return axisAngleToMatrix(theta[start], theta[start + 1], theta[start + 2]);
+    });
+    return multiply3(root, neck);
+  }
+
+  /** The middle of the posed head's box, without what the neck does not turn. */
+  centre() {
+    const low = [Infinity, Infinity, Infinity], high = [-Infinity, -Infinity, -Infinity];
+    for (let v = 0; v < this.vertices.length / 3; v++) {
+      if (this.skinning[5 * v] >= 0.5) continue;
+      for (let i = 0; i < 3; i++) {
+        low[i] = Math.min(low[i], this.vertices[3 * v + i]);
+        high[i] = Math.max(high[i], this.vertices[3 * v + i]);
+      }
+    }
+    return low.map((value, i) => (value + high[i]) / 2);
+  }
+
   /** theta with its expressions and eyelids at rest. */
   _withoutLinear(theta) {
     const moved = theta.slice();

@@ -226,8 +226,14 @@ class OnlineTrainer(RGBAvatarTrainer):
     def save_checkpoint(self, step: int) -> None:
         """Write avatar, pools and frames atomically; raises UserError if they do not fit."""
         model = self.pipeline.model
-        theta, index = self.stream.pools.thetas()
-        model.subject = dataclasses.replace(model.subject, theta=theta, frame_index=index)
+        theta, views, index = self.stream.pools.parameters()
+        model.subject = dataclasses.replace(
+            model.subject,
+            theta=theta,
+            frame_index=index,
+            train=tuple(range(len(theta))),
+            world_to_camera=views,
+        )
         super().save_checkpoint(step)
 
     def _save_end(self) -> None:

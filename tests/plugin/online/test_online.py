@@ -415,6 +415,6 @@ def test_a_killed_run_goes_on_from_its_last_checkpoint(
     state = stream_state(folder)
     again = online("again", load_dir=folder)
     assert again.stream.pools.num_added == state["frames"]["added"] > 0
-    assert torch.equal(again.stream.pools.thetas()[0], state["frames"]["theta"])
+    assert torch.equal(again.stream.pools.parameters()[0], state["frames"]["theta"])
     again.train()
     assert summary(again)["frames"] == STREAMED
