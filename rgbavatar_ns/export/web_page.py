@@ -131,7 +131,7 @@ def _film(avatar: Avatar, seen: TrainingStatistics | None) -> dict[str, Any]:
     films.
     """
     rest = torch.zeros(1, avatar.layout.size)
-    known = seen or TrainingStatistics.of(rest, rest[:, :0], avatar.layout)
+    known = seen or TrainingStatistics.of(rest, torch.zeros(1, 1), avatar.layout)
     turns = (known.filmed_turns(), known.turn_reach())
     turn, reach = ([end.deg2rad().tolist() for end in ends] for ends in turns)
     theta = None if seen is None else [end.tolist() for end in seen.film_range()]

@@ -138,10 +138,9 @@ class App {
       return Math.abs(Math.atan2(Math.sin(off), Math.cos(off))) > (high[i] - low[i]) / 2;
     });
     if (away[0] || away[1]) {
-      const degrees = (angle) => `${Math.round((180 * angle) / Math.PI)}°`;
-      const i = away[0] ? 0 : 1;
-      found.push(`seen from ${degrees(this.turnSeen[i])} ${["sideways", "below or above"][i]}, `
-        + `filmed ${degrees(low[i])} to ${degrees(high[i])}`);
+      const i = away[0] ? 0 : 1, sides = [["right", "left"], ["above", "below"]][i];
+      const said = (angle) => `${Math.round(Math.abs((180 * angle) / Math.PI))}° ${sides[angle > 0 ? 1 : 0]}`;
+      found.push(`seen from ${said(this.turnSeen[i])}, filmed ${said(low[i])} to ${said(high[i])}`);
     }
     found.push(...this.panel.namesBeyond());
     this.beyond.textContent = found.length ? `Beyond the film: ${found.join("; ")}` : "";

@@ -117,7 +117,8 @@ class Panel {
       row.title = `in the film ${from.toFixed(2)} to ${to.toFixed(2)}`;
       const input = row.querySelector("input"), ends = document.createElement("datalist");
       ends.id = `${input.id}-film`; // the browser marks its values on the slider
-      ends.append(new Option("", from), new Option("", to));
+      const onStep = (value) => range[0] + Math.round((value - range[0]) / input.step) * input.step;
+      ends.append(new Option("", onStep(from)), new Option("", onStep(to)));
       input.setAttribute("list", ends.id);
       row.append(ends);
       if (title !== "Head") this.watched.push([name, places]);
