@@ -73,7 +73,7 @@ def basis_grid(
 def _is_clear(picture: Picture, base: Picture) -> bool:
     changed = np.abs(picture.astype(int) - base).max(-1)
     covered = (base != base[0, 0]).any(-1).sum()
-    return (changed >= _CLEAR).sum() >= _CLEAR_SHARE * covered
+    return bool((changed >= _CLEAR).sum() >= _CLEAR_SHARE * covered)
 
 
 def _change(picture: Picture, base: Picture) -> Picture:

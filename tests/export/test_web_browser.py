@@ -239,7 +239,8 @@ def test_sliders_show_the_film_and_jaws_only_open(open_page):
         "() => [...document.querySelector('#slider-jaw-open').list.options]"
         ".map((end) => Number(end.value))"
     )
-    assert ends == pytest.approx([max(0.0, low[place]), high[place]], abs=0.002)
+    filmed = [max(0.0, float(low[place])), float(high[place])]
+    assert ends == pytest.approx(filmed, abs=0.002)
     jaw.fill("0.5")
     _shown(page)
     assert "jaw open" in page.locator("#beyond").text_content()
