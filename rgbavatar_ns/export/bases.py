@@ -14,7 +14,7 @@ from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.export.drawing import Color, Picture, pictures
 from rgbavatar_ns.kernels import PinholeCameras
 
-_CLEAR, _CLEAR_SHARE = 60, 0.02
+_CLEAR, _CLEAR_SHARE = 60, 0.01
 """A change is seen where it is so many of 255 steps, in so much of what the avatar covers."""
 _STRONGEST_GAIN = 64.0
 _CHANGE_GAIN = 2

@@ -72,10 +72,10 @@ def write_web_page(
     directory, block = pack(head_arrays(avatar) | gaussian_arrays(avatar) | network | frames)
     manifest = _manifest(avatar, camera, theta, options)
     manifest |= {"film": _film(avatar, seen), "network": layers, "arrays": directory}
-    text = _assemble(manifest, block, options.title)
+    content = _assemble(manifest, block, options.title).encode()
     with atomic_write(path) as partial:
-        partial.write_text(text, encoding="utf-8")
-    return len(text)
+        partial.write_bytes(content)
+    return len(content)
 
 
 @torch.no_grad()

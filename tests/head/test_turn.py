@@ -22,17 +22,13 @@ def test_angles_are_those_of_the_turns_about_y_then_x_then_z(seed):
     generator = torch.Generator().manual_seed(seed)
     spans = torch.tensor([170.0, 80.0, 170.0])
     wanted = spans * (2 * torch.rand(20, 3, generator=generator) - 1)
-    yaw, pitch, roll = wanted.deg2rad().unbind(1)
     # Head to camera: -yaw about y, then -pitch about x, then roll about z.
-    turns = roma.euler_to_rotmat("zxy", [roll, -pitch, -yaw])
-    # roma's lower case turns about fixed axes, from the last to the first named, or the reverse.
-    upper = roma.euler_to_rotmat("ZXY", [roll, -pitch, -yaw])
-    about = [
-        roma.rotvec_to_rotmat(a[:, None] * torch.eye(3)[i])
-        for a, i in ((roll, 2), (-pitch, 0), (-yaw, 1))
-    ]
-    assert any(torch.allclose(about[0] @ about[1] @ about[2], t, atol=1e-5) for t in (turns, upper))
-    seen = turn_seen(torch.zeros(1, _LAYOUT.size), _views(about[0] @ about[1] @ about[2]), _LAYOUT)
+    yaw, pitch, roll = (
+        roma.rotvec_to_rotmat(angle[:, None] * torch.eye(3)[axis])
+        for angle, axis in zip(wanted.deg2rad().unbind(1), (1, 0, 2))
+    )
+    views = _views(roll @ pitch.mT @ yaw.mT)
+    seen = turn_seen(torch.zeros(1, _LAYOUT.size), views, _LAYOUT)
     assert torch.allclose(seen, wanted, atol=1e-2)
 
 

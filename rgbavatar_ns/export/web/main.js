@@ -139,7 +139,8 @@ class App {
     });
     if (away[0] || away[1]) {
       const i = away[0] ? 0 : 1, sides = [["right", "left"], ["above", "below"]][i];
-      const said = (angle) => `${Math.round(Math.abs((180 * angle) / Math.PI))}° ${sides[angle > 0 ? 1 : 0]}`;
+      const degrees = (angle) => `${Math.round(Math.abs((180 * angle) / Math.PI))}°`;
+      const said = (angle) => `${degrees(angle)} ${sides[angle > 0 ? 1 : 0]}`;
       found.push(`seen from ${said(this.turnSeen[i])}, filmed ${said(low[i])} to ${said(high[i])}`);
     }
     found.push(...this.panel.namesBeyond());
