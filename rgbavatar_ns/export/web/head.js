@@ -39,25 +39,17 @@ class Head {
     this.lengthRatio = new Float32Array(this.numTriangles).fill(1);
   }
 
-  /** Pose the head: fills `vertices`, `frames`, `quaternions` and `lengthRatio`. */
+  /** Pose the head: fills `turn`, `vertices`, `frames`, `quaternions` and `lengthRatio`. */
   pose(theta) {
     const turns = JOINT_FIELDS.map((name) => {
       const [start] = this.slices[name];
       return axisAngleToMatrix(theta[start], theta[start + 1], theta[start + 2]);
     });
+    this.turn = multiply3(turns[0], turns[1]); // of root and neck together, nine numbers
     const moved = this.movedByJointsOnly ? this._withoutLinear(theta) : theta;
     this._shape(moved, turns);
     this._skin(moved, turns);
     this._frame();
-  }
-
-  /** How the head is turned in the world: nine numbers, root and neck together. */
-  turn(theta) {
-    const [root, neck] = ["rotation", "neck"].map((name) => {
-      const [start] = this.slices[name];
-      return axisAngleToMatrix(theta[start], theta[start + 1], theta[start + 2]);
-    });
-    return multiply3(root, neck);
   }
 
   /** The middle of the posed head's box, without what the neck does not turn. */

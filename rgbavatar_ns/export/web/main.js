@@ -85,10 +85,9 @@ class App {
     this.psi = this.network.evaluate(this.theta);
     for (const [k, value] of this.heldWeights) this.psi[k] = value;
     this.head.pose(this.theta);
-    const turn = this.head.turn(this.theta);
-    this.orbit.seen = viewAngles(multiply3(this.data.camera.rotation, turn));
+    this.orbit.seen = viewAngles(multiply3(this.data.camera.rotation, this.head.turn));
     const camera = this.orbit.at(width, height, this.head.centre());
-    this.turnSeen = viewAngles(multiply3(camera.rotation, turn));
+    this.turnSeen = viewAngles(multiply3(camera.rotation, this.head.turn));
     this.positions.blend(this.psi);
     this.positions.place(this.head);
     this.positions.sort(camera);
