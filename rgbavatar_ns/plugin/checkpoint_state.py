@@ -21,11 +21,13 @@ def model_state(avatar: Avatar, subject: Subject) -> dict[str, Any]:
     `avatar` is what `Avatar.from_state` needs; `frames` lets another program play the training
     performance without the dataset; `statistics` says what was seen in it.
     """
+    # A stream's pools may be empty still.
+    seen = film_statistics(avatar, subject).to_state() if len(subject.theta) else None
     return {
         "avatar": avatar.to_state(),
         "layout": avatar.layout.to_json(),
         "frames": {"theta": subject.theta, "index": list(subject.frame_index)},
-        "statistics": film_statistics(avatar, subject).to_state(),
+        "statistics": seen,
     }
 
 

@@ -209,14 +209,11 @@ class RGBAvatarModel(Model):
 
     def get_extra_state(self) -> dict[str, Any]:
         """What rebuilds the avatar without this dataset: its make, and every frame's theta."""
-        return model_state(self.avatar, self.film())
-
-    def film(self) -> Subject:
-        """The subject with the theta that drives the avatar in each frame."""
-        if self.refinement is None:
-            return self.subject
-        theta = self.refinement.all_frames(self.subject.theta.to(self.device))
-        return replace(self.subject, theta=theta.cpu())
+        subject = self.subject
+        if self.refinement is not None:
+            theta = self.refinement.all_frames(subject.theta.to(self.device))
+            subject = replace(subject, theta=theta.cpu())
+        return model_state(self.avatar, subject)
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Nothing to restore: `load_state_dict` has compared it with this dataset's subject."""

@@ -227,14 +227,18 @@ class OnlineTrainer(RGBAvatarTrainer):
         """Write avatar, pools and frames atomically; raises UserError if they do not fit."""
         model = self.pipeline.model
         theta, views, index = self.stream.pools.parameters()
+        newest = model.subject
         model.subject = dataclasses.replace(
-            model.subject,
+            newest,
             theta=theta,
             frame_index=index,
             train=tuple(range(len(theta))),
             world_to_camera=views,
         )
-        super().save_checkpoint(step)
+        try:
+            super().save_checkpoint(step)
+        finally:
+            model.subject = newest
 
     def _save_end(self) -> None:
         self.stream.record()

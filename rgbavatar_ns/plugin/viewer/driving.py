@@ -1,6 +1,6 @@
 """Which theta and psi a viewer's state means on a model."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
@@ -25,7 +25,8 @@ class DrivingSignal:
 
 def training_statistics(model: RGBAvatarModel) -> TrainingStatistics:
     """What the avatar has seen, with the weights that its network gives now."""
-    return film_statistics(model.avatar, model.film())
+    theta = model.driving_theta(list(range(len(model.frame_theta))))
+    return film_statistics(model.avatar, replace(model.subject, theta=theta.cpu()))
 
 
 @torch.no_grad()
