@@ -11,6 +11,7 @@ from rgbavatar_ns.options import FrameRate
 
 if TYPE_CHECKING:
     from rgbavatar_ns.avatar import Avatar
+    from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
     from rgbavatar_ns.data import TrackedDataset
 
 Format = Literal["bundle", "ply", "ply-sequence", "web"]
@@ -51,10 +52,7 @@ def run(
     avatar = Avatar.load(run_folder)
     dataset = _dataset(avatar, run_folder, data, needed=frame is not None or frames is not None)
     if format == "bundle":
-        from rgbavatar_ns.avatar.storage.bundle import load_statistics
-        from rgbavatar_ns.export import statistics_of
-
-        seen = load_statistics(run_folder) if dataset is None else statistics_of(avatar, dataset)
+        seen = _seen(avatar, run_folder, dataset)
         avatar.save(destination, statistics=seen, with_head=head_inside)
         print(f"Avatar.load({str(destination)!r}) opens it.")
     elif format == "ply":
@@ -62,7 +60,18 @@ def run(
     elif format == "ply-sequence":
         _write_sequence(avatar, dataset, frames, destination)
     else:
-        _write_page(avatar, dataset, frames, destination, frames_per_second, title)
+        seen = _seen(avatar, run_folder, dataset)
+        _write_page(avatar, seen, dataset, frames, destination, frames_per_second, title)
+
+
+def _seen(
+    avatar: "Avatar", run_folder: Path, dataset: "TrackedDataset | None"
+) -> "TrainingStatistics | None":
+    """What the avatar saw in training, if that is known."""
+    from rgbavatar_ns.avatar.storage.bundle import load_statistics
+    from rgbavatar_ns.export import statistics_of
+
+    return load_statistics(run_folder) if dataset is None else statistics_of(avatar, dataset)
 
 
 def _dataset(
@@ -129,6 +138,7 @@ def _write_sequence(
 
 def _write_page(
     avatar: "Avatar",
+    seen: "TrainingStatistics | None",
     dataset: "TrackedDataset | None",
     frames: tuple[int, int] | None,
     destination: Path,
@@ -146,5 +156,5 @@ def _write_page(
         chosen = chosen_frames(len(dataset), frames, range(len(dataset)))
         camera, theta = dataset.cameras.select([chosen[0]]), dataset.theta[list(chosen)]
     options = PageOptions(title, frames_per_second)
-    size = write_web_page(avatar, destination, camera, theta, options)
+    size = write_web_page(avatar, destination, camera, theta, options, seen)
     print(f"{destination}: {size / 1e6:.1f} MB; open it in a browser")

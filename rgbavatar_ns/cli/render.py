@@ -62,8 +62,8 @@ def run(
     frames: tuple[int, int] | None = None,
     hold: Counted | None = None,
     camera_path: Path | None = None,
-    gain: Weight = 1.5,
-    arc: Annotated[float, Between(-360, 360)] = 360.0,
+    gain: Weight | None = None,
+    arc: Annotated[float, Between(-360, 360)] | None = None,
     picture: Annotated[PictureOptions, tyro.conf.arg(name="")] = _PICTURE,
     driving: Annotated[DrivingOptions, tyro.conf.arg(name="")] = _DRIVING,
 ) -> None:
@@ -72,7 +72,9 @@ def run(
     comparison: held-out frames, avatar and error (times 4) side by side. performance: the avatar
     alone, or with --driver beside the other person who drives it. views: four fixed views in a
     row. orbit: the camera swings around the head. camera-path: the cameras of nerfstudio's viewer.
-    turntable: once around the head. bases: the grid of learned bases, each alone.
+    turntable: the camera goes to and fro about the head. Views, orbit and turntable show the head
+    no more than 30 degrees beyond what was filmed; what goes beyond the film is told. bases: each
+    learned basis alone, made strong enough to be seen, beside what it changes.
 
     Args:
         run_folder: a run of ns-train, a checkpoint or an avatar bundle.
@@ -86,8 +88,10 @@ def run(
             the driver's frames, or the held-out ones of the avatar's own dataset.
         hold: show the expression of this one of the chosen frames, instead of playing them.
         camera_path: for camera-path, the JSON file saved in the viewer's render panel.
-        arc: for the turntable, how far around the head in degrees; less than 360 goes to and fro.
-        gain: for bases, by how much each basis's largest weight in training is exaggerated.
+        arc: for the turntable, how far around the head in degrees, whatever was filmed; less than
+            360 goes to and fro.
+        gain: for bases, by how much each basis's largest weight in training is exaggerated; by
+            default by as much as it takes to see what it does.
         picture: how pictures are written.
         driving: how the driver's performance becomes the avatar's.
     """
@@ -101,7 +105,7 @@ def run(
     else:
         kind = picture.kind_for(show)
         scene, beside = _scene(subject, driver, frames, picture, driving)
-        total, drawn = _drawn(subject.avatar, scene, beside, show, hold, arc, camera_path, picture)
+        total, drawn = _drawn(subject, scene, beside, show, hold, arc, camera_path, picture)
         _write(drawn, total, output, show, kind, picture.frames_per_second)
 
 
@@ -161,11 +165,14 @@ def _compare(
     print(f"{count} frames: {video} and {still}")
 
 
-def _write_bases(subject: _Subject, output: Path, gain: float, picture: PictureOptions) -> None:
+def _write_bases(
+    subject: _Subject, output: Path, gain: float | None, picture: PictureOptions
+) -> None:
     from rgbavatar_ns.export import basis_grid, write_png
 
     background = None if picture.transparent else picture.background
-    grid = basis_grid(subject.avatar, subject.seen, subject.camera, background, gain)
+    with progress_bar("bases") as update:
+        grid = basis_grid(subject.avatar, subject.seen, subject.camera, background, gain, update)
     write_png(output / "bases.png", grid)
     print(f"base and {subject.avatar.config.num_bases} bases: {output / 'bases.png'}")
 
@@ -200,34 +207,37 @@ def _scene(
 
 
 def _drawn(
-    avatar: "Avatar",
+    subject: _Subject,
     scene: "Scene",
     beside: "tuple[TrackedDataset, tuple[int, ...]] | None",
     show: Show,
     hold: int | None,
-    arc: float,
+    arc: float | None,
     camera_path: Path | None,
     picture: PictureOptions,
 ) -> "tuple[int, Iterator[np.ndarray]]":
     """How many pictures there will be, and the pictures."""
     from rgbavatar_ns.export import pictures, scenes
 
+    avatar, seen = subject.avatar, subject.seen
     background = None if picture.transparent else picture.background
     if hold is not None or show == "turntable":
         moving = show in ("orbit", "turntable")
         scene = scene.held(hold or 0, scenes.TURNTABLE_FRAMES if moving else 1)
         beside = None
     if show == "views":
-        return len(scene), scenes.side_by_side(avatar, scene, background)
+        return len(scene), scenes.side_by_side(avatar, scene, seen, background)
     if show == "orbit":
-        scene = scenes.orbiting(avatar, scene)
+        scene = scenes.orbiting(avatar, scene, seen)
     elif show == "turntable":
-        scene = scenes.turntable(avatar, scene, arc)
+        scene = scenes.turntable(avatar, scene, seen, arc)
     elif show == "camera-path":
         if camera_path is None:
             raise UserError("There is no camera path.", "Name its file with --camera-path.")
         scene = scenes.along_path(camera_path, scene)
-    elif beside is not None and background is not None:
+    if told := scenes.told_beyond_film(avatar, scene, seen):
+        print(told)
+    if show == "performance" and beside is not None and background is not None:
         return len(scene), scenes.beside_driver(avatar, scene, *beside, background)
     return len(scene), pictures(avatar, scene.theta, scene.cameras, background)
 

@@ -9,7 +9,6 @@ from rgbavatar_ns.export.ply import write_ply
 from rgbavatar_ns.export.run_data import dataset_folder, statistics_of
 from rgbavatar_ns.export.video import write_gif, write_png, write_pngs, write_video
 from rgbavatar_ns.export.views import (
-    four_views,
     front_camera,
     head_centre,
     orbit,
@@ -29,7 +28,6 @@ __all__ = [
     "dataset_folder",
     "draw",
     "drive",
-    "four_views",
     "front_camera",
     "head_centre",
     "one_euro",

@@ -1,5 +1,6 @@
 """Another's performance for an avatar: mapped by name, made relative, held to what was seen."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -62,7 +63,8 @@ class DrivingOptions:
     """Of the head's turns and place: departures from the driver's mean pose start from the avatar's
     own; absolute takes them as they are; keep holds the avatar's mean pose."""
     project: bool = False
-    """Hold the expression to the span and range of those seen in training."""
+    """Hold the expression to the span and range of those seen in training. Without it the command
+    tells how many frames go beyond."""
     smooth: bool = False
     """Filter jitter with a one-euro filter."""
     filter: OneEuroOptions = field(default_factory=OneEuroOptions)
@@ -145,6 +147,30 @@ def drive(
     if options.project:
         result = own.project(result)
     return replace(mapped, theta=result)
+
+
+def told_beyond(
+    seen: TrainingStatistics,
+    names: Sequence[str],
+    theta: Float[Tensor, "#F H"],
+    turns_degrees: Float[Tensor, "#F 3"],
+) -> str:
+    """What goes beyond the film that the avatar was trained on, most frequent first; may be empty.
+
+    names: of theta's numbers. turns_degrees: `head.turn_seen` of the frames.
+    """
+    numbers, view = seen.beyond(theta, turns_degrees)
+    frames = max(len(numbers), len(view))
+    beyond = torch.cat([view[:, None].expand(frames, 1), numbers.expand(frames, -1)], 1)
+    counts = beyond.sum(0).tolist()
+    found = sorted((-count, place) for place, count in enumerate(counts) if count)
+    if not found:
+        return ""
+    called = ("the head's turn", *names)
+    several = frames > 1
+    told = [called[place] + (f" ({-count})" if several else "") for count, place in found]
+    share = f" in {int(beyond.any(1).sum())} of {frames} pictures" if several else ""
+    return f"beyond the film{share}: {first_few(told, 6)}"
 
 
 def _references(

@@ -57,4 +57,5 @@ def statistics_of(avatar: Avatar, dataset: TrackedDataset) -> TrainingStatistics
     avatar.require_layout(dataset.layout, f"The dataset {dataset.root}")
     theta = dataset.theta[list(dataset.train)]
     psi = avatar.weights(theta.to(avatar.identity.device)).cpu()
-    return TrainingStatistics.of(theta, psi, avatar.layout)
+    views = dataset.cameras.world_to_camera[list(dataset.train)]
+    return TrainingStatistics.of(theta, psi, avatar.layout, views)

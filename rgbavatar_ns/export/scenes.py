@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -15,8 +16,21 @@ from rgbavatar_ns.drawing.compositing import composite_bytes
 from rgbavatar_ns.drawing.contact_sheet import scaled
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.export.drawing import Color, Picture, pictures
-from rgbavatar_ns.export.driving import DrivingOptions, MappedTheta, ThetaNames, drive
-from rgbavatar_ns.export.views import four_views, head_centre, orbit, read_camera_path, swing
+from rgbavatar_ns.export.driving import (
+    DrivingOptions,
+    MappedTheta,
+    ThetaNames,
+    drive,
+    told_beyond,
+)
+from rgbavatar_ns.export.views import (
+    FOUR_VIEWS_DEGREES,
+    head_centre,
+    orbit,
+    read_camera_path,
+    swing,
+)
+from rgbavatar_ns.head import turn_seen
 from rgbavatar_ns.kernels import PinholeCameras
 
 TURNTABLE_FRAMES = 72
@@ -41,7 +55,13 @@ class Scene:
             raise UserError(
                 f"There is no frame {frame} to hold.", f"Name one from 0 to {len(self) - 1}."
             )
-        return replace(self, theta=self.theta[frame].expand(count, -1))
+        return replace(
+            self, theta=self.theta[frame].expand(count, -1), cameras=self.camera_of(frame)
+        )
+
+    def camera_of(self, frame: int) -> PinholeCameras:
+        """The camera that sees this frame."""
+        return self.cameras.select([frame if len(self.cameras.focal_px) > 1 else 0])
 
 
 def chosen_frames(
@@ -85,27 +105,67 @@ def driven_by(
     return replace(mapped, theta=mapped.theta[list(chosen)])
 
 
-def orbiting(avatar: Avatar, scene: Scene) -> Scene:
+def room(avatar: Avatar, scene: Scene, seen: TrainingStatistics) -> Float[Tensor, "2 F 2"]:
+    """How far each frame's camera may turn about the head to stay where the avatar holds.
+
+    Lowest and highest, yaw and pitch in degrees; zero is always among them.
+    """
+    there = turn_seen(scene.theta, scene.cameras.world_to_camera, avatar.layout)[:, :2]
+    low, high = seen.turn_reach()
+    return torch.stack([(low - there).clamp(max=0), (high - there).clamp(min=0)])
+
+
+def turned(
+    avatar: Avatar,
+    scene: Scene,
+    seen: TrainingStatistics | None,
+    yaw_degrees: Float[Tensor, "F"],
+    pitch_degrees: Float[Tensor, "F"],
+) -> Scene:
+    """The scene seen from cameras that turn about each frame's head.
+
+    Where it is told what was seen in training, no farther than the avatar holds.
+    """
+    angles = torch.stack([yaw_degrees, pitch_degrees], 1)
+    if seen is not None:
+        low, high = room(avatar, scene, seen)
+        angles = torch.minimum(torch.maximum(angles, low), high)
+    centre = head_centre(avatar, scene.theta)
+    return replace(scene, cameras=orbit(scene.cameras, centre, *angles.unbind(1)))
+
+
+def orbiting(avatar: Avatar, scene: Scene, seen: TrainingStatistics) -> Scene:
     """The camera swings to both sides and a little up and down, once over the scene."""
     sideways, upwards = _ORBIT_DEGREES
-    yaw = swing(len(scene), sideways)
-    pitch = [upwards * angle / sideways for angle in swing(len(scene), sideways)]
-    pitch = pitch[len(pitch) // 4 :] + pitch[: len(pitch) // 4]
-    cameras = orbit(scene.cameras, head_centre(avatar), yaw, pitch)
-    return replace(scene, cameras=cameras)
+    to_and_fro = swing(len(scene))
+    up_and_down = upwards * to_and_fro.roll(-(len(scene) // 4))
+    return turned(avatar, scene, seen, sideways * to_and_fro, up_and_down)
 
 
-def turntable(avatar: Avatar, scene: Scene, arc_degrees: float) -> Scene:
-    """The camera goes around the head once over the scene, or to and fro on a part of the circle.
+def turntable(
+    avatar: Avatar, scene: Scene, seen: TrainingStatistics, arc_degrees: float | None
+) -> Scene:
+    """The camera goes to and fro about the head, as far as the avatar holds, once over the scene.
 
-    What no camera saw in training, such as the back of the head, has no learned looks.
+    With an arc so far, whatever was filmed; with one of 360 degrees once around. What no camera
+    saw in training, such as the back of the head, has no learned looks.
     """
-    if arc_degrees >= 360:
-        yaw = [360.0 * frame / len(scene) for frame in range(len(scene))]
+    level, to_and_fro = torch.zeros(len(scene)), swing(len(scene))
+    if arc_degrees is None:
+        low, high = room(avatar, scene, seen)[..., 0]
+        yaw = torch.where(to_and_fro < 0, -low, high) * to_and_fro
+    elif arc_degrees >= 360:
+        yaw = torch.arange(len(scene)) * (360 / len(scene))
     else:
-        yaw = swing(len(scene), arc_degrees / 2)
-    cameras = orbit(scene.cameras, head_centre(avatar), yaw, [0.0] * len(scene))
-    return replace(scene, cameras=cameras)
+        yaw = to_and_fro * (arc_degrees / 2)
+    return turned(avatar, scene, None, yaw, level)
+
+
+def told_beyond_film(avatar: Avatar, scene: Scene, seen: TrainingStatistics) -> str:
+    """What of the scene goes beyond the film, in a line; empty where nothing does."""
+    turns = turn_seen(scene.theta, scene.cameras.world_to_camera, avatar.layout)
+    names = ThetaNames.of(avatar.layout, avatar.head.arrays).numbers
+    return told_beyond(seen, names, scene.theta, turns)
 
 
 def along_path(path: Path, scene: Scene) -> Scene:
@@ -116,12 +176,15 @@ def along_path(path: Path, scene: Scene) -> Scene:
     return Scene(scene.theta[places], cameras, frames_per_second)
 
 
-def side_by_side(avatar: Avatar, scene: Scene, background: Color | None) -> Iterator[Picture]:
+def side_by_side(
+    avatar: Avatar, scene: Scene, seen: TrainingStatistics, background: Color | None
+) -> Iterator[Picture]:
     """Four views of each frame in a row."""
-    views = four_views(scene.cameras, head_centre(avatar))
-    for theta in scene.theta:
-        same = theta.expand(len(views.world_to_camera), -1)
-        yield np.concatenate(list(pictures(avatar, same, views, background)), axis=1)
+    yaw, pitch = torch.tensor(FOUR_VIEWS_DEGREES).unbind(1)
+    for frame in range(len(scene)):
+        same = scene.held(frame, len(yaw))
+        views = turned(avatar, same, seen, yaw, pitch)
+        yield np.concatenate(list(pictures(avatar, views.theta, views.cameras, background)), axis=1)
 
 
 def beside_driver(

@@ -1,7 +1,6 @@
 """Cameras to look at an avatar with: fixed views, orbits, nerfstudio's camera paths."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -28,15 +27,18 @@ _MOST_CAMERAS, _LARGEST_SIDE, _MOST_FRAMES_PER_SECOND = 100_000, 16384, 1000.0
 
 
 @torch.no_grad()
-def head_centre(avatar: Avatar) -> Float[Tensor, "3"]:
-    """The middle of the avatar's head at rest, in metres."""
-    rest = avatar.identity.new_zeros(1, avatar.layout.size)
-    return avatar.head(rest, avatar.identity)[0].mean(0).cpu()
+def head_centre(avatar: Avatar, theta: Float[Tensor, "F H"]) -> Float[Tensor, "F 3"]:
+    """The middle of the posed head's box, without what the neck does not turn; in metres."""
+    vertices = avatar.head(theta.to(avatar.identity), avatar.identity).cpu()
+    head = vertices[:, torch.from_numpy(avatar.head.arrays.skinning_weights[:, 0] < 0.5)]
+    return (head.amin(1) + head.amax(1)) / 2
 
 
+@torch.no_grad()
 def front_camera(avatar: Avatar, width: int, height: int) -> PinholeCameras:
     """A camera 1.1 m in front of the face that sees the whole head."""
-    x, y, z = head_centre(avatar).tolist()
+    rest = avatar.identity.new_zeros(1, avatar.layout.size)
+    x, y, z = avatar.head(rest, avatar.identity)[0].mean(0).tolist()
     world_to_camera = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))[None]
     world_to_camera[0, :3, 3] = torch.tensor([-x, y, z + _DISTANCE_M])
     focal_px = torch.full((1, 2), min(width, height) * _DISTANCE_M / _SEEN_M)
@@ -45,33 +47,27 @@ def front_camera(avatar: Avatar, width: int, height: int) -> PinholeCameras:
 
 
 def orbit(
-    camera: PinholeCameras,
-    centre: Float[Tensor, "3"],
-    yaw_degrees: Sequence[float],
-    pitch_degrees: Sequence[float],
+    cameras: PinholeCameras,
+    centre: Float[Tensor, "#C 3"],
+    yaw_degrees: Float[Tensor, "C"],
+    pitch_degrees: Float[Tensor, "C"],
 ) -> PinholeCameras:
-    """The first camera carried around a point, at the same distance: a view for each angle.
+    """Cameras (one for all angles, or one each) carried around a point, at the same distance.
 
     Positive yaw shows the head's left side, positive pitch looks from below. Angles of zero give
-    the camera itself.
+    the camera itself; the point stays where it is in the picture.
     """
-    yaw, pitch = (torch.tensor(a).deg2rad() for a in (yaw_degrees, pitch_degrees))
+    yaw, pitch = yaw_degrees.deg2rad(), pitch_degrees.deg2rad()
     zero = torch.zeros_like(yaw)
     about_x = axis_angle_to_matrix(torch.stack([-pitch, zero, zero], -1))
     about_y = axis_angle_to_matrix(torch.stack([zero, -yaw, zero], -1))
-    world_to_camera = camera.world_to_camera[0].expand(len(yaw), 4, 4).clone()
+    world_to_camera = cameras.world_to_camera.expand(len(yaw), 4, 4).clone()
     rotation, translation = world_to_camera[:, :3, :3], world_to_camera[:, :3, 3]
     turned = rotation @ about_x @ about_y
-    world_to_camera[:, :3, 3] = translation + (rotation - turned) @ centre
-    world_to_camera[:, :3, :3] = turned
-    cameras = camera.select([0] * len(yaw))
-    return replace(cameras, world_to_camera=world_to_camera)
-
-
-def four_views(camera: PinholeCameras, centre: Float[Tensor, "3"]) -> PinholeCameras:
-    """The four fixed views around the first camera."""
-    yaw, pitch = zip(*FOUR_VIEWS_DEGREES)
-    return orbit(camera, centre, yaw, pitch)
+    moved = translation + ((rotation - turned) @ centre[..., None])[..., 0]
+    world_to_camera[:, :3, 3], world_to_camera[:, :3, :3] = moved, turned
+    places = range(len(yaw)) if len(cameras.focal_px) > 1 else [0] * len(yaw)
+    return replace(cameras.select(places), world_to_camera=world_to_camera)
 
 
 def resized(cameras: PinholeCameras, width: int, height: int) -> PinholeCameras:
@@ -134,7 +130,6 @@ def read_camera_path(path: Path) -> tuple[PinholeCameras, float]:
     return cameras, float(frames_per_second)
 
 
-def swing(num_frames: int, reach_degrees: float) -> list[float]:
-    """Angles of a calm swing to both sides that ends where it began."""
-    turn = [2 * math.pi * frame / num_frames for frame in range(num_frames)]
-    return [reach_degrees * math.sin(angle) for angle in turn]
+def swing(num_frames: int) -> Float[Tensor, "num_frames"]:
+    """Between -1 and 1 and back: a calm swing to both sides that ends where it began."""
+    return (torch.arange(num_frames) * (2 * math.pi / num_frames)).sin()

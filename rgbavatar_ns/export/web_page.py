@@ -16,6 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from rgbavatar_ns.avatar.avatar import Avatar
+from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
 from rgbavatar_ns.export.web_arrays import gaussian_arrays, head_arrays, network_arrays, pack
 from rgbavatar_ns.files import atomic_write
 from rgbavatar_ns.kernels import PinholeCameras
@@ -56,22 +57,25 @@ def write_web_page(
     camera: PinholeCameras,
     theta: Float[Tensor, "F H"],
     options: PageOptions | None = None,
+    seen: TrainingStatistics | None = None,
 ) -> int:
     """Write the page and return its size in bytes; nothing in it is loaded from elsewhere.
 
     camera: where the page's view starts (its first camera). theta: the performance, which may
-    have no frames. The bases are kept in 8 bits with a unit for each component. Raises UserError
-    where the file cannot be written.
+    have no frames. seen: what the page tells of the film, and how far its camera turns.
+    The bases are kept in 8 bits with a unit for each component. Raises UserError where the file
+    cannot be written.
     """
     options = PageOptions() if options is None else options
     layers, network = network_arrays(avatar)
     frames = {"theta": theta.detach().cpu().numpy().astype(np.float32)}
     directory, block = pack(head_arrays(avatar) | gaussian_arrays(avatar) | network | frames)
-    manifest = _manifest(avatar, camera, theta, options) | {"network": layers, "arrays": directory}
-    text = _assemble(manifest, block, options.title)
+    manifest = _manifest(avatar, camera, theta, options)
+    manifest |= {"film": _film(avatar, seen), "network": layers, "arrays": directory}
+    content = _assemble(manifest, block, options.title).encode()
     with atomic_write(path) as partial:
-        partial.write_text(text, encoding="utf-8")
-    return len(text)
+        partial.write_bytes(content)
+    return len(content)
 
 
 @torch.no_grad()
@@ -80,7 +84,6 @@ def _manifest(
 ) -> dict[str, Any]:
     config, layout = avatar.config, avatar.layout
     rest = theta.new_zeros(1, layout.size)
-    vertices = avatar.head(rest.to(avatar.identity), avatar.identity)[0]
     seen = torch.cat([rest, theta]).to(avatar.identity)
     expression = seen[:, layout.slice("expression")]
     names = avatar.head.arrays.expression_names
@@ -116,10 +119,23 @@ def _manifest(
             "width": camera.width,
             "height": camera.height,
         },
-        "centre": vertices.mean(0).tolist(),
         "background": list(options.background),
         "frames_per_second": options.frames_per_second,
     }
+
+
+def _film(avatar: Avatar, seen: TrainingStatistics | None) -> dict[str, Any]:
+    """What counts as filmed: lowest and highest yaw and pitch in radians, lowest and highest theta.
+
+    Of an avatar that brings no statistics, theta's range is None and the turns are those of most
+    films.
+    """
+    rest = torch.zeros(1, avatar.layout.size)
+    known = seen or TrainingStatistics.of(rest, torch.zeros(1, 1), avatar.layout)
+    turns = (known.filmed_turns(), known.turn_reach())
+    turn, reach = ([end.deg2rad().tolist() for end in ends] for ends in turns)
+    theta = None if seen is None else [end.tolist() for end in seen.film_range()]
+    return {"turn": turn, "turn_reach": reach, "theta": theta}
 
 
 def _assemble(manifest: dict[str, Any], block: bytes, title: str) -> str:

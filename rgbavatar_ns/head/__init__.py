@@ -6,6 +6,7 @@ from rgbavatar_ns.head.frames import edges_to_frame, frame_quats_wxyz, tangent_f
 from rgbavatar_ns.head.landmarks import SPARSE_51, LandmarkMap, facemesh_landmarks
 from rgbavatar_ns.head.layout import ThetaField, ThetaLayout
 from rgbavatar_ns.head.model import HeadModel
+from rgbavatar_ns.head.turn import turn_range, turn_seen
 
 __all__ = [
     "SPARSE_51",
@@ -19,5 +20,7 @@ __all__ = [
     "facemesh_landmarks",
     "frame_quats_wxyz",
     "tangent_frames",
+    "turn_range",
+    "turn_seen",
     "uv_anchors",
 ]

@@ -48,6 +48,23 @@ def matrix_to_axis_angle(matrix: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "
     return roma.rotmat_to_rotvec(matrix)
 
 
+def matrix_to_view_degrees(
+    head_to_camera: Float[Tensor, "*batch 3 3"],
+) -> Float[Tensor, "*batch 3"]:
+    """How a camera (OpenCV's axes) sees a head: yaw, pitch and roll in degrees, 0 from the front.
+
+    Positive yaw shows the head's left side, positive pitch looks from below, positive roll sees it
+    tilted to its right shoulder: the matrix is that of the frontal view after turns by -yaw about
+    y, -pitch about x and roll about z, in this order.
+    """
+    to_left, to_top, to_front = head_to_camera[..., 2, :].neg().unbind(-1)
+    yaw = torch.atan2(to_left, to_front)
+    pitch = torch.atan2(-to_top, torch.hypot(to_left, to_front))
+    x, y = head_to_camera[..., :2, 0].unbind(-1), head_to_camera[..., :2, 2].unbind(-1)
+    level_x, level_y = (a * yaw.cos() - b * yaw.sin() for a, b in zip(x, y))
+    return torch.stack([yaw, pitch, torch.atan2(-level_y, level_x)], -1).rad2deg()
+
+
 def matrix_to_6d_rows(matrix: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 6"]:
     """The first two ROWS of the matrix, one after the other; the identity is 1 0 0 0 1 0.
 

@@ -4,7 +4,10 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
+import torch
+
 from rgbavatar_ns.avatar import Avatar, describe_layout
+from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import ThetaLayout
 from rgbavatar_ns.plugin.dataparser import Subject
@@ -16,13 +19,25 @@ def model_state(avatar: Avatar, subject: Subject) -> dict[str, Any]:
     """Tensors and plain values only, so that checkpoints load with `weights_only=True`.
 
     `avatar` is what `Avatar.from_state` needs; `frames` lets another program play the training
-    performance without the dataset.
+    performance without the dataset; `statistics` says what was seen in it.
     """
+    # A stream's pools may be empty still.
+    seen = film_statistics(avatar, subject).to_state() if len(subject.theta) else None
     return {
         "avatar": avatar.to_state(),
         "layout": avatar.layout.to_json(),
         "frames": {"theta": subject.theta, "index": list(subject.frame_index)},
+        "statistics": seen,
     }
+
+
+@torch.no_grad()
+def film_statistics(avatar: Avatar, film: Subject) -> TrainingStatistics:
+    """Statistics of the training frames, with the weights that the avatar's network gives now."""
+    train = list(film.train) or [0]
+    theta = film.theta[train].cpu()
+    psi = avatar.weights(theta.to(avatar.identity)).cpu()
+    return TrainingStatistics.of(theta, psi, avatar.layout, film.world_to_camera[train].cpu())
 
 
 def require_same_layout(state_dict: Mapping[str, Any], avatar: Avatar) -> None:

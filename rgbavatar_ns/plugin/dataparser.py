@@ -37,8 +37,7 @@ class Subject:
     frame_index: tuple[int, ...]
     train: tuple[int, ...]
     """Positions of the training frames."""
-    camera_center: Float[Tensor, "3"]
-    """Where the first frame was filmed from, in the head's world."""
+    world_to_camera: Float[Tensor, "F 4 4"]
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "Subject":
         """nerfstudio copies metadata deeply; nothing here is ever changed, so share it."""
@@ -109,7 +108,7 @@ class RGBAvatarDataParser(DataParser):
                     theta=tracked.theta,
                     frame_index=tuple(tracked.frame_index),
                     train=tuple(tracked.train),
-                    camera_center=torch.linalg.inv(cameras.world_to_camera[0])[:3, 3],
+                    world_to_camera=cameras.world_to_camera.expand(len(tracked), 4, 4),
                 )
             },
         )

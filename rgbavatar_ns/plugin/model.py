@@ -210,7 +210,8 @@ class RGBAvatarModel(Model):
         """What rebuilds the avatar without this dataset: its make, and every frame's theta."""
         subject = self.subject
         if self.refinement is not None:
-            subject = replace(subject, theta=self.refinement.all_frames(subject.theta))
+            theta = self.refinement.all_frames(subject.theta.to(self.device))
+            subject = replace(subject, theta=theta.cpu())
         return model_state(self.avatar, subject)
 
     def set_extra_state(self, state: dict[str, Any]) -> None:

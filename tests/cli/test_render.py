@@ -1,6 +1,7 @@
 """`rgbavatar render` on a small avatar: what is asked for is written, mistakes are told."""
 
 import json
+import re
 from pathlib import Path
 
 import av
@@ -77,7 +78,7 @@ def test_views_orbit_and_turntable(bundle, data, tmp_path):
     assert views.shape == (24, 4 * 24, 4)
     _render(bundle, tmp_path, *common, "--show", "orbit")
     assert len(_film(tmp_path / "orbit.mp4")) == _HELD_OUT
-    _render(bundle, tmp_path, *common, "--show", "turntable")
+    _render(bundle, tmp_path, *common, "--show", "turntable", "--arc", 360)
     turn = _film(tmp_path / "turntable.gif")
     assert len(turn) == 72
     assert np.abs(turn[0].astype(int) - turn[36]).max() > 100, "front and back differ"
@@ -103,7 +104,8 @@ def test_a_camera_path_sets_size_rate_and_length(bundle, data, tmp_path):
 
 def test_the_grid_of_bases(bundle, data, tmp_path):
     _render(bundle, tmp_path, "--data", data, "--show", "bases")
-    assert cv2.imread(str(tmp_path / "bases.png")).shape == (_SIZE, 5 * _SIZE, 3)
+    # Base and four bases, each beside what it changes.
+    assert cv2.imread(str(tmp_path / "bases.png")).shape == (2 * _SIZE, 4 * 2 * _SIZE, 3)
 
 
 def test_another_person_drives_the_avatar_and_is_shown_beside(bundle, data, tmp_path, capsys):
@@ -113,7 +115,11 @@ def test_another_person_drives_the_avatar_and_is_shown_beside(bundle, data, tmp_
     film = _film(tmp_path / "performance.mp4")
     assert len(film) == _FRAMES
     assert film[0].shape == (_SIZE, 2 * _SIZE, 3)
-    assert "left out" not in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert "left out" not in told
+    _render(bundle, tmp_path, *words[:-1])
+    beyond = r"beyond the film in \d of 7 pictures: .*\(\d\)"
+    assert re.search(beyond, capsys.readouterr().out), "what is not held back is told"
 
 
 def test_a_bundle_with_statistics_needs_no_dataset(bundle, data, tmp_path, refused):

@@ -156,8 +156,8 @@ def test_pools_go_on_from_a_checkpoint_as_they_were(
         assert torch.equal(one.theta, other.theta)
     fill(whole, range(6, 20), encode)
     fill(resumed, range(6, 20), encode)
-    assert whole.thetas()[1] == resumed.thetas()[1]
-    assert torch.equal(whole.thetas()[0], resumed.thetas()[0])
+    assert whole.parameters()[2] == resumed.parameters()[2]
+    assert torch.equal(whole.parameters()[0], resumed.parameters()[0])
 
 
 @pytest.mark.parametrize(

@@ -87,16 +87,31 @@ def test_the_grid_holds_the_base_and_every_basis(avatar, camera):
     theta = lively_theta(avatar, 20)
     with torch.no_grad():
         seen = TrainingStatistics.of(theta, avatar.weights(theta), avatar.layout)
-    grid = basis_grid(avatar, seen, camera, gain=20.0, columns=3)
-    assert grid.shape == (2 * 40, 3 * 48, 3)
+    grid = basis_grid(avatar, seen, camera, gain=20.0, columns=3).astype(int)
+    assert grid.shape == (2 * 40, 3 * 96, 3)
     base = grid[15:40, :48]
     for k in range(1, 5):
         row, column = divmod(k, 3)
-        other = grid[40 * row + 15 : 40 * row + 40, 48 * column : 48 * column + 48]
-        assert np.abs(other.astype(int) - base).max() > 20, f"basis {k - 1} shows nothing"
-    assert (grid[40:, 96:] == 255).all(), "the last row is filled up"
+        tile = grid[40 * row + 15 : 40 * row + 40, 96 * column : 96 * column + 96]
+        other, change = tile[:, :48], tile[:, 48:]
+        assert np.abs(other - base).max() > 20, f"basis {k - 1} shows nothing"
+        assert np.array_equal(change, np.clip(128 + 2 * (other - base), 0, 255))
+    assert (grid[40:, 192:] == 255).all(), "the last row is filled up"
     with pytest.raises(UserError, match="no learned bases"):
         basis_grid(avatar_of(num_bases=0), seen, camera)
+
+
+def test_a_weak_basis_is_made_strong_enough_to_be_seen(avatar, camera):
+    theta = lively_theta(avatar, 20)
+    with torch.no_grad():
+        seen = TrainingStatistics.of(theta, avatar.weights(theta), avatar.layout)
+    plain, strong = (
+        basis_grid(avatar, seen, camera, gain=gain, columns=5).astype(int) for gain in (1.0, None)
+    )
+    for k in range(1, 5):
+        change = [np.abs(g[:, 96 * k + 48 : 96 * k + 96] - 128).max(-1) for g in (plain, strong)]
+        assert change[0].max() < 60, "hardly seen as it is"
+        assert 0.005 < (change[1] >= 120).mean() < 0.3, "clearly seen, but not torn to pieces"
 
 
 def test_a_gif_has_the_frames_and_nearly_their_colours(tmp_path, avatar, camera):

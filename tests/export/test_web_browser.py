@@ -11,8 +11,10 @@ import pytest
 import torch
 
 from rgbavatar_ns.avatar import Avatar
+from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
 from rgbavatar_ns.export import PageOptions, front_camera, pictures, write_web_page
-from rgbavatar_ns.head import HeadArrays
+from rgbavatar_ns.export.views import head_centre, orbit
+from rgbavatar_ns.head import HeadArrays, turn_seen
 from tests.avatar.small_head import small_head_arrays
 from tests.browser import IN_BROWSER, chromium, picture_of
 
@@ -36,10 +38,10 @@ def open_page(browser: Any, tmp_path: Path) -> Iterator[Any]:
     asked: list[str] = []
     problems: list[str] = []
 
-    def show(avatar: Avatar, theta: torch.Tensor) -> Any:
+    def show(avatar: Avatar, theta: torch.Tensor, seen: TrainingStatistics | None = None) -> Any:
         file = tmp_path / "avatar.html"
         camera = front_camera(avatar, _SIZE, _SIZE)
-        write_web_page(avatar, file, camera, theta, PageOptions(title="<me> & you"))
+        write_web_page(avatar, file, camera, theta, PageOptions(title="<me> & you"), seen)
         page = context.new_page()
         page.on("request", lambda request: asked.append(request.url))
         page.on("pageerror", lambda error: problems.append(str(error)))
@@ -163,3 +165,86 @@ def test_playing_moves_the_performance_on_and_a_drag_turns_the_head(open_page):
     page.get_by_text("Picture", exact=True).click()
     page.get_by_text("Camera back").click()
     assert np.array_equal(_shown(page), before)
+
+
+def _drag(page: Any, across: int, down: int = 0) -> None:
+    """Press at the middle of the view and move, without letting go."""
+    box = page.locator("#view").bounding_box()
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    page.mouse.move(x, y)
+    page.mouse.down()
+    page.mouse.move(x + across, y + down, steps=4)
+
+
+def _degrees_seen(page: Any) -> np.ndarray:
+    """Yaw and pitch, from the camera that draws."""
+    page.evaluate("() => app.draw()")
+    return np.degrees(page.evaluate("() => app.turnSeen"))
+
+
+def test_the_camera_gives_way_beyond_the_film_comes_back_and_says_so(open_page):
+    avatar = avatar_of()
+    theta = 0.2 * lively_theta(avatar, 60)
+    theta[:, avatar.layout.slice("translation")] += torch.tensor([0.05, -0.03, 0.1])
+    camera = front_camera(avatar, _SIZE, _SIZE)
+    with torch.no_grad():
+        seen = TrainingStatistics.of(
+            theta, avatar.weights(theta), avatar.layout, camera.world_to_camera
+        )
+    page = open_page(avatar, theta, seen)
+    ours = turn_seen(theta[:1], camera.world_to_camera, avatar.layout)[0, :2].numpy()
+    assert np.allclose(_degrees_seen(page), ours, atol=0.01)
+    said = page.locator("#beyond")
+    assert said.text_content() == ""
+    low, high = (end.numpy() for end in seen.turn_reach())
+
+    _drag(page, -300)
+    pulled = _degrees_seen(page)
+    assert high[0] + 3 < pulled[0] < high[0] + 15, "it resists"
+    assert "Beyond the film: seen from" in said.text_content()
+    page.mouse.up()
+    page.wait_for_function("() => !app.orbit.settle(0)")
+    assert _degrees_seen(page)[0] == pytest.approx(high[0], abs=0.1)
+    page.evaluate("() => app.orbit.reset()")
+    assert np.allclose(_degrees_seen(page), ours, atol=0.01)
+    assert said.text_content() == ""
+
+    # The same picture as ours from there, about the same centre.
+    _drag(page, -40, 20)
+    page.mouse.up()
+    yaw, pitch = torch.tensor(page.evaluate("() => app.orbit.angles()")).rad2deg()
+    there = orbit(camera, head_centre(avatar, theta[:1]), yaw[None], pitch[None])
+    (expected,) = pictures(avatar, theta[:1], there, (1.0, 1.0, 1.0))
+    assert psnr(_shown(page), expected / 255) > 40
+
+    page.get_by_text("Picture", exact=True).click()
+    page.locator("#turn-freely").check()
+    _drag(page, 400)
+    page.mouse.up()
+    assert _degrees_seen(page)[0] < low[0] - 40
+    assert "right" in said.text_content()
+
+
+def test_sliders_show_the_film_and_jaws_only_open(open_page):
+    avatar = avatar_of()
+    theta = lively_theta(avatar, 30)
+    with torch.no_grad():
+        seen = TrainingStatistics.of(theta, avatar.weights(theta), avatar.layout)
+    page = open_page(avatar, theta, seen)
+    jaw = page.locator("#slider-jaw-open")
+    assert jaw.get_attribute("min") == "0"
+    low, high = seen.film_range()
+    place = avatar.layout.slice("jaw").start
+    ends = page.evaluate(
+        "() => [...document.querySelector('#slider-jaw-open').list.options]"
+        ".map((end) => Number(end.value))"
+    )
+    filmed = [max(0.0, float(low[place])), float(high[place])]
+    assert ends == pytest.approx(filmed, abs=0.002)
+    jaw.fill("0.5")
+    _shown(page)
+    assert "jaw open" in page.locator("#beyond").text_content()
+    assert page.locator(".row.beyond #slider-jaw-open").count() == 1
+    jaw.fill("0.05")
+    _shown(page)
+    assert "jaw open" not in page.locator("#beyond").text_content()

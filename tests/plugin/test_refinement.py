@@ -127,7 +127,11 @@ def test_a_stream_is_refused(tiny_data, tmp_path):
     """Its model knows one frame of many."""
     trainer = make_trainer(_config(tiny_data, tmp_path, refine=False))
     model = trainer.pipeline.model
-    streamed = dataclasses.replace(model.subject, theta=model.subject.theta[:1])
+    streamed = dataclasses.replace(
+        model.subject,
+        theta=model.subject.theta[:1],
+        world_to_camera=model.subject.world_to_camera[:1],
+    )
     with pytest.raises(UserError, match="while frames arrive"):
         frame_refinement(streamed, model.config.refinement)
 

@@ -199,6 +199,26 @@ def _ticking(desk: Desk, seconds: float) -> Callable[[], float]:
     return clock
 
 
+def test_sliders_show_the_film_and_what_leaves_it_is_told(desk: Desk):
+    seen, layout = training_statistics(desk.model), desk.model.avatar.layout
+    jaw, place = desk.viewer.gui["Jaw opens (°)"], layout.slice("jaw").start
+    assert jaw.limits[0] == 0, "a jaw only opens"
+    filmed = seen.theta_max[place].rad2deg().item()
+    assert jaw.options["marks"][-1] == pytest.approx(filmed, abs=jaw.limits[2])
+    assert jaw.limits[1] > 1.1 * filmed, "it goes on beyond"
+    desk.panel.show_neutral()
+    desk.picture()
+    assert "eyond the film" not in desk.told()
+    desk.set("Jaw opens (°)", jaw.limits[1])
+    desk.picture()
+    assert "Beyond the film: Jaw opens (°)" in desk.told()
+    camera = desk.camera()
+    turn = torch.eye(3)[[1, 0, 2]] * torch.tensor([[1.0], [-1.0], [1.0]])  # a quarter about z: up
+    camera.camera_to_worlds = turn @ camera.camera_to_worlds
+    desk.picture(camera)
+    assert "the head's turn" in desk.told()
+
+
 def test_play_by_hand_plays_the_film(desk: Desk):
     desk.set("Jaw opens (°)", 20.0)
     desk.set("Play", True)

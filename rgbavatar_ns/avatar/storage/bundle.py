@@ -124,15 +124,11 @@ def load_any(path: Path) -> StoredAvatar:
 
 
 def load_statistics(path: Path) -> TrainingStatistics | None:
-    """What the avatar of a bundle saw in training, if kept; raises UserError as `load_any`."""
-    if not os.path.exists(path / MANIFEST_NAME):
+    """What an avatar saw in training, if its file kept it; raises UserError as `load_any`."""
+    stored = load_any(path)
+    if stored.statistics is None:
         return None
-    manifest, _ = _read_bundle(path)
-    if "statistics" not in manifest:
-        return None
-    return TrainingStatistics.from_state(
-        manifest["statistics"], ThetaLayout.from_json(manifest.get("layout"))
-    )
+    return TrainingStatistics.from_state(stored.statistics, ThetaLayout.from_json(stored.layout))
 
 
 def _load_bundle(path: Path) -> StoredAvatar:
@@ -141,7 +137,9 @@ def _load_bundle(path: Path) -> StoredAvatar:
     with damage_of(path):
         if is_reference(state["head"]):
             state["head"] = resolve(state["head"], path)
-    return StoredAvatar(path, state, _below("parameters/", tensors), manifest.get("layout"))
+    parameters = _below("parameters/", tensors)
+    seen = manifest.get("statistics")
+    return StoredAvatar(path, state, parameters, manifest.get("layout"), seen)
 
 
 def _below(prefix: str, tensors: dict[str, Any]) -> dict[str, Any]:
@@ -210,7 +208,8 @@ def _load_checkpoint(path: Path) -> StoredAvatar:
         )
     with damage_of(path):
         parameters = _below(CHECKPOINT_PREFIX, pipeline or {})
-    return StoredAvatar(path, extra["avatar"], parameters, extra.get("layout"))
+    seen = extra.get("statistics")
+    return StoredAvatar(path, extra["avatar"], parameters, extra.get("layout"), seen)
 
 
 def _split_off_tensors(value: Any, name: str, tensors: dict[str, Tensor]) -> Any:

@@ -1,6 +1,6 @@
-"""What an avatar has seen in training: ranges of theta and psi, and its space of expressions."""
+"""What an avatar has seen in training: ranges of theta, psi and views, its space of expressions."""
 
-from dataclasses import dataclass, fields
+from dataclasses import MISSING, dataclass, field, fields
 from typing import Any
 
 import torch
@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from rgbavatar_ns.errors import UserError
-from rgbavatar_ns.head import ThetaLayout
+from rgbavatar_ns.head import ThetaLayout, turn_range, turn_seen
 
 _RIGID = ("rotation", "neck", "translation")
 """Fields that move the head as a whole; the others make the expression."""
@@ -19,9 +19,16 @@ _AXES = {
     "components": "CH",
     "component_min": "C",
     "component_max": "C",
+    "turn_low": "3",
+    "turn_high": "3",
 }
 _EXPLAINED = 0.999
 _NOTHING = 1e-8
+_UNKNOWN_TURN_DEGREES = 15.0
+"""Either way where the cameras were not kept, as people turn who talk to a camera."""
+_SAME_SHARE, _SAME, _SAME_DEGREES = 0.1, 0.02, 5.0
+"""Beyond is farther than this: of a number's range, in its own unit, of a turn."""
+_REACH_DEGREES = 30.0
 
 
 @dataclass(frozen=True)
@@ -45,13 +52,23 @@ class TrainingStatistics:
     """Orthonormal principal components of the expression that hold .999 of its variance."""
     component_min: Float[Tensor, "C"]
     component_max: Float[Tensor, "C"]
+    turn_low: Float[Tensor, "3"] = field(default_factory=lambda: _unknown_turn(-1))
+    """Yaw, pitch and roll in degrees as the cameras saw the head (`turn_seen`)."""
+    turn_high: Float[Tensor, "3"] = field(default_factory=lambda: _unknown_turn(1))
 
     @classmethod
     @torch.no_grad()
     def of(
-        cls, theta: Float[Tensor, "F H"], psi: Float[Tensor, "F K"], layout: ThetaLayout
+        cls,
+        theta: Float[Tensor, "F H"],
+        psi: Float[Tensor, "F K"],
+        layout: ThetaLayout,
+        world_to_camera: Float[Tensor, "#F 4 4"] | None = None,
     ) -> "TrainingStatistics":
-        """Statistics of training frames; raises UserError where there are none."""
+        """Statistics of training frames; raises UserError where there are none.
+
+        Without cameras the views are taken to be those of most films.
+        """
         if len(theta) == 0:
             raise UserError("There are no training frames.", "Give a dataset with frames.")
         expressive = expressive_numbers(layout)
@@ -62,6 +79,10 @@ class TrainingStatistics:
         count = int((share < _EXPLAINED).sum()) + 1 if strengths.max() > _NOTHING else 0
         components = directions[:count].to(theta.dtype)
         along = centred @ components.T
+        turns = {}
+        if world_to_camera is not None:
+            low, high = turn_range(turn_seen(theta, world_to_camera, layout))
+            turns = {"turn_low": low, "turn_high": high}
         return cls(
             num_frames=len(theta),
             theta_mean=mean,
@@ -77,7 +98,42 @@ class TrainingStatistics:
             components=components,
             component_min=along.amin(0),
             component_max=along.amax(0),
+            **turns,
         )
+
+    def film_range(self) -> tuple[Float[Tensor, "H"], Float[Tensor, "H"]]:
+        """What of theta still counts as seen, lowest and highest: a little more than the film."""
+        same = _SAME_SHARE * (self.theta_max - self.theta_min) + _SAME
+        return self.theta_min - same, self.theta_max + same
+
+    def filmed_turns(self) -> tuple[Float[Tensor, "2"], Float[Tensor, "2"]]:
+        """Yaw and pitch in degrees that still count as seen, lowest and highest.
+
+        Without roll, since pictures can be turned.
+        """
+        return self.turn_low[:2] - _SAME_DEGREES, self.turn_high[:2] + _SAME_DEGREES
+
+    def beyond(
+        self, theta: Float[Tensor, "#F H"], turns_degrees: Float[Tensor, "#F 3"]
+    ) -> tuple[Bool[Tensor, "#F H"], Bool[Tensor, "#F"]]:
+        """Which numbers of the expression, and which views of the head, the film did not show.
+
+        turns_degrees: `turn_seen`.
+        """
+        low, high = self.film_range()
+        leftmost, rightmost = self.filmed_turns()
+        middle = (leftmost + rightmost) / 2
+        away = ((turns_degrees[:, :2] - middle + 180) % 360 - 180).abs()
+        outside = (away > rightmost - middle).any(1)
+        return ((theta < low) | (theta > high)) & self.expressive, outside
+
+    def turn_reach(self) -> tuple[Float[Tensor, "2"], Float[Tensor, "2"]]:
+        """Yaw and pitch in degrees, lowest and highest, from where an avatar is shown unasked.
+
+        30 degrees beyond what was filmed, and at least so far from the front.
+        """
+        low, high = self.turn_low[:2].clamp(max=0), self.turn_high[:2].clamp(min=0)
+        return low - _REACH_DEGREES, high + _REACH_DEGREES
 
     def project(self, theta: Float[Tensor, "F H"]) -> Float[Tensor, "F H"]:
         """The nearest expression in the span and range of the components; rigid motion stays."""
@@ -87,7 +143,7 @@ class TrainingStatistics:
 
     def to_state(self) -> dict[str, Any]:
         """Tensors and numbers by field."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}
+        return {part.name: getattr(self, part.name) for part in fields(self)}
 
     @classmethod
     def from_state(cls, state: Any, layout: ThetaLayout) -> "TrainingStatistics":
@@ -95,12 +151,16 @@ class TrainingStatistics:
         remedy = "Export the avatar again."
         if not isinstance(state, dict):
             raise UserError("The training statistics are none.", remedy)
-        missing = [field.name for field in fields(cls) if field.name not in state]
+        # What was written before the film's turns were kept has none.
+        wanted = [f for f in fields(cls) if f.name in state or f.default_factory is MISSING]
+        missing = [part.name for part in wanted if part.name not in state]
         if missing:
             raise UserError(f"The training statistics lack {', '.join(missing)}.", remedy)
-        values = {field.name: state[field.name] for field in fields(cls)}
-        sizes = {"H": layout.size}
+        values = {part.name: state[part.name] for part in wanted}
+        sizes = {"H": layout.size, "3": 3}
         for name, axes in _AXES.items():
+            if name not in values:
+                continue
             value = values[name]
             fits = isinstance(value, Tensor) and value.ndim == len(axes)
             if fits and name == "expressive":
@@ -114,6 +174,10 @@ class TrainingStatistics:
         if type(values["num_frames"]) is not int or values["num_frames"] < 1:
             raise UserError("The training statistics are of no frames.", remedy)
         return cls(**values)
+
+
+def _unknown_turn(sign: int) -> Float[Tensor, "3"]:
+    return torch.full((3,), sign * _UNKNOWN_TURN_DEGREES)
 
 
 def expressive_numbers(layout: ThetaLayout) -> Bool[Tensor, "H"]:

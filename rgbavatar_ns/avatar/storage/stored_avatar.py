@@ -54,6 +54,8 @@ class StoredAvatar:
     state: dict[str, Any]
     parameters: dict[str, Any]
     layout: Any = None
+    statistics: Any = None
+    """What `TrainingStatistics.from_state` takes, if there is any."""
 
     @contextmanager
     def damage_told(self) -> Iterator[None]:

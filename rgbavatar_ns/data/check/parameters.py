@@ -9,7 +9,7 @@ from rgbavatar_ns.data.check.problems import Problem
 from rgbavatar_ns.data.importers.formats import FORMATS
 from rgbavatar_ns.data.native.dataset import TrackedDataset
 from rgbavatar_ns.errors import first_few
-from rgbavatar_ns.head.rotations import axis_angle_to_matrix
+from rgbavatar_ns.head import turn_range, turn_seen
 
 _LARGEST_COEFFICIENT, _LARGEST_TURN_RAD = 12.0, np.pi + 0.01
 _NARROWEST_DEGREES, _WIDEST_DEGREES = 3.0, 120.0
@@ -57,21 +57,10 @@ class HeadTurns:
 
 def head_turns(dataset: TrackedDataset) -> HeadTurns:
     """Where the face looks, as the camera sees it, whether head, neck or camera moves."""
-    parts = dataset.layout.split(dataset.theta)
-    seen = dataset.cameras.world_to_camera[:, :3, :3]
-    for name in ("rotation", "neck"):
-        if name in parts and parts[name].shape[1] == 3:
-            seen = seen @ axis_angle_to_matrix(parts[name])
-    right, down, ahead = seen[:, :, 2].double().unbind(1)
-    # The face looks along +z of the head, towards the camera; a median frame is its middle.
-    turned = (torch.atan2(right, -ahead), torch.atan2(down, torch.hypot(right, ahead)))
-    spread = []
-    for angle in turned:
-        away = angle - angle.median()
-        away = torch.atan2(away.sin(), away.cos())
-        low, high = np.percentile(away.numpy(), [2, 98])
-        spread.append(float(np.degrees(high - low)))
-    return HeadTurns(*spread)
+    views = dataset.cameras.world_to_camera
+    low, high = turn_range(turn_seen(dataset.theta, views, dataset.layout))
+    sideways, nodding, _ = (high - low).tolist()
+    return HeadTurns(sideways, nodding)
 
 
 def field_ranges(dataset: TrackedDataset) -> tuple[FieldRange, ...]:

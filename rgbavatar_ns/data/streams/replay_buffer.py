@@ -134,12 +134,15 @@ class ReplayBuffer:
             local = self._pools.local_frames
             return self._held[local[-1]].frame.theta.clone() if local else None
 
-    def thetas(self) -> tuple[Float[Tensor, "F H"], tuple[int, ...]]:
-        """Theta and serial of all that the pools hold, in the order of their arrival."""
+    def parameters(
+        self,
+    ) -> tuple[Float[Tensor, "F H"], Float[Tensor, "F 4 4"], tuple[int, ...]]:
+        """Theta, world_to_camera and serial of all that the pools hold, in order of arrival."""
         with self._lock:
             serials = sorted(self._held)
-            theta = self._columns(serials)["theta"].reshape(-1, self._subject.layout.size)
-            return theta, tuple(serials)
+            columns = self._columns(serials)
+            theta = columns["theta"].reshape(-1, self._subject.layout.size)
+            return theta, columns["world_to_camera"].reshape(-1, 4, 4), tuple(serials)
 
     def held(self) -> list[tuple[int, StreamedFrame]]:
         """Serial and frame of all that the pools hold, in the order of their arrival."""

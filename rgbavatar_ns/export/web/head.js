@@ -39,16 +39,30 @@ class Head {
     this.lengthRatio = new Float32Array(this.numTriangles).fill(1);
   }
 
-  /** Pose the head: fills `vertices`, `frames`, `quaternions` and `lengthRatio`. */
+  /** Pose the head: fills `turn`, `vertices`, `frames`, `quaternions` and `lengthRatio`. */
   pose(theta) {
     const turns = JOINT_FIELDS.map((name) => {
       const [start] = this.slices[name];
       return axisAngleToMatrix(theta[start], theta[start + 1], theta[start + 2]);
     });
+    this.turn = multiply3(turns[0], turns[1]); // of root and neck together, nine numbers
     const moved = this.movedByJointsOnly ? this._withoutLinear(theta) : theta;
     this._shape(moved, turns);
     this._skin(moved, turns);
     this._frame();
+  }
+
+  /** The middle of the posed head's box, without what the neck does not turn. */
+  centre() {
+    const low = [Infinity, Infinity, Infinity], high = [-Infinity, -Infinity, -Infinity];
+    for (let v = 0; v < this.vertices.length / 3; v++) {
+      if (this.skinning[5 * v] >= 0.5) continue;
+      for (let i = 0; i < 3; i++) {
+        low[i] = Math.min(low[i], this.vertices[3 * v + i]);
+        high[i] = Math.max(high[i], this.vertices[3 * v + i]);
+      }
+    }
+    return low.map((value, i) => (value + high[i]) / 2);
   }
 
   /** theta with its expressions and eyelids at rest. */

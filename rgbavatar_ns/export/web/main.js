@@ -11,9 +11,10 @@ class App {
     this.positions = new GaussianPositions(data);
     this.renderer = new Renderer(canvas, data);
     this.performance = new RecordedPerformance(data);
-    this.orbit = new OrbitCamera(data.camera, data.centre);
+    this.orbit = new OrbitCamera(data.camera, data.film.turn_reach);
     this.background = data.background;
     this.heldWeights = new Map(); // psi that a slider holds, by number
+    this.beyond = document.getElementById("beyond");
     this.size = null; // of the picture in pixels, where a script has set it
     this.theta = this.performance.length ? this.performance.current()
       : new Array(this.performance.size).fill(0);
@@ -81,15 +82,18 @@ class App {
     ];
     if (this.canvas.width !== width) this.canvas.width = width;
     if (this.canvas.height !== height) this.canvas.height = height;
-    const camera = this.orbit.at(width, height);
     this.psi = this.network.evaluate(this.theta);
     for (const [k, value] of this.heldWeights) this.psi[k] = value;
     this.head.pose(this.theta);
+    this.orbit.seen = viewAngles(multiply3(this.data.camera.rotation, this.head.turn));
+    const camera = this.orbit.at(width, height, this.head.centre());
+    this.turnSeen = viewAngles(multiply3(camera.rotation, this.head.turn));
     this.positions.blend(this.psi);
     this.positions.place(this.head);
     this.positions.sort(camera);
     this.renderer.draw(this.positions, this.head, this.psi, camera, this.background);
     this.panel.show();
+    this._tellBeyond();
     this.due = false;
     this.pictures++;
   }
@@ -110,11 +114,36 @@ class App {
       this.theta = this.performance.current();
       this.due = true;
     }
+    if (this.orbit.settle(seconds)) this.due = true;
     if (this.due) {
       this.draw();
       this._tellRate(now);
     }
     requestAnimationFrame((next) => this._tick(next));
+  }
+
+  /** Whether a number of theta is farther than in the film; there may be none to compare with. */
+  isBeyond(place) {
+    const [low, high] = this.data.film.theta ?? [];
+    return low !== undefined && (this.theta[place] < low[place] || this.theta[place] > high[place]);
+  }
+
+  /** What of this picture the film did not show; what is seen then is a guess. */
+  _tellBeyond() {
+    const { film, layout } = this.data, found = [];
+    const [low, high] = film.turn;
+    const away = this.turnSeen.map((angle, i) => {
+      const off = angle - (low[i] + high[i]) / 2;
+      return Math.abs(Math.atan2(Math.sin(off), Math.cos(off))) > (high[i] - low[i]) / 2;
+    });
+    if (away[0] || away[1]) {
+      const i = away[0] ? 0 : 1, sides = [["right", "left"], ["above", "below"]][i];
+      const degrees = (angle) => `${Math.round(Math.abs((180 * angle) / Math.PI))}°`;
+      const said = (angle) => `${degrees(angle)} ${sides[angle > 0 ? 1 : 0]}`;
+      found.push(`seen from ${said(this.turnSeen[i])}, filmed ${said(low[i])} to ${said(high[i])}`);
+    }
+    found.push(...this.panel.namesBeyond());
+    this.beyond.textContent = found.length ? `Beyond the film: ${found.join("; ")}` : "";
   }
 
   /** Pictures a second while the performance plays, told twice a second. */

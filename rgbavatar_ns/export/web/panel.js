@@ -7,6 +7,7 @@ class Panel {
     this.root = root;
     this.app = app;
     this.readers = [];
+    this.watched = []; // [name, places in theta] of sliders, to tell what is beyond the film
     if (app.performance.length > 0) this._performance();
     for (const [title, open, entries] of this._thetaGroups()) this._theta(title, open, entries);
     if (app.data.num_bases > 0) this._bases();
@@ -16,6 +17,13 @@ class Panel {
   /** Bring all controls to the app's state. */
   show() {
     for (const read of this.readers) read();
+  }
+
+  /** Names of the sliders that stand where the film never was. */
+  namesBeyond() {
+    const beyond = ([, places]) => places.some((place) => this.app.isBeyond(place));
+    const names = this.watched.filter(beyond).map(([name]) => name);
+    return names.length > 4 ? [...names.slice(0, 4), `${names.length - 4} more`] : names;
   }
 
   _group(title, open) {
@@ -79,7 +87,7 @@ class Panel {
     layout.reduce((sum, { name, size }) => { start[name] = sum; return sum + size; }, 0);
     const turns = (field, reach) => ["nod", "turn", "tilt"].map(
       (name, axis) => [`${field} ${name}`, [start[field] + axis], [-reach, reach]]);
-    const face = [["jaw open", [start.jaw], [-0.05, 0.5]], ["jaw sideways", [start.jaw + 1], [-0.2, 0.2]]];
+    const face = [["jaw open", [start.jaw], [0, 0.5]], ["jaw sideways", [start.jaw + 1], [-0.2, 0.2]]];
     for (const [name, axis] of [["eyes down", 0], ["eyes sideways", 1]]) {
       face.push([name, [start.left_eye + axis, start.right_eye + axis], [-0.5, 0.5]]);
     }
@@ -99,10 +107,22 @@ class Panel {
     this._button(group, "Reset", () => {
       for (const [, places] of entries) for (const place of places) app.setParameter(place, 0);
     });
+    const [low, high] = app.data.film.theta ?? [];
     for (const [name, places, range] of entries) {
-      this._slider(group, name, range, () => app.theta[places[0]], (value) => {
+      const row = this._slider(group, name, range, () => app.theta[places[0]], (value) => {
         for (const place of places) app.setParameter(place, value);
       });
+      if (!low) continue;
+      const [from, to] = [Math.max(low[places[0]], range[0]), Math.min(high[places[0]], range[1])];
+      row.title = `in the film ${from.toFixed(2)} to ${to.toFixed(2)}`;
+      const input = row.querySelector("input"), ends = document.createElement("datalist");
+      ends.id = `${input.id}-film`; // the browser marks its values on the slider
+      const onStep = (value) => range[0] + Math.round((value - range[0]) / input.step) * input.step;
+      ends.append(new Option("", onStep(from)), new Option("", onStep(to)));
+      input.setAttribute("list", ends.id);
+      row.append(ends);
+      if (title !== "Head") this.watched.push([name, places]);
+      this.readers.push(() => row.classList.toggle("beyond", places.some((p) => app.isBeyond(p))));
     }
   }
 
@@ -131,6 +151,12 @@ class Panel {
     label.textContent = "Background ";
     label.append(input);
     group.append(label, document.createElement("br"));
+    const free = document.createElement("input");
+    Object.assign(free, { type: "checkbox", id: "turn-freely" });
+    free.addEventListener("input", () => { app.orbit.free = free.checked; app.changed(); });
+    const freely = document.createElement("label");
+    freely.append(free, " Turn freely, beyond what was filmed");
+    group.append(freely, document.createElement("br"));
     this._button(group, "Camera back", () => app.orbit.reset());
     this._button(group, "Save picture", () => app.savePicture());
   }

@@ -37,6 +37,14 @@ function apply3(m, [x, y, z]) {
   ];
 }
 
+/**
+ * How a camera sees a head (its nine numbers from head to camera): yaw and pitch in radians.
+ * Positive yaw shows the head's left side, positive pitch looks from below.
+ */
+function viewAngles(m) {
+  return [Math.atan2(-m[6], -m[8]), Math.atan2(m[7], Math.hypot(m[6], m[8]))];
+}
+
 /** Write the unit quaternion of the rotation with these columns to `out` at `place`. */
 function writeQuaternion(out, place, tx, ty, tz, bx, by, bz, nx, ny, nz) {
   // The largest of the four components is found from the diagonal, the others by division.

@@ -126,7 +126,11 @@ class OnlineDataManager(RGBAvatarDataManager):
         first = self.train_dataset.metadata["subject"]
         assert isinstance(first, Subject)
         self.train_dataset.metadata["subject"] = dataclasses.replace(
-            first, theta=first.theta[:1].clone(), frame_index=first.frame_index[:1], train=(0,)
+            first,
+            theta=first.theta[:1].clone(),
+            frame_index=first.frame_index[:1],
+            train=(0,),
+            world_to_camera=first.world_to_camera[:1].clone(),
         )
 
     def start(self) -> None:

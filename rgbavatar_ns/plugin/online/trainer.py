@@ -226,9 +226,19 @@ class OnlineTrainer(RGBAvatarTrainer):
     def save_checkpoint(self, step: int) -> None:
         """Write avatar, pools and frames atomically; raises UserError if they do not fit."""
         model = self.pipeline.model
-        theta, index = self.stream.pools.thetas()
-        model.subject = dataclasses.replace(model.subject, theta=theta, frame_index=index)
-        super().save_checkpoint(step)
+        theta, views, index = self.stream.pools.parameters()
+        newest = model.subject
+        model.subject = dataclasses.replace(
+            newest,
+            theta=theta,
+            frame_index=index,
+            train=tuple(range(len(theta))),
+            world_to_camera=views,
+        )
+        try:
+            super().save_checkpoint(step)
+        finally:
+            model.subject = newest
 
     def _save_end(self) -> None:
         self.stream.record()

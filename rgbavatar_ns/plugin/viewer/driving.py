@@ -1,6 +1,6 @@
 """Which theta and psi a viewer's state means on a model."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
@@ -8,6 +8,7 @@ from torch import Tensor
 
 from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
 from rgbavatar_ns.export.bases import basis_weights
+from rgbavatar_ns.plugin.checkpoint_state import film_statistics
 from rgbavatar_ns.plugin.model import RGBAvatarModel
 from rgbavatar_ns.plugin.viewer.viewer_state import ViewerState
 
@@ -22,12 +23,10 @@ class DrivingSignal:
     """The frame of the dataset that it can be compared with, if there is one."""
 
 
-@torch.no_grad()
 def training_statistics(model: RGBAvatarModel) -> TrainingStatistics:
     """What the avatar has seen, with the weights that its network gives now."""
-    theta = model.driving_theta(list(model.subject.train) or [0])
-    psi = model.avatar.weights(theta.to(model.avatar.identity))
-    return TrainingStatistics.of(theta.cpu(), psi.cpu(), model.avatar.layout)
+    theta = model.driving_theta(list(range(len(model.frame_theta))))
+    return film_statistics(model.avatar, replace(model.subject, theta=theta.cpu()))
 
 
 @torch.no_grad()

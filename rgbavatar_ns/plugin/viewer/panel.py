@@ -4,6 +4,7 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +16,9 @@ from torch import Tensor
 from rgbavatar_ns.data import TrackedDataset, load_dataset
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.export import dataset_folder
-from rgbavatar_ns.export.driving import DrivingOptions, ThetaNames
+from rgbavatar_ns.export.driving import DrivingOptions, ThetaNames, told_beyond
 from rgbavatar_ns.export.scenes import driven_by
+from rgbavatar_ns.head import turn_seen
 from rgbavatar_ns.kernels import PinholeCameras
 from rgbavatar_ns.plugin.model import RGBAvatarModel
 from rgbavatar_ns.plugin.viewer.client import serve_sharp_client
@@ -71,6 +73,7 @@ class ViewerPanel(ViewerControl):
         self._model, self._film, self._clock = model, film, clock
         self._viewer: Any = None
         self._widgets: Widgets | None = None
+        self._beyond: Callable[..., str] = lambda theta, turns: ""
         self._changing = threading.RLock()
         self._report: _Report | None = None
         self._told = self._played = self._report
@@ -91,6 +94,9 @@ class ViewerPanel(ViewerControl):
         self.state = ViewerState(background=(1.0, 1.0, 1.0))
         arrays, statistics = self._model.avatar.head.arrays, training_statistics(self._model)
         sliders = number_sliders(ThetaNames.of(self._model.avatar.layout, arrays), statistics)
+        labels = {slider.place: slider.label for slider in sliders}
+        names = [labels[place] for place in range(len(labels))]
+        self._beyond = partial(told_beyond, statistics, names)
         gui = viewer.viser_server.gui
         self._widgets = Widgets(gui, self, sliders, statistics, self._num_frames)
         viewpoint = Viewpoint.before(self._model.avatar, self._model.subject)
@@ -117,7 +123,11 @@ class ViewerPanel(ViewerControl):
         size = f"{camera.width} x {camera.height}"
         rate = f"{1 / max(seconds, 1e-6):.0f} frames/s"
         psnr = "" if drawn.psnr is None else f"  \nPSNR of this frame {drawn.psnr:.2f} dB"
-        text = f"{size} in {1e3 * seconds:.0f} ms: {rate}{psnr}"
+        layout = self._model.avatar.layout
+        turns = turn_seen(signal.theta, camera.world_to_camera, layout).cpu()
+        beyond = self._beyond(signal.theta.cpu(), turns)
+        beyond = f"  \n{beyond[:1].upper()}{beyond[1:]}" if beyond else ""
+        text = f"{size} in {1e3 * seconds:.0f} ms: {rate}{psnr}{beyond}"
         theta, psi = (part[0].cpu() for part in (signal.theta, self._psi_of(signal)))
         longer_px = max(camera.width, camera.height)
         self._report = _Report(text, trouble, seconds, longer_px, theta, psi)
@@ -220,7 +230,12 @@ class ViewerPanel(ViewerControl):
             self._widgets.offer_sequence(len(mapped.theta))
         unknown = ", ".join(mapped.unmapped)
         left_out = f", not known to the avatar: {unknown}" if unknown else ""
-        self.tell(f"{len(mapped.theta)} frames of {driver.root}{left_out}")
+        camera = self._model.subject.world_to_camera[:1]
+        turns = turn_seen(mapped.theta, camera, self._model.avatar.layout)
+        beyond = self._beyond(mapped.theta, turns)
+        self.tell(
+            f"{len(mapped.theta)} frames of {driver.root}{left_out}{beyond and f', {beyond}'}"
+        )
         self.change(driven_by="driving sequence", sequence=mapped.theta, sequence_frame=0)
 
     def advance(self) -> None:

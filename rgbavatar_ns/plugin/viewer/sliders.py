@@ -14,6 +14,8 @@ _UNITS = {
 }
 _LEAST_REACH = {"linear": 1.0, "axis_angle": math.radians(20), "translation": 0.05}
 _BEYOND = 0.25
+_ONE_WAY = ("jaw", 0)
+"""The field and number that go to one side only: a mouth is open or closed."""
 _STEPS = 200
 
 TITLES = {
@@ -55,6 +57,8 @@ class NumberSlider:
     low: float
     high: float
     step: float
+    marks: tuple[float, float]
+    """Where the film ends."""
     shown_per_unit: float
     """The shown number is this times theta's."""
 
@@ -66,7 +70,8 @@ class NumberSlider:
 def number_sliders(names: ThetaNames, statistics: TrainingStatistics) -> list[NumberSlider]:
     """A slider for each number of theta, expressions that moved most in training first.
 
-    Each goes a quarter beyond what was seen, and at least to +-1, 20 degrees or 5 cm.
+    Each goes a quarter beyond what was seen, and at least to +-1, 20 degrees or 5 cm; the jaw only
+    opens.
     """
     sliders = []
     for part in names.layout.fields:
@@ -81,12 +86,16 @@ def number_sliders(names: ThetaNames, statistics: TrainingStatistics) -> list[Nu
             low = min(float(seen[0]), -_LEAST_REACH[part.form])
             high = max(float(seen[1]), _LEAST_REACH[part.form])
             reach = _BEYOND * (high - low)
-            low, high, step = slider_ends(factor * (low - reach), factor * (high + reach))
+            low, high = low - reach, high + reach
+            if (part.name, place - numbers.start) == _ONE_WAY:
+                low = 0.0
+            low, high, step = slider_ends(factor * low, factor * high)
             label, goes = _meaning(names, place, part.name, place - numbers.start)
-            shown = [f"{on_step(factor * float(end), step):g}" for end in seen]
-            hint = f"In {unit}{goes}; in training {shown[0]} to {shown[1]}"
+            shown = [on_step(factor * float(end), step) for end in seen]
+            marks = min(max(shown[0], low), high), min(max(shown[1], low), high)
+            hint = f"In {unit}{goes}; in training {shown[0]:g} to {shown[1]:g}"
             sliders.append(
-                NumberSlider(place, part.name, label + sign, hint, low, high, step, factor)
+                NumberSlider(place, part.name, label + sign, hint, low, high, step, marks, factor)
             )
     return sliders
 

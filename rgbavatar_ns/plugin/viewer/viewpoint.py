@@ -32,7 +32,8 @@ class Viewpoint:
         """From the first frame's camera, a little nearer than it, at the middle of the head."""
         means = avatar.gaussians(subject.theta[:1].to(avatar.identity)).means[0]
         middle = (means.amin(0) + means.amax(0)) / 2
-        eye = torch.lerp(middle, subject.camera_center.to(middle), _NEARER)
+        camera_center = torch.linalg.inv(subject.world_to_camera[0])[:3, 3]
+        eye = torch.lerp(middle, camera_center.to(middle), _NEARER)
         ends = head_to_nerfstudio(torch.stack([eye, middle])).tolist()
         return cls(eye=tuple(ends[0]), look_at=tuple(ends[1]))
 

@@ -150,6 +150,7 @@ class Widgets:
             0.0,
             lambda value: self._do.set_theta_number(slider.place, value / slider.shown_per_unit),
             slider.hint,
+            slider.marks,
         )
         self._numbers.append((slider, handle))
 
@@ -182,11 +183,13 @@ class Widgets:
             low, high = float(seen.psi_min[basis]), float(seen.psi_max[basis])
             reach = max(_LEAST_WEIGHT, 1.5 * max(high, -low))
             ends = slider_ends(-reach, reach)
-            seen_ends = " to ".join(f"{on_step(end, ends[2]):g}" for end in (low, high))
+            marks = on_step(low, ends[2]), on_step(high, ends[2])
+            seen_ends = " to ".join(f"{end:g}" for end in marks)
             hint = f"How much of this change is added (psi); in training {seen_ends}"
             set_this = partial(do.set_weight, basis)
             self._reach.append(ends)
-            self._weights.append(self._slider(f"Basis {basis + 1}", ends, 0.0, set_this, hint))
+            label = f"Basis {basis + 1}"
+            self._weights.append(self._slider(label, ends, 0.0, set_this, hint, marks))
 
     def _add_looks(self) -> None:
         gui, do = self._gui, self._do
@@ -207,9 +210,11 @@ class Widgets:
         value: _Number,
         done: Callable[..., Any],
         hint: str | None = None,
+        marks: tuple[float, float] | None = None,
     ) -> Any:
         value = min(max(value, limits[0]), limits[1])
-        return _on(self._gui.add_slider(label, *limits, value, hint=hint), done)
+        ends = None if marks is None else tuple(sorted(set(marks)))
+        return _on(self._gui.add_slider(label, *limits, value, marks=ends, hint=hint), done)
 
     def _button(self, label: str, done: Callable[[], None], hint: str) -> None:
         self._gui.add_button(label, hint=hint).on_click(lambda _: done())

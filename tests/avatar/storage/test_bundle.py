@@ -1,4 +1,5 @@
 import json
+import math
 import pickle
 from pathlib import Path
 
@@ -230,7 +231,8 @@ def test_a_head_has_the_digest_that_bundles_of_before_name():
 def _statistics(avatar: Avatar, count: int = 12) -> TrainingStatistics:
     theta = random_theta(avatar.layout, count)
     with torch.no_grad():
-        return TrainingStatistics.of(theta, avatar.weights(theta), avatar.layout)
+        views = front_camera(24).world_to_camera
+        return TrainingStatistics.of(theta, avatar.weights(theta), avatar.layout, views)
 
 
 def test_statistics_and_layout_are_inside_the_bundle(make_avatar, tmp_path):
@@ -247,10 +249,52 @@ def test_statistics_and_layout_are_inside_the_bundle(make_avatar, tmp_path):
     assert Avatar.load(tmp_path / "me").layout == avatar.layout
 
 
-def test_a_bundle_may_have_none_and_a_run_has_none(make_avatar, tmp_path):
+def test_a_bundle_and_an_earlier_run_may_have_none(make_avatar, tmp_path):
     make_avatar().save(tmp_path / "me")
     assert load_statistics(tmp_path / "me") is None
-    assert load_statistics(tmp_path) is None
+    assert load_statistics(Path(__file__).parents[2] / "golden" / "step-000000007.ckpt") is None
+    with pytest.raises(UserError, match="There is no"):
+        load_statistics(tmp_path / "nobody")
+
+
+def test_statistics_of_before_have_the_views_of_most_films(make_avatar):
+    avatar = make_avatar()
+    state, layout = _statistics(avatar).to_state(), avatar.layout
+    for name in ("turn_low", "turn_high"):
+        del state[name]
+    seen = TrainingStatistics.from_state(state, layout)
+    assert seen.turn_low.tolist() == [-15] * 3
+    assert seen.turn_high.tolist() == [15] * 3
+    assert [end.tolist() for end in seen.turn_reach()] == [[-45] * 2, [45] * 2]
+    with pytest.raises(UserError, match="turn_low does not fit"):
+        TrainingStatistics.from_state(state | {"turn_low": torch.zeros(2)}, layout)
+
+
+def test_the_reach_is_thirty_degrees_at_least_even_of_a_film_from_one_side(make_avatar):
+    layout = make_avatar().layout
+    theta = torch.zeros(60, layout.size)
+    theta[:, layout.slice("neck").start + 1] = torch.linspace(-0.6, -0.4, 60)
+    views = front_camera(24).world_to_camera
+    seen = TrainingStatistics.of(theta, torch.zeros(60, 1), layout, views)
+    low, high = seen.turn_reach()
+    assert low.tolist() == pytest.approx([-30, -30], abs=0.1)
+    assert high.tolist() == pytest.approx([math.degrees(0.6) + 30, 30], abs=0.3)
+
+
+def test_what_is_beyond_is_told_by_number_and_by_view(make_avatar):
+    layout = make_avatar().layout
+    theta = torch.zeros(10, layout.size)
+    theta[:, 0] = torch.linspace(0, 1, 10)
+    views = front_camera(24).world_to_camera
+    seen = TrainingStatistics.of(theta, torch.zeros(10, 1), layout, views)
+    asked = torch.zeros(3, layout.size)
+    asked[1, 0], asked[2, layout.slice("translation")] = 1.2, 5.0
+    turns = torch.tensor([[0.0, 4, 0], [9, 0, 0], [0, 0, 90]])
+    numbers, view = seen.beyond(asked, turns)
+    # A tenth of the range, five degrees, and where the head is or how it lies do not count.
+    assert numbers.nonzero().tolist() == [[1, 0]]
+    assert view.tolist() == [False, True, False]
+    assert not seen.beyond(theta, torch.zeros(1, 3))[0].any()
 
 
 def test_statistics_that_lack_a_part_are_refused(make_avatar, tmp_path):

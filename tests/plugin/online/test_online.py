@@ -21,6 +21,7 @@ from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.utils.eval_utils import eval_setup
 
 from rgbavatar_ns import Avatar
+from rgbavatar_ns.avatar.storage.bundle import load_statistics
 from rgbavatar_ns.avatar.storage.checkpoint_file import list_checkpoints
 from rgbavatar_ns.data import TrackedFrame, load_dataset
 from rgbavatar_ns.data.streams import StreamClient, StreamSubject
@@ -252,6 +253,9 @@ def test_frames_sent_over_a_socket_are_trained_on_and_kept(
     frames_saved = newest_state(trainer.checkpoint_dir)["pipeline"]["_model._extra_state"]["frames"]
     assert torch.equal(frames_saved["theta"], load_dataset(tiny_data).theta[:STREAMED])
     assert loaded.num_gaussians == trainer.pipeline.model.avatar.num_gaussians
+    seen = load_statistics(trainer.base_dir)
+    assert seen is not None
+    assert seen.num_frames == STREAMED
     # The run is complete in itself: it holds the frames, and other commands find them.
     recorded = load_dataset(trainer.base_dir / "stream")
     assert len(recorded) == STREAMED
@@ -415,6 +419,6 @@ def test_a_killed_run_goes_on_from_its_last_checkpoint(
     state = stream_state(folder)
     again = online("again", load_dir=folder)
     assert again.stream.pools.num_added == state["frames"]["added"] > 0
-    assert torch.equal(again.stream.pools.thetas()[0], state["frames"]["theta"])
+    assert torch.equal(again.stream.pools.parameters()[0], state["frames"]["theta"])
     again.train()
     assert summary(again)["frames"] == STREAMED

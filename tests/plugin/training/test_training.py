@@ -14,8 +14,11 @@ import torch
 from torch.utils._pytree import keystr, tree_flatten_with_path
 
 from rgbavatar_ns import Avatar
+from rgbavatar_ns.avatar.storage.bundle import load_statistics
 from rgbavatar_ns.avatar.storage.checkpoint_file import list_checkpoints
+from rgbavatar_ns.data import load_dataset
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.export import statistics_of
 from rgbavatar_ns.plugin.methods import rgbavatar
 from rgbavatar_ns.plugin.training.trainer import RGBAvatarTrainer, RGBAvatarTrainerConfig
 from tests.plugin.run import (
@@ -181,6 +184,16 @@ def test_checkpoint_is_an_avatar_without_nerfstudio(train: Train):
         expected, seen = model.avatar.gaussians(theta), loaded.gaussians(theta)
     for name in ("means", "quats_wxyz", "scales", "opacities", "colors"):
         assert torch.equal(getattr(expected, name), getattr(seen, name))
+
+
+def test_checkpoint_says_what_was_filmed(train: Train, tiny_data: Path):
+    trainer = train(max_num_iterations=3)
+    dataset = load_dataset(tiny_data)
+    expected = statistics_of(trainer.pipeline.model.avatar, dataset).to_state()
+    seen = load_statistics(trainer.base_dir)
+    assert seen is not None
+    for name, value in seen.to_state().items():
+        assert torch.equal(torch.as_tensor(value), torch.as_tensor(expected[name])), name
 
 
 def test_full_disk_at_a_checkpoint_is_a_user_error_and_the_old_one_survives(
