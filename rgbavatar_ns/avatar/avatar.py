@@ -79,13 +79,10 @@ class Avatar(nn.Module):
         if anchors is None:
             anchors = uv_anchors(head.uv, head.uv_faces, config.uv_resolution)
         self.anchors = GaussianAnchors(head, anchors, rest_vertices, config.tangent_variant)
-        scale_m: float | Tensor = config.initial_scale_m
-        if config.scale_from_texel_spacing:
-            scale_m = 0.5 * self.anchors.texel_spacing()
         self.blendshapes = GaussianBlendshapes(
             len(self.anchors),
             config.num_bases,
-            scale_m=scale_m,
+            scale_m=self.initial_scale_m(),
             opacity=config.initial_opacity,
             color=config.initial_color,
         )
@@ -118,6 +115,12 @@ class Avatar(nn.Module):
     def num_gaussians(self) -> int:
         """The number N of Gaussians."""
         return len(self.anchors)
+
+    def initial_scale_m(self) -> Float[Tensor, "N"]:
+        """Return the standard deviation that each Gaussian of a fresh avatar has, in metres."""
+        if self.config.scale_from_texel_spacing:
+            return 0.5 * self.anchors.texel_spacing()
+        return self.identity.new_full((len(self.anchors),), self.config.initial_scale_m)
 
     def weights(self, theta: Float[Tensor, "B H"]) -> Float[Tensor, "B K"]:
         """Return the blendshape weights psi = F(theta); raises UserError on a theta unfit."""

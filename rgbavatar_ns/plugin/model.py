@@ -13,6 +13,7 @@ from torch.nn import Parameter
 
 from rgbavatar_ns.avatar import Avatar, AvatarConfig
 from rgbavatar_ns.avatar.metrics import LPIPSMetric, evaluate_images
+from rgbavatar_ns.avatar.prior import SurfacePrior
 from rgbavatar_ns.avatar.refinement import RefinementConfig
 from rgbavatar_ns.avatar.training.color_init import ColorInitSchedule
 from rgbavatar_ns.avatar.training.losses import LPIPSLoss, image_losses
@@ -39,6 +40,9 @@ class RGBAvatarModelConfig(ModelConfig):
     """Sizes, variants and initial values of the avatar."""
     initialize_colors: bool = True
     """Give each Gaussian the mean colour of the pixels it covers when it is first seen."""
+    surface_prior: bool = True
+    """Keep what the film does not show on the person's surface, closed and plain: heads can be
+    turned beyond their film. Ours; False leaves it to chance, as the paper does."""
     lpips_weight: Weight = 0.0
     """Weight of the LPIPS loss (paper: 0, and 0.05 for its sharper variant)."""
     lpips_start_step: Counted = 0
@@ -99,6 +103,9 @@ class RGBAvatarModel(Model):
         self.refinement = None
         if self.config.refine_tracking:
             self.refinement = frame_refinement(subject, self.config.refinement)
+        self.prior = None
+        if self.config.surface_prior:
+            self.prior = SurfacePrior(self.avatar.num_gaussians)
         self.lpips_loss = LPIPSLoss()
         self.lpips_metric: LPIPSMetric | None = None
 
@@ -177,6 +184,7 @@ class RGBAvatarModel(Model):
             lpips_weight=config.lpips_weight,
             lpips_start_step=config.lpips_start_step,
             color_init=ColorInitSchedule() if config.initialize_colors else None,
+            surface_prior=config.surface_prior,
             orthogonality=config.orthogonality,
             fast=config.fast,
             batch_parallel=config.batch_parallel,

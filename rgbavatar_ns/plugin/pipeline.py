@@ -71,6 +71,7 @@ class RGBAvatarPipeline(VanillaPipeline):
             options,
             frames=self.datamanager.device_frames,
             refinement=self.model.refinement,
+            prior=self.model.prior,
             lpips=self.model.lpips_loss,
             recorder=self.recorder,
         )

@@ -140,6 +140,10 @@ class GaussianAnchors(nn.Module):
         )
         return summed.view(len(self), num_images, 3).transpose(0, 1).contiguous()
 
+    def corners(self) -> tuple[Int[Tensor, "N 3"], Float[Tensor, "N 3"]]:
+        """Return the vertices of each Gaussian's triangle, and its barycentric coordinates."""
+        return self._anchor_vertices, self.barycentric
+
     def texel_spacing(self) -> Float[Tensor, "N"]:
         """Return the distance in metres between neighbouring texels on the head at rest."""
         corners = self._uv[self._used_uv_faces]

@@ -14,6 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from rgbavatar_ns.avatar.avatar import LEARNING_RATES, Avatar
+from rgbavatar_ns.avatar.prior import SurfacePrior
 from rgbavatar_ns.avatar.refinement.frames import FrameRefinement
 from rgbavatar_ns.avatar.training.batches import ChosenFrames, DeviceFrames, TrainingBatch
 from rgbavatar_ns.avatar.training.color_init import ColorInitSchedule, initialize_colors
@@ -47,6 +48,9 @@ class TrainingOptions:
     """First step with the LPIPS loss (release: after 20k images)."""
     color_init: ColorInitSchedule | None = field(default_factory=ColorInitSchedule)
     """When colours are initialised; None leaves them grey."""
+    surface_prior: bool = True
+    """Keep what the film does not show on the person's surface, closed and plain (ours; the paper
+    leaves it to chance)."""
     orthogonality: Orthogonality = "free"
     """How bases are kept orthogonal: not at all, by a loss, or by QR or Gram-Schmidt at times."""
     max_norm: Mapping[str, float] = field(default_factory=dict)
@@ -89,6 +93,7 @@ class TrainingStep:
         frames: gives all training frames on the device, or None; asked only where steps could be
             recorded. A recorded step takes `ChosenFrames` of them in place of a `TrainingBatch`.
         refinement: corrects the frames' theta by the gradient that each step leaves there.
+        prior: what it remembers of a run so far; where options ask for it, by default a fresh one.
         lpips: the LPIPS loss, where it counts.
         recorder: how a step becomes one that the device takes by itself.
 
@@ -105,6 +110,7 @@ class TrainingStep:
         *,
         frames: Callable[[], DeviceFrames | None] | None = None,
         refinement: FrameRefinement | None = None,
+        prior: SurfacePrior | None = None,
         lpips: LPIPSLoss | None = None,
         recorder: Recorder = record_cuda_graph,
     ) -> None:
@@ -113,6 +119,10 @@ class TrainingStep:
         self.avatar, self.optimizers = avatar, list(optimizers)
         self.options = TrainingOptions() if options is None else options
         self.refinement = refinement
+        self._prior = None
+        if self.options.surface_prior:
+            fresh = SurfacePrior(avatar.num_gaussians).to(avatar.identity.device)
+            self._prior = fresh if prior is None else prior
         self._lpips = LPIPSLoss() if lpips is None else lpips
         self._orthogonality = self.options.orthogonality if avatar.config.num_bases else "free"
         self._fused: FusedStep | None = None
@@ -167,6 +177,7 @@ class TrainingStep:
         """
         if isinstance(batch, ChosenFrames):
             return self._take_recorded(batch, step)
+        self._begin(lambda: batch)
         theta = batch.theta
         if self.refinement is not None:
             assert batch.position is not None, "Refined tracking needs the frames' positions."
@@ -183,6 +194,7 @@ class TrainingStep:
         frames, rows = self._frames, chosen.rows
         if frames is None:
             raise ValueError(f"Steps are {self.kind}: {self.reason}. Pass a TrainingBatch.")
+        self._begin(lambda: frames.batch(rows))
         if self._recorded is None:
             self._recorded = RecordedStep(
                 self.avatar,
@@ -245,11 +257,21 @@ class TrainingStep:
             losses["orthogonality"] = ORTHOGONALITY_WEIGHT * error
         return losses
 
+    def _begin(self, shown: Callable[[], TrainingBatch]) -> None:
+        """What is due before the first step of a run."""
+        if self._prior is not None and not self._prior.has_begun:
+            batch = shown()
+            self._prior.begin(self.avatar, batch.theta, batch.cameras, batch.images_rgba)
+
     def _finish(self, step: int, shown: Callable[[], TrainingBatch]) -> None:
-        """What is due after a step: orthogonal bases, first colours."""
+        """What is due after a step: orthogonal bases, first colours, what is not seen."""
         method, schedule = self._orthogonality, self.options.color_init
         if (step + 1) % ORTHOGONALIZE_EVERY == 0 and method in ("qr", "gram_schmidt"):
             orthogonalize(self.avatar.blendshapes, method)
+        if self._prior is not None and self._prior.due(step):
+            batch = shown()
+            frames = batch.theta, batch.cameras, batch.images_rgba
+            self._prior.after_step(self.avatar, *frames, step, self.options.backend)
         if schedule is None or not schedule.due(step):
             return
         if not bool(self.avatar.color_initialized.all()):

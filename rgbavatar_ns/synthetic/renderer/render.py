@@ -122,9 +122,7 @@ class DemoRenderer:
             light = self._through_lenses(lenses, rays, light)
         return self._develop(rays, to_srgb(light))
 
-    def _may_matter(
-        self, vertices: np.ndarray, normals: np.ndarray, key: np.ndarray
-    ) -> np.ndarray:
+    def _may_matter(self, vertices: np.ndarray, normals: np.ndarray, key: np.ndarray) -> np.ndarray:
         """Triangles that face the camera or the key lamp, or are no skin; the rest of the head is
         hidden behind these and throws no shadow that they do not throw.
         """

@@ -1,0 +1,5 @@
+"""What a head is taken for where the film does not show it: closed, plain, and of its outline."""
+
+from rgbavatar_ns.avatar.prior.surface_prior import SurfacePrior
+
+__all__ = ["SurfacePrior"]

@@ -1,0 +1,108 @@
+"""Smooth functions over a head's mesh: known in places, continued to the others."""
+
+import torch
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import KDTree
+from torch import Tensor
+
+from rgbavatar_ns.avatar.avatar import Avatar
+
+_MIRROR_REACH_M = 5e-3
+_MIRROR_TRUST = 0.3
+"""How much what is known of one side of the face tells of the other."""
+
+
+class MeshField:
+    """The vertices of an avatar's mesh as a graph, and the Gaussians' places in it.
+
+    Values are continued harmonically, as heat would spread, to both sides of the face alike. Ours:
+    because what nobody filmed is best guessed by what surrounds it.
+    """
+
+    def __init__(self, avatar: Avatar) -> None:
+        self._corners, self._barycentric = avatar.anchors.corners()
+        faces = avatar.head.faces.long()
+        template = torch.as_tensor(avatar.head.arrays.v_template).to(self._barycentric)
+        self.num_vertices = len(template)
+        ends = torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+        self.edges = torch.unique(torch.cat([ends, ends.flip(1)]), dim=0)
+        self._mirror, self._mirrored = _mirror_of(template)
+
+    def of_gaussians(
+        self, values: Float[Tensor, "N C"], confidence: Float[Tensor, "N"]
+    ) -> tuple[Float[Tensor, "V C"], Float[Tensor, "V"]]:
+        """Each vertex's mean of the Gaussians around it, and their confidence together."""
+        shares = self._barycentric * confidence[:, None]
+        ones = torch.cat([values, torch.ones_like(values[:, :1])], 1)
+        sums = ones.new_zeros(self.num_vertices, ones.shape[1])
+        for corner in range(3):
+            sums.index_add_(0, self._corners[:, corner], ones * shares[:, corner : corner + 1])
+        return sums[:, :-1] / sums[:, -1:].clamp(min=1e-12), sums[:, -1]
+
+    def at_gaussians(self, values: Float[Tensor, "V C"]) -> Float[Tensor, "N C"]:
+        """The values of vertices where the Gaussians are."""
+        at = values[self._corners] * self._barycentric[:, :, None]
+        return at.sum(1)
+
+    def likeness(
+        self, colors: Float[Tensor, "V 3"], known: Bool[Tensor, "V"], spread: float, least: float
+    ) -> Float[Tensor, "E"]:
+        """How far each edge's ends look alike: 1 for the same colour, and where one is unknown."""
+        first, second = self.edges.unbind(1)
+        apart = (colors[first] - colors[second]).square().sum(1)
+        alike = torch.exp(-apart / (2 * spread**2)).clamp(min=least)
+        return torch.where(known[first] & known[second], alike, torch.ones_like(alike))
+
+    def continued(
+        self,
+        values: Float[Tensor, "V C"],
+        confidence: Float[Tensor, "V"],
+        start: Float[Tensor, "V C"],
+        *,
+        stiffness: float | Float[Tensor, "E"],
+        rest: float,
+        iterations: int,
+    ) -> Float[Tensor, "V C"]:
+        """The smooth function near `values`, as near as `confidence` says, from a first guess.
+
+        Minimises sum confidence (x - values)^2 + rest x^2 + sum over edges stiffness (x_i - x_j)^2
+        by conjugate gradients, without waiting for the device.
+        """
+        there = _MIRROR_TRUST * self._mirrored * confidence[self._mirror]
+        weight = (confidence + there)[:, None]
+        known = confidence[:, None] * values + there[:, None] * values[self._mirror]
+        first, second = self.edges.unbind(1)
+        pull = values.new_ones(len(self.edges)) * stiffness
+        degree = pull.new_zeros(self.num_vertices).index_add_(0, first, pull)[:, None]
+        diagonal = weight + rest + degree
+
+        def product(x: Tensor) -> Tensor:
+            neighbours = torch.zeros_like(x).index_add_(0, first, pull[:, None] * x[second])
+            return diagonal * x - neighbours
+
+        return _conjugate_gradients(product, known, start, diagonal, iterations)
+
+
+def _conjugate_gradients(product, wanted: Tensor, start: Tensor, diagonal: Tensor, iterations: int):
+    """Solve each column by itself, preconditioned by the diagonal."""
+    x, left = start, wanted - product(start)
+    scaled = left / diagonal
+    direction, size = scaled, (left * scaled).sum(0)
+    for _ in range(iterations):
+        image = product(direction)
+        step = size / (direction * image).sum(0).clamp(min=1e-30)
+        x, left = x + step * direction, left - step * image
+        scaled = left / diagonal
+        size, before = (left * scaled).sum(0), size
+        direction = scaled + size / before.clamp(min=1e-30) * direction
+    return x
+
+
+def _mirror_of(
+    template: Float[Tensor, "V 3"],
+) -> tuple[Int[Tensor, "V"], Float[Tensor, "V"]]:
+    """Each vertex's partner on the other side of x = 0, and 1 where there is one."""
+    places = template.cpu().double().numpy()
+    distance, partner = KDTree(places).query(places * [-1, 1, 1])
+    found = torch.from_numpy(distance < _MIRROR_REACH_M).to(template)
+    return torch.from_numpy(partner).to(template.device), found
