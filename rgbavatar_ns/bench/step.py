@@ -109,7 +109,9 @@ def time_step(
 
 def step_by_step(avatar: Avatar, batch: TrainingBatch, *, fast: bool) -> Take:
     """A step by the backend's loops, or through autograd."""
-    step = TrainingStep(avatar, options=TrainingOptions(color_init=None, fast=fast))
+    step = TrainingStep(
+        avatar, options=TrainingOptions(color_init=None, surface_prior=False, fast=fast)
+    )
     return lambda: step(batch, 0)["l1"]
 
 
@@ -120,7 +122,7 @@ def recorded_step(
     start = StartingPoint(avatar)
     frames = DeviceFrames(batch.theta, batch.cameras, torch.as_tensor(batch.images_rgba))
     count = len(batch.theta)
-    options = TrainingOptions(color_init=None)
+    options = TrainingOptions(color_init=None, surface_prior=False)
     step = TrainingStep(avatar, options=options, frames=lambda: frames, recorder=recorder)
     chosen = ChosenFrames(list(range(count)), random_backgrounds(0, count))
     for _ in range(8):

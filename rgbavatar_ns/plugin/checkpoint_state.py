@@ -7,12 +7,14 @@ from typing import Any
 import torch
 
 from rgbavatar_ns.avatar import Avatar, describe_layout
+from rgbavatar_ns.avatar.prior import SurfacePrior
 from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import ThetaLayout
 from rgbavatar_ns.plugin.dataparser import Subject
 
 _EXTRA_STATE = "_extra_state"
+_PRIOR = "prior."
 
 
 def model_state(avatar: Avatar, subject: Subject) -> dict[str, Any]:
@@ -60,6 +62,17 @@ def require_same_layout(state_dict: Mapping[str, Any], avatar: Avatar) -> None:
             "tracked with the same head model.",
         )
     _require_same_make(config, avatar)
+
+
+def with_prior_as(state_dict: Mapping[str, Any], prior: SurfacePrior | None) -> dict[str, Any]:
+    """Return the state with the surface prior that the model has, or without one.
+
+    A run that began without it goes on without: a fresh prior does nothing.
+    """
+    others = {k: v for k, v in state_dict.items() if not k.startswith(_PRIOR)}
+    if prior is None or len(others) < len(state_dict):
+        return others if prior is None else dict(state_dict)
+    return others | {_PRIOR + name: value for name, value in prior.state_dict().items()}
 
 
 @contextmanager

@@ -24,7 +24,12 @@ from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.kernels import PinholeCameras
 from rgbavatar_ns.options import Counted, Seed, Weight
 from rgbavatar_ns.plugin.cameras import filled_depth, from_nerfstudio
-from rgbavatar_ns.plugin.checkpoint_state import misfits_told, model_state, require_same_layout
+from rgbavatar_ns.plugin.checkpoint_state import (
+    misfits_told,
+    model_state,
+    require_same_layout,
+    with_prior_as,
+)
 from rgbavatar_ns.plugin.dataparser import Subject
 from rgbavatar_ns.plugin.refinement import frame_refinement, require_same_refinement
 
@@ -231,5 +236,6 @@ class RGBAvatarModel(Model):
         """Load parameters; raises UserError where they are not all those of this model's make."""
         require_same_layout(state_dict, self.avatar)
         require_same_refinement(state_dict, self.refinement)
+        state_dict = with_prior_as(state_dict, self.prior)
         with misfits_told():
             return super().load_state_dict(state_dict, strict=strict, assign=assign)

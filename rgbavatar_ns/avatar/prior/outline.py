@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from rgbavatar_ns.avatar.avatar import Avatar
@@ -128,12 +128,14 @@ def _add_frame(sums: _Sums, image: np.ndarray, seen: _Placed, faces: np.ndarray)
     corners = np.round(px[faces].clip(-(2**14), 2**14) * 16).astype(np.int32)
     for triangle in corners:
         cv2.fillConvexPoly(mesh, triangle, (1,), shift=4)
-    depth = _signed_distance_px(image)
+    depth = _signed_distance_px((image[..., 3] > 127) | unfilmed_pixels(image))
     rows, columns = np.gradient(depth)
     inwards = np.stack([_at(columns, px), _at(rows, px)], 1)
     beside = _at(mesh.astype(np.float32), px + _BESIDE_PX * outwards)
     filmed = _at(unfilmed_pixels(image).astype(np.float32), px) < 0.1
-    metres = _at(depth, px) * seen.places_m[:, 2].numpy() / float(seen.focal_px[0])
+    # A rim's vertex may lie a little within the mesh's own outline.
+    apart = _at(depth, px) - _at(_signed_distance_px(mesh > 0), px)
+    metres = apart * seen.places_m[:, 2].numpy() / float(seen.focal_px[0])
     rim = (np.abs(along) < _GRAZING) & (beside >= 0) & (beside < 0.1) & filmed
     rim &= (-(inwards * outwards).sum(1) > _AGREES) & (np.abs(metres) < _REACH_M)
     sums.distance_m[rim] += metres[rim]
@@ -146,11 +148,13 @@ def _add_frame(sums: _Sums, image: np.ndarray, seen: _Placed, faces: np.ndarray)
     sums.facing += facing
 
 
-def _signed_distance_px(image: np.ndarray) -> Float[np.ndarray, "height width"]:
-    """Distance to the matte's border, positive inside; the picture's own border is none."""
-    inside = ((image[..., 3] > 127) | unfilmed_pixels(image)).astype(np.uint8)
+def _signed_distance_px(
+    mask: Bool[np.ndarray, "height width"],
+) -> Float[np.ndarray, "height width"]:
+    """Distance to a mask's border, positive inside; the picture's own border is none."""
+    inside = mask.astype(np.uint8)
     within, beyond = (cv2.distanceTransform(m, cv2.DIST_L2, 5) for m in (inside, 1 - inside))
-    return cv2.GaussianBlur(np.where(inside > 0, within - 0.5, 0.5 - beyond), (0, 0), 0.7)
+    return cv2.GaussianBlur(np.where(mask, within - 0.5, 0.5 - beyond), (0, 0), 0.7)
 
 
 def _on_background(image: np.ndarray, px: np.ndarray) -> np.ndarray:
@@ -160,7 +164,7 @@ def _on_background(image: np.ndarray, px: np.ndarray) -> np.ndarray:
 
 def _at(values: np.ndarray, px: Float[np.ndarray, "V 2"]) -> np.ndarray:
     """Bilinear values of an image at places; -1 beyond its border."""
-    column, row = np.ascontiguousarray(px.T - 0.5)[:, :, None]
+    column, row = np.ascontiguousarray(px.T - 0.5, np.float32)[:, :, None]
     found = cv2.remap(
         values.astype(np.float32), column, row, cv2.INTER_LINEAR, borderValue=(-1, -1, -1, -1)
     )

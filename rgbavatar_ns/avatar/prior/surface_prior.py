@@ -13,7 +13,6 @@ from torch import Tensor, nn
 
 from rgbavatar_ns.avatar.avatar import Avatar
 from rgbavatar_ns.avatar.prior.mesh_field import MeshField
-from rgbavatar_ns.avatar.prior.outline import measure_outline
 from rgbavatar_ns.drawing.compositing import is_unfilmed
 from rgbavatar_ns.kernels import PinholeCameras, weighted_color_average
 
@@ -26,15 +25,15 @@ _FIRST_STEP, _FIRST_PULL = 60, 160
 _RATE = 0.3
 """Share of the way to the surface that an unseen Gaussian goes at a time."""
 _FORGETS = 0.97
-_SEEN_PX = 0.03
+_SEEN_PX = 0.1
 """Pixels that a Gaussian covers in the frame that shows it best, at which it is half known."""
 _CLEAR_PX = 0.1
 """Pixels from which its colour tells that of its surroundings."""
-_SINK_M = 2e-3
-"""How deep a Gaussian's centre lies below the surface that its extent reaches to."""
+_SUNK = 1.25
+"""How many of its widths a Gaussian's centre lies below the surface that it reaches to."""
 _FLATNESS = math.log(0.25)
 """Logarithm of thickness over width: surfaces are made of discs."""
-_CLOSED, _EMPTY = math.log(0.95 / 0.05), math.log(0.01 / 0.99)
+_CLOSED, _EMPTY = math.log(0.9 / 0.1), math.log(0.01 / 0.99)
 _STIFFNESS, _REST, _ITERATIONS = 0.02, 1e-6, 30
 
 
@@ -65,7 +64,7 @@ class SurfacePrior(nn.Module):
 
     @property
     def has_begun(self) -> bool:
-        """Whether the surface has been measured; waits for the device until it has."""
+        """Whether the surface has been measured; else nothing is drawn to it."""
         self._has_begun = self._has_begun or bool(self.begun)
         return self._has_begun
 
@@ -77,20 +76,24 @@ class SurfacePrior(nn.Module):
         images_rgba: Images,
     ) -> None:
         """Measure the surface by these frames, and put a fresh avatar's Gaussians on it."""
+        # Here, so that timing steps on a bare machine needs no OpenCV.
+        from rgbavatar_ns.avatar.prior.outline import measure_outline
+
         field = self._mesh_field(avatar)
         outline = measure_outline(avatar, field, theta, cameras, _as_bytes(images_rgba))
-        known = torch.stack([outline.offset_m - _SINK_M, outline.empty], 1)
+        known = torch.stack([outline.offset_m, outline.empty], 1)
         offset_m, empty = field.at_gaussians(known).unbind(1)
-        self.offset_m.copy_(offset_m)
+        self.offset_m.copy_(offset_m - _SUNK * avatar.initial_scale_m())
         self.opacity_logit.copy_(torch.where(empty > 0.5, _EMPTY, _CLOSED))
         self.begun.fill_(True)
         with torch.no_grad():
-            avatar.blendshapes.position[:, 2] = offset_m
+            avatar.blendshapes.position[:, 2] = self.offset_m
             avatar.blendshapes.log_scale[:, 2] += _FLATNESS
+            avatar.blendshapes.opacity_logit.copy_(self.opacity_logit)
 
     def due(self, step: int) -> bool:
         """Whether `after_step` has something to do after this step, counted from 0."""
-        return step >= _FIRST_STEP and (step + 1) % EVERY == 0
+        return step >= _FIRST_STEP and (step + 1) % EVERY == 0 and self.has_begun
 
     @torch.no_grad()
     def after_step(

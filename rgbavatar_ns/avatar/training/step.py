@@ -93,7 +93,8 @@ class TrainingStep:
         frames: gives all training frames on the device, or None; asked only where steps could be
             recorded. A recorded step takes `ChosenFrames` of them in place of a `TrainingBatch`.
         refinement: corrects the frames' theta by the gradient that each step leaves there.
-        prior: what it remembers of a run so far; where options ask for it, by default a fresh one.
+        prior: what was seen in a run's earlier steps; where options ask for it, by default a fresh
+            one, which does nothing in a run that it has not seen from its first step.
         lpips: the LPIPS loss, where it counts.
         recorder: how a step becomes one that the device takes by itself.
 
@@ -119,10 +120,9 @@ class TrainingStep:
         self.avatar, self.optimizers = avatar, list(optimizers)
         self.options = TrainingOptions() if options is None else options
         self.refinement = refinement
-        self._prior = None
-        if self.options.surface_prior:
-            fresh = SurfacePrior(avatar.num_gaussians).to(avatar.identity.device)
-            self._prior = fresh if prior is None else prior
+        self._prior = prior if self.options.surface_prior else None
+        if self.options.surface_prior and prior is None:
+            self._prior = SurfacePrior(avatar.num_gaussians).to(avatar.identity.device)
         self._lpips = LPIPSLoss() if lpips is None else lpips
         self._orthogonality = self.options.orthogonality if avatar.config.num_bases else "free"
         self._fused: FusedStep | None = None
@@ -177,7 +177,7 @@ class TrainingStep:
         """
         if isinstance(batch, ChosenFrames):
             return self._take_recorded(batch, step)
-        self._begin(lambda: batch)
+        self._begin(step, lambda: batch)
         theta = batch.theta
         if self.refinement is not None:
             assert batch.position is not None, "Refined tracking needs the frames' positions."
@@ -194,7 +194,7 @@ class TrainingStep:
         frames, rows = self._frames, chosen.rows
         if frames is None:
             raise ValueError(f"Steps are {self.kind}: {self.reason}. Pass a TrainingBatch.")
-        self._begin(lambda: frames.batch(rows))
+        self._begin(step, lambda: frames.batch(rows))
         if self._recorded is None:
             self._recorded = RecordedStep(
                 self.avatar,
@@ -257,9 +257,9 @@ class TrainingStep:
             losses["orthogonality"] = ORTHOGONALITY_WEIGHT * error
         return losses
 
-    def _begin(self, shown: Callable[[], TrainingBatch]) -> None:
+    def _begin(self, step: int, shown: Callable[[], TrainingBatch]) -> None:
         """What is due before the first step of a run."""
-        if self._prior is not None and not self._prior.has_begun:
+        if step == 0 and self._prior is not None and not self._prior.has_begun:
             batch = shown()
             self._prior.begin(self.avatar, batch.theta, batch.cameras, batch.images_rgba)
 

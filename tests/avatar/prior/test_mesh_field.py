@@ -1,0 +1,64 @@
+"""Values over the mesh: continued as a dense solver says, to both sides of the face alike."""
+
+import torch
+
+from rgbavatar_ns.avatar import Avatar, AvatarConfig
+from rgbavatar_ns.avatar.prior.mesh_field import MeshField
+from rgbavatar_ns.head import HeadModel
+
+
+def embedded_avatar(uv_resolution: int = 48, num_bases: int = 2) -> Avatar:
+    head = HeadModel.embedded()
+    config = AvatarConfig(
+        num_bases=num_bases, uv_resolution=uv_resolution, scale_from_texel_spacing=True
+    )
+    return Avatar(head, torch.zeros(head.num_identity), config)
+
+
+def test_the_continuation_solves_its_equations(make_avatar):
+    field = MeshField(make_avatar())
+    count, random = field.num_vertices, torch.Generator().manual_seed(0)
+    values = torch.rand(count, 2, generator=random)
+    confidence = (torch.rand(count, generator=random) > 0.6).float()
+    stiffness = 0.1 + torch.rand(len(field.edges), generator=random)
+    # An edge pulls both ways alike.
+    first, second = field.edges.unbind(1)
+    weights = torch.zeros(count, count).index_put((first, second), stiffness)
+    weights = 0.5 * (weights + weights.T)
+    found = field.continued(
+        values,
+        confidence,
+        torch.zeros_like(values),
+        stiffness=weights[first, second],
+        rest=0.01,
+        iterations=400,
+    )
+    there = 0.3 * field._mirrored * confidence[field._mirror]
+    system = torch.diag(confidence + there + 0.01 + weights.sum(1)) - weights
+    wanted = confidence[:, None] * values + there[:, None] * values[field._mirror]
+    assert torch.allclose(found, torch.linalg.solve(system, wanted), atol=1e-4)
+
+
+def test_a_constant_stays_one_wherever_it_is_known():
+    avatar = embedded_avatar()
+    field = MeshField(avatar)
+    rest = avatar.carrier_vertices(torch.zeros(1, avatar.layout.size))
+    front = (avatar.anchors.origins(rest)[0, :, 2] > 0.06).float()
+    known, confidence = field.of_gaussians(torch.full((len(front), 1), 0.7), front)
+    assert 0 < int((confidence > 0).sum()) < len(confidence) / 2
+    found = field.continued(
+        known, confidence, 0.7 * torch.ones_like(known), stiffness=0.02, rest=0.0, iterations=30
+    )
+    assert torch.allclose(field.at_gaussians(found), torch.full((len(front), 1), 0.7), atol=1e-3)
+
+
+def test_what_one_side_of_the_face_shows_tells_of_the_other():
+    avatar = embedded_avatar()
+    field = MeshField(avatar)
+    x_m = torch.as_tensor(avatar.head.arrays.v_template)[:, 0]
+    left = (x_m > 0.02).float()
+    found = field.continued(
+        x_m.abs()[:, None], left, torch.zeros(len(x_m), 1), stiffness=1e-3, rest=0.0, iterations=600
+    )[:, 0]
+    right = x_m < -0.02
+    assert float((found - x_m.abs())[right].abs().median()) < 2e-3

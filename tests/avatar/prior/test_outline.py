@@ -1,0 +1,81 @@
+"""Outlines of mattes: a person drawn thicker than the mesh is found to be as thick."""
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from rgbavatar_ns.avatar.prior.mesh_field import MeshField
+from rgbavatar_ns.avatar.prior.outline import measure_outline
+from rgbavatar_ns.kernels import PinholeCameras
+from rgbavatar_ns.kernels.constants import UNFILMED_RGBA
+
+from .test_mesh_field import embedded_avatar
+
+SIZE = 256
+
+
+def front_camera() -> PinholeCameras:
+    world_to_camera = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))[None]
+    world_to_camera[0, 2, 3] = 1.1
+    focal_px = torch.full((1, 2), 900.0)
+    return PinholeCameras(world_to_camera, focal_px, torch.full((1, 2), SIZE / 2), SIZE, SIZE)
+
+
+def drawn_thicker(avatar, theta: torch.Tensor, thickness_m: float) -> torch.Tensor:
+    """The mesh as a pinhole sees it, widened by a disc that is as large as the thickness."""
+    camera, images = front_camera(), []
+    for vertices in avatar.carrier_vertices(theta):
+        seen = vertices @ camera.world_to_camera[0, :3, :3].T + camera.world_to_camera[0, :3, 3]
+        px = (seen[:, :2] / seen[:, 2:] * camera.focal_px + camera.principal_point_px).numpy()
+        mask = np.zeros((SIZE * 4, SIZE * 4), np.uint8)
+        for triangle in px[avatar.head.faces.numpy()]:
+            cv2.fillConvexPoly(mask, np.round(triangle * 4 * 16).astype(np.int32), (1,), shift=4)
+        radius = round(4 * abs(thickness_m) / 1.1 * 900)
+        disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
+        change = cv2.dilate if thickness_m > 0 else cv2.erode
+        mask = change(mask, disc, borderValue=0 if thickness_m > 0 else 1)
+        alpha = cv2.resize(mask * 255, (SIZE, SIZE), interpolation=cv2.INTER_AREA)
+        images.append(np.dstack([np.full((SIZE, SIZE, 3), 128, np.uint8), alpha]))
+    return torch.from_numpy(np.stack(images))
+
+
+def turned(avatar, degrees: list[float]) -> torch.Tensor:
+    theta = torch.zeros(len(degrees), avatar.layout.size)
+    theta[:, avatar.layout.slice("rotation").start + 1] = torch.deg2rad(torch.tensor(degrees))
+    return theta
+
+
+@pytest.mark.parametrize("thickness_m", [0.0, 0.01, -0.004])
+def test_the_outline_tells_how_thick_the_person_is(thickness_m: float):
+    avatar = embedded_avatar()
+    theta = turned(avatar, [-8.0, -3.0, 2.0, 8.0])
+    images = drawn_thicker(avatar, theta, thickness_m)
+    found = measure_outline(avatar, MeshField(avatar), theta, front_camera(), images)
+    v_template = torch.as_tensor(avatar.head.arrays.v_template)
+    crown = v_template[:, 1] > v_template[:, 1].max() - 0.02
+    assert float(found.offset_m[crown].median()) == pytest.approx(thickness_m, abs=2e-3)
+    assert float(found.empty.mean()) < 0.01 or thickness_m < 0
+
+
+def test_what_nobody_filmed_is_no_outline():
+    avatar = embedded_avatar()
+    theta = turned(avatar, [0.0, 4.0])
+    images = drawn_thicker(avatar, theta, 0.0)
+    images[:, : SIZE // 2] = torch.tensor(UNFILMED_RGBA, dtype=torch.uint8)
+    found = measure_outline(avatar, MeshField(avatar), theta, front_camera(), images)
+    v_template = torch.as_tensor(avatar.head.arrays.v_template)
+    crown = v_template[:, 1] > v_template[:, 1].max() - 0.02
+    assert float(found.offset_m[crown].abs().max()) < 2e-3
+    assert not found.empty[crown].any()
+
+
+def test_where_mattes_show_background_the_surface_is_empty():
+    avatar = embedded_avatar()
+    theta = turned(avatar, [0.0, 4.0])
+    images = drawn_thicker(avatar, theta, 0.0)
+    images[:, SIZE * 2 // 3 :] = 0
+    found = measure_outline(avatar, MeshField(avatar), theta, front_camera(), images)
+    y_m = torch.as_tensor(avatar.head.arrays.v_template)[:, 1]
+    assert float(found.empty[(y_m > -0.13) & (y_m < -0.1)].mean()) > 0.95
+    assert float(found.empty[y_m > 0.0].mean()) < 0.01
