@@ -25,7 +25,7 @@ _FIRST_STEP, _FIRST_PULL = 60, 160
 _RATE = 0.3
 """Share of the way to the surface that an unseen Gaussian goes at a time."""
 _FORGETS = 0.97
-_SEEN_PX = 0.1
+_SEEN_PX = 0.02
 """Pixels that a Gaussian covers in the frame that shows it best, at which it is half known."""
 _CLEAR_PX = 0.1
 """Pixels from which its colour tells that of its surroundings."""
