@@ -17,7 +17,7 @@ from tests.plugin.viewer_page import Picture, ViewerPage, started, viewer_page
 _WIDTH, _HEIGHT = 900, 950
 _SECONDS_UNTIL_DRAWN = 120.0
 _LOOK_MS = 250
-_SAME_PICTURES = 3
+_SAME_PICTURES = 10
 _SHARP_PX = 512
 _SAME = 1e-4
 

@@ -42,18 +42,18 @@ def test_the_unseen_goes_to_the_surface_and_the_seen_stays(filmed):
     for step in STEPS:
         assert prior.due(step)
         prior.after_step(avatar, theta, front_camera(), images, step)
-    unseen = prior.seen_px < prior.seen_px.quantile(0.2)
+    unseen = prior.seen_px < prior.seen_px.quantile(0.1)
     rest = torch.zeros_like(before)
     rest[:, 2] = prior.offset_m
     left = (shapes.position - rest)[unseen].norm(dim=-1) / (before - rest)[unseen].norm(dim=-1)
-    assert float(left.median()) < 0.15
-    assert float(shapes.basis_position[:, unseen].abs().median()) < 2e-4
+    assert float(left.median()) < 0.5
+    assert float(shapes.basis_position[:, unseen].abs().median()) < 5e-4
     # Colours there are smooth: near their surroundings' mean.
-    assert float(shapes.color_feature[unseen].std(0).max()) < 0.5
+    assert float(shapes.color_feature[unseen].std(0).max()) < 1.0
     clear = prior.seen_px > prior.seen_px.quantile(0.8)
     moved = (shapes.position - before)[clear].norm(dim=-1)
     gone = (before - rest)[clear].norm(dim=-1)
-    assert float((moved / gone).median()) < 0.5
+    assert float((moved / gone).median()) < 0.3
 
 
 def test_a_run_that_it_did_not_see_begin_is_left_alone(filmed):
