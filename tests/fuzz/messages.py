@@ -3,8 +3,8 @@
 import dataclasses
 import io
 import json
-import resource
 import struct
+import time
 import zlib
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -21,8 +21,9 @@ from tests.data.small_dataset import HEIGHT, WIDTH
 from tests.data.streaming import HEAD, GivenStream, subject, tracked
 
 NAME = "messages of a stream"
-MOST_SECONDS = 2.0
-"""Of this thread's own time; what the system spends on memory for it grows with what else runs."""
+MOST_SECONDS = 10.0
+"""Of a thread's processor time, which grows with what else runs: what blocked the listener took 25
+and more. `python -m tests.fuzz` allows 2 of the clock."""
 
 _Random = np.random.Generator
 _Case = tuple[str, Callable[[], object]]
@@ -64,19 +65,15 @@ def cases(seed: int, count: int) -> Iterator[_Case]:
 
 def _attack(message: bytes | str) -> Callable[[], object]:
     def attack() -> None:
-        began_s = _own_seconds()
+        began_s = time.thread_time()
         try:
             _receive(message)
         finally:
-            took_s = _own_seconds() - began_s
+            took_s = time.thread_time() - began_s
             if took_s > MOST_SECONDS:
                 raise AssertionError(f"it took {took_s:.1f} s")
 
     return attack
-
-
-def _own_seconds() -> float:
-    return resource.getrusage(resource.RUSAGE_THREAD).ru_utime
 
 
 def _receive(message: bytes | str) -> None:
