@@ -36,6 +36,7 @@ _MAX_UNPACKED_TIMES = 200
 _SMALL_BYTES = 16 << 20
 """What may unpack from anything: constant arrays shrink without limit."""
 _PLAIN_KINDS = "biufcSU"
+_LONG_NUMBER = re.compile("[0-9]{19}")
 _LONE_SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")
 
 
@@ -101,7 +102,9 @@ def parse_json(text: bytes | str) -> Any:
     with damage_told():
         if isinstance(text, bytes):
             text = text.decode("utf-8-sig")
-        value = json.loads(text, parse_int=_bounded_int)
+        # A call for each number would cost most of the time.
+        parse_int = _bounded_int if _LONG_NUMBER.search(text) else None
+        value = json.loads(text, parse_int=parse_int)
         if _LONE_SURROGATE.search(text):
             json.dumps(value, ensure_ascii=False).encode()
         _check_depth(value)

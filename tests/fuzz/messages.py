@@ -21,9 +21,7 @@ from tests.data.small_dataset import HEIGHT, WIDTH
 from tests.data.streaming import HEAD, GivenStream, subject, tracked
 
 NAME = "messages of a stream"
-MOST_SECONDS = 10.0
-"""Of a thread's processor time, which grows with what else runs: what blocked the listener took 25
-and more. `python -m tests.fuzz` allows 2 of the clock."""
+MOST_SECONDS = 2.0
 
 _Random = np.random.Generator
 _Case = tuple[str, Callable[[], object]]
