@@ -2,83 +2,22 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import pytest
 import torch
 import viser
-from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.viewer.utils import parse_object
 from nerfstudio.viewer.viewer_elements import ViewerControl
 
-from rgbavatar_ns import Avatar
 from rgbavatar_ns.plugin.cameras import from_nerfstudio
-from rgbavatar_ns.plugin.model import RGBAvatarModel
 from rgbavatar_ns.plugin.pipeline import RGBAvatarPipeline
 from rgbavatar_ns.plugin.viewer.driving import training_statistics
 from rgbavatar_ns.plugin.viewer.panel import ViewerPanel
 from rgbavatar_ns.plugin.viewer.sliders import on_step
 from rgbavatar_ns.plugin.viewer.viewpoint import Viewpoint
+from tests.plugin.desk import Desk, rendered
 from tests.plugin.fake_viewer import FakeViewer
-from tests.plugin.run import small_config, trained
-from tests.plugin.tiny import NUM_FRAMES, SIZE, tiny_dataset
-
-
-@pytest.fixture(scope="module")
-def pipeline(tiny_data: Path, tmp_path_factory: pytest.TempPathFactory) -> RGBAvatarPipeline:
-    config = small_config(tiny_data, tmp_path_factory.mktemp("run"), max_num_iterations=30)
-    return trained(config).pipeline.eval()
-
-
-class Desk:
-    """A panel with its controls, in a viewer whose time passes when it is told to."""
-
-    def __init__(self, pipeline: RGBAvatarPipeline) -> None:
-        self.model: RGBAvatarModel = pipeline.model
-        self.cameras = pipeline.datamanager.train_dataset.cameras
-        self.now_s = 0.0
-        self.panel = ViewerPanel(self.model, pipeline.film, clock=lambda: self.now_s)
-        self.viewer, self.asked = FakeViewer(), []
-        self.panel.attach(self.viewer)
-        browser = SimpleNamespace(client=None, action=self.asked.append)
-        self.viewer.render_statemachines[0] = browser
-
-    def set(self, label: str, value: Any) -> None:
-        self.viewer.gui[label].user_sets(value)
-
-    def picture(self, camera: Cameras | None = None, time: float | None = None) -> torch.Tensor:
-        camera = self.camera() if camera is None else camera
-        return self.panel.draw(from_nerfstudio(camera), time)["rgb"]
-
-    def told(self) -> str:
-        """What stands in the panel after a while."""
-        self.pass_time(1.0)
-        return "\n".join(self.viewer.gui.texts())
-
-    def white(self, theta: torch.Tensor, psi: torch.Tensor | None = None) -> torch.Tensor:
-        """The avatar drawn without the panel, over the panel's background."""
-        return _rendered(self.model.avatar, theta, self.camera(), white=True, psi=psi)
-
-    def pass_time(self, seconds: float) -> None:
-        self.now_s += seconds
-        self.panel.tick()
-
-    def camera(self) -> Cameras:
-        camera = self.cameras[0:1]
-        camera.metadata = {}
-        return camera
-
-
-@pytest.fixture
-def desk(pipeline: RGBAvatarPipeline) -> Desk:
-    return Desk(pipeline)
-
-
-@torch.no_grad()
-def _rendered(avatar: Avatar, theta: torch.Tensor, camera: Cameras, white=False, psi=None):
-    ground = torch.ones(3) if white else torch.zeros(3)
-    return avatar.render(theta, from_nerfstudio(camera), ground, psi=psi).image[0].clamp(0, 1)
+from tests.plugin.tiny import NUM_FRAMES, tiny_dataset
 
 
 def test_without_a_viewer_the_cameras_time_chooses_and_the_ground_is_black(
@@ -90,7 +29,7 @@ def test_without_a_viewer_the_cameras_time_chooses_and_the_ground_is_black(
     for share, position in ((0.0, 0), (0.51, 7), (1.0, 13), (1.5, 13), (-1.0, 0)):
         camera.times = torch.tensor([[share]])
         drawn = model.get_outputs_for_camera(camera)
-        expected = _rendered(model.avatar, model.frame_theta[position : position + 1], camera)
+        expected = rendered(model.avatar, model.frame_theta[position : position + 1], camera)
         assert torch.equal(drawn["rgb"], expected)
         assert drawn["depth"].shape == drawn["accumulation"].shape == (*expected.shape[:2], 1)
 
@@ -98,7 +37,7 @@ def test_without_a_viewer_the_cameras_time_chooses_and_the_ground_is_black(
 def test_a_cameras_own_theta_comes_before_the_panel(pipeline: RGBAvatarPipeline):
     camera, _ = next(iter(pipeline.datamanager.fixed_indices_eval_dataloader))
     drawn = pipeline.model.get_outputs_for_camera(camera)["rgb"]
-    expected = _rendered(pipeline.model.avatar, camera.metadata["theta"], camera)
+    expected = rendered(pipeline.model.avatar, camera.metadata["theta"], camera)
     assert torch.equal(drawn.clamp(0, 1), expected)
 
 
@@ -292,65 +231,6 @@ def test_one_basis_alone_is_base_and_basis_on_the_neutral_frame(desk: Desk):
     assert torch.allclose(desk.picture(), desk.white(seen.theta_neutral[None], psi), atol=1e-5)
     desk.set("Show one alone", "none")
     assert torch.equal(desk.picture(), desk.white(desk.model.frame_theta[0:1]))
-
-
-def test_film_avatar_and_error_stand_in_a_row(desk: Desk, pipeline: RGBAvatarPipeline):
-    desk.panel.change(frame=4, picture="beside the film", background=(0.0, 0.0, 0.0))
-    wide = desk.camera()
-    wide.width, wide.height = (torch.full_like(wide.width, s * SIZE) for s in (3, 1))
-    row = desk.picture(wide)
-    rgba = torch.from_numpy(pipeline.datamanager.dataparser.tracked.read_image(4)).float() / 255
-    truth = rgba[..., :3] * rgba[..., 3:]
-    assert torch.allclose(row[:, :SIZE], truth, atol=1e-6)
-    camera = pipeline.datamanager.dataparser.tracked.cameras.select([4])
-    avatar = desk.model.avatar.render(desk.model.frame_theta[4:5], camera).image[0]
-    assert torch.allclose(row[:, SIZE : 2 * SIZE], avatar.clamp(0, 1), atol=1e-5)
-    # The error is bright where the two differ most.
-    error, difference = row[:, 2 * SIZE :].sum(-1), (avatar - truth).abs().mean(-1)
-    assert error[difference > 0.2].min() > error[difference < 0.01].max()
-    psnr = -10 * (avatar.clamp(0, 1) - truth).square().mean().log10()
-    assert f"PSNR of this frame {psnr:.2f} dB" in desk.told()
-
-
-@pytest.mark.parametrize(
-    ("width", "height", "places"),
-    [
-        (3, 1, [(0, 0), (0, 1), (0, 2)]),
-        (1, 3, [(0, 0), (1, 0), (2, 0)]),
-        (2, 2, [(0, 0), (0, 1), (1, 0.5)]),
-    ],
-)
-def test_film_avatar_and_error_use_the_window(
-    desk: Desk, width: int, height: int, places: list[tuple[float, float]]
-):
-    desk.panel.change(frame=4, picture="beside the film", background=(0.0, 0.0, 1.0))
-    window = desk.camera()
-    window.width, window.height = (torch.full_like(window.width, s * SIZE) for s in (width, height))
-    image = desk.picture(window)
-    desk.panel.change(picture="error")
-    tile = desk.picture()
-    row, column = (round(SIZE * part) for part in places[2])
-    assert torch.equal(image[row : row + SIZE, column : column + SIZE], tile)
-
-
-@pytest.mark.parametrize("picture", ["alpha", "depth", "error"])
-def test_other_pictures_are_drawn(desk: Desk, picture: str):
-    plain = desk.picture()
-    desk.set("Picture", picture)
-    image = desk.picture()
-    assert image.shape == plain.shape
-    assert (image - plain).abs().max() > 0.1
-    assert image.std() > 0.01
-
-
-@pytest.mark.parametrize("label", ["Mesh", "Gaussian centres"])
-def test_overlays_lie_on_the_head(desk: Desk, label: str):
-    plain = desk.picture()
-    desk.set(label, True)
-    alpha = desk.panel.draw(from_nerfstudio(desk.camera()), None)["accumulation"]
-    changed = (desk.picture() - plain).abs().amax(-1) > 0.05
-    assert 0.02 < changed.float().mean() < 0.95
-    assert alpha[..., 0][changed].mean() > alpha[..., 0][~changed].mean() + 0.2
 
 
 def test_a_driver_plays_on_this_avatar(desk: Desk, tmp_path: Path):
