@@ -59,7 +59,6 @@ class SurfacePrior(nn.Module):
         self.register_buffer("opacity_logit", torch.full((num_gaussians,), _CLOSED))
         self.register_buffer("begun", torch.zeros((), dtype=torch.bool))
         self._field: tuple[torch.device, MeshField] | None = None
-        self._width: Tensor | None = None
         self._has_begun = False
 
     @property
@@ -88,7 +87,7 @@ class SurfacePrior(nn.Module):
         self.begun.fill_(True)
         with torch.no_grad():
             avatar.blendshapes.position[:, 2] = self.offset_m
-            avatar.blendshapes.log_scale[:, 2] += _FLATNESS
+            avatar.blendshapes.log_scale.copy_(_disc(avatar))
             avatar.blendshapes.opacity_logit.copy_(self.opacity_logit)
 
     def due(self, step: int) -> bool:
@@ -126,7 +125,7 @@ class SurfacePrior(nn.Module):
         rest = {
             "position": place,
             "rotation_wxyz": upright,
-            "log_scale": self._disc(avatar),
+            "log_scale": _disc(avatar),
             "opacity_logit": self.opacity_logit,
             "color_feature": field.at_gaussians(color),
         }
@@ -137,19 +136,18 @@ class SurfacePrior(nn.Module):
             if shapes.num_bases:
                 getattr(shapes, name).mul_((1 - pull)[:, None])
 
-    def _disc(self, avatar: Avatar) -> Float[Tensor, "N 3"]:
-        """The logarithms of the scales that a fresh Gaussian of the surface has."""
-        if self._width is None or self._width.device != self.seen_px.device:
-            log_scale = avatar.initial_scale_m().log()[:, None].expand(-1, 3).clone()
-            log_scale[:, 2] += _FLATNESS
-            self._width = log_scale
-        return self._width
-
     def _mesh_field(self, avatar: Avatar) -> MeshField:
         device = self.seen_px.device
         if self._field is None or self._field[0] != device:
             self._field = device, MeshField(avatar)
         return self._field[1]
+
+
+def _disc(avatar: Avatar) -> Float[Tensor, "N 3"]:
+    """The logarithms of the scales that a fresh Gaussian of the surface has."""
+    log_scale = avatar.initial_scale_m().log()[:, None].repeat(1, 3)
+    log_scale[:, 2] += _FLATNESS
+    return log_scale
 
 
 def _seen_px(
