@@ -4,8 +4,9 @@
 
 A procedural person is filmed within a narrow range (`situations.py`) and scored on truth beyond it,
 in dB over the full frame, for avatars with K = 20 bases (ours), without the surface prior (the
-paper's setting), with K = 0, and trained on everything, which tells what could be reached. "closed"
-is the share of the gap between the paper's setting and the last that ours closes.
+paper's setting), with K = 0, and trained on everything, which tells what could be reached.
+"closed" is the share of the gap between the paper's setting and the last that ours closes. Holes
+and coloured noise of the turned head, which need no truth, are told as `turned.py` tells them.
 """
 
 import argparse
@@ -19,6 +20,7 @@ import torch
 from rich.progress import track
 from situations import FilmedPerson, Shots
 from subject import BATCH_SIZE, write_figures
+from turned import tell_turned, turned
 
 from rgbavatar_ns import Avatar
 from rgbavatar_ns.avatar import AvatarConfig
@@ -35,6 +37,8 @@ from rgbavatar_ns.drawing.compositing import composite, rgba_to_float
 
 _LAST_RATE = 0.1
 _SHOWN = 6
+_BESIDE = (2, 4, 5, 6)
+"""Situations that `beside` shows: turns of 30 and 60 degrees, the back, an open mouth."""
 
 
 @dataclass(frozen=True)
@@ -102,6 +106,21 @@ def picture(avatar: Avatar | None, filmed: FilmedPerson, path: Path) -> None:
     cv2.imwrite(str(path), cv2.cvtColor(sheet, cv2.COLOR_RGB2BGR))
 
 
+def beside(folder: Path, seed: int) -> None:
+    """Truth, the paper's way and ours beside each other, from pictures that are there."""
+    sheets = [cv2.imread(str(folder / f"{seed} {name}.png")) for name in ("truth", "paper", "ours")]
+    size = sheets[0].shape[1] // _SHOWN
+    cells = [
+        sheet[row * size : (row + 1) * size, column * size : (column + 1) * size]
+        for row in _BESIDE
+        for sheet in sheets
+        for column in (0, _SHOWN - 1)
+    ]
+    wide = 2 * len(sheets)
+    rows = [np.concatenate(cells[k : k + wide], 1) for k in range(0, len(cells), wide)]
+    cv2.imwrite(str(folder / f"{seed} beside.png"), np.concatenate(rows))
+
+
 def tell(title: str, rows: dict[str, dict[str, float]]) -> None:
     """Print a table: a situation a row, a variant a column, and what ours closes."""
     print(f"{title:<18}" + "".join(f"{name:>12}" for name in rows) + f"{'closed':>10}")
@@ -124,6 +143,7 @@ def main() -> None:
     parser.add_argument("--pictures", type=Path, help="folder for pictures of all situations")
     arguments = parser.parse_args()
     seeds: dict[str, dict[str, dict[str, float]]] = {}
+    looks: dict[str, dict[str, dict[str, dict[str, float]]]] = {}
     means: dict[str, dict[str, float]] = {}
     for seed in arguments.seeds:
         filmed = FilmedPerson.of(seed, arguments.image_size, arguments.light)
@@ -131,17 +151,22 @@ def main() -> None:
         for name, variant in VARIANTS.items():
             avatar = train(filmed, variant, arguments.steps, seed)
             rows[name] = {k: score(avatar, filmed, shots) for k, shots in filmed.scored.items()}
+            held_out = filmed.scored["film"].theta[::10]
+            looks.setdefault(str(seed), {})[name] = turned(avatar, held_out, filmed.camera)
             if arguments.pictures:
                 picture(avatar, filmed, arguments.pictures / f"{seed} {name}.png")
         if arguments.pictures:
             picture(None, filmed, arguments.pictures / f"{seed} truth.png")
+            beside(arguments.pictures, seed)
         tell(f"seed {seed}", rows)
+        for name, found in looks[str(seed)].items():
+            tell_turned(name, found)
         seeds[str(seed)] = rows
         means = {
             name: {k: statistics.fmean(s[name][k] for s in seeds.values()) for k in rows[name]}
             for name in VARIANTS
         }
-        write_figures(arguments.json, arguments, seeds=seeds, means=means)
+        write_figures(arguments.json, arguments, seeds=seeds, means=means, turned=looks)
     tell("means", means)
 
 

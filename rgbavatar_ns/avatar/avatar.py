@@ -1,7 +1,7 @@
 """The avatar: the one composition from a head model's parameters theta to Gaussians and images."""
 
 from contextlib import nullcontext
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ from rgbavatar_ns.avatar.config import AvatarConfig
 from rgbavatar_ns.avatar.model.anchors import GaussianAnchors
 from rgbavatar_ns.avatar.model.blendshapes import GaussianBlendshapes
 from rgbavatar_ns.avatar.model.tangent_to_world import tangent_to_world
-from rgbavatar_ns.avatar.model.weight_network import WeightNetwork
+from rgbavatar_ns.avatar.model.weight_network import WeightNetwork, softly_within
 from rgbavatar_ns.avatar.storage.bundle import load_any, save_bundle
 from rgbavatar_ns.avatar.storage.head_reference import reference_to
 from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
@@ -29,6 +29,7 @@ from rgbavatar_ns.kernels import (
     rasterize,
 )
 from rgbavatar_ns.kernels.checks import holds_nonfinite
+from rgbavatar_ns.kernels.constants import MIN_ALPHA
 
 LEARNING_RATES: dict[str, float] = {
     "position": 8e-4,
@@ -42,6 +43,10 @@ LEARNING_RATES: dict[str, float] = {
     "weight_network": 1e-3,
 }
 """Adam's learning rate for each parameter group (paper, supplement: implementation details)."""
+
+
+FILM_RANGE = ("theta_low", "theta_high")
+"""An avatar's buffers with the range of theta that training saw."""
 
 
 class Avatar(nn.Module):
@@ -59,6 +64,8 @@ class Avatar(nn.Module):
 
     color_initialized: Tensor
     identity: Tensor
+    theta_low: Float[Tensor, "H"]
+    theta_high: Float[Tensor, "H"]
 
     def __init__(
         self,
@@ -105,6 +112,8 @@ class Avatar(nn.Module):
                 generator=torch.Generator().manual_seed(seed),
             )
         self.register_buffer("color_initialized", torch.zeros(len(self.anchors), dtype=torch.bool))
+        for name, end in zip(FILM_RANGE, (torch.inf, -torch.inf)):
+            self.register_buffer(name, self.identity.new_full((self.layout.size,), end))
 
     @property
     def layout(self) -> ThetaLayout:
@@ -123,14 +132,24 @@ class Avatar(nn.Module):
         return self.identity.new_full((len(self.anchors),), self.config.initial_scale_m)
 
     def weights(self, theta: Float[Tensor, "B H"]) -> Float[Tensor, "B K"]:
-        """Return the blendshape weights psi = F(theta); raises UserError on a theta unfit."""
-        theta = self._checked(theta)
+        """Return the blendshape weights psi = F(theta); raises UserError on a theta unfit.
+
+        Beyond what training saw, F hardly follows: nothing taught it what is there.
+        """
+        theta = softly_within(self._checked(theta), self.theta_low, self.theta_high)
         if self.weight_network is None:
             return theta[:, self.layout.slice("expression")][:, : self.config.num_bases]
         features = self.layout.network_features(
             theta, self.config.pose_input, self.config.translation_input
         )
         return self.weight_network(features)
+
+    @torch.no_grad()
+    def widen_film_range(self, theta: Float[Tensor, "B H"]) -> None:
+        """Count these frames' theta as what training saw."""
+        theta = theta.to(self.theta_low)
+        torch.minimum(self.theta_low, theta.amin(0), out=self.theta_low)
+        torch.maximum(self.theta_high, theta.amax(0), out=self.theta_high)
 
     def carrier_vertices(self, theta: Float[Tensor, "B H"]) -> Float[Tensor, "B V 3"]:
         """Return the posed mesh whose tangent frames carry the Gaussians, as `carrier` says."""
@@ -265,8 +284,10 @@ class Avatar(nn.Module):
         with stored.damage_told():
             avatar = cls.from_state(stored.state)
             own = avatar._own_state_dict()
-            stored.check_fits(own, avatar.layout.to_json())
-            avatar.load_state_dict({name: stored.parameters[name] for name in own}, strict=False)
+            # Of an avatar that was trained before its range was kept, none is known.
+            parameters = {name: own[name] for name in FILM_RANGE} | stored.parameters
+            replace(stored, parameters=parameters).check_fits(own, avatar.layout.to_json())
+            avatar.load_state_dict({name: parameters[name] for name in own}, strict=False)
         return avatar
 
     def _own_state_dict(self) -> dict[str, Tensor]:
@@ -301,6 +322,26 @@ class Avatar(nn.Module):
             AvatarConfig.from_json(state["config"]),
             anchors=anchors,
         )
+
+    def without_undrawn(self) -> "Avatar":
+        """Return the avatar without Gaussians too transparent for any picture; images stay.
+
+        Opacities change with no theta, so that these show in none.
+        """
+        drawn = self.blendshapes.opacity_logit.detach().sigmoid() >= MIN_ALPHA
+        kept = torch.nonzero(drawn)[:, 0]
+        state = self.to_state()
+        for name, value in state["anchors"].items():
+            if isinstance(value, Tensor):
+                state["anchors"][name] = value[kept.to(value.device)]
+        smaller = Avatar.from_state(state).to(self.identity)
+        own, wanted = self._own_state_dict(), smaller._own_state_dict()
+        for name, value in own.items():
+            for axis, size in enumerate(wanted[name].shape):
+                if value.shape[axis] != size:
+                    own[name] = value.index_select(axis, kept)
+        smaller.load_state_dict(own, strict=False)
+        return smaller
 
     def _checked(self, theta: Float[Tensor, "B H"]) -> Float[Tensor, "B H"]:
         """Return theta in the parameters' dtype, or raise UserError with the reason."""

@@ -49,7 +49,11 @@ def run(
     """
     from rgbavatar_ns import Avatar
 
-    avatar = Avatar.load(run_folder)
+    whole = Avatar.load(run_folder)
+    avatar = whole.without_undrawn()
+    if avatar.num_gaussians < whole.num_gaussians:
+        left_out = whole.num_gaussians - avatar.num_gaussians
+        print(f"{left_out} of {whole.num_gaussians} Gaussians show in no picture: left out.")
     dataset = _dataset(avatar, run_folder, data, needed=frame is not None or frames is not None)
     if format == "bundle":
         seen = _seen(avatar, run_folder, dataset)

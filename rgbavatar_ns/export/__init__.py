@@ -10,8 +10,6 @@ from rgbavatar_ns.export.run_data import dataset_folder, statistics_of
 from rgbavatar_ns.export.video import write_gif, write_png, write_pngs, write_video
 from rgbavatar_ns.export.views import (
     front_camera,
-    head_centre,
-    orbit,
     read_camera_path,
     resized,
     swing,
@@ -29,9 +27,7 @@ __all__ = [
     "draw",
     "drive",
     "front_camera",
-    "head_centre",
     "one_euro",
-    "orbit",
     "pictures",
     "read_camera_path",
     "resized",

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from rgbavatar_ns.avatar.avatar import Avatar
+from rgbavatar_ns.avatar.orbit import head_centre, orbit
 from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
 from rgbavatar_ns.data.native.dataset import TrackedDataset
 from rgbavatar_ns.drawing.compositing import composite_bytes
@@ -23,13 +24,7 @@ from rgbavatar_ns.export.driving import (
     drive,
     told_beyond,
 )
-from rgbavatar_ns.export.views import (
-    FOUR_VIEWS_DEGREES,
-    head_centre,
-    orbit,
-    read_camera_path,
-    swing,
-)
+from rgbavatar_ns.export.views import FOUR_VIEWS_DEGREES, read_camera_path, swing
 from rgbavatar_ns.head import turn_seen
 from rgbavatar_ns.kernels import PinholeCameras
 

@@ -1,7 +1,6 @@
-"""Cameras to look at an avatar with: fixed views, orbits, nerfstudio's camera paths."""
+"""Cameras to look at an avatar with: fixed views, nerfstudio's camera paths."""
 
 import math
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +10,6 @@ from torch import Tensor
 
 from rgbavatar_ns.avatar.avatar import Avatar
 from rgbavatar_ns.errors import UserError
-from rgbavatar_ns.head.rotations import axis_angle_to_matrix
 from rgbavatar_ns.kernels import PinholeCameras
 from rgbavatar_ns.reading import DamagedFileError, json_numbers, load_json
 
@@ -27,14 +25,6 @@ _MOST_CAMERAS, _LARGEST_SIDE, _MOST_FRAMES_PER_SECOND = 100_000, 16384, 1000.0
 
 
 @torch.no_grad()
-def head_centre(avatar: Avatar, theta: Float[Tensor, "F H"]) -> Float[Tensor, "F 3"]:
-    """The middle of the posed head's box, without what the neck does not turn; in metres."""
-    vertices = avatar.head(theta.to(avatar.identity), avatar.identity).cpu()
-    head = vertices[:, torch.from_numpy(avatar.head.arrays.skinning_weights[:, 0] < 0.5)]
-    return (head.amin(1) + head.amax(1)) / 2
-
-
-@torch.no_grad()
 def front_camera(avatar: Avatar, width: int, height: int) -> PinholeCameras:
     """A camera 1.1 m in front of the face that sees the whole head."""
     rest = avatar.identity.new_zeros(1, avatar.layout.size)
@@ -44,30 +34,6 @@ def front_camera(avatar: Avatar, width: int, height: int) -> PinholeCameras:
     focal_px = torch.full((1, 2), min(width, height) * _DISTANCE_M / _SEEN_M)
     centre_px = torch.tensor([[width / 2, height / 2]])
     return PinholeCameras(world_to_camera, focal_px, centre_px, width, height)
-
-
-def orbit(
-    cameras: PinholeCameras,
-    centre: Float[Tensor, "#C 3"],
-    yaw_degrees: Float[Tensor, "C"],
-    pitch_degrees: Float[Tensor, "C"],
-) -> PinholeCameras:
-    """Cameras (one for all angles, or one each) carried around a point, at the same distance.
-
-    Positive yaw shows the head's left side, positive pitch looks from below. Angles of zero give
-    the camera itself; the point stays where it is in the picture.
-    """
-    yaw, pitch = yaw_degrees.deg2rad(), pitch_degrees.deg2rad()
-    zero = torch.zeros_like(yaw)
-    about_x = axis_angle_to_matrix(torch.stack([-pitch, zero, zero], -1))
-    about_y = axis_angle_to_matrix(torch.stack([zero, -yaw, zero], -1))
-    world_to_camera = cameras.world_to_camera.expand(len(yaw), 4, 4).clone()
-    rotation, translation = world_to_camera[:, :3, :3], world_to_camera[:, :3, 3]
-    turned = rotation @ about_x @ about_y
-    moved = translation + ((rotation - turned) @ centre[..., None])[..., 0]
-    world_to_camera[:, :3, 3], world_to_camera[:, :3, :3] = moved, turned
-    places = range(len(yaw)) if len(cameras.focal_px) > 1 else [0] * len(yaw)
-    return replace(cameras.select(places), world_to_camera=world_to_camera)
 
 
 def resized(cameras: PinholeCameras, width: int, height: int) -> PinholeCameras:

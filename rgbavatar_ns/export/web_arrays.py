@@ -112,8 +112,12 @@ def gaussian_arrays(avatar: Avatar) -> Arrays:
 
 
 def network_arrays(avatar: Avatar) -> tuple[list[dict[str, int]], Arrays]:
-    """Sizes of the weight network's layers, and their matrices and biases."""
-    layers, arrays = [], {}
+    """Sizes of the weight network's layers; their matrices and biases, and what training saw."""
+    layers: list[dict[str, int]] = []
+    arrays: Arrays = {
+        "theta_low": _numpy(avatar.theta_low),
+        "theta_high": _numpy(avatar.theta_high),
+    }
     linear = [] if avatar.weight_network is None else avatar.weight_network.layers
     for layer in linear:
         if isinstance(layer, torch.nn.Linear):

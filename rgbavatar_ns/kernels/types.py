@@ -47,12 +47,12 @@ class PinholeCameras:
     width: int
     height: int
 
-    def to(self, device: torch.device | str) -> "PinholeCameras":
-        """The same cameras there."""
+    def to(self, target: torch.device | str | Tensor) -> "PinholeCameras":
+        """The same cameras on a device, or like a tensor: on its device and of its dtype."""
         return PinholeCameras(
-            self.world_to_camera.to(device),
-            self.focal_px.to(device),
-            self.principal_point_px.to(device),
+            self.world_to_camera.to(target),
+            self.focal_px.to(target),
+            self.principal_point_px.to(target),
             self.width,
             self.height,
         )
@@ -64,6 +64,16 @@ class PinholeCameras:
             self.world_to_camera[chosen],
             self.focal_px[chosen],
             self.principal_point_px[chosen],
+            self.width,
+            self.height,
+        )
+
+    def joined(self, others: "PinholeCameras") -> "PinholeCameras":
+        """These cameras, then others of the same image size."""
+        return PinholeCameras(
+            torch.cat([self.world_to_camera, others.world_to_camera]),
+            torch.cat([self.focal_px, others.focal_px]),
+            torch.cat([self.principal_point_px, others.principal_point_px]),
             self.width,
             self.height,
         )

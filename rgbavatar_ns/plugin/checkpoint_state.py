@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 
-from rgbavatar_ns.avatar import Avatar, describe_layout
+from rgbavatar_ns.avatar import FILM_RANGE, Avatar, describe_layout
 from rgbavatar_ns.avatar.prior import SurfacePrior
 from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
 from rgbavatar_ns.errors import UserError
@@ -14,7 +14,7 @@ from rgbavatar_ns.head import ThetaLayout
 from rgbavatar_ns.plugin.dataparser import Subject
 
 _EXTRA_STATE = "_extra_state"
-_PRIOR = "prior."
+_AVATAR, _PRIOR = "avatar.", "prior."
 
 
 def model_state(avatar: Avatar, subject: Subject) -> dict[str, Any]:
@@ -64,15 +64,20 @@ def require_same_layout(state_dict: Mapping[str, Any], avatar: Avatar) -> None:
     _require_same_make(config, avatar)
 
 
-def with_prior_as(state_dict: Mapping[str, Any], prior: SurfacePrior | None) -> dict[str, Any]:
-    """Return the state with the surface prior that the model has, or without one.
+def of_this_version(
+    state_dict: Mapping[str, Any], avatar: Avatar, prior: SurfacePrior | None
+) -> dict[str, Any]:
+    """Return the state with all that the model has, and without a prior where it has none.
 
-    A run that began without it goes on without: a fresh prior does nothing.
+    A run that began without a prior, or without its views, goes on without: a fresh one does
+    nothing. Of what an earlier version saw, nothing is known.
     """
-    others = {k: v for k, v in state_dict.items() if not k.startswith(_PRIOR)}
-    if prior is None or len(others) < len(state_dict):
-        return others if prior is None else dict(state_dict)
-    return others | {_PRIOR + name: value for name, value in prior.state_dict().items()}
+    fresh = {_AVATAR + name: getattr(avatar, name) for name in FILM_RANGE}
+    if prior is None:
+        state_dict = {k: v for k, v in state_dict.items() if not k.startswith(_PRIOR)}
+    else:
+        fresh |= {_PRIOR + name: value for name, value in prior.state_dict().items()}
+    return fresh | dict(state_dict)
 
 
 @contextmanager

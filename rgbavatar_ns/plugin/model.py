@@ -27,8 +27,8 @@ from rgbavatar_ns.plugin.cameras import filled_depth, from_nerfstudio
 from rgbavatar_ns.plugin.checkpoint_state import (
     misfits_told,
     model_state,
+    of_this_version,
     require_same_layout,
-    with_prior_as,
 )
 from rgbavatar_ns.plugin.dataparser import Subject
 from rgbavatar_ns.plugin.refinement import frame_refinement, require_same_refinement
@@ -110,7 +110,7 @@ class RGBAvatarModel(Model):
             self.refinement = frame_refinement(subject, self.config.refinement)
         self.prior = None
         if self.config.surface_prior:
-            self.prior = SurfacePrior(self.avatar.num_gaussians)
+            self.prior = SurfacePrior(self.avatar)
         self.lpips_loss = LPIPSLoss()
         self.lpips_metric: LPIPSMetric | None = None
 
@@ -236,6 +236,6 @@ class RGBAvatarModel(Model):
         """Load parameters; raises UserError where they are not all those of this model's make."""
         require_same_layout(state_dict, self.avatar)
         require_same_refinement(state_dict, self.refinement)
-        state_dict = with_prior_as(state_dict, self.prior)
+        state_dict = of_this_version(state_dict, self.avatar, self.prior)
         with misfits_told():
             return super().load_state_dict(state_dict, strict=strict, assign=assign)

@@ -286,3 +286,19 @@ def test_the_fused_step_trains_both(make_avatar):
             pytest.skip("no compiled extension")
         moved = [n for n, p in avatar.named_parameters() if not torch.equal(p, before[n])]
         assert {"blendshapes.position", "blendshapes.basis_color_feature"} <= set(moved)
+
+
+def test_what_shows_in_no_picture_is_left_out_and_pictures_stay(make_avatar, tmp_path):
+    avatar = make_avatar(random=True)
+    with torch.no_grad():
+        avatar.blendshapes.opacity_logit[::3] = -7.0  # alpha .0009, below 1/255
+    avatar.widen_film_range(random_theta(avatar.layout, 4))
+    smaller = avatar.without_undrawn()
+    assert smaller.num_gaussians == avatar.num_gaussians - len(range(0, avatar.num_gaussians, 3))
+    theta = random_theta(avatar.layout, 3)
+    expected = avatar.render(theta, front_camera()).image
+    assert expected.max() > 0.3
+    assert torch.equal(smaller.render(theta, front_camera()).image, expected)
+    smaller.save(tmp_path / "me")
+    assert torch.equal(Avatar.load(tmp_path / "me").render(theta, front_camera()).image, expected)
+    assert smaller.without_undrawn().num_gaussians == smaller.num_gaussians

@@ -3,10 +3,10 @@ import json
 import pytest
 import torch
 
+from rgbavatar_ns.avatar.orbit import orbit
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.export import (
     front_camera,
-    orbit,
     read_camera_path,
     resized,
     swing,

@@ -11,9 +11,9 @@ import pytest
 import torch
 
 from rgbavatar_ns.avatar import Avatar
+from rgbavatar_ns.avatar.orbit import head_centre, orbit
 from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
 from rgbavatar_ns.export import PageOptions, front_camera, pictures, write_web_page
-from rgbavatar_ns.export.views import head_centre, orbit
 from rgbavatar_ns.head import HeadArrays, turn_seen
 from tests.avatar.small_head import small_head_arrays
 from tests.browser import IN_BROWSER, chromium, picture_of
@@ -103,6 +103,18 @@ def test_the_page_shows_the_picture_that_render_draws(open_page, changes):
         assert ours.std() > 0.1, "there is something to see"
         quality = psnr(_shown(page), ours)
         assert quality > 45, quality
+
+
+def test_beyond_the_film_the_pages_weights_are_those_of_the_avatar(open_page):
+    avatar = avatar_of()
+    theta = lively_theta(avatar, 2)
+    unbound = _ours(avatar, theta[:1])
+    avatar.widen_film_range(0.2 * theta)
+    page = open_page(avatar, theta)
+    for frame in range(2):
+        page.evaluate("frame => app.showFrame(frame)", frame)
+        assert psnr(_shown(page), _ours(avatar, theta[frame : frame + 1])) > 45
+    assert psnr(unbound, _ours(avatar, theta[:1])) < 40, "the range changes something"
 
 
 def test_sliders_change_the_picture_and_bring_it_back(open_page):

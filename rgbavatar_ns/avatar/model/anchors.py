@@ -154,6 +154,20 @@ class GaussianAnchors(nn.Module):
         middle = spacing.median()
         return spacing.clamp(middle / 10, middle * 10)[self._frame_index]
 
+    def texel_stretch(self) -> Float[Tensor, "N 2"]:
+        """Return how far texels lie apart along u and along v, over `texel_spacing`; 1/3 to 3."""
+        corners, places = self._uv[self._used_uv_faces], self._rest_vertices[self._used_faces]
+        uv_sides, sides = (points[:, 1:] - points[:, :1] for points in (corners, places))
+        (a, b), (c, d) = (row.unbind(-1) for row in uv_sides.unbind(1))
+        area = a * d - b * c
+        area = torch.where(area.abs() < 1e-12, 1e-12, area)[:, None]
+        first, second = sides.unbind(1)
+        along_u = (d[:, None] * first - b[:, None] * second) / area
+        along_v = (a[:, None] * second - c[:, None] * first) / area
+        lengths = torch.stack([along_u, along_v], 1).norm(dim=-1)
+        spacing = self._rest_length / (0.5 * area[:, 0].abs()).sqrt()
+        return (lengths / spacing[:, None]).clamp(1 / 3, 3)[self._frame_index]
+
     def to_state(self) -> dict[str, Any]:
         """Return triangles and barycentric coordinates as tensors, for a checkpoint."""
         return {

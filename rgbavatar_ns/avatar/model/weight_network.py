@@ -7,6 +7,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+_ROOM = 0.05
+"""Of a number that never moved: radians, or shares of an expression."""
+
 
 class WeightNetwork(nn.Module):
     """Three linear layers with ReLU between them, or a single one; no output activation.
@@ -39,6 +42,20 @@ class WeightNetwork(nn.Module):
     def forward(self, features: Float[Tensor, "B F"]) -> Float[Tensor, "B K"]:
         """Map features to blendshape weights."""
         return self.layers(features)
+
+
+def softly_within(
+    theta: Float[Tensor, "*batch H"], low: Float[Tensor, "H"], high: Float[Tensor, "H"]
+) -> Float[Tensor, "*batch H"]:
+    """Theta as it is within a range; beyond, each number by itself goes ever less far.
+
+    At most as far again as the range is wide, and .05. Where `low` is above `high` nothing is known
+    and theta stays. Ours: weights of what training never saw ran away with its bases.
+    """
+    known = low <= high
+    room = torch.where(known, high - low, 0) + _ROOM
+    nearest = torch.where(known, torch.minimum(torch.maximum(theta, low), high), theta)
+    return nearest + room * torch.tanh((theta - nearest) / room)
 
 
 def _linear(num_in: int, num_out: int, generator: torch.Generator) -> nn.Linear:

@@ -1,5 +1,6 @@
 """What a head is taken for where the film does not show it: closed, plain, and of its outline."""
 
 from rgbavatar_ns.avatar.prior.surface_prior import SurfacePrior
+from rgbavatar_ns.avatar.prior.virtual_views import VirtualViews
 
-__all__ = ["SurfacePrior"]
+__all__ = ["SurfacePrior", "VirtualViews"]

@@ -1,15 +1,37 @@
 """Smooth functions over a head's mesh: known in places, continued to the others."""
 
+from dataclasses import dataclass
+
 import torch
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 from torch import Tensor
 
 from rgbavatar_ns.avatar.avatar import Avatar
+from rgbavatar_ns.head import HeadArrays
 
+_BEHIND_EYES_M, _BELOW_EYES_M = 0.095, 0.05
+"""Hair grows behind the ears, down to about their lobes; and from there up to the crown."""
+_ABOVE_EARS_M, _TEMPLE_M = 0.04, 0.06
+_HAIRLINE = 0.005
+"""How stiff a link over the border of hair is."""
+_EYES = [3, 4]
+"""Their joints."""
 _MIRROR_REACH_M = 5e-3
 _MIRROR_TRUST = 0.3
 """How much what is known of one side of the face tells of the other."""
+
+
+@dataclass(frozen=True)
+class Outline:
+    """What mattes say about each of V vertices."""
+
+    offset_m: Float[Tensor, "V"]
+    """How far the person stands off the mesh along its normal."""
+    empty: Float[Tensor, "V"]
+    """Share of the frames in which the moved vertex lies on background."""
+    goes_on_below: bool
+    """Whether mattes show the person below the mesh: a neck, shoulders."""
 
 
 class MeshField:
@@ -27,6 +49,10 @@ class MeshField:
         ends = torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
         self.edges = torch.unique(torch.cat([ends, ends.flip(1)]), dim=0)
         self._mirror, self._mirrored = _mirror_of(template)
+        self.scalp = _scalp_of(avatar.head.arrays).to(template.device)
+        first, second = self.edges.unbind(1)
+        across = self.scalp[first] != self.scalp[second]
+        self.links = torch.where(across, _HAIRLINE, 1.0).to(template)
 
     def of_gaussians(
         self, values: Float[Tensor, "N C"], confidence: Float[Tensor, "N"]
@@ -60,7 +86,7 @@ class MeshField:
         start: Float[Tensor, "V C"],
         *,
         stiffness: float | Float[Tensor, "E"],
-        rest: float,
+        rest: float | Float[Tensor, "V"],
         iterations: int,
     ) -> Float[Tensor, "V C"]:
         """The smooth function near `values`, as near as `confidence` says, from a first guess.
@@ -72,9 +98,9 @@ class MeshField:
         weight = (confidence + there)[:, None]
         known = confidence[:, None] * values + there[:, None] * values[self._mirror]
         first, second = self.edges.unbind(1)
-        pull = values.new_ones(len(self.edges)) * stiffness
+        pull = self.links.to(values) * stiffness
         degree = pull.new_zeros(self.num_vertices).index_add_(0, first, pull)[:, None]
-        diagonal = weight + rest + degree
+        diagonal = weight + (values.new_ones(self.num_vertices) * rest)[:, None] + degree
 
         def product(x: Tensor) -> Tensor:
             neighbours = torch.zeros_like(x).index_add_(0, first, pull[:, None] * x[second])
@@ -96,6 +122,14 @@ def _conjugate_gradients(product, wanted: Tensor, start: Tensor, diagonal: Tenso
         size, before = (left * scaled).sum(0), size
         direction = scaled + size / before.clamp(min=1e-30) * direction
     return x
+
+
+def _scalp_of(arrays: HeadArrays) -> Bool[Tensor, "V"]:
+    """Vertices where nearly everybody who has hair has it, by where they lie to the eyes."""
+    eyes = (arrays.joint_regressor[_EYES] @ arrays.v_template).mean(0)
+    _, up, forward = torch.from_numpy((arrays.v_template - eyes).astype("float32")).unbind(1)
+    behind = (forward < -_BEHIND_EYES_M) & (up > -_BELOW_EYES_M)
+    return behind | ((forward < -_TEMPLE_M) & (up > _ABOVE_EARS_M))
 
 
 def _mirror_of(

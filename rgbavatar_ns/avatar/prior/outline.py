@@ -10,11 +10,11 @@ import cv2
 import numpy as np
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from rgbavatar_ns.avatar.avatar import Avatar
-from rgbavatar_ns.avatar.prior.mesh_field import MeshField
+from rgbavatar_ns.avatar.prior.mesh_field import MeshField, Outline
 from rgbavatar_ns.drawing.compositing import unfilmed_pixels
 from rgbavatar_ns.kernels import PinholeCameras
 
@@ -26,20 +26,11 @@ _REACH_M = 0.04
 """Farther borders belong to something else."""
 _BESIDE_PX = 3.0
 _SPREAD, _LEAST_ALIKE = 0.12, 0.02
-_REST = 0.05
+_REST, _SCALP_REST = 0.05, 0.0005
+"""How soon the offset goes back to none away from a rim; hair goes around the head."""
 _MOST_FRAMES = 4.0
 """Confidence of a vertex never exceeds that of so many frames."""
 _ITERATIONS = 200
-
-
-@dataclass(frozen=True)
-class Outline:
-    """What mattes say about each of V vertices."""
-
-    offset_m: Float[Tensor, "V"]
-    """How far the person stands off the mesh along its normal."""
-    empty: Float[Tensor, "V"]
-    """Share of the frames in which the moved vertex lies on background."""
 
 
 @dataclass
@@ -67,11 +58,11 @@ def measure_outline(
     """
     faces = avatar.head.faces.cpu().long()
     vertices = avatar.carrier_vertices(theta)
-    normals = _vertex_normals(vertices.cpu(), faces)
+    normals = vertex_normals(vertices.cpu(), faces)
     images = images_rgba.cpu().numpy()
     count = vertices.shape[1]
     sums = _Sums(*(np.zeros((count, *size), np.float32) for size in ((), (), (3,), ())))
-    placed = [_Placed.of(vertices.cpu(), normals, cameras, k) for k in range(len(theta))]
+    placed = [PlacedMesh.of(vertices.cpu(), normals, cameras, k) for k in range(len(theta))]
     for image, seen in zip(images, placed):
         _add_frame(sums, image, seen, faces.numpy())
     facing = torch.from_numpy(sums.facing)
@@ -81,16 +72,25 @@ def measure_outline(
     device = vertices.device
     alike = field.likeness(colors.to(device), (facing > 0.5).to(device), _SPREAD, _LEAST_ALIKE)
     offset, confidence = offset.to(device), confidence.to(device)
+    rest = torch.where(field.scalp, _SCALP_REST, _REST).to(device)
     offset = field.continued(
-        offset, confidence, offset, stiffness=alike, rest=_REST, iterations=_ITERATIONS
+        offset, confidence, offset, stiffness=alike, rest=rest, iterations=_ITERATIONS
     )[:, 0]
     moved = [seen.moved(offset.cpu()) for seen in placed]
-    empty = np.mean([_on_background(image, px) for image, px in zip(images, moved)], axis=0)
-    return Outline(offset, torch.from_numpy(empty.astype(np.float32)).to(device))
+    shares = [_on_background(image, px) for image, px in zip(images, moved)]
+    empty, known = (torch.from_numpy(np.mean(part, 0)).to(device) for part in zip(*shares))
+    empty = empty[:, None] / known[:, None].clamp(min=1e-6)
+    # What no frame has in the picture is there or not as its surroundings are.
+    empty = field.continued(
+        empty, 100 * known, empty, stiffness=1.0, rest=1e-6, iterations=_ITERATIONS
+    )[:, 0]
+    rim = lower_rim(avatar)
+    below = [_shown_below(image, seen, rim) for image, seen in zip(images, placed)]
+    return Outline(offset, empty.clamp(0, 1), bool(np.mean(below) > 0.1))
 
 
 @dataclass(frozen=True)
-class _Placed:
+class PlacedMesh:
     """The mesh as one camera sees it, in its own axes."""
 
     places_m: Float[Tensor, "V 3"]
@@ -99,7 +99,7 @@ class _Placed:
     principal_point_px: Float[Tensor, "2"]
 
     @classmethod
-    def of(cls, vertices: Tensor, normals: Tensor, cameras: PinholeCameras, k: int) -> "_Placed":
+    def of(cls, vertices: Tensor, normals: Tensor, cameras: PinholeCameras, k: int) -> "PlacedMesh":
         """Frame k of a batch with one camera, or one a frame."""
         camera = cameras.select([k % len(cameras.focal_px)])
         pose = camera.world_to_camera[0].cpu().to(vertices)
@@ -118,16 +118,13 @@ class _Placed:
         return px.numpy().astype(np.float32)
 
 
-def _add_frame(sums: _Sums, image: np.ndarray, seen: _Placed, faces: np.ndarray) -> None:
+def _add_frame(sums: _Sums, image: np.ndarray, seen: PlacedMesh, faces: np.ndarray) -> None:
     """Rims with their distance to the matte's border, and colours of what faces the camera."""
     height, width = image.shape[:2]
     px, view = seen.moved(0.0), F.normalize(seen.places_m, dim=-1)
     along = (seen.normals * view).sum(-1).numpy()
     outwards = F.normalize(seen.normals[:, :2], dim=-1).numpy()
-    mesh = np.zeros((height, width), np.uint8)
-    corners = np.round(px[faces].clip(-(2**14), 2**14) * 16).astype(np.int32)
-    for triangle in corners:
-        cv2.fillConvexPoly(mesh, triangle, (1,), shift=4)
+    mesh = covered_pixels(px, faces, width, height)
     depth = _signed_distance_px((image[..., 3] > 127) | unfilmed_pixels(image))
     rows, columns = np.gradient(depth)
     inwards = np.stack([_at(columns, px), _at(rows, px)], 1)
@@ -148,18 +145,62 @@ def _add_frame(sums: _Sums, image: np.ndarray, seen: _Placed, faces: np.ndarray)
     sums.facing += facing
 
 
+def covered_pixels(
+    px: Float[np.ndarray, "V 2"], faces: Int[np.ndarray, "F 3"], width: int, height: int
+) -> UInt8[np.ndarray, "height width"]:
+    """1 where a projected mesh covers or touches a pixel."""
+    mesh = np.zeros((height, width), np.uint8)
+    # OpenCV's first pixel has its centre at 0.
+    corners = np.round((px[faces].clip(-(2**14), 2**14) - 0.5) * 16).astype(np.int32)
+    for triangle in corners:
+        cv2.fillConvexPoly(mesh, triangle, (1,), shift=4)
+    return mesh
+
+
 def _signed_distance_px(
     mask: Bool[np.ndarray, "height width"],
 ) -> Float[np.ndarray, "height width"]:
     """Distance to a mask's border, positive inside; the picture's own border is none."""
     inside = mask.astype(np.uint8)
-    within, beyond = (cv2.distanceTransform(m, cv2.DIST_L2, 5) for m in (inside, 1 - inside))
+    # Where a mask has no border, OpenCV's distance is not finite.
+    within, beyond = (
+        cv2.distanceTransform(m, cv2.DIST_L2, 5).clip(max=sum(mask.shape))
+        for m in (inside, 1 - inside)
+    )
     return cv2.GaussianBlur(np.where(mask, within - 0.5, 0.5 - beyond), (0, 0), 0.7)
 
 
-def _on_background(image: np.ndarray, px: np.ndarray) -> np.ndarray:
-    background = (image[..., 3] < 26) & ~unfilmed_pixels(image)
-    return _at(background.astype(np.float32), px) > 0.5
+def lower_rim(avatar: Avatar) -> Int[np.ndarray, "R"]:
+    """The vertices at the mesh's border that lie below its middle."""
+    faces = avatar.head.faces.cpu().long()
+    ends = torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).sort(1).values
+    edges, counts = torch.unique(ends, dim=0, return_counts=True)
+    border = torch.unique(edges[counts == 1]).numpy()
+    height = np.asarray(avatar.head.arrays.v_template)[:, 1]
+    return border[height[border] < (height.min() + height.max()) / 2]
+
+
+def _shown_below(image: np.ndarray, seen: PlacedMesh, rim: Int[np.ndarray, "R"]) -> float:
+    """Share of the matte that is there below the lowest of the rim, over what the mesh is wide."""
+    height, width = image.shape[:2]
+    px = seen.moved(0.0)
+    if not len(rim) or not 0 <= (lowest := int(px[rim, 1].max()) + 1) < height - 1:
+        return 0.0
+    left, right = (
+        int(end) for end in px[:, 0].clip(0, width)[[px[:, 0].argmin(), px[:, 0].argmax()]]
+    )
+    below = image[lowest:, left : max(right, left + 1), 3] > 127
+    return float(below.mean()) if below.size else 0.0
+
+
+def _on_background(
+    image: np.ndarray, px: np.ndarray
+) -> tuple[Float[np.ndarray, "V"], Float[np.ndarray, "V"]]:
+    """Which places lie on background, and which of all were filmed."""
+    filmed = ~unfilmed_pixels(image)
+    background = (image[..., 3] < 26) & filmed
+    found = _at(np.dstack([background, filmed]).astype(np.float32), px) > 0.5
+    return found[:, 0].astype(np.float32), found[:, 1].astype(np.float32)
 
 
 def _at(values: np.ndarray, px: Float[np.ndarray, "V 2"]) -> np.ndarray:
@@ -171,7 +212,7 @@ def _at(values: np.ndarray, px: Float[np.ndarray, "V 2"]) -> np.ndarray:
     return found.reshape(len(px), *values.shape[2:])
 
 
-def _vertex_normals(vertices: Float[Tensor, "B V 3"], faces: Tensor) -> Float[Tensor, "B V 3"]:
+def vertex_normals(vertices: Float[Tensor, "B V 3"], faces: Tensor) -> Float[Tensor, "B V 3"]:
     """Unit normals, each the mean of the faces around it by area."""
     first, second, third = (vertices[:, faces[:, k]] for k in range(3))
     normals = torch.linalg.cross(second - first, third - first)

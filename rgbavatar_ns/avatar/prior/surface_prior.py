@@ -8,11 +8,13 @@ without it a head turned beyond its film shatters (the paper names the limit, no
 import math
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 
 from rgbavatar_ns.avatar.avatar import Avatar
 from rgbavatar_ns.avatar.prior.mesh_field import MeshField
+from rgbavatar_ns.avatar.prior.virtual_views import VirtualViews
 from rgbavatar_ns.drawing.compositing import is_unfilmed
 from rgbavatar_ns.kernels import PinholeCameras, weighted_color_average
 
@@ -27,13 +29,21 @@ _RATE = 0.3
 _FORGETS = 0.97
 _SEEN_PX = 0.02
 """Pixels that a Gaussian covers in the frame that shows it best, at which it is half known."""
+_TURNED_AWAY, _FACING, _FRONTAL = -0.3, 0.0, 0.4
+"""Cosines between normal and view: up to the first a Gaussian counts as not seen, from the second
+as seen, else the back of a head is stretched until it paints the rim of its front; from the second
+to the third its colour becomes clear, which at the rim is that of the neck behind."""
 _CLEAR_PX = 0.1
-"""Pixels from which its colour tells that of its surroundings."""
+"""Clear pixels at which its colour half tells that of its surroundings."""
 _SUNK = 1.25
 """How many of its widths a Gaussian's centre lies below the surface that it reaches to."""
 _FLATNESS = math.log(0.25)
 """Logarithm of thickness over width: surfaces are made of discs."""
-_CLOSED, _EMPTY = math.log(0.9 / 0.1), math.log(0.01 / 0.99)
+_OVERLAP = math.log(1.4)
+"""Logarithm of how much wider discs are than fresh ones where nothing is seen."""
+_CLOSED, _EMPTY = math.log(0.9 / 0.1), math.log(0.001 / 0.999)
+_FAINT = math.log(0.01 / 0.99)
+"""What is empty begins as: drawn still, so that frames to come may want it."""
 _STIFFNESS, _REST, _ITERATIONS = 0.02, 1e-6, 30
 
 
@@ -41,23 +51,33 @@ class SurfacePrior(nn.Module):
     """Remembers how much each of N Gaussians was seen, and draws the unseen to the surface.
 
     Attributes:
-        seen_px: pixels that each covered in the frame that showed it best, slowly forgotten.
+        seen_px: pixels that each covered, from its own side, in the frame that showed it best,
+            slowly forgotten.
+        clear_px: the same from ever more in front, for what its colour tells of its surroundings.
+        through_px: the same from whichever side: a matte that fades shows the far side's opacity.
         offset_m: how far the surface stands off the mesh at each, by the outlines of mattes.
         opacity_logit: of the surface: closed, but where mattes show background.
         begun: whether the surface has been measured.
+        views: from where nobody filmed.
     """
 
     seen_px: Float[Tensor, "N"]
+    clear_px: Float[Tensor, "N"]
+    through_px: Float[Tensor, "N"]
     offset_m: Float[Tensor, "N"]
     opacity_logit: Float[Tensor, "N"]
     begun: Tensor
 
-    def __init__(self, num_gaussians: int) -> None:
+    def __init__(self, avatar: Avatar) -> None:
         super().__init__()
+        num_gaussians = avatar.num_gaussians
         self.register_buffer("seen_px", torch.zeros(num_gaussians))
+        self.register_buffer("clear_px", torch.zeros(num_gaussians))
+        self.register_buffer("through_px", torch.zeros(num_gaussians))
         self.register_buffer("offset_m", torch.zeros(num_gaussians))
         self.register_buffer("opacity_logit", torch.full((num_gaussians,), _CLOSED))
         self.register_buffer("begun", torch.zeros((), dtype=torch.bool))
+        self.views = VirtualViews(len(avatar.head.arrays.v_template), avatar.layout.size)
         self._field: tuple[torch.device, MeshField] | None = None
         self._has_begun = False
 
@@ -84,11 +104,13 @@ class SurfacePrior(nn.Module):
         offset_m, empty = field.at_gaussians(known).unbind(1)
         self.offset_m.copy_(offset_m - _SUNK * avatar.initial_scale_m())
         self.opacity_logit.copy_(torch.where(empty > 0.5, _EMPTY, _CLOSED))
+        self.views.begin(avatar, outline, theta, cameras)
+        self.views.see(avatar, theta, cameras)
         self.begun.fill_(True)
         with torch.no_grad():
             avatar.blendshapes.position[:, 2] = self.offset_m
             avatar.blendshapes.log_scale.copy_(_disc(avatar))
-            avatar.blendshapes.opacity_logit.copy_(self.opacity_logit)
+            avatar.blendshapes.opacity_logit.copy_(self.opacity_logit.clamp(min=_FAINT))
 
     def due(self, step: int) -> bool:
         """Whether `after_step` has something to do after this step, counted from 0."""
@@ -105,19 +127,30 @@ class SurfacePrior(nn.Module):
         backend: str = "auto",
     ) -> None:
         """See what these frames show, and draw what none shows to the surface."""
-        self.seen_px.mul_(_FORGETS)
-        seen_px = _seen_px(avatar, theta, cameras, images_rgba, backend)
-        torch.maximum(self.seen_px, seen_px, out=self.seen_px)
+        self.views.see(avatar, theta, cameras)
+        for known in (self.seen_px, self.clear_px, self.through_px):
+            known.mul_(_FORGETS)
+        shown_px = _shown_px(avatar, theta, cameras, images_rgba, backend)
+        facing = _facing(avatar, theta, cameras)
+        for known, share in (
+            (self.through_px, torch.ones_like(facing)),
+            (self.seen_px, _ramp(facing, _TURNED_AWAY, _FACING)),
+            (self.clear_px, _ramp(facing, _FACING, _FRONTAL)),
+        ):
+            torch.maximum(known, (shown_px * share).amax(0), out=known)
         if step < _FIRST_PULL:
             return
         shapes, field = avatar.blendshapes, self._mesh_field(avatar)
-        clear = self.seen_px.square() / (self.seen_px.square() + _CLEAR_PX**2)
+        clear = self.clear_px.square() / (self.clear_px.square() + _CLEAR_PX**2)
         told, confidence = field.of_gaussians(shapes.color_feature, clear)
         start, _ = field.of_gaussians(shapes.color_feature, torch.ones_like(clear))
         color = field.continued(
             told, confidence, start, stiffness=_STIFFNESS, rest=_REST, iterations=_ITERATIONS
         )
-        pull = _RATE * _SEEN_PX / (self.seen_px + _SEEN_PX)
+        pull, close = (_RATE * _SEEN_PX / (px + _SEEN_PX) for px in (self.seen_px, self.through_px))
+        disc = _disc(avatar)
+        # As far as nothing shows it, nothing else closes the surface around it.
+        disc[:, :2] += (_OVERLAP * (close / _RATE).square())[:, None]
         place = torch.zeros_like(shapes.position)
         place[:, 2] = self.offset_m
         upright = torch.zeros_like(shapes.rotation_wxyz)
@@ -125,13 +158,14 @@ class SurfacePrior(nn.Module):
         rest = {
             "position": place,
             "rotation_wxyz": upright,
-            "log_scale": _disc(avatar),
+            "log_scale": disc,
             "opacity_logit": self.opacity_logit,
             "color_feature": field.at_gaussians(color),
         }
         for name, target in rest.items():
             value = getattr(shapes, name)
-            value.lerp_(target, pull.view(-1, *[1] * (value.ndim - 1)))
+            share = close if name == "opacity_logit" else pull
+            value.lerp_(target, share.view(-1, *[1] * (value.ndim - 1)))
         for name in ("basis_position", "basis_rotation_wxyz", "basis_color_feature"):
             if shapes.num_bases:
                 getattr(shapes, name).mul_((1 - pull)[:, None])
@@ -146,25 +180,44 @@ class SurfacePrior(nn.Module):
 def _disc(avatar: Avatar) -> Float[Tensor, "N 3"]:
     """The logarithms of the scales that a fresh Gaussian of the surface has."""
     log_scale = avatar.initial_scale_m().log()[:, None].repeat(1, 3)
+    log_scale[:, :2] += avatar.anchors.texel_stretch().log()
     log_scale[:, 2] += _FLATNESS
     return log_scale
 
 
-def _seen_px(
+def _shown_px(
     avatar: Avatar,
     theta: Float[Tensor, "B H"],
     cameras: PinholeCameras,
     images_rgba: Images,
     backend: str,
-) -> Float[Tensor, "N"]:
-    """Filmed pixels that each Gaussian covers, by blending weight, in the best of the frames."""
+) -> Float[Tensor, "B N"]:
+    """Filmed pixels that each Gaussian covers, by blending weight, in each of the frames."""
     filmed = (~is_unfilmed(images_rgba)).to(avatar.identity)[..., None]
     renderer = avatar.renderer(theta, cameras, backend=backend)
     if renderer is not None:
         sums = renderer.weighted_color_average(filmed)
     else:
         sums = weighted_color_average(avatar.gaussians(theta), cameras, filmed, backend=backend)
-    return sums.weighted_sum[..., 0].amax(0)
+    return sums.weighted_sum[..., 0]
+
+
+def _facing(
+    avatar: Avatar, theta: Float[Tensor, "B H"], cameras: PinholeCameras
+) -> Float[Tensor, "B N"]:
+    """Cosine of the angle between the surface's normal at each Gaussian and its way to the eye."""
+    mesh = avatar.anchors.triangles(with_rest_length=False)
+    corners = avatar.carrier_vertices(theta)[:, mesh["triangle_vertices"]]
+    first, second, third = corners.unbind(2)
+    normal = torch.linalg.cross(second - first, third - first)
+    pose = cameras.world_to_camera.to(first)
+    eye = -(pose[:, :3, :3].mT @ pose[:, :3, 3:]).mT
+    return F.cosine_similarity(normal, eye - first, dim=-1)[:, mesh["triangle_of"]]
+
+
+def _ramp(values: Float[Tensor, "B N"], start: float, end: float) -> Float[Tensor, "B N"]:
+    """0 up to `start`, 1 from `end`, a line between."""
+    return ((values - start) / (end - start)).clamp(0, 1)
 
 
 def _as_bytes(images_rgba: Images) -> UInt8[Tensor, "B height width 4"]:

@@ -46,10 +46,9 @@ class FrameRefinement(nn.Module):
         return torch.where(known[:, None], corrected, self.frames.calibrated(theta))
 
     def step(self, step: int, position: Int[Tensor, "B"], gradient: Float[Tensor, "B H"]) -> None:
-        """Correct a batch of training frames, once it is time, by the gradient of its loss."""
+        """Correct training frames, once it is time, by the gradient of each one's own loss."""
         if step >= self.start_step:
-            # The batch's loss is a mean; each frame is to have the gradient of its own.
-            self.frames.step(self._row_of[position], gradient * len(gradient))
+            self.frames.step(self._row_of[position], gradient)
 
     def all_frames(self, tracked: Float[Tensor, "F H"]) -> Float[Tensor, "F H"]:
         """The whole dataset's theta, corrected or calibrated."""

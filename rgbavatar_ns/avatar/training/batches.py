@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
@@ -44,3 +45,16 @@ class DeviceFrames:
         chosen, shared = list(rows), len(self.cameras.focal_px) == 1
         cameras = self.cameras if shared else self.cameras.select(chosen)
         return TrainingBatch(self.theta[chosen], cameras, self.images_rgba[chosen])
+
+    def joined(self, others: "DeviceFrames") -> "DeviceFrames":
+        """These frames, then others of the same size, each with a camera."""
+        return DeviceFrames(
+            torch.cat([self.theta, others.theta]),
+            each_its_own(self.cameras, len(self.theta)).joined(others.cameras),
+            torch.cat([self.images_rgba, others.images_rgba]),
+        )
+
+
+def each_its_own(cameras: PinholeCameras, num_frames: int) -> PinholeCameras:
+    """One camera a frame, where there may be one for all."""
+    return cameras.select([0] * num_frames) if len(cameras.focal_px) == 1 else cameras

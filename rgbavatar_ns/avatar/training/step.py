@@ -5,7 +5,7 @@ frames on the device), fused (the backend's own loops, without autograd) and eag
 """
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Literal
 
@@ -14,9 +14,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from rgbavatar_ns.avatar.avatar import LEARNING_RATES, Avatar
-from rgbavatar_ns.avatar.prior import SurfacePrior
+from rgbavatar_ns.avatar.prior import SurfacePrior, VirtualViews
 from rgbavatar_ns.avatar.refinement.frames import FrameRefinement
-from rgbavatar_ns.avatar.training.batches import ChosenFrames, DeviceFrames, TrainingBatch
+from rgbavatar_ns.avatar.training.batches import (
+    ChosenFrames,
+    DeviceFrames,
+    TrainingBatch,
+    each_its_own,
+)
 from rgbavatar_ns.avatar.training.color_init import ColorInitSchedule, initialize_colors
 from rgbavatar_ns.avatar.training.cuda_graph import Recorder, record_cuda_graph
 from rgbavatar_ns.avatar.training.fused_step import FusedStep
@@ -122,11 +127,12 @@ class TrainingStep:
         self.refinement = refinement
         self._prior = prior if self.options.surface_prior else None
         if self.options.surface_prior and prior is None:
-            self._prior = SurfacePrior(avatar.num_gaussians).to(avatar.identity.device)
+            self._prior = SurfacePrior(avatar).to(avatar.identity.device)
         self._lpips = LPIPSLoss() if lpips is None else lpips
         self._orthogonality = self.options.orthogonality if avatar.config.num_bases else "free"
         self._fused: FusedStep | None = None
         self._frames: DeviceFrames | None = None
+        self._shown: DeviceFrames | None = None
         self._recorded: RecordedStep | None = None
         self._recorder = recorder
         self.kind: StepKind = "eager"
@@ -182,10 +188,15 @@ class TrainingStep:
         if self.refinement is not None:
             assert batch.position is not None, "Refined tracking needs the frames' positions."
             theta = self.refinement.corrected(theta, batch.position).requires_grad_()
-        losses = self._losses(batch, theta, step)
+        self.avatar.widen_film_range(theta)
+        shown = self._with_view(replace(batch, theta=theta), step)
+        losses = self._losses(shown, shown.theta, step)
         if self.refinement is not None and theta.grad is not None:
             assert batch.position is not None
-            self.refinement.step(step, batch.position, theta.grad)
+            filmed = len(theta) if shown.theta is theta else len(theta) - 1
+            # The batch's loss is a mean; each frame is to have the gradient of its own.
+            own = theta.grad[:filmed] * len(theta)
+            self.refinement.step(step, batch.position[:filmed], own)
         theta = theta.detach()
         self._finish(step, lambda: TrainingBatch(theta, batch.cameras, batch.images_rgba))
         return losses
@@ -195,18 +206,56 @@ class TrainingStep:
         if frames is None:
             raise ValueError(f"Steps are {self.kind}: {self.reason}. Pass a TrainingBatch.")
         self._begin(step, lambda: frames.batch(rows))
+        views = self._views()
         if self._recorded is None:
+            self.avatar.widen_film_range(frames.theta)
+            self._shown = frames
+            if views is not None:
+                bank = views.frames(self.avatar)
+                others = DeviceFrames(bank.theta, bank.cameras, bank.images_rgba)
+                self._shown = frames.joined(others)
             self._recorded = RecordedStep(
                 self.avatar,
                 self.optimizers,
-                frames,
+                self._shown,
                 len(rows),
                 backend=self.options.backend,
                 recorder=self._recorder,
             )
-        losses = {"l1": self._recorded(rows, chosen.background)}
+        taken, view = rows, views.due(step, len(rows)) if views is not None else None
+        if views is not None and view is not None:
+            assert self._shown is not None
+            row = len(frames.theta) + view
+            drawn = views.frame(self.avatar, view, self.options.backend)
+            self._shown.images_rgba[row].copy_(drawn.images_rgba[0])
+            taken = [*rows[:-1], row]
+        losses = {"l1": self._recorded(taken, chosen.background)}
         self._finish(step, lambda: frames.batch(rows))
         return losses
+
+    def _views(self) -> VirtualViews | None:
+        """From where nobody filmed; None where no prior has measured the person."""
+        return self._prior.views if self._prior is not None and self._prior.has_begun else None
+
+    def _with_view(self, batch: TrainingBatch, step: int) -> TrainingBatch:
+        """The batch; at times its last frame gives way to a view that nobody filmed."""
+        views, count = self._views(), len(batch.theta)
+        index = views.due(step, count) if views is not None else None
+        if views is None or index is None:
+            return batch
+        view = views.frame(self.avatar, index, self.options.backend)
+        if view.images_rgba.shape[1:] != batch.images_rgba.shape[1:]:
+            return batch
+        image = view.images_rgba
+        if batch.images_rgba.dtype != torch.uint8:
+            image = image.to(batch.images_rgba) / 255
+        cameras = each_its_own(batch.cameras, count).select(range(count - 1))
+        return TrainingBatch(
+            torch.cat([batch.theta[:-1], view.theta.to(batch.theta)]),
+            cameras.joined(view.cameras),
+            torch.cat([batch.images_rgba[:-1], image]),
+            batch.background,
+        )
 
     def _losses(self, batch: TrainingBatch, theta: Float[Tensor, "B H"], step: int) -> Losses:
         """Step with the optimisers; `theta.grad` is left where theta requires it."""

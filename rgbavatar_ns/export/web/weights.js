@@ -7,10 +7,22 @@ class WeightNetwork {
     this.numBases = data.num_bases;
     this.withPose = data.pose_input;
     this.withTranslation = data.translation_input;
+    this.low = data.arrays.theta_low; // of the film; above `high` where nothing is known
+    this.high = data.arrays.theta_high;
     this.layers = data.network.map(({ inputs, outputs }, i) => ({
       inputs, outputs,
       matrix: data.arrays[`network_matrix_${i}`], bias: data.arrays[`network_bias_${i}`],
     }));
+  }
+
+  /** Theta as it is within the film's range; beyond, each number by itself goes ever less far. */
+  within(theta) {
+    return Array.from(theta, (value, i) => {
+      const [low, high] = [this.low[i], this.high[i]];
+      if (low > high) return value;
+      const room = high - low + 0.05, nearest = Math.min(Math.max(value, low), high);
+      return nearest + room * Math.tanh((value - nearest) / room);
+    });
   }
 
   /** Linear fields as they are, rotations as the first two rows of their matrix. */
@@ -39,7 +51,8 @@ class WeightNetwork {
   }
 
   /** psi, a plain array with a number for each basis. */
-  evaluate(theta) {
+  evaluate(wanted) {
+    const theta = this.within(wanted);
     // Without a network the first expression coefficients are the weights.
     if (!this.layers.length) return this.expressions(theta).slice(0, this.numBases);
     let values = this.features(theta);

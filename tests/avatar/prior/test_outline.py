@@ -79,3 +79,34 @@ def test_where_mattes_show_background_the_surface_is_empty():
     y_m = torch.as_tensor(avatar.head.arrays.v_template)[:, 1]
     assert float(found.empty[(y_m > -0.13) & (y_m < -0.1)].mean()) > 0.95
     assert float(found.empty[y_m > 0.0].mean()) < 0.01
+
+
+def test_what_lies_below_every_picture_is_as_empty_as_what_is_above_it():
+    avatar = embedded_avatar()
+    theta = turned(avatar, [0.0, 4.0])
+    theta[:, avatar.layout.slice("translation").start + 1] = -0.05
+    images = drawn_thicker(avatar, theta, 0.0)
+    y_m = torch.as_tensor(avatar.head.arrays.v_template)[:, 1]
+    below = y_m < y_m.min() + 0.01  # the lowest centimetre of the neck is in no picture
+    for faded in (False, True):
+        if faded:
+            images[:, SIZE - 30 :] = 0
+        found = measure_outline(avatar, MeshField(avatar), theta, front_camera(), images)
+        assert bool((found.empty[below] > 0.5).all()) == faded
+        assert not (found.empty[y_m > 0] > 0.5).any()
+
+
+def test_hair_goes_around_the_head_and_ends_at_the_nape():
+    avatar = embedded_avatar()
+    theta = turned(avatar, [-8.0, -3.0, 2.0, 8.0])
+    images = drawn_thicker(avatar, theta, 0.01)
+    v_template = torch.as_tensor(avatar.head.arrays.v_template)
+    height_m, depth_m = v_template[:, 1], v_template[:, 2]
+    # Only the crown's rim is filmed; nothing is known of the rest.
+    unfilmed = torch.tensor(UNFILMED_RGBA, dtype=torch.uint8)
+    images[:, SIZE // 3 :] = unfilmed
+    found = measure_outline(avatar, MeshField(avatar), theta, front_camera(), images).offset_m
+    back = (depth_m < depth_m.min() + 0.02) & (height_m > 0.02)
+    nape = (depth_m < -0.06) & (height_m < -0.08)
+    assert float(found[back].median()) > 0.006
+    assert float(found[nape].abs().max()) < 0.002

@@ -43,7 +43,7 @@ def _on_the_surface(avatar, prior) -> torch.Tensor:
 
 def test_what_no_frame_shows_comes_to_the_surface(filmed):
     avatar, theta, images = filmed
-    prior, shapes = SurfacePrior(avatar.num_gaussians), avatar.blendshapes
+    prior, shapes = SurfacePrior(avatar), avatar.blendshapes
     prior.begin(avatar, theta, front_camera(), images)
     shaken(avatar)
     nobody_filmed = torch.tensor(UNFILMED_RGBA, dtype=torch.uint8).expand_as(images).contiguous()
@@ -59,7 +59,7 @@ def test_what_no_frame_shows_comes_to_the_surface(filmed):
 
 def test_what_a_frame_shows_well_stays(filmed):
     avatar, theta, images = filmed
-    prior, shapes = SurfacePrior(avatar.num_gaussians), avatar.blendshapes
+    prior, shapes = SurfacePrior(avatar), avatar.blendshapes
     prior.begin(avatar, theta, front_camera(), images)
     shaken(avatar)
     names = ("position", "color_feature", "log_scale", "opacity_logit", "basis_color_feature")
@@ -81,7 +81,7 @@ def test_what_a_frame_shows_well_stays(filmed):
 
 def test_a_run_that_it_did_not_see_begin_is_left_alone(filmed):
     avatar, theta, images = filmed
-    prior = SurfacePrior(avatar.num_gaussians)
+    prior = SurfacePrior(avatar)
     assert not any(prior.due(step) for step in STEPS)
     take = TrainingStep(avatar, prior=prior)
     take(TrainingBatch(theta, front_camera(), images), 5)
@@ -90,7 +90,7 @@ def test_a_run_that_it_did_not_see_begin_is_left_alone(filmed):
 
 def test_without_the_option_nothing_is_measured(filmed):
     avatar, theta, images = filmed
-    prior = SurfacePrior(avatar.num_gaussians)
+    prior = SurfacePrior(avatar)
     take = TrainingStep(avatar, options=TrainingOptions(surface_prior=False), prior=prior)
     take(TrainingBatch(theta, front_camera(), images), 0)
     assert not prior.has_begun
@@ -98,7 +98,7 @@ def test_without_the_option_nothing_is_measured(filmed):
 
 def test_its_memory_goes_on_from_its_state(filmed):
     avatar, theta, images = filmed
-    prior, copy = (SurfacePrior(avatar.num_gaussians) for _ in range(2))
+    prior, copy = (SurfacePrior(avatar) for _ in range(2))
     prior.begin(avatar, theta, front_camera(), images)
     prior.after_step(avatar, theta, front_camera(), images, 79)
     copy.load_state_dict(prior.state_dict())

@@ -1,0 +1,217 @@
+"""Views that nobody filmed: nothing beside the person's outline, and within it no hole, no noise.
+
+A picture cannot tell how deep a Gaussian lies. Seen from elsewhere, what lies wrong stands beside
+the head, where the surface says that there is nothing. Within the outline the avatar is asked for
+its own picture, closed and smoothed: what the film shows withstands, what it left open follows.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, UInt8
+from torch import Tensor, nn
+
+from rgbavatar_ns.avatar.avatar import Avatar
+from rgbavatar_ns.avatar.orbit import head_centre, orbit
+from rgbavatar_ns.avatar.prior.mesh_field import Outline
+from rgbavatar_ns.head import turn_seen
+from rgbavatar_ns.kernels import PinholeCameras
+from rgbavatar_ns.kernels.constants import UNFILMED_RGBA
+
+TURNS_DEGREES = (
+    *(
+        (sign * yaw, lean * pitch)
+        for yaw, pitch in ((15, 8), (40, 12), (22, 8), (60, 12), (30, 10), (50, 12))
+        for sign in (1, -1)
+        for lean in (1, -1)
+    ),
+    *((0, pitch) for pitch in (20, -20, 32, -32)),
+)
+"""(yaw, pitch) away from each frame's own view."""
+_JAWS_RAD = (0.0, 0.3, 0.0, 0.15)
+"""How far the mouth is opened, at least, in one view after the other: its inside is the part of a
+face that films show least."""
+_FRAMES_A_VIEW = 40
+"""Frames trained on for each view. Ours: one in 20 leaves less noise, one in 60 more detail."""
+_BORDER_PX = 1
+"""The outline is soft: so wide a rim within it is left alone."""
+_CLEAR_DEGREES = 5.0
+"""How far a view lies beyond what was filmed, at least."""
+
+
+@dataclass(frozen=True)
+class ViewedFrames:
+    """What views are trained on; where nothing is known, pixels are unfilmed."""
+
+    theta: Float[Tensor, "W H"]
+    cameras: PinholeCameras
+    images_rgba: UInt8[Tensor, "W height width 4"]
+
+
+class VirtualViews(nn.Module):
+    """Frames of the film seen from elsewhere, and how far the film itself goes.
+
+    Attributes:
+        surface_m: how far the person stands off each of V vertices.
+        empty: share of the frames that show background at each vertex.
+        goes_on_below: whether the film shows the person below the mesh.
+        theta: of the W views, some with an open mouth, whose cameras are held by their parts.
+        turns_degrees: yaw, pitch and roll of the head in each view.
+        filmed_low_degrees: the lowest turns that the film has shown so far; "high": the highest.
+    """
+
+    surface_m: Float[Tensor, "V"]
+    empty: Float[Tensor, "V"]
+    goes_on_below: Tensor
+    theta: Float[Tensor, "W H"]
+    world_to_camera: Float[Tensor, "W 4 4"]
+    focal_px: Float[Tensor, "W 2"]
+    principal_point_px: Float[Tensor, "W 2"]
+    turns_degrees: Float[Tensor, "W 3"]
+    size_px: Tensor
+    filmed_low_degrees: Float[Tensor, "3"]
+    filmed_high_degrees: Float[Tensor, "3"]
+
+    def __init__(self, num_vertices: int, theta_size: int) -> None:
+        super().__init__()
+        count = len(TURNS_DEGREES)
+        self.register_buffer("surface_m", torch.zeros(num_vertices))
+        self.register_buffer("empty", torch.zeros(num_vertices))
+        self.register_buffer("goes_on_below", torch.zeros((), dtype=torch.bool))
+        self.register_buffer("theta", torch.zeros(count, theta_size))
+        self.register_buffer("world_to_camera", torch.eye(4).repeat(count, 1, 1))
+        self.register_buffer("focal_px", torch.ones(count, 2))
+        self.register_buffer("principal_point_px", torch.zeros(count, 2))
+        self.register_buffer("turns_degrees", torch.zeros(count, 3))
+        self.register_buffer("size_px", torch.zeros(2, dtype=torch.int64))
+        self.register_buffer("filmed_low_degrees", torch.full((3,), torch.inf))
+        self.register_buffer("filmed_high_degrees", torch.full((3,), -torch.inf))
+        self._drawn: dict[int, _Mask] = {}
+        self._beyond: list[int] | None = None
+        self.register_load_state_dict_post_hook(lambda module, _: module._forget())
+
+    def _forget(self) -> None:
+        """Drop what follows from the state."""
+        self._drawn, self._beyond = {}, None
+
+    @torch.no_grad()
+    def begin(
+        self,
+        avatar: Avatar,
+        outline: Outline,
+        theta: Float[Tensor, "B H"],
+        cameras: PinholeCameras,
+    ) -> None:
+        """Turn around these frames; `outline` says where the person's surface is."""
+        count, shared = len(TURNS_DEGREES), len(cameras.focal_px) == 1
+        frames = [k % len(theta) for k in range(count)]
+        theta = theta[frames].cpu().float()
+        before = cameras.to("cpu").select([0] * count if shared else frames)
+        yaw, pitch = torch.tensor(TURNS_DEGREES).to(before.world_to_camera).unbind(1)
+        views = orbit(before, head_centre(avatar, theta).to(yaw), yaw, pitch)
+        jaw = theta[:, avatar.layout.slice("jaw").start]
+        opened = torch.tensor(_JAWS_RAD).repeat(count // len(_JAWS_RAD) + 1)[:count]
+        jaw.copy_(torch.maximum(jaw, opened))
+        self.surface_m.copy_(outline.offset_m)
+        self.empty.copy_(outline.empty)
+        self.goes_on_below.fill_(outline.goes_on_below)
+        self.theta.copy_(theta)
+        self.world_to_camera.copy_(views.world_to_camera)
+        self.focal_px.copy_(views.focal_px)
+        self.principal_point_px.copy_(views.principal_point_px)
+        self.turns_degrees.copy_(turn_seen(theta, views.world_to_camera, avatar.layout))
+        self.size_px.copy_(torch.tensor([views.width, views.height]))
+        self._forget()
+
+    def see(self, avatar: Avatar, theta: Float[Tensor, "B H"], cameras: PinholeCameras) -> None:
+        """Take into account how far these frames of the film go."""
+        turns = turn_seen(theta, cameras.world_to_camera, avatar.layout).to(self.turns_degrees)
+        torch.minimum(self.filmed_low_degrees, turns.amin(0), out=self.filmed_low_degrees)
+        torch.maximum(self.filmed_high_degrees, turns.amax(0), out=self.filmed_high_degrees)
+        self._beyond = None
+
+    def due(self, step: int, batch_size: int) -> int | None:
+        """The view that takes the place of a batch's last frame at this step, if any."""
+        every = max(2, round(_FRAMES_A_VIEW / batch_size))
+        if step % every:
+            return None
+        if self._beyond is None:
+            turns, clear = self.turns_degrees[:, :2], _CLEAR_DEGREES
+            below = turns < self.filmed_low_degrees[:2] - clear
+            above = turns > self.filmed_high_degrees[:2] + clear
+            beyond = (below | above).any(1) & (self.size_px > 0).all()
+            self._beyond = torch.nonzero(beyond)[:, 0].tolist()
+        return self._beyond[step // every % len(self._beyond)] if self._beyond else None
+
+    @torch.no_grad()
+    def frame(self, avatar: Avatar, view: int, backend: str = "auto") -> ViewedFrames:
+        """A view as the avatar is to show it: its own picture now, closed and smoothed."""
+        # Here, as below, so that timing steps on a bare machine needs no OpenCV.
+        from rgbavatar_ns.avatar.prior.closing import closed
+
+        theta, cameras, mask = self.theta[[view]], self._cameras([view]), self._mask(avatar, view)
+        here = cameras.to(avatar.identity)
+        drawn = avatar.render(theta.to(avatar.identity), here, backend=backend)
+        own = torch.cat([drawn.image, drawn.alpha], -1)[0].cpu().numpy()
+        image = mask.image_rgba.clone()
+        image[0, mask.inner] = torch.from_numpy(closed(own)).to(image.device)[mask.inner]
+        return ViewedFrames(theta, cameras, image)
+
+    def frames(self, avatar: Avatar) -> ViewedFrames:
+        """All W views, with nothing known within the outlines yet."""
+        views = range(len(self.theta))
+        images = torch.cat([self._mask(avatar, view).image_rgba for view in views])
+        return ViewedFrames(self.theta, self._cameras(list(views)), images)
+
+    def _mask(self, avatar: Avatar, view: int) -> "_Mask":
+        if view not in self._drawn:
+            self._drawn[view] = self._draw(avatar, view)
+        return self._drawn[view]
+
+    def _cameras(self, views: list[int]) -> PinholeCameras:
+        width, height = self.size_px.tolist()
+        focal_px, principal_point_px = self.focal_px[views], self.principal_point_px[views]
+        return PinholeCameras(
+            self.world_to_camera[views], focal_px, principal_point_px, width, height
+        )
+
+    @torch.no_grad()
+    def _draw(self, avatar: Avatar, view: int) -> "_Mask":
+        import cv2
+
+        from rgbavatar_ns.avatar.prior.outline import (
+            PlacedMesh,
+            covered_pixels,
+            lower_rim,
+            vertex_normals,
+        )
+
+        faces = avatar.head.faces.cpu().long()
+        vertices = avatar.carrier_vertices(self.theta[[view]].to(avatar.identity)).cpu()
+        cameras = self._cameras([view]).to("cpu")
+        seen = PlacedMesh.of(vertices, vertex_normals(vertices, faces), cameras, 0)
+        px, size = seen.moved(self.surface_m.cpu()), (cameras.width, cameras.height)
+        there = ~(self.empty.cpu() > 0.5)[faces].any(1)
+        unknown = covered_pixels(px, faces.numpy(), *size) > 0
+        body = covered_pixels(px, faces[there].numpy(), *size) if not there.all() else unknown
+        rim = np.ones((2 * _BORDER_PX + 1,) * 2, np.uint8)
+        inner = cv2.erode(body.astype(np.uint8), rim, borderValue=(1,)) > 0
+        # What the mesh ends in goes on below it: a neck, shoulders.
+        if self.goes_on_below:
+            lowest = max(0, int(px[lower_rim(avatar), 1].min()))
+            unknown[lowest:], inner[lowest:] = True, False
+        image = np.zeros((cameras.height, cameras.width, 4), np.uint8)
+        image[unknown] = UNFILMED_RGBA
+        device = self.theta.device
+        return _Mask(torch.from_numpy(image)[None].to(device), torch.from_numpy(inner).to(device))
+
+
+@dataclass(frozen=True)
+class _Mask:
+    """What is known of a view before anything is drawn."""
+
+    image_rgba: UInt8[Tensor, "1 height width 4"]
+    """Background beside the outline, unfilmed within and below it."""
+    inner: Bool[Tensor, "height width"]
+    """Where the person is, for certain."""

@@ -1,0 +1,45 @@
+"""Closed pictures: holes take the colour around them, noise goes, a plain picture stays."""
+
+import numpy as np
+
+from rgbavatar_ns.avatar.prior.closing import closed
+
+WIDTH, HEIGHT = 256, 40
+
+
+def test_a_plain_picture_stays_and_holes_take_its_colour():
+    color = np.array([0.8, 0.4, 0.2])
+    alpha = np.ones((HEIGHT, WIDTH, 1))
+    alpha[10:14, 100:104] = 0
+    alpha[20:30, 50:60] = 0.3
+    found = closed(np.dstack([color * alpha, alpha]))
+    assert found.shape == (HEIGHT, WIDTH, 4)
+    assert (found[..., 3] == 255).all()
+    assert np.abs(found[..., :3] / 255 - color).max() < 0.5 / 255 + 1e-3
+
+
+def test_noise_of_hue_goes_and_edges_of_light_stay():
+    hue = 0.1 * np.random.default_rng(0).normal(size=(HEIGHT, WIDTH, 3))
+    hue -= hue.mean(-1, keepdims=True)
+    light = np.full((HEIGHT, WIDTH, 1), 0.3)
+    light[:, WIDTH // 2 :] = 0.7
+    found = closed(np.dstack([light + hue, np.ones_like(light)]))[..., :3] / 255
+    inner = slice(12, HEIGHT - 12), slice(12, WIDTH - 12)
+    left = found - found.mean(-1, keepdims=True)
+    # A Gaussian's blur of 3 pixels leaves 1 / (2 sqrt(pi) 3) of the deviation of white noise.
+    assert 0.5 / 10.6 < left[inner].std() / hue[inner].std() < 1.5 / 10.6
+    # From dark to bright in a few pixels: 80 % of the step within +-2.
+    row, middle = found[HEIGHT // 2].mean(-1), WIDTH // 2
+    assert row[middle + 2] - row[middle - 3] > 0.8 * 0.4
+
+
+def test_the_blur_follows_the_pictures_width():
+    def reach(width: int) -> int:
+        image = np.zeros((16, width, 4))
+        image[:, width // 2 :, 0] = 1
+        image[..., 3] = 1
+        found = closed(image)[8] / 255
+        hue = found[:, 0] - found[:, 1]
+        return int(((hue > 0.05) & (hue < 0.95)).sum())
+
+    assert 1.7 < reach(512) / reach(256) < 2.3

@@ -1,0 +1,69 @@
+"""Steps in which a view that nobody filmed takes a frame's place: every way takes the same."""
+
+import pytest
+import torch
+
+from rgbavatar_ns.avatar.prior import VirtualViews, virtual_views
+from rgbavatar_ns.avatar.refinement import FrameRefinement, RefinementConfig
+from rgbavatar_ns.avatar.training import (
+    TrainingBatch,
+    TrainingOptions,
+    TrainingStep,
+    make_optimizer,
+)
+from rgbavatar_ns.avatar.training.batches import ChosenFrames, DeviceFrames
+from tests.avatar.fused_scene import far_batch, parting, stir
+
+SIZE, EVERY = 24, 2
+
+
+@pytest.fixture(autouse=True)
+def _views_are_frequent(monkeypatch):
+    monkeypatch.setattr(virtual_views, "_FRAMES_A_VIEW", 2 * EVERY)
+
+
+def trained(make_avatar, kind: str, steps: int = 7):
+    """An avatar after steps on two of four frames each, with a camera of their own."""
+    avatar = stir(make_avatar())
+    batch, background = far_batch(avatar, 4, SIZE, SIZE, cameras=4)
+    frames = DeviceFrames(batch.theta, batch.cameras, batch.images_rgba)
+    optimizer = make_optimizer(avatar)
+    for group in optimizer.param_groups:
+        group["lr"] *= 0.1
+    options = TrainingOptions(fast=kind != "eager")
+    given = (lambda: frames) if kind == "recorded" else None
+    take = TrainingStep(avatar, optimizer, options, frames=given, recorder=lambda work: work)
+    assert take.kind == kind
+    for step in range(steps):
+        rows = [step % 4, (step + 2) % 4]
+        colors = background[rows]
+        chosen = frames.batch(rows)
+        images = TrainingBatch(chosen.theta, chosen.cameras, chosen.images_rgba, colors)
+        take(ChosenFrames(rows, colors) if kind == "recorded" else images, step)
+    return avatar
+
+
+def test_recorded_fused_and_eager_steps_show_the_same_views(emulated, make_avatar, monkeypatch):
+    recorded, fused, eager = (trained(make_avatar, kind) for kind in ("recorded", "fused", "eager"))
+    assert parting(recorded, fused) < 1e-3
+    assert parting(eager, fused) < 1e-3
+    monkeypatch.setattr(VirtualViews, "due", lambda self, step, size: None)
+    assert parting(trained(make_avatar, "fused"), fused) > 1e-2
+
+
+def test_a_frame_that_a_view_displaced_is_not_refined_by_it(make_avatar):
+    avatar = stir(make_avatar())
+    batch, background = far_batch(avatar, 4, SIZE, SIZE)
+    config = RefinementConfig(start_step=0)
+    refinement = FrameRefinement(batch.theta, list(range(4)), avatar.layout, config)
+    take = TrainingStep(avatar, refinement=refinement)
+    visits = []
+    for step in range(2):
+        position = torch.tensor([3, 1])
+        images = batch.images_rgba[position]
+        take(
+            TrainingBatch(batch.theta[position], batch.cameras, images, background[:2], position),
+            step,
+        )
+        visits.append(refinement.frames.visits.tolist())
+    assert visits == [[0, 0, 0, 1], [0, 1, 0, 2]]
