@@ -108,13 +108,16 @@ def test_the_page_shows_the_picture_that_render_draws(open_page, changes):
 def test_beyond_the_film_the_pages_weights_are_those_of_the_avatar(open_page):
     avatar = avatar_of()
     theta = lively_theta(avatar, 2)
+    with torch.no_grad():  # a trained network's weights are of size one, a new one's of a tenth
+        for parameter in avatar.weight_network.layers[-1].parameters():
+            parameter.mul_(15)
     unbound = _ours(avatar, theta[:1])
     avatar.widen_film_range(0.2 * theta)
     page = open_page(avatar, theta)
     for frame in range(2):
         page.evaluate("frame => app.showFrame(frame)", frame)
         assert psnr(_shown(page), _ours(avatar, theta[frame : frame + 1])) > 45
-    assert psnr(unbound, _ours(avatar, theta[:1])) < 40, "the range changes something"
+    assert psnr(unbound, _ours(avatar, theta[:1])) < 36, "the range changes something"
 
 
 def test_sliders_change_the_picture_and_bring_it_back(open_page):
