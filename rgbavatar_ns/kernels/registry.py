@@ -38,6 +38,10 @@ class MorphedRenderer(Protocol):
         """As `rasterize`, without gradients."""
         ...
 
+    def draw_one(self, place: int) -> RenderedBatch:
+        """The set at a place of the batch by itself, over black; ValueError where none is."""
+        ...
+
     def weighted_color_average(self, images: Float[Tensor, "#B H W C"]) -> WeightedColors:
         """As `weighted_color_average`."""
         ...

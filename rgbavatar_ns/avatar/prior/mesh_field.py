@@ -1,5 +1,6 @@
 """Smooth functions over a head's mesh: known in places, continued to the others."""
 
+import warnings
 from dataclasses import dataclass
 
 import torch
@@ -51,6 +52,8 @@ class MeshField:
         self._mirror, self._mirrored = _mirror_of(template)
         self.scalp = _scalp_of(avatar.head.arrays).to(template.device)
         first, second = self.edges.unbind(1)
+        ends_of_rows = torch.bincount(first, minlength=self.num_vertices).cumsum(0)
+        self._row_starts = torch.cat([ends_of_rows.new_zeros(1), ends_of_rows])
         across = self.scalp[first] != self.scalp[second]
         self.links = torch.where(across, _HAIRLINE, 1.0).to(template)
 
@@ -97,16 +100,26 @@ class MeshField:
         there = _MIRROR_TRUST * self._mirrored * confidence[self._mirror]
         weight = (confidence + there)[:, None]
         known = confidence[:, None] * values + there[:, None] * values[self._mirror]
-        first, second = self.edges.unbind(1)
-        pull = self.links.to(values) * stiffness
-        degree = pull.new_zeros(self.num_vertices).index_add_(0, first, pull)[:, None]
+        neighbours = self._matrix(self.links.to(values) * stiffness)
+        degree = neighbours @ values.new_ones(self.num_vertices, 1)
         diagonal = weight + (values.new_ones(self.num_vertices) * rest)[:, None] + degree
 
         def product(x: Tensor) -> Tensor:
-            neighbours = torch.zeros_like(x).index_add_(0, first, pull[:, None] * x[second])
-            return diagonal * x - neighbours
+            return diagonal * x - neighbours @ x
 
         return _conjugate_gradients(product, known, start, diagonal, iterations)
+
+    def _matrix(self, entries: Float[Tensor, "E"]) -> Tensor:
+        """The matrix [V, V] with an entry for each edge, sparse by rows."""
+        with warnings.catch_warnings():  # torch calls the format new
+            warnings.filterwarnings("ignore", message="Sparse CSR tensor support")
+            return torch.sparse_csr_tensor(
+                self._row_starts,
+                self.edges[:, 1],
+                entries,
+                (self.num_vertices, self.num_vertices),
+                check_invariants=False,
+            )
 
 
 def _conjugate_gradients(product, wanted: Tensor, start: Tensor, diagonal: Tensor, iterations: int):

@@ -20,11 +20,11 @@ from rgbavatar_ns.kernels import PinholeCameras, weighted_color_average
 
 Images = UInt8[Tensor, "B height width 4"] | Float[Tensor, "B height width 4"]
 
-EVERY = 20
-"""Steps between two looks at what was seen."""
+EVERY = 40
+"""Steps between two looks at what was seen; at first it is twice as often."""
 _FIRST_STEP, _FIRST_PULL = 60, 160
 """Until the surface has closed everything is seen; then frames are looked at before any pull."""
-_RATE = 0.3
+_RATE = 0.4
 """Share of the way to the surface that an unseen Gaussian goes at a time."""
 _FORGETS = 0.97
 _SEEN_PX = 0.02
@@ -114,7 +114,8 @@ class SurfacePrior(nn.Module):
 
     def due(self, step: int) -> bool:
         """Whether `after_step` has something to do after this step, counted from 0."""
-        return step >= _FIRST_STEP and (step + 1) % EVERY == 0 and self.has_begun
+        every = EVERY if step >= _FIRST_PULL else EVERY // 2
+        return step >= _FIRST_STEP and (step + 1) % every == 0 and self.has_begun
 
     @torch.no_grad()
     def after_step(

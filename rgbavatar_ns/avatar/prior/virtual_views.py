@@ -5,18 +5,19 @@ the head, where the surface says that there is nothing. Within the outline the a
 its own picture, closed and smoothed: what the film shows withstands, what it left open follows.
 """
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor, nn
 
 from rgbavatar_ns.avatar.avatar import Avatar
 from rgbavatar_ns.avatar.orbit import head_centre, orbit
 from rgbavatar_ns.avatar.prior.mesh_field import Outline
 from rgbavatar_ns.head import turn_seen
-from rgbavatar_ns.kernels import PinholeCameras
+from rgbavatar_ns.kernels import PinholeCameras, RenderedBatch
 from rgbavatar_ns.kernels.constants import UNFILMED_RGBA
 
 TURNS_DEGREES = (
@@ -144,25 +145,35 @@ class VirtualViews(nn.Module):
             self._beyond = torch.nonzero(beyond)[:, 0].tolist()
         return self._beyond[step // every % len(self._beyond)] if self._beyond else None
 
-    @torch.no_grad()
-    def frame(self, avatar: Avatar, view: int, backend: str = "auto") -> ViewedFrames:
-        """A view as the avatar is to show it: its own picture now, closed and smoothed."""
+    def frames(self, avatar: Avatar, views: Sequence[int]) -> ViewedFrames:
+        """Some of the W views, with nothing known within the outlines yet."""
+        images = torch.cat([self._mask(avatar, view).image_rgba for view in views])
+        return ViewedFrames(self.theta[list(views)], self._cameras(list(views)), images)
+
+    def completed(
+        self, avatar: Avatar, view: int, own: RenderedBatch
+    ) -> UInt8[Tensor, "1 height width 4"]:
+        """A view's image as the avatar is to show it: its `own` picture, closed and smoothed."""
         # Here, as below, so that timing steps on a bare machine needs no OpenCV.
         from rgbavatar_ns.avatar.prior.closing import closed
 
-        theta, cameras, mask = self.theta[[view]], self._cameras([view]), self._mask(avatar, view)
-        here = cameras.to(avatar.identity)
-        drawn = avatar.render(theta.to(avatar.identity), here, backend=backend)
-        own = torch.cat([drawn.image, drawn.alpha], -1)[0].cpu().numpy()
+        mask = self._mask(avatar, view)
+        rows, columns = mask.box
+        parts = own.image[0, rows, columns], own.alpha[0, rows, columns]
+        picture = closed(torch.cat(parts, -1).cpu().numpy(), own.image.shape[2])
         image = mask.image_rgba.clone()
-        image[0, mask.inner] = torch.from_numpy(closed(own)).to(image.device)[mask.inner]
-        return ViewedFrames(theta, cameras, image)
+        there = image[0, rows, columns]
+        inner = mask.inner[rows, columns, None]
+        there.copy_(torch.where(inner, torch.from_numpy(picture).to(there), there))
+        return image
 
-    def frames(self, avatar: Avatar) -> ViewedFrames:
-        """All W views, with nothing known within the outlines yet."""
-        views = range(len(self.theta))
-        images = torch.cat([self._mask(avatar, view).image_rgba for view in views])
-        return ViewedFrames(self.theta, self._cameras(list(views)), images)
+    @torch.no_grad()
+    def frame(self, avatar: Avatar, view: int, backend: str = "auto") -> ViewedFrames:
+        """A view with its completed image."""
+        known = self.frames(avatar, [view])
+        here = known.cameras.to(avatar.identity)
+        own = avatar.render(known.theta.to(avatar.identity), here, backend=backend)
+        return replace(known, images_rgba=self.completed(avatar, view, own))
 
     def _mask(self, avatar: Avatar, view: int) -> "_Mask":
         if view not in self._drawn:
@@ -193,8 +204,8 @@ class VirtualViews(nn.Module):
         seen = PlacedMesh.of(vertices, vertex_normals(vertices, faces), cameras, 0)
         px, size = seen.moved(self.surface_m.cpu()), (cameras.width, cameras.height)
         there = ~(self.empty.cpu() > 0.5)[faces].any(1)
-        unknown = covered_pixels(px, faces.numpy(), *size) > 0
-        body = covered_pixels(px, faces[there].numpy(), *size) if not there.all() else unknown
+        body, rest = (covered_pixels(px, faces[k].numpy(), *size) > 0 for k in (there, ~there))
+        unknown = body | rest
         rim = np.ones((2 * _BORDER_PX + 1,) * 2, np.uint8)
         inner = cv2.erode(body.astype(np.uint8), rim, borderValue=(1,)) > 0
         # What the mesh ends in goes on below it: a neck, shoulders.
@@ -204,7 +215,9 @@ class VirtualViews(nn.Module):
         image = np.zeros((cameras.height, cameras.width, 4), np.uint8)
         image[unknown] = UNFILMED_RGBA
         device = self.theta.device
-        return _Mask(torch.from_numpy(image)[None].to(device), torch.from_numpy(inner).to(device))
+        rows, columns = (np.flatnonzero(inner.any(axis)) for axis in (1, 0))
+        image, inner = torch.from_numpy(image)[None].to(device), torch.from_numpy(inner).to(device)
+        return _Mask(image, inner, (_reach(rows), _reach(columns)))
 
 
 @dataclass(frozen=True)
@@ -215,3 +228,10 @@ class _Mask:
     """Background beside the outline, unfilmed within and below it."""
     inner: Bool[Tensor, "height width"]
     """Where the person is, for certain."""
+    box: tuple[slice, slice]
+    """The rows and columns of that."""
+
+
+def _reach(places: Int[np.ndarray, "P"]) -> slice:
+    """From the first of sorted places to the last."""
+    return slice(int(places[0]), int(places[-1]) + 1) if len(places) else slice(0)

@@ -189,11 +189,11 @@ class TrainingStep:
             assert batch.position is not None, "Refined tracking needs the frames' positions."
             theta = self.refinement.corrected(theta, batch.position).requires_grad_()
         self.avatar.widen_film_range(theta)
-        shown = self._with_view(replace(batch, theta=theta), step)
-        losses = self._losses(shown, shown.theta, step)
+        shown, view = self._with_view(replace(batch, theta=theta), step)
+        losses = self._losses(shown, shown.theta, step, view)
         if self.refinement is not None and theta.grad is not None:
             assert batch.position is not None
-            filmed = len(theta) if shown.theta is theta else len(theta) - 1
+            filmed = len(theta) if view is None else len(theta) - 1
             # The batch's loss is a mean; each frame is to have the gradient of its own.
             own = theta.grad[:filmed] * len(theta)
             self.refinement.step(step, batch.position[:filmed], own)
@@ -211,7 +211,7 @@ class TrainingStep:
             self.avatar.widen_film_range(frames.theta)
             self._shown = frames
             if views is not None:
-                bank = views.frames(self.avatar)
+                bank = views.frames(self.avatar, range(len(views.theta)))
                 others = DeviceFrames(bank.theta, bank.cameras, bank.images_rgba)
                 self._shown = frames.joined(others)
             self._recorded = RecordedStep(
@@ -237,28 +237,32 @@ class TrainingStep:
         """From where nobody filmed; None where no prior has measured the person."""
         return self._prior.views if self._prior is not None and self._prior.has_begun else None
 
-    def _with_view(self, batch: TrainingBatch, step: int) -> TrainingBatch:
-        """The batch; at times its last frame gives way to a view that nobody filmed."""
+    def _with_view(self, batch: TrainingBatch, step: int) -> tuple[TrainingBatch, int | None]:
+        """The batch; at times its last frame gives way to a view that nobody filmed.
+
+        Returns which one did; its image is not completed yet.
+        """
         views, count = self._views(), len(batch.theta)
         index = views.due(step, count) if views is not None else None
         if views is None or index is None:
-            return batch
-        view = views.frame(self.avatar, index, self.options.backend)
+            return batch, None
+        view = views.frames(self.avatar, [index])
         if view.images_rgba.shape[1:] != batch.images_rgba.shape[1:]:
-            return batch
-        image = view.images_rgba
-        if batch.images_rgba.dtype != torch.uint8:
-            image = image.to(batch.images_rgba) / 255
+            return batch, None
         cameras = each_its_own(batch.cameras, count).select(range(count - 1))
-        return TrainingBatch(
+        shown = TrainingBatch(
             torch.cat([batch.theta[:-1], view.theta.to(batch.theta)]),
             cameras.joined(view.cameras),
-            torch.cat([batch.images_rgba[:-1], image]),
+            batch.images_rgba,
             batch.background,
         )
+        return shown, index
 
-    def _losses(self, batch: TrainingBatch, theta: Float[Tensor, "B H"], step: int) -> Losses:
+    def _losses(
+        self, batch: TrainingBatch, theta: Float[Tensor, "B H"], step: int, view: int | None
+    ) -> Losses:
         """Step with the optimisers; `theta.grad` is left where theta requires it."""
+        views = self._views()
         background = batch.background
         if background is None:
             background = random_backgrounds(step, len(theta), self.options.seed)
@@ -266,7 +270,14 @@ class TrainingStep:
         images, by_autograd = batch.images_rgba, self.options.lpips_counts(step)
         # Compiled loops read 8-bit images; others have more to say.
         if self._fused is not None and images.dtype == torch.uint8 and not by_autograd:
-            return {"l1": self._fused(theta, batch.cameras, images, background)}
+            from_own = None
+            if views is not None and view is not None:
+                from_own = partial(views.completed, self.avatar, view)
+            return {"l1": self._fused(theta, batch.cameras, images, background, from_own)}
+        if views is not None and view is not None:
+            last = views.frame(self.avatar, view, self.options.backend).images_rgba
+            last = last if images.dtype == torch.uint8 else last.to(images) / 255
+            batch = replace(batch, images_rgba=torch.cat([images[:-1], last.to(images.device)]))
         for optimizer in self.optimizers:
             optimizer.zero_grad(set_to_none=True)
         losses = self.eager_losses(batch, theta, background, step)

@@ -10,7 +10,7 @@ class Gaussians:
 
 class _Drawing:
     def draw(
-        self, background: Tensor, image: Tensor, alpha: Tensor, depth: Tensor | None
+        self, background: Tensor, first: int, image: Tensor, alpha: Tensor, depth: Tensor | None
     ) -> None: ...
     def average(
         self,

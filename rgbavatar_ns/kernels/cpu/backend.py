@@ -68,7 +68,7 @@ def _draw(
     size = (request.batch, request.cameras.height, request.cameras.width)
     image, alpha = background.new_empty(*size, 3), background.new_empty(*size, 1)
     session = _session(gaussians, request.cameras, request.batch)
-    session.draw(background, image, alpha, request.depth)
+    session.draw(background, 0, image, alpha, request.depth)
     if request.visibility is not None:
         session.average(None, None, None, request.visibility)
 

@@ -73,12 +73,21 @@ class CpuMorphedRenderer:
         size = (batch, self._cameras.height, self._cameras.width)
         image, alpha = new(*size, 3), new(*size, 1)
         depth = new(*size, 1) if with_depth else None
-        self._session.draw(background.detach().contiguous(), image, alpha, depth)
+        self._session.draw(background.detach().contiguous(), 0, image, alpha, depth)
         visibility = None
         if with_visibility:
             visibility = new(batch, self._count)
             self._session.average(None, None, None, visibility)
         return RenderedBatch(image, alpha, depth, visibility)
+
+    def draw_one(self, place: int) -> RenderedBatch:
+        """The set at a place of the batch by itself, over black."""
+        if not 0 <= place < len(self._weights):
+            raise ValueError(f"There is no set {place} among {len(self._weights)}.")
+        new, size = self._weights.new_empty, (1, self._cameras.height, self._cameras.width)
+        image, alpha = new(*size, 3), new(*size, 1)
+        self._session.draw(self._weights.new_zeros(1, 3), place, image, alpha, None)
+        return RenderedBatch(image, alpha)
 
     def weighted_color_average(self, images: Float[Tensor, "#B H W C"]) -> WeightedColors:
         """As `weighted_color_average`."""

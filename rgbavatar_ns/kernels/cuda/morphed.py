@@ -108,6 +108,13 @@ class CudaMorphedRenderer:
         visibility = self._tiles.average(None)[2] if with_visibility else None
         return RenderedBatch(image, alpha, depth, visibility)
 
+    def draw_one(self, place: int) -> RenderedBatch:
+        """The set at a place of the batch by itself, over black."""
+        if not 0 <= place < self._images.batch:
+            raise ValueError(f"There is no set {place} among {self._images.batch}.")
+        every, one = self.draw(), slice(place, place + 1)
+        return RenderedBatch(every.image[one], every.alpha[one])
+
     def draw_at_once(self, background: Float[Tensor, "#B 3"]) -> RenderedBatch:
         """As `draw`, without waiting for the room that it needs; see `overflowed`."""
         image, alpha, _ = self._tiles.draw(background, with_depth=False, checked=False)

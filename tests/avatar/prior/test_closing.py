@@ -12,7 +12,7 @@ def test_a_plain_picture_stays_and_holes_take_its_colour():
     alpha = np.ones((HEIGHT, WIDTH, 1))
     alpha[10:14, 100:104] = 0
     alpha[20:30, 50:60] = 0.3
-    found = closed(np.dstack([color * alpha, alpha]))
+    found = closed(np.dstack([color * alpha, alpha]), WIDTH)
     assert found.shape == (HEIGHT, WIDTH, 4)
     assert (found[..., 3] == 255).all()
     assert np.abs(found[..., :3] / 255 - color).max() < 0.5 / 255 + 1e-3
@@ -23,7 +23,7 @@ def test_noise_of_hue_goes_and_edges_of_light_stay():
     hue -= hue.mean(-1, keepdims=True)
     light = np.full((HEIGHT, WIDTH, 1), 0.3)
     light[:, WIDTH // 2 :] = 0.7
-    found = closed(np.dstack([light + hue, np.ones_like(light)]))[..., :3] / 255
+    found = closed(np.dstack([light + hue, np.ones_like(light)]), WIDTH)[..., :3] / 255
     inner = slice(12, HEIGHT - 12), slice(12, WIDTH - 12)
     left = found - found.mean(-1, keepdims=True)
     # A Gaussian's blur of 3 pixels leaves 1 / (2 sqrt(pi) 3) of the deviation of white noise.
@@ -38,7 +38,7 @@ def test_the_blur_follows_the_pictures_width():
         image = np.zeros((16, width, 4))
         image[:, width // 2 :, 0] = 1
         image[..., 3] = 1
-        found = closed(image)[8] / 255
+        found = closed(image, width)[8] / 255
         hue = found[:, 0] - found[:, 1]
         return int(((hue > 0.05) & (hue < 0.95)).sum())
 

@@ -11,7 +11,7 @@ from rgbavatar_ns.kernels.constants import UNFILMED_RGBA
 from .test_mesh_field import embedded_avatar
 from .test_outline import drawn_thicker, front_camera, turned
 
-STEPS = range(179, 800, 20)
+STEPS = range(199, 1440, 40)
 
 
 @pytest.fixture

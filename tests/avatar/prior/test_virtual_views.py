@@ -172,7 +172,7 @@ def test_its_state_gives_the_same_views():
     copy = VirtualViews(len(avatar.head.arrays.v_template), avatar.layout.size)
     assert copy.due(0, BATCH) is None  # of an earlier version, or not yet begun
     copy.load_state_dict(views.state_dict())
-    every, others = views.frames(avatar), copy.frames(avatar)
+    every, others = (v.frames(avatar, range(len(TURNS_DEGREES))) for v in (views, copy))
     assert torch.equal(every.images_rgba, others.images_rgba)
     assert torch.equal(every.cameras.world_to_camera, others.cameras.world_to_camera)
     assert torch.equal(views.frame(avatar, 3).images_rgba, copy.frame(avatar, 3).images_rgba)

@@ -67,3 +67,21 @@ def test_a_frame_that_a_view_displaced_is_not_refined_by_it(make_avatar):
         )
         visits.append(refinement.frames.visits.tolist())
     assert visits == [[0, 0, 0, 1], [0, 1, 0, 2]]
+
+
+@pytest.mark.parametrize("backend", ["cpu", "cuda"])
+def test_one_set_of_a_batch_is_drawn_by_itself(make_avatar, backend, request):
+    if backend == "cuda":
+        request.getfixturevalue("emulated")
+    avatar = stir(make_avatar())
+    batch, _ = far_batch(avatar, 3, 40, 31)
+    renderer = avatar.renderer(batch.theta, batch.cameras, backend=backend)
+    together = renderer.draw()
+    for place in (2, 0, 1):
+        alone = renderer.draw_one(place)
+        assert torch.equal(alone.image, together.image[[place]])
+        assert torch.equal(alone.alpha, together.alpha[[place]])
+    assert not torch.equal(together.image[0], together.image[2])
+    for place in (-1, 3):
+        with pytest.raises(ValueError, match="no set"):
+            renderer.draw_one(place)

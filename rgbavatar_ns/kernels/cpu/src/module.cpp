@@ -61,9 +61,10 @@ struct Drawing {
   int threads;
   Rendering rendering;
 
-  void draw(const Input& background, const Output& image, const Output& alpha,
+  void draw(const Input& background, int first, const Output& image, const Output& alpha,
             const std::optional<Output>& depth) {
-    rendering.draw(attribute(background), image.data(), alpha.data(), pointer(depth), threads);
+    rendering.draw(attribute(background), first, int(image.shape(0)), image.data(), alpha.data(),
+                   pointer(depth), threads);
   }
 
   void average(const std::optional<Input>& images, const std::optional<Output>& weighted_sum,
@@ -76,8 +77,8 @@ struct Drawing {
 
   static void bind(nb::class_<Drawing>& type) {
     using Release = nb::call_guard<nb::gil_scoped_release>;
-    type.def("draw", &Drawing::draw, "background"_a.noconvert(), "image"_a.noconvert(),
-             "alpha"_a.noconvert(), "depth"_a.noconvert().none(), Release())
+    type.def("draw", &Drawing::draw, "background"_a.noconvert(), "first"_a,
+             "image"_a.noconvert(), "alpha"_a.noconvert(), "depth"_a.noconvert().none(), Release())
         .def("average", &Drawing::average, "images"_a.noconvert().none(),
              "weighted_sum"_a.noconvert().none(), "weight_sum"_a.noconvert().none(),
              "max_weight"_a.noconvert(), Release());

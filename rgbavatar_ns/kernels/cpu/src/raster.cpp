@@ -112,15 +112,15 @@ void Rendering::lay_out_slots(int width) {
                             w.slots.data() + w.slot_start[image] * width};
 }
 
-void Rendering::draw(const Attribute& background, float* image, float* alpha, float* depth,
-                     int threads) {
+void Rendering::draw(const Attribute& background, int first, int sets, float* image, float* alpha,
+                     float* depth, int threads) {
   Team team(threads);
   make_scratch(team.size());
   const size_t pixels = size_t(width_) * height_;
-  team.run(int64_t(batch_) * tiles_per_image(), [&](int64_t item, int thread) {
-    const int b = int(item / tiles_per_image());
-    const ForwardOutput out = {background.of(b), image + b * pixels * 3, alpha + b * pixels,
-                               depth ? depth + b * pixels : nullptr};
+  team.run(int64_t(sets) * tiles_per_image(), [&](int64_t item, int thread) {
+    const int place = int(item / tiles_per_image()), b = first + place;
+    const ForwardOutput out = {background.of(b), image + place * pixels * 3,
+                               alpha + place * pixels, depth ? depth + place * pixels : nullptr};
     kernels_->forward_tile(tile(b, int(item % tiles_per_image())), out,
                            workspace_->scratch[thread]);
   });

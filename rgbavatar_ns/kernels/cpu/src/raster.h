@@ -98,8 +98,10 @@ class Rendering {
   Rendering(const Rendering&) = delete;
   Rendering& operator=(const Rendering&) = delete;
 
-  // image [B, H, W, 3], alpha [B, H, W], depth [B, H, W] or null, background [B or 1, 3].
-  void draw(const Attribute& background, float* image, float* alpha, float* depth, int threads);
+  // image [S, H, W, 3], alpha [S, H, W], depth [S, H, W] or null, of the S sets from `first` on;
+  // background [B or 1, 3].
+  void draw(const Attribute& background, int first, int sets, float* image, float* alpha,
+            float* depth, int threads);
 
   // images [B or 1, H, W, C] with C >= 0; outputs [B, N, C], [B, N], [B, N]; each may be null.
   void average(const Attribute& images, int channels, float* weighted_sum, float* weight_sum,
