@@ -10,6 +10,8 @@ from torch import Tensor
 
 from rgbavatar_ns.kernels.constants import UNFILMED_RGBA
 
+ImagesRGBA = UInt8[Tensor, "*batch height width 4"] | Float[Tensor, "*batch height width 4"]
+"""Straight-alpha images, of 8 bits or in [0, 1]."""
 _UNFILMED = int(np.array(UNFILMED_RGBA, np.uint8).view(np.int32)[0])
 ERROR_GAIN = 4.0
 """By how much a shown error is larger than it is, so that 1/4 is white."""

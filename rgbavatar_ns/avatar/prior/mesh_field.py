@@ -100,14 +100,15 @@ class MeshField:
         there = _MIRROR_TRUST * self._mirrored * confidence[self._mirror]
         weight = (confidence + there)[:, None]
         known = confidence[:, None] * values + there[:, None] * values[self._mirror]
-        neighbours = self._matrix(self.links.to(values) * stiffness)
-        degree = neighbours @ values.new_ones(self.num_vertices, 1)
-        diagonal = weight + (values.new_ones(self.num_vertices) * rest)[:, None] + degree
+        # Sparse products promote no types.
+        neighbours = self._matrix((self.links * stiffness).to(known))
+        degree = neighbours @ known.new_ones(self.num_vertices, 1)
+        diagonal = weight + (known.new_ones(self.num_vertices) * rest)[:, None] + degree
 
         def product(x: Tensor) -> Tensor:
             return diagonal * x - neighbours @ x
 
-        return _conjugate_gradients(product, known, start, diagonal, iterations)
+        return _conjugate_gradients(product, known, start.to(known), diagonal, iterations)
 
     def _matrix(self, entries: Float[Tensor, "E"]) -> Tensor:
         """The matrix [V, V] with an entry for each edge, sparse by rows."""

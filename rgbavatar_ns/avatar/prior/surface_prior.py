@@ -8,17 +8,14 @@ without it a head turned beyond its film shatters (the paper names the limit, no
 import math
 
 import torch
-import torch.nn.functional as F
 from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 
 from rgbavatar_ns.avatar.avatar import Avatar
 from rgbavatar_ns.avatar.prior.mesh_field import MeshField
 from rgbavatar_ns.avatar.prior.virtual_views import VirtualViews
-from rgbavatar_ns.drawing.compositing import is_unfilmed
-from rgbavatar_ns.kernels import PinholeCameras, weighted_color_average
-
-Images = UInt8[Tensor, "B height width 4"] | Float[Tensor, "B height width 4"]
+from rgbavatar_ns.drawing.compositing import ImagesRGBA, is_unfilmed
+from rgbavatar_ns.kernels import MorphedRenderer, PinholeCameras, weighted_color_average
 
 EVERY = 40
 """Steps between two looks at what was seen; at first it is twice as often."""
@@ -92,7 +89,7 @@ class SurfacePrior(nn.Module):
         avatar: Avatar,
         theta: Float[Tensor, "B H"],
         cameras: PinholeCameras,
-        images_rgba: Images,
+        images_rgba: ImagesRGBA,
     ) -> None:
         """Measure the surface by these frames, and put a fresh avatar's Gaussians on it."""
         # Here, so that timing steps on a bare machine needs no OpenCV.
@@ -113,32 +110,42 @@ class SurfacePrior(nn.Module):
             avatar.blendshapes.opacity_logit.copy_(self.opacity_logit.clamp(min=_FAINT))
 
     def due(self, step: int) -> bool:
-        """Whether `after_step` has something to do after this step, counted from 0."""
+        """Whether to `look` before this step, counted from 0, and to `pull` after it."""
         every = EVERY if step >= _FIRST_PULL else EVERY // 2
         return step >= _FIRST_STEP and (step + 1) % every == 0 and self.has_begun
 
     @torch.no_grad()
-    def after_step(
+    def look(
         self,
         avatar: Avatar,
         theta: Float[Tensor, "B H"],
         cameras: PinholeCameras,
-        images_rgba: Images,
-        step: int,
+        images_rgba: ImagesRGBA,
+        renderer: MorphedRenderer | None = None,
         backend: str = "auto",
     ) -> None:
-        """See what these frames show, and draw what none shows to the surface."""
+        """See what these frames show; `renderer` is theirs, where there is one already."""
         self.views.see(avatar, theta, cameras)
         for known in (self.seen_px, self.clear_px, self.through_px):
             known.mul_(_FORGETS)
-        shown_px = _shown_px(avatar, theta, cameras, images_rgba, backend)
-        facing = _facing(avatar, theta, cameras)
+        if renderer is None:
+            renderer = avatar.renderer(theta, cameras, backend=backend)
+        filmed = (~is_unfilmed(images_rgba)).to(avatar.identity)[..., None]
+        if renderer is not None:
+            sums = renderer.weighted_color_average(filmed)
+        else:
+            sums = weighted_color_average(avatar.gaussians(theta), cameras, filmed, backend=backend)
+        shown_px, facing = sums.weighted_sum[..., 0], _facing(avatar, theta, cameras)
         for known, share in (
             (self.through_px, torch.ones_like(facing)),
             (self.seen_px, _ramp(facing, _TURNED_AWAY, _FACING)),
             (self.clear_px, _ramp(facing, _FACING, _FRONTAL)),
         ):
             torch.maximum(known, (shown_px * share).amax(0), out=known)
+
+    @torch.no_grad()
+    def pull(self, avatar: Avatar, step: int) -> None:
+        """Draw to the surface what no frame shows."""
         if step < _FIRST_PULL:
             return
         shapes, field = avatar.blendshapes, self._mesh_field(avatar)
@@ -186,23 +193,6 @@ def _disc(avatar: Avatar) -> Float[Tensor, "N 3"]:
     return log_scale
 
 
-def _shown_px(
-    avatar: Avatar,
-    theta: Float[Tensor, "B H"],
-    cameras: PinholeCameras,
-    images_rgba: Images,
-    backend: str,
-) -> Float[Tensor, "B N"]:
-    """Filmed pixels that each Gaussian covers, by blending weight, in each of the frames."""
-    filmed = (~is_unfilmed(images_rgba)).to(avatar.identity)[..., None]
-    renderer = avatar.renderer(theta, cameras, backend=backend)
-    if renderer is not None:
-        sums = renderer.weighted_color_average(filmed)
-    else:
-        sums = weighted_color_average(avatar.gaussians(theta), cameras, filmed, backend=backend)
-    return sums.weighted_sum[..., 0]
-
-
 def _facing(
     avatar: Avatar, theta: Float[Tensor, "B H"], cameras: PinholeCameras
 ) -> Float[Tensor, "B N"]:
@@ -212,8 +202,10 @@ def _facing(
     first, second, third = corners.unbind(2)
     normal = torch.linalg.cross(second - first, third - first)
     pose = cameras.world_to_camera.to(first)
-    eye = -(pose[:, :3, :3].mT @ pose[:, :3, 3:]).mT
-    return F.cosine_similarity(normal, eye - first, dim=-1)[:, mesh["triangle_of"]]
+    to_eye = -(pose[:, :3, :3].mT @ pose[:, :3, 3:]).mT - first
+    lengths = normal.square().sum(-1) * to_eye.square().sum(-1)
+    cosine = (normal * to_eye).sum(-1) * lengths.clamp(min=1e-30).rsqrt()
+    return cosine[:, mesh["triangle_of"]]
 
 
 def _ramp(values: Float[Tensor, "B N"], start: float, end: float) -> Float[Tensor, "B N"]:
@@ -221,7 +213,7 @@ def _ramp(values: Float[Tensor, "B N"], start: float, end: float) -> Float[Tenso
     return ((values - start) / (end - start)).clamp(0, 1)
 
 
-def _as_bytes(images_rgba: Images) -> UInt8[Tensor, "B height width 4"]:
+def _as_bytes(images_rgba: ImagesRGBA) -> UInt8[Tensor, "B height width 4"]:
     if images_rgba.dtype == torch.uint8:
         return images_rgba
     return (images_rgba.clamp(0, 1) * 255 + 0.5).to(torch.uint8)

@@ -13,12 +13,7 @@ from torch import Tensor
 from rgbavatar_ns.avatar.avatar import Avatar
 from rgbavatar_ns.avatar.training.losses import require_images_of
 from rgbavatar_ns.avatar.training.optimizer_states import AdamStates
-from rgbavatar_ns.kernels import (
-    MorphedGradient,
-    MorphedRenderer,
-    PinholeCameras,
-    RenderedBatch,
-)
+from rgbavatar_ns.kernels import MorphedGradient, MorphedRenderer, PinholeCameras
 
 
 class FusedStep:
@@ -36,12 +31,11 @@ class FusedStep:
         cameras: PinholeCameras,
         images_rgba: UInt8[Tensor, "B H_px W_px 4"],
         background: Float[Tensor, "B 3"],
-        last_from_own: Callable[[RenderedBatch], UInt8[Tensor, "1 H_px W_px 4"]] | None = None,
+        before_loss: Callable[[MorphedRenderer], UInt8[Tensor, "B H_px W_px 4"]] | None = None,
     ) -> Float[Tensor, ""]:
         """Take one step and return the loss.
 
-        `last_from_own`, where given, makes the batch's last image from the avatar's own picture of
-        it as it is now, over black.
+        `before_loss`, where given, looks at what is about to be drawn and returns the images.
         Where theta requires a gradient, `theta.grad` gets that of the loss before the step, as
         from `backward`. Raises ValueError where the images are not of the cameras' size or not as
         many as theta, or the backend has no step without autograd.
@@ -57,9 +51,8 @@ class FusedStep:
         )
         if renderer is None:
             raise ValueError("This backend's steps go through autograd. Use the eager step.")
-        if last_from_own is not None:
-            last = last_from_own(renderer.draw_one(len(theta) - 1))
-            images_rgba = torch.cat([images_rgba[:-1], last])
+        if before_loss is not None:
+            images_rgba = before_loss(renderer)
         loss = renderer.forward_loss(images_rgba, background)
         gradient = self.update_gaussians(renderer, with_vertices=theta.requires_grad)
         self.update_network(psi, gradient.weights)

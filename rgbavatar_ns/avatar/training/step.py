@@ -34,6 +34,7 @@ from rgbavatar_ns.avatar.training.orthogonality import (
     orthogonalize,
 )
 from rgbavatar_ns.avatar.training.recorded_step import RecordedStep
+from rgbavatar_ns.drawing.compositing import ImagesRGBA
 from rgbavatar_ns.kernels import DeviceRenderer, MorphedRenderer, PinholeCameras
 
 Losses = dict[str, Float[Tensor, ""]]
@@ -189,16 +190,16 @@ class TrainingStep:
             assert batch.position is not None, "Refined tracking needs the frames' positions."
             theta = self.refinement.corrected(theta, batch.position).requires_grad_()
         self.avatar.widen_film_range(theta)
-        shown, view = self._with_view(replace(batch, theta=theta), step)
-        losses = self._losses(shown, shown.theta, step, view)
+        filmed = replace(batch, theta=theta)
+        shown, view = self._with_view(filmed, step)
+        losses = self._losses(shown, step, partial(self._images, filmed, step, view))
         if self.refinement is not None and theta.grad is not None:
             assert batch.position is not None
-            filmed = len(theta) if view is None else len(theta) - 1
+            count = len(theta) if view is None else len(theta) - 1
             # The batch's loss is a mean; each frame is to have the gradient of its own.
-            own = theta.grad[:filmed] * len(theta)
-            self.refinement.step(step, batch.position[:filmed], own)
-        theta = theta.detach()
-        self._finish(step, lambda: TrainingBatch(theta, batch.cameras, batch.images_rgba))
+            own = theta.grad[:count] * len(theta)
+            self.refinement.step(step, batch.position[:count], own)
+        self._finish(step, lambda: replace(filmed, theta=theta.detach()))
         return losses
 
     def _take_recorded(self, chosen: ChosenFrames, step: int) -> Losses:
@@ -222,6 +223,8 @@ class TrainingStep:
                 backend=self.options.backend,
                 recorder=self._recorder,
             )
+        if self._prior is not None and self._prior.due(step):
+            self._look(frames.batch(rows))
         taken, view = rows, views.due(step, len(rows)) if views is not None else None
         if views is not None and view is not None:
             assert self._shown is not None
@@ -258,26 +261,50 @@ class TrainingStep:
         )
         return shown, index
 
+    def _images(
+        self,
+        filmed: TrainingBatch,
+        step: int,
+        view: int | None,
+        renderer: MorphedRenderer | None = None,
+    ) -> ImagesRGBA:
+        """The step's images, a view's as the avatar is now; the prior looks at them when it is due.
+
+        `renderer`: what is about to be drawn.
+        """
+        images, views, backend = filmed.images_rgba, self._views(), self.options.backend
+        if self._prior is not None and self._prior.due(step):
+            self._look(filmed, renderer if view is None else None)
+        if views is None or view is None:
+            return images
+        if renderer is None:
+            last = views.frame(self.avatar, view, backend).images_rgba
+        else:
+            last = views.completed(self.avatar, view, renderer.draw_one(len(images) - 1))
+        last = last if images.dtype == torch.uint8 else last.to(images) / 255
+        return torch.cat([images[:-1], last.to(images.device)])
+
+    def _look(self, filmed: TrainingBatch, renderer: MorphedRenderer | None = None) -> None:
+        assert self._prior is not None
+        frames = filmed.theta.detach(), filmed.cameras, filmed.images_rgba
+        self._prior.look(self.avatar, *frames, renderer, self.options.backend)
+
     def _losses(
-        self, batch: TrainingBatch, theta: Float[Tensor, "B H"], step: int, view: int | None
+        self,
+        batch: TrainingBatch,
+        step: int,
+        images_with: Callable[[MorphedRenderer | None], ImagesRGBA],
     ) -> Losses:
-        """Step with the optimisers; `theta.grad` is left where theta requires it."""
-        views = self._views()
-        background = batch.background
+        """Step with the optimisers; theta's gradient is left where it requires one."""
+        theta, background = batch.theta, batch.background
         if background is None:
             background = random_backgrounds(step, len(theta), self.options.seed)
         background = background.to(theta.device, self.avatar.blendshapes.position.dtype)
         images, by_autograd = batch.images_rgba, self.options.lpips_counts(step)
         # Compiled loops read 8-bit images; others have more to say.
         if self._fused is not None and images.dtype == torch.uint8 and not by_autograd:
-            from_own = None
-            if views is not None and view is not None:
-                from_own = partial(views.completed, self.avatar, view)
-            return {"l1": self._fused(theta, batch.cameras, images, background, from_own)}
-        if views is not None and view is not None:
-            last = views.frame(self.avatar, view, self.options.backend).images_rgba
-            last = last if images.dtype == torch.uint8 else last.to(images) / 255
-            batch = replace(batch, images_rgba=torch.cat([images[:-1], last.to(images.device)]))
+            return {"l1": self._fused(theta, batch.cameras, images, background, images_with)}
+        batch = replace(batch, images_rgba=images_with(None))
         for optimizer in self.optimizers:
             optimizer.zero_grad(set_to_none=True)
         losses = self.eager_losses(batch, theta, background, step)
@@ -329,9 +356,7 @@ class TrainingStep:
         if (step + 1) % ORTHOGONALIZE_EVERY == 0 and method in ("qr", "gram_schmidt"):
             orthogonalize(self.avatar.blendshapes, method)
         if self._prior is not None and self._prior.due(step):
-            batch = shown()
-            frames = batch.theta, batch.cameras, batch.images_rgba
-            self._prior.after_step(self.avatar, *frames, step, self.options.backend)
+            self._prior.pull(self.avatar, step)
         if schedule is None or not schedule.due(step):
             return
         if not bool(self.avatar.color_initialized.all()):

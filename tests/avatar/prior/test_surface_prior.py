@@ -49,7 +49,8 @@ def test_what_no_frame_shows_comes_to_the_surface(filmed):
     nobody_filmed = torch.tensor(UNFILMED_RGBA, dtype=torch.uint8).expand_as(images).contiguous()
     for step in STEPS:
         assert prior.due(step)
-        prior.after_step(avatar, theta, front_camera(), nobody_filmed, step)
+        prior.look(avatar, theta, front_camera(), nobody_filmed)
+        prior.pull(avatar, step)
     assert not prior.seen_px.any()
     assert float((shapes.position - _on_the_surface(avatar, prior)).abs().max()) < 1e-6
     assert float(shapes.basis_position.abs().max()) < 1e-6
@@ -65,7 +66,8 @@ def test_what_a_frame_shows_well_stays(filmed):
     names = ("position", "color_feature", "log_scale", "opacity_logit", "basis_color_feature")
     before = {name: getattr(shapes, name).detach().clone() for name in names}
     gone = before["position"] - _on_the_surface(avatar, prior)
-    prior.after_step(avatar, theta, front_camera(), images, STEPS[0])
+    prior.look(avatar, theta, front_camera(), images)
+    prior.pull(avatar, STEPS[0])
     clear = prior.seen_px > 1
     assert 100 < int(clear.sum()) < avatar.num_gaussians
     moved = shapes.position - before["position"]
@@ -100,7 +102,7 @@ def test_its_memory_goes_on_from_its_state(filmed):
     avatar, theta, images = filmed
     prior, copy = (SurfacePrior(avatar) for _ in range(2))
     prior.begin(avatar, theta, front_camera(), images)
-    prior.after_step(avatar, theta, front_camera(), images, 79)
+    prior.look(avatar, theta, front_camera(), images)
     copy.load_state_dict(prior.state_dict())
     assert copy.has_begun
     for name, value in prior.state_dict().items():

@@ -190,6 +190,8 @@ static void average_tile(const Tile& tile, const float* image, int channels, Til
                          float* slots) {
   if (channels == 0)
     average_channels<0>(tile, image, channels, scratch, slots);
+  else if (channels == 1)
+    average_channels<1>(tile, image, channels, scratch, slots);
   else if (channels <= 4)
     average_channels<4>(tile, image, channels, scratch, slots);
   else
