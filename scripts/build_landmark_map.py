@@ -5,7 +5,7 @@
 writes `rgbavatar_ns/head/assets/facemesh_landmarks.npz`. Painted heads of several identities are
 rendered from several sides, with the mouth shut and a little open; each detected point is taken
 back to the nearest visible place on the skin (irises: on the eyeball); the places' median over all
-renders, made symmetric, is the point's place. Needs mediapipe 0.10.9.
+renders, made symmetric, is the point's place. Needs mediapipe.
 """
 
 import argparse

@@ -9,7 +9,7 @@ is seen is explained, in the skull's frame, by `LandmarkResponse`'s terms: a rob
 whose priors say how many millimetres a term may be expected to do. What the response leaves of a
 performance by a person on whom it was not measured is the points' noise: its principal components
 are stored too. Seeds begin at 100: the benchmarks' people are others. Takes about an hour, two
-gigabytes of memory and mediapipe 0.10.9. (Left out, 30 people leave .81 px an axis, 120 .68, 230
+gigabytes of memory and mediapipe. (Left out, 30 people leave .81 px an axis, 120 .68, 230
 .68, 300 .67 of 1.54: more people would not help.)
 """
 

@@ -22,7 +22,7 @@ PYTHON = VENV / "bin" / "python"
 STAMP = VENV / "rgbavatar-setup.json"
 TORCH = "2.13.0"
 PYTORCH_CPU_INDEX = "https://download.pytorch.org/whl/cpu"
-MEDIAPIPE = "mediapipe==0.10.9"
+MEDIAPIPE = "mediapipe==0.10.21"
 FIRST_IMPORTS = (
     "nerfstudio.scripts.train, nerfstudio.scripts.eval, nerfstudio.scripts.viewer.run_viewer",
     "torchmetrics.image, matplotlib.pyplot, scipy.optimize, av, rgbavatar_ns.cli.main",
@@ -158,13 +158,14 @@ def install_torchvision() -> None:
 
 def install_tracker() -> None:
     """Install mediapipe for `rgbavatar track`, without its own OpenCV; it may be absent."""
-    if run(PYTHON, "-c", "import mediapipe", quiet=True):
+    installed = f"import mediapipe as m; assert 'mediapipe==' + m.__version__ == '{MEDIAPIPE}'"
+    if run(PYTHON, "-c", installed, quiet=True):
         return
     say(f"installing {MEDIAPIPE} for the tracker")
     if not pip("install", "--no-deps", MEDIAPIPE, quiet=True):
         say(
-            f"{MEDIAPIPE} has no build for this Python: `rgbavatar track` will not work here "
-            "(Python 3.10 and 3.11 have one); everything else does."
+            f"{MEDIAPIPE} cannot be installed here: `rgbavatar track` will not work (x86-64 Linux, "
+            "macOS and Windows with Python 3.10 to 3.12 have builds); everything else does."
         )
 
 

@@ -10,7 +10,6 @@ from jaxtyping import Float, UInt8
 
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.tracking.face.follow import FaceFollower
-from rgbavatar_ns.tracking.face.landmark_bytes import decoded, hand_over_bytes
 from rgbavatar_ns.tracking.input.image_files import fitted_size
 
 FOREHEAD, CHIN = 10, 152
@@ -38,7 +37,7 @@ def load_mediapipe() -> ModuleType:
         raise UserError(
             f"Tracking needs mediapipe, which cannot be imported ({error}).",
             "Install it without its second OpenCV: "
-            "pip install --no-deps mediapipe==0.10.9 absl-py attrs flatbuffers",
+            "pip install --no-deps mediapipe==0.10.21 protobuf==4.25.9 absl-py attrs flatbuffers",
         ) from error
 
 
@@ -53,7 +52,6 @@ class FaceLandmarker:
         self._mesh = face_mesh.FaceMesh(
             static_image_mode=False, max_num_faces=_MOST_FACES, refine_landmarks=True
         )
-        hand_over_bytes(self._mesh)
         self._follower = FaceFollower()
 
     def close(self) -> None:
@@ -74,7 +72,8 @@ class FaceLandmarker:
         if small != (width, height):
             image_rgb = cv2.resize(image_rgb, small, interpolation=cv2.INTER_AREA)
         found = self._mesh.process(np.ascontiguousarray(image_rgb)).multi_face_landmarks or []
-        return np.array([decoded(face) for face in found]).reshape(-1, 478, 2)
+        faces = [[(point.x, point.y) for point in face.landmark] for face in found]
+        return np.array(faces).reshape(-1, 478, 2)
 
 
 def face_height_px(landmarks_px: Float[np.ndarray, "*batch 478 2"]) -> Float[np.ndarray, "*batch"]:
