@@ -158,6 +158,8 @@ class VirtualViews(nn.Module):
         from rgbavatar_ns.avatar.prior.closing import closed
 
         mask = self._mask(avatar, view)
+        if not mask.inner.any():
+            return mask.image_rgba
         rows, columns = mask.box
         parts = own.image[0, rows, columns], own.alpha[0, rows, columns]
         picture = closed(torch.cat(parts, -1).cpu().numpy(), own.image.shape[2])
@@ -234,4 +236,4 @@ class _Mask:
 
 def _reach(places: Int[np.ndarray, "P"]) -> slice:
     """From the first of sorted places to the last."""
-    return slice(int(places[0]), int(places[-1]) + 1) if len(places) else slice(0)
+    return slice(int(places[0]), int(places[-1]) + 1) if len(places) else slice(0, 0)

@@ -108,6 +108,14 @@ def test_what_the_film_shows_to_be_empty_is_not_closed():
     assert int(neck.min()) > SIZE // 2
 
 
+def test_a_view_in_which_nobody_is_for_certain_asks_for_no_colours():
+    avatar = embedded_avatar()
+    nowhere = torch.ones(len(avatar.head.arrays.v_template))
+    image = views_of(avatar, turned(avatar, [0.0]), empty=nowhere).frame(avatar, 0).images_rgba
+    assert is_unfilmed(image).any()
+    assert not image[~is_unfilmed(image)].any()
+
+
 def test_views_turn_about_the_head_as_far_as_they_say():
     avatar = embedded_avatar()
     theta = turned(avatar, [0.0])
