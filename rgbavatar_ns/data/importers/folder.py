@@ -112,6 +112,13 @@ def numbers(value: Any, count: int, what: str) -> Float[np.ndarray, "_"]:
     return finite(array.reshape(count), what)
 
 
+def number(value: Any, what: str) -> float:
+    """One finite number by itself, as text files have it; raises UnusableFrameError."""
+    if isinstance(value, list | tuple | np.ndarray):
+        raise UnusableFrameError(f"{what} that is no single number")
+    return float(numbers(value, 1, what)[0])
+
+
 def matrix(value: Any, rows: int, columns: int, what: str) -> Float[np.ndarray, "R C"]:
     """A matrix of finite numbers, one batch axis of 1 allowed; raises UnusableFrameError."""
     array = as_array(value, what)

@@ -9,7 +9,14 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from rgbavatar_ns.data.importers.folder import IMAGE_SUFFIXES, Folder, matrix, numbers, read_json
+from rgbavatar_ns.data.importers.folder import (
+    IMAGE_SUFFIXES,
+    Folder,
+    matrix,
+    number,
+    numbers,
+    read_json,
+)
 from rgbavatar_ns.data.importers.frame_record import CameraRecord
 from rgbavatar_ns.data.importers.import_report import UnusableFrameError
 from rgbavatar_ns.data.importers.source import Reading
@@ -128,7 +135,7 @@ def camera_of(values: Mapping[str, Any], opengl: bool) -> CameraRecord:
         camera_to_world = camera_to_world @ _OPENGL_TO_OPENCV
     width, height = size_of(values)
     focal = [_focal(values, "x", (width, height)), _focal(values, "y", (width, height))]
-    centre = [numbers(values.get(name), 1, name)[0] for name in ("cx", "cy")]
+    centre = [number(values.get(name), name) for name in ("cx", "cy")]
     return CameraRecord(inverse(camera_to_world), np.array(focal), np.array(centre))
 
 
@@ -151,9 +158,9 @@ def size_of(values: Mapping[str, Any]) -> tuple[int, int]:
 def _focal(values: Mapping[str, Any], axis: str, size: tuple[int, int]) -> float:
     """In pixels: as it is written, else from the angle of view."""
     if f"fl_{axis}" in values:
-        return float(numbers(values[f"fl_{axis}"], 1, f"fl_{axis}")[0])
+        return number(values[f"fl_{axis}"], f"fl_{axis}")
     if f"camera_angle_{axis}" in values:
-        angle = float(numbers(values[f"camera_angle_{axis}"], 1, f"camera_angle_{axis}")[0])
+        angle = number(values[f"camera_angle_{axis}"], f"camera_angle_{axis}")
         if 0 < angle < math.pi:
             return 0.5 * size[axis == "y"] / math.tan(0.5 * angle)
     if axis == "y":

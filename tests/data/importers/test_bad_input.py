@@ -148,6 +148,19 @@ def test_a_damaged_folder_is_refused_or_read_the_same(
         shutil.rmtree(place)
 
 
+@pytest.mark.parametrize("key", ["fl_x", "fl_y", "cx", "cy"])
+def test_a_list_in_place_of_a_cameras_number_is_refused(key, folders, flame_folder, tmp_path):
+    folder = shutil.copytree(folders["insta-meshes"], tmp_path / "insta")
+    for path in folder.glob("*.json"):
+        content = json.loads(path.read_text())
+        for values in (content, *content["frames"]):
+            if key in values:
+                values[key] = [[values[key]]]
+        path.write_text(json.dumps(content))
+    with pytest.raises(UserError, match=f"{key} that is no single number"):
+        read(folder, flame_folder)
+
+
 @pytest.mark.parametrize("name", ["metrical", "vhap", "imavatar", "flashavatar"])
 def test_with_consent_the_other_frames_are_read_and_the_loss_is_told(
     name, folders, flame_folder, tmp_path
