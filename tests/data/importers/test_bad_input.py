@@ -29,7 +29,8 @@ from tests.data.importers.takes import FIRST, HEIGHT, NUM_FRAMES, WIDTH
 from tests.data.importers.test_round_trips import FORMATS, write
 from tests.fuzz.attacks import turned
 
-BAD_VALUES = (float("nan"), float("inf"), None, "text", [], {}, [[1.0]], True, 10**400, -1e300)
+MATRIX = [[1.0, 2.0], [3.0, 4.0]]  # a list of one number may be all that is known of a shape
+BAD_VALUES = (float("nan"), float("inf"), None, "text", [], {}, MATRIX, True, 10**400, -1e300)
 ODD_NAMES = ("日本語 ", "ü ñ", "two words", "%s{}")
 
 
