@@ -8,6 +8,7 @@ import pytest
 from rgbavatar_ns.drawing.compositing import unfilmed_pixels
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.tracking import TrackConfig, track_video
+from rgbavatar_ns.tracking.face.detector import load_mediapipe
 
 from .clips import REAL_CLIPS, astronaut, gradient_images, write_clip
 
@@ -88,6 +89,16 @@ def test_missing_mediapipe_is_told_with_the_command_that_installs_it(
     clip = write_clip(tmp_path / "grey.mp4", gradient_images(2, 96, 96))
     with pytest.raises(UserError, match=r"--no-deps mediapipe==0\.10\.21 protobuf==4\.25"):
         track_video(clip, tmp_path / "set")
+
+
+def test_a_protobuf_that_mediapipe_fails_beside_is_told_with_the_remedy(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    import google.protobuf
+
+    monkeypatch.setattr(google.protobuf, "__version__", "3.20.3")
+    with pytest.raises(UserError, match=r"beside protobuf 3\.20\.3.*protobuf==4\.25"):
+        load_mediapipe()
 
 
 @pytest.mark.parametrize("keep_torso", [False, True], ids=["head", "torso"])

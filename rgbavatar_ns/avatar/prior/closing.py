@@ -5,7 +5,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 _WIDTH = 256
-"""Pixels that a picture is wide at least when it is smoothed: blurs leave no more than these."""
+"""Pictures twice as wide or more are smoothed at about this width: blurs leave no more detail."""
 _LIGHT_PX, _HUE_PX = 1.0, 3.0
 """Standard deviations of the blurs in a picture so wide: eyes see noise of hue first, and skin and
 hair have less of it than of light."""

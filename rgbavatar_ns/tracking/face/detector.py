@@ -31,14 +31,20 @@ _MOST_FACES = 3
 def load_mediapipe() -> ModuleType:
     """mediapipe, imported on first use; UserError with the remedy where it is absent."""
     os.environ.setdefault("GLOG_minloglevel", "2")
+    remedy = (
+        "Install it without its second OpenCV: "
+        "pip install --no-deps mediapipe==0.10.21 protobuf==4.25.9 absl-py attrs flatbuffers"
+    )
     try:
-        return importlib.import_module("mediapipe")
+        mediapipe = importlib.import_module("mediapipe")
+        protobuf = importlib.import_module("google.protobuf").__version__
     except ImportError as error:
         raise UserError(
-            f"Tracking needs mediapipe, which cannot be imported ({error}).",
-            "Install it without its second OpenCV: "
-            "pip install --no-deps mediapipe==0.10.21 protobuf==4.25.9 absl-py attrs flatbuffers",
+            f"Tracking needs mediapipe, which cannot be imported ({error}).", remedy
         ) from error
+    if int(protobuf.split(".")[0]) < 4:
+        raise UserError(f"mediapipe's graphs fail beside protobuf {protobuf}.", remedy)
+    return mediapipe
 
 
 class FaceLandmarker:
