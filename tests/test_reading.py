@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rgbavatar_ns.head.arrays import EMBEDDED_HEAD
+from rgbavatar_ns.head.arrays import embedded_file
 from rgbavatar_ns.reading import (
     DamagedFileError,
     MissingFileError,
@@ -67,8 +67,8 @@ def test_only_finite_numbers_of_the_shape_count_as_numbers(value):
 
 
 def test_the_embedded_head_is_read_as_numpy_reads_it():
-    ours = load_arrays(EMBEDDED_HEAD)
-    with np.load(EMBEDDED_HEAD) as theirs:
+    ours = load_arrays(embedded_file())
+    with np.load(embedded_file()) as theirs:
         assert set(ours) == set(theirs.files)
         for name, array in ours.items():
             np.testing.assert_array_equal(array, theirs[name])

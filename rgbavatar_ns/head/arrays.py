@@ -15,12 +15,28 @@ from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.files import atomic_write, digest
 from rgbavatar_ns.reading import DamagedFileError, load_arrays
 
-EMBEDDED_HEAD = Path(__file__).parent / "assets" / "makehuman_head.npz"
+NECK_SHIFTS = ("neckLeft", "neckUp", "neckForward")
+"""Expressions of a bust that carry the head along the torso's x, y and z, in centimetres, as the
+neck does without a turn of its one joint."""
+EMBEDDED_HEAD, EMBEDDED_BUST = "makehuman", "makehuman_bust"
+"""Names of the CC0 heads that ship with the package: one ends at the neck, the other one has
+shoulders and chest too. Their first vertices, triangles and expressions are the same."""
+_EMBEDDED = {EMBEDDED_HEAD: "makehuman_head.npz", EMBEDDED_BUST: "makehuman_bust.npz"}
 _GROUP = "group_"
 _MAY_BE_HALF = ("shapedirs", "posedirs", "eyelid_dirs")
 _WHOLE_NUMBERS = ("parents", "faces", "uv_faces")
 _MOST_ROWS, _MOST_DIRECTIONS, _LONGEST_NAME = 1 << 20, 4096, 200
 _FARTHEST_M = 100.0
+
+
+def embedded_file(name: str = EMBEDDED_HEAD) -> Path:
+    """Where an embedded head lies; UserError for a name that none has."""
+    if name not in _EMBEDDED:
+        raise UserError(
+            f"No head model of the name '{name[:_LONGEST_NAME]}' ships with this package.",
+            f"It has {' and '.join(_EMBEDDED)}.",
+        )
+    return Path(__file__).parent / "assets" / _EMBEDDED[name]
 
 
 @dataclass(frozen=True)
@@ -53,7 +69,7 @@ class HeadArrays:
     eyelid_dirs: Float[np.ndarray, "V 3 2"] | None = None
     """Offsets that close the left and the right eyelid, where the model has them."""
     vertex_groups: dict[str, Int[np.ndarray, "_"]] = field(default_factory=dict)
-    """Vertices of skin, left_eye, right_eye, upper_teeth, lower_teeth, tongue, if known."""
+    """Vertices of skin, left_eye, right_eye, upper_teeth, lower_teeth, tongue, torso, if known."""
 
     def __post_init__(self) -> None:
         # Sums round by the order in memory: a head is the same before and after it was stored.
@@ -122,11 +138,20 @@ class HeadArrays:
         """How many expression directions follow the identity directions."""
         return len(self.expression_names)
 
+    @property
+    def has_torso(self) -> bool:
+        """Whether the mesh goes on below the neck, where the root joint carries it."""
+        return "torso" in self.vertex_groups
+
     @classmethod
-    @cache
-    def embedded(cls) -> "HeadArrays":
-        """The CC0 MakeHuman head that ships with the package (assets/LICENSE)."""
-        return cls.load(EMBEDDED_HEAD)
+    def embedded(cls, name: str = EMBEDDED_HEAD) -> "HeadArrays":
+        """MakeHuman's head (assets/LICENSE), or its bust; UserError for another name."""
+        return _load_embedded(name)
+
+    @classmethod
+    def embedded_as(cls, name: str) -> "HeadArrays | None":
+        """The embedded head of this name, or None where there is none."""
+        return cls.embedded(name) if name in _EMBEDDED else None
 
     def save(self, path: Path) -> None:
         """Write one npz without pickles; offsets go as float16 where that loses nothing."""
@@ -205,3 +230,8 @@ class HeadArrays:
             if name.startswith(_GROUP)
         }
         return cls(**values, vertex_groups=groups)
+
+
+@cache
+def _load_embedded(name: str) -> HeadArrays:
+    return HeadArrays.load(embedded_file(name))

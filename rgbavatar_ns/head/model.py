@@ -8,7 +8,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from rgbavatar_ns.errors import UserError
-from rgbavatar_ns.head.arrays import HeadArrays
+from rgbavatar_ns.head.arrays import EMBEDDED_HEAD, HeadArrays
 from rgbavatar_ns.head.layout import ThetaField, ThetaLayout
 from rgbavatar_ns.head.rotations import axis_angle_to_matrix
 
@@ -61,9 +61,9 @@ class HeadModel(nn.Module):
         self._remembered: _Person | None = None
 
     @classmethod
-    def embedded(cls, dtype: torch.dtype = torch.float32) -> "HeadModel":
-        """The CC0 MakeHuman head that ships with the package."""
-        return cls(HeadArrays.embedded(), dtype)
+    def embedded(cls, dtype: torch.dtype = torch.float32, name: str = EMBEDDED_HEAD) -> "HeadModel":
+        """The CC0 MakeHuman head that ships with the package, or the bust (`EMBEDDED_BUST`)."""
+        return cls(HeadArrays.embedded(name), dtype)
 
     @property
     def num_identity(self) -> int:

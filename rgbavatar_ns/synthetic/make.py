@@ -14,7 +14,8 @@ from torch import Tensor
 from rgbavatar_ns.data.native.dataset import TrackedDataset
 from rgbavatar_ns.data.native.frame import TrackedFrame
 from rgbavatar_ns.data.native.writer import DatasetWriter, make_room
-from rgbavatar_ns.head import HeadModel
+from rgbavatar_ns.head import EMBEDDED_BUST, EMBEDDED_HEAD, HeadModel
+from rgbavatar_ns.head.arrays import NECK_SHIFTS
 from rgbavatar_ns.head.rotations import axis_angle_to_matrix, matrix_to_axis_angle
 from rgbavatar_ns.kernels.types import PinholeCameras
 from rgbavatar_ns.synthetic.config import DemoConfig
@@ -32,9 +33,9 @@ Progress = Callable[[int, int], None]
 WIDE_OPEN_RAD = 0.33
 _THREADS = 2
 _CHUNK = 16
-_CAMERA_HEIGHT_M = 0.007
 _CAMERA_DISTANCE_M = 1.1
-_HALF_VIEW_M = 0.153
+# How high the picture's middle lies and half of what it shows: the head, or shoulders too.
+_HEAD_VIEW_M, _BUST_VIEW_M = (0.007, 0.153), (-0.08, 0.26)
 
 
 def as_pinhole(camera: StillCamera) -> PinholeCameras:
@@ -59,7 +60,10 @@ class DemoPerson:
     @classmethod
     def of(cls, config: DemoConfig) -> "DemoPerson":
         """Model, paint and light the person; a few seconds."""
-        head = HeadModel.embedded()
+        name, view_m = EMBEDDED_HEAD, _HEAD_VIEW_M
+        if config.body != "none":
+            name, view_m = EMBEDDED_BUST, _BUST_VIEW_M
+        head = HeadModel.embedded(name=name)
         # Looks of their own, but no caricature.
         drawn = np.random.default_rng([config.seed, 0]).standard_normal(head.num_identity)
         identity = torch.from_numpy(np.clip(0.6 * drawn, -1.2, 1.2)).float()
@@ -75,8 +79,8 @@ class DemoPerson:
             bridge = np.abs(at_rest[:, 0]) < 0.012
             bridge &= np.abs(at_rest[:, 1] - eyes[:, 1].mean()) < 0.008
             glasses = make_glasses(eyes[0], eyes[1], float(at_rest[bridge, 2].max()))
-        focal_px = 0.5 * config.image_size * _CAMERA_DISTANCE_M / _HALF_VIEW_M
-        camera = StillCamera(_CAMERA_HEIGHT_M, _CAMERA_DISTANCE_M, focal_px, config.image_size)
+        focal_px = 0.5 * config.image_size * _CAMERA_DISTANCE_M / view_m[1]
+        camera = StillCamera(view_m[0], _CAMERA_DISTANCE_M, focal_px, config.image_size)
         renderer = DemoRenderer(
             surface,
             paint,
@@ -120,8 +124,24 @@ class DemoPerson:
         root, neck = self.head.joints(self.identity)[:2]
         body = axis_angle_to_matrix(parts["rotation"])
         turn = axis_angle_to_matrix(parts["neck"])
-        shift = body @ (neck - turn @ neck - root) + root + parts["translation"]
+        carried, neck_carried = self._carried(parts["expression"])
+        neck = neck + neck_carried
+        shift = body @ (neck - turn @ (neck - carried) - root) + root + parts["translation"]
         return (body @ turn).numpy(), shift.numpy()
+
+    def _carried(
+        self, expression: Float[Tensor, "E"]
+    ) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
+        """How a bust's neck shifts carry the skull, and the neck's joint; 0 for a head alone."""
+        arrays = self.head.arrays
+        if not arrays.has_torso:
+            return torch.zeros(3), torch.zeros(3)
+        columns = [arrays.expression_names.index(name) for name in NECK_SHIFTS]
+        offsets = arrays.shapedirs[..., [arrays.num_identity + column for column in columns]]
+        skull = arrays.vertex_groups["upper_teeth"][0]
+        moved = np.stack([offsets[skull], np.tensordot(arrays.joint_regressor[1], offsets, 1)])
+        carried, neck = torch.from_numpy(moved).float() @ expression[columns]
+        return carried, neck
 
     def with_stiff_neck(self, theta: Float[Tensor, "F H"]) -> Float[Tensor, "F H"]:
         """Theta that moves the skull likewise, and everything else with it."""
@@ -178,6 +198,7 @@ def film_demo(config: DemoConfig, stiff_neck: bool = False) -> DemoFilm:
         config.num_test_frames,
         config.frames_per_second,
         config.seed,
+        config.body,
     )
     tracked = with_tracker_noise(acted, layout, config.theta_noise, config.seed)
     found, true = (torch.from_numpy(theta).float() for theta in (tracked, acted))

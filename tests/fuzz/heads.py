@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from rgbavatar_ns.head import HeadArrays, HeadModel
-from rgbavatar_ns.head.arrays import EMBEDDED_HEAD
+from rgbavatar_ns.head.arrays import embedded_file
 from rgbavatar_ns.head.flame import _read_eyelid
 from rgbavatar_ns.head.flame_uv import read_uv_map
 from rgbavatar_ns.reading import load_arrays
@@ -134,7 +134,7 @@ def _eyelid(folder: Path, generator) -> None:
     if kind == 0:
         harm(path, generator)
     elif kind == 1:
-        path.write_bytes(EMBEDDED_HEAD.read_bytes()[:10_000])
+        path.write_bytes(embedded_file().read_bytes()[:10_000])
     elif kind == 2:
         shape = b"{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000000,)}\n"
         path.write_bytes(b"\x93NUMPY\1\0" + len(shape).to_bytes(2, "little") + shape)

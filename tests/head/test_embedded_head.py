@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from rgbavatar_ns.head import SPARSE_51, HeadModel, facemesh_landmarks
-from rgbavatar_ns.head.arrays import EMBEDDED_HEAD
+from rgbavatar_ns.head.arrays import embedded_file
 
 MM = 1e-3
 
@@ -36,8 +36,8 @@ def test_is_complete_and_small(head: HeadModel) -> None:
     assert set(arrays.vertex_groups) == parts
     counts = sum(len(group) for group in arrays.vertex_groups.values())
     assert counts == len(arrays.v_template) == len(np.unique(arrays.faces))
-    assert EMBEDDED_HEAD.stat().st_size < 1_000_000
-    assert "CC0" in (EMBEDDED_HEAD.parent / "LICENSE").read_text()
+    assert embedded_file().stat().st_size < 1_000_000
+    assert "CC0" in (embedded_file().parent / "LICENSE").read_text()
 
 
 def test_is_an_adult_head_in_metres_with_the_subjects_left_at_positive_x(head: HeadModel) -> None:

@@ -76,8 +76,8 @@ def _candidates(described: dict[str, Any]) -> Iterator[HeadArrays]:
     file = os.environ.get(HEAD_VARIABLE)
     if file:
         yield HeadArrays.load(Path(file))
-    embedded = HeadArrays.embedded()
-    if name == embedded.name:
+    embedded = HeadArrays.embedded_as(name)
+    if embedded is not None:
         yield embedded
     versions = [version for version in VERSIONS if name.startswith(f"FLAME {version}")]
     if versions and os.environ.get(FLAME_VARIABLE):

@@ -169,12 +169,11 @@ def _read_head(root: Path, name: str) -> HeadArrays:
     path = root / HEAD_FILE
     if os.path.lexists(path):
         return HeadArrays.load(path)
-    embedded = HeadArrays.embedded()
-    if name != embedded.name:
+    embedded = HeadArrays.embedded_as(name)
+    if embedded is None:
         raise UserError(
             f"The dataset {root} was made for the head '{name[:_SHOWN]}', which is not known here.",
-            f"Put its arrays beside it as {HEAD_FILE}, or track the video with the embedded head "
-            f"'{embedded.name}'.",
+            f"Put its arrays beside it as {HEAD_FILE}, or track the video with the embedded head.",
         )
     return embedded
 

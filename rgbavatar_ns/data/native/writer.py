@@ -67,7 +67,7 @@ class DatasetWriter:
     What an interrupted writer left in a folder is replaced by the next.
 
     Args:
-        arrays: the head model, or the embedded one's name ("makehuman").
+        arrays: the head model, or an embedded one's name (`EMBEDDED_HEAD`, `EMBEDDED_BUST`).
         overwrite: replace a dataset that is there; else a folder with anything in it is refused,
             as one of other things always is.
         keep_images: go on with an unfinished dataset: images that are there stay, for
@@ -196,7 +196,8 @@ class DatasetWriter:
             )
         head = self._arrays
         if not isinstance(head, str):
-            if head.digest() != HeadArrays.embedded().digest():
+            embedded = HeadArrays.embedded_as(head.name)
+            if embedded is None or head.digest() != embedded.digest():
                 head.save(self._root / HEAD_FILE)
             head = head.name
         index: dict[str, Any] = {

@@ -68,7 +68,7 @@ def subject_message(subject: StreamSubject) -> bytes:
         "layout": subject.layout.to_json(),
         **{name: getattr(subject, name) for name in ("width", "height", "session")},
     }
-    if subject.arrays is HeadArrays.embedded():
+    if subject.arrays is HeadArrays.embedded_as(subject.arrays.name):
         return encode(header)
     fields, payload = pack_head(subject.arrays)
     return encode(header | fields, payload)
@@ -152,12 +152,13 @@ def _numbers(values: Any) -> Float[Tensor, "_"]:
 
 def _head(header: Header, payload: bytes, identity: Float[Tensor, "I"]) -> HeadArrays:
     """The embedded head, or the one that is sent."""
-    name, embedded = str(header["head"])[:_LONGEST_NAME], HeadArrays.embedded()
+    name = str(header["head"])[:_LONGEST_NAME]
+    embedded = HeadArrays.embedded_as(name)
     if payload:
         return unpack_head(payload, {field: header[field] for field in HEAD_FIELDS}, name, identity)
-    if name != embedded.name:
+    if embedded is None:
         raise DamagedFileError(
             f"the head '{name}' is not known here: send its arrays with the subject, or use the "
-            f"embedded head '{embedded.name}'"
+            "embedded head"
         )
     return embedded

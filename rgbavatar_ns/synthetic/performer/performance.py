@@ -2,12 +2,16 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
 
 from rgbavatar_ns.head import ThetaLayout
+from rgbavatar_ns.head.arrays import NECK_SHIFTS
 
+Body = Literal["none", "sway", "still", "lean"]
+"""What the torso does; without one the head sways as if there were."""
 Shapes = Mapping[str, float]
 """Expression coefficients by name; "Left" and "Right" are added to a name that ends in "*", and
 "jaw" is the jaw's opening in radians."""
@@ -47,6 +51,7 @@ def perform(
     num_test_frames: int,
     frames_per_second: float,
     seed: int,
+    body: Body = "none",
 ) -> Float[np.ndarray, "F H"]:
     """Script a performance whose held-out end combines what training showed apart.
 
@@ -58,7 +63,8 @@ def perform(
     seconds = np.arange(num_frames) / frames_per_second
     train_end = (num_frames - num_test_frames) / frames_per_second
     early_end = train_end / 3
-    expression = _Expression(expression_names, seconds)
+    names = list(expression_names)
+    expression = _Expression(names, seconds)
     talk = _talking(rng, seconds)
     common = [name for name in MOUTH_MOODS if name not in EARLY_ONLY]
     # Every mood is to come back however short the end is.
@@ -80,7 +86,13 @@ def perform(
     gaze = _gaze(rng, seconds)
     _lids(rng, seconds, gaze, expression)
     head = _head_turns(rng, seconds, early_end, train_end)
-    return _join(layout, expression, gaze, head)
+    if body in ("still", "lean"):
+        head |= _torso_motion(seconds, seed, body)
+    theta = _join(layout, expression, gaze, head)
+    if body != "none":
+        columns = [layout.slice("expression").start + names.index(name) for name in NECK_SHIFTS]
+        theta[:, columns] = _neck_shifts_cm(seconds, seed)
+    return theta
 
 
 def with_tracker_noise(
@@ -222,6 +234,22 @@ def _head_turns(
         "rotation": np.stack(sway, 1) * [0.6, 1.0, 0.5],
         "translation": np.stack(drift, 1),
     }
+
+
+def _torso_motion(seconds: np.ndarray, seed: int, body: Body) -> dict[str, np.ndarray]:
+    """Rotation and translation of a torso that keeps still, or leans to all sides."""
+    if body == "still":
+        return {name: np.zeros((len(seconds), 3)) for name in ("rotation", "translation")}
+    rng = np.random.default_rng([seed, 3])
+    lean = [_waves(rng, seconds, (3.7, 5.3)) * np.radians(degrees) for degrees in (9.0, 7.0, 8.0)]
+    drift = [_waves(rng, seconds, (4.1, 6.1)) * size for size in (0.025, 0.01, 0.03)]
+    return {"rotation": np.stack(lean, 1), "translation": np.stack(drift, 1)}
+
+
+def _neck_shifts_cm(seconds: np.ndarray, seed: int) -> np.ndarray:
+    """How the neck carries the head beside its turns [F, 3]: no neck has one joint."""
+    rng = np.random.default_rng([seed, 4])
+    return np.stack([size * _waves(rng, seconds, (2.9, 4.3)) for size in (0.4, 0.2, 0.6)], 1)
 
 
 def _join(
