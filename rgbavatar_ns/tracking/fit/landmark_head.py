@@ -211,6 +211,10 @@ class LandmarkHead:
         """World rotation of the skull: global rotation, then neck."""
         return self._chain(theta, np.zeros(self._joint_dirs.shape[-1])).turned[SKULL]
 
+    def chain(self, theta: _Theta, identity: _Identity) -> PoseChain:
+        """The joints of a pose."""
+        return self._chain(theta, self._coefficients(theta, identity))
+
     def jacobian(
         self, theta: _Theta, identity: _Identity, unknowns: Unknowns, eye_m: _Point | None = None
     ) -> tuple[Float[np.ndarray, "L 3"], Float[np.ndarray, "3 L Q"]]:

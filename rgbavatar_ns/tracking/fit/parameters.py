@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from rgbavatar_ns.head import ThetaLayout
+from rgbavatar_ns.head.arrays import NECK_SHIFTS
 
 # Jaw opening to 26 degrees; gaze to 30 degrees; the head to a little beyond profile.
 _JAW_OPEN = (-0.02, 0.45)
@@ -92,7 +93,7 @@ def fit_parameters(
     first = layout.slice("expression").start
     numbered = all(_NUMBERED.fullmatch(name) for name in expression_names)
     for number, (name, size_m) in enumerate(zip(expression_names, expression_size_m.tolist())):
-        if size_m < 2e-4 or name.startswith("eyeLook"):
+        if size_m < 2e-4 or name.startswith("eyeLook") or name in NECK_SHIFTS:
             continue
         if not numbered:
             quick = name.startswith("eyeBlink")

@@ -1,0 +1,1 @@
+"""The body under the head: where it is, and how the neck carries the head upon it."""

@@ -1,0 +1,169 @@
+"""Where the body is in every frame, out of how it moves, where the head is, and the shoulders."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from scipy.ndimage import gaussian_filter1d
+from scipy.spatial.transform import Rotation
+
+from rgbavatar_ns.tracking.fit.camera import StillCamera
+from rgbavatar_ns.tracking.torso.body_mesh import BodyMesh
+from rgbavatar_ns.tracking.torso.follow import BodySighting
+from rgbavatar_ns.tracking.torso.rigid_motion import RigidMotion
+from rgbavatar_ns.tracking.torso.solve import run_motions
+
+# Motion below this, of the neck's joint and the shoulders', is what a body that keeps still shows:
+# breath, and the noise of the points.
+_STILL_M = 0.004
+_SMOOTH_FRAMES = 1.5
+# One camera hardly tells how a body is turned: people sit before it, and only what is plainly
+# otherwise counts. The detector's own error is some 6 degrees sideways and 2 in the tilt.
+_DOUBTED_YAW_RAD, _DOUBTED_ROLL_RAD = 0.2, 0.035
+_LEAST_FRAMES = 10
+_ROUNDS = 5
+
+
+@dataclass(frozen=True)
+class SeenShoulders:
+    """Shoulders in one frame: where, left first, in pixels of the source, and the chest's turn."""
+
+    position: int
+    shoulders_px: Float[np.ndarray, "2 2"]
+    yaw_rad: float
+
+
+@dataclass(frozen=True)
+class BodyPlaces:
+    """The body's pose in each of F frames: what rests at the neck's joint is at `neck_m`."""
+
+    rotation: Float[np.ndarray, "F 3 3"]
+    neck_m: Float[np.ndarray, "F 3"]
+    still: bool
+    """Whether it keeps still all the time."""
+    followed: float
+    """Share of the frames in which the clothes showed its motion."""
+
+
+def place_body(
+    body: BodyMesh,
+    camera: StillCamera,
+    sightings: Sequence[BodySighting],
+    head_neck_m: Float[np.ndarray, "F 3"],
+    shoulders: Sequence[SeenShoulders],
+) -> BodyPlaces:
+    """The body's place in every frame; `head_neck_m` is where the heads say the neck's joint is.
+
+    The clothes' pattern says how the body moves, never the head's turn. What they do not say is
+    where it stood: upright and turned to the camera on the whole, unless the shoulders say plainly
+    otherwise, and under the head on the whole.
+    """
+    frames = len(sightings)
+    runs = np.array([one.run for one in sightings])
+    rotation, neck_m = np.tile(np.eye(3), (frames, 1, 1)), head_neck_m.copy()
+    still, followed = True, 0
+    for run in np.unique(runs):
+        own = np.flatnonzero(runs == run)
+        near = [one for one in shoulders if own[0] <= one.position <= own[-1]]
+        seen = [sightings[k] for k in own]
+        motions, start, count = _Run(
+            body, camera, seen, head_neck_m[own], near, int(own[0])
+        ).solved()
+        still &= all(motion is motions[0] for motion in motions)
+        followed += count
+        for motion, k in zip(motions, own):
+            here = motion.after(start)
+            rotation[k], neck_m[k] = here.rotation, here(body.neck_m)
+    return BodyPlaces(rotation, neck_m, still, followed / max(frames, 1))
+
+
+@dataclass(frozen=True)
+class _Run:
+    """Frames through which the body is followed; `first` is the position of the first one."""
+
+    body: BodyMesh
+    camera: StillCamera
+    sightings: Sequence[BodySighting]
+    neck_m: Float[np.ndarray, "F 3"]
+    shoulders: Sequence[SeenShoulders]
+    first: int
+
+    def solved(self) -> tuple[list[RigidMotion], RigidMotion, int]:
+        """Motions since the first frame, where the body is in that, and in how many it was found.
+
+        How far a turn moves points follows from how deep they lie, and that from how the body
+        stands in the first frame, which is known when its motion is: so it goes round.
+        """
+        start = RigidMotion(np.eye(3), self.neck_m[0] - self.body.neck_m)
+        motions, count = [RigidMotion.none()] * len(self.sightings), 0
+        for _ in range(_ROUNDS):
+            found = run_motions(self.body, self.camera, self.sightings, start)
+            count = sum(motion is not None for motion in found)
+            motions, pivot = _filled(found), start(self.body.neck_m)
+            if _extent_m(self.body, motions, pivot) < _STILL_M:
+                motions = [RigidMotion.none()] * len(motions)
+            else:
+                motions = _smoothed(motions, pivot)
+            turn = self._upright(motions)
+            back = [motion.undone()(place) for motion, place in zip(motions, self.neck_m)]
+            start = RigidMotion(turn, np.median(back, axis=0) - turn @ self.body.neck_m)
+        return motions, start, count
+
+    def _upright(self, motions: Sequence[RigidMotion]) -> Float[np.ndarray, "3 3"]:
+        """The rotation in the first frame with which the body is upright on the whole."""
+        turns = Rotation.from_matrix([motion.rotation for motion in motions])
+        level = turns.mean().inv() if len(motions) >= _LEAST_FRAMES else Rotation.identity()
+        tilts, yaws = [], []
+        for one in self.shoulders:
+            k = one.position - self.first
+            turn = (turns[k] * level).as_matrix()
+            marks = (self.body.shoulders_m - self.body.neck_m) @ turn.T + self.neck_m[k]
+            tilts.append(_slant(self.camera.project(marks)) - _slant(one.shoulders_px))
+            yaws.append(one.yaw_rad)
+        yaw, roll = _plain(yaws, _DOUBTED_YAW_RAD), _plain(tilts, _DOUBTED_ROLL_RAD)
+        return (level * Rotation.from_rotvec([0.0, yaw, roll])).as_matrix()
+
+
+def _filled(motions: Sequence[RigidMotion | None]) -> list[RigidMotion]:
+    """Frames without a motion take the last one."""
+    last, filled = RigidMotion.none(), []
+    for motion in motions:
+        last = last if motion is None else motion
+        filled.append(last)
+    return filled
+
+
+def _extent_m(
+    body: BodyMesh, motions: Sequence[RigidMotion], neck_m: Float[np.ndarray, "3"]
+) -> float:
+    """How far the neck's joint and the shoulders go from where they mostly are."""
+    marks = np.stack([body.neck_m, *body.shoulders_m]) - body.neck_m + neck_m
+    places = np.array([motion(marks) for motion in motions])
+    away = np.linalg.norm(places - np.median(places, axis=0), axis=-1).max(1)
+    return float(np.percentile(away, 98))
+
+
+def _smoothed(motions: Sequence[RigidMotion], pivot: Float[np.ndarray, "3"]) -> list[RigidMotion]:
+    """Motions without what points tremble: bodies are heavy."""
+    turns = Rotation.from_matrix([m.rotation for m in motions]).as_rotvec()
+    pivots = np.array([m(pivot) for m in motions])
+    turns, pivots = (
+        gaussian_filter1d(part, _SMOOTH_FRAMES, axis=0, mode="nearest") for part in (turns, pivots)
+    )
+    matrices = Rotation.from_rotvec(turns).as_matrix()
+    return [RigidMotion(r, p - r @ pivot) for r, p in zip(matrices, pivots)]
+
+
+def _slant(pair_px: Float[np.ndarray, "2 2"]) -> float:
+    """Angle of the line from the right shoulder to the left one, clockwise in the picture."""
+    x, y = pair_px[0] - pair_px[1]
+    return float(np.arctan2(y, x))
+
+
+def _plain(angles: Sequence[float], doubt: float) -> float:
+    """The median as far as it is beyond doubt."""
+    if not len(angles):
+        return 0.0
+    middle = float(np.median(angles))
+    return float(np.sign(middle) * max(0.0, abs(middle) - doubt))

@@ -1,0 +1,95 @@
+"""How a rigid body moved, from where its points are seen."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from rgbavatar_ns.tracking.fit.camera import StillCamera
+from rgbavatar_ns.tracking.fit.pose_chain import cross_matrix, rotation_matrices
+
+_Points = Float[np.ndarray, "P 3"]
+
+_ITERATIONS = 8
+# Points this far off (a sleeve that folds, a hand) hardly count: Geman and McClure's loss.
+_ROBUST_PX = 0.7
+# A frame's motion is drawn to the one before it by so much, so that few or flat points do not let
+# it wander: standard deviations from frame to frame.
+_TURN_RAD, _SHIFT_M = 0.05, 0.02
+_LEAST_POINTS = 8
+
+
+@dataclass(frozen=True)
+class RigidMotion:
+    """x goes to rotation x + shift_m; in the world."""
+
+    rotation: Float[np.ndarray, "3 3"]
+    shift_m: Float[np.ndarray, "3"]
+
+    @classmethod
+    def none(cls) -> "RigidMotion":
+        """Everything stays."""
+        return cls(np.eye(3), np.zeros(3))
+
+    def __call__(self, points_m: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
+        """Points moved."""
+        return points_m @ self.rotation.T + self.shift_m
+
+    def after(self, first: "RigidMotion") -> "RigidMotion":
+        """`first`, then this."""
+        return RigidMotion(self.rotation @ first.rotation, self(first.shift_m))
+
+    def undone(self) -> "RigidMotion":
+        """The way back."""
+        return RigidMotion(self.rotation.T, -self.rotation.T @ self.shift_m)
+
+
+def fit_rigid_motion(
+    points_m: _Points,
+    seen_px: Float[np.ndarray, "P 2"],
+    certainty: Float[np.ndarray, "P 2 2"],
+    camera: StillCamera,
+    before: RigidMotion,
+    pivot_m: Float[np.ndarray, "3"],
+) -> tuple[RigidMotion, float] | None:
+    """The motion that carries points to where they are seen, near `before`, and its error.
+
+    `certainty` says along which directions of the picture a place counts. Turns are drawn to those
+    of `before` about `pivot_m`. The error is the median distance in pixels. None where too few
+    points agree.
+    """
+    if len(points_m) < _LEAST_POINTS:
+        return None
+    sigma_px = _ROBUST_PX
+    motion = before
+    turned, shifted = np.zeros(3), np.zeros(3)
+    pivot = before(pivot_m)
+    for _ in range(_ITERATIONS):
+        places = motion(points_m)
+        away = camera.project(places) - seen_px
+        counted = np.einsum("pxy,py->px", certainty, away)
+        distance = (counted * away).sum(1).clip(0)
+        weight = 1 / (1 + distance / sigma_px**2) ** 2
+        lever = places - (pivot + shifted)
+        derivative = np.empty((3, len(places), 6))
+        for axis in range(3):
+            derivative[:, :, axis] = cross_matrix(np.eye(3)[axis]) @ lever.T
+            derivative[:, :, 3 + axis] = np.eye(3)[:, axis, None]
+        rows = camera.image_derivative(places, derivative) / sigma_px
+        weighted = rows * weight[:, None, None]
+        precision = np.repeat([_TURN_RAD**-2.0, _SHIFT_M**-2.0], 3)
+        known = np.einsum("pxy,pyb->pxb", certainty, rows)
+        hessian = np.einsum("pxa,pxb->ab", weighted, known) + np.diag(precision)
+        gradient = np.einsum("pxa,px->a", weighted, counted / sigma_px)
+        gradient += precision * np.concatenate([turned, shifted])
+        step = -np.linalg.solve(hessian, gradient)
+        turned, shifted = turned + step[:3], shifted + step[3:]
+        turn = rotation_matrices(turned[None])[0]
+        motion = RigidMotion(turn, pivot + shifted - turn @ pivot).after(before)
+        if np.abs(step).max() < 1e-6:
+            break
+    away = camera.project(motion(points_m)) - seen_px
+    away = np.sqrt(np.einsum("px,pxy,py->p", away, certainty, away).clip(0))
+    if np.count_nonzero(away < 2 * sigma_px) < max(_LEAST_POINTS, 0.3 * len(away)):
+        return None
+    return motion, float(np.median(away))

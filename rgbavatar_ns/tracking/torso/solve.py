@@ -1,0 +1,42 @@
+"""The body's motion out of the points that were followed, once it is known how it stands."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from rgbavatar_ns.tracking.fit.camera import StillCamera
+from rgbavatar_ns.tracking.torso.body_mesh import BodyMesh
+from rgbavatar_ns.tracking.torso.follow import BodySighting
+from rgbavatar_ns.tracking.torso.rigid_motion import RigidMotion, fit_rigid_motion
+
+
+def run_motions(
+    body: BodyMesh, camera: StillCamera, run: Sequence[BodySighting], start: RigidMotion
+) -> list[RigidMotion | None]:
+    """How the body moves from the first frame of a run to each; None where it was not found.
+
+    `start` places the body at rest in the first frame: how deep points lie follows from it, and so
+    how far a turn carries them.
+    """
+    motions: list[RigidMotion | None] = []
+    last, pivot = RigidMotion.none(), start(body.neck_m)
+    places_m, near, certainty = np.zeros((0, 3)), np.zeros(0, bool), np.zeros((0, 2, 2))
+    for sighting in run:
+        chosen = sighting.chosen_px
+        found = not motions and chosen is not None and len(chosen) > 0
+        if len(places_m):
+            seen = near & np.isfinite(sighting.seen_px[:, 0])
+            fitted = fit_rigid_motion(
+                places_m[seen], sighting.seen_px[seen], certainty[seen], camera, last, pivot
+            )
+            found = fitted is not None
+            last = last if fitted is None else fitted[0]
+        motions.append(last if found else None)
+        if sighting.chosen_px is not None:
+            places_m, near = np.zeros((0, 3)), np.zeros(0, bool)
+            if len(sighting.chosen_px):
+                places_m, near = body.lifted(sighting.chosen_px, last.after(start), camera)
+                places_m = last.undone()(places_m)
+                assert sighting.certainty is not None
+                certainty = sighting.certainty
+    return motions

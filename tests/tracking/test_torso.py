@@ -1,0 +1,228 @@
+"""The body under the head: followed by its clothes, never turned by the head."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+from jaxtyping import Float, UInt8
+from scipy.spatial.transform import Rotation
+
+from rgbavatar_ns.head import EMBEDDED_BUST, HeadModel
+from rgbavatar_ns.head.landmarks import facemesh_landmarks
+from rgbavatar_ns.head.rotations import axis_angle_to_matrix
+from rgbavatar_ns.synthetic import DemoConfig
+from rgbavatar_ns.synthetic.make import DemoFilm, film_demo
+from rgbavatar_ns.tracking.fit.camera import StillCamera
+from rgbavatar_ns.tracking.fit.landmark_head import LandmarkHead
+from rgbavatar_ns.tracking.torso.body_mesh import NECK, BodyMesh
+from rgbavatar_ns.tracking.torso.compose import on_body
+from rgbavatar_ns.tracking.torso.features import FollowedPoints
+from rgbavatar_ns.tracking.torso.follow import BodyFollower, BodySighting
+from rgbavatar_ns.tracking.torso.place import BodyPlaces, SeenShoulders, place_body
+from rgbavatar_ns.tracking.torso.rigid_motion import RigidMotion, fit_rigid_motion
+
+SIZE, FRAMES = 320, 24
+CAMERA = StillCamera(700.0, (160.0, 160.0), 1.1)
+
+
+@pytest.fixture(scope="module")
+def bust() -> HeadModel:
+    return HeadModel.embedded(torch.float64, EMBEDDED_BUST)
+
+
+def degrees(first: np.ndarray, second: np.ndarray) -> Float[np.ndarray, "F"]:
+    """Angles between rotations."""
+    return np.degrees(Rotation.from_matrix(first @ second.swapaxes(-1, -2)).magnitude())
+
+
+def turned(yaw: float, pitch: float = 0.0, roll: float = 0.0) -> Float[np.ndarray, "3 3"]:
+    return Rotation.from_rotvec(np.radians([pitch, yaw, roll])).as_matrix()
+
+
+def test_a_head_put_on_a_body_stays_where_it_was(bust: HeadModel) -> None:
+    drawn = np.random.default_rng(0)
+    layout, identity = bust.layout, 0.7 * drawn.standard_normal(bust.num_identity)
+    theta = np.zeros((5, layout.size))
+    theta[:, layout.slice("rotation")] = 0.4 * drawn.standard_normal((5, 3))
+    theta[:, layout.slice("translation")] = 0.1 * drawn.standard_normal((5, 3))
+    theta[:, layout.slice("jaw").start] = 0.2
+    theta[:, :40] = drawn.uniform(0, 0.5, (5, 40))
+    marks = facemesh_landmarks()
+    ids = bust.arrays.faces[marks.triangle].astype(np.int64)
+    head = LandmarkHead(bust, ids, marks.barycentric)
+    necks = np.array([head.chain(row, identity).placed[NECK] for row in theta])
+    moved = necks + 0.008 * drawn.standard_normal((5, 3))
+    bodies = np.array([turned(*drawn.uniform(-10, 10, 3)) for _ in range(5)])
+    found = on_body(head, bust.arrays, identity, theta, BodyPlaces(bodies, moved, False, 1.0))
+
+    person = torch.from_numpy(identity)
+    before, after = (bust(torch.from_numpy(rows), person).numpy() for rows in (theta, found))
+    skull = bust.arrays.skinning_weights[:, NECK:].sum(1) > 0.999
+    assert skull.sum() > 2500
+    np.testing.assert_allclose(after[:, skull], before[:, skull], atol=3e-4)
+    root = axis_angle_to_matrix(torch.from_numpy(found[:, layout.slice("rotation")])).numpy()
+    np.testing.assert_allclose(root, bodies, atol=1e-9)
+
+
+def test_a_body_too_far_from_its_head_follows_it(bust: HeadModel) -> None:
+    identity = np.zeros(bust.num_identity)
+    head = LandmarkHead(bust, np.array([[0, 1, 2]]), np.full((1, 3), 1 / 3))
+    theta = np.zeros((1, bust.layout.size))
+    far = head.chain(theta[0], identity).placed[NECK][None] + [0.2, 0, 0]
+    found = on_body(head, bust.arrays, identity, theta, BodyPlaces(np.eye(3)[None], far, True, 1.0))
+    assert found[:, bust.layout.slice("translation")][0, 0] == pytest.approx(0.03, abs=0.002)
+    teeth = bust.arrays.vertex_groups["upper_teeth"]
+    vertices = bust(torch.from_numpy(found)).numpy()[0]
+    np.testing.assert_allclose(vertices[teeth], bust.arrays.v_template[teeth], atol=1e-4)
+
+
+def test_a_known_motion_is_found_among_points_that_lie() -> None:
+    drawn = np.random.default_rng(1)
+    points = drawn.uniform([-0.2, -0.3, -0.1], [0.2, -0.1, 0.1], (80, 3))
+    true = RigidMotion(turned(1.2, 0.8, -1.5), np.array([0.002, -0.004, 0.003]))
+    seen = CAMERA.project(true(points))
+    seen[:16] += 12 * drawn.standard_normal((16, 2))
+    certain = np.tile(np.eye(2), (80, 1, 1))
+    motion, pivot = RigidMotion.none(), np.array([0.0, -0.05, 0.0])
+    for _ in range(3):  # frame after frame it comes nearer
+        fitted = fit_rigid_motion(points, seen, certain, CAMERA, motion, pivot)
+        assert fitted is not None
+        motion, error_px = fitted
+    assert degrees(motion.rotation, true.rotation) < 0.2
+    assert np.linalg.norm(motion.shift_m - true.shift_m) < 0.002
+    assert error_px < 0.5
+
+
+def test_points_that_agree_on_nothing_are_no_motion() -> None:
+    drawn = np.random.default_rng(2)
+    points = drawn.uniform(-0.2, 0.2, (40, 3))
+    certain = np.tile(np.eye(2), (40, 1, 1))
+    seen = drawn.uniform(0, 320, (40, 2))
+    none = RigidMotion.none()
+    assert fit_rigid_motion(points, seen, certain, CAMERA, none, np.zeros(3)) is None
+    few = slice(0, 5)
+    assert fit_rigid_motion(points[few], seen[few], certain[few], CAMERA, none, np.zeros(3)) is None
+
+
+def test_a_point_on_a_stripe_counts_only_across_it() -> None:
+    rows = np.mgrid[:200, :200][0]
+    stripes = (127 + 100 * np.sin(rows / 4)).astype(np.uint8)
+    stripes += np.random.default_rng(3).integers(0, 4, stripes.shape).astype(np.uint8)
+    chosen = FollowedPoints.chosen(stripes, np.ones((200, 200), bool))
+    assert len(chosen.points_px) > 20
+    assert chosen.certainty[:, 0, 0].max() < 0.2, "along the stripe nothing is known"
+    assert chosen.certainty[:, 1, 1].min() > 0.8
+
+
+@pytest.fixture(scope="module")
+def films() -> Callable[[str], tuple[DemoFilm, UInt8[np.ndarray, "F S S 4"]]]:
+    made: dict[str, tuple[DemoFilm, np.ndarray]] = {}
+
+    def film(body: str) -> tuple[DemoFilm, np.ndarray]:
+        if body not in made:
+            config = DemoConfig(
+                image_size=SIZE,
+                num_frames=FRAMES,
+                num_test_frames=4,
+                seed=6,
+                frames_per_second=12.0,
+                theta_noise=0.0,
+                supersampling=1,
+                glasses=False,
+                body=body,
+            )
+            shot = film_demo(config)
+            made[body] = shot, np.stack([frame.image_rgba for frame in shot.frames()])
+        return made[body]
+
+    return film
+
+
+class Filmed:
+    """A procedural person as the tracker meets it: pictures, mesh, where heads say the neck is."""
+
+    def __init__(self, film: DemoFilm, images: UInt8[np.ndarray, "F S S 4"], drift_px=0) -> None:
+        head, person = film.person.head, film.person.identity
+        layout, camera = head.layout, film.person.camera
+        self.camera = StillCamera(camera.focal_px, (SIZE / 2, SIZE / 2), camera.distance_m)
+        up = np.array([0, -camera.height_m, 0])
+        with torch.no_grad():
+            vertices = head(film.true, person).double().numpy() + up
+        self.vertices_px = self.camera.project(vertices)
+        self.rotation = (
+            axis_angle_to_matrix(film.true[:, layout.slice("rotation")]).double().numpy()
+        )
+        root, neck = head.joints(person)[:2].double().numpy()
+        shift = film.true[:, layout.slice("translation")].double().numpy()
+        self.neck_m = self.rotation @ (neck - root) + root + shift + up
+        room = np.random.default_rng(4).integers(60, 200, (SIZE, SIZE + 64, 3)).astype(np.float32)
+        alpha = images[..., 3:].astype(np.float32) / 255
+        behind = np.stack([room[:, k * drift_px % 64 :][:, :SIZE] for k in range(len(images))])
+        self.images = (images[..., :3] * alpha + behind * (1 - alpha)).astype(np.uint8)
+        self.mattes = alpha[..., 0]
+        self.body = BodyMesh.of(head, person.double().numpy())
+
+    def followed(self) -> list[BodySighting]:
+        mattes = {image.tobytes(): matte for image, matte in zip(self.images, self.mattes)}
+        follow = BodyFollower(self.body, self.camera, 1.0, lambda image: mattes[image.tobytes()])
+        found = zip(self.images, self.neck_m, self.vertices_px)
+        return [follow(image, neck, px, k == 0) for k, (image, neck, px) in enumerate(found)]
+
+
+def test_a_body_that_keeps_still_is_not_turned_by_its_head(films) -> None:
+    film = Filmed(*films("still"))
+    turns = np.ptp(film.vertices_px[:, 0], axis=0)
+    assert turns.max() > 10, "the head does turn"
+    places = place_body(film.body, film.camera, film.followed(), film.neck_m, [])
+    assert places.still
+    assert places.followed == 1
+    assert np.array_equal(places.rotation, np.tile(places.rotation[:1], (FRAMES, 1, 1)))
+    assert degrees(places.rotation, film.rotation).max() < 1.5
+    assert np.linalg.norm(places.neck_m - film.neck_m, axis=1).max() < 5e-3
+
+
+def test_a_body_that_leans_is_followed(films) -> None:
+    film = Filmed(*films("lean"))
+    assert degrees(film.rotation, film.rotation[:1]).max() > 6
+    places = place_body(film.body, film.camera, film.followed(), film.neck_m, [])
+    assert not places.still
+    # How it stands on the whole one camera hardly tells: relative to its mean.
+    mean = [
+        Rotation.from_matrix(turns).mean().as_matrix() for turns in (places.rotation, film.rotation)
+    ]
+    moved = [turns @ m.T for turns, m in zip((places.rotation, film.rotation), mean)]
+    assert degrees(*moved).mean() < 1.5
+    away = places.neck_m - film.neck_m
+    assert np.linalg.norm(away, axis=1).mean() < 5e-3
+
+
+def test_another_place_of_the_background_tells_a_moving_camera(films) -> None:
+    still, moving = (Filmed(*films("still"), drift_px=drift).followed() for drift in (0, 1))
+    assert np.nanmax([one.background_px for one in still]) < 0.3
+    assert np.nanmax([one.background_px for one in moving]) > 10
+
+
+def test_a_plain_shirt_leaves_the_body_where_it_was() -> None:
+    body = BodyMesh.of(HeadModel.embedded(torch.float64, EMBEDDED_BUST), np.zeros(30))
+    none = np.zeros((0, 2))
+    unseen = [BodySighting(k, none, none, np.zeros((0, 2, 2)), np.nan) for k in range(4)]
+    necks = np.tile(np.array([[0.01], [0.02], [0.03], [0.04]]), (1, 3))
+    places = place_body(body, CAMERA, unseen, necks, [])
+    assert places.followed == 0
+    assert places.still
+    np.testing.assert_allclose(places.rotation, np.tile(np.eye(3), (4, 1, 1)), atol=1e-12)
+
+
+@pytest.mark.parametrize(("roll_degrees", "told"), [(1.0, 0.0), (10.0, 8.0)])
+def test_shoulders_tilt_a_body_only_where_they_are_plainly_aslant(
+    roll_degrees: float, told: float
+) -> None:
+    body = BodyMesh.of(HeadModel.embedded(torch.float64, EMBEDDED_BUST), np.zeros(30))
+    neck = np.array([0.0, -0.05, 0.0])
+    marks = (body.shoulders_m - body.neck_m) @ turned(0, 0, roll_degrees).T + neck
+    shoulders = [SeenShoulders(0, CAMERA.project(marks), 0.0)]
+    none = np.zeros((0, 2))
+    unseen = [BodySighting(0, none, none, np.zeros((0, 2, 2)), np.nan)]
+    places = place_body(body, CAMERA, unseen, neck[None], shoulders)
+    assert degrees(places.rotation[0], turned(0, 0, told)) < 0.3
