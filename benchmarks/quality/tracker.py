@@ -7,7 +7,9 @@ head model and prints: rotation error of the skull (mean, degrees; its constant 
 roll), error across the image plane in percent of the distance, distance of vertices of the face
 and of the whole head in mm (position, depth and size of the head aligned: one camera does not
 tell them), correlation of the expression coefficients that are active (all of them pooled, and the
-median of each one's own), of jaw and of gaze, how much the fit's second differences shrink against
+median of each one's own), of jaw and of gaze, the gaze's error (mean angle between an eye's found
+and true direction in the skull, degrees, where lids are open) and the share of frames whose gaze is
+at a bound, how much the fit's second differences shrink against
 a fit without smoothing, its lag in frames, and CPU time of the fit.
 """
 
@@ -25,17 +27,20 @@ import torch
 from jaxtyping import Float
 
 from rgbavatar_ns.head import HeadModel
-from rgbavatar_ns.head.rotations import matrix_to_axis_angle
+from rgbavatar_ns.head.rotations import axis_angle_to_matrix, matrix_to_axis_angle
 from rgbavatar_ns.synthetic import DemoConfig
 from rgbavatar_ns.synthetic.make import DemoPerson
 from rgbavatar_ns.synthetic.performer.performance import perform
 from rgbavatar_ns.tracking.config import TrackConfig
 from rgbavatar_ns.tracking.face.detector import FaceLandmarker
 from rgbavatar_ns.tracking.fit.subject import SubjectTracker
+from rgbavatar_ns.tracking.verify.gaze import gaze_quality
 
 FRAMES_PER_SECOND = 12.0
 FACE_FRONT_M = 0.02
 """Vertices of the template in front of this are the face."""
+OPEN_LIDS = 0.35
+"""Blinks below this leave the iris to be seen."""
 
 
 class Subject:
@@ -88,6 +93,21 @@ def lag_frames(found: Float[np.ndarray, "F"], true: Float[np.ndarray, "F"]) -> i
     inner = slice(3, -3)
     scores = [correlation(np.roll(found, -shift)[inner], true[inner]) for shift in shifts]
     return shifts[int(np.argmax(scores))]
+
+
+def gaze_degrees(
+    head: HeadModel, theta: Float[np.ndarray, "F H"], true: Float[np.ndarray, "F H"]
+) -> float:
+    """Mean angle between found and true directions of both eyes; closed ones are not counted."""
+    first = head.layout.slice("expression").start
+    lids = [first + k for k, name in enumerate(head.arrays.expression_names) if "Blink" in name]
+    seen = (true[:, lids] < OPEN_LIDS).all(1)
+    off = []
+    for name in ("left_eye", "right_eye"):
+        both = [torch.from_numpy(one[seen][:, head.layout.slice(name)]) for one in (theta, true)]
+        found, real = (axis_angle_to_matrix(one)[..., 2] for one in both)
+        off.append(torch.rad2deg(torch.acos((found * real).sum(-1).clamp(-1, 1))))
+    return float(torch.stack(off).mean())
 
 
 def jitter(values: Float[np.ndarray, "F P"]) -> float:
@@ -165,6 +185,8 @@ def measure(subject: Subject, head: HeadModel, *, known_focal: bool) -> dict[str
         ),
         "jaw": correlation(theta[:, jaw], true[:, jaw]),
         "gaze": correlation(theta[:, eye], true[:, eye]),
+        "gaze_degrees": gaze_degrees(head, theta, true),
+        "gaze_at_bound": gaze_quality(tracker, fit, subject.landmarks_px)["gaze_at_bound_share"],
         "jitter_ratio": jitter(fit.values) / jitter(unsmoothed.values),
         "lag_frames": lag_frames(yaw[0], yaw[1]),
         "fit_cpu_ms": 1e3 * seconds / len(true),

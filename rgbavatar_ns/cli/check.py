@@ -73,10 +73,11 @@ def _in_words(data: Path, report: CheckReport) -> str:
             f"  {report.frames} frames ({report.train} to train on, {report.test} held out) of "
             f"{width} x {height} pixels, {shared}, focal length {focal} pixels",
             f"  head model {report.head}",
-            f"  {report.turns}",
             *(f"    {line}" for line in report.ranges),
             *(f"  note: {note}" for note in report.notes),
         ]
+        if report.film is not None:
+            lines += [f"  {line}" for line in (report.film.turns, *report.film.in_words())]
     if report.unfilmed:
         lines.append(
             f"  {report.unfilmed:.1%} of the images were not filmed (hatched in the sheet): they "

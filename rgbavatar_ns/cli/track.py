@@ -50,6 +50,8 @@ def run(
     console = Console(soft_wrap=True, highlight=False)
     console.print(summary_table(report))
     console.print(f"{report['verdict']}", style="bold")
+    for line in report["film"]["in_words"]:
+        console.print(line)
     for note in report["notes"]:
         console.print(f"note: {note}")
     print(f"{len(dataset.train)} frames to train on, {len(dataset.test)} held out, in {dst}")

@@ -15,7 +15,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from rgbavatar_ns.data import DatasetWriter, TrackedDataset
+from rgbavatar_ns.data.check.film import FilmFacts, film_facts
 from rgbavatar_ns.data.check.problems import verdict
+from rgbavatar_ns.data.check.sample import spread, take_sample
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.files import digest, disk_errors, write_json
 from rgbavatar_ns.head import HeadArrays
@@ -41,6 +43,8 @@ from rgbavatar_ns.tracking.verify.report import (
     tracking_findings,
 )
 
+_LIGHT_FRAMES = 60
+"""Frames that tell how bright the film is and whether that changes."""
 Progress = Callable[[str, int, int | None], None]
 """Called with (stage, frames done, frames in all); None where a file does not say how many."""
 
@@ -139,10 +143,11 @@ class _Tracking:
         self._write_images(clip, thetas, writer, noted)
         with disk_errors(dst, GO_ON):
             write_tracking_sheet(dst, clip.tracker, clip.fit, found, clip.crop)
-            report = self._report(clip, [noted[index] for index in found.frame_index])
-            write_json(dst / "tracking.json", report)
             test = len(found) // 5 if config.test_frames is None else config.test_frames
             dataset = writer.finish(test)
+            report = self._report(clip, [noted[index] for index in found.frame_index])
+            report["film"] = _film_shown(dataset, report).to_json()
+            write_json(dst / "tracking.json", report)
         self.run.close()
         return dataset
 
@@ -213,6 +218,13 @@ class _Tracking:
             "crop": {"left": crop.left, "top": crop.top, "side": crop.side},
         }
         return {"verdict": verdict(tracking_findings(report)), **report}
+
+
+def _film_shown(dataset: TrackedDataset, report: dict[str, Any]) -> FilmFacts:
+    """What the film shows and lacks, from its dataset and from what only tracking knows."""
+    some = take_sample(dataset, spread(len(dataset), _LIGHT_FRAMES).tolist())
+    blurred = len(report["blurred"]) / report["frames_tracked"]
+    return film_facts(dataset, some, report["face_height_px"], blurred)
 
 
 def _digest_of_fit(

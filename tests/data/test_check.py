@@ -11,7 +11,7 @@ import torch
 
 from rgbavatar_ns.data import TrackedDataset
 from rgbavatar_ns.data.check import check_dataset, quick_check, unreadable_report
-from rgbavatar_ns.data.check.parameters import head_turns
+from rgbavatar_ns.data.check.film import head_turns
 from rgbavatar_ns.data.check.sample import take_sample
 from rgbavatar_ns.data.check.silhouette import down_to_the_neck, silhouette_overlap
 from rgbavatar_ns.data.check.timing import longest_run, offset_agreement
@@ -355,6 +355,32 @@ def test_head_turns_are_what_the_camera_sees_whatever_moves(good, mover):
         theta[:, good.layout.slice({"head": "rotation"}.get(mover, mover))] = turn
     seen = head_turns(replace(good, theta=theta, cameras=cameras))
     # Between the percentiles 2 and 98 of an even turn of 40 degrees.
-    assert seen.sideways == pytest.approx(0.96 * 40, abs=0.3)
-    assert seen.nodding == pytest.approx(0, abs=0.3)
-    assert "film 30" in str(seen)
+    assert seen.left + seen.right == pytest.approx(0.96 * 40, abs=0.3)
+    assert max(seen.up, seen.down) < 5, "where this camera stands, and no more"
+
+
+@pytest.mark.parametrize(
+    ("axis", "sign", "told"), [(1, 1, "left"), (1, -1, "right"), (0, -1, "up"), (0, 1, "down")]
+)
+def test_a_turn_is_told_by_the_side_that_the_face_goes_to(good, axis, sign, told):
+    theta = torch.zeros_like(good.theta)
+    first = good.layout.slice("rotation").start
+    theta[:, first + axis] = sign * torch.linspace(0, 25, len(good)).deg2rad()
+    # The face looks along the turned z axis: y up, +x the subject's left.
+    ahead = axis_angle_to_matrix(theta[-1, first : first + 3])[:, 2]
+    where = {"left": ahead[0], "right": -ahead[0], "up": ahead[1], "down": -ahead[1]}[told]
+    assert where > 0.4
+    views = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0])).expand(len(good), 4, 4)
+    seen = vars(head_turns(with_cameras(replace(good, theta=theta), world_to_camera=views)))
+    assert seen.pop(told) == pytest.approx(0.98 * 25, abs=0.3)
+    assert max(seen.values()) < 1
+
+
+def test_the_check_says_what_the_film_lacks(good):
+    film = check_dataset(good).film
+    assert film is not None
+    assert film.frames == len(good)
+    lacking = check_dataset(good).to_json()["film"]["lacks"]
+    assert any(what.startswith("length") for what in lacking)
+    assert film.face_height_px is None, "only the tracker has seen the film itself"
+    assert not any("face" in what for what in lacking)

@@ -42,7 +42,7 @@ def _seen(
 ) -> FrameTerms:
     """The head's points, each as many shares of the face's height away."""
     points = CAMERA.project(cost.head.points(theta, np.zeros(30), CAMERA.eye_m))
-    target = Target(points - away_share * FACE_PX, FACE_PX, np.eye(2))
+    target = Target(points - away_share * FACE_PX, FACE_PX, np.eye(2), np.ones(len(points)))
     return FrameTerms(target, CAMERA, redescending)
 
 
@@ -131,7 +131,10 @@ def test_ties_draw_entries_together_and_leave_their_mean_to_the_widths() -> None
 def test_both_sides_of_a_face_are_tied_and_no_side_of_the_jaw(tracker: SubjectTracker) -> None:
     names, first = tracker.head.arrays.expression_names, tracker.head.layout.slice("expression")
     pairs = tracker.cost.parameters.ties.tolist()
-    tied = {frozenset(names[column - first.start] for column in pair) for pair in pairs}
+    layout = tracker.head.layout
+    left, right = (layout.slice(name).start for name in ("left_eye", "right_eye"))
+    assert pairs[:2] == [[left, right], [left + 1, right + 1]], "eyes move together"
+    tied = {frozenset(names[column - first.start] for column in pair) for pair in pairs[2:]}
     assert frozenset(("mouthSmileLeft", "mouthSmileRight")) in tied
     assert frozenset(("cheekSquintLeft", "mouthSmileLeft")) in tied
     assert frozenset(("browInnerUp", "browOuterUpRight")) in tied

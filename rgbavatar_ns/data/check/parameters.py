@@ -9,11 +9,9 @@ from rgbavatar_ns.data.check.problems import Problem
 from rgbavatar_ns.data.importers.formats import FORMATS
 from rgbavatar_ns.data.native.dataset import TrackedDataset
 from rgbavatar_ns.errors import first_few
-from rgbavatar_ns.head import turn_range, turn_seen
 
 _LARGEST_COEFFICIENT, _LARGEST_TURN_RAD = 12.0, np.pi + 0.01
 _NARROWEST_DEGREES, _WIDEST_DEGREES = 3.0, 120.0
-_WISHED_TURN_DEGREES = 40.0
 _NEAREST_M, _FARTHEST_M = 0.1, 20.0
 _FLAME_2023 = ("VHAP", "raw VHAP")
 """Systems that track with this version, and can be told to use another; all others use 2020."""
@@ -38,29 +36,6 @@ class FieldRange:
         if self.is_angle:
             low, high, unit = np.degrees(low), np.degrees(high), " degrees"
         return f"{self.name} ({self.size}): {low:.3g} to {high:.3g}{unit}{still}"
-
-
-@dataclass(frozen=True)
-class HeadTurns:
-    """How far the head turns before the camera, in degrees between the 2nd and 98th percentile."""
-
-    sideways: float
-    nodding: float
-
-    def __str__(self) -> str:
-        """A line of the report: what is there, and what an avatar needs to be turned."""
-        told = f"the head turns {self.sideways:.0f} degrees sideways and nods {self.nodding:.0f}"
-        if self.sideways < _WISHED_TURN_DEGREES:
-            told += "; film 30 to each side if the avatar is to be seen from there"
-        return told
-
-
-def head_turns(dataset: TrackedDataset) -> HeadTurns:
-    """Where the face looks, as the camera sees it, whether head, neck or camera moves."""
-    views = dataset.cameras.world_to_camera
-    low, high = turn_range(turn_seen(dataset.theta, views, dataset.layout))
-    sideways, nodding, _ = (high - low).tolist()
-    return HeadTurns(sideways, nodding)
 
 
 def field_ranges(dataset: TrackedDataset) -> tuple[FieldRange, ...]:

@@ -1,19 +1,18 @@
 """The check of a dataset: what is in it, what is odd, and whether it can be trained."""
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from rgbavatar_ns.data.check.contact_sheet import MAX_TILES, write_check_sheet
+from rgbavatar_ns.data.check.film import FilmFacts, film_facts
 from rgbavatar_ns.data.check.parameters import (
     FieldRange,
-    HeadTurns,
     camera_problems,
     field_ranges,
-    head_turns,
     parameter_problems,
     version_problem,
 )
@@ -57,7 +56,8 @@ class CheckReport:
     """Whether a camera stands in several places or has several focal lengths."""
     focal_px: tuple[float, float] = (0.0, 0.0)
     ranges: tuple[FieldRange, ...] = ()
-    turns: HeadTurns | None = None
+    film: FilmFacts | None = None
+    """None where the images cannot be read."""
     notes: tuple[str, ...] = ()
     iou: dict[int, float] = field(default_factory=dict)
     """Overlap of head mesh and matte by frame number, of the frames that were looked at."""
@@ -84,7 +84,7 @@ class CheckReport:
             "cameras": self.num_cameras,
             "moving": self.moving,
             "focal_px": list(self.focal_px),
-            "head_turns_degrees": None if self.turns is None else asdict(self.turns),
+            "film": None if self.film is None else self.film.to_json(),
             "parameters": {r.name: [r.smallest, r.largest] for r in self.ranges},
             "notes": list(self.notes),
             "iou": {str(number): round(value, 4) for number, value in self.iou.items()},
@@ -124,10 +124,11 @@ def check_dataset(
     positions = spread(len(dataset), max_frames).tolist()
     problems = [*parameter_problems(dataset), *camera_problems(dataset)]
     problems += [one for one in [version_problem(dataset)] if one is not None]
-    found_overlaps, unfilmed = [], 0.0
+    found_overlaps, unfilmed, film = [], 0.0, None
     try:
         sample = take_sample(dataset, positions, progress)
         unfilmed = float(1 - sample.filmed.mean())
+        film = film_facts(dataset, sample)
         found_overlaps = overlaps(sample, projected(sample))
         found = _image_problems(dataset, sample, found_overlaps)
         if sheet is not None:
@@ -158,7 +159,7 @@ def check_dataset(
         len(np.unique(views, axis=0)) > num_cameras,
         (float(focal.min()), float(focal.max())),
         field_ranges(dataset),
-        head_turns(dataset),
+        film,
         tuple(map(str, dataset.source.get("notes", ()))),
         {dataset.frame_index[p]: one.iou for p, one in zip(positions, found_overlaps)},
         sheet,

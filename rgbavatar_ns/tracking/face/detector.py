@@ -23,9 +23,14 @@ FACE_OVAL = (
 LIP_PAIRS = ((13, 14), (82, 87), (312, 317), (81, 178), (311, 402), (80, 88), (310, 318))
 LID_PAIRS = ((159, 145), (158, 153), (160, 144), (386, 374), (385, 380), (387, 373))
 """Pairs of points whose distance says how far lips and lids are open."""
+EYE_CORNERS = ((33, 133), (362, 263))
+"""Corners of the subject's right and left eye; their distance is an eye's width."""
 MAX_SIDE_PX = 1280
 """Images that are larger are made smaller before faces are looked for."""
 _MOST_FACES = 3
+# Where lids are less than the first share of the eye's width apart, FaceMesh guesses the iris: on
+# renders it is off by 1 mm and more there, beyond the second share by .4 mm.
+_IRIS_HIDDEN, _IRIS_SHOWN = 0.1, 0.2
 
 
 def load_mediapipe() -> ModuleType:
@@ -86,6 +91,23 @@ def face_height_px(landmarks_px: Float[np.ndarray, "*batch 478 2"]) -> Float[np.
     """Distance from the top of the forehead to the chin, the measure of errors."""
     span = landmarks_px[..., FOREHEAD, :] - landmarks_px[..., CHIN, :]
     return np.linalg.norm(span, axis=-1)
+
+
+def eye_widths_px(
+    landmarks_px: Float[np.ndarray, "*batch 478 2"],
+) -> Float[np.ndarray, "*batch 2"]:
+    """Distance of the corners of the right eye and of the left one."""
+    first, second = (landmarks_px[..., list(ends), :] for ends in zip(*EYE_CORNERS))
+    return np.linalg.norm(first - second, axis=-1)
+
+
+def irises_seen(landmarks_px: Float[np.ndarray, "*batch 478 2"]) -> Float[np.ndarray, "*batch 2"]:
+    """How much the right iris and the left one are to be believed: 0 behind closed lids, else 1."""
+    upper, lower = (landmarks_px[..., list(ends), :] for ends in zip(*LID_PAIRS))
+    gap = np.linalg.norm(upper - lower, axis=-1)
+    gap = gap.reshape(*gap.shape[:-1], 2, len(LID_PAIRS) // 2).mean(-1)
+    share = gap / (eye_widths_px(landmarks_px) + 1e-9)
+    return ((share - _IRIS_HIDDEN) / (_IRIS_SHOWN - _IRIS_HIDDEN)).clip(0, 1)
 
 
 def upright_turn(

@@ -31,6 +31,8 @@ class Target:
     face_height_px: float
     to_upright: Float[np.ndarray, "2 2"]
     """Rotation of the image after which the forehead is straight above the chin."""
+    seen: Float[np.ndarray, "L"]
+    """How much each landmark counts, 0 to 1: irises fade behind closing lids."""
 
 
 @dataclass(frozen=True)
@@ -128,7 +130,7 @@ class FrameCost:
         amounts, weight, factor = np.zeros(self._modes.shape[1]), residual, None
         for robust in losses:
             left = residual - (self._modes @ amounts).reshape(-1, 2)
-            weight = np.repeat(robust(np.linalg.norm(left, axis=1))[1], 2)
+            weight = np.repeat(robust(np.linalg.norm(left, axis=1))[1] * target.seen, 2)
             weighted = self._modes * weight[:, None]
             normal = weighted.T @ self._modes + np.eye(len(amounts))
             factor = cho_factor(normal, check_finite=False)
@@ -136,8 +138,8 @@ class FrameCost:
         assert factor is not None
         left = residual - (self._modes @ amounts).reshape(-1, 2)
         loss, soften = losses[-1](np.linalg.norm(left, axis=1))
-        cost = float(loss.sum() + 0.5 * amounts @ amounts)
-        return cost, (left * soften[:, None]).reshape(-1), weight, factor
+        cost = float(loss @ target.seen + 0.5 * amounts @ amounts)
+        return cost, (left * (soften * target.seen)[:, None]).reshape(-1), weight, factor
 
 
 def _huber(distance: _Distances) -> tuple[_Distances, _Distances]:

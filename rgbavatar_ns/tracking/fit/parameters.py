@@ -10,9 +10,17 @@ from jaxtyping import Float, Int
 from rgbavatar_ns.head import ThetaLayout
 from rgbavatar_ns.head.arrays import NECK_SHIFTS
 
-# Jaw opening to 26 degrees; gaze to 30 degrees; the head to a little beyond profile.
+# Jaw opening to 26 degrees; the head to a little beyond profile.
 _JAW_OPEN = (-0.02, 0.45)
-_GAZE = (-0.55, 0.55)
+# Eyes turn by 45 to 50 degrees at most, but beyond some 20 the head comes along (Stahl 1999), and
+# beyond 30 lids and lashes hide an iris from FaceMesh. Up and down they go less far, and there
+# FaceMesh's irises tell little: they follow by 40 % on renders, by 10 to 40 % on photographs whose
+# irises were moved by hand. Undoing that makes errors as many times larger, so that without a
+# narrow prior a person's lids of another shape look like a gaze of 10 to 30 degrees.
+GAZE_BOUNDS_RAD = (-0.55, 0.55)
+_GAZE_PITCH_WIDTH, _GAZE_YAW_WIDTH, _GAZE_STEP = 0.1, 0.2, 0.08
+# Both eyes move as one (Hering's law) but for vergence, by a few degrees; their height is the same.
+_SAME_PITCH_WIDTH, _VERGENCE_WIDTH = 0.02, 0.05
 _EXPRESSION = (0.0, 1.0)
 _EXPRESSION_WIDTH, _BLINK_WIDTH = 0.4, 1.0
 # Expressions that have a number for a name, as FLAME's have, were found by statistics: they go
@@ -89,7 +97,8 @@ def fit_parameters(
     rows.append((layout.slice("jaw").start, *_JAW_OPEN, 0.3, 0.1))
     for name in ("left_eye", "right_eye"):
         first = layout.slice(name).start
-        rows += [(first, *_GAZE, 0.25, 0.08), (first + 1, *_GAZE, 0.25, 0.08)]
+        for angle, width in enumerate((_GAZE_PITCH_WIDTH, _GAZE_YAW_WIDTH)):
+            rows.append((first + angle, *GAZE_BOUNDS_RAD, width, _GAZE_STEP))
     first = layout.slice("expression").start
     numbered = all(_NUMBERED.fullmatch(name) for name in expression_names)
     for number, (name, size_m) in enumerate(zip(expression_names, expression_size_m.tolist())):
@@ -108,14 +117,14 @@ def fit_parameters(
     columns, lower, upper, prior, temporal = (np.array(part) for part in zip(*rows))
     fitted = {name: first + number for number, name in enumerate(expression_names)}
     fitted = {name: column for name, column in fitted.items() if column in set(columns.tolist())}
-    ties, tie_width = _ties(fitted)
+    ties, tie_width = _ties(layout, fitted)
     return FitParameters(columns.astype(np.int64), lower, upper, prior, temporal, ties, tie_width)
 
 
 def _ties(
-    fitted: Mapping[str, int],
+    layout: ThetaLayout, fitted: Mapping[str, int]
 ) -> tuple[Int[np.ndarray, "T 2"], Float[np.ndarray, "T"]]:
-    """Columns by name -> pairs of sides and of partners on each side, with their widths."""
+    """Pairs of columns with their widths: eyes, sides, partners; expressions' columns by name."""
     found: dict[tuple[str, str], float] = {}
     for name in fitted:
         other = name.removesuffix("Left") + "Right"
@@ -127,8 +136,11 @@ def _ties(
             first, second = (name if name in fitted else name + side for name in pair)
             found[first, second] = _PARTNERS_WIDTH
     known = {pair: width for pair, width in found.items() if set(pair) <= set(fitted)}
-    ties = [(fitted[first], fitted[second]) for first, second in known]
-    return np.array(ties, np.int64).reshape(-1, 2), np.array(list(known.values()), np.float64)
+    left, right = (layout.slice(name).start for name in ("left_eye", "right_eye"))
+    ties = [(left, right), (left + 1, right + 1)]
+    ties += [(fitted[first], fitted[second]) for first, second in known]
+    widths = [_SAME_PITCH_WIDTH, _VERGENCE_WIDTH, *known.values()]
+    return np.array(ties, np.int64), np.array(widths, np.float64)
 
 
 def _columns(layout: ThetaLayout, name: str) -> range:

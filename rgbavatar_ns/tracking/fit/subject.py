@@ -25,6 +25,7 @@ from rgbavatar_ns.tracking.face.detector import (
     LID_PAIRS,
     LIP_PAIRS,
     face_height_px,
+    irises_seen,
     upright_turn,
 )
 from rgbavatar_ns.tracking.fit.fit import (
@@ -35,6 +36,7 @@ from rgbavatar_ns.tracking.fit.fit import (
     key_frame_positions,
     subject_offsets,
 )
+from rgbavatar_ns.tracking.fit.irises import iris_places
 from rgbavatar_ns.tracking.fit.landmark_cost import FrameCost, Target
 from rgbavatar_ns.tracking.fit.landmark_head import LandmarkHead
 from rgbavatar_ns.tracking.fit.parameters import fit_parameters
@@ -79,9 +81,12 @@ class SubjectTracker:
     def targets(self, landmarks_px: Float[np.ndarray, "F 478 2"]) -> list[Target]:
         """Each frame's landmarks in the order of the landmark head."""
         heights, turns = face_height_px(landmarks_px), upright_turn(landmarks_px)
+        seen = np.ones((len(landmarks_px), len(self.facemesh_index)))
+        irises = [int(np.flatnonzero(self.facemesh_index == iris)[0]) for iris in IRIS_CENTERS]
+        seen[:, irises] = irises_seen(landmarks_px)
         return [
-            Target(points[self.facemesh_index], float(height), turn)
-            for points, height, turn in zip(landmarks_px, heights, turns)
+            Target(points[self.facemesh_index], float(height), turn, own)
+            for points, height, turn, own in zip(landmarks_px, heights, turns, seen)
         ]
 
     def fit(
@@ -131,6 +136,17 @@ class SubjectTracker:
                 for theta in self.thetas(fit)
             ]
         )
+
+    def irises_px(self, fit: ClipFit) -> Float[np.ndarray, "F 2 2"]:
+        """Where the middle of the mesh's right iris and of its left one is, source pixels."""
+        irises = LandmarkHead(self.head, *iris_places(self.head.arrays))
+        points = [irises.points(theta, fit.subject.identity) for theta in self.thetas(fit)]
+        return fit.subject.camera.project(np.array(points))
+
+    def gaze(self, fit: ClipFit) -> Float[np.ndarray, "F 4"]:
+        """Pitch and yaw of the right eye and of the left one, radians."""
+        first = [self.head.layout.slice(name).start for name in ("right_eye", "left_eye")]
+        return self.thetas(fit)[:, [column + angle for column in first for angle in (0, 1)]]
 
     def rejected(self, fit: ClipFit, landmarks_px: Float[np.ndarray, "F 478 2"]) -> list[int]:
         """Positions whose landmarks no pose of the head explains."""

@@ -12,13 +12,16 @@ from rgbavatar_ns.tracking.face.detector import LID_PAIRS, LIP_PAIRS, face_heigh
 from rgbavatar_ns.tracking.fit.fit import ClipFit
 from rgbavatar_ns.tracking.fit.subject import SubjectTracker
 from rgbavatar_ns.tracking.image.head_mask import HeadOutline
+from rgbavatar_ns.tracking.verify.gaze import gaze_quality
 
 # An eye is closed where its lids' gap is below this share of the clip's widely open ones.
 _CLOSED_SHARE = 0.5
 # Limits of the words: beyond the first a clip is no longer good, beyond the second it is to be
-# looked at. Shares of the face's height, correlations, shares of frames, pixels.
+# looked at. Shares of the face's height, correlations, shares of frames, pixels,
+# eye widths (on renders, whose truth is known, irises lie .05 off).
 _FITTED_ERROR, _MESH_ERROR = (0.01, 0.02), (0.015, 0.03)
 _CORRELATION, _COVERAGE = (0.85, 0.6), (0.95, 0.85)
+_IRIS_ERROR, _AT_BOUND = (0.1, 0.2), (0.02, 0.2)
 _REJECTED, _BLURRED = (0.05, 0.25), (0.1, 0.3)
 _FACE_PX, _FRAMES = (100.0, 50.0), (100, 25)
 # The part of the face whose outline is skin: from a little above the chin to the eyes, as shares
@@ -29,7 +32,7 @@ _FACE_FROM, _FACE_TO, _BESIDE = 0.1, 0.6, 0.2
 def fit_quality(
     tracker: SubjectTracker, fit: ClipFit, landmarks_px: Float[np.ndarray, "F 478 2"]
 ) -> dict[str, Any]:
-    """Reprojection errors, agreement of lips and lids, blinks, and the camera.
+    """Reprojection errors, agreement of lips and lids, blinks, gaze, and the camera.
 
     Errors are mean distances over all landmarks and frames: `reprojection` with the subject's
     constant landmark offsets, which is what the fit minimises, and `mesh` without them. Shares
@@ -56,6 +59,7 @@ def fit_quality(
         "eyelid_opening_correlation": gap_correlation(*gaps["eyelid"]),
         "blinks_measured": count_blinks(gaps["eyelid"][1] / height),
         "blinks_fitted": count_blinks(gaps["eyelid"][0] / height),
+        **gaze_quality(tracker, fit, landmarks_px),
         "focal_px": fit.subject.camera.focal_px,
         "camera_distance_m": fit.subject.camera.distance_m,
     }
@@ -132,12 +136,15 @@ def tracking_findings(report: Mapping[str, Any]) -> list[Finding]:
     height = report["face_height_px"]
     fitted, mesh = (report[f"{one}reprojection_error_share"] for one in ("", "mesh_"))
     mouth, lids = (report[f"{one}_opening_correlation"] for one in ("mouth", "eyelid"))
+    at_bound = report["gaze_at_bound_share"]
     found = []
     for kind, cause, value, (mild, grave) in (
         ("landmarks", "the fit leaves the landmarks", fitted, _FITTED_ERROR),
         ("misfit", "the mesh lies off the face", mesh, _MESH_ERROR),
         ("landmarks", "the mouth is not followed", mouth, _CORRELATION),
         ("landmarks", "the eyelids are not followed", lids, _CORRELATION),
+        ("gaze", "the irises lie off the film's", report["iris_error_eye_widths"], _IRIS_ERROR),
+        ("gaze", f"the gaze is at its bounds in {at_bound:.0%} of frames", at_bound, _AT_BOUND),
         ("mattes", "the matte misses part of the head", report["silhouette_coverage"], _COVERAGE),
         ("faces", f"{read - tracked} of {read} frames are left out", 1 - tracked / read, _REJECTED),
         ("faces", f"{len(blurred)} frames are blurred", len(blurred) / tracked, _BLURRED),
