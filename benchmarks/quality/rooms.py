@@ -1,8 +1,7 @@
-"""A procedural person with loose hair and shoulders, filmed in a room: a clip and its true mattes."""
+"""A procedural person with loose hair, filmed in a room: a clip and its true mattes."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from fractions import Fraction
 from pathlib import Path
 
 import av
@@ -16,14 +15,14 @@ from rgbavatar_ns.synthetic.make import DemoPerson
 from rgbavatar_ns.synthetic.performer.performance import perform
 from rgbavatar_ns.synthetic.performer.regions import above_hairline_m
 
-FRAMES_PER_SECOND = 20.0
+FRAMES_PER_SECOND = 20
 HEIGHT_PX, WIDTH_PX = 480, 640
-_STRANDS, _STRAND_M, _STRAND_POINTS = 700, 0.022, 7
+_STRANDS, _STRAND_M, _STRAND_POINTS = 4000, 0.024, 7
 _STRAND_FINE = 3
 """Strands are drawn so many times larger, then averaged."""
 _HAIR_SRGB = (66.0, 48.0, 38.0)
 _SHIRT_SRGB = (58.0, 84.0, 112.0)
-# What the exposure of a dim room leaves of linear light, and the power that stands for sRGB's curve.
+# What a dim room's exposure leaves of linear light, and the power that stands for sRGB's curve.
 _DIM, _GAMMA = 0.22, 2.2
 
 RGBA = Float[np.ndarray, "H W 4"]
@@ -89,7 +88,7 @@ ROOMS = {
 
 
 class Performance:
-    """One person's true RGBA frames [F, H, W, 4], with strands and shoulders, in [0, 1]."""
+    """One person's true frames, with loose hair and shoulders: straight alpha, lit evenly."""
 
     def __init__(self, seed: int, frames: int, supersampling: int = 3) -> None:
         config = DemoConfig(
@@ -139,7 +138,8 @@ class _Strands:
         outward /= np.linalg.norm(outward, axis=1, keepdims=True)
         bend = rng.standard_normal((_STRANDS, 3))
         along = np.linspace(0, 1, _STRAND_POINTS)[:, None, None]
-        length = _STRAND_M * rng.uniform(0.3, 1.0, (_STRANDS, 1)) ** 2
+        # Mostly a soft fringe, and a few that stand far off.
+        length = _STRAND_M * rng.uniform(0.1, 1.0, (_STRANDS, 1)) ** 3
         falls = np.array([0, -0.3, 0])
         self._points = roots + length * (
             along * outward + along**2 * (0.5 * bend + falls) + 0.12 * along**3 * bend[::-1]
@@ -158,7 +158,7 @@ class _Strands:
         alpha = np.zeros((HEIGHT_PX * fine, WIDTH_PX * fine), np.float32)
         for strand, opacity in zip(np.ascontiguousarray(places.swapaxes(0, 1)), self._opacity):
             line = [strand.reshape(-1, 1, 2)]
-            cv2.polylines(alpha, line, False, float(opacity), 2, cv2.LINE_8, shift=4)
+            cv2.polylines(alpha, line, False, [float(opacity)], 1, cv2.LINE_8, shift=4)
         alpha = cv2.resize(alpha, (WIDTH_PX, HEIGHT_PX), interpolation=cv2.INTER_AREA)
         color = np.broadcast_to(np.array(_HAIR_SRGB) / 255, (*alpha.shape, 3))
         return np.concatenate([color, alpha[..., None]], -1)
@@ -183,33 +183,49 @@ class FilmedRoom:
     room: Room
     seed: int
 
-    def truth(self) -> Iterator[UInt8[np.ndarray, "H W 4"]]:
-        """Straight-alpha frames as the room lights them."""
-        for frame in self.performance.frames:
+    def truth(self, tremble_px: float = 0.0) -> Iterator[UInt8[np.ndarray, "H W 4"]]:
+        """Straight-alpha frames as the room lights them, and as the camera's place shows them."""
+        for frame, shift in zip(self.performance.frames, self._shifts(tremble_px)):
             if self.room.dim:
-                level = np.arange(256) * _DIM ** (1 / _GAMMA)
-                color = np.round(level).astype(np.uint8)[frame[..., :3]]
-                frame = np.concatenate([color, frame[..., 3:]], -1)
-            yield frame
+                level = np.round(np.arange(256) * _DIM ** (1 / _GAMMA)).astype(np.uint8)
+                frame = np.concatenate([level[frame[..., :3]], frame[..., 3:]], -1)
+            yield _moved(frame, shift)
 
-    def write(self, path: Path) -> None:
-        """The clip: noise, a flickering lamp, JPEG as in the camera's cable, H.264 as recorded."""
+    def write(self, path: Path, tremble_px: float = 0.0) -> None:
+        """The clip: noise, a flickering lamp, JPEG as in the camera's cable, H.264 as recorded.
+
+        `tremble_px`: how far the camera wanders.
+        """
         rng = np.random.default_rng([self.seed, 13])
         behind = self.room.background(rng)
         with av.open(str(path), "w") as container:
-            stream = container.add_stream("libx264", rate=Fraction(FRAMES_PER_SECOND))
+            stream = container.add_stream("libx264", rate=FRAMES_PER_SECOND)
             stream.width, stream.height, stream.pix_fmt = WIDTH_PX, HEIGHT_PX, "yuv420p"
             stream.options = {"crf": "20"}
-            for frame in self.truth():
-                alpha = frame[..., 3:] / 255
-                seen = frame[..., :3] * alpha + behind * (1 - alpha)
+            for frame, shift in zip(self.truth(tremble_px), self._shifts(tremble_px)):
+                share = frame[..., 3:] / 255
+                seen = frame[..., :3] * share + _moved(behind, shift) * (1 - share)
                 seen = seen * (1 + 0.004 * rng.standard_normal())
                 # A camera smooths its noise a little.
                 noise = cv2.GaussianBlur(rng.standard_normal(seen.shape), (0, 0), 0.6) * 2.1
                 seen = np.clip(seen + self.room.noise_levels * noise, 0, 255).round()
-                packed = cv2.imencode(
-                    ".jpg", seen.astype(np.uint8)[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 88]
-                )[1]
-                picture = cv2.imdecode(packed, cv2.IMREAD_COLOR)
+                quality = [cv2.IMWRITE_JPEG_QUALITY, 88]
+                packed = cv2.imencode(".jpg", seen.astype(np.uint8)[..., ::-1], quality)[1]
+                picture = cv2.imdecode(packed, cv2.IMREAD_COLOR).astype(np.uint8)
                 container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="bgr24")))
             container.mux(stream.encode())
+
+    def _shifts(self, tremble_px: float) -> list[tuple[int, int]]:
+        """By how many rows and columns each frame is moved: a slow sway, in whole pixels."""
+        rng = np.random.default_rng([self.seed, 14])
+        steps = rng.standard_normal((len(self.performance.frames), 2)).cumsum(0)
+        steps = (steps - steps.mean(0)) / steps.std(0)
+        return [(round(row), round(column)) for row, column in (tremble_px * steps).tolist()]
+
+
+def _moved(picture: np.ndarray, rows_columns: tuple[int, int]) -> np.ndarray:
+    """The picture shifted; its border goes on."""
+    rows, columns = rows_columns
+    room = (max(rows, 0), max(-rows, 0), max(columns, 0), max(-columns, 0))
+    wide = cv2.copyMakeBorder(picture, *room, cv2.BORDER_REPLICATE)
+    return wide[room[1] : room[1] + HEIGHT_PX, room[3] : room[3] + WIDTH_PX]

@@ -25,9 +25,9 @@ _QUARTILE_SIGMAS = 1.349
 # A pixel tells of motion where the plate changes by so many levels from one pixel to the next, and
 # the clip is told by it where a pixel in two hundred does.
 _TEXTURE_LEVELS, _TEXTURE_SHARE = 8.0, 0.005
-# The camera moves where what it shows wanders by more (one standard deviation, pixels of an image
-# of 480, and so does not blur the plate beyond what interpolation does).
-_STILL_PX, _OF_SIDE_PX = 0.5, 480
+# The camera moves where what it shows wanders by more (one standard deviation, pixels of the crop):
+# less blurs the plate no more than interpolation does.
+_STILL_PX = 0.5
 # The light changes where one frame in ten is off by more levels; less is followed frame by frame.
 _LIGHT_LEVELS, _LIGHT_PERCENTILE = 10.0, 90
 
@@ -131,12 +131,11 @@ def find_background(
     light = _light_changes(images, free, color, often)
     motion = _motion_px(color, spread, often)
     kind: BackgroundKind = "still"
-    limit = _STILL_PX * len(color) / _OF_SIDE_PX
     if often.mean() < _TEXTURE_SHARE:
         kind = "covered"
     elif light > _LIGHT_LEVELS:
         kind = "light changes"
-    elif motion is not None and motion > limit:
+    elif motion is not None and motion > _STILL_PX:
         kind = "moves"
     if kind != "still":
         return Background(kind, motion, light, None)

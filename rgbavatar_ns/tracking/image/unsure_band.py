@@ -40,6 +40,9 @@ _GUESS_FROM, _GUESS_TO, _GUESS_PX, _TEXTURE_PX = 0.3, 4.0, 4.0, 9
 # From so many times the noise on, a pixel may be hair that stands off; a pixel is no background, if
 # all around it are as far off.
 _MAYBE, _NOT_ROOM, _AROUND = 3.0, 4.0, np.ones((3, 3), np.uint8)
+# Mixtures lie on the line between both colours: no mixture has so large a squared sine to it, nor
+# lies so far along it.
+_ASIDE, _WHOLE = 0.1, 0.85
 # How sure the segmentation is of alpha: at its outline, and away from it on either side.
 _UNSURE, _SURE = 0.5, 0.08
 _INWARD_PX, _OUTWARD_PX, _FLAT_PX = 6.0, 8.0, 1.0
@@ -132,8 +135,8 @@ def band_matte(image_rgb: _Image, coarse: _Values, plate: RoomColors | None = No
     )
     apart = image - room.color
     differs = _squares(apart) / (3 * room.variance)
-    alone = cv2.erode((differs > _NOT_ROOM**2).astype(np.uint8), _AROUND) > 0
-    sure = (inward > _CORE_PX) | (alone & (inward > 0))
+    core = inward > _CORE_PX
+    sure = core | _unmixed(image, apart, room, core, differs, inward)
     band = ~sure & ~outside
     if plate is not None:
         band |= outside & (inward > -_REACH_PX) & (differs > _MAYBE**2)
@@ -144,6 +147,28 @@ def band_matte(image_rgb: _Image, coarse: _Values, plate: RoomColors | None = No
     mixed = _mixture(image, apart, room, person, prior, inward, open_px)
     alpha.reshape(-1)[open_px] = np.clip((mixed - _LEFT) / (1 - 2 * _LEFT), 0, 1)
     return BandMatte(_in_one_piece(alpha, inward > 0), room.color)
+
+
+def _unmixed(
+    image: _Colors,
+    apart: _Colors,
+    room: RoomColors,
+    core: _Mask,
+    differs: _Values,
+    inward: _Values,
+) -> _Mask:
+    """What within the outline is neither the room nor a mixture of it with the person near by."""
+    alone = cv2.erode((differs > _NOT_ROOM**2).astype(np.uint8), _AROUND) > 0
+    asked = np.flatnonzero(alone & (inward > 0) & ~core)
+    person = spread_colors(image, core.astype(np.float32), _PERSON_PX, 8).reshape(-1, 3)[asked]
+    off = apart.reshape(-1, 3)[asked]
+    across = person - room.color.reshape(-1, 3)[asked]
+    along, size = (off * across).sum(1), (off * off).sum(1)
+    length = (across * across).sum(1) + np.float32(1e-3)
+    aside = 1 - along * np.abs(along) / (length * size + np.float32(1e-3))
+    found = np.zeros(core.shape, bool)
+    found.reshape(-1)[asked] = (aside > _ASIDE) | (along > _WHOLE * length)
+    return found
 
 
 def _mixture(
