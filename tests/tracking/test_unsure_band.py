@@ -112,7 +112,7 @@ def test_soft_edges_have_the_person_s_colour() -> None:
     color = foreground_color(image, found.alpha, found.background)
     soft = (alpha > 0.3) & (alpha < 0.9) & (np.arange(SIZE)[:, None] < 130)
     off = np.abs(color[soft].astype(float) - HAIR).mean()
-    assert off < 0.35 * np.abs(image[soft].astype(float) - HAIR).mean()
+    assert off < 0.45 * np.abs(image[soft].astype(float) - HAIR).mean()
 
 
 def test_a_lamp_that_flickers_does_not_matter() -> None:

@@ -25,7 +25,7 @@ _Mask = Bool[np.ndarray, "S S"]
 _OF_SIDE_PX = 480
 # From the segmentation's outline: inside of the first everything is the person; the second is how
 # far hair that stands off is looked for, if a plate tells it from the room.
-_CORE_PX, _REACH_PX = 4.0, 45.0
+_CORE_PX, _REACH_PX = 3.0, 45.0
 # Without a plate nothing is looked for farther outside; beyond it the frame shows the background.
 _NEAR_PX = 8.0
 # Within how many pixels, and more, a colour's mean is taken: of the person, of the background.
@@ -35,21 +35,24 @@ _LIGHT_PX, _LIGHT_LEVELS = (10, 40), 12.0
 _WIDER = 1e-3
 # Noise of a webcam after its compression, and what a guessed background's texture adds to it: at
 # the border of what is known, and at most, some pixels away from it.
-_NOISE_LEVELS, _GUESS_LEVELS, _TEXTURE = 2.0, 2.0, 0.3
+_NOISE_LEVELS, _GUESS_LEVELS, _TEXTURE = 2.0, 2.0, 0.1
 _GUESS_FROM, _GUESS_TO, _GUESS_PX, _TEXTURE_PX = 0.3, 4.0, 4.0, 9
 # From so many times the noise on, a pixel may be hair that stands off; a pixel is no background, if
 # all around it are as far off.
-_MAYBE, _NOT_ROOM, _AROUND = 3.0, 4.0, np.ones((3, 3), np.uint8)
+_MAYBE, _NOT_ROOM, _AROUND = 2.0, 4.0, np.ones((3, 3), np.uint8)
 # Mixtures lie on the line between both colours: no mixture has so large a squared sine to it, nor
 # lies so far along it.
-_ASIDE, _WHOLE = 0.1, 0.85
+_ASIDE, _WHOLE = 0.1, 0.7
+# Hair may be mixed with the room so far within the outline. It is where the hues of both differ by
+# so many levels and so many times the noise, and less than such a share of the person's is there.
+_DEEP_PX, _HUE_LEVELS, _HUE_SIGMAS, _PURE = 10.0, 45.0, 8.0, 0.85
 # How sure the segmentation is of alpha: at its outline, and away from it on either side.
 _UNSURE, _SURE = 0.5, 0.08
-_INWARD_PX, _OUTWARD_PX, _FLAT_PX = 6.0, 8.0, 1.0
+_INWARD_PX, _OUTWARD_PX = 4.0, 8.0
 # The share of the person's own variance near by that makes a mixture unsure.
-_PERSON_SPREAD = 0.5
-# The segmentation hovers a little off 0 and 1; what is left of haze would be learnt by an avatar.
-_HAZE, _LEFT = 0.06, 0.05
+_PERSON_SPREAD = 1.0
+# The segmentation hovers off 0 and 1, and mixtures a little; an avatar would learn that as haze.
+_HAZE, _LEFT = 0.15, 0.03
 # What is enclosed by the person and smaller is a fault of the segmentation, unless the plate shows
 # through; shares of the image.
 _HOLE_SHARE = 0.003
@@ -106,16 +109,18 @@ def spread_colors(
     """
     size = len(weight)
     few, scale = max(1, size // coarser), size / coarser / _OF_SIDE_PX
-    held = cv2.merge(
-        [*cv2.split(values * weight.reshape(size, size, *[1] * (values.ndim - 2))), weight]
-    )
-    small = cv2.resize(held, (few, few), interpolation=cv2.INTER_AREA)
-    total, share = np.zeros_like(small), np.float32(1)
+    weighted = values * weight.reshape(size, size, *[1] * (values.ndim - 2))
+    parts = [
+        cv2.resize(part, (few, few), interpolation=cv2.INTER_AREA) for part in (weighted, weight)
+    ]
+    totals, share = [np.zeros_like(part) for part in parts], np.float32(1)
     for radius_px in radii_px:
-        total += share * cv2.blur(small, (2 * max(1, round(radius_px * scale)) + 1,) * 2)
+        box = (2 * max(1, round(radius_px * scale)) + 1,) * 2
+        for total, part in zip(totals, parts):
+            total += share * cv2.blur(part, box)
         share *= np.float32(_WIDER)
-    means = total[..., :-1] / (total[..., -1:] + np.float32(1e-12))
-    return cv2.resize(means, (size, size)).reshape(values.shape)
+    held = (totals[1] + np.float32(1e-12)).reshape(few, few, *[1] * (values.ndim - 2))
+    return cv2.resize(totals[0] / held, (size, size))
 
 
 def band_matte(image_rgb: _Image, coarse: _Values, plate: RoomColors | None = None) -> BandMatte:
@@ -135,8 +140,11 @@ def band_matte(image_rgb: _Image, coarse: _Values, plate: RoomColors | None = No
     )
     apart = image - room.color
     differs = _squares(apart) / (3 * room.variance)
-    core = inward > _CORE_PX
-    sure = core | _unmixed(image, apart, room, core, differs, inward)
+    deep = (inward > _DEEP_PX).astype(np.float32)
+    towards = spread_colors(image, deep, _PERSON_PX, 8) - room.color
+    tinted = _tinted(apart, towards, room, inward)
+    core = (inward > _CORE_PX) & ~tinted
+    sure = core | (_unmixed(apart, towards, differs, inward) & ~tinted)
     band = ~sure & ~outside
     if plate is not None:
         band |= outside & (inward > -_REACH_PX) & (differs > _MAYBE**2)
@@ -144,30 +152,41 @@ def band_matte(image_rgb: _Image, coarse: _Values, plate: RoomColors | None = No
     open_px = np.flatnonzero(band)
     alpha = sure.astype(np.float32)
     prior = np.clip((coarse - _HAZE) / (1 - 2 * _HAZE), 0, 1)
-    mixed = _mixture(image, apart, room, person, prior, inward, open_px)
+    # Where the hue tells, the segmentation is not asked more than at its outline.
+    depth = np.where(tinted, 0, inward)
+    mixed = _mixture(image, apart, room, person, prior, depth, open_px)
     alpha.reshape(-1)[open_px] = np.clip((mixed - _LEFT) / (1 - 2 * _LEFT), 0, 1)
     return BandMatte(_in_one_piece(alpha, inward > 0), room.color)
 
 
-def _unmixed(
-    image: _Colors,
-    apart: _Colors,
-    room: RoomColors,
-    core: _Mask,
-    differs: _Values,
-    inward: _Values,
-) -> _Mask:
+def _tinted(apart: _Colors, towards: _Colors, room: RoomColors, inward: _Values) -> _Mask:
+    """Pixels near the outline whose hue, whatever their light, has a share of the room's.
+
+    Real hair lets a coloured wall through far within its outline; between greys light alone would
+    have to tell, and hair shines.
+    """
+    asked = np.flatnonzero((inward > 0) & (inward < _DEEP_PX))
+    hue, across = (
+        part - part.mean(1, keepdims=True)
+        for part in (colors.reshape(-1, 3)[asked] for colors in (apart, towards))
+    )
+    length = (across * across).sum(1)
+    telling = length > np.maximum(_HUE_LEVELS**2, _HUE_SIGMAS**2 * room.variance.flat[asked])
+    found = np.zeros(inward.shape, bool)
+    found.flat[asked] = telling & ((hue * across).sum(1) < _PURE * length)
+    return found
+
+
+def _unmixed(apart: _Colors, towards: _Colors, differs: _Values, inward: _Values) -> _Mask:
     """What within the outline is neither the room nor a mixture of it with the person near by."""
     alone = cv2.erode((differs > _NOT_ROOM**2).astype(np.uint8), _AROUND) > 0
-    asked = np.flatnonzero(alone & (inward > 0) & ~core)
-    person = spread_colors(image, core.astype(np.float32), _PERSON_PX, 8).reshape(-1, 3)[asked]
-    off = apart.reshape(-1, 3)[asked]
-    across = person - room.color.reshape(-1, 3)[asked]
+    asked = np.flatnonzero(alone & (inward > 0) & (inward <= _CORE_PX))
+    off, across = (colors.reshape(-1, 3)[asked] for colors in (apart, towards))
     along, size = (off * across).sum(1), (off * off).sum(1)
     length = (across * across).sum(1) + np.float32(1e-3)
     aside = 1 - along * np.abs(along) / (length * size + np.float32(1e-3))
-    found = np.zeros(core.shape, bool)
-    found.reshape(-1)[asked] = (aside > _ASIDE) | (along > _WHOLE * length)
+    found = np.zeros(inward.shape, bool)
+    found.flat[asked] = (aside > _ASIDE) | (along > _WHOLE * length)
     return found
 
 
@@ -182,22 +201,24 @@ def _mixture(
 ) -> Float[np.ndarray, "N"]:
     """Alpha that explains the open pixels' colours by the person's near by and the room's."""
     color = spread_colors(image, person, _PERSON_PX, 2)
-    near = color.reshape(-1, 3)[open_px]
-    # About the mean at each place: a wide window's own mean would make far strands unsure.
-    varies = spread_colors(_squares(image - color) / 3, person, _PERSON_PX, 2)
-    varies = varies.reshape(-1)[open_px]
+    # How far the person's own colours differ towards the room's: hair that shines is no mixture
+    # with a coloured wall. About the mean at each place, since a wide window's own mean would make
+    # far strands unsure.
+    towards = color - room.color
+    length = _squares(towards) + np.float32(1e-3)
+    varies = _dot(image - color, towards) ** 2 / length
+    varies = spread_colors(varies, person, _PERSON_PX, 2).reshape(-1)[open_px]
     off, depth = apart.reshape(-1, 3)[open_px], inward.reshape(-1)[open_px]
     variance = room.variance.reshape(-1)[open_px]
-    across = near - room.color.reshape(-1, 3)[open_px]
-    length = (across**2).sum(1) + np.float32(1e-3)
+    across, length = towards.reshape(-1, 3)[open_px], length.reshape(-1)[open_px]
     share = (off * across).sum(1) / length
-    away = np.where(depth > 0, (depth - _FLAT_PX) / _INWARD_PX, -depth / _OUTWARD_PX)
+    away = np.where(depth > 0, depth / _INWARD_PX, -depth / _OUTWARD_PX)
     trusted = (_UNSURE * (_SURE / _UNSURE) ** np.clip(away, 0, 1)) ** -2
     before = prior.reshape(-1)[open_px]
     alpha = before
     # The person's variance counts as far as the person is seen, which is to be found.
     for _ in range(2):
-        precision = length / 3 / (variance + _PERSON_SPREAD * alpha * alpha * varies)
+        precision = length / (variance + _PERSON_SPREAD * alpha * alpha * varies)
         alpha = np.clip((precision * share + trusted * before) / (precision + trusted), 0, 1)
     return alpha
 
@@ -252,6 +273,10 @@ def _inward(coarse: _Values) -> _Values:
     return (inside - outside) * np.float32(_OF_SIDE_PX / len(coarse))
 
 
+def _dot(first: _Colors, second: _Colors) -> _Values:
+    """Scalar product over the channels."""
+    return cv2.transform(cv2.multiply(first, second), np.ones((1, 3), np.float32))
+
+
 def _squares(colors: _Colors) -> _Values:
-    """Sum of squares over the channels."""
-    return cv2.transform(cv2.multiply(colors, colors), np.ones((1, 3), np.float32))
+    return _dot(colors, colors)
