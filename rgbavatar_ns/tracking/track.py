@@ -29,6 +29,7 @@ from rgbavatar_ns.tracking.face.find_faces import find_faces
 from rgbavatar_ns.tracking.fit.fit import ClipFit
 from rgbavatar_ns.tracking.fit.own_head import read_own_head, subject_tracker
 from rgbavatar_ns.tracking.fit.subject import SubjectTracker
+from rgbavatar_ns.tracking.image.background import Background
 from rgbavatar_ns.tracking.image.crop import SquareCrop, steady_crop
 from rgbavatar_ns.tracking.image.frame_images import FrameImages
 from rgbavatar_ns.tracking.input.image_files import source_digest
@@ -136,45 +137,61 @@ class _Tracking:
         arrays, layout = clip.tracker.head.arrays, clip.tracker.head.layout
         thetas = torch.from_numpy(clip.tracker.thetas(clip.fit)).float()
         identity = torch.from_numpy(clip.fit.subject.identity).float()
-        noted = self.run.noted_images(_digest_of_fit(clip, thetas, identity))
+        made_from = _digest_of_fit(clip, thetas, identity)
+        noted = self.run.noted_images(made_from)
+        images = FrameImages(
+            clip.tracker,
+            clip.fit,
+            found,
+            clip.crop,
+            config.keep_torso,
+            self.mattes,
+            clip.source_alpha,
+        )
+        background = self._background(images, made_from) if images.finds_mattes else None
         with disk_errors(dst, GO_ON):
             size, keep = config.image_size, bool(noted)
             writer = DatasetWriter(dst, arrays, identity, layout, size, size, True, keep)
-        self._write_images(clip, thetas, writer, noted)
+        self._write_images(clip, thetas, images, background, writer, noted)
         with disk_errors(dst, GO_ON):
             write_tracking_sheet(dst, clip.tracker, clip.fit, found, clip.crop)
             test = len(found) // 5 if config.test_frames is None else config.test_frames
             dataset = writer.finish(test)
-            report = self._report(clip, [noted[index] for index in found.frame_index])
+            report = self._report(clip, background, [noted[k] for k in found.frame_index])
             report["film"] = _film_shown(dataset, report).to_json()
             write_json(dst / "tracking.json", report)
         self.run.close()
         return dataset
 
+    def _background(self, images: FrameImages, made_from: str) -> Background:
+        """What is behind the person, looked at once; kept in the work folder."""
+
+        def look(key: str) -> str:
+            self.clock.begin("background", None)
+            found = images.background(self.source, self.clock.done)
+            name = f"background_{key[:16]}.npz"
+            found.save(self.run.folder / name, GO_ON)
+            return name
+
+        return Background.load(self.run.folder / self.run.stages.run("background", made_from, look))
+
     def _write_images(
         self,
         clip: _FittedClip,
         thetas: Float[Tensor, "F H"],
+        images: FrameImages,
+        background: Background | None,
         writer: DatasetWriter,
         noted: dict[int, dict[str, Any]],
     ) -> None:
         """Every frame's image, but for those that are noted; what is made is noted too."""
         found, crop = clip.found, clip.crop
-        images = FrameImages(
-            clip.tracker,
-            clip.fit,
-            found,
-            crop,
-            self.config.keep_torso,
-            self.mattes,
-            clip.source_alpha,
-        )
         camera = crop.pinhole(clip.fit.subject.camera)
         ready = [k for k, index in enumerate(found.frame_index) if index in noted]
         self.clock.begin("pictures", len(found))
         done = len(ready)
         self.clock.done(done)
-        with closing(images(self.source, ready)) as made:
+        with closing(images(self.source, background, ready)) as made:
             for index, theta in zip(found.frame_index, thetas):
                 image = None if index in noted else next(made)
                 unfilmed = noted[index]["unfilmed"] if image is None else image.unfilmed
@@ -189,7 +206,9 @@ class _Tracking:
                     self.clock.done(done)
         self.clock.end()
 
-    def _report(self, clip: _FittedClip, shares: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    def _report(
+        self, clip: _FittedClip, background: Background | None, shares: Sequence[dict[str, Any]]
+    ) -> dict[str, Any]:
         """What `tracking.json` holds."""
         seen, found, crop = clip.seen, clip.found, clip.crop
         with_others, tracked = set(seen.with_others), set(found.frame_index)
@@ -213,6 +232,7 @@ class _Tracking:
             **silhouette_summary(shares),
             "unfilmed_share": sum(one["unfilmed"] for one in shares) / len(shares),
             "matte": given if own_mattes else "selfie segmentation",
+            **({} if background is None else background.report()),
             "stages": self.clock.stages,
             "frames_per_second": self.clock.frames_per_second(seen.frames_read),
             "crop": {"left": crop.left, "top": crop.top, "side": crop.side},

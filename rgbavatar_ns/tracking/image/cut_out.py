@@ -31,9 +31,10 @@ class MattedCrop:
         matte: Float[np.ndarray, "S S"],
         inside: Bool[np.ndarray, "S S"],
         color_is_clean: bool = False,
+        background: Float[np.ndarray, "S S 3"] | None = None,
     ) -> "MattedCrop":
         """The crop with its background's share taken out of the colour, unless that is clean."""
-        color = image_rgb if color_is_clean else foreground_color(image_rgb, matte)
+        color = image_rgb if color_is_clean else foreground_color(image_rgb, matte, background)
         return cls(color, matte, inside)
 
 

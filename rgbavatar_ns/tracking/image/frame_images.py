@@ -1,9 +1,10 @@
 """The second reading of a clip: crops and mattes of the tracked frames."""
 
 from collections import deque
-from collections.abc import Collection, Generator, Iterable, Iterator
+from collections.abc import Callable, Collection, Generator, Iterable, Iterator
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace
+from functools import partial
 
 import cv2
 import numpy as np
@@ -14,11 +15,17 @@ from rgbavatar_ns.drawing.compositing import unfilmed_pixels
 from rgbavatar_ns.tracking.face.clip import ClipLandmarks
 from rgbavatar_ns.tracking.fit.fit import ClipFit
 from rgbavatar_ns.tracking.fit.subject import SubjectTracker
+from rgbavatar_ns.tracking.image.background import (
+    Background,
+    find_background,
+    sampled_positions,
+)
 from rgbavatar_ns.tracking.image.crop import SquareCrop
 from rgbavatar_ns.tracking.image.cut_out import CutOut, MattedCrop
 from rgbavatar_ns.tracking.image.head_mask import HeadOutline
 from rgbavatar_ns.tracking.image.matting import PersonMatte, refined_matte
 from rgbavatar_ns.tracking.image.steady_matte import NEIGHBOURS, CoarseMatte, head_motion, steadied
+from rgbavatar_ns.tracking.image.unsure_band import RoomColors, band_matte
 from rgbavatar_ns.tracking.input.mattes import UserMattes
 from rgbavatar_ns.tracking.input.video import FrameSource
 from rgbavatar_ns.tracking.threads import in_background, map_in_order
@@ -63,7 +70,8 @@ class FrameImages:
 
     Mattes are the user's own (`mattes`), or the alpha channel of the source where
     `source_alpha`, or found. Reading, segmentation and the rest run in threads of their own; a
-    few frames are in memory at a time. Each image depends on the clip and the fit alone.
+    few frames are in memory at a time. Each image depends on the clip, the fit and the background
+    alone.
     """
 
     def __init__(
@@ -82,10 +90,38 @@ class FrameImages:
         self._inside = crop.inside(found.width, found.height)
         self._follows = found.follows()
 
+    @property
+    def finds_mattes(self) -> bool:
+        """Whether mattes are found here, and not given."""
+        return self._mattes is None and not self._source_alpha
+
+    def background(self, source: FrameSource, done: Callable[[int], None]) -> Background:
+        """What is behind the person, from frames spread over the clip; `done` counts them."""
+        positions = sampled_positions(len(self._found), self._crop.size)
+
+        def looked_at() -> Iterator[tuple[np.ndarray, np.ndarray]]:
+            for count, crop in enumerate(segmented, 1):
+                assert crop.coarse is not None
+                yield crop.image_rgb, refined_matte(crop.image_rgb, crop.coarse)
+                done(count)
+
+        with ExitStack() as closed:
+            crops = in_background(self._crops(source, positions), _AHEAD)
+            closed.enter_context(closing(crops))
+            segmented = in_background(self._segmented(crops), _AHEAD)
+            closed.enter_context(closing(segmented))
+            return find_background(looked_at(), self._inside)
+
     def __call__(
-        self, source: FrameSource, without: Collection[int] = ()
+        self,
+        source: FrameSource,
+        background: Background | None = None,
+        without: Collection[int] = (),
     ) -> Generator[FrameImage, None, None]:
-        """The image of every tracked frame, in order, but for the positions in `without`."""
+        """The image of every tracked frame, in order, but for the positions in `without`.
+
+        The `background`'s plate, if it has one, tells the person from the room.
+        """
         wanted = [k for k in range(len(self._found)) if k not in set(without)]
         read = sorted({near for k in wanted for near in self._window(k)})
         if not wanted:
@@ -96,12 +132,14 @@ class FrameImages:
             segmented = in_background(self._segmented(crops), _AHEAD)
             closed.enter_context(closing(segmented))
             windows = self._windows(segmented, frozenset(wanted))
-            yield from closed.enter_context(closing(map_in_order(self._finish, windows, _WORKERS)))
+            plate = None if background is None else background.plate
+            finish = partial(self._finish, None if plate is None else RoomColors.of_plate(plate))
+            yield from closed.enter_context(closing(map_in_order(finish, windows, _WORKERS)))
 
     def _window(self, position: int) -> range:
         """Positions around this one whose frames come directly before and after it."""
         first = last = position
-        if self._mattes is not None or self._source_alpha:
+        if not self.finds_mattes:
             return range(first, last + 1)
         while first > position - NEIGHBOURS and self._follows[first]:
             first -= 1
@@ -145,7 +183,8 @@ class FrameImages:
                     yield crop
                     continue
                 matte = matte or PersonMatte()
-                coarse = matte.coarse(crop.image_rgb)
+                face_px = self._crop.points(self._found.points_px[crop.position])
+                coarse = matte.coarse_with_face(crop.image_rgb, face_px)
                 small = CoarseMatte.of(crop.image_rgb, coarse)
                 yield replace(crop, coarse=coarse, small=small)
         finally:
@@ -169,11 +208,15 @@ class FrameImages:
             while held and held[0].position < needed:
                 held.popleft()
 
-    def _finish(self, window: _Window) -> FrameImage:
+    def _finish(self, plate: RoomColors | None, window: _Window) -> FrameImage:
         crop, around = window
-        matted = MattedCrop.of(
-            crop.image_rgb, self._alpha(crop, around), self._inside, crop.color_is_clean
-        )
+        if crop.alpha is not None:
+            matted = MattedCrop.of(crop.image_rgb, crop.alpha, self._inside, crop.color_is_clean)
+        else:
+            found = band_matte(crop.image_rgb, self._steadied(crop, around), plate)
+            matted = MattedCrop.of(
+                crop.image_rgb, found.alpha, self._inside, background=found.background
+            )
         outline = self._cut_out.outline(
             self._crop,
             self._tracker.vertices_px(self._fit, crop.position),
@@ -188,9 +231,7 @@ class FrameImages:
         png = encode_png_rgba(image, _PNG_LEVEL)
         return FrameImage(crop.position, png, outline, matte, inside, unfilmed)
 
-    def _alpha(self, crop: _Cropped, around: tuple[_Cropped, ...]) -> Float[np.ndarray, "S S"]:
-        if crop.alpha is not None:
-            return crop.alpha
+    def _steadied(self, crop: _Cropped, around: tuple[_Cropped, ...]) -> Float[np.ndarray, "S S"]:
         assert crop.coarse is not None
         assert crop.small is not None
         points = self._found.points_px
@@ -200,4 +241,4 @@ class FrameImages:
             for other in around
             if other.small is not None and other.position != crop.position
         ]
-        return refined_matte(crop.image_rgb, steadied(crop.coarse, crop.small, near))
+        return steadied(crop.coarse, crop.small, near)

@@ -1,0 +1,148 @@
+"""How near the mattes of a clip, and those of a stream, come to the truth.
+
+    python benchmarks/quality/mattes.py --seeds 5 6 --json mattes.json
+
+For each procedural person (dark hair, loose strands, shoulders) and each room (a light wall, a
+busy shelf, dark on dark) it films a clip with a webcam's noise and compression, tracks it, and
+prints for each way to find mattes: the mean absolute error of alpha in percent, in the unsure band
+(where the truth or a stream's matte is between .02 and .98, and 3 pixels of 480 around) and over
+the whole image; its flicker (mean absolute change of the error from frame to frame in the band,
+percent); and the error of the colour on a white and on a green background in the band, in levels.
+
+"frame" is a stream's way: plain segmentation and guided filter, each frame by itself. "clip" is
+what `rgbavatar track` writes. Each room is filmed twice: by a camera that stands, and by one that
+trembles by some pixels, where no plate can be of use.
+"""
+
+import argparse
+import json
+import tempfile
+from collections.abc import Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, UInt8
+from rooms import ROOMS, FilmedRoom, Performance
+
+from rgbavatar_ns.drawing.compositing import composite_bytes
+from rgbavatar_ns.tracking import TrackConfig, track_video
+from rgbavatar_ns.tracking.image.crop import SquareCrop
+from rgbavatar_ns.tracking.image.matting import (
+    PersonMatte,
+    foreground_color,
+    straight_rgba,
+)
+from rgbavatar_ns.tracking.input.video import FrameSource
+
+_SIZE, _UNSURE, _AROUND = 480, 0.02, 7
+_NEW_ROOMS = {"white": (1.0, 1.0, 1.0), "green": (0.24, 0.78, 0.24)}
+_TREMBLE_PX = 3.0
+
+Pictures = list[UInt8[np.ndarray, "S S 4"]]
+
+
+def cropped(crop: SquareCrop, rgba: UInt8[np.ndarray, "H W 4"]) -> UInt8[np.ndarray, "S S 4"]:
+    """The crop of a straight-alpha picture, as light adds up."""
+    light = rgba.astype(np.float32)
+    light[..., :3] *= light[..., 3:] / 255
+    held = crop.apply(light)
+    held[..., :3] /= np.maximum(held[..., 3:] / 255, 1e-6)
+    return np.clip(held + 0.5, 0, 255).astype(np.uint8)
+
+
+def alpha(picture: UInt8[np.ndarray, "S S 4"]) -> np.ndarray:
+    """In [0, 1]."""
+    return picture[..., 3].astype(np.float32) / 255
+
+
+def unsure(truth: Pictures, plain: Pictures) -> list[Bool[np.ndarray, "S S"]]:
+    """Where the truth or the plain matte is soft, and around."""
+    soft = [
+        (np.abs(np.stack([alpha(a), alpha(b)]) - 0.5) < 0.5 - _UNSURE).any(0)
+        for a, b in zip(truth, plain)
+    ]
+    kernel = np.ones((_AROUND, _AROUND), np.uint8)
+    return [cv2.dilate(one.astype(np.uint8), kernel) > 0 for one in soft]
+
+
+def figures(
+    found: Pictures, truth: Pictures, bands: list[Bool[np.ndarray, "S S"]], inside: np.ndarray
+) -> dict[str, float]:
+    """All errors of one way."""
+    off = [alpha(a) - alpha(b) for a, b in zip(found, truth)]
+    bands = [band & inside for band in bands]
+    row = {
+        "band": 100 * np.mean([np.abs(one)[band].mean() for one, band in zip(off, bands)]),
+        "whole": 100 * np.mean([np.abs(one)[inside].mean() for one in off]),
+        "flicker": 100
+        * np.mean([np.abs(b - a)[band].mean() for a, b, band in zip(off, off[1:], bands[1:])]),
+    }
+    for name, color in _NEW_ROOMS.items():
+        shown = [[composite_bytes(one, color).astype(float) for one in p] for p in (found, truth)]
+        apart = [np.abs(a - b)[band].mean() for a, b, band in zip(*shown, bands)]
+        row[name] = np.mean(apart)
+    return {name: float(value) for name, value in row.items()}
+
+
+def measure(film: FilmedRoom, folder: Path, tremble_px: float) -> dict[str, Any]:
+    """Film, track and compare one clip."""
+    clip, dst = folder / "clip.mp4", folder / "set"
+    film.write(clip, tremble_px)
+    config = TrackConfig(image_size=_SIZE, keep_torso=True)
+    dataset = track_video(clip, dst, config)
+    report = json.loads((dst / "tracking.json").read_text())
+    crop = SquareCrop(**report["crop"], size=_SIZE)
+    left_out = {frame for frames in report["rejected"].values() for frame in frames}
+    frames = [k for k in range(report["frames_read"]) if k not in left_out]
+    truth = [cropped(crop, one) for k, one in enumerate(film.truth(tremble_px)) if k in set(frames)]
+    found = [dataset.read_image(place) for place in range(len(frames))]
+    plain, inside = [], np.ones((_SIZE, _SIZE), bool)
+    with closing(PersonMatte()) as matte:
+        for frame in FrameSource.open(clip).read(set(frames).__contains__):
+            image, inside = crop.apply(frame.image_rgb), crop.inside(frame.width, frame.height)
+            level = matte(image)
+            plain.append(straight_rgba(foreground_color(image, level), level))
+    bands = unsure(truth, plain)
+    return {
+        "background": report["background"],
+        "known": report["background_known_share"],
+        "pictures_per_second": report["stages"]["pictures"]["frames_per_second"],
+        "frame": figures(plain, truth, bands, inside),
+        "clip": figures(found, truth, bands, inside),
+    }
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Print two rows for each person, room and camera."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[5, 6])
+    parser.add_argument("--frames", type=int, default=60)
+    parser.add_argument("--rooms", nargs="+", default=list(ROOMS), choices=list(ROOMS))
+    parser.add_argument("--json", type=Path, help="also write the figures here")
+    chosen = parser.parse_args(arguments)
+    rows = []
+    for seed in chosen.seeds:
+        performance = Performance(seed, chosen.frames, supersampling=2)
+        for name in chosen.rooms:
+            for tremble_px in (0.0, _TREMBLE_PX):
+                with tempfile.TemporaryDirectory() as folder:
+                    film = FilmedRoom(performance, ROOMS[name], seed)
+                    row = measure(film, Path(folder), tremble_px)
+                rows.append({"seed": seed, "room": name, "tremble_px": tremble_px, **row})
+                for way in ("frame", "clip"):
+                    errors = "  ".join(f"{key} {value:.2f}" for key, value in row[way].items())
+                    print(f"{seed} {name} {tremble_px:g} px ({row['background']}) {way}: {errors}")
+                print(
+                    f"    band x {row['clip']['band'] / row['frame']['band']:.2f}, "
+                    f"{row['pictures_per_second']:.1f} pictures/s",
+                    flush=True,
+                )
+    if chosen.json:
+        chosen.json.write_text(json.dumps(rows, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,194 @@
+"""What is behind the person: a clean plate of it where the camera stands still."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from rgbavatar_ns.files import atomic_write
+
+SAMPLES = 40
+"""Frames that are looked at, spread over the clip: each pixel's median needs no more."""
+# Of a very large image fewer are held at once.
+_SAMPLES_BYTES, _FEWEST = 256 * 2**20, 8
+# A pixel counts as uncovered in a frame whose matte is below this.
+_UNCOVERED = 0.3
+# A plate's colour is known where so many frames show it, and agree to so many levels (0 to 255).
+_SEEN, _AGREE_LEVELS = 4, 6.0
+# Sorting is done by so many rows at a time, so that little is held beside the samples.
+_ROWS = 32
+_QUARTILE_SIGMAS = 1.349
+# A pixel tells of motion where the plate changes by so many levels from one pixel to the next, and
+# the clip is told by it where a pixel in two hundred does.
+_TEXTURE_LEVELS, _TEXTURE_SHARE = 8.0, 0.005
+# The camera moves where what it shows wanders by more (one standard deviation, pixels of the crop):
+# less blurs the plate no more than interpolation does.
+_STILL_PX = 0.5
+# The light changes where one frame in ten is off by more levels; less is followed frame by frame.
+_LIGHT_LEVELS, _LIGHT_PERCENTILE = 10.0, 90
+
+BackgroundKind = Literal["still", "moves", "light changes", "covered", "too short"]
+
+
+@dataclass(frozen=True)
+class CleanPlate:
+    """The room without the person, as far as the clip uncovers it."""
+
+    color: UInt8[np.ndarray, "S S 3"]
+    """Black where nothing is known."""
+    seen: UInt8[np.ndarray, "S S"]
+    """In how many of the sampled frames each pixel was background; 0 where these disagree."""
+    spread: Float[np.ndarray, "S S"]
+    """One standard deviation over time, levels of the worst channel."""
+
+    @property
+    def known(self) -> Bool[np.ndarray, "S S"]:
+        """Where enough frames agree."""
+        return self.seen >= _SEEN
+
+
+@dataclass(frozen=True)
+class Background:
+    """What a clip's background does, and the plate if it is of use."""
+
+    kind: BackgroundKind
+    motion_px: float | None
+    """How far it wanders (one standard deviation, pixels of the crop); None without texture."""
+    light_levels: float
+    """How far frames are brighter or darker than the clip's median, of 255 (percentile 90)."""
+    plate: CleanPlate | None
+
+    @property
+    def camera_is_still(self) -> bool | None:
+        """Whether the camera stands; None where nothing behind the person would tell."""
+        if self.kind in ("covered", "too short") or self.motion_px is None:
+            return None
+        return self.kind != "moves"
+
+    def report(self) -> dict[str, Any]:
+        """What `tracking.json` says of it."""
+        known = None if self.plate is None else float(self.plate.known.mean())
+        return {
+            "background": self.kind,
+            "background_motion_px": self.motion_px,
+            "background_light_levels": self.light_levels,
+            "background_known_share": known,
+        }
+
+    def save(self, path: Path, remedy: str) -> None:
+        """Write everything to a file of NumPy's."""
+        plate = {}
+        if self.plate is not None:
+            plate = {name: getattr(self.plate, name) for name in ("color", "seen", "spread")}
+        motion = np.nan if self.motion_px is None else self.motion_px
+        with atomic_write(path, remedy=remedy) as partial, partial.open("wb") as file:
+            np.savez(file, kind=self.kind, motion=motion, light=self.light_levels, **plate)
+
+    @classmethod
+    def load(cls, path: Path) -> "Background":
+        """What `save` wrote."""
+        with np.load(path) as held:
+            plate = None
+            if "color" in held:
+                plate = CleanPlate(held["color"], held["seen"], held["spread"])
+            motion = float(held["motion"])
+            return cls(
+                held["kind"].item(),
+                None if np.isnan(motion) else motion,
+                float(held["light"]),
+                plate,
+            )
+
+
+def sampled_positions(count: int, size: int) -> list[int]:
+    """Which of `count` frames of `size` x `size` pixels are looked at."""
+    held = max(_FEWEST, min(SAMPLES, _SAMPLES_BYTES // (3 * size * size)))
+    return np.unique(np.linspace(0, count - 1, min(count, held)).round().astype(int)).tolist()
+
+
+def find_background(
+    samples: Iterable[tuple[UInt8[np.ndarray, "S S 3"], Float[np.ndarray, "S S"]]],
+    inside: Bool[np.ndarray, "S S"],
+) -> Background:
+    """Judge the background by (image, matte of the person) of frames spread over a clip.
+
+    Each pixel's colour is the median over the frames that do not show the person there, which a
+    matte's errors leave alone as long as most of these frames are right. `inside` is where the
+    images show what was filmed.
+    """
+    images, free = [], []
+    for image, matte in samples:
+        images.append(image)
+        free.append((matte <= _UNCOVERED) & inside)
+    if len(images) < _FEWEST:
+        return Background("too short", None, 0.0, None)
+    color, spread, count = _medians(images, free)
+    often = count >= _SEEN
+    light = _light_changes(images, free, color, often)
+    motion = _motion_px(color, spread, often)
+    kind: BackgroundKind = "still"
+    if often.mean() < _TEXTURE_SHARE:
+        kind = "covered"
+    elif light > _LIGHT_LEVELS:
+        kind = "light changes"
+    elif motion is not None and motion > _STILL_PX:
+        kind = "moves"
+    if kind != "still":
+        return Background(kind, motion, light, None)
+    seen = np.where(spread < _AGREE_LEVELS, count, 0).astype(np.uint8)
+    return Background(kind, motion, light, CleanPlate(color, seen, spread))
+
+
+def _medians(
+    images: list[np.ndarray], free: list[np.ndarray]
+) -> tuple[UInt8[np.ndarray, "S S 3"], Float[np.ndarray, "S S"], UInt8[np.ndarray, "S S"]]:
+    """Median colour, spread and number of the frames that count, for each pixel."""
+    color = np.zeros_like(images[0])
+    spread = np.zeros(color.shape[:2], np.float32)
+    count = np.sum(free, axis=0, dtype=np.uint8)
+    for top in range(0, len(color), _ROWS):
+        rows = slice(top, top + _ROWS)
+        levels = np.stack([image[rows] for image in images], -1).astype(np.int16)
+        counts = np.stack([one[rows] for one in free], -1)
+        # What does not count is sorted behind everything that does.
+        levels[~np.broadcast_to(counts[:, :, None], levels.shape)] = 256
+        levels.sort(axis=-1)
+        last = np.maximum(count[rows].astype(np.int64) - 1, 0)[..., None, None]
+        low, middle, high = (
+            np.take_along_axis(levels, np.broadcast_to(place, (*levels.shape[:3], 1)), -1)[..., 0]
+            for place in (last // 4, last // 2, last - last // 4)
+        )
+        seen = count[rows] > 0
+        color[rows][seen] = middle[seen]
+        spread[rows][seen] = ((high - low).max(-1) / np.float32(_QUARTILE_SIGMAS))[seen]
+    return color, spread, count
+
+
+def _light_changes(
+    images: list[np.ndarray], free: list[np.ndarray], color: np.ndarray, often: np.ndarray
+) -> float:
+    """By how many levels frames differ from the plate all over, as most of them do at worst."""
+    off = []
+    for image, uncovered in zip(images, free):
+        both = uncovered & often
+        if both.any():
+            off.append(np.abs(np.median(image[both].astype(np.int16) - color[both], axis=0)).max())
+    return float(np.percentile(off, _LIGHT_PERCENTILE)) if off else 0.0
+
+
+def _motion_px(color: np.ndarray, spread: np.ndarray, often: np.ndarray) -> float | None:
+    """How far the background wanders: what edges change over time by how steep they are."""
+    grey = cv2.GaussianBlur(cv2.cvtColor(color, cv2.COLOR_RGB2GRAY).astype(np.float32), (0, 0), 1)
+    steep = np.hypot(cv2.Scharr(grey, -1, 1, 0), cv2.Scharr(grey, -1, 0, 1)) / 32
+    # The border of what is known is no edge of the room.
+    known = cv2.erode(often.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
+    telling = known & (steep > _TEXTURE_LEVELS)
+    if telling.mean() < _TEXTURE_SHARE:
+        return None
+    noise = float(np.percentile(spread[known], 25))
+    moved = np.sqrt(np.maximum(spread[telling] ** 2 - noise**2, 0)) / steep[telling]
+    return float(np.median(moved))

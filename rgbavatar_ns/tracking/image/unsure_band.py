@@ -1,0 +1,282 @@
+"""Alpha where the segmentation leaves it open, from the colours of person and background.
+
+The segmentation is trusted well inside and well outside of its outline. Between them each pixel's
+colour is explained as a mixture of the person's colour near by and the background's, which a clean
+plate knows or the surroundings suggest. How far a mixture tells more than the segmentation follows
+from how different both colours are, and how much each of them varies.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
+
+from rgbavatar_ns.tracking.image.background import CleanPlate
+
+_Image = UInt8[np.ndarray, "S S 3"]
+_Colors = Float[np.ndarray, "S S 3"]
+_Values = Float[np.ndarray, "S S"]
+_Mask = Bool[np.ndarray, "S S"]
+
+# The numbers below were chosen on procedural people (`benchmarks/quality/mattes.py`, seeds 1 and
+# 2, all rooms). Lengths are pixels of an image of this side, and grow with it.
+_OF_SIDE_PX = 480
+# From the segmentation's outline: inside of the first everything is the person; the second is how
+# far hair that stands off is looked for, if a plate tells it from the room.
+_CORE_PX, _REACH_PX = 3.0, 45.0
+# Without a plate nothing is looked for farther outside; beyond it the frame shows the background.
+_NEAR_PX = 8.0
+# Within how many pixels, and more, a colour's mean is taken: of the person, of the background.
+_PERSON_PX, _ROOM_PX = (2, 5, 12, 40), (2, 6, 20, 60)
+_LIGHT_PX, _LIGHT_LEVELS = (10, 40), 12.0
+# Each wider mean only counts where the narrower one knows next to nothing.
+_WIDER = 1e-3
+# Noise of a webcam after its compression, and what a guessed background's texture adds to it: at
+# the border of what is known, and at most, some pixels away from it.
+_NOISE_LEVELS, _GUESS_LEVELS, _TEXTURE = 2.0, 2.0, 0.1
+_GUESS_FROM, _GUESS_TO, _GUESS_PX, _TEXTURE_PX = 0.3, 4.0, 4.0, 9
+# From so many times the noise on, a pixel may be hair that stands off; a pixel is no background, if
+# all around it are as far off.
+_MAYBE, _NOT_ROOM, _AROUND = 2.0, 4.0, np.ones((3, 3), np.uint8)
+# Mixtures lie on the line between both colours: no mixture has so large a squared sine to it, nor
+# lies so far along it.
+_ASIDE, _WHOLE = 0.1, 0.7
+# Hair may be mixed with the room so far within the outline. It is where the hues of both differ by
+# so many levels and so many times the noise, and less than such a share of the person's is there.
+_DEEP_PX, _HUE_LEVELS, _HUE_SIGMAS, _PURE = 10.0, 45.0, 8.0, 0.85
+# How sure the segmentation is of alpha: at its outline, and away from it on either side.
+_UNSURE, _SURE = 0.5, 0.08
+_INWARD_PX, _OUTWARD_PX = 4.0, 8.0
+# The share of the person's own variance near by that makes a mixture unsure.
+_PERSON_SPREAD = 1.0
+# The segmentation hovers off 0 and 1, and mixtures a little; an avatar would learn that as haze.
+_HAZE, _LEFT = 0.15, 0.03
+# What is enclosed by the person and smaller is a fault of the segmentation, unless the plate shows
+# through; shares of the image.
+_HOLE_SHARE = 0.003
+_STRAY_ALPHA, _BRIDGE_PX = 0.05, 5
+
+
+@dataclass(frozen=True)
+class RoomColors:
+    """What is behind the person everywhere: known, or guessed from what is known near by."""
+
+    color: _Colors
+    variance: _Values
+    """Of the worst case of noise and guess, levels squared."""
+    known: _Mask
+
+    @classmethod
+    def of(cls, color: _Image, known: _Mask, spread: _Values | float, coarser: int) -> "RoomColors":
+        """Colours go on smoothly beyond what is known, and are the less sure the more texture."""
+        weight = known.astype(np.float32)
+        found = color.astype(np.float32)
+        found[~known] = spread_colors(found, weight, _ROOM_PX, coarser)[~known]
+        box = (_TEXTURE_PX, _TEXTURE_PX)
+        mean = cv2.blur(found, box)
+        texture = np.maximum(cv2.blur(found * found, box) - mean * mean, 0).mean(-1)
+        away = cv2.distanceTransform(1 - known.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
+        away *= _OF_SIDE_PX / len(color)
+        guess = texture * (_TEXTURE * np.clip(away / _GUESS_PX, _GUESS_FROM, _GUESS_TO))
+        guess = np.where(known, np.float32(spread) ** 2, guess + _GUESS_LEVELS**2)
+        return cls(found, (guess + _NOISE_LEVELS**2).astype(np.float32), known)
+
+    @classmethod
+    def of_plate(cls, plate: CleanPlate) -> "RoomColors":
+        """The room as a clip's plate knows it."""
+        return cls.of(plate.color, plate.known, plate.spread, 1)
+
+
+@dataclass(frozen=True)
+class BandMatte:
+    """Alpha, and the background's colour that goes with it."""
+
+    alpha: _Values
+    background: _Colors
+
+
+def spread_colors(
+    values: Float[np.ndarray, "S S *channels"],
+    weight: _Values,
+    radii_px: Sequence[int],
+    coarser: int,
+) -> Float[np.ndarray, "S S *channels"]:
+    """Weighted means within the narrowest radius that holds any weight, of each pixel.
+
+    Radii are pixels of an image of 480; the means are taken at an image so many times `coarser`.
+    """
+    size = len(weight)
+    few, scale = max(1, size // coarser), size / coarser / _OF_SIDE_PX
+    weighted = values * weight.reshape(size, size, *[1] * (values.ndim - 2))
+    parts = [
+        cv2.resize(part, (few, few), interpolation=cv2.INTER_AREA) for part in (weighted, weight)
+    ]
+    totals, share = [np.zeros_like(part) for part in parts], np.float32(1)
+    for radius_px in radii_px:
+        box = (2 * max(1, round(radius_px * scale)) + 1,) * 2
+        for total, part in zip(totals, parts):
+            total += share * cv2.blur(part, box)
+        share *= np.float32(_WIDER)
+    held = (totals[1] + np.float32(1e-12)).reshape(few, few, *[1] * (values.ndim - 2))
+    return cv2.resize(totals[0] / held, (size, size))
+
+
+def band_matte(image_rgb: _Image, coarse: _Values, plate: RoomColors | None = None) -> BandMatte:
+    """Alpha of the person in one piece, in [0, 1], from a segmentation that knows it coarsely.
+
+    `plate` is the room as other frames know it; without it the frame's own surroundings stand for
+    it. Ours: difference matting (Smith and Blinn 1996) weighed as Bayesian matting does (Chuang
+    2001), with the segmentation as prior, on those pixels alone that it leaves open.
+    """
+    coarse = _without_holes(image_rgb, coarse, plate)
+    image, inward = image_rgb.astype(np.float32), _inward(coarse)
+    outside = inward < -_NEAR_PX
+    room = (
+        RoomColors.of(image_rgb, outside, 0.0, 2)
+        if plate is None
+        else _lit_as(image, plate, outside)
+    )
+    apart = image - room.color
+    differs = _squares(apart) / (3 * room.variance)
+    deep = (inward > _DEEP_PX).astype(np.float32)
+    towards = spread_colors(image, deep, _PERSON_PX, 8) - room.color
+    tinted = _tinted(apart, towards, room, inward)
+    core = (inward > _CORE_PX) & ~tinted
+    sure = core | (_unmixed(apart, towards, differs, inward) & ~tinted)
+    band = ~sure & ~outside
+    if plate is not None:
+        band |= outside & (inward > -_REACH_PX) & (differs > _MAYBE**2)
+    person = cv2.erode(sure.astype(np.uint8), _AROUND).astype(np.float32)
+    open_px = np.flatnonzero(band)
+    alpha = sure.astype(np.float32)
+    prior = np.clip((coarse - _HAZE) / (1 - 2 * _HAZE), 0, 1)
+    # Where the hue tells, the segmentation is not asked more than at its outline.
+    depth = np.where(tinted, 0, inward)
+    mixed = _mixture(image, apart, room, person, prior, depth, open_px)
+    alpha.reshape(-1)[open_px] = np.clip((mixed - _LEFT) / (1 - 2 * _LEFT), 0, 1)
+    return BandMatte(_in_one_piece(alpha, inward > 0), room.color)
+
+
+def _tinted(apart: _Colors, towards: _Colors, room: RoomColors, inward: _Values) -> _Mask:
+    """Pixels near the outline whose hue, whatever their light, has a share of the room's.
+
+    Real hair lets a coloured wall through far within its outline; between greys light alone would
+    have to tell, and hair shines.
+    """
+    asked = np.flatnonzero((inward > 0) & (inward < _DEEP_PX))
+    hue, across = (
+        part - part.mean(1, keepdims=True)
+        for part in (colors.reshape(-1, 3)[asked] for colors in (apart, towards))
+    )
+    length = (across * across).sum(1)
+    telling = length > np.maximum(_HUE_LEVELS**2, _HUE_SIGMAS**2 * room.variance.flat[asked])
+    found = np.zeros(inward.shape, bool)
+    found.flat[asked] = telling & ((hue * across).sum(1) < _PURE * length)
+    return found
+
+
+def _unmixed(apart: _Colors, towards: _Colors, differs: _Values, inward: _Values) -> _Mask:
+    """What within the outline is neither the room nor a mixture of it with the person near by."""
+    alone = cv2.erode((differs > _NOT_ROOM**2).astype(np.uint8), _AROUND) > 0
+    asked = np.flatnonzero(alone & (inward > 0) & (inward <= _CORE_PX))
+    off, across = (colors.reshape(-1, 3)[asked] for colors in (apart, towards))
+    along, size = (off * across).sum(1), (off * off).sum(1)
+    length = (across * across).sum(1) + np.float32(1e-3)
+    aside = 1 - along * np.abs(along) / (length * size + np.float32(1e-3))
+    found = np.zeros(inward.shape, bool)
+    found.flat[asked] = (aside > _ASIDE) | (along > _WHOLE * length)
+    return found
+
+
+def _mixture(
+    image: _Colors,
+    apart: _Colors,
+    room: RoomColors,
+    person: _Values,
+    prior: _Values,
+    inward: _Values,
+    open_px: Int[np.ndarray, "N"],
+) -> Float[np.ndarray, "N"]:
+    """Alpha that explains the open pixels' colours by the person's near by and the room's."""
+    color = spread_colors(image, person, _PERSON_PX, 2)
+    # How far the person's own colours differ towards the room's: hair that shines is no mixture
+    # with a coloured wall. About the mean at each place, since a wide window's own mean would make
+    # far strands unsure.
+    towards = color - room.color
+    length = _squares(towards) + np.float32(1e-3)
+    varies = _dot(image - color, towards) ** 2 / length
+    varies = spread_colors(varies, person, _PERSON_PX, 2).reshape(-1)[open_px]
+    off, depth = apart.reshape(-1, 3)[open_px], inward.reshape(-1)[open_px]
+    variance = room.variance.reshape(-1)[open_px]
+    across, length = towards.reshape(-1, 3)[open_px], length.reshape(-1)[open_px]
+    share = (off * across).sum(1) / length
+    away = np.where(depth > 0, depth / _INWARD_PX, -depth / _OUTWARD_PX)
+    trusted = (_UNSURE * (_SURE / _UNSURE) ** np.clip(away, 0, 1)) ** -2
+    before = prior.reshape(-1)[open_px]
+    alpha = before
+    # The person's variance counts as far as the person is seen, which is to be found.
+    for _ in range(2):
+        precision = length / (variance + _PERSON_SPREAD * alpha * alpha * varies)
+        alpha = np.clip((precision * share + trusted * before) / (precision + trusted), 0, 1)
+    return alpha
+
+
+def _lit_as(image: _Colors, plate: RoomColors, outside: _Mask) -> RoomColors:
+    """The plate as bright as this frame shows it: lamps flicker, cameras adapt, a person shades."""
+    off = np.clip(image - plate.color, -_LIGHT_LEVELS, _LIGHT_LEVELS)
+    weight = (outside & plate.known).astype(np.float32)
+    return replace(plate, color=plate.color + spread_colors(off, weight, _LIGHT_PX, 8))
+
+
+def _without_holes(image_rgb: _Image, coarse: _Values, plate: RoomColors | None) -> _Values:
+    """The segmentation without small holes, but for those that show the plate."""
+    empty = (coarse <= 0.5).astype(np.uint8)
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(empty, connectivity=4)
+    small = stats[:, cv2.CC_STAT_AREA] < _HOLE_SHARE * coarse.size
+    if count < 3 or not small[1:].any():
+        return coarse
+    filled = coarse.copy()
+    for label in np.flatnonzero(small[1:]) + 1:
+        left, top, wide, high = stats[label, :4]
+        if left == 0 or top == 0 or left + wide == len(coarse) or top + high == len(coarse):
+            continue
+        hole = labels == label
+        if plate is not None and plate.known[hole].mean() > 0.5:
+            off = image_rgb[hole].astype(np.float32) - plate.color[hole]
+            if np.median((off**2).mean(1) / plate.variance[hole]) < _NOT_ROOM**2:
+                continue
+        filled[hole] = 1
+    return filled
+
+
+def _in_one_piece(alpha: _Values, segmented: _Mask) -> _Values:
+    """Only what hangs together with most of the segmented person, strands across small gaps too."""
+    size = len(alpha)
+    few = max(1, size // 2)
+    seen = cv2.resize(alpha, (few, few), interpolation=cv2.INTER_AREA) > _STRAY_ALPHA
+    bridged = cv2.dilate(seen.astype(np.uint8), np.ones((_BRIDGE_PX, _BRIDGE_PX), np.uint8))
+    _, labels = cv2.connectedComponents(bridged)
+    person = cv2.resize(segmented.astype(np.uint8), (few, few), interpolation=cv2.INTER_NEAREST)
+    votes = np.bincount(labels[(person > 0) & (bridged > 0)], minlength=1)
+    kept = (labels == votes.argmax()).astype(np.uint8)
+    return alpha * cv2.resize(kept, (size, size), interpolation=cv2.INTER_NEAREST)
+
+
+def _inward(coarse: _Values) -> _Values:
+    """How far within the segmentation's outline each pixel lies, negative outside of it."""
+    person = (coarse > 0.5).astype(np.uint8)
+    inside, outside = (
+        cv2.distanceTransform(one, cv2.DIST_L2, cv2.DIST_MASK_5) for one in (person, 1 - person)
+    )
+    return (inside - outside) * np.float32(_OF_SIDE_PX / len(coarse))
+
+
+def _dot(first: _Colors, second: _Colors) -> _Values:
+    """Scalar product over the channels."""
+    return cv2.transform(cv2.multiply(first, second), np.ones((1, 3), np.float32))
+
+
+def _squares(colors: _Colors) -> _Values:
+    return _dot(colors, colors)
