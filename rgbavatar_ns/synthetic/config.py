@@ -5,6 +5,7 @@ from typing import Annotated, Literal
 
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.options import Between, CheckedOptions, FrameRate, Seed
+from rgbavatar_ns.synthetic.performer.hair import HairStyle
 
 
 @dataclass(frozen=True)
@@ -31,6 +32,8 @@ class DemoConfig(CheckedOptions):
     """Depth of the wrinkles that come with expressions; 0 leaves them out."""
     glasses: bool = True
     """Whether the person wears glasses."""
+    hair: HairStyle = "short"
+    """The person's hair, or a hat over it."""
     light: Literal["room", "head"] = "room"
     """What the lamps are fixed to: the room, in which the head turns, or the head itself, so that
     each point of it looks alike from everywhere but for highlights."""
