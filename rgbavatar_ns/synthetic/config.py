@@ -5,6 +5,7 @@ from typing import Annotated, Literal
 
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.options import Between, CheckedOptions, FrameRate, Seed
+from rgbavatar_ns.synthetic.performer.hair import HairStyle
 from rgbavatar_ns.synthetic.performer.performance import Body
 
 
@@ -35,6 +36,8 @@ class DemoConfig(CheckedOptions):
     body: Body = "none"
     """Whether shoulders and chest are in the picture, and what they do: sway a little, as the head
     alone does by default; keep still while the head turns; or lean to all sides."""
+    hair: HairStyle = "short"
+    """The person's hair, or a hat over it."""
     light: Literal["room", "head"] = "room"
     """What the lamps are fixed to: the room, in which the head turns, or the head itself, so that
     each point of it looks alike from everywhere but for highlights."""

@@ -20,10 +20,11 @@ from rgbavatar_ns.head.rotations import axis_angle_to_matrix, matrix_to_axis_ang
 from rgbavatar_ns.kernels.types import PinholeCameras
 from rgbavatar_ns.synthetic.config import DemoConfig
 from rgbavatar_ns.synthetic.performer.glasses import make_glasses
+from rgbavatar_ns.synthetic.performer.hair import SCALP_HAIR, make_hair_piece
 from rgbavatar_ns.synthetic.performer.paint import paint_head
 from rgbavatar_ns.synthetic.performer.performance import perform, with_tracker_noise
 from rgbavatar_ns.synthetic.performer.surface import TrueSurface
-from rgbavatar_ns.synthetic.performer.wrinkles import wrinkle_activations
+from rgbavatar_ns.synthetic.performer.wrinkles import WRINKLES, wrinkle_activations
 from rgbavatar_ns.synthetic.renderer.raycast import StillCamera
 from rgbavatar_ns.synthetic.renderer.render import DemoRenderer, Moment
 
@@ -67,9 +68,10 @@ class DemoPerson:
         # Looks of their own, but no caricature.
         drawn = np.random.default_rng([config.seed, 0]).standard_normal(head.num_identity)
         identity = torch.from_numpy(np.clip(0.6 * drawn, -1.2, 1.2)).float()
-        surface = TrueSurface(head.arrays, config.seed, config.wrinkles)
+        scalp_hair = SCALP_HAIR[config.hair]
+        surface = TrueSurface(head.arrays, config.seed, config.wrinkles, scalp_hair)
         resolution = min(max(256, 2 ** int(np.ceil(np.log2(2 * config.image_size)))), 2048)
-        paint = paint_head(head.arrays, resolution, config.seed, config.wrinkles)
+        paint = paint_head(head.arrays, resolution, config.seed, config.wrinkles, scalp_hair > 0)
         rest = torch.zeros(2, head.layout.size)
         rest[1, head.layout.slice("jaw").start] = WIDE_OPEN_RAD
         at_rest, jaw_open = head(rest, identity).numpy()
@@ -79,12 +81,15 @@ class DemoPerson:
             bridge = np.abs(at_rest[:, 0]) < 0.012
             bridge &= np.abs(at_rest[:, 1] - eyes[:, 1].mean()) < 0.008
             glasses = make_glasses(eyes[0], eyes[1], float(at_rest[bridge, 2].max()))
+        bare = surface.pose(at_rest, np.zeros(len(WRINKLES))).vertices
+        hair = make_hair_piece(config.hair, bare, config.seed)
         focal_px = 0.5 * config.image_size * _CAMERA_DISTANCE_M / view_m[1]
         camera = StillCamera(view_m[0], _CAMERA_DISTANCE_M, focal_px, config.image_size)
         renderer = DemoRenderer(
             surface,
             paint,
             glasses,
+            hair,
             at_rest,
             jaw_open,
             camera,

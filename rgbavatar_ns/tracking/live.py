@@ -1,7 +1,7 @@
 """The tracker for a stream: one frame in, one tracked frame out."""
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
@@ -17,11 +17,13 @@ from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.tracking.config import TrackConfig
 from rgbavatar_ns.tracking.face.detector import FaceLandmarker
 from rgbavatar_ns.tracking.fit.fit import ClipFit, SubjectFit, fit_frame, rigid_start
+from rgbavatar_ns.tracking.fit.outline import PersonOutline
 from rgbavatar_ns.tracking.fit.own_head import read_own_head, subject_tracker
 from rgbavatar_ns.tracking.fit.subject import SubjectTracker
-from rgbavatar_ns.tracking.image.crop import FollowingCrop, SquareCrop
+from rgbavatar_ns.tracking.image.crop import FollowingCrop, SquareCrop, steady_crop
 from rgbavatar_ns.tracking.image.cut_out import CutOut, MattedCrop
 from rgbavatar_ns.tracking.image.matting import PersonMatte
+from rgbavatar_ns.tracking.image.outlines import OUTLINE_PX, levels, person_outline
 
 # Share of a clip's pull to both neighbours: a stream has only the past, and must not lag.
 _CAUSAL_SHARE = 0.25
@@ -133,7 +135,8 @@ class LiveTracker:
         seen, self._warm_up = self._warm_up, []
         landmarks = np.stack([one for _, _, one in seen])
         height, width = seen[0][1].shape[:2]
-        self._fit = _CausalFit(self._tracker, self._tracker.fit_subject(landmarks, width, height))
+        subject = self._tracker.fit_subject(landmarks, width, height, self._outlines(seen))
+        self._fit = _CausalFit(self._tracker, subject)
         self._crop = FollowingCrop.around(landmarks, width, height, self._config.image_size)
         square = self._crop.square
         for index, image, landmarks_px in seen:
@@ -141,6 +144,20 @@ class LiveTracker:
             frame = self._tracked(self._fit, index, landmarks_px, square, matted)
             if frame is not None:
                 self._backlog.append(frame)
+
+    def _outlines(
+        self, seen: Sequence[tuple[int, _Image, _Landmarks]]
+    ) -> list[PersonOutline | None]:
+        """The person's outlines in the key frames of the warm-up."""
+        landmarks = np.stack([one for _, _, one in seen])
+        height, width = seen[0][1].shape[:2]
+        crop = steady_crop(landmarks, width, height, OUTLINE_PX)
+        outlines = []
+        for position in self._tracker.key_positions(landmarks):
+            _, image, landmarks_px = seen[position]
+            matte = levels(self._matte(crop.apply(image)))
+            outlines.append(person_outline(matte, crop, landmarks_px))
+        return outlines
 
     def _matted(self, image_rgb: _Image, crop: SquareCrop) -> MattedCrop:
         image, (height, width) = crop.apply(image_rgb), image_rgb.shape[:2]

@@ -32,6 +32,7 @@ from rgbavatar_ns.tracking.fit.subject import SubjectTracker
 from rgbavatar_ns.tracking.image.background import Background
 from rgbavatar_ns.tracking.image.crop import SquareCrop, steady_crop
 from rgbavatar_ns.tracking.image.frame_images import FrameImages
+from rgbavatar_ns.tracking.image.outlines import key_outlines
 from rgbavatar_ns.tracking.input.image_files import source_digest
 from rgbavatar_ns.tracking.input.mattes import UserMattes
 from rgbavatar_ns.tracking.input.video import FrameSource
@@ -117,7 +118,11 @@ class _Tracking:
             def half_done() -> None:
                 clock.done(next(calls) // 2)
 
-            fit = tracker.fit(seen.points_px, seen.follows(), width, height, half_done)
+            alpha = self.mattes is None and bool(faces.has_alpha.any())
+            keys = tracker.key_positions(seen.points_px)
+            outlines = key_outlines(self.source, self.mattes, alpha, seen, keys, self.run)
+            follows = seen.follows()
+            fit = tracker.fit(seen.points_px, follows, width, height, half_done, outlines)
             lost = tracker.rejected(fit, seen.points_px)
             found, fit = seen.without(lost), fit.without(lost)
             clock.done(len(seen))
@@ -128,7 +133,6 @@ class _Tracking:
                 )
         crop = steady_crop(found.points_px, width, height, config.image_size)
         left_out = tuple(seen.frame_index[position] for position in lost)
-        alpha = self.mattes is None and bool(faces.has_alpha.any())
         return _FittedClip(seen, found, left_out, tracker, fit, crop, alpha)
 
     def write(self, clip: _FittedClip) -> TrackedDataset:

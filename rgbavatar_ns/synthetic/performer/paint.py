@@ -78,8 +78,13 @@ def _slopes(
     return np.stack([right, up], -1) / metres_per_texel
 
 
-def paint_head(arrays: HeadArrays, resolution: int, seed: int, wrinkles: float) -> Paint:
-    """Paint textures of `resolution` texels a side; `wrinkles` scales the folds' depth."""
+def paint_head(
+    arrays: HeadArrays, resolution: int, seed: int, wrinkles: float, scalp_hair: bool = True
+) -> Paint:
+    """Paint textures of `resolution` texels a side; `wrinkles` scales the folds' depth.
+
+    Without `scalp_hair` the scalp is skin.
+    """
     anchors = uv_anchors(torch.from_numpy(arrays.uv), torch.from_numpy(arrays.uv_faces), resolution)
     triangle = anchors.triangle_index.numpy()
     corners = arrays.v_template[arrays.faces[triangle]]
@@ -88,7 +93,7 @@ def paint_head(arrays: HeadArrays, resolution: int, seed: int, wrinkles: float) 
         name: np.isin(arrays.faces[:, 0], arrays.vertex_groups[name])[triangle]
         for name in ("left_eye", "right_eye", "upper_teeth", "lower_teeth", "tongue")
     }
-    color, gloss, relief = _skin(p, seed)
+    color, gloss, relief = _skin(p, seed, scalp_hair)
     for paint, parts in ((_teeth, ("upper_teeth", "lower_teeth")), (_tongue, ("tongue",))):
         where = np.logical_or.reduce([inner[part] for part in parts])
         color[where], gloss[where] = paint(p[where])
@@ -130,7 +135,7 @@ def _texel_lengths(arrays: HeadArrays, triangle: np.ndarray, resolution: int) ->
     return (np.linalg.norm(tangents, axis=2) / resolution)[triangle].astype(np.float32)
 
 
-def _skin(p: Points, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _skin(p: Points, seed: int, scalp_hair: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Colour, gloss and relief of everything but eyes, teeth and tongue."""
     x, y, z = np.abs(p[:, 0]), p[:, 1], p[:, 2]
     color = np.tile(_SKIN, (len(p), 1))
@@ -155,11 +160,16 @@ def _skin(p: Points, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         color = _mix(color, np.array([0.10, 0.05, 0.035]), mole * 0.85)
     gloss = 0.22 + 0.16 * bump(x, 0, 0.014) * (z > 0.03) + 0.06 * pores
     relief = 3.0e-5 * pores * (z > 0)
-    return _dress(p, seed, color, gloss, relief)
+    return _dress(p, seed, scalp_hair, color, gloss, relief)
 
 
 def _dress(
-    p: Points, seed: int, color: np.ndarray, gloss: np.ndarray, relief: np.ndarray
+    p: Points,
+    seed: int,
+    scalp_hair: bool,
+    color: np.ndarray,
+    gloss: np.ndarray,
+    relief: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Lips, lashes, the inside of the mouth, brows, hair and the shirt, in this order."""
     lips = regions.lips(p)
@@ -178,7 +188,8 @@ def _dress(
     strands = value_noise(p * np.array([700, 500, 500]) + p[:, 1:2] * 500, seed + 6)
     brow = regions.brows(p) * smooth(strands, -1.1, -0.1)
     color, gloss = _mix(color, _HAIR * 0.9, 0.92 * brow), gloss * (1 - 0.6 * brow)
-    color, gloss, relief = _hair(p, seed, color, gloss, relief)
+    if scalp_hair:
+        color, gloss, relief = _hair(p, seed, color, gloss, relief)
     shirt = regions.shirt(p)
     threads = np.sin(p[:, 0] * 2 * np.pi / 0.0042) * np.sin(p[:, 1] * 2 * np.pi / 0.0042)
     stripe = smooth(np.sin(p[:, 1] * 2 * np.pi / 0.022 + 1.2), 0.55, 0.75)
@@ -200,6 +211,13 @@ def _hair(
         p * np.array([420, 110, 260]), seed + 7
     )
     hair = smooth(frayed, -0.004, 0.008)
+    hair_color, hair_gloss, hair_relief = strands_of_hair(p, seed)
+    color = _mix(color, hair_color, hair)
+    return color, gloss + (hair_gloss - gloss) * hair, relief + (hair_relief - relief) * hair
+
+
+def strands_of_hair(p: Points, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Colour [N, 3], gloss [N] and relief [N] in metres of hair at points on a head."""
     # Combed back on top, down on the sides.
     side = smooth(np.abs(p[:, 0]), 0.035, 0.060)[:, None]
     top_way, side_way = np.array([520, 140, 60]), np.array([520, 60, 520])
@@ -208,10 +226,7 @@ def _hair(
     strands = strands + side * value_noise((p + curl) * side_way, seed + 10)[:, None]
     locks = fractal_noise((p + curl) * np.array([130, 60, 40]), seed + 11, 2)[:, None]
     shade = np.clip(1 + 0.38 * strands + 0.32 * locks, 0.25, 2.2)
-    color = _mix(color, _HAIR * shade, hair)
-    strand_gloss = 0.30 + 0.25 * strands[:, 0]
-    relief = relief + (2.2e-4 * (strands + 0.8 * locks)[:, 0] - relief) * hair
-    return color, gloss + (strand_gloss - gloss) * hair, relief
+    return _HAIR * shade, 0.30 + 0.25 * strands[:, 0], 2.2e-4 * (strands + 0.8 * locks)[:, 0]
 
 
 def _teeth(p: Points) -> tuple[np.ndarray, np.ndarray]:

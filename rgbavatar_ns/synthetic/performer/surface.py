@@ -65,10 +65,13 @@ class TrueSurface:
     """Makes the true surface out of the head model's vertices.
 
     Every triangle of the tracked mesh becomes four; hair stands off the scalp, heavier on the
-    side that hangs down; folds rise and sink with their activations.
+    side that hangs down; folds rise and sink with their activations. `scalp_hair` is how high hair
+    stands, by the height of a short cut.
     """
 
-    def __init__(self, arrays: HeadArrays, seed: int, wrinkles: float) -> None:
+    def __init__(
+        self, arrays: HeadArrays, seed: int, wrinkles: float, scalp_hair: float = 1.0
+    ) -> None:
         count = len(arrays.v_template)
         self._coarse_faces = arrays.faces
         self.faces, self._split = split_in_four(arrays.faces, count)
@@ -89,7 +92,7 @@ class TrueSurface:
         skin = (self._split @ (part_of_vertex == 0).astype(np.float32) > 0.99).astype(np.float32)
         above = regions.above_hairline_m(self.template)
         locks = 1 + 0.45 * fractal_noise(self.template * 55, seed + 12, 2)
-        full = 0.0055 + 0.0085 * smooth(self.template[:, 1], 0.05, 0.12)
+        full = scalp_hair * (0.0055 + 0.0085 * smooth(self.template[:, 1], 0.05, 0.12))
         self._hair_m = (full * locks * smooth(above, -0.001, 0.022) * skin).astype(np.float32)
         self._folds_m = wrinkle_heights_m(self.template) * (skin * np.float32(wrinkles))[:, None]
 

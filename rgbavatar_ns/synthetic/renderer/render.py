@@ -1,4 +1,4 @@
-"""Draws the demo person: posed surface and glasses in, RGBA image with soft alpha out."""
+"""Draws the demo person: posed surface, glasses and hair in, RGBA image with soft alpha out."""
 
 from dataclasses import dataclass
 
@@ -7,7 +7,8 @@ import numpy as np
 from embreex.rtcore import EmbreeDevice
 from jaxtyping import Float, UInt8
 
-from rgbavatar_ns.synthetic.performer.glasses import Glasses, Mesh
+from rgbavatar_ns.synthetic.performer.glasses import Glasses, Mesh, joined
+from rgbavatar_ns.synthetic.performer.hair import HairPiece
 from rgbavatar_ns.synthetic.performer.paint import Paint, paint_eye
 from rgbavatar_ns.synthetic.performer.regions import smooth
 from rgbavatar_ns.synthetic.performer.surface import PARTS, PosedSurface, TrueSurface, unit
@@ -22,11 +23,11 @@ from rgbavatar_ns.synthetic.renderer.lighting import (
 )
 from rgbavatar_ns.synthetic.renderer.raycast import PixelRays, RayScene, StillCamera, cast_pixels
 
-_FRAME_MATERIAL = len(PARTS)
+_FRAME_MATERIAL, _HAIR_MATERIAL = len(PARTS), len(PARTS) + 1
 _AMBIENT_RAYS = 48
 _AMBIENT_REACH_M = 0.12
-_SHARPNESS = np.array([16.0, 260.0, 260.0, 70.0, 70.0, 40.0, 60.0], np.float32)
-_TRANSLUCENCY = np.array([1.0, 0.3, 0.3, 0.4, 0.4, 1.0, 0.0], np.float32)
+_SHARPNESS = np.array([16.0, 260.0, 260.0, 70.0, 70.0, 40.0, 60.0, 12.0], np.float32)
+_TRANSLUCENCY = np.array([1.0, 0.3, 0.3, 0.4, 0.4, 1.0, 0.0, 0.0], np.float32)
 _SHADOW = 0.6
 _FRAME_SHADOW = 0.25
 _FRAME_COLOR = np.array([0.190, 0.095, 0.055], np.float32)
@@ -60,6 +61,7 @@ class DemoRenderer:
         surface: TrueSurface,
         paint: Paint,
         glasses: Glasses | None,
+        hair: HairPiece | None,
         at_rest: Float[np.ndarray, "V 3"],
         jaw_open: Float[np.ndarray, "V 3"],
         camera: StillCamera,
@@ -68,19 +70,21 @@ class DemoRenderer:
         light_follows_head: bool = False,
     ) -> None:
         self._device = EmbreeDevice()
-        self._surface, self._paint, self._glasses = surface, paint, glasses
+        self._surface, self._paint, self._glasses, self._hair = surface, paint, glasses, hair
         self._camera, self._supersampling = camera, supersampling
         self._light_follows_head = light_follows_head
         still = np.zeros(len(WRINKLES))
         self._openness = [
             self._ambient(surface.pose(vertices, still)) for vertices in (at_rest, jaw_open)
         ]
-        frame_faces = np.zeros((0, 3), np.int64) if glasses is None else glasses.frame.faces
-        count = len(surface.template)
-        self._faces = np.concatenate([surface.faces, frame_faces + count])
-        self._material = np.concatenate(
-            [surface.face_part, np.full(len(frame_faces), _FRAME_MATERIAL, np.int8)]
-        )
+        worn = [] if glasses is None else [(glasses.frame, _FRAME_MATERIAL)]
+        worn += [] if hair is None else [(hair.mesh, _HAIR_MATERIAL)]
+        self._worn = joined([mesh for mesh, _ in worn]) if worn else None
+        faces, material = [surface.faces], [surface.face_part]
+        if self._worn is not None:
+            faces.append(self._worn.faces + len(surface.template))
+            material += [np.full(len(mesh.faces), kind, np.int8) for mesh, kind in worn]
+        self._faces, self._material = np.concatenate(faces), np.concatenate(material)
 
     def _ambient(self, posed: PosedSurface) -> Float[np.ndarray, "V"]:
         """Share of the hemisphere over each vertex from which light comes, cosine-weighted."""
@@ -106,10 +110,10 @@ class DemoRenderer:
         tilt = float(0.35 * moment.head_rotation[0, 1] - 0.25 * moment.head_rotation[0, 2])
         posed = self._surface.pose(moment.tracked, moment.activations, tilt)
         vertices, normals = posed.vertices, posed.normals
-        if self._glasses is not None:
-            frame = self._glasses.frame.moved(moment.head_rotation, moment.head_shift_m)
-            vertices = np.concatenate([vertices, frame.vertices])
-            normals = np.concatenate([normals, frame.normals])
+        if self._worn is not None:
+            worn = self._worn.moved(moment.head_rotation, moment.head_shift_m)
+            vertices = np.concatenate([vertices, worn.vertices])
+            normals = np.concatenate([normals, worn.normals])
         still = np.eye(3, dtype=np.float32)
         light_to_world = moment.head_rotation if self._light_follows_head else still
         key = (light_to_world @ KEY_DIRECTION).astype(np.float32)
@@ -145,7 +149,7 @@ class DemoRenderer:
         albedo = np.tile(_FRAME_COLOR, (len(n), 1))
         gloss = np.full(len(n), 0.5, np.float32)
         openness = np.ones(len(n), np.float32)
-        body = np.flatnonzero(material != _FRAME_MATERIAL)
+        body = np.flatnonzero(material < _FRAME_MATERIAL)
         corners = self._faces[hits.triangle[body]]
         weights = hits.weights[body]
         share = np.float32(moment.jaw_open)
@@ -160,6 +164,11 @@ class DemoRenderer:
             self._surface.template, self._faces[hits.triangle[eye]], hits.weights[eye]
         )
         albedo[eye], gloss[eye] = paint_eye(place)
+        if self._hair is not None and self._worn is not None:
+            piece = material == _HAIR_MATERIAL
+            corners = self._faces[hits.triangle[piece]] - len(self._surface.template)
+            place = _interpolate(self._worn.vertices, corners, hits.weights[piece])
+            albedo[piece], gloss[piece] = self._hair.paint(place)
         n = unit(n)
         to_eye = -rays.directions
         n = np.where((n * to_eye).sum(1, keepdims=True) < -0.2, -n, n)

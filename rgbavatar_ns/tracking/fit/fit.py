@@ -1,6 +1,6 @@
 """Fit of the head model to a clip's landmarks: identity and camera once, then every frame."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -10,6 +10,7 @@ from jaxtyping import Float
 from rgbavatar_ns.tracking.fit.camera import StillCamera
 from rgbavatar_ns.tracking.fit.landmark_cost import FrameCost, FrameTerms, Target
 from rgbavatar_ns.tracking.fit.levenberg_marquardt import QuadraticModel, levenberg_marquardt
+from rgbavatar_ns.tracking.fit.outline import OutlineCost, OutlineTerms, PersonOutline
 
 _Values = Float[np.ndarray, "P"]
 _Packed = Float[np.ndarray, "Q"]
@@ -23,6 +24,8 @@ _SCAN_KEYS = 4
 _HEAD_HEIGHT_M = 0.19
 _OFFSET_SHRINK = 0.8
 _ROBUST_STEPS = 2
+# Steps with the outlines: first into them, then with hair of one thickness, found anew each time.
+_INTO_OUTLINE_STEPS, _HAIR_STEPS, _HAIR_ROUNDS = 10, 4, 3
 
 
 @dataclass(frozen=True)
@@ -189,6 +192,46 @@ def subject_offsets(
     return _OFFSET_SHRINK * np.median(found, axis=0)
 
 
+def fit_outlines(
+    cost: FrameCost,
+    outline_cost: OutlineCost,
+    keys: Sequence[Target],
+    outlines: Sequence[PersonOutline | None],
+    subject: SubjectFit,
+    identity_components: int,
+) -> SubjectFit:
+    """The subject of `fit_subject`, moved to where the key frames' outlines allow it to be.
+
+    `outline_cost` has this cost's entries and identity components. Outlines go with `keys`; None
+    where a frame has none. The camera stays.
+    """
+    seen = [number for number, outline in enumerate(outlines) if outline is not None]
+    if not seen:
+        return subject
+    camera = subject.camera
+    terms = {
+        number: OutlineTerms(outline, camera, key.to_upright)
+        for number, (outline, key) in enumerate(zip(outlines, keys))
+        if outline is not None
+    }
+    for rounds in range(1 + _HAIR_ROUNDS):
+        if rounds:
+            thetas = [cost.theta(subject.key_values[number]) for number in seen]
+            hair_m = outline_cost.hair_m(thetas, subject.identity, [terms[k] for k in seen])
+            terms = {number: replace(one, hair_m=hair_m) for number, one in terms.items()}
+        _, subject = _fit_keys(
+            cost,
+            keys,
+            camera,
+            identity_components,
+            _HAIR_STEPS if rounds else _INTO_OUTLINE_STEPS,
+            subject.key_values,
+            subject.identity,
+            (outline_cost, terms),
+        )
+    return subject
+
+
 def _fit_keys(
     cost: FrameCost,
     keys: Sequence[Target],
@@ -196,7 +239,10 @@ def _fit_keys(
     identity_components: int,
     iterations: int,
     starts: Float[np.ndarray, "K P"] | None = None,
+    identity: Float[np.ndarray, "I"] | None = None,
+    outlines: tuple[OutlineCost, Mapping[int, OutlineTerms]] | None = None,
 ) -> tuple[float, SubjectFit]:
+    """Fit all key frames and the person together, from `starts` and `identity` (the average)."""
     if starts is None:
         starts = np.array(
             [
@@ -219,6 +265,16 @@ def _fit_keys(
         person[:shared] = packed[common]
         return packed[: common.start].reshape(frames, size), person
 
+    def models_of(number: int, own: _Values, person: np.ndarray) -> Iterator[QuadraticModel]:
+        yield joint.model(own, person, terms[number])
+        if outlines is not None and number in outlines[1]:
+            yield outlines[0].model(cost.theta(own), person, outlines[1][number])
+
+    def values_of(number: int, own: _Values, person: np.ndarray) -> Iterator[float]:
+        yield joint.value(own, person, terms[number])
+        if outlines is not None and number in outlines[1]:
+            yield outlines[0].value(cost.theta(own), person, outlines[1][number])
+
     def model_at(packed: _Packed) -> QuadraticModel:
         values, person = unpacked(packed)
         pull = precision * packed[common]
@@ -226,34 +282,35 @@ def _fit_keys(
         gradient, hessian = np.zeros(len(packed)), np.zeros((len(packed), len(packed)))
         gradient[common] = pull
         hessian[common, common] = precision * np.eye(shared)
-        for number, frame in enumerate(terms):
+        for number in range(frames):
             own = slice(number * size, (number + 1) * size)
-            model = joint.model(values[number], person, frame)
-            total += model.cost
-            gradient[own] = model.gradient[:size]
-            gradient[common] += model.gradient[size:]
-            hessian[own, own] = model.hessian[:size, :size]
-            hessian[own, common] = model.hessian[:size, size:]
-            hessian[common, own] = model.hessian[size:, :size]
-            hessian[common, common] += model.hessian[size:, size:]
+            for model in models_of(number, values[number], person):
+                total += model.cost
+                gradient[own] += model.gradient[:size]
+                gradient[common] += model.gradient[size:]
+                hessian[own, own] += model.hessian[:size, :size]
+                hessian[own, common] += model.hessian[:size, size:]
+                hessian[common, own] += model.hessian[size:, :size]
+                hessian[common, common] += model.hessian[size:, size:]
         return QuadraticModel(total, gradient, hessian)
 
     def cost_at(packed: _Packed) -> float:
         values, person = unpacked(packed)
         total = 0.5 * precision * float(packed[common] @ packed[common])
-        return total + sum(joint.value(own, person, frame) for own, frame in zip(values, terms))
+        return total + sum(sum(values_of(number, own, person)) for number, own in enumerate(values))
 
+    begun = np.zeros(shared) if identity is None else identity[:shared]
     packed, total = levenberg_marquardt(
         cost_at,
         model_at,
-        np.concatenate([starts.reshape(-1), np.zeros(shared)]),
+        np.concatenate([starts.reshape(-1), begun]),
         lower,
         upper,
         iterations=iterations,
         tolerance=1e-3,
     )
-    values, identity = unpacked(packed)
-    return total, SubjectFit(identity, camera, values)
+    values, found = unpacked(packed)
+    return total, SubjectFit(found, camera, values)
 
 
 def key_frame_positions(landmarks_px: Float[np.ndarray, "F L 2"], count: int) -> list[int]:

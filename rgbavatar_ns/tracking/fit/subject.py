@@ -32,6 +32,7 @@ from rgbavatar_ns.tracking.fit.fit import (
     ClipFit,
     SubjectFit,
     fit_clip,
+    fit_outlines,
     fit_subject,
     key_frame_positions,
     subject_offsets,
@@ -39,6 +40,7 @@ from rgbavatar_ns.tracking.fit.fit import (
 from rgbavatar_ns.tracking.fit.irises import iris_places
 from rgbavatar_ns.tracking.fit.landmark_cost import FrameCost, Target
 from rgbavatar_ns.tracking.fit.landmark_head import LandmarkHead
+from rgbavatar_ns.tracking.fit.outline import OutlineCost, PersonOutline
 from rgbavatar_ns.tracking.fit.parameters import fit_parameters
 
 # Lips, lids, brows, nose and irises are seen; cheeks and forehead are interpolated by FaceMesh,
@@ -96,25 +98,41 @@ class SubjectTracker:
         width: int,
         height: int,
         advance: Callable[[], None] = lambda: None,
+        outlines: Sequence[PersonOutline | None] = (),
     ) -> ClipFit:
-        """Identity, camera and offsets from key frames, then every frame."""
+        """Identity, camera and offsets from key frames, then every frame.
+
+        `outlines` are those of the person in the frames of `key_positions`, in their order.
+        """
         # The matrices are small: more threads would only wait for each other.
         with threadpool_limits(1):
-            subject = self.fit_subject(landmarks_px, width, height)
+            subject = self.fit_subject(landmarks_px, width, height, outlines)
             targets = self.targets(landmarks_px)
             weight = self.config.temporal_weight
             return fit_clip(self.cost, subject, targets, follows, weight, advance)
 
+    def key_positions(self, landmarks_px: Float[np.ndarray, "F 478 2"]) -> list[int]:
+        """The frames that the subject is fitted on: those that differ most."""
+        return key_frame_positions(landmarks_px, self.config.key_frames)
+
     def fit_subject(
-        self, landmarks_px: Float[np.ndarray, "F 478 2"], width: int, height: int
+        self,
+        landmarks_px: Float[np.ndarray, "F 478 2"],
+        width: int,
+        height: int,
+        outlines: Sequence[PersonOutline | None] = (),
     ) -> SubjectFit:
-        """Identity, camera and landmark offsets from the frames that differ most."""
+        """Identity, camera and landmark offsets from the key frames.
+
+        `outlines` as in `fit`; without any, landmarks alone decide.
+        """
         targets = self.targets(landmarks_px)
-        picked = key_frame_positions(landmarks_px, self.config.key_frames)
-        keys = [targets[position] for position in picked]
-        subject = fit_subject(
-            self.cost, keys, width, height, self.config.identity_components, self.config.focal_px
-        )
+        keys = [targets[position] for position in self.key_positions(landmarks_px)]
+        shared = min(self.config.identity_components, self.cost.head.num_identity)
+        subject = fit_subject(self.cost, keys, width, height, shared, self.config.focal_px)
+        if outlines:
+            outline_cost = OutlineCost(self.head, self.cost.parameters.columns, shared)
+            subject = fit_outlines(self.cost, outline_cost, keys, outlines, subject, shared)
         offsets = subject_offsets(self.cost, subject, keys)
         self.cost = replace(self.cost, head=self.cost.head.with_offsets(offsets))
         return subject

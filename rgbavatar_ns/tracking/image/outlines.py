@@ -1,0 +1,127 @@
+"""The person's outline in the key frames, which the fit asks for before there are any crops."""
+
+from collections.abc import Iterator, Sequence
+from contextlib import closing
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.files import atomic_write
+from rgbavatar_ns.reading import DamagedFileError, load_arrays
+from rgbavatar_ns.tracking.face.clip import ClipLandmarks
+from rgbavatar_ns.tracking.fit.outline import PersonOutline
+from rgbavatar_ns.tracking.image.crop import SquareCrop, steady_crop
+from rgbavatar_ns.tracking.image.matting import PersonMatte
+from rgbavatar_ns.tracking.input.mattes import UserMattes
+from rgbavatar_ns.tracking.input.video import FrameSource
+from rgbavatar_ns.tracking.resumable_run import GO_ON, ResumableRun
+
+OUTLINE_PX = 256
+"""Side of the crops that outlines are found in: segmentation knows no more."""
+# A matte that holds less of the face than this is of something else, or of nothing.
+_OF_FACE = 0.8
+_MOST_BYTES = 1 << 28
+
+
+def person_outline(
+    matte: UInt8[np.ndarray, "s s"], crop: SquareCrop, landmarks_px: Float[np.ndarray, "478 2"]
+) -> PersonOutline | None:
+    """The outline of whom the face belongs to, of a matte's crop; None where it misses the face.
+
+    Holes are filled and what stands apart is left out: only where the person ends is asked.
+    """
+    solid = (matte > 127).astype(np.uint8)
+    hull = cv2.convexHull(crop.points(landmarks_px).astype(np.float32))
+    face = cv2.fillConvexPoly(np.zeros_like(solid), np.round(hull - 0.5).astype(np.int32), 1)
+    contours, _ = cv2.findContours(solid, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    person, most = np.zeros_like(solid), 0
+    for contour in contours:
+        filled = cv2.drawContours(np.zeros_like(solid), [contour], 0, 1, cv2.FILLED)
+        shared = int((filled & face).sum())
+        if shared > most:
+            person, most = filled, shared
+    if most == 0 or most < _OF_FACE * face.sum() or person.all():
+        return None
+    outwards, inwards = (
+        cv2.distanceTransform(part, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+        for part in (1 - person, person)
+    )
+    step_px = 1 / crop.scale
+    # Distances are to the nearest pixel of the other kind; the edge lies half a pixel before it.
+    away = np.where(person > 0, 0.5 - inwards, outwards - 0.5)
+    first_px = np.array([crop.left, crop.top]) + 0.5 * step_px
+    return PersonOutline(away.astype(np.float64) * step_px, first_px, step_px)
+
+
+def key_outlines(
+    source: FrameSource,
+    mattes: UserMattes | None,
+    source_alpha: bool,
+    found: ClipLandmarks,
+    positions: Sequence[int],
+    run: ResumableRun,
+) -> list[PersonOutline | None]:
+    """The outlines in these frames, from the user's own mattes, the source's alpha, or found.
+
+    The frames are read once more; what was found is kept in `run`.
+    """
+    crop = steady_crop(found.points_px, found.width, found.height, OUTLINE_PX)
+    place = {found.frame_index[position]: position for position in positions}
+    path = run.folder / "key_mattes.npz"
+
+    def look(key: str) -> dict[str, Any]:
+        made = dict(_mattes(source, mattes, source_alpha, found, frozenset(place), crop))
+        with atomic_write(path, remedy=GO_ON) as partial:
+            np.savez(partial, matte=np.stack([made[index] for index in sorted(place)]))
+        return {"file": path.name}
+
+    made_from = [sorted(place), crop.left, crop.top, crop.side]
+    run.stages.run("mattes of key frames", made_from, look)
+    try:
+        kept = load_arrays(path, _MOST_BYTES)["matte"]
+        if kept.shape != (len(place), OUTLINE_PX, OUTLINE_PX) or kept.dtype != np.uint8:
+            raise DamagedFileError("its arrays do not fit together")
+    except (DamagedFileError, KeyError) as error:
+        raise UserError(
+            f"{path} holds no mattes of key frames: {error}.",
+            "Remove the folder's unfinished tracking, or track with --overwrite.",
+        ) from None
+    return [
+        person_outline(matte, crop, found.points_px[place[index]])
+        for index, matte in zip(sorted(place), kept)
+    ]
+
+
+def _mattes(
+    source: FrameSource,
+    mattes: UserMattes | None,
+    source_alpha: bool,
+    found: ClipLandmarks,
+    wanted: frozenset[int],
+    crop: SquareCrop,
+) -> Iterator[tuple[int, UInt8[np.ndarray, "s s"]]]:
+    """The mattes' crops, in the frames' order."""
+    if mattes is not None:
+        for index, level in mattes.levels(wanted, found.width, found.height):
+            yield index, crop.apply(level)
+        return
+    last = max(wanted)
+    with closing(PersonMatte()) as matte:
+        for frame in source.read(wanted.__contains__):
+            if source_alpha:
+                alpha = frame.alpha
+                if alpha is None:
+                    alpha = np.full((frame.height, frame.width), 255, np.uint8)
+                yield frame.index, crop.apply(alpha)
+            else:
+                yield frame.index, levels(matte(crop.apply(frame.image_rgb)))
+            if frame.index == last:
+                return
+
+
+def levels(matte: Float[np.ndarray, "s s"]) -> UInt8[np.ndarray, "s s"]:
+    """A matte in [0, 1] as bytes."""
+    return (matte * 255 + 0.5).astype(np.uint8)
