@@ -91,7 +91,7 @@ def measure(film: FilmedRoom, folder: Path, tremble_px: float) -> dict[str, Any]
     """Film, track and compare one clip."""
     clip, dst = folder / "clip.mp4", folder / "set"
     film.write(clip, tremble_px)
-    config = TrackConfig(image_size=_SIZE, keep_torso=True)
+    config = TrackConfig(image_size=_SIZE)
     dataset = track_video(clip, dst, config)
     report = json.loads((dst / "tracking.json").read_text())
     crop = SquareCrop(**report["crop"], size=_SIZE)

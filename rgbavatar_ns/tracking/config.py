@@ -11,8 +11,9 @@ from rgbavatar_ns.options import Between, CheckedOptions, Count, Counted
 class TrackConfig(CheckedOptions):
     """Options of `track_video`; the defaults suit a webcam or phone clip of one person."""
 
-    image_size: Annotated[int, Between(16, 4096)] = 256
-    """Side of the square images of the dataset, pixels."""
+    image_size: Annotated[int, Between(16, 4096)] | None = None
+    """Side of the square images of the dataset, pixels. None gives the head 256, and so more to a
+    picture that shows shoulders too."""
     test_frames: Counted | None = None
     """Last frames held out for evaluation; None holds out a fifth of the tracked frames."""
     max_frames: Count | None = None
@@ -23,10 +24,9 @@ class TrackConfig(CheckedOptions):
     """How many identity components of the head model are fitted."""
     key_frames: Annotated[int, Between(1, 1000)] = 12
     """Frames that identity and focal length are fitted on."""
-    keep_torso: bool = False
-    """Keep neck and shoulders as the matte found them. By default the matte fades out below the
-    neck of the fitted head, because the avatar's Gaussians ride on a mesh that ends there: a
-    torso in the image would be explained by stretched Gaussians that swing with the head."""
+    head_only: bool = False
+    """Make an avatar that ends at the neck, where the mattes fade out. By default it has shoulders
+    and chest as far as they are filmed. Of your own head model (`flame`) only the head is made."""
     mattes: Path | None = None
     """Your own mattes, in place of those that are found: a folder with one image a frame (named
     like the frames, or in the order of their numbers; white or opaque is the person), or a mask

@@ -28,6 +28,7 @@ from rgbavatar_ns.tracking.image.outlines import OUTLINE_PX, levels, person_outl
 # Share of a clip's pull to both neighbours: a stream has only the past, and must not lag.
 _CAUSAL_SHARE = 0.25
 _ITERATIONS, _ITERATIONS_ANEW = 4, 25
+_SIZE_PX = 512
 
 _Image = UInt8[np.ndarray, "H W 3"]
 _Landmarks = Float[np.ndarray, "478 2"]
@@ -48,12 +49,13 @@ class LiveTracker:
     """
 
     def __init__(self, config: TrackConfig | None = None) -> None:
-        self._config = config or TrackConfig(image_size=512)
+        # A stream has its head alone: how a body moves is known from the clip as a whole.
+        self._config = replace(config or TrackConfig(), head_only=True)
         self._tracker = subject_tracker(self._config, read_own_head(self._config.flame))
         self.head = self._tracker.head
         self._landmarker = FaceLandmarker()
         self._matte = PersonMatte()
-        self._cut_out = CutOut(self.head.arrays, self._config.keep_torso)
+        self._cut_out = CutOut(self.head.arrays)
         self._worker = ThreadPoolExecutor(1, "rgbavatar-matte")
         self._warm_up: list[tuple[int, _Image, _Landmarks]] = []
         self._backlog: list[TrackedFrame] = []
@@ -137,7 +139,8 @@ class LiveTracker:
         height, width = seen[0][1].shape[:2]
         subject = self._tracker.fit_subject(landmarks, width, height, self._outlines(seen))
         self._fit = _CausalFit(self._tracker, subject)
-        self._crop = FollowingCrop.around(landmarks, width, height, self._config.image_size)
+        size = self._config.image_size or _SIZE_PX
+        self._crop = FollowingCrop.around(landmarks, width, height, size)
         square = self._crop.square
         for index, image, landmarks_px in seen:
             matted = partial(self._matted, image, square)

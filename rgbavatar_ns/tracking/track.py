@@ -1,9 +1,8 @@
 """A video in, a tracked dataset out: faces, fit, images, report; an interrupted run goes on."""
 
-import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from itertools import count
 from pathlib import Path
@@ -32,11 +31,16 @@ from rgbavatar_ns.tracking.fit.subject import SubjectTracker
 from rgbavatar_ns.tracking.image.background import Background
 from rgbavatar_ns.tracking.image.crop import SquareCrop, steady_crop
 from rgbavatar_ns.tracking.image.frame_images import FrameImages
+from rgbavatar_ns.tracking.image.matting import PersonMatte
 from rgbavatar_ns.tracking.image.outlines import key_outlines
 from rgbavatar_ns.tracking.input.image_files import source_digest
 from rgbavatar_ns.tracking.input.mattes import UserMattes
 from rgbavatar_ns.tracking.input.video import FrameSource
 from rgbavatar_ns.tracking.resumable_run import GO_ON, ResumableRun
+from rgbavatar_ns.tracking.stage_clock import Progress, StageClock
+from rgbavatar_ns.tracking.torso.compose import on_body
+from rgbavatar_ns.tracking.torso.find_body import find_body
+from rgbavatar_ns.tracking.torso.place import BodyPlaces
 from rgbavatar_ns.tracking.verify.contact_sheet import write_tracking_sheet
 from rgbavatar_ns.tracking.verify.report import (
     fit_quality,
@@ -47,8 +51,6 @@ from rgbavatar_ns.tracking.verify.report import (
 
 _LIGHT_FRAMES = 60
 """Frames that tell how bright the film is and whether that changes."""
-Progress = Callable[[str, int, int | None], None]
-"""Called with (stage, frames done, frames in all); None where a file does not say how many."""
 
 
 def track_video(
@@ -73,7 +75,7 @@ def track_video(
     mattes = None if config.mattes is None else UserMattes.open(config.mattes, source)
     load_mediapipe()
     run = ResumableRun.open(Path(dst), _settings(source, config, own_head), config.overwrite)
-    tracking = _Tracking(source, mattes, own_head, config, run, _StageClock(progress))
+    tracking = _Tracking(source, mattes, own_head, config, run, StageClock(progress))
     with _one_thread_a_call():
         return tracking.write(tracking.fitted_clip())
 
@@ -87,6 +89,7 @@ class _FittedClip:
     lost: tuple[int, ...]
     tracker: SubjectTracker
     fit: ClipFit
+    body: BodyPlaces | None
     crop: SquareCrop
     source_alpha: bool
 
@@ -100,7 +103,7 @@ class _Tracking:
     own_head: HeadArrays | None
     config: TrackConfig
     run: ResumableRun
-    clock: "_StageClock"
+    clock: StageClock
 
     def fitted_clip(self) -> _FittedClip:
         """Find the face in every frame and fit the head to it."""
@@ -131,9 +134,22 @@ class _Tracking:
                     "The head model fits none of the faces that were found.",
                     "Use a video in which the face is seen larger and more from the front.",
                 )
-        crop = steady_crop(found.points_px, width, height, config.image_size)
+        body = None
+        if tracker.head.arrays.has_torso:
+            clock.begin("body", len(found))
+            with closing(PersonMatte()) as person:
+                body = find_body(
+                    self.source, self.run, tracker, fit, found, person.coarse, clock.done
+                )
+            identity, heads = fit.subject.identity, tracker.thetas(fit)
+            arrays = tracker.head.arrays
+            upon = on_body(tracker.mesh_landmarks, arrays, identity, heads, body)
+            fit = replace(fit, upon_body=upon)
+        crop = steady_crop(
+            found.points_px, width, height, config.image_size, with_body=body is not None
+        )
         left_out = tuple(seen.frame_index[position] for position in lost)
-        return _FittedClip(seen, found, left_out, tracker, fit, crop, alpha)
+        return _FittedClip(seen, found, left_out, tracker, fit, body, crop, alpha)
 
     def write(self, clip: _FittedClip) -> TrackedDataset:
         """Make the images that are missing, and the dataset with its report."""
@@ -148,13 +164,12 @@ class _Tracking:
             clip.fit,
             found,
             clip.crop,
-            config.keep_torso,
             self.mattes,
             clip.source_alpha,
         )
         background = self._background(images, made_from) if images.finds_mattes else None
         with disk_errors(dst, GO_ON):
-            size, keep = config.image_size, bool(noted)
+            size, keep = clip.crop.size, bool(noted)
             writer = DatasetWriter(dst, arrays, identity, layout, size, size, True, keep)
         self._write_images(clip, thetas, images, background, writer, noted)
         with disk_errors(dst, GO_ON):
@@ -239,6 +254,7 @@ class _Tracking:
             **({} if background is None else background.report()),
             "stages": self.clock.stages,
             "frames_per_second": self.clock.frames_per_second(seen.frames_read),
+            "body": None if clip.body is None else clip.body.report(),
             "crop": {"left": crop.left, "top": crop.top, "side": crop.side},
         }
         return {"verdict": verdict(tracking_findings(report)), **report}
@@ -286,54 +302,3 @@ def _one_thread_a_call() -> Iterator[None]:
         yield
     finally:
         cv2.setNumThreads(before)
-
-
-@dataclass
-class _StageClock:
-    """Tells the progress of one stage after the other, and how long each one took.
-
-    A stage's first report says how many of its frames were done in an earlier run.
-    """
-
-    progress: Progress | None
-    stages: dict[str, dict[str, float | int]] = field(default_factory=dict)
-    """Of each stage the frames done in this run, seconds, and frames a second."""
-    _name: str = ""
-    _total: int | None = None
-    _first: int | None = None
-    _now: int = 0
-    _began: float = 0.0
-
-    def begin(self, name: str, total: int | None) -> None:
-        """End the stage before."""
-        self.end()
-        self._name, self._total, self._first = name, total, None
-        self._began = time.perf_counter()
-
-    def done(self, frames: int) -> None:
-        """So many of the stage's frames are done."""
-        self._now = frames
-        self._first = frames if self._first is None else self._first
-        if self.progress is not None:
-            total = None if self._total is None else max(self._total, frames)
-            self.progress(self._name, frames, total)
-
-    def end(self) -> None:
-        """Note down the stage's time."""
-        if self._name:
-            seconds = time.perf_counter() - self._began
-            frames = self._now - (self._first or 0)
-            self.stages[self._name] = {
-                "frames": frames,
-                "seconds": seconds,
-                "frames_per_second": frames / seconds,
-            }
-            if self.progress is not None:
-                self.progress(self._name, self._now, self._now)
-        self._name = ""
-
-    def frames_per_second(self, frames: int) -> float | None:
-        """Of the whole run; None where some of it was done in an earlier run."""
-        if not all(stage["frames"] for stage in self.stages.values()):
-            return None
-        return frames / sum(stage["seconds"] for stage in self.stages.values())

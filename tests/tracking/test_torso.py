@@ -54,7 +54,7 @@ def test_a_head_put_on_a_body_stays_where_it_was(bust: HeadModel) -> None:
     necks = np.array([head.chain(row, identity).placed[NECK] for row in theta])
     moved = necks + 0.008 * drawn.standard_normal((5, 3))
     bodies = np.array([turned(*drawn.uniform(-10, 10, 3)) for _ in range(5)])
-    found = on_body(head, bust.arrays, identity, theta, BodyPlaces(bodies, moved, False, 1.0))
+    found = on_body(head, bust.arrays, identity, theta, BodyPlaces(bodies, moved, False, 1.0, 0.0))
 
     person = torch.from_numpy(identity)
     before, after = (bust(torch.from_numpy(rows), person).numpy() for rows in (theta, found))
@@ -70,7 +70,9 @@ def test_a_body_too_far_from_its_head_follows_it(bust: HeadModel) -> None:
     head = LandmarkHead(bust, np.array([[0, 1, 2]]), np.full((1, 3), 1 / 3))
     theta = np.zeros((1, bust.layout.size))
     far = head.chain(theta[0], identity).placed[NECK][None] + [0.2, 0, 0]
-    found = on_body(head, bust.arrays, identity, theta, BodyPlaces(np.eye(3)[None], far, True, 1.0))
+    found = on_body(
+        head, bust.arrays, identity, theta, BodyPlaces(np.eye(3)[None], far, True, 1.0, 0.0)
+    )
     assert found[:, bust.layout.slice("translation")][0, 0] == pytest.approx(0.03, abs=0.002)
     teeth = bust.arrays.vertex_groups["upper_teeth"]
     vertices = bust(torch.from_numpy(found)).numpy()[0]

@@ -43,10 +43,16 @@ class ClipFit:
 
     subject: SubjectFit
     values: Float[np.ndarray, "F P"]
+    upon_body: Float[np.ndarray, "F H"] | None = None
+    """theta of the same heads upon a body, where that was found."""
 
     def without(self, rejected: Sequence[int]) -> "ClipFit":
         """The same without the given positions."""
-        return replace(self, values=np.delete(self.values, list(rejected), axis=0))
+        upon_body = self.upon_body
+        if upon_body is not None:
+            upon_body = np.delete(upon_body, list(rejected), axis=0)
+        values = np.delete(self.values, list(rejected), axis=0)
+        return replace(self, values=values, upon_body=upon_body)
 
 
 def fit_subject(

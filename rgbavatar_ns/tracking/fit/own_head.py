@@ -5,7 +5,7 @@ from pathlib import Path
 import torch
 
 from rgbavatar_ns.errors import UserError
-from rgbavatar_ns.head import HeadArrays, HeadModel
+from rgbavatar_ns.head import EMBEDDED_BUST, EMBEDDED_HEAD, HeadArrays, HeadModel
 from rgbavatar_ns.head.flame import load_flame
 from rgbavatar_ns.tracking.config import TrackConfig
 from rgbavatar_ns.tracking.face.landmark_transfer import fitted_head
@@ -13,12 +13,14 @@ from rgbavatar_ns.tracking.fit.subject import SubjectTracker
 
 
 def subject_tracker(config: TrackConfig, own_head: HeadArrays | None = None) -> SubjectTracker:
-    """A tracker that fits the embedded head, or `own_head` with landmarks carried over to it.
+    """A tracker that fits the embedded bust, with `config.head_only` the embedded head, or
+    `own_head` with landmarks carried over to it.
 
     Raises UserError where no face is found on that head.
     """
     if own_head is None:
-        return SubjectTracker(HeadModel.embedded(dtype=torch.float64), config)
+        name = EMBEDDED_HEAD if config.head_only else EMBEDDED_BUST
+        return SubjectTracker(HeadModel.embedded(torch.float64, name), config)
     known = fitted_head(own_head)
     head = HeadModel(known.arrays, dtype=torch.float64)
     return SubjectTracker(head, config, known.landmarks, known.response, known.noise)

@@ -138,7 +138,11 @@ class SubjectTracker:
         return subject
 
     def thetas(self, fit: ClipFit) -> Float[np.ndarray, "F H"]:
-        """theta of every frame."""
+        """theta of every frame, upon the body where that is known."""
+        return self._head_thetas(fit) if fit.upon_body is None else fit.upon_body
+
+    def _head_thetas(self, fit: ClipFit) -> Float[np.ndarray, "F H"]:
+        """theta as it was fitted: the head is the whole body."""
         return np.array([self.cost.theta(values) for values in fit.values])
 
     def fitted_px(self, fit: ClipFit, *, with_offsets: bool = True) -> Float[np.ndarray, "F L 2"]:
@@ -151,7 +155,7 @@ class SubjectTracker:
         return np.array(
             [
                 camera.project(head.points(theta, identity, camera.eye_m))
-                for theta in self.thetas(fit)
+                for theta in self._head_thetas(fit)
             ]
         )
 
@@ -174,7 +178,9 @@ class SubjectTracker:
 
     def vertices_px(self, fit: ClipFit, position: int) -> Float[np.ndarray, "V 2"]:
         """The full mesh of one frame in source pixels."""
-        theta = torch.from_numpy(self.cost.theta(fit.values[position]))
+        known = fit.upon_body
+        row = self.cost.theta(fit.values[position]) if known is None else known[position]
+        theta = torch.from_numpy(row)
         with torch.no_grad():
             vertices = self.head(theta, torch.from_numpy(fit.subject.identity))
         return fit.subject.camera.project(vertices.numpy())

@@ -14,8 +14,11 @@ from rgbavatar_ns.tracking.fit.camera import StillCamera
 # Shares of the face's height (forehead to chin) around the landmarks' box: room for hair above,
 # for ears and hair at the sides, for the neck below.
 _ABOVE, _SIDES, _BELOW = 0.6, 0.3, 0.35
+# The same for whoever shall have shoulders: beside the face, and below the chin down to the chest.
+_BODY_SIDES, _BODY_BELOW = 0.95, 1.3
 # How much larger than the head's own square a following crop is: so much may the head move.
 _ROOM = 1.25
+_HEAD_PX, _MULTIPLE_PX = 256, 16
 
 
 @dataclass(frozen=True)
@@ -85,13 +88,40 @@ def _within(start: int, side: int, span: int) -> tuple[int, int]:
 
 
 def steady_crop(
-    landmarks_px: Float[np.ndarray, "F 478 2"], width: int, height: int, size: int
+    landmarks_px: Float[np.ndarray, "F 478 2"],
+    width: int,
+    height: int,
+    size: int | None,
+    *,
+    with_body: bool = False,
 ) -> SquareCrop:
     """The smallest square around all frames' landmarks with room for hair, ears and neck.
 
-    It is pushed inside the frame where it fits. One crop for the clip, so that the camera
-    stands still and only the head moves.
+    With the body there is room for shoulders and chest too, as far as the frame shows them. It is
+    pushed inside the frame where it fits. One crop for the clip, so that the camera stands still
+    and only the person moves. A size of None gives the head's own square 256 pixels.
     """
+    head = _head_square(landmarks_px, width, height)
+    square = _body_square(landmarks_px, head, width, height) if with_body else head
+    if size is None:
+        size = round(_HEAD_PX * square.side / head.side / _MULTIPLE_PX) * _MULTIPLE_PX
+    return replace(square, size=size)
+
+
+def _body_square(
+    landmarks_px: Float[np.ndarray, "F 478 2"], head: SquareCrop, width: int, height: int
+) -> SquareCrop:
+    """The head's square grown downwards and to both sides, as far as the frame goes."""
+    face = float(np.median(face_height_px(landmarks_px)))
+    low, high = landmarks_px.min((0, 1)), landmarks_px.max((0, 1))
+    across = high[0] - low[0] + 2 * _BODY_SIDES * face
+    down = high[1] + _BODY_BELOW * face - head.top
+    side = min(max(int(np.ceil(max(across, down))), head.side), max(head.side, min(width, height)))
+    left = _push_inside((low[0] + high[0] - side) / 2, side, width)
+    return SquareCrop(left, _push_inside(head.top, side, height), side, head.size)
+
+
+def _head_square(landmarks_px: Float[np.ndarray, "F 478 2"], width: int, height: int) -> SquareCrop:
     face = float(np.median(face_height_px(landmarks_px)))
     low, high = landmarks_px.min((0, 1)), landmarks_px.max((0, 1))
     low = low - face * np.array([_SIDES, _ABOVE])
@@ -99,7 +129,7 @@ def steady_crop(
     side = max(2, int(np.ceil((high - low).max())))
     corner = (low + high) / 2 - side / 2
     left, top = (_push_inside(start, side, span) for start, span in zip(corner, (width, height)))
-    return SquareCrop(left, top, side, size)
+    return SquareCrop(left, top, side, _HEAD_PX)
 
 
 def _push_inside(start: float, side: int, span: int) -> int:

@@ -12,6 +12,9 @@ from rgbavatar_ns.tracking.image.crop import SquareCrop
 from rgbavatar_ns.tracking.image.head_mask import HeadMask, HeadOutline
 from rgbavatar_ns.tracking.image.matting import foreground_color, straight_rgba
 
+# Over which share of the picture's height a body fades out at its bottom.
+_FADE = 0.04
+
 
 @dataclass(frozen=True)
 class MattedCrop:
@@ -39,10 +42,13 @@ class MattedCrop:
 
 
 class CutOut:
-    """Cuts the head out of a matted crop; `keep_torso` keeps what lies below the neck."""
+    """Cuts what the head model has out of a matted crop: a head down to its neck, or the body too.
 
-    def __init__(self, arrays: HeadArrays, keep_torso: bool) -> None:
-        self._keep_torso = keep_torso
+    A body ends where the picture does: there it fades out, over a few rows.
+    """
+
+    def __init__(self, arrays: HeadArrays) -> None:
+        self._has_body = arrays.has_torso
         self._mask = HeadMask(arrays.faces, arrays.skinning_weights)
 
     def outline(
@@ -62,10 +68,21 @@ class CutOut:
         background there too.
         """
         alpha, may_be_head = matted.alpha, np.ones_like(matted.alpha)
-        if not self._keep_torso:
+        if self._has_body:
+            alpha = alpha * fade_at_bottom(matted.inside)
+        else:
             may_be_head = self._mask(outline, len(alpha))
             alpha = alpha * may_be_head
         image = straight_rgba(matted.color, alpha)
         image[~matted.inside] = 0
         image[~matted.inside & (may_be_head >= 0.5 / 255)] = UNFILMED_RGBA
         return image
+
+
+def fade_at_bottom(inside: Bool[np.ndarray, "S S"]) -> Float[np.ndarray, "S 1"]:
+    """1, and towards 0 over the last rows of what the frame shows."""
+    size = len(inside)
+    rows = np.flatnonzero(inside.any(1))
+    last = rows[-1] + 1 if len(rows) else size
+    share = np.clip((last - np.arange(size, dtype=np.float32) - 0.5) / (_FADE * size), 0, 1)
+    return (share * share * (3 - 2 * share))[:, None]

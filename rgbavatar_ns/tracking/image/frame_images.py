@@ -80,13 +80,12 @@ class FrameImages:
         fit: ClipFit,
         found: ClipLandmarks,
         crop: SquareCrop,
-        keep_torso: bool,
         mattes: UserMattes | None = None,
         source_alpha: bool = False,
     ) -> None:
         self._tracker, self._fit, self._found, self._crop = tracker, fit, found, crop
         self._mattes, self._source_alpha = mattes, source_alpha
-        self._cut_out = CutOut(tracker.head.arrays, keep_torso)
+        self._cut_out = CutOut(tracker.head.arrays)
         self._inside = crop.inside(found.width, found.height)
         self._follows = found.follows()
 

@@ -1,5 +1,6 @@
 """How the body moves from frame to frame, by the pattern of its clothes."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import cv2
@@ -9,14 +10,20 @@ from jaxtyping import Bool, Float, UInt8
 from rgbavatar_ns.tracking.fit.camera import StillCamera
 from rgbavatar_ns.tracking.torso.body_mesh import BodyMesh
 from rgbavatar_ns.tracking.torso.features import FollowedPoints
-from rgbavatar_ns.tracking.torso.rigid_motion import RigidMotion, fit_rigid_motion
+from rgbavatar_ns.tracking.torso.rigid_motion import LEAST_POINTS, RigidMotion, fit_rigid_motion
 
 # A fresh key picture is taken when fewer of the points than this share are found again.
 _FEW = 0.4
 _PERSON, _BACKGROUND = 0.9, 0.05
 _LEAST_BACKGROUND = 12
+# How many frames of a body without a pattern pass until one is looked for again.
+_PATIENCE = 15
 # The head's shadow and the chin's are no pattern of the clothes: so far below the neck's joint.
 _BELOW_NECK_M = 0.075
+
+
+MatteOf = Callable[[UInt8[np.ndarray, "h w 3"]], Float[np.ndarray, "h w"]]
+"""The person's alpha of a picture."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +59,9 @@ class BodyFollower:
     of a picture; it is asked for key pictures alone.
     """
 
-    def __init__(self, body: BodyMesh, camera: StillCamera, scale: float, matte_of) -> None:
+    def __init__(
+        self, body: BodyMesh, camera: StillCamera, scale: float, matte_of: MatteOf
+    ) -> None:
         self._body, self._scale, self._matte_of = body, scale, matte_of
         center = (camera.center_px[0] * scale - 0.5, camera.center_px[1] * scale - 0.5)
         # In pixels of the pictures, whose first centre is at 0 for OpenCV.
@@ -62,6 +71,7 @@ class BodyFollower:
         self._start = RigidMotion.none()
         self._motion = RigidMotion.none()
         self._near = (np.zeros((0, 2)), np.zeros((0, 2)))
+        self._plain_frames = 0
 
     def __call__(
         self,
@@ -84,13 +94,21 @@ class BodyFollower:
             self._start = RigidMotion(np.eye(3), neck_m - self._body.neck_m)
             self._motion = RigidMotion.none()
             seen_px = np.zeros((0, 2))
+            self._plain_frames = _PATIENCE
         chosen_px, certainty = None, None
-        if len(seen_px) == 0 or np.isfinite(seen_px[:, 0]).mean() < _FEW:
+        if self._wants_key(seen_px):
             chosen_px = self._in_source(self._take_key(image_rgb, gray, vertices_px))
             assert self._key is not None
             certainty = self._key.body.certainty
         seen_px = self._in_source(seen_px)
         return BodySighting(self._run, seen_px, chosen_px, certainty, background_px)
+
+    def _wants_key(self, seen_px: Float[np.ndarray, "P 2"]) -> bool:
+        """Whether to choose points anew; on a plain shirt only now and then."""
+        if len(seen_px):
+            return bool(np.isfinite(seen_px[:, 0]).mean() < _FEW)
+        self._plain_frames += 1
+        return self._plain_frames % _PATIENCE == 1
 
     def _in_source(self, points_px: Float[np.ndarray, "P 2"]) -> Float[np.ndarray, "P 2"]:
         return (points_px + 0.5) / self._scale
@@ -99,6 +117,8 @@ class BodyFollower:
         """The points in this picture, NaN where lost; None where they show no motion of a body."""
         assert self._key is not None
         key = self._key
+        if len(key.places_m) < LEAST_POINTS:
+            return np.zeros((0, 2))
         px, seen = key.body.found_in(gray, self._near[0])
         pivot = self._start(self._body.neck_m)
         fitted = fit_rigid_motion(

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -44,6 +45,20 @@ class BodyPlaces:
     """Whether it keeps still all the time."""
     followed: float
     """Share of the frames in which the clothes showed its motion."""
+    background_px: float
+    """How far the background moves over the clip, pixels of the source; NaN where none is seen."""
+
+    def report(self) -> dict[str, Any]:
+        """What `tracking.json` tells of the body."""
+        turns = Rotation.from_matrix(self.rotation)
+        away = np.degrees((turns * turns.mean().inv()).magnitude())
+        return {
+            "still": self.still,
+            "followed_share": self.followed,
+            "turned_degrees": float(np.percentile(away, 98)),
+            "moved_mm": float(1e3 * np.percentile(_away(self.neck_m), 98)),
+            "background_moves_px": None if np.isnan(self.background_px) else self.background_px,
+        }
 
 
 def place_body(
@@ -75,7 +90,9 @@ def place_body(
         for motion, k in zip(motions, own):
             here = motion.after(start)
             rotation[k], neck_m[k] = here.rotation, here(body.neck_m)
-    return BodyPlaces(rotation, neck_m, still, followed / max(frames, 1))
+    moved = np.array([one.background_px for one in sightings])
+    background_px = float(np.nanpercentile(moved, 98)) if np.isfinite(moved).any() else np.nan
+    return BodyPlaces(rotation, neck_m, still, followed / max(frames, 1), background_px)
 
 
 @dataclass(frozen=True)
@@ -123,6 +140,11 @@ class _Run:
             yaws.append(one.yaw_rad)
         yaw, roll = _plain(yaws, _DOUBTED_YAW_RAD), _plain(tilts, _DOUBTED_ROLL_RAD)
         return (level * Rotation.from_rotvec([0.0, yaw, roll])).as_matrix()
+
+
+def _away(points_m: Float[np.ndarray, "F 3"]) -> Float[np.ndarray, "F"]:
+    """Distances to the median point."""
+    return np.linalg.norm(points_m - np.median(points_m, axis=0), axis=1)
 
 
 def _filled(motions: Sequence[RigidMotion | None]) -> list[RigidMotion]:

@@ -16,7 +16,7 @@ _ROBUST_PX = 0.7
 # A frame's motion is drawn to the one before it by so much, so that few or flat points do not let
 # it wander: standard deviations from frame to frame.
 _TURN_RAD, _SHIFT_M = 0.05, 0.02
-_LEAST_POINTS = 8
+LEAST_POINTS = 8
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ def fit_rigid_motion(
     of `before` about `pivot_m`. The error is the median distance in pixels. None where too few
     points agree.
     """
-    if len(points_m) < _LEAST_POINTS:
+    if len(points_m) < LEAST_POINTS:
         return None
     sigma_px = _ROBUST_PX
     motion = before
@@ -90,6 +90,6 @@ def fit_rigid_motion(
             break
     away = camera.project(motion(points_m)) - seen_px
     away = np.sqrt(np.einsum("px,pxy,py->p", away, certainty, away).clip(0))
-    if np.count_nonzero(away < 2 * sigma_px) < max(_LEAST_POINTS, 0.3 * len(away)):
+    if np.count_nonzero(away < 2 * sigma_px) < max(LEAST_POINTS, 0.3 * len(away)):
         return None
     return motion, float(np.median(away))
