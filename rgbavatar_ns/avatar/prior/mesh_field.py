@@ -51,6 +51,7 @@ class MeshField:
         self.edges = torch.unique(torch.cat([ends, ends.flip(1)]), dim=0)
         self._mirror, self._mirrored = _mirror_of(template)
         self.scalp = _scalp_of(avatar.head.arrays).to(template.device)
+        self.body = _body_of(avatar.head.arrays).to(template.device)
         first, second = self.edges.unbind(1)
         ends_of_rows = torch.bincount(first, minlength=self.num_vertices).cumsum(0)
         self._row_starts = torch.cat([ends_of_rows.new_zeros(1), ends_of_rows])
@@ -144,6 +145,13 @@ def _scalp_of(arrays: HeadArrays) -> Bool[Tensor, "V"]:
     _, up, forward = torch.from_numpy((arrays.v_template - eyes).astype("float32")).unbind(1)
     behind = (forward < -_BEHIND_EYES_M) & (up > -_BELOW_EYES_M)
     return behind | ((forward < -_TEMPLE_M) & (up > _ABOVE_EARS_M))
+
+
+def _body_of(arrays: HeadArrays) -> Bool[Tensor, "V"]:
+    """Vertices below the neck, of heads that have such."""
+    body = torch.zeros(len(arrays.v_template), dtype=torch.bool)
+    body[torch.as_tensor(arrays.vertex_groups.get("torso", []), dtype=torch.int64)] = True
+    return body
 
 
 def _mirror_of(

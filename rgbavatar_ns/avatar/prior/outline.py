@@ -84,6 +84,8 @@ def measure_outline(
     empty = field.continued(
         empty, 100 * known, empty, stiffness=1.0, rest=1e-6, iterations=_ITERATIONS
     )[:, 0]
+    # But a body ends where the picture does: nobody knows what is worn farther down.
+    empty[field.body & (known == 0)] = 1.0
     rim = lower_rim(avatar)
     below = [_shown_below(image, seen, rim) for image, seen in zip(images, placed)]
     return Outline(offset, empty.clamp(0, 1), bool(np.mean(below) > 0.1))
