@@ -43,6 +43,10 @@ def test_a_written_clip_becomes_a_dataset_without_its_faceless_frames(
     assert not set(dataset.frame_index) & set(report["rejected"]["no face"])
     assert report["frames_tracked"] == len(dataset) >= 5
     assert report["reprojection_error_share"] < 0.015
+    assert report["iris_error_eye_widths"] < 0.1
+    assert report["film"]["frames"] == len(dataset)
+    assert f"length ({len(dataset)} of 500 frames)" in report["film"]["lacks"]
+    assert report["film"]["face_height_px"] == report["face_height_px"]
     assert (tmp_path / "set" / "overlay.png").stat().st_size > 10_000
     assert len(dataset.test) == len(dataset) // 5
     stages = list(dict.fromkeys(call[0] for call in calls))
