@@ -61,7 +61,7 @@ class PersonMatte:
         if side > _NEARLY_ALL * size:
             return whole
         middle = (low + high) / 2 - (0, _RAISED * height)
-        left, top = np.clip(middle - side / 2, 0, size - side).round().astype(int)
+        left, top = np.clip(middle - side / 2, 0, size - side).round().astype(int).tolist()
         here = (slice(top, top + side), slice(left, left + side))
         few = (_SEGMENTED_PX, _SEGMENTED_PX)
         close = self.coarse(cv2.resize(lit[here], few, interpolation=cv2.INTER_AREA))
