@@ -50,7 +50,7 @@ class PersonMatte:
     ) -> Float[np.ndarray, "H W"]:
         """The segmentation of a brightened square image, its head segmented once more, closer.
 
-        Twice the time of `coarse`, and a fifth to a third of its error less. `face_px` are the
+        Twice the work of `coarse`, and a tenth to a third of its error less. `face_px` are the
         face's landmarks.
         """
         lit, size = _lit(image_rgb), len(image_rgb)
