@@ -50,7 +50,8 @@ def test_a_written_clip_becomes_a_dataset_without_its_faceless_frames(
     assert (tmp_path / "set" / "overlay.png").stat().st_size > 10_000
     assert len(dataset.test) == len(dataset) // 5
     stages = list(dict.fromkeys(call[0] for call in calls))
-    assert stages == ["faces", "fit", "pictures"]
+    assert stages == ["faces", "fit", "background", "pictures"]
+    assert report["background"] in ("still", "covered", "too short")
     for stage in stages:
         done = [call[1] for call in calls if call[0] == stage]
         assert done == sorted(done)

@@ -30,7 +30,8 @@ _CORE_PX, _REACH_PX = 3.0, 45.0
 _NEAR_PX = 8.0
 # Within how many pixels, and more, a colour's mean is taken: of the person, of the background.
 _PERSON_PX, _ROOM_PX = (2, 5, 12, 40), (2, 6, 20, 60)
-_LIGHT_PX, _LIGHT_LEVELS = (10, 40), 12.0
+# Changes of light are smooth: every fourth pixel of every fourth row tells them.
+_LIGHT_PX, _LIGHT_LEVELS, _LIGHT_EVERY = (10, 40), 12.0, 4
 # Each wider mean only counts where the narrower one knows next to nothing.
 _WIDER = 1e-3
 # Noise of a webcam after its compression, and what a guessed background's texture adds to it: at
@@ -225,9 +226,11 @@ def _mixture(
 
 def _lit_as(image: _Colors, plate: RoomColors, outside: _Mask) -> RoomColors:
     """The plate as bright as this frame shows it: lamps flicker, cameras adapt, a person shades."""
-    off = np.clip(image - plate.color, -_LIGHT_LEVELS, _LIGHT_LEVELS)
-    weight = (outside & plate.known).astype(np.float32)
-    return replace(plate, color=plate.color + spread_colors(off, weight, _LIGHT_PX, 8))
+    few = (slice(None, None, _LIGHT_EVERY),) * 2
+    off = np.clip(image[few] - plate.color[few], -_LIGHT_LEVELS, _LIGHT_LEVELS)
+    weight = (outside & plate.known)[few].astype(np.float32)
+    shift = cv2.resize(spread_colors(off, weight, _LIGHT_PX, 2), outside.shape)
+    return replace(plate, color=plate.color + shift)
 
 
 def _without_holes(image_rgb: _Image, coarse: _Values, plate: RoomColors | None) -> _Values:
