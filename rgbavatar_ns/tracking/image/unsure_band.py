@@ -208,12 +208,14 @@ def _revealed(differs: _Values, room: RoomColors, inward: _Values) -> _Mask:
     """What hangs on the segmented person and is far from the plate's colour all over: the
     segmentation overlooked it, as it does hair before the ears, or a stripe of a shirt."""
     other = (differs > _OTHER**2) & room.known & (inward > -_NEAR_PX)
-    alone = cv2.morphologyEx(other.astype(np.uint8), cv2.MORPH_OPEN, _AROUND)
-    person = (inward > 0).astype(np.uint8)
-    count, labels = cv2.connectedComponents(alone | person)
+    alone = np.asarray(cv2.morphologyEx(other.astype(np.uint8), cv2.MORPH_OPEN, _AROUND)) > 0
+    person = inward > 0
+    count, found = cv2.connectedComponents((alone | person).astype(np.uint8))
+    labels = np.asarray(found)
     hangs = np.zeros(count, bool)
-    hangs[np.unique(labels[person > 0])] = True
-    return cv2.erode((alone > 0).astype(np.uint8), _AROUND) * hangs[labels] > 0
+    hangs[np.unique(labels[person])] = True
+    whole = np.asarray(cv2.erode(alone.astype(np.uint8), _AROUND)) > 0
+    return whole & hangs[labels]
 
 
 def _mixture(
