@@ -35,12 +35,12 @@ def person_outline(
     """
     solid = (matte > 127).astype(np.uint8)
     hull = cv2.convexHull(crop.points(landmarks_px).astype(np.float32))
-    face = cv2.fillConvexPoly(np.zeros_like(solid), np.round(hull - 0.5).astype(np.int32), 1)
+    face = cv2.fillConvexPoly(np.zeros_like(solid), np.round(hull - 0.5).astype(np.int32), (1,))
     contours, _ = cv2.findContours(solid, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     person, most = np.zeros_like(solid), 0
     for contour in contours:
-        filled = cv2.drawContours(np.zeros_like(solid), [contour], 0, 1, cv2.FILLED)
-        shared = int((filled & face).sum())
+        filled = cv2.drawContours(np.zeros_like(solid), [contour], 0, (1,), cv2.FILLED)
+        shared = int(np.sum(filled * face))
         if shared > most:
             person, most = filled, shared
     if most == 0 or most < _OF_FACE * face.sum() or person.all():
