@@ -1,6 +1,7 @@
 """The person's outline in the fit: what it asks for, what it leaves alone, and what it survives."""
 
 from collections.abc import Callable
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -8,14 +9,18 @@ import pytest
 import torch
 
 from rgbavatar_ns.drawing.wireframe import mesh_silhouette
+from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.tracking.config import TrackConfig
+from rgbavatar_ns.tracking.face.clip import ClipLandmarks
 from rgbavatar_ns.tracking.face.detector import FACE_OVAL
 from rgbavatar_ns.tracking.fit.fit import ClipFit
 from rgbavatar_ns.tracking.fit.outline import OutlineCost, OutlineTerms, PersonOutline
 from rgbavatar_ns.tracking.fit.subject import SubjectTracker
 from rgbavatar_ns.tracking.image.crop import SquareCrop
-from rgbavatar_ns.tracking.image.outlines import OUTLINE_PX, person_outline
+from rgbavatar_ns.tracking.image.outlines import OUTLINE_PX, key_outlines, person_outline
+from rgbavatar_ns.tracking.input.video import FrameSource
+from rgbavatar_ns.tracking.resumable_run import ResumableRun
 
 from .acting import CAMERA, observed, performance
 
@@ -212,8 +217,33 @@ def test_holes_are_filled_and_what_stands_apart_is_left_out() -> None:
     matte[44:50, 40:60], matte[5:15, 80:95] = 0, 255
     altered = person_outline(matte, crop, points)
     assert altered is not None
-    # Distances in float32 come out in another order.
-    np.testing.assert_allclose(altered.outside_px, whole.outside_px, atol=1e-4)
+    np.testing.assert_array_equal(altered.outside_px, whole.outside_px)
+
+
+def test_damaged_mattes_of_key_frames_are_told(
+    clip_of_key_frames: tuple[FrameSource, ClipLandmarks], tmp_path: Path
+) -> None:
+    run = ResumableRun(tmp_path)
+    run.folder.mkdir()
+    source, found = clip_of_key_frames
+    for _ in range(2):  # made, then kept
+        assert key_outlines(source, None, True, found, [1], run) == [None], "all is opaque"
+    kept = run.folder / "key_mattes.npz"
+    kept.write_bytes(kept.read_bytes()[:-40])
+    with pytest.raises(UserError, match="no mattes of key frames"):
+        key_outlines(source, None, True, found, [1], run)
+
+
+@pytest.fixture
+def clip_of_key_frames(tmp_path: Path) -> tuple[FrameSource, ClipLandmarks]:
+    """Two frames without a matte of their own, and where a face would be."""
+    folder = tmp_path / "frames"
+    folder.mkdir()
+    for number in range(2):
+        cv2.imwrite(str(folder / f"{number}.png"), np.full((48, 64, 3), 90, np.uint8))
+    points = np.random.default_rng(1).uniform(20, 40, (2, 478, 2))
+    found = ClipLandmarks(points, (0, 1), (0, 0), (0, 0), 2, 64, 48, (), ())
+    return FrameSource.open(folder), found
 
 
 def test_a_matte_that_misses_the_face_or_holds_everything_is_no_evidence() -> None:

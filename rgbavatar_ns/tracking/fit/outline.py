@@ -27,11 +27,11 @@ _OUTSIDE_M, _LOST_M, _LEFT_OUT_M = 0.002, 0.02, 0.04
 # Hair is as thick all over to about this, but for a bun, a brim or what hangs down; which is one
 # person's habit in all key frames alike, so that less is known than so many points would say.
 _HAIR_EVEN_M, _NO_HAIR_M = 0.008, 0.012
-_HAIR_WEIGHT = 3.0
+_HAIR_WEIGHT = 2.0
 _THICKEST_M = 0.06
 # Directions in which the mesh's outermost point is looked for, from straight up to both sides, a
 # little beyond the ears' tops; below there hang hair and neck.
-_FAN_RAD, _DIRECTIONS = np.radians(120), 25
+_FAN_RAD, _DIRECTIONS = np.radians(120), 49
 _SPREAD_POINTS = 240  # about 9 mm apart
 _BELOW_EYES_M = 0.06  # the upper lip: below it the jaw moves
 _RIGID = 0.95
