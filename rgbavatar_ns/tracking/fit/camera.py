@@ -30,7 +30,7 @@ class StillCamera:
         return np.array([0.0, 0.0, self.distance_m])
 
     def scaled(self, scale: float) -> "StillCamera":
-        """The camera of smaller pictures, whose first pixel has its centre at 0, as OpenCV has it."""
+        """The camera of smaller pictures, whose first centre is at 0, as OpenCV has it."""
         x, y = self.center_px
         center = (x * scale - 0.5, y * scale - 0.5)
         return replace(self, focal_px=self.focal_px * scale, center_px=center)

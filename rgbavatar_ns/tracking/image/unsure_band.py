@@ -211,7 +211,7 @@ def _revealed(differs: _Values, room: RoomColors, inward: _Values) -> _Mask:
     alone = np.asarray(cv2.morphologyEx(other.astype(np.uint8), cv2.MORPH_OPEN, _AROUND)) > 0
     person = inward > 0
     count, found = cv2.connectedComponents((alone | person).astype(np.uint8))
-    labels = np.asarray(found)
+    labels = np.asarray(found, np.int64)
     hangs = np.zeros(count, bool)
     hangs[np.unique(labels[person])] = True
     whole = np.asarray(cv2.erode(alone.astype(np.uint8), _AROUND)) > 0
