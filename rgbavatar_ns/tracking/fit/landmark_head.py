@@ -148,14 +148,18 @@ class LandmarkHead:
     def with_response(self, response: LandmarkResponse) -> "LandmarkHead":
         """The same landmarks where a detector sees them; before any identity is folded in."""
         slides = np.concatenate([response.view, response.jaw_open[..., None], response.gaze], -1)
-        count = self.num_identity + response.expression.shape[-1]
-        coefficients = np.concatenate([response.identity, response.expression], -1)
+        # A bust has directions more, of its body: none of them moves a landmark.
+        first, known = self.num_identity, (response.identity, response.expression)
+        places = np.concatenate(
+            [np.arange(known[0].shape[-1]), first + np.arange(known[1].shape[-1])]
+        )
+        coefficients = np.concatenate(known, -1)
         moved = copy(self)
         moved._moments = []
         for part in self._moments:
             share = part.share[:, None, None]
             dirs = part.dirs.copy()
-            dirs[..., :count] += (share * coefficients[part.rows]).transpose(1, 0, 2)
+            dirs[..., places] += (share * coefficients[part.rows]).transpose(1, 0, 2)
             rest = part.rest + (share[..., 0] * response.rest[part.rows]).T
             own = np.ascontiguousarray((share * slides[part.rows]).transpose(1, 0, 2))
             moved._moments.append(replace(part, rest=rest, dirs=dirs, slides=own))
