@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -91,7 +92,7 @@ class _Reading:
             with closing(frames):
                 for k, frame in enumerate(frames):
                     cut = k == 0 or found.clip[k] != found.clip[k - 1]
-                    pixels = self._tracker.vertices_px(self._fit, k)
+                    pixels = partial(self._tracker.vertices_px, self._fit, k)
                     image = frame.image_rgb
                     sightings.append(follow(image, self._neck_m[k], pixels, cut))
                     if k % every == 0 and (seen := pose(image)) is not None:
