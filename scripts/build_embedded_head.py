@@ -6,15 +6,16 @@ writes `makehuman_head.npz` and `makehuman_bust.npz`, the head with neck and sho
 `rgbavatar_ns/head/assets` and the licence beside them. The head comes in FLAME's convention:
 metres, y up, z forward, +x the subject's left, the eyes near (+-.03, .03, .03); identity directions
 before expression directions; joints root, neck, jaw, left eye, right eye. The bust is the same head
-to the bit, in the same order, and what follows its root joint; its three expressions more, in
-centimetres, carry the head upon the neck, as no joint does: to the left, up, forward.
+to the bit, in the same order, and what follows its root joint; its five expressions more, in
+centimetres, carry the head upon the neck, as no joint does, to the left, up and forward, and set
+the shoulders higher and wider.
 """
 
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from embedded_bust_parts import TORSO_TOP, lowered_arms, torso_uv, with_torso
+from embedded_bust_parts import TORSO_TOP, lowered_arms, shoulder_directions, torso_uv, with_torso
 from embedded_head_parts import (
     PARTS,
     HeadMesh,
@@ -34,7 +35,7 @@ from makehuman_source import (
     read_target,
 )
 
-from rgbavatar_ns.head.arrays import NECK_SHIFTS
+from rgbavatar_ns.head.arrays import BODY_SHAPES, NECK_SHIFTS
 
 ASSETS = Path(__file__).resolve().parent.parent / "rgbavatar_ns/head/assets"
 NUM_IDENTITY = 30
@@ -46,8 +47,8 @@ CLOSED_LIPS = {
 }
 """The average adult's lips stand a millimetre open; so much of these expressions closes them."""
 IDENTITY_FOLDERS = ("head", "nose", "mouth", "chin", "cheek", "eyes", "forehead", "ears", "neck")
-NECK_SHIFT_M = 0.01
-"""How a unit of the bust's last expressions carries the head along x, y and z of the torso."""
+CENTIMETRE = 0.01
+"""How far a unit of the bust's own expressions moves what it moves."""
 OFFSET_STEP_M = 2.0**-16
 """Offsets are rounded to 15 micrometres: exact in float16 up to 31 mm, and they compress well."""
 
@@ -235,20 +236,21 @@ def bust_of(
     shapedirs = longer(
         "shapedirs", np.concatenate([as_float16(identity[:, count:].transpose(1, 2, 0)), still], 2)
     )
-    carried = (1 - weights[:, :1, None]) * NECK_SHIFT_M * np.eye(3)
+    carried = (1 - weights[:, :1, None]) * CENTIMETRE * np.eye(3)
+    added = np.concatenate([carried, CENTIMETRE * shoulder_directions(bust.vertices, weights)], 2)
     uv, uv_faces = torso_uv(bust)
     head_uv = head["uv"] * [1, 1 - TORSO_TOP] + [0, TORSO_TOP]
     return head | {
         "name": np.array("makehuman_bust"),
         "v_template": longer("v_template", bust.vertices[count:]),
-        "shapedirs": np.concatenate([shapedirs, as_float16(carried)], 2),
+        "shapedirs": np.concatenate([shapedirs, as_float16(added)], 2),
         "posedirs": np.zeros((len(bust.vertices), 3, 36), np.float16),
         "joint_regressor": np.pad(head["joint_regressor"], [(0, 0), (0, len(torso))]),
         "skinning_weights": weights,
         "faces": bust.faces.astype(np.int32),
         "uv": np.concatenate([head_uv, uv]).astype(np.float32),
         "uv_faces": np.concatenate([head["uv_faces"], uv_faces + len(head_uv)]).astype(np.int32),
-        "expression_names": np.concatenate([head["expression_names"], NECK_SHIFTS]),
+        "expression_names": np.concatenate([head["expression_names"], NECK_SHIFTS, BODY_SHAPES]),
         "group_torso": torso.astype(np.int32),
     }
 

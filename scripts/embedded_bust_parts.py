@@ -77,6 +77,16 @@ def with_torso(
     )
 
 
+def shoulder_directions(points: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """How shoulders and arms [V, 3, 2] go up, and apart, by 1; the neck and the breastbone stay."""
+    x = np.abs(points[:, 0])
+    outside = ((x - 0.05) / 0.08).clip(0, 1)
+    share = weights[:, 0] * outside * outside * (3 - 2 * outside)
+    none = np.zeros_like(share)
+    up, apart = [none, share, none], [np.sign(points[:, 0]) * share, none, none]
+    return np.stack([np.stack(up, 1), np.stack(apart, 1)], 2)
+
+
 def torso_uv(mesh: HeadMesh) -> tuple[np.ndarray, np.ndarray]:
     """UV [VT, 2] of the torso's two charts, front and back, in its strip, and faces into it."""
     faces = mesh.faces[mesh.face_parts == "torso"]

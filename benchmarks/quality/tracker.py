@@ -24,16 +24,21 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.head.rotations import axis_angle_to_matrix, matrix_to_axis_angle
 from rgbavatar_ns.synthetic import DemoConfig
 from rgbavatar_ns.synthetic.make import DemoPerson
+from rgbavatar_ns.synthetic.performer.hair import HairStyle
 from rgbavatar_ns.synthetic.performer.performance import perform
 from rgbavatar_ns.tracking.config import TrackConfig
 from rgbavatar_ns.tracking.face.detector import FaceLandmarker
+from rgbavatar_ns.tracking.fit.outline import PersonOutline
 from rgbavatar_ns.tracking.fit.subject import SubjectTracker
+from rgbavatar_ns.tracking.image.crop import steady_crop
+from rgbavatar_ns.tracking.image.matting import PersonMatte
+from rgbavatar_ns.tracking.image.outlines import OUTLINE_PX, levels, person_outline
 from rgbavatar_ns.tracking.verify.gaze import gaze_quality
 
 FRAMES_PER_SECOND = 12.0
@@ -46,7 +51,9 @@ OPEN_LIDS = 0.35
 class Subject:
     """A procedural person with its true parameters and the landmarks found on its images."""
 
-    def __init__(self, seed: int, size: int, frames: int, glasses: bool) -> None:
+    def __init__(
+        self, seed: int, size: int, frames: int, glasses: bool, hair: HairStyle = "short"
+    ) -> None:
         config = DemoConfig(
             image_size=size,
             num_frames=frames,
@@ -54,6 +61,7 @@ class Subject:
             seed=seed,
             frames_per_second=FRAMES_PER_SECOND,
             glasses=glasses,
+            hair=hair,
             supersampling=2,
         )
         person = DemoPerson.of(config)
@@ -65,16 +73,23 @@ class Subject:
         room = np.stack([90 + 60 * column, 110 + 40 * row, 130 - 30 * column], -1)
         found: list[np.ndarray] = []
         kept: list[int] = []
+        pictures: list[np.ndarray] = []
+        alphas: list[np.ndarray] = []
         with closing(FaceLandmarker()) as landmarker:
             images = person.draw(torch.from_numpy(acted).float())
             for number, image in enumerate(images):
                 alpha = image[..., 3:] / 255
                 picture = image[..., :3] * alpha + room * (1 - alpha)
-                points = landmarker(picture.round().astype(np.uint8))
+                pixels = picture.round().astype(np.uint8)
+                points = landmarker(pixels)
                 if points is not None:
                     found.append(points)
+                    pictures.append(pixels)
+                    alphas.append(image[..., 3])
                     kept.append(number)
         self.theta = acted[kept]
+        self.config, self.person = config, person
+        self.pictures, self.alphas = np.array(pictures), np.array(alphas)
         self.landmarks_px = np.array(found)
         self.follows = [False, *(np.diff(kept) == 1).tolist()]
         self.lost = frames - len(kept)
@@ -115,6 +130,30 @@ def jitter(values: Float[np.ndarray, "F P"]) -> float:
     return float(np.square(np.diff(values, 2, axis=0)).mean())
 
 
+def aligned_to_face(
+    ours: Float[np.ndarray, "F V 3"],
+    real: Float[np.ndarray, "F V 3"],
+    face: Bool[np.ndarray, "V"],
+    focal_ratio: float,
+) -> tuple[Float[np.ndarray, "F V 3"], Float[np.ndarray, "F"]]:
+    """Vertices moved and scaled so that the face has its true place and size, from the cameras.
+
+    One camera does not tell depth and size. Second: how far apart the faces' middles are across
+    the image, as a share of the distance. `focal_ratio`: found by true focal length.
+    """
+    our_middle, real_middle = ours[:, face].mean(1), real[:, face].mean(1)
+    # The pixel of the face's middle, seen at its true depth through the true camera.
+    across = our_middle[:, :2] / our_middle[:, 2:] * focal_ratio
+    across = across * real_middle[:, 2:]
+    away = np.linalg.norm(across - real_middle[:, :2], axis=1) / -real_middle[:, 2]
+    extent = [
+        np.linalg.norm(points[:, face] - middle[:, None], axis=-1).mean()
+        for points, middle in ((ours, our_middle), (real, real_middle))
+    ]
+    placed = np.concatenate([across, real_middle[:, 2:]], 1)
+    return (ours - our_middle[:, None]) * (extent[1] / extent[0]) + placed[:, None], away
+
+
 def vertex_errors(
     head: HeadModel,
     found: tuple[np.ndarray, np.ndarray, float, float],
@@ -129,17 +168,7 @@ def vertex_errors(
     ours = ours - [0, 0, distance_m]
     real = real - [0, height_m, true_distance_m]
     face = head.arrays.v_template[:, 2] > FACE_FRONT_M
-    our_middle, real_middle = ours[:, face].mean(1), real[:, face].mean(1)
-    # The pixel of the face's middle, seen at its true depth through the true camera.
-    across = our_middle[:, :2] / our_middle[:, 2:] * (focal_px / true_focal_px)
-    across = across * real_middle[:, 2:]
-    away = np.linalg.norm(across - real_middle[:, :2], axis=1) / -real_middle[:, 2]
-    extent = [
-        np.linalg.norm(points[:, face] - middle[:, None], axis=-1).mean()
-        for points, middle in ((ours, our_middle), (real, real_middle))
-    ]
-    placed = np.concatenate([across, real_middle[:, 2:]], 1)
-    aligned = (ours - our_middle[:, None]) * (extent[1] / extent[0]) + placed[:, None]
+    aligned, away = aligned_to_face(ours, real, face, focal_px / true_focal_px)
     error_mm = np.linalg.norm(aligned - real, axis=-1) * 1e3
     return {
         "translation_percent": float(100 * away.mean()),
@@ -148,15 +177,25 @@ def vertex_errors(
     }
 
 
+def outlines(subject: Subject, tracker: SubjectTracker) -> list[PersonOutline | None]:
+    """The person's outlines in the key frames, as `rgbavatar track` finds them."""
+    crop = steady_crop(subject.landmarks_px, subject.size, subject.size, OUTLINE_PX)
+    keys = tracker.key_positions(subject.landmarks_px)
+    with closing(PersonMatte()) as matte:
+        mattes = [levels(matte(crop.apply(subject.pictures[key]))) for key in keys]
+    return [person_outline(m, crop, subject.landmarks_px[key]) for m, key in zip(mattes, keys)]
+
+
 def measure(subject: Subject, head: HeadModel, *, known_focal: bool) -> dict[str, Any]:
     """All figures of one subject."""
     config = TrackConfig(focal_px=subject.camera.focal_px if known_focal else None)
     tracker = SubjectTracker(head, config)
+    known, size = outlines(subject, tracker), subject.size
     started = time.process_time()
-    fit = tracker.fit(subject.landmarks_px, subject.follows, subject.size, subject.size)
+    fit = tracker.fit(subject.landmarks_px, subject.follows, size, size, outlines=known)
     seconds = time.process_time() - started
     rough = SubjectTracker(head, replace(config, temporal_weight=0.0))
-    unsmoothed = rough.fit(subject.landmarks_px, subject.follows, subject.size, subject.size)
+    unsmoothed = rough.fit(subject.landmarks_px, subject.follows, size, size, outlines=known)
     theta, true, layout = tracker.thetas(fit), subject.theta, head.layout
     turns = [np.array([tracker.mesh_landmarks.head_rotation(t) for t in x]) for x in (theta, true)]
     off = matrix_to_axis_angle(torch.from_numpy(turns[0] @ turns[1].transpose(0, 2, 1))).numpy()

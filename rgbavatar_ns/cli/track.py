@@ -71,7 +71,8 @@ def summary_table(report: Mapping[str, Any]) -> Table:
         "reprojection error": f"{_percent(report['mesh_reprojection_error_share'])} of the face's "
         f"height, {_percent(report['reprojection_error_share'])} with landmark offsets; "
         f"worst frame {_percent(report['worst_frame_error_share'])}",
-        "silhouette": f"matte holds {_percent(report['silhouette_coverage'])} of the head; "
+        "silhouette": f"matte holds {_percent(report['silhouette_coverage'])} of the head, "
+        f"{_percent(report['mesh_outside_matte'])} stand out of it; "
         f"IoU between chin and eyes {_share(report['face_silhouette_iou'])}",
         "mouth, eyelids": f"correlation of fitted and measured opening "
         f"{_share(report['mouth_opening_correlation'])}, "

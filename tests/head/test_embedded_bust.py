@@ -6,7 +6,7 @@ import torch
 
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import EMBEDDED_BUST, EMBEDDED_HEAD, HeadArrays, HeadModel, uv_anchors
-from rgbavatar_ns.head.arrays import NECK_SHIFTS
+from rgbavatar_ns.head.arrays import BODY_SHAPES, NECK_SHIFTS
 
 CM, MM = 1e-2, 1e-3
 
@@ -30,7 +30,7 @@ def test_its_head_is_the_embedded_one_in_every_pose(bust: HeadModel, head: HeadM
     }
     identity = torch.randn(head.num_identity, generator=drawn, dtype=torch.float64)
     alone = head(head.layout.join(parts), identity)
-    more = torch.zeros(4, len(NECK_SHIFTS), dtype=torch.float64)
+    more = torch.zeros(4, len(NECK_SHIFTS + BODY_SHAPES), dtype=torch.float64)
     parts["expression"] = torch.cat([parts["expression"], more], 1)
     on_shoulders = bust(bust.layout.join(parts), identity)
     torch.testing.assert_close(on_shoulders[:, :count], alone, atol=1e-9, rtol=0)
@@ -71,6 +71,18 @@ def test_a_neck_shift_carries_the_head_a_centimetre_and_no_shoulder(
         np.testing.assert_allclose(moved[group], np.tile(np.eye(3)[axis] * CM, (len(group), 1)),
                                    atol=0.02 * MM)  # fmt: skip
     assert np.abs(moved[bust.arrays.v_template[:, 1] < -0.22]).max() < 0.01 * MM
+
+
+def test_shoulders_go_up_and_apart_by_centimetres_and_leave_the_head(bust: HeadModel) -> None:
+    first = bust.layout.slice("expression").start
+    left = bust.arrays.v_template[:, 0] > 0.16
+    head = bust.arrays.skinning_weights[:, 0] < 1e-6
+    for name, axis in zip(BODY_SHAPES, (1, 0)):
+        theta = torch.zeros(bust.layout.size, dtype=torch.float64)
+        theta[first + bust.arrays.expression_names.index(name)] = 2.0
+        moved = bust(theta).numpy() - bust.arrays.v_template
+        np.testing.assert_allclose(moved[left][:, axis], 2 * CM, atol=0.05 * MM)
+        assert np.abs(moved[head]).max() < 0.01 * MM
 
 
 def test_it_reaches_shoulders_and_chest_without_a_gap(bust: HeadModel) -> None:

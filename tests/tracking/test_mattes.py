@@ -15,7 +15,7 @@ from rgbavatar_ns.tracking.input.video import FrameSource
 
 from .clips import astronaut, gradient_images, write_clip
 
-CONFIG = TrackConfig(image_size=96, key_frames=1, focal_px=500.0, keep_torso=True)
+CONFIG = TrackConfig(image_size=96, key_frames=1, focal_px=500.0)
 
 
 def _folder(path: Path, images: dict[str, np.ndarray]) -> Path:

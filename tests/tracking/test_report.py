@@ -40,6 +40,8 @@ GOOD: dict[str, Any] = {
     "worst_iris_error_eye_widths": 0.1,
     "gaze_at_bound_share": 0.0,
     "silhouette_coverage": 0.99,
+    "mesh_outside_matte": 0.01,
+    "matte_misses": 0.0,
     "face_silhouette_iou": 0.92,
     "face_height_px": 180.0,
     "stages": {"faces": {"frames": 200, "seconds": 8.0, "frames_per_second": 25.0}},
@@ -74,13 +76,25 @@ def test_correlation_of_openings() -> None:
         ({"iris_error_eye_widths": 0.15}, "usable: the irises lie off the film's"),
         ({"iris_error_eye_widths": None}, "good"),
         ({"gaze_at_bound_share": 0.3}, "look at it: the gaze is at its bounds in 30% of frames"),
-        ({"silhouette_coverage": 0.5}, "look at it: the matte misses part of the head"),
+        (
+            {"silhouette_coverage": 0.5, "mesh_outside_matte": 0.1, "matte_misses": 0.4},
+            "look at it: the matte misses part of the head",
+        ),
+        (
+            {"silhouette_coverage": 0.9, "mesh_outside_matte": 0.09, "matte_misses": 0.01},
+            "usable: the mesh stands out of the person's outline",
+        ),
         ({"other_faces": [4, 5]}, "look at it: another face is seen in 2 frames"),
         ({"face_height_px": 40.0}, "look at it: the face is only 40 pixels high"),
         ({"blurred": list(range(30))}, "usable: 30 frames are blurred"),
         # Grave words come before mild ones.
         (
-            {"mesh_reprojection_error_share": 0.02, "silhouette_coverage": 0.5},
+            {
+                "mesh_reprojection_error_share": 0.02,
+                "silhouette_coverage": 0.5,
+                "mesh_outside_matte": 0.1,
+                "matte_misses": 0.4,
+            },
             "look at it: the matte misses part of the head; the mesh lies off the face",
         ),
     ],
@@ -108,17 +122,38 @@ def test_silhouettes_compared_by_hand() -> None:
     hair, wider, half = mesh.copy(), mesh.copy(), mesh.copy()
     hair[:30, 20:80] = 1
     with_hair = silhouette_shares(outline, hair, seen)
-    assert with_hair == {"coverage": 1, "face_iou": 1}, "hair on top costs nothing"
+    assert with_hair == {"coverage": 1, "outside": 0, "missed": 0, "face_iou": 1}, (
+        "hair on top costs nothing"
+    )
     wider[:, 65:75] = 1
     assert silhouette_shares(outline, wider, seen)["face_iou"] == pytest.approx(40 / 45)
     half[:, :50] = 0
     halved = silhouette_shares(outline, half, seen)
-    assert halved == pytest.approx({"coverage": 0.5, "face_iou": 0.5})
+    # Above the chin 70 rows of 40: of the lost 20 columns 8 rows on top and 8 columns are rim.
+    missed = 62 * 12 / (70 * 40)
+    expected = {"coverage": 0.5, "outside": 0.5 - missed, "missed": missed, "face_iou": 0.5}
+    assert halved == pytest.approx(expected)
     outside = silhouette_shares(outline, half, 0 * seen)
-    assert outside == {"coverage": None, "face_iou": None}
+    assert set(outside.values()) == {None}
     summary = silhouette_summary([halved, outside, with_hair])
     assert summary["silhouette_coverage"] == pytest.approx(0.75)
     assert summary["worst_silhouette_coverage"] == pytest.approx(0.5)
+
+
+def test_a_mesh_that_stands_out_and_a_matte_with_a_hole_are_told_apart() -> None:
+    above = height_above_chin(np.array([50.0, 0.0]), np.array([50.0, 80.0]), 100)
+    mesh, seen = np.zeros((100, 100), np.float32), np.ones((100, 100), np.float32)
+    mesh[10:95, 30:70] = 1
+    outline = HeadOutline(mesh, above, 80.0, None)
+    lower, hole = mesh.copy(), mesh.copy()
+    lower[:16] = 0
+    hole[40:46, 40:60] = 0
+    for matte, name, lost in ((lower, "outside", 6 * 40), (hole, "missed", 6 * 20)):
+        shares = silhouette_shares(outline, matte, seen)
+        other = "missed" if name == "outside" else "outside"
+        assert shares[name] == pytest.approx(lost / (70 * 40))
+        assert shares[other] == 0
+        assert shares["coverage"] == pytest.approx(1 - lost / (70 * 40))
 
 
 def test_a_silhouette_is_the_pixels_whose_centres_lie_inside() -> None:

@@ -17,6 +17,7 @@ from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.tracking import TrackConfig, track_video
 from rgbavatar_ns.tracking import track as track_module
 from rgbavatar_ns.tracking.face.find_faces import find_faces
+from rgbavatar_ns.tracking.image import outlines
 from rgbavatar_ns.tracking.resumable_run import WORK_FOLDER, ResumableRun
 
 from .clips import astronaut, gradient_images, write_clip
@@ -185,6 +186,21 @@ def test_a_torn_line_and_a_torn_image_are_made_again(tmp_path: Path) -> None:
     cv2.imwrite(str(images / "00007.png"), np.zeros((4, 4, 4), np.uint8))
     assert sorted(run.noted_images("fit")) == [0, 2, 7]
     assert run.noted_images("another fit") == {}
+
+
+def test_mattes_of_key_frames_are_found_once(
+    clip: Path, uninterrupted: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    dst = tmp_path / "set"
+    with pytest.raises(KeyboardInterrupt):
+        track_video(clip, dst, CONFIG, _interrupting("pictures", 1))
+
+    def never() -> None:
+        raise AssertionError("the mattes of key frames were there")
+
+    monkeypatch.setattr(outlines, "PersonMatte", never)
+    track_video(clip, dst, CONFIG)
+    assert _files(dst) == _files(uninterrupted)
 
 
 def test_ctrl_c_ends_with_one_line_and_code_130(

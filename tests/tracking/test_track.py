@@ -50,7 +50,8 @@ def test_a_written_clip_becomes_a_dataset_without_its_faceless_frames(
     assert (tmp_path / "set" / "overlay.png").stat().st_size > 10_000
     assert len(dataset.test) == len(dataset) // 5
     stages = list(dict.fromkeys(call[0] for call in calls))
-    assert stages == ["faces", "fit", "pictures"]
+    assert stages == ["faces", "fit", "body", "background", "pictures"]
+    assert report["background"] in ("still", "covered", "too short")
     for stage in stages:
         done = [call[1] for call in calls if call[0] == stage]
         assert done == sorted(done)
@@ -63,16 +64,18 @@ def test_a_written_clip_becomes_a_dataset_without_its_faceless_frames(
     assert (image[..., 3] > 0).mean() < 0.7
 
 
-def test_torso_is_kept_only_when_asked_for(
+def test_the_body_is_left_out_only_when_asked_for(
     portrait: tuple[Path, list[int]], tmp_path: Path
 ) -> None:
     shares = []
-    for keep in (False, True):
+    for head_only in (True, False):
         config = TrackConfig(
-            image_size=96, key_frames=1, max_frames=1, focal_px=500.0, keep_torso=keep
+            image_size=96, key_frames=1, max_frames=1, focal_px=500.0, head_only=head_only
         )
-        dataset = track_video(portrait[0], tmp_path / str(keep), config)
-        shares.append(dataset.read_image(0)[-8:, :, 3].mean() / 255)
+        dataset = track_video(portrait[0], tmp_path / str(head_only), config)
+        assert dataset.arrays.has_torso != head_only
+        shares.append(dataset.read_image(0)[-12:-6, :, 3].mean() / 255)
+        assert not dataset.read_image(0)[-1, :, 3].any(), "it fades out at the bottom"
     assert shares[0] < 0.05
     assert shares[1] > 0.3
 
@@ -105,12 +108,12 @@ def test_a_protobuf_that_mediapipe_fails_beside_is_told_with_the_remedy(
         load_mediapipe()
 
 
-@pytest.mark.parametrize("keep_torso", [False, True], ids=["head", "torso"])
-def test_what_the_frame_cuts_off_is_marked_as_not_filmed(tmp_path: Path, keep_torso: bool) -> None:
+@pytest.mark.parametrize("head_only", [True, False], ids=["head", "body"])
+def test_what_the_frame_cuts_off_is_marked_as_not_filmed(tmp_path: Path, head_only: bool) -> None:
     """The portrait ends above the chin: the crop reaches beyond, where the chin would be."""
     height = 160
     clip = write_clip(tmp_path / "cut.mp4", [astronaut()[:height]] * 2)
-    config = TrackConfig(image_size=96, focal_px=500.0, keep_torso=keep_torso)
+    config = TrackConfig(image_size=96, focal_px=500.0, head_only=head_only)
     dataset = track_video(clip, tmp_path / "set", config)
     report = json.loads((tmp_path / "set" / "tracking.json").read_text())
     image = dataset.read_image(0)
@@ -119,10 +122,10 @@ def test_what_the_frame_cuts_off_is_marked_as_not_filmed(tmp_path: Path, keep_to
     last = int((height - crop["top"]) * len(image) / crop["side"])
     assert last < len(image) - 4, "the crop reaches beyond"
     assert not unfilmed[: last - 1].any()
-    assert image[last - 2, :, 3].max() > 200, "the face goes on to the edge"
+    assert image[last - 6, :, 3].max() > 200, "the face goes on to the edge"
     assert not image[last:, :, 3].any()
     chin = [one.mean() for one in np.nonzero(unfilmed)]
-    if keep_torso:
+    if not head_only:
         assert unfilmed[last:].all()
     else:
         assert last < chin[0] < last + 12

@@ -1,6 +1,6 @@
 """The still camera of a clip: the head near the world's origin, the camera in front of it."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -28,6 +28,12 @@ class StillCamera:
     def eye_m(self) -> Float[np.ndarray, "3"]:
         """Where the camera is, in the world."""
         return np.array([0.0, 0.0, self.distance_m])
+
+    def scaled(self, scale: float) -> "StillCamera":
+        """The camera of smaller pictures, whose first centre is at 0, as OpenCV has it."""
+        x, y = self.center_px
+        center = (x * scale - 0.5, y * scale - 0.5)
+        return replace(self, focal_px=self.focal_px * scale, center_px=center)
 
     def project(self, points_m: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 2"]:
         """Image points in pixels."""

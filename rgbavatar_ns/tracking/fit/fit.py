@@ -211,19 +211,19 @@ def fit_outlines(
     `outline_cost` has this cost's entries and identity components. Outlines go with `keys`; None
     where a frame has none. The camera stays.
     """
-    seen = [number for number, outline in enumerate(outlines) if outline is not None]
-    if not seen:
+    camera, terms = subject.camera, dict[int, OutlineTerms]()
+    for number, (outline, key) in enumerate(zip(outlines, keys)):
+        if outline is not None:
+            frame = OutlineTerms(outline, camera, key.to_upright)
+            theta = cost.theta(subject.key_values[number])
+            if outline_cost.tells(theta, subject.identity, frame):
+                terms[number] = frame
+    if not terms:
         return subject
-    camera = subject.camera
-    terms = {
-        number: OutlineTerms(outline, camera, key.to_upright)
-        for number, (outline, key) in enumerate(zip(outlines, keys))
-        if outline is not None
-    }
     for rounds in range(1 + _HAIR_ROUNDS):
         if rounds:
-            thetas = [cost.theta(subject.key_values[number]) for number in seen]
-            hair_m = outline_cost.hair_m(thetas, subject.identity, [terms[k] for k in seen])
+            thetas = [cost.theta(subject.key_values[number]) for number in terms]
+            hair_m = outline_cost.hair_m(thetas, subject.identity, list(terms.values()))
             terms = {number: replace(one, hair_m=hair_m) for number, one in terms.items()}
         _, subject = _fit_keys(
             cost,

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.tracking.fit.camera import StillCamera
@@ -21,19 +21,23 @@ _Points = Float[np.ndarray, "N 3"]
 _PerPoint = Float[np.ndarray, "N"]
 
 # A matte knows an edge to about a pixel of 256, some millimetres. What lies much farther out is no
-# error of the head but of the matte (a hat that it leaves out): it costs a constant.
-_OUTSIDE_M, _LOST_M = 0.003, 0.02
+# error of the head but of the matte: it costs a constant. Landmarks alone put skulls up to 2 cm too
+# high; a matte that lacks twice as much has left out a hat, or hair, and says nothing about a head.
+_OUTSIDE_M, _LOST_M, _LEFT_OUT_M = 0.002, 0.02, 0.04
 # Hair is as thick all over to about this, but for a bun, a brim or what hangs down; which is one
 # person's habit in all key frames alike, so that less is known than so many points would say.
 _HAIR_EVEN_M, _NO_HAIR_M = 0.008, 0.012
-_HAIR_WEIGHT = 3.0
+_HAIR_WEIGHT = 2.0
 _THICKEST_M = 0.06
 # Directions in which the mesh's outermost point is looked for, from straight up to both sides, a
 # little beyond the ears' tops; below there hang hair and neck.
-_FAN_RAD, _DIRECTIONS = np.radians(100), 15
+_FAN_RAD, _DIRECTIONS = np.radians(120), 49
 _SPREAD_POINTS = 240  # about 9 mm apart
 _BELOW_EYES_M = 0.06  # the upper lip: below it the jaw moves
 _RIGID = 0.95
+# From between the eyes, metres: how high the ears' tops are, how high the hairline is there and how
+# it rises forwards, and what lies behind the ears.
+_EAR_TOP_M, _HAIRLINE_M, _HAIRLINE_SLOPE, _BEHIND_EARS_M = 0.02, 0.043, 0.96, -0.095
 
 
 @dataclass(frozen=True)
@@ -51,7 +55,8 @@ class PersonOutline:
     def at(self, points_px: Float[np.ndarray, "N 2"]) -> tuple[_PerPoint, Float[np.ndarray, "N 2"]]:
         """Distances at points of the frame, and how they grow with column and row."""
         most = np.array(self.outside_px.shape[::-1], np.float64) - 1
-        place = np.clip((points_px - self.first_px) / self.step_px, 0, most)
+        unbounded = (points_px - self.first_px) / self.step_px
+        place = np.clip(unbounded, 0, most)
         corner = np.minimum(np.floor(place), most - 1).astype(np.int64)
         (x, y), (column, row) = (place - corner).T, corner.T
         field = self.outside_px
@@ -59,7 +64,8 @@ class PersonOutline:
         left_below, right_below = field[row + 1, column], field[row + 1, column + 1]
         here, below = left + x * (right - left), left_below + x * (right_below - left_below)
         across = (1 - y) * (right - left) + y * (right_below - left_below)
-        return here + y * (below - here), np.stack([across, below - here], 1) / self.step_px
+        slope = np.stack([across, below - here], 1) / self.step_px
+        return here + y * (below - here), slope * (unbounded == place)
 
 
 @dataclass(frozen=True)
@@ -86,7 +92,9 @@ class OutlineCost:
     def __init__(
         self, head: HeadModel, columns: Int[np.ndarray, "P"], identity_columns: int
     ) -> None:
-        corners = np.repeat(spread_vertices(head)[:, None], 3, axis=1)
+        chosen = spread_vertices(head)
+        self._haired = haired_vertices(head)[chosen]
+        corners = np.repeat(chosen[:, None], 3, axis=1)
         self._head = LandmarkHead(head, corners, np.tile([1.0, 0.0, 0.0], (len(corners), 1)))
         self._unknowns = self._head.unknowns(columns, identity_columns)
 
@@ -97,11 +105,20 @@ class OutlineCost:
     def model(self, theta: _Theta, identity: _Identity, terms: OutlineTerms) -> QuadraticModel:
         """The cost around a pose and a person."""
         points, derivative = self._head.jacobian(theta, identity, self._unknowns)
-        cost, pull, weight, slope = self._explained(points, terms)
+        cost, pull, weight = self._explained(points, terms)
         asked = np.flatnonzero(weight)
-        moved = terms.camera.image_derivative(points[asked], derivative[:, asked])
-        rows = np.einsum("ni,niq->nq", slope[asked], moved)
+        points, derivative, camera = points[asked], derivative[:, asked], terms.camera
+        away_px, slope = terms.outline.at(camera.project(points))
+        moved = np.einsum("ni,niq->nq", slope, camera.image_derivative(points, derivative))
+        # A distance in metres is one in pixels times the depth.
+        rows = moved * _metres_a_pixel(points, camera)[:, None]
+        rows -= (away_px / camera.focal_px)[:, None] * derivative[2]
         return QuadraticModel(cost, rows.T @ pull[asked], rows.T @ (rows * weight[asked, None]))
+
+    def tells(self, theta: _Theta, identity: _Identity, terms: OutlineTerms) -> bool:
+        """Whether the outline may be believed where landmarks alone put the head."""
+        points = self._head.points(theta, identity)
+        return bool(self._rim_m(points, terms)[1].max() < _LEFT_OUT_M)
 
     def hair_m(
         self,
@@ -109,38 +126,60 @@ class OutlineCost:
         identity: _Identity,
         terms: Sequence[OutlineTerms],
     ) -> float:
-        """How thick hair is: the median over the outermost points of all frames, metres."""
+        """How thick hair is: the median over the rims of all frames, metres."""
         found = []
         for theta, frame in zip(thetas, terms):
-            points = self._head.points(theta, identity)
-            points_px = frame.camera.project(points)
-            outermost = _outermost(points_px, frame.to_upright)
-            away_px, _ = frame.outline.at(points_px[outermost])
-            found.append(-away_px * _metres_a_pixel(points[outermost], frame.camera))
+            rim, away_m = self._rim_m(self._head.points(theta, identity), frame)
+            found.append(-away_m[self._haired[rim]])
         return float(np.clip(np.median(np.concatenate(found)), 0, _THICKEST_M))
 
     def _explained(
         self, points: _Points, terms: OutlineTerms
-    ) -> tuple[float, _PerPoint, _PerPoint, Float[np.ndarray, "N 2"]]:
-        """Cost, its gradient to each point's distance in pixels, curvature, the distance's slope.
+    ) -> tuple[float, _PerPoint, _PerPoint]:
+        """Cost, its gradient to each point's distance in metres, and its curvature.
 
         Geman and McClure's loss, so that what is far off counts ever less.
         """
-        points_px = terms.camera.project(points)
-        away_px, slope = terms.outline.at(points_px)
-        metres = _metres_a_pixel(points, terms.camera)
-        away_m = away_px * metres
+        rim, away_m = self._rim_m(points, terms)
         out_m = np.maximum(away_m, 0)
-        loss, weight = _geman_mcclure(out_m, _OUTSIDE_M, _LOST_M)
-        cost, pull, weight = float(loss.sum()), weight * out_m, weight * (out_m > 0)
+        loss, even = _geman_mcclure(out_m, _OUTSIDE_M, _LOST_M)
+        pull, weight = np.zeros(len(points)), np.zeros(len(points))
+        cost, pull[rim], weight[rim] = float(loss.sum()), even * out_m, even * (out_m > 0)
         if terms.hair_m is not None:
-            outermost = _outermost(points_px, terms.to_upright)
-            apart_m = away_m[outermost] + terms.hair_m
+            under_hair = self._haired[rim]
+            haired, apart_m = rim[under_hair], away_m[under_hair] + terms.hair_m
             loss, even = _geman_mcclure(apart_m, _HAIR_EVEN_M, _NO_HAIR_M)
             cost += _HAIR_WEIGHT * float(loss.sum())
-            pull[outermost] += _HAIR_WEIGHT * even * apart_m
-            weight[outermost] += _HAIR_WEIGHT * even
-        return cost, pull * metres, weight * metres**2, slope
+            pull[haired] += _HAIR_WEIGHT * even * apart_m
+            weight[haired] += _HAIR_WEIGHT * even
+        return cost, pull, weight
+
+    def _rim_m(
+        self, points: _Points, terms: OutlineTerms
+    ) -> tuple[Int[np.ndarray, "K"], Float[np.ndarray, "K"]]:
+        """The mesh's rim, and how far out of the person it lies, metres.
+
+        The farthest points in directions around the top of the head. What lies deeper within the
+        mesh has no say: where the matte lacks that, the matte is wrong.
+        """
+        points_px = terms.camera.project(points)
+        angle = np.linspace(-_FAN_RAD, _FAN_RAD, _DIRECTIONS)
+        outwards = np.stack([np.sin(angle), -np.cos(angle)], axis=1) @ terms.to_upright
+        rim = np.unique((points_px @ outwards.T).argmax(0))
+        away_px, _ = terms.outline.at(points_px[rim])
+        return rim, away_px * _metres_a_pixel(points[rim], terms.camera)
+
+
+def haired_vertices(head: HeadModel) -> Bool[np.ndarray, "V"]:
+    """Where hair grows on most heads: above the forehead and the ears, and behind the ears.
+
+    In a head's own measure from between its eyes, so that it holds for any head model.
+    """
+    template = head.arrays.v_template.astype(np.float64)
+    eyes = (head.arrays.joint_regressor.astype(np.float64) @ template)[-2:].mean(0)
+    _, above, ahead = (template - eyes).T
+    line_m = np.maximum(_EAR_TOP_M, _HAIRLINE_M + _HAIRLINE_SLOPE * ahead)
+    return (above > line_m) | ((ahead < _BEHIND_EARS_M) & (above > -_BELOW_EYES_M))
 
 
 def spread_vertices(head: HeadModel) -> Int[np.ndarray, "N"]:
@@ -160,15 +199,6 @@ def spread_vertices(head: HeadModel) -> Int[np.ndarray, "N"]:
         chosen.append(int(np.argmax(nearest)))
         nearest = np.minimum(nearest, np.linalg.norm(places - places[chosen[-1]], axis=1))
     return may[chosen]
-
-
-def _outermost(
-    points_px: Float[np.ndarray, "N 2"], to_upright: Float[np.ndarray, "2 2"]
-) -> Int[np.ndarray, "K"]:
-    """Points of the mesh's outline: the farthest ones in directions around the top of the head."""
-    angle = np.linspace(-_FAN_RAD, _FAN_RAD, _DIRECTIONS)
-    outwards = np.stack([np.sin(angle), -np.cos(angle)], axis=1) @ to_upright
-    return np.unique((points_px @ outwards.T).argmax(0))
 
 
 def _metres_a_pixel(points: _Points, camera: StillCamera) -> _PerPoint:

@@ -50,7 +50,7 @@ class PersonMatte:
     ) -> Float[np.ndarray, "H W"]:
         """The segmentation of a brightened square image, its head segmented once more, closer.
 
-        Twice the time of `coarse`, and a fifth to a third of its error less. `face_px` are the
+        Twice the work of `coarse`, and a tenth to a third of its error less. `face_px` are the
         face's landmarks.
         """
         lit, size = _lit(image_rgb), len(image_rgb)
@@ -61,7 +61,7 @@ class PersonMatte:
         if side > _NEARLY_ALL * size:
             return whole
         middle = (low + high) / 2 - (0, _RAISED * height)
-        left, top = np.clip(middle - side / 2, 0, size - side).round().astype(int)
+        left, top = np.clip(middle - side / 2, 0, size - side).round().astype(int).tolist()
         here = (slice(top, top + side), slice(left, left + side))
         few = (_SEGMENTED_PX, _SEGMENTED_PX)
         close = self.coarse(cv2.resize(lit[here], few, interpolation=cv2.INTER_AREA))
@@ -74,7 +74,8 @@ class PersonMatte:
 
 def _lit(image_rgb: _Image) -> _Image:
     """A dark picture as a lit room would look; others as they are."""
-    bright = float(np.percentile(image_rgb, _LIT_PERCENTILE))
+    # A pixel in 64 tells it as well, in a fiftieth of the time.
+    bright = float(np.percentile(image_rgb[::8, ::8], _LIT_PERCENTILE))
     if bright >= _DARK_BELOW:
         return image_rgb
     power = np.log(_LIT_LEVEL) / np.log(max(bright, 8) / 255)

@@ -35,25 +35,31 @@ def person_outline(
     """
     solid = (matte > 127).astype(np.uint8)
     hull = cv2.convexHull(crop.points(landmarks_px).astype(np.float32))
-    face = cv2.fillConvexPoly(np.zeros_like(solid), np.round(hull - 0.5).astype(np.int32), 1)
+    face = cv2.fillConvexPoly(np.zeros_like(solid), np.round(hull - 0.5).astype(np.int32), (1,))
     contours, _ = cv2.findContours(solid, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     person, most = np.zeros_like(solid), 0
     for contour in contours:
-        filled = cv2.drawContours(np.zeros_like(solid), [contour], 0, 1, cv2.FILLED)
-        shared = int((filled & face).sum())
+        filled = cv2.drawContours(np.zeros_like(solid), [contour], 0, (1,), cv2.FILLED)
+        shared = int(np.sum(filled * face))
         if shared > most:
             person, most = filled, shared
     if most == 0 or most < _OF_FACE * face.sum() or person.all():
         return None
-    outwards, inwards = (
-        cv2.distanceTransform(part, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-        for part in (1 - person, person)
-    )
+    outwards, inwards = (_distances(part) for part in (1 - person, person))
     step_px = 1 / crop.scale
     # Distances are to the nearest pixel of the other kind; the edge lies half a pixel before it.
     away = np.where(person > 0, 0.5 - inwards, outwards - 0.5)
     first_px = np.array([crop.left, crop.top]) + 0.5 * step_px
-    return PersonOutline(away.astype(np.float64) * step_px, first_px, step_px)
+    return PersonOutline(away * step_px, first_px, step_px)
+
+
+def _distances(part: UInt8[np.ndarray, "s s"]) -> Float[np.ndarray, "s s"]:
+    """How far each pixel is from the nearest one that is 0.
+
+    OpenCV's differ in the last digits from call to call; their squares are whole numbers.
+    """
+    found = cv2.distanceTransform(part, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    return np.sqrt(np.rint(np.square(found.astype(np.float64))))
 
 
 def key_outlines(

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from rgbavatar_ns.tracking.image.background import CleanPlate
+from rgbavatar_ns.tracking.image.matting import refined_matte
 
 _Image = UInt8[np.ndarray, "S S 3"]
 _Colors = Float[np.ndarray, "S S 3"]
@@ -30,7 +31,8 @@ _CORE_PX, _REACH_PX = 3.0, 45.0
 _NEAR_PX = 8.0
 # Within how many pixels, and more, a colour's mean is taken: of the person, of the background.
 _PERSON_PX, _ROOM_PX = (2, 5, 12, 40), (2, 6, 20, 60)
-_LIGHT_PX, _LIGHT_LEVELS = (10, 40), 12.0
+# Changes of light are smooth: every fourth pixel of every fourth row tells them.
+_LIGHT_PX, _LIGHT_LEVELS, _LIGHT_EVERY = (10, 40), 12.0, 4
 # Each wider mean only counts where the narrower one knows next to nothing.
 _WIDER = 1e-3
 # Noise of a webcam after its compression, and what a guessed background's texture adds to it: at
@@ -40,6 +42,8 @@ _GUESS_FROM, _GUESS_TO, _GUESS_PX, _TEXTURE_PX = 0.3, 4.0, 4.0, 9
 # From so many times the noise on, a pixel may be hair that stands off; a pixel is no background, if
 # all around it are as far off.
 _MAYBE, _NOT_ROOM, _AROUND = 2.0, 4.0, np.ones((3, 3), np.uint8)
+# So far off a known plate, what hangs on the person is of the person: shadows are not.
+_OTHER = 12.0
 # Mixtures lie on the line between both colours: no mixture has so large a squared sine to it, nor
 # lies so far along it.
 _ASIDE, _WHOLE = 0.1, 0.7
@@ -48,6 +52,8 @@ _ASIDE, _WHOLE = 0.1, 0.7
 _DEEP_PX, _HUE_LEVELS, _HUE_SIGMAS, _PURE = 10.0, 45.0, 8.0, 0.85
 # How sure the segmentation is of alpha: at its outline, and away from it on either side.
 _UNSURE, _SURE = 0.5, 0.08
+_UNSURE_BESIDE = 0.15
+"""The same where a plate is known elsewhere, but not here."""
 _INWARD_PX, _OUTWARD_PX = 4.0, 8.0
 # The share of the person's own variance near by that makes a mixture unsure.
 _PERSON_SPREAD = 1.0
@@ -142,9 +148,12 @@ def band_matte(image_rgb: _Image, coarse: _Values, plate: RoomColors | None = No
     differs = _squares(apart) / (3 * room.variance)
     deep = (inward > _DEEP_PX).astype(np.float32)
     towards = spread_colors(image, deep, _PERSON_PX, 8) - room.color
-    tinted = _tinted(apart, towards, room, inward)
+    # A guessed room has hues of its own: a white stripe on a blue shirt would pass for it.
+    tinted = _tinted(apart, towards, room, inward) & room.known & (plate is not None)
     core = (inward > _CORE_PX) & ~tinted
     sure = core | (_unmixed(apart, towards, differs, inward) & ~tinted)
+    if plate is not None:
+        sure |= _revealed(differs, room, inward)
     band = ~sure & ~outside
     if plate is not None:
         band |= outside & (inward > -_REACH_PX) & (differs > _MAYBE**2)
@@ -152,9 +161,14 @@ def band_matte(image_rgb: _Image, coarse: _Values, plate: RoomColors | None = No
     open_px = np.flatnonzero(band)
     alpha = sure.astype(np.float32)
     prior = np.clip((coarse - _HAZE) / (1 - 2 * _HAZE), 0, 1)
+    if plate is not None:
+        # Where a body keeps still no frame shows the room beside it, and a shirt's pattern is no
+        # mixture: there the image's own edges say where the outline goes.
+        prior = np.where(room.known, prior, refined_matte(image_rgb, coarse))
     # Where the hue tells, the segmentation is not asked more than at its outline.
     depth = np.where(tinted, 0, inward)
-    mixed = _mixture(image, apart, room, person, prior, depth, open_px)
+    guess = _UNSURE if plate is None else _UNSURE_BESIDE
+    mixed = _mixture(image, apart, room, person, prior, depth, open_px, guess)
     alpha.reshape(-1)[open_px] = np.clip((mixed - _LEFT) / (1 - 2 * _LEFT), 0, 1)
     return BandMatte(_in_one_piece(alpha, inward > 0), room.color)
 
@@ -190,6 +204,20 @@ def _unmixed(apart: _Colors, towards: _Colors, differs: _Values, inward: _Values
     return found
 
 
+def _revealed(differs: _Values, room: RoomColors, inward: _Values) -> _Mask:
+    """What hangs on the segmented person and is far from the plate's colour all over: the
+    segmentation overlooked it, as it does hair before the ears, or a stripe of a shirt."""
+    other = (differs > _OTHER**2) & room.known & (inward > -_NEAR_PX)
+    alone = np.asarray(cv2.morphologyEx(other.astype(np.uint8), cv2.MORPH_OPEN, _AROUND)) > 0
+    person = inward > 0
+    count, found = cv2.connectedComponents((alone | person).astype(np.uint8))
+    labels = np.asarray(found, np.int64)
+    hangs = np.zeros(count, bool)
+    hangs[np.unique(labels[person])] = True
+    whole = np.asarray(cv2.erode(alone.astype(np.uint8), _AROUND)) > 0
+    return whole & hangs[labels]
+
+
 def _mixture(
     image: _Colors,
     apart: _Colors,
@@ -198,6 +226,7 @@ def _mixture(
     prior: _Values,
     inward: _Values,
     open_px: Int[np.ndarray, "N"],
+    unsure_of_guess: float,
 ) -> Float[np.ndarray, "N"]:
     """Alpha that explains the open pixels' colours by the person's near by and the room's."""
     color = spread_colors(image, person, _PERSON_PX, 2)
@@ -213,7 +242,8 @@ def _mixture(
     across, length = towards.reshape(-1, 3)[open_px], length.reshape(-1)[open_px]
     share = (off * across).sum(1) / length
     away = np.where(depth > 0, depth / _INWARD_PX, -depth / _OUTWARD_PX)
-    trusted = (_UNSURE * (_SURE / _UNSURE) ** np.clip(away, 0, 1)) ** -2
+    unsure = np.where(room.known.reshape(-1)[open_px], _UNSURE, unsure_of_guess)
+    trusted = (unsure * (_SURE / unsure) ** np.clip(away, 0, 1)) ** -2
     before = prior.reshape(-1)[open_px]
     alpha = before
     # The person's variance counts as far as the person is seen, which is to be found.
@@ -225,9 +255,11 @@ def _mixture(
 
 def _lit_as(image: _Colors, plate: RoomColors, outside: _Mask) -> RoomColors:
     """The plate as bright as this frame shows it: lamps flicker, cameras adapt, a person shades."""
-    off = np.clip(image - plate.color, -_LIGHT_LEVELS, _LIGHT_LEVELS)
-    weight = (outside & plate.known).astype(np.float32)
-    return replace(plate, color=plate.color + spread_colors(off, weight, _LIGHT_PX, 8))
+    few = (slice(None, None, _LIGHT_EVERY),) * 2
+    off = np.clip(image[few] - plate.color[few], -_LIGHT_LEVELS, _LIGHT_LEVELS)
+    weight = (outside & plate.known)[few].astype(np.float32)
+    shift = cv2.resize(spread_colors(off, weight, _LIGHT_PX, 2), outside.shape)
+    return replace(plate, color=plate.color + shift)
 
 
 def _without_holes(image_rgb: _Image, coarse: _Values, plate: RoomColors | None) -> _Values:

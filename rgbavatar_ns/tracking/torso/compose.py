@@ -5,7 +5,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from rgbavatar_ns.head import HeadArrays, ThetaLayout
-from rgbavatar_ns.head.arrays import NECK_SHIFTS
+from rgbavatar_ns.head.arrays import BODY_SHAPES, NECK_SHIFTS
 from rgbavatar_ns.tracking.fit.landmark_head import LandmarkHead
 from rgbavatar_ns.tracking.torso.body_mesh import NECK
 from rgbavatar_ns.tracking.torso.place import BodyPlaces
@@ -34,6 +34,7 @@ def on_body(
     columns = [first + arrays.expression_names.index(name) for name in NECK_SHIFTS]
     carried_m, joint_m = _shift_per_unit(arrays)
     result = theta.copy()
+    result[:, first + arrays.expression_names.index(BODY_SHAPES[0])] = places.shoulders_up_cm
     for row, body, place in zip(result, places.rotation, places.neck_m):
         chain = head.chain(row, identity)
         skull = chain.turned[NECK]

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from rgbavatar_ns.tracking.threads import in_background
 from rgbavatar_ns.tracking.torso.body_mesh import NECK, BodyMesh
 from rgbavatar_ns.tracking.torso.follow import BodyFollower, BodySighting, MatteOf
 from rgbavatar_ns.tracking.torso.place import BodyPlaces, SeenShoulders, place_body
+from rgbavatar_ns.tracking.torso.shape import ShoulderLine, shoulder_line, shoulders_up_cm
 from rgbavatar_ns.tracking.torso.shoulders import ShoulderFinder
 
 _SIDE_PX, _AHEAD = 640, 4
@@ -26,6 +28,7 @@ _SIDE_PX, _AHEAD = 640, 4
 # body stands on the whole.
 _SHOULDER_FRAMES = 24
 _MOST_BYTES = 1 << 32
+_Seen = tuple[list[BodySighting], list[SeenShoulders], list[ShoulderLine]]
 
 
 def find_body(
@@ -49,16 +52,19 @@ def find_body(
 
     def look(key: str) -> str:
         reading = _Reading(tracker, fit, found, body, neck_m, matte_of)
-        sightings, shoulders = reading.read(source, advance)
+        seen = reading.read(source, advance)
         name = f"body_{key[:16]}.npz"
         with atomic_write(run.folder / name, remedy=GO_ON) as partial:
-            np.savez(partial, **_packed(sightings, shoulders))
+            np.savez(partial, **_packed(*seen))
         return name
 
     made_from = digest([repr(found.frame_index), heads, identity])
-    sightings, shoulders = _load(run.folder / run.stages.run("body", made_from, look))
+    sightings, shoulders, lines = _load(run.folder / run.stages.run("body", made_from, look))
     advance(len(found))
-    return place_body(body, fit.subject.camera, sightings, neck_m, shoulders)
+    camera = fit.subject.camera
+    places = place_body(body, camera, sightings, neck_m, shoulders)
+    up_cm = shoulders_up_cm(body, camera, lines, places.rotation)
+    return replace(places, shoulders_up_cm=up_cm)
 
 
 class _Reading:
@@ -77,14 +83,14 @@ class _Reading:
         self._body, self._neck_m, self._matte_of = body, neck_m, matte_of
         self._scale = min(1.0, _SIDE_PX / max(found.width, found.height))
 
-    def read(
-        self, source: FrameSource, advance: Callable[[int], None]
-    ) -> tuple[list[BodySighting], list[SeenShoulders]]:
+    def read(self, source: FrameSource, advance: Callable[[int], None]) -> _Seen:
         """What is seen of the body in every frame, and of the shoulders in some."""
         found, place = self._found, {index: k for k, index in enumerate(self._found.frame_index)}
         every = max(1, len(found) // _SHOULDER_FRAMES)
         sightings: list[BodySighting] = []
         shoulders: list[SeenShoulders] = []
+        lines: list[ShoulderLine] = []
+        small = self._fit.subject.camera.scaled(self._scale)
         pose = ShoulderFinder()
         try:
             follow = BodyFollower(self._body, self._fit.subject.camera, self._scale, self._matte_of)
@@ -95,19 +101,25 @@ class _Reading:
                     pixels = partial(self._tracker.vertices_px, self._fit, k)
                     image = frame.image_rgb
                     sightings.append(follow(image, self._neck_m[k], pixels, cut))
-                    if k % every == 0 and (seen := pose(image)) is not None:
-                        size = np.array([frame.width, frame.height])
-                        shoulders.append(SeenShoulders(k, seen[0] * size, seen[1]))
+                    if k % every == 0:
+                        lines.append(
+                            shoulder_line(k, self._matte_of(image), self._neck_m[k], small)
+                        )
+                        if (seen := pose(image)) is not None:
+                            size = np.array([frame.width, frame.height])
+                            shoulders.append(SeenShoulders(k, seen[0] * size, seen[1]))
                     advance(k + 1)
                     if k + 1 == len(found):
                         break
         finally:
             pose.close()
-        return sightings, shoulders
+        return sightings, shoulders, lines
 
 
 def _packed(
-    sightings: Sequence[BodySighting], shoulders: Sequence[SeenShoulders]
+    sightings: Sequence[BodySighting],
+    shoulders: Sequence[SeenShoulders],
+    lines: Sequence[ShoulderLine],
 ) -> dict[str, np.ndarray]:
     """Plain arrays; frames that chose no points have a count of -1."""
     no_points, no_certainty = np.zeros((0, 2)), np.zeros((0, 2, 2))
@@ -125,11 +137,13 @@ def _packed(
         "certainty": np.concatenate([no_certainty, *certain]),
         "shoulder_frame": np.array([one.position for one in shoulders], np.int64),
         "shoulders_px": np.array([one.shoulders_px for one in shoulders]).reshape(-1, 2, 2),
+        "line_frame": np.array([one.position for one in lines], np.int64),
+        "line_cm": np.array([one.above_cm for one in lines]),
         "yaw_rad": np.array([one.yaw_rad for one in shoulders], np.float64),
     }
 
 
-def _load(path: Path) -> tuple[list[BodySighting], list[SeenShoulders]]:
+def _load(path: Path) -> _Seen:
     """What `_packed` made; UserError where the file holds anything else."""
     try:
         return _unpacked(load_arrays(path, _MOST_BYTES))
@@ -140,9 +154,7 @@ def _load(path: Path) -> tuple[list[BodySighting], list[SeenShoulders]]:
         ) from None
 
 
-def _unpacked(
-    arrays: Mapping[str, np.ndarray],
-) -> tuple[list[BodySighting], list[SeenShoulders]]:
+def _unpacked(arrays: Mapping[str, np.ndarray]) -> _Seen:
     seen_at, chosen_at = (np.cumsum(arrays[name].clip(0)) for name in ("seen", "chosen"))
     seen_px = np.split(arrays["seen_px"], seen_at)[:-1]
     chosen_px = np.split(arrays["chosen_px"], chosen_at)[:-1]
@@ -158,4 +170,6 @@ def _unpacked(
         for k in range(len(arrays["run"]))
     ]
     rows = zip(arrays["shoulder_frame"], arrays["shoulders_px"], arrays["yaw_rad"])
-    return sightings, [SeenShoulders(int(k), px, float(yaw)) for k, px, yaw in rows]
+    shoulders = [SeenShoulders(int(k), px, float(yaw)) for k, px, yaw in rows]
+    heights = zip(arrays["line_frame"], arrays["line_cm"])
+    return sightings, shoulders, [ShoulderLine(int(k), above) for k, above in heights]

@@ -1,7 +1,7 @@
 """How the body moves from frame to frame, by the pattern of its clothes."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -65,9 +65,7 @@ class BodyFollower:
         self, body: BodyMesh, camera: StillCamera, scale: float, matte_of: MatteOf
     ) -> None:
         self._body, self._scale, self._matte_of = body, scale, matte_of
-        center = (camera.center_px[0] * scale - 0.5, camera.center_px[1] * scale - 0.5)
-        # In pixels of the pictures, whose first centre is at 0 for OpenCV.
-        self._camera = replace(camera, focal_px=camera.focal_px * scale, center_px=center)
+        self._camera = camera.scaled(scale)
         self._key: _Key | None = None
         self._run = -1
         self._start = RigidMotion.none()

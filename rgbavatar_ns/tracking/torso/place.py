@@ -47,6 +47,8 @@ class BodyPlaces:
     """Share of the frames in which the clothes showed its motion."""
     background_px: float
     """How far the background moves over the clip, pixels of the source; NaN where none is seen."""
+    shoulders_up_cm: float = 0.0
+    """How much higher the shoulders are than the mesh has them."""
 
     def report(self) -> dict[str, Any]:
         """What `tracking.json` tells of the body."""
@@ -55,6 +57,7 @@ class BodyPlaces:
         return {
             "still": self.still,
             "followed_share": self.followed,
+            "shoulders_up_cm": self.shoulders_up_cm,
             "turned_degrees": float(np.percentile(away, 98)),
             "moved_mm": float(1e3 * np.percentile(_away(self.neck_m), 98)),
             "background_moves_px": None if np.isnan(self.background_px) else self.background_px,

@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
@@ -27,6 +28,9 @@ _FACE_PX, _FRAMES = (100.0, 50.0), (100, 25)
 # The part of the face whose outline is skin: from a little above the chin to the eyes, as shares
 # of the height from chin to forehead; and how far beside the head the matte is looked at.
 _FACE_FROM, _FACE_TO, _BESIDE = 0.1, 0.6, 0.2
+# A mesh that is too large stands out of the matte by a rim; what the matte lacks deeper within the
+# mesh, as a share of the face's height, is the matte's own fault.
+_RIM = 0.1
 
 
 def fit_quality(
@@ -99,13 +103,18 @@ def silhouette_shares(
 ) -> dict[str, float | None]:
     """How well mesh and matte of a frame agree; None where the head is outside of the image.
 
-    `coverage`: the share of the mesh above the chin that the matte holds. `face_iou`: intersection
+    `coverage`: the share of the mesh above the chin that the matte holds; the rest is `outside`,
+    the share by which a rim of the mesh stands out of the matte, and `missed`, what the matte
+    lacks deeper within the mesh: holes and parts of the head. `face_iou`: intersection
     over union of both between chin and eyes, up to a fifth of the face's height beside the mesh:
     there the outline is skin, unless hair hangs down beside the cheeks, which lowers it. `inside`
     is 1 where the image is.
     """
     seen, height = inside > 0.5, outline.above_chin
     head = silhouette_overlap(outline.silhouette, matte, seen & (height > 0))
+    core = _core(outline.silhouette, round(_RIM * outline.face_height_px))
+    missing = (outline.silhouette > 0.5) & (matte <= 0.5) & seen & (height > 0)
+    missed, lacking = int((missing & core).sum()), int(missing.sum())
     skin = seen & (height > _FACE_FROM) & (height < _FACE_TO)
     columns = np.flatnonzero(((outline.silhouette > 0.5) & skin).any(0))
     if columns.size:
@@ -115,18 +124,32 @@ def silhouette_shares(
     face = silhouette_overlap(outline.silhouette, matte, skin)
     return {
         "coverage": head.covered if head.mesh else None,
+        "outside": (lacking - missed) / head.mesh if head.mesh else None,
+        "missed": missed / head.mesh if head.mesh else None,
         "face_iou": face.iou if face.either else None,
     }
 
 
+def _core(silhouette: Float[np.ndarray, "s s"], rim_px: int) -> Bool[np.ndarray, "s s"]:
+    """The mesh without a rim of so many pixels; beyond the image it goes on."""
+    mesh = np.pad((silhouette > 0.5).astype(np.uint8), 1, mode="edge")
+    within = cv2.distanceTransform(mesh, cv2.DIST_L2, cv2.DIST_MASK_5)[1:-1, 1:-1]
+    return np.asarray(within > rim_px)
+
+
 def silhouette_summary(shares: Sequence[Mapping[str, float | None]]) -> dict[str, float | None]:
     """Means over all frames' `silhouette_shares`, and the lowest coverage."""
-    coverage = [one["coverage"] for one in shares if one["coverage"] is not None]
-    face_iou = [one["face_iou"] for one in shares if one["face_iou"] is not None]
+    known = {
+        name: [share for one in shares if (share := one[name]) is not None]
+        for name in ("coverage", "outside", "missed", "face_iou")
+    }
+    means = {name: float(np.mean(found)) if found else None for name, found in known.items()}
     return {
-        "silhouette_coverage": float(np.mean(coverage)) if coverage else None,
-        "worst_silhouette_coverage": float(np.min(coverage)) if coverage else None,
-        "face_silhouette_iou": float(np.mean(face_iou)) if face_iou else None,
+        "silhouette_coverage": means["coverage"],
+        "worst_silhouette_coverage": min(known["coverage"], default=None),
+        "mesh_outside_matte": means["outside"],
+        "matte_misses": means["missed"],
+        "face_silhouette_iou": means["face_iou"],
     }
 
 
@@ -138,6 +161,14 @@ def tracking_findings(report: Mapping[str, Any]) -> list[Finding]:
     mouth, lids = (report[f"{one}_opening_correlation"] for one in ("mouth", "eyelid"))
     at_bound = report["gaze_at_bound_share"]
     found = []
+    outside, missed = report["mesh_outside_matte"], report["matte_misses"]
+    # Whichever lacks more: the mesh stands out of the matte, or the matte misses what is there.
+    by_mesh = outside is not None and outside > missed
+    culprit: tuple[str, str] = (
+        ("misfit", "the mesh stands out of the person's outline")
+        if by_mesh
+        else ("mattes", "the matte misses part of the head")
+    )
     for kind, cause, value, (mild, grave) in (
         ("landmarks", "the fit leaves the landmarks", fitted, _FITTED_ERROR),
         ("misfit", "the mesh lies off the face", mesh, _MESH_ERROR),
@@ -145,7 +176,7 @@ def tracking_findings(report: Mapping[str, Any]) -> list[Finding]:
         ("landmarks", "the eyelids are not followed", lids, _CORRELATION),
         ("gaze", "the irises lie off the film's", report["iris_error_eye_widths"], _IRIS_ERROR),
         ("gaze", f"the gaze is at its bounds in {at_bound:.0%} of frames", at_bound, _AT_BOUND),
-        ("mattes", "the matte misses part of the head", report["silhouette_coverage"], _COVERAGE),
+        (*culprit, report["silhouette_coverage"], _COVERAGE),
         ("faces", f"{read - tracked} of {read} frames are left out", 1 - tracked / read, _REJECTED),
         ("faces", f"{len(blurred)} frames are blurred", len(blurred) / tracked, _BLURRED),
         ("faces", f"the face is only {height:.0f} pixels high", height, _FACE_PX),
