@@ -1,6 +1,6 @@
 """Fit of the head model to a clip's landmarks: identity and camera once, then every frame."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -9,7 +9,11 @@ from jaxtyping import Float
 
 from rgbavatar_ns.tracking.fit.camera import StillCamera
 from rgbavatar_ns.tracking.fit.landmark_cost import FrameCost, FrameTerms, Target
-from rgbavatar_ns.tracking.fit.levenberg_marquardt import QuadraticModel, levenberg_marquardt
+from rgbavatar_ns.tracking.fit.levenberg_marquardt import (
+    Evaluation,
+    QuadraticModel,
+    levenberg_marquardt,
+)
 from rgbavatar_ns.tracking.fit.outline import OutlineCost, OutlineTerms, PersonOutline
 
 _Values = Float[np.ndarray, "P"]
@@ -130,8 +134,7 @@ def fit_frame(
     for steps, redescending in ((iterations - robust, False), (robust, True)):
         frame = FrameTerms(target, camera, redescending, neighbours, temporal_weight)
         values, _ = levenberg_marquardt(
-            partial(cost.value, identity=identity, frame=frame),
-            partial(cost.model, identity=identity, frame=frame),
+            partial(cost.at, identity=identity, frame=frame),
             values,
             cost.parameters.lower,
             cost.parameters.upper,
@@ -271,44 +274,39 @@ def _fit_keys(
         person[:shared] = packed[common]
         return packed[: common.start].reshape(frames, size), person
 
-    def models_of(number: int, own: _Values, person: np.ndarray) -> Iterator[QuadraticModel]:
-        yield joint.model(own, person, terms[number])
-        if outlines is not None and number in outlines[1]:
-            yield outlines[0].model(cost.theta(own), person, outlines[1][number])
-
-    def values_of(number: int, own: _Values, person: np.ndarray) -> Iterator[float]:
-        yield joint.value(own, person, terms[number])
-        if outlines is not None and number in outlines[1]:
-            yield outlines[0].value(cost.theta(own), person, outlines[1][number])
-
-    def model_at(packed: _Packed) -> QuadraticModel:
+    def evaluations(packed: _Packed) -> list[tuple[int, Evaluation]]:
+        """What each frame costs, by its landmarks and by its outline."""
         values, person = unpacked(packed)
-        pull = precision * packed[common]
-        total = 0.5 * float(pull @ packed[common])
-        gradient, hessian = np.zeros(len(packed)), np.zeros((len(packed), len(packed)))
-        gradient[common] = pull
-        hessian[common, common] = precision * np.eye(shared)
-        for number in range(frames):
-            own = slice(number * size, (number + 1) * size)
-            for model in models_of(number, values[number], person):
-                total += model.cost
-                gradient[own] += model.gradient[:size]
-                gradient[common] += model.gradient[size:]
-                hessian[own, own] += model.hessian[:size, :size]
-                hessian[own, common] += model.hessian[:size, size:]
-                hessian[common, own] += model.hessian[size:, :size]
-                hessian[common, common] += model.hessian[size:, size:]
-        return QuadraticModel(total, gradient, hessian)
+        found = [(k, joint.at(own, person, terms[k])) for k, own in enumerate(values)]
+        if outlines is not None:
+            outline_cost, seen = outlines
+            for k, outline in seen.items():
+                found.append((k, outline_cost.at(cost.theta(values[k]), person, outline)))
+        return found
 
-    def cost_at(packed: _Packed) -> float:
-        values, person = unpacked(packed)
-        total = 0.5 * precision * float(packed[common] @ packed[common])
-        return total + sum(sum(values_of(number, own, person)) for number, own in enumerate(values))
+    def evaluate(packed: _Packed) -> Evaluation:
+        found, pull = evaluations(packed), precision * packed[common]
+        total = 0.5 * float(pull @ packed[common]) + sum(one.cost for _, one in found)
+
+        def model() -> QuadraticModel:
+            gradient, hessian = np.zeros(len(packed)), np.zeros((len(packed), len(packed)))
+            gradient[common] = pull
+            hessian[common, common] = precision * np.eye(shared)
+            for number, one in found:
+                own, part = slice(number * size, (number + 1) * size), one.model()
+                gradient[own] += part.gradient[:size]
+                gradient[common] += part.gradient[size:]
+                hessian[own, own] += part.hessian[:size, :size]
+                hessian[own, common] += part.hessian[:size, size:]
+                hessian[common, own] += part.hessian[size:, :size]
+                hessian[common, common] += part.hessian[size:, size:]
+            return QuadraticModel(total, gradient, hessian)
+
+        return Evaluation(total, model)
 
     begun = np.zeros(shared) if identity is None else identity[:shared]
     packed, total = levenberg_marquardt(
-        cost_at,
-        model_at,
+        evaluate,
         np.concatenate([starts.reshape(-1), begun]),
         lower,
         upper,
