@@ -27,7 +27,12 @@ _IDENTITY_WIDTH = 1.0  # principal components, of variance 1
 _SCAN_KEYS = 4
 _HEAD_HEIGHT_M = 0.19
 _OFFSET_SHRINK = 0.8
-_ROBUST_STEPS = 2
+# Steps towards a frame from the one before it, and from a pose that fits already; from nowhere,
+# where a clip or a stream begins or a face comes back; and for key frames, whose person is unknown.
+# Each first with the loss that finds the head from afar, then with the one that lets go.
+STEPS_ONWARD, _STEPS_AGAIN, STEPS_ANEW, _STEPS_KEY = (4, 2), (0, 2), (17, 8), (10, 5)
+# From afar a fit need only come near: it stops when a step lowers the cost by less than this share.
+_NEAR_ENOUGH, _SETTLED = 1e-2, 1e-3
 # Steps with the outlines: first into them, then with hair of one thickness, found anew each time.
 _INTO_OUTLINE_STEPS, _HAIR_STEPS, _HAIR_ROUNDS = 10, 4, 3
 
@@ -122,24 +127,25 @@ def fit_frame(
     start: _Values,
     neighbours: _Values | None,
     temporal_weight: float,
-    iterations: int,
+    steps: tuple[int, int],
 ) -> _Values:
     """One frame's bounded fit from `start`, drawn towards `neighbours` if given.
 
-    The last third of at most `iterations` steps, and no fewer than `_ROBUST_STEPS`, let go of
-    landmarks that are far off.
+    At most so many `steps` with each loss: the first one finds the head from afar, the second one
+    lets go of landmarks that are far off.
     """
-    identity = np.zeros(cost.head.num_identity)
-    values, robust = start, max(_ROBUST_STEPS, iterations // 3)
-    for steps, redescending in ((iterations - robust, False), (robust, True)):
+    identity, values = np.zeros(cost.head.num_identity), start
+    for most, redescending in zip(steps, (False, True)):
+        if not most:
+            continue
         frame = FrameTerms(target, camera, redescending, neighbours, temporal_weight)
         values, _ = levenberg_marquardt(
             partial(cost.at, identity=identity, frame=frame),
             values,
             cost.parameters.lower,
             cost.parameters.upper,
-            iterations=steps,
-            tolerance=1e-3,
+            iterations=most,
+            tolerance=_SETTLED if redescending else _NEAR_ENOUGH,
         )
     return values
 
@@ -161,10 +167,10 @@ def fit_clip(
     values: list[np.ndarray] = []
     for number, target in enumerate(targets):
         if number and follows[number]:
-            start, iterations = values[-1], 6
+            start, steps = values[-1], STEPS_ONWARD
         else:
-            start, iterations = rigid_start(person, subject.camera, target), 25
-        values.append(fit_frame(person, subject.camera, target, start, None, 0.0, iterations))
+            start, steps = rigid_start(person, subject.camera, target), STEPS_ANEW
+        values.append(fit_frame(person, subject.camera, target, start, None, 0.0, steps))
         advance()
     for number, target in enumerate(targets):
         near = []
@@ -175,7 +181,13 @@ def fit_clip(
         if near and temporal_weight > 0:
             middle = np.mean(near, axis=0)
             values[number] = fit_frame(
-                person, subject.camera, target, values[number], middle, temporal_weight, 3
+                person,
+                subject.camera,
+                target,
+                values[number],
+                middle,
+                temporal_weight,
+                _STEPS_AGAIN,
             )
         advance()
     return ClipFit(subject, np.array(values))
@@ -255,7 +267,7 @@ def _fit_keys(
     if starts is None:
         starts = np.array(
             [
-                fit_frame(cost, camera, key, rigid_start(cost, camera, key), None, 0.0, 15)
+                fit_frame(cost, camera, key, rigid_start(cost, camera, key), None, 0.0, _STEPS_KEY)
                 for key in keys
             ]
         )
