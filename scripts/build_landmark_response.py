@@ -167,12 +167,9 @@ def response_terms(
     Terms [K]: 1, then `LandmarkResponse`'s other factors in its order.
     """
     view = landmarks._view(theta, landmarks._coefficients(theta, identity), eye_m)
-    turned = np.zeros((landmarks.num_landmarks, 3, 3))
-    for part in landmarks._moments:
-        turned[part.rows] += part.share[:, None, None] * view.chain.turned[part.joint]
     expression = theta[landmarks.layout.slice("expression")]
     terms = [np.ones(1), view.signals[:5], expression, view.signals[5:], identity]
-    return np.concatenate(terms), turned
+    return np.concatenate(terms), landmarks.skinning(view.chain)
 
 
 def observations(landmarks: LandmarkHead, index: np.ndarray, seeds: range) -> Iterator[Observation]:

@@ -16,7 +16,13 @@ from rgbavatar_ns.data import TrackedFrame
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.tracking.config import TrackConfig
 from rgbavatar_ns.tracking.face.detector import FaceLandmarker
-from rgbavatar_ns.tracking.fit.fit import ClipFit, SubjectFit, fit_frame, rigid_start
+from rgbavatar_ns.tracking.fit.fit import (
+    STEPS_ANEW,
+    ClipFit,
+    SubjectFit,
+    fit_frame,
+    rigid_start,
+)
 from rgbavatar_ns.tracking.fit.outline import PersonOutline
 from rgbavatar_ns.tracking.fit.own_head import read_own_head, subject_tracker
 from rgbavatar_ns.tracking.fit.subject import SubjectTracker
@@ -27,7 +33,8 @@ from rgbavatar_ns.tracking.image.outlines import OUTLINE_PX, levels, person_outl
 
 # Share of a clip's pull to both neighbours: a stream has only the past, and must not lag.
 _CAUSAL_SHARE = 0.25
-_ITERATIONS, _ITERATIONS_ANEW = 4, 25
+# Fewer steps than a clip's frames get, since the next frame goes on.
+_STEPS_ONWARD = (2, 2)
 _SIZE_PX = 512
 
 _Image = UInt8[np.ndarray, "H W 3"]
@@ -208,8 +215,8 @@ class _CausalFit:
         camera, before = self.subject.camera, self._previous
         target = self._tracker.targets(landmarks_px[None])[0]
         start = rigid_start(self._cost, camera, target) if before is None else before
-        iterations = _ITERATIONS_ANEW if before is None else _ITERATIONS
-        values = fit_frame(self._cost, camera, target, start, before, self._weight, iterations)
+        steps = STEPS_ANEW if before is None else _STEPS_ONWARD
+        values = fit_frame(self._cost, camera, target, start, before, self._weight, steps)
         lost = self._tracker.rejected(ClipFit(self.subject, values[None]), landmarks_px[None])
         self._previous = None if lost else values
         return self._previous

@@ -53,7 +53,7 @@ def test_small_errors_cost_what_their_covariance_says(tracker: SubjectTracker, s
     modes = cost.noise.modes.reshape(-1, 3)
     covariance = np.diag(np.repeat(cost.noise.own_share**2, 2)) + modes @ modes.T
     expected = 0.5 * away.reshape(-1) @ np.linalg.solve(covariance, away.reshape(-1))
-    found = cost.data_cost(theta, np.zeros(30), _seen(cost, theta, away))
+    found = cost.data_at(theta, np.zeros(30), _seen(cost, theta, away)).cost
     np.testing.assert_allclose(found, expected, rtol=1e-9)
 
 
@@ -62,7 +62,7 @@ def test_what_all_points_err_in_common_costs_little_and_alone_much(tracker: Subj
     mode = cost.noise.modes[..., 0]
     others = mode[np.random.default_rng(1).permutation(len(mode))]
     common, mixed = (
-        cost.data_cost(theta, np.zeros(30), _seen(cost, theta, away)) for away in (mode, others)
+        cost.data_at(theta, np.zeros(30), _seen(cost, theta, away)).cost for away in (mode, others)
     )
     assert common < 0.55, "one standard deviation of one number"
     assert mixed > 20 * common
@@ -74,10 +74,10 @@ def test_the_gradient_is_the_costs_derivative(tracker: SubjectTracker, redescend
     random = np.random.default_rng(3)
     away = 0.006 * random.normal(size=(cost.head.num_landmarks, 2))
     frame = _seen(cost, theta, away, redescending)
-    found = cost.data_model(theta, np.zeros(30), frame)
+    found = cost.data_at(theta, np.zeros(30), frame).model()
 
     def value(theta: np.ndarray) -> float:
-        return cost.data_cost(theta, np.zeros(30), frame)
+        return cost.data_at(theta, np.zeros(30), frame).cost
 
     translation = set(range(*cost.head.layout.slice("translation").indices(len(theta))))
     for place, column in enumerate(cost.parameters.columns):
@@ -108,9 +108,9 @@ def test_a_picture_turned_by_a_quarter_costs_the_same(tracker: SubjectTracker) -
     wanted = np.stack([upright[:, 1], -upright[:, 0], upright[:, 2]], 1)
     lying[shift] += (wanted - moved).mean(0)
     costs = [
-        tracker.cost.data_cost(
+        tracker.cost.data_at(
             pose, np.zeros(30), FrameTerms(tracker.targets(points[None])[0], camera)
-        )
+        ).cost
         for pose, points in ((theta, seen), (lying, turned))
     ]
     np.testing.assert_allclose(costs[0], costs[1], rtol=0.02)  # the view's slides change a little

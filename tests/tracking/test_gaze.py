@@ -66,7 +66,7 @@ def _fitted_gaze(tracker: SubjectTracker, points: np.ndarray, seen: float = 1.0)
     irises = np.isin(tracker.facemesh_index, IRIS_CENTERS)
     target = replace(target, seen=np.where(irises, seen, 1.0))
     start = np.zeros(len(tracker.cost.parameters.columns))
-    theta = tracker.cost.theta(fit_frame(tracker.cost, CAMERA, target, start, None, 0.0, 20))
+    theta = tracker.cost.theta(fit_frame(tracker.cost, CAMERA, target, start, None, 0.0, (14, 6)))
     return np.degrees([theta[tracker.head.layout.slice(name)][:2] for name in EYES])
 
 

@@ -3,6 +3,7 @@ import pytest
 from scipy.optimize import lsq_linear
 
 from rgbavatar_ns.tracking.fit.levenberg_marquardt import (
+    Evaluation,
     QuadraticModel,
     levenberg_marquardt,
     minimize_box_quadratic,
@@ -34,8 +35,7 @@ def test_levenberg_marquardt_finds_the_bounded_minimum_of_a_curved_valley() -> N
         )
 
     best, cost = levenberg_marquardt(
-        lambda point: model_at(point).cost,
-        model_at,
+        lambda point: Evaluation(model_at(point).cost, lambda: model_at(point)),
         np.array([-1.2, 1.0]),
         np.array([-2.0, -2.0]),
         np.array([0.5, 2.0]),

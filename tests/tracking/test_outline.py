@@ -126,14 +126,14 @@ def test_the_outlines_gradient_is_the_costs_own(head: HeadModel, hair_m: float |
     rows, column = np.mgrid[:240, :320] + 0.5
     away = np.hypot(column - 160, rows - 110) - 70
     terms = OutlineTerms(PersonOutline(away, np.array([0.5, 0.5]), 1.0), CAMERA, UPRIGHT, hair_m)
-    model = cost.model(theta[1], identity, terms)
-    assert model.cost == pytest.approx(cost.value(theta[1], identity, terms))
+    model = cost.at(theta[1], identity, terms).model()
+    assert model.cost == pytest.approx(cost.at(theta[1], identity, terms).cost)
     step = 1e-6
     for place, column in enumerate(columns[:8]):
         there, here = theta[1].copy(), theta[1].copy()
         there[column] += step
         here[column] -= step
-        values = [cost.value(one, identity, terms) for one in (there, here)]
+        values = [cost.at(one, identity, terms).cost for one in (there, here)]
         slope = (values[0] - values[1]) / (2 * step)
         # Between the field's samples the slope jumps, and the outermost points may change.
         assert model.gradient[place] == pytest.approx(slope, rel=0.03, abs=5)
@@ -141,7 +141,7 @@ def test_the_outlines_gradient_is_the_costs_own(head: HeadModel, hair_m: float |
         there, here = identity.copy(), identity.copy()
         there[place] += step
         here[place] -= step
-        values = [cost.value(theta[1], one, terms) for one in (there, here)]
+        values = [cost.at(theta[1], one, terms).cost for one in (there, here)]
         slope = (values[0] - values[1]) / (2 * step)
         assert model.gradient[len(columns) + place] == pytest.approx(slope, rel=0.05, abs=1)
 
@@ -152,11 +152,11 @@ def test_only_what_stands_out_costs(head: HeadModel) -> None:
     wide = person_outline(haired(silhouette(head, theta[0], identity)), CROP, _face(head))
     assert wide is not None
     terms = OutlineTerms(wide, CAMERA, UPRIGHT)
-    assert cost.value(theta[0], identity, terms) == 0
+    assert cost.at(theta[0], identity, terms).cost == 0
     assert cost.hair_m([theta[0]], identity, [terms]) == pytest.approx(HAIR_M, abs=0.002)
     up = theta[0].copy()
     up[head.layout.slice("translation").start + 1] += 2 * HAIR_M
-    assert cost.value(up, identity, terms) > 1
+    assert cost.at(up, identity, terms).cost > 1
 
 
 def test_a_skull_that_landmarks_put_too_high_comes_down_into_the_outline(

@@ -174,7 +174,10 @@ class Filmed:
         mattes = {image.tobytes(): matte for image, matte in zip(self.images, self.mattes)}
         follow = BodyFollower(self.body, self.camera, 1.0, lambda image: mattes[image.tobytes()])
         found = zip(self.images, self.neck_m, self.vertices_px)
-        return [follow(image, neck, px, k == 0) for k, (image, neck, px) in enumerate(found)]
+        return [
+            follow(image, neck, lambda px=px: px, k == 0)
+            for k, (image, neck, px) in enumerate(found)
+        ]
 
 
 def test_a_body_that_keeps_still_is_not_turned_by_its_head(films) -> None:

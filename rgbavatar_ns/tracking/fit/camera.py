@@ -41,14 +41,11 @@ class StillCamera:
         across = points_m[..., :2] * (1.0, -1.0)
         return self.focal_px * across / depth[..., None] + self.center_px
 
-    def image_derivative(
-        self, points_m: Float[np.ndarray, "L 3"], derivative: Float[np.ndarray, "3 L Q"]
-    ) -> Float[np.ndarray, "L 2 Q"]:
-        """Derivative of `project` where the points' own derivative is given."""
+    def image_slope(self, points_m: Float[np.ndarray, "L 3"]) -> Float[np.ndarray, "L 2 3"]:
+        """Derivative of `project` to the points, pixels a metre."""
         depth = self.distance_m - points_m[:, 2]
         across = self.focal_px / depth
-        towards = across[:, None] * points_m[:, :2] / depth[:, None]
-        result = np.empty((len(points_m), 2, derivative.shape[-1]))
-        result[:, 0] = across[:, None] * derivative[0] + towards[:, :1] * derivative[2]
-        result[:, 1] = -across[:, None] * derivative[1] - towards[:, 1:] * derivative[2]
-        return result
+        slope = np.zeros((len(points_m), 2, 3))
+        slope[:, 0, 0], slope[:, 1, 1] = across, -across
+        slope[:, :, 2] = (across / depth)[:, None] * points_m[:, :2] * (1.0, -1.0)
+        return slope

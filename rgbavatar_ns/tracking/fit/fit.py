@@ -1,6 +1,6 @@
 """Fit of the head model to a clip's landmarks: identity and camera once, then every frame."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -9,7 +9,11 @@ from jaxtyping import Float
 
 from rgbavatar_ns.tracking.fit.camera import StillCamera
 from rgbavatar_ns.tracking.fit.landmark_cost import FrameCost, FrameTerms, Target
-from rgbavatar_ns.tracking.fit.levenberg_marquardt import QuadraticModel, levenberg_marquardt
+from rgbavatar_ns.tracking.fit.levenberg_marquardt import (
+    Evaluation,
+    QuadraticModel,
+    levenberg_marquardt,
+)
 from rgbavatar_ns.tracking.fit.outline import OutlineCost, OutlineTerms, PersonOutline
 
 _Values = Float[np.ndarray, "P"]
@@ -23,7 +27,12 @@ _IDENTITY_WIDTH = 1.0  # principal components, of variance 1
 _SCAN_KEYS = 4
 _HEAD_HEIGHT_M = 0.19
 _OFFSET_SHRINK = 0.8
-_ROBUST_STEPS = 2
+# Steps towards a frame from the one before it, and from a pose that fits already; from nowhere,
+# where a clip or a stream begins or a face comes back; and for key frames, whose person is unknown.
+# Each first with the loss that finds the head from afar, then with the one that lets go.
+STEPS_ONWARD, _STEPS_AGAIN, STEPS_ANEW, _STEPS_KEY = (4, 2), (0, 2), (17, 8), (10, 5)
+# From afar a fit need only come near: it stops when a step lowers the cost by less than this share.
+_NEAR_ENOUGH, _SETTLED = 1e-2, 1e-3
 # Steps with the outlines: first into them, then with hair of one thickness, found anew each time.
 _INTO_OUTLINE_STEPS, _HAIR_STEPS, _HAIR_ROUNDS = 10, 4, 3
 
@@ -118,25 +127,25 @@ def fit_frame(
     start: _Values,
     neighbours: _Values | None,
     temporal_weight: float,
-    iterations: int,
+    steps: tuple[int, int],
 ) -> _Values:
     """One frame's bounded fit from `start`, drawn towards `neighbours` if given.
 
-    The last third of at most `iterations` steps, and no fewer than `_ROBUST_STEPS`, let go of
-    landmarks that are far off.
+    At most so many `steps` with each loss: the first one finds the head from afar, the second one
+    lets go of landmarks that are far off.
     """
-    identity = np.zeros(cost.head.num_identity)
-    values, robust = start, max(_ROBUST_STEPS, iterations // 3)
-    for steps, redescending in ((iterations - robust, False), (robust, True)):
+    identity, values = np.zeros(cost.head.num_identity), start
+    for most, redescending in zip(steps, (False, True)):
+        if not most:
+            continue
         frame = FrameTerms(target, camera, redescending, neighbours, temporal_weight)
         values, _ = levenberg_marquardt(
-            partial(cost.value, identity=identity, frame=frame),
-            partial(cost.model, identity=identity, frame=frame),
+            partial(cost.at, identity=identity, frame=frame),
             values,
             cost.parameters.lower,
             cost.parameters.upper,
-            iterations=steps,
-            tolerance=1e-3,
+            iterations=most,
+            tolerance=_SETTLED if redescending else _NEAR_ENOUGH,
         )
     return values
 
@@ -158,10 +167,10 @@ def fit_clip(
     values: list[np.ndarray] = []
     for number, target in enumerate(targets):
         if number and follows[number]:
-            start, iterations = values[-1], 6
+            start, steps = values[-1], STEPS_ONWARD
         else:
-            start, iterations = rigid_start(person, subject.camera, target), 25
-        values.append(fit_frame(person, subject.camera, target, start, None, 0.0, iterations))
+            start, steps = rigid_start(person, subject.camera, target), STEPS_ANEW
+        values.append(fit_frame(person, subject.camera, target, start, None, 0.0, steps))
         advance()
     for number, target in enumerate(targets):
         near = []
@@ -172,7 +181,13 @@ def fit_clip(
         if near and temporal_weight > 0:
             middle = np.mean(near, axis=0)
             values[number] = fit_frame(
-                person, subject.camera, target, values[number], middle, temporal_weight, 3
+                person,
+                subject.camera,
+                target,
+                values[number],
+                middle,
+                temporal_weight,
+                _STEPS_AGAIN,
             )
         advance()
     return ClipFit(subject, np.array(values))
@@ -252,7 +267,7 @@ def _fit_keys(
     if starts is None:
         starts = np.array(
             [
-                fit_frame(cost, camera, key, rigid_start(cost, camera, key), None, 0.0, 15)
+                fit_frame(cost, camera, key, rigid_start(cost, camera, key), None, 0.0, _STEPS_KEY)
                 for key in keys
             ]
         )
@@ -271,44 +286,39 @@ def _fit_keys(
         person[:shared] = packed[common]
         return packed[: common.start].reshape(frames, size), person
 
-    def models_of(number: int, own: _Values, person: np.ndarray) -> Iterator[QuadraticModel]:
-        yield joint.model(own, person, terms[number])
-        if outlines is not None and number in outlines[1]:
-            yield outlines[0].model(cost.theta(own), person, outlines[1][number])
-
-    def values_of(number: int, own: _Values, person: np.ndarray) -> Iterator[float]:
-        yield joint.value(own, person, terms[number])
-        if outlines is not None and number in outlines[1]:
-            yield outlines[0].value(cost.theta(own), person, outlines[1][number])
-
-    def model_at(packed: _Packed) -> QuadraticModel:
+    def evaluations(packed: _Packed) -> list[tuple[int, Evaluation]]:
+        """What each frame costs, by its landmarks and by its outline."""
         values, person = unpacked(packed)
-        pull = precision * packed[common]
-        total = 0.5 * float(pull @ packed[common])
-        gradient, hessian = np.zeros(len(packed)), np.zeros((len(packed), len(packed)))
-        gradient[common] = pull
-        hessian[common, common] = precision * np.eye(shared)
-        for number in range(frames):
-            own = slice(number * size, (number + 1) * size)
-            for model in models_of(number, values[number], person):
-                total += model.cost
-                gradient[own] += model.gradient[:size]
-                gradient[common] += model.gradient[size:]
-                hessian[own, own] += model.hessian[:size, :size]
-                hessian[own, common] += model.hessian[:size, size:]
-                hessian[common, own] += model.hessian[size:, :size]
-                hessian[common, common] += model.hessian[size:, size:]
-        return QuadraticModel(total, gradient, hessian)
+        found = [(k, joint.at(own, person, terms[k])) for k, own in enumerate(values)]
+        if outlines is not None:
+            outline_cost, seen = outlines
+            for k, outline in seen.items():
+                found.append((k, outline_cost.at(cost.theta(values[k]), person, outline)))
+        return found
 
-    def cost_at(packed: _Packed) -> float:
-        values, person = unpacked(packed)
-        total = 0.5 * precision * float(packed[common] @ packed[common])
-        return total + sum(sum(values_of(number, own, person)) for number, own in enumerate(values))
+    def evaluate(packed: _Packed) -> Evaluation:
+        found, pull = evaluations(packed), precision * packed[common]
+        total = 0.5 * float(pull @ packed[common]) + sum(one.cost for _, one in found)
+
+        def model() -> QuadraticModel:
+            gradient, hessian = np.zeros(len(packed)), np.zeros((len(packed), len(packed)))
+            gradient[common] = pull
+            hessian[common, common] = precision * np.eye(shared)
+            for number, one in found:
+                own, part = slice(number * size, (number + 1) * size), one.model()
+                gradient[own] += part.gradient[:size]
+                gradient[common] += part.gradient[size:]
+                hessian[own, own] += part.hessian[:size, :size]
+                hessian[own, common] += part.hessian[:size, size:]
+                hessian[common, own] += part.hessian[size:, :size]
+                hessian[common, common] += part.hessian[size:, size:]
+            return QuadraticModel(total, gradient, hessian)
+
+        return Evaluation(total, model)
 
     begun = np.zeros(shared) if identity is None else identity[:shared]
     packed, total = levenberg_marquardt(
-        cost_at,
-        model_at,
+        evaluate,
         np.concatenate([starts.reshape(-1), begun]),
         lower,
         upper,

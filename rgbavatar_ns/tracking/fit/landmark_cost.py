@@ -1,15 +1,16 @@
 """How badly a pose of the head explains one frame's landmarks, with derivatives."""
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg.lapack import dposv, dtrtrs
 
 from rgbavatar_ns.head.landmarks import LandmarkNoise
 from rgbavatar_ns.tracking.fit.camera import StillCamera
-from rgbavatar_ns.tracking.fit.landmark_head import LandmarkHead
-from rgbavatar_ns.tracking.fit.levenberg_marquardt import QuadraticModel
+from rgbavatar_ns.tracking.fit.landmark_head import LandmarkHead, PosedLandmarks
+from rgbavatar_ns.tracking.fit.levenberg_marquardt import Evaluation, QuadraticModel
 from rgbavatar_ns.tracking.fit.parameters import FitParameters
 
 _Values = Float[np.ndarray, "P"]
@@ -64,8 +65,10 @@ class FrameCost:
     def __post_init__(self) -> None:
         self._unknowns = self.head.unknowns(self.parameters.columns, self.identity_columns)
         self._prior_precision = self.parameters.prior_precision()
+        # Residuals go by direction in the upright face, then by landmark.
         scaled = self.noise.modes / self.noise.own_share[:, None, None]
-        self._modes = scaled.reshape(-1, scaled.shape[2])
+        self._modes = scaled.transpose(1, 0, 2).copy()
+        self._no_modes = np.eye(scaled.shape[2])
 
     def theta(self, values: _Values) -> _Theta:
         """theta with these fitted entries, and 0 elsewhere."""
@@ -73,86 +76,106 @@ class FrameCost:
         theta[self.parameters.columns] = values
         return theta
 
-    def value(self, values: _Values, identity: _Identity, frame: FrameTerms) -> float:
-        """The cost of `model` alone, in a fraction of its time."""
-        return self.data_cost(self.theta(values), identity, frame) + self._prior(values, frame)
-
-    def model(self, values: _Values, identity: _Identity, frame: FrameTerms) -> QuadraticModel:
-        """The cost around a frame's values; derivatives to identity's first columns come last."""
-        data = self.data_model(self.theta(values), identity, frame)
-        own = slice(len(values))
-        data.gradient[own] += self._prior_precision @ values
-        data.hessian[own, own] += self._prior_precision
+    def at(self, values: _Values, identity: _Identity, frame: FrameTerms) -> Evaluation:
+        """The cost of a frame's values; its model's last entries are identity's first columns."""
+        theta = self.theta(values)
+        posed = self.head.posed(theta, identity, frame.camera.eye_m)
+        found = self._explained(posed.points_m, frame)
+        pull = self._prior_precision @ values
+        cost = found.cost + 0.5 * float(values @ pull)
+        closeness, apart = None, values
         if frame.neighbours is not None and frame.temporal_weight > 0:
             closeness = frame.temporal_weight * self.parameters.temporal_width**-2.0
-            data.gradient[own] += closeness * (values - frame.neighbours)
-            data.hessian[own, own] += np.diag(closeness)
-        return replace(data, cost=data.cost + self._prior(values, frame))
+            apart = values - frame.neighbours
+            cost += 0.5 * float(closeness @ apart**2)
 
-    def _prior(self, values: _Values, frame: FrameTerms) -> float:
-        cost = 0.5 * float(values @ self._prior_precision @ values)
-        if frame.neighbours is not None and frame.temporal_weight > 0:
-            closeness = frame.temporal_weight * self.parameters.temporal_width**-2.0
-            cost += 0.5 * float(closeness @ (values - frame.neighbours) ** 2)
-        return cost
+        def model() -> QuadraticModel:
+            data = self._model(posed, found, frame)
+            own = slice(len(values))
+            data.gradient[own] += pull
+            data.hessian[own, own] += self._prior_precision
+            if closeness is not None:
+                data.gradient[own] += closeness * apart
+                data.hessian[own, own] += np.diag(closeness)
+            return replace(data, cost=cost)
 
-    def data_cost(self, theta: _Theta, identity: _Identity, frame: FrameTerms) -> float:
-        """What the landmarks cost."""
-        points = self.head.points(theta, identity, frame.camera.eye_m)
-        return self._explained(points, frame)[0]
+        return Evaluation(cost, model)
 
-    def data_model(self, theta: _Theta, identity: _Identity, frame: FrameTerms) -> QuadraticModel:
-        """What the landmarks cost around theta."""
-        camera, target = frame.camera, frame.target
-        points, derivative = self.head.jacobian(theta, identity, self._unknowns, camera.eye_m)
-        jacobian = camera.image_derivative(points, derivative)
-        cost, pull, weight, factor = self._explained(points, frame)
-        turn = target.to_upright / (target.face_height_px * self.noise.own_share[:, None, None])
-        rows = (turn @ jacobian).reshape(len(pull), -1)
-        weighted = rows * weight[:, None]
-        shared = self._modes.T @ weighted
-        hessian = rows.T @ weighted - shared.T @ cho_solve(factor, shared)
-        return QuadraticModel(cost, rows.T @ pull, hessian)
+    def data_at(self, theta: _Theta, identity: _Identity, frame: FrameTerms) -> Evaluation:
+        """What the landmarks alone cost."""
+        posed = self.head.posed(theta, identity, frame.camera.eye_m)
+        found = self._explained(posed.points_m, frame)
+        return Evaluation(found.cost, partial(self._model, posed, found, frame))
 
-    def _explained(
-        self, points: Float[np.ndarray, "L 3"], frame: FrameTerms
-    ) -> tuple[float, _Distances, _Distances, tuple[Float[np.ndarray, "K K"], bool]]:
+    def _model(
+        self, posed: PosedLandmarks, found: "_Explanation", frame: FrameTerms
+    ) -> QuadraticModel:
+        """What the landmarks cost around a pose."""
+        target = frame.target
+        own_px = target.face_height_px * self.noise.own_share
+        slope = (target.to_upright / own_px[:, None, None]) @ frame.camera.image_slope(
+            posed.points_m
+        )
+        rows = (slope @ self.head.derivative(posed, self._unknowns)).transpose(1, 0, 2)
+        weighted = (rows * found.root_weight[:, None]).reshape(len(found.pull), -1)
+        rows = rows.reshape(weighted.shape)
+        # numpy knows the product of a matrix with its own transpose, and does half the work.
+        left = dtrtrs(found.factor, found.modes.T @ weighted, lower=1)[0]
+        hessian = weighted.T @ weighted - left.T @ left
+        return QuadraticModel(found.cost, rows.T @ found.pull, hessian)
+
+    def _explained(self, points: Float[np.ndarray, "L 3"], frame: FrameTerms) -> "_Explanation":
         """The cheapest explanation: modes of the detector's noise, and what is left robustly.
 
-        Cost, its gradient to the residuals, their weights, the factor of I + modes' weights modes.
         Found by reweighting, from Huber's loss on, since the other one has many minima. Residuals
         are in the upright face, in standard deviations of a landmark's own error.
         """
         target, losses = frame.target, _REDESCENDING if frame.redescending else _FROM_AFAR
         away_px = frame.camera.project(points) - target.points_px
         own_px = target.face_height_px * self.noise.own_share
-        residual = away_px @ target.to_upright.T / own_px[:, None]
-        amounts, weight, factor = np.zeros(self._modes.shape[1]), residual, None
+        residual = target.to_upright @ (away_px / own_px[:, None]).T
+        left, weighted, factor = residual, self._modes, self._no_modes
+        amounts, root = np.zeros(len(factor)), target.seen
         for robust in losses:
-            left = residual - (self._modes @ amounts).reshape(-1, 2)
-            weight = np.repeat(robust(np.linalg.norm(left, axis=1))[1] * target.seen, 2)
-            weighted = self._modes * weight[:, None]
-            normal = weighted.T @ self._modes + np.eye(len(amounts))
-            factor = cho_factor(normal, check_finite=False)
-            amounts = cho_solve(factor, weighted.T @ residual.reshape(-1), check_finite=False)
-        assert factor is not None
-        left = residual - (self._modes @ amounts).reshape(-1, 2)
-        loss, soften = losses[-1](np.linalg.norm(left, axis=1))
+            root = np.sqrt(robust(np.square(left).sum(0))[1] * target.seen)
+            weighted = (self._modes * root[:, None]).reshape(-1, len(factor))
+            normal = weighted.T @ weighted + self._no_modes
+            factor, amounts, _ = dposv(normal, weighted.T @ (root * residual).reshape(-1), lower=1)
+            left = residual - self._modes @ amounts
+        loss, soften = losses[-1](np.square(left).sum(0))
         cost = float(loss @ target.seen + 0.5 * amounts @ amounts)
-        return cost, (left * (soften * target.seen)[:, None]).reshape(-1), weight, factor
+        pull = (left * (soften * target.seen)).reshape(-1)
+        return _Explanation(cost, pull, root, weighted, factor)
 
 
-def _huber(distance: _Distances) -> tuple[_Distances, _Distances]:
+@dataclass(frozen=True)
+class _Explanation:
+    """A cost, its gradient to the residuals, and what its Gauss-Newton Hessian is made from.
+
+    `root_weight` are square roots of the landmarks' weights, `modes` are scaled by them, and
+    `factor` is the lower Cholesky factor of I + modes' weights modes.
+    """
+
+    cost: float
+    pull: Float[np.ndarray, "R"]
+    root_weight: Float[np.ndarray, "L"]
+    modes: Float[np.ndarray, "R K"]
+    factor: Float[np.ndarray, "K K"]
+
+
+def _huber(squared: _Distances) -> tuple[_Distances, _Distances]:
     """Loss and weight (its derivative by distance^2 / 2): far-off points pull evenly."""
-    far = distance > _HUBER_SIGMAS
-    loss = np.where(far, _HUBER_SIGMAS * (distance - 0.5 * _HUBER_SIGMAS), 0.5 * distance**2)
-    return loss, np.where(far, _HUBER_SIGMAS / np.maximum(distance, 1e-12), 1.0)
+    distance = np.sqrt(squared)
+    # Within, `near` is the distance itself.
+    near = np.minimum(distance, _HUBER_SIGMAS)
+    loss = near * (distance - 0.5 * near)
+    return loss, _HUBER_SIGMAS / np.maximum(distance, _HUBER_SIGMAS)
 
 
-def _geman_mcclure(distance: _Distances) -> tuple[_Distances, _Distances]:
+def _geman_mcclure(squared: _Distances) -> tuple[_Distances, _Distances]:
     """Loss and weight: far-off points cost a constant and hardly pull."""
-    share = 1 / (1 + (distance / _REDESCENDING_SIGMAS) ** 2)
-    return 0.5 * distance**2 * share, share**2
+    share = 1 / (1 + squared / _REDESCENDING_SIGMAS**2)
+    return 0.5 * squared * share, share**2
 
 
 _FROM_AFAR = (_huber,) * 3

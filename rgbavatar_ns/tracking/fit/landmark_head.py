@@ -10,15 +10,12 @@ from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.head.landmarks import LandmarkResponse
 from rgbavatar_ns.tracking.fit.pose_chain import (
     JAW,
-    NUM_SIGNALS,
-    ROOT,
     SKULL,
     PoseChain,
     PoseView,
-    angular_velocities,
-    cross_matrix,
+    cross_matrices,
     rotation_matrices,
-    signal_slope,
+    signal_slopes,
 )
 
 _Theta = Float[np.ndarray, "H"]
@@ -30,58 +27,79 @@ POSE_FIELDS = ("rotation", "neck", "jaw", "left_eye", "right_eye")
 
 
 @dataclass(frozen=True)
-class _JointMoments:
-    """What one joint carries: `rows` are the landmarks with any weight on it.
+class _Moments:
+    """What the joints carry of each landmark: M of them, as many as any landmark has weights on.
 
-    share [R] sums barycentric * skinning weight; rest [3, R], dirs [3, R, C] and pose_dirs
-    [3, R, 36] are the positions' and offsets' sums with the same weights; slides [3, R, 8] is what
-    a detector's response adds for each signal.
+    `joint` are these joints; where a landmark has fewer, what stands in the other places is 0.
+    share sums barycentric * skinning weight; rest, dirs and pose_dirs are the positions' and
+    offsets' sums with the same weights; slides is what a detector's response adds for each signal.
     """
 
-    joint: int
-    rows: Int[np.ndarray, "R"]
-    share: Float[np.ndarray, "R"]
-    rest: Float[np.ndarray, "3 R"]
-    dirs: Float[np.ndarray, "3 R C"]
-    pose_dirs: Float[np.ndarray, "3 R 36"] | None
-    slides: Float[np.ndarray, "3 R 8"] | None = None
+    joint: Int[np.ndarray, "L M"]
+    share: Float[np.ndarray, "L M"]
+    rest: Float[np.ndarray, "L M 3"]
+    dirs: Float[np.ndarray, "L M 3 C"]
+    pose_dirs: Float[np.ndarray, "L M 3 36"] | None
+    slides: Float[np.ndarray, "L M 3 8"] | None = None
+
+    @classmethod
+    def of(
+        cls,
+        shares: Float[np.ndarray, "L 3 5"],
+        vertex_ids: Int[np.ndarray, "L 3"],
+        template: Float[np.ndarray, "V 3"],
+        dirs: Float[np.ndarray, "V 3 C"],
+        pose_dirs: Float[np.ndarray, "V 3 36"],
+    ) -> "_Moments":
+        """Of landmarks between three vertices each; `shares` are barycentric * skinning weight."""
+        has = shares.any(1)
+        most = int(has.sum(1).max())
+        joint = np.argsort(~has, axis=1, kind="stable")[:, :most]
+        weights = np.take_along_axis(shares.transpose(0, 2, 1), joint[..., None], axis=1)
+        corners = pose_dirs[vertex_ids].astype(np.float64)
+        posed = np.einsum("lmk,lkxp->lmxp", weights, corners) if np.any(corners) else None
+        return cls(
+            joint,
+            weights.sum(2),
+            np.einsum("lmk,lkx->lmx", weights, template[vertex_ids]),
+            np.einsum("lmk,lkxc->lmxc", weights, dirs[vertex_ids]),
+            posed,
+        )
+
+    def joint_shares(self) -> Float[np.ndarray, "L 5"]:
+        """How much of each landmark each joint carries."""
+        shares = np.zeros((len(self.joint), len(POSE_FIELDS)))
+        np.put_along_axis(shares, self.joint, self.share, axis=1)
+        return shares
 
 
 @dataclass(frozen=True)
 class Unknowns:
-    """What a fit asks derivatives for, in this order: places in the derivative's last axis.
+    """What a fit asks derivatives for: Q places in the derivative's last axis.
 
-    angles: (joint, axis, place); shifts: (axis, place); coefficients: their places, and each
-    joint's `dirs` and joint directions for them alone.
+    `joints` and `axes` say which entries of axis angles A of the places are, `angles` at which
+    places; `carries` tells what a turn of each carries, joint by joint. `dirs` and `joint_dirs` are
+    derivatives of what rests to the places that are coefficients, and 0 elsewhere; `shifts` those
+    of a joint's place to the translation.
     """
 
-    size: int
-    angles: tuple[tuple[int, int, int], ...]
-    shifts: tuple[tuple[int, int], ...]
-    coefficients: Int[np.ndarray, "K"]
-    dirs: tuple[Float[np.ndarray, "3 _"], ...]
-    joint_dirs: Float[np.ndarray, "5 3 K"]
+    angles: Int[np.ndarray, "A"]
+    joints: Int[np.ndarray, "A"]
+    axes: Int[np.ndarray, "A"]
+    carries: Float[np.ndarray, "5 A"]
+    dirs: Float[np.ndarray, "L M 3 Q"]
+    joint_dirs: Float[np.ndarray, "5 3 Q"]
+    shifts: Float[np.ndarray, "3 Q"]
 
 
-def _joint_moments(
-    joint: int,
-    shares: Float[np.ndarray, "L 3"],
-    vertex_ids: Int[np.ndarray, "L 3"],
-    template: Float[np.ndarray, "V 3"],
-    dirs: Float[np.ndarray, "V 3 C"],
-    pose_dirs: Float[np.ndarray, "V 3 36"],
-) -> _JointMoments:
-    rows = np.flatnonzero(np.any(shares, axis=1))
-    corners, weights = vertex_ids[rows], shares[rows]
-    posed = np.einsum("rk,rkxp->xrp", weights, pose_dirs[corners].astype(np.float64))
-    return _JointMoments(
-        joint,
-        rows,
-        weights.sum(1),
-        np.einsum("rk,rkx->xr", weights, template[corners]),
-        np.einsum("rk,rkxc->xrc", weights, dirs[corners]),
-        posed if np.any(posed) else None,
-    )
+@dataclass(frozen=True)
+class PosedLandmarks:
+    """Landmarks of one pose, and what their derivatives are made from."""
+
+    points_m: Float[np.ndarray, "L 3"]
+    carried_m: Float[np.ndarray, "L M 3"]
+    """What each joint adds to them."""
+    view: PoseView
 
 
 class LandmarkHead:
@@ -89,7 +107,8 @@ class LandmarkHead:
 
     Skinning is linear in the rest positions, so each landmark needs only its skinning-weighted
     moments per joint: sum over its three vertices of barycentric * weight * position. That equals
-    the full `HeadModel` at these points (a test compares them). float64 numpy throughout.
+    the full `HeadModel` at these points (a test compares them). float64 numpy throughout, in few
+    calls: on arrays this small a call costs more than its arithmetic.
     """
 
     def __init__(
@@ -107,11 +126,8 @@ class LandmarkHead:
         shape_dirs = arrays.shapedirs.astype(np.float64)
         lids = np.zeros((len(template), 3, 0)) if arrays.eyelid_dirs is None else arrays.eyelid_dirs
         dirs = np.concatenate([shape_dirs, lids], axis=2)
-        self._moments = [
-            _joint_moments(joint, shares[..., joint], vertex_ids, template, dirs, arrays.posedirs)
-            for joint in range(5)
-            if np.any(shares[..., joint])
-        ]
+        self._moments = _Moments.of(shares, vertex_ids, template, dirs, arrays.posedirs)
+        self._joint_shares = self._moments.joint_shares()
         regressor = arrays.joint_regressor.astype(np.float64)
         self._joint_rest = regressor @ template
         # Eyelids shift no joint.
@@ -121,28 +137,23 @@ class LandmarkHead:
 
     def of_person(self, identity: _Identity) -> "LandmarkHead":
         """The same head with this identity folded in: smaller, and its identity has size 0."""
-        count = self.num_identity
+        count, moments = self.num_identity, self._moments
         person = copy(self)
         person.num_identity = 0
-        person._moments = [
-            replace(
-                part,
-                rest=part.rest + part.dirs[..., :count] @ identity,
-                dirs=np.ascontiguousarray(part.dirs[..., count:]),
-            )
-            for part in self._moments
-        ]
+        person._moments = replace(
+            moments,
+            rest=moments.rest + moments.dirs[..., :count] @ identity,
+            dirs=np.ascontiguousarray(moments.dirs[..., count:]),
+        )
         person._joint_rest = self._joint_rest + self._joint_dirs[..., :count] @ identity
         person._joint_dirs = np.ascontiguousarray(self._joint_dirs[..., count:])
         return person
 
     def with_offsets(self, offsets_m: Float[np.ndarray, "L 3"]) -> "LandmarkHead":
         """Every landmark moved at rest; skinning carries the offsets along."""
-        moved = copy(self)
-        moved._moments = [
-            replace(part, rest=part.rest + (part.share[:, None] * offsets_m[part.rows]).T)
-            for part in self._moments
-        ]
+        moved, moments = copy(self), self._moments
+        rest = moments.rest + moments.share[..., None] * offsets_m[:, None]
+        moved._moments = replace(moments, rest=rest)
         return moved
 
     def with_response(self, response: LandmarkResponse) -> "LandmarkHead":
@@ -153,26 +164,20 @@ class LandmarkHead:
         places = np.concatenate(
             [np.arange(known[0].shape[-1]), first + np.arange(known[1].shape[-1])]
         )
-        coefficients = np.concatenate(known, -1)
-        moved = copy(self)
-        moved._moments = []
-        for part in self._moments:
-            share = part.share[:, None, None]
-            dirs = part.dirs.copy()
-            dirs[..., places] += (share * coefficients[part.rows]).transpose(1, 0, 2)
-            rest = part.rest + (share[..., 0] * response.rest[part.rows]).T
-            own = np.ascontiguousarray((share * slides[part.rows]).transpose(1, 0, 2))
-            moved._moments.append(replace(part, rest=rest, dirs=dirs, slides=own))
+        moved, moments = copy(self), self._moments
+        share = moments.share[..., None, None]
+        dirs = moments.dirs.copy()
+        dirs[..., places] += share * np.concatenate(known, -1)[:, None]
+        rest = moments.rest + share[..., 0] * response.rest[:, None]
+        moved._moments = replace(moments, rest=rest, dirs=dirs, slides=share * slides[:, None])
         return moved
 
     def expression_size_m(self) -> Float[np.ndarray, "E"]:
         """How far each expression at 1 moves the landmark that it moves most."""
         first = self.num_identity
         count = self.layout.slice("expression").stop - self.layout.slice("expression").start
-        moved = np.zeros((3, self.num_landmarks, count))
-        for part in self._moments:
-            moved[:, part.rows] += part.dirs[..., first : first + count]
-        return np.linalg.norm(moved, axis=0).max(0)
+        moved = self._moments.dirs[..., first : first + count].sum(1)
+        return np.linalg.norm(moved, axis=1).max(0)
 
     def unknowns(self, theta_columns: Int[np.ndarray, "P"], identity_columns: int = 0) -> Unknowns:
         """Entries of theta, then the identity's first coefficients, as unknowns of a fit."""
@@ -192,24 +197,81 @@ class LandmarkHead:
                     place += 1
         asked = [kinds[int(column)] for column in theta_columns]
         asked += [("coefficient", number) for number in range(identity_columns)]
-        rows = [(number, kind[1]) for number, kind in enumerate(asked) if kind[0] == "coefficient"]
-        sources = [source for _, source in rows]
-        return Unknowns(
-            len(asked),
-            tuple((s // 3, s % 3, n) for n, (kind, s) in enumerate(asked) if kind == "angle"),
-            tuple((s, n) for n, (kind, s) in enumerate(asked) if kind == "shift"),
-            np.array([number for number, _ in rows], dtype=np.int64),
-            tuple(part.dirs[..., sources].reshape(3, -1) for part in self._moments),
-            self._joint_dirs[..., sources],
-        )
+
+        def of_kind(wanted: str) -> Int[np.ndarray, "2 _"]:
+            """Places in the derivative, and numbers within the kind."""
+            found = [(n, source) for n, (kind, source) in enumerate(asked) if kind == wanted]
+            return np.array(found, dtype=np.int64).reshape(-1, 2).T
+
+        angles, entries = of_kind("angle")
+        joints, axes = np.divmod(entries, 3)
+        carries = [[self._hangs_on(own, joint) for joint in joints.tolist()] for own in range(5)]
+        places, sources = of_kind("coefficient")
+        dirs = np.zeros((*self._moments.rest.shape, len(asked)))
+        joint_dirs, shifts = np.zeros((5, 3, len(asked))), np.zeros((3, len(asked)))
+        dirs[..., places] = self._moments.dirs[..., sources]
+        joint_dirs[..., places] = self._joint_dirs[..., sources]
+        along, directions = of_kind("shift")
+        shifts[directions, along] = 1.0
+        carried = np.array(carries, dtype=np.float64)
+        return Unknowns(angles, joints, axes, carried, dirs, joint_dirs, shifts)
 
     def points(
         self, theta: _Theta, identity: _Identity, eye_m: _Point | None = None
     ) -> Float[np.ndarray, "L 3"]:
         """Landmarks in world space, metres; a response sees them from `eye_m` (far off in z)."""
-        coefficients = self._coefficients(theta, identity)
+        return self.posed(theta, identity, eye_m).points_m
+
+    def posed(
+        self, theta: _Theta, identity: _Identity, eye_m: _Point | None = None
+    ) -> PosedLandmarks:
+        """Landmarks as `points` has them, from which `derivative` goes on."""
+        coefficients, moments = self._coefficients(theta, identity), self._moments
         view = self._view(theta, coefficients, eye_m)
-        return sum(self._carried(view, coefficients), np.zeros((3, self.num_landmarks))).T
+        chain = view.chain
+        rest = moments.rest + _times(moments.dirs, coefficients)
+        if moments.pose_dirs is not None:
+            rest += _times(moments.pose_dirs, chain.features)
+        if moments.slides is not None:
+            rest += _times(moments.slides, view.signals)
+        shift = chain.placed - (chain.turned @ chain.at_rest[..., None])[..., 0]
+        carried = np.einsum("lmxy,lmy->lmx", chain.turned[moments.joint], rest)
+        carried += moments.share[..., None] * shift[moments.joint]
+        return PosedLandmarks(carried.sum(1), carried, view)
+
+    def derivative(self, posed: PosedLandmarks, unknowns: Unknowns) -> Float[np.ndarray, "L 3 Q"]:
+        """Of landmarks in metres to `unknowns` of this head.
+
+        Exact but for the direction to the camera, which counts as fixed while the head moves
+        sideways.
+        """
+        view, chain, moments = posed.view, posed.view.chain, self._moments
+        joints, axes, angles = unknowns.joints, unknowns.axes, unknowns.angles
+        local_spins = chain.local_spins()[joints, :, axes]
+        spins = (chain.above[joints] @ local_spins[..., None])[..., 0]
+        # All joints of a landmark in one product: (3, 3 M) (3 M, Q).
+        count, size = len(moments.joint), unknowns.dirs.shape[-1]
+        turned = chain.turned[moments.joint].transpose(0, 2, 1, 3).reshape(count, 3, -1)
+        result = turned @ unknowns.dirs.reshape(count, -1, size)
+        # A joint's turn carries what hangs on it about the joint.
+        cross = cross_matrices(spins)
+        pivots = (cross @ chain.placed[joints][..., None])[..., 0].T
+        swung = _times(posed.carried_m, cross.transpose(2, 1, 0).reshape(3, -1))
+        swung = swung.reshape(*moments.rest.shape, -1) - moments.share[..., None, None] * pivots
+        by_angle = (swung * unknowns.carries[moments.joint][:, :, None]).sum(1)
+        if moments.slides is not None:
+            slid = _times(moments.slides, signal_slopes(view, joints, axes, spins))
+            by_angle += turned @ slid.reshape(count, -1, len(joints))
+        if moments.pose_dirs is not None:
+            turning = cross_matrices(local_spins) @ chain.local[joints]
+            slopes = np.zeros((len(POSE_FIELDS), 9, len(joints)))
+            slopes[joints, :, np.arange(len(joints))] = turning.reshape(-1, 9)
+            corrected = _times(moments.pose_dirs, slopes[1:].reshape(36, -1))
+            by_angle += turned @ corrected.reshape(count, -1, len(joints))
+        result[..., angles] += by_angle
+        shifts = self._joint_shifts(chain, unknowns).reshape(len(POSE_FIELDS), -1)
+        result += (self._joint_shares @ shifts).reshape(result.shape)
+        return result
 
     def head_rotation(self, theta: _Theta) -> Float[np.ndarray, "3 3"]:
         """World rotation of the skull: global rotation, then neck."""
@@ -219,31 +281,9 @@ class LandmarkHead:
         """The joints of a pose."""
         return self._chain(theta, self._coefficients(theta, identity))
 
-    def jacobian(
-        self, theta: _Theta, identity: _Identity, unknowns: Unknowns, eye_m: _Point | None = None
-    ) -> tuple[Float[np.ndarray, "L 3"], Float[np.ndarray, "3 L Q"]]:
-        """Landmarks in metres, with their derivatives to `unknowns` of this head.
-
-        Exact but for the direction to the camera, which counts as fixed while the head moves
-        sideways.
-        """
-        coefficients = self._coefficients(theta, identity)
-        view = self._view(theta, coefficients, eye_m)
-        carried, chain = self._carried(view, coefficients), view.chain
-        derivative = np.zeros((3, self.num_landmarks, unknowns.size))
-        derivative[..., unknowns.coefficients] = self._coefficient_jacobian(chain, unknowns)
-        for axis, place in unknowns.shifts:
-            derivative[axis, :, place] = 1.0
-        slid = self._slid(chain)
-        for joint in range(len(POSE_FIELDS)):
-            asked = [(axis, place) for own, axis, place in unknowns.angles if own == joint]
-            if asked:
-                axes, places = (list(part) for part in zip(*asked))
-                derivative[..., places] = self._turning(view, carried, joint, axes)
-                if slid is not None:
-                    slopes = [signal_slope(view, joint, axis) for axis in axes]
-                    derivative[..., places] += slid @ np.stack(slopes, axis=-1)
-        return sum(carried, np.zeros((3, self.num_landmarks))).T, derivative
+    def skinning(self, chain: PoseChain) -> Float[np.ndarray, "L 3 3"]:
+        """How a pose turns what is added to each landmark at rest."""
+        return np.tensordot(self._joint_shares, chain.turned, axes=1)
 
     def _coefficients(self, theta: _Theta, identity: _Identity) -> _Coefficients:
         parts = [identity, theta[self.layout.slice("expression")]]
@@ -251,73 +291,15 @@ class LandmarkHead:
             parts.append(theta[self.layout.slice("eyelids")])
         return np.concatenate(parts)
 
-    def _carried(
-        self, view: PoseView, coefficients: _Coefficients
-    ) -> list[Float[np.ndarray, "3 L"]]:
-        """What each part of `_moments` adds to the landmarks in the world."""
-        found, chain = [], view.chain
-        for part in self._moments:
-            rest = part.rest + part.dirs @ coefficients
-            if part.pose_dirs is not None:
-                rest = rest + part.pose_dirs @ chain.features
-            if part.slides is not None:
-                rest = rest + part.slides @ view.signals
-            rest -= part.share * chain.at_rest[part.joint][:, None]
-            carried = np.zeros((3, self.num_landmarks))
-            placed = chain.placed[part.joint][:, None] * part.share
-            carried[:, part.rows] = chain.turned[part.joint] @ rest + placed
-            found.append(carried)
-        return found
-
-    def _coefficient_jacobian(
-        self, chain: PoseChain, unknowns: Unknowns
-    ) -> Float[np.ndarray, "3 L K"]:
-        placed = np.zeros_like(unknowns.joint_dirs)
+    def _joint_shifts(self, chain: PoseChain, unknowns: Unknowns) -> Float[np.ndarray, "5 3 Q"]:
+        """How what a joint carries moves as the joints' own places do."""
+        placed, own = np.zeros_like(unknowns.joint_dirs), unknowns.joint_dirs
         for joint, parent in enumerate(self._parents):
-            placed[joint] = unknowns.joint_dirs[joint]
-            if parent >= 0:
-                apart = unknowns.joint_dirs[joint] - unknowns.joint_dirs[parent]
-                placed[joint] = placed[parent] + chain.turned[parent] @ apart
-        moved = np.zeros((3, self.num_landmarks, unknowns.joint_dirs.shape[-1]))
-        for part, dirs in zip(self._moments, unknowns.dirs):
-            turned = chain.turned[part.joint]
-            shift = placed[part.joint] - turned @ unknowns.joint_dirs[part.joint]
-            own = (turned @ dirs).reshape(3, len(part.rows), -1)
-            moved[:, part.rows] += own + part.share[:, None] * shift[:, None]
-        return moved
-
-    def _turning(
-        self, view: PoseView, carried: list[Float[np.ndarray, "3 L"]], joint: int, axes: list[int]
-    ) -> Float[np.ndarray, "3 L A"]:
-        """Derivative of the landmarks to entries of a joint's axis angle."""
-        chain = view.chain
-        lever = np.zeros((3, self.num_landmarks))
-        for part, own in zip(self._moments, carried):
-            if self._hangs_on(part.joint, joint):
-                lever += own
-                lever[:, part.rows] -= chain.placed[joint][:, None] * part.share
-        spins = chain.spin[joint][:, axes]
-        moved = np.stack([cross_matrix(spin) @ lever for spin in spins.T], axis=-1)
-        if joint == ROOT:
-            return moved
-        above = chain.turned[self._parents[joint]].T
-        local = np.stack([cross_matrix(above @ spin) @ chain.local[joint] for spin in spins.T], -1)
-        for part in self._moments:
-            if part.pose_dirs is not None:
-                own = part.pose_dirs[..., 9 * joint - 9 : 9 * joint] @ local.reshape(9, -1)
-                turned = chain.turned[part.joint] @ own.reshape(3, -1)
-                moved[:, part.rows] += turned.reshape(3, -1, len(axes))
-        return moved
-
-    def _slid(self, chain: PoseChain) -> Float[np.ndarray, "3 L 8"] | None:
-        """What each signal moves in the world."""
-        slid = None
-        for part in self._moments:
-            if part.slides is not None:
-                slid = np.zeros((3, self.num_landmarks, NUM_SIGNALS)) if slid is None else slid
-                own = chain.turned[part.joint] @ part.slides.reshape(3, -1)
-                slid[:, part.rows] += own.reshape(part.slides.shape)
-        return slid
+            if parent < 0:
+                placed[joint] = own[joint] + unknowns.shifts
+            else:
+                placed[joint] = placed[parent] + chain.above[joint] @ (own[joint] - own[parent])
+        return placed - chain.turned @ own
 
     def _hangs_on(self, joint: int, ancestor: int) -> bool:
         while joint != ancestor and joint >= 0:
@@ -344,13 +326,17 @@ class LandmarkHead:
                 poses[joint] = theta[self.layout.slice(name)]
         local = rotation_matrices(poses)
         at_rest = self._joint_rest + self._joint_dirs @ coefficients
-        turned, placed, spin = local.copy(), at_rest.copy(), np.zeros((5, 3, 3))
+        turned, placed, above = local.copy(), at_rest.copy(), np.tile(np.eye(3), (5, 1, 1))
         for joint, parent in enumerate(self._parents):
-            above = turned[parent] if parent >= 0 else np.eye(3)
-            spin[joint] = above @ angular_velocities(poses[joint], local[joint])
             if parent < 0:
                 placed[joint] += theta[self.layout.slice("translation")]
                 continue
-            turned[joint] = above @ local[joint]
-            placed[joint] = placed[parent] + above @ (at_rest[joint] - at_rest[parent])
-        return PoseChain(local, turned, spin, at_rest, placed)
+            above[joint] = turned[parent]
+            turned[joint] = above[joint] @ local[joint]
+            placed[joint] = placed[parent] + above[joint] @ (at_rest[joint] - at_rest[parent])
+        return PoseChain(poses, local, above, turned, at_rest, placed)
+
+
+def _times(rows: Float[np.ndarray, "*L C"], factor: Float[np.ndarray, "C *A"]) -> np.ndarray:
+    """Their product as that of two matrices, where numpy would make many small ones."""
+    return (rows.reshape(-1, rows.shape[-1]) @ factor).reshape(*rows.shape[:-1], *factor.shape[1:])

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
-from scipy.linalg import LinAlgError, cho_factor, cho_solve
+from scipy.linalg import LinAlgError
+from scipy.linalg.lapack import dposv
 
 Vector = Float[np.ndarray, "P"]
 Matrix = Float[np.ndarray, "P P"]
@@ -23,6 +24,14 @@ class QuadraticModel:
     cost: float
     gradient: Vector
     hessian: Matrix
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """The cost at one point; `model` goes on from what the cost was found with."""
+
+    cost: float
+    model: Callable[[], QuadraticModel]
 
 
 def minimize_box_quadratic(
@@ -42,8 +51,10 @@ def minimize_box_quadratic(
         if free.size == 0 or np.abs(slope[free]).max() <= 1e-10 * (1 + np.abs(gradient).max()):
             break
         direction = np.zeros_like(step)
-        factor = cho_factor(hessian[np.ix_(free, free)], check_finite=False)
-        direction[free] = -cho_solve(factor, slope[free], check_finite=False)
+        _, solved, failed = dposv(hessian[np.ix_(free, free)], slope[free])
+        if failed:
+            raise LinAlgError("the matrix is not positive definite")
+        direction[free] = -solved
         length = 1.0
         while True:
             trial = np.clip(step + length * direction, lower, upper)
@@ -61,8 +72,7 @@ def minimize_box_quadratic(
 
 
 def levenberg_marquardt(
-    cost_at: Callable[[Vector], float],
-    model_at: Callable[[Vector], QuadraticModel],
+    evaluate: Callable[[Vector], Evaluation],
     start: Vector,
     lower: Vector,
     upper: Vector,
@@ -72,32 +82,30 @@ def levenberg_marquardt(
 ) -> tuple[Vector, float]:
     """Minimise inside the bounds, from `start`; the damping follows whether steps succeed.
 
-    `model_at` is asked only where a step is taken from, `cost_at` where one may end. Returns the
-    best point and its cost. Stops when a step lowers the cost by less than `tolerance` of it.
-    Deterministic.
+    A model is asked for only where a step is taken from. Returns the best point and its cost.
+    Stops when a step lowers the cost by less than `tolerance` of it. Deterministic.
     """
     point, damping = np.clip(start, lower, upper), 1e-4
-    model, cost = None, np.inf
+    here, model = evaluate(point), None
     for _ in range(iterations):
-        if model is None:
-            model = model_at(point)
-            cost = model.cost
-        diagonal = np.maximum(np.diag(model.hessian), 1e-9)
-        damped = model.hessian + np.diag(damping * diagonal + 1e-12)
+        model = here.model() if model is None else model
+        damped = model.hessian.copy()
+        diagonal = np.einsum("ii->i", damped)
+        diagonal += damping * np.maximum(diagonal, 1e-9) + 1e-12
         try:
             step = minimize_box_quadratic(damped, model.gradient, lower - point, upper - point)
         except LinAlgError:
             damping = max(damping, 1e-6) * 10
             continue
         trial = np.clip(point + step, lower, upper)
-        trial_cost = cost_at(trial)
-        if trial_cost < cost:
-            gained = cost - trial_cost
-            point, cost, model, damping = trial, trial_cost, None, max(damping / 5, 1e-9)
-            if gained < tolerance * (cost + 1e-12):
+        there = evaluate(trial)
+        if there.cost < here.cost:
+            gained = here.cost - there.cost
+            point, here, model, damping = trial, there, None, max(damping / 5, 1e-9)
+            if gained < tolerance * (here.cost + 1e-12):
                 break
         else:
             damping = max(damping, 1e-6) * 10
             if damping > 1e6:
                 break
-    return point, cost if np.isfinite(cost) else cost_at(point)
+    return point, here.cost

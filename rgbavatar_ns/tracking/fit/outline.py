@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.tracking.fit.camera import StillCamera
 from rgbavatar_ns.tracking.fit.landmark_head import LandmarkHead
-from rgbavatar_ns.tracking.fit.levenberg_marquardt import QuadraticModel
+from rgbavatar_ns.tracking.fit.levenberg_marquardt import Evaluation, QuadraticModel
 from rgbavatar_ns.tracking.fit.pose_chain import SKULL
 
 _Theta = Float[np.ndarray, "H"]
@@ -98,22 +98,24 @@ class OutlineCost:
         self._head = LandmarkHead(head, corners, np.tile([1.0, 0.0, 0.0], (len(corners), 1)))
         self._unknowns = self._head.unknowns(columns, identity_columns)
 
-    def value(self, theta: _Theta, identity: _Identity, terms: OutlineTerms) -> float:
-        """The cost of `model` alone."""
-        return self._explained(self._head.points(theta, identity), terms)[0]
+    def at(self, theta: _Theta, identity: _Identity, terms: OutlineTerms) -> Evaluation:
+        """The cost of a pose and a person."""
+        posed, camera = self._head.posed(theta, identity), terms.camera
+        cost, pull, weight = self._explained(posed.points_m, terms)
 
-    def model(self, theta: _Theta, identity: _Identity, terms: OutlineTerms) -> QuadraticModel:
-        """The cost around a pose and a person."""
-        points, derivative = self._head.jacobian(theta, identity, self._unknowns)
-        cost, pull, weight = self._explained(points, terms)
-        asked = np.flatnonzero(weight)
-        points, derivative, camera = points[asked], derivative[:, asked], terms.camera
-        away_px, slope = terms.outline.at(camera.project(points))
-        moved = np.einsum("ni,niq->nq", slope, camera.image_derivative(points, derivative))
-        # A distance in metres is one in pixels times the depth.
-        rows = moved * _metres_a_pixel(points, camera)[:, None]
-        rows -= (away_px / camera.focal_px)[:, None] * derivative[2]
-        return QuadraticModel(cost, rows.T @ pull[asked], rows.T @ (rows * weight[asked, None]))
+        def model() -> QuadraticModel:
+            asked = np.flatnonzero(weight)
+            points = posed.points_m[asked]
+            derivative = self._head.derivative(posed, self._unknowns)[asked]
+            away_px, slope = terms.outline.at(camera.project(points))
+            moved = np.einsum("ni,niq->nq", slope, camera.image_slope(points) @ derivative)
+            # A distance in metres is one in pixels times the depth.
+            rows = moved * _metres_a_pixel(points, camera)[:, None]
+            rows -= (away_px / camera.focal_px)[:, None] * derivative[:, 2]
+            hessian = rows.T @ (rows * weight[asked, None])
+            return QuadraticModel(cost, rows.T @ pull[asked], hessian)
+
+        return Evaluation(cost, model)
 
     def tells(self, theta: _Theta, identity: _Identity, terms: OutlineTerms) -> bool:
         """Whether the outline may be believed where landmarks alone put the head."""

@@ -3,32 +3,40 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 ROOT, SKULL, JAW = 0, 1, 2
 NUM_SIGNALS = 8
 """The view's five terms, the jaw, the eyes' pitch and yaw."""
 _NO_ANGLE_RAD = 1e-7
+_EYE = np.eye(3)
+# Row y holds the matrix of the cross product with axis y, flat.
+_AXES_CROSS = np.cross(_EYE[:, None], _EYE[None]).transpose(0, 2, 1).reshape(3, 9)
 
 
 @dataclass(frozen=True)
 class PoseChain:
     """Joints of a pose: what rests at x on joint j goes to turned_j (x - at_rest_j) + placed_j.
 
-    `local` are the joints' own rotations; column k of `spin` is the angular velocity in the world
-    as entry k of the joint's axis angle grows.
+    `local` are the joints' own rotations, of `axis_angles`; `above` are those of their parents in
+    the world, so that turned_j = above_j local_j.
     """
 
+    axis_angles: Float[np.ndarray, "5 3"]
     local: Float[np.ndarray, "5 3 3"]
+    above: Float[np.ndarray, "5 3 3"]
     turned: Float[np.ndarray, "5 3 3"]
-    spin: Float[np.ndarray, "5 3 3"]
     at_rest: Float[np.ndarray, "5 3"]
     placed: Float[np.ndarray, "5 3"]
 
     @property
     def features(self) -> Float[np.ndarray, "36"]:
         """R - I of all joints but the root, FLAME's order."""
-        return (self.local[1:] - np.eye(3)).reshape(36)
+        return (self.local[1:] - _EYE).reshape(36)
+
+    def local_spins(self) -> Float[np.ndarray, "5 3 3"]:
+        """Column k: angular velocity in the parent's frame as entry k of the axis angle grows."""
+        return angular_velocities(self.axis_angles, self.local)
 
 
 @dataclass(frozen=True)
@@ -43,42 +51,50 @@ class PoseView:
     signals: Float[np.ndarray, "8"]
 
 
-def signal_slope(view: PoseView, joint: int, axis: int) -> Float[np.ndarray, "8"]:
-    """Derivative of the signals to one entry of a joint's axis angle."""
-    slope = np.zeros(NUM_SIGNALS)
-    if joint <= SKULL:
-        spin = view.chain.spin[joint, :, axis]
-        dx, dy, _ = -view.chain.turned[SKULL].T @ np.cross(spin, view.towards)
-        x, y = view.signals[:2]
-        slope[:5] = dx, dy, 2 * x * dx, 2 * y * dy, x * dy + y * dx
-    elif joint == JAW and axis == 0:
-        slope[5] = view.cosines[0, 0]
-    elif joint > JAW and axis < 2:
-        slope[6 + axis] = 0.5 * view.cosines[joint - JAW, axis]
-    return slope
+def signal_slopes(
+    view: PoseView,
+    joints: Int[np.ndarray, "A"],
+    axes: Int[np.ndarray, "A"],
+    spins: Float[np.ndarray, "A 3"],
+) -> Float[np.ndarray, "8 A"]:
+    """Derivative of the signals to entries of joints' axis angles.
+
+    `spins` are the angular velocities in the world as these entries grow.
+    """
+    slopes = np.zeros((NUM_SIGNALS, len(joints)))
+    # The direction to the camera turns the other way, as the skull sees it.
+    seen = -(spins @ cross_matrices(view.towards)) @ view.chain.turned[SKULL]
+    dx, dy = np.where(joints <= SKULL, seen[:, :2].T, 0.0)
+    x, y = view.signals[:2]
+    slopes[:5] = dx, dy, 2 * x * dx, 2 * y * dy, x * dy + y * dx
+    for place, (joint, axis) in enumerate(zip(joints.tolist(), axes.tolist())):
+        if joint == JAW and axis == 0:
+            slopes[5, place] = view.cosines[0, 0]
+        elif joint > JAW and axis < 2:
+            slopes[6 + axis, place] = 0.5 * view.cosines[joint - JAW, axis]
+    return slopes
 
 
-def cross_matrix(vector: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """The matrix whose product with v is `vector` x v."""
-    x, y, z = vector
-    return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+def cross_matrices(vectors: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3 3"]:
+    """The matrices whose product with v is the vector x v."""
+    return (vectors @ _AXES_CROSS).reshape(*vectors.shape, 3)
 
 
 def rotation_matrices(axis_angles: Float[np.ndarray, "J 3"]) -> Float[np.ndarray, "J 3 3"]:
     """Rodrigues' formula; `head.rotations` has it for torch, which takes longer for five joints."""
-    angles = np.linalg.norm(axis_angles, axis=1)[:, None, None]
-    cross = np.stack([cross_matrix(vector) for vector in axis_angles])
+    angles = np.sqrt(np.square(axis_angles).sum(1))[:, None, None]
+    cross = cross_matrices(axis_angles)
     # sin(a) / a and (1 - cos(a)) / a^2, without dividing by 0.
     first, half = np.sinc(angles / np.pi), np.sinc(angles / (2 * np.pi))
-    return np.eye(3) + first * cross + 0.5 * half**2 * (cross @ cross)
+    return _EYE + first * cross + 0.5 * half**2 * (cross @ cross)
 
 
 def angular_velocities(
-    axis_angle: Float[np.ndarray, "3"], rotation: Float[np.ndarray, "3 3"]
-) -> Float[np.ndarray, "3 3"]:
+    axis_angles: Float[np.ndarray, "J 3"], rotations: Float[np.ndarray, "J 3 3"]
+) -> Float[np.ndarray, "J 3 3"]:
     """Column k: angular velocity of exp(v) as v's entry k grows (Gallego and Yezzi 2015)."""
-    squared = float(axis_angle @ axis_angle)
-    if squared < _NO_ANGLE_RAD**2:
-        return np.eye(3)
-    across = cross_matrix(axis_angle) @ (np.eye(3) - rotation)
-    return (np.outer(axis_angle, axis_angle) + across) / squared
+    squared = np.square(axis_angles).sum(1)[:, None, None]
+    none = squared < _NO_ANGLE_RAD**2
+    across = cross_matrices(axis_angles) @ (_EYE - rotations)
+    own = axis_angles[:, :, None] * axis_angles[:, None]
+    return np.where(none, _EYE, (own + across) / np.where(none, 1.0, squared))

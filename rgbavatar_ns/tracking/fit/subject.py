@@ -78,6 +78,7 @@ class SubjectTracker:
         if self.response is not None:
             seen = seen.with_response(self.response.select(rows))
         self._seen = seen
+        self._person = _AsTensor()
         self.cost = FrameCost(seen, self.noise.select(marks.facemesh_index), parameters)
 
     def targets(self, landmarks_px: Float[np.ndarray, "F 478 2"]) -> list[Target]:
@@ -182,5 +183,21 @@ class SubjectTracker:
         row = self.cost.theta(fit.values[position]) if known is None else known[position]
         theta = torch.from_numpy(row)
         with torch.no_grad():
-            vertices = self.head(theta, torch.from_numpy(fit.subject.identity))
+            vertices = self.head(theta, self._person(fit.subject.identity))
         return fit.subject.camera.project(vertices.numpy())
+
+
+class _AsTensor:
+    """The same tensor for the same array, so that the head knows its person again.
+
+    To fold an identity into the mesh takes as long as to pose it.
+    """
+
+    def __init__(self) -> None:
+        self._known: tuple[np.ndarray, torch.Tensor] | None = None
+
+    def __call__(self, array: Float[np.ndarray, "I"]) -> Float[torch.Tensor, "I"]:
+        known = self._known
+        if known is None or known[0] is not array:
+            known = self._known = array, torch.from_numpy(array)
+        return known[1]

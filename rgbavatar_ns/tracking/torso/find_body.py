@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -97,7 +98,7 @@ class _Reading:
             with closing(frames):
                 for k, frame in enumerate(frames):
                     cut = k == 0 or found.clip[k] != found.clip[k - 1]
-                    pixels = self._tracker.vertices_px(self._fit, k)
+                    pixels = partial(self._tracker.vertices_px, self._fit, k)
                     image = frame.image_rgb
                     sightings.append(follow(image, self._neck_m[k], pixels, cut))
                     if k % every == 0:

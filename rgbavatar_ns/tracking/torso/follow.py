@@ -24,6 +24,8 @@ _BELOW_NECK_M = 0.075
 
 MatteOf = Callable[[UInt8[np.ndarray, "h w 3"]], Float[np.ndarray, "h w"]]
 """The person's alpha of a picture."""
+MeshPx = Callable[[], Float[np.ndarray, "V 2"]]
+"""The fitted head's mesh in a frame, in pixels of the source; found where it is asked for."""
 
 
 @dataclass(frozen=True)
@@ -75,13 +77,13 @@ class BodyFollower:
         self,
         image_rgb: UInt8[np.ndarray, "h w 3"],
         neck_m: Float[np.ndarray, "3"],
-        vertices_px: Float[np.ndarray, "V 2"],
+        mesh_px: MeshPx,
         is_cut: bool,
     ) -> BodySighting:
         """The next frame; `neck_m` is where its head says that the neck's joint is.
 
-        `vertices_px` is the fitted head's mesh, in pixels of the source; `is_cut` says that the
-        picture has nothing to do with the one before.
+        `mesh_px` is asked for key pictures alone; `is_cut` says that the picture has nothing to do
+        with the one before.
         """
         gray = cv2.cvtColor(image_rgb, cv2.COLOR_RGB2GRAY)
         followed = self._key is not None and not is_cut
@@ -95,7 +97,7 @@ class BodyFollower:
             self._plain_frames = _PATIENCE
         chosen_px, certainty = None, None
         if self._wants_key(seen_px):
-            chosen_px = self._in_source(self._take_key(image_rgb, gray, vertices_px))
+            chosen_px = self._in_source(self._take_key(image_rgb, gray, mesh_px))
             assert self._key is not None
             certainty = self._key.body.certainty
         seen_px = self._in_source(seen_px)
@@ -147,12 +149,12 @@ class BodyFollower:
         self,
         image_rgb: UInt8[np.ndarray, "h w 3"],
         gray: UInt8[np.ndarray, "h w"],
-        vertices_px: Float[np.ndarray, "V 2"],
+        mesh_px: MeshPx,
     ) -> Float[np.ndarray, "Q 2"]:
         """Choose points of the body anew in this picture."""
         matte = self._matte_of(image_rgb)
         placed = self._motion.after(self._start)
-        region = (matte > _PERSON) & ~self._of_head(vertices_px, placed, gray.shape)
+        region = (matte > _PERSON) & ~self._of_head(mesh_px(), placed, gray.shape)
         chosen = FollowedPoints.chosen(gray, region)
         places, near = self._body.lifted(chosen.points_px, placed, self._camera)
         chosen, places = chosen.select(near), self._motion.undone()(places[near])

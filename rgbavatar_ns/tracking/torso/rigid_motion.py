@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from rgbavatar_ns.tracking.fit.camera import StillCamera
-from rgbavatar_ns.tracking.fit.pose_chain import cross_matrix, rotation_matrices
+from rgbavatar_ns.tracking.fit.pose_chain import cross_matrices, rotation_matrices
 
 _Points = Float[np.ndarray, "P 3"]
 
@@ -64,23 +64,20 @@ def fit_rigid_motion(
     motion = before
     turned, shifted = np.zeros(3), np.zeros(3)
     pivot = before(pivot_m)
+    precision = np.repeat([_TURN_RAD**-2.0, _SHIFT_M**-2.0], 3)
+    # By turn and shift: the shift's part stays.
+    moved = np.tile(np.eye(3, 6, 3), (len(points_m), 1, 1))
     for _ in range(_ITERATIONS):
         places = motion(points_m)
-        away = camera.project(places) - seen_px
-        counted = np.einsum("pxy,py->px", certainty, away)
-        distance = (counted * away).sum(1).clip(0)
-        weight = 1 / (1 + distance / sigma_px**2) ** 2
-        lever = places - (pivot + shifted)
-        derivative = np.empty((3, len(places), 6))
-        for axis in range(3):
-            derivative[:, :, axis] = cross_matrix(np.eye(3)[axis]) @ lever.T
-            derivative[:, :, 3 + axis] = np.eye(3)[:, axis, None]
-        rows = camera.image_derivative(places, derivative) / sigma_px
-        weighted = rows * weight[:, None, None]
-        precision = np.repeat([_TURN_RAD**-2.0, _SHIFT_M**-2.0], 3)
-        known = np.einsum("pxy,pyb->pxb", certainty, rows)
-        hessian = np.einsum("pxa,pxb->ab", weighted, known) + np.diag(precision)
-        gradient = np.einsum("pxa,px->a", weighted, counted / sigma_px)
+        away = (camera.project(places) - seen_px) / sigma_px
+        counted = (certainty @ away[..., None])[..., 0]
+        weight = 1 / (1 + (counted * away).sum(1).clip(0)) ** 2
+        moved[..., :3] = -cross_matrices(places - (pivot + shifted))
+        rows = camera.image_slope(places) / sigma_px @ moved
+        known = (certainty @ rows).reshape(-1, 6)
+        weighted = (rows * weight[:, None, None]).reshape(-1, 6)
+        hessian = weighted.T @ known + np.diag(precision)
+        gradient = weighted.T @ counted.reshape(-1)
         gradient += precision * np.concatenate([turned, shifted])
         step = -np.linalg.solve(hessian, gradient)
         turned, shifted = turned + step[:3], shifted + step[3:]
@@ -89,7 +86,7 @@ def fit_rigid_motion(
         if np.abs(step).max() < 1e-6:
             break
     away = camera.project(motion(points_m)) - seen_px
-    away = np.sqrt(np.einsum("px,pxy,py->p", away, certainty, away).clip(0))
+    away = np.sqrt((away * (certainty @ away[..., None])[..., 0]).sum(1).clip(0))
     if np.count_nonzero(away < 2 * sigma_px) < max(LEAST_POINTS, 0.3 * len(away)):
         return None
     return motion, float(np.median(away))
