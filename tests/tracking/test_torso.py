@@ -116,7 +116,7 @@ def test_a_point_on_a_stripe_counts_only_across_it() -> None:
     rows = np.mgrid[:200, :200][0]
     stripes = (127 + 100 * np.sin(rows / 4)).astype(np.uint8)
     stripes += np.random.default_rng(3).integers(0, 4, stripes.shape).astype(np.uint8)
-    chosen = FollowedPoints.chosen(stripes, np.ones((200, 200), bool))
+    chosen = FollowedPoints.chosen(stripes, np.ones((200, 200), bool), 160)
     assert len(chosen.points_px) > 20
     assert chosen.certainty[:, 0, 0].max() < 0.2, "along the stripe nothing is known"
     assert chosen.certainty[:, 1, 1].min() > 0.8

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, UInt8
 _Gray = UInt8[np.ndarray, "H W"]
 _Points = Float[np.ndarray, "P 2"]
 
-_MOST_POINTS, _LEAST_QUALITY, _APART_SHARE = 160, 0.01, 1 / 60
+_LEAST_QUALITY, _APART_SHARE = 0.01, 1 / 60
 _WINDOW_PX, _LEVELS = 21, 3
 _LEAST_POINTS = 8
 _PLAIN_SHARE = 0.1
@@ -20,15 +20,15 @@ _BACK_PX = 0.7
 _INSIDE_SHARE = 1 / 60
 
 
-def corners_within(gray: _Gray, region: Bool[np.ndarray, "H W"]) -> _Points:
-    """Places that can be followed, well within a region; none where it is plain."""
+def corners_within(gray: _Gray, region: Bool[np.ndarray, "H W"], most: int) -> _Points:
+    """At most so many places that can be followed, well within a region; none where it is plain."""
     side = max(gray.shape)
     reach = 2 * round(side * _INSIDE_SHARE) + 1
     inside = cv2.erode(region.astype(np.uint8), np.ones((reach, reach), np.uint8), borderValue=(0,))
     if not inside.any():
         return np.zeros((0, 2))
     apart = max(3.0, side * _APART_SHARE)
-    found = cv2.goodFeaturesToTrack(gray, _MOST_POINTS, _LEAST_QUALITY, apart, mask=inside)
+    found = cv2.goodFeaturesToTrack(gray, most, _LEAST_QUALITY, apart, mask=inside)
     return np.zeros((0, 2)) if found is None else found.reshape(-1, 2).astype(np.float64)
 
 
@@ -44,9 +44,9 @@ class FollowedPoints:
     certainty: Float[np.ndarray, "P 2 2"]
 
     @classmethod
-    def chosen(cls, gray: _Gray, region: Bool[np.ndarray, "H W"]) -> "FollowedPoints":
-        """Corners within a region."""
-        points = corners_within(gray, region)
+    def chosen(cls, gray: _Gray, region: Bool[np.ndarray, "H W"], most: int) -> "FollowedPoints":
+        """The best corners within a region."""
+        points = corners_within(gray, region, most)
         return cls(gray, points, _certainty(gray, points))
 
     def select(self, rows: Bool[np.ndarray, "P"]) -> "FollowedPoints":

@@ -7,6 +7,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.files import atomic_write, digest
@@ -52,7 +53,9 @@ def find_body(
 
     def look(key: str) -> str:
         reading = _Reading(tracker, fit, found, body, neck_m, matte_of)
-        seen = reading.read(source, advance)
+        # The matrices are small: more threads would only wait for each other.
+        with threadpool_limits(1):
+            seen = reading.read(source, advance)
         name = f"body_{key[:16]}.npz"
         with atomic_write(run.folder / name, remedy=GO_ON) as partial:
             np.savez(partial, **_packed(*seen))
@@ -62,8 +65,9 @@ def find_body(
     sightings, shoulders, lines = _load(run.folder / run.stages.run("body", made_from, look))
     advance(len(found))
     camera = fit.subject.camera
-    places = place_body(body, camera, sightings, neck_m, shoulders)
-    up_cm = shoulders_up_cm(body, camera, lines, places.rotation)
+    with threadpool_limits(1):
+        places = place_body(body, camera, sightings, neck_m, shoulders)
+        up_cm = shoulders_up_cm(body, camera, lines, places.rotation)
     return replace(places, shoulders_up_cm=up_cm)
 
 

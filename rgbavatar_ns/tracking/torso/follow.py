@@ -14,8 +14,10 @@ from rgbavatar_ns.tracking.torso.rigid_motion import LEAST_POINTS, RigidMotion, 
 
 # A fresh key picture is taken when fewer of the points than this share are found again.
 _FEW = 0.4
+_MOST_POINTS = 160
 _PERSON, _BACKGROUND = 0.9, 0.05
-_LEAST_BACKGROUND = 12
+# The background's points only tell by their median whether the camera moves.
+_LEAST_BACKGROUND, _MOST_BACKGROUND = 12, 48
 # How many frames of a body without a pattern pass until one is looked for again.
 _PATIENCE = 15
 # The head's shadow and the chin's are no pattern of the clothes: so far below the neck's joint.
@@ -155,10 +157,10 @@ class BodyFollower:
         matte = self._matte_of(image_rgb)
         placed = self._motion.after(self._start)
         region = (matte > _PERSON) & ~self._of_head(mesh_px(), placed, gray.shape)
-        chosen = FollowedPoints.chosen(gray, region)
+        chosen = FollowedPoints.chosen(gray, region, _MOST_POINTS)
         places, near = self._body.lifted(chosen.points_px, placed, self._camera)
         chosen, places = chosen.select(near), self._motion.undone()(places[near])
-        beside = FollowedPoints.chosen(gray, matte < _BACKGROUND)
+        beside = FollowedPoints.chosen(gray, matte < _BACKGROUND, _MOST_BACKGROUND)
         self._key = _Key(chosen, places, beside)
         self._near = chosen.points_px, beside.points_px
         return chosen.points_px

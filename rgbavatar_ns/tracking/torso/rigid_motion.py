@@ -11,6 +11,8 @@ from rgbavatar_ns.tracking.fit.pose_chain import cross_matrices, rotation_matric
 _Points = Float[np.ndarray, "P 3"]
 
 _ITERATIONS = 8
+# A step this small, radians and metres, is a fraction of what the points' own noise moves.
+_SETTLED = 1e-4
 # Points this far off (a sleeve that folds, a hand) hardly count: Geman and McClure's loss.
 _ROBUST_PX = 0.7
 # A frame's motion is drawn to the one before it by so much, so that few or flat points do not let
@@ -83,7 +85,7 @@ def fit_rigid_motion(
         turned, shifted = turned + step[:3], shifted + step[3:]
         turn = rotation_matrices(turned[None])[0]
         motion = RigidMotion(turn, pivot + shifted - turn @ pivot).after(before)
-        if np.abs(step).max() < 1e-6:
+        if np.abs(step).max() < _SETTLED:
             break
     away = camera.project(motion(points_m)) - seen_px
     away = np.sqrt((away * (certainty @ away[..., None])[..., 0]).sum(1).clip(0))
