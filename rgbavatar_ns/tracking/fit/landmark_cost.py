@@ -5,7 +5,7 @@ from functools import partial
 
 import numpy as np
 from jaxtyping import Float
-from scipy.linalg.lapack import dposv, dtrtrs
+from scipy.linalg.lapack import dposv, dtrtrs  # pyright: ignore[reportAttributeAccessIssue]
 
 from rgbavatar_ns.head.landmarks import LandmarkNoise
 from rgbavatar_ns.tracking.fit.camera import StillCamera
