@@ -6,9 +6,9 @@ writes `makehuman_head.npz` and `makehuman_bust.npz`, the head with neck and sho
 `rgbavatar_ns/head/assets` and the licence beside them. The head comes in FLAME's convention:
 metres, y up, z forward, +x the subject's left, the eyes near (+-.03, .03, .03); identity directions
 before expression directions; joints root, neck, jaw, left eye, right eye. The bust is the same head
-to the bit, in the same order, and what follows its root joint; its five expressions more, in
-centimetres, carry the head upon the neck, as no joint does, to the left, up and forward, and set
-the shoulders higher and wider.
+to the bit, in the same order, and what follows its root joint. In centimetres, its two identity
+directions more set the shoulders higher and wider, and its three expressions more carry the head
+upon the neck, as no joint does, to the left, up and forward.
 """
 
 from dataclasses import dataclass
@@ -35,7 +35,7 @@ from makehuman_source import (
     read_target,
 )
 
-from rgbavatar_ns.head.arrays import BODY_SHAPES, NECK_SHIFTS
+from rgbavatar_ns.head.arrays import BODY_IDENTITY, NECK_SHIFTS
 
 ASSETS = Path(__file__).resolve().parent.parent / "rgbavatar_ns/head/assets"
 NUM_IDENTITY = 30
@@ -237,20 +237,29 @@ def bust_of(
         "shapedirs", np.concatenate([as_float16(identity[:, count:].transpose(1, 2, 0)), still], 2)
     )
     carried = (1 - weights[:, :1, None]) * CENTIMETRE * np.eye(3)
-    added = np.concatenate([carried, CENTIMETRE * shoulder_directions(bust.vertices, weights)], 2)
+    shoulders = CENTIMETRE * shoulder_directions(bust.vertices, weights)
     uv, uv_faces = torso_uv(bust)
     head_uv = head["uv"] * [1, 1 - TORSO_TOP] + [0, TORSO_TOP]
     return head | {
         "name": np.array("makehuman_bust"),
         "v_template": longer("v_template", bust.vertices[count:]),
-        "shapedirs": np.concatenate([shapedirs, as_float16(added)], 2),
+        "shapedirs": np.concatenate(
+            [
+                shapedirs[..., :NUM_IDENTITY],
+                as_float16(shoulders),
+                shapedirs[..., NUM_IDENTITY:],
+                as_float16(carried),
+            ],
+            2,
+        ),
+        "num_identity": np.array(NUM_IDENTITY + len(BODY_IDENTITY)),
         "posedirs": np.zeros((len(bust.vertices), 3, 36), np.float16),
         "joint_regressor": np.pad(head["joint_regressor"], [(0, 0), (0, len(torso))]),
         "skinning_weights": weights,
         "faces": bust.faces.astype(np.int32),
         "uv": np.concatenate([head_uv, uv]).astype(np.float32),
         "uv_faces": np.concatenate([head["uv_faces"], uv_faces + len(head_uv)]).astype(np.int32),
-        "expression_names": np.concatenate([head["expression_names"], NECK_SHIFTS, BODY_SHAPES]),
+        "expression_names": np.concatenate([head["expression_names"], NECK_SHIFTS]),
         "group_torso": torso.astype(np.int32),
     }
 

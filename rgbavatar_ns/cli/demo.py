@@ -19,12 +19,15 @@ METHOD = "rgbavatar-tiny"
 HELD_OUT_STEPS = 40
 """Steps of fitting a video's held-out frames, for the score that looks at their images."""
 
+_SIZE_PX = 256
+
 
 def run(
     output: Path | None = None,
     video: tuple[Path, ...] = (),
     frames: Annotated[int, Between(2, 100_000)] = 240,
-    image_size: Annotated[int, Between(16, 4096)] = 256,
+    image_size: Annotated[int, Between(16, 4096)] | None = None,
+    head_only: bool = False,
     steps: Count | None = None,
     seed: Seed = 0,
     fresh: bool = False,
@@ -37,7 +40,8 @@ def run(
         video: your own video (several clips of one person may be given) in place of the demo
             subject.
         frames: frames of the demo subject; its last quarter is held out.
-        image_size: width and height of the images in pixels.
+        image_size: width and height of the images in pixels; by default the head has 256.
+        head_only: track the head of a video without its body.
         steps: training steps; by default those of the method rgbavatar-tiny.
         seed: of the demo subject and of the training.
         fresh: do every stage again, also those that are done.
@@ -53,10 +57,14 @@ def run(
     stages = Stages(output, fresh=fresh, tell=_tell_stage)
     if video:
         settings: dict[str, Any] = {"video": [_fingerprint(clip) for clip in video]}
-        settings["image_size"] = image_size
-        data = stages.run("track", settings, lambda key: _track(video, output / "data", image_size))
+        settings |= {"image_size": image_size, "head_only": head_only}
+        data = stages.run(
+            "track",
+            settings,
+            lambda key: _track(video, output / "data", image_size, head_only),
+        )
     else:
-        settings = {"frames": frames, "image_size": image_size, "seed": seed}
+        settings = {"frames": frames, "image_size": image_size or _SIZE_PX, "seed": seed}
         data = stages.run("demo subject", settings, lambda key: _demo(output / "data", settings))
     folder = Path(data["data"])
     trained = stages.run(
@@ -108,11 +116,13 @@ def _demo(destination: Path, settings: dict[str, Any]) -> Result:
     return {"data": str(destination)}
 
 
-def _track(video: tuple[Path, ...], destination: Path, image_size: int) -> Result:
+def _track(
+    video: tuple[Path, ...], destination: Path, image_size: int | None, head_only: bool
+) -> Result:
     from rgbavatar_ns.tracking import TrackConfig, track_video
 
     # What an interrupted run has done is gone on with.
-    config = TrackConfig(image_size=image_size, overwrite=True)
+    config = TrackConfig(image_size=image_size, head_only=head_only, overwrite=True)
     with stage_bars("frames") as update:
         track_video(video, destination, config, progress=update)
     return {"data": str(destination)}

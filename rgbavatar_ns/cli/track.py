@@ -14,6 +14,9 @@ from rgbavatar_ns.cli.progress import stage_bars
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.tracking import TrackConfig, track_video
 
+_FOLLOWED = 0.5
+"""Share of the frames in which clothes must be followed for it to be said that they were."""
+
 
 def run(
     paths: Annotated[
@@ -81,6 +84,7 @@ def summary_table(report: Mapping[str, Any]) -> Table:
         "face": f"{report['face_height_px']:.0f} pixels high; "
         f"{_counted(len(report['blurred']), 'blurred frame', 'blurred frames')}, "
         f"another face in {_counted(len(report['other_faces']), 'frame', 'frames')}",
+        "body": _body_told(report["body"]),
         "speed": ", ".join(
             f"{name} {stage['frames_per_second']:.0f} frames/s"
             for name, stage in report["stages"].items()
@@ -92,6 +96,16 @@ def summary_table(report: Mapping[str, Any]) -> Table:
     for name, value in rows.items():
         table.add_row(name, value)
     return table
+
+
+def _body_told(body: Mapping[str, Any] | None) -> str:
+    if body is None:
+        return "the head alone, down to the neck"
+    if body["followed_share"] < _FOLLOWED:
+        return "taken to keep still: its clothes show no pattern to follow"
+    if body["still"]:
+        return "keeps still"
+    return f"turns by {body['turned_degrees']:.0f} degrees, moves by {body['moved_mm'] / 10:.0f} cm"
 
 
 def _percent(share: float | None) -> str:

@@ -21,9 +21,8 @@ neck does without a turn of its one joint."""
 EMBEDDED_HEAD, EMBEDDED_BUST = "makehuman", "makehuman_bust"
 """Names of the CC0 heads that ship with the package: one ends at the neck, the other one has
 shoulders and chest too. Their first vertices, triangles and expressions are the same."""
-BODY_SHAPES = ("shouldersUp", "shouldersWide")
-"""Expressions of a bust that fit its shoulders to a person, in centimetres: the same in all frames
-of a film."""
+BODY_IDENTITY = ("shoulders up", "shoulders wide")
+"""What a bust's last identity directions do to it, in centimetres; the others are the head's."""
 _EMBEDDED = {EMBEDDED_HEAD: "makehuman_head.npz", EMBEDDED_BUST: "makehuman_bust.npz"}
 _GROUP = "group_"
 _MAY_BE_HALF = ("shapedirs", "posedirs", "eyelid_dirs")

@@ -141,10 +141,10 @@ class _Tracking:
                 body = find_body(
                     self.source, self.run, tracker, fit, found, person.coarse, clock.done
                 )
-            identity, heads = fit.subject.identity, tracker.thetas(fit)
-            arrays = tracker.head.arrays
-            upon = on_body(tracker.mesh_landmarks, arrays, identity, heads, body)
-            fit = replace(fit, upon_body=upon)
+            arrays, heads = tracker.head.arrays, tracker.thetas(fit)
+            alone = fit.subject.identity
+            identity, upon = on_body(tracker.mesh_landmarks, arrays, alone, heads, body)
+            fit = replace(fit, subject=replace(fit.subject, identity=identity), upon_body=upon)
         crop = steady_crop(
             found.points_px, width, height, config.image_size, with_body=body is not None
         )

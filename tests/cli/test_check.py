@@ -40,7 +40,7 @@ def test_good_data_is_told_in_words_with_exit_code_0(data, capsys):
     assert "36 frames (32 to train on, 4 held out) of 96 x 96 pixels, one camera" in told
     assert "head model makehuman" in told
     assert re.search(r"jaw \(3\): 0 to [\d.]+ degrees", told)
-    assert re.search(r"the head turns \d+ degrees sideways and nods \d+", told)
+    assert re.search(r"the head turns \d+ degrees to its left, \d+ to its right", told)
     assert told.strip().endswith("It can be trained.")
     assert (data / "check.png").stat().st_size > 10_000
 

@@ -6,7 +6,7 @@ import torch
 
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import EMBEDDED_BUST, EMBEDDED_HEAD, HeadArrays, HeadModel, uv_anchors
-from rgbavatar_ns.head.arrays import BODY_SHAPES, NECK_SHIFTS
+from rgbavatar_ns.head.arrays import BODY_IDENTITY, NECK_SHIFTS
 
 CM, MM = 1e-2, 1e-3
 
@@ -30,9 +30,10 @@ def test_its_head_is_the_embedded_one_in_every_pose(bust: HeadModel, head: HeadM
     }
     identity = torch.randn(head.num_identity, generator=drawn, dtype=torch.float64)
     alone = head(head.layout.join(parts), identity)
-    more = torch.zeros(4, len(NECK_SHIFTS + BODY_SHAPES), dtype=torch.float64)
+    more = torch.zeros(4, len(NECK_SHIFTS), dtype=torch.float64)
     parts["expression"] = torch.cat([parts["expression"], more], 1)
-    on_shoulders = bust(bust.layout.join(parts), identity)
+    average = torch.zeros(len(BODY_IDENTITY), dtype=torch.float64)
+    on_shoulders = bust(bust.layout.join(parts), torch.cat([identity, average]))
     torch.testing.assert_close(on_shoulders[:, :count], alone, atol=1e-9, rtol=0)
     triangles = len(head.arrays.faces)
     assert np.array_equal(bust.arrays.faces[:triangles], head.arrays.faces)
@@ -74,13 +75,13 @@ def test_a_neck_shift_carries_the_head_a_centimetre_and_no_shoulder(
 
 
 def test_shoulders_go_up_and_apart_by_centimetres_and_leave_the_head(bust: HeadModel) -> None:
-    first = bust.layout.slice("expression").start
     left = bust.arrays.v_template[:, 0] > 0.16
     head = bust.arrays.skinning_weights[:, 0] < 1e-6
-    for name, axis in zip(BODY_SHAPES, (1, 0)):
-        theta = torch.zeros(bust.layout.size, dtype=torch.float64)
-        theta[first + bust.arrays.expression_names.index(name)] = 2.0
-        moved = bust(theta).numpy() - bust.arrays.v_template
+    theta = torch.zeros(bust.layout.size, dtype=torch.float64)
+    for direction, axis in enumerate((1, 0)):
+        person = torch.zeros(bust.num_identity, dtype=torch.float64)
+        person[bust.num_identity - len(BODY_IDENTITY) + direction] = 2.0
+        moved = bust(theta, person).numpy() - bust.arrays.v_template
         np.testing.assert_allclose(moved[left][:, axis], 2 * CM, atol=0.05 * MM)
         assert np.abs(moved[head]).max() < 0.01 * MM
 

@@ -23,7 +23,7 @@ from .acting import CAMERA, degrees_apart, observed, performance, skulls
 from .clips import astronaut, write_clip
 from .remeshed_head import TURN, as_another_model, remeshed
 
-CONFIG = TrackConfig(focal_px=CAMERA.focal_px, key_frames=6, identity_components=10)
+CONFIG = TrackConfig(focal_px=CAMERA.focal_px, key_frames=6, identity_components=10, head_only=True)
 FRAMES = 10
 
 

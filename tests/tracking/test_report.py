@@ -46,6 +46,7 @@ GOOD: dict[str, Any] = {
     "face_height_px": 180.0,
     "stages": {"faces": {"frames": 200, "seconds": 8.0, "frames_per_second": 25.0}},
     "frames_per_second": 12.0,
+    "body": None,
 }
 
 
@@ -67,6 +68,10 @@ def test_correlation_of_openings() -> None:
     ("changes", "words"),
     [
         ({}, "good"),
+        ({"background": "moves"}, "usable: the camera moves"),
+        ({"body": {"background_moves_px": 20.0}}, "usable: the camera moves"),
+        ({"body": {"background_moves_px": 2.0}}, "good"),
+        ({"body": {"background_moves_px": None}}, "good"),
         ({"mouth_opening_correlation": None, "eyelid_opening_correlation": None}, "good"),
         ({"mesh_reprojection_error_share": 0.02}, "usable: the mesh lies off the face"),
         ({"mesh_reprojection_error_share": 0.05}, "look at it: the mesh lies off the face"),

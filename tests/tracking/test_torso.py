@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -21,6 +22,7 @@ from rgbavatar_ns.tracking.torso.features import FollowedPoints
 from rgbavatar_ns.tracking.torso.follow import BodyFollower, BodySighting
 from rgbavatar_ns.tracking.torso.place import BodyPlaces, SeenShoulders, place_body
 from rgbavatar_ns.tracking.torso.rigid_motion import RigidMotion, fit_rigid_motion
+from rgbavatar_ns.tracking.torso.shape import shoulder_line, shoulders_up_cm
 
 SIZE, FRAMES = 320, 24
 CAMERA = StillCamera(700.0, (160.0, 160.0), 1.1)
@@ -43,6 +45,7 @@ def turned(yaw: float, pitch: float = 0.0, roll: float = 0.0) -> Float[np.ndarra
 def test_a_head_put_on_a_body_stays_where_it_was(bust: HeadModel) -> None:
     drawn = np.random.default_rng(0)
     layout, identity = bust.layout, 0.7 * drawn.standard_normal(bust.num_identity)
+    identity[-2:] = 0
     theta = np.zeros((5, layout.size))
     theta[:, layout.slice("rotation")] = 0.4 * drawn.standard_normal((5, 3))
     theta[:, layout.slice("translation")] = 0.1 * drawn.standard_normal((5, 3))
@@ -54,10 +57,13 @@ def test_a_head_put_on_a_body_stays_where_it_was(bust: HeadModel) -> None:
     necks = np.array([head.chain(row, identity).placed[NECK] for row in theta])
     moved = necks + 0.008 * drawn.standard_normal((5, 3))
     bodies = np.array([turned(*drawn.uniform(-10, 10, 3)) for _ in range(5)])
-    found = on_body(head, bust.arrays, identity, theta, BodyPlaces(bodies, moved, False, 1.0, 0.0))
+    places = BodyPlaces(bodies, moved, False, 1.0, 0.0, shoulders_up_cm=3.0)
+    person, found = on_body(head, bust.arrays, identity, theta, places)
 
-    person = torch.from_numpy(identity)
-    before, after = (bust(torch.from_numpy(rows), person).numpy() for rows in (theta, found))
+    before, after = (
+        bust(torch.from_numpy(rows), torch.from_numpy(who)).numpy()
+        for rows, who in ((theta, identity), (found, person))
+    )
     skull = bust.arrays.skinning_weights[:, NECK:].sum(1) > 0.999
     assert skull.sum() > 2500
     np.testing.assert_allclose(after[:, skull], before[:, skull], atol=3e-4)
@@ -70,9 +76,8 @@ def test_a_body_too_far_from_its_head_follows_it(bust: HeadModel) -> None:
     head = LandmarkHead(bust, np.array([[0, 1, 2]]), np.full((1, 3), 1 / 3))
     theta = np.zeros((1, bust.layout.size))
     far = head.chain(theta[0], identity).placed[NECK][None] + [0.2, 0, 0]
-    found = on_body(
-        head, bust.arrays, identity, theta, BodyPlaces(np.eye(3)[None], far, True, 1.0, 0.0)
-    )
+    places = BodyPlaces(np.eye(3)[None], far, True, 1.0, 0.0)
+    _, found = on_body(head, bust.arrays, identity, theta, places)
     assert found[:, bust.layout.slice("translation")][0, 0] == pytest.approx(0.03, abs=0.002)
     teeth = bust.arrays.vertex_groups["upper_teeth"]
     vertices = bust(torch.from_numpy(found)).numpy()[0]
@@ -218,11 +223,11 @@ def test_a_body_that_leans_is_followed(films) -> None:
 def test_another_place_of_the_background_tells_a_moving_camera(films) -> None:
     still, moving = (Filmed(*films("still"), drift_px=drift).followed() for drift in (0, 1))
     assert np.nanmax([one.background_px for one in still]) < 0.3
-    assert np.nanmax([one.background_px for one in moving]) > 10
+    assert np.nanmax([one.background_px for one in moving]) > 5
 
 
 def test_a_plain_shirt_leaves_the_body_where_it_was() -> None:
-    body = BodyMesh.of(HeadModel.embedded(torch.float64, EMBEDDED_BUST), np.zeros(30))
+    body = BodyMesh.of(HeadModel.embedded(torch.float64, EMBEDDED_BUST), np.zeros(32))
     none = np.zeros((0, 2))
     unseen = [BodySighting(k, none, none, np.zeros((0, 2, 2)), np.nan) for k in range(4)]
     necks = np.tile(np.array([[0.01], [0.02], [0.03], [0.04]]), (1, 3))
@@ -236,7 +241,7 @@ def test_a_plain_shirt_leaves_the_body_where_it_was() -> None:
 def test_shoulders_tilt_a_body_only_where_they_are_plainly_aslant(
     roll_degrees: float, told: float
 ) -> None:
-    body = BodyMesh.of(HeadModel.embedded(torch.float64, EMBEDDED_BUST), np.zeros(30))
+    body = BodyMesh.of(HeadModel.embedded(torch.float64, EMBEDDED_BUST), np.zeros(32))
     neck = np.array([0.0, -0.05, 0.0])
     marks = (body.shoulders_m - body.neck_m) @ turned(0, 0, roll_degrees).T + neck
     shoulders = [SeenShoulders(0, CAMERA.project(marks), 0.0)]
@@ -244,3 +249,30 @@ def test_shoulders_tilt_a_body_only_where_they_are_plainly_aslant(
     unseen = [BodySighting(0, none, none, np.zeros((0, 2, 2)), np.nan)]
     places = place_body(body, CAMERA, unseen, neck[None], shoulders)
     assert degrees(places.rotation[0], turned(0, 0, told)) < 0.3
+
+
+@pytest.mark.parametrize(("up_cm", "told_cm"), [(0.0, 0.0), (4.0, 2.8), (-3.0, -2.5)])
+def test_shoulders_go_to_the_outline_less_cloth_and_doubt(up_cm: float, told_cm: float) -> None:
+    head = HeadModel.embedded(torch.float64, EMBEDDED_BUST)
+    identity = np.zeros(head.num_identity)
+    body = BodyMesh.of(head, identity)
+    identity[-2] = up_cm
+    person = BodyMesh.of(head, identity)
+    neck = np.array([0.0, -0.05, 0.0])
+    px = CAMERA.project(person.vertices_m - person.neck_m + neck)
+    matte = np.zeros((320, 320), np.uint8)
+    for triangle in np.round(px[person.faces] * 8).astype(np.int32):
+        cv2.fillConvexPoly(matte, triangle, (1,), shift=3)
+    lines = [shoulder_line(k, matte.astype(np.float32), neck, CAMERA) for k in range(6)]
+    rotation = np.tile(np.eye(3), (6, 1, 1))
+    assert shoulders_up_cm(body, CAMERA, lines, rotation) == pytest.approx(told_cm, abs=0.35)
+
+
+def test_hair_beside_the_neck_or_a_picture_without_shoulders_raises_nothing() -> None:
+    body = BodyMesh.of(HeadModel.embedded(torch.float64, EMBEDDED_BUST), np.zeros(32))
+    neck, rotation = np.array([0.0, -0.05, 0.0]), np.eye(3)[None]
+    everything = np.ones((320, 320), np.float32)
+    for matte in (everything, np.zeros_like(everything)):
+        line = shoulder_line(0, matte, neck, CAMERA)
+        assert np.isnan(line.above_cm).all()
+        assert shoulders_up_cm(body, CAMERA, [line], rotation) == 0.0

@@ -75,7 +75,7 @@ def test_the_body_is_left_out_only_when_asked_for(
         dataset = track_video(portrait[0], tmp_path / str(head_only), config)
         assert dataset.arrays.has_torso != head_only
         shares.append(dataset.read_image(0)[-12:-6, :, 3].mean() / 255)
-        assert not dataset.read_image(0)[-1, :, 3].any(), "it fades out at the bottom"
+        assert dataset.read_image(0)[-1, :, 3].max() < 20, "it fades out at the bottom"
     assert shares[0] < 0.05
     assert shares[1] > 0.3
 

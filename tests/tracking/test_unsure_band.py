@@ -130,7 +130,7 @@ def test_the_cost_is_bounded_by_the_band(monkeypatch: pytest.MonkeyPatch) -> Non
     real = unsure_band._mixture
 
     def counted(*given: Any) -> np.ndarray:
-        asked.append(len(given[-1]))
+        asked.append(len(given[-2]))
         return real(*given)
 
     monkeypatch.setattr(unsure_band, "_mixture", counted)

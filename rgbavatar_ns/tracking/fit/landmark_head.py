@@ -159,12 +159,15 @@ class LandmarkHead:
     def with_response(self, response: LandmarkResponse) -> "LandmarkHead":
         """The same landmarks where a detector sees them; before any identity is folded in."""
         slides = np.concatenate([response.view, response.jaw_open[..., None], response.gaze], -1)
-        count = self.num_identity + response.expression.shape[-1]
-        coefficients = np.concatenate([response.identity, response.expression], -1)
+        # A bust has directions more, of its body: none of them moves a landmark.
+        first, known = self.num_identity, (response.identity, response.expression)
+        places = np.concatenate(
+            [np.arange(known[0].shape[-1]), first + np.arange(known[1].shape[-1])]
+        )
         moved, moments = copy(self), self._moments
         share = moments.share[..., None, None]
         dirs = moments.dirs.copy()
-        dirs[..., :count] += share * coefficients[:, None]
+        dirs[..., places] += share * np.concatenate(known, -1)[:, None]
         rest = moments.rest + share[..., 0] * response.rest[:, None]
         moved._moments = replace(moments, rest=rest, dirs=dirs, slides=share * slides[:, None])
         return moved

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from rgbavatar_ns.head import ThetaLayout
-from rgbavatar_ns.head.arrays import BODY_SHAPES, NECK_SHIFTS
+from rgbavatar_ns.head.arrays import NECK_SHIFTS
 
 # Jaw opening to 26 degrees; the head to a little beyond profile.
 _JAW_OPEN = (-0.02, 0.45)
@@ -100,10 +100,9 @@ def fit_parameters(
         for angle, width in enumerate((_GAZE_PITCH_WIDTH, _GAZE_YAW_WIDTH)):
             rows.append((first + angle, *GAZE_BOUNDS_RAD, width, _GAZE_STEP))
     first = layout.slice("expression").start
-    of_body = (*NECK_SHIFTS, *BODY_SHAPES)
     numbered = all(_NUMBERED.fullmatch(name) for name in expression_names)
     for number, (name, size_m) in enumerate(zip(expression_names, expression_size_m.tolist())):
-        if size_m < 2e-4 or name.startswith("eyeLook") or name in of_body:
+        if size_m < 2e-4 or name.startswith("eyeLook") or name in NECK_SHIFTS:
             continue
         if not numbered:
             quick = name.startswith("eyeBlink")

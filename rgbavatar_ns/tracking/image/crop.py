@@ -118,7 +118,7 @@ def _body_square(
     down = high[1] + _BODY_BELOW * face - head.top
     side = min(max(int(np.ceil(max(across, down))), head.side), max(head.side, min(width, height)))
     left = _push_inside((low[0] + high[0] - side) / 2, side, width)
-    return SquareCrop(left, _push_inside(head.top, side, height), side, head.size)
+    return SquareCrop(left, _push_inside(float(head.top), side, height), side, head.size)
 
 
 def _head_square(landmarks_px: Float[np.ndarray, "F 478 2"], width: int, height: int) -> SquareCrop:

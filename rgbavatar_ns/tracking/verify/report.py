@@ -25,6 +25,8 @@ _CORRELATION, _COVERAGE = (0.85, 0.6), (0.95, 0.85)
 _IRIS_ERROR, _AT_BOUND = (0.1, 0.2), (0.02, 0.2)
 _REJECTED, _BLURRED = (0.05, 0.25), (0.1, 0.3)
 _FACE_PX, _FRAMES = (100.0, 50.0), (100, 25)
+# How far the background wanders, in shares of the face's height, until the camera is said to move.
+_MOVES = 0.03
 # The part of the face whose outline is skin: from a little above the chin to the eyes, as shares
 # of the height from chin to forehead; and how far beside the head the matte is looked at.
 _FACE_FROM, _FACE_TO, _BESIDE = 0.1, 0.6, 0.2
@@ -186,7 +188,15 @@ def tracking_findings(report: Mapping[str, Any]) -> list[Finding]:
         if value is not None and sign * (value - mild) > 0:
             severity: Severity = "error" if sign * (value - grave) > 0 else "warning"
             found.append(Finding(kind, severity, cause))
+    if _camera_moves(report):
+        found.append(Finding("camera", "warning", "the camera moves"))
     others = len(report["other_faces"])
     if others:
         found.append(Finding("faces", "error", f"another face is seen in {others} frames"))
     return found
+
+
+def _camera_moves(report: Mapping[str, Any]) -> bool:
+    """Whether what is behind the person moves, in the crop or about it."""
+    moved_px = (report["body"] or {}).get("background_moves_px") or 0.0
+    return report.get("background") == "moves" or moved_px > _MOVES * report["face_height_px"]
