@@ -30,6 +30,7 @@ from rooms import ROOMS, FilmedRoom, Performance
 from rgbavatar_ns.drawing.compositing import composite_bytes
 from rgbavatar_ns.tracking import TrackConfig, track_video
 from rgbavatar_ns.tracking.image.crop import SquareCrop
+from rgbavatar_ns.tracking.image.cut_out import fade_at_bottom
 from rgbavatar_ns.tracking.image.matting import (
     PersonMatte,
     foreground_color,
@@ -103,6 +104,8 @@ def measure(film: FilmedRoom, folder: Path, tremble_px: float) -> dict[str, Any]
     with closing(PersonMatte()) as matte:
         for frame in FrameSource.open(clip).read(set(frames).__contains__):
             image, inside = crop.apply(frame.image_rgb), crop.inside(frame.width, frame.height)
+            # A body fades out where the picture ends: that is no error of the matte.
+            inside = inside & (fade_at_bottom(inside) >= 1)
             level = matte(image)
             plain.append(straight_rgba(foreground_color(image, level), level))
     bands = unsure(truth, plain)

@@ -91,3 +91,14 @@ def test_key_frames_differ_and_are_the_same_each_time() -> None:
     assert len(chosen) == 2
     assert 2 in chosen, "a translation alone is no new shape"
     assert key_frame_positions(clip, 99) == key_frame_positions(clip, 5)
+
+
+def test_the_mesh_is_of_the_person_that_is_asked_for(head: HeadModel) -> None:
+    tracker, _, _, points = acted(head, 3, key_frames=3, identity_components=3)
+    first = tracker.fit(points, [False, True, True], 320, 240)
+    other = replace(first, subject=replace(first.subject, identity=first.subject.identity + 1))
+    found = [tracker.vertices_px(fit, 0) for fit in (first, other, first)]
+    np.testing.assert_array_equal(found[0], found[2])
+    alone = SubjectTracker(head, tracker.config).vertices_px(other, 0)
+    np.testing.assert_array_equal(found[1], alone)
+    assert np.abs(found[1] - found[0]).max() > 1, "another person"

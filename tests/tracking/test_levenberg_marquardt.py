@@ -44,3 +44,21 @@ def test_levenberg_marquardt_finds_the_bounded_minimum_of_a_curved_valley() -> N
     )
     np.testing.assert_allclose(best, [0.5, 0.25], atol=1e-5)
     assert cost == pytest.approx(0.125, abs=1e-6)
+
+
+def test_a_point_is_evaluated_once_and_its_model_made_only_where_a_step_is_taken() -> None:
+    evaluated, modelled = [], []
+
+    def evaluate(point: np.ndarray) -> Evaluation:
+        evaluated.append(tuple(point))
+
+        def model() -> QuadraticModel:
+            modelled.append(tuple(point))
+            return QuadraticModel(0.5 * float(point @ point), point, np.eye(2))
+
+        return Evaluation(0.5 * float(point @ point), model)
+
+    free = np.full(2, np.inf)
+    levenberg_marquardt(evaluate, np.array([3.0, 4.0]), -free, free, iterations=1)
+    assert modelled == [(3.0, 4.0)]
+    assert len(evaluated) == len(set(evaluated)) == 2

@@ -192,6 +192,19 @@ def test_a_body_that_keeps_still_is_not_turned_by_its_head(films) -> None:
     assert np.linalg.norm(places.neck_m - film.neck_m, axis=1).max() < 5e-3
 
 
+def test_the_mesh_is_asked_for_where_points_are_chosen_alone(films) -> None:
+    film, asked = Filmed(*films("still")), []
+
+    def mesh_px() -> Float[np.ndarray, "V 2"]:
+        asked.append(True)
+        return film.vertices_px[0]
+
+    follow = BodyFollower(film.body, film.camera, 1.0, lambda _: film.mattes[0])
+    frames = zip(film.images[:4], film.neck_m)
+    seen = [follow(image, neck, mesh_px, k == 0) for k, (image, neck) in enumerate(frames)]
+    assert len(asked) == sum(one.chosen_px is not None for one in seen) == 1
+
+
 def test_a_body_that_leans_is_followed(films) -> None:
     film = Filmed(*films("lean"))
     assert degrees(film.rotation, film.rotation[:1]).max() > 6

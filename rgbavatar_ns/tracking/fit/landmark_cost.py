@@ -5,7 +5,7 @@ from functools import partial
 
 import numpy as np
 from jaxtyping import Float
-from scipy.linalg.lapack import dposv, dtrtrs  # pyright: ignore[reportAttributeAccessIssue]
+from scipy.linalg import get_lapack_funcs
 
 from rgbavatar_ns.head.landmarks import LandmarkNoise
 from rgbavatar_ns.tracking.fit.camera import StillCamera
@@ -22,6 +22,9 @@ _Distances = Float[np.ndarray, "R"]
 # count ever less: Geman and McClure's loss. Sigmas are of a landmark's own error.
 _HUBER_SIGMAS = 2.5
 _REDESCENDING_SIGMAS = 3.0
+
+# LAPACK itself: scipy's wrappers take longer than these matrices do.
+_solve_positive, _solve_triangular = get_lapack_funcs(("posv", "trtrs"), dtype=np.float64)
 
 
 @dataclass(frozen=True)
@@ -120,7 +123,7 @@ class FrameCost:
         weighted = (rows * found.root_weight[:, None]).reshape(len(found.pull), -1)
         rows = rows.reshape(weighted.shape)
         # numpy knows the product of a matrix with its own transpose, and does half the work.
-        left = dtrtrs(found.factor, found.modes.T @ weighted, lower=1)[0]
+        left = _solve_triangular(found.factor, found.modes.T @ weighted, lower=1)[0]
         hessian = weighted.T @ weighted - left.T @ left
         return QuadraticModel(found.cost, rows.T @ found.pull, hessian)
 
@@ -140,7 +143,9 @@ class FrameCost:
             root = np.sqrt(robust(np.square(left).sum(0))[1] * target.seen)
             weighted = (self._modes * root[:, None]).reshape(-1, len(factor))
             normal = weighted.T @ weighted + self._no_modes
-            factor, amounts, _ = dposv(normal, weighted.T @ (root * residual).reshape(-1), lower=1)
+            factor, amounts, _ = _solve_positive(
+                normal, weighted.T @ (root * residual).reshape(-1), lower=1
+            )
             left = residual - self._modes @ amounts
         loss, soften = losses[-1](np.square(left).sum(0))
         cost = float(loss @ target.seen + 0.5 * amounts @ amounts)

@@ -9,12 +9,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
-from scipy.linalg import LinAlgError
-from scipy.linalg.lapack import dposv  # pyright: ignore[reportAttributeAccessIssue]
+from scipy.linalg import LinAlgError, get_lapack_funcs
 
 Vector = Float[np.ndarray, "P"]
 Matrix = Float[np.ndarray, "P P"]
 _BOX_STEPS = 50
+# LAPACK itself: scipy's wrappers take longer than these matrices do.
+(_solve_positive,) = get_lapack_funcs(("posv",), dtype=np.float64)
 
 
 @dataclass(frozen=True)
@@ -51,7 +52,7 @@ def minimize_box_quadratic(
         if free.size == 0 or np.abs(slope[free]).max() <= 1e-10 * (1 + np.abs(gradient).max()):
             break
         direction = np.zeros_like(step)
-        _, solved, failed = dposv(hessian[np.ix_(free, free)], slope[free])
+        _, solved, failed = _solve_positive(hessian[np.ix_(free, free)], slope[free])
         if failed:
             raise LinAlgError("the matrix is not positive definite")
         direction[free] = -solved
