@@ -12,10 +12,23 @@ from rgbavatar_ns.data.native.writer import make_room
 from rgbavatar_ns.data.png import png_size
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.files import DiskError, Stages, atomic_write, disk_errors, read_json, write_json
+from rgbavatar_ns.reading import DamagedFileError
 
 WORK_FOLDER = ".tracking"
 GO_ON = "Free some space and give the same command again: it goes on from here."
 _SETTINGS, _IMAGES = "run.json", "images.jsonl"
+
+
+@contextmanager
+def stage_damage_told(path: Path, what: str) -> Iterator[None]:
+    """Reading a stage's file in here, damage becomes a UserError: it holds no `what`."""
+    try:
+        yield
+    except (DamagedFileError, KeyError, TypeError, ValueError, IndexError) as error:
+        raise UserError(
+            f"{path} holds no {what}: {error}.",
+            "Remove the folder's unfinished tracking, or track with --overwrite.",
+        ) from None
 
 
 class ResumableRun:

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
+from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.tracking.image.background import (
     Background,
     find_background,
@@ -113,6 +114,23 @@ def test_what_is_kept_comes_back(tmp_path: Path) -> None:
         if again.plate is not None and found.plate is not None:
             np.testing.assert_array_equal(again.plate.color, found.plate.color)
             np.testing.assert_array_equal(again.plate.known, found.plate.known)
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [{"kind": "new"}, {"seen": np.zeros((3, 3), np.uint8)}, {"motion": np.zeros(4)}],
+)
+def test_a_damaged_or_foreign_background_is_told(tmp_path: Path, changed: dict) -> None:
+    path = tmp_path / "background.npz"
+    find_background(_film(_room()), INSIDE).save(path, "")
+    with np.load(path) as held:
+        arrays = dict(held)
+    path.write_bytes(path.read_bytes()[:-40])
+    with pytest.raises(UserError, match="no background that was found"):
+        Background.load(path)
+    np.savez(path, **(arrays | changed))
+    with pytest.raises(UserError, match=r"no background.*--overwrite"):
+        Background.load(path)
 
 
 def test_samples_are_spread_and_their_memory_is_bounded() -> None:

@@ -1,6 +1,7 @@
 """The body under the head: followed by its clothes, never turned by the head."""
 
 from collections.abc import Callable
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -9,6 +10,7 @@ import torch
 from jaxtyping import Float, UInt8
 from scipy.spatial.transform import Rotation
 
+from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import EMBEDDED_BUST, HeadModel
 from rgbavatar_ns.head.landmarks import facemesh_landmarks
 from rgbavatar_ns.head.rotations import axis_angle_to_matrix
@@ -19,10 +21,11 @@ from rgbavatar_ns.tracking.fit.landmark_head import LandmarkHead
 from rgbavatar_ns.tracking.torso.body_mesh import NECK, BodyMesh
 from rgbavatar_ns.tracking.torso.compose import on_body
 from rgbavatar_ns.tracking.torso.features import FollowedPoints
+from rgbavatar_ns.tracking.torso.find_body import _load, _packed
 from rgbavatar_ns.tracking.torso.follow import BodyFollower, BodySighting
 from rgbavatar_ns.tracking.torso.place import BodyPlaces, SeenShoulders, place_body
 from rgbavatar_ns.tracking.torso.rigid_motion import RigidMotion, fit_rigid_motion
-from rgbavatar_ns.tracking.torso.shape import shoulder_line, shoulders_up_cm
+from rgbavatar_ns.tracking.torso.shape import ShoulderLine, shoulder_line, shoulders_up_cm
 
 SIZE, FRAMES = 320, 24
 CAMERA = StillCamera(700.0, (160.0, 160.0), 1.1)
@@ -266,6 +269,29 @@ def test_shoulders_go_to_the_outline_less_cloth_and_doubt(up_cm: float, told_cm:
     lines = [shoulder_line(k, matte.astype(np.float32), neck, CAMERA) for k in range(6)]
     rotation = np.tile(np.eye(3), (6, 1, 1))
     assert shoulders_up_cm(body, CAMERA, lines, rotation) == pytest.approx(told_cm, abs=0.35)
+
+
+def test_what_was_seen_of_a_body_comes_back_and_damage_is_told(tmp_path: Path) -> None:
+    none, drawn = np.zeros((0, 2)), np.random.default_rng(5)
+    chosen, certain = drawn.uniform(0, 99, (9, 2)), np.tile(np.eye(2), (9, 1, 1))
+    seen = [
+        BodySighting(0, none, chosen, certain, np.nan),
+        BodySighting(0, chosen + 1, None, None, 0.5),
+        BodySighting(1, none, none, np.zeros((0, 2, 2)), np.nan),
+    ]
+    shoulders = [SeenShoulders(1, drawn.uniform(0, 99, (2, 2)), 0.1)]
+    lines = [ShoulderLine(0, np.array([1.0, np.nan, 2.0]))]
+    path = tmp_path / "body.npz"
+    np.savez(path, **_packed(seen, shoulders, lines))
+    sightings, marks, heights = _load(path)
+    assert [one.run for one in sightings] == [0, 0, 1]
+    assert [one.chosen_px is None for one in sightings] == [False, True, False]
+    np.testing.assert_array_equal(sightings[1].seen_px, seen[1].seen_px)
+    np.testing.assert_array_equal(marks[0].shoulders_px, shoulders[0].shoulders_px)
+    np.testing.assert_array_equal(heights[0].above_cm, lines[0].above_cm)
+    path.write_bytes(path.read_bytes()[:-60])
+    with pytest.raises(UserError, match=r"no body that was seen.*--overwrite"):
+        _load(path)
 
 
 def test_hair_beside_the_neck_or_a_picture_without_shoulders_raises_nothing() -> None:

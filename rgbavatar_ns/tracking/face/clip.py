@@ -12,6 +12,7 @@ from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.reading import DamagedFileError, load_arrays
 from rgbavatar_ns.tracking.face.detector import face_height_px
 from rgbavatar_ns.tracking.face.follow import FaceFollower
+from rgbavatar_ns.tracking.resumable_run import stage_damage_told
 
 # In one frame's time a face moves and grows by less than this; more is a cut or a jump.
 _JUMP_SHARE, _JUMP_SIZE = 0.4, 1.3
@@ -51,7 +52,7 @@ class SeenFaces:
     @classmethod
     def load(cls, path: Path) -> "SeenFaces":
         """What `np.savez(path, **vars(faces))` wrote; UserError where it holds anything else."""
-        try:
+        with stage_damage_told(path, "faces that were found"):
             arrays = load_arrays(path, _MOST_BYTES)
             faces = cls(*(arrays[item.name] for item in fields(cls)))
             rows = [getattr(faces, name).shape for name in _PER_FRAME]
@@ -62,11 +63,6 @@ class SeenFaces:
             if faces.count.sum() != len(faces.points):
                 raise DamagedFileError("it counts other faces than it holds")
             return faces
-        except (DamagedFileError, KeyError, TypeError) as error:
-            raise UserError(
-                f"{path} holds no faces that were found: {error}.",
-                "Remove the folder's unfinished tracking, or track with --overwrite.",
-            ) from None
 
 
 @dataclass(frozen=True)

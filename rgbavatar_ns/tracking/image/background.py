@@ -3,14 +3,17 @@
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from rgbavatar_ns.files import atomic_write
+from rgbavatar_ns.reading import DamagedFileError, load_arrays
+from rgbavatar_ns.tracking.resumable_run import stage_damage_told
 
+_MOST_BYTES = 1 << 32
 SAMPLES = 40
 """Frames that are looked at, spread over the clip: each pixel's median needs no more."""
 # Of a very large image fewer are held at once.
@@ -74,6 +77,7 @@ class Background:
         known = None if self.plate is None else float(self.plate.known.mean())
         return {
             "background": self.kind,
+            "camera_is_still": self.camera_is_still,
             "background_motion_px": self.motion_px,
             "background_light_levels": self.light_levels,
             "background_known_share": known,
@@ -90,18 +94,18 @@ class Background:
 
     @classmethod
     def load(cls, path: Path) -> "Background":
-        """What `save` wrote."""
-        with np.load(path) as held:
-            plate = None
+        """What `save` wrote; UserError where the file holds anything else."""
+        with stage_damage_told(path, "background that was found"):
+            held, plate = load_arrays(path, _MOST_BYTES), None
+            kind, motion = held["kind"].item(), float(held["motion"])
+            if kind not in get_args(BackgroundKind):
+                raise DamagedFileError("its kind of background is none")
             if "color" in held:
-                plate = CleanPlate(held["color"], held["seen"], held["spread"])
-            motion = float(held["motion"])
-            return cls(
-                held["kind"].item(),
-                None if np.isnan(motion) else motion,
-                float(held["light"]),
-                plate,
-            )
+                color, seen, spread = (held[name] for name in ("color", "seen", "spread"))
+                if not color.shape[:2] == seen.shape == spread.shape:
+                    raise DamagedFileError("its arrays do not fit together")
+                plate = CleanPlate(color, seen, spread)
+            return cls(kind, None if np.isnan(motion) else motion, float(held["light"]), plate)
 
 
 def sampled_positions(count: int, size: int) -> list[int]:

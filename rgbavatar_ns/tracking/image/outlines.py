@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.files import atomic_write
 from rgbavatar_ns.reading import DamagedFileError, load_arrays
 from rgbavatar_ns.tracking.face.clip import ClipLandmarks
@@ -17,7 +16,7 @@ from rgbavatar_ns.tracking.image.crop import SquareCrop, steady_crop
 from rgbavatar_ns.tracking.image.matting import PersonMatte
 from rgbavatar_ns.tracking.input.mattes import UserMattes
 from rgbavatar_ns.tracking.input.video import FrameSource
-from rgbavatar_ns.tracking.resumable_run import GO_ON, ResumableRun
+from rgbavatar_ns.tracking.resumable_run import GO_ON, ResumableRun, stage_damage_told
 
 OUTLINE_PX = 256
 """Side of the crops that outlines are found in: segmentation knows no more."""
@@ -86,15 +85,10 @@ def key_outlines(
 
     made_from = [sorted(place), crop.left, crop.top, crop.side]
     run.stages.run("mattes of key frames", made_from, look)
-    try:
+    with stage_damage_told(path, "mattes of key frames"):
         kept = load_arrays(path, _MOST_BYTES)["matte"]
         if kept.shape != (len(place), OUTLINE_PX, OUTLINE_PX) or kept.dtype != np.uint8:
             raise DamagedFileError("its arrays do not fit together")
-    except (DamagedFileError, KeyError) as error:
-        raise UserError(
-            f"{path} holds no mattes of key frames: {error}.",
-            "Remove the folder's unfinished tracking, or track with --overwrite.",
-        ) from None
     return [
         person_outline(matte, crop, found.points_px[place[index]])
         for index, matte in zip(sorted(place), kept)

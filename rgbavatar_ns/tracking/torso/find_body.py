@@ -9,14 +9,13 @@ from pathlib import Path
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.files import atomic_write, digest
-from rgbavatar_ns.reading import DamagedFileError, load_arrays
+from rgbavatar_ns.reading import load_arrays
 from rgbavatar_ns.tracking.face.clip import ClipLandmarks
 from rgbavatar_ns.tracking.fit.fit import ClipFit
 from rgbavatar_ns.tracking.fit.subject import SubjectTracker
 from rgbavatar_ns.tracking.input.video import FrameSource
-from rgbavatar_ns.tracking.resumable_run import GO_ON, ResumableRun
+from rgbavatar_ns.tracking.resumable_run import GO_ON, ResumableRun, stage_damage_told
 from rgbavatar_ns.tracking.threads import in_background
 from rgbavatar_ns.tracking.torso.body_mesh import NECK, BodyMesh
 from rgbavatar_ns.tracking.torso.follow import BodyFollower, BodySighting, MatteOf
@@ -149,13 +148,8 @@ def _packed(
 
 def _load(path: Path) -> _Seen:
     """What `_packed` made; UserError where the file holds anything else."""
-    try:
+    with stage_damage_told(path, "body that was seen"):
         return _unpacked(load_arrays(path, _MOST_BYTES))
-    except (DamagedFileError, KeyError, TypeError, ValueError, IndexError) as error:
-        raise UserError(
-            f"{path} holds no body that was seen: {error}.",
-            "Remove the folder's unfinished tracking, or track with --overwrite.",
-        ) from None
 
 
 def _unpacked(arrays: Mapping[str, np.ndarray]) -> _Seen:
