@@ -127,13 +127,13 @@ def test_a_lamp_that_flickers_does_not_matter() -> None:
 def test_the_cost_is_bounded_by_the_band(monkeypatch: pytest.MonkeyPatch) -> None:
     """What is asked of colours grows with the outline's length and not with the person's area."""
     asked: list[int] = []
-    real = unsure_band._mixture
+    real = unsure_band.mixed_alpha
 
     def counted(*given: Any) -> np.ndarray:
-        asked.append(len(given[-2]))
+        asked.append(len(given[-1]))
         return real(*given)
 
-    monkeypatch.setattr(unsure_band, "_mixture", counted)
+    monkeypatch.setattr(unsure_band, "mixed_alpha", counted)
     for radius in (60, 180):
         alpha = np.zeros((480, 480), np.float32)
         cv2.circle(alpha, (240, 240), radius, 1.0, -1)

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from rgbavatar_ns.files import atomic_write
 from rgbavatar_ns.reading import DamagedFileError, load_arrays
+from rgbavatar_ns.tracking.image.sharpness import edge_width_px
 from rgbavatar_ns.tracking.resumable_run import stage_damage_told
 
 _MOST_BYTES = 1 << 32
@@ -64,6 +65,8 @@ class Background:
     light_levels: float
     """How far frames are brighter or darker than the clip's median, of 255 (percentile 90)."""
     plate: CleanPlate | None
+    edge_px: float | None = None
+    """How wide the film's sharp edges are (`sharpness.py`, the median frame); None without any."""
 
     @property
     def camera_is_still(self) -> bool | None:
@@ -81,6 +84,7 @@ class Background:
             "background_motion_px": self.motion_px,
             "background_light_levels": self.light_levels,
             "background_known_share": known,
+            "film_edge_px": self.edge_px,
         }
 
     def save(self, path: Path, remedy: str) -> None:
@@ -88,16 +92,24 @@ class Background:
         plate = {}
         if self.plate is not None:
             plate = {name: getattr(self.plate, name) for name in ("color", "seen", "spread")}
-        motion = np.nan if self.motion_px is None else self.motion_px
+        motion, edge = (
+            np.nan if value is None else value for value in (self.motion_px, self.edge_px)
+        )
         with atomic_write(path, remedy=remedy) as partial, partial.open("wb") as file:
-            np.savez(file, kind=self.kind, motion=motion, light=self.light_levels, **plate)
+            np.savez(
+                file, kind=self.kind, motion=motion, edge=edge, light=self.light_levels, **plate
+            )
 
     @classmethod
     def load(cls, path: Path) -> "Background":
         """What `save` wrote; UserError where the file holds anything else."""
         with stage_damage_told(path, "background that was found"):
             held, plate = load_arrays(path, _MOST_BYTES), None
-            kind, motion = held["kind"].item(), float(held["motion"])
+            kind = held["kind"].item()
+            motion, edge = (
+                None if np.isnan(value) else value
+                for value in (float(held["motion"]), float(held["edge"]))
+            )
             if kind not in get_args(BackgroundKind):
                 raise DamagedFileError("its kind of background is none")
             if "color" in held:
@@ -105,7 +117,7 @@ class Background:
                 if not color.shape[:2] == seen.shape == spread.shape:
                     raise DamagedFileError("its arrays do not fit together")
                 plate = CleanPlate(color, seen, spread)
-            return cls(kind, None if np.isnan(motion) else motion, float(held["light"]), plate)
+            return cls(kind, motion, float(held["light"]), plate, edge)
 
 
 def sampled_positions(count: int, size: int) -> list[int]:
@@ -124,12 +136,15 @@ def find_background(
     matte's errors leave alone as long as most of these frames are right. `inside` is where the
     images show what was filmed.
     """
-    images, free = [], []
+    images, free, edges = [], [], []
     for image, matte in samples:
         images.append(image)
+        edges.append(edge_width_px(image, matte))
         free.append((matte <= _UNCOVERED) & inside)
+    told = [edge for edge in edges if edge is not None]
+    edge_px = float(np.median(told)) if told else None
     if len(images) < _FEWEST:
-        return Background("too short", None, 0.0, None)
+        return Background("too short", None, 0.0, None, edge_px)
     color, spread, count = _medians(images, free)
     often = count >= _SEEN
     light = _light_changes(images, free, color, often)
@@ -142,9 +157,9 @@ def find_background(
     elif motion is not None and motion > _STILL_PX:
         kind = "moves"
     if kind != "still":
-        return Background(kind, motion, light, None)
+        return Background(kind, motion, light, None, edge_px)
     seen = np.where(spread < _AGREE_LEVELS, count, 0).astype(np.uint8)
-    return Background(kind, motion, light, CleanPlate(color, seen, spread))
+    return Background(kind, motion, light, CleanPlate(color, seen, spread), edge_px)
 
 
 def _medians(

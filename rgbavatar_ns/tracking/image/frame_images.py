@@ -33,10 +33,20 @@ from rgbavatar_ns.tracking.threads import in_background, map_in_order
 _AHEAD, _WORKERS = 2, 2
 # A fast level: the files grow by a few hundredths and take a third of the time.
 _PNG_LEVEL = 1
-# No edge is sharper than the film's own pixels: an avatar would learn how it flickers (2.3 dB of
-# the held-out frames of the two real clips). One standard deviation, in pixels of the film, and
-# its bounds in pixels of the image.
-_SOFTNESS, _SOFTEST_PX = 1.0, (0.4, 1.0)
+# No edge is sharper than the film's own: an avatar would learn how it flickers. A found matte's
+# edges are so wide by themselves, and so are those that a renderer draws; by what the film's are
+# wider they are softened, and a quarter more: held-out frames of the two real clips lose 2.3 dB
+# without, .4 to .5 for each .2 pixels less. In pixels of the image.
+_MATTE_EDGE_PX, _MORE, _SOFTEST_PX = 0.65, 1.25, 1.0
+# Where no edge tells, as wide as a webcam's.
+_UNKNOWN_EDGE_PX = 1.0
+
+
+def _softness_px(background: Background | None) -> float:
+    """By how wide a Gaussian a found matte is softened; 0 where the film is as sharp as it is."""
+    edge_px = None if background is None else background.edge_px
+    wider = max((edge_px or _UNKNOWN_EDGE_PX) ** 2 - _MATTE_EDGE_PX**2, 0)
+    return min(_MORE * float(np.sqrt(wider)), _SOFTEST_PX)
 
 
 @dataclass(frozen=True)
@@ -91,7 +101,6 @@ class FrameImages:
         self._mattes, self._source_alpha = mattes, source_alpha
         self._cut_out = CutOut(tracker.head.arrays)
         self._inside = crop.inside(found.width, found.height)
-        self._softness_px = float(np.clip(_SOFTNESS * crop.scale, *_SOFTEST_PX))
         self._follows = found.follows()
 
     @property
@@ -137,7 +146,11 @@ class FrameImages:
             closed.enter_context(closing(segmented))
             windows = self._windows(segmented, frozenset(wanted))
             plate = None if background is None else background.plate
-            finish = partial(self._finish, None if plate is None else RoomColors.of_plate(plate))
+            finish = partial(
+                self._finish,
+                None if plate is None else RoomColors.of_plate(plate),
+                _softness_px(background),
+            )
             yield from closed.enter_context(closing(map_in_order(finish, windows, _WORKERS)))
 
     def _window(self, position: int) -> range:
@@ -212,13 +225,15 @@ class FrameImages:
             while held and held[0].position < needed:
                 held.popleft()
 
-    def _finish(self, plate: RoomColors | None, window: _Window) -> FrameImage:
+    def _finish(self, plate: RoomColors | None, softness_px: float, window: _Window) -> FrameImage:
         crop, around = window
         if crop.alpha is not None:
             matted = MattedCrop.of(crop.image_rgb, crop.alpha, self._inside, crop.color_is_clean)
         else:
             found = band_matte(crop.image_rgb, self._steadied(crop, around), plate)
-            alpha = cv2.GaussianBlur(found.alpha, (0, 0), self._softness_px)
+            alpha = found.alpha
+            if softness_px > 0:
+                alpha = cv2.GaussianBlur(alpha, (0, 0), softness_px)
             matted = MattedCrop.of(crop.image_rgb, alpha, self._inside, background=found.background)
         outline = self._cut_out.outline(
             self._crop,

@@ -6,7 +6,6 @@ plate knows or the surroundings suggest. How far a mixture tells more than the s
 from how different both colours are, and how much each of them varies.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -15,6 +14,13 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from rgbavatar_ns.tracking.image.background import CleanPlate
 from rgbavatar_ns.tracking.image.matting import refined_matte
+from rgbavatar_ns.tracking.image.mixture import (
+    OF_SIDE_PX,
+    PERSON_PX,
+    Guess,
+    mixed_alpha,
+    spread_colors,
+)
 
 _Image = UInt8[np.ndarray, "S S 3"]
 _Colors = Float[np.ndarray, "S S 3"]
@@ -22,19 +28,16 @@ _Values = Float[np.ndarray, "S S"]
 _Mask = Bool[np.ndarray, "S S"]
 
 # The numbers below were chosen on procedural people (`benchmarks/quality/mattes.py`, seeds 1 and
-# 2, all rooms). Lengths are pixels of an image of this side, and grow with it.
-_OF_SIDE_PX = 480
+# 2, all rooms). Lengths are pixels of an image of `OF_SIDE_PX`, and grow with it.
 # From the segmentation's outline: inside of the first everything is the person; the second is how
 # far hair that stands off is looked for, if a plate tells it from the room.
 _CORE_PX, _REACH_PX = 3.0, 45.0
 # Without a plate nothing is looked for farther outside; beyond it the frame shows the background.
 _NEAR_PX = 8.0
-# Within how many pixels, and more, a colour's mean is taken: of the person, of the background.
-_PERSON_PX, _ROOM_PX = (2, 5, 12, 40), (2, 6, 20, 60)
+# Within how many pixels, and more, the background's mean colour is taken.
+_ROOM_PX = (2, 6, 20, 60)
 # Changes of light are smooth: every fourth pixel of every fourth row tells them.
 _LIGHT_PX, _LIGHT_LEVELS, _LIGHT_EVERY = (10, 40), 12.0, 4
-# Each wider mean only counts where the narrower one knows next to nothing.
-_WIDER = 1e-3
 # Noise of a webcam after its compression, and what a guessed background's texture adds to it: at
 # the border of what is known, and at most, some pixels away from it.
 _NOISE_LEVELS, _GUESS_LEVELS, _TEXTURE = 2.0, 2.0, 0.1
@@ -51,14 +54,12 @@ _ASIDE, _WHOLE = 0.1, 0.7
 # so many levels and so many times the noise, and less than such a share of the person's is there.
 _DEEP_PX, _HUE_LEVELS, _HUE_SIGMAS, _PURE = 10.0, 45.0, 8.0, 0.85
 # How sure the segmentation is of alpha: at its outline, and away from it on either side.
-_UNSURE, _SURE = 0.5, 0.08
+_UNSURE, _SURE = 0.8, 0.15
 _UNSURE_BESIDE = 0.15
 """The same where a plate is known elsewhere, but not here."""
 _INWARD_PX, _OUTWARD_PX = 4.0, 8.0
-# The share of the person's own variance near by that makes a mixture unsure.
-_PERSON_SPREAD = 1.0
-# The segmentation hovers off 0 and 1, and mixtures a little; an avatar would learn that as haze.
-_HAZE, _LEFT = 0.15, 0.03
+# The segmentation hovers off 0 and 1; an avatar would learn that as haze.
+_HAZE = 0.15
 # What is enclosed by the person and smaller is a fault of the segmentation, unless the plate shows
 # through; shares of the image.
 _HOLE_SHARE = 0.003
@@ -84,7 +85,7 @@ class RoomColors:
         mean = cv2.blur(found, box)
         texture = np.maximum(cv2.blur(found * found, box) - mean * mean, 0).mean(-1)
         away = cv2.distanceTransform(1 - known.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
-        away *= _OF_SIDE_PX / len(color)
+        away *= OF_SIDE_PX / len(color)
         guess = texture * (_TEXTURE * np.clip(away / _GUESS_PX, _GUESS_FROM, _GUESS_TO))
         guess = np.where(known, np.float32(spread) ** 2, guess + _GUESS_LEVELS**2)
         return cls(found, (guess + _NOISE_LEVELS**2).astype(np.float32), known)
@@ -101,32 +102,6 @@ class BandMatte:
 
     alpha: _Values
     background: _Colors
-
-
-def spread_colors(
-    values: Float[np.ndarray, "S S *channels"],
-    weight: _Values,
-    radii_px: Sequence[int],
-    coarser: int,
-) -> Float[np.ndarray, "S S *channels"]:
-    """Weighted means within the narrowest radius that holds any weight, of each pixel.
-
-    Radii are pixels of an image of 480; the means are taken at an image so many times `coarser`.
-    """
-    size = len(weight)
-    few, scale = max(1, size // coarser), size / coarser / _OF_SIDE_PX
-    weighted = values * weight.reshape(size, size, *[1] * (values.ndim - 2))
-    parts = [
-        cv2.resize(part, (few, few), interpolation=cv2.INTER_AREA) for part in (weighted, weight)
-    ]
-    totals, share = [np.zeros_like(part) for part in parts], np.float32(1)
-    for radius_px in radii_px:
-        box = (2 * max(1, round(radius_px * scale)) + 1,) * 2
-        for total, part in zip(totals, parts):
-            total += share * cv2.blur(part, box)
-        share *= np.float32(_WIDER)
-    held = (totals[1] + np.float32(1e-12)).reshape(few, few, *[1] * (values.ndim - 2))
-    return cv2.resize(totals[0] / held, (size, size))
 
 
 def band_matte(image_rgb: _Image, coarse: _Values, plate: RoomColors | None = None) -> BandMatte:
@@ -147,7 +122,7 @@ def band_matte(image_rgb: _Image, coarse: _Values, plate: RoomColors | None = No
     apart = image - room.color
     differs = _squares(apart) / (3 * room.variance)
     deep = (inward > _DEEP_PX).astype(np.float32)
-    towards = spread_colors(image, deep, _PERSON_PX, 8) - room.color
+    towards = spread_colors(image, deep, PERSON_PX, 8) - room.color
     # A guessed room has hues of its own: a white stripe on a blue shirt would pass for it.
     tinted = _tinted(apart, towards, room, inward) & room.known & (plate is not None)
     core = (inward > _CORE_PX) & ~tinted
@@ -166,10 +141,11 @@ def band_matte(image_rgb: _Image, coarse: _Values, plate: RoomColors | None = No
         # mixture: there the image's own edges say where the outline goes.
         prior = np.where(room.known, prior, refined_matte(image_rgb, coarse))
     # Where the hue tells, the segmentation is not asked more than at its outline.
-    depth = np.where(tinted, 0, inward)
-    guess = _UNSURE if plate is None else _UNSURE_BESIDE
-    mixed = _mixture(image, apart, room, person, prior, depth, open_px, guess)
-    alpha.reshape(-1)[open_px] = np.clip((mixed - _LEFT) / (1 - 2 * _LEFT), 0, 1)
+    depth = np.where(tinted, 0, inward).reshape(-1)[open_px]
+    guess = Guess(prior.reshape(-1)[open_px], _precision(room, depth, open_px, plate is not None))
+    alpha.reshape(-1)[open_px] = mixed_alpha(
+        image, room.color, room.variance, person, guess, open_px
+    )
     return BandMatte(_in_one_piece(alpha, inward > 0), room.color)
 
 
@@ -218,39 +194,15 @@ def _revealed(differs: _Values, room: RoomColors, inward: _Values) -> _Mask:
     return whole & hangs[labels]
 
 
-def _mixture(
-    image: _Colors,
-    apart: _Colors,
-    room: RoomColors,
-    person: _Values,
-    prior: _Values,
-    inward: _Values,
-    open_px: Int[np.ndarray, "N"],
-    unsure_of_guess: float,
+def _precision(
+    room: RoomColors, depth: Float[np.ndarray, "N"], open_px: Int[np.ndarray, "N"], has_plate: bool
 ) -> Float[np.ndarray, "N"]:
-    """Alpha that explains the open pixels' colours by the person's near by and the room's."""
-    color = spread_colors(image, person, _PERSON_PX, 2)
-    # How far the person's own colours differ towards the room's: hair that shines is no mixture
-    # with a coloured wall. About the mean at each place, since a wide window's own mean would make
-    # far strands unsure.
-    towards = color - room.color
-    length = _squares(towards) + np.float32(1e-3)
-    varies = _dot(image - color, towards) ** 2 / length
-    varies = spread_colors(varies, person, _PERSON_PX, 2).reshape(-1)[open_px]
-    off, depth = apart.reshape(-1, 3)[open_px], inward.reshape(-1)[open_px]
-    variance = room.variance.reshape(-1)[open_px]
-    across, length = towards.reshape(-1, 3)[open_px], length.reshape(-1)[open_px]
-    share = (off * across).sum(1) / length
-    away = np.where(depth > 0, depth / _INWARD_PX, -depth / _OUTWARD_PX)
-    unsure = np.where(room.known.reshape(-1)[open_px], _UNSURE, unsure_of_guess)
-    trusted = (unsure * (_SURE / unsure) ** np.clip(away, 0, 1)) ** -2
-    before = prior.reshape(-1)[open_px]
-    alpha = before
-    # The person's variance counts as far as the person is seen, which is to be found.
-    for _ in range(2):
-        precision = length / (variance + _PERSON_SPREAD * alpha * alpha * varies)
-        alpha = np.clip((precision * share + trusted * before) / (precision + trusted), 0, 1)
-    return alpha
+    """How much the segmentation counts at the open pixels: one over its variance."""
+    unsure = np.float32(_UNSURE)
+    if has_plate:
+        unsure = np.where(room.known.reshape(-1)[open_px], unsure, np.float32(_UNSURE_BESIDE))
+    away = np.clip(np.where(depth > 0, depth / _INWARD_PX, -depth / _OUTWARD_PX), 0, 1)
+    return (unsure * (_SURE / unsure) ** away) ** -2
 
 
 def _lit_as(image: _Colors, plate: RoomColors, outside: _Mask) -> RoomColors:
@@ -302,13 +254,9 @@ def _inward(coarse: _Values) -> _Values:
     inside, outside = (
         cv2.distanceTransform(one, cv2.DIST_L2, cv2.DIST_MASK_5) for one in (person, 1 - person)
     )
-    return (inside - outside) * np.float32(_OF_SIDE_PX / len(coarse))
-
-
-def _dot(first: _Colors, second: _Colors) -> _Values:
-    """Scalar product over the channels."""
-    return cv2.transform(cv2.multiply(first, second), np.ones((1, 3), np.float32))
+    return (inside - outside) * np.float32(OF_SIDE_PX / len(coarse))
 
 
 def _squares(colors: _Colors) -> _Values:
-    return _dot(colors, colors)
+    """Squared length over the channels."""
+    return cv2.transform(cv2.multiply(colors, colors), np.ones((1, 3), np.float32))

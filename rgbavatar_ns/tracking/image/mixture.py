@@ -1,0 +1,147 @@
+"""What share of the person explains a pixel's colour, beside what the segmentation says of it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Int
+
+_Colors = Float[np.ndarray, "S S 3"]
+_Values = Float[np.ndarray, "S S"]
+_Open = Float[np.ndarray, "N"]
+
+# Chosen with the numbers of `unsure_band.py`, as they were. Lengths are pixels of an image of this
+# side, and grow with it.
+OF_SIDE_PX = 480
+# Within how many pixels, and more, a colour's mean is taken: of the person, and of its darker part.
+PERSON_PX, _DARKER_PX = (2, 5, 12, 40), (12, 40)
+# Each wider mean only counts where the narrower one knows next to nothing.
+_WIDER = 1e-3
+# A pixel's channels err together: three say little more than one.
+_CHANNELS_TELL = 0.5
+# The darker part has to explain a colour better by so much (minus twice a log likelihood).
+_DARKER_IS_RARE = 1.0
+# Of 0, 1 and what lies between, the first two are the likelier the less a mixture tells: off .5 by
+# so many more standard deviations' share. It is what makes the mean error least.
+_DECIDED = 2.0
+
+
+def spread_colors(
+    values: Float[np.ndarray, "S S *channels"],
+    weight: _Values,
+    radii_px: Sequence[int],
+    coarser: int,
+) -> Float[np.ndarray, "S S *channels"]:
+    """Weighted means within the narrowest radius that holds any weight, of each pixel.
+
+    Radii are pixels of an image of 480; the means are taken at an image so many times `coarser`.
+    """
+    size = len(weight)
+    few, scale = max(1, size // coarser), size / coarser / OF_SIDE_PX
+    weighted = values * weight.reshape(size, size, *[1] * (values.ndim - 2))
+    parts = [
+        cv2.resize(part, (few, few), interpolation=cv2.INTER_AREA) for part in (weighted, weight)
+    ]
+    totals, share = [np.zeros_like(part) for part in parts], np.float32(1)
+    for radius_px in radii_px:
+        box = (2 * max(1, round(radius_px * scale)) + 1,) * 2
+        for total, part in zip(totals, parts):
+            total += share * cv2.blur(part, box)
+        share *= np.float32(_WIDER)
+    held = (totals[1] + np.float32(1e-12)).reshape(few, few, *[1] * (values.ndim - 2))
+    return cv2.resize(totals[0] / held, (size, size))
+
+
+@dataclass(frozen=True)
+class Guess:
+    """What is known of alpha at the open pixels before their colours are asked."""
+
+    alpha: _Open
+    precision: _Open
+    """One over its variance."""
+
+
+def mixed_alpha(
+    image: _Colors,
+    room: _Colors,
+    room_variance: _Values,
+    person: _Values,
+    guess: Guess,
+    open_px: Int[np.ndarray, "N"],
+) -> _Open:
+    """Alpha of the open pixels (flat indices), given where the `person` is for sure.
+
+    A colour is explained with the person's near by, and with its darker part's farther around:
+    hair that stands off before an ear has not the ear's colour. Both count as likely as they make
+    what is seen. Ours: Bayesian matting (Chuang 2001) of two clusters.
+    """
+    light = cv2.transform(image, np.full((1, 3), 1 / 3, np.float32))
+    darker = person * (light < spread_colors(light, person, _DARKER_PX, 4))
+    near, dark = (
+        _explained(image, room, room_variance, weight, radii_px, guess, open_px)
+        for weight, radii_px in ((person, PERSON_PX), (darker, _DARKER_PX))
+    )
+    odds = 0.5 * (near.unlikely - dark.unlikely - _DARKER_IS_RARE)
+    share = 1 / (1 + np.exp(-np.clip(odds, -30, 30)))
+    alpha, precision = (
+        a + share * (b - a) for a, b in ((near.alpha, dark.alpha), (near.precision, dark.precision))
+    )
+    decided = 1 + _DECIDED / np.sqrt(precision + guess.precision)
+    return np.clip(0.5 + (alpha - 0.5) * decided, 0, 1)
+
+
+@dataclass(frozen=True)
+class _Explanation:
+    alpha: _Open
+    precision: _Open
+    unlikely: _Open
+    """Minus twice the log likelihood of the colours, but for what all explanations share."""
+
+
+def _explained(
+    image: _Colors,
+    room: _Colors,
+    room_variance: _Values,
+    person: _Values,
+    radii_px: Sequence[int],
+    guess: Guess,
+    open_px: Int[np.ndarray, "N"],
+) -> _Explanation:
+    """The open pixels as mixtures of the mean colour of these pixels of the person and the room."""
+    color = spread_colors(image, person, radii_px, 2)
+    # How far the person's own colours differ towards the room's: hair that shines is no mixture
+    # with a coloured wall. About the mean at each place, since a wide window's own mean would make
+    # far strands unsure.
+    towards, own = color - room, image - color
+    length = _squares(towards) + np.float32(1e-3)
+    varies = _dot(own, towards) ** 2 / length
+    beside = np.maximum(_squares(own) - varies, 0)
+    varies, beside = (
+        spread_colors(part, person, radii_px, 2).reshape(-1)[open_px] for part in (varies, beside)
+    )
+    off, across = ((part.reshape(-1, 3)[open_px]) for part in (image - room, towards))
+    variance = room_variance.reshape(-1)[open_px] / np.float32(_CHANNELS_TELL)
+    length = length.reshape(-1)[open_px]
+    share = (off * across).sum(1) / length
+    alpha, precision = guess.alpha, guess.precision
+    # The person's variance counts as far as the person is seen, which is to be found.
+    for _ in range(2):
+        precision = length / (variance + alpha * alpha * varies)
+        total = precision + guess.precision
+        alpha = np.clip((precision * share + guess.precision * guess.alpha) / total, 0, 1)
+    aside = np.maximum((off * off).sum(1) - share * share * length, 0)
+    surprise = (share - guess.alpha) ** 2 * precision * guess.precision
+    unlikely = surprise / (precision + guess.precision) + aside / (
+        variance + alpha * alpha * beside / 2
+    )
+    return _Explanation(alpha, precision, unlikely)
+
+
+def _dot(first: _Colors, second: _Colors) -> _Values:
+    """Scalar product over the channels."""
+    return cv2.transform(cv2.multiply(first, second), np.ones((1, 3), np.float32))
+
+
+def _squares(colors: _Colors) -> _Values:
+    return _dot(colors, colors)
