@@ -1,7 +1,7 @@
 """What share of the person explains a pixel's colour, beside what the segmentation says of it."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -18,6 +18,8 @@ OF_SIDE_PX = 480
 PERSON_PX, _DARKER_PX = (2, 5, 12, 40), (12, 40)
 # Each wider mean only counts where the narrower one knows next to nothing.
 _WIDER = 1e-3
+# Of every so many pixels and rows one is asked for them.
+_EVERY = 2
 # A pixel's channels err together: three say little more than one.
 _CHANNELS_TELL = 0.5
 # The darker part has to explain a colour better by so much (minus twice a log likelihood).
@@ -76,12 +78,18 @@ def mixed_alpha(
     hair that stands off before an ear has not the ear's colour. Both count as likely as they make
     what is seen. Ours: Bayesian matting (Chuang 2001) of two clusters.
     """
-    light = cv2.transform(image, np.full((1, 3), 1 / 3, np.float32))
-    darker = person * (light < spread_colors(light, person, _DARKER_PX, 4))
-    near, dark = (
-        _explained(image, room, room_variance, weight, radii_px, guess, open_px)
-        for weight, radii_px in ((person, PERSON_PX), (darker, _DARKER_PX))
+    few = _Sampled.of(image, room, person)
+    light = cv2.transform(few.image, np.full((1, 3), 1 / 3, np.float32))
+    mean = spread_colors(light, person[::_EVERY, ::_EVERY], _DARKER_PX, 2)
+    pixels = _OpenPixels(
+        image.reshape(-1, 3)[open_px],
+        room.reshape(-1, 3)[open_px],
+        room_variance.reshape(-1)[open_px] / np.float32(_CHANNELS_TELL),
+        guess,
+        np.divmod(open_px, len(person)),
     )
+    near = _explained(pixels, few, PERSON_PX)
+    dark = _explained(pixels, replace(few, person=few.person * (light < mean)), _DARKER_PX)
     odds = 0.5 * (near.unlikely - dark.unlikely - _DARKER_IS_RARE)
     share = 1 / (1 + np.exp(-np.clip(odds, -30, 30)))
     alpha, precision = (
@@ -92,6 +100,30 @@ def mixed_alpha(
 
 
 @dataclass(frozen=True)
+class _Sampled:
+    """A part of the pixels: means and variances need no more."""
+
+    image: _Colors
+    room: _Colors
+    person: _Values
+
+    @classmethod
+    def of(cls, *full: np.ndarray) -> "_Sampled":
+        return cls(*(np.ascontiguousarray(part[::_EVERY, ::_EVERY]) for part in full))
+
+
+@dataclass(frozen=True)
+class _OpenPixels:
+    """What is to be explained."""
+
+    color: Float[np.ndarray, "N 3"]
+    room: Float[np.ndarray, "N 3"]
+    variance: _Open
+    guess: Guess
+    row_column: tuple[Int[np.ndarray, "N"], Int[np.ndarray, "N"]]
+
+
+@dataclass(frozen=True)
 class _Explanation:
     alpha: _Open
     precision: _Open
@@ -99,43 +131,31 @@ class _Explanation:
     """Minus twice the log likelihood of the colours, but for what all explanations share."""
 
 
-def _explained(
-    image: _Colors,
-    room: _Colors,
-    room_variance: _Values,
-    person: _Values,
-    radii_px: Sequence[int],
-    guess: Guess,
-    open_px: Int[np.ndarray, "N"],
-) -> _Explanation:
-    """The open pixels as mixtures of the mean colour of these pixels of the person and the room."""
-    color = spread_colors(image, person, radii_px, 2)
+def _explained(pixels: _OpenPixels, few: _Sampled, radii_px: Sequence[int]) -> _Explanation:
+    """The open pixels as mixtures of the mean colour of the person near by and the room."""
+    color = spread_colors(few.image, few.person, radii_px, 1)
     # How far the person's own colours differ towards the room's: hair that shines is no mixture
     # with a coloured wall. About the mean at each place, since a wide window's own mean would make
     # far strands unsure.
-    towards, own = color - room, image - color
-    length = _squares(towards) + np.float32(1e-3)
-    varies = _dot(own, towards) ** 2 / length
-    beside = np.maximum(_squares(own) - varies, 0)
-    varies, beside = (
-        spread_colors(part, person, radii_px, 2).reshape(-1)[open_px] for part in (varies, beside)
-    )
-    off, across = ((part.reshape(-1, 3)[open_px]) for part in (image - room, towards))
-    variance = room_variance.reshape(-1)[open_px] / np.float32(_CHANNELS_TELL)
-    length = length.reshape(-1)[open_px]
+    towards, own = color - few.room, few.image - color
+    along = _dot(own, towards) ** 2 / (_squares(towards) + np.float32(1e-3))
+    varies = cv2.merge([along, np.maximum(_squares(own) - along, 0)])
+    varies = spread_colors(varies, few.person, radii_px, 1)
+    row, column = (place // _EVERY for place in pixels.row_column)
+    varies, beside = varies[row, column].T
+    off, across, guess = pixels.color - pixels.room, color[row, column] - pixels.room, pixels.guess
+    length = (across * across).sum(1) + np.float32(1e-3)
     share = (off * across).sum(1) / length
     alpha, precision = guess.alpha, guess.precision
     # The person's variance counts as far as the person is seen, which is to be found.
     for _ in range(2):
-        precision = length / (variance + alpha * alpha * varies)
+        precision = length / (pixels.variance + alpha * alpha * varies)
         total = precision + guess.precision
         alpha = np.clip((precision * share + guess.precision * guess.alpha) / total, 0, 1)
-    aside = np.maximum((off * off).sum(1) - share * share * length, 0)
     surprise = (share - guess.alpha) ** 2 * precision * guess.precision
-    unlikely = surprise / (precision + guess.precision) + aside / (
-        variance + alpha * alpha * beside / 2
-    )
-    return _Explanation(alpha, precision, unlikely)
+    aside = np.maximum((off * off).sum(1) - share * share * length, 0)
+    aside = aside / (pixels.variance + alpha * alpha * beside / 2)
+    return _Explanation(alpha, precision, surprise / (precision + guess.precision) + aside)
 
 
 def _dot(first: _Colors, second: _Colors) -> _Values:
