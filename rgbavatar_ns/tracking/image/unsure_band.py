@@ -53,6 +53,8 @@ _ASIDE, _WHOLE = 0.1, 0.7
 # Hair may be mixed with the room so far within the outline. It is where the hues of both differ by
 # so many levels and so many times the noise, and less than such a share of the person's is there.
 _DEEP_PX, _HUE_LEVELS, _HUE_SIGMAS, _PURE = 10.0, 45.0, 8.0, 0.85
+# A guessed wall of so little texture and so much colour is as good as known, levels.
+_SMOOTH_LEVELS, _COLORED_LEVELS = 8.0, 60.0
 # How sure the segmentation is of alpha: at its outline, and away from it on either side.
 _UNSURE, _SURE = 0.8, 0.15
 _UNSURE_BESIDE = 0.15
@@ -123,8 +125,12 @@ def band_matte(image_rgb: _Image, coarse: _Values, plate: RoomColors | None = No
     differs = _squares(apart) / (3 * room.variance)
     deep = (inward > _DEEP_PX).astype(np.float32)
     towards = spread_colors(image, deep, PERSON_PX, 8) - room.color
-    # A guessed room has hues of its own: a white stripe on a blue shirt would pass for it.
-    tinted = _tinted(apart, towards, room, inward) & room.known & (plate is not None)
+    # A guessed room has hues of its own: a white stripe on a blue shirt would pass for it. A wall
+    # without texture is known well enough by its surroundings, if it is coloured itself.
+    told = room.known | (room.variance < _SMOOTH_LEVELS**2) & (
+        _hue(room.color) > _COLORED_LEVELS**2
+    )
+    tinted = _tinted(apart, towards, room, inward) & told & (plate is not None)
     core = (inward > _CORE_PX) & ~tinted
     sure = core | (_unmixed(apart, towards, differs, inward) & ~tinted)
     if plate is not None:
@@ -255,6 +261,11 @@ def _inward(coarse: _Values) -> _Values:
         cv2.distanceTransform(one, cv2.DIST_L2, cv2.DIST_MASK_5) for one in (person, 1 - person)
     )
     return (inside - outside) * np.float32(OF_SIDE_PX / len(coarse))
+
+
+def _hue(colors: _Colors) -> _Values:
+    """Squared distance from grey."""
+    return _squares(colors - colors.mean(-1, keepdims=True))
 
 
 def _squares(colors: _Colors) -> _Values:
