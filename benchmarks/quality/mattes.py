@@ -10,8 +10,10 @@ the whole image; its flicker (mean absolute change of the error from frame to fr
 percent); and the error of the colour on a white and on a green background in the band, in levels.
 
 "frame" is a stream's way: plain segmentation and guided filter, each frame by itself. "clip" is
-what `rgbavatar track` writes. Each room is filmed twice: by a camera that stands, and by one that
-trembles by some pixels, where no plate can be of use.
+what `rgbavatar track` writes. "colours" is the band's error of each pixel by itself where the true
+colours of person and room are told, before a camera that stands: what noise and compression leave,
+and what only a guess about neighbours can undercut. Each room is filmed twice: by a camera that
+stands, and by one that trembles by some pixels, where no plate can be of use.
 """
 
 import argparse
@@ -24,7 +26,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, UInt8
+from jaxtyping import Bool, Float, UInt8
 from rooms import ROOMS, FilmedRoom, Performance
 
 from rgbavatar_ns.drawing.compositing import composite_bytes
@@ -88,6 +90,21 @@ def figures(
     return {name: float(value) for name, value in row.items()}
 
 
+def from_true_colors(
+    image: UInt8[np.ndarray, "S S 3"],
+    truth: UInt8[np.ndarray, "S S 4"],
+    room: Float[np.ndarray, "S S 3"],
+) -> UInt8[np.ndarray, "S S 4"]:
+    """The truth with the alpha that the film's own colour gives, pixel by pixel."""
+    seen = (truth[..., 3:] > _UNSURE * 255).astype(np.float32)
+    near = (_AROUND, _AROUND)
+    person = truth[..., :3].astype(np.float32)
+    around = cv2.blur(person * seen, near) / (cv2.blur(seen, near)[..., None] + 1e-6)
+    towards = np.where(seen > 0, person, around) - room
+    share = ((image - room) * towards).sum(-1) / ((towards * towards).sum(-1) + 1e-3)
+    return straight_rgba(truth[..., :3], np.clip(share, 0, 1).astype(np.float32))
+
+
 def measure(film: FilmedRoom, folder: Path, tremble_px: float) -> dict[str, Any]:
     """Film, track and compare one clip."""
     clip, dst = folder / "clip.mp4", folder / "set"
@@ -100,7 +117,8 @@ def measure(film: FilmedRoom, folder: Path, tremble_px: float) -> dict[str, Any]
     frames = [k for k in range(report["frames_read"]) if k not in left_out]
     truth = [cropped(crop, one) for k, one in enumerate(film.truth(tremble_px)) if k in set(frames)]
     found = [dataset.read_image(place) for place in range(len(frames))]
-    plain, inside = [], np.ones((_SIZE, _SIZE), bool)
+    plain, told, inside = [], [], np.ones((_SIZE, _SIZE), bool)
+    room = crop.apply(film.behind().astype(np.float32))
     with closing(PersonMatte()) as matte:
         for frame in FrameSource.open(clip).read(set(frames).__contains__):
             image, inside = crop.apply(frame.image_rgb), crop.inside(frame.width, frame.height)
@@ -108,11 +126,13 @@ def measure(film: FilmedRoom, folder: Path, tremble_px: float) -> dict[str, Any]
             inside = inside & (fade_at_bottom(inside) >= 1)
             level = matte(image)
             plain.append(straight_rgba(foreground_color(image, level), level))
+            told.append(from_true_colors(image, truth[len(told)], room))
     bands = unsure(truth, plain)
     return {
         "background": report["background"],
         "known": report["background_known_share"],
         "pictures_per_second": report["stages"]["pictures"]["frames_per_second"],
+        "colours": figures(told, truth, bands, inside)["band"] if tremble_px == 0 else None,
         "frame": figures(plain, truth, bands, inside),
         "clip": figures(found, truth, bands, inside),
     }
@@ -138,6 +158,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
                 for way in ("frame", "clip"):
                     errors = "  ".join(f"{key} {value:.2f}" for key, value in row[way].items())
                     print(f"{seed} {name} {tremble_px:g} px ({row['background']}) {way}: {errors}")
+                if row["colours"] is not None:
+                    print(f"    true colours: band {row['colours']:.2f}")
                 print(
                     f"    band x {row['clip']['band'] / row['frame']['band']:.2f}, "
                     f"{row['pictures_per_second']:.1f} pictures/s",

@@ -191,12 +191,16 @@ class FilmedRoom:
                 frame = np.concatenate([level[frame[..., :3]], frame[..., 3:]], -1)
             yield _moved(frame, shift)
 
+    def behind(self) -> Float[np.ndarray, "H W 3"]:
+        """The room alone, as a camera that stands sees it without noise."""
+        return self.room.background(self._film_rng())
+
     def write(self, path: Path, tremble_px: float = 0.0) -> None:
         """The clip: noise, a flickering lamp, JPEG as in the camera's cable, H.264 as recorded.
 
         `tremble_px`: how far the camera wanders.
         """
-        rng = np.random.default_rng([self.seed, 13])
+        rng = self._film_rng()
         behind = self.room.background(rng)
         with av.open(str(path), "w") as container:
             stream = container.add_stream("libx264", rate=FRAMES_PER_SECOND)
@@ -214,6 +218,9 @@ class FilmedRoom:
                 picture = cv2.imdecode(packed, cv2.IMREAD_COLOR).astype(np.uint8)
                 container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="bgr24")))
             container.mux(stream.encode())
+
+    def _film_rng(self) -> np.random.Generator:
+        return np.random.default_rng([self.seed, 13])
 
     def _shifts(self, tremble_px: float) -> list[tuple[int, int]]:
         """By how many rows and columns each frame is moved: a slow sway, in whole pixels."""
