@@ -125,12 +125,7 @@ def band_matte(image_rgb: _Image, coarse: _Values, plate: RoomColors | None = No
     differs = _squares(apart) / (3 * room.variance)
     deep = (inward > _DEEP_PX).astype(np.float32)
     towards = spread_colors(image, deep, PERSON_PX, 8) - room.color
-    # A guessed room has hues of its own: a white stripe on a blue shirt would pass for it. A wall
-    # without texture is known well enough by its surroundings, if it is coloured itself.
-    told = room.known | (room.variance < _SMOOTH_LEVELS**2) & (
-        _hue(room.color) > _COLORED_LEVELS**2
-    )
-    tinted = _tinted(apart, towards, room, inward) & told & (plate is not None)
+    tinted = _tinted(apart, towards, room, inward) & (plate is not None)
     core = (inward > _CORE_PX) & ~tinted
     sure = core | (_unmixed(apart, towards, differs, inward) & ~tinted)
     if plate is not None:
@@ -159,15 +154,19 @@ def _tinted(apart: _Colors, towards: _Colors, room: RoomColors, inward: _Values)
     """Pixels near the outline whose hue, whatever their light, has a share of the room's.
 
     Real hair lets a coloured wall through far within its outline; between greys light alone would
-    have to tell, and hair shines.
+    have to tell, and hair shines. A guessed room has hues of its own: a white stripe on a blue
+    shirt would pass for it. But a wall without texture is known well enough by its surroundings,
+    if it is coloured itself.
     """
     asked = np.flatnonzero((inward > 0) & (inward < _DEEP_PX))
-    hue, across = (
+    hue, across, behind = (
         part - part.mean(1, keepdims=True)
-        for part in (colors.reshape(-1, 3)[asked] for colors in (apart, towards))
+        for part in (colors.reshape(-1, 3)[asked] for colors in (apart, towards, room.color))
     )
-    length = (across * across).sum(1)
-    telling = length > np.maximum(_HUE_LEVELS**2, _HUE_SIGMAS**2 * room.variance.flat[asked])
+    length, variance = (across * across).sum(1), room.variance.flat[asked]
+    plain = (variance < _SMOOTH_LEVELS**2) & ((behind * behind).sum(1) > _COLORED_LEVELS**2)
+    telling = length > np.maximum(_HUE_LEVELS**2, _HUE_SIGMAS**2 * variance)
+    telling &= room.known.flat[asked] | plain
     found = np.zeros(inward.shape, bool)
     found.flat[asked] = telling & ((hue * across).sum(1) < _PURE * length)
     return found
@@ -261,11 +260,6 @@ def _inward(coarse: _Values) -> _Values:
         cv2.distanceTransform(one, cv2.DIST_L2, cv2.DIST_MASK_5) for one in (person, 1 - person)
     )
     return (inside - outside) * np.float32(OF_SIDE_PX / len(coarse))
-
-
-def _hue(colors: _Colors) -> _Values:
-    """Squared distance from grey."""
-    return _squares(colors - colors.mean(-1, keepdims=True))
 
 
 def _squares(colors: _Colors) -> _Values:
