@@ -57,8 +57,8 @@ _DEEP_PX, _HUE_LEVELS, _HUE_SIGMAS, _PURE = 10.0, 45.0, 8.0, 0.85
 _SMOOTH_LEVELS, _COLORED_LEVELS = 8.0, 60.0
 # How sure the segmentation is of alpha: at its outline, and away from it on either side.
 _UNSURE, _SURE = 0.8, 0.15
-_UNSURE_BESIDE = 0.15
-"""The same where a plate is known elsewhere, but not here."""
+_UNSURE_BESIDE, _UNSURE_ALONE = 0.15, 0.25
+"""At its outline where a plate is known elsewhere, but not here; and where there is none."""
 _INWARD_PX, _OUTWARD_PX = 4.0, 8.0
 # The segmentation hovers off 0 and 1; an avatar would learn that as haze.
 _HAZE = 0.15
@@ -203,9 +203,9 @@ def _precision(
     room: RoomColors, depth: Float[np.ndarray, "N"], open_px: Int[np.ndarray, "N"], has_plate: bool
 ) -> Float[np.ndarray, "N"]:
     """How much the segmentation counts at the open pixels: one over its variance."""
-    unsure = np.float32(_UNSURE)
+    unsure = np.full(len(depth), _UNSURE_ALONE, np.float32)
     if has_plate:
-        unsure = np.where(room.known.reshape(-1)[open_px], unsure, np.float32(_UNSURE_BESIDE))
+        unsure = np.where(room.known.reshape(-1)[open_px], _UNSURE, _UNSURE_BESIDE)
     away = np.clip(np.where(depth > 0, depth / _INWARD_PX, -depth / _OUTWARD_PX), 0, 1)
     return (unsure * (_SURE / unsure) ** away) ** -2
 
