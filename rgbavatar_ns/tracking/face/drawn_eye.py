@@ -11,10 +11,10 @@ PARAMETERS = 15
 CENTER, LOG_RADIUS, OBLIQUE, UPPER_LID, LOWER_LID = slice(0, 2), 2, 3, slice(4, 6), slice(6, 8)
 SKIN, SCLERA, IRIS, PUPIL, LASHES = slice(8, 10), slice(10, 12), 12, 13, 14
 """Where an eye's parameters stand: the iris's middle (eye widths, from the middle of the corners,
-along them and across, down), the logarithm of its radius, width by height; each lid's height over
+along them and across, down), the logarithm of its radius, width by height; how far each lid is below
 the line of the corners and how it bends to a side; brightness of skin above and below, of the sclera
-beside the iris before and after it, of the iris; how much is added in the pupil and along the upper
-lid's edge."""
+before and after the iris, of the iris; what is added in the pupil and along the upper lid's edge.
+"""
 SHAPE = slice(0, SKIN.start)
 
 STEP, ACROSS, DOWN = 1 / 28, 34, 20

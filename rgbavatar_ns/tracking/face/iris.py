@@ -1,5 +1,6 @@
 """Irises found in the picture itself: a drawn eye laid over the small patch that shows one."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -54,8 +55,9 @@ _ROUNDS, _MOST_STEP = 8, np.array([0.06, 0.06, 0.15, 0.1, 0.06, 0.15, 0.06, 0.15
 _SOFT_PX, _SOFT_LEAST, _BLUR_BY_STEP = 0.35, 0.015, 0.5
 # An iris is seen where lids are open, where it is darker than the sclera by this share of the
 # range, and where the fit's standard errors along and across the eye are below these eye widths.
-_OPEN, _CONTRAST, _SURE = 0.25, 0.25, np.array([0.02, 0.035])
+_OPEN, _CONTRAST, _SURE = 0.25, 0.25, np.array([0.03, 0.06])
 # Shadows and lids are not quite as drawn: what errors are found to have beside the fit's own.
+_NOTHING_EXPECTED = 1e-6
 _OWN_ERROR = np.array([0.008, 0.008])
 
 
@@ -74,6 +76,18 @@ class FoundIrises:
     def found(self) -> Bool[np.ndarray, "*batch 2"]:
         """Which irises are seen."""
         return np.isfinite(self.sigma).all(-1)
+
+    @classmethod
+    def stacked(cls, each: "Sequence[FoundIrises]") -> "FoundIrises":
+        """Those of several pictures."""
+        return cls(
+            np.array([one.centers for one in each]).reshape(-1, 2, 2),
+            np.array([one.sigma for one in each]).reshape(-1, 2, 2),
+        )
+
+    def of(self, frames: Sequence[int]) -> "FoundIrises":
+        """Those of these pictures of several."""
+        return FoundIrises(self.centers[list(frames)], self.sigma[list(frames)])
 
 
 @dataclass(frozen=True)
@@ -210,25 +224,36 @@ def _fitted(
     widths = np.concatenate([shape_width, _COLOUR_WIDTH * span[:, None]], axis=1)
     expected = np.eye(PARAMETERS) * (widths**-2.0)[:, None]
     least, most = start[:, LOG_RADIUS] - _LOG_RADIUS_REACH, start[:, LOG_RADIUS] + _LOG_RADIUS_REACH
-    eyes, noise = start.copy(), np.maximum(_NOISE_AT_FIRST * span, _NOISE_LEVELS)
-    for number in range(_ROUNDS + 1):
-        drawn, slopes = drawn_eye(eyes, soft)
-        away = patches - drawn
-        if number:
-            typical = _DEVIATION_BY_MEDIAN * np.median(np.abs(away), axis=1)
-            noise = np.maximum(typical, _NOISE_LEVELS)
-        squared = np.square(away / noise[:, None])
-        trust = 1 / (1 + squared / _FAR_OFF**2) ** 2 if number else np.ones_like(away)
-        weighted = slopes * (trust / (_SAMPLES_ALIKE * noise[:, None] ** 2))[..., None]
-        told = weighted.transpose(0, 2, 1) @ slopes
-        if number == _ROUNDS:
-            break
-        pull = (away[:, None] @ weighted)[:, 0] + (start - eyes) / widths**2
-        step = np.linalg.solve(told + expected, pull[..., None])[..., 0]
+    noise = np.maximum(_NOISE_AT_FIRST * span, _NOISE_LEVELS)
+    eyes, told, pull = start, *_evidence(patches, start, soft, noise)
+    for _ in range(_ROUNDS):
+        step = np.linalg.solve(told + expected, (pull + (start - eyes) / widths**2)[..., None])[
+            ..., 0
+        ]
         share = (_MOST_STEP / np.maximum(np.abs(step[:, SHAPE]), 1e-9)).min(1).clip(None, 1)
         eyes = eyes + step * share[:, None]
         eyes[:, LOG_RADIUS] = eyes[:, LOG_RADIUS].clip(least, most)
         eyes[:, OBLIQUE] = eyes[:, OBLIQUE].clip(*_OBLIQUE_BOUNDS)
-    expected[:, [0, 1], [0, 1]] = 1e-6
+        told, pull = _evidence(patches, eyes, soft, None)
+    expected[:, [0, 1], [0, 1]] = _NOTHING_EXPECTED
     variance = np.linalg.inv(told + expected)[:, [0, 1], [0, 1]]
     return eyes, variance
+
+
+def _evidence(
+    patches: Float[np.ndarray, "2 N"],
+    eyes: Float[np.ndarray, "2 15"],
+    soft: Float[np.ndarray, "2"],
+    noise: Float[np.ndarray, "2"] | None,
+) -> tuple[Float[np.ndarray, "2 15 15"], Float[np.ndarray, "2 15"]]:
+    """Precision and gradient that the pictures add; without a given `noise` it is measured, and
+    what is far off counts less."""
+    drawn, slopes = drawn_eye(eyes, soft)
+    away = patches - drawn
+    trust = np.ones_like(away)
+    if noise is None:
+        noise = _DEVIATION_BY_MEDIAN * np.median(np.abs(away), axis=1)
+        noise = np.maximum(noise, _NOISE_LEVELS)
+        trust = 1 / (1 + np.square(away / (_FAR_OFF * noise[:, None]))) ** 2
+    weighted = slopes * (trust / (_SAMPLES_ALIKE * noise[:, None] ** 2))[..., None]
+    return weighted.transpose(0, 2, 1) @ slopes, (away[:, None] @ weighted)[:, 0]

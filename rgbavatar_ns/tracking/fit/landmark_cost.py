@@ -74,6 +74,7 @@ class FrameCost:
     def __post_init__(self) -> None:
         self._unknowns = self.head.unknowns(self.parameters.columns, self.identity_columns)
         self._prior_precision = self.parameters.prior_precision()
+        self._prior_pull = self.parameters.prior_pull()
         # Residuals go by direction in the upright face, then by landmark.
         scaled = self.noise.modes / self.noise.own_share[:, None, None]
         self._modes = scaled.transpose(1, 0, 2).copy()
@@ -90,8 +91,10 @@ class FrameCost:
         theta = self.theta(values)
         posed = self.head.posed(theta, identity, frame.camera.eye_m)
         found = self._explained(posed.points_m, frame)
-        pull = self._prior_precision @ values
-        cost = found.cost + 0.5 * float(values @ pull)
+        weighed = self._prior_precision @ values
+        pull = weighed - self._prior_pull
+        # But for the constant by which the prior's mean costs nothing.
+        cost = found.cost + float(values @ (0.5 * weighed - self._prior_pull))
         closeness, apart = None, values
         if frame.neighbours is not None and frame.temporal_weight > 0:
             closeness = frame.temporal_weight * self.parameters.temporal_width**-2.0
