@@ -11,9 +11,9 @@ PARAMETERS = 15
 CENTER, LOG_RADIUS, OBLIQUE, UPPER_LID, LOWER_LID = slice(0, 2), 2, 3, slice(4, 6), slice(6, 8)
 SKIN, SCLERA, IRIS, PUPIL, LASHES = slice(8, 10), slice(10, 12), 12, 13, 14
 """Where an eye's parameters stand: the iris's middle (eye widths, from the middle of the corners,
-along them and across, down), the logarithm of its radius, width by height; how far each lid is below
-the line of the corners and how it bends to a side; brightness of skin above and below, of the sclera
-before and after the iris, of the iris; what is added in the pupil and along the upper lid's edge.
+along them and across, down), the logarithm of its radius, width by height; how far below the line
+of the corners each lid is and how it bends to a side; brightness of skin above and below, of the
+sclera before and after the iris, of the iris; what is added in the pupil and along the upper lid.
 """
 SHAPE = slice(0, SKIN.start)
 
@@ -40,7 +40,7 @@ _NO_DISTANCE = 1e-6
 
 def drawn_eye(
     parameters: Float[np.ndarray, "E 15"], soft: Float[np.ndarray, "E"]
-) -> tuple[Float[np.ndarray, "E N"], Float[np.ndarray, "E N 15"]]:
+) -> tuple[Float[np.ndarray, "E N"], Float[np.ndarray, "E 15 N"]]:
     """Brightness of every sample, and its derivatives to the parameters.
 
     `soft` is how far edges reach, in eye widths. The sclera's blend counts as fixed.
@@ -68,24 +68,24 @@ def drawn_eye(
     lashed = np.exp(-0.5 * from_lid**2)
     brightness = skin + between * (eye - skin) + lashes * lashed
 
-    slopes = np.empty((*brightness.shape, PARAMETERS))
+    slopes = np.empty((len(parameters), PARAMETERS, ALONG.size), brightness.dtype)
     rim = between * (iris - sclera) * in_iris * (1 - in_iris) * sharpness
     inner_rim = between * pupil * in_pupil * (1 - in_pupil) * sharpness
     outwards = (rim + inner_rim) / distance
-    slopes[..., 0] = outwards * off_x / oblique
-    slopes[..., 1] = outwards * off_y
-    slopes[..., LOG_RADIUS] = (rim + _PUPIL_SHARE * inner_rim) * radius
-    slopes[..., OBLIQUE] = outwards * off_x**2 / oblique
+    slopes[:, 0] = outwards * off_x / oblique
+    slopes[:, 1] = outwards * off_y
+    slopes[:, LOG_RADIUS] = (rim + _PUPIL_SHARE * inner_rim) * radius
+    slopes[:, OBLIQUE] = outwards * off_x**2 / oblique
     uncovered = (eye - skin) * between * sharpness
     by_upper = lashes * lashed * from_lid / _LASHES - uncovered * (1 - under_upper)
     by_lower = uncovered * (1 - over_lower)
-    slopes[..., 4], slopes[..., 5] = by_upper * _OPENING, by_upper * _BENT
-    slopes[..., 6], slopes[..., 7] = by_lower * _OPENING, by_lower * _BENT
-    slopes[..., 8], slopes[..., 9] = (1 - between) * (1 - _LOWER), (1 - between) * _LOWER
+    slopes[:, 4], slopes[:, 5] = by_upper * _OPENING, by_upper * _BENT
+    slopes[:, 6], slopes[:, 7] = by_lower * _OPENING, by_lower * _BENT
+    slopes[:, 8], slopes[:, 9] = (1 - between) * (1 - _LOWER), (1 - between) * _LOWER
     white = between * (1 - in_iris)
-    slopes[..., 10], slopes[..., 11] = white * (1 - after), white * after
-    slopes[..., IRIS], slopes[..., PUPIL] = between * in_iris, between * in_pupil
-    slopes[..., LASHES] = lashed
+    slopes[:, 10], slopes[:, 11] = white * (1 - after), white * after
+    slopes[:, IRIS], slopes[:, PUPIL] = between * in_iris, between * in_pupil
+    slopes[:, LASHES] = lashed
     return brightness, slopes
 
 

@@ -50,7 +50,7 @@ _BRIGHT_PERCENT, _DARK_PERCENT, _RANGE_PERCENTS, _LEAST_RANGE = 85, 8, (5, 95), 
 # of these (highlights, a frame of glasses) counts ever less. Neighbouring samples err alike.
 _NOISE_LEVELS, _NOISE_AT_FIRST, _DEVIATION_BY_MEDIAN = 4.0, 0.2, 1.48
 _FAR_OFF, _SAMPLES_ALIKE = 2.0, 3.0
-_ROUNDS, _MOST_STEP = 8, np.array([0.06, 0.06, 0.15, 0.1, 0.06, 0.15, 0.06, 0.15])
+_ROUNDS, _MOST_STEP = 5, np.array([0.06, 0.06, 0.15, 0.1, 0.06, 0.15, 0.06, 0.15])
 # How far a limbus reaches; and how much a large eye is blurred before it is sampled.
 _SOFT_PX, _SOFT_LEAST, _BLUR_BY_STEP = 0.35, 0.015, 0.5
 # An iris is seen where lids are open, where it is darker than the sclera by this share of the
@@ -244,16 +244,19 @@ def _evidence(
     patches: Float[np.ndarray, "2 N"],
     eyes: Float[np.ndarray, "2 15"],
     soft: Float[np.ndarray, "2"],
-    noise: Float[np.ndarray, "2"] | None,
+    known_noise: Float[np.ndarray, "2"] | None,
 ) -> tuple[Float[np.ndarray, "2 15 15"], Float[np.ndarray, "2 15"]]:
-    """Precision and gradient that the pictures add; without a given `noise` it is measured, and
-    what is far off counts less."""
+    """Precision and gradient that the pictures add.
+
+    Without known noise it is measured, and what is far off counts less.
+    """
     drawn, slopes = drawn_eye(eyes, soft)
     away = patches - drawn
-    trust = np.ones_like(away)
-    if noise is None:
-        noise = _DEVIATION_BY_MEDIAN * np.median(np.abs(away), axis=1)
-        noise = np.maximum(noise, _NOISE_LEVELS)
-        trust = 1 / (1 + np.square(away / (_FAR_OFF * noise[:, None]))) ** 2
-    weighted = slopes * (trust / (_SAMPLES_ALIKE * noise[:, None] ** 2))[..., None]
-    return weighted.transpose(0, 2, 1) @ slopes, (away[:, None] @ weighted)[:, 0]
+    if known_noise is None:
+        typical = _DEVIATION_BY_MEDIAN * np.median(np.abs(away), axis=1)
+        noise = np.maximum(typical, _NOISE_LEVELS)[:, None]
+        trust = 1 / (1 + np.square(away / (_FAR_OFF * noise))) ** 2
+    else:
+        noise, trust = known_noise[:, None], np.ones_like(away)
+    weighted = slopes * (trust / (_SAMPLES_ALIKE * noise**2))[:, None]
+    return weighted @ slopes.transpose(0, 2, 1), (weighted @ away[..., None])[..., 0]
