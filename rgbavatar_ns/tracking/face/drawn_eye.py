@@ -17,7 +17,7 @@ sclera before and after the iris, of the iris; what is added in the pupil and al
 """
 SHAPE = slice(0, SKIN.start)
 
-STEP, ACROSS, DOWN = 1 / 28, 34, 20
+STEP, ACROSS, DOWN = 1 / 22, 26, 16
 """Samples of a patch: their distance in eye widths, and how many."""
 ALONG, BELOW = (
     axis.reshape(1, -1) * STEP

@@ -44,12 +44,14 @@ _OBLIQUE_USUAL, _OBLIQUE_BOUNDS = 0.95, (0.75, 1.0)
 # is darker than its iris (in brown eyes hardly), and lashes darken the upper lid's edge.
 _COLOUR_WIDTH = np.array([1, 1, 1, 1, 1, 0.3, 0.1])
 _DARKER_PUPIL, _LASHES_LEVELS = -0.3, -10.0
-_BRIGHT_PERCENT, _DARK_PERCENT, _RANGE_PERCENTS, _LEAST_RANGE = 85, 8, (5, 95), 8.0
+# What of a patch is dark (iris), usual (skin) and bright (sclera), and how far it ranges.
+_IRIS_PERCENT, _SKIN_PERCENT, _SCLERA_PERCENT, _RANGE_PERCENTS = 8, 50, 85, (5, 95)
+_LEAST_RANGE = 8.0
 # A pixel errs at least by so many of 255 levels: noise, compression. How much it does is measured
 # from the second round on: 1.48 medians are a normal distribution's deviation. What is beyond two
 # of these (highlights, a frame of glasses) counts ever less. Neighbouring samples err alike.
 _NOISE_LEVELS, _NOISE_AT_FIRST, _DEVIATION_BY_MEDIAN = 4.0, 0.2, 1.48
-_FAR_OFF, _SAMPLES_ALIKE = 2.0, 3.0
+_FAR_OFF, _SAMPLES_ALIKE = 2.0, 2.0
 _ROUNDS, _MOST_STEP = 5, np.array([0.06, 0.06, 0.15, 0.1, 0.06, 0.15, 0.06, 0.15])
 # How far a limbus reaches; and how much a large eye is blurred before it is sampled.
 _SOFT_PX, _SOFT_LEAST, _BLUR_BY_STEP = 0.35, 0.015, 0.5
@@ -143,16 +145,19 @@ def find_irises(
     """
     eyes = _EyeAxes.of(landmarks_px)
     nowhere = FoundIrises(landmarks_px[list(IRIS_CENTERS)], np.full((2, 2), np.inf))
-    if (irises_seen(landmarks_px) < _OPEN).all() or not _within(image_rgb, eyes):
+    are_open = irises_seen(landmarks_px) > _OPEN
+    if not are_open.any() or not _within(image_rgb, eyes):
         return nowhere
     patches = np.stack([_patch(image_rgb, eyes, eye) for eye in range(2)])
     soft = np.maximum(_SOFT_PX / eyes.width_px, _SOFT_LEAST)
-    span = np.ptp(np.percentile(patches, _RANGE_PERCENTS, axis=1), axis=0).clip(_LEAST_RANGE)
-    start = _start(eyes, landmarks_px, patches, span)
+    percents = (_IRIS_PERCENT, _SKIN_PERCENT, _SCLERA_PERCENT, *_RANGE_PERCENTS)
+    *levels, low, high = np.percentile(patches, percents, axis=1)
+    span = (high - low).clip(_LEAST_RANGE)
+    start = _start(eyes, landmarks_px, np.stack(levels), span)
     fitted, variance = _fitted(patches, span, start, soft)
     sigma = np.sqrt(variance)
     contrast = (fitted[:, SCLERA].mean(1) - fitted[:, IRIS]) / span
-    seen = (irises_seen(landmarks_px) > _OPEN) & (contrast > _CONTRAST) & (sigma < _SURE).all(1)
+    seen = are_open & (contrast > _CONTRAST) & (sigma < _SURE).all(1)
     sigma = np.where(seen[:, None], np.hypot(sigma, _OWN_ERROR), np.inf)
     centers = np.where(seen[:, None], eyes.out_of(fitted[:, CENTER]), nowhere.centers)
     return FoundIrises(centers, sigma)
@@ -183,10 +188,10 @@ def _patch(
 def _start(
     eyes: _EyeAxes,
     landmarks_px: Float[np.ndarray, "478 2"],
-    patches: Float[np.ndarray, "2 N"],
+    levels: Float[np.ndarray, "3 2"],
     span: Float[np.ndarray, "2"],
 ) -> Float[np.ndarray, "2 15"]:
-    """The eyes as FaceMesh sees them, in the colours of their patches."""
+    """The eyes as FaceMesh sees them, with the brightness of iris, skin and sclera."""
     start = np.zeros((2, PARAMETERS))
     centers, rims = landmarks_px[list(IRIS_CENTERS)], landmarks_px[np.array(IRIS_RIMS)]
     ring_px = np.linalg.norm(rims - centers[:, None], axis=-1).mean(1)
@@ -194,20 +199,21 @@ def _start(
     start[:, LOG_RADIUS] = np.log(_LIMBUS_BY_RING * (ring_px / eyes.width_px).clip(1e-3))
     start[:, OBLIQUE] = _OBLIQUE_USUAL
     for part, lid in zip((UPPER_LID, LOWER_LID), zip(*LID_PAIRS)):
-        points = eyes.into(landmarks_px[np.array(lid)].reshape(2, -1, 2))
-        start[:, part] = [_lid(one) for one in points]
-    bright, dark = np.percentile(patches, (_BRIGHT_PERCENT, _DARK_PERCENT), axis=1)
-    start[:, SKIN] = np.median(patches, axis=1)[:, None]
-    start[:, SCLERA], start[:, IRIS] = bright[:, None], dark
+        start[:, part] = _lids(eyes.into(landmarks_px[np.array(lid)].reshape(2, -1, 2)))
+    start[:, IRIS], start[:, SKIN], start[:, SCLERA] = levels[0], levels[1:2].T, levels[2:].T
     start[:, PUPIL], start[:, LASHES] = _DARKER_PUPIL * span, _LASHES_LEVELS
     return start
 
 
-def _lid(points: Float[np.ndarray, "K 2"]) -> Float[np.ndarray, "2"]:
-    """Height and bend of the lid that goes through these points."""
-    along, below = points.T
+def _lids(points: Float[np.ndarray, "2 K 2"]) -> Float[np.ndarray, "2 2"]:
+    """Height and bend of the lids that go through these points."""
+    along, below = points[..., :1], points[..., 1:]
     opening = 1 - 4 * along**2
-    return np.linalg.lstsq(np.stack([opening, opening * along], 1), below, rcond=None)[0]
+    courses = np.concatenate([opening, opening * along], axis=2)
+    across = courses.transpose(0, 2, 1)
+    # Points of one place, as only damaged landmarks have them, say nothing of the bend.
+    normal = across @ courses + _NOTHING_EXPECTED * np.eye(2)
+    return np.linalg.solve(normal, across @ below)[..., 0]
 
 
 def _fitted(
