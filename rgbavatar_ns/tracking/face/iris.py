@@ -59,8 +59,9 @@ _SOFT_PX, _SOFT_LEAST, _BLUR_BY_STEP = 0.35, 0.015, 0.5
 # range, and where the fit's standard errors along and across the eye are below these eye widths.
 _OPEN, _CONTRAST, _SURE = 0.25, 0.25, np.array([0.03, 0.06])
 # Shadows and lids are not quite as drawn: what errors are found to have beside the fit's own.
+_OWN_ERROR = 0.008
+# A precision that is none, and keeps what nothing tells from being infinite.
 _NOTHING_EXPECTED = 1e-6
-_OWN_ERROR = np.array([0.008, 0.008])
 
 
 @dataclass(frozen=True)
@@ -78,6 +79,12 @@ class FoundIrises:
     def found(self) -> Bool[np.ndarray, "*batch 2"]:
         """Which irises are seen."""
         return np.isfinite(self.sigma).all(-1)
+
+    @classmethod
+    def unseen(cls, landmarks_px: Float[np.ndarray, "*batch 478 2"]) -> "FoundIrises":
+        """None of them seen, so that they are where FaceMesh guesses."""
+        centers = landmarks_px[..., list(IRIS_CENTERS), :]
+        return cls(centers, np.full_like(centers, np.inf))
 
     @classmethod
     def stacked(cls, each: "Sequence[FoundIrises]") -> "FoundIrises":
@@ -144,10 +151,10 @@ def find_irises(
     closed, blurred, behind a reflection or out of the picture, no iris is seen.
     """
     eyes = _EyeAxes.of(landmarks_px)
-    nowhere = FoundIrises(landmarks_px[list(IRIS_CENTERS)], np.full((2, 2), np.inf))
+    unseen = FoundIrises.unseen(landmarks_px)
     are_open = irises_seen(landmarks_px) > _OPEN
     if not are_open.any() or not _within(image_rgb, eyes):
-        return nowhere
+        return unseen
     patches = np.stack([_patch(image_rgb, eyes, eye) for eye in range(2)])
     soft = np.maximum(_SOFT_PX / eyes.width_px, _SOFT_LEAST)
     percents = (_IRIS_PERCENT, _SKIN_PERCENT, _SCLERA_PERCENT, *_RANGE_PERCENTS)
@@ -159,7 +166,7 @@ def find_irises(
     contrast = (fitted[:, SCLERA].mean(1) - fitted[:, IRIS]) / span
     seen = are_open & (contrast > _CONTRAST) & (sigma < _SURE).all(1)
     sigma = np.where(seen[:, None], np.hypot(sigma, _OWN_ERROR), np.inf)
-    centers = np.where(seen[:, None], eyes.out_of(fitted[:, CENTER]), nowhere.centers)
+    centers = np.where(seen[:, None], eyes.out_of(fitted[:, CENTER]), unseen.centers)
     return FoundIrises(centers, sigma)
 
 

@@ -98,22 +98,15 @@ class SubjectTracker:
         Without found ones FaceMesh's tell the gaze.
         """
         heights, turns = face_height_px(landmarks_px), upright_turn(landmarks_px)
-        frames, count = len(landmarks_px), self.cost.head.num_landmarks
-        found, last = slice(len(self.facemesh_index), count), np.zeros((frames, 2), bool)
-        points = np.zeros((frames, count, 2))
-        points[:, : found.start] = landmarks_px[:, self.facemesh_index]
-        points[:, found] = landmarks_px[:, list(IRIS_CENTERS)]
-        own_share = np.repeat(self.cost.noise.own_share[None, :, None], frames, axis=0)
-        own_share = np.repeat(own_share, 2, axis=2)
-        if irises is not None:
-            last = irises.found
-            own = irises.sigma * (eye_widths_px(landmarks_px) / heights[:, None])[..., None]
-            own_share[:, found] = np.where(last[..., None], own, 1.0)
-            points[:, found] = irises.centers
-        seen = np.ones((frames, count))
+        irises = FoundIrises.unseen(landmarks_px) if irises is None else irises
+        points = np.concatenate([landmarks_px[:, self.facemesh_index], irises.centers], axis=1)
+        seen, found = np.ones(points.shape[:2]), slice(len(self.facemesh_index), None)
         guessed = [int(np.flatnonzero(self.facemesh_index == iris)[0]) for iris in IRIS_CENTERS]
-        seen[:, guessed] = irises_seen(landmarks_px) * ~last
-        seen[:, found] = last
+        seen[:, guessed] = irises_seen(landmarks_px) * ~irises.found
+        seen[:, found] = irises.found
+        own_share = np.broadcast_to(self.cost.noise.own_share[:, None], points.shape).copy()
+        as_found = irises.sigma * (eye_widths_px(landmarks_px) / heights[:, None])[..., None]
+        own_share[:, found] = np.where(irises.found[..., None], as_found, own_share[:, found])
         return [
             Target(one, own, float(height), turn, counts)
             for one, own, height, turn, counts in zip(points, own_share, heights, turns, seen)
