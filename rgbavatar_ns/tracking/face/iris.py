@@ -163,8 +163,8 @@ def find_irises(
     start = _start(eyes, landmarks_px, np.stack(levels), span)
     fitted, variance = _fitted(patches, span, start, soft)
     sigma = np.sqrt(variance)
-    contrast = (fitted[:, SCLERA].mean(1) - fitted[:, IRIS]) / span
-    seen = are_open & (contrast > _CONTRAST) & (sigma < _SURE).all(1)
+    darker = fitted[:, SCLERA].mean(1) - fitted[:, IRIS]
+    seen = are_open & (darker > _CONTRAST * span) & (sigma < _SURE).all(1)
     sigma = np.where(seen[:, None], np.hypot(sigma, _OWN_ERROR), np.inf)
     centers = np.where(seen[:, None], eyes.out_of(fitted[:, CENTER]), unseen.centers)
     return FoundIrises(centers, sigma)
