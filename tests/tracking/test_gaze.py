@@ -166,9 +166,8 @@ def test_irises_found_in_the_picture_tell_the_gaze_where_facemeshs_lag(
         start = np.zeros(len(tracker.cost.parameters.columns))
         values = fit_frame(tracker.cost, CAMERA, target, start, None, 0.0, (14, 6))
         gaze = tracker.gaze(ClipFit(SubjectFit(np.zeros(0), CAMERA, values[None]), values[None]))
-        np.testing.assert_allclose(
-            np.degrees(gaze.reshape(2, 2).mean(0)), np.degrees([pitch, yaw]), atol=1.5
-        )
+        found_degrees = np.degrees(gaze.reshape(2, 2).mean(0))
+        np.testing.assert_allclose(found_degrees, np.degrees([pitch, yaw]), atol=1.5)
 
 
 def test_a_found_iris_is_weighed_by_its_own_error_along_each_axis(tracker: SubjectTracker) -> None:

@@ -18,12 +18,12 @@ from rgbavatar_ns.tracking.face.detector import (
     LID_PAIRS,
     FaceLandmarker,
 )
-from rgbavatar_ns.tracking.face.drawn_eye import ALONG, BELOW, PARAMETERS, drawn_eye
+from rgbavatar_ns.tracking.face.drawn_eye import ALONG, BELOW, PARAMETERS, SHAPE, drawn_eye
 from rgbavatar_ns.tracking.face.iris import FoundIrises, find_irises
 from rgbavatar_ns.tracking.fit.irises import iris_places
 from rgbavatar_ns.tracking.fit.landmark_head import LandmarkHead
 
-FINE = 8
+FINE = 4
 """Subpixels a pixel, along each axis, that the tests' eyes are drawn with."""
 BROWN, BLUE, DARK_SKIN, SKIN = (70, 45, 30), (90, 130, 150), (120, 80, 60), (215, 170, 145)
 
@@ -91,13 +91,13 @@ class Eyes:
         return find_irises(self.image, self.points)
 
 
-@pytest.mark.parametrize("width_px", [20.0, 34.0, 60.0, 110.0])
+@pytest.mark.parametrize("width_px", [20.0, 34.0, 60.0])
 @pytest.mark.parametrize(("iris", "light"), [(BLUE, 1.0), (BROWN, 1.0), (BROWN, 0.35)])
 def test_irises_are_found_to_a_fraction_of_a_pixel(
     width_px: float, iris: tuple[int, int, int], light: float
 ) -> None:
     off = []
-    for seed in range(6):
+    for seed in range(4):
         skin = DARK_SKIN if seed % 2 else SKIN
         eyes = Eyes(width_px, seed, iris, skin, light)
         found = eyes.found()
@@ -125,7 +125,7 @@ def _out_of_the_picture(eyes: Eyes) -> np.ndarray:
 
 
 def _behind_a_reflection(eyes: Eyes) -> np.ndarray:
-    return (225 + 0.1 * eyes.image).clip(0, 255).astype(np.uint8)
+    return (235 + 0.02 * eyes.image).astype(np.uint8)
 
 
 @pytest.mark.parametrize(
@@ -147,7 +147,7 @@ def test_where_no_iris_can_be_seen_none_is(hidden: Callable[[Eyes], np.ndarray])
 def test_a_highlight_on_the_limbus_moves_nothing() -> None:
     eyes = Eyes(40.0, 1)
     before = eyes.found()
-    for x, y in eyes.irises_px + (6.0, -2.0):
+    for x, y in eyes.irises_px + np.array([6.0, -2.0]):
         cv2.circle(eyes.image, (int(x), int(y)), 2, (255, 255, 255), -1)
     after = eyes.found()
     assert np.abs(after.centers - before.centers).max() < 0.4
@@ -163,24 +163,23 @@ def test_a_picture_moved_by_whole_pixels_moves_irises_alike() -> None:
     before = eyes.found()
     eyes.image = cv2.copyMakeBorder(eyes.image, 7, 0, 11, 0, cv2.BORDER_REPLICATE)
     eyes.points += (11, 7)
-    np.testing.assert_allclose(eyes.found().centers, before.centers + (11, 7), atol=1e-4)
+    np.testing.assert_allclose(eyes.found().centers, before.centers + np.array([11, 7]), atol=1e-4)
 
 
 def test_the_drawn_eyes_derivatives_are_its_slopes() -> None:
     random = np.random.default_rng(0)
     eye = np.array([[0.05, -0.02, np.log(0.2), 0.9, -0.2, 0.1, 0.12, -0.05]])
-    colours = np.array([[180.0, 200, 220, 200, 90, -40, -20]]) + random.normal(0, 5, (1, 7))
+    colours = np.array([[180.0, 200, 220, 200, 90, -40, -20, 15]]) + random.normal(0, 5, (1, 8))
     eye, soft = np.concatenate([eye, colours], axis=1), np.array([0.03])
     _, slopes = drawn_eye(eye, soft)
     for place in range(PARAMETERS):
-        step = 1e-5 if place < 8 else 1e-2
+        is_shape = place < SHAPE.stop
+        step, tolerance = (1e-5, 2.0) if is_shape else (1e-2, 1e-6)  # of hundreds of levels
         ends = [eye + sign * step * np.eye(PARAMETERS)[place] for sign in (1, -1)]
         slope = np.subtract(*(drawn_eye(end, soft)[0] for end in ends))[0] / (2 * step)
         # Where one sclera goes over into the other counts as fixed: it is behind the iris.
         beside = np.hypot(ALONG - eye[0, 0], BELOW - eye[0, 1])[0] > (0.0 if place > 2 else 0.45)
-        np.testing.assert_allclose(
-            slopes[0, place, beside], slope[beside], atol=2.0 if place < 8 else 1e-6
-        )
+        np.testing.assert_allclose(slopes[0, place, beside], slope[beside], atol=tolerance)
 
 
 def test_the_irises_of_a_procedural_person_are_nearer_than_facemeshs() -> None:

@@ -7,13 +7,14 @@ along a circle, wants the circle's top and bottom, which lids hide.
 import numpy as np
 from jaxtyping import Float
 
-PARAMETERS = 15
+PARAMETERS = 16
 CENTER, LOG_RADIUS, OBLIQUE, UPPER_LID, LOWER_LID = slice(0, 2), 2, 3, slice(4, 6), slice(6, 8)
-SKIN, SCLERA, IRIS, PUPIL, LASHES = slice(8, 10), slice(10, 12), 12, 13, 14
+SKIN, SCLERA, IRIS, PUPIL, LASHES, RAMP = slice(8, 10), slice(10, 12), 12, 13, 14, 15
 """Where an eye's parameters stand: the iris's middle (eye widths, from the middle of the corners,
 along them and across, down), the logarithm of its radius, width by height; how far below the line
 of the corners each lid is and how it bends to a side; brightness of skin above and below, of the
-sclera before and after the iris, of the iris; what is added in the pupil and along the upper lid.
+sclera before and after the iris, of the iris; what is added in the pupil, along the upper lid, and
+an eye width along everything (the light of one side, a reflection in glasses).
 """
 SHAPE = slice(0, SKIN.start)
 
@@ -39,8 +40,8 @@ _NO_DISTANCE = 1e-6
 
 
 def drawn_eye(
-    parameters: Float[np.ndarray, "E 15"], soft: Float[np.ndarray, "E"]
-) -> tuple[Float[np.ndarray, "E N"], Float[np.ndarray, "E 15 N"]]:
+    parameters: Float[np.ndarray, "E 16"], soft: Float[np.ndarray, "E"]
+) -> tuple[Float[np.ndarray, "E N"], Float[np.ndarray, "E 16 N"]]:
     """Brightness of every sample, and its derivatives to the parameters.
 
     `soft` is how far edges reach, in eye widths. The sclera's blend counts as fixed.
@@ -48,7 +49,9 @@ def drawn_eye(
     by_parameter = parameters.T[..., None]
     center_x, center_y, log_radius, oblique = by_parameter[:4]
     upper_height, upper_bend, lower_height, lower_bend = by_parameter[4:8]
-    skin_above, skin_below, sclera_before, sclera_after, iris, pupil, lashes = by_parameter[8:]
+    skin_above, skin_below, sclera_before, sclera_after, iris, pupil, lashes, ramp = by_parameter[
+        8:
+    ]
     sharpness = 1 / soft[:, None]
     above = (BELOW - upper_height * _OPENING - upper_bend * _BENT) * sharpness
     under_upper = _step(above)
@@ -66,7 +69,7 @@ def drawn_eye(
     skin = skin_above + (skin_below - skin_above) * _LOWER
     from_lid = above / (sharpness * _LASHES)
     lashed = np.exp(-0.5 * from_lid**2)
-    brightness = skin + between * (eye - skin) + lashes * lashed
+    brightness = skin + between * (eye - skin) + lashes * lashed + ramp * ALONG
 
     slopes = np.empty((len(parameters), PARAMETERS, ALONG.size), brightness.dtype)
     rim = between * (iris - sclera) * in_iris * (1 - in_iris) * sharpness
@@ -86,6 +89,7 @@ def drawn_eye(
     slopes[:, 10], slopes[:, 11] = white * (1 - after), white * after
     slopes[:, IRIS], slopes[:, PUPIL] = between * in_iris, between * in_pupil
     slopes[:, LASHES] = lashed
+    slopes[:, RAMP] = ALONG
     return brightness, slopes
 
 

@@ -41,8 +41,9 @@ _SHAPE_WIDTH = np.array([0.12, 0.04, 0.06, 0.04, 0.05, 0.1, 0.04, 0.1])
 _LIMBUS_BY_RING, _LOG_RADIUS_REACH = 1.1, 0.3
 _OBLIQUE_USUAL, _OBLIQUE_BOUNDS = 0.95, (0.75, 1.0)
 # Brightness, in shares of the patch's range: skin, skin, sclera, sclera and iris are free; a pupil
-# is darker than its iris (in brown eyes hardly), and lashes darken the upper lid's edge.
-_COLOUR_WIDTH = np.array([1, 1, 1, 1, 1, 0.3, 0.1])
+# is darker than its iris (in brown eyes hardly), lashes darken the upper lid's edge, and light comes
+# from a side.
+_COLOUR_WIDTH = np.array([1, 1, 1, 1, 1, 0.3, 0.1, 0.5])
 _DARKER_PUPIL, _LASHES_LEVELS = -0.3, -10.0
 # What of a patch is dark (iris), usual (skin) and bright (sclera), and how far it ranges.
 _IRIS_PERCENT, _SKIN_PERCENT, _SCLERA_PERCENT, _RANGE_PERCENTS = 8, 50, 85, (5, 95)
@@ -197,7 +198,7 @@ def _start(
     landmarks_px: Float[np.ndarray, "478 2"],
     levels: Float[np.ndarray, "3 2"],
     span: Float[np.ndarray, "2"],
-) -> Float[np.ndarray, "2 15"]:
+) -> Float[np.ndarray, "2 16"]:
     """The eyes as FaceMesh sees them, with the brightness of iris, skin and sclera."""
     start = np.zeros((2, PARAMETERS))
     centers, rims = landmarks_px[list(IRIS_CENTERS)], landmarks_px[np.array(IRIS_RIMS)]
@@ -226,9 +227,9 @@ def _lids(points: Float[np.ndarray, "2 K 2"]) -> Float[np.ndarray, "2 2"]:
 def _fitted(
     patches: Float[np.ndarray, "2 N"],
     span: Float[np.ndarray, "2"],
-    start: Float[np.ndarray, "2 15"],
+    start: Float[np.ndarray, "2 16"],
     soft: Float[np.ndarray, "2"],
-) -> tuple[Float[np.ndarray, "2 15"], Float[np.ndarray, "2 2"]]:
+) -> tuple[Float[np.ndarray, "2 16"], Float[np.ndarray, "2 2"]]:
     """The most likely eyes, by robust Gauss-Newton steps from `start`, which is what is expected.
 
     Second: variance of the iris's middle along and across, as the picture alone tells it.
@@ -255,10 +256,10 @@ def _fitted(
 
 def _evidence(
     patches: Float[np.ndarray, "2 N"],
-    eyes: Float[np.ndarray, "2 15"],
+    eyes: Float[np.ndarray, "2 16"],
     soft: Float[np.ndarray, "2"],
     known_noise: Float[np.ndarray, "2"] | None,
-) -> tuple[Float[np.ndarray, "2 15 15"], Float[np.ndarray, "2 15"]]:
+) -> tuple[Float[np.ndarray, "2 16 16"], Float[np.ndarray, "2 16"]]:
     """Precision and gradient that the pictures add.
 
     Without known noise it is measured, and what is far off counts less.
