@@ -49,9 +49,8 @@ def drawn_eye(
     by_parameter = parameters.T[..., None]
     center_x, center_y, log_radius, oblique = by_parameter[:4]
     upper_height, upper_bend, lower_height, lower_bend = by_parameter[4:8]
-    skin_above, skin_below, sclera_before, sclera_after, iris, pupil, lashes, ramp = by_parameter[
-        8:
-    ]
+    skin_above, skin_below, sclera_before, sclera_after = by_parameter[8:12]
+    iris, pupil, lashes, ramp = by_parameter[12:]
     sharpness = 1 / soft[:, None]
     above = (BELOW - upper_height * _OPENING - upper_bend * _BENT) * sharpness
     under_upper = _step(above)

@@ -41,8 +41,7 @@ _SHAPE_WIDTH = np.array([0.12, 0.04, 0.06, 0.04, 0.05, 0.1, 0.04, 0.1])
 _LIMBUS_BY_RING, _LOG_RADIUS_REACH = 1.1, 0.3
 _OBLIQUE_USUAL, _OBLIQUE_BOUNDS = 0.95, (0.75, 1.0)
 # Brightness, in shares of the patch's range: skin, skin, sclera, sclera and iris are free; a pupil
-# is darker than its iris (in brown eyes hardly), lashes darken the upper lid's edge, and light comes
-# from a side.
+# is darker than its iris (in brown eyes hardly), lashes darken the upper lid, light has a side.
 _COLOUR_WIDTH = np.array([1, 1, 1, 1, 1, 0.3, 0.1, 0.5])
 _DARKER_PUPIL, _LASHES_LEVELS = -0.3, -10.0
 # What of a patch is dark (iris), usual (skin) and bright (sclera), and how far it ranges.
@@ -56,9 +55,10 @@ _FAR_OFF, _SAMPLES_ALIKE = 2.0, 2.0
 _ROUNDS, _MOST_STEP = 5, np.array([0.06, 0.06, 0.15, 0.1, 0.06, 0.15, 0.06, 0.15])
 # How far a limbus reaches; and how much a large eye is blurred before it is sampled.
 _SOFT_PX, _SOFT_LEAST, _BLUR_BY_STEP = 0.35, 0.015, 0.5
-# An iris is seen where lids are open, where it is darker than the sclera by this share of the
-# range, and where the fit's standard errors along and across the eye are below these eye widths.
-_OPEN, _CONTRAST, _SURE = 0.25, 0.25, np.array([0.03, 0.06])
+# An iris is seen where lids are open, where it is darker than the sclera by this share of the range
+# and by so many levels, and where the fit's standard errors along and across the eye are below
+# these eye widths.
+_OPEN, _CONTRAST, _CONTRAST_LEVELS, _SURE = 0.25, 0.25, 10.0, np.array([0.03, 0.06])
 # Shadows and lids are not quite as drawn: what errors are found to have beside the fit's own.
 _OWN_ERROR = 0.008
 # A precision that is none, and keeps what nothing tells from being infinite.
@@ -165,7 +165,8 @@ def find_irises(
     fitted, variance = _fitted(patches, span, start, soft)
     sigma = np.sqrt(variance)
     darker = fitted[:, SCLERA].mean(1) - fitted[:, IRIS]
-    seen = are_open & (darker > _CONTRAST * span) & (sigma < _SURE).all(1)
+    plain = darker > np.maximum(_CONTRAST * span, _CONTRAST_LEVELS)
+    seen = are_open & plain & (sigma < _SURE).all(1)
     sigma = np.where(seen[:, None], np.hypot(sigma, _OWN_ERROR), np.inf)
     centers = np.where(seen[:, None], eyes.out_of(fitted[:, CENTER]), unseen.centers)
     return FoundIrises(centers, sigma)
