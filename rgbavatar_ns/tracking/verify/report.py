@@ -20,7 +20,7 @@ from rgbavatar_ns.tracking.verify.gaze import gaze_quality
 _CLOSED_SHARE = 0.5
 # Limits of the words: beyond the first a clip is no longer good, beyond the second it is to be
 # looked at. Shares of the face's height, correlations, shares of frames, pixels,
-# eye widths (on renders, whose truth is known, irises lie .05 off).
+# eye widths (on renders, whose truth is known, found irises lie .02 off).
 _FITTED_ERROR, _MESH_ERROR = (0.01, 0.02), (0.015, 0.03)
 _CORRELATION, _COVERAGE = (0.85, 0.6), (0.95, 0.85)
 _IRIS_ERROR, _AT_BOUND = (0.1, 0.2), (0.02, 0.2)
