@@ -1,11 +1,11 @@
-"""Where a drawn avatar looks, beside where the film's person does: irises as FaceMesh finds them.
+"""Where a drawn avatar looks, beside where the film's person does: irises found in both pictures.
 
     python benchmarks/quality/gaze.py AVATAR DATASET [--json gaze.json]
 
 draws the held-out frames of a dataset, finds irises on them and on the film's own pictures, and
 prints how far they lie apart within their eyes, in eye widths (corner to corner): mean and 95th
 percentile; and how well the drawn ones follow the filmed ones sideways and up and down
-(correlation). FaceMesh's irises follow a gaze by 90 % sideways and by 40 % up and down.
+(correlation). An iris that is not seen in both pictures of a frame leaves the frame out.
 """
 
 import argparse
@@ -19,40 +19,37 @@ from subject import Subject, write_figures
 
 from rgbavatar_ns import Avatar
 from rgbavatar_ns.data import load_dataset
-from rgbavatar_ns.tracking.face.detector import (
-    EYE_CORNERS,
-    IRIS_CENTERS,
-    FaceLandmarker,
-    irises_seen,
-)
-
-OPEN = 0.5
-"""Irises that are seen less, behind closing lids, are not compared."""
+from rgbavatar_ns.tracking.face.detector import EYE_CORNERS, FaceLandmarker
+from rgbavatar_ns.tracking.face.iris import FoundIrises, find_irises
 
 
-def irises_in_eyes(landmarks_px: Float[np.ndarray, "*batch 478 2"]) -> Float[np.ndarray, "*b 2 2"]:
+def irises_in_eyes(
+    landmarks_px: Float[np.ndarray, "478 2"], irises: FoundIrises
+) -> Float[np.ndarray, "2 2"]:
     """Right and left iris from the middle of its eye's corners: along them, across; eye widths."""
     first, second = (landmarks_px[..., list(ends), :] for ends in zip(*EYE_CORNERS))
     along = second - first
     width = np.linalg.norm(along, axis=-1, keepdims=True)
     along = along / width
     across = np.stack([-along[..., 1], along[..., 0]], -1)
-    away = (landmarks_px[..., list(IRIS_CENTERS), :] - (first + second) / 2) / width
+    away = (irises.centers - (first + second) / 2) / width
     return np.stack([(away * along).sum(-1), (away * across).sum(-1)], -1)
 
 
 def gaze_figures(
     drawn: Sequence[UInt8[np.ndarray, "H W 3"]], filmed: Sequence[UInt8[np.ndarray, "H W 3"]]
 ) -> dict[str, float | int]:
-    """The figures of pairs of pictures; frames without a face or with closed eyes are left out."""
+    """The figures of pairs of pictures; frames without a face or irises are left out."""
     pairs: list[Float[np.ndarray, "2 2 2"]] = []
     with closing(FaceLandmarker()) as first, closing(FaceLandmarker()) as second:
         for pictures in zip(drawn, filmed):
-            found = [look(picture) for look, picture in zip((first, second), pictures)]
-            if all(points is not None and (irises_seen(points) > OPEN).all() for points in found):
-                pairs.append(irises_in_eyes(np.array(found)))
+            looks = [look(picture) for look, picture in zip((first, second), pictures)]
+            faces = [points for points in looks if points is not None]
+            irises = [find_irises(*pair) for pair in zip(pictures, faces)]
+            if len(faces) == 2 and all(eyes.found.all() for eyes in irises):
+                pairs.append(np.array([irises_in_eyes(*eyes) for eyes in zip(faces, irises)]))
     if not pairs:
-        raise SystemExit("FaceMesh finds no open eyes in both pictures of any frame.")
+        raise SystemExit("No irises are found in both pictures of any frame.")
     ours, theirs = np.array(pairs).transpose(1, 0, 2, 3)
     away = np.linalg.norm(ours - theirs, axis=-1)
     axes = [np.corrcoef(a, b)[0, 1] for a, b in zip(ours.mean(1).T, theirs.mean(1).T)]

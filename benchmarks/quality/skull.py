@@ -84,7 +84,8 @@ def measure(subject: Subject, head: HeadModel, *, with_outlines: bool) -> dict[s
     known = outlines(subject, tracker) if with_outlines else ()
     started = time.process_time()
     size = subject.size
-    fit = tracker.fit(subject.landmarks_px, subject.follows, size, size, outlines=known)
+    landmarks, follows = subject.landmarks_px, subject.follows
+    fit = tracker.fit(landmarks, follows, size, size, outlines=known, irises=subject.irises)
     seconds = time.process_time() - started
     thetas, camera = tracker.thetas(fit), fit.subject.camera
     turns = [

@@ -8,9 +8,12 @@ roll), error across the image plane in percent of the distance, distance of vert
 and of the whole head in mm (position, depth and size of the head aligned: one camera does not
 tell them), correlation of the expression coefficients that are active (all of them pooled, and the
 median of each one's own), of jaw and of gaze, the gaze's error (mean angle between an eye's found
-and true direction in the skull, degrees, where lids are open) and the share of frames whose gaze is
-at a bound, how much the fit's second differences shrink against
-a fit without smoothing, its lag in frames, and CPU time of the fit.
+and true direction in the skull, degrees, where lids are open; its constant part as pitch and yaw;
+the error without each eye's constant part, of which pictures tell little), how far irises found in
+the pictures lie from the true ones and how far the fitted mesh's do (mean, eye widths, lids open),
+the share of open eyes with a found iris and of frames whose gaze is at a bound, how much the fit's
+second differences shrink against a fit without smoothing, its lag in frames, and CPU time of the
+fit.
 """
 
 import argparse
@@ -33,7 +36,11 @@ from rgbavatar_ns.synthetic.make import DemoPerson
 from rgbavatar_ns.synthetic.performer.hair import HairStyle
 from rgbavatar_ns.synthetic.performer.performance import perform
 from rgbavatar_ns.tracking.config import TrackConfig
-from rgbavatar_ns.tracking.face.detector import FaceLandmarker
+from rgbavatar_ns.tracking.face.detector import FaceLandmarker, eye_widths_px
+from rgbavatar_ns.tracking.face.iris import FoundIrises, find_irises
+from rgbavatar_ns.tracking.fit.fit import ClipFit
+from rgbavatar_ns.tracking.fit.irises import iris_places
+from rgbavatar_ns.tracking.fit.landmark_head import LandmarkHead
 from rgbavatar_ns.tracking.fit.outline import PersonOutline
 from rgbavatar_ns.tracking.fit.subject import SubjectTracker
 from rgbavatar_ns.tracking.image.crop import steady_crop
@@ -91,6 +98,9 @@ class Subject:
         self.config, self.person = config, person
         self.pictures, self.alphas = np.array(pictures), np.array(alphas)
         self.landmarks_px = np.array(found)
+        self.irises = FoundIrises.stacked(
+            [find_irises(*seen) for seen in zip(self.pictures, self.landmarks_px)]
+        )
         self.follows = [False, *(np.diff(kept) == 1).tolist()]
         self.lost = frames - len(kept)
 
@@ -110,19 +120,61 @@ def lag_frames(found: Float[np.ndarray, "F"], true: Float[np.ndarray, "F"]) -> i
     return shifts[int(np.argmax(scores))]
 
 
-def gaze_degrees(
-    head: HeadModel, theta: Float[np.ndarray, "F H"], true: Float[np.ndarray, "F H"]
-) -> float:
-    """Mean angle between found and true directions of both eyes; closed ones are not counted."""
+def lids_open(head: HeadModel, true: Float[np.ndarray, "F H"]) -> Bool[np.ndarray, "F"]:
+    """In which frames neither eye blinks."""
     first = head.layout.slice("expression").start
     lids = [first + k for k, name in enumerate(head.arrays.expression_names) if "Blink" in name]
-    seen = (true[:, lids] < OPEN_LIDS).all(1)
-    off = []
+    return (true[:, lids] < OPEN_LIDS).all(1)
+
+
+def gaze_errors(
+    head: HeadModel, theta: Float[np.ndarray, "F H"], true: Float[np.ndarray, "F H"]
+) -> dict[str, Any]:
+    """Angles between found and true directions of both eyes; closed ones are not counted."""
+    seen = lids_open(head, true)
+    angles, off = [], []
     for name in ("left_eye", "right_eye"):
         both = [torch.from_numpy(one[seen][:, head.layout.slice(name)]) for one in (theta, true)]
         found, real = (axis_angle_to_matrix(one)[..., 2] for one in both)
         off.append(torch.rad2deg(torch.acos((found * real).sum(-1).clamp(-1, 1))))
-    return float(torch.stack(off).mean())
+        pitch_yaw = [
+            torch.stack([-torch.asin(one[:, 1]), torch.atan2(one[:, 0], one[:, 2])], -1)
+            for one in (found, real)
+        ]
+        angles.append(torch.rad2deg(pitch_yaw[0] - pitch_yaw[1]))
+    apart = torch.stack(angles)
+    varying = apart - apart.mean(1, keepdim=True)
+    return {
+        "gaze_degrees": float(torch.stack(off).mean()),
+        "gaze_bias_degrees": apart.mean((0, 1)).numpy().round(2).tolist(),
+        "gaze_varying_degrees": float(varying.norm(dim=-1).mean()),
+    }
+
+
+def true_irises_px(subject: "Subject", head: HeadModel) -> Float[np.ndarray, "F 2 2"]:
+    """Where the middles of the person's right and left iris are in its pictures."""
+    irises, camera = LandmarkHead(head, *iris_places(head.arrays)), subject.camera
+    eye_m = np.array([0.0, camera.height_m, camera.distance_m])
+    away = np.array([irises.points(theta, subject.identity) for theta in subject.theta]) - eye_m
+    return away[..., :2] * (1, -1) * camera.focal_px / -away[..., 2:] + camera.size / 2
+
+
+def iris_errors(
+    subject: "Subject", tracker: SubjectTracker, fit: ClipFit, head: HeadModel
+) -> dict[str, float]:
+    """How far found irises and the fitted mesh's lie from the true ones, eye widths."""
+    true_px, found = true_irises_px(subject, head), subject.irises
+    seen = np.repeat(lids_open(head, subject.theta)[:, None], 2, axis=1)
+    widths = eye_widths_px(subject.landmarks_px)
+    drawn, picture = (
+        np.linalg.norm(irises - true_px, axis=-1) / widths
+        for irises in (tracker.irises_px(fit), found.centers)
+    )
+    return {
+        "irises_found_share": float(found.found[seen].mean()),
+        "iris_found_off": float(picture[seen & found.found].mean()),
+        "iris_drawn_off": float(drawn[seen].mean()),
+    }
 
 
 def jitter(values: Float[np.ndarray, "F P"]) -> float:
@@ -192,10 +244,11 @@ def measure(subject: Subject, head: HeadModel, *, known_focal: bool) -> dict[str
     tracker = SubjectTracker(head, config)
     known, size = outlines(subject, tracker), subject.size
     started = time.process_time()
-    fit = tracker.fit(subject.landmarks_px, subject.follows, size, size, outlines=known)
+    landmarks, follows, irises = subject.landmarks_px, subject.follows, subject.irises
+    fit = tracker.fit(landmarks, follows, size, size, outlines=known, irises=irises)
     seconds = time.process_time() - started
     rough = SubjectTracker(head, replace(config, temporal_weight=0.0))
-    unsmoothed = rough.fit(subject.landmarks_px, subject.follows, size, size, outlines=known)
+    unsmoothed = rough.fit(landmarks, follows, size, size, outlines=known, irises=irises)
     theta, true, layout = tracker.thetas(fit), subject.theta, head.layout
     turns = [np.array([tracker.mesh_landmarks.head_rotation(t) for t in x]) for x in (theta, true)]
     off = matrix_to_axis_angle(torch.from_numpy(turns[0] @ turns[1].transpose(0, 2, 1))).numpy()
@@ -224,8 +277,9 @@ def measure(subject: Subject, head: HeadModel, *, known_focal: bool) -> dict[str
         ),
         "jaw": correlation(theta[:, jaw], true[:, jaw]),
         "gaze": correlation(theta[:, eye], true[:, eye]),
-        "gaze_degrees": gaze_degrees(head, theta, true),
-        "gaze_at_bound": gaze_quality(tracker, fit, subject.landmarks_px)["gaze_at_bound_share"],
+        **gaze_errors(head, theta, true),
+        **iris_errors(subject, tracker, fit, head),
+        "gaze_at_bound": gaze_quality(tracker, fit, landmarks, irises)["gaze_at_bound_share"],
         "jitter_ratio": jitter(fit.values) / jitter(unsmoothed.values),
         "lag_frames": lag_frames(yaw[0], yaw[1]),
         "fit_cpu_ms": 1e3 * seconds / len(true),

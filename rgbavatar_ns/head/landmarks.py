@@ -35,6 +35,11 @@ class _Rows:
         """The same of these rows."""
         return type(self)(*(getattr(self, field.name)[rows] for field in fields(self)))
 
+    def and_none(self: _Kind, count: int) -> _Kind:
+        """The same with so many rows of zeros after them."""
+        arrays = [getattr(self, field.name) for field in fields(self)]
+        return type(self)(*(np.pad(a, [(0, count)] + [(0, 0)] * (a.ndim - 1)) for a in arrays))
+
 
 @dataclass(frozen=True)
 class LandmarkResponse(_Rows):

@@ -16,6 +16,7 @@ from rgbavatar_ns.data import TrackedFrame
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.tracking.config import TrackConfig
 from rgbavatar_ns.tracking.face.detector import FaceLandmarker
+from rgbavatar_ns.tracking.face.iris import FoundIrises, find_irises
 from rgbavatar_ns.tracking.fit.fit import (
     STEPS_ANEW,
     ClipFit,
@@ -64,7 +65,7 @@ class LiveTracker:
         self._matte = PersonMatte()
         self._cut_out = CutOut(self.head.arrays)
         self._worker = ThreadPoolExecutor(1, "rgbavatar-matte")
-        self._warm_up: list[tuple[int, _Image, _Landmarks]] = []
+        self._warm_up: list[tuple[int, _Image, _Landmarks, FoundIrises]] = []
         self._backlog: list[TrackedFrame] = []
         self._fit: _CausalFit | None = None
         self._crop: FollowingCrop | None = None
@@ -117,7 +118,8 @@ class LiveTracker:
                 self._fit.forget()
                 self.counts["no face"] += 1
                 return None
-            frame = self._tracked(self._fit, index, landmarks, square, matted.result)
+            irises = find_irises(image_rgb, landmarks)
+            frame = self._tracked(self._fit, index, landmarks, irises, square, matted.result)
             self._crop.follow(landmarks)
             return frame
 
@@ -135,38 +137,39 @@ class LiveTracker:
         if landmarks is None:
             self.counts["no face"] += 1
             return
-        self._warm_up.append((index, image_rgb.copy(), landmarks))
+        irises = find_irises(image_rgb, landmarks)
+        self._warm_up.append((index, image_rgb.copy(), landmarks, irises))
         if len(self._warm_up) >= self._config.key_frames:
             self._fit_subject()
 
     def _fit_subject(self) -> None:
         """Fit the subject to the warm-up's frames, then track these."""
         seen, self._warm_up = self._warm_up, []
-        landmarks = np.stack([one for _, _, one in seen])
+        landmarks = np.stack([points for _, _, points, _ in seen])
+        irises = FoundIrises.stacked([one for *_, one in seen])
         height, width = seen[0][1].shape[:2]
-        subject = self._tracker.fit_subject(landmarks, width, height, self._outlines(seen))
+        outlines = self._outlines(landmarks, [image for _, image, _, _ in seen])
+        subject = self._tracker.fit_subject(landmarks, width, height, outlines, irises)
         self._fit = _CausalFit(self._tracker, subject)
         size = self._config.image_size or _SIZE_PX
         self._crop = FollowingCrop.around(landmarks, width, height, size)
         square = self._crop.square
-        for index, image, landmarks_px in seen:
+        for index, image, landmarks_px, found in seen:
             matted = partial(self._matted, image, square)
-            frame = self._tracked(self._fit, index, landmarks_px, square, matted)
+            frame = self._tracked(self._fit, index, landmarks_px, found, square, matted)
             if frame is not None:
                 self._backlog.append(frame)
 
     def _outlines(
-        self, seen: Sequence[tuple[int, _Image, _Landmarks]]
+        self, landmarks: Float[np.ndarray, "F 478 2"], images: Sequence[_Image]
     ) -> list[PersonOutline | None]:
         """The person's outlines in the key frames of the warm-up."""
-        landmarks = np.stack([one for _, _, one in seen])
-        height, width = seen[0][1].shape[:2]
+        height, width = images[0].shape[:2]
         crop = steady_crop(landmarks, width, height, OUTLINE_PX)
         outlines = []
         for position in self._tracker.key_positions(landmarks):
-            _, image, landmarks_px = seen[position]
-            matte = levels(self._matte(crop.apply(image)))
-            outlines.append(person_outline(matte, crop, landmarks_px))
+            matte = levels(self._matte(crop.apply(images[position])))
+            outlines.append(person_outline(matte, crop, landmarks[position]))
         return outlines
 
     def _matted(self, image_rgb: _Image, crop: SquareCrop) -> MattedCrop:
@@ -178,11 +181,12 @@ class LiveTracker:
         fit: "_CausalFit",
         index: int,
         landmarks_px: _Landmarks,
+        irises: FoundIrises,
         crop: SquareCrop,
         matted: Callable[[], MattedCrop],
     ) -> TrackedFrame | None:
         """Fit the head, then cut it out of what `matted` waits for."""
-        values = fit(landmarks_px)
+        values = fit(landmarks_px, irises)
         if values is None:
             matted()
             self.counts["does not fit"] += 1
@@ -210,10 +214,10 @@ class _CausalFit:
         """A gap: the next frame starts anew."""
         self._previous = None
 
-    def __call__(self, landmarks_px: _Landmarks) -> _Values | None:
+    def __call__(self, landmarks_px: _Landmarks, irises: FoundIrises) -> _Values | None:
         """The frame's fitted entries of theta; None where no pose of the head explains it."""
         camera, before = self.subject.camera, self._previous
-        target = self._tracker.targets(landmarks_px[None])[0]
+        target = self._tracker.targets(landmarks_px[None], FoundIrises.stacked([irises]))[0]
         start = rigid_start(self._cost, camera, target) if before is None else before
         steps = STEPS_ANEW if before is None else _STEPS_ONWARD
         values = fit_frame(self._cost, camera, target, start, before, self._weight, steps)

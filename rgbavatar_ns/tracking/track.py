@@ -125,7 +125,9 @@ class _Tracking:
             keys = tracker.key_positions(seen.points_px)
             outlines = key_outlines(self.source, self.mattes, alpha, seen, keys, self.run)
             follows = seen.follows()
-            fit = tracker.fit(seen.points_px, follows, width, height, half_done, outlines)
+            fit = tracker.fit(
+                seen.points_px, follows, width, height, half_done, outlines, seen.irises
+            )
             lost = tracker.rejected(fit, seen.points_px)
             found, fit = seen.without(lost), fit.without(lost)
             clock.done(len(seen))
@@ -247,7 +249,7 @@ class _Tracking:
             "other_faces": list(seen.with_others),
             "blurred": [index for index in seen.blurred if index in tracked],
             "notes": list(self.source.notes),
-            **fit_quality(clip.tracker, clip.fit, found.points_px),
+            **fit_quality(clip.tracker, clip.fit, found.points_px, found.irises),
             **silhouette_summary(shares),
             "unfilmed_share": sum(one["unfilmed"] for one in shares) / len(shares),
             "matte": given if own_mattes else "selfie segmentation",

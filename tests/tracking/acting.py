@@ -38,7 +38,7 @@ def observed(tracker: SubjectTracker, theta: np.ndarray, identity: np.ndarray) -
     points = np.zeros((len(theta), 478, 2))
     for frame, row in enumerate(theta):
         projected = CAMERA.project(tracker.cost.head.points(row, identity, CAMERA.eye_m))
-        points[frame, tracker.facemesh_index] = projected
+        points[frame, tracker.facemesh_index] = projected[: len(tracker.facemesh_index)]
     return points
 
 

@@ -4,6 +4,7 @@ import numpy as np
 import torch
 
 from rgbavatar_ns.head import HeadModel
+from rgbavatar_ns.tracking.face.iris import FoundIrises
 from rgbavatar_ns.tracking.fit.fit import fit_clip, key_frame_positions
 from rgbavatar_ns.tracking.fit.subject import SubjectTracker
 from rgbavatar_ns.tracking.verify.report import fit_quality
@@ -34,7 +35,7 @@ def test_known_performance_is_recovered_from_its_own_landmarks(head: HeadModel) 
     away = np.linalg.norm((ours - true)[..., :2], axis=-1)
     assert away.mean() < 0.002, "metres across the image, face"
 
-    quality = fit_quality(tracker, fit, noisy)
+    quality = fit_quality(tracker, fit, noisy, FoundIrises.unseen(noisy))
     assert quality["reprojection_error_share"] < 0.01
     assert quality["mouth_opening_correlation"] > 0.95
     assert quality["eyelid_opening_correlation"] > 0.95

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from rgbavatar_ns.tracking.face.clip import SeenFaces, followed_face
+from rgbavatar_ns.tracking.face.detector import IRIS_CENTERS
 from rgbavatar_ns.tracking.face.follow import FaceFollower
 
 from .clips import astronaut
@@ -104,6 +105,8 @@ def _seen(faces: list[np.ndarray | None], **changes: np.ndarray) -> SeenFaces:
         "time_s": np.arange(len(faces)) * 0.04,
         "has_alpha": np.zeros(len(faces), dtype=bool),
         "points": np.array(there) / (WIDTH, HEIGHT),
+        "irises": np.array([face[list(IRIS_CENTERS)] for face in there]) / (WIDTH, HEIGHT),
+        "iris_sigma": np.full((len(there), 2, 2), 0.02),
         "sharpness": np.ones(len(there)),
     }
     return SeenFaces(**(plain | changes))

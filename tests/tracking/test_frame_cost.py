@@ -42,7 +42,9 @@ def _seen(
 ) -> FrameTerms:
     """The head's points, each as many shares of the face's height away."""
     points = CAMERA.project(cost.head.points(theta, np.zeros(30), CAMERA.eye_m))
-    target = Target(points - away_share * FACE_PX, FACE_PX, np.eye(2), np.ones(len(points)))
+    own_share = np.repeat(cost.noise.own_share[:, None], 2, axis=1)
+    seen_px = points - away_share * FACE_PX
+    target = Target(seen_px, own_share, FACE_PX, np.eye(2), np.ones(len(points)))
     return FrameTerms(target, CAMERA, redescending)
 
 
@@ -96,7 +98,8 @@ def test_a_picture_turned_by_a_quarter_costs_the_same(tracker: SubjectTracker) -
     camera = StillCamera(700.0, (120.0, 120.0), 0.8)
     head, theta = tracker.cost.head, np.zeros(tracker.head.layout.size)
     seen = np.zeros((478, 2))
-    seen[tracker.facemesh_index] = camera.project(head.points(theta, np.zeros(30), camera.eye_m))
+    points_px = camera.project(head.points(theta, np.zeros(30), camera.eye_m))
+    seen[tracker.facemesh_index] = points_px[: len(tracker.facemesh_index)]
     seen += FACE_PX * away
     turned = np.stack([240 - seen[:, 1], seen[:, 0]], 1)
     lying = theta.copy()
@@ -120,12 +123,16 @@ def test_ties_draw_entries_together_and_leave_their_mean_to_the_widths() -> None
     width = np.array([0.5, 0.5, 1.0])
     free = np.zeros(3)
     parameters = FitParameters(
-        np.array([7, 9, 11]), free, free, width, width, np.array([[7, 9]]), np.array([0.1])
+        *(np.array([7, 9, 11]), free, free, width, width),
+        *(np.array([[7, 9]]), np.array([0.3]), np.array([0.1])),
     )
     precision = parameters.prior_precision()
     np.testing.assert_allclose(precision @ [1.0, 1.0, 0.0], [4.0, 4.0, 0.0])
     np.testing.assert_allclose(precision @ [1.0, -1.0, 0.0], [204.0, -204.0, 0.0])
     assert precision[2, 2] == 1.0
+    # The first is drawn .3 above the second, against widths of .5 around 0.
+    best = np.linalg.solve(precision, parameters.prior_pull())
+    np.testing.assert_allclose(best, [0.3 * 100 / 204, -0.3 * 100 / 204, 0.0], rtol=1e-12)
 
 
 def test_both_sides_of_a_face_are_tied_and_no_side_of_the_jaw(tracker: SubjectTracker) -> None:
@@ -134,6 +141,8 @@ def test_both_sides_of_a_face_are_tied_and_no_side_of_the_jaw(tracker: SubjectTr
     layout = tracker.head.layout
     left, right = (layout.slice(name).start for name in ("left_eye", "right_eye"))
     assert pairs[:2] == [[left, right], [left + 1, right + 1]], "eyes move together"
+    assert tracker.cost.parameters.tie_mean[1] < 0, "the left eye turns to its right, to the nose"
+    assert not np.delete(tracker.cost.parameters.tie_mean, 1).any()
     tied = {frozenset(names[column - first.start] for column in pair) for pair in pairs[2:]}
     assert frozenset(("mouthSmileLeft", "mouthSmileRight")) in tied
     assert frozenset(("cheekSquintLeft", "mouthSmileLeft")) in tied

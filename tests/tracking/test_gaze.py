@@ -16,6 +16,7 @@ from rgbavatar_ns.tracking.face.detector import (
     eye_widths_px,
     irises_seen,
 )
+from rgbavatar_ns.tracking.face.iris import FoundIrises
 from rgbavatar_ns.tracking.fit.fit import ClipFit, SubjectFit, fit_frame
 from rgbavatar_ns.tracking.fit.irises import iris_places
 from rgbavatar_ns.tracking.fit.parameters import GAZE_BOUNDS_RAD
@@ -63,8 +64,9 @@ def _looking(tracker: SubjectTracker, eyes_rad: tuple[float, float]) -> tuple[np
 def _fitted_gaze(tracker: SubjectTracker, points: np.ndarray, seen: float = 1.0) -> np.ndarray:
     """Degrees: pitch and yaw of the right eye, of the left one."""
     target = tracker.targets(points[None])[0]
-    irises = np.isin(tracker.facemesh_index, IRIS_CENTERS)
-    target = replace(target, seen=np.where(irises, seen, 1.0))
+    counts = target.seen.copy()
+    counts[np.flatnonzero(np.isin(tracker.facemesh_index, IRIS_CENTERS))] = seen
+    target = replace(target, seen=counts)
     start = np.zeros(len(tracker.cost.parameters.columns))
     theta = tracker.cost.theta(fit_frame(tracker.cost, CAMERA, target, start, None, 0.0, (14, 6)))
     return np.degrees([theta[tracker.head.layout.slice(name)][:2] for name in EYES])
@@ -85,7 +87,9 @@ def test_eyes_turn_together_whatever_each_iris_says(tracker: SubjectTracker) -> 
 def test_a_glance_is_found_and_hardly_shrunk_sideways(tracker: SubjectTracker) -> None:
     for yaw in (-0.25, 0.25):
         _, points = _looking(tracker, (0.0, yaw))
-        np.testing.assert_allclose(_fitted_gaze(tracker, points)[:, 1], np.degrees(yaw), atol=2)
+        found = _fitted_gaze(tracker, points)[:, 1]
+        np.testing.assert_allclose(found.mean(), np.degrees(yaw), atol=2)
+        assert 0 < found[0] - found[1] < 2.5, "the right eye turns left of the left one: they meet"
 
 
 def test_what_lids_hide_says_nothing(tracker: SubjectTracker) -> None:
@@ -134,11 +138,45 @@ def test_iris_errors_are_in_eye_widths_and_bounds_are_counted(head: HeadModel) -
     theta[5, layout.slice("right_eye").start + 1] = GAZE_BOUNDS_RAD[0]
     fit = _clip(tracker, theta, identity)
     points = np.repeat(_eyes(0.3)[None], 8, axis=0)
-    points[:, list(IRIS_CENTERS)] = tracker.irises_px(fit) + np.array([0, 40 * 0.07])
-    quality = gaze_quality(tracker, fit, points)
+    sigma = np.full((8, 2, 2), 0.02)
+    sigma[6:, 0] = np.inf
+    found = FoundIrises(tracker.irises_px(fit) + np.array([0, 40 * 0.07]), sigma)
+    quality = gaze_quality(tracker, fit, points, found)
+    assert quality["irises_found_share"] == pytest.approx(14 / 16)
     assert quality["iris_error_eye_widths"] == pytest.approx(0.07)
     assert quality["worst_iris_error_eye_widths"] == pytest.approx(0.07)
     assert quality["gaze_at_bound_share"] == pytest.approx(2 / 8)
-    shut = np.repeat(_eyes(0.02)[None], 8, axis=0)
-    assert np.isnan(iris_distances(tracker.irises_px(fit), shut)).all()
-    assert gaze_quality(tracker, fit, shut)["iris_error_eye_widths"] is None
+    unseen = FoundIrises.unseen(points)
+    assert np.isnan(iris_distances(tracker.irises_px(fit), points, unseen)).all()
+    assert gaze_quality(tracker, fit, points, unseen)["iris_error_eye_widths"] is None
+
+
+def test_irises_found_in_the_picture_tell_the_gaze_where_facemeshs_lag(
+    tracker: SubjectTracker,
+) -> None:
+    for pitch, yaw in ((-0.15, 0.0), (0.15, 0.2), (0.0, -0.3)):
+        theta, points = _looking(tracker, (pitch, yaw))
+        _, ahead = _looking(tracker, (0.0, 0.0))
+        points[list(IRIS_CENTERS)] = ahead[list(IRIS_CENTERS)]  # they do not follow at all
+        true_px = tracker.irises_px(
+            _clip(tracker, theta[None], np.zeros(tracker.head.num_identity))
+        )
+        found = FoundIrises(true_px, np.full((1, 2, 2), 0.01))
+        (target,) = tracker.targets(points[None], found)
+        start = np.zeros(len(tracker.cost.parameters.columns))
+        values = fit_frame(tracker.cost, CAMERA, target, start, None, 0.0, (14, 6))
+        gaze = tracker.gaze(ClipFit(SubjectFit(np.zeros(0), CAMERA, values[None]), values[None]))
+        found_degrees = np.degrees(gaze.reshape(2, 2).mean(0))
+        np.testing.assert_allclose(found_degrees, np.degrees([pitch, yaw]), atol=1.5)
+
+
+def test_a_found_iris_is_weighed_by_its_own_error_along_each_axis(tracker: SubjectTracker) -> None:
+    _, points = _looking(tracker, (0.0, 0.0))
+    sigma = np.array([[[0.01, 0.03], [np.inf, np.inf]]])
+    centers = points[None, list(IRIS_CENTERS)]
+    (target,) = tracker.targets(points[None], FoundIrises(centers, sigma))
+    width, height = eye_widths_px(points)[0], target.face_height_px
+    np.testing.assert_allclose(target.own_share[-2] * height, sigma[0, 0] * width)
+    guessed = [list(tracker.facemesh_index).index(iris) for iris in IRIS_CENTERS]
+    np.testing.assert_array_equal(target.seen[guessed], [0, 1], "found: FaceMesh's is not asked")
+    np.testing.assert_array_equal(target.seen[-2:], [1, 0])

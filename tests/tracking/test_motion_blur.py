@@ -15,6 +15,7 @@ from rgbavatar_ns.tracking.config import TrackConfig
 from rgbavatar_ns.tracking.face.clip import ClipLandmarks, SeenFaces, followed_face
 from rgbavatar_ns.tracking.face.detector import FaceLandmarker
 from rgbavatar_ns.tracking.face.find_faces import sharpness
+from rgbavatar_ns.tracking.face.iris import FoundIrises, find_irises
 from rgbavatar_ns.tracking.fit.own_head import subject_tracker
 
 from .acting import degrees_apart, skulls
@@ -26,12 +27,15 @@ pytest.importorskip("mediapipe", reason="the tracker's optional extra is not ins
 def follow(pictures: Sequence[np.ndarray]) -> ClipLandmarks:
     """The face as `rgbavatar track` sees it, frame after frame."""
     height, width = pictures[0].shape[:2]
-    points, found, sharp = [], [], []
+    points, irises, sigmas, found, sharp = [], [], [], [], []
     with closing(FaceLandmarker()) as landmarker:
         for picture in pictures:
             faces = landmarker.faces(picture)
             found.append(len(faces))
             points.append(faces)
+            eyes = [find_irises(picture, face * (width, height)) for face in faces]
+            irises.append(FoundIrises.stacked(eyes).centers / (width, height))
+            sigmas.append(FoundIrises.stacked(eyes).sigma)
             sharp += [sharpness(picture, face) for face in faces]
     count = len(pictures)
     seen = SeenFaces(
@@ -40,6 +44,8 @@ def follow(pictures: Sequence[np.ndarray]) -> ClipLandmarks:
         np.full(count, np.nan),
         np.zeros(count, bool),
         np.concatenate(points),
+        np.concatenate(irises),
+        np.concatenate(sigmas),
         np.array(sharp),
     )
     return followed_face(seen, width, height)
@@ -103,7 +109,7 @@ def test_a_swinging_head_is_followed_through_frames_exposed_for_half_their_time(
     focal_px = person.camera.focal_px
     known = TrackConfig(focal_px=focal_px, key_frames=4, identity_components=8, head_only=True)
     tracker = subject_tracker(known)
-    fit = tracker.fit(clip.points_px, clip.follows(), SIZE, SIZE)
+    fit = tracker.fit(clip.points_px, clip.follows(), SIZE, SIZE, irises=clip.irises)
     assert tracker.rejected(fit, clip.points_px) == []
     true = _swinging(layout, np.arange(FRAMES, dtype=float))
     away = degrees_apart(skulls(tracker, tracker.thetas(fit)), skulls(tracker, true))

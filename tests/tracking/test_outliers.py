@@ -45,10 +45,12 @@ def test_a_pose_stays_right_when_landmarks_go_wrong(
     identity = np.zeros(tracker.head.num_identity)
     points = CAMERA.project(tracker.cost.head.points(theta, identity, CAMERA.eye_m))
     whole = np.zeros((478, 2))
-    whole[tracker.facemesh_index] = points
+    whole[tracker.facemesh_index] = points[: len(tracker.facemesh_index)]
     face_px = float(face_height_px(whole[None])[0])
     start = np.zeros(len(tracker.cost.parameters.columns))
-    target = Target(spoil(points, face_px, random), face_px, np.eye(2), np.ones(len(points)))
+    own_share = np.repeat(tracker.cost.noise.own_share[:, None], 2, axis=1)
+    spoilt = spoil(points, face_px, random)
+    target = Target(spoilt, own_share, face_px, np.eye(2), np.ones(len(points)))
     values = fit_frame(tracker.cost, CAMERA, target, start, None, 0.0, (8, 4))
     found = tracker.cost.theta(values)
 

@@ -14,6 +14,7 @@ from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.tracking.config import TrackConfig
 from rgbavatar_ns.tracking.face.clip import ClipLandmarks
 from rgbavatar_ns.tracking.face.detector import FACE_OVAL
+from rgbavatar_ns.tracking.face.iris import FoundIrises
 from rgbavatar_ns.tracking.fit.fit import ClipFit
 from rgbavatar_ns.tracking.fit.outline import OutlineCost, OutlineTerms, PersonOutline
 from rgbavatar_ns.tracking.fit.subject import SubjectTracker
@@ -241,7 +242,9 @@ def clip_of_key_frames(tmp_path: Path) -> tuple[FrameSource, ClipLandmarks]:
     for number in range(2):
         cv2.imwrite(str(folder / f"{number}.png"), np.full((48, 64, 3), 90, np.uint8))
     points = np.random.default_rng(1).uniform(20, 40, (2, 478, 2))
-    found = ClipLandmarks(points, (0, 1), (0, 0), (0, 0), 2, 64, 48, (), ())
+    found = ClipLandmarks(
+        points, FoundIrises.unseen(points), (0, 1), (0, 0), (0, 0), 2, 64, 48, (), ()
+    )
     return FrameSource.open(folder), found
 
 

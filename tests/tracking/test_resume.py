@@ -267,3 +267,21 @@ def test_after_a_full_disk_the_same_command_goes_on(
     assert (tmp_path / "set" / WORK_FOLDER).is_dir()
     track_video(clip, tmp_path / "set", CONFIG)
     assert _files(tmp_path / "set") == _files(uninterrupted)
+
+
+def test_a_run_begun_before_irises_were_found_looks_for_faces_anew(
+    clip: Path, uninterrupted: Path, tmp_path: Path
+) -> None:
+    dst = tmp_path / "set"
+    with pytest.raises(KeyboardInterrupt):
+        track_video(clip, dst, CONFIG, _interrupting("fit", 1))
+    stages = dst / WORK_FOLDER / "stages.json"
+    named = stages.read_text()
+    assert "faces and irises from frame" in named
+    stages.write_text(named.replace("faces and irises from frame", "faces from frame"))
+    for path in (dst / WORK_FOLDER).glob("faces_*.npz"):
+        with np.load(path) as whole:
+            before = {name: whole[name] for name in whole.files if "iris" not in name}
+        np.savez(path, **before)  # pyright: ignore[reportArgumentType]
+    track_video(clip, dst, CONFIG)
+    assert _files(dst) == _files(uninterrupted)

@@ -12,6 +12,7 @@ from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.reading import DamagedFileError, load_arrays
 from rgbavatar_ns.tracking.face.detector import face_height_px
 from rgbavatar_ns.tracking.face.follow import FaceFollower
+from rgbavatar_ns.tracking.face.iris import FoundIrises
 from rgbavatar_ns.tracking.resumable_run import stage_damage_told
 
 # In one frame's time a face moves and grows by less than this; more is a cut or a jump.
@@ -22,15 +23,16 @@ _PAUSE = 4.0
 # blurred) is noted as blur. Frames of a face that talks and keeps still are above .7.
 _BLURRED, _SHARP_PERCENT = 0.35, 90
 _MOST_BYTES = 1 << 32
-_PER_FRAME, _POINTS = ("count", "clip", "time_s", "has_alpha"), (478, 2)
+_PER_FRAME, _POINTS, _IRISES = ("count", "clip", "time_s", "has_alpha"), (478, 2), (2, 2)
 
 
 @dataclass(frozen=True)
 class SeenFaces:
     """Every face in every frame read: `count` faces of frame f lie in a row in `points`.
 
-    `points` are shares of the frame's width and height; `sharpness` has any unit; `time_s` is NaN
-    where the source has no clock; `has_alpha` tells frames that bring their own matte.
+    `points` and `irises` are shares of the frame's width and height; `iris_sigma` are the irises'
+    standard errors as `FoundIrises` has them; `sharpness` has any unit; `time_s` is NaN where the
+    source has no clock; `has_alpha` tells frames that bring their own matte.
     """
 
     count: Int[np.ndarray, "F"]
@@ -38,6 +40,8 @@ class SeenFaces:
     time_s: Float[np.ndarray, "F"]
     has_alpha: Bool[np.ndarray, "F"]
     points: Float[np.ndarray, "N 478 2"]
+    irises: Float[np.ndarray, "N 2 2"]
+    iris_sigma: Float[np.ndarray, "N 2 2"]
     sharpness: Float[np.ndarray, "N"]
 
     def __len__(self) -> int:
@@ -56,9 +60,10 @@ class SeenFaces:
             arrays = load_arrays(path, _MOST_BYTES)
             faces = cls(*(arrays[item.name] for item in fields(cls)))
             rows = [getattr(faces, name).shape for name in _PER_FRAME]
-            shown = (len(faces.sharpness), *_POINTS)
+            shown = [(len(faces.sharpness), *size) for size in (_POINTS, _IRISES, _IRISES)]
+            there = [one.shape for one in (faces.points, faces.irises, faces.iris_sigma)]
             whole = faces.count.dtype.kind == "i" and (faces.count >= 0).all()
-            if rows != [(len(faces),)] * len(rows) or faces.points.shape != shown or not whole:
+            if rows != [(len(faces),)] * len(rows) or there != shown or not whole:
                 raise DamagedFileError("its arrays do not fit together")
             if faces.count.sum() != len(faces.points):
                 raise DamagedFileError("it counts other faces than it holds")
@@ -67,7 +72,7 @@ class SeenFaces:
 
 @dataclass(frozen=True)
 class ClipLandmarks:
-    """Landmarks (source pixels) of the frames that show the followed face, and which those are.
+    """Landmarks and irises (source pixels) of the frames that show the followed face, and which.
 
     `frame_index` counts all frames read, `clip` says from which file each one is, `segment` counts
     up at each gap, cut or jump. `with_others` lists frames in which another face was seen too,
@@ -75,6 +80,7 @@ class ClipLandmarks:
     """
 
     points_px: Float[np.ndarray, "F 478 2"]
+    irises: FoundIrises
     frame_index: tuple[int, ...]
     clip: tuple[int, ...]
     segment: tuple[int, ...]
@@ -98,6 +104,7 @@ class ClipLandmarks:
         return replace(
             self,
             points_px=self.points_px[keep],
+            irises=self.irises.of(keep),
             frame_index=tuple(self.frame_index[k] for k in keep),
             clip=tuple(self.clip[k] for k in keep),
             segment=tuple(self.segment[k] for k in keep),
@@ -122,6 +129,7 @@ def followed_face(seen: SeenFaces, width: int, height: int) -> ClipLandmarks:
     follower = FaceFollower()
     first_face = np.concatenate([[0], np.cumsum(seen.count)])
     points: list[Float[np.ndarray, "478 2"]] = []
+    irises: list[FoundIrises] = []
     sharpness: list[float] = []
     index: list[int] = []
     jumps: list[int] = []
@@ -134,7 +142,10 @@ def followed_face(seen: SeenFaces, width: int, height: int) -> ClipLandmarks:
             others.append(frame)
         if sighting.position is not None:
             points.append(faces[sighting.position])
-            sharpness.append(float(seen.sharpness[rows][sighting.position]))
+            row = rows.start + sighting.position
+            centers_px = seen.irises[row] * (width, height)
+            irises.append(FoundIrises(centers_px, seen.iris_sigma[row]))
+            sharpness.append(float(seen.sharpness[row]))
             index.append(frame)
             if sighting.jumped:
                 jumps.append(frame)
@@ -147,6 +158,7 @@ def followed_face(seen: SeenFaces, width: int, height: int) -> ClipLandmarks:
     landmarks = np.array(points)
     return ClipLandmarks(
         landmarks,
+        FoundIrises.stacked(irises),
         tuple(index),
         tuple(int(seen.clip[k]) for k in index),
         _segments(landmarks, np.array(index), seen, jumps),

@@ -15,6 +15,8 @@ from rgbavatar_ns.tracking.input.image_files import fitted_size
 FOREHEAD, CHIN = 10, 152
 IRIS_CENTERS = (468, 473)
 """FaceMesh's iris centres; 468 is the subject's right eye, 473 the left one."""
+IRIS_RIMS = ((469, 470, 471, 472), (474, 475, 476, 477))
+"""Four points around each of them."""
 FACE_OVAL = (
     *(10, 338, 297, 332, 284, 251, 389, 356, 454, 323, 361, 288, 397, 365, 379, 378, 400, 377),
     *(152, 148, 176, 149, 150, 136, 172, 58, 132, 93, 234, 127, 162, 21, 54, 103, 67, 109),

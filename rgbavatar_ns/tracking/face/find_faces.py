@@ -1,4 +1,4 @@
-"""The first reading of a clip: every face in every frame, kept on disk as the reading goes on."""
+"""The first reading of a clip: every frame's faces and irises, kept on disk as it goes on."""
 
 from collections.abc import Callable, Generator
 from typing import Any
@@ -10,6 +10,7 @@ from jaxtyping import Float, UInt8
 from rgbavatar_ns.files import atomic_write
 from rgbavatar_ns.tracking.face.clip import SeenFaces
 from rgbavatar_ns.tracking.face.detector import MAX_SIDE_PX, FaceLandmarker
+from rgbavatar_ns.tracking.face.iris import FoundIrises, find_irises
 from rgbavatar_ns.tracking.input.video import FrameSource, SourceFrame
 from rgbavatar_ns.tracking.resumable_run import GO_ON, ResumableRun
 from rgbavatar_ns.tracking.threads import in_background
@@ -25,8 +26,10 @@ _SHARPNESS_PX = 96
 _Block = tuple[SeenFaces, tuple[int, int] | None]
 """Some frames' faces; the last block tells the frames' width and height."""
 _NONE = np.zeros(0, np.int64)
+_NO_IRISES = np.zeros((0, 2, 2))
 _NO_FRAMES = SeenFaces(
-    _NONE, _NONE, np.zeros(0), np.zeros(0, bool), np.zeros((0, 478, 2)), np.zeros(0)
+    *(_NONE, _NONE, np.zeros(0), np.zeros(0, bool), np.zeros((0, 478, 2))),
+    *(_NO_IRISES, _NO_IRISES, np.zeros(0)),
 )
 
 
@@ -59,7 +62,8 @@ def find_faces(
 
     try:
         while not blocks or blocks[-1]["size"] is None:
-            blocks.append(run.stages.run(f"faces from frame {start}", None, look))
+            # A stage of a run that was begun before irises were found has another name.
+            blocks.append(run.stages.run(f"faces and irises from frame {start}", None, look))
             start += blocks[-1]["frames"]
     finally:
         if found is not None:
@@ -109,14 +113,19 @@ def _blocks(
 
 
 def _faces_in(frame: SourceFrame, faces: Float[np.ndarray, "N 478 2"]) -> SeenFaces:
-    """What is kept of one frame; its image is looked at only for sharpness."""
+    """What is kept of one frame; its image is looked at for irises and sharpness."""
+    image = frame.image_rgb
+    size = np.array([image.shape[1], image.shape[0]])
+    irises = FoundIrises.stacked([find_irises(image, face * size) for face in faces])
     return SeenFaces(
         np.array([len(faces)], dtype=np.int64),
         np.array([frame.clip], dtype=np.int64),
         np.array([np.nan if frame.time_s is None else frame.time_s], dtype=np.float64),
         np.array([frame.alpha is not None]),
         faces,
-        np.array([sharpness(frame.image_rgb, face) for face in faces], dtype=np.float64),
+        irises.centers / size,
+        irises.sigma,
+        np.array([sharpness(image, face) for face in faces], dtype=np.float64),
     )
 
 

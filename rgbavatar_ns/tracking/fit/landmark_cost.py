@@ -29,14 +29,20 @@ _solve_positive, _solve_triangular = get_lapack_funcs(("posv", "trtrs"), dtype=n
 
 @dataclass(frozen=True)
 class Target:
-    """One frame's landmarks in pixels (those of the landmark head, in its order)."""
+    """One frame's landmarks in pixels (those of the landmark head, in its order).
+
+    `own_share` is how much each errs by itself across and along the upright face, as shares of
+    its height.
+    """
 
     points_px: Float[np.ndarray, "L 2"]
+    own_share: Float[np.ndarray, "L 2"]
     face_height_px: float
     to_upright: Float[np.ndarray, "2 2"]
     """Rotation of the image after which the forehead is straight above the chin."""
     seen: Float[np.ndarray, "L"]
-    """How much each landmark counts, 0 to 1: irises fade behind closing lids."""
+    """How much each landmark counts, 0 to 1: irises fade behind closing lids, and FaceMesh's count
+    only where none are found."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +66,7 @@ class FrameCost:
 
     head: LandmarkHead
     noise: LandmarkNoise
-    """Of the landmarks, row for row of `head`."""
+    """Of the landmarks, row for row of `head`; a target's own share differs where modes are 0."""
     parameters: FitParameters
     identity_columns: int = 0
     """How many identity coefficients are unknown too."""
@@ -68,6 +74,7 @@ class FrameCost:
     def __post_init__(self) -> None:
         self._unknowns = self.head.unknowns(self.parameters.columns, self.identity_columns)
         self._prior_precision = self.parameters.prior_precision()
+        self._prior_pull = self.parameters.prior_pull()
         # Residuals go by direction in the upright face, then by landmark.
         scaled = self.noise.modes / self.noise.own_share[:, None, None]
         self._modes = scaled.transpose(1, 0, 2).copy()
@@ -84,8 +91,10 @@ class FrameCost:
         theta = self.theta(values)
         posed = self.head.posed(theta, identity, frame.camera.eye_m)
         found = self._explained(posed.points_m, frame)
-        pull = self._prior_precision @ values
-        cost = found.cost + 0.5 * float(values @ pull)
+        weighed = self._prior_precision @ values
+        pull = weighed - self._prior_pull
+        # But for the constant by which the prior's mean costs nothing.
+        cost = found.cost + float(values @ (0.5 * weighed - self._prior_pull))
         closeness, apart = None, values
         if frame.neighbours is not None and frame.temporal_weight > 0:
             closeness = frame.temporal_weight * self.parameters.temporal_width**-2.0
@@ -115,10 +124,8 @@ class FrameCost:
     ) -> QuadraticModel:
         """What the landmarks cost around a pose."""
         target = frame.target
-        own_px = target.face_height_px * self.noise.own_share
-        slope = (target.to_upright / own_px[:, None, None]) @ frame.camera.image_slope(
-            posed.points_m
-        )
+        own_px = target.face_height_px * target.own_share
+        slope = (target.to_upright / own_px[..., None]) @ frame.camera.image_slope(posed.points_m)
         rows = (slope @ self.head.derivative(posed, self._unknowns)).transpose(1, 0, 2)
         weighted = (rows * found.root_weight[:, None]).reshape(len(found.pull), -1)
         rows = rows.reshape(weighted.shape)
@@ -135,8 +142,8 @@ class FrameCost:
         """
         target, losses = frame.target, _REDESCENDING if frame.redescending else _FROM_AFAR
         away_px = frame.camera.project(points) - target.points_px
-        own_px = target.face_height_px * self.noise.own_share
-        residual = target.to_upright @ (away_px / own_px[:, None]).T
+        own_px = target.face_height_px * target.own_share
+        residual = target.to_upright @ away_px.T / own_px.T
         left, weighted, factor = residual, self._modes, self._no_modes
         amounts, root = np.zeros(len(factor)), target.seen
         for robust in losses:

@@ -19,8 +19,10 @@ _JAW_OPEN = (-0.02, 0.45)
 # narrow prior a person's lids of another shape look like a gaze of 10 to 30 degrees.
 GAZE_BOUNDS_RAD = (-0.55, 0.55)
 _GAZE_PITCH_WIDTH, _GAZE_YAW_WIDTH, _GAZE_STEP = 0.1, 0.2, 0.08
-# Both eyes move as one (Hering's law) but for vergence, by a few degrees; their height is the same.
-_SAME_PITCH_WIDTH, _VERGENCE_WIDTH = 0.02, 0.05
+# Both eyes move as one (Hering's law); their height is the same. They meet on what is looked at:
+# 63 mm apart they turn towards each other by 6 degrees at .6 m and by 1 at 3 m; 2.3 are in between.
+# Pictures tell little of it: half a millimetre in the eyes' places on the head are 2 degrees.
+_SAME_PITCH_WIDTH, _VERGENCE, _VERGENCE_WIDTH = 0.02, 0.04, 0.02
 _EXPRESSION = (0.0, 1.0)
 _EXPRESSION_WIDTH, _BLINK_WIDTH = 0.4, 1.0
 # Expressions that have a number for a name, as FLAME's have, were found by statistics: they go
@@ -55,7 +57,7 @@ class FitParameters:
     """The fitted entries of theta (`columns`), with bounds, prior width and temporal width.
 
     Widths are standard deviations in the entry's unit; inf means free. `ties` are pairs of columns
-    whose difference has a prior too, of width `tie_width`.
+    whose difference has a prior too, around `tie_mean` with the width `tie_width`.
     """
 
     columns: Int[np.ndarray, "P"]
@@ -64,17 +66,25 @@ class FitParameters:
     prior_width: Float[np.ndarray, "P"]
     temporal_width: Float[np.ndarray, "P"]
     ties: Int[np.ndarray, "T 2"]
+    tie_mean: Float[np.ndarray, "T"]
     tie_width: Float[np.ndarray, "T"]
 
     def prior_precision(self) -> Float[np.ndarray, "P P"]:
-        """Inverse covariance of the prior around 0."""
-        precision = np.diag(self.prior_width**-2.0)
+        """Inverse covariance of the prior."""
+        apart = self._tied() / self.tie_width[:, None]
+        return np.diag(self.prior_width**-2.0) + apart.T @ apart
+
+    def prior_pull(self) -> Float[np.ndarray, "P"]:
+        """The prior's precision times its mean, which is 0 but for the ties' sake."""
+        return (self.tie_mean / self.tie_width**2) @ self._tied()
+
+    def _tied(self) -> Float[np.ndarray, "T P"]:
+        """A tie's difference from the entries."""
         place = {int(column): number for number, column in enumerate(self.columns)}
-        for tie, width in zip(self.ties, self.tie_width):
-            apart = np.zeros(len(self.columns))
-            apart[[place[int(column)] for column in tie]] = 1.0, -1.0
-            precision += np.outer(apart, apart) / width**2
-        return precision
+        apart = np.zeros((len(self.ties), len(self.columns)))
+        for row, tie in zip(apart, self.ties):
+            row[[place[int(column)] for column in tie]] = 1.0, -1.0
+        return apart
 
 
 def fit_parameters(
@@ -117,14 +127,17 @@ def fit_parameters(
     columns, lower, upper, prior, temporal = (np.array(part) for part in zip(*rows))
     fitted = {name: first + number for number, name in enumerate(expression_names)}
     fitted = {name: column for name, column in fitted.items() if column in set(columns.tolist())}
-    ties, tie_width = _ties(layout, fitted)
-    return FitParameters(columns.astype(np.int64), lower, upper, prior, temporal, ties, tie_width)
+    ties = _ties(layout, fitted)
+    return FitParameters(columns.astype(np.int64), lower, upper, prior, temporal, *ties)
 
 
 def _ties(
     layout: ThetaLayout, fitted: Mapping[str, int]
-) -> tuple[Int[np.ndarray, "T 2"], Float[np.ndarray, "T"]]:
-    """Pairs of columns with their widths: eyes, sides, partners; expressions' columns by name."""
+) -> tuple[Int[np.ndarray, "T 2"], Float[np.ndarray, "T"], Float[np.ndarray, "T"]]:
+    """Pairs of columns with their differences' means and widths; expressions' columns by name.
+
+    Of eyes, then of the sides of the face and of partners.
+    """
     found: dict[tuple[str, str], float] = {}
     for name in fitted:
         other = name.removesuffix("Left") + "Right"
@@ -139,8 +152,9 @@ def _ties(
     left, right = (layout.slice(name).start for name in ("left_eye", "right_eye"))
     ties = [(left, right), (left + 1, right + 1)]
     ties += [(fitted[first], fitted[second]) for first, second in known]
-    widths = [_SAME_PITCH_WIDTH, _VERGENCE_WIDTH, *known.values()]
-    return np.array(ties, np.int64), np.array(widths, np.float64)
+    means, widths = np.zeros(len(ties)), [_SAME_PITCH_WIDTH, _VERGENCE_WIDTH, *known.values()]
+    means[1] = -_VERGENCE  # towards the nose: the left eye to its right
+    return np.array(ties, np.int64), means, np.array(widths, np.float64)
 
 
 def _columns(layout: ThetaLayout, name: str) -> range:

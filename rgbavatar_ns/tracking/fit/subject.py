@@ -24,10 +24,12 @@ from rgbavatar_ns.tracking.face.detector import (
     IRIS_CENTERS,
     LID_PAIRS,
     LIP_PAIRS,
+    eye_widths_px,
     face_height_px,
     irises_seen,
     upright_turn,
 )
+from rgbavatar_ns.tracking.face.iris import FoundIrises
 from rgbavatar_ns.tracking.fit.fit import (
     ClipFit,
     SubjectFit,
@@ -69,27 +71,45 @@ class SubjectTracker:
         rows = np.flatnonzero(np.isin(self.landmarks.facemesh_index, sorted(_SEEN)))
         marks = self.landmarks.select(rows)
         self.facemesh_index = marks.facemesh_index
+        # After FaceMesh's points the irises that are found in the picture, which lie on the mesh.
+        irises, places = iris_places(self.head.arrays)
         vertex_ids = self.head.arrays.faces[marks.triangle].astype(np.int64)
-        self.mesh_landmarks = LandmarkHead(self.head, vertex_ids, marks.barycentric)
+        self.mesh_landmarks = LandmarkHead(
+            self.head,
+            np.concatenate([vertex_ids, irises]),
+            np.concatenate([marks.barycentric, places]),
+        )
         size_m = self.mesh_landmarks.expression_size_m()
         names, layout = self.head.arrays.expression_names, self.head.layout
         parameters = fit_parameters(layout, names, size_m)
         seen = self.mesh_landmarks
         if self.response is not None:
-            seen = seen.with_response(self.response.select(rows))
+            seen = seen.with_response(self.response.select(rows).and_none(len(irises)))
         self._seen = seen
         self._person = _AsTensor()
-        self.cost = FrameCost(seen, self.noise.select(marks.facemesh_index), parameters)
+        noise = self.noise.select(np.array([*marks.facemesh_index, *IRIS_CENTERS]))
+        self.cost = FrameCost(seen, noise, parameters)
 
-    def targets(self, landmarks_px: Float[np.ndarray, "F 478 2"]) -> list[Target]:
-        """Each frame's landmarks in the order of the landmark head."""
+    def targets(
+        self, landmarks_px: Float[np.ndarray, "F 478 2"], irises: FoundIrises | None = None
+    ) -> list[Target]:
+        """Each frame's landmarks in the order of the landmark head, irises found (px) at the end.
+
+        Without found ones FaceMesh's tell the gaze.
+        """
         heights, turns = face_height_px(landmarks_px), upright_turn(landmarks_px)
-        seen = np.ones((len(landmarks_px), len(self.facemesh_index)))
-        irises = [int(np.flatnonzero(self.facemesh_index == iris)[0]) for iris in IRIS_CENTERS]
-        seen[:, irises] = irises_seen(landmarks_px)
+        irises = FoundIrises.unseen(landmarks_px) if irises is None else irises
+        points = np.concatenate([landmarks_px[:, self.facemesh_index], irises.centers], axis=1)
+        seen, found = np.ones(points.shape[:2]), slice(len(self.facemesh_index), None)
+        guessed = [int(np.flatnonzero(self.facemesh_index == iris)[0]) for iris in IRIS_CENTERS]
+        seen[:, guessed] = irises_seen(landmarks_px) * ~irises.found
+        seen[:, found] = irises.found
+        own_share = np.broadcast_to(self.cost.noise.own_share[:, None], points.shape).copy()
+        as_found = irises.sigma * (eye_widths_px(landmarks_px) / heights[:, None])[..., None]
+        own_share[:, found] = np.where(irises.found[..., None], as_found, own_share[:, found])
         return [
-            Target(points[self.facemesh_index], float(height), turn, own)
-            for points, height, turn, own in zip(landmarks_px, heights, turns, seen)
+            Target(one, own, float(height), turn, counts)
+            for one, own, height, turn, counts in zip(points, own_share, heights, turns, seen)
         ]
 
     def fit(
@@ -100,15 +120,17 @@ class SubjectTracker:
         height: int,
         advance: Callable[[], None] = lambda: None,
         outlines: Sequence[PersonOutline | None] = (),
+        irises: FoundIrises | None = None,
     ) -> ClipFit:
         """Identity, camera and offsets from key frames, then every frame.
 
-        `outlines` are those of the person in the frames of `key_positions`, in their order.
+        `outlines` are those of the person in the frames of `key_positions`, in their order;
+        `irises` those found in the pictures, in pixels.
         """
         # The matrices are small: more threads would only wait for each other.
         with threadpool_limits(1):
-            subject = self.fit_subject(landmarks_px, width, height, outlines)
-            targets = self.targets(landmarks_px)
+            subject = self.fit_subject(landmarks_px, width, height, outlines, irises)
+            targets = self.targets(landmarks_px, irises)
             weight = self.config.temporal_weight
             return fit_clip(self.cost, subject, targets, follows, weight, advance)
 
@@ -122,12 +144,13 @@ class SubjectTracker:
         width: int,
         height: int,
         outlines: Sequence[PersonOutline | None] = (),
+        irises: FoundIrises | None = None,
     ) -> SubjectFit:
         """Identity, camera and landmark offsets from the key frames.
 
-        `outlines` as in `fit`; without any, landmarks alone decide.
+        `outlines` and `irises` as in `fit`; without any, landmarks alone decide.
         """
-        targets = self.targets(landmarks_px)
+        targets = self.targets(landmarks_px, irises)
         keys = [targets[position] for position in self.key_positions(landmarks_px)]
         shared = min(self.config.identity_components, self.cost.head.num_identity)
         subject = fit_subject(self.cost, keys, width, height, shared, self.config.focal_px)
@@ -135,6 +158,8 @@ class SubjectTracker:
             outline_cost = OutlineCost(self.head, self.cost.parameters.columns, shared)
             subject = fit_outlines(self.cost, outline_cost, keys, outlines, subject, shared)
         offsets = subject_offsets(self.cost, subject, keys)
+        # An iris that is seen is where the mesh's is to be.
+        offsets[len(self.facemesh_index) :] = 0
         self.cost = replace(self.cost, head=self.cost.head.with_offsets(offsets))
         return subject
 
@@ -147,7 +172,7 @@ class SubjectTracker:
         return np.array([self.cost.theta(values) for values in fit.values])
 
     def fitted_px(self, fit: ClipFit, *, with_offsets: bool = True) -> Float[np.ndarray, "F L 2"]:
-        """Where the fitted head's landmarks are detected, source pixels, with or without offsets.
+        """Where FaceMesh sees the fitted head's points, source pixels, with or without offsets.
 
         The offsets are the subject's own; the detector's response is in both.
         """
@@ -158,7 +183,7 @@ class SubjectTracker:
                 camera.project(head.points(theta, identity, camera.eye_m))
                 for theta in self._head_thetas(fit)
             ]
-        )
+        )[:, : len(self.facemesh_index)]
 
     def irises_px(self, fit: ClipFit) -> Float[np.ndarray, "F 2 2"]:
         """Where the middle of the mesh's right iris and of its left one is, source pixels."""

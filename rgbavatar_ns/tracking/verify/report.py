@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Int
 from rgbavatar_ns.data.check.problems import Finding, Severity
 from rgbavatar_ns.data.check.silhouette import silhouette_overlap
 from rgbavatar_ns.tracking.face.detector import LID_PAIRS, LIP_PAIRS, face_height_px
+from rgbavatar_ns.tracking.face.iris import FoundIrises
 from rgbavatar_ns.tracking.fit.fit import ClipFit
 from rgbavatar_ns.tracking.fit.subject import SubjectTracker
 from rgbavatar_ns.tracking.image.head_mask import HeadOutline
@@ -19,7 +20,7 @@ from rgbavatar_ns.tracking.verify.gaze import gaze_quality
 _CLOSED_SHARE = 0.5
 # Limits of the words: beyond the first a clip is no longer good, beyond the second it is to be
 # looked at. Shares of the face's height, correlations, shares of frames, pixels,
-# eye widths (on renders, whose truth is known, irises lie .05 off).
+# eye widths (on renders, whose truth is known, found irises lie .02 off).
 _FITTED_ERROR, _MESH_ERROR = (0.01, 0.02), (0.015, 0.03)
 _CORRELATION, _COVERAGE = (0.85, 0.6), (0.95, 0.85)
 _IRIS_ERROR, _AT_BOUND = (0.1, 0.2), (0.02, 0.2)
@@ -36,7 +37,10 @@ _RIM = 0.1
 
 
 def fit_quality(
-    tracker: SubjectTracker, fit: ClipFit, landmarks_px: Float[np.ndarray, "F 478 2"]
+    tracker: SubjectTracker,
+    fit: ClipFit,
+    landmarks_px: Float[np.ndarray, "F 478 2"],
+    irises: FoundIrises,
 ) -> dict[str, Any]:
     """Reprojection errors, agreement of lips and lids, blinks, gaze, and the camera.
 
@@ -65,7 +69,7 @@ def fit_quality(
         "eyelid_opening_correlation": gap_correlation(*gaps["eyelid"]),
         "blinks_measured": count_blinks(gaps["eyelid"][1] / height),
         "blinks_fitted": count_blinks(gaps["eyelid"][0] / height),
-        **gaze_quality(tracker, fit, landmarks_px),
+        **gaze_quality(tracker, fit, landmarks_px, irises),
         "focal_px": fit.subject.camera.focal_px,
         "camera_distance_m": fit.subject.camera.distance_m,
     }
