@@ -22,6 +22,8 @@ _SMOOTH_FRAMES = 1.5
 # One camera hardly tells how a body is turned: people sit before it, and only what is plainly
 # otherwise counts. The detector's own error is some 6 degrees sideways and 2 in the tilt.
 _DOUBTED_YAW_RAD, _DOUBTED_ROLL_RAD = 0.2, 0.035
+# Where so much of the clothes looks otherwise, something is before them: folds are less.
+_COVERED = 0.05
 _LEAST_FRAMES = 10
 _ROUNDS = 5
 
@@ -49,6 +51,12 @@ class BodyPlaces:
     """How far the background moves over the clip, pixels of the source; NaN where none is seen."""
     shoulders_up_cm: float = 0.0
     """How much higher the shoulders are than the mesh has them."""
+    covered_share: float = 0.0
+    """Share of the frames in which something is before the body."""
+    seen_cm2: float = np.nan
+    """Area of body that half of the frames show; NaN where nobody looked."""
+    beside_share: float = 0.0
+    """Share of the frames in which the matte holds something beside the person."""
 
     def report(self) -> dict[str, Any]:
         """What `tracking.json` tells of the body."""
@@ -61,6 +69,9 @@ class BodyPlaces:
             "turned_degrees": float(np.percentile(away, 98)),
             "moved_mm": float(1e3 * np.percentile(_away(self.neck_m), 98)),
             "background_moves_px": None if np.isnan(self.background_px) else self.background_px,
+            "covered_share": self.covered_share,
+            "seen_cm2": None if np.isnan(self.seen_cm2) else self.seen_cm2,
+            "beside_share": self.beside_share,
         }
 
 
@@ -95,7 +106,15 @@ def place_body(
             rotation[k], neck_m[k] = here.rotation, here(body.neck_m)
     moved = np.array([one.background_px for one in sightings])
     background_px = float(np.nanpercentile(moved, 98)) if np.isfinite(moved).any() else np.nan
-    return BodyPlaces(rotation, neck_m, still, followed / max(frames, 1), background_px)
+    covered = np.mean([one.covered > _COVERED for one in sightings])
+    return BodyPlaces(
+        rotation,
+        neck_m,
+        still,
+        followed / max(frames, 1),
+        background_px,
+        covered_share=float(covered),
+    )
 
 
 @dataclass(frozen=True)

@@ -27,6 +27,10 @@ _REJECTED, _BLURRED = (0.05, 0.25), (0.1, 0.3)
 _FACE_PX, _FRAMES = (100.0, 50.0), (100, 25)
 # How far the background wanders, in shares of the face's height, until the camera is said to move.
 _MOVES = 0.03
+# A body that is not there or hardly, square centimetres (shoulders and chest have 800, a picture
+# that ends at the collar 150), and shares of frames in which something is before or beside it.
+_NO_BODY_CM2, _LITTLE_BODY_CM2 = 15.0, 80.0
+_COVERED, _BESIDE = 0.03, 0.1
 # The part of the face whose outline is skin: from a little above the chin to the eyes, as shares
 # of the height from chin to forehead; and how far beside the head the matte is looked at.
 _FACE_FROM, _FACE_TO, _BESIDE = 0.1, 0.6, 0.2
@@ -190,6 +194,7 @@ def tracking_findings(report: Mapping[str, Any]) -> list[Finding]:
             found.append(Finding(kind, severity, cause))
     if _camera_moves(report):
         found.append(Finding("camera", "warning", "the camera moves"))
+    found += _body_findings(report["body"] or {})
     others = len(report["other_faces"])
     if others:
         found.append(Finding("faces", "error", f"another face is seen in {others} frames"))
@@ -200,3 +205,24 @@ def _camera_moves(report: Mapping[str, Any]) -> bool:
     """Whether what is behind the person moves, in the crop or about it."""
     moved_px = (report["body"] or {}).get("background_moves_px") or 0.0
     return report.get("background") == "moves" or moved_px > _MOVES * report["face_height_px"]
+
+
+def _body_findings(body: Mapping[str, Any]) -> list[Finding]:
+    """What keeps the body from being followed: of a body that is not seen, nothing else is told."""
+    seen, covered, beside = (
+        body.get(name) for name in ("seen_cm2", "covered_share", "beside_share")
+    )
+    if seen is not None and seen < _LITTLE_BODY_CM2:
+        nothing = "no body is in the picture: it is taken to keep still"
+        cause = nothing if seen < _NO_BODY_CM2 else "the body is hardly seen"
+        return [Finding("body", "warning", cause)]
+    found = []
+    if covered is not None and covered > _COVERED:
+        cause = f"something is before the body in {covered:.0%} of frames (an arm, a hand)"
+        found.append(Finding("body", "warning", cause))
+    if beside is not None and beside > _BESIDE:
+        cause = (
+            f"the matte holds more than the person in {beside:.0%} of frames (somebody, a chair)"
+        )
+        found.append(Finding("body", "warning", cause))
+    return found
