@@ -83,6 +83,7 @@ def _sightings_packed(sightings: Sequence[BodySighting]) -> dict[str, np.ndarray
         "run": np.array([one.run for one in sightings]),
         "background_px": np.array([one.background_px for one in sightings]),
         "covered": np.array([one.covered for one in sightings]),
+        "of_first": np.array([one.of_first for one in sightings]),
         "seen": np.array([len(one.seen_px) for one in sightings]),
         "seen_px": np.concatenate([no_points, *(one.seen_px for one in sightings)]),
         "chosen": np.array(
@@ -106,6 +107,7 @@ def _sightings_unpacked(held: _Arrays) -> list[BodySighting]:
             certainty[k] if held["chosen"][k] >= 0 else None,
             float(held["background_px"][k]),
             float(held["covered"][k]),
+            bool(held["of_first"][k]),
         )
         for k in range(len(held["run"]))
     ]
@@ -121,15 +123,9 @@ def _state_packed(state: FollowerState) -> dict[str, np.ndarray]:
         "beside_px": state.beside_px,
     }
     if state.key is not None:
-        arrays |= {
-            "key": state.key.body.key,
-            "key_points_px": state.key.body.points_px,
-            "key_certainty": state.key.body.certainty,
-            "key_places_m": state.key.places_m,
-            "key_beside_px": state.key.background.points_px,
-            "key_beside_certainty": state.key.background.certainty,
-            "key_covered": np.array(state.key.covered),
-        }
+        arrays |= _key_packed("key", state.key)
+    if state.first is not None and state.first is not state.key:
+        arrays |= _key_packed("first", state.first)
     if state.cloth is not None:
         arrays |= {"cloth_places_m": state.cloth.places_m, "cloth_rgb": state.cloth.rgb}
     return arrays
@@ -138,14 +134,34 @@ def _state_packed(state: FollowerState) -> dict[str, np.ndarray]:
 def _state_unpacked(held: _Arrays) -> FollowerState:
     run, plain_frames = held["state_counts"].tolist()
     start, motion = map(RigidMotion, held["state_turns"], held["state_shifts_m"])
-    key, cloth = None, None
-    if "key" in held:
-        body = FollowedPoints(held["key"], held["key_points_px"], held["key_certainty"])
-        beside = FollowedPoints(held["key"], held["key_beside_px"], held["key_beside_certainty"])
-        key = KeyPicture(body, held["key_places_m"], beside, held["key_covered"].item())
-        if len(held["near_px"]) != len(body.points_px) or held["key"].dtype != np.uint8:
-            raise DamagedFileError("its arrays do not fit together")
+    key = _key_unpacked("key", held)
+    first = _key_unpacked("first", held) or key
+    near_px, beside_px = held["near_px"], held["beside_px"]
+    if key is not None and len(near_px) != len(key.places_m):
+        raise DamagedFileError("its arrays do not fit together")
+    cloth = None
     if "cloth_rgb" in held:
         cloth = ClothColors(held["cloth_places_m"], held["cloth_rgb"])
-    beside_px = held["beside_px"]
-    return FollowerState(run, plain_frames, start, motion, key, held["near_px"], beside_px, cloth)
+    return FollowerState(run, plain_frames, start, motion, first, key, near_px, beside_px, cloth)
+
+
+def _key_packed(name: str, key: KeyPicture) -> dict[str, np.ndarray]:
+    arrays = {
+        "picture": key.body.key,
+        "points_px": key.body.points_px,
+        "certainty": key.body.certainty,
+        "places_m": key.places_m,
+        "beside_px": key.background.points_px,
+        "beside_certainty": key.background.certainty,
+        "covered": np.array(key.covered),
+    }
+    return {f"{name}_{part}": array for part, array in arrays.items()}
+
+
+def _key_unpacked(name: str, held: _Arrays) -> KeyPicture | None:
+    if f"{name}_picture" not in held:
+        return None
+    picture = held[f"{name}_picture"]
+    body = FollowedPoints(picture, held[f"{name}_points_px"], held[f"{name}_certainty"])
+    beside = FollowedPoints(picture, held[f"{name}_beside_px"], held[f"{name}_beside_certainty"])
+    return KeyPicture(body, held[f"{name}_places_m"], beside, held[f"{name}_covered"].item())

@@ -18,7 +18,7 @@ _LEAST_PLACES = 12
 
 @dataclass(frozen=True)
 class ClothColors:
-    """Colours that places of the body had when they were last seen, of the run's first frame."""
+    """Colours that places of the body, as it was in a run's first frame, have where it is seen."""
 
     places_m: Float[np.ndarray, "P 3"]
     rgb: Float[np.ndarray, "P 3"]
@@ -40,9 +40,7 @@ class ClothColors:
 
         The share is NaN where too few are within it. Light that changes all alike is no change.
         """
-        height, width = image_rgb.shape[:2]
-        x, y = places_px.T
-        within = (x >= 0) & (y >= 0) & (x <= width - 1) & (y <= height - 1)
+        within = _within(image_rgb, places_px)
         if within.sum() < _LEAST_PLACES:
             return np.zeros(len(within), bool), np.nan
         cells = _cells(image_rgb)
@@ -56,18 +54,17 @@ class ClothColors:
         otherwise = within & (change > _OTHERWISE_LEVELS)
         return otherwise, float(otherwise.sum() / within.sum())
 
-    def renewed(
-        self,
-        image_rgb: _Image,
-        places_px: Float[np.ndarray, "P 2"],
-        covered: Bool[np.ndarray, "P"],
-    ) -> "ClothColors":
-        """With the colours of now, where the places are seen: light moves on through a film."""
-        height, width = image_rgb.shape[:2]
-        x, y = places_px.T
-        seen = ~covered & (x >= 0) & (y >= 0) & (x <= width - 1) & (y <= height - 1)
+    def renewed(self, image_rgb: _Image, places_px: Float[np.ndarray, "P 2"]) -> "ClothColors":
+        """With the colours of now, within the picture: light moves on through a film."""
         now = _sampled(_cells(image_rgb), image_rgb, places_px)
-        return ClothColors(self.places_m, np.where(seen[:, None], now, self.rgb))
+        within = _within(image_rgb, places_px)[:, None]
+        return ClothColors(self.places_m, np.where(within, now, self.rgb))
+
+
+def _within(image_rgb: _Image, px: Float[np.ndarray, "P 2"]) -> Bool[np.ndarray, "P"]:
+    height, width = image_rgb.shape[:2]
+    x, y = px.T
+    return (x >= 0) & (y >= 0) & (x <= width - 1) & (y <= height - 1)
 
 
 def _cells(image_rgb: _Image) -> Float[np.ndarray, "r c 3"]:

@@ -32,6 +32,12 @@ _BELOW_NECK_M = 0.075
 _HIDES_SHARE = 1 / 24
 # When so much less of the clothes is covered than in the key picture, a fresh one is taken.
 _CLEARED = 0.1
+# Up to so much is no cover, but folds and light: then the clothes' colours are those of now.
+_CLEAR = 0.02
+# A run's first key picture is returned to where the body stands again much as it did in it, within
+# such a share of the picture's longer side, and so many of the points are found: then nothing that
+# went astray since is left.
+_AGAIN_SHARE, _MANY = 1 / 16, 0.6
 
 
 MatteOf = Callable[[UInt8[np.ndarray, "h w 3"]], Float[np.ndarray, "h w"]]
@@ -57,6 +63,9 @@ class BodySighting:
     certainty: Float[np.ndarray, "Q 2 2"] | None
     background_px: float
     covered: float = np.nan
+    of_first: bool = False
+    """Whether `seen_px` are the points that the run chose first, not the last ones, and go on to
+    be followed."""
 
 
 @dataclass(frozen=True)
@@ -75,13 +84,15 @@ class FollowerState:
     """All that following goes on from.
 
     `start` places the body at rest where the run began, `motion` moves it from there to the last
-    picture, where the key's points were near `near_px`, and its background's `beside_px`.
+    picture, where the key's points were near `near_px`, and its background's `beside_px`. `first`
+    is the run's first key picture.
     """
 
     run: int
     plain_frames: int
     start: RigidMotion
     motion: RigidMotion
+    first: KeyPicture | None
     key: KeyPicture | None
     near_px: Float[np.ndarray, "P 2"]
     beside_px: Float[np.ndarray, "B 2"]
@@ -91,7 +102,7 @@ class FollowerState:
     def before_the_first(cls) -> "FollowerState":
         """Nothing seen yet."""
         none, nowhere = RigidMotion.none(), np.zeros((0, 2))
-        return cls(-1, 0, none, none, None, nowhere, nowhere, None)
+        return cls(-1, 0, none, none, None, None, nowhere, nowhere, None)
 
 
 class BodyFollower:
@@ -129,10 +140,14 @@ class BodyFollower:
         gray = cv2.cvtColor(image_rgb, cv2.COLOR_RGB2GRAY)
         key = None if is_cut else self.state.key
         background_px, covered, hidden_px, seen_px = np.nan, np.nan, np.zeros((0, 2)), None
+        of_first = False
         if key is not None:
             background_px = self._background_px(key, gray)
             covered, hidden_px = self._covered(image_rgb)
-            seen_px = self._followed(key, gray, hidden_px)
+            seen_px = self._first_again(key, gray, hidden_px)
+            of_first = seen_px is not None
+            if seen_px is None:
+                seen_px = self._followed(key, self.state.near_px, gray, hidden_px)
         if seen_px is None:
             self._begin_run(neck_m)
             seen_px, covered, hidden_px = np.zeros((0, 2)), np.nan, np.zeros((0, 2))
@@ -141,7 +156,9 @@ class BodyFollower:
             key = self._take_key(image_rgb, gray, mesh_px, covered, hidden_px)
             chosen_px, certainty = self._in_source(key.body.points_px), key.body.certainty
         seen_px = self._in_source(seen_px)
-        return BodySighting(self.state.run, seen_px, chosen_px, certainty, background_px, covered)
+        return BodySighting(
+            self.state.run, seen_px, chosen_px, certainty, background_px, covered, of_first
+        )
 
     def _begin_run(self, neck_m: Float[np.ndarray, "3"]) -> None:
         """Nothing leads here from the frames before."""
@@ -151,6 +168,7 @@ class BodyFollower:
             start=RigidMotion(np.eye(3), neck_m - self._body.neck_m),
             motion=RigidMotion.none(),
             plain_frames=_PATIENCE,
+            first=None,
             cloth=None,
         )
 
@@ -177,13 +195,36 @@ class BodyFollower:
         otherwise, share = cloth.covered(image_rgb, px)
         return share, px[otherwise]
 
-    def _followed(
+    def _first_again(
         self, key: KeyPicture, gray: UInt8[np.ndarray, "h w"], hidden_px: Float[np.ndarray, "C 2"]
+    ) -> Float[np.ndarray, "P 2"] | None:
+        """The points of the run's first key picture, if it serves again; None if it does not."""
+        first, before = self.state.first, self.state
+        if first is None or first is key or len(first.places_m) < LEAST_POINTS:
+            return None
+        near_px = self._camera.project(before.motion(first.places_m))
+        moved_px = np.linalg.norm(near_px - first.body.points_px, axis=1).mean()
+        if moved_px > _AGAIN_SHARE * max(gray.shape):
+            return None
+        seen_px = self._followed(first, near_px, gray, hidden_px)
+        if seen_px is None or np.isfinite(seen_px[:, 0]).mean() < _MANY:
+            self.state = before
+            return None
+        beside_px = first.background.points_px
+        self.state = replace(self.state, key=first, beside_px=beside_px)
+        return seen_px
+
+    def _followed(
+        self,
+        key: KeyPicture,
+        near_px: Float[np.ndarray, "P 2"],
+        gray: UInt8[np.ndarray, "h w"],
+        hidden_px: Float[np.ndarray, "C 2"],
     ) -> Float[np.ndarray, "P 2"] | None:
         """The points in this picture, NaN where lost; None where they show no motion of a body."""
         if len(key.places_m) < LEAST_POINTS:
             return np.zeros((0, 2))
-        px, seen = key.body.found_in(gray, self.state.near_px)
+        px, seen = key.body.found_in(gray, near_px)
         seen &= ~_near_any(px, hidden_px, _HIDES_SHARE * max(gray.shape))
         pivot = self.state.start(self._body.neck_m)
         fitted = fit_rigid_motion(
@@ -204,7 +245,9 @@ class BodyFollower:
         points = key.background
         px, seen = points.found_in(gray, self.state.beside_px)
         moved = np.linalg.norm(px - points.points_px, axis=1)
-        self.state = replace(self.state, beside_px=np.where(seen[:, None], px, points.points_px))
+        # All are looked for where most have gone: on a chequered chair each by itself would stray.
+        onward = np.median((px - points.points_px)[seen], axis=0) if seen.any() else 0.0
+        self.state = replace(self.state, beside_px=points.points_px + onward)
         # Somebody beside the person moves in one half, the camera in both.
         left = points.points_px[:, 0] < gray.shape[1] / 2
         halves = [moved[seen & half] for half in (left, ~left)]
@@ -231,9 +274,14 @@ class BodyFollower:
         chosen, places = chosen.select(near), state.motion.undone()(places[near])
         beside = _beside(gray, matte < _BACKGROUND)
         key = KeyPicture(chosen, places, beside, 0.0 if np.isnan(covered) else covered)
-        cloth = None if len(places) < LEAST_POINTS else self._cloth(image_rgb, region, hidden_px)
+        cloth = None if len(places) < LEAST_POINTS else self._cloth(image_rgb, region, covered)
         self.state = replace(
-            state, key=key, near_px=chosen.points_px, beside_px=beside.points_px, cloth=cloth
+            state,
+            first=state.first or key,
+            key=key,
+            near_px=chosen.points_px,
+            beside_px=beside.points_px,
+            cloth=cloth,
         )
         return key
 
@@ -241,14 +289,14 @@ class BodyFollower:
         self,
         image_rgb: UInt8[np.ndarray, "h w 3"],
         region: Bool[np.ndarray, "h w"],
-        hidden_px: Float[np.ndarray, "C 2"],
+        covered: float,
     ) -> ClothColors:
-        """The clothes' colours: known ones go on, so that what covers them is not learned."""
+        """The clothes' colours; what covers them is not learned."""
         state = self.state
         if state.cloth is not None:
             px = self._camera.project(state.motion(state.cloth.places_m))
-            covered, _ = state.cloth.covered(image_rgb, px)
-            return state.cloth.renewed(image_rgb, px, covered)
+            clear = not covered > _CLEAR
+            return state.cloth.renewed(image_rgb, px) if clear else state.cloth
         px = grid_within(region)
         places, near = self._body.lifted(px, state.motion.after(state.start), self._camera)
         return ClothColors.of(image_rgb, state.motion.undone()(places[near]), px[near])

@@ -221,8 +221,6 @@ def _body_findings(body: Mapping[str, Any]) -> list[Finding]:
         cause = f"something is before the body in {covered:.0%} of frames (an arm, a hand)"
         found.append(Finding("body", "warning", cause))
     if beside is not None and beside > _BESIDE:
-        cause = (
-            f"the matte holds more than the person in {beside:.0%} of frames (somebody, a chair)"
-        )
+        cause = f"beside the person there is somebody, or a chair, in {beside:.0%} of frames"
         found.append(Finding("body", "warning", cause))
     return found
