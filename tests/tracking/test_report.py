@@ -71,6 +71,14 @@ def test_correlation_of_openings() -> None:
         ({"background": "moves"}, "usable: the camera moves"),
         ({"body": {"background_moves_px": 20.0}}, "usable: the camera moves"),
         ({"body": {"background_moves_px": 2.0}}, "good"),
+        (
+            {"background": "moves", "body": {"background_moves_px": 0.2}},
+            "usable: something moves behind the person",
+        ),
+        (
+            {"background": "moves", "body": {"background_moves_px": 2.0}},
+            "usable: the camera moves",
+        ),
         ({"body": {"background_moves_px": None}}, "good"),
         (
             {"body": {"seen_cm2": 0.0}},

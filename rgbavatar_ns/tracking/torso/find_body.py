@@ -31,7 +31,7 @@ _SIDE_PX, _AHEAD = 640, 4
 # body stands on the whole.
 _SHOULDER_FRAMES = 24
 # The person is not alone where more of these frames show something else.
-_OTHERS_SHARE = 0.1
+_OTHERS_SHARE = 0.05
 
 
 def find_body(

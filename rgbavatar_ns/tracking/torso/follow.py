@@ -18,7 +18,7 @@ _FEW = 0.4
 _MOST_POINTS = 160
 _PERSON, _BACKGROUND = 0.9, 0.05
 # The background's points only tell whether the camera moves. They are chosen in each half of the
-# picture, and count there from so many on.
+# picture, and tell it where each has so many.
 _LEAST_BACKGROUND, _MOST_BACKGROUND = 8, 24
 # A camera moves all that it sees, something behind the person only a part: what all but this share
 # of the points of a half do.
@@ -243,16 +243,19 @@ class BodyFollower:
 
     def _background_px(self, key: KeyPicture, gray: UInt8[np.ndarray, "h w"]) -> float:
         points = key.background
-        px, seen = points.found_in(gray, self.state.beside_px)
+        # Most cameras stand, and on a chequered chair what is looked for elsewhere is found there.
+        px, seen = points.found_in(gray, points.points_px)
+        if seen.sum() < _FEW * len(seen):
+            px, seen = points.found_in(gray, self.state.beside_px)
         moved = np.linalg.norm(px - points.points_px, axis=1)
-        # All are looked for where most have gone: on a chequered chair each by itself would stray.
         onward = np.median((px - points.points_px)[seen], axis=0) if seen.any() else 0.0
         self.state = replace(self.state, beside_px=points.points_px + onward)
         # Somebody beside the person moves in one half, the camera in both.
         left = points.points_px[:, 0] < gray.shape[1] / 2
         halves = [moved[seen & half] for half in (left, ~left)]
-        told = [np.quantile(half, _STILLEST) for half in halves if len(half) >= _LEAST_BACKGROUND]
-        return float(min(told)) / self._scale if told else np.nan
+        if min(map(len, halves)) < _LEAST_BACKGROUND:
+            return np.nan
+        return float(min(np.quantile(half, _STILLEST) for half in halves)) / self._scale
 
     def _take_key(
         self,

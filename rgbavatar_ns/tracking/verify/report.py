@@ -26,11 +26,12 @@ _IRIS_ERROR, _AT_BOUND = (0.1, 0.2), (0.02, 0.2)
 _REJECTED, _BLURRED = (0.05, 0.25), (0.1, 0.3)
 _FACE_PX, _FRAMES = (100.0, 50.0), (100, 25)
 # How far the background wanders, in shares of the face's height, until the camera is said to move.
-_MOVES = 0.03
+# A camera that stands leaves it within so many pixels.
+_MOVES, _STANDS_PX = 0.03, 0.5
 # A body that is not there or hardly, square centimetres (shoulders and chest have 800, a picture
 # that ends at the collar 150), and shares of frames in which something is before or beside it.
 _NO_BODY_CM2, _LITTLE_BODY_CM2 = 15.0, 80.0
-_COVERED, _BESIDE = 0.03, 0.1
+_COVERED, _BESIDE = 0.03, 0.05
 # The part of the face whose outline is skin: from a little above the chin to the eyes, as shares
 # of the height from chin to forehead; and how far beside the head the matte is looked at.
 _FACE_FROM, _FACE_TO, _BESIDE = 0.1, 0.6, 0.2
@@ -192,8 +193,7 @@ def tracking_findings(report: Mapping[str, Any]) -> list[Finding]:
         if value is not None and sign * (value - mild) > 0:
             severity: Severity = "error" if sign * (value - grave) > 0 else "warning"
             found.append(Finding(kind, severity, cause))
-    if _camera_moves(report):
-        found.append(Finding("camera", "warning", "the camera moves"))
+    found += _background_findings(report)
     found += _body_findings(report["body"] or {})
     others = len(report["other_faces"])
     if others:
@@ -201,10 +201,17 @@ def tracking_findings(report: Mapping[str, Any]) -> list[Finding]:
     return found
 
 
-def _camera_moves(report: Mapping[str, Any]) -> bool:
-    """Whether what is behind the person moves, in the crop or about it."""
-    moved_px = (report["body"] or {}).get("background_moves_px") or 0.0
-    return report.get("background") == "moves" or moved_px > _MOVES * report["face_height_px"]
+def _background_findings(report: Mapping[str, Any]) -> list[Finding]:
+    """What moves behind the person: all of it with the camera, or somebody, something."""
+    moved_px = (report["body"] or {}).get("background_moves_px")
+    if moved_px is not None and moved_px > _MOVES * report["face_height_px"]:
+        return [Finding("camera", "warning", "the camera moves")]
+    if report.get("background") != "moves":
+        return []
+    # What the body's follower finds still in either half of the whole picture, no camera moves.
+    still = moved_px is not None and moved_px < _STANDS_PX
+    cause = "something moves behind the person" if still else "the camera moves"
+    return [Finding("camera", "warning", cause)]
 
 
 def _body_findings(body: Mapping[str, Any]) -> list[Finding]:
