@@ -28,8 +28,8 @@ _FACE_PX, _FRAMES = (100.0, 50.0), (100, 25)
 # How far the background wanders, in shares of the face's height, until the camera is said to move.
 # A camera that stands leaves it within so many pixels.
 _MOVES, _STANDS_PX = 0.03, 0.5
-# A body that is not there or hardly, square centimetres (shoulders and chest have 800, a picture
-# that ends at the collar 150), and shares of frames in which something is before or beside it.
+# A body that is not there or hardly, square centimetres (shoulders and chest have 800, the two real
+# clips, which end at the collar, 40), and shares of frames with something before or beside it.
 _NO_BODY_CM2, _LITTLE_BODY_CM2 = 15.0, 80.0
 _COVERED, _BESIDE = 0.03, 0.05
 # The part of the face whose outline is skin: from a little above the chin to the eyes, as shares
