@@ -102,7 +102,7 @@ def _body_told(body: Mapping[str, Any] | None) -> str:
     if body is None:
         return "the head alone, down to the neck"
     if body["followed_share"] < _FOLLOWED:
-        return "taken to keep still: its clothes show no pattern to follow"
+        return "taken to keep still: no pattern of clothes is seen that could be followed"
     if body["still"]:
         return "keeps still"
     return f"turns by {body['turned_degrees']:.0f} degrees, moves by {body['moved_mm'] / 10:.0f} cm"

@@ -71,7 +71,32 @@ def test_correlation_of_openings() -> None:
         ({"background": "moves"}, "usable: the camera moves"),
         ({"body": {"background_moves_px": 20.0}}, "usable: the camera moves"),
         ({"body": {"background_moves_px": 2.0}}, "good"),
+        (
+            {"background": "moves", "body": {"background_moves_px": 0.2}},
+            "usable: something moves behind the person",
+        ),
+        (
+            {"background": "moves", "body": {"background_moves_px": 2.0}},
+            "usable: the camera moves",
+        ),
         ({"body": {"background_moves_px": None}}, "good"),
+        (
+            {"body": {"seen_cm2": 0.0}},
+            "usable: no body is in the picture: it is taken to keep still",
+        ),
+        (
+            {"body": {"seen_cm2": 40.0, "covered_share": 0.5}},
+            "usable: the body is hardly seen",
+        ),
+        (
+            {"body": {"seen_cm2": 700.0, "covered_share": 0.2, "beside_share": 0.0}},
+            "usable: something is before the body in 20% of frames (an arm, a hand)",
+        ),
+        (
+            {"body": {"seen_cm2": 700.0, "covered_share": 0.0, "beside_share": 0.3}},
+            "usable: beside the person there is somebody, or a chair, in 30% of frames",
+        ),
+        ({"body": {"seen_cm2": 700.0, "covered_share": 0.02, "beside_share": 0.05}}, "good"),
         ({"mouth_opening_correlation": None, "eyelid_opening_correlation": None}, "good"),
         ({"mesh_reprojection_error_share": 0.02}, "usable: the mesh lies off the face"),
         ({"mesh_reprojection_error_share": 0.05}, "look at it: the mesh lies off the face"),

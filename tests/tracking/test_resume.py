@@ -19,12 +19,13 @@ from rgbavatar_ns.tracking import track as track_module
 from rgbavatar_ns.tracking.face.find_faces import find_faces
 from rgbavatar_ns.tracking.image import outlines
 from rgbavatar_ns.tracking.resumable_run import WORK_FOLDER, ResumableRun
+from rgbavatar_ns.tracking.torso.find_body import find_body
 
 from .clips import astronaut, gradient_images, write_clip
 
 pytest.importorskip("mediapipe", reason="the tracker's optional extra is not installed")
 CONFIG = TrackConfig(image_size=64, key_frames=2, focal_px=500.0)
-FRAMES, BLOCK = 22, 10
+FRAMES, BLOCK, BODY_BLOCK = 22, 10, 7
 Progress = Callable[[str, int, int | None], None]
 
 
@@ -37,16 +38,21 @@ def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_clip(tmp_path_factory.mktemp("clip") / "clip.mp4", frames)
 
 
+def _shorten_blocks(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(track_module, "find_faces", partial(find_faces, block_frames=BLOCK))
+    patch.setattr(track_module, "find_body", partial(find_body, block_frames=BODY_BLOCK))
+
+
 @pytest.fixture(autouse=True)
 def short_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(track_module, "find_faces", partial(find_faces, block_frames=BLOCK))
+    _shorten_blocks(monkeypatch)
 
 
 @pytest.fixture(scope="module")
 def uninterrupted(clip: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     dst = tmp_path_factory.mktemp("whole") / "set"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(track_module, "find_faces", partial(find_faces, block_frames=BLOCK))
+        _shorten_blocks(patch)
         track_video(clip, dst, CONFIG)
     return dst
 
@@ -73,7 +79,7 @@ def test_a_run_interrupted_in_every_stage_ends_with_the_same_files(
 ) -> None:
     dst = tmp_path / "set"
     counted: list[tuple[str, int]] = []
-    for stage, frames in (("faces", 13), ("pictures", 3), ("pictures", 9)):
+    for stage, frames in (("faces", 13), ("body", 9), ("pictures", 3), ("pictures", 9)):
         with pytest.raises(KeyboardInterrupt):
             track_video(clip, dst, CONFIG, _interrupting(stage, frames))
         with pytest.raises(UserError):
@@ -109,6 +115,23 @@ def test_only_the_block_that_was_begun_is_read_again(clip: Path, tmp_path: Path)
     with pytest.raises(KeyboardInterrupt):
         track_video(clip, dst, CONFIG, watch)
     assert seen[:2] == [BLOCK, BLOCK + 1]
+
+
+def test_of_the_body_too_only_the_block_that_was_begun_is_read_again(
+    clip: Path, uninterrupted: Path, tmp_path: Path
+) -> None:
+    dst = tmp_path / "set"
+    with pytest.raises(KeyboardInterrupt):
+        track_video(clip, dst, CONFIG, _interrupting("body", 2 * BODY_BLOCK + 3))
+    seen: list[int] = []
+
+    def watch(stage: str, done: int, total: int | None) -> None:
+        if stage == "body":
+            seen.append(done)
+
+    track_video(clip, dst, CONFIG, watch)
+    assert seen[:2] == [2 * BODY_BLOCK, 2 * BODY_BLOCK + 1]
+    assert _files(dst) == _files(uninterrupted)
 
 
 def test_other_options_or_another_video_are_refused_in_words_or_start_anew(

@@ -18,14 +18,15 @@ from rgbavatar_ns.synthetic import DemoConfig
 from rgbavatar_ns.synthetic.make import DemoFilm, film_demo
 from rgbavatar_ns.tracking.fit.camera import StillCamera
 from rgbavatar_ns.tracking.fit.landmark_head import LandmarkHead
+from rgbavatar_ns.tracking.torso.body_blocks import BodyBlock
 from rgbavatar_ns.tracking.torso.body_mesh import NECK, BodyMesh
 from rgbavatar_ns.tracking.torso.compose import on_body
 from rgbavatar_ns.tracking.torso.features import FollowedPoints
-from rgbavatar_ns.tracking.torso.find_body import _load, _packed
-from rgbavatar_ns.tracking.torso.follow import BodyFollower, BodySighting
+from rgbavatar_ns.tracking.torso.follow import BodyFollower, BodySighting, FollowerState
 from rgbavatar_ns.tracking.torso.place import BodyPlaces, SeenShoulders, place_body
 from rgbavatar_ns.tracking.torso.rigid_motion import RigidMotion, fit_rigid_motion
 from rgbavatar_ns.tracking.torso.shape import ShoulderLine, shoulder_line, shoulders_up_cm
+from rgbavatar_ns.tracking.torso.shown import BodyShown
 
 SIZE, FRAMES = 320, 24
 CAMERA = StillCamera(700.0, (160.0, 160.0), 1.1)
@@ -281,17 +282,19 @@ def test_what_was_seen_of_a_body_comes_back_and_damage_is_told(tmp_path: Path) -
     ]
     shoulders = [SeenShoulders(1, drawn.uniform(0, 99, (2, 2)), 0.1)]
     lines = [ShoulderLine(0, np.array([1.0, np.nan, 2.0]))]
+    shown = [BodyShown(0, 800.0, 0.01)]
     path = tmp_path / "body.npz"
-    np.savez(path, **_packed(seen, shoulders, lines))
-    sightings, marks, heights = _load(path)
-    assert [one.run for one in sightings] == [0, 0, 1]
-    assert [one.chosen_px is None for one in sightings] == [False, True, False]
-    np.testing.assert_array_equal(sightings[1].seen_px, seen[1].seen_px)
-    np.testing.assert_array_equal(marks[0].shoulders_px, shoulders[0].shoulders_px)
-    np.testing.assert_array_equal(heights[0].above_cm, lines[0].above_cm)
+    BodyBlock(seen, shoulders, lines, shown, FollowerState.before_the_first()).save(path)
+    back = BodyBlock.load(path)
+    assert [one.run for one in back.sightings] == [0, 0, 1]
+    assert [one.chosen_px is None for one in back.sightings] == [False, True, False]
+    np.testing.assert_array_equal(back.sightings[1].seen_px, seen[1].seen_px)
+    np.testing.assert_array_equal(back.shoulders[0].shoulders_px, shoulders[0].shoulders_px)
+    np.testing.assert_array_equal(back.lines[0].above_cm, lines[0].above_cm)
+    assert back.shown == shown
     path.write_bytes(path.read_bytes()[:-60])
     with pytest.raises(UserError, match=r"no body that was seen.*--overwrite"):
-        _load(path)
+        BodyBlock.load(path)
 
 
 def test_hair_beside_the_neck_or_a_picture_without_shoulders_raises_nothing() -> None:

@@ -16,7 +16,7 @@ class Finding:
 
     kind: a stable word for programs: "unreadable", "axes", "focal length", "principal point",
     "mirrored", "frame offset", "outside", "misfit", "FLAME version", "parameters", "cameras",
-    "mattes", "landmarks", "faces", "gaze".
+    "mattes", "landmarks", "faces", "gaze", "camera", "body".
     """
 
     kind: str

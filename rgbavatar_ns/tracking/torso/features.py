@@ -18,18 +18,30 @@ _BACK_PX = 0.7
 # Points at the outline follow the background; so far within the region they are chosen, as a share
 # of the picture's longer side.
 _INSIDE_SHARE = 1 / 60
+_GRID_SHARE = 1 / 36
 
 
 def corners_within(gray: _Gray, region: Bool[np.ndarray, "H W"], most: int) -> _Points:
     """At most so many places that can be followed, well within a region; none where it is plain."""
-    side = max(gray.shape)
-    reach = 2 * round(side * _INSIDE_SHARE) + 1
-    inside = cv2.erode(region.astype(np.uint8), np.ones((reach, reach), np.uint8), borderValue=(0,))
+    inside = _well_within(region)
     if not inside.any():
         return np.zeros((0, 2))
-    apart = max(3.0, side * _APART_SHARE)
+    apart = max(3.0, max(gray.shape) * _APART_SHARE)
     found = cv2.goodFeaturesToTrack(gray, most, _LEAST_QUALITY, apart, mask=inside)
     return np.zeros((0, 2)) if found is None else found.reshape(-1, 2).astype(np.float64)
+
+
+def grid_within(region: Bool[np.ndarray, "H W"]) -> _Points:
+    """Places evenly over a region, well within it, whatever they show."""
+    apart = max(1, round(max(region.shape) * _GRID_SHARE))
+    row, column = np.nonzero(_well_within(region)[::apart, ::apart])
+    return apart * np.stack([column, row], axis=1).astype(np.float64)
+
+
+def _well_within(region: Bool[np.ndarray, "H W"]) -> UInt8[np.ndarray, "H W"]:
+    """1 inside a region, without a rim; the picture's edge is one too."""
+    reach = 2 * round(max(region.shape) * _INSIDE_SHARE) + 1
+    return cv2.erode(region.astype(np.uint8), np.ones((reach, reach), np.uint8), borderValue=(0,))
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 from scipy.ndimage import gaussian_filter1d
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import Rotation, Slerp
 
 from rgbavatar_ns.tracking.fit.camera import StillCamera
 from rgbavatar_ns.tracking.torso.body_mesh import BodyMesh
@@ -19,9 +19,14 @@ from rgbavatar_ns.tracking.torso.solve import run_motions
 # breath, and the noise of the points.
 _STILL_M = 0.004
 _SMOOTH_FRAMES = 1.5
+# A neck carries its head about three centimetres from where it mostly is; the head's own distance
+# is known to some centimetres. Where a body seems to be farther from its head, it is none.
+_NECK_REACH_M = 0.08
 # One camera hardly tells how a body is turned: people sit before it, and only what is plainly
 # otherwise counts. The detector's own error is some 6 degrees sideways and 2 in the tilt.
 _DOUBTED_YAW_RAD, _DOUBTED_ROLL_RAD = 0.2, 0.035
+# Where so much of the clothes looks otherwise, something is before them: folds are less.
+_COVERED = 0.05
 _LEAST_FRAMES = 10
 _ROUNDS = 5
 
@@ -49,6 +54,12 @@ class BodyPlaces:
     """How far the background moves over the clip, pixels of the source; NaN where none is seen."""
     shoulders_up_cm: float = 0.0
     """How much higher the shoulders are than the mesh has them."""
+    covered_share: float = 0.0
+    """Share of the frames in which something is before the body."""
+    seen_cm2: float = np.nan
+    """Area of body that half of the frames show; NaN where nobody looked."""
+    beside_share: float = 0.0
+    """Share of the frames in which the matte holds something beside the person."""
 
     def report(self) -> dict[str, Any]:
         """What `tracking.json` tells of the body."""
@@ -61,6 +72,9 @@ class BodyPlaces:
             "turned_degrees": float(np.percentile(away, 98)),
             "moved_mm": float(1e3 * np.percentile(_away(self.neck_m), 98)),
             "background_moves_px": None if np.isnan(self.background_px) else self.background_px,
+            "covered_share": self.covered_share,
+            "seen_cm2": None if np.isnan(self.seen_cm2) else self.seen_cm2,
+            "beside_share": self.beside_share,
         }
 
 
@@ -95,7 +109,15 @@ def place_body(
             rotation[k], neck_m[k] = here.rotation, here(body.neck_m)
     moved = np.array([one.background_px for one in sightings])
     background_px = float(np.nanpercentile(moved, 98)) if np.isfinite(moved).any() else np.nan
-    return BodyPlaces(rotation, neck_m, still, followed / max(frames, 1), background_px)
+    covered = np.mean([one.covered > _COVERED for one in sightings])
+    return BodyPlaces(
+        rotation,
+        neck_m,
+        still,
+        followed / max(frames, 1),
+        background_px,
+        covered_share=float(covered),
+    )
 
 
 @dataclass(frozen=True)
@@ -119,8 +141,10 @@ class _Run:
         motions, count = [RigidMotion.none()] * len(self.sightings), 0
         for _ in range(_ROUNDS):
             found = run_motions(self.body, self.camera, self.sightings, start)
+            pivot = start(self.body.neck_m)
+            found = self._near_the_head(found, pivot)
             count = sum(motion is not None for motion in found)
-            motions, pivot = _filled(found), start(self.body.neck_m)
+            motions = _filled(found, pivot)
             if _extent_m(self.body, motions, pivot) < _STILL_M:
                 motions = [RigidMotion.none()] * len(motions)
             else:
@@ -129,6 +153,21 @@ class _Run:
             back = [motion.undone()(place) for motion, place in zip(motions, self.neck_m)]
             start = RigidMotion(turn, np.median(back, axis=0) - turn @ self.body.neck_m)
         return motions, start, count
+
+    def _near_the_head(
+        self, motions: Sequence[RigidMotion | None], pivot_m: Float[np.ndarray, "3"]
+    ) -> list[RigidMotion | None]:
+        """Motions without those that no body under this head makes: an arm's, a neighbour's."""
+        apart = np.array(
+            [
+                np.full(3, np.nan) if motion is None else motion(pivot_m) - place
+                for motion, place in zip(motions, self.neck_m)
+            ]
+        )
+        if not np.isfinite(apart).any():
+            return list(motions)
+        off = np.linalg.norm(apart - np.nanmedian(apart, axis=0), axis=1)
+        return [motion if far < _NECK_REACH_M else None for motion, far in zip(motions, off)]
 
     def _upright(self, motions: Sequence[RigidMotion]) -> Float[np.ndarray, "3 3"]:
         """The rotation in the first frame with which the body is upright on the whole."""
@@ -150,13 +189,21 @@ def _away(points_m: Float[np.ndarray, "F 3"]) -> Float[np.ndarray, "F"]:
     return np.linalg.norm(points_m - np.median(points_m, axis=0), axis=1)
 
 
-def _filled(motions: Sequence[RigidMotion | None]) -> list[RigidMotion]:
-    """Frames without a motion take the last one."""
-    last, filled = RigidMotion.none(), []
-    for motion in motions:
-        last = last if motion is None else motion
-        filled.append(last)
-    return filled
+def _filled(
+    motions: Sequence[RigidMotion | None], pivot_m: Float[np.ndarray, "3"]
+) -> list[RigidMotion]:
+    """Frames without a motion go evenly from the last one that has one to the next."""
+    known = [k for k, motion in enumerate(motions) if motion is not None]
+    found = [motion for motion in motions if motion is not None]
+    if not found:
+        return [RigidMotion.none()] * len(motions)
+    at = np.arange(len(motions)).clip(known[0], known[-1])
+    turns = Rotation.from_matrix([motion.rotation for motion in found])
+    between = turns if len(known) == 1 else Slerp(known, turns)(at)
+    pivots = np.array([motion(pivot_m) for motion in found])
+    places = np.stack([np.interp(at, known, along) for along in pivots.T], axis=1)
+    matrices = np.broadcast_to(between.as_matrix(), (len(at), 3, 3))
+    return [RigidMotion(turn, place - turn @ pivot_m) for turn, place in zip(matrices, places)]
 
 
 def _extent_m(

@@ -18,6 +18,8 @@ _BESIDE_M = np.linspace(0.08, 0.18, 11)
 # Cloth lies so far off the skin, and less than so much is the outline's own error.
 _CLOTH_CM, _DOUBT_CM = 0.5, 0.7
 _LOWEST_CM, _HIGHEST_CM = -3.0, 7.0
+# What ends so far above the mesh's shoulder is a chair's back, a head or a raised arm.
+_NO_SHOULDER_CM = 10.0
 # Hair and collars only raise an outline: the lower of both sides' and most frames' heights counts.
 _PERCENTILE = 40
 _LEAST = 12
@@ -66,6 +68,7 @@ def shoulders_up_cm(
     for line in lines:
         own = _mesh_line_cm(body, camera, rotation[line.position])
         both = line.above_cm - own
+        both[both > _NO_SHOULDER_CM] = np.nan
         sides = [part[np.isfinite(part)] for part in np.split(both, 2)]
         apart += [np.median(side) for side in sides if len(side) >= 3]
     if len(apart) < min(_LEAST, len(lines)) or not apart:

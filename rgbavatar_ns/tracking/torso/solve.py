@@ -21,7 +21,10 @@ def run_motions(
     motions: list[RigidMotion | None] = []
     last, pivot = RigidMotion.none(), start(body.neck_m)
     places_m, near, certainty = np.zeros((0, 3)), np.zeros(0, bool), np.zeros((0, 2, 2))
+    first = None
     for sighting in run:
+        if sighting.of_first and first is not None:
+            places_m, near, certainty = first
         chosen = sighting.chosen_px
         found = not motions and chosen is not None and len(chosen) > 0
         if len(places_m):
@@ -39,4 +42,5 @@ def run_motions(
                 places_m = last.undone()(places_m)
                 assert sighting.certainty is not None
                 certainty = sighting.certainty
+            first = first or (places_m, near, certainty)
     return motions

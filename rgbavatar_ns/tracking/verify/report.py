@@ -27,7 +27,12 @@ _IRIS_ERROR, _AT_BOUND = (0.1, 0.2), (0.02, 0.2)
 _REJECTED, _BLURRED = (0.05, 0.25), (0.1, 0.3)
 _FACE_PX, _FRAMES = (100.0, 50.0), (100, 25)
 # How far the background wanders, in shares of the face's height, until the camera is said to move.
-_MOVES = 0.03
+# A camera that stands leaves it within so many pixels.
+_MOVES, _STANDS_PX = 0.03, 0.5
+# A body that is not there or hardly, square centimetres (shoulders and chest have 800, the two real
+# clips, which end at the collar, 40), and shares of frames with something before or beside it.
+_NO_BODY_CM2, _LITTLE_BODY_CM2 = 15.0, 80.0
+_COVERED, _BESIDE = 0.03, 0.05
 # The part of the face whose outline is skin: from a little above the chin to the eyes, as shares
 # of the height from chin to forehead; and how far beside the head the matte is looked at.
 _FACE_FROM, _FACE_TO, _BESIDE = 0.1, 0.6, 0.2
@@ -192,15 +197,41 @@ def tracking_findings(report: Mapping[str, Any]) -> list[Finding]:
         if value is not None and sign * (value - mild) > 0:
             severity: Severity = "error" if sign * (value - grave) > 0 else "warning"
             found.append(Finding(kind, severity, cause))
-    if _camera_moves(report):
-        found.append(Finding("camera", "warning", "the camera moves"))
+    found += _background_findings(report)
+    found += _body_findings(report["body"] or {})
     others = len(report["other_faces"])
     if others:
         found.append(Finding("faces", "error", f"another face is seen in {others} frames"))
     return found
 
 
-def _camera_moves(report: Mapping[str, Any]) -> bool:
-    """Whether what is behind the person moves, in the crop or about it."""
-    moved_px = (report["body"] or {}).get("background_moves_px") or 0.0
-    return report.get("background") == "moves" or moved_px > _MOVES * report["face_height_px"]
+def _background_findings(report: Mapping[str, Any]) -> list[Finding]:
+    """What moves behind the person: all of it with the camera, or somebody, something."""
+    moved_px = (report["body"] or {}).get("background_moves_px")
+    if moved_px is not None and moved_px > _MOVES * report["face_height_px"]:
+        return [Finding("camera", "warning", "the camera moves")]
+    if report.get("background") != "moves":
+        return []
+    # What the body's follower finds still in either half of the whole picture, no camera moves.
+    still = moved_px is not None and moved_px < _STANDS_PX
+    cause = "something moves behind the person" if still else "the camera moves"
+    return [Finding("camera", "warning", cause)]
+
+
+def _body_findings(body: Mapping[str, Any]) -> list[Finding]:
+    """What keeps the body from being followed: of a body that is not seen, nothing else is told."""
+    seen, covered, beside = (
+        body.get(name) for name in ("seen_cm2", "covered_share", "beside_share")
+    )
+    if seen is not None and seen < _LITTLE_BODY_CM2:
+        nothing = "no body is in the picture: it is taken to keep still"
+        cause = nothing if seen < _NO_BODY_CM2 else "the body is hardly seen"
+        return [Finding("body", "warning", cause)]
+    found = []
+    if covered is not None and covered > _COVERED:
+        cause = f"something is before the body in {covered:.0%} of frames (an arm, a hand)"
+        found.append(Finding("body", "warning", cause))
+    if beside is not None and beside > _BESIDE:
+        cause = f"beside the person there is somebody, or a chair, in {beside:.0%} of frames"
+        found.append(Finding("body", "warning", cause))
+    return found
