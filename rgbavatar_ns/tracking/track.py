@@ -194,7 +194,8 @@ class _Tracking:
             found.save(self.run.folder / name, GO_ON)
             return name
 
-        return Background.load(self.run.folder / self.run.stages.run("background", made_from, look))
+        name = self.run.stages.run("background and its edges", made_from, look)
+        return Background.load(self.run.folder / name)
 
     def _write_images(
         self,
