@@ -228,3 +228,13 @@ def test_frames_without_a_motion_lie_between_those_with_one(still: Still) -> Non
     places = place_body(still.body, CAMERA, run, necks, [])
     assert places.followed == pytest.approx(4 / 7)
     np.testing.assert_allclose(places.neck_m[3], necks[3], atol=2e-3)
+
+
+def test_a_collar_with_too_few_points_to_follow_keeps_still(still: Still) -> None:
+    """As clips that end at the collar show it: chosen, and left alone by the follower."""
+    few = np.array([[150.0, 230], [160, 232], [155, 236], [165, 231]])
+    none = np.zeros((0, 2))
+    run = [BodySighting(0, none, few, np.tile(np.eye(2), (4, 1, 1)), np.nan)]
+    run += [BodySighting(0, none, None, None, np.nan) for _ in range(4)]
+    places = place_body(still.body, CAMERA, run, np.tile(NECK_M, (5, 1)), [])
+    np.testing.assert_allclose(places.neck_m, np.tile(NECK_M, (5, 1)), atol=1e-9)

@@ -7,7 +7,7 @@ import numpy as np
 from rgbavatar_ns.tracking.fit.camera import StillCamera
 from rgbavatar_ns.tracking.torso.body_mesh import BodyMesh
 from rgbavatar_ns.tracking.torso.follow import BodySighting
-from rgbavatar_ns.tracking.torso.rigid_motion import RigidMotion, fit_rigid_motion
+from rgbavatar_ns.tracking.torso.rigid_motion import LEAST_POINTS, RigidMotion, fit_rigid_motion
 
 
 def run_motions(
@@ -27,7 +27,8 @@ def run_motions(
             places_m, near, certainty = first
         chosen = sighting.chosen_px
         found = not motions and chosen is not None and len(chosen) > 0
-        if len(places_m):
+        # The follower left fewer alone: it tells none of them.
+        if len(places_m) >= LEAST_POINTS:
             seen = near & np.isfinite(sighting.seen_px[:, 0])
             fitted = fit_rigid_motion(
                 places_m[seen], sighting.seen_px[seen], certainty[seen], camera, last, pivot
