@@ -32,7 +32,7 @@ _MOVES, _STANDS_PX = 0.03, 0.5
 # A body that is not there or hardly, square centimetres (shoulders and chest have 800, the two real
 # clips, which end at the collar, 40), and shares of frames with something before or beside it.
 _NO_BODY_CM2, _LITTLE_BODY_CM2 = 15.0, 80.0
-_COVERED, _BESIDE = 0.03, 0.05
+_COVERED, _SOMEBODY = 0.03, 0.05
 # The part of the face whose outline is skin: from a little above the chin to the eyes, as shares
 # of the height from chin to forehead; and how far beside the head the matte is looked at.
 _FACE_FROM, _FACE_TO, _BESIDE = 0.1, 0.6, 0.2
@@ -231,7 +231,7 @@ def _body_findings(body: Mapping[str, Any]) -> list[Finding]:
     if covered is not None and covered > _COVERED:
         cause = f"something is before the body in {covered:.0%} of frames (an arm, a hand)"
         found.append(Finding("body", "warning", cause))
-    if beside is not None and beside > _BESIDE:
+    if beside is not None and beside > _SOMEBODY:
         cause = f"beside the person there is somebody, or a chair, in {beside:.0%} of frames"
         found.append(Finding("body", "warning", cause))
     return found
