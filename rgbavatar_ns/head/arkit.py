@@ -11,6 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.head.arkit_fit import fitted_table
 from rgbavatar_ns.head.arrays import NECK_SHIFTS, HeadArrays
 from rgbavatar_ns.head.layout import ThetaLayout
 from rgbavatar_ns.head.model import layout_of
@@ -108,10 +109,10 @@ def arkit_map(arrays: HeadArrays) -> ArkitMap:
         table[ARKIT_NAMES.index("jawOpen"), layout.slice("jaw").start] = _JAW_OPEN_RAD
         unexplained = np.zeros(len(ARKIT_NAMES))
     else:
-        # Takes scipy's sparse solvers, which no other user of the map needs.
-        from rgbavatar_ns.head.arkit_fit import fitted_table
-
-        table, unexplained = fitted_table(arrays, layout)
+        known = arkit_map(HeadArrays.embedded())
+        looks = [name.startswith("eyeLook") for name in ARKIT_NAMES]
+        faces = np.where(np.array(looks)[:, None], 0.0, known.theta_per_unit)
+        table, unexplained = fitted_table(arrays, layout, faces)
     for side, field, mirrored in (("Left", "left_eye", 1), ("Right", "right_eye", -1)):
         start = layout.slice(field).start
         for look, (axis, sign) in _LOOKS.items():
