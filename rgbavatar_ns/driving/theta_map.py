@@ -10,8 +10,7 @@ from torch import Tensor
 from rgbavatar_ns.avatar.avatar import Avatar
 from rgbavatar_ns.errors import UserError, first_few
 from rgbavatar_ns.head import HeadArrays, ThetaLayout
-from rgbavatar_ns.head.arkit import arkit_map, speaks_arkit
-from rgbavatar_ns.head.arrays import NECK_SHIFTS
+from rgbavatar_ns.head.arkit import arkit_map, head_carrier, speaks_arkit
 from rgbavatar_ns.head.rotations import axis_angle_to_matrix, matrix_to_axis_angle
 
 _CARRIERS = ("rotation", "neck")
@@ -44,7 +43,7 @@ class ThetaNames:
     @property
     def has_shoulders(self) -> bool:
         """Whether the root carries a body and the neck the head upon it."""
-        return set(NECK_SHIFTS) <= set(self.expression_names)
+        return head_carrier(self.expression_names) == "neck"
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,8 @@ from rgbavatar_ns.errors import first_few
 from rgbavatar_ns.head import ThetaLayout
 from rgbavatar_ns.head.rotations import axis_angle_to_matrix, matrix_to_axis_angle
 
+DrivenPose = Literal["relative", "absolute", "keep"]
+
 
 @dataclass(frozen=True)
 class DrivingOptions:
@@ -23,7 +25,7 @@ class DrivingOptions:
     relative: Literal["neutral", "mean", "off"] = "neutral"
     """Of the expression: subtract the driver's neutral frame (or mean), add the avatar's own. Off
     takes the driver's numbers as they are, with the other tracker's bias and the other's rest."""
-    pose: Literal["relative", "absolute", "keep"] = "relative"
+    pose: DrivenPose = "relative"
     """Of the head's turns and place: departures from the driver's mean pose start from the avatar's
     own; absolute takes them as they are; keep holds the avatar's mean pose."""
     project: bool = False

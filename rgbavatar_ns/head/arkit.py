@@ -1,7 +1,7 @@
 """The 52 ARKit blend shapes as a head model's theta: one table a head, and its way back."""
 
 import difflib
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -83,9 +83,9 @@ class ArkitMap:
         return matrix_to_axis_angle(root @ neck)
 
 
-def has_shoulders(arrays: HeadArrays) -> bool:
-    """Whether the neck carries the head upon a body, which the root carries."""
-    return set(NECK_SHIFTS) <= set(arrays.expression_names)
+def head_carrier(expression_names: Collection[str]) -> Turns:
+    """The joint that turns the head: the neck upon a body, which the root carries, or the root."""
+    return "neck" if set(NECK_SHIFTS) <= set(expression_names) else "rotation"
 
 
 def speaks_arkit(arrays: HeadArrays) -> bool:
@@ -120,8 +120,7 @@ def arkit_map(arrays: HeadArrays) -> ArkitMap:
             turned = sign * (mirrored if axis == "yaw" else 1) * _GAZE_RAD[axis]
             table[row, start + (axis == "yaw")] = turned
             unexplained[row] = 0.0
-    turns: Turns = "neck" if has_shoulders(arrays) else "rotation"
-    return ArkitMap(layout, table, turns, unexplained)
+    return ArkitMap(layout, table, head_carrier(arrays.expression_names), unexplained)
 
 
 def arkit_coefficients(named: Mapping[str, float]) -> Float[Tensor, "52"]:
