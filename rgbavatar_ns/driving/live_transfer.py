@@ -40,7 +40,7 @@ class LiveOptions(CheckedOptions):
     calibrate_s: Weight = 1.0
     """For so many seconds the performer's rest is learnt; 0 takes the numbers as they are."""
     pose: DrivenPose = "relative"
-    """Of the head's turns and place: departures from the performer's, as they are, or not at all."""
+    """Of the head's turns and place: departures from the performer's, as they are, or none."""
     keep_range: bool = True
     """Hold expressions softly to the film's range, and turns to where the avatar holds."""
     smooth: bool = True
@@ -84,7 +84,7 @@ class LiveTransfer:
         self._expressive = expressive_numbers(avatar.layout)
         self._filter = OneEuroFilter(options.filter)
         self._reference: Reference | None = None
-        self._seen: list[Float[Tensor, H]] = []
+        self._seen: list[Tensor] = []
         self._began_s: float | None = None
         self._last_s: float | None = None
         self._learning, self._calibrated = options.calibrate_s > 0, False

@@ -31,8 +31,8 @@ class OneEuroFilter:
 
     def __init__(self, options: OneEuroOptions | None = None) -> None:
         self._options = OneEuroOptions() if options is None else options
-        self._last: Float[Tensor, D] | None = None
-        self._speed: Float[Tensor, D] | None = None
+        self._last: Tensor | None = None
+        self._speed: Tensor | None = None
 
     def __call__(self, values: Float[Tensor, "D"], seconds: float) -> Float[Tensor, "D"]:
         """The next vector, so many seconds after the one before it; the first is as it comes."""
