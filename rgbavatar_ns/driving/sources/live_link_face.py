@@ -3,7 +3,8 @@
 A packet, big-endian, is: version (uint8, 6), device and subject (each an int32 length and UTF-8
 text), frame (int32), part of a frame (float32), rate (int32 / int32), a count (uint8, 61) and as
 many float32: 52 coefficients in the order of `ARKIT_NAMES`, then yaw, pitch and roll of the head
-and of both eyes in radians. Source: Unreal Engine's AppleARKitFaceSupport, and readers of its packets.
+and of both eyes in radians. Source: Unreal Engine's AppleARKitFaceSupport, and what reads its
+packets.
 """
 
 import math
