@@ -149,9 +149,9 @@ class LiveDrive:
     def _told(self, silent_s: float) -> str:
         if silent_s > _SILENT_S:
             return f"Waiting for {self._source.waits_for}; Ctrl-C ends."
-        shown = "; ".join(str(one.latencies) for one in self._outputs if one.latencies.shown)
-        learning = "; learning the neutral face" if self._transfer.calibrating else ""
-        return f"{self.shown} frames: {shown}{learning}"
+        told = [str(one.latencies) for one in self._outputs if one.latencies.shown]
+        told += ["learning the neutral face"] if self._transfer.calibrating else []
+        return "; ".join([f"{self.shown} frames", *told])
 
     def _next(self) -> DrivenFrame | None:
         with self._changed:

@@ -3,11 +3,10 @@
 from dataclasses import dataclass, field
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from rgbavatar_ns.avatar.avatar import Avatar
-from rgbavatar_ns.avatar.model.weight_network import softly_within
 from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics, expressive_numbers
 from rgbavatar_ns.driving.one_euro import OneEuroFilter, OneEuroOptions
 from rgbavatar_ns.driving.source import PerformanceFrame, PerformerHead
@@ -19,14 +18,21 @@ from rgbavatar_ns.driving.transfer import (
     own_reference,
     relative_theta,
 )
-from rgbavatar_ns.head import turn_seen
+from rgbavatar_ns.head import ThetaLayout, turn_seen
 from rgbavatar_ns.head.arkit import head_carrier
 from rgbavatar_ns.head.rotations import axis_angle_to_matrix, matrix_to_axis_angle
 from rgbavatar_ns.kernels import PinholeCameras
 from rgbavatar_ns.options import CheckedOptions, Weight
 
-_CALMEST = 0.25
-"""Share of the calibration's frames that count as rest: people talk and blink meanwhile."""
+_LOWEST = 0.1
+"""Of a calibration's frames this share may lie below rest, as a tracker's noise does."""
+_ROOM_SHARE = 0.5
+"""How far expressions may go beyond the film, of its range."""
+_NONE_BELOW = 0.05
+"""FLAME's components go to both sides; named expressions at most by a tracker's noise."""
+_TURN_ROOM_DEGREES = 20.0
+"""How far the head may turn beyond the film. A viewer goes 30 degrees (`turn_reach`) because who
+turns there knows; a performer's every turn would show what nobody filmed."""
 _GAP_S = 0.5
 """After a longer gap the performer may be anywhere: nothing is smoothed across it."""
 _MOST_FRAMES = 600
@@ -82,6 +88,7 @@ class LiveTransfer:
         self._driving = DrivingOptions(relative=relative, pose=options.pose)
         self._carrier = head_carrier(avatar.head.arrays.expression_names)
         self._expressive = expressive_numbers(avatar.layout)
+        self._rises = _rises(avatar.layout, own)
         self._filter = OneEuroFilter(options.filter)
         self._reference: Reference | None = None
         self._seen: list[Tensor] = []
@@ -143,24 +150,42 @@ class LiveTransfer:
             self._learning, self._calibrated, self._seen = False, True, []
 
     def _reference_of(self, theta: Float[Tensor, "F H"]) -> Reference:
-        """Rest: the mean of the calmest frames; the pose: the mean of all."""
-        activity = theta[:, self._expressive].abs().sum(1)
-        calmest = activity.argsort()[: max(1, round(_CALMEST * len(theta)))]
-        return Reference(theta[calmest].mean(0), theta.mean(0))
+        """Rest, number by number; the pose: the mean of all.
+
+        Who is met talks and blinks: what only ever rises from rest, as an open jaw does, rests
+        where it is lowest. What goes to both sides, as a gaze does, rests at its median.
+        """
+        rest = torch.where(
+            self._rises, torch.quantile(theta, _LOWEST, dim=0), theta.median(0).values
+        )
+        return Reference(rest, theta.mean(0))
 
     def _held(self, theta: Float[Tensor, "H"]) -> Float[Tensor, "H"]:
-        """The expression within the film's range, the head's turn where the avatar holds."""
-        own = self._own
-        theta = torch.where(self._expressive, softly_within(theta, *own.film_range()), theta)
-        low, high = own.turn_reach()
+        """The expression within the film's range, the head's turn where the avatar holds.
+
+        What only rises from rest never falls below it; everything else goes ever less far beyond
+        the film: half the range for expressions, 20 degrees for the head.
+        """
+        low, high = self._own.film_range()
+        room = _ROOM_SHARE * (high - low)
+        held = _softly(theta, low, high, room)
+        held = torch.where(self._rises, torch.maximum(held, self._own.theta_min), held)
+        return self._turned_back(torch.where(self._expressive, held, theta))
+
+    def _turned_back(self, theta: Float[Tensor, "H"]) -> Float[Tensor, "H"]:
+        """With the head's turn as the camera sees it softly within those filmed."""
+        low, high = self._own.filmed_turns()
         seen = self._turn(theta)
-        rest = torch.minimum(torch.maximum(self._turn(own.theta_mean), low), high)
-        beyond = seen - torch.minimum(torch.maximum(seen, low), high)
-        share = float((1 - beyond.abs() / (seen - rest).abs().clamp(min=1e-3)).clamp(0, 1).min())
+        beyond = seen - _softly(seen, low, high, torch.full_like(seen, _TURN_ROOM_DEGREES))
+        start_seen = self._turn(self._own.theta_mean)
+        share = float(
+            (1 - beyond.abs() / (seen - start_seen).abs().clamp(min=1.0)).clamp(0, 1).min()
+        )
         if share == 1.0:
             return theta
         carrier = self._layout.slice(self._carrier)
-        start, end = (axis_angle_to_matrix(part[carrier]) for part in (own.theta_mean, theta))
+        mean = self._own.theta_mean
+        start, end = (axis_angle_to_matrix(part[carrier]) for part in (mean, theta))
         held = axis_angle_to_matrix(share * matrix_to_axis_angle(end @ start.mT)) @ start
         theta = theta.clone()
         theta[carrier] = matrix_to_axis_angle(held)
@@ -177,3 +202,26 @@ class LiveTransfer:
             self._filter = OneEuroFilter(self.options.filter)
             return self._filter(theta, 0.0)
         return self._filter(theta, seconds)
+
+
+def _rises(layout: ThetaLayout, own: TrainingStatistics) -> Bool[Tensor, "H"]:
+    """Which numbers only ever rise from rest: named expressions, lids, and the jaw's opening."""
+    rises = torch.zeros(layout.size, dtype=torch.bool)
+    for part in layout.fields:
+        where = layout.slice(part.name)
+        if part.form == "linear":
+            rises[where] = own.theta_min[where] > -_NONE_BELOW
+        elif part.name == "jaw":
+            rises[where.start] = True
+    return rises
+
+
+def _softly(
+    values: Float[Tensor, "D"],
+    low: Float[Tensor, "D"],
+    high: Float[Tensor, "D"],
+    room: Float[Tensor, "D"],
+) -> Float[Tensor, "D"]:
+    """Values as they are within a range; beyond, each goes ever less far, at most by `room`."""
+    nearest = torch.minimum(torch.maximum(values, low), high)
+    return nearest + room * torch.tanh((values - nearest) / room.clamp(min=1e-6))
