@@ -46,7 +46,7 @@ _MOST_FRAMES = 8
 _SIDE_PX = 256
 _FINEST = 1e-7
 """The step of theta's numbers where they hardly change; float32 has no finer one at 1."""
-_MANIFEST_BYTES = 6_000
+_MANIFEST_BYTES = 8_000
 """About."""
 _MOST_BYTES, _MOST_MANIFEST_BYTES = 1 << 28, 1 << 24
 

@@ -26,6 +26,7 @@ SCRIPTS = (
     "gaussians.js",
     "shaders.js",
     "renderer.js",
+    "pace.js",
     "camera.js",
     "performance.js",
     "panel.js",

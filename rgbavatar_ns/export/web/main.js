@@ -10,6 +10,7 @@ class App {
     this.head = new Head(data);
     this.network = new WeightNetwork(data);
     this.renderer = new Renderer(canvas, data);
+    this.pace = new Pace();
     this.performance = new RecordedPerformance(data);
     this.orbit = new OrbitCamera(manifest.camera, manifest.film.turn_reach);
     this.background = manifest.background;
@@ -82,8 +83,8 @@ class App {
     this.changed();
   }
 
-  /** Draw now. */
-  draw() {
+  /** Draw now; share: how much, where not all (`Pace`). */
+  draw(share) {
     const pixels = window.devicePixelRatio || 1;
     const [width, height] = this.size || [
       Math.max(1, Math.round(this.canvas.clientWidth * pixels)),
@@ -97,7 +98,7 @@ class App {
     this.orbit.seen = viewAngles(multiply3(this.data.camera.rotation, this.head.turn));
     const camera = this.orbit.at(width, height, this.head.centre());
     this.turnSeen = viewAngles(multiply3(camera.rotation, this.head.turn));
-    this.renderer.draw(this.head, this.psi, camera, this.background);
+    this.renderer.draw(this.head, this.psi, camera, this.background, share);
     this.panel.show();
     this._tellBeyond();
     this.due = false;
@@ -121,8 +122,10 @@ class App {
       this.due = true;
     }
     if (this.orbit.settle(seconds)) this.due = true;
+    if (this.due) this.pace.moves(now);
+    else this.due = this.pace.rests(now);
     if (this.due) {
-      this.draw();
+      this.draw(this.pace.share);
       this._tellRate(now);
     }
     requestAnimationFrame((next) => this._tick(next));
@@ -154,13 +157,15 @@ class App {
 
   /** Pictures a second while the performance plays, told twice a second. */
   _tellRate(now) {
+    if (this.message.className === "error") return;
     if (!this._rateFrom || !this.performance.playing) {
       this._rateFrom = { now, pictures: this.pictures };
       if (!this.performance.playing) this.message.textContent = "";
     } else if (now - this._rateFrom.now > 500) {
       const rate = (1000 * (this.pictures - this._rateFrom.pictures)) / (now - this._rateFrom.now);
       this.message.textContent = `${rate.toFixed(0)} pictures/s, `
-        + `${this.data.num_gaussians.toLocaleString("en")} Gaussians`;
+        + `${this.data.num_gaussians.toLocaleString("en")} Gaussians`
+        + (this.pace.told && `, ${this.pace.told}`);
       this._rateFrom = { now, pictures: this.pictures };
     }
   }
@@ -174,7 +179,10 @@ window.rgbavatar = (async () => {
     const app = new App(data, document.getElementById("view"), message);
     app.draw();
     message.textContent = "";
-    app.complete = data.complete;
+    app.complete = data.complete.catch((error) => {
+      message.className = "error";
+      message.textContent = error.message;
+    });
     return app;
   } catch (error) {
     message.className = "error";
