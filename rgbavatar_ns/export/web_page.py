@@ -1,23 +1,20 @@
 """The avatar as one HTML file that plays and drives it in any browser, without a server."""
 
 import base64
-import gzip
 import html
-import json
 import re
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from rgbavatar_ns.avatar.avatar import Avatar
 from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
-from rgbavatar_ns.export.web_arrays import gaussian_arrays, head_arrays, network_arrays, pack
+from rgbavatar_ns.export.avatar_file import avatar_parts
 from rgbavatar_ns.files import atomic_write
 from rgbavatar_ns.kernels import PinholeCameras
 
@@ -29,6 +26,7 @@ SCRIPTS = (
     "gaussians.js",
     "shaders.js",
     "renderer.js",
+    "pace.js",
     "camera.js",
     "performance.js",
     "panel.js",
@@ -63,16 +61,13 @@ def write_web_page(
 
     camera: where the page's view starts (its first camera). theta: the performance, which may
     have no frames. seen: what the page tells of the film, and how far its camera turns.
-    The bases are kept in 8 bits with a unit for each component. Raises UserError where the file
+    It shows a coarse head before it is all there (avatar_file.py). Raises UserError where the file
     cannot be written.
     """
     options = PageOptions() if options is None else options
-    layers, network = network_arrays(avatar)
-    frames = {"theta": theta.detach().cpu().numpy().astype(np.float32)}
-    directory, block = pack(head_arrays(avatar) | gaussian_arrays(avatar) | network | frames)
-    manifest = _manifest(avatar, camera, theta, options)
-    manifest |= {"film": _film(avatar, seen), "network": layers, "arrays": directory}
-    content = _assemble(manifest, block, options.title).encode()
+    manifest = _manifest(avatar, camera, theta, options) | {"film": _film(avatar, seen)}
+    parts = avatar_parts(avatar, manifest, theta, {})
+    content = _assemble(parts, options.title).encode()
     with atomic_write(path) as partial:
         partial.write_bytes(content)
     return len(content)
@@ -93,9 +88,6 @@ def _manifest(
     strength = expression.std(0, unbiased=False)
     psi = avatar.weights(seen).abs().amax(0)
     return {
-        "format": "rgbavatar-web",
-        "version": 1,
-        "num_gaussians": avatar.num_gaussians,
         "num_bases": config.num_bases,
         "variant": config.tangent_variant,
         "carrier": config.carrier,
@@ -138,22 +130,23 @@ def _film(avatar: Avatar, seen: TrainingStatistics | None) -> dict[str, Any]:
     return {"turn": turn, "turn_reach": reach, "theta": theta}
 
 
-def _assemble(manifest: dict[str, Any], block: bytes, title: str) -> str:
-    """Fill the page's template."""
+def _assemble(parts: list[bytes], title: str) -> str:
+    """Fill the page's template; a script element for each part, after the programs."""
     folder = resources.files("rgbavatar_ns.export") / "web"
     scripts = "\n".join(
         f"<script>\n{(folder / name).read_text(encoding='utf-8')}</script>" for name in SCRIPTS
     )
-    packed = base64.b64encode(gzip.compress(block, compresslevel=6, mtime=0)).decode("ascii")
-    # Within a script element "</script" and "<!--" have a meaning of their own.
-    described = json.dumps(manifest, allow_nan=False).replace("<", "\\u003c")
-    parts = {
+    payload = "\n".join(
+        '<script type="application/octet-stream" class="part">'
+        f"{base64.b64encode(part).decode('ascii')}</script>"
+        for part in parts
+    )
+    filled = {
         "title": html.escape(title),
         "style": (folder / "style.css").read_text(encoding="utf-8"),
         "scripts": scripts,
-        "manifest": described,
-        "payload": packed,
+        "parts": payload,
     }
     page = (folder / "page.html").read_text(encoding="utf-8")
     # In one pass: what is filled in is not looked at again.
-    return re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found[1]], page)
+    return re.sub(r"\{\{(\w+)\}\}", lambda found: filled[found[1]], page)

@@ -47,7 +47,10 @@ def open_page(browser: Any, tmp_path: Path) -> Iterator[Any]:
         page.on("pageerror", lambda error: problems.append(str(error)))
         page.goto(file.as_uri())
         page.evaluate(
-            "size => rgbavatar.then((app) => { window.app = app; app.setSize(size, size); })", _SIZE
+            """size => rgbavatar.then(async (app) => {
+              window.app = app; app.setSize(size, size); await app.complete;
+            })""",
+            _SIZE,
         )
         return page
 

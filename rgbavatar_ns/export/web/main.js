@@ -3,16 +3,17 @@
 
 class App {
   constructor(data, canvas, message) {
-    this.data = data;
+    const { manifest } = data;
+    this.data = manifest;
     this.canvas = canvas;
     this.message = message;
     this.head = new Head(data);
     this.network = new WeightNetwork(data);
-    this.positions = new GaussianPositions(data);
     this.renderer = new Renderer(canvas, data);
+    this.pace = new Pace();
     this.performance = new RecordedPerformance(data);
-    this.orbit = new OrbitCamera(data.camera, data.film.turn_reach);
-    this.background = data.background;
+    this.orbit = new OrbitCamera(manifest.camera, manifest.film.turn_reach);
+    this.background = manifest.background;
     this.heldWeights = new Map(); // psi that a slider holds, by number
     this.beyond = document.getElementById("beyond");
     this.size = null; // of the picture in pixels, where a script has set it
@@ -24,6 +25,11 @@ class App {
     this.panel = new Panel(document.getElementById("panel"), this);
     this.orbit.listen(canvas, () => this.changed());
     new ResizeObserver(() => this.changed()).observe(canvas);
+    this.touched = false; // whether the theta shown is somebody's choice
+    data.onMore = () => {
+      if (!this.touched && this.performance.length) this.theta = this.performance.current();
+      this.changed();
+    };
     this._last = null;
     requestAnimationFrame((now) => this._tick(now));
   }
@@ -34,23 +40,27 @@ class App {
   }
 
   play(on) {
+    this.touched = true;
     this.performance.playing = on;
     if (on) this.showFrame(this.performance.place);
   }
 
   showFrame(place) {
+    this.touched = true;
     this.performance.place = place;
     this.theta = this.performance.current();
   }
 
   /** Set one number of theta by hand, which stops the performance. */
   setParameter(place, value) {
+    this.touched = true;
     this.performance.playing = false;
     this.theta[place] = value;
     this.changed();
   }
 
   setTheta(theta) {
+    this.touched = true;
     this.performance.playing = false;
     this.theta = Array.from(theta);
     this.changed();
@@ -73,8 +83,8 @@ class App {
     this.changed();
   }
 
-  /** Draw now. */
-  draw() {
+  /** Draw now; share: how much, where not all (`Pace`). */
+  draw(share) {
     const pixels = window.devicePixelRatio || 1;
     const [width, height] = this.size || [
       Math.max(1, Math.round(this.canvas.clientWidth * pixels)),
@@ -88,10 +98,7 @@ class App {
     this.orbit.seen = viewAngles(multiply3(this.data.camera.rotation, this.head.turn));
     const camera = this.orbit.at(width, height, this.head.centre());
     this.turnSeen = viewAngles(multiply3(camera.rotation, this.head.turn));
-    this.positions.blend(this.psi);
-    this.positions.place(this.head);
-    this.positions.sort(camera);
-    this.renderer.draw(this.positions, this.head, this.psi, camera, this.background);
+    this.renderer.draw(this.head, this.psi, camera, this.background, share);
     this.panel.show();
     this._tellBeyond();
     this.due = false;
@@ -115,8 +122,10 @@ class App {
       this.due = true;
     }
     if (this.orbit.settle(seconds)) this.due = true;
+    if (this.due) this.pace.moves(now);
+    else this.due = this.pace.rests(now);
     if (this.due) {
-      this.draw();
+      this.draw(this.pace.share);
       this._tellRate(now);
     }
     requestAnimationFrame((next) => this._tick(next));
@@ -148,13 +157,15 @@ class App {
 
   /** Pictures a second while the performance plays, told twice a second. */
   _tellRate(now) {
+    if (this.message.className === "error") return;
     if (!this._rateFrom || !this.performance.playing) {
       this._rateFrom = { now, pictures: this.pictures };
       if (!this.performance.playing) this.message.textContent = "";
     } else if (now - this._rateFrom.now > 500) {
       const rate = (1000 * (this.pictures - this._rateFrom.pictures)) / (now - this._rateFrom.now);
       this.message.textContent = `${rate.toFixed(0)} pictures/s, `
-        + `${this.data.num_gaussians.toLocaleString("en")} Gaussians`;
+        + `${this.data.num_gaussians.toLocaleString("en")} Gaussians`
+        + (this.pace.told && `, ${this.pace.told}`);
       this._rateFrom = { now, pictures: this.pictures };
     }
   }
@@ -164,10 +175,14 @@ class App {
 window.rgbavatar = (async () => {
   const message = document.getElementById("message");
   try {
-    const data = await loadAvatarData();
+    const data = await AvatarData.open(streamOfPage());
     const app = new App(data, document.getElementById("view"), message);
     app.draw();
     message.textContent = "";
+    app.complete = data.complete.catch((error) => {
+      message.className = "error";
+      message.textContent = error.message;
+    });
     return app;
   } catch (error) {
     message.className = "error";

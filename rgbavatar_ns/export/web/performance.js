@@ -3,10 +3,10 @@
 
 class RecordedPerformance {
   constructor(data) {
-    this.size = data.layout.reduce((sum, { size }) => sum + size, 0);
+    this.size = data.manifest.layout.reduce((sum, { size }) => sum + size, 0);
     this.theta = data.arrays.theta;
     this.length = this.theta.length / this.size;
-    this.framesPerSecond = data.frames_per_second;
+    this.framesPerSecond = data.manifest.frames_per_second;
     this.speed = 1;
     this.playing = false;
     this.place = 0; // in frames

@@ -44,24 +44,3 @@ function apply3(m, [x, y, z]) {
 function viewAngles(m) {
   return [Math.atan2(-m[6], -m[8]), Math.atan2(m[7], Math.hypot(m[6], m[8]))];
 }
-
-/** Write the unit quaternion of the rotation with these columns to `out` at `place`. */
-function writeQuaternion(out, place, tx, ty, tz, bx, by, bz, nx, ny, nz) {
-  // The largest of the four components is found from the diagonal, the others by division.
-  const trace = tx + by + nz;
-  let w, x, y, z;
-  if (trace > 0) {
-    const s = 2 * Math.sqrt(1 + trace);
-    w = s / 4; x = (bz - ny) / s; y = (nx - tz) / s; z = (ty - bx) / s;
-  } else if (tx > by && tx > nz) {
-    const s = 2 * Math.sqrt(1 + tx - by - nz);
-    w = (bz - ny) / s; x = s / 4; y = (bx + ty) / s; z = (nx + tz) / s;
-  } else if (by > nz) {
-    const s = 2 * Math.sqrt(1 + by - tx - nz);
-    w = (nx - tz) / s; x = (bx + ty) / s; y = s / 4; z = (ny + bz) / s;
-  } else {
-    const s = 2 * Math.sqrt(1 + nz - tx - by);
-    w = (ty - bx) / s; x = (nx + tz) / s; y = (ny + bz) / s; z = s / 4;
-  }
-  out[place] = w; out[place + 1] = x; out[place + 2] = y; out[place + 3] = z;
-}
