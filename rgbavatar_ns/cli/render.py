@@ -64,6 +64,7 @@ def run(
     camera_path: Path | None = None,
     gain: Weight | None = None,
     arc: Annotated[float, Between(-360, 360)] | None = None,
+    texture: Path | None = None,
     picture: Annotated[PictureOptions, tyro.conf.arg(name="")] = _PICTURE,
     driving: Annotated[DrivingOptions, tyro.conf.arg(name="")] = _DRIVING,
 ) -> None:
@@ -92,12 +93,14 @@ def run(
             360 goes to and fro.
         gain: for bases, by how much each basis's largest weight in training is exaggerated; by
             default by as much as it takes to see what it does.
+        texture: a PNG painted over what `rgbavatar export --format texture` wrote of this avatar:
+            its colours change as it was changed.
         picture: how pictures are written.
         driving: how the driver's performance becomes the avatar's.
     """
     if driver is not None and show == "comparison":
         show = "performance"
-    subject = _subject(run_folder, data, picture)
+    subject = _subject(run_folder, data, texture, picture)
     if show == "comparison":
         _compare(subject, output, frames, picture)
     elif show == "bases":
@@ -120,13 +123,24 @@ class _Subject:
     """The dataset's first camera, or one before the face, for pictures of the size asked for."""
 
 
-def _subject(run_folder: Path, data: Path | None, picture: PictureOptions) -> _Subject:
+def _subject(
+    run_folder: Path, data: Path | None, texture: Path | None, picture: PictureOptions
+) -> _Subject:
     from rgbavatar_ns import Avatar
     from rgbavatar_ns.avatar.storage.bundle import load_statistics
     from rgbavatar_ns.data import load_dataset
-    from rgbavatar_ns.export import dataset_folder, front_camera, resized, statistics_of
+    from rgbavatar_ns.export import (
+        dataset_folder,
+        front_camera,
+        read_texture,
+        resized,
+        statistics_of,
+        with_texture,
+    )
 
     avatar, seen = Avatar.load(run_folder), load_statistics(run_folder)
+    if texture is not None:
+        avatar = with_texture(avatar, read_texture(texture))
     folder = dataset_folder(run_folder) if data is None else data
     if data is None and folder == run_folder:
         if seen is None:

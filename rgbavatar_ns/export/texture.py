@@ -33,7 +33,6 @@ _SAME_LEVELS = 1.5
 """Of 255: a level up or down comes from other programs' rounding and counts as not painted."""
 _STEPS = 10
 """Of fitting: painted checks of four texels gain 1.7 dB from ten steps, .1 dB from ten more."""
-_WIRE_RGBA = (255, 255, 255, 255)
 
 
 @dataclass(frozen=True)
@@ -65,7 +64,7 @@ class _Unfolded:
         return drawn / self.alpha.clamp(min=_LEAST_ALPHA)
 
     def pulled(self, picture: Float[Tensor, "R R 3"]) -> tuple[Tensor, Tensor]:
-        """Each Gaussian's mean of a picture [N 3], over what is seen of it, and how much is [N 1]."""
+        """The mean of a picture over what is seen of each Gaussian, and how much that is [N 1]."""
         found = weighted_color_average(self.gaussians, self.camera, picture[None].contiguous())
         weight = found.weight_sum.reshape(-1, 1)
         return found.weighted_sum.reshape(-1, 3) / weight.clamp(min=_LEAST_ALPHA), weight
@@ -76,11 +75,11 @@ def color_texture(avatar: Avatar, side_px: int | None = None) -> UInt8[np.ndarra
     """Draw what the head at rest looks like, spread out over its UV layout; RGBA, upright.
 
     Alpha is 255 where Gaussians are seen, else 0; there the nearest seen colour stands, so that
-    brushes and filters find no edge. `side_px` is four pixels a texel by default. Raises UserError
+    brushes and filters find no edge. By default with four pixels a texel. Raises UserError
     for a side out of range. Ours: trained Gaussians lie several texels beside the ones that carry
     them, so that a picture by texels would be a scramble.
     """
-    side_px = avatar.anchors.resolution * PIXELS_PER_TEXEL if side_px is None else side_px
+    side_px = _own_side_px(avatar) if side_px is None else side_px
     if not _SMALLEST_SIDE_PX <= side_px <= LARGEST_SIDE_PX:
         raise UserError(
             f"A texture of {side_px} x {side_px} pixels is out of range.",
@@ -99,7 +98,7 @@ def color_texture(avatar: Avatar, side_px: int | None = None) -> UInt8[np.ndarra
 
 
 @torch.no_grad()
-def with_texture(avatar: Avatar, painted: UInt8[np.ndarray, "R R 4"]) -> Avatar:
+def with_texture(avatar: Avatar, painted: UInt8[np.ndarray, "H W 4"]) -> Avatar:
     """Return the avatar in the colours of a painted `color_texture` of its own.
 
     What differs from the texture of the painted picture's own size is added to the base colours,
@@ -120,15 +119,20 @@ def with_texture(avatar: Avatar, painted: UInt8[np.ndarray, "R R 4"]) -> Avatar:
     result = copy.deepcopy(avatar)
     if not change.any():
         return result
-    side_px = avatar.anchors.resolution * PIXELS_PER_TEXEL
+    side_px = _own_side_px(avatar)
     if side_px != width:
         method = cv2.INTER_AREA if side_px < width else cv2.INTER_LINEAR
         change = cv2.resize(change, (side_px, side_px), interpolation=method)
     flat = _Unfolded.of(avatar, side_px)
     wanted = torch.from_numpy(change).to(avatar.identity) * flat.covered
     added = _fitted(flat, wanted)
-    result.blendshapes.color_feature += added / COLOR_SCALE
+    result.blendshapes.color_feature.add_(added / COLOR_SCALE)
     return result
+
+
+def _own_side_px(avatar: Avatar) -> int:
+    """The side of the texture that has room for all that the avatar's Gaussians can show."""
+    return min(avatar.anchors.resolution * PIXELS_PER_TEXEL, LARGEST_SIDE_PX)
 
 
 def _painted_change(
@@ -178,12 +182,12 @@ def _spread(
 
 
 def uv_wires(avatar: Avatar, side_px: int) -> UInt8[np.ndarray, "R R 4"]:
-    """Draw the edges of the head's triangles over its UV layout, white on nothing: a guide layer."""
+    """Draw the edges of the head's triangles in its UV layout, white on nothing: a guide layer."""
     corners = avatar.head.uv.cpu().double().numpy()[avatar.head.uv_faces.cpu().numpy()]
     outline_px = np.stack([corners[..., 0], 1 - corners[..., 1]], -1) * side_px
     wires = np.zeros((side_px, side_px), np.uint8)
-    cv2.polylines(wires, list(fixed_point(outline_px)), True, 255, 1, cv2.LINE_AA, 4)
-    drawn = np.full((side_px, side_px, 4), _WIRE_RGBA, np.uint8)
+    cv2.polylines(wires, list(fixed_point(outline_px)), True, (255,), 1, cv2.LINE_AA, 4)
+    drawn = np.full((side_px, side_px, 4), 255, np.uint8)
     drawn[..., 3] = wires
     return drawn
 
@@ -201,8 +205,8 @@ def write_texture(path: Path, avatar: Avatar, side_px: int | None = None) -> Pat
     return wires
 
 
-def read_texture(path: Path) -> UInt8[np.ndarray, "R R 4"]:
-    """Read a painted texture: a square PNG, grey, RGB or RGBA, of 8 or 16 bits.
+def read_texture(path: Path) -> UInt8[np.ndarray, "H W 4"]:
+    """Read a painted texture: a PNG, grey, RGB or RGBA, of 8 or 16 bits.
 
     Raises UserError where it is none, or larger than 4096 pixels a side.
     """
