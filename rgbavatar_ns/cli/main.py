@@ -20,7 +20,7 @@ COMMANDS = {
     "import": "turn other systems' data (INSTA, VHAP, metrical-tracker, ...) into a dataset",
     "check": "look at data before training: what it is, what is odd, and a picture of the fit",
     "render": "films and pictures: held-out frames, another's performance, views, learned bases",
-    "export": "the avatar as a bundle, Gaussians for other programs, a picture to paint, a web page",
+    "export": "the avatar as a bundle, Gaussians for other programs, a texture or a web page",
     "sweep": "train and evaluate every cell of an experiment, configs/*.yaml or your own",
     "report": "tables and plots of a sweep",
     "bench": "how fast the rasterizer, a training step and rendering are on this machine",

@@ -31,8 +31,10 @@ _LEAST_ALPHA = 0.05
 """Where the Gaussians cover less, a pixel shows none of them."""
 _SAME_LEVELS = 1.5
 """Of 255: a level up or down comes from other programs' rounding and counts as not painted."""
+_NEAR_PX = 2 * PIXELS_PER_TEXEL + 1
+"""Two texels: with five pixels painted checks lose .2 dB, with seventeen they gain .1 dB."""
 _STEPS = 10
-"""Of fitting: painted checks of four texels gain 1.7 dB from ten steps, .1 dB from ten more."""
+"""Of fitting: painted checks of four texels gain 1.3 dB from ten, and nothing from ten more."""
 
 
 @dataclass(frozen=True)
@@ -102,12 +104,12 @@ def with_texture(avatar: Avatar, painted: UInt8[np.ndarray, "H W 4"]) -> Avatar:
     """Return the avatar in the colours of a painted `color_texture` of its own.
 
     What differs from the texture of the painted picture's own size is added to the base colours,
-    whatever the expression, as far as alpha says. Gaussians that no painted pixel shows keep their
-    colours to the bit. Raises UserError for a picture that is not square, or out of range.
+    whatever the expression, as far as alpha says. Gaussians more than a texel and a half away from
+    paint keep their colours to the bit. Raises UserError for a picture that is not square, or out of range.
 
-    Ours: SIRT (as in tomography), the colours held within 0 and 1 unless they were beyond, so that
-    what is painted is fitted as sharply as the Gaussians allow and nothing grows that only cancels
-    out at rest.
+    Ours: SIRT (as in tomography) fits what was painted as sharply as the Gaussians allow. No colour
+    changes more than something painted near it, or the other way: that would fit a little better,
+    but paint would have a rim of the opposite colour.
     """
     height, width = painted.shape[:2]
     if height != width:
@@ -146,25 +148,33 @@ def _painted_change(
 
 def _fitted(flat: _Unfolded, wanted: Float[Tensor, "R R 3"]) -> Float[Tensor, "N 3"]:
     """Changes of the Gaussians' colours that show as this change of the picture."""
-    own = flat.gaussians.colors[0]
-    low, high = own.clamp(max=0), own.clamp(min=1)
+    # In the layout, as grid_sample counts it: -1 to 1.
+    places = 2 * flat.gaussians.means[:, None, :, :2]
 
-    def held(added: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
-        return (own + added).clamp(low, high) - own
+    def above(picture: Float[Tensor, "R R 3"]) -> Float[Tensor, "N 3"]:
+        planes = picture.movedim(-1, 0)[None]
+        found = F.grid_sample(planes, places, padding_mode="border", align_corners=False)
+        return found[0, :, 0].T
 
+    darkest, lightest = (above(end) for end in _ends_nearby(wanted))
     pulled, seen = flat.pulled(wanted)
     # Gaussians that nothing is seen of at rest take the colour above their place.
-    places = 2 * flat.gaussians.means[:, None, :, :2]
-    above = F.grid_sample(wanted.movedim(-1, 0)[None], places, align_corners=False)[0, :, 0].T
-    hidden = seen < _LEAST_ALPHA
-    # Of the others, only those that show a painted pixel may follow.
-    painted = (wanted != 0).any(-1, keepdim=True).to(wanted).expand_as(wanted)
-    follows = (flat.pulled(painted)[0][:, :1] > 0) & ~hidden
-    added = held(torch.where(hidden, above, pulled))
+    added = torch.where(seen < _LEAST_ALPHA, above(wanted), pulled)
     for _ in range(_STEPS):
+        added = added.maximum(darkest).minimum(lightest)
         lacking = (wanted - flat.mean(added)) * flat.covered
-        added = held(added + flat.pulled(lacking)[0] * follows)
-    return added
+        added = added + flat.pulled(lacking)[0]
+    return added.maximum(darkest).minimum(lightest)
+
+
+def _ends_nearby(
+    change: Float[Tensor, "R R 3"],
+) -> tuple[Float[Tensor, "R R 3"], Float[Tensor, "R R 3"]]:
+    """The least and the greatest change about each pixel, and none."""
+    values, near = change.cpu().numpy(), np.ones((_NEAR_PX, _NEAR_PX), np.uint8)
+    least = torch.from_numpy(cv2.erode(values, near)).to(change)
+    greatest = torch.from_numpy(cv2.dilate(values, near)).to(change)
+    return least.clamp(max=0), greatest.clamp(min=0)
 
 
 def _spread(
