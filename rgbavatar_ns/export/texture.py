@@ -105,7 +105,8 @@ def with_texture(avatar: Avatar, painted: UInt8[np.ndarray, "H W 4"]) -> Avatar:
 
     What differs from the texture of the painted picture's own size is added to the base colours,
     whatever the expression, as far as alpha says. Gaussians more than a texel and a half away from
-    paint keep their colours to the bit. Raises UserError for a picture that is not square, or out of range.
+    paint keep their colours to the bit. Raises UserError for a picture that is not square, or out
+    of range.
 
     Ours: SIRT (as in tomography) fits what was painted as sharply as the Gaussians allow. No colour
     changes more than something painted near it, or the other way: that would fit a little better,
