@@ -1,13 +1,13 @@
 """A performance as it comes, as the avatar's theta: calibrated, relative, held, smoothed."""
 
-from dataclasses import dataclass, field
+import math
+from dataclasses import dataclass, field, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from rgbavatar_ns.avatar.avatar import Avatar
-from rgbavatar_ns.avatar.model.weight_network import softly_within
 from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics, expressive_numbers
 from rgbavatar_ns.driving.one_euro import OneEuroFilter, OneEuroOptions
 from rgbavatar_ns.driving.source import PerformanceFrame, PerformerHead
@@ -19,14 +19,26 @@ from rgbavatar_ns.driving.transfer import (
     own_reference,
     relative_theta,
 )
-from rgbavatar_ns.head import turn_seen
+from rgbavatar_ns.head import ThetaLayout, turn_seen
 from rgbavatar_ns.head.arkit import head_carrier
+from rgbavatar_ns.head.lips import LipGap
 from rgbavatar_ns.head.rotations import axis_angle_to_matrix, matrix_to_axis_angle
 from rgbavatar_ns.kernels import PinholeCameras
 from rgbavatar_ns.options import CheckedOptions, Weight
 
-_CALMEST = 0.25
-"""Share of the calibration's frames that count as rest: people talk and blink meanwhile."""
+_LOWEST = 0.1
+"""Of a calibration's frames this share may lie below rest, as a tracker's noise does."""
+_ROOM_SHARE = 0.5
+"""How far expressions may go beyond the film, of its range."""
+_NONE_BELOW = 0.05
+"""FLAME's components go to both sides; named expressions at most by a tracker's noise."""
+_TURN_ROOM_DEGREES = 20.0
+"""How far the head may turn beyond the film. A viewer goes 30 degrees (`turn_reach`) because who
+turns there knows; a performer's every turn would show what nobody filmed."""
+_SETTLES_IN_S = 0.3
+"""Rest comes down within so many seconds to where a calmer face stays, and hardly for one frame."""
+_LEAST_UNIT = 0.1
+"""Of smoothing: what hardly moved in the film trembles all the more in another's performance."""
 _GAP_S = 0.5
 """After a longer gap the performer may be anywhere: nothing is smoothed across it."""
 _MOST_FRAMES = 600
@@ -45,8 +57,8 @@ class LiveOptions(CheckedOptions):
     """Hold expressions softly to the film's range, and turns to where the avatar holds."""
     smooth: bool = True
     """Filter jitter with a one-euro filter."""
-    filter: OneEuroOptions = field(default_factory=OneEuroOptions)
-    """The filter's settings."""
+    filter: OneEuroOptions = field(default_factory=lambda: OneEuroOptions(3.0, 30.0))
+    """The filter's settings; speeds count in each number's range in the film."""
 
 
 class LiveTransfer:
@@ -82,6 +94,13 @@ class LiveTransfer:
         self._driving = DrivingOptions(relative=relative, pose=options.pose)
         self._carrier = head_carrier(avatar.head.arrays.expression_names)
         self._expressive = expressive_numbers(avatar.layout)
+        low, high = own.film_range()
+        self._unit = (high - low).clamp(min=_LEAST_UNIT)
+        self._lips = LipGap.of(avatar.head, avatar.identity)
+        if self._lips is not None:
+            self._closed_m = self._lips.at_rest_m
+            self._own_closed_m = float(self._lips(own.theta_neutral[None])[0])
+        self._rises = _rises(avatar.layout, own)
         self._filter = OneEuroFilter(options.filter)
         self._reference: Reference | None = None
         self._seen: list[Tensor] = []
@@ -103,13 +122,17 @@ class LiveTransfer:
     def __call__(self, frame: PerformanceFrame) -> Float[Tensor, "H"]:
         """The avatar's theta for a frame."""
         mapped = self._mapped(frame)
-        theta = mapped.theta[0]
+        performed = mapped.theta[0]
+        seconds = 0.0 if self._last_s is None else frame.time_s - self._last_s
+        self._last_s = frame.time_s
+        if not 0 < seconds < _GAP_S:
+            self._filter, seconds = OneEuroFilter(self.options.filter), 0.0
         if self._learning:
-            self._learn(theta, frame.time_s)
-        driver = self._reference or Reference(theta, theta)
-        result = relative_theta(
+            self._learn(performed, frame.time_s)
+        self._settle(performed, seconds)
+        theta = relative_theta(
             mapped.theta,
-            driver,
+            self._reference or Reference(performed, performed),
             own_reference(self._own),
             mapped.known,
             self._own,
@@ -117,8 +140,12 @@ class LiveTransfer:
             self._driving,
         )[0]
         if self.options.keep_range:
-            result = self._held(result)
-        return self._smoothed(result, frame.time_s) if self.options.smooth else result
+            theta = self._held(theta)
+        if self._lips is not None and self._driving.relative != "off":
+            theta = self._with_lips(self._lips, theta, performed, seconds)
+        if self.options.smooth:
+            theta = self._filter(theta / self._unit, seconds) * self._unit
+        return theta
 
     def _mapped(self, frame: PerformanceFrame) -> MappedTheta:
         if self._map is not None and frame.theta is not None:
@@ -142,25 +169,76 @@ class LiveTransfer:
         if over:
             self._learning, self._calibrated, self._seen = False, True, []
 
+    def _settle(self, theta: Float[Tensor, "H"], seconds: float) -> None:
+        """Let rest follow down what only rises from it: who talked while being met rests later."""
+        if self._reference is None or self._driving.relative == "off":
+            return
+        rest = self._reference.neutral
+        share = 1 - math.exp(-seconds / _SETTLES_IN_S)
+        lower = rest + share * (torch.minimum(theta, rest) - rest)
+        self._reference = replace(self._reference, neutral=torch.where(self._rises, lower, rest))
+
     def _reference_of(self, theta: Float[Tensor, "F H"]) -> Reference:
-        """Rest: the mean of the calmest frames; the pose: the mean of all."""
-        activity = theta[:, self._expressive].abs().sum(1)
-        calmest = activity.argsort()[: max(1, round(_CALMEST * len(theta)))]
-        return Reference(theta[calmest].mean(0), theta.mean(0))
+        """Rest, number by number; the pose: the mean of all.
+
+        Who is met talks and blinks: what only ever rises from rest, as an open jaw does, rests
+        where it is lowest. What goes to both sides, as a gaze does, rests at its median.
+        """
+        rest = torch.where(
+            self._rises, torch.quantile(theta, _LOWEST, dim=0), theta.median(0).values
+        )
+        return Reference(rest, theta.mean(0))
 
     def _held(self, theta: Float[Tensor, "H"]) -> Float[Tensor, "H"]:
-        """The expression within the film's range, the head's turn where the avatar holds."""
-        own = self._own
-        theta = torch.where(self._expressive, softly_within(theta, *own.film_range()), theta)
-        low, high = own.turn_reach()
+        """The expression within the film's range, the head's turn where the avatar holds.
+
+        What only rises from rest never falls below it; everything else goes ever less far beyond
+        the film: half the range for expressions, 20 degrees for the head.
+        """
+        low, high = self._own.film_range()
+        room = _ROOM_SHARE * (high - low)
+        held = _softly(theta, low, high, room)
+        held = torch.where(self._rises, torch.maximum(held, self._own.theta_min), held)
+        return self._turned_back(torch.where(self._expressive, held, theta))
+
+    def _with_lips(
+        self,
+        lips: LipGap,
+        theta: Float[Tensor, "H"],
+        performed: Float[Tensor, "H"],
+        seconds: float,
+    ) -> Float[Tensor, "H"]:
+        """The jaw moved so that the lips are as far apart as the performer's.
+
+        Rest and range are learnt number by number, and small errors of many add up at the lips,
+        where everybody looks: closed lips would stand open, and words be said through closed ones.
+        """
+        gap_m, own_m = lips(torch.stack([performed, theta])).tolist()
+        share = 1 - math.exp(-seconds / _SETTLES_IN_S)
+        self._closed_m += share * min(gap_m - self._closed_m, 0.0)
+        wanted_m = self._own_closed_m + gap_m - self._closed_m
+        theta = theta.clone()
+        step = (wanted_m - own_m) / lips.slope_m_per_rad
+        low, high = (float(end[lips.jaw]) for end in self._own.film_range())
+        room = _ROOM_SHARE * (high - low)
+        jaw = min(max(float(theta[lips.jaw]) + step, low), high + room)
+        theta[lips.jaw] = jaw
+        return theta
+
+    def _turned_back(self, theta: Float[Tensor, "H"]) -> Float[Tensor, "H"]:
+        """With the head's turn as the camera sees it softly within those filmed."""
+        low, high = self._own.filmed_turns()
         seen = self._turn(theta)
-        rest = torch.minimum(torch.maximum(self._turn(own.theta_mean), low), high)
-        beyond = seen - torch.minimum(torch.maximum(seen, low), high)
-        share = float((1 - beyond.abs() / (seen - rest).abs().clamp(min=1e-3)).clamp(0, 1).min())
+        beyond = seen - _softly(seen, low, high, torch.full_like(seen, _TURN_ROOM_DEGREES))
+        start_seen = self._turn(self._own.theta_mean)
+        share = float(
+            (1 - beyond.abs() / (seen - start_seen).abs().clamp(min=1.0)).clamp(0, 1).min()
+        )
         if share == 1.0:
             return theta
         carrier = self._layout.slice(self._carrier)
-        start, end = (axis_angle_to_matrix(part[carrier]) for part in (own.theta_mean, theta))
+        mean = self._own.theta_mean
+        start, end = (axis_angle_to_matrix(part[carrier]) for part in (mean, theta))
         held = axis_angle_to_matrix(share * matrix_to_axis_angle(end @ start.mT)) @ start
         theta = theta.clone()
         theta[carrier] = matrix_to_axis_angle(held)
@@ -170,10 +248,25 @@ class LiveTransfer:
         """Yaw and pitch in degrees as the camera sees the head."""
         return turn_seen(theta[None], self._world_to_camera, self._layout)[0, :2]
 
-    def _smoothed(self, theta: Float[Tensor, "H"], time_s: float) -> Float[Tensor, "H"]:
-        seconds = None if self._last_s is None else time_s - self._last_s
-        self._last_s = time_s
-        if seconds is None or not 0 < seconds < _GAP_S:
-            self._filter = OneEuroFilter(self.options.filter)
-            return self._filter(theta, 0.0)
-        return self._filter(theta, seconds)
+
+def _rises(layout: ThetaLayout, own: TrainingStatistics) -> Bool[Tensor, "H"]:
+    """Which numbers only ever rise from rest: named expressions, lids, and the jaw's opening."""
+    rises = torch.zeros(layout.size, dtype=torch.bool)
+    for part in layout.fields:
+        where = layout.slice(part.name)
+        if part.form == "linear":
+            rises[where] = own.theta_min[where] > -_NONE_BELOW
+        elif part.name == "jaw":
+            rises[where.start] = True
+    return rises
+
+
+def _softly(
+    values: Float[Tensor, "D"],
+    low: Float[Tensor, "D"],
+    high: Float[Tensor, "D"],
+    room: Float[Tensor, "D"],
+) -> Float[Tensor, "D"]:
+    """Values as they are within a range; beyond, each goes ever less far, at most by `room`."""
+    nearest = torch.minimum(torch.maximum(values, low), high)
+    return nearest + room * torch.tanh((values - nearest) / room.clamp(min=1e-6))

@@ -83,6 +83,8 @@ def parse_performance(message: dict[str, Any], layout: ThetaLayout) -> SentPerfo
             raise UserError("The coefficients are no numbers by name.", _REMEDY)
         row = arkit_coefficients(named)
         pose = message.get("pose")
+        if pose is not None and not isinstance(pose, dict):
+            raise UserError("pose is no object with a rotation.", _REMEDY)
         turn = None if pose is None else _numbers(pose.get("rotation"), 3, "pose.rotation")
         if turn is not None and float(turn.norm()) > _LONGEST_TURN:
             raise UserError("pose.rotation is longer than two turns.", "Give radians.")

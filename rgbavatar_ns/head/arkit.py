@@ -123,7 +123,7 @@ def arkit_map(arrays: HeadArrays) -> ArkitMap:
     return ArkitMap(layout, table, head_carrier(arrays.expression_names), unexplained)
 
 
-def arkit_coefficients(named: Mapping[str, float]) -> Float[Tensor, "52"]:
+def arkit_coefficients(named: Mapping[str, int | float]) -> Float[Tensor, "52"]:
     """Coefficients by name (`jawOpen`, or `JawOpen` as Live Link Face writes it) as a row.
 
     Raises UserError for a name that ARKit does not have, and for a value that is no number.

@@ -124,28 +124,42 @@ class LiveTracker:
             self._crop.follow(landmarks)
             return frame
 
-    def pose(self, image_rgb: _Image) -> Float[Tensor, "H"] | None:
+    def pose(self, image_rgb: _Image, index: int = 0) -> Float[Tensor, "H"] | None:
         """The frame's theta alone, where no picture of the person is wanted; None as a call gives.
 
-        Of the warm-up's frames there is no backlog.
+        The warm-up's frames are in `pose_backlog`, by the numbers that they were given here.
         """
         self._require_size(image_rgb.shape[1], image_rgb.shape[0])
         with self._libraries.limit(limits=1, user_api="blas"):
             if self._fit is None:
-                if self._collected(self._next_index, image_rgb):
+                if self._collected(index, image_rgb):
                     self._meet()
-                    self._warm_up = []
                 return None
             landmarks = self._landmarker(image_rgb)
             if landmarks is None:
                 self._fit.forget()
                 self.counts["no face"] += 1
                 return None
-            values = self._fit(landmarks, find_irises(image_rgb, landmarks))
-            if values is None:
-                self.counts["does not fit"] += 1
-                return None
-            return self._theta(self._fit, values)
+            return self._pose(self._fit, landmarks, find_irises(image_rgb, landmarks))
+
+    def pose_backlog(self) -> list[tuple[int, Float[Tensor, "H"]]]:
+        """Theta of the warm-up's frames by their numbers, once; nothing before `ready`."""
+        if self._fit is None:
+            return []
+        numbered = [(index, (points, eyes)) for index, _, points, eyes in self._warm_up]
+        self._warm_up = []
+        with self._libraries.limit(limits=1, user_api="blas"):
+            posed = [(index, self._pose(self._fit, *found)) for index, found in numbered]
+        return [(index, theta) for index, theta in posed if theta is not None]
+
+    def _pose(
+        self, fit: "_CausalFit", landmarks_px: _Landmarks, irises: FoundIrises
+    ) -> Float[Tensor, "H"] | None:
+        values = fit(landmarks_px, irises)
+        if values is None:
+            self.counts["does not fit"] += 1
+            return None
+        return self._theta(fit, values)
 
     def _require_size(self, width: int, height: int) -> None:
         if self._size is not None and self._size != (width, height):

@@ -2,13 +2,17 @@
 
 import glob
 import time
-from collections import Counter
+from collections import Counter, deque
 from pathlib import Path
 from typing import Any
+
+from jaxtyping import Float
+from torch import Tensor
 
 from rgbavatar_ns.driving.source import PerformanceFrame, PerformerHead
 from rgbavatar_ns.errors import UserError, first_few
 from rgbavatar_ns.tracking.input.capture import (
+    CapturedFrame,
     FileCapture,
     FrameCapture,
     LatestFrameCapture,
@@ -48,12 +52,16 @@ class FilmedPerformer:
         self.head = PerformerHead(tracker.head.layout, tracker.head.arrays)
         self._with_images = with_images
         self._counts = Counter[str]()
+        self._keeps_all = not real_time
+        self._unmet: dict[int, CapturedFrame] = {}
+        self._backlog: deque[PerformanceFrame] = deque()
+        self._closed = False
         self._began_s, self._shown = time.monotonic(), False
 
     @property
     def ended(self) -> bool:
         """Whether the file is at its end."""
-        return self._capture.ended
+        return self._capture.ended and not self._backlog
 
     @property
     def counts(self) -> Counter[str]:
@@ -73,24 +81,41 @@ class FilmedPerformer:
 
     def next(self, timeout_s: float) -> PerformanceFrame | None:
         """The head in the newest picture; tracking one may take longer than `timeout_s`."""
+        if self._backlog:
+            return self._backlog.popleft()
         captured = self._capture.next(timeout_s)
         if captured is None:
             self._require_pictures()
             return None
         self._shown = True
+        met = self._tracker.ready
         try:
-            theta = self._tracker.pose(captured.image_rgb)
+            theta = self._tracker.pose(captured.image_rgb, captured.index)
         except UserError:
             self._counts["another resolution"] += 1
             return None
-        if theta is None:
-            return None
+        if not met:
+            self._meet(captured)
+            return self._backlog.popleft() if self._backlog else None
+        return None if theta is None else self._performed(captured, theta)
+
+    def _meet(self, captured: CapturedFrame) -> None:
+        """Keep a recording's first frames until the person is known; a camera's would be late."""
+        if self._keeps_all:
+            self._unmet[captured.index] = captured
+        if not self._tracker.ready:
+            return
+        posed = self._tracker.pose_backlog()
+        if self._keeps_all:
+            for index, theta in posed:
+                self._backlog.append(self._performed(self._unmet[index], theta))
+        self._unmet.clear()
+
+    def _performed(self, captured: CapturedFrame, theta: Float[Tensor, "H"]) -> PerformanceFrame:
+        clock_s = captured.captured_s if captured.time_s is None else captured.time_s
+        image_rgb = captured.image_rgb if self._with_images else None
         return PerformanceFrame(
-            captured.index,
-            captured.captured_s,
-            captured.captured_s if captured.time_s is None else captured.time_s,
-            theta=theta,
-            image_rgb=captured.image_rgb if self._with_images else None,
+            captured.index, captured.captured_s, clock_s, theta=theta, image_rgb=image_rgb
         )
 
     def _require_pictures(self) -> None:
@@ -102,8 +127,10 @@ class FilmedPerformer:
 
     def close(self) -> None:
         """Let go of camera and tracker."""
-        self._capture.close()
-        self._tracker.close()
+        if not self._closed:
+            self._closed = True
+            self._capture.close()
+            self._tracker.close()
 
 
 _REMEDY = (
