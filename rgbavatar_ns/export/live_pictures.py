@@ -4,7 +4,7 @@ import os
 import sys
 import time
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -24,6 +24,7 @@ _MOST_REPEATS = 250
 """A pause of the performer stands still in the film for at most so many pictures."""
 
 
+@runtime_checkable
 class PictureSink(Protocol):
     """Where drawn pictures go."""
 
@@ -104,7 +105,7 @@ class FilmSink:
         if self._film.count == 0:
             nothing = UserError(f"{self._path} has no picture.", "The performer was never seen.")
             self._film.__exit__(UserError, nothing, None)
-            return
+            raise nothing
         self._film.__exit__(None, None, None)
 
 
