@@ -63,7 +63,9 @@ class PictureOutput:
         self._sink.add(picture, frame.time_s)
         self.latencies.add(frame.captured_s, time.monotonic())
 
-    def _performer(self, image_rgb: _Picture, picture: _Picture) -> _Picture:
+    def _performer(
+        self, image_rgb: UInt8[np.ndarray, "H W 3"], picture: _Picture
+    ) -> UInt8[np.ndarray, "height beside 3"]:
         """The performer's picture as high as the avatar's, and as wide as the first one was."""
         performer = scaled(image_rgb, len(picture) / len(image_rgb))
         self._beside_px = self._beside_px or performer.shape[1]
