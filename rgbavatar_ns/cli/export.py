@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
     from rgbavatar_ns.data import TrackedDataset
 
-Format = Literal["bundle", "ply", "ply-sequence", "web"]
+Format = Literal["bundle", "ply", "gltf", "spz", "compressed-ply", "sog", "texture", "web"]
 
 
 def run(
@@ -25,31 +25,38 @@ def run(
     frame: int | None = None,
     frames: tuple[int, int] | None = None,
     head_inside: bool = True,
+    texture: Path | None = None,
     frames_per_second: FrameRate = 25.0,
     title: str = "Avatar",
 ) -> None:
-    """Write an avatar as a bundle, as Gaussians in PLY files or as a web page.
+    """Write an avatar as a bundle, as Gaussians for other programs, as a picture or as a web page.
 
     bundle: a folder that `Avatar.load` opens without nerfstudio, with what the avatar saw in
-    training. ply: the Gaussians of one frame, as viewers of 3D Gaussian splatting
-    open them. ply-sequence: a folder of them. web: one HTML file that plays and drives the avatar
-    in a browser, without a server or a network.
+    training. ply, gltf, spz, compressed-ply, sog: the Gaussians of one frame, or a folder of
+    several frames' (--frames), as viewers of 3D Gaussian splatting open them. texture: the head's
+    colours as a picture to paint on, for --texture. web: one HTML file that plays and drives the
+    avatar in a browser, without a server or a network.
 
     Args:
         run_folder: a run of ns-train, a checkpoint or an avatar bundle.
-        destination: the folder (bundle, ply-sequence) or file (ply, web) to write.
+        destination: the file to write; for bundle, and with --frames, the folder.
         format: what to write.
         data: the dataset whose frames are meant; by default the one that the run names.
-        frame: for ply, the frame's place in the dataset; without it the head is at rest.
-        frames: for ply-sequence and web, first frame and the frame after the last one.
+        frame: of Gaussians, the frame's place in the dataset; without it the head is at rest.
+        frames: of Gaussians and for web, first frame and the frame after the last one.
         head_inside: for bundle, put the head model inside. Without it the bundle only names its
             head model, as the licence of FLAME asks where it is passed on.
+        texture: a PNG painted over what --format texture wrote of this avatar: its colours change
+            as it was changed.
         frames_per_second: for web, of the performance.
         title: for web, the page's title.
     """
     from rgbavatar_ns import Avatar
+    from rgbavatar_ns.export import GAUSSIAN_FILES, read_texture, with_texture
 
     whole = Avatar.load(run_folder)
+    if texture is not None:
+        whole = with_texture(whole, read_texture(texture))
     avatar = whole.without_undrawn()
     if avatar.num_gaussians < whole.num_gaussians:
         left_out = whole.num_gaussians - avatar.num_gaussians
@@ -59,10 +66,10 @@ def run(
         seen = _seen(avatar, run_folder, dataset)
         avatar.save(destination, statistics=seen, with_head=head_inside)
         print(f"Avatar.load({str(destination)!r}) opens it.")
-    elif format == "ply":
-        _write_frame(avatar, dataset, frame, destination)
-    elif format == "ply-sequence":
-        _write_sequence(avatar, dataset, frames, destination)
+    elif format in GAUSSIAN_FILES:
+        _write_gaussians(avatar, dataset, format, frame, frames, destination)
+    elif format == "texture":
+        _write_texture(avatar, destination)
     else:
         seen = _seen(avatar, run_folder, dataset)
         _write_page(avatar, seen, dataset, frames, destination, frames_per_second, title)
@@ -101,43 +108,41 @@ def _dataset(
     return dataset
 
 
-def _write_frame(
-    avatar: "Avatar", dataset: "TrackedDataset | None", frame: int | None, destination: Path
-) -> None:
-    import torch
-
-    from rgbavatar_ns.export import write_ply
-    from rgbavatar_ns.export.scenes import chosen_frames
-
-    theta = torch.zeros(1, avatar.layout.size)
-    if frame is not None:
-        assert dataset is not None
-        theta = dataset.theta[list(chosen_frames(len(dataset), (frame, frame + 1), ()))]
-    with torch.no_grad():
-        count = write_ply(destination, avatar.gaussians(theta))
-    print(f"{count} Gaussians in {destination}")
-
-
-def _write_sequence(
+def _write_gaussians(
     avatar: "Avatar",
     dataset: "TrackedDataset | None",
+    format: Format,
+    frame: int | None,
     frames: tuple[int, int] | None,
     destination: Path,
 ) -> None:
     import torch
 
-    from rgbavatar_ns.export import write_ply
+    from rgbavatar_ns.export import write_gaussian_sequence, write_gaussians
     from rgbavatar_ns.export.scenes import chosen_frames
 
-    if dataset is None:
-        raise UserError("A sequence needs a dataset.", "Name it with --data.")
-    chosen = chosen_frames(len(dataset), frames, range(len(dataset)))
-    with progress_bar("PLY files") as update, torch.no_grad():
-        for done, place in enumerate(chosen, start=1):
-            gaussians = avatar.gaussians(dataset.theta[place : place + 1])
-            write_ply(destination / f"{place:05d}.ply", gaussians)
-            update(done, len(chosen))
-    print(f"{len(chosen)} PLY files in {destination}")
+    if frame is not None and frames is not None:
+        raise UserError("There is both --frame and --frames.", "Leave one of them out.")
+    if dataset is None or (frame is None and frames is None):
+        count = write_gaussians(avatar, torch.zeros(1, avatar.layout.size), destination, format)
+        print(f"{count} Gaussians in {destination}")
+    elif frames is None and frame is not None:
+        (place,) = chosen_frames(len(dataset), (frame, frame + 1), ())
+        count = write_gaussians(avatar, dataset.theta[[place]], destination, format)
+        print(f"{count} Gaussians in {destination}")
+    else:
+        chosen = chosen_frames(len(dataset), frames, ())
+        with progress_bar(format) as update:
+            write_gaussian_sequence(avatar, dataset.theta, chosen, destination, format, update)
+        print(f"{len(chosen)} files in {destination}")
+
+
+def _write_texture(avatar: "Avatar", destination: Path) -> None:
+    from rgbavatar_ns.export import write_texture
+
+    wires = write_texture(destination, avatar)
+    print(f"{destination}: paint on it, the face is upright and its left side on the right.")
+    print(f"{wires}: the head's mesh, to lay over it. --texture takes the painted picture.")
 
 
 def _write_page(

@@ -1,7 +1,7 @@
 """`rgbavatar render`: films and pictures of a trained avatar."""
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -15,11 +15,9 @@ from rgbavatar_ns.options import Between, CheckedOptions, Counted, FrameRate, Pi
 if TYPE_CHECKING:
     import numpy as np
 
-    from rgbavatar_ns.avatar import Avatar
-    from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
     from rgbavatar_ns.data import TrackedDataset
     from rgbavatar_ns.export.scenes import Scene
-    from rgbavatar_ns.kernels import PinholeCameras
+    from rgbavatar_ns.export.subject import Subject
 
 Show = Literal["comparison", "performance", "views", "orbit", "camera-path", "turntable", "bases"]
 Kind = Literal["mp4", "png", "gif"]
@@ -64,6 +62,7 @@ def run(
     camera_path: Path | None = None,
     gain: Weight | None = None,
     arc: Annotated[float, Between(-360, 360)] | None = None,
+    texture: Path | None = None,
     picture: Annotated[PictureOptions, tyro.conf.arg(name="")] = _PICTURE,
     driving: Annotated[DrivingOptions, tyro.conf.arg(name="")] = _DRIVING,
 ) -> None:
@@ -92,12 +91,19 @@ def run(
             360 goes to and fro.
         gain: for bases, by how much each basis's largest weight in training is exaggerated; by
             default by as much as it takes to see what it does.
+        texture: a PNG painted over what `rgbavatar export --format texture` wrote of this avatar:
+            its colours change as it was changed.
         picture: how pictures are written.
         driving: how the driver's performance becomes the avatar's.
     """
     if driver is not None and show == "comparison":
         show = "performance"
-    subject = _subject(run_folder, data, picture)
+    from rgbavatar_ns.export import read_texture, with_texture
+    from rgbavatar_ns.export.subject import load_subject
+
+    subject = load_subject(run_folder, data, picture.width, picture.height)
+    if texture is not None:
+        subject = replace(subject, avatar=with_texture(subject.avatar, read_texture(texture)))
     if show == "comparison":
         _compare(subject, output, frames, picture)
     elif show == "bases":
@@ -109,39 +115,8 @@ def run(
         _write(drawn, total, output, show, kind, picture.frames_per_second)
 
 
-@dataclass(frozen=True)
-class _Subject:
-    """An avatar and what is known about its training."""
-
-    avatar: "Avatar"
-    dataset: "TrackedDataset | None"
-    seen: "TrainingStatistics"
-    camera: "PinholeCameras"
-    """The dataset's first camera, or one before the face, for pictures of the size asked for."""
-
-
-def _subject(run_folder: Path, data: Path | None, picture: PictureOptions) -> _Subject:
-    from rgbavatar_ns import Avatar
-    from rgbavatar_ns.avatar.storage.bundle import load_statistics
-    from rgbavatar_ns.data import load_dataset
-    from rgbavatar_ns.export import dataset_folder, front_camera, resized, statistics_of
-
-    avatar, seen = Avatar.load(run_folder), load_statistics(run_folder)
-    folder = dataset_folder(run_folder) if data is None else data
-    if data is None and folder == run_folder:
-        if seen is None:
-            raise UserError(f"{run_folder} does not name its dataset.", "Name it with --data.")
-        camera = front_camera(avatar, picture.width or 512, picture.height or 512)
-        return _Subject(avatar, None, seen, camera)
-    dataset = load_dataset(folder)
-    avatar.require_layout(dataset.layout, f"The dataset {folder}")
-    size = picture.width or dataset.width, picture.height or dataset.height
-    camera = resized(dataset.cameras.select([0]), *size)
-    return _Subject(avatar, dataset, seen or statistics_of(avatar, dataset), camera)
-
-
 def _compare(
-    subject: _Subject, output: Path, frames: tuple[int, int] | None, picture: PictureOptions
+    subject: "Subject", output: Path, frames: tuple[int, int] | None, picture: PictureOptions
 ) -> None:
     from rgbavatar_ns.export import write_comparison
     from rgbavatar_ns.export.scenes import chosen_frames
@@ -166,7 +141,7 @@ def _compare(
 
 
 def _write_bases(
-    subject: _Subject, output: Path, gain: float | None, picture: PictureOptions
+    subject: "Subject", output: Path, gain: float | None, picture: PictureOptions
 ) -> None:
     from rgbavatar_ns.export import basis_grid, write_png
 
@@ -178,7 +153,7 @@ def _write_bases(
 
 
 def _scene(
-    subject: _Subject,
+    subject: "Subject",
     driver: Path | None,
     frames: tuple[int, int] | None,
     picture: PictureOptions,
@@ -207,7 +182,7 @@ def _scene(
 
 
 def _drawn(
-    subject: _Subject,
+    subject: "Subject",
     scene: "Scene",
     beside: "tuple[TrackedDataset, tuple[int, ...]] | None",
     show: Show,
