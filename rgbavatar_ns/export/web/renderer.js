@@ -1,5 +1,5 @@
 "use strict";
-/* WebGL2: places all Gaussians in one pass and draws them from far to near. */
+/* WebGL2: places all Gaussians in one pass, draws them from far to near, shows the picture. */
 
 const TEXTURE_WIDTH = 1024;
 const VARIANTS = ["normalized", "raw", "orthonormal"];
@@ -25,12 +25,11 @@ class Renderer {
     this.levels = new DetailLevels(data);
     this.placing = this._program(WHOLE_TARGET_VERTEX, PLACE_FRAGMENT);
     this.drawing = this._program(DRAW_VERTEX, DRAW_FRAGMENT);
+    this.showing = this._program(WHOLE_TARGET_VERTEX, SHOW_FRAGMENT);
     this._makeTextures();
     this._makePlaceTarget();
     this._makeBoxes();
-    this.offscreen = gl.createFramebuffer();
-    this.offscreenPicture = null;
-    this.offscreenIs = []; // width, height, format
+    this.pictureIs = []; // width, height, format
     this.filledParts = 0; // of the file, so many are in the textures
   }
 
@@ -219,19 +218,21 @@ class Renderer {
     this.orderTable = this._table("R32UI", TEXTURE_WIDTH, this.rows);
   }
 
-  /** The target of a picture that is not drawn into the canvas at once. */
-  _offscreen(width, height, bytes) {
+  /** Half floats hold the unrounded sums of many thin layers. */
+  _fitPicture(width, height, bytes) {
     const gl = this.gl, format = bytes ? gl.RGBA8 : gl.RGBA16F;
-    if (this.offscreenIs.join() !== [width, height, format].join()) {
-      gl.deleteTexture(this.offscreenPicture);
-      this.offscreenPicture = this._texture().texture;
-      gl.texStorage2D(gl.TEXTURE_2D, 1, format, width, height);
-      gl.bindFramebuffer(gl.FRAMEBUFFER, this.offscreen);
-      gl.framebufferTexture2D(
-        gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, this.offscreenPicture, 0);
-      this.offscreenIs = [width, height, format];
+    if (this.pictureIs.join() === [width, height, format].join()) return;
+    if (this.picture) gl.deleteTexture(this.picture.texture);
+    this.picture = this._texture();
+    gl.texStorage2D(gl.TEXTURE_2D, 1, format, width, height);
+    for (const name of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) {
+      gl.texParameteri(gl.TEXTURE_2D, name, gl.LINEAR);
     }
-    return this.offscreen;
+    this.pictureTarget = this.pictureTarget || gl.createFramebuffer();
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.pictureTarget);
+    gl.framebufferTexture2D(
+      gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, this.picture.texture, 0);
+    this.pictureIs = [width, height, format];
   }
 
   /** Bind textures to a program's samplers by their names. */
@@ -254,18 +255,20 @@ class Renderer {
     const count = this.count(share), camera = this._reduced(seen, share.resolution);
     this._fill();
     this._fillAnchors(count);
+    // What is kept in bytes and is as large as the canvas needs no place of its own.
+    const direct = share.bytes && share.resolution === 1 && background;
+    if (!direct) this._fitPicture(camera.width, camera.height, share.bytes);
     this.order.sort(head, psi, camera, count);
     this._renew(this.orderTable, this.order.order.subarray(0, TEXTURE_WIDTH
       * Math.ceil(count / TEXTURE_WIDTH)));
     this._renew(this.head.vertex, head.vertices);
     this._weigh(psi);
     this._placeAll(camera, count);
-    if (share.bytes && camera.width === seen.width && camera.height === seen.height) {
-      this._drawAll(camera, count, background, null);
+    if (direct) {
+      this._drawAll(camera, count, null, [...background, 1]);
     } else {
-      const { width, height } = camera;
-      this._drawAll(camera, count, background, this._offscreen(width, height, share.bytes));
-      this._copy(camera, seen);
+      this._drawAll(camera, count, this.pictureTarget, [0, 0, 0, 0]);
+      this._showOver(background, seen);
     }
   }
 
@@ -320,12 +323,12 @@ class Renderer {
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 
-  /** From far to near over the background, into a target (null is the canvas). */
-  _drawAll({ width, height }, count, background, target) {
+  /** From far to near over a colour, into a target; null is the canvas. */
+  _drawAll({ width, height }, count, target, ground) {
     const gl = this.gl, { program, uniforms } = this.drawing;
     gl.bindFramebuffer(gl.FRAMEBUFFER, target);
     gl.viewport(0, 0, width, height);
-    gl.clearColor(...background, 1);
+    gl.clearColor(...ground);
     gl.clear(gl.COLOR_BUFFER_BIT);
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
@@ -337,12 +340,15 @@ class Renderer {
     gl.bindVertexArray(null);
   }
 
-  /** From the offscreen target to the canvas. */
-  _copy(from, to) {
-    const gl = this.gl, same = from.width === to.width && from.height === to.height;
-    gl.bindFramebuffer(gl.READ_FRAMEBUFFER, this.offscreen);
-    gl.bindFramebuffer(gl.DRAW_FRAMEBUFFER, null);
-    gl.blitFramebuffer(0, 0, from.width, from.height, 0, 0, to.width, to.height,
-      gl.COLOR_BUFFER_BIT, same ? gl.NEAREST : gl.LINEAR);
+  _showOver(background, { width, height }) {
+    const gl = this.gl, { program, uniforms } = this.showing;
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    gl.viewport(0, 0, width, height);
+    gl.disable(gl.BLEND);
+    gl.useProgram(program);
+    this._bind(uniforms, { picture: this.picture });
+    gl.uniform3fv(uniforms.background, background);
+    gl.uniform2f(uniforms.size, width, height);
+    gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 }

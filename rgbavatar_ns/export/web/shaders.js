@@ -1,5 +1,5 @@
 "use strict";
-/* The two programs of the page: place every Gaussian, draw them.
+/* The three programs of the page: place every Gaussian, draw them, show the result.
 
 The rule is that of the project's rasterizer: camera axes x right, y down, z forward; lengths in
 metres; image coordinates in pixels from the upper left corner; an alpha is
@@ -164,4 +164,18 @@ void main() {
   float alpha = min(0.999, colorOpacity.a * exp(-0.5 * dot(deviations, deviations)));
   if (alpha < 1.0 / 255.0) discard;
   result = vec4(colorOpacity.rgb * alpha, alpha);
+}`;
+
+/** The picture over its background. */
+const SHOW_FRAGMENT = `#version 300 es
+precision highp float;
+precision highp sampler2D;
+uniform sampler2D picture; // as large as the canvas or smaller
+uniform vec3 background;
+uniform vec2 size;         // of the canvas
+out vec4 result;
+
+void main() {
+  vec4 seen = texture(picture, gl_FragCoord.xy / size);
+  result = vec4(seen.rgb + (1.0 - seen.a) * background, 1.0);
 }`;
