@@ -65,3 +65,13 @@ function writeQuaternion(out, place, tx, ty, tz, bx, by, bz, nx, ny, nz) {
   }
   out[place] = w; out[place + 1] = x; out[place + 2] = y; out[place + 3] = z;
 }
+
+/** Axis-angle vector in radians of a rotation matrix, of at most half a turn. */
+function matrixToAxisAngle(m) {
+  const q = [1, 0, 0, 0];
+  writeQuaternion(q, 0, m[0], m[3], m[6], m[1], m[4], m[7], m[2], m[5], m[8]);
+  const sine = Math.hypot(q[1], q[2], q[3]);
+  const sign = q[0] < 0 ? -1 : 1;
+  const factor = sine > 1e-9 ? (sign * 2 * Math.atan2(sine, Math.abs(q[0]))) / sine : 2;
+  return [factor * q[1], factor * q[2], factor * q[3]];
+}
