@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from rgbavatar_ns.cli.progress import progress_bar
+from rgbavatar_ns.driving.transfer import DrivingOptions
 from rgbavatar_ns.errors import UserError
-from rgbavatar_ns.export.driving import DrivingOptions
 from rgbavatar_ns.options import Between, CheckedOptions, Counted, FrameRate, Pixels, Share, Weight
 
 if TYPE_CHECKING:

@@ -14,8 +14,9 @@ from torch import Tensor
 from rgbavatar_ns.avatar import Avatar
 from rgbavatar_ns.data import TrackedDataset
 from rgbavatar_ns.drawing.compositing import composite_bytes
+from rgbavatar_ns.driving import DrivingOptions
 from rgbavatar_ns.errors import UserError
-from rgbavatar_ns.export import DrivingOptions, pictures, statistics_of
+from rgbavatar_ns.export import pictures, statistics_of
 from rgbavatar_ns.export.scenes import driven_by
 from rgbavatar_ns.head import HeadModel, ThetaLayout
 from rgbavatar_ns.kernels import PinholeCameras

@@ -3,8 +3,6 @@
 from rgbavatar_ns.export.bases import basis_grid
 from rgbavatar_ns.export.comparison import comparison_frames, write_comparison
 from rgbavatar_ns.export.drawing import draw, pictures
-from rgbavatar_ns.export.driving import DrivingOptions, ThetaNames, drive
-from rgbavatar_ns.export.one_euro import OneEuroOptions, one_euro
 from rgbavatar_ns.export.ply import write_ply
 from rgbavatar_ns.export.run_data import dataset_folder, statistics_of
 from rgbavatar_ns.export.video import write_gif, write_png, write_pngs, write_video
@@ -17,17 +15,12 @@ from rgbavatar_ns.export.views import (
 from rgbavatar_ns.export.web_page import PageOptions, write_web_page
 
 __all__ = [
-    "DrivingOptions",
-    "OneEuroOptions",
     "PageOptions",
-    "ThetaNames",
     "basis_grid",
     "comparison_frames",
     "dataset_folder",
     "draw",
-    "drive",
     "front_camera",
-    "one_euro",
     "pictures",
     "read_camera_path",
     "resized",

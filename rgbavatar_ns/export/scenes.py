@@ -15,15 +15,15 @@ from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
 from rgbavatar_ns.data.native.dataset import TrackedDataset
 from rgbavatar_ns.drawing.compositing import composite_bytes
 from rgbavatar_ns.drawing.contact_sheet import scaled
-from rgbavatar_ns.errors import UserError
-from rgbavatar_ns.export.drawing import Color, Picture, pictures
-from rgbavatar_ns.export.driving import (
+from rgbavatar_ns.driving.transfer import (
     DrivingOptions,
     MappedTheta,
     ThetaNames,
     drive,
     told_beyond,
 )
+from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.export.drawing import Color, Picture, pictures
 from rgbavatar_ns.export.views import FOUR_VIEWS_DEGREES, read_camera_path, swing
 from rgbavatar_ns.head import turn_seen
 from rgbavatar_ns.kernels import PinholeCameras

@@ -57,7 +57,7 @@ class HeadModel(nn.Module):
             self.register_buffer(name, torch.tensor(values, dtype=dtype), persistent=False)
         for name, index in (("faces", arrays.faces), ("uv_faces", arrays.uv_faces)):
             self.register_buffer(name, torch.tensor(index, dtype=torch.int64), persistent=False)
-        self.layout = _layout(arrays)
+        self.layout = layout_of(arrays)
         self._remembered: _Person | None = None
 
     @classmethod
@@ -199,7 +199,8 @@ def _flat_directions(directions: Float[np.ndarray, "V 3 C"]) -> Float[np.ndarray
     return np.ascontiguousarray(directions.transpose(2, 1, 0)).reshape(count, 3 * num_vertices)
 
 
-def _layout(arrays: HeadArrays) -> ThetaLayout:
+def layout_of(arrays: HeadArrays) -> ThetaLayout:
+    """What the numbers of this head's theta mean."""
     fields = [ThetaField("expression", arrays.num_expressions, "linear")]
     fields += [ThetaField(name, 3, "axis_angle") for name in _JOINT_FIELDS]
     if arrays.eyelid_dirs is not None:

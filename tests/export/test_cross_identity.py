@@ -13,7 +13,8 @@ import torch
 from rgbavatar_ns.avatar import Avatar, AvatarConfig
 from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics, expressive_numbers
 from rgbavatar_ns.avatar.training.color_init import initialize_colors
-from rgbavatar_ns.export import DrivingOptions, ThetaNames, draw, drive
+from rgbavatar_ns.driving import DrivingOptions, ThetaNames, drive
+from rgbavatar_ns.export import draw
 from rgbavatar_ns.synthetic.config import DemoConfig
 from rgbavatar_ns.synthetic.make import DemoPerson, as_pinhole
 from rgbavatar_ns.synthetic.performer.performance import perform

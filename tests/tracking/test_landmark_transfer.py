@@ -11,9 +11,9 @@ from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadArrays, facemesh_landmarks
 from rgbavatar_ns.head.flame import load_flame
 from rgbavatar_ns.head.landmarks import LandmarkMap, facemesh_noise, facemesh_response
+from rgbavatar_ns.head.registration import register
 from rgbavatar_ns.synthetic.flame import write_synthetic_flame
 from rgbavatar_ns.tracking.face.landmark_transfer import FittedHead, carried_noise, fitted_head
-from rgbavatar_ns.tracking.face.registration import register
 from tests.head.synthetic_head import flame_shaped_arrays
 
 from .remeshed_head import SCALE, TURN, as_another_model, moved, remeshed

@@ -14,9 +14,9 @@ from nerfstudio.viewer.viewer_elements import ViewerControl
 from torch import Tensor
 
 from rgbavatar_ns.data import TrackedDataset, load_dataset
+from rgbavatar_ns.driving.transfer import DrivingOptions, ThetaNames, told_beyond
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.export import dataset_folder
-from rgbavatar_ns.export.driving import DrivingOptions, ThetaNames, told_beyond
 from rgbavatar_ns.export.scenes import driven_by
 from rgbavatar_ns.head import turn_seen
 from rgbavatar_ns.kernels import PinholeCameras

@@ -18,8 +18,8 @@ from rgbavatar_ns.head.landmarks import (
     facemesh_noise,
     facemesh_response,
 )
-from rgbavatar_ns.tracking.face.registration import Registration, register, similarity_slopes
-from rgbavatar_ns.tracking.face.surface import SkinSurface, is_skin, skin_points
+from rgbavatar_ns.head.registration import Registration, register, similarity_slopes
+from rgbavatar_ns.head.skin_surface import SkinSurface, is_skin, skin_points
 
 _JAW, _EYES = 2, (3, 4)
 # Landmark displacements are told apart to this much; coefficients are of the order of one.

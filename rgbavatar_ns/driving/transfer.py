@@ -9,8 +9,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics, neutral_frame
+from rgbavatar_ns.driving.one_euro import OneEuroOptions, one_euro
 from rgbavatar_ns.errors import UserError, first_few
-from rgbavatar_ns.export.one_euro import OneEuroOptions, one_euro
 from rgbavatar_ns.head import HeadArrays, ThetaLayout
 from rgbavatar_ns.head.rotations import axis_angle_to_matrix, matrix_to_axis_angle
 

@@ -5,8 +5,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from rgbavatar_ns.driving import OneEuroOptions, one_euro
 from rgbavatar_ns.errors import UserError
-from rgbavatar_ns.export import OneEuroOptions, one_euro
 
 _RATE = 25.0
 

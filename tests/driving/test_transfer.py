@@ -7,14 +7,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
-from rgbavatar_ns.errors import UserError
-from rgbavatar_ns.export.driving import (
+from rgbavatar_ns.driving.transfer import (
     DrivingOptions,
     ThetaNames,
     drive,
     make_relative,
     map_by_name,
 )
+from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import ThetaField, ThetaLayout
 from rgbavatar_ns.head.rotations import axis_angle_to_matrix
 

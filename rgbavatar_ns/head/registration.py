@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sparse
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.sparse.linalg import splu
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head.arrays import HeadArrays
 from rgbavatar_ns.head.landmarks import facemesh_landmarks
-from rgbavatar_ns.tracking.face.surface import SkinPoints, SkinSurface, is_skin, skin_points
+from rgbavatar_ns.head.skin_surface import SkinPoints, SkinSurface, is_skin, skin_points
 
 _EYES = [3, 4]
 # What lies this near to a landmark is the face; a rim around it counts as little.
@@ -59,6 +59,8 @@ class Registration:
     """The embedded head's coefficients that come nearest to the other head."""
     placed: Float[np.ndarray, "V 3"]
     """All the embedded head's vertices, metres; those of the face lie on the other head."""
+    face_vertices: Int[np.ndarray, "F"]
+    """Which of them are the face."""
 
 
 def register(head: HeadArrays) -> Registration:
@@ -82,7 +84,7 @@ def register(head: HeadArrays) -> Registration:
     if unlike_m > _NO_FACE_M:
         raise _no_face(head, f"it stays {1e3 * unlike_m:.0f} mm away")
     placed = _close_the_rest(face, surface, placed)
-    return Registration(pose, identity, placed)
+    return Registration(pose, identity, placed, face.rows[face.weight == 1])
 
 
 def _no_face(head: HeadArrays, why: str) -> UserError:
