@@ -13,8 +13,11 @@ if TYPE_CHECKING:
     from rgbavatar_ns.avatar import Avatar
     from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
     from rgbavatar_ns.data import TrackedDataset
+    from rgbavatar_ns.export import PageOptions
 
-Format = Literal["bundle", "ply", "ply-sequence", "web"]
+Format = Literal["bundle", "ply", "ply-sequence", "web", "web-module"]
+_LONGEST_SECONDS = 30.0
+"""Of a performance that nobody chose: a minute of film would double the size of a page."""
 
 
 def run(
@@ -25,27 +28,35 @@ def run(
     frame: int | None = None,
     frames: tuple[int, int] | None = None,
     head_inside: bool = True,
+    performance: bool = True,
     frames_per_second: FrameRate = 25.0,
     title: str = "Avatar",
+    origins: tuple[str, ...] = (),
+    servers: tuple[str, ...] = (),
 ) -> None:
-    """Write an avatar as a bundle, as Gaussians in PLY files or as a web page.
+    """Write an avatar as a bundle, as Gaussians in PLY files, as a web page or for web pages.
 
     bundle: a folder that `Avatar.load` opens without nerfstudio, with what the avatar saw in
     training. ply: the Gaussians of one frame, as viewers of 3D Gaussian splatting
     open them. ply-sequence: a folder of them. web: one HTML file that plays and drives the avatar
-    in a browser, without a server or a network.
+    in a browser, without a server or a network. web-module: a folder with the avatar's file, an ES
+    module that shows and drives it on a canvas of your own page, and examples.
 
     Args:
         run_folder: a run of ns-train, a checkpoint or an avatar bundle.
-        destination: the folder (bundle, ply-sequence) or file (ply, web) to write.
+        destination: the folder (bundle, ply-sequence, web-module) or file (ply, web) to write.
         format: what to write.
         data: the dataset whose frames are meant; by default the one that the run names.
         frame: for ply, the frame's place in the dataset; without it the head is at rest.
-        frames: for ply-sequence and web, first frame and the frame after the last one.
+        frames: for ply-sequence and web, first frame and the frame after the last one; by default,
+            for web, the first 30 seconds of the run's own film.
         head_inside: for bundle, put the head model inside. Without it the bundle only names its
             head model, as the licence of FLAME asks where it is passed on.
+        performance: for web, whether it brings those frames to play.
         frames_per_second: for web, of the performance.
         title: for web, the page's title.
+        origins: for web, other pages whose messages it takes, such as https://example.org.
+        servers: for web, what may drive it by ?ws= beside this machine, such as wss://example.org.
     """
     from rgbavatar_ns import Avatar
 
@@ -64,8 +75,12 @@ def run(
     elif format == "ply-sequence":
         _write_sequence(avatar, dataset, frames, destination)
     else:
+        from rgbavatar_ns.export import PageOptions
+
+        options = PageOptions(title, frames_per_second, origins=origins, servers=servers)
         seen = _seen(avatar, run_folder, dataset)
-        _write_page(avatar, seen, dataset, frames, destination, frames_per_second, title)
+        places = _performance(dataset, frames, frames_per_second)
+        _write_web(format, avatar, seen, dataset, places, performance, destination, options)
 
 
 def _seen(
@@ -140,25 +155,48 @@ def _write_sequence(
     print(f"{len(chosen)} PLY files in {destination}")
 
 
-def _write_page(
-    avatar: "Avatar",
-    seen: "TrainingStatistics | None",
-    dataset: "TrackedDataset | None",
-    frames: tuple[int, int] | None,
-    destination: Path,
-    frames_per_second: float,
-    title: str,
-) -> None:
-    import torch
+def _performance(
+    dataset: "TrackedDataset | None", frames: tuple[int, int] | None, frames_per_second: float
+) -> tuple[int, ...]:
+    """Places of the frames that a page plays: those named, or the film's beginning.
 
-    from rgbavatar_ns.export import PageOptions, front_camera, write_web_page
+    Of several cameras the first one's film: the others saw the same.
+    """
     from rgbavatar_ns.export.scenes import chosen_frames
 
     if dataset is None:
-        camera, theta = front_camera(avatar, 512, 512), torch.zeros(0, avatar.layout.size)
+        return ()
+    names = dataset.camera_names
+    film = [place for place in range(len(dataset)) if not names or names[place] == names[0]]
+    most = max(1, round(_LONGEST_SECONDS * frames_per_second))
+    return chosen_frames(len(dataset), frames, film[:most])
+
+
+def _write_web(
+    format: Format,
+    avatar: "Avatar",
+    seen: "TrainingStatistics | None",
+    dataset: "TrackedDataset | None",
+    places: tuple[int, ...],
+    performance: bool,
+    destination: Path,
+    options: "PageOptions",
+) -> None:
+    import torch
+
+    from rgbavatar_ns.export import calm_theta, front_camera, write_web_page
+
+    if dataset is None:
+        camera, theta = front_camera(avatar, 512, 512), torch.zeros(1, avatar.layout.size)
     else:
-        chosen = chosen_frames(len(dataset), frames, range(len(dataset)))
-        camera, theta = dataset.cameras.select([chosen[0]]), dataset.theta[list(chosen)]
-    options = PageOptions(title, frames_per_second)
-    size = write_web_page(avatar, destination, camera, theta, options, seen)
-    print(f"{destination}: {size / 1e6:.1f} MB; open it in a browser")
+        camera, theta = dataset.cameras.select([places[0]]), dataset.theta[list(places)]
+    neutral = calm_theta(seen, theta[0])
+    if dataset is None or not performance:
+        theta = theta[:0]
+    shown = (camera, theta, options, seen, neutral)
+    if format == "web":
+        size = write_web_page(avatar, destination, *shown)
+        print(f"{destination}: {size / 1e6:.1f} MB; open it in a browser")
+    else:
+        write_web_module(avatar, destination, *shown)
+        print(f"{destination}: `python -m http.server -d {destination}` shows example.html")

@@ -12,11 +12,12 @@ from rgbavatar_ns.export.views import (
     resized,
     swing,
 )
-from rgbavatar_ns.export.web_page import PageOptions, write_web_page
+from rgbavatar_ns.export.web_page import PageOptions, calm_theta, write_web_page
 
 __all__ = [
     "PageOptions",
     "basis_grid",
+    "calm_theta",
     "comparison_frames",
     "dataset_folder",
     "draw",

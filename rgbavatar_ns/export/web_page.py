@@ -6,7 +6,6 @@ import html
 import json
 import re
 from dataclasses import dataclass
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -17,38 +16,47 @@ from torch import Tensor
 
 from rgbavatar_ns.avatar.avatar import Avatar
 from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
-from rgbavatar_ns.export.web_arrays import gaussian_arrays, head_arrays, network_arrays, pack
-from rgbavatar_ns.files import atomic_write
-from rgbavatar_ns.kernels import PinholeCameras
-
-SCRIPTS = (
-    "data.js",
-    "rotations.js",
-    "head.js",
-    "weights.js",
-    "gaussians.js",
-    "shaders.js",
-    "renderer.js",
-    "camera.js",
-    "performance.js",
-    "panel.js",
-    "main.js",
+from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.export.web_arrays import (
+    Arrays,
+    gaussian_arrays,
+    head_arrays,
+    network_arrays,
+    pack,
 )
-"""The page's programs in the order in which they build on one another."""
+from rgbavatar_ns.export.web_scripts import PAGE_SCRIPTS, sources, web_text
+from rgbavatar_ns.files import atomic_write
+from rgbavatar_ns.head.arkit import ARKIT_NAMES
+from rgbavatar_ns.kernels import PinholeCameras
 
 _LINEAR_RANGE = (-3.0, 3.0)
 _NAMED_RANGE = (0.0, 1.0)
+_LOOPBACK = ("127.0.0.1", "localhost")
+"""Without [::1], which a content security policy cannot name."""
+_HOST = r"([a-z0-9-]+\.)*[a-z0-9-]+(:[0-9]{1,5})?"
+_DEFAULT_PORTS = {"http": ":80", "ws": ":80", "https": ":443", "wss": ":443"}
 
 
 @dataclass(frozen=True)
 class PageOptions:
-    """How the page begins."""
+    """How the page begins, and who may speak to it."""
 
     title: str = "Avatar"
     frames_per_second: float = 25.0
     """Of the performance."""
     background: tuple[float, float, float] = (1.0, 1.0, 1.0)
     """Colour behind the head, each channel in [0, 1]."""
+    origins: tuple[str, ...] = ()
+    """Of other pages whose messages (postMessage) it takes, such as https://example.org."""
+    servers: tuple[str, ...] = ()
+    """That may drive it (`?ws=`) beside programs on its own machine, such as wss://example.org."""
+
+    def __post_init__(self) -> None:
+        """Raise UserError for what is no origin or no server."""
+        for text in self.origins:
+            _check_address(text, "origin", ("https", "http"))
+        for text in self.servers:
+            _check_address(text, "server", ("wss", "ws"))
 
 
 def write_web_page(
@@ -58,24 +66,60 @@ def write_web_page(
     theta: Float[Tensor, "F H"],
     options: PageOptions | None = None,
     seen: TrainingStatistics | None = None,
+    neutral: Float[Tensor, "H"] | None = None,
 ) -> int:
     """Write the page and return its size in bytes; nothing in it is loaded from elsewhere.
 
     camera: where the page's view starts (its first camera). theta: the performance, which may
-    have no frames. seen: what the page tells of the film, and how far its camera turns.
+    have no frames. seen: what the page tells of the film, and how far its camera turns. neutral:
+    what it shows at rest, by default the head at rest (`calm_theta`).
     The bases are kept in 8 bits with a unit for each component. Raises UserError where the file
     cannot be written.
     """
     options = PageOptions() if options is None else options
     layers, network = network_arrays(avatar)
-    frames = {"theta": theta.detach().cpu().numpy().astype(np.float32)}
-    directory, block = pack(head_arrays(avatar) | gaussian_arrays(avatar) | network | frames)
+    driving = _driving_arrays(avatar, theta, neutral)
+    directory, block = pack(head_arrays(avatar) | gaussian_arrays(avatar) | network | driving)
     manifest = _manifest(avatar, camera, theta, options)
     manifest |= {"film": _film(avatar, seen), "network": layers, "arrays": directory}
-    content = _assemble(manifest, block, options.title).encode()
+    content = _assemble(manifest, block, options).encode()
     with atomic_write(path) as partial:
         partial.write_bytes(content)
     return len(content)
+
+
+def calm_theta(
+    seen: TrainingStatistics | None, posed: Float[Tensor, "H"]
+) -> Float[Tensor, "H"]:
+    """The film's calmest expression in the pose of another frame; that frame's where none is known.
+
+    Zeros are no calm face: what a person's tracked head has at rest is seldom zero.
+    """
+    return posed if seen is None else torch.where(seen.expressive, seen.theta_neutral, posed)
+
+
+def _check_address(text: str, kind: str, schemes: tuple[str, ...]) -> None:
+    """Raise UserError unless the text is an address as the browser writes it."""
+    scheme, _, host = text.partition("://")
+    if scheme not in schemes or not re.fullmatch(_HOST, host) or host.endswith(
+        _DEFAULT_PORTS[scheme]
+    ):
+        raise UserError(
+            f"{text!r} is no {kind} of a page.",
+            f"Write it as browsers do, in small letters, without a path and without the usual "
+            f"port: {schemes[0]}://example.org or {schemes[1]}://localhost:8000.",
+        )
+
+
+def _driving_arrays(
+    avatar: Avatar, theta: Float[Tensor, "F H"], neutral: Float[Tensor, "H"] | None
+) -> Arrays:
+    """The performance, the face at rest, and what ARKit's coefficients do."""
+    calm = theta.new_zeros(avatar.layout.size) if neutral is None else neutral
+    numbers = {"theta": theta, "neutral_theta": calm}
+    arrays = {name: tensor.detach().cpu().numpy() for name, tensor in numbers.items()}
+    arrays["arkit_theta"] = avatar.arkit.theta_per_unit
+    return {name: values.astype(np.float32) for name, values in arrays.items()}
 
 
 @torch.no_grad()
@@ -119,6 +163,7 @@ def _manifest(
             "width": camera.width,
             "height": camera.height,
         },
+        "arkit": {"names": list(ARKIT_NAMES), "turns": avatar.arkit.turns},
         "background": list(options.background),
         "frames_per_second": options.frames_per_second,
     }
@@ -138,22 +183,24 @@ def _film(avatar: Avatar, seen: TrainingStatistics | None) -> dict[str, Any]:
     return {"turn": turn, "turn_reach": reach, "theta": theta}
 
 
-def _assemble(manifest: dict[str, Any], block: bytes, title: str) -> str:
+def _assemble(manifest: dict[str, Any], block: bytes, options: PageOptions) -> str:
     """Fill the page's template."""
-    folder = resources.files("rgbavatar_ns.export") / "web"
-    scripts = "\n".join(
-        f"<script>\n{(folder / name).read_text(encoding='utf-8')}</script>" for name in SCRIPTS
-    )
+    scripts = "\n".join(f"<script>\n{source}</script>" for source in sources(PAGE_SCRIPTS))
     packed = base64.b64encode(gzip.compress(block, compresslevel=6, mtime=0)).decode("ascii")
-    # Within a script element "</script" and "<!--" have a meaning of their own.
-    described = json.dumps(manifest, allow_nan=False).replace("<", "\\u003c")
+    loopback = [f"{scheme}://{host}:*" for scheme in ("ws", "wss") for host in _LOOPBACK]
     parts = {
-        "title": html.escape(title),
-        "style": (folder / "style.css").read_text(encoding="utf-8"),
+        "title": html.escape(options.title),
+        "connect": " ".join([*loopback, *options.servers]),
+        "style": web_text("style.css"),
         "scripts": scripts,
-        "manifest": described,
+        "page": _within_script({"origins": options.origins, "servers": options.servers}),
+        "manifest": _within_script(manifest),
         "payload": packed,
     }
-    page = (folder / "page.html").read_text(encoding="utf-8")
     # In one pass: what is filled in is not looked at again.
-    return re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found[1]], page)
+    return re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found[1]], web_text("page.html"))
+
+
+def _within_script(content: dict[str, Any]) -> str:
+    """JSON for a script element, in which "</script" and "<!--" have a meaning of their own."""
+    return json.dumps(content, allow_nan=False).replace("<", "\\u003c")

@@ -14,17 +14,24 @@ function bytesOfBase64(text) {
   return bytes;
 }
 
-/** The manifest, with `arrays` as typed arrays. */
-async function loadAvatarData() {
-  const manifest = JSON.parse(document.getElementById("manifest").textContent);
-  const element = document.getElementById("payload");
-  const packed = new Blob([bytesOfBase64(element.textContent)]);
-  element.remove(); // its text is no longer needed and takes memory
-  const stream = packed.stream().pipeThrough(new DecompressionStream("gzip"));
-  const buffer = await new Response(stream).arrayBuffer();
-  const arrays = {};
-  for (const [name, { dtype, offset, length }] of Object.entries(manifest.arrays)) {
-    arrays[name] = new ARRAY_TYPES[dtype](buffer, offset, length);
+class AvatarData {
+  constructor(manifest, arrays) {
+    this.manifest = manifest;
+    this.arrays = arrays;
+    Object.assign(this, manifest, { arrays });
   }
-  return { ...manifest, arrays };
+
+  static async ofPage() {
+    const manifest = JSON.parse(document.getElementById("manifest").textContent);
+    const element = document.getElementById("payload");
+    const packed = new Blob([bytesOfBase64(element.textContent)]);
+    element.remove(); // its text is no longer needed and takes memory
+    const stream = packed.stream().pipeThrough(new DecompressionStream("gzip"));
+    const buffer = await new Response(stream).arrayBuffer();
+    const arrays = {};
+    for (const [name, { dtype, offset, length }] of Object.entries(manifest.arrays)) {
+      arrays[name] = new ARRAY_TYPES[dtype](buffer, offset, length);
+    }
+    return new AvatarData(manifest, arrays);
+  }
 }

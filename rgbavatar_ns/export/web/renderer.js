@@ -14,6 +14,7 @@ class Renderer {
     }
     this.gl = gl;
     this.canvas = canvas;
+    this._made = []; // what frees each object of the graphics memory
     this.count = data.num_gaussians;
     this.numBases = data.num_bases;
     this.rows = Math.ceil(this.count / TEXTURE_WIDTH);
@@ -35,11 +36,13 @@ class Renderer {
       gl.shaderSource(shader, source);
       gl.compileShader(shader);
       gl.attachShader(program, shader);
+      gl.deleteShader(shader); // goes with its program
       if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS) && !gl.isContextLost()) {
         throw new Error(`A shader was refused: ${gl.getShaderInfoLog(shader)}`);
       }
     }
     gl.linkProgram(program);
+    this._made.push(() => gl.deleteProgram(program));
     const uniforms = {};
     const number = gl.getProgramParameter(program, gl.ACTIVE_UNIFORMS);
     for (let i = 0; i < number; i++) {
@@ -51,6 +54,7 @@ class Renderer {
 
   _texture(target = this.gl.TEXTURE_2D) {
     const gl = this.gl, texture = gl.createTexture();
+    this._made.push(() => gl.deleteTexture(texture));
     gl.bindTexture(target, texture);
     for (const [name, value] of [
       [gl.TEXTURE_MIN_FILTER, gl.NEAREST], [gl.TEXTURE_MAG_FILTER, gl.NEAREST],
@@ -65,6 +69,18 @@ class Renderer {
     const height = values.length / (4 * width);
     gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA32F, width, height, 0, gl.RGBA, gl.FLOAT, values);
     return { ...made, width, height };
+  }
+
+  _framebuffer() {
+    const gl = this.gl, made = gl.createFramebuffer();
+    this._made.push(() => gl.deleteFramebuffer(made));
+    return made;
+  }
+
+  /** Free all graphics memory; the canvas may be drawn on by another. */
+  dispose() {
+    for (const free of this._made) free();
+    this._made = [];
   }
 
   _renew(floats, values) {
@@ -108,7 +124,7 @@ class Renderer {
     this.projected = {
       place: this._floats(empty), shape: this._floats(empty), shade: this._floats(empty),
     };
-    this.blendTarget = gl.createFramebuffer();
+    this.blendTarget = this._framebuffer();
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.blendTarget);
     const attachments = Object.values(this.projected).map(({ texture }, i) => {
       const place = gl.COLOR_ATTACHMENT0 + i;
@@ -125,8 +141,10 @@ class Renderer {
       corners.set([4 * i, 4 * i + 1, 4 * i + 2, 4 * i + 2, 4 * i + 1, 4 * i + 3], 6 * i);
     }
     this.boxes = gl.createVertexArray();
+    const buffer = gl.createBuffer();
+    this._made.push(() => gl.deleteVertexArray(this.boxes), () => gl.deleteBuffer(buffer));
     gl.bindVertexArray(this.boxes);
-    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
+    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, buffer);
     gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, corners, gl.STATIC_DRAW);
     gl.bindVertexArray(null);
     this.order = this._texture();
@@ -147,7 +165,7 @@ class Renderer {
     if (this.picture) gl.deleteTexture(this.picture.texture);
     this.picture = this._texture();
     gl.texStorage2D(gl.TEXTURE_2D, 1, gl.RGBA16F, width, height);
-    this.pictureTarget = this.pictureTarget || gl.createFramebuffer();
+    this.pictureTarget = this.pictureTarget || this._framebuffer();
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.pictureTarget);
     gl.framebufferTexture2D(
       gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, this.picture.texture, 0);
@@ -235,7 +253,7 @@ class Renderer {
     gl.disable(gl.BLEND);
     gl.useProgram(program);
     this._bind(uniforms, { picture: this.picture });
-    gl.uniform3fv(uniforms.background, background);
+    gl.uniform4fv(uniforms.background, background ? [...background, 1] : [0, 0, 0, 0]);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 }
