@@ -26,7 +26,7 @@ from rgbavatar_ns.export.web_arrays import (
 )
 from rgbavatar_ns.export.web_scripts import PAGE_SCRIPTS, sources, web_text
 from rgbavatar_ns.files import atomic_write
-from rgbavatar_ns.head.arkit import ARKIT_NAMES
+from rgbavatar_ns.head.arkit import ARKIT_NAMES, ArkitMap
 from rgbavatar_ns.kernels import PinholeCameras
 
 _LINEAR_RANGE = (-3.0, 3.0)
@@ -114,12 +114,22 @@ def _check_address(text: str, kind: str, schemes: tuple[str, ...]) -> None:
 def _driving_arrays(
     avatar: Avatar, theta: Float[Tensor, "F H"], neutral: Float[Tensor, "H"] | None
 ) -> Arrays:
-    """The performance, the face at rest, and what ARKit's coefficients do."""
+    """The performance and the face at rest; what ARKit's coefficients do, if that is known."""
     calm = theta.new_zeros(avatar.layout.size) if neutral is None else neutral
     numbers = {"theta": theta, "neutral_theta": calm}
     arrays = {name: tensor.detach().cpu().numpy() for name, tensor in numbers.items()}
-    arrays["arkit_theta"] = avatar.arkit.theta_per_unit
+    known = _arkit(avatar)
+    if known is not None:
+        arrays["arkit_theta"] = known.theta_per_unit
     return {name: values.astype(np.float32) for name, values in arrays.items()}
+
+
+def _arkit(avatar: Avatar) -> ArkitMap | None:
+    """None of a head on which no face is found; all else works without."""
+    try:
+        return avatar.arkit
+    except UserError:
+        return None
 
 
 @torch.no_grad()
@@ -136,6 +146,7 @@ def _manifest(
     low, high = _LINEAR_RANGE if numbered else _NAMED_RANGE
     strength = expression.std(0, unbiased=False)
     psi = avatar.weights(seen).abs().amax(0)
+    arkit = _arkit(avatar)
     return {
         "format": "rgbavatar-web",
         "version": 1,
@@ -163,7 +174,7 @@ def _manifest(
             "width": camera.width,
             "height": camera.height,
         },
-        "arkit": {"names": list(ARKIT_NAMES), "turns": avatar.arkit.turns},
+        "arkit": arkit and {"names": list(ARKIT_NAMES), "turns": arkit.turns},
         "background": list(options.background),
         "frames_per_second": options.frames_per_second,
     }

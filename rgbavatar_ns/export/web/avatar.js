@@ -41,7 +41,8 @@ class RGBAvatar extends EventTarget {
     this._positions = new GaussianPositions(data);
     this._renderer = new Renderer(canvas, data);
     this._neutral = Array.from(arrays.neutral_theta);
-    this._arkit = new ARKitMap(manifest.arkit, arrays.arkit_theta, this._fields, this._neutral);
+    this._arkit = manifest.arkit
+      && new ARKitMap(manifest.arkit, arrays.arkit_theta, this._fields, this._neutral);
     this.performance = new RecordedPerformance(arrays.theta, this._fields.size,
       manifest.frames_per_second, (theta) => this._show(theta));
     this.camera = new OrbitCamera(manifest.camera, manifest.film.turn_reach);
@@ -78,9 +79,9 @@ class RGBAvatar extends EventTarget {
     return this.data.manifest.expression_names;
   }
 
-  /** The names that `setARKit` knows. */
+  /** The names that `setARKit` knows; none of a head that is no face to it. */
   get arkitNames() {
-    return this._arkit.names;
+    return this._arkit ? this._arkit.names : [];
   }
 
   /** Theta of the calm face that is shown first. */
@@ -131,6 +132,7 @@ class RGBAvatar extends EventTarget {
    * missing is as in the neutral face. Throws TypeError or RangeError as `setTheta` does.
    */
   setARKit(coefficients, pose) {
+    if (!this._arkit) throw new Error("This avatar's head has no ARKit blend shapes.");
     this.setTheta(this._arkit.theta(coefficients, pose));
   }
 

@@ -9,7 +9,7 @@ const HELP = [
   ["wheel, two fingers, + and -", "zoom"],
   ["Shift or right button, two fingers", "move"],
   ["space", "play and pause"],
-  ["r, double click", "camera back; r also brings the calm face"],
+  ["r, double click", "back to the start; r also brings the calm face"],
   ["f", "hide and show the controls"],
 ];
 
