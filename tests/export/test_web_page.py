@@ -90,7 +90,9 @@ def test_the_page_is_one_file_that_names_no_other_place(tmp_path):
     # RGBAvatar.load takes an address, which a page of its own never gives it.
     assert re.findall(r"fetch\s*\(\w*", rest) == ["fetch(source"]
     assert "default-src 'none'" in rest
-    loopback = [f"{kind}://{host}:*" for kind in ("ws", "wss") for host in ("127.0.0.1", "localhost")]
+    loopback = [
+        f"{kind}://{host}:*" for kind in ("ws", "wss") for host in ("127.0.0.1", "localhost")
+    ]
     assert f'connect-src {" ".join(loopback)}"' in rest
     described = json.loads(manifest[1])
     block = gzip.decompress(base64.b64decode(payload[1]))
