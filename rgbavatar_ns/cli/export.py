@@ -184,7 +184,7 @@ def _write_web(
 ) -> None:
     import torch
 
-    from rgbavatar_ns.export import calm_theta, front_camera, write_web_page
+    from rgbavatar_ns.export import calm_theta, front_camera, write_web_module, write_web_page
 
     if dataset is None:
         camera, theta = front_camera(avatar, 512, 512), torch.zeros(1, avatar.layout.size)
@@ -193,10 +193,11 @@ def _write_web(
     neutral = calm_theta(seen, theta[0])
     if dataset is None or not performance:
         theta = theta[:0]
-    shown = (camera, theta, options, seen, neutral)
     if format == "web":
-        size = write_web_page(avatar, destination, *shown)
+        size = write_web_page(avatar, destination, camera, theta, options, seen, neutral)
         print(f"{destination}: {size / 1e6:.1f} MB; open it in a browser")
     else:
-        write_web_module(avatar, destination, *shown)
-        print(f"{destination}: `python -m http.server -d {destination}` shows example.html")
+        rate = options.frames_per_second
+        size = write_web_module(avatar, destination, camera, theta, rate, seen, neutral)
+        print(f"{destination}: {size / 1e6:.1f} MB, the avatar; `python -m http.server` in there")
+        print("shows example.html at http://localhost:8000/example.html")

@@ -12,7 +12,9 @@ from rgbavatar_ns.export.views import (
     resized,
     swing,
 )
-from rgbavatar_ns.export.web_page import PageOptions, calm_theta, write_web_page
+from rgbavatar_ns.export.web_manifest import calm_theta
+from rgbavatar_ns.export.web_module import write_web_module
+from rgbavatar_ns.export.web_page import PageOptions, write_web_page
 
 __all__ = [
     "PageOptions",
@@ -33,5 +35,6 @@ __all__ = [
     "write_png",
     "write_pngs",
     "write_video",
+    "write_web_module",
     "write_web_page",
 ]

@@ -9,28 +9,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from rgbavatar_ns.avatar.avatar import Avatar
 from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
 from rgbavatar_ns.errors import UserError
-from rgbavatar_ns.export.web_arrays import (
-    Arrays,
-    gaussian_arrays,
-    head_arrays,
-    network_arrays,
-    pack,
-)
+from rgbavatar_ns.export.web_arrays import gaussian_arrays, head_arrays, network_arrays, pack
+from rgbavatar_ns.export.web_manifest import avatar_manifest, driving_arrays
 from rgbavatar_ns.export.web_scripts import PAGE_SCRIPTS, sources, web_text
 from rgbavatar_ns.files import atomic_write
-from rgbavatar_ns.head.arkit import ARKIT_NAMES, ArkitMap
 from rgbavatar_ns.kernels import PinholeCameras
 
-_LINEAR_RANGE = (-3.0, 3.0)
-_NAMED_RANGE = (0.0, 1.0)
 _LOOPBACK = ("127.0.0.1", "localhost")
 """Without [::1], which a content security policy cannot name."""
 _HOST = r"([a-z0-9-]+\.)*[a-z0-9-]+(:[0-9]{1,5})?"
@@ -77,25 +67,21 @@ def write_web_page(
     cannot be written.
     """
     options = PageOptions() if options is None else options
-    layers, network = network_arrays(avatar)
-    driving = _driving_arrays(avatar, theta, neutral)
-    directory, block = pack(head_arrays(avatar) | gaussian_arrays(avatar) | network | driving)
-    manifest = _manifest(avatar, camera, theta, options)
-    manifest |= {"film": _film(avatar, seen), "network": layers, "arrays": directory}
+    manifest = avatar_manifest(
+        avatar, camera, theta, seen, options.frames_per_second, options.background
+    )
+    manifest, block = _packed(avatar, manifest, theta, neutral)
     content = _assemble(manifest, block, options).encode()
     with atomic_write(path) as partial:
         partial.write_bytes(content)
     return len(content)
 
 
-def calm_theta(
-    seen: TrainingStatistics | None, posed: Float[Tensor, "H"]
-) -> Float[Tensor, "H"]:
-    """The film's calmest expression in the pose of another frame; that frame's where none is known.
-
-    Zeros are no calm face: what a person's tracked head has at rest is seldom zero.
-    """
-    return posed if seen is None else torch.where(seen.expressive, seen.theta_neutral, posed)
+def _packed(avatar, manifest, theta, neutral):
+    layers, network = network_arrays(avatar)
+    driving = driving_arrays(avatar, theta, neutral)
+    directory, block = pack(head_arrays(avatar) | gaussian_arrays(avatar) | network | driving)
+    return manifest | {"network": layers, "arrays": directory}, block
 
 
 def _check_address(text: str, kind: str, schemes: tuple[str, ...]) -> None:
@@ -109,89 +95,6 @@ def _check_address(text: str, kind: str, schemes: tuple[str, ...]) -> None:
             f"Write it as browsers do, in small letters, without a path and without the usual "
             f"port: {schemes[0]}://example.org or {schemes[1]}://localhost:8000.",
         )
-
-
-def _driving_arrays(
-    avatar: Avatar, theta: Float[Tensor, "F H"], neutral: Float[Tensor, "H"] | None
-) -> Arrays:
-    """The performance and the face at rest; what ARKit's coefficients do, if that is known."""
-    calm = theta.new_zeros(avatar.layout.size) if neutral is None else neutral
-    numbers = {"theta": theta, "neutral_theta": calm}
-    arrays = {name: tensor.detach().cpu().numpy() for name, tensor in numbers.items()}
-    known = _arkit(avatar)
-    if known is not None:
-        arrays["arkit_theta"] = known.theta_per_unit
-    return {name: values.astype(np.float32) for name, values in arrays.items()}
-
-
-def _arkit(avatar: Avatar) -> ArkitMap | None:
-    """None of a head on which no face is found; all else works without."""
-    try:
-        return avatar.arkit
-    except UserError:
-        return None
-
-
-@torch.no_grad()
-def _manifest(
-    avatar: Avatar, camera: PinholeCameras, theta: Float[Tensor, "F H"], options: PageOptions
-) -> dict[str, Any]:
-    config, layout = avatar.config, avatar.layout
-    rest = theta.new_zeros(1, layout.size)
-    seen = torch.cat([rest, theta]).to(avatar.identity)
-    expression = seen[:, layout.slice("expression")]
-    names = avatar.head.arrays.expression_names
-    # Blend shapes named after what they do run from 0 to 1; numbered components to both sides.
-    numbered = bool((expression < -0.05).any()) or all(n[-1:].isdigit() for n in names)
-    low, high = _LINEAR_RANGE if numbered else _NAMED_RANGE
-    strength = expression.std(0, unbiased=False)
-    psi = avatar.weights(seen).abs().amax(0)
-    arkit = _arkit(avatar)
-    return {
-        "format": "rgbavatar-web",
-        "version": 1,
-        "num_gaussians": avatar.num_gaussians,
-        "num_bases": config.num_bases,
-        "variant": config.tangent_variant,
-        "carrier": config.carrier,
-        "scale_with_triangle": config.scale_with_triangle,
-        "pose_input": config.pose_input,
-        "translation_input": config.translation_input,
-        "layout": layout.to_json(),
-        "parents": [int(parent) for parent in avatar.head.arrays.parents],
-        "expression_names": list(names),
-        "expression_range": [
-            expression.amin(0).clamp(max=low).tolist(),
-            expression.amax(0).clamp(min=high).tolist(),
-        ],
-        "expression_order": torch.argsort(strength, descending=True, stable=True).tolist(),
-        "psi_range": (1.5 * psi).clamp(min=0.1).tolist(),
-        "camera": {
-            "rotation": camera.world_to_camera[0, :3, :3].flatten().tolist(),
-            "translation": camera.world_to_camera[0, :3, 3].tolist(),
-            "focal": camera.focal_px[0].tolist(),
-            "principal": camera.principal_point_px[0].tolist(),
-            "width": camera.width,
-            "height": camera.height,
-        },
-        "arkit": arkit and {"names": list(ARKIT_NAMES), "turns": arkit.turns},
-        "background": list(options.background),
-        "frames_per_second": options.frames_per_second,
-    }
-
-
-def _film(avatar: Avatar, seen: TrainingStatistics | None) -> dict[str, Any]:
-    """What counts as filmed: lowest and highest yaw and pitch in radians, lowest and highest theta.
-
-    Of an avatar that brings no statistics, theta's range is None and the turns are those of most
-    films.
-    """
-    rest = torch.zeros(1, avatar.layout.size)
-    known = seen or TrainingStatistics.of(rest, torch.zeros(1, 1), avatar.layout)
-    turns = (known.filmed_turns(), known.turn_reach())
-    turn, reach = ([end.deg2rad().tolist() for end in ends] for ends in turns)
-    theta = None if seen is None else [end.tolist() for end in seen.film_range()]
-    return {"turn": turn, "turn_reach": reach, "theta": theta}
 
 
 def _assemble(manifest: dict[str, Any], block: bytes, options: PageOptions) -> str:

@@ -1,4 +1,4 @@
-"""The page driven from outside, in a real browser: a WebSocket, the page around it, keys, fingers."""
+"""The page driven from outside, in a browser: a WebSocket, the page around it, keys, fingers."""
 
 import functools
 import json

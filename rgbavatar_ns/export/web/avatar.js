@@ -104,6 +104,11 @@ class RGBAvatar extends EventTarget {
     return this._turnSeen;
   }
 
+  /** The middle of the head in its world, in metres, as in the last picture. */
+  get headCentre() {
+    return this._head.centre();
+  }
+
   /** Drawn so far. */
   get pictures() {
     return this._pictures;

@@ -26,6 +26,17 @@ class AvatarData {
     const element = document.getElementById("payload");
     const packed = new Blob([bytesOfBase64(element.textContent)]);
     element.remove(); // its text is no longer needed and takes memory
+    return AvatarData.unpacked(manifest, packed);
+  }
+
+  static async open(stream) {
+    const bytes = new Uint8Array(await new Response(stream).arrayBuffer());
+    const end = 4 + new DataView(bytes.buffer).getUint32(0, true);
+    const manifest = JSON.parse(new TextDecoder().decode(bytes.subarray(4, end)));
+    return AvatarData.unpacked(manifest, new Blob([bytes.subarray(end)]));
+  }
+
+  static async unpacked(manifest, packed) {
     const stream = packed.stream().pipeThrough(new DecompressionStream("gzip"));
     const buffer = await new Response(stream).arrayBuffer();
     const arrays = {};
