@@ -79,7 +79,7 @@ def run(
 
         options = PageOptions(title, frames_per_second, origins=origins, servers=servers)
         seen = _seen(avatar, run_folder, dataset)
-        places = _performance(dataset, frames, frames_per_second)
+        places = page_frames(dataset, frames, frames_per_second)
         _write_web(format, avatar, seen, dataset, places, performance, destination, options)
 
 
@@ -155,7 +155,7 @@ def _write_sequence(
     print(f"{len(chosen)} PLY files in {destination}")
 
 
-def _performance(
+def page_frames(
     dataset: "TrackedDataset | None", frames: tuple[int, int] | None, frames_per_second: float
 ) -> tuple[int, ...]:
     """Places of the frames that a page plays: those named, or the film's beginning.

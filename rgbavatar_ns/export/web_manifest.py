@@ -18,9 +18,7 @@ _LINEAR_RANGE = (-3.0, 3.0)
 _NAMED_RANGE = (0.0, 1.0)
 
 
-def calm_theta(
-    seen: TrainingStatistics | None, posed: Float[Tensor, "H"]
-) -> Float[Tensor, "H"]:
+def calm_theta(seen: TrainingStatistics | None, posed: Float[Tensor, "H"]) -> Float[Tensor, "H"]:
     """The film's calmest expression in the pose of another frame; that frame's where none is known.
 
     Zeros are no calm face: what a person's tracked head has at rest is seldom zero.

@@ -87,8 +87,10 @@ def _packed(avatar, manifest, theta, neutral):
 def _check_address(text: str, kind: str, schemes: tuple[str, ...]) -> None:
     """Raise UserError unless the text is an address as the browser writes it."""
     scheme, _, host = text.partition("://")
-    if scheme not in schemes or not re.fullmatch(_HOST, host) or host.endswith(
-        _DEFAULT_PORTS[scheme]
+    if (
+        scheme not in schemes
+        or not re.fullmatch(_HOST, host)
+        or host.endswith(_DEFAULT_PORTS[scheme])
     ):
         raise UserError(
             f"{text!r} is no {kind} of a page.",

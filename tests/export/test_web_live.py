@@ -1,10 +1,7 @@
 """The page driven from outside, in a browser: a WebSocket, the page around it, keys, fingers."""
 
-import functools
-import json
-import threading
 from collections.abc import Iterator
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,6 +13,7 @@ from rgbavatar_ns.export import PageOptions, front_camera, write_web_page
 from tests.browser import IN_BROWSER, chromium
 
 from .drive_server import DriveServer, hello
+from .local_site import served
 from .subject import avatar_of, lively_theta
 
 pytestmark = IN_BROWSER
@@ -42,25 +40,17 @@ def theta(avatar) -> torch.Tensor:
 def site(avatar, theta, tmp_path_factory) -> Iterator[Any]:
     """A folder with the page on two servers, so two origins; the page listens to the first."""
     folder = tmp_path_factory.mktemp("site")
-    handler = functools.partial(_Quiet, directory=str(folder))
-    servers = [ThreadingHTTPServer(("127.0.0.1", 0), handler) for _ in range(2)]
-    for server in servers:
-        threading.Thread(target=server.serve_forever, daemon=True).start()
-    origins = [f"http://127.0.0.1:{server.server_port}" for server in servers]
-    options = PageOptions(origins=(origins[0],), servers=("ws://drive.example:8765",))
+    with served(folder) as named, served(folder) as stranger:
+        _fill(folder, avatar, theta, named)
+        yield folder, (named, stranger)
+
+
+def _fill(folder: Path, avatar: Avatar, theta: torch.Tensor, origin: str) -> None:
+    options = PageOptions(origins=(origin,), servers=("ws://drive.example:8765",))
     camera = front_camera(avatar, 64, 64)
     write_web_page(avatar, folder / "avatar.html", camera, theta, options)
     for name in ("around.html", "stranger.html"):
-        (folder / name).write_text(_AROUND.replace("{{page}}", f"{origins[0]}/avatar.html"))
-    yield folder, origins
-    for server in servers:
-        server.shutdown()
-        server.server_close()
-
-
-class _Quiet(SimpleHTTPRequestHandler):
-    def log_message(self, format: str, *args: Any) -> None:
-        pass
+        (folder / name).write_text(_AROUND.replace("{{page}}", f"{origin}/avatar.html"))
 
 
 _AROUND = """<!doctype html><title>around</title>
@@ -74,8 +64,8 @@ _AROUND = """<!doctype html><title>around</title>
 
 @pytest.fixture
 def context(browser) -> Iterator[Any]:
-    """A window on a desk; what goes wrong in a page fails the test."""
-    context = browser.new_context(viewport={"width": 900, "height": 500})
+    """A window as wide as a desk's and, for speed, low; errors in a page fail the test."""
+    context = browser.new_context(viewport={"width": 800, "height": 200})
     problems: list[str] = []
     context.on("weberror", lambda error: problems.append(str(error.error)))
     yield context
@@ -303,6 +293,7 @@ def test_the_browser_itself_keeps_the_page_from_other_servers(open_page, server)
 
 
 def test_who_touches_the_page_goes_before_who_drives_it(driven, server, theta):
+    driven.locator("#slider-jaw-open").fill("0.2")  # before anybody drives, which takes nothing
     server.send(_theta_message(0, theta[0]))
     _shows(driven, theta[0])
     assert driven.locator("#live-again").is_hidden()
@@ -391,9 +382,22 @@ def test_no_other_origin_is_listened_to_or_spoken_to(context, site, theta):
     inner.wait_for_function("() => heard > 0")
     assert inner.evaluate("() => avatar.theta") == before
     assert page.evaluate("() => answers") == []
-    # Nor is the page's own origin enough, where it is not named.
-    inner.evaluate("message => { heard = 0; window.postMessage(message, '*'); }", json.loads("{}"))
-    inner.wait_for_function("() => heard > 0")
+
+
+def test_the_pages_own_origin_is_not_enough(context, site, theta):
+    page = context.new_page()
+    page.goto(f"{site[1][1]}/avatar.html")
+    _ready(page)
+    before = page.evaluate("() => avatar.theta")
+    page.evaluate(
+        """async (message) => {
+          const heard = new Promise((done) => window.addEventListener("message", done));
+          window.postMessage(message, "*");
+          await heard;
+        }""",
+        _theta_message(0, theta[0]),
+    )
+    assert page.evaluate("() => avatar.theta") == before
 
 
 def test_keys_turn_zoom_reset_play_and_fold(open_page):

@@ -13,8 +13,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
 from rgbavatar_ns.errors import UserError
-from rgbavatar_ns.export import PageOptions, front_camera, write_web_page
+from rgbavatar_ns.export import PageOptions, calm_theta, front_camera, write_web_page
 from rgbavatar_ns.export.web_arrays import head_arrays, pack, quantize
 from rgbavatar_ns.head import HeadArrays
 
@@ -116,6 +117,43 @@ def test_no_name_or_title_can_break_the_page(tmp_path):
     assert json.loads(described[1])["expression_names"][0] == hostile
     assert f"<title>{html.escape(hostile)}</title>" in page
     assert page.count("</style>") == 1
+
+
+def test_the_calm_face_is_the_films_expression_in_another_frames_pose():
+    layout = avatar_of().layout
+    theta = torch.zeros(2, layout.size)
+    expression, turn = layout.slice("expression").start, layout.slice("rotation").start
+    theta[:, expression] = torch.tensor([0.2, 0.9])
+    theta[:, turn] = torch.tensor([0.4, 0.1])
+    seen = TrainingStatistics.of(theta, torch.zeros(2, 1), layout)
+    calm = calm_theta(seen, theta[1])
+    assert (calm[expression], calm[turn]) == (theta[0, expression], theta[1, turn])
+    assert torch.equal(calm_theta(None, theta[1]), theta[1])
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "null",
+        "*",
+        "https://",
+        "https://Example.org",
+        "https://a.b/",
+        "https://a.b:443",
+        "ftp://a.b",
+        "https://a.b c",
+        "https://a.b;script-src",
+        "https://*.a.b",
+        "http://a:b",
+        "ws://a.b",
+        "",
+    ],
+)
+def test_what_is_no_origin_is_refused_before_anything_is_written(text):
+    with pytest.raises(UserError, match="is no origin"):
+        PageOptions(origins=(text,))
+    with pytest.raises(UserError, match="is no server"):
+        PageOptions(servers=(text.replace("ws:", "http:"),))
 
 
 def test_a_page_that_cannot_be_written_is_told(tmp_path):

@@ -48,7 +48,7 @@ class App {
 
   /** Who is at the page goes before who drives it, until "Live" gives it back. */
   takeOver() {
-    this.driver.active = false;
+    this.driver.active = !this.driver.driven;
     this._showButtons();
   }
 
@@ -87,7 +87,7 @@ class App {
 
   _showButtons() {
     this.playButton.textContent = this.avatar.performance.playing ? "Pause" : "Play";
-    this.liveButton.hidden = this.driver.active || !this.driver.driven;
+    this.liveButton.hidden = this.driver.active;
     const folded = document.body.classList.contains("full");
     this.foldButton.textContent = folded ? "Controls" : "Hide controls";
     this.foldButton.setAttribute("aria-expanded", String(!folded));
