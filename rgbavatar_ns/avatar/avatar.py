@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from rgbavatar_ns.avatar.config import AvatarConfig
@@ -355,19 +355,22 @@ class Avatar(nn.Module):
         Opacities change with no theta, so that these show in none.
         """
         drawn = self.blendshapes.opacity_logit.detach().sigmoid() >= MIN_ALPHA
-        kept = torch.nonzero(drawn)[:, 0]
-        state = self.to_state()
+        return self.with_gaussians(torch.nonzero(drawn)[:, 0])
+
+    def with_gaussians(self, places: Int[Tensor, "M"]) -> "Avatar":
+        """Return the avatar with only the Gaussians of these places, in this order."""
+        state, places = self.to_state(), places.to(self.identity.device)
         for name, value in state["anchors"].items():
             if isinstance(value, Tensor):
-                state["anchors"][name] = value[kept.to(value.device)]
-        smaller = Avatar.from_state(state).to(self.identity)
-        own, wanted = self._own_state_dict(), smaller._own_state_dict()
+                state["anchors"][name] = value[places.cpu()]
+        chosen = Avatar.from_state(state).to(self.identity)
+        own = self._own_state_dict()
         for name, value in own.items():
-            for axis, size in enumerate(wanted[name].shape):
-                if value.shape[axis] != size:
-                    own[name] = value.index_select(axis, kept)
-        smaller.load_state_dict(own, strict=False)
-        return smaller
+            if name.startswith(("anchors.", "blendshapes.", "color_initialized")):
+                axis = 1 if ".basis_" in name else 0
+                own[name] = value.index_select(axis, places)
+        chosen.load_state_dict(own, strict=False)
+        return chosen
 
     def _checked(self, theta: Float[Tensor, "B H"]) -> Float[Tensor, "B H"]:
         """Return theta in the parameters' dtype, or raise UserError with the reason."""

@@ -79,6 +79,8 @@ def run(
 
         options = PageOptions(title, frames_per_second, origins=origins, servers=servers)
         seen = _seen(avatar, run_folder, dataset)
+        if dataset is not None:
+            avatar = _as_filmed(avatar, dataset)
         places = page_frames(dataset, frames, frames_per_second)
         _write_web(format, avatar, seen, dataset, places, performance, destination, options)
 
@@ -153,6 +155,19 @@ def _write_sequence(
             write_ply(destination / f"{place:05d}.ply", gaussians)
             update(done, len(chosen))
     print(f"{len(chosen)} PLY files in {destination}")
+
+
+def _as_filmed(avatar: "Avatar", dataset: "TrackedDataset") -> "Avatar":
+    """The avatar without what lies beyond the film's edges."""
+    import torch
+
+    from rgbavatar_ns.export import within_film
+
+    kept = torch.nonzero(within_film(avatar, dataset))[:, 0]
+    if len(kept) < avatar.num_gaussians:
+        left_out = avatar.num_gaussians - len(kept)
+        print(f"{left_out} Gaussians lie beyond every picture's edge: left out.")
+    return avatar.with_gaussians(kept)
 
 
 def page_frames(

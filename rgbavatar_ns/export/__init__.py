@@ -3,6 +3,7 @@
 from rgbavatar_ns.export.bases import basis_grid
 from rgbavatar_ns.export.comparison import comparison_frames, write_comparison
 from rgbavatar_ns.export.drawing import draw, pictures
+from rgbavatar_ns.export.filmed import within_film
 from rgbavatar_ns.export.ply import write_ply
 from rgbavatar_ns.export.run_data import dataset_folder, statistics_of
 from rgbavatar_ns.export.video import write_gif, write_png, write_pngs, write_video
@@ -29,6 +30,7 @@ __all__ = [
     "resized",
     "statistics_of",
     "swing",
+    "within_film",
     "write_comparison",
     "write_gif",
     "write_ply",

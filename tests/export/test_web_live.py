@@ -434,6 +434,14 @@ def test_on_a_phone_the_face_comes_first_and_fingers_turn_and_zoom(browser, site
     assert (box["width"], box["height"]) == (390, 844)
     assert page.locator("#panel").is_hidden()
     assert page.evaluate("() => avatar.canvas.width") == 780, "no more than two pixels a point"
+    # The 64 x 64 home picture is cut at its sides for a larger face, about the head's middle.
+    camera = page.evaluate("() => avatar.camera.at(390, 844, avatar.headCentre)")
+    home = page.evaluate("() => avatar.camera.home")
+    assert camera["focal"][0] == pytest.approx(1.4 * home["focal"][0] * 390 / 64)
+    x, _, z = np.reshape(camera["rotation"], (3, 3)) @ page.evaluate("() => avatar.headCentre")
+    right, forward = camera["translation"][0], z + camera["translation"][2]
+    column = camera["focal"][0] * (x + right) / forward + camera["principal"][0]
+    assert column == pytest.approx(390 / 2, abs=1e-3)
     _ready(page)
     touch = context.new_cdp_session(page)
 

@@ -29,8 +29,9 @@ _UNKNOWN_TURN_DEGREES = 15.0
 _SAME_SHARE, _SAME, _SAME_DEGREES = 0.1, 0.02, 5.0
 """Beyond is farther than this: of a number's range, in its own unit, of a turn."""
 _REACH_DEGREES = 30.0
-_CALM = 1.25
-"""Times the smallest expression; on the speakers of the README a third of the frames."""
+_CALM = 1.35
+"""Times the smallest expression: of the README's speakers half to two thirds of the frames, none of
+which blinks."""
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ const SETTLES_IN = 0.15; // seconds, about
 const STEEPEST = 1.5; // radians up or down, short of the poles
 const NEARNESS = [0.2, 4]; // times the home camera's
 const TURN_BY_DRAG = 3; // radians over the canvas's height
+const CLOSER_ON_TALL = 1.4; // a phone shows less of the shoulders and more of the face
 const SHIFT_BY_DRAG = 0.35; // metres over the canvas's height
 
 const clamp = (value, [low, high]) => Math.min(Math.max(value, low), high);
@@ -127,15 +128,16 @@ class OrbitCamera {
   }
 
   /**
-   * The camera for a picture of this size in pixels; the home picture fits into its middle, and
-   * the head's centre stays where the home camera sees it, nearer or farther.
+   * The camera for a picture of this size in pixels; the home picture fits into its middle, or its
+   * sides are cut where that leaves much room above and below. The head's centre stays where the
+   * home camera sees it, nearer or farther.
    */
   at(width, height, centre) {
     const { rotation, translation, focal, principal } = this.home;
-    const zoom = Math.min(width / this.home.width, height / this.home.height);
     const turned = multiply3(rotation, OrbitCamera.turn(this.angles()));
     const ahead = apply3(rotation, centre).map((value, i) => value + translation[i]);
     const moved = apply3(turned, centre);
+    const { zoom, middle } = this._cut(width, height, (focal[0] * ahead[0]) / ahead[2] + principal[0]);
     return {
       rotation: turned,
       translation: [
@@ -144,11 +146,21 @@ class OrbitCamera {
       ],
       focal: focal.map((value) => value * zoom),
       principal: [
-        width / 2 + (principal[0] - this.home.width / 2) * zoom,
+        width / 2 + (principal[0] - middle) * zoom,
         height / 2 + (principal[1] - this.home.height / 2) * zoom,
       ],
       width, height,
     };
+  }
+
+  /** How much larger the home picture is shown, and which of its columns is in the middle. */
+  _cut(width, height, headColumn) {
+    const across = width / this.home.width, down = height / this.home.height;
+    const zoom = Math.min(down, across * CLOSER_ON_TALL);
+    if (zoom <= across) return { zoom, middle: this.home.width / 2 };
+    this._column ??= headColumn; // the first one's, so that a head that moves is seen to move
+    const half = this.home.width * (across / zoom) / 2;
+    return { zoom, middle: clamp(this._column, [half, this.home.width - half]) };
   }
 
   /**
