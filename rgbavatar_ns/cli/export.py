@@ -164,9 +164,10 @@ def _as_filmed(avatar: "Avatar", dataset: "TrackedDataset") -> "Avatar":
     from rgbavatar_ns.export import within_film
 
     kept = torch.nonzero(within_film(avatar, dataset))[:, 0]
-    if len(kept) < avatar.num_gaussians:
-        left_out = avatar.num_gaussians - len(kept)
-        print(f"{left_out} Gaussians lie beyond every picture's edge: left out.")
+    left_out = avatar.num_gaussians - len(kept)
+    if len(kept) == 0 or left_out == 0:  # without any, the data's cameras are not of this avatar
+        return avatar
+    print(f"{left_out} Gaussians lie beyond every picture's edge: left out.")
     return avatar.with_gaussians(kept)
 
 

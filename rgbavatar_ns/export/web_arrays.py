@@ -1,156 +1,106 @@
-"""An avatar's numbers as the web page wants them: compact, flat, little-endian."""
-
-from dataclasses import dataclass
-from typing import Any
+"""An avatar's Gaussians and weight network as a page wants them: whole numbers in columns."""
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int8, Int16
+from jaxtyping import Float
 from torch import Tensor
 
 from rgbavatar_ns.avatar.avatar import Avatar
-from rgbavatar_ns.head import HeadArrays
+from rgbavatar_ns.avatar.model.blendshapes import COLOR_SCALE
+from rgbavatar_ns.export.seen_order import SeenOrder
+from rgbavatar_ns.export.stored_array import StoredArray, exact, ranged, stepped
 
-TEXTURE_WIDTH = 1024
-"""Texels in a row of the page's textures."""
+_PLACE_STEP, _BASIS_PLACE_STEP = 0.01, 0.02
+"""Of a middling Gaussian's size. Coarser bases would change which of two Gaussians is before the
+other: the picture would fall below 45 dB where psi is large."""
+_TURN_STEP = 0.01
+"""Of a middling quaternion's length: half a degree."""
+_COLOR_STEP = 0.5 / 255 / COLOR_SCALE
+"""Of a colour's feature: half of a picture's step."""
+_LEAST_PSI = 0.05
+"""The page's sliders reach twice as far, whatever the film called for."""
+_LEAST_WEIGHT = 1e-2
+"""Of the mean; what is not seen at all still has a logarithm."""
+_NETWORK_STEPS = 1024
+"""To the largest weight of each of a layer's inputs."""
 
-Arrays = dict[str, np.ndarray]
+Arrays = dict[str, StoredArray]
 
 
-@dataclass(frozen=True)
-class Quantized:
-    """Whole numbers times one unit for each column of the second axis."""
+def gaussian_arrays(avatar: Avatar, seen: SeenOrder, psi: Float[np.ndarray, "K"]) -> Arrays:
+    """The Gaussians, in the avatar's order; columns of bases are psi's k first, then components.
 
-    values: Int8[np.ndarray, "K C N"] | Int16[np.ndarray, "K C N"]
-    unit: Float[np.ndarray, "K C"]
-
-
-def quantize(
-    values: Float[np.ndarray, "K C N"], dtype: type[np.int8] | type[np.int16] = np.int8
-) -> Quantized:
-    """Round to the type's whole numbers, with the largest magnitude of each row at its limit.
-
-    The error of a value is at most half of its row's unit.
+    seen: as `seen_order` of this avatar gives it. psi: the largest magnitude of each weight that
+    the film calls for; a basis is rounded to where psi times its error is the base's.
     """
-    limit = np.iinfo(dtype).max
-    unit = np.abs(values).max(-1, initial=0) / limit
-    safe = np.where(unit > 0, unit, 1)
-    return Quantized(np.rint(values / safe[..., None]).astype(dtype), unit.astype(np.float32))
-
-
-def head_arrays(avatar: Avatar) -> Arrays:
-    """The person's neutral head, its offsets as sparse columns, joints and skinning."""
-    arrays, head = avatar.head.arrays, avatar.head
-    identity = avatar.identity.cpu().numpy().astype(np.float64)
-    shapes = arrays.shapedirs.astype(np.float64)
-    neutral = arrays.v_template + shapes[..., : arrays.num_identity] @ identity
-    expressions = shapes[..., arrays.num_identity :]
-    regressor = arrays.joint_regressor.astype(np.float64)
-    columns = [expressions]
-    if arrays.eyelid_dirs is not None:
-        columns.append(arrays.eyelid_dirs)
-    if arrays.posedirs.any():
-        columns.append(arrays.posedirs)
-    with torch.no_grad():
-        joints = head.joints(avatar.identity).cpu().numpy()
-    return {
-        "neutral_vertices": neutral.astype(np.float32),
-        "skinning_weights": arrays.skinning_weights.astype(np.float32),
-        "joints": joints,
-        "joint_directions": np.einsum("jv,vcx->xjc", regressor, expressions).astype(np.float32),
-        **_sparse_columns(np.concatenate(columns, -1), arrays),
+    shapes, mesh = avatar.blendshapes, avatar.anchors.triangles(with_rest_length=False)
+    few = len(mesh["triangle_vertices"]) <= 1 << 16
+    place = _place_step(avatar)
+    turn = np.full(4, _TURN_STEP * _middle(shapes.rotation_wxyz.norm(dim=1)))
+    color = np.full(3, _COLOR_STEP)
+    weight = _numpy(seen.weight).astype(np.float64)
+    weight += max(_LEAST_WEIGHT * weight.mean(), np.finfo(np.float32).tiny)
+    of_cell = np.bincount(_numpy(seen.cell), weight)
+    size = torch.cat([shapes.log_scale.exp(), shapes.opacity_logit.sigmoid()[:, None]], 1)
+    arrays = {
+        "triangle_of": exact(_numpy(mesh["triangle_of"]), "uint16" if few else "uint32", "uint32"),
+        "barycentric": ranged(_columns(avatar.anchors.barycentric[:, :2])),
+        "position": stepped(_columns(shapes.position), place, by_item=False),
+        "rotation": stepped(_columns(shapes.rotation_wxyz), turn),
+        "scale": ranged(_columns(size[:, :3]), logarithmic=True),
+        "opacity": ranged(_columns(size[:, 3:])),
+        "color": stepped(_columns(shapes.color_feature), color),
+        "cell": exact(_numpy(seen.cell), "uint16", "uint32"),
+        "weight": ranged(weight[None], logarithmic=True),
+        "cell_weight": ranged(of_cell[None], "uint16", logarithmic=True),
     }
-
-
-def _sparse_columns(offsets: Float[np.ndarray, "V 3 C"], arrays: HeadArrays) -> Arrays:
-    """Only the vertices that each column moves; offsets in 16 bits to a column's unit."""
-    quantized = quantize(offsets.transpose(2, 1, 0).reshape(offsets.shape[2], 1, -1), np.int16)
-    dense = quantized.values.reshape(-1, 3, len(offsets)).transpose(0, 2, 1)
-    column, vertex = np.nonzero(dense.any(-1))
-    start = np.searchsorted(column, np.arange(len(dense) + 1))
-    few = len(arrays.v_template) <= np.iinfo(np.uint16).max
-    return {
-        "offset_start": start.astype(np.uint32),
-        "offset_vertex": vertex.astype(np.uint16 if few else np.uint32),
-        "offset_value": dense[column, vertex],
-        "offset_unit": quantized.unit[:, 0],
-    }
-
-
-def gaussian_arrays(avatar: Avatar) -> Arrays:
-    """Anchors and base in full, bases as signed bytes with a unit for each component."""
-    shapes = avatar.blendshapes
-    mesh = avatar.anchors.triangles(with_rest_length=True)
-    number = _padded(mesh["triangle_of"][:, None].float())
-    result = {
-        "triangle_vertices": _numpy(mesh["triangle_vertices"]).astype(np.uint32),
-        "edges_to_frame": _numpy(mesh["edges_to_frame"]),
-        "rest_length": _numpy(mesh["rest_length"]),
-        "triangle_of": _numpy(mesh["triangle_of"]).astype(np.uint32),
-        "barycentric": _numpy(mesh["barycentric"]),
-        "position": _numpy(shapes.position).T,
-        "rotation": _padded(shapes.rotation_wxyz),
-        "scale_opacity": _padded(
-            torch.cat([shapes.log_scale.exp(), shapes.opacity_logit.sigmoid()[:, None]], 1)
-        ),
-        "color_triangle": np.concatenate([_padded(shapes.color_feature), number], 1),
-    }
-    if avatar.config.num_bases == 0:
-        empty = np.zeros(0, np.float32)
-        names = ("basis_position", "basis_rotation", "basis_color")
-        return result | {name + end: empty for name in names for end in ("", "_unit")}
-    position = quantize(_numpy(shapes.basis_position).transpose(0, 2, 1))
-    result |= {"basis_position": position.values, "basis_position_unit": position.unit}
-    for name, bases in (
-        ("basis_rotation", shapes.basis_rotation_wxyz),
-        ("basis_color", shapes.basis_color_feature),
-    ):
-        quantized = quantize(_numpy(bases).transpose(0, 2, 1))
-        texels = _texels(quantized.values.transpose(0, 2, 1))
-        result |= {name: texels, f"{name}_unit": quantized.unit}
-    return result
+    if avatar.config.num_bases > 0:
+        reached = np.maximum(psi, _LEAST_PSI)
+        for name, bases, step in (
+            ("basis_position", shapes.basis_position, place * (_BASIS_PLACE_STEP / _PLACE_STEP)),
+            ("basis_rotation", shapes.basis_rotation_wxyz, turn),
+            ("basis_color", shapes.basis_color_feature, color),
+        ):
+            columns = _numpy(bases).transpose(0, 2, 1).reshape(-1, avatar.num_gaussians)
+            steps = (step / reached[:, None]).reshape(-1)
+            arrays[name] = stepped(columns, steps, "int8", "int8", by_item=False)
+    return arrays
 
 
 def network_arrays(avatar: Avatar) -> tuple[list[dict[str, int]], Arrays]:
     """Sizes of the weight network's layers; their matrices and biases, and what training saw."""
     layers: list[dict[str, int]] = []
     arrays: Arrays = {
-        "theta_low": _numpy(avatar.theta_low),
-        "theta_high": _numpy(avatar.theta_high),
+        "theta_low": exact(_numpy(avatar.theta_low), "float32"),
+        "theta_high": exact(_numpy(avatar.theta_high), "float32"),
     }
     linear = [] if avatar.weight_network is None else avatar.weight_network.layers
     for layer in linear:
         if isinstance(layer, torch.nn.Linear):
-            place = len(layers)
-            arrays[f"network_matrix_{place}"] = _numpy(layer.weight)
-            arrays[f"network_bias_{place}"] = _numpy(layer.bias)
+            place, matrix = len(layers), _columns(layer.weight)
+            step = np.abs(matrix).max(1, initial=0) / _NETWORK_STEPS
+            arrays[f"network_matrix_{place}"] = stepped(matrix, np.maximum(step, 1e-12))
+            arrays[f"network_bias_{place}"] = exact(_numpy(layer.bias), "float32")
             layers.append({"inputs": layer.in_features, "outputs": layer.out_features})
     return layers, arrays
 
 
-def pack(arrays: Arrays) -> tuple[dict[str, dict[str, Any]], bytes]:
-    """One block of bytes, each array at a multiple of four, and where each is."""
-    directory: dict[str, dict[str, Any]] = {}
-    block = bytearray()
-    for name, values in arrays.items():
-        little = np.ascontiguousarray(values).astype(values.dtype.newbyteorder("<"))
-        directory[name] = {"dtype": values.dtype.name, "offset": len(block), "length": values.size}
-        block += little.tobytes()
-        block += bytes(-len(block) % 4)
-    return directory, bytes(block)
+@torch.no_grad()
+def _place_step(avatar: Avatar) -> Float[np.ndarray, "3"]:
+    """Of positions in tangent frames, whose columns may be metres a unit of UV."""
+    rest = avatar.identity.new_zeros(1, avatar.layout.size)
+    frames = avatar.anchors.frames(avatar.carrier_vertices(rest)).matrix[0]
+    size = _middle(avatar.blendshapes.log_scale.exp())
+    return _PLACE_STEP * size / frames.norm(dim=1).mean(0).cpu().numpy().astype(np.float64)
+
+
+def _middle(values: Float[Tensor, "..."]) -> float:
+    return float(values.detach().median())
 
 
 def _numpy(tensor: Tensor) -> np.ndarray:
     return tensor.detach().cpu().numpy()
 
 
-def _padded(rows: Float[Tensor, "N C"]) -> Float[np.ndarray, "T C"]:
-    """Rows of numbers, filled up to whole rows of texels."""
-    values = _numpy(rows).astype(np.float32)
-    return np.pad(values, ((0, -len(values) % TEXTURE_WIDTH), (0, 0)))
-
-
-def _texels(values: Int8[np.ndarray, "K N C"]) -> Int8[np.ndarray, "K T 4"]:
-    """Four bytes a Gaussian, filled up to whole rows of texels."""
-    _, count, components = values.shape
-    return np.pad(values, ((0, 0), (0, -count % TEXTURE_WIDTH), (0, 4 - components)))
+def _columns(rows: Float[Tensor, "N C"]) -> Float[np.ndarray, "C N"]:
+    return _numpy(rows).T

@@ -2,7 +2,6 @@
 
 from typing import Any
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -10,6 +9,7 @@ from torch import Tensor
 from rgbavatar_ns.avatar.avatar import Avatar
 from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.export.stored_array import exact
 from rgbavatar_ns.export.web_arrays import Arrays
 from rgbavatar_ns.head.arkit import ARKIT_NAMES, ArkitMap
 from rgbavatar_ns.kernels import PinholeCameras
@@ -26,17 +26,14 @@ def calm_theta(seen: TrainingStatistics | None, posed: Float[Tensor, "H"]) -> Fl
     return posed if seen is None else torch.where(seen.expressive, seen.theta_neutral, posed)
 
 
-def driving_arrays(
-    avatar: Avatar, theta: Float[Tensor, "F H"], neutral: Float[Tensor, "H"] | None
-) -> Arrays:
-    """The performance and the face at rest; what ARKit's coefficients do, if that is known."""
-    calm = theta.new_zeros(avatar.layout.size) if neutral is None else neutral
-    numbers = {"theta": theta, "neutral_theta": calm}
-    arrays = {name: tensor.detach().cpu().numpy() for name, tensor in numbers.items()}
+def driving_arrays(avatar: Avatar, neutral: Float[Tensor, "H"] | None) -> Arrays:
+    """The face at rest; what ARKit's coefficients do, if that is known."""
+    calm = torch.zeros(avatar.layout.size) if neutral is None else neutral
+    arrays = {"neutral_theta": exact(calm.detach().cpu().numpy(), "float32")}
     known = _arkit(avatar)
     if known is not None:
-        arrays["arkit_theta"] = known.theta_per_unit
-    return {name: values.astype(np.float32) for name, values in arrays.items()}
+        arrays["arkit_theta"] = exact(known.theta_per_unit, "float32")
+    return arrays
 
 
 def _arkit(avatar: Avatar) -> ArkitMap | None:
@@ -69,9 +66,6 @@ def avatar_manifest(
     psi = avatar.weights(shown).abs().amax(0)
     arkit = _arkit(avatar)
     return {
-        "format": "rgbavatar-web",
-        "version": 1,
-        "num_gaussians": avatar.num_gaussians,
         "num_bases": config.num_bases,
         "variant": config.tangent_variant,
         "carrier": config.carrier,

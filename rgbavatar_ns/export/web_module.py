@@ -1,8 +1,5 @@
 """The avatar for web pages of one's own: its file, an ES module that shows it, and examples."""
 
-import gzip
-import json
-import struct
 from pathlib import Path
 
 from jaxtyping import Float
@@ -10,8 +7,8 @@ from torch import Tensor
 
 from rgbavatar_ns.avatar.avatar import Avatar
 from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
-from rgbavatar_ns.export.web_manifest import avatar_manifest
-from rgbavatar_ns.export.web_page import _packed
+from rgbavatar_ns.export.avatar_file import avatar_parts
+from rgbavatar_ns.export.web_manifest import avatar_manifest, driving_arrays
 from rgbavatar_ns.export.web_scripts import module_source, web_text
 from rgbavatar_ns.files import atomic_write
 from rgbavatar_ns.kernels import PinholeCameras
@@ -37,9 +34,7 @@ def write_web_module(
     UserError where a file cannot be written.
     """
     manifest = avatar_manifest(avatar, camera, theta, seen, frames_per_second, _WHITE)
-    manifest, block = _packed(avatar, manifest, theta, neutral)
-    text = json.dumps(manifest, allow_nan=False).encode()
-    content = struct.pack("<I", len(text)) + text + gzip.compress(block, 6, mtime=0)
+    content = b"".join(avatar_parts(avatar, manifest, theta, driving_arrays(avatar, neutral)))
     files = {
         AVATAR_FILE: content,
         MODULE_FILE: module_source().encode(),

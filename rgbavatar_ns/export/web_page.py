@@ -1,7 +1,6 @@
 """The avatar as one HTML file that plays and drives it in any browser, without a server."""
 
 import base64
-import gzip
 import html
 import json
 import re
@@ -15,7 +14,7 @@ from torch import Tensor
 from rgbavatar_ns.avatar.avatar import Avatar
 from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
 from rgbavatar_ns.errors import UserError
-from rgbavatar_ns.export.web_arrays import gaussian_arrays, head_arrays, network_arrays, pack
+from rgbavatar_ns.export.avatar_file import avatar_parts
 from rgbavatar_ns.export.web_manifest import avatar_manifest, driving_arrays
 from rgbavatar_ns.export.web_scripts import PAGE_SCRIPTS, sources, web_text
 from rgbavatar_ns.files import atomic_write
@@ -63,25 +62,18 @@ def write_web_page(
     camera: where the page's view starts (its first camera). theta: the performance, which may
     have no frames. seen: what the page tells of the film, and how far its camera turns. neutral:
     what it shows at rest, by default the head at rest (`calm_theta`).
-    The bases are kept in 8 bits with a unit for each component. Raises UserError where the file
+    It shows a coarse head before it is all there (avatar_file.py). Raises UserError where the file
     cannot be written.
     """
     options = PageOptions() if options is None else options
     manifest = avatar_manifest(
         avatar, camera, theta, seen, options.frames_per_second, options.background
     )
-    manifest, block = _packed(avatar, manifest, theta, neutral)
-    content = _assemble(manifest, block, options).encode()
+    parts = avatar_parts(avatar, manifest, theta, driving_arrays(avatar, neutral))
+    content = _assemble(parts, options).encode()
     with atomic_write(path) as partial:
         partial.write_bytes(content)
     return len(content)
-
-
-def _packed(avatar, manifest, theta, neutral):
-    layers, network = network_arrays(avatar)
-    driving = driving_arrays(avatar, theta, neutral)
-    directory, block = pack(head_arrays(avatar) | gaussian_arrays(avatar) | network | driving)
-    return manifest | {"network": layers, "arrays": directory}, block
 
 
 def _check_address(text: str, kind: str, schemes: tuple[str, ...]) -> None:
@@ -99,22 +91,25 @@ def _check_address(text: str, kind: str, schemes: tuple[str, ...]) -> None:
         )
 
 
-def _assemble(manifest: dict[str, Any], block: bytes, options: PageOptions) -> str:
-    """Fill the page's template."""
+def _assemble(parts: list[bytes], options: PageOptions) -> str:
+    """Fill the page's template; a script element for each part, after the programs."""
     scripts = "\n".join(f"<script>\n{source}</script>" for source in sources(PAGE_SCRIPTS))
-    packed = base64.b64encode(gzip.compress(block, compresslevel=6, mtime=0)).decode("ascii")
+    payload = "\n".join(
+        '<script type="application/octet-stream" class="part">'
+        f"{base64.b64encode(part).decode('ascii')}</script>"
+        for part in parts
+    )
     loopback = [f"{scheme}://{host}:*" for scheme in ("ws", "wss") for host in _LOOPBACK]
-    parts = {
+    filled = {
         "title": html.escape(options.title),
         "connect": " ".join([*loopback, *options.servers]),
         "style": web_text("style.css"),
         "scripts": scripts,
         "page": _within_script({"origins": options.origins, "servers": options.servers}),
-        "manifest": _within_script(manifest),
-        "payload": packed,
+        "parts": payload,
     }
     # In one pass: what is filled in is not looked at again.
-    return re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found[1]], web_text("page.html"))
+    return re.sub(r"\{\{(\w+)\}\}", lambda found: filled[found[1]], web_text("page.html"))
 
 
 def _within_script(content: dict[str, Any]) -> str:

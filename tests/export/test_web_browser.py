@@ -47,8 +47,9 @@ def open_page(browser: Any, tmp_path: Path) -> Iterator[Any]:
         page.on("pageerror", lambda error: problems.append(str(error)))
         page.goto(file.as_uri())
         page.evaluate(
-            "size => rgbavatar.then((app) => {"
-            " window.avatar = app.avatar; avatar.setSize(size, size); })",
+            """size => rgbavatar.then(async (app) => {
+              window.avatar = app.avatar; avatar.setSize(size, size); await avatar.complete;
+            })""",
             _SIZE,
         )
         return page

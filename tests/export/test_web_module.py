@@ -89,8 +89,8 @@ def page(bare_page) -> Any:
 
 def _load(page: Any, options: str = "{}") -> None:
     page.evaluate(
-        "async (size) => { window.avatar = await module.RGBAvatar.load('avatar.rgba',"
-        f" document.querySelector('canvas'), {options}); }}"
+        "async () => { window.avatar = await module.RGBAvatar.load('avatar.rgba',"
+        f" document.querySelector('canvas'), {options}); await avatar.complete; }}"
     )
 
 
@@ -288,6 +288,39 @@ def test_what_cannot_be_loaded_is_told(bare_page, arguments, said):
         f"() => module.RGBAvatar.load({arguments}).then(() => '', (error) => error.message)"
     )
     assert said in told
+
+
+def test_a_file_that_is_cut_off_is_told_and_what_is_there_stays(bare_page, folder):
+    whole = (folder / "avatar.rgba").read_bytes()
+    (folder / "cut.rgba").write_bytes(whole[:-5])
+    told = bare_page.evaluate(
+        """async () => {
+          window.avatar = await module.RGBAvatar.load("cut.rgba", document.querySelector("canvas"));
+          return avatar.complete.then(() => "", (error) => error.message);
+        }"""
+    )
+    assert told == f"The avatar's file is cut off after {len(whole) - 5} bytes."
+    assert _shown(bare_page)[..., :3].std() > 0.1
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda whole: b"<!doctype html>" + whole, "This is no avatar's file."),
+        (lambda whole: whole[:8] + b"\x09" + whole[9:], "The avatar's file has version 9;"),
+        (lambda whole: whole[:500], "The avatar's file is cut off after 500 bytes."),
+        (lambda whole: whole[:99] + b"x" + whole[100:], "The avatar's file is damaged."),
+        (lambda whole: b"", "The avatar's file is cut off after 0 bytes."),
+    ],
+    ids=["another", "version", "short", "damaged", "empty"],
+)
+def test_what_is_no_avatars_file_is_told(bare_page, folder, change, said):
+    (folder / "odd.rgba").write_bytes(change((folder / "avatar.rgba").read_bytes()))
+    told = bare_page.evaluate(
+        "() => module.RGBAvatar.load('odd.rgba', document.querySelector('canvas'))"
+        ".then(() => '', (error) => error.message)"
+    )
+    assert told.startswith(said)
 
 
 def test_disposing_frees_the_graphics_memory_and_another_may_draw(bare_page, avatar, neutral):

@@ -38,13 +38,12 @@ class RGBAvatar extends EventTarget {
     this._fields = new ThetaFields(manifest.layout);
     this._head = new Head(data);
     this._network = new WeightNetwork(data);
-    this._positions = new GaussianPositions(data);
+    this._detail = 1;
     this._renderer = new Renderer(canvas, data);
     this._neutral = Array.from(arrays.neutral_theta);
     this._arkit = manifest.arkit
       && new ARKitMap(manifest.arkit, arrays.arkit_theta, this._fields, this._neutral);
-    this.performance = new RecordedPerformance(arrays.theta, this._fields.size,
-      manifest.frames_per_second, (theta) => this._show(theta));
+    this.performance = new RecordedPerformance(data, (theta) => this._show(theta));
     this.camera = new OrbitCamera(manifest.camera, manifest.film.turn_reach);
     this._foreignCamera = null;
     this._background = background === undefined ? manifest.background : readColor(background);
@@ -57,6 +56,11 @@ class RGBAvatar extends EventTarget {
     this._automatic = automatic;
     this._ended = new AbortController();
     this._last = null;
+    const { onMore } = data; // of another avatar with the same data
+    data.onMore = (from, to) => {
+      onMore(from, to);
+      this.changed();
+    };
     const { signal } = this._ended;
     if (controls) {
       canvas.style.touchAction = "none"; // a finger turns the head and scrolls no page
@@ -68,6 +72,11 @@ class RGBAvatar extends EventTarget {
     canvas.addEventListener("webglcontextlost", (event) => this._loseContext(event), { signal });
     canvas.addEventListener("webglcontextrestored", () => this._restoreContext(), { signal });
     this._frame = requestAnimationFrame((now) => this._tick(now));
+  }
+
+  /** Resolves when all of it has arrived; rejects with an Error where it does not. */
+  get complete() {
+    return this.data.complete;
   }
 
   /** Theta's fields in order: { name, size, form }. */
@@ -181,6 +190,17 @@ class RGBAvatar extends EventTarget {
     this.changed();
   }
 
+  /** The share of the Gaussians that is drawn, the most needed ones first; in (0, 1]. */
+  get detail() {
+    return this._detail;
+  }
+
+  set detail(share) {
+    if (!(share > 0 && share <= 1)) throw new RangeError(`detail is ${told(share)}; expected (0, 1].`);
+    this._detail = share;
+    this.changed();
+  }
+
   /** Have a new picture drawn. */
   changed() {
     this._due = true;
@@ -190,7 +210,7 @@ class RGBAvatar extends EventTarget {
   draw() {
     if (!this._renderer) return;
     const [width, height] = this._fitCanvas();
-    const head = this._head, positions = this._positions;
+    const head = this._head;
     this._psi = this._network.evaluate(this._theta);
     for (const [k, value] of this._heldWeights) this._psi[k] = value;
     head.pose(this._theta);
@@ -198,10 +218,8 @@ class RGBAvatar extends EventTarget {
     const camera = this._foreignCamera ? resizedCamera(this._foreignCamera, width, height)
       : this.camera.at(width, height, head.centre());
     this._turnSeen = viewAngles(multiply3(camera.rotation, head.turn));
-    positions.blend(this._psi);
-    positions.place(head);
-    positions.sort(camera);
-    this._renderer.draw(positions, head, this._psi, camera, this._background);
+    this._renderer.detail = this._detail;
+    this._renderer.draw(head, this._psi, camera, this._background);
     this._due = false;
     this._pictures++;
     this.dispatchEvent(new Event("drawn"));

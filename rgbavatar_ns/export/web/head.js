@@ -1,14 +1,16 @@
 "use strict";
 /* The head model: theta to posed vertices and to the tangent frames of its triangles. */
 
+const VERTEX = 4; // numbers a vertex: a texel
+
 const JOINT_FIELDS = ["rotation", "neck", "jaw", "left_eye", "right_eye"];
 
 class Head {
-  /** data: the manifest with arrays; theta's layout, the person's neutral head, its offsets. */
+  /** data: theta's layout, the person's neutral head, its offsets. */
   constructor(data) {
-    const a = data.arrays;
-    this.parents = data.parents;
-    this.variant = data.variant;
+    const a = data.arrays, { manifest } = data;
+    this.parents = manifest.parents;
+    this.variant = manifest.variant;
     this.neutral = a.neutral_vertices;
     this.skinning = a.skinning_weights;
     this.joints = a.joints;
@@ -17,14 +19,15 @@ class Head {
       start: a.offset_start, vertex: a.offset_vertex, value: a.offset_value, unit: a.offset_unit,
     };
     this.triangles = a.triangle_vertices;
-    this.edgesToFrame = a.edges_to_frame;
-    this.restLength = data.scale_with_triangle ? a.rest_length : null;
+    this.edgesToFrame = edgesToFrame(a);
+    this.restLength = manifest.scale_with_triangle ? a.rest_length : null;
     this.numTriangles = this.triangles.length / 3;
-    this.movedByJointsOnly = data.carrier === "joints";
+    this.numVertices = this.neutral.length / 3;
+    this.movedByJointsOnly = manifest.carrier === "joints";
     this.slices = {};
     this.linear = [];
     let start = 0;
-    for (const { name, size, form } of data.layout) {
+    for (const { name, size, form } of manifest.layout) {
       this.slices[name] = [start, size];
       if (form === "linear") this.linear.push([start, size]);
       start += size;
@@ -32,14 +35,10 @@ class Head {
     this.numExpressions = this.slices.expression[1];
     this.numEyelids = this.slices.eyelids ? this.slices.eyelids[1] : 0;
     this.shaped = new Float32Array(this.neutral.length);
-    this.vertices = new Float32Array(this.neutral.length);
-    // T, B, N of each triangle that carries Gaussians, and the rotation that belongs to it.
-    this.frames = new Float32Array(9 * this.numTriangles);
-    this.quaternions = new Float32Array(4 * 1024 * Math.ceil(this.numTriangles / 1024));
-    this.lengthRatio = new Float32Array(this.numTriangles).fill(1);
+    this.vertices = new Float32Array(VERTEX * 1024 * Math.ceil(this.numVertices / 1024));
   }
 
-  /** Pose the head: fills `turn`, `vertices`, `frames`, `quaternions` and `lengthRatio`. */
+  /** Pose the head: fills `turn` and `vertices`. */
   pose(theta) {
     const turns = JOINT_FIELDS.map((name) => {
       const [start] = this.slices[name];
@@ -49,17 +48,16 @@ class Head {
     const moved = this.movedByJointsOnly ? this._withoutLinear(theta) : theta;
     this._shape(moved, turns);
     this._skin(moved, turns);
-    this._frame();
   }
 
   /** The middle of the posed head's box, without what the neck does not turn. */
   centre() {
     const low = [Infinity, Infinity, Infinity], high = [-Infinity, -Infinity, -Infinity];
-    for (let v = 0; v < this.vertices.length / 3; v++) {
+    for (let v = 0; v < this.numVertices; v++) {
       if (this.skinning[5 * v] >= 0.5) continue;
       for (let i = 0; i < 3; i++) {
-        low[i] = Math.min(low[i], this.vertices[3 * v + i]);
-        high[i] = Math.max(high[i], this.vertices[3 * v + i]);
+        low[i] = Math.min(low[i], this.vertices[VERTEX * v + i]);
+        high[i] = Math.max(high[i], this.vertices[VERTEX * v + i]);
       }
     }
     return low.map((value, i) => (value + high[i]) / 2);
@@ -127,7 +125,7 @@ class Head {
     }
     const [moved] = this.slices.translation;
     const m = new Float64Array(12);
-    for (let v = 0; v < this.vertices.length / 3; v++) {
+    for (let v = 0; v < this.numVertices; v++) {
       m.fill(0);
       for (let j = 0; j < 5; j++) {
         const weight = this.skinning[5 * v + j];
@@ -137,19 +135,24 @@ class Head {
       }
       const x = this.shaped[3 * v], y = this.shaped[3 * v + 1], z = this.shaped[3 * v + 2];
       for (let i = 0; i < 3; i++) {
-        this.vertices[3 * v + i] = m[3 * i] * x + m[3 * i + 1] * y + m[3 * i + 2] * z + m[9 + i]
+        this.vertices[VERTEX * v + i] = m[3 * i] * x + m[3 * i + 1] * y + m[3 * i + 2] * z + m[9 + i]
           + theta[moved + i];
       }
     }
   }
 
-  /** Tangent frames: T and B along u and v of the texture map, N the outward normal. */
-  _frame() {
-    const p = this.vertices, frames = this.frames, edges = this.edgesToFrame;
+  /**
+   * Each triangle's corners and tangent frame as depths: six numbers, of the corners and of a step
+   * along T and B (u and v of the texture map) and N (the outward normal).
+   */
+  frameDepths(camera, depths = null) {
+    const p = this.vertices, edges = this.edgesToFrame, { variant } = this;
+    const [rx, ry, rz] = camera.rotation.slice(6), shift = camera.translation[2];
+    const found = depths ?? new Float32Array(6 * this.numTriangles);
     for (let f = 0; f < this.numTriangles; f++) {
-      const a = 3 * this.triangles[3 * f];
-      const b = 3 * this.triangles[3 * f + 1];
-      const c = 3 * this.triangles[3 * f + 2];
+      const a = VERTEX * this.triangles[3 * f];
+      const b = VERTEX * this.triangles[3 * f + 1];
+      const c = VERTEX * this.triangles[3 * f + 2];
       let ux = p[b] - p[a], uy = p[b + 1] - p[a + 1], uz = p[b + 2] - p[a + 2];
       let vx = p[c] - p[a], vy = p[c + 1] - p[a + 1], vz = p[c + 2] - p[a + 2];
       let nx = uy * vz - uz * vy, ny = uz * vx - ux * vz, nz = ux * vy - uy * vx;
@@ -161,40 +164,46 @@ class Head {
       } else {
         nx /= doubled; ny /= doubled; nz /= doubled;
       }
-      if (this.restLength) {
-        this.lengthRatio[f] = Math.sqrt(Math.max(doubled / 2, 1e-16)) / this.restLength[f];
-      }
       const e0 = edges[4 * f], e1 = edges[4 * f + 1], e2 = edges[4 * f + 2], e3 = edges[4 * f + 3];
       let tx = e0 * ux + e1 * vx, ty = e0 * uy + e1 * vy, tz = e0 * uz + e1 * vz;
       let bx = e2 * ux + e3 * vx, by = e2 * uy + e3 * vy, bz = e2 * uz + e3 * vz;
-      if (this.variant !== "raw") {
+      if (variant !== "raw") {
         const length = Math.sqrt(tx * tx + ty * ty + tz * tz);
         tx /= length; ty /= length; tz /= length;
       }
-      if (this.variant === "orthonormal") {
+      if (variant === "orthonormal") {
         bx = ny * tz - nz * ty; by = nz * tx - nx * tz; bz = nx * ty - ny * tx;
-      } else if (this.variant === "normalized") {
+      } else if (variant === "normalized") {
         const length = Math.sqrt(bx * bx + by * by + bz * bz);
         bx /= length; by /= length; bz /= length;
       }
-      const place = 9 * f;
-      frames[place] = tx; frames[place + 1] = ty; frames[place + 2] = tz;
-      frames[place + 3] = bx; frames[place + 4] = by; frames[place + 5] = bz;
-      frames[place + 6] = nx; frames[place + 7] = ny; frames[place + 8] = nz;
-      this._rotation(f, tx, ty, tz, bx, by, bz, nx, ny, nz);
+      const place = 6 * f;
+      found[place] = rx * p[a] + ry * p[a + 1] + rz * p[a + 2] + shift;
+      found[place + 1] = rx * p[b] + ry * p[b + 1] + rz * p[b + 2] + shift;
+      found[place + 2] = rx * p[c] + ry * p[c + 1] + rz * p[c + 2] + shift;
+      found[place + 3] = rx * tx + ry * ty + rz * tz;
+      found[place + 4] = rx * bx + ry * by + rz * bz;
+      found[place + 5] = rx * nx + ry * ny + rz * nz;
     }
+    return found;
   }
+}
 
-  /** The rotation nearest to a frame that keeps N: T and B turned back by 90 degrees, averaged. */
-  _rotation(f, tx, ty, tz, bx, by, bz, nx, ny, nz) {
-    const qx = by * nz - bz * ny, qy = bz * nx - bx * nz, qz = bx * ny - by * nx;
-    const sign = qx * tx + qy * ty + qz * tz < 0 ? -1 : 1;
-    let wx = tx + sign * qx, wy = ty + sign * qy, wz = tz + sign * qz;
-    const off = wx * nx + wy * ny + wz * nz;
-    wx -= off * nx; wy -= off * ny; wz -= off * nz;
-    const length = Math.sqrt(wx * wx + wy * wy + wz * wz);
-    wx /= length; wy /= length; wz /= length;
-    writeQuaternion(this.quaternions, 4 * f, wx, wy, wz,
-      ny * wz - nz * wy, nz * wx - nx * wz, nx * wy - ny * wx, nx, ny, nz);
+/** Each triangle's matrix whose rows give T and B from its two edges; the identity without area. */
+function edgesToFrame(arrays) {
+  const { triangle_vertices: triangles, triangle_seams: seams, uv } = arrays;
+  const found = new Float32Array(4 * triangles.length / 3);
+  for (let f = 0; f < triangles.length / 3; f++) {
+    // A corner's place in `uv` is its vertex's, or so much farther at a seam of the map.
+    const [a, b, c] = [0, 1, 2].map((i) => 2 * (triangles[3 * f + i] + seams[3 * f + i]));
+    const u1 = uv[b] - uv[a], v1 = uv[b + 1] - uv[a + 1];
+    const u2 = uv[c] - uv[a], v2 = uv[c + 1] - uv[a + 1];
+    const determinant = u1 * v2 - u2 * v1;
+    const longest = Math.max(u1 * u1, u2 * u2) + Math.max(v1 * v1, v2 * v2);
+    const flat = !(Math.abs(determinant) > 1e-6 * longest + 1e-14);
+    found.set(flat ? [1, 0, 0, 1] : [v2, -v1, -u2, u1].map((x) => x / determinant), 4 * f);
   }
+  const { thin_triangle: thin, thin_edges_to_frame: exact } = arrays;
+  thin.forEach((f, i) => found.set(exact.subarray(4 * i, 4 * i + 4), 4 * f));
+  return found;
 }

@@ -157,10 +157,14 @@ window.rgbavatar = (async () => {
   const message = document.getElementById("message");
   try {
     const page = JSON.parse(document.getElementById("page").textContent);
-    const avatar = await RGBAvatar.load({ data: await AvatarData.ofPage() }, document.getElementById("view"));
+    const avatar = await RGBAvatar.load(streamOfPage(), document.getElementById("view"));
     message.textContent = "";
     const app = new App(avatar, page);
     avatar.draw();
+    avatar.complete.catch((error) => { // what is there of it stays
+      message.className = "error";
+      message.textContent = error.message;
+    });
     return app;
   } catch (error) {
     message.className = "error";

@@ -151,6 +151,7 @@ class Panel {
     label.textContent = "Background ";
     label.append(input);
     group.append(label, document.createElement("br"));
+    this._slider(group, "Detail", [0.1, 1], () => avatar.detail, (share) => { avatar.detail = share; });
     const free = document.createElement("input");
     Object.assign(free, { type: "checkbox", id: "turn-freely" });
     free.addEventListener("input", () => { avatar.camera.free = free.checked; avatar.changed(); });

@@ -2,13 +2,16 @@
 /* The recorded performance: theta of frame after frame. */
 
 class RecordedPerformance {
-  /** theta: the frames after one another; show: called with the theta of each new place. */
-  constructor(theta, size, framesPerSecond, show) {
-    this.length = theta.length / size;
-    this.framesPerSecond = framesPerSecond;
+  /** show: called with the theta of each new place. */
+  constructor(data, show) {
+    const { arrays, manifest } = data;
+    this.length = manifest.arrays.theta.items;
+    this.framesPerSecond = manifest.frames_per_second;
     this.speed = 1;
-    this._theta = theta;
-    this._size = size;
+    this._data = data;
+    this._part = manifest.parts.findIndex(({ slices }) => slices.some(([name]) => name === "theta"));
+    this._theta = arrays.theta;
+    this._size = manifest.arrays.theta.columns;
     this._show = show;
     this._place = 0;
     this._playing = false;
@@ -27,7 +30,7 @@ class RecordedPerformance {
   play() {
     if (this.length === 0) return;
     this._playing = true;
-    this._show(this._current());
+    this._follow();
   }
 
   pause() {
@@ -38,14 +41,23 @@ class RecordedPerformance {
   seek(place) {
     if (this.length === 0) return;
     this._place = Math.min(Math.max(place, 0), this.length - 1);
-    this._show(this._current());
+    this._follow();
   }
 
   /** Go on by so many seconds where it plays; after the last frame comes the first. */
   advance(seconds) {
-    if (!this._playing) return;
+    if (!this._playing || !this._isThere()) return;
     this._place = (this._place + seconds * this.framesPerSecond * this.speed) % this.length;
-    this._show(this._current());
+    this._follow();
+  }
+
+  /** Of a file that is still arriving, the film comes after the first picture. */
+  _isThere() {
+    return this._data.spans.length > this._part;
+  }
+
+  _follow() {
+    if (this._isThere()) this._show(this._current());
   }
 
   /** theta at the current place, linear between frames. */

@@ -1,7 +1,9 @@
 "use strict";
-/* WebGL2: blends all Gaussians in one pass, draws them from far to near, shows the picture. */
+/* WebGL2: places all Gaussians in one pass, draws them from far to near, shows the picture. */
 
 const TEXTURE_WIDTH = 1024;
+const VARIANTS = ["normalized", "raw", "orthonormal"];
+const LEAST_GAUSSIANS = 1000;
 
 class Renderer {
   /** Throws an Error with a reason where the browser lacks what is needed. */
@@ -13,18 +15,28 @@ class Renderer {
       throw new Error("This graphics driver cannot draw to float textures; try another browser.");
     }
     this.gl = gl;
-    this.canvas = canvas;
+    this.data = data;
     this._made = []; // what frees each object of the graphics memory
-    this.count = data.num_gaussians;
-    this.numBases = data.num_bases;
-    this.rows = Math.ceil(this.count / TEXTURE_WIDTH);
-    this.blend = this._program(WHOLE_TARGET_VERTEX, BLEND_FRAGMENT);
+    this.detail = 1; // share of the Gaussians that is drawn, in (0, 1]
+    this.total = data.manifest.num_gaussians;
+    this.numBases = data.manifest.num_bases;
+    this.rows = Math.ceil(this.total / TEXTURE_WIDTH);
+    this.order = new GaussianOrder(data);
+    this.levels = new DetailLevels(data);
+    this.placing = this._program(WHOLE_TARGET_VERTEX, PLACE_FRAGMENT);
     this.drawing = this._program(DRAW_VERTEX, DRAW_FRAGMENT);
-    this.show = this._program(WHOLE_TARGET_VERTEX, SHOW_FRAGMENT);
-    this._upload(data);
-    this._makeBlendTarget();
+    this.showing = this._program(WHOLE_TARGET_VERTEX, SHOW_FRAGMENT);
+    this._makeTextures();
+    this._makePlaceTarget();
     this._makeBoxes();
     this.pictureSize = [0, 0];
+    this.filledParts = 0; // of the file, so many are in the textures
+  }
+
+  /** How many Gaussians are drawn: the share `detail`, and no more than have arrived. */
+  get count() {
+    const wanted = Math.max(Math.ceil(this.detail * this.total), LEAST_GAUSSIANS);
+    return Math.min(wanted, this.data.available);
   }
 
   _program(vertexSource, fragmentSource) {
@@ -63,70 +75,142 @@ class Renderer {
     return { target, texture };
   }
 
-  /** A float texture with four numbers a texel, in rows of 1,024. */
-  _floats(values, width = TEXTURE_WIDTH) {
-    const gl = this.gl, made = this._texture();
-    const height = values.length / (4 * width);
-    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA32F, width, height, 0, gl.RGBA, gl.FLOAT, values);
-    return { ...made, width, height };
-  }
-
   _framebuffer() {
     const gl = this.gl, made = gl.createFramebuffer();
     this._made.push(() => gl.deleteFramebuffer(made));
     return made;
   }
 
-  /** Free all graphics memory; the canvas may be drawn on by another. */
+  /** Free all graphics memory; another may draw on the canvas. */
   dispose() {
     for (const free of this._made) free();
     this._made = [];
   }
 
-  _renew(floats, values) {
-    const gl = this.gl;
-    gl.bindTexture(gl.TEXTURE_2D, floats.texture);
-    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, floats.width, floats.height, gl.RGBA, gl.FLOAT, values);
-  }
-
-  /** Bases as signed bytes, a layer each; at least one layer, which nobody reads, is needed. */
-  _layers(values) {
-    const gl = this.gl, made = this._texture(gl.TEXTURE_2D_ARRAY);
-    const layers = Math.max(this.numBases, 1);
-    const bytes = this.numBases ? values : new Int8Array(4 * TEXTURE_WIDTH * this.rows);
-    gl.texImage3D(gl.TEXTURE_2D_ARRAY, 0, gl.RGBA8_SNORM, TEXTURE_WIDTH, this.rows, layers, 0,
-      gl.RGBA, gl.BYTE, bytes);
+  /** A texture of rows of 1,024 texels, each with some of these numbers. */
+  _table(format, width, height, values = null) {
+    const gl = this.gl, made = { ...this._texture(), width, height, format };
+    gl.texStorage2D(gl.TEXTURE_2D, 1, gl[format], width, height);
+    if (values !== null) this._renew(made, values);
     return made;
   }
 
-  _upload(data) {
-    const a = data.arrays, texels = TEXTURE_WIDTH * this.rows;
-    this.fixed = {
-      scaleOpacity: this._floats(a.scale_opacity),
-      baseRotation: this._floats(a.rotation),
-      baseColor: this._floats(a.color_triangle),
-      basisRotation: this._layers(a.basis_rotation),
-      basisColor: this._layers(a.basis_color),
-    };
-    this.rotationUnit = a.basis_rotation_unit;
-    this.colorUnit = a.basis_color_unit;
-    this.weightValues = new Float32Array(8 * Math.max(this.numBases, 1));
-    const triangleRows = Math.ceil(a.triangle_vertices.length / 3 / TEXTURE_WIDTH);
-    this.moving = {
-      position: this._floats(new Float32Array(4 * texels)),
-      triangleRotation: this._floats(new Float32Array(4 * TEXTURE_WIDTH * triangleRows)),
-      weights: this._floats(this.weightValues, Math.max(this.numBases, 1)),
-    };
+  /** Replace whole rows of a table, from one on; values: of as many rows as they are. */
+  _renew({ texture, width, format }, values, row = 0) {
+    const gl = this.gl, [numbers, kind, components] = {
+      RGBA32F: [gl.RGBA, gl.FLOAT, 4], RGBA32UI: [gl.RGBA_INTEGER, gl.UNSIGNED_INT, 4],
+      R32UI: [gl.RED_INTEGER, gl.UNSIGNED_INT, 1],
+    }[format];
+    gl.bindTexture(gl.TEXTURE_2D, texture);
+    const height = values.length / (components * width);
+    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, row, width, height, numbers, kind, values);
   }
 
-  _makeBlendTarget() {
-    const gl = this.gl, empty = new Float32Array(4 * TEXTURE_WIDTH * this.rows);
-    this.projected = {
-      place: this._floats(empty), shape: this._floats(empty), shade: this._floats(empty),
+  /** Bases as signed bytes, a layer each; at least one layer, which nobody reads, is needed. */
+  _layers() {
+    const gl = this.gl, made = this._texture(gl.TEXTURE_2D_ARRAY);
+    const layers = Math.max(this.numBases, 1);
+    gl.texStorage3D(gl.TEXTURE_2D_ARRAY, 1, gl.RGBA8_SNORM, TEXTURE_WIDTH, this.rows, layers);
+    return made;
+  }
+
+  _makeTextures() {
+    const rows = this.rows, a = this.data.arrays, { scale_with_triangle: follows } = this.data.manifest;
+    const table = () => this._table("RGBA32F", TEXTURE_WIDTH, rows);
+    this.gaussians = {
+      scaleOpacity: table(), baseRotation: table(), baseColor: table(), basePosition: table(),
+      anchor: table(),
+      basisRotation: this._layers(), basisColor: this._layers(), basisPosition: this._layers(),
     };
-    this.blendTarget = this._framebuffer();
-    gl.bindFramebuffer(gl.FRAMEBUFFER, this.blendTarget);
-    const attachments = Object.values(this.projected).map(({ texture }, i) => {
+    const faces = a.triangle_vertices.length / 3;
+    const faceRows = Math.ceil(faces / TEXTURE_WIDTH);
+    const corners = new Uint32Array(4 * TEXTURE_WIDTH * faceRows);
+    const lengths = new Float32Array(corners.buffer);
+    for (let f = 0; f < faces; f++) {
+      for (let i = 0; i < 3; i++) corners[4 * f + i] = a.triangle_vertices[3 * f + i];
+      if (follows) lengths[4 * f + 3] = a.rest_length[f];
+    }
+    const edges = new Float32Array(corners.length);
+    edges.set(edgesToFrame(a));
+    this.head = {
+      corners: this._table("RGBA32UI", TEXTURE_WIDTH, faceRows, corners),
+      edgesToFrame: this._table("RGBA32F", TEXTURE_WIDTH, faceRows, edges),
+      vertex: this._table("RGBA32F", TEXTURE_WIDTH,
+        Math.ceil(a.neutral_vertices.length / 3 / TEXTURE_WIDTH)),
+    };
+    this.weightValues = new Float32Array(12 * Math.max(this.numBases, 1));
+    this.weights = this._table("RGBA32F", Math.max(this.numBases, 1), 3);
+  }
+
+  /** Bring to the textures what has arrived since. */
+  _fill() {
+    const { spans } = this.data;
+    for (; this.filledParts < spans.length; this.filledParts++) {
+      const [from, to] = spans[this.filledParts];
+      if (to > from) this._fillRows(Math.floor(from / TEXTURE_WIDTH), Math.ceil(to / TEXTURE_WIDTH));
+    }
+  }
+
+  _fillRows(top, bottom) {
+    const gl = this.gl, { manifest, arrays } = this.data, first = TEXTURE_WIDTH * top;
+    const texels = TEXTURE_WIDTH * (bottom - top), last = Math.min(first + texels, this.total);
+    /** Put columns of an array side by side into texels, from number `at` of each on. */
+    const fill = (texelValues, at, name, column, columns) => {
+      const source = arrays[name], described = manifest.arrays[name];
+      const [item, next] = described.by_item ? [described.columns, 1] : [1, described.items];
+      for (let c = 0; c < columns; c++) {
+        const place = (column + c) * next;
+        for (let i = first; i < last; i++) {
+          texelValues[4 * (i - first) + at + c] = source[place + i * item];
+        }
+      }
+    };
+    for (const [table, ...parts] of [
+      ["scaleOpacity", ["scale", 3], ["opacity", 1]], ["baseRotation", ["rotation", 4]],
+      ["baseColor", ["color", 3], ["triangle_of", 1]], ["basePosition", ["position", 3]],
+    ]) {
+      const values = new Float32Array(4 * texels);
+      let at = 0;
+      for (const [name, columns] of parts) {
+        fill(values, at, name, 0, columns);
+        at += columns;
+      }
+      this._renew(this.gaussians[table], values, top);
+    }
+    for (const [table, name, columns] of [
+      ["basisRotation", "basis_rotation", 4], ["basisColor", "basis_color", 3],
+      ["basisPosition", "basis_position", 3],
+    ]) {
+      const bytes = new Int8Array(4 * texels);
+      for (let k = 0; k < this.numBases; k++) {
+        fill(bytes, 0, name, columns * k, columns);
+        gl.bindTexture(gl.TEXTURE_2D_ARRAY, this.gaussians[table].texture);
+        gl.texSubImage3D(gl.TEXTURE_2D_ARRAY, 0, 0, top, k, TEXTURE_WIDTH, bottom - top, 1, gl.RGBA,
+          gl.BYTE, bytes);
+      }
+    }
+    this.levels.count = 0; // their anchors, too, are to be filled
+  }
+
+  /** Barycentric coordinates and growth of the Gaussians that are drawn. */
+  _fillAnchors(count) {
+    if (!this.levels.choose(count)) return;
+    const { barycentric } = this.data.arrays;
+    const values = new Float32Array(4 * TEXTURE_WIDTH * Math.ceil(count / TEXTURE_WIDTH));
+    for (let i = 0; i < count; i++) {
+      values[4 * i] = barycentric[2 * i];
+      values[4 * i + 1] = barycentric[2 * i + 1];
+      values[4 * i + 2] = this.levels.growth[i];
+    }
+    this._renew(this.gaussians.anchor, values);
+  }
+
+  _makePlaceTarget() {
+    const gl = this.gl, table = () => this._table("RGBA32F", TEXTURE_WIDTH, this.rows);
+    this.placed = { place: table(), shape: table(), shade: table() };
+    this.placeTarget = this._framebuffer();
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.placeTarget);
+    const attachments = Object.values(this.placed).map(({ texture }, i) => {
       const place = gl.COLOR_ATTACHMENT0 + i;
       gl.framebufferTexture2D(gl.FRAMEBUFFER, place, gl.TEXTURE_2D, texture, 0);
       return place;
@@ -136,8 +220,8 @@ class Renderer {
 
   /** Four corners and two triangles for each Gaussian; instances of four are slow to start. */
   _makeBoxes() {
-    const gl = this.gl, corners = new Uint32Array(6 * this.count);
-    for (let i = 0; i < this.count; i++) {
+    const gl = this.gl, corners = new Uint32Array(6 * this.total);
+    for (let i = 0; i < this.total; i++) {
       corners.set([4 * i, 4 * i + 1, 4 * i + 2, 4 * i + 2, 4 * i + 1, 4 * i + 3], 6 * i);
     }
     this.boxes = gl.createVertexArray();
@@ -147,15 +231,7 @@ class Renderer {
     gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, buffer);
     gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, corners, gl.STATIC_DRAW);
     gl.bindVertexArray(null);
-    this.order = this._texture();
-    gl.texStorage2D(gl.TEXTURE_2D, 1, gl.R32UI, TEXTURE_WIDTH, this.rows);
-  }
-
-  _renewOrder(order) {
-    const gl = this.gl;
-    gl.bindTexture(gl.TEXTURE_2D, this.order.texture);
-    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, TEXTURE_WIDTH, this.rows, gl.RED_INTEGER,
-      gl.UNSIGNED_INT, order);
+    this.orderTable = this._table("R32UI", TEXTURE_WIDTH, this.rows);
   }
 
   /** Half floats hold the unrounded sums of many thin layers. */
@@ -183,36 +259,46 @@ class Renderer {
     gl.activeTexture(gl.TEXTURE0);
   }
 
-  /** Draw sorted positions on a posed head with weights psi, seen by a camera of canvas size. */
-  draw(positions, head, psi, camera, background) {
-    const gl = this.gl, { width, height } = camera;
-    this._fitPicture(width, height);
-    this._renew(this.moving.position, positions.world);
-    this._renew(this.moving.triangleRotation, head.quaternions);
-    for (let k = 0; k < this.numBases; k++) {
-      for (let i = 0; i < 4; i++) {
-        // A byte of 127 is read as 1.
-        this.weightValues[4 * k + i] = psi[k] * 127 * this.rotationUnit[4 * k + i];
-        const color = i < 3 ? psi[k] * 127 * this.colorUnit[3 * k + i] : 0;
-        this.weightValues[4 * (this.numBases + k) + i] = color;
-      }
-    }
-    this._renew(this.moving.weights, this.weightValues);
-    this._renewOrder(positions.order);
-    this._blendAll(camera);
-    this._drawAll(camera);
+  /** Draw a posed head with weights psi, seen by a camera of canvas size. */
+  draw(head, psi, camera, background) {
+    const count = this.count;
+    this._fill();
+    this._fillAnchors(count);
+    this._fitPicture(camera.width, camera.height);
+    this.order.sort(head, psi, camera, count);
+    this._renew(this.orderTable, this.order.order.subarray(0, TEXTURE_WIDTH
+      * Math.ceil(count / TEXTURE_WIDTH)));
+    this._renew(this.head.vertex, head.vertices);
+    this._weigh(psi);
+    this._placeAll(camera, count);
+    this._drawAll(camera, count);
     this._showOver(background, camera);
   }
 
-  _blendAll(camera) {
-    const gl = this.gl, { program, uniforms } = this.blend;
-    gl.bindFramebuffer(gl.FRAMEBUFFER, this.blendTarget);
-    gl.viewport(0, 0, TEXTURE_WIDTH, this.rows);
+  /** psi times the units of rotation, colour and position; a byte of 127 is read as 1. */
+  _weigh(psi) {
+    const { arrays } = this.data.manifest, row = 4 * Math.max(this.numBases, 1);
+    ["basis_rotation", "basis_color", "basis_position"].forEach((name, place) => {
+      for (let k = 0; k < this.numBases; k++) {
+        const { unit } = arrays[name], columns = unit.length / this.numBases;
+        for (let i = 0; i < columns; i++) {
+          this.weightValues[place * row + 4 * k + i] = 127 * psi[k] * unit[columns * k + i];
+        }
+      }
+    });
+    this._renew(this.weights, this.weightValues);
+  }
+
+  _placeAll(camera, count) {
+    const gl = this.gl, { program, uniforms } = this.placing;
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.placeTarget);
+    gl.viewport(0, 0, TEXTURE_WIDTH, Math.ceil(count / TEXTURE_WIDTH));
     gl.disable(gl.BLEND);
     gl.useProgram(program);
-    this._bind(uniforms, { ...this.fixed, ...this.moving });
-    gl.uniform1i(uniforms.count, this.count);
+    this._bind(uniforms, { ...this.gaussians, ...this.head, weights: this.weights });
+    gl.uniform1i(uniforms.count, count);
     gl.uniform1i(uniforms.numBases, this.numBases);
+    gl.uniform1i(uniforms.variant, VARIANTS.indexOf(this.data.manifest.variant));
     const { rotation, translation, focal, principal, width, height } = camera;
     gl.uniform3fv(uniforms.cameraX, rotation.slice(0, 3));
     gl.uniform3fv(uniforms.cameraY, rotation.slice(3, 6));
@@ -230,7 +316,7 @@ class Renderer {
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 
-  _drawAll({ width, height }) {
+  _drawAll({ width, height }, count) {
     const gl = this.gl, { program, uniforms } = this.drawing;
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.pictureTarget);
     gl.viewport(0, 0, width, height);
@@ -239,15 +325,15 @@ class Renderer {
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
     gl.useProgram(program);
-    this._bind(uniforms, { ...this.projected, order: this.order });
+    this._bind(uniforms, { ...this.placed, order: this.orderTable });
     gl.uniform2f(uniforms.imageSize, width, height);
     gl.bindVertexArray(this.boxes);
-    gl.drawElements(gl.TRIANGLES, 6 * this.count, gl.UNSIGNED_INT, 0);
+    gl.drawElements(gl.TRIANGLES, 6 * count, gl.UNSIGNED_INT, 0);
     gl.bindVertexArray(null);
   }
 
   _showOver(background, { width, height }) {
-    const gl = this.gl, { program, uniforms } = this.show;
+    const gl = this.gl, { program, uniforms } = this.showing;
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     gl.viewport(0, 0, width, height);
     gl.disable(gl.BLEND);

@@ -85,6 +85,8 @@ export class RGBAvatar extends EventTarget {
   /** For `load` on another canvas. */
   readonly data: unknown;
   readonly performance: Performance;
+  /** Resolves when all of the file is there; the first picture is drawn long before. */
+  readonly complete: Promise<void>;
   /** Theta's fields in order. */
   readonly layout: readonly ThetaField[];
   readonly expressionNames: readonly string[];
@@ -102,6 +104,8 @@ export class RGBAvatar extends EventTarget {
   readonly headCentre: [number, number, number];
   /** Drawn so far. */
   readonly pictures: number;
+  /** The share of the Gaussians that is drawn, the most needed ones first, in (0, 1]; 1. */
+  detail: number;
   get background(): number[] | null;
   set background(color: Numbers | null);
 

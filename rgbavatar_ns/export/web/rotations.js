@@ -45,33 +45,15 @@ function viewAngles(m) {
   return [Math.atan2(-m[6], -m[8]), Math.atan2(m[7], Math.hypot(m[6], m[8]))];
 }
 
-/** Write the unit quaternion of the rotation with these columns to `out` at `place`. */
-function writeQuaternion(out, place, tx, ty, tz, bx, by, bz, nx, ny, nz) {
-  // The largest of the four components is found from the diagonal, the others by division.
-  const trace = tx + by + nz;
-  let w, x, y, z;
-  if (trace > 0) {
-    const s = 2 * Math.sqrt(1 + trace);
-    w = s / 4; x = (bz - ny) / s; y = (nx - tz) / s; z = (ty - bx) / s;
-  } else if (tx > by && tx > nz) {
-    const s = 2 * Math.sqrt(1 + tx - by - nz);
-    w = (bz - ny) / s; x = s / 4; y = (bx + ty) / s; z = (nx + tz) / s;
-  } else if (by > nz) {
-    const s = 2 * Math.sqrt(1 + by - tx - nz);
-    w = (nx - tz) / s; x = (bx + ty) / s; y = s / 4; z = (ny + bz) / s;
-  } else {
-    const s = 2 * Math.sqrt(1 + nz - tx - by);
-    w = (ty - bx) / s; x = (nx + tz) / s; y = (ny + bz) / s; z = s / 4;
-  }
-  out[place] = w; out[place + 1] = x; out[place + 2] = y; out[place + 3] = z;
-}
-
 /** Axis-angle vector in radians of a rotation matrix, of at most half a turn. */
 function matrixToAxisAngle(m) {
-  const q = [1, 0, 0, 0];
-  writeQuaternion(q, 0, m[0], m[3], m[6], m[1], m[4], m[7], m[2], m[5], m[8]);
-  const sine = Math.hypot(q[1], q[2], q[3]);
-  const sign = q[0] < 0 ? -1 : 1;
-  const factor = sine > 1e-9 ? (sign * 2 * Math.atan2(sine, Math.abs(q[0]))) / sine : 2;
-  return [factor * q[1], factor * q[2], factor * q[3]];
+  const sines = [(m[7] - m[5]) / 2, (m[2] - m[6]) / 2, (m[3] - m[1]) / 2]; // the axis, that long
+  const sine = Math.hypot(...sines), cosine = (m[0] + m[4] + m[8] - 1) / 2;
+  const angle = Math.atan2(sine, cosine);
+  if (sine > 1e-6) return sines.map((value) => (value * angle) / sine);
+  if (cosine > 0) return sines;
+  // Half a turn: the matrix is twice the axis's outer product less the identity.
+  const i = [m[0], m[4], m[8]].reduce((most, value, k, all) => (value > all[most] ? k : most), 0);
+  const length = Math.sqrt((m[4 * i] + 1) / 2);
+  return [0, 1, 2].map((k) => angle * (k === i ? length : (m[3 * i + k] + m[3 * k + i]) / (4 * length)));
 }

@@ -1,5 +1,5 @@
 "use strict";
-/* The three programs of the page: blend every Gaussian, draw them, show the result.
+/* The three programs of the page: place every Gaussian, draw them, show the result.
 
 The rule is that of the project's rasterizer: camera axes x right, y down, z forward; lengths in
 metres; image coordinates in pixels from the upper left corner; an alpha is
@@ -16,23 +16,27 @@ void main() {
   gl_Position = vec4(corner, 0.0, 1.0);
 }`;
 
-/** One fragment a Gaussian: base plus weighted bases, activated, projected into the image. */
-const BLEND_FRAGMENT = `#version 300 es
+/** One fragment a Gaussian: base plus weighted bases, activated, placed, projected. */
+const PLACE_FRAGMENT = `#version 300 es
 precision highp float;
 precision highp int;
 precision highp sampler2D;
+precision highp usampler2D;
 precision highp sampler2DArray;
 
 uniform int count;
 uniform int numBases;
+uniform int variant;                // of tangent frames: 0 normalized, 1 raw, 2 orthonormal
 uniform sampler2D scaleOpacity;     // standard deviations in metres, opacity
 uniform sampler2D baseRotation;     // quaternion, real part first
 uniform sampler2D baseColor;        // colour, triangle's number
-uniform sampler2DArray basisRotation;
-uniform sampler2DArray basisColor;
-uniform sampler2D weights;          // psi times the bases' units: row 0 rotation, row 1 colour
-uniform sampler2D position;         // world position, growth of the triangle
-uniform sampler2D triangleRotation; // quaternion, real part first
+uniform sampler2D basePosition;     // in the triangle's tangent frame
+uniform sampler2D anchor;           // two barycentric coordinates, growth of this level of detail
+uniform sampler2DArray basisRotation, basisColor, basisPosition;
+uniform sampler2D weights;          // psi times units: rows of rotation, colour, position
+uniform sampler2D vertex;           // of the posed head
+uniform usampler2D corners;         // three vertices' numbers, length at rest or 0 (float's bits)
+uniform sampler2D edgesToFrame;
 uniform vec3 cameraX, cameraY, cameraZ, cameraTranslation; // rows of world to camera
 uniform vec2 focal, principal, slopeLow, slopeHigh;
 
@@ -41,10 +45,6 @@ layout(location = 1) out vec4 shape;   // inverse covariance xx, xy, yy, opacity
 layout(location = 2) out vec4 shade;   // colour
 
 ${TEXEL}
-
-vec4 product(vec4 p, vec4 q) { // Hamilton product, real part in x
-  return vec4(p.x * q.x - dot(p.yzw, q.yzw), p.x * q.yzw + q.x * p.yzw + cross(p.yzw, q.yzw));
-}
 
 vec3 turned(vec4 q, vec3 v) {
   vec3 t = 2.0 * cross(q.yzw, v);
@@ -61,17 +61,49 @@ void main() {
   vec4 rotation = texelFetch(baseRotation, at, 0);
   vec4 colorTriangle = texelFetch(baseColor, at, 0);
   vec3 color = colorTriangle.rgb;
+  vec3 local = texelFetch(basePosition, at, 0).xyz;
   for (int k = 0; k < numBases; k++) {
     rotation += texelFetch(weights, ivec2(k, 0), 0) * texelFetch(basisRotation, ivec3(at, k), 0);
     color += texelFetch(weights, ivec2(k, 1), 0).rgb * texelFetch(basisColor, ivec3(at, k), 0).rgb;
+    local += texelFetch(weights, ivec2(k, 2), 0).rgb
+      * texelFetch(basisPosition, ivec3(at, k), 0).rgb;
   }
-  vec4 frame = texelFetch(triangleRotation, texel(int(colorTriangle.w)), 0);
-  rotation = normalize(product(frame, rotation));
-  vec4 world = texelFetch(position, at, 0);
-  vec4 size = texelFetch(scaleOpacity, at, 0);
-  vec3 scale = size.xyz * world.w;
+  rotation = normalize(rotation);
 
-  vec3 centre = toCamera(world.xyz) + cameraTranslation;
+  // The triangle's tangent frame: along u and v of the texture map, and the outward normal.
+  ivec2 face = texel(int(colorTriangle.w));
+  uvec4 corner = texelFetch(corners, face, 0);
+  vec3 a = texelFetch(vertex, texel(int(corner.x)), 0).xyz;
+  vec3 b = texelFetch(vertex, texel(int(corner.y)), 0).xyz;
+  vec3 c = texelFetch(vertex, texel(int(corner.z)), 0).xyz;
+  vec3 u = b - a, v = c - a, normal = cross(u, v);
+  float doubled = length(normal);
+  if (doubled * doubled > 1e-10 * dot(u, u) * dot(v, v) + 1e-30) {
+    normal /= doubled;
+  } else { // without area: the world's axes
+    u = vec3(1.0, 0.0, 0.0); v = vec3(0.0, 1.0, 0.0); normal = vec3(0.0, 0.0, 1.0);
+  }
+  vec4 edges = texelFetch(edgesToFrame, face, 0);
+  vec3 tangent = edges.x * u + edges.y * v, bitangent = edges.z * u + edges.w * v;
+  if (variant != 1) tangent = normalize(tangent);
+  if (variant == 2) bitangent = cross(normal, tangent);
+  else if (variant == 0) bitangent = normalize(bitangent);
+
+  vec4 on = texelFetch(anchor, at, 0);
+  vec3 world = on.x * a + on.y * b + (1.0 - on.x - on.y) * c
+    + local.x * tangent + local.y * bitangent + local.z * normal;
+  // The rotation nearest to the frame that keeps the normal: tangent and bitangent turned back by
+  // 90 degrees, averaged.
+  vec3 back = cross(bitangent, normal);
+  vec3 wished = tangent + (dot(back, tangent) < 0.0 ? -back : back);
+  vec3 alongU = normalize(wished - dot(wished, normal) * normal);
+  mat3 frame = mat3(alongU, cross(normal, alongU), normal);
+
+  vec4 size = texelFetch(scaleOpacity, at, 0);
+  float rest = uintBitsToFloat(corner.w);
+  vec3 scale = size.xyz * on.z * (rest > 0.0 ? sqrt(max(0.5 * doubled, 1e-16)) / rest : 1.0);
+
+  vec3 centre = toCamera(world) + cameraTranslation;
   if (centre.z < 0.01 || size.w < 1.0 / 255.0) return;
   vec2 slope = centre.xy / centre.z;
   vec2 held = clamp(slope, slopeLow, slopeHigh);
@@ -79,7 +111,7 @@ void main() {
   vec3 covariance = vec3(0.3, 0.0, 0.3); // xx, xy, yy: the usual low-pass filter
   for (int axis = 0; axis < 3; axis++) {
     vec3 along = vec3(axis == 0, axis == 1, axis == 2) * scale[axis];
-    vec3 seen = toCamera(turned(rotation, along));
+    vec3 seen = toCamera(frame * turned(rotation, along));
     vec2 inImage = (seen.xy - held * seen.z) * perMetre;
     covariance += vec3(inImage.x * inImage.x, inImage.x * inImage.y, inImage.y * inImage.y);
   }

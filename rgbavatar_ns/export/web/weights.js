@@ -3,13 +3,14 @@
 
 class WeightNetwork {
   constructor(data) {
-    this.layout = data.layout;
-    this.numBases = data.num_bases;
-    this.withPose = data.pose_input;
-    this.withTranslation = data.translation_input;
+    const { manifest } = data;
+    this.layout = manifest.layout;
+    this.numBases = manifest.num_bases;
+    this.withPose = manifest.pose_input;
+    this.withTranslation = manifest.translation_input;
     this.low = data.arrays.theta_low; // of the film; above `high` where nothing is known
     this.high = data.arrays.theta_high;
-    this.layers = data.network.map(({ inputs, outputs }, i) => ({
+    this.layers = manifest.network.map(({ inputs, outputs }, i) => ({
       inputs, outputs,
       matrix: data.arrays[`network_matrix_${i}`], bias: data.arrays[`network_bias_${i}`],
     }));
