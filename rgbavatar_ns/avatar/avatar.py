@@ -154,7 +154,7 @@ class Avatar(nn.Module):
 
     def theta_from_arkit(
         self,
-        coefficients: Mapping[str, float] | Float[Tensor, "*batch 52"],
+        coefficients: Mapping[str, int | float] | Float[Tensor, "*batch 52"],
         head_rotation: Float[Tensor, "*batch 3"] | None = None,
     ) -> Float[Tensor, "*batch H"]:
         """Return theta of ARKit coefficients in [0, 1] and the head's turn.

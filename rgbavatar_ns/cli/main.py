@@ -20,6 +20,7 @@ COMMANDS = {
     "import": "turn other systems' data (INSTA, VHAP, metrical-tracker, ...) into a dataset",
     "check": "look at data before training: what it is, what is odd, and a picture of the fit",
     "render": "films and pictures: held-out frames, another's performance, views, learned bases",
+    "drive": "an avatar moved live by a camera, a phone, a film or any program",
     "export": "the avatar as a bundle, as PLY files of Gaussians or as a web page",
     "sweep": "train and evaluate every cell of an experiment, configs/*.yaml or your own",
     "report": "tables and plots of a sweep",

@@ -15,11 +15,9 @@ from rgbavatar_ns.options import Between, CheckedOptions, Counted, FrameRate, Pi
 if TYPE_CHECKING:
     import numpy as np
 
-    from rgbavatar_ns.avatar import Avatar
-    from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
     from rgbavatar_ns.data import TrackedDataset
     from rgbavatar_ns.export.scenes import Scene
-    from rgbavatar_ns.kernels import PinholeCameras
+    from rgbavatar_ns.export.subject import Subject
 
 Show = Literal["comparison", "performance", "views", "orbit", "camera-path", "turntable", "bases"]
 Kind = Literal["mp4", "png", "gif"]
@@ -97,7 +95,9 @@ def run(
     """
     if driver is not None and show == "comparison":
         show = "performance"
-    subject = _subject(run_folder, data, picture)
+    from rgbavatar_ns.export.subject import load_subject
+
+    subject = load_subject(run_folder, data, picture.width, picture.height)
     if show == "comparison":
         _compare(subject, output, frames, picture)
     elif show == "bases":
@@ -109,39 +109,8 @@ def run(
         _write(drawn, total, output, show, kind, picture.frames_per_second)
 
 
-@dataclass(frozen=True)
-class _Subject:
-    """An avatar and what is known about its training."""
-
-    avatar: "Avatar"
-    dataset: "TrackedDataset | None"
-    seen: "TrainingStatistics"
-    camera: "PinholeCameras"
-    """The dataset's first camera, or one before the face, for pictures of the size asked for."""
-
-
-def _subject(run_folder: Path, data: Path | None, picture: PictureOptions) -> _Subject:
-    from rgbavatar_ns import Avatar
-    from rgbavatar_ns.avatar.storage.bundle import load_statistics
-    from rgbavatar_ns.data import load_dataset
-    from rgbavatar_ns.export import dataset_folder, front_camera, resized, statistics_of
-
-    avatar, seen = Avatar.load(run_folder), load_statistics(run_folder)
-    folder = dataset_folder(run_folder) if data is None else data
-    if data is None and folder == run_folder:
-        if seen is None:
-            raise UserError(f"{run_folder} does not name its dataset.", "Name it with --data.")
-        camera = front_camera(avatar, picture.width or 512, picture.height or 512)
-        return _Subject(avatar, None, seen, camera)
-    dataset = load_dataset(folder)
-    avatar.require_layout(dataset.layout, f"The dataset {folder}")
-    size = picture.width or dataset.width, picture.height or dataset.height
-    camera = resized(dataset.cameras.select([0]), *size)
-    return _Subject(avatar, dataset, seen or statistics_of(avatar, dataset), camera)
-
-
 def _compare(
-    subject: _Subject, output: Path, frames: tuple[int, int] | None, picture: PictureOptions
+    subject: "Subject", output: Path, frames: tuple[int, int] | None, picture: PictureOptions
 ) -> None:
     from rgbavatar_ns.export import write_comparison
     from rgbavatar_ns.export.scenes import chosen_frames
@@ -166,7 +135,7 @@ def _compare(
 
 
 def _write_bases(
-    subject: _Subject, output: Path, gain: float | None, picture: PictureOptions
+    subject: "Subject", output: Path, gain: float | None, picture: PictureOptions
 ) -> None:
     from rgbavatar_ns.export import basis_grid, write_png
 
@@ -178,7 +147,7 @@ def _write_bases(
 
 
 def _scene(
-    subject: _Subject,
+    subject: "Subject",
     driver: Path | None,
     frames: tuple[int, int] | None,
     picture: PictureOptions,
@@ -207,7 +176,7 @@ def _scene(
 
 
 def _drawn(
-    subject: _Subject,
+    subject: "Subject",
     scene: "Scene",
     beside: "tuple[TrackedDataset, tuple[int, ...]] | None",
     show: Show,

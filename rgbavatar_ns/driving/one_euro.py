@@ -22,27 +22,39 @@ class OneEuroOptions(CheckedOptions):
     """Cutoff of the speed itself, as in the paper."""
 
 
+class OneEuroFilter:
+    """Smooths one vector after the other, each number with a cutoff that rises with its speed.
+
+    Looks back only. Rotations may come as axis-angle vectors, as long as they stay below half a
+    turn. At a steady speed v the result lags by v / (2 pi cutoff), less one frame at most.
+    """
+
+    def __init__(self, options: OneEuroOptions | None = None) -> None:
+        self._options = OneEuroOptions() if options is None else options
+        self._last: Tensor | None = None
+        self._speed: Tensor | None = None
+
+    def __call__(self, values: Float[Tensor, "D"], seconds: float) -> Float[Tensor, "D"]:
+        """The next vector, so many seconds after the one before it; the first is as it comes."""
+        if self._last is None or self._speed is None or seconds <= 0:
+            self._last, self._speed = values.clone(), torch.zeros_like(values)
+            return self._last
+        options, rate = self._options, 1 / seconds
+        measured = (values - self._last) * rate
+        slow = torch.full_like(values, options.derivative_cutoff_hz)
+        self._speed = torch.lerp(self._speed, measured, _share(slow, rate))
+        cutoff = options.min_cutoff_hz + options.beta * self._speed.abs()
+        self._last = torch.lerp(self._last, values, _share(cutoff, rate))
+        return self._last
+
+
 def one_euro(
     values: Float[Tensor, "F D"], frames_per_second: float, options: OneEuroOptions | None = None
 ) -> Float[Tensor, "F D"]:
-    """Smooth each column over time with a cutoff that rises with its speed; looks back only.
-
-    Rotations may come as axis-angle vectors, as long as they stay below half a turn. At a steady
-    speed v the result lags by v / (2 pi cutoff), less one frame at most.
-    """
-    options = OneEuroOptions() if options is None else options
-    result = values.clone()
-    if len(values) == 0:
-        return result
-    speed = torch.zeros_like(values[0])
-    slow = _share(torch.full_like(speed, options.derivative_cutoff_hz), frames_per_second)
-    for frame in range(1, len(values)):
-        measured = (values[frame] - result[frame - 1]) * frames_per_second
-        speed = torch.lerp(speed, measured, slow)
-        cutoff = options.min_cutoff_hz + options.beta * speed.abs()
-        share = _share(cutoff, frames_per_second)
-        result[frame] = torch.lerp(result[frame - 1], values[frame], share)
-    return result
+    """Smooth each column of a whole performance (`OneEuroFilter`)."""
+    smoothed = OneEuroFilter(options)
+    rows = [smoothed(row, 1 / frames_per_second) for row in values]
+    return torch.stack(rows) if rows else values.clone()
 
 
 def _share(cutoff_hz: Float[Tensor, "D"], frames_per_second: float) -> Float[Tensor, "D"]:

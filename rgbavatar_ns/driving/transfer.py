@@ -1,4 +1,4 @@
-"""Another's performance for an avatar: mapped by name, made relative, held to what was seen."""
+"""Another's performance for an avatar: made relative, held to what was seen."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -10,46 +10,12 @@ from torch import Tensor
 
 from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics, neutral_frame
 from rgbavatar_ns.driving.one_euro import OneEuroOptions, one_euro
-from rgbavatar_ns.errors import UserError, first_few
-from rgbavatar_ns.head import HeadArrays, ThetaLayout
+from rgbavatar_ns.driving.theta_map import MappedTheta
+from rgbavatar_ns.errors import first_few
+from rgbavatar_ns.head import ThetaLayout
 from rgbavatar_ns.head.rotations import axis_angle_to_matrix, matrix_to_axis_angle
 
-
-@dataclass(frozen=True)
-class ThetaNames:
-    """What each number of theta is called."""
-
-    layout: ThetaLayout
-    expression_names: tuple[str, ...]
-
-    @classmethod
-    def of(cls, layout: ThetaLayout, arrays: HeadArrays) -> "ThetaNames":
-        """The names of a head model's theta."""
-        return cls(layout, arrays.expression_names)
-
-    @property
-    def numbers(self) -> tuple[str, ...]:
-        """A name for each number; the expressions' own, and field and place for the others."""
-        names: list[str] = []
-        for part in self.layout.fields:
-            if part.name == "expression":
-                names += self.expression_names
-            else:
-                names += [f"{part.name}[{i}]" for i in range(part.size)]
-        return tuple(names)
-
-
-@dataclass(frozen=True)
-class MappedTheta:
-    """A driver's theta in the avatar's layout."""
-
-    theta: Float[Tensor, "F H"]
-    known: Bool[Tensor, "H"]
-    """Which of the avatar's numbers the driver has; the others are 0."""
-    unmapped: tuple[str, ...]
-    """The driver's numbers that the avatar does not know."""
-    missing: tuple[str, ...]
-    """The avatar's numbers that the driver does not know."""
+DrivenPose = Literal["relative", "absolute", "keep"]
 
 
 @dataclass(frozen=True)
@@ -59,7 +25,7 @@ class DrivingOptions:
     relative: Literal["neutral", "mean", "off"] = "neutral"
     """Of the expression: subtract the driver's neutral frame (or mean), add the avatar's own. Off
     takes the driver's numbers as they are, with the other tracker's bias and the other's rest."""
-    pose: Literal["relative", "absolute", "keep"] = "relative"
+    pose: DrivenPose = "relative"
     """Of the head's turns and place: departures from the driver's mean pose start from the avatar's
     own; absolute takes them as they are; keep holds the avatar's mean pose."""
     project: bool = False
@@ -69,36 +35,6 @@ class DrivingOptions:
     """Filter jitter with a one-euro filter."""
     filter: OneEuroOptions = field(default_factory=OneEuroOptions)
     """The filter's settings."""
-
-
-def map_by_name(theta: Float[Tensor, "F G"], driver: ThetaNames, avatar: ThetaNames) -> MappedTheta:
-    """Theta of one head model in the layout of another, number by number by its name.
-
-    Raises UserError where not a single expression has a name that the avatar knows.
-    """
-    if theta.shape[-1] != driver.layout.size:
-        raise UserError(
-            f"The driver's theta has {theta.shape[-1]} numbers, its layout {driver.layout.size}.",
-            "Write the driver's dataset again.",
-        )
-    if not set(driver.expression_names) & set(avatar.expression_names):
-        raise UserError(
-            "The driver has no expression that the avatar knows: the driver's are "
-            f"{first_few(driver.expression_names, 4)}, the avatar's "
-            f"{first_few(avatar.expression_names, 4)}.",
-            "Track the driver's video with the avatar's head model.",
-        )
-    place_of = {name: place for place, name in enumerate(driver.numbers)}
-    result = theta.new_zeros(len(theta), avatar.layout.size)
-    wanted = avatar.numbers
-    known = torch.tensor([name in place_of for name in wanted])
-    result[:, known] = theta[:, [place_of[name] for name in wanted if name in place_of]]
-    return MappedTheta(
-        result,
-        known,
-        unmapped=tuple(name for name in driver.numbers if name not in wanted),
-        missing=tuple(name for name in wanted if name not in place_of),
-    )
 
 
 def make_relative(
@@ -125,28 +61,70 @@ def make_relative(
 
 
 def drive(
-    theta: Float[Tensor, "F G"],
-    driver: ThetaNames,
-    avatar: ThetaNames,
+    mapped: MappedTheta,
+    layout: ThetaLayout,
     own: TrainingStatistics,
     frames_per_second: float,
     options: DrivingOptions | None = None,
 ) -> MappedTheta:
-    """A driver's performance as the avatar's theta: mapped, smoothed, relative, held.
+    """A whole performance as the avatar's theta: smoothed, relative, held.
 
-    `own` is what the avatar saw in training. Raises UserError as `map_by_name`.
+    `layout` and `own` are the avatar's: what its theta holds, and what it saw in training.
     """
     options = DrivingOptions() if options is None else options
-    mapped = map_by_name(theta, driver, avatar)
     result = mapped.theta
     if options.smooth:
         result = one_euro(result, frames_per_second, options.filter)
-    result = make_relative(result, *_references(result, own, options, avatar.layout), avatar.layout)
-    if options.pose == "keep":
-        result = torch.where(own.expressive, result, own.theta_mean)
+    references = reference_of(result, layout), own_reference(own)
+    result = relative_theta(result, *references, mapped.known, own, layout, options)
+    return replace(mapped, theta=result)
+
+
+@dataclass(frozen=True)
+class Reference:
+    """What departures are counted from, of a driver or an avatar."""
+
+    neutral: Float[Tensor, "H"]
+    """At rest."""
+    mean: Float[Tensor, "H"]
+
+
+def reference_of(theta: Float[Tensor, "F H"], layout: ThetaLayout) -> Reference:
+    """A driver's reference over all its frames."""
+    # Angles of a head are small: their mean is that of their axis-angle vectors.
+    return Reference(neutral_frame(theta, layout), theta.mean(0))
+
+
+def own_reference(own: TrainingStatistics) -> Reference:
+    """The avatar's reference."""
+    return Reference(own.theta_neutral, own.theta_mean)
+
+
+def relative_theta(
+    theta: Float[Tensor, "F H"],
+    driver: Reference,
+    avatar: Reference,
+    known: Bool[Tensor, "H"],
+    own: TrainingStatistics,
+    layout: ThetaLayout,
+    options: DrivingOptions,
+) -> Float[Tensor, "F H"]:
+    """A driver's theta as departures from its reference, put upon the avatar's own.
+
+    What the driver does not know of the head's place and turn stays the avatar's.
+    """
+    nothing = Reference(*[torch.zeros_like(own.theta_mean)] * 2)
+    theirs, ours = (nothing, nothing) if options.relative == "off" else (driver, avatar)
+    expression = (
+        (theirs.mean, ours.mean) if options.relative == "mean" else (theirs.neutral, ours.neutral)
+    )
+    posed = (driver.mean, avatar.mean) if options.pose == "relative" else (nothing.mean,) * 2
+    starts = [torch.where(own.expressive, e, p) for e, p in zip(expression, posed)]
+    result = make_relative(theta, starts[0], starts[1], layout)
     if options.project:
         result = own.project(result)
-    return replace(mapped, theta=result)
+    still = ~own.expressive if options.pose == "keep" else ~own.expressive & ~known
+    return torch.where(still, own.theta_mean, result)
 
 
 def told_beyond(
@@ -171,23 +149,3 @@ def told_beyond(
     told = [called[place] + (f" ({-count})" if several else "") for count, place in found]
     share = f" in {int(beyond.any(1).sum())} of {frames} pictures" if several else ""
     return f"beyond the film{share}: {first_few(told, 6)}"
-
-
-def _references(
-    theta: Float[Tensor, "F H"],
-    own: TrainingStatistics,
-    options: DrivingOptions,
-    layout: ThetaLayout,
-) -> tuple[Float[Tensor, "H"], Float[Tensor, "H"]]:
-    """What is subtracted from the driver's theta, and what of the avatar's own is added."""
-    nothing = torch.zeros_like(own.theta_mean)
-    # Angles of a head are small: their mean is that of their axis-angle vectors.
-    mean = (theta.mean(0), own.theta_mean)
-    expression = {
-        "neutral": (neutral_frame(theta, layout), own.theta_neutral),
-        "mean": mean,
-        "off": (nothing, nothing),
-    }[options.relative]
-    pose = mean if options.pose == "relative" else (nothing, nothing)
-    driver, avatar = (torch.where(own.expressive, e, p) for e, p in zip(expression, pose))
-    return driver, avatar

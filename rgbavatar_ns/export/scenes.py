@@ -15,10 +15,9 @@ from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
 from rgbavatar_ns.data.native.dataset import TrackedDataset
 from rgbavatar_ns.drawing.compositing import composite_bytes
 from rgbavatar_ns.drawing.contact_sheet import scaled
+from rgbavatar_ns.driving.theta_map import MappedTheta, ThetaNames, theta_map
 from rgbavatar_ns.driving.transfer import (
     DrivingOptions,
-    MappedTheta,
-    ThetaNames,
     drive,
     told_beyond,
 )
@@ -89,14 +88,8 @@ def driven_by(
 
     Raises UserError where no expression of the driver is known to the avatar.
     """
-    mapped = drive(
-        driver.theta,
-        ThetaNames.of(driver.layout, driver.arrays),
-        ThetaNames.of(avatar.layout, avatar.head.arrays),
-        own,
-        frames_per_second,
-        options,
-    )
+    mapped = theta_map(driver.layout, driver.arrays, avatar)(driver.theta)
+    mapped = drive(mapped, avatar.layout, own, frames_per_second, options)
     return replace(mapped, theta=mapped.theta[list(chosen)])
 
 

@@ -1,40 +1,71 @@
 """Frames to films and pictures, with PyAV (FFmpeg's libraries come inside its wheel)."""
 
 from collections.abc import Iterable
+from contextlib import ExitStack
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import av
 import numpy as np
+from av.container import OutputContainer
 from av.filter import Graph
+from av.video.stream import VideoStream
+from jaxtyping import UInt8
 
 from rgbavatar_ns.data.png import encode_png_rgba
 from rgbavatar_ns.files import atomic_write
 
 
-def write_video(path: Path, frames: Iterable[np.ndarray], frames_per_second: float = 25.0) -> int:
-    """Encode RGB frames as H.264 and return their number.
+class FilmWriter:
+    """Encodes RGB frames as H.264, as they come; within `with`.
 
-    frames: uint8 [H, W, 3], all of one size; an odd size is padded by one pixel, as the codec
-    asks. The file appears under its name only when it is complete.
+    The file appears under its name only when it is complete, and not at all where an error ends
+    it. All frames have one size; an odd one is padded by a pixel, as the codec asks.
     """
-    count = 0
-    with atomic_write(path) as partial, av.open(str(partial), "w", format="mp4") as container:
-        stream = None
+
+    def __init__(self, path: Path, frames_per_second: float = 25.0) -> None:
+        self._path, self._rate = path, Fraction(frames_per_second).limit_denominator(1001)
+        self._open = ExitStack()
+        self._container: OutputContainer | None = None
+        self._stream: VideoStream | None = None
+        self.count = 0
+
+    def __enter__(self) -> "FilmWriter":
+        """Begin the file."""
+        with ExitStack() as opening:
+            partial = opening.enter_context(atomic_write(self._path))
+            self._container = opening.enter_context(av.open(str(partial), "w", format="mp4"))
+            self._open = opening.pop_all()
+        return self
+
+    def add(self, frame: UInt8[np.ndarray, "H W 3"]) -> None:
+        """Encode one more frame."""
+        assert self._container is not None
+        frame = np.pad(frame, ((0, frame.shape[0] % 2), (0, frame.shape[1] % 2), (0, 0)))
+        if self._stream is None:
+            self._stream = self._container.add_stream("libx264", rate=self._rate)
+            self._stream.height, self._stream.width = frame.shape[:2]
+            self._stream.pix_fmt = "yuv420p"
+            self._stream.options = {"crf": "18"}
+        picture = av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format="rgb24")
+        self._container.mux(self._stream.encode(picture))
+        self.count += 1
+
+    def __exit__(self, *raised: Any) -> bool | None:
+        """Complete the file, or leave none."""
+        if raised[0] is None and self._stream is not None:
+            assert self._container is not None
+            self._container.mux(self._stream.encode(None))
+        return self._open.__exit__(*raised)
+
+
+def write_video(path: Path, frames: Iterable[np.ndarray], frames_per_second: float = 25.0) -> int:
+    """Write RGB frames, uint8 [H, W, 3], as `FilmWriter` does, and return their number."""
+    with FilmWriter(path, frames_per_second) as film:
         for frame in frames:
-            frame = np.pad(frame, ((0, frame.shape[0] % 2), (0, frame.shape[1] % 2), (0, 0)))
-            if stream is None:
-                rate = Fraction(frames_per_second).limit_denominator(1001)
-                stream = container.add_stream("libx264", rate=rate)
-                stream.height, stream.width = frame.shape[:2]
-                stream.pix_fmt = "yuv420p"
-                stream.options = {"crf": "18"}
-            picture = av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format="rgb24")
-            container.mux(stream.encode(picture))
-            count += 1
-        if stream is not None:
-            container.mux(stream.encode(None))
-    return count
+            film.add(frame)
+    return film.count
 
 
 def write_gif(path: Path, frames: Iterable[np.ndarray], frames_per_second: float = 25.0) -> int:

@@ -1,7 +1,7 @@
 """The 52 ARKit blend shapes as a head model's theta: one table a head, and its way back."""
 
 import difflib
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -11,6 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.head.arkit_fit import fitted_table
 from rgbavatar_ns.head.arrays import NECK_SHIFTS, HeadArrays
 from rgbavatar_ns.head.layout import ThetaLayout
 from rgbavatar_ns.head.model import layout_of
@@ -82,9 +83,9 @@ class ArkitMap:
         return matrix_to_axis_angle(root @ neck)
 
 
-def has_shoulders(arrays: HeadArrays) -> bool:
-    """Whether the neck carries the head upon a body, which the root carries."""
-    return set(NECK_SHIFTS) <= set(arrays.expression_names)
+def head_carrier(expression_names: Collection[str]) -> Turns:
+    """The joint that turns the head: the neck upon a body, which the root carries, or the root."""
+    return "neck" if set(NECK_SHIFTS) <= set(expression_names) else "rotation"
 
 
 def speaks_arkit(arrays: HeadArrays) -> bool:
@@ -108,10 +109,10 @@ def arkit_map(arrays: HeadArrays) -> ArkitMap:
         table[ARKIT_NAMES.index("jawOpen"), layout.slice("jaw").start] = _JAW_OPEN_RAD
         unexplained = np.zeros(len(ARKIT_NAMES))
     else:
-        # Takes scipy's sparse solvers, which no other user of the map needs.
-        from rgbavatar_ns.head.arkit_fit import fitted_table
-
-        table, unexplained = fitted_table(arrays, layout)
+        known = arkit_map(HeadArrays.embedded())
+        looks = [name.startswith("eyeLook") for name in ARKIT_NAMES]
+        faces = np.where(np.array(looks)[:, None], 0.0, known.theta_per_unit)
+        table, unexplained = fitted_table(arrays, layout, faces)
     for side, field, mirrored in (("Left", "left_eye", 1), ("Right", "right_eye", -1)):
         start = layout.slice(field).start
         for look, (axis, sign) in _LOOKS.items():
@@ -119,11 +120,10 @@ def arkit_map(arrays: HeadArrays) -> ArkitMap:
             turned = sign * (mirrored if axis == "yaw" else 1) * _GAZE_RAD[axis]
             table[row, start + (axis == "yaw")] = turned
             unexplained[row] = 0.0
-    turns: Turns = "neck" if has_shoulders(arrays) else "rotation"
-    return ArkitMap(layout, table, turns, unexplained)
+    return ArkitMap(layout, table, head_carrier(arrays.expression_names), unexplained)
 
 
-def arkit_coefficients(named: Mapping[str, float]) -> Float[Tensor, "52"]:
+def arkit_coefficients(named: Mapping[str, int | float]) -> Float[Tensor, "52"]:
     """Coefficients by name (`jawOpen`, or `JawOpen` as Live Link Face writes it) as a row.
 
     Raises UserError for a name that ARKit does not have, and for a value that is no number.

@@ -5,7 +5,6 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from rgbavatar_ns.head.arkit import ARKIT_NAMES, arkit_map
 from rgbavatar_ns.head.arrays import HeadArrays
 from rgbavatar_ns.head.layout import ThetaLayout
 from rgbavatar_ns.head.model import HeadModel
@@ -26,20 +25,24 @@ _JAW_PRIOR_M = 0.002
 
 
 def fitted_table(
-    arrays: HeadArrays, layout: ThetaLayout
+    arrays: HeadArrays, layout: ThetaLayout, embedded_table: Float[np.ndarray, "52 G"]
 ) -> tuple[Float[np.ndarray, "52 H"], Float[np.ndarray, "52"]]:
     """Theta of each ARKit expression at 1, and the share of its motion that is left over.
 
     The embedded head, which has ARKit's expressions, is laid over the other one (`register`); each
     of its expressions moves the points of the face, and the other head's expression, eyelids and
     jaw are found that move the same points alike (least squares with a prior). Gaze stays 0.
+    embedded_table: theta of the embedded head for the same expressions.
     Source: ours. Raises UserError for a head on which no face is found.
     """
     embedded = HeadArrays.embedded()
     registration = register(arrays)
     face = registration.face_vertices
     places = SkinSurface(arrays).nearest(skin_points(embedded, registration.placed).select(face))
-    wanted = _motions(embedded, face) @ (registration.pose.scale * registration.pose.turn).T
+    wanted = (
+        _motions(embedded, embedded_table, face)
+        @ (registration.pose.scale * registration.pose.turn).T
+    )
     head = HeadModel(arrays, dtype=torch.float64)
     corners = torch.from_numpy(arrays.faces[places.triangle].astype(np.int64))
     barycentric = torch.from_numpy(places.barycentric)
@@ -64,20 +67,19 @@ def fitted_table(
     for _ in range(_STEPS):
         left = (target - points(entries)).flatten(1)
         entries = entries + torch.linalg.solve(normal, (left @ slopes - prior * entries).T).T
-    table = np.zeros((len(ARKIT_NAMES), layout.size))
+    table = np.zeros((len(wanted), layout.size))
     table[:, free] = entries.numpy()
     size = np.linalg.norm(wanted.reshape(len(wanted), -1), axis=1)
     left_over = (target - points(entries)).flatten(1).norm(dim=1).numpy()
     return table, np.divide(left_over, size, out=np.ones_like(size), where=size > _STILL_M)
 
 
-def _motions(embedded: HeadArrays, face: Int[np.ndarray, "P"]) -> Float[np.ndarray, "52 P 3"]:
-    """How each expression at 1 moves the embedded head's face, metres; nothing where eyes turn."""
-    known = arkit_map(embedded)
-    theta = known.theta(torch.eye(len(ARKIT_NAMES), dtype=torch.float64))
-    head = HeadModel(embedded, dtype=torch.float64)
-    moved = head(theta) - head(torch.zeros(1, theta.shape[1], dtype=torch.float64))
-    return moved[:, face].numpy()
+def _motions(
+    embedded: HeadArrays, table: Float[np.ndarray, "52 G"], face: Int[np.ndarray, "P"]
+) -> Float[np.ndarray, "52 P 3"]:
+    """How each expression at 1 moves the embedded head's face, metres."""
+    head, theta = HeadModel(embedded, dtype=torch.float64), torch.from_numpy(table)
+    return (head(theta) - head(torch.zeros_like(theta[:1])))[:, face].numpy()
 
 
 def _free_columns(layout: ThetaLayout) -> Int[np.ndarray, "C"]:

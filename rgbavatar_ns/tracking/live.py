@@ -109,7 +109,8 @@ class LiveTracker:
         # Small matrices: more threads would only wait for each other.
         with self._libraries.limit(limits=1, user_api="blas"):
             if self._fit is None or self._crop is None:
-                self._collect(index, image_rgb)
+                if self._collected(index, image_rgb):
+                    self._track_warm_up(*self._meet())
                 return None
             square = self._crop.square
             matted = self._worker.submit(self._matted, image_rgb, square)
@@ -123,6 +124,43 @@ class LiveTracker:
             self._crop.follow(landmarks)
             return frame
 
+    def pose(self, image_rgb: _Image, index: int = 0) -> Float[Tensor, "H"] | None:
+        """The frame's theta alone, where no picture of the person is wanted; None as a call gives.
+
+        The warm-up's frames are in `pose_backlog`, by the numbers that they were given here.
+        """
+        self._require_size(image_rgb.shape[1], image_rgb.shape[0])
+        with self._libraries.limit(limits=1, user_api="blas"):
+            if self._fit is None:
+                if self._collected(index, image_rgb):
+                    self._meet()
+                return None
+            landmarks = self._landmarker(image_rgb)
+            if landmarks is None:
+                self._fit.forget()
+                self.counts["no face"] += 1
+                return None
+            return self._pose(self._fit, landmarks, find_irises(image_rgb, landmarks))
+
+    def pose_backlog(self) -> list[tuple[int, Float[Tensor, "H"]]]:
+        """Theta of the warm-up's frames by their numbers, once; nothing before `ready`."""
+        if self._fit is None:
+            return []
+        numbered = [(index, (points, eyes)) for index, _, points, eyes in self._warm_up]
+        self._warm_up = []
+        with self._libraries.limit(limits=1, user_api="blas"):
+            posed = [(index, self._pose(self._fit, *found)) for index, found in numbered]
+        return [(index, theta) for index, theta in posed if theta is not None]
+
+    def _pose(
+        self, fit: "_CausalFit", landmarks_px: _Landmarks, irises: FoundIrises
+    ) -> Float[Tensor, "H"] | None:
+        values = fit(landmarks_px, irises)
+        if values is None:
+            self.counts["does not fit"] += 1
+            return None
+        return self._theta(fit, values)
+
     def _require_size(self, width: int, height: int) -> None:
         if self._size is not None and self._size != (width, height):
             raise UserError(
@@ -132,19 +170,19 @@ class LiveTracker:
             )
         self._size = (width, height)
 
-    def _collect(self, index: int, image_rgb: _Image) -> None:
+    def _collected(self, index: int, image_rgb: _Image) -> bool:
+        """Take a frame into the warm-up; whether these are enough to meet the subject."""
         landmarks = self._landmarker(image_rgb)
         if landmarks is None:
             self.counts["no face"] += 1
-            return
+            return False
         irises = find_irises(image_rgb, landmarks)
         self._warm_up.append((index, image_rgb.copy(), landmarks, irises))
-        if len(self._warm_up) >= self._config.key_frames:
-            self._fit_subject()
+        return len(self._warm_up) >= self._config.key_frames
 
-    def _fit_subject(self) -> None:
-        """Fit the subject to the warm-up's frames, then track these."""
-        seen, self._warm_up = self._warm_up, []
+    def _meet(self) -> "tuple[_CausalFit, FollowingCrop]":
+        """Fit the subject to the warm-up's frames; from now on frames are tracked."""
+        seen = self._warm_up
         landmarks = np.stack([points for _, _, points, _ in seen])
         irises = FoundIrises.stacked([one for *_, one in seen])
         height, width = seen[0][1].shape[:2]
@@ -153,10 +191,14 @@ class LiveTracker:
         self._fit = _CausalFit(self._tracker, subject)
         size = self._config.image_size or _SIZE_PX
         self._crop = FollowingCrop.around(landmarks, width, height, size)
-        square = self._crop.square
+        return self._fit, self._crop
+
+    def _track_warm_up(self, fit: "_CausalFit", crop: FollowingCrop) -> None:
+        """Track the frames that the subject was met in."""
+        seen, self._warm_up = self._warm_up, []
         for index, image, landmarks_px, found in seen:
-            matted = partial(self._matted, image, square)
-            frame = self._tracked(self._fit, index, landmarks_px, found, square, matted)
+            matted = partial(self._matted, image, crop.square)
+            frame = self._tracked(fit, index, landmarks_px, found, crop.square, matted)
             if frame is not None:
                 self._backlog.append(frame)
 
@@ -194,9 +236,13 @@ class LiveTracker:
         one = ClipFit(fit.subject, values[None])
         outline = self._cut_out.outline(crop, self._tracker.vertices_px(one, 0), landmarks_px)
         rgba = self._cut_out(matted(), outline)
-        theta = torch.from_numpy(self._tracker.thetas(one)[0]).float()
-        self.counts["tracked"] += 1
+        theta = self._theta(fit, values)
         return TrackedFrame(index, theta, crop.pinhole(fit.subject.camera), rgba)
+
+    def _theta(self, fit: "_CausalFit", values: _Values) -> Float[Tensor, "H"]:
+        self.counts["tracked"] += 1
+        one = ClipFit(fit.subject, values[None])
+        return torch.from_numpy(self._tracker.thetas(one)[0]).float()
 
 
 class _CausalFit:

@@ -7,13 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
-from rgbavatar_ns.driving.transfer import (
-    DrivingOptions,
-    ThetaNames,
-    drive,
-    make_relative,
-    map_by_name,
-)
+from rgbavatar_ns.driving.theta_map import ThetaNames, map_by_name
+from rgbavatar_ns.driving.transfer import DrivingOptions, drive, make_relative
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import ThetaField, ThetaLayout
 from rgbavatar_ns.head.rotations import axis_angle_to_matrix
@@ -42,7 +37,8 @@ def _statistics(theta: torch.Tensor, names: ThetaNames = _OURS) -> TrainingStati
 
 
 def _driven(theta: torch.Tensor, own: TrainingStatistics, **options: Any) -> torch.Tensor:
-    return drive(theta, _OURS, _OURS, own, 25.0, DrivingOptions(**options)).theta
+    mapped = map_by_name(theta, _OURS, _OURS)
+    return drive(mapped, _OURS.layout, own, 25.0, DrivingOptions(**options)).theta
 
 
 def test_numbers_go_to_the_same_name_and_what_has_none_is_listed():

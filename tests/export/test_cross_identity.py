@@ -13,7 +13,7 @@ import torch
 from rgbavatar_ns.avatar import Avatar, AvatarConfig
 from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics, expressive_numbers
 from rgbavatar_ns.avatar.training.color_init import initialize_colors
-from rgbavatar_ns.driving import DrivingOptions, ThetaNames, drive
+from rgbavatar_ns.driving import DrivingOptions, ThetaNames, drive, map_by_name
 from rgbavatar_ns.export import draw
 from rgbavatar_ns.synthetic.config import DemoConfig
 from rgbavatar_ns.synthetic.make import DemoPerson, as_pinhole
@@ -82,7 +82,8 @@ def pair() -> _Pair:
 def _driven(pair: _Pair, options: DrivingOptions) -> torch.Tensor:
     """The avatar's theta, without what its own tracker adds: comparable with the truth."""
     names = ThetaNames.of(pair.target.head.layout, pair.target.head.arrays)
-    mapped = drive(pair.tracked_of_driver, names, names, pair.own, 8.0, options)
+    mapped = map_by_name(pair.tracked_of_driver, names, names)
+    mapped = drive(mapped, names.layout, pair.own, 8.0, options)
     assert mapped.unmapped == mapped.missing == ()
     return mapped.theta - pair.bias_of_target
 

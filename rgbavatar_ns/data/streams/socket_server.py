@@ -2,19 +2,18 @@
 
 import contextlib
 import logging
-import os
-import socket
 import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Literal
 
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.server import Server, ServerConnection, serve
 
 from rgbavatar_ns.data.streams import message_format
 from rgbavatar_ns.data.streams.address import DEFAULT_ADDRESS, StreamAddress
+from rgbavatar_ns.data.streams.listener import BoundedListener, hang_up
 from rgbavatar_ns.data.streams.protocol import StreamedFrame, StreamSubject
 from rgbavatar_ns.errors import UserError
 
@@ -22,9 +21,6 @@ _MOST_WAITING = 16
 """Frames that wait to be taken; a client that sends more is made to wait."""
 _OPEN_S, _CLOSE_S = 3.0, 1.0
 """For WebSocket's own greetings and farewells."""
-_MOST_CONNECTIONS = 8
-"""Each may fill memory with the largest message."""
-_RETRY_S = 0.02
 _LONGEST_TOLD = 400
 # Port scanners and browsers are no news to the user.
 _log = logging.getLogger(f"{__name__}.websockets")
@@ -126,7 +122,7 @@ class SocketStream:
 
     def _listen(self, address: StreamAddress) -> Server:
         try:
-            self._listener = _Listener(address)
+            self._listener = BoundedListener(address)
         except OSError as error:
             raise UserError(
                 f"Frames cannot be listened for at {address}: {error.strerror}.",
@@ -186,7 +182,7 @@ class SocketStream:
             self._subject = self._subject or subject
             self._changed.notify_all()
         if before is not None:
-            _hang_up(before.socket)
+            hang_up(before.socket)
 
     def _is_silent(self) -> bool:
         since_s = self._listening_since_s
@@ -261,59 +257,3 @@ def _check_same(subject: StreamSubject, first: StreamSubject) -> None:
             f"The stream began with the head '{mine.name}', this client's is another.",
             "Keep to one head model.",
         )
-
-
-class _Listener(socket.socket):
-    """A listening socket that lives through floods: it holds a bounded number of connections."""
-
-    def __init__(self, address: StreamAddress) -> None:
-        super().__init__(socket.AF_INET6 if ":" in address.host else socket.AF_INET)
-        try:
-            if os.name == "posix":  # Elsewhere two programs could listen at one address.
-                self.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            self.bind(address)
-            self.listen()
-        except BaseException:
-            self.close()
-            raise
-        self._connections: list[socket.socket] = []
-        self._kept: socket.socket | None = None
-
-    def accept(self) -> tuple[socket.socket, Any]:
-        """The next connection; the oldest ones that are no client make room for it."""
-        while True:
-            try:
-                connection, peer = super().accept()
-            except OSError:
-                if self.fileno() < 0:
-                    raise
-                time.sleep(_RETRY_S)  # The process has no file left, or the other side has gone.
-                continue
-            self._make_room()
-            self._connections = [*self._open(), connection]
-            return connection, peer
-
-    def _make_room(self) -> None:
-        for waiting in [one for one in self._open() if one is not self._kept]:
-            if len(self._open()) < _MOST_CONNECTIONS:
-                return
-            _hang_up(waiting)
-            time.sleep(_RETRY_S)
-
-    def keep(self, connection: socket.socket) -> None:
-        """This is the client's: it is not hung up on to make room."""
-        self._kept = connection
-
-    def hang_up_on_all(self) -> None:
-        """End all connections at once."""
-        for connection in self._open():
-            _hang_up(connection)
-
-    def _open(self) -> list[socket.socket]:
-        return [one for one in self._connections if one.fileno() >= 0]
-
-
-def _hang_up(connection: socket.socket) -> None:
-    """End a connection for its own threads too, also where they wait for it."""
-    with contextlib.suppress(OSError):
-        connection.shutdown(socket.SHUT_RDWR)

@@ -58,6 +58,8 @@ def _theta(
         return state.theta_by_hand, min(state.frame, last)
     if state.driven_by == "driving sequence" and state.sequence is not None:
         return state.sequence[min(max(state.sequence_frame, 0), len(state.sequence) - 1)], None
+    if state.driven_by == "live performer" and state.live is not None:
+        return state.live.theta, None
     frame = state.frame
     if state.driven_by == "viewer's time" and time is not None:
         frame = round(time * last)

@@ -14,7 +14,9 @@ from nerfstudio.viewer.viewer_elements import ViewerControl
 from torch import Tensor
 
 from rgbavatar_ns.data import TrackedDataset, load_dataset
-from rgbavatar_ns.driving.transfer import DrivingOptions, ThetaNames, told_beyond
+from rgbavatar_ns.driving.live_drive import DrivenFrame
+from rgbavatar_ns.driving.theta_map import ThetaNames
+from rgbavatar_ns.driving.transfer import DrivingOptions, told_beyond
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.export import dataset_folder
 from rgbavatar_ns.export.scenes import driven_by
@@ -79,6 +81,8 @@ class ViewerPanel(ViewerControl):
         self._told = self._played = self._report
         self._next_told_s = self._next_frame_s = self._played_s = 0.0
         self._may_refine = True
+        self._calibrate: Callable[[], None] = lambda: None
+        self._drawn_live: Callable[[ViewerState], None] = lambda state: None
         serve_sharp_client()
 
     def _setup(self, viewer: Any) -> None:
@@ -131,6 +135,7 @@ class ViewerPanel(ViewerControl):
         theta, psi = (part[0].cpu() for part in (signal.theta, self._psi_of(signal)))
         longer_px = max(camera.width, camera.height)
         self._report = _Report(text, trouble, seconds, longer_px, theta, psi)
+        self._drawn_live(state)
         return drawn.outputs()
 
     def tick(self) -> None:
@@ -166,6 +171,9 @@ class ViewerPanel(ViewerControl):
         """Choose what drives; by hand starts from what is shown."""
         if driven_by == "by hand":
             self.set_theta(self.theta_shown())
+        elif driven_by == "live performer" and self.state.live is None:
+            self.tell("Nobody performs: start `rgbavatar drive RUN --show viewer`.")
+            self._refresh()
         elif driven_by == "driving sequence" and self.state.sequence is None:
             self.tell("Load a driver first: a dataset or a run, in the folder 'Driver'.")
             self._refresh()
@@ -238,6 +246,20 @@ class ViewerPanel(ViewerControl):
         )
         self.change(driven_by="driving sequence", sequence=mapped.theta, sequence_frame=0)
 
+    def listen_live(
+        self, calibrate: Callable[[], None], drawn: Callable[[ViewerState], None]
+    ) -> None:
+        """Offer what a live performance needs; `drawn` is called after each picture."""
+        self._calibrate, self._drawn_live = calibrate, drawn
+
+    def show_live(self, frame: DrivenFrame) -> None:
+        """Show a live performer's frame, unless the user has chosen something else meanwhile."""
+        first = self.state.live is None
+        if first and self._widgets is not None:
+            self._widgets.offer_calibration(self._calibrate)
+        driven_by = "live performer" if first else self.state.driven_by
+        self.change(live=frame, driven_by=driven_by)
+
     def advance(self) -> None:
         """Show the next frame, after the last the first, where frames drive."""
         state = self.state
@@ -290,7 +312,8 @@ class ViewerPanel(ViewerControl):
         """Show the state in the controls and draw anew; does nothing without a viewer."""
         if self._widgets is not None:
             self._widgets.follow(self.state)
-            ask_for_pictures(self._viewer, hold_training=not self.state.playing)
+            moving = self.state.playing or self.state.driven_by == "live performer"
+            ask_for_pictures(self._viewer, hold_training=not moving)
 
     def _hide_training(self) -> None:
         """Take away what steers training where there is none."""

@@ -5,7 +5,7 @@ import re
 from dataclasses import dataclass
 
 from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
-from rgbavatar_ns.driving.transfer import ThetaNames
+from rgbavatar_ns.driving.theta_map import ThetaNames
 
 _UNITS = {
     "linear": ("", "as the tracker counts", 1.0),

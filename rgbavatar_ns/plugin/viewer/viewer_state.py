@@ -6,7 +6,11 @@ from typing import Literal
 from jaxtyping import Float
 from torch import Tensor
 
-DrivenBy = Literal["dataset frame", "viewer's time", "by hand", "driving sequence"]
+from rgbavatar_ns.driving.live_drive import DrivenFrame
+
+DrivenBy = Literal[
+    "dataset frame", "viewer's time", "by hand", "driving sequence", "live performer"
+]
 PictureKind = Literal["avatar", "beside the film", "error", "alpha", "depth"]
 
 
@@ -20,6 +24,8 @@ class ViewerState:
     sequence: Float[Tensor, "S H"] | None = None
     """Another person's performance in the avatar's theta."""
     sequence_frame: int = 0
+    live: DrivenFrame | None = None
+    """What `rgbavatar drive` shows now."""
     psi_by_hand: Float[Tensor, "K"] | None = None
     """Replaces the weight network's answer."""
     bases_used: int | None = None

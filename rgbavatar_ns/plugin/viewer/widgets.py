@@ -88,6 +88,12 @@ class Widgets:
                 "Driver's frame", ends, 0, lambda v: self._do.change(sequence_frame=int(v))
             )
 
+    def offer_calibration(self, calibrate: Callable[[], None]) -> None:
+        """Make the button with which a live performer's neutral face is learnt again."""
+        with self._driver_folder:
+            hint = "The performer's neutral face is learnt again from the next second"
+            self._button("Calibrate", calibrate, hint)
+
     def report(self, text: str) -> None:
         """Say how the last picture was drawn."""
         self._report.content = text

@@ -4,8 +4,9 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -17,6 +18,7 @@ from rgbavatar_ns.tracking.input.video import FrameSource
 _FRAMES_PER_SECOND = 25.0
 """Of a folder of images, which has no clock."""
 _TIMEOUT_MS = 5000
+Pace = Literal["each", "newest", "at once"]
 
 
 @dataclass(frozen=True)
@@ -26,18 +28,23 @@ class CapturedFrame:
     index: int
     image_rgb: UInt8[np.ndarray, "H W 3"]
     captured_s: float
+    time_s: float | None = None
+    """By the source's own clock, where it has one."""
 
 
 class FileCapture:
-    """Every frame of a video file or a folder of images, none before its time.
+    """Frames of a video file or a folder of images.
 
-    Raises UserError where there is none, and from `next` where it cannot be read.
+    pace: "each" gives every frame, none before its time; "newest" the newest that is due, and
+    `captured_s` is when it was due; "at once" every frame as soon as it is asked for. Raises
+    UserError where there is no file, and from `next` where it cannot be read.
     """
 
     keeps_frames = True
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, pace: Pace = "each") -> None:
         self.counts: Counter[str] = Counter()
+        self._pace: Pace = pace
         self._frames = iter(FrameSource.open(path))
         self._waiting: CapturedFrame | None = None
         self._due_s = 0.0
@@ -48,14 +55,21 @@ class FileCapture:
         """The next frame, once it is due by the file's clock."""
         if self._waiting is None and not self._read():
             return None
-        late_s = self._due_s - time.monotonic()
+        late_s = 0.0 if self._pace == "at once" else self._due_s - time.monotonic()
         if late_s > 0:
             time.sleep(min(late_s, timeout_s))
             if late_s > timeout_s:
                 return None
         due, self._waiting = self._waiting, None
         assert due is not None
-        return CapturedFrame(due.index, due.image_rgb, time.monotonic())
+        if self._pace != "newest":
+            return replace(due, captured_s=time.monotonic())
+        due_s = self._due_s
+        while self._read() and self._due_s <= time.monotonic():
+            assert self._waiting is not None
+            due, due_s, self._waiting = self._waiting, self._due_s, None
+            self.counts["skipped"] += 1
+        return replace(due, captured_s=due_s)
 
     def _read(self) -> bool:
         frame = None if self.ended else next(self._frames, None)
@@ -67,7 +81,7 @@ class FileCapture:
         if self._began is None:
             self._began = now, clock_s
         self._due_s = self._began[0] + clock_s - self._began[1]
-        self._waiting = CapturedFrame(frame.index, frame.image_rgb, now)
+        self._waiting = CapturedFrame(frame.index, frame.image_rgb, now, clock_s)
         return True
 
     def close(self) -> None:

@@ -1,0 +1,286 @@
+"""`rgbavatar drive`: an avatar moved by a camera, a phone, a film or any program."""
+
+import functools
+import sys
+import tempfile
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+
+from rgbavatar_ns.driving.live_transfer import LiveOptions
+from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.options import CheckedOptions, FrameRate, Pixels, Share
+
+if TYPE_CHECKING:
+    from rgbavatar_ns.driving.live_drive import DriveOutput, LiveDrive
+    from rgbavatar_ns.driving.source import PerformanceSource
+    from rgbavatar_ns.export.subject import Subject
+
+Show = Literal["page", "viewer", "none"]
+_FRAMES_PER_SECOND, _CSV_FRAMES_PER_SECOND = 25.0, 60.0
+"""Of a dataset, and of Live Link Face."""
+
+
+@dataclass(frozen=True)
+class SourceOptions(CheckedOptions):
+    """Who performs, and how they are reached."""
+
+    source: str = "camera"
+    """camera (or a camera's number, a device, rtsp://...), a video file or a folder of images, a
+    dataset or a run that names one, a CSV file of ARKit curves, arkit (Live Link Face over UDP),
+    vmc (OSC), websocket."""
+    listen: str | None = None
+    """HOST:PORT where arkit (127.0.0.1:11111), vmc (127.0.0.1:39539) or websocket (127.0.0.1:7071)
+    wait; a phone needs 0.0.0.0:11111."""
+    allow_remote: bool = False
+    """Let other machines reach what listens. Nothing is encrypted."""
+    source_frames_per_second: FrameRate | None = None
+    """Of a dataset (25 by default) or a CSV file (60)."""
+    head_angles: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    """Factors of the head's yaw, pitch and roll from arkit and CSV: -1 mirrors, .01745 is for
+    senders of degrees."""
+    real_time: bool | None = None
+    """Play a recording at its own speed and skip what is late, or each of its frames. By default
+    in real time, unless only a film is written."""
+
+
+@dataclass(frozen=True)
+class ShowOptions(CheckedOptions):
+    """Where the avatar is seen."""
+
+    show: Show | None = None
+    """page (a browser on this machine), viewer (nerfstudio's; needs a run) or none. By default
+    page, or none with --out."""
+    out: str | None = None
+    """A film (film.mp4), - for raw RGB frames on standard output, or a v4l2 loopback device
+    (/dev/video10) that OBS and video calls read."""
+    beside: bool = False
+    """In pictures: the performer beside the avatar."""
+    width: Pixels | None = None
+    """Width of pictures; the avatar's dataset's, or 512, by default."""
+    height: Pixels | None = None
+    """Height of pictures, likewise."""
+    background: tuple[Share, Share, Share] = (1.0, 1.0, 1.0)
+    """Colour behind the head, red, green and blue in [0, 1]."""
+    frames_per_second: FrameRate = 25.0
+    """Of a film and of a virtual camera."""
+    serve: str | None = None
+    """HOST:PORT of the page and of pages opened with ?ws= (127.0.0.1:7072)."""
+    seconds: Annotated[float, tyro.conf.arg(metavar="SECONDS")] | None = None
+    """End after so many seconds."""
+
+
+_SOURCE, _SHOW, _LIVE = SourceOptions(), ShowOptions(), LiveOptions()
+
+
+def run(
+    run_folder: Annotated[Path, tyro.conf.Positional],
+    data: Path | None = None,
+    source: Annotated[SourceOptions, tyro.conf.arg(name="")] = _SOURCE,
+    show: Annotated[ShowOptions, tyro.conf.arg(name="")] = _SHOW,
+    live: Annotated[LiveOptions, tyro.conf.arg(name="")] = _LIVE,
+) -> None:
+    """Drive an avatar live.
+
+    The performer's neutral face is learnt in the first second; c learns it again, q ends. Only
+    departures from it move the avatar, so that another person's face drives it as well.
+
+    Args:
+        run_folder: a run of ns-train, a checkpoint or an avatar bundle.
+        data: the avatar's own dataset; by default the one that the run names.
+        source: who performs.
+        show: where the avatar is seen.
+        live: how the performance becomes the avatar's.
+    """
+    from rgbavatar_ns.cli.keys import on_keys
+    from rgbavatar_ns.driving.live_drive import LiveDrive
+    from rgbavatar_ns.driving.live_transfer import LiveTransfer
+    from rgbavatar_ns.export.subject import load_subject
+
+    shown = show.show or ("none" if show.out else "page")
+    if shown == "none" and show.out is None:
+        raise UserError("Nothing would be shown.", "Add --out film.mp4, or --show page.")
+    only_film = shown == "none" and show.out is not None and show.out.endswith(".mp4")
+    real_time = not only_film if source.real_time is None else source.real_time
+    subject = load_subject(run_folder, data, show.width, show.height)
+    performer = _performer(subject, source, real_time, show.beside)
+    transfer = LiveTransfer(subject.avatar, subject.seen, performer.head, subject.camera, live)
+    outputs: list[DriveOutput] = []
+    drive = LiveDrive(performer, transfer, outputs, real_time, _tell)
+    try:
+        if show.out is not None:
+            outputs.append(_pictures(subject, show))
+        if shown == "page":
+            outputs.append(_page(subject, show, source.allow_remote, drive.calibrate))
+        if shown == "viewer":
+            outputs.append(_viewer(run_folder, drive))
+        with on_keys({"c": drive.calibrate, "q": drive.stop}) as heard:
+            _tell("c: learn the neutral face again, q: end." if heard else "Ctrl-C ends.")
+            _run(drive, show.seconds)
+    except BrokenPipeError:
+        _tell("The reader of the pictures has gone.")
+    finally:
+        performer.close()
+    left_out = ", ".join(f"{name}: {count}" for name, count in (+performer.counts).items())
+    lines = [str(output.latencies) for output in outputs if output.latencies.shown]
+    _tell("; ".join([f"{drive.shown} frames", *lines]) + (f" ({left_out})" if left_out else ""))
+    if show.out is not None and show.out.endswith(".mp4"):
+        _tell(f"The film is {show.out}.")
+
+
+def _tell(line: str) -> None:
+    """To standard error: standard output may carry pictures."""
+    print(line, file=sys.stderr, flush=True)
+
+
+def _run(drive: "LiveDrive", seconds: float | None) -> None:
+    """Until the end, q, Ctrl-C or the time is over; films are complete in each case."""
+    timer = None if seconds is None else threading.Timer(seconds, drive.stop)
+    if timer is not None:
+        timer.daemon = True
+        timer.start()
+    try:
+        drive.run()
+    except KeyboardInterrupt:
+        _tell("Ended.")
+    finally:
+        if timer is not None:
+            timer.cancel()
+
+
+def _performer(
+    subject: "Subject", options: SourceOptions, real_time: bool, with_images: bool
+) -> "PerformanceSource":
+    """The source that the flags name; raises UserError where there is none."""
+    from rgbavatar_ns.driving.source import PerformerHead
+    from rgbavatar_ns.driving.sources import live_link_face, vmc, web_socket
+
+    name, listen, remote = options.source, options.listen, options.allow_remote
+    if name == "arkit":
+        return live_link_face.LiveLinkFaceSource(
+            listen or live_link_face.DEFAULT_ADDRESS, remote, options.head_angles
+        )
+    if name == "vmc":
+        return vmc.VmcSource(listen or vmc.DEFAULT_ADDRESS, remote)
+    if name == "websocket":
+        own = PerformerHead(subject.avatar.layout, subject.avatar.head.arrays)
+        return web_socket.WebSocketSource(own, listen or web_socket.DEFAULT_ADDRESS, remote)
+    if listen is not None:
+        raise UserError(
+            f"The source {name} listens to nobody.", "--listen is for arkit, vmc and websocket."
+        )
+    path = Path(name).expanduser()
+    if path.suffix.lower() == ".csv":
+        from rgbavatar_ns.driving.sources.arkit_csv import csv_source
+
+        rate = options.source_frames_per_second or _CSV_FRAMES_PER_SECOND
+        return csv_source(path, rate, real_time, options.head_angles)
+    if path.is_dir() and _is_dataset(path):
+        from rgbavatar_ns.driving.sources.dataset import dataset_source
+        from rgbavatar_ns.export import dataset_folder
+
+        rate = options.source_frames_per_second or _FRAMES_PER_SECOND
+        return dataset_source(dataset_folder(path), rate, real_time, with_images)
+    try:
+        from rgbavatar_ns.tracking.performer import FilmedPerformer
+    except ImportError as error:
+        raise UserError(
+            f"A camera or a video needs mediapipe ({error}).", "make setup installs it."
+        ) from None
+    return FilmedPerformer(_camera(name), real_time, with_images)
+
+
+def _is_dataset(folder: Path) -> bool:
+    """Whether it is a dataset or a run rather than a folder of images."""
+    from rgbavatar_ns.data import load_dataset
+    from rgbavatar_ns.export import dataset_folder
+
+    try:
+        load_dataset(dataset_folder(folder))
+    except UserError:
+        return False
+    return True
+
+
+def _camera(name: str) -> str:
+    if name == "camera":
+        return "0"
+    known = name.isdecimal() or "://" in name or name.startswith("/dev/")
+    if not known and not Path(name).expanduser().exists():
+        raise UserError(
+            f"There is no source {name}.",
+            "Name camera, arkit, vmc, websocket, a video, a dataset or a CSV file.",
+        )
+    return name if known else str(Path(name).expanduser())
+
+
+def _pictures(subject: "Subject", show: ShowOptions) -> "DriveOutput":
+    """A film, raw frames or a virtual camera."""
+    from rgbavatar_ns.export import live_pictures
+
+    assert show.out is not None
+    sink: live_pictures.PictureSink
+    if show.out == "-":
+        if sys.stdout.isatty():
+            raise UserError(
+                "Raw pictures would fill the terminal.",
+                "Send them on: ... --out - | ffplay -f rawvideo -pixel_format rgb24 "
+                "-video_size 512x512 -i -",
+            )
+        sink = live_pictures.RawSink()
+    elif show.out.startswith("/dev/"):
+        sink = live_pictures.VirtualCameraSink(show.out, show.frames_per_second)
+    elif show.out.endswith(".mp4"):
+        sink = live_pictures.FilmSink(Path(show.out), show.frames_per_second)
+    else:
+        raise UserError(
+            f"Pictures cannot go to {show.out}.",
+            "Name a film (film.mp4), - for standard output, or a device such as /dev/video10.",
+        )
+    return live_pictures.PictureOutput(
+        subject.avatar, subject.camera, show.background, sink, show.beside
+    )
+
+
+def _page(
+    subject: "Subject", show: ShowOptions, allow_remote: bool, calibrate: Callable[[], None]
+) -> "DriveOutput":
+    """The page, served, and told what moves it."""
+    from rgbavatar_ns.export.live_page import DEFAULT_ADDRESS, PageOutput
+
+    output = PageOutput(
+        subject.avatar.layout,
+        show.serve or DEFAULT_ADDRESS,
+        allow_remote,
+        functools.cache(lambda: _page_content(subject, show)),
+        calibrate,
+    )
+    _tell(f"Open http://{output.address}/?ws=ws://{output.address}")
+    _tell(f"or a page of this avatar (rgbavatar export) with ?ws=ws://{output.address}")
+    return output
+
+
+def _page_content(subject: "Subject", show: ShowOptions) -> bytes:
+    import torch
+
+    from rgbavatar_ns.export import PageOptions, write_web_page
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "page.html"
+        options = PageOptions(background=show.background)
+        nothing = torch.zeros(0, subject.avatar.layout.size)
+        drawn = subject.avatar.without_undrawn()
+        write_web_page(drawn, path, subject.camera, nothing, options, subject.seen)
+        return path.read_bytes()
+
+
+def _viewer(run_folder: Path, drive: "LiveDrive") -> "DriveOutput":
+    from rgbavatar_ns.plugin.live_viewer import ViewerOutput
+
+    output = ViewerOutput(run_folder, drive.calibrate)
+    _tell(f"Open {output.address}")
+    return output

@@ -1,0 +1,200 @@
+"""From a performance to whatever shows the avatar, as it happens; how late it is."""
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from rgbavatar_ns.driving.live_transfer import LiveTransfer
+from rgbavatar_ns.driving.source import PerformanceSource
+
+_PATIENCE_S = 0.2
+_SILENT_S = 1.5
+"""After so long without a frame it is told what is waited for."""
+_TOLD_EVERY_S = 1.0
+_WAITING = 4
+"""Frames of a recording that are tracked while others are drawn."""
+_KEPT = 3000
+"""Latencies that are kept: two minutes."""
+
+
+@dataclass(frozen=True)
+class DrivenFrame:
+    """The avatar's theta for one frame of the performance."""
+
+    index: int
+    theta: Float[Tensor, "H"]
+    captured_s: float
+    """When the performer's picture or packet was there, by time.monotonic()."""
+    time_s: float
+    """By the source's own clock."""
+    image_rgb: UInt8[np.ndarray, "H W 3"] | None = None
+    """The performer's picture, where there is one."""
+
+
+class Latencies:
+    """Seconds from a performer's picture to the avatar's, of the last two minutes."""
+
+    def __init__(self) -> None:
+        self._seconds: deque[float] = deque(maxlen=_KEPT)
+        self._shown_s: deque[float] = deque(maxlen=_KEPT)
+        self.shown = 0
+
+    def add(self, captured_s: float, shown_s: float) -> None:
+        """One picture was captured and shown at these times."""
+        self._seconds.append(shown_s - captured_s)
+        self._shown_s.append(shown_s)
+        self.shown += 1
+
+    def quantile_s(self, share: float) -> float:
+        """The latency that so large a share of the pictures does not exceed."""
+        return float(np.quantile(list(self._seconds), share)) if self._seconds else 0.0
+
+    def frames_per_second(self) -> float:
+        """Pictures a second over what is kept."""
+        times = list(self._shown_s)
+        lasted_s = times[-1] - times[0] if len(times) > 1 else 0.0
+        return (len(times) - 1) / lasted_s if lasted_s > 0 else 0.0
+
+    def __str__(self) -> str:
+        """For the user."""
+        return (
+            f"{self.frames_per_second():.0f} pictures/s, "
+            f"{1e3 * self.quantile_s(0.5):.0f} ms from picture to picture "
+            f"(95 %: {1e3 * self.quantile_s(0.95):.0f})"
+        )
+
+
+class DriveOutput(Protocol):
+    """What shows the avatar."""
+
+    latencies: Latencies
+
+    def show(self, frame: DrivenFrame) -> None:
+        """Draw or pass on one frame; its latency counts once it can be seen."""
+        ...
+
+    def close(self) -> None:
+        """Complete what was begun."""
+        ...
+
+
+class LiveDrive:
+    """Follows a source in a thread of its own and shows each frame from the caller's.
+
+    real_time: the newest frame is shown and older ones are skipped; otherwise each one is.
+    tell: is called with what a user should read, at most once a second.
+    """
+
+    def __init__(
+        self,
+        source: PerformanceSource,
+        transfer: LiveTransfer,
+        outputs: Sequence[DriveOutput],
+        real_time: bool = True,
+        tell: Callable[[str], None] = lambda line: None,
+    ) -> None:
+        self._source, self._transfer, self._outputs = source, transfer, outputs
+        self._tell = tell
+        self._waiting: deque[DrivenFrame] = deque(maxlen=1 if real_time else None)
+        self._room = 1 if real_time else _WAITING
+        self._real_time = real_time
+        self._changed = threading.Condition()
+        self._stopped = self._followed = self._asked = False
+        self._trouble: BaseException | None = None
+        self.not_drawn = 0
+        self.shown = 0
+
+    def calibrate(self) -> None:
+        """Learn the performer's rest anew; may be called from any thread."""
+        self._asked = True
+
+    def stop(self) -> None:
+        """End `run` soon; may be called from any thread."""
+        with self._changed:
+            self._stopped = True
+            self._changed.notify_all()
+
+    def run(self) -> None:
+        """Show the performance until its end, `stop`, or Ctrl-C; raises what the source raised."""
+        follower = threading.Thread(target=self._follow, name="rgbavatar performer", daemon=True)
+        follower.start()
+        silent_since_s = told_s = time.monotonic()
+        try:
+            while (frame := self._next()) is not None or not self._over():
+                now_s = time.monotonic()
+                if frame is not None:
+                    silent_since_s = now_s
+                    for output in self._outputs:
+                        output.show(frame)
+                    self.shown += 1
+                if time.monotonic() - told_s > _TOLD_EVERY_S:
+                    told_s = time.monotonic()
+                    self._tell(self._told(told_s - silent_since_s))
+        finally:
+            self.stop()
+            follower.join(timeout=10.0)
+            self._source.close()
+            for output in self._outputs:
+                output.close()
+        if self._trouble is not None:
+            raise self._trouble
+
+    def _told(self, silent_s: float) -> str:
+        if silent_s > _SILENT_S:
+            return f"Waiting for {self._source.waits_for}; Ctrl-C ends."
+        told = [str(one.latencies) for one in self._outputs if one.latencies.shown]
+        told += ["learning the neutral face"] if self._transfer.calibrating else []
+        return "; ".join([f"{self.shown} frames", *told])
+
+    def _next(self) -> DrivenFrame | None:
+        with self._changed:
+            self._changed.wait_for(lambda: self._waiting or self._over(), _PATIENCE_S)
+            frame = self._waiting.popleft() if self._waiting and not self._stopped else None
+            self._changed.notify_all()
+            return frame
+
+    def _over(self) -> bool:
+        return self._stopped or (self._followed and not self._waiting)
+
+    def _follow(self) -> None:
+        """Take frames from the source as theta, until it ends."""
+        try:
+            while not (self._stopped or self._source.ended):
+                performed = self._source.next(_PATIENCE_S)
+                if performed is None:
+                    continue
+                if self._asked:
+                    self._asked = False
+                    self._transfer.calibrate()
+                theta = self._transfer(performed)
+                self._put(
+                    DrivenFrame(
+                        performed.index,
+                        theta,
+                        performed.captured_s,
+                        performed.time_s,
+                        performed.image_rgb,
+                    )
+                )
+        except BaseException as error:
+            self._trouble = error
+        finally:
+            with self._changed:
+                self._followed = True
+                self._changed.notify_all()
+
+    def _put(self, frame: DrivenFrame) -> None:
+        with self._changed:
+            if not self._real_time:
+                self._changed.wait_for(lambda: len(self._waiting) < self._room or self._stopped)
+            elif self._waiting:
+                self.not_drawn += 1
+            self._waiting.append(frame)
+            self._changed.notify_all()

@@ -1,0 +1,1 @@
+"""Sources of performances that need no camera: files, phones and other programs."""

@@ -1,0 +1,108 @@
+"""A take of ARKit curves in a CSV file, as Live Link Face and many senders export it."""
+
+import csv
+import io
+import math
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from rgbavatar_ns.driving.source import PerformanceFrame
+from rgbavatar_ns.driving.sources.live_link_face import HEAD_ANGLES, head_rotation
+from rgbavatar_ns.driving.sources.paced import RecordedSource
+from rgbavatar_ns.errors import UserError, first_few
+from rgbavatar_ns.head.arkit import ARKIT_NAMES
+from rgbavatar_ns.reading import DamagedFileError, read_file
+
+_MOST_BYTES = 1 << 28
+"""An hour at 60 frames a second has 150 MB."""
+_TIMECODE = re.compile(r"(\d{1,3}):(\d{1,2}):(\d{1,2}):(\d{1,3})(?:\.(\d+))?")
+_REMEDY = (
+    "Give the CSV file of a take of Live Link Face: a row of names (EyeBlinkLeft, JawOpen, ...), "
+    "then a row of numbers for each frame."
+)
+
+
+def csv_source(
+    path: Path, frames_per_second: float, real_time: bool, angle_gain: Sequence[float] = (1, 1, 1)
+) -> RecordedSource:
+    """The rows of a CSV file; columns are known by their names, in any order and case.
+
+    Frames last 1 / `frames_per_second` seconds: the file's timecodes (hours:minutes:seconds:frames)
+    say how many frames lie between two rows, not how long one is. Rows without numbers, as the
+    app leaves where it lost the face, are passed over. angle_gain: of yaw, pitch and roll.
+    Raises UserError where the file cannot be read or has no such column.
+    """
+    names, rows = _read(path)
+    columns = {name.strip().lower(): place for place, name in enumerate(names)}
+    places = [columns.get(name.lower()) for name in ARKIT_NAMES]
+    if all(place is None for place in places):
+        raise UserError(f"{path} has no ARKit columns: {first_few(names, 4)}.", _REMEDY)
+    angles = [columns.get(name.lower()) for name in HEAD_ANGLES]
+    frames = [(values, time_s) for values, time_s in _timed(names, rows, frames_per_second)]
+    if not frames:
+        raise UserError(f"{path} has no row of numbers.", _REMEDY)
+
+    def frame(place: int, captured_s: float) -> PerformanceFrame:
+        values, time_s = frames[place]
+        turn = None
+        if None not in angles:
+            yaw, pitch, roll = (values[one] * gain for one, gain in zip(angles, angle_gain))  # type: ignore[index]
+            turn = head_rotation(yaw, pitch, roll)
+        return PerformanceFrame(
+            place,
+            captured_s,
+            time_s,
+            coefficients=_coefficients(values, places),
+            head_rotation=turn,
+        )
+
+    source = RecordedSource([time_s for _, time_s in frames], frame, None, real_time)
+    source.counts["rows without numbers"] = len(rows) - len(frames)
+    return source
+
+
+def _read(path: Path) -> tuple[list[str], list[list[str]]]:
+    try:
+        text = read_file(path, _MOST_BYTES).decode("utf-8-sig")
+        table = list(csv.reader(io.StringIO(text)))
+    except (DamagedFileError, UnicodeDecodeError, csv.Error, OSError) as error:
+        raise UserError(f"{path} cannot be read as CSV: {error}.", _REMEDY) from None
+    if len(table) < 2:
+        raise UserError(f"{path} holds no rows.", _REMEDY)
+    return table[0], table[1:]
+
+
+def _timed(
+    names: list[str], rows: list[list[str]], frames_per_second: float
+) -> list[tuple[list[float], float]]:
+    """Each row's numbers (NaN where there is none) and its time; rows without any are left out."""
+    clock = next((k for k, name in enumerate(names) if name.strip().lower() == "timecode"), None)
+    found: list[tuple[list[float], float]] = []
+    last_s = -math.inf
+    for place, row in enumerate(rows):
+        values = [_number(text) for text in row] + [math.nan] * (len(names) - len(row))
+        told = [value for k, value in enumerate(values) if k != clock and math.isfinite(value)]
+        if len(told) < 2:  # the count of blend shapes alone
+            continue
+        # Rows are frames, unless the timecode says that some between were lost.
+        time_s = max(place / frames_per_second, last_s + 1e-6)
+        found.append((values, time_s))
+        last_s = time_s
+    return found
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
+
+
+def _coefficients(values: list[float], places: Sequence[int | None]) -> Float[Tensor, "52"]:
+    told = [math.nan if place is None else values[place] for place in places]
+    return torch.tensor([value if math.isfinite(value) else 0.0 for value in told])

@@ -1,0 +1,141 @@
+"""Another head's theta in the avatar's layout: by name, or by what ARKit calls the expressions."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from rgbavatar_ns.avatar.avatar import Avatar
+from rgbavatar_ns.errors import UserError, first_few
+from rgbavatar_ns.head import HeadArrays, ThetaLayout
+from rgbavatar_ns.head.arkit import arkit_map, head_carrier, speaks_arkit
+from rgbavatar_ns.head.rotations import axis_angle_to_matrix, matrix_to_axis_angle
+
+_CARRIERS = ("rotation", "neck")
+"""The joints that turn the head: the root, and the neck upon it."""
+
+
+@dataclass(frozen=True)
+class ThetaNames:
+    """What each number of theta is called."""
+
+    layout: ThetaLayout
+    expression_names: tuple[str, ...]
+
+    @classmethod
+    def of(cls, layout: ThetaLayout, arrays: HeadArrays) -> "ThetaNames":
+        """The names of a head model's theta."""
+        return cls(layout, arrays.expression_names)
+
+    @property
+    def numbers(self) -> tuple[str, ...]:
+        """A name for each number; the expressions' own, and field and place for the others."""
+        names: list[str] = []
+        for part in self.layout.fields:
+            if part.name == "expression":
+                names += self.expression_names
+            else:
+                names += [f"{part.name}[{i}]" for i in range(part.size)]
+        return tuple(names)
+
+    @property
+    def has_shoulders(self) -> bool:
+        """Whether the root carries a body and the neck the head upon it."""
+        return head_carrier(self.expression_names) == "neck"
+
+
+@dataclass(frozen=True)
+class MappedTheta:
+    """A driver's theta in the avatar's layout."""
+
+    theta: Float[Tensor, "F H"]
+    known: Bool[Tensor, "H"]
+    """Which of the avatar's numbers the driver has; the others are 0."""
+    unmapped: tuple[str, ...] = ()
+    """The driver's numbers that the avatar does not know."""
+    missing: tuple[str, ...] = ()
+    """The avatar's numbers that the driver does not know."""
+
+
+ThetaMap = Callable[[Float[Tensor, "F G"]], MappedTheta]
+"""From a driver's theta to the avatar's."""
+
+
+def theta_map(layout: ThetaLayout, arrays: HeadArrays, avatar: Avatar) -> ThetaMap:
+    """The way from the theta of a driver's head (`layout`, `arrays`) to the avatar's.
+
+    By name where a name is shared; from a head with ARKit's names to any other head through
+    ARKit's coefficients (`Avatar.arkit`). Raises UserError where neither is possible.
+    """
+    driver = ThetaNames.of(layout, arrays)
+    own = ThetaNames.of(avatar.layout, avatar.head.arrays)
+    if set(driver.expression_names) & set(own.expression_names) or not speaks_arkit(arrays):
+        _require_a_shared_name(driver, own)
+        return lambda theta: map_by_name(theta, driver, own)
+    theirs, ours = arkit_map(arrays), avatar.arkit
+
+    def by_arkit(theta: Float[Tensor, "F G"]) -> MappedTheta:
+        return arkit_theta(avatar, theirs.coefficients(theta), theirs.head_rotation(theta))
+
+    assert ours.layout == avatar.layout
+    return by_arkit
+
+
+def arkit_theta(
+    avatar: Avatar,
+    coefficients: Float[Tensor, "F 52"],
+    head_rotation: Float[Tensor, "F 3"] | None,
+) -> MappedTheta:
+    """ARKit coefficients and the head's turn as the avatar's theta; what they do not tell is 0."""
+    known = torch.as_tensor(avatar.arkit.theta_per_unit).abs().sum(0) > 0
+    if head_rotation is not None:
+        known[avatar.layout.slice(avatar.arkit.turns)] = True
+    return MappedTheta(avatar.arkit.theta(coefficients, head_rotation), known)
+
+
+def map_by_name(theta: Float[Tensor, "F G"], driver: ThetaNames, avatar: ThetaNames) -> MappedTheta:
+    """Theta of one head model in the layout of another, number by number by its name.
+
+    Between a head and one upon shoulders the head's whole turn goes to the joint that carries it;
+    what a head alone says of place and turn is nothing that shoulders have to follow. Raises
+    UserError where not a single expression has a name that the avatar knows.
+    """
+    if theta.shape[-1] != driver.layout.size:
+        raise UserError(
+            f"The driver's theta has {theta.shape[-1]} numbers, its layout {driver.layout.size}.",
+            "Write the driver's dataset again.",
+        )
+    _require_a_shared_name(driver, avatar)
+    place_of = {name: place for place, name in enumerate(driver.numbers)}
+    result = theta.new_zeros(len(theta), avatar.layout.size)
+    wanted = avatar.numbers
+    known = torch.tensor([name in place_of for name in wanted])
+    result[:, known] = theta[:, [place_of[name] for name in wanted if name in place_of]]
+    if driver.has_shoulders != avatar.has_shoulders:
+        parts = driver.layout.split(theta)
+        root, neck = (axis_angle_to_matrix(parts[name]) for name in _CARRIERS)
+        carrier, other = reversed(_CARRIERS) if avatar.has_shoulders else _CARRIERS
+        result[:, avatar.layout.slice(carrier)] = matrix_to_axis_angle(root @ neck)
+        result[:, avatar.layout.slice(other)] = 0
+        if avatar.has_shoulders:
+            for name in ("rotation", "translation"):
+                known[avatar.layout.slice(name)] = False
+                result[:, avatar.layout.slice(name)] = 0
+    return MappedTheta(
+        result,
+        known,
+        unmapped=tuple(name for name in driver.numbers if name not in wanted),
+        missing=tuple(name for name in wanted if name not in place_of),
+    )
+
+
+def _require_a_shared_name(driver: ThetaNames, avatar: ThetaNames) -> None:
+    if not set(driver.expression_names) & set(avatar.expression_names):
+        raise UserError(
+            "The driver has no expression that the avatar knows: the driver's are "
+            f"{first_few(driver.expression_names, 4)}, the avatar's "
+            f"{first_few(avatar.expression_names, 4)}.",
+            "Track the driver's video with the avatar's head model.",
+        )

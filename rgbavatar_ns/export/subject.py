@@ -1,0 +1,49 @@
+"""An avatar with what a command needs to know about it: its film, what it saw, how it is seen."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from rgbavatar_ns.avatar.avatar import Avatar
+from rgbavatar_ns.avatar.storage.bundle import load_statistics
+from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
+from rgbavatar_ns.data.native.dataset import TrackedDataset
+from rgbavatar_ns.data.opening import load_dataset
+from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.export.run_data import dataset_folder, statistics_of
+from rgbavatar_ns.export.views import front_camera, resized
+from rgbavatar_ns.kernels import PinholeCameras
+
+_SIDE_PX = 512
+"""Of a picture where nothing says how large it should be."""
+
+
+@dataclass(frozen=True)
+class Subject:
+    """An avatar and what is known about its training."""
+
+    avatar: Avatar
+    dataset: TrackedDataset | None
+    seen: TrainingStatistics
+    camera: PinholeCameras
+    """The dataset's first camera, or one before the face, for pictures of the size asked for."""
+
+
+def load_subject(
+    run_folder: Path, data: Path | None, width: int | None = None, height: int | None = None
+) -> Subject:
+    """Load an avatar from a run, a checkpoint or a bundle, with its dataset if it names one.
+
+    data: the dataset in place of the run's own. Raises UserError where the avatar or its dataset
+    cannot be read, and for a bundle that knows nothing about its training.
+    """
+    avatar, seen = Avatar.load(run_folder), load_statistics(run_folder)
+    folder = dataset_folder(run_folder) if data is None else data
+    if data is None and folder == run_folder:
+        if seen is None:
+            raise UserError(f"{run_folder} does not name its dataset.", "Name it with --data.")
+        camera = front_camera(avatar, width or _SIDE_PX, height or _SIDE_PX)
+        return Subject(avatar, None, seen, camera)
+    dataset = load_dataset(folder)
+    avatar.require_layout(dataset.layout, f"The dataset {folder}")
+    camera = resized(dataset.cameras.select([0]), width or dataset.width, height or dataset.height)
+    return Subject(avatar, dataset, seen or statistics_of(avatar, dataset), camera)

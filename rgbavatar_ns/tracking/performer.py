@@ -1,0 +1,156 @@
+"""A person before a camera, or in a video, as a performance that drives an avatar."""
+
+import glob
+import time
+from collections import Counter, deque
+from pathlib import Path
+from typing import Any
+
+from jaxtyping import Float
+from torch import Tensor
+
+from rgbavatar_ns.driving.source import PerformanceFrame, PerformerHead
+from rgbavatar_ns.errors import UserError, first_few
+from rgbavatar_ns.tracking.input.capture import (
+    CapturedFrame,
+    FileCapture,
+    FrameCapture,
+    LatestFrameCapture,
+    open_capture,
+)
+
+_FIRST_PICTURE_S = 10.0
+"""A camera that has shown nothing for so long will show nothing: it is told."""
+
+
+class FilmedPerformer:
+    """Tracks the newest picture of a camera, or those of a file, and gives the head's theta.
+
+    The first dozen pictures with a face give the person, which takes two seconds; what comes
+    meanwhile is skipped. `tracker` serves in place of a `LiveTracker`, `capture` in place of what
+    `source` names: a camera's number, a device, a network address, a video file or a folder of
+    images. Of a file in real time only what is due is tracked, else every frame. Raises UserError
+    where the camera cannot be opened or shows nothing, and where the file cannot be read.
+    """
+
+    def __init__(
+        self,
+        source: str,
+        real_time: bool = True,
+        with_images: bool = False,
+        tracker: Any = None,
+        capture: FrameCapture | None = None,
+    ) -> None:
+        self._source = source
+        self._capture = _open(source, real_time) if capture is None else capture
+        if tracker is None:
+            # Imports mediapipe, which who brings a tracker need not have.
+            from rgbavatar_ns.tracking.live import LiveTracker
+
+            tracker = LiveTracker()
+        self._tracker = tracker
+        self.head = PerformerHead(tracker.head.layout, tracker.head.arrays)
+        self._with_images = with_images
+        self._counts = Counter[str]()
+        self._keeps_all = not real_time
+        self._unmet: dict[int, CapturedFrame] = {}
+        self._backlog: deque[PerformanceFrame] = deque()
+        self._closed = False
+        self._began_s, self._shown = time.monotonic(), False
+
+    @property
+    def ended(self) -> bool:
+        """Whether the file is at its end."""
+        return self._capture.ended and not self._backlog
+
+    @property
+    def counts(self) -> Counter[str]:
+        """Pictures without a face, skipped, and losses of the source, by name."""
+        whole = self._counts + self._capture.counts
+        for name in ("no face", "does not fit"):
+            whole[name] = self._tracker.counts[name]
+        return +whole
+
+    @property
+    def waits_for(self) -> str:
+        """A picture, or a face in it."""
+        if not self._shown:
+            return f"the first picture of {self._source}"
+        told = "to be met" if not self._tracker.ready else "to be found again"
+        return f"a face in {self._source} {told}: look at the camera, well lit and near"
+
+    def next(self, timeout_s: float) -> PerformanceFrame | None:
+        """The head in the newest picture; tracking one may take longer than `timeout_s`."""
+        if self._backlog:
+            return self._backlog.popleft()
+        captured = self._capture.next(timeout_s)
+        if captured is None:
+            self._require_pictures()
+            return None
+        self._shown = True
+        met = self._tracker.ready
+        try:
+            theta = self._tracker.pose(captured.image_rgb, captured.index)
+        except UserError:
+            self._counts["another resolution"] += 1
+            return None
+        if not met:
+            self._meet(captured)
+            return self._backlog.popleft() if self._backlog else None
+        return None if theta is None else self._performed(captured, theta)
+
+    def _meet(self, captured: CapturedFrame) -> None:
+        """Keep a recording's first frames until the person is known; a camera's would be late."""
+        if self._keeps_all:
+            self._unmet[captured.index] = captured
+        if not self._tracker.ready:
+            return
+        posed = self._tracker.pose_backlog()
+        if self._keeps_all:
+            for index, theta in posed:
+                self._backlog.append(self._performed(self._unmet[index], theta))
+        self._unmet.clear()
+
+    def _performed(self, captured: CapturedFrame, theta: Float[Tensor, "H"]) -> PerformanceFrame:
+        clock_s = captured.captured_s if captured.time_s is None else captured.time_s
+        image_rgb = captured.image_rgb if self._with_images else None
+        return PerformanceFrame(
+            captured.index, captured.captured_s, clock_s, theta=theta, image_rgb=image_rgb
+        )
+
+    def _require_pictures(self) -> None:
+        silent_s = time.monotonic() - self._began_s
+        if not self._shown and not self.ended and silent_s > _FIRST_PICTURE_S:
+            raise UserError(
+                f"{self._source} has shown no picture for {silent_s:.0f} seconds.", _REMEDY
+            )
+
+    def close(self) -> None:
+        """Let go of camera and tracker."""
+        if not self._closed:
+            self._closed = True
+            self._capture.close()
+            self._tracker.close()
+
+
+_REMEDY = (
+    "Close the program that uses the camera, choose another one with --source NUMBER, or give a "
+    "video file."
+)
+
+
+def _open(source: str, real_time: bool) -> FrameCapture:
+    if not (source.isdecimal() or "://" in source or source.startswith("/dev/")):
+        return FileCapture(Path(source), "newest" if real_time else "at once")
+    # The capture would try for ever, as a stream has to; who starts a camera is told at once.
+    tried = open_capture(source)
+    opened = tried.isOpened()
+    tried.release()
+    if not opened:
+        there = sorted(glob.glob("/dev/video*"))
+        known = f" There are {first_few(there, 4)}." if there else " No camera is there."
+        which = f"Camera {source}" if source.isdecimal() else source
+        raise UserError(
+            f"{which} cannot be opened: it is not there, or another program has it.{known}", _REMEDY
+        )
+    return LatestFrameCapture(source)

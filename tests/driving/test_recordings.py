@@ -1,0 +1,139 @@
+"""CSV takes and datasets as performances."""
+
+import math
+
+import pytest
+import torch
+
+from rgbavatar_ns.data import load_dataset
+from rgbavatar_ns.driving.source import PerformanceFrame
+from rgbavatar_ns.driving.sources.arkit_csv import csv_source
+from rgbavatar_ns.driving.sources.dataset import dataset_source
+from rgbavatar_ns.driving.sources.paced import RecordedSource
+from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.head.arkit import ARKIT_NAMES
+from rgbavatar_ns.synthetic import DemoConfig, make_demo_dataset
+
+
+class _Clock:
+    def __init__(self):
+        self.now_s = 100.0
+
+    def __call__(self):
+        return self.now_s
+
+    def sleep(self, seconds):
+        self.now_s += seconds
+
+
+def _recorded(clock, real_time=True, count=10):
+    def frame(place, captured_s):
+        return PerformanceFrame(place, captured_s, place / 25)
+
+    times_s = [place / 25 for place in range(count)]
+    return RecordedSource(times_s, frame, None, real_time, clock, clock.sleep)
+
+
+def test_a_recording_plays_at_its_own_speed():
+    clock = _Clock()
+    source = _recorded(clock)
+    at = []
+    while not source.ended:
+        frame = source.next(1.0)
+        at.append(round(clock.now_s - 100.0, 6))
+        assert frame.captured_s == pytest.approx(clock.now_s)
+    assert at == [round(k / 25, 6) for k in range(10)]
+    assert source.counts["skipped"] == 0
+
+
+def test_who_is_slow_gets_the_newest_frame_and_how_late_it_is():
+    clock = _Clock()
+    source = _recorded(clock)
+    source.next(1.0)
+    clock.now_s += 0.21
+    frame = source.next(1.0)
+    assert frame.index == 5
+    assert clock.now_s - frame.captured_s == pytest.approx(0.01)
+    assert source.counts["skipped"] == 4
+
+
+def test_without_a_clock_every_frame_is_given():
+    clock = _Clock()
+    source = _recorded(clock, real_time=False)
+    indices = []
+    while not source.ended:
+        clock.now_s += 1.0
+        indices.append(source.next(0.0).index)
+    assert indices == list(range(10))
+
+
+def _take(tmp_path, header, rows):
+    path = tmp_path / "take.csv"
+    path.write_text("\n".join([header, *rows]) + "\n")
+    return path
+
+
+def test_columns_are_known_by_name_in_any_order_and_case(tmp_path):
+    header = "Timecode,BlendShapeCount,JawOpen,eyeBlinkLeft,HeadYaw,HeadPitch,HeadRoll"
+    rows = ["00:00:00:01.000,61,0.25,0.5,0.1,0,0", "00:00:00:02.000,61,0.75,1.0,0.2,0,0"]
+    source = csv_source(_take(tmp_path, header, rows), 60.0, False)
+    frames = [source.next(0.0), source.next(0.0)]
+    assert source.ended
+    jaw, blink = ARKIT_NAMES.index("jawOpen"), ARKIT_NAMES.index("eyeBlinkLeft")
+    assert [float(f.coefficients[jaw]) for f in frames] == [0.25, 0.75]
+    assert [float(f.coefficients[blink]) for f in frames] == [0.5, 1.0]
+    assert frames[1].head_rotation[1] == pytest.approx(-0.2, abs=1e-6)
+    assert frames[1].time_s == pytest.approx(1 / 60)
+
+
+def test_mirrored_and_degree_senders_are_put_right(tmp_path):
+    header = "jawOpen,HeadYaw,HeadPitch,HeadRoll"
+    gain = (-math.pi / 180, 1.0, 1.0)
+    source = csv_source(_take(tmp_path, header, ["0.1,30,0,0"]), 60.0, False, gain)
+    assert source.next(0.0).head_rotation[1] == pytest.approx(math.pi / 6, abs=1e-5)
+
+
+def test_rows_without_numbers_are_passed_over_in_their_time(tmp_path):
+    rows = ["00:00:00:01.000,61,0.1", "00:00:00:02.000,0,", "00:00:00:03.000,61,0.3"]
+    source = csv_source(_take(tmp_path, "Timecode,BlendShapeCount,JawOpen", rows), 60.0, False)
+    frames = [source.next(0.0), source.next(0.0)]
+    assert source.ended
+    assert source.counts["rows without numbers"] == 1
+    assert frames[1].time_s == pytest.approx(2 / 60)
+
+
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [
+        ("a,b\n1,2\n", "has no ARKit columns: a, b"),
+        ("jawOpen\n", "holds no rows"),
+        ("jawOpen,mouthClose\nx,y\n", "no row of numbers"),
+        ("", "holds no rows"),
+    ],
+)
+def test_other_files_are_told(tmp_path, content, told):
+    path = tmp_path / "take.csv"
+    path.write_text(content)
+    with pytest.raises(UserError, match=told):
+        csv_source(path, 60.0, False)
+
+
+def test_a_missing_or_binary_file_is_told(tmp_path):
+    with pytest.raises(UserError, match="cannot be read as CSV"):
+        csv_source(tmp_path / "none.csv", 60.0, False)
+    (tmp_path / "b.csv").write_bytes(bytes(range(256)))
+    with pytest.raises(UserError, match="cannot be read as CSV"):
+        csv_source(tmp_path / "b.csv", 60.0, False)
+
+
+def test_a_dataset_performs_with_its_own_theta_and_pictures(tmp_path):
+    config = DemoConfig(num_frames=6, num_test_frames=2, image_size=32)
+    make_demo_dataset(tmp_path / "data", config)
+    made = load_dataset(tmp_path / "data")
+    source = dataset_source(made.root, 25.0, False, True)
+    frames = []
+    while not source.ended:
+        frames.append(source.next(0.0))
+    assert torch.equal(torch.stack([f.theta for f in frames]), made.theta)
+    assert frames[0].image_rgb.shape == (32, 32, 3)
+    assert source.head.layout == made.layout

@@ -1,0 +1,106 @@
+import json
+import time
+
+import pytest
+import torch
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
+
+from rgbavatar_ns.driving.source import PerformerHead
+from rgbavatar_ns.driving.sources.web_socket import WebSocketSource
+from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.head import HeadArrays, HeadModel
+from rgbavatar_ns.head.arkit import ARKIT_NAMES
+
+_HEAD = HeadModel.embedded()
+
+
+@pytest.fixture
+def source():
+    listening = WebSocketSource(PerformerHead(_HEAD.layout, HeadArrays.embedded()), "127.0.0.1:0")
+    yield listening
+    listening.close()
+
+
+def _say(client, **message):
+    client.send(json.dumps(message))
+
+
+def test_coefficients_and_pose_come_in(source):
+    with connect(f"ws://{source.address}") as client:
+        _say(client, type="hello", format="rgbavatar-drive", version=1)
+        pose = {"rotation": [0.1, 0.2, 0.3]}
+        _say(client, type="arkit", coefficients={"jawOpen": 0.4}, pose=pose)
+        frame = source.next(2.0)
+    assert frame.coefficients[ARKIT_NAMES.index("jawOpen")] == pytest.approx(0.4)
+    torch.testing.assert_close(frame.head_rotation, torch.tensor([0.1, 0.2, 0.3]))
+
+
+def test_the_avatars_own_theta_comes_in(source):
+    theta = torch.linspace(-0.1, 0.1, _HEAD.layout.size)
+    with connect(f"ws://{source.address}") as client:
+        _say(client, type="theta", theta=theta.tolist())
+        torch.testing.assert_close(source.next(2.0).theta, theta)
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("garbage", "cannot be read"),
+        ("[1]", "no object with a type"),
+        ('{"type": "dance"}', "no message of type dance"),
+        ('{"type": "hello", "format": "rgbavatar-drive", "version": 2}', "drive 2, not"),
+        ('{"type": "arkit", "coefficients": {"jawOpen": "wide"}}', "no numbers by name"),
+        ('{"type": "arkit", "coefficients": {"jawOpne": 0.1}}', "Did you mean jawOpen"),
+        ('{"type": "arkit", "coefficients": {"jawOpen": NaN}}', "no numbers by name"),
+        ('{"type": "arkit", "pose": {"rotation": [1, 2]}}', "not 3 numbers, but 2"),
+        ('{"type": "arkit", "pose": {"rotation": [90, 0, 0]}}', "longer than two turns"),
+        ('{"type": "arkit", "pose": 3}', "pose"),
+        ('{"type": "theta", "theta": [1, 2]}', "numbers, but 2 values"),
+        ('{"type": "theta", "theta": [' + ",".join(["1e30"] * 70) + "]}", "No head does this"),
+    ],
+)
+def test_what_cannot_be_used_is_answered_with_the_reason(source, text, told):
+    with connect(f"ws://{source.address}") as client:
+        client.send(text)
+        answer = json.loads(client.recv(timeout=2.0))
+        assert answer["type"] == "error"
+        assert told in answer["text"]
+        # The sender is still heard.
+        _say(client, type="arkit", coefficients={"jawOpen": 2})
+        frame = source.next(2.0)
+    assert frame.coefficients.max() == 1.0
+    assert source.counts["unreadable"] == 1
+    assert source.counts["values beyond 0..1"] == 1
+
+
+def test_the_newest_message_counts_and_the_last_who_came(source):
+    with connect(f"ws://{source.address}") as first:
+        _say(first, type="arkit", coefficients={"jawOpen": 0.1})
+        assert source.next(2.0) is not None
+        with connect(f"ws://{source.address}") as second:
+            for k in range(5):
+                _say(second, type="arkit", coefficients={"jawOpen": k / 10})
+            time.sleep(0.2)
+            frame = source.next(1.0)
+            assert frame.coefficients.max() == pytest.approx(0.4)
+            _say(first, type="arkit", coefficients={"jawOpen": 0.9})
+            assert source.next(0.2) is None
+    assert source.counts["another sender"] == 1
+    assert source.counts["skipped"] == 4
+
+
+def test_pages_of_this_machine_may_speak_and_others_may_not(source):
+    for origin in ("null", "http://localhost:3000", "http://127.0.0.1:8000"):
+        with connect(f"ws://{source.address}", origin=origin) as client:
+            _say(client, type="arkit", coefficients={})
+            assert source.next(2.0) is not None
+    for origin in ("https://example.com", "http://localhost.example.com", "http://127.0.0.1.evil"):
+        with pytest.raises(InvalidStatus), connect(f"ws://{source.address}", origin=origin):
+            pass
+
+
+def test_other_machines_reach_it_only_when_asked_for():
+    own = PerformerHead(_HEAD.layout, HeadArrays.embedded())
+    with pytest.raises(UserError, match="Other machines could reach"):
+        WebSocketSource(own, "0.0.0.0:0")
