@@ -12,6 +12,7 @@ AVATAR_SCRIPTS = (
     "gaussians.js",
     "shaders.js",
     "renderer.js",
+    "pace.js",
     "camera.js",
     "arkit.js",
     "performance.js",

@@ -39,6 +39,7 @@ class RGBAvatar extends EventTarget {
     this._head = new Head(data);
     this._network = new WeightNetwork(data);
     this._detail = 1;
+    this._pace = new Pace();
     this._renderer = new Renderer(canvas, data);
     this._neutral = Array.from(arrays.neutral_theta);
     this._arkit = manifest.arkit
@@ -206,8 +207,17 @@ class RGBAvatar extends EventTarget {
     this._due = true;
   }
 
+  /** What is left out while something moves, in words; empty where nothing is. */
+  get pace() {
+    return this._pace.told;
+  }
+
   /** Draw now; an event "drawn" follows. Nothing where the context is lost or all is disposed of. */
   draw() {
+    this._draw(WHOLE);
+  }
+
+  _draw(share) {
     if (!this._renderer) return;
     const [width, height] = this._fitCanvas();
     const head = this._head;
@@ -219,7 +229,7 @@ class RGBAvatar extends EventTarget {
       : this.camera.at(width, height, head.centre());
     this._turnSeen = viewAngles(multiply3(camera.rotation, head.turn));
     this._renderer.detail = this._detail;
-    this._renderer.draw(head, this._psi, camera, this._background);
+    this._renderer.draw(head, this._psi, camera, this._background, share);
     this._due = false;
     this._pictures++;
     this.dispatchEvent(new Event("drawn"));
@@ -258,7 +268,10 @@ class RGBAvatar extends EventTarget {
     this._last = now;
     this.performance.advance(seconds);
     if (this.camera.settle(seconds)) this._due = true;
-    if (this._due && this._automatic) this.draw();
+    if (!this._automatic) return;
+    if (this._due) this._pace.moves(now);
+    else this._due = this._pace.rests(now);
+    if (this._due) this._draw(this._pace.share);
   }
 
   /** The driver takes the graphics away; prevented from its default, it gives them back. */

@@ -139,6 +139,7 @@ class App {
 
   /** Pictures a second while the performance plays, told twice a second. */
   _tellRate(now) {
+    if (this.message.className === "error") return;
     const { pictures } = this.avatar, { playing } = this.avatar.performance;
     if (!this._rateFrom || !playing) {
       this._rateFrom = { now, pictures };
@@ -146,7 +147,8 @@ class App {
     } else if (now - this._rateFrom.now > 500) {
       const rate = (1000 * (pictures - this._rateFrom.pictures)) / (now - this._rateFrom.now);
       this.message.textContent = `${rate.toFixed(0)} pictures/s, `
-        + `${this.avatar.data.manifest.num_gaussians.toLocaleString("en")} Gaussians`;
+        + `${this.avatar.data.manifest.num_gaussians.toLocaleString("en")} Gaussians`
+        + (this.avatar.pace && `, ${this.avatar.pace}`);
       this._rateFrom = { now, pictures };
     }
   }

@@ -4,6 +4,7 @@
 const TEXTURE_WIDTH = 1024;
 const VARIANTS = ["normalized", "raw", "orthonormal"];
 const LEAST_GAUSSIANS = 1000;
+const WHOLE = { detail: 1, resolution: 1 };
 
 class Renderer {
   /** Throws an Error with a reason where the browser lacks what is needed. */
@@ -33,9 +34,9 @@ class Renderer {
     this.filledParts = 0; // of the file, so many are in the textures
   }
 
-  /** How many Gaussians are drawn: the share `detail`, and no more than have arrived. */
-  get count() {
-    const wanted = Math.max(Math.ceil(this.detail * this.total), LEAST_GAUSSIANS);
+  /** How many Gaussians are drawn for a share of `detail`; no more than have arrived. */
+  count({ detail }) {
+    const wanted = Math.max(Math.ceil(this.detail * detail * this.total), LEAST_GAUSSIANS);
     return Math.min(wanted, this.data.available);
   }
 
@@ -241,6 +242,9 @@ class Renderer {
     if (this.picture) gl.deleteTexture(this.picture.texture);
     this.picture = this._texture();
     gl.texStorage2D(gl.TEXTURE_2D, 1, gl.RGBA16F, width, height);
+    for (const name of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) {
+      gl.texParameteri(gl.TEXTURE_2D, name, gl.LINEAR);
+    }
     this.pictureTarget = this.pictureTarget || this._framebuffer();
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.pictureTarget);
     gl.framebufferTexture2D(
@@ -259,9 +263,12 @@ class Renderer {
     gl.activeTexture(gl.TEXTURE0);
   }
 
-  /** Draw a posed head with weights psi, seen by a camera of canvas size. */
-  draw(head, psi, camera, background) {
-    const count = this.count;
+  /**
+   * Draw a posed head with weights psi, seen by a camera of the canvas's size. share: of the detail
+   * and of the sides' pixels, each in (0, 1], as `Pace` has it.
+   */
+  draw(head, psi, seen, background, share = WHOLE) {
+    const count = this.count(share), camera = this._reduced(seen, share.resolution);
     this._fill();
     this._fillAnchors(count);
     this._fitPicture(camera.width, camera.height);
@@ -272,7 +279,17 @@ class Renderer {
     this._weigh(psi);
     this._placeAll(camera, count);
     this._drawAll(camera, count);
-    this._showOver(background, camera);
+    this._showOver(background, seen);
+  }
+
+  /** The camera of the picture, which may have fewer pixels than the canvas. */
+  _reduced({ rotation, translation, focal, principal, width, height }, resolution) {
+    const size = [width, height].map((side) => Math.max(1, Math.round(resolution * side)));
+    const [x, y] = [size[0] / width, size[1] / height];
+    return {
+      rotation, translation, width: size[0], height: size[1],
+      focal: [focal[0] * x, focal[1] * y], principal: [principal[0] * x, principal[1] * y],
+    };
   }
 
   /** psi times the units of rotation, colour and position; a byte of 127 is read as 1. */
@@ -340,6 +357,7 @@ class Renderer {
     gl.useProgram(program);
     this._bind(uniforms, { picture: this.picture });
     gl.uniform4fv(uniforms.background, background ? [...background, 1] : [0, 0, 0, 0]);
+    gl.uniform2f(uniforms.size, width, height);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 }

@@ -104,6 +104,8 @@ export class RGBAvatar extends EventTarget {
   readonly headCentre: [number, number, number];
   /** Drawn so far. */
   readonly pictures: number;
+  /** What is left out while something moves slowly, in words; empty where nothing is. */
+  readonly pace: string;
   /** The share of the Gaussians that is drawn, the most needed ones first, in (0, 1]; 1. */
   detail: number;
   get background(): number[] | null;

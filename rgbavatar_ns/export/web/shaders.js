@@ -40,8 +40,8 @@ uniform sampler2D edgesToFrame;
 uniform vec3 cameraX, cameraY, cameraZ, cameraTranslation; // rows of world to camera
 uniform vec2 focal, principal, slopeLow, slopeHigh;
 
-layout(location = 0) out vec4 place;   // centre in pixels, half size of its box in pixels
-layout(location = 1) out vec4 shape;   // inverse covariance xx, xy, yy, opacity
+layout(location = 0) out vec4 place;   // centre and longer half axis in pixels
+layout(location = 1) out vec4 shape;   // other half axis in pixels, both in deviations, opacity
 layout(location = 2) out vec4 shade;   // colour
 
 ${TEXEL}
@@ -115,15 +115,19 @@ void main() {
     vec2 inImage = (seen.xy - held * seen.z) * perMetre;
     covariance += vec3(inImage.x * inImage.x, inImage.x * inImage.y, inImage.y * inImage.y);
   }
-  float determinant = covariance.x * covariance.z - covariance.y * covariance.y;
+  // The ellipse's longer half axis, where alpha falls below 1/255, and the length of the other.
+  float middle = 0.5 * (covariance.x + covariance.z);
+  float uneven = 0.5 * (covariance.x - covariance.z);
+  float apart = length(vec2(uneven, covariance.y));
+  float angle = 0.5 * atan(covariance.y, uneven + 1e-20);
   float reach = sqrt(2.0 * log(size.w * 255.0));
-  place = vec4(focal * slope + principal, reach * sqrt(covariance.xz));
-  shape = vec4(covariance.z, -covariance.y, covariance.x, 0.0) / determinant;
-  shape.w = size.w;
+  vec2 axes = reach * sqrt(vec2(middle + apart, max(middle - apart, 0.3)));
+  place = vec4(focal * slope + principal, axes.x * vec2(cos(angle), sin(angle)));
+  shape = vec4(axes.y, reach, size.w, 0.0);
   shade = vec4(vec3(0.5) + 0.28209479177387814 * color, 1.0);
 }`;
 
-/** Each Gaussian is a box around what may be seen of it. */
+/** Each Gaussian is a box around the ellipse that may be seen of it. */
 const DRAW_VERTEX = `#version 300 es
 precision highp float;
 precision highp int;
@@ -133,48 +137,46 @@ precision highp usampler2D;
 uniform usampler2D order; // from far to near
 uniform sampler2D place, shape, shade;
 uniform vec2 imageSize;
-out vec2 offset;
-flat out vec4 conicOpacity;
-flat out vec3 color;
+out vec2 deviations; // from the centre, along both axes
+flat out vec4 colorOpacity;
 
 ${TEXEL}
 
 void main() {
   ivec2 at = texel(int(texelFetch(order, texel(gl_VertexID >> 2), 0).r));
-  vec4 box = texelFetch(place, at, 0);
-  conicOpacity = texelFetch(shape, at, 0);
-  color = texelFetch(shade, at, 0).rgb;
-  offset = box.zw * vec2((gl_VertexID & 1) * 2 - 1, (gl_VertexID & 2) - 1);
-  vec2 pixel = box.xy + offset;
+  vec4 box = texelFetch(place, at, 0), rest = texelFetch(shape, at, 0);
+  colorOpacity = vec4(texelFetch(shade, at, 0).rgb, rest.z);
+  vec2 corner = vec2((gl_VertexID & 1) * 2 - 1, (gl_VertexID & 2) - 1);
+  deviations = corner * rest.y;
+  vec2 along = box.zw, across = rest.x * normalize(vec2(-along.y, along.x));
+  vec2 pixel = box.xy + corner.x * along + corner.y * across;
   gl_Position = vec4(2.0 * pixel.x / imageSize.x - 1.0, 1.0 - 2.0 * pixel.y / imageSize.y, 0.0, 1.0);
-  if (box.z <= 0.0) gl_Position = vec4(2.0, 2.0, 2.0, 1.0); // not to be seen
+  if (rest.x <= 0.0) gl_Position = vec4(2.0, 2.0, 2.0, 1.0); // not to be seen
 }`;
 
 const DRAW_FRAGMENT = `#version 300 es
 precision highp float;
-in vec2 offset;
-flat in vec4 conicOpacity;
-flat in vec3 color;
+in vec2 deviations;
+flat in vec4 colorOpacity;
 out vec4 result;
 
 void main() {
-  float squared = conicOpacity.x * offset.x * offset.x + conicOpacity.z * offset.y * offset.y
-    + 2.0 * conicOpacity.y * offset.x * offset.y;
-  float alpha = min(0.999, conicOpacity.w * exp(-0.5 * squared));
+  float alpha = min(0.999, colorOpacity.a * exp(-0.5 * dot(deviations, deviations)));
   if (alpha < 1.0 / 255.0) discard;
-  result = vec4(color * alpha, alpha);
+  result = vec4(colorOpacity.rgb * alpha, alpha);
 }`;
 
 /** The picture over its background, whose colour is premultiplied as the result's is. */
 const SHOW_FRAGMENT = `#version 300 es
 precision highp float;
 precision highp sampler2D;
-uniform sampler2D picture;
+uniform sampler2D picture; // as large as the canvas or smaller
 uniform vec4 background;
+uniform vec2 size;         // of the canvas
 out vec4 result;
 
 void main() {
-  vec4 seen = texelFetch(picture, ivec2(gl_FragCoord.xy), 0);
+  vec4 seen = texture(picture, gl_FragCoord.xy / size);
   seen += (1.0 - seen.a) * background;
   result = vec4(clamp(seen.rgb, 0.0, seen.a), seen.a); // more than alpha would glow
 }`;

@@ -1,0 +1,82 @@
+"use strict";
+/* How much is drawn while something moves, so that pictures follow one another fast enough. */
+
+/** Share of the Gaussians and of the resolution (of each side), from all to least. */
+const PACE_STEPS = [[1, 1], [1, 0.7], [0.5, 0.7], [0.5, 0.5], [0.25, 0.5]];
+const SLOW = 40, FAST = 20; // milliseconds a picture: 25 and 50 a second
+const SLOW_PICTURES = 7; // whose middle one is slow, until less is drawn
+const FAST_PICTURES = 60; // in a row, until more is tried
+const MOST_PATIENCE = 16; // times as many, where more was too much before
+const REST = 250; // milliseconds without a moving picture, until one is drawn in full
+
+class Pace {
+  constructor() {
+    this.place = 0; // in PACE_STEPS
+    this.resting = true;
+    this._recent = [];
+    this._fast = 0;
+    this._patience = 1;
+    this._last = null; // when the last moving picture was drawn
+    this._drew = null; // the same, if that was the frame before
+  }
+
+  /** What is to be drawn now: { detail, resolution }. */
+  get share() {
+    const [detail, resolution] = PACE_STEPS[this.resting ? 0 : this.place];
+    return { detail, resolution };
+  }
+
+  /** In words, empty where all is drawn. */
+  get told() {
+    const { detail, resolution } = this.share;
+    const parts = [];
+    if (detail < 1) parts.push(`${Math.round(100 * detail)}% of the Gaussians`);
+    if (resolution < 1) parts.push(`${Math.round(100 * resolution)}% of the resolution`);
+    return parts.length ? `while moving ${parts.join(", ")}` : "";
+  }
+
+  /** Another moving picture is due in this frame of the browser (milliseconds). */
+  moves(now) {
+    this._frame(now);
+    this.resting = false;
+    this._last = this._drew = now;
+  }
+
+  /** Nothing has moved before this frame; whether a picture in full is due. */
+  rests(now) {
+    this._frame(now);
+    this._drew = null;
+    if (this.resting || now - this._last < REST) return false;
+    const reduced = this.place > 0;
+    this.resting = true;
+    this._recent = [];
+    return reduced;
+  }
+
+  /** The browser's next frame is late where a picture took long; whoever drives may be slow too. */
+  _frame(now) {
+    if (!this.resting && this._drew !== null) this._judge(now - this._drew);
+  }
+
+  _judge(milliseconds) {
+    this._fast = milliseconds < FAST ? this._fast + 1 : 0;
+    this._recent.push(milliseconds);
+    if (this._fast >= FAST_PICTURES * this._patience && this.place > 0) {
+      this._go(-1);
+    } else if (this._recent.length === SLOW_PICTURES) {
+      const middle = [...this._recent].sort((a, b) => a - b)[SLOW_PICTURES >> 1];
+      this._recent.shift();
+      if (middle > SLOW && this.place < PACE_STEPS.length - 1) {
+        if (this._tried) this._patience = Math.min(2 * this._patience, MOST_PATIENCE);
+        this._go(1);
+      }
+    }
+  }
+
+  _go(step) {
+    this.place += step;
+    this._tried = step < 0; // whether it is now more than what was fast enough
+    this._recent = [];
+    this._fast = 0;
+  }
+}
