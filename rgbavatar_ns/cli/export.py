@@ -15,7 +15,9 @@ if TYPE_CHECKING:
     from rgbavatar_ns.data import TrackedDataset
     from rgbavatar_ns.export import PageOptions
 
-Format = Literal["bundle", "ply", "ply-sequence", "web", "web-module"]
+Format = Literal[
+    "bundle", "ply", "gltf", "spz", "compressed-ply", "sog", "texture", "web", "web-module"
+]
 _LONGEST_SECONDS = 30.0
 """Of a performance that nobody chose: a minute of film would double the size of a page."""
 
@@ -28,39 +30,47 @@ def run(
     frame: int | None = None,
     frames: tuple[int, int] | None = None,
     head_inside: bool = True,
+    texture: Path | None = None,
     performance: bool = True,
     frames_per_second: FrameRate = 25.0,
     title: str = "Avatar",
     origins: tuple[str, ...] = (),
     servers: tuple[str, ...] = (),
 ) -> None:
-    """Write an avatar as a bundle, as Gaussians in PLY files, as a web page or for web pages.
+    """Write an avatar as a bundle, as Gaussians for other programs, as a picture or for browsers.
 
     bundle: a folder that `Avatar.load` opens without nerfstudio, with what the avatar saw in
-    training. ply: the Gaussians of one frame, as viewers of 3D Gaussian splatting
-    open them. ply-sequence: a folder of them. web: one HTML file that plays and drives the avatar
-    in a browser, without a server or a network. web-module: a folder with the avatar's file, an ES
-    module that shows and drives it on a canvas of your own page, and examples.
+    training. ply, gltf, spz, compressed-ply, sog: the Gaussians of one frame, or a folder of
+    several frames' (--frames), as viewers of 3D Gaussian splatting open them. texture: the head's
+    colours as a picture to paint on, for --texture. web: one HTML file that plays and drives the
+    avatar in a browser, without a server or a network. web-module: a folder with the avatar's file,
+    an ES module that shows and drives it on a canvas of your own page, and examples.
 
     Args:
         run_folder: a run of ns-train, a checkpoint or an avatar bundle.
-        destination: the folder (bundle, ply-sequence, web-module) or file (ply, web) to write.
+        destination: the file to write; for bundle and web-module, and with --frames of Gaussians,
+            the folder.
         format: what to write.
         data: the dataset whose frames are meant; by default the one that the run names.
-        frame: for ply, the frame's place in the dataset; without it the head is at rest.
-        frames: for ply-sequence and web, first frame and the frame after the last one; by default,
-            for web, the first 30 seconds of the run's own film.
+        frame: of Gaussians, the frame's place in the dataset; without it the head is at rest.
+        frames: of Gaussians and for browsers, first frame and the frame after the last one; by
+            default, for browsers, the first 30 seconds of the run's own film.
         head_inside: for bundle, put the head model inside. Without it the bundle only names its
             head model, as the licence of FLAME asks where it is passed on.
-        performance: for web, whether it brings those frames to play.
-        frames_per_second: for web, of the performance.
+        texture: a PNG painted over what --format texture wrote of this avatar: its colours change
+            as it was changed.
+        performance: for browsers, whether the avatar brings those frames to play.
+        frames_per_second: for browsers, of the performance.
         title: for web, the page's title.
         origins: for web, other pages whose messages it takes, such as https://example.org.
         servers: for web, what may drive it by ?ws= beside this machine, such as wss://example.org.
     """
     from rgbavatar_ns import Avatar
+    from rgbavatar_ns.export import GAUSSIAN_FILES, read_texture, with_texture
 
     whole = Avatar.load(run_folder)
+    if texture is not None:
+        whole = with_texture(whole, read_texture(texture))
     avatar = whole.without_undrawn()
     if avatar.num_gaussians < whole.num_gaussians:
         left_out = whole.num_gaussians - avatar.num_gaussians
@@ -70,10 +80,10 @@ def run(
         seen = _seen(avatar, run_folder, dataset)
         avatar.save(destination, statistics=seen, with_head=head_inside)
         print(f"Avatar.load({str(destination)!r}) opens it.")
-    elif format == "ply":
-        _write_frame(avatar, dataset, frame, destination)
-    elif format == "ply-sequence":
-        _write_sequence(avatar, dataset, frames, destination)
+    elif format in GAUSSIAN_FILES:
+        _write_gaussians(avatar, dataset, format, frame, frames, destination)
+    elif format == "texture":
+        _write_texture(avatar, destination)
     else:
         from rgbavatar_ns.export import PageOptions
 
@@ -118,43 +128,41 @@ def _dataset(
     return dataset
 
 
-def _write_frame(
-    avatar: "Avatar", dataset: "TrackedDataset | None", frame: int | None, destination: Path
-) -> None:
-    import torch
-
-    from rgbavatar_ns.export import write_ply
-    from rgbavatar_ns.export.scenes import chosen_frames
-
-    theta = torch.zeros(1, avatar.layout.size)
-    if frame is not None:
-        assert dataset is not None
-        theta = dataset.theta[list(chosen_frames(len(dataset), (frame, frame + 1), ()))]
-    with torch.no_grad():
-        count = write_ply(destination, avatar.gaussians(theta))
-    print(f"{count} Gaussians in {destination}")
-
-
-def _write_sequence(
+def _write_gaussians(
     avatar: "Avatar",
     dataset: "TrackedDataset | None",
+    format: Format,
+    frame: int | None,
     frames: tuple[int, int] | None,
     destination: Path,
 ) -> None:
     import torch
 
-    from rgbavatar_ns.export import write_ply
+    from rgbavatar_ns.export import write_gaussian_sequence, write_gaussians
     from rgbavatar_ns.export.scenes import chosen_frames
 
-    if dataset is None:
-        raise UserError("A sequence needs a dataset.", "Name it with --data.")
-    chosen = chosen_frames(len(dataset), frames, range(len(dataset)))
-    with progress_bar("PLY files") as update, torch.no_grad():
-        for done, place in enumerate(chosen, start=1):
-            gaussians = avatar.gaussians(dataset.theta[place : place + 1])
-            write_ply(destination / f"{place:05d}.ply", gaussians)
-            update(done, len(chosen))
-    print(f"{len(chosen)} PLY files in {destination}")
+    if frame is not None and frames is not None:
+        raise UserError("There is both --frame and --frames.", "Leave one of them out.")
+    if dataset is None or (frame is None and frames is None):
+        count = write_gaussians(avatar, torch.zeros(1, avatar.layout.size), destination, format)
+        print(f"{count} Gaussians in {destination}")
+    elif frames is None and frame is not None:
+        (place,) = chosen_frames(len(dataset), (frame, frame + 1), ())
+        count = write_gaussians(avatar, dataset.theta[[place]], destination, format)
+        print(f"{count} Gaussians in {destination}")
+    else:
+        chosen = chosen_frames(len(dataset), frames, ())
+        with progress_bar(format) as update:
+            write_gaussian_sequence(avatar, dataset.theta, chosen, destination, format, update)
+        print(f"{len(chosen)} files in {destination}")
+
+
+def _write_texture(avatar: "Avatar", destination: Path) -> None:
+    from rgbavatar_ns.export import write_texture
+
+    wires = write_texture(destination, avatar)
+    print(f"{destination}: paint on it, the face is upright and its left side on the right.")
+    print(f"{wires}: the head's mesh, to lay over it. --texture takes the painted picture.")
 
 
 def _as_filmed(avatar: "Avatar", dataset: "TrackedDataset") -> "Avatar":

@@ -21,7 +21,7 @@ COMMANDS = {
     "check": "look at data before training: what it is, what is odd, and a picture of the fit",
     "render": "films and pictures: held-out frames, another's performance, views, learned bases",
     "drive": "an avatar moved live by a camera, a phone, a film or any program",
-    "export": "the avatar as a bundle, as PLY files of Gaussians or as a web page",
+    "export": "the avatar as a bundle, Gaussians for other programs, a texture or a web page",
     "sweep": "train and evaluate every cell of an experiment, configs/*.yaml or your own",
     "report": "tables and plots of a sweep",
     "bench": "how fast the rasterizer, a training step and rendering are on this machine",

@@ -1,7 +1,7 @@
 """`rgbavatar render`: films and pictures of a trained avatar."""
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -62,6 +62,7 @@ def run(
     camera_path: Path | None = None,
     gain: Weight | None = None,
     arc: Annotated[float, Between(-360, 360)] | None = None,
+    texture: Path | None = None,
     picture: Annotated[PictureOptions, tyro.conf.arg(name="")] = _PICTURE,
     driving: Annotated[DrivingOptions, tyro.conf.arg(name="")] = _DRIVING,
 ) -> None:
@@ -90,14 +91,19 @@ def run(
             360 goes to and fro.
         gain: for bases, by how much each basis's largest weight in training is exaggerated; by
             default by as much as it takes to see what it does.
+        texture: a PNG painted over what `rgbavatar export --format texture` wrote of this avatar:
+            its colours change as it was changed.
         picture: how pictures are written.
         driving: how the driver's performance becomes the avatar's.
     """
     if driver is not None and show == "comparison":
         show = "performance"
+    from rgbavatar_ns.export import read_texture, with_texture
     from rgbavatar_ns.export.subject import load_subject
 
     subject = load_subject(run_folder, data, picture.width, picture.height)
+    if texture is not None:
+        subject = replace(subject, avatar=with_texture(subject.avatar, read_texture(texture)))
     if show == "comparison":
         _compare(subject, output, frames, picture)
     elif show == "bases":

@@ -37,8 +37,9 @@ _TURN_ROOM_DEGREES = 20.0
 turns there knows; a performer's every turn would show what nobody filmed."""
 _SETTLES_IN_S = 0.3
 """Rest comes down within so many seconds to where a calmer face stays, and hardly for one frame."""
-_LEAST_UNIT = 0.1
+_LEAST_UNIT = 0.3
 """Of smoothing: what hardly moved in the film trembles all the more in another's performance."""
+_MOST_TURNS_BACK, _SAME_DEGREES = 4, 0.5
 _GAP_S = 0.5
 """After a longer gap the performer may be anywhere: nothing is smoothed across it."""
 _MOST_FRAMES = 600
@@ -57,7 +58,7 @@ class LiveOptions(CheckedOptions):
     """Hold expressions softly to the film's range, and turns to where the avatar holds."""
     smooth: bool = True
     """Filter jitter with a one-euro filter."""
-    filter: OneEuroOptions = field(default_factory=lambda: OneEuroOptions(3.0, 30.0))
+    filter: OneEuroOptions = field(default_factory=lambda: OneEuroOptions(2.0, 15.0))
     """The filter's settings; speeds count in each number's range in the film."""
 
 
@@ -92,7 +93,10 @@ class LiveTransfer:
         self._world_to_camera = camera.world_to_camera[:1]
         relative = "neutral" if options.calibrate_s > 0 else "off"
         self._driving = DrivingOptions(relative=relative, pose=options.pose)
-        self._carrier = head_carrier(avatar.head.arrays.expression_names)
+        # Shoulders do what they do: only the head upon them is held back.
+        upon = head_carrier(avatar.head.arrays.expression_names) == "neck"
+        names = ("neck",) if upon else ("rotation", "neck")
+        self._carriers = [avatar.layout.slice(name) for name in names]
         self._expressive = expressive_numbers(avatar.layout)
         low, high = own.film_range()
         self._unit = (high - low).clamp(min=_LEAST_UNIT)
@@ -228,20 +232,23 @@ class LiveTransfer:
     def _turned_back(self, theta: Float[Tensor, "H"]) -> Float[Tensor, "H"]:
         """With the head's turn as the camera sees it softly within those filmed."""
         low, high = self._own.filmed_turns()
-        seen = self._turn(theta)
-        beyond = seen - _softly(seen, low, high, torch.full_like(seen, _TURN_ROOM_DEGREES))
-        start_seen = self._turn(self._own.theta_mean)
-        share = float(
-            (1 - beyond.abs() / (seen - start_seen).abs().clamp(min=1.0)).clamp(0, 1).min()
-        )
-        if share == 1.0:
-            return theta
-        carrier = self._layout.slice(self._carrier)
+        room = torch.full_like(low, _TURN_ROOM_DEGREES)
+        wanted = _softly(self._turn(theta), low, high, room)
         mean = self._own.theta_mean
-        start, end = (axis_angle_to_matrix(part[carrier]) for part in (mean, theta))
-        held = axis_angle_to_matrix(share * matrix_to_axis_angle(end @ start.mT)) @ start
-        theta = theta.clone()
-        theta[carrier] = matrix_to_axis_angle(held)
+        start_seen = self._turn(mean)
+        starts = [axis_angle_to_matrix(mean[carrier]) for carrier in self._carriers]
+        # Angles of large turns do not add: what is left is taken back again.
+        for _ in range(_MOST_TURNS_BACK):
+            seen = self._turn(theta)
+            kept = (wanted - start_seen) / torch.where(seen == start_seen, 1.0, seen - start_seen)
+            share = float(torch.where((seen - wanted).abs() > _SAME_DEGREES, kept, 1.0).min())
+            if share >= 1.0:
+                break
+            theta = theta.clone()
+            for carrier, start in zip(self._carriers, starts):
+                moved = matrix_to_axis_angle(axis_angle_to_matrix(theta[carrier]) @ start.mT)
+                held = axis_angle_to_matrix(max(share, 0.0) * moved) @ start
+                theta[carrier] = matrix_to_axis_angle(held)
         return theta
 
     def _turn(self, theta: Float[Tensor, "H"]) -> Float[Tensor, "2"]:

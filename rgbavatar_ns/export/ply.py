@@ -32,16 +32,26 @@ def write_ply(path: Path, gaussians: GaussianSet) -> int:
     unit quaternions with the real part first. World of the head model: metres, y up, the face
     looks along +z. Raises ValueError for more than one set, UserError where it cannot be written.
     """
+    content = encode_ply(gaussians)
+    with atomic_write(path) as partial:
+        partial.write_bytes(content)
+    return gaussians.means.shape[1]
+
+
+def encode_ply(gaussians: GaussianSet, *, with_rest: bool = True) -> bytes:
+    """Return what `write_ply` writes; the higher harmonics can be left out.
+
+    Raises ValueError for more than one set.
+    """
     if len(gaussians.means) != 1:
-        raise ValueError(f"A PLY file holds one set of Gaussians, not {len(gaussians.means)}.")
-    table = _table(gaussians)
-    header = "".join(f"property float {name}\n" for name in COLUMNS)
+        raise ValueError(f"A file holds one set of Gaussians, not {len(gaussians.means)}.")
+    kept = [place for place, name in enumerate(COLUMNS) if with_rest or "rest" not in name]
+    table = _table(gaussians)[:, kept]
+    header = "".join(f"property float {COLUMNS[place]}\n" for place in kept)
     header = (
         f"ply\nformat binary_little_endian 1.0\nelement vertex {len(table)}\n{header}end_header\n"
     )
-    with atomic_write(path) as partial:
-        partial.write_bytes(header.encode("ascii") + table.tobytes())
-    return len(table)
+    return header.encode("ascii") + table.tobytes()
 
 
 @torch.no_grad()

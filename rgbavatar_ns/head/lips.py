@@ -2,7 +2,7 @@
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from rgbavatar_ns.head.arrays import HeadArrays
@@ -27,7 +27,7 @@ class LipGap:
         self,
         head: HeadModel,
         identity: Float[Tensor, "I"],
-        vertices: Float[np.ndarray, "2 K"],
+        vertices: Int[np.ndarray, "2 K"],
         weights: Float[np.ndarray, "2 K"],
     ) -> None:
         self._head, self._identity = head, identity

@@ -79,6 +79,12 @@ def rows_6d_to_matrix(rows: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch 
     return roma.special_gramschmidt(columns).transpose(-1, -2)
 
 
+def quat_wxyz_to_matrix(quat_wxyz: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3 3"]:
+    """Rotation matrices of quaternions of any length but zero."""
+    unit = torch.nn.functional.normalize(quat_wxyz, dim=-1)
+    return roma.unitquat_to_rotmat(unit.roll(-1, -1))
+
+
 def matrix_to_quat_wxyz(matrix: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 4"]:
     """Unit quaternions of proper rotations; the sign is either.
 

@@ -16,6 +16,7 @@ from rgbavatar_ns.avatar.storage.bundle import load_statistics
 from rgbavatar_ns.cli import main as cli
 from rgbavatar_ns.cli.export import page_frames
 from rgbavatar_ns.data import load_dataset
+from rgbavatar_ns.data.png import encode_png_rgba, read_png_rgba
 from tests.data.small_dataset import NUM_FRAMES, NUM_TEST, small_dataset
 from tests.export.avatar_of_page import avatar_of_page
 from tests.export.subject import avatar_of
@@ -62,10 +63,29 @@ def test_a_ply_of_a_frame_and_of_the_head_at_rest(bundle, data, tmp_path):
         np.testing.assert_allclose(np.stack([vertex[a] for a in "xyz"], 1), expected)
 
 
-def test_a_sequence_has_a_file_for_each_frame(bundle, data, tmp_path):
-    words = ["--format", "ply-sequence", "--data", data, "--frames", 2, 4]
+@pytest.mark.parametrize(("format", "suffix"), [("ply", "ply"), ("gltf", "glb")])
+def test_a_sequence_has_a_file_for_each_frame(bundle, data, tmp_path, format, suffix):
+    words = ["--format", format, "--data", data, "--frames", 2, 4]
     _export(bundle, tmp_path / "film", *words)
-    assert sorted(p.name for p in (tmp_path / "film").iterdir()) == ["00002.ply", "00003.ply"]
+    names = sorted(path.name for path in (tmp_path / "film").iterdir())
+    assert names == [f"00002.{suffix}", f"00003.{suffix}"]
+
+
+def test_colours_go_out_are_painted_and_come_back(bundle, tmp_path, capsys):
+    _export(bundle, tmp_path / "me.png", "--format", "texture")
+    assert "me_wires.png" in capsys.readouterr().out
+    picture = read_png_rgba(tmp_path / "me.png")
+    assert read_png_rgba(tmp_path / "me_wires.png").shape == picture.shape
+    _export(bundle, tmp_path / "same", "--texture", tmp_path / "me.png")
+    _export(bundle, tmp_path / "plain")
+    picture[..., :3] = (255, 0, 0)
+    (tmp_path / "red.png").write_bytes(encode_png_rgba(picture))
+    _export(bundle, tmp_path / "red", "--texture", tmp_path / "red.png")
+    plain, same, red = (Avatar.load(tmp_path / name) for name in ("plain", "same", "red"))
+    colors = [avatar.blendshapes.color_feature for avatar in (plain, same, red)]
+    assert torch.equal(colors[0], colors[1])
+    middle = (0.5 + 0.28209479 * colors[2]).median(0).values
+    assert torch.allclose(middle, torch.tensor([1.0, 0.0, 0.0]), atol=0.05)
 
 
 def _frames(page: Path) -> int:
@@ -131,13 +151,16 @@ def test_the_runs_own_data_is_the_default(bundle, data, tmp_path, capsys):
 
 
 def test_mistakes_are_told(bundle, data, tmp_path, refused):
+    framed = [bundle, tmp_path / "a.ply", "--format", "ply", "--data", data]
     for words, told in (
         ([tmp_path / "none", tmp_path / "out"], "There is no"),
         ([bundle, tmp_path / "a.ply", "--format", "ply", "--frame", 1], "--data"),
-        ([bundle, tmp_path / "out", "--format", "ply-sequence"], "--data"),
+        ([bundle, tmp_path / "out", "--format", "gltf", "--frames", 0, 2], "--data"),
+        ([bundle, tmp_path / "out", "--texture", data / "dataset.json"], "not a PNG"),
+        ([*framed, "--frame", 1, "--frames", 0, 2], "both --frame and --frames"),
         ([bundle, tmp_path / "a.html", "--format", "web", "--frames", 0, 2], "--data"),
         ([bundle, tmp_path / "a.html", "--format", "web", "--frames-per-second", "nan"], "is nan"),
-        ([bundle, tmp_path / "a", "--format", "ply", "--data", data, "--frame", 99], "no frames"),
+        ([*framed, "--frame", 99], "no frames"),
         ([bundle, tmp_path / "a.html", "--format", "web", "--origins", "null"], "is no origin"),
         ([bundle, tmp_path / "a.html", "--format", "web", "--origins", "https://a.b/c"], "a path"),
         (

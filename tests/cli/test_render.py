@@ -12,7 +12,7 @@ import torch
 
 from rgbavatar_ns.cli import main as cli
 from rgbavatar_ns.data import DatasetWriter, TrackedFrame
-from rgbavatar_ns.data.png import read_png_rgba
+from rgbavatar_ns.data.png import encode_png_rgba, read_png_rgba
 from rgbavatar_ns.export import front_camera, pictures
 from rgbavatar_ns.synthetic.flame import write_synthetic_flame
 from tests.export.subject import avatar_of, camera_path, lively_theta
@@ -100,6 +100,20 @@ def test_a_camera_path_sets_size_rate_and_length(bundle, data, tmp_path):
     film = _film(tmp_path / "camera-path.mp4")
     assert len(film) == 5
     assert film[0].shape == (20, 30, 3)
+
+
+def test_a_painted_texture_shows(bundle, data, tmp_path, refused):
+    red = np.full((64, 64, 4), (255, 0, 0, 255), np.uint8)
+    (tmp_path / "red.png").write_bytes(encode_png_rgba(red))
+    words = ["--show", "performance", "--kind", "png", "--frames", 1, 2, "--texture"]
+    _render(bundle, tmp_path, "--data", data, *words, tmp_path / "red.png")
+    middle = read_png_rgba(tmp_path / "performance" / "00000.png")[_SIZE // 2, _SIZE // 2]
+    assert middle[0] > 200
+    assert max(middle[1:3]) < 60
+    (tmp_path / "red.png").write_bytes(encode_png_rgba(red[1:]))
+    assert "64 x 63 pixels" in refused(
+        "render", bundle, tmp_path, "--data", data, *words, tmp_path / "red.png"
+    )
 
 
 def test_the_grid_of_bases(bundle, data, tmp_path):

@@ -22,7 +22,7 @@ _STANDARD = (
 ).split()
 
 
-def _read(path: Path) -> GaussianSet:
+def read_ply(path: Path) -> GaussianSet:
     """As a viewer of 3D Gaussian splatting does: sigmoid, exp, normalise, colour of degree 0."""
     vertex = PlyData.read(str(path))["vertex"]
 
@@ -48,7 +48,7 @@ def test_plyfile_reads_it_and_it_renders_to_the_same_picture(tmp_path):
     camera = front_camera(avatar, 96, 96)
     background = torch.ones(3)
     ours = draw(avatar, theta, camera, (1.0, 1.0, 1.0)).image[0].numpy()
-    theirs = rasterize(_read(tmp_path / "a.ply"), camera, background).image[0].numpy()
+    theirs = rasterize(read_ply(tmp_path / "a.ply"), camera, background).image[0].numpy()
     assert ours.std() > 0.1
     assert psnr(ours, theirs) > 60
 
@@ -81,7 +81,7 @@ def test_opacities_and_scales_at_their_limits_stay_finite(tmp_path):
         colors=torch.tensor([[[-1.0, 0.5, 2.0]] * 2]),
     )
     write_ply(tmp_path / "a.ply", extreme)
-    read = _read(tmp_path / "a.ply")
+    read = read_ply(tmp_path / "a.ply")
     assert all(torch.isfinite(value).all() for value in vars(read).values())
     assert torch.allclose(read.opacities, extreme.opacities, atol=1e-5)
     assert torch.allclose(read.scales, extreme.scales, atol=1e-6)

@@ -78,3 +78,9 @@ def test_axis_angle_agrees_with_roma_at_small_and_large_angles() -> None:
     assert torch.equal(
         rotations.axis_angle_to_matrix(torch.zeros(2, 3)), torch.eye(3).expand(2, 3, 3)
     )
+
+
+def test_a_quaternion_of_any_length_is_the_matrix_that_it_came_from() -> None:
+    turns = rotations.axis_angle_to_matrix(torch.randn(20, 3, dtype=torch.float64))
+    quats_wxyz = rotations.matrix_to_quat_wxyz(turns)
+    assert torch.allclose(rotations.quat_wxyz_to_matrix(3 * quats_wxyz), turns, atol=1e-12)
