@@ -3,7 +3,7 @@
 from rgbavatar_ns.export.bases import basis_grid
 from rgbavatar_ns.export.comparison import comparison_frames, write_comparison
 from rgbavatar_ns.export.drawing import draw, pictures
-from rgbavatar_ns.export.filmed import within_film
+from rgbavatar_ns.export.filmed import as_filmed, within_film
 from rgbavatar_ns.export.gaussian_files import (
     GAUSSIAN_FILES,
     write_gaussian_sequence,
@@ -27,6 +27,7 @@ from rgbavatar_ns.export.web_page import PageOptions, write_web_page
 __all__ = [
     "GAUSSIAN_FILES",
     "PageOptions",
+    "as_filmed",
     "basis_grid",
     "calm_theta",
     "color_texture",
