@@ -2,8 +2,10 @@
 
 import math
 from dataclasses import dataclass, field, replace
+from typing import Annotated
 
 import torch
+import tyro
 from jaxtyping import Bool, Float
 from torch import Tensor
 
@@ -50,7 +52,7 @@ _MOST_FRAMES = 600
 class LiveOptions(CheckedOptions):
     """How a live performance becomes the avatar's."""
 
-    calibrate_s: Weight = 1.0
+    calibrate_s: Annotated[Weight, tyro.conf.arg(aliases=("--calibrate",))] = 1.0
     """For so many seconds the performer's rest is learnt; 0 takes the numbers as they are."""
     pose: DrivenPose = "relative"
     """Of the head's turns and place: departures from the performer's, as they are, or none."""

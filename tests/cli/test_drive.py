@@ -186,4 +186,5 @@ def test_a_run_is_a_performance_and_pictures_are_none(performer, tmp_path):
 
 def test_options_out_of_range_are_told(avatar, refused):
     assert SourceOptions().source == "camera"
-    assert "calibrate" in refused("drive", avatar, "--calibrate-s", "-1", "--out", "f.mp4")
+    for flag in ("--calibrate", "--calibrate-s"):
+        assert "calibrate_s" in refused("drive", avatar, flag, "-1", "--out", "f.mp4")

@@ -1,5 +1,6 @@
 import math
 import socket
+import sys
 import time
 
 import pytest
@@ -7,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rgbavatar_ns.driving.sources.vmc import VmcSource
+from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head.arkit import ARKIT_NAMES
 
 osc = pytest.importorskip("pythonosc.osc_message_builder", reason="python-osc is not installed")
@@ -104,3 +106,9 @@ def test_what_is_no_number_or_unknown_is_counted(source):
 @given(st.binary(max_size=200), st.sampled_from([b"", b"/VMC/Ext/Blend/Val\0\0", b"#bundle\0"]))
 def test_no_bytes_end_it(source, content, begin):
     source._read(begin + content)
+
+
+def test_a_missing_library_is_told(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pythonosc.osc_packet", None)
+    with pytest.raises(UserError, match="pip install python-osc"):
+        VmcSource("127.0.0.1:0")
