@@ -187,4 +187,4 @@ def test_a_run_is_a_performance_and_pictures_are_none(performer, tmp_path):
 def test_options_out_of_range_are_told(avatar, refused):
     assert SourceOptions().source == "camera"
     for flag in ("--calibrate", "--calibrate-s"):
-        assert "calibrate_s" in refused("drive", avatar, flag, "-1", "--out", "f.mp4")
+        assert "--calibrate-s is -1" in refused("drive", avatar, flag, "-1", "--out", "f.mp4")
