@@ -13,8 +13,13 @@ if TYPE_CHECKING:
     from rgbavatar_ns.avatar import Avatar
     from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
     from rgbavatar_ns.data import TrackedDataset
+    from rgbavatar_ns.export import PageOptions
 
-Format = Literal["bundle", "ply", "gltf", "spz", "compressed-ply", "sog", "texture", "web"]
+Format = Literal[
+    "bundle", "ply", "gltf", "spz", "compressed-ply", "sog", "texture", "web", "web-module"
+]
+_LONGEST_SECONDS = 30.0
+"""Of a performance that nobody chose: a minute of film would double the size of a page."""
 
 
 def run(
@@ -26,30 +31,39 @@ def run(
     frames: tuple[int, int] | None = None,
     head_inside: bool = True,
     texture: Path | None = None,
+    performance: bool = True,
     frames_per_second: FrameRate = 25.0,
     title: str = "Avatar",
+    origins: tuple[str, ...] = (),
+    servers: tuple[str, ...] = (),
 ) -> None:
-    """Write an avatar as a bundle, as Gaussians for other programs, as a picture or as a web page.
+    """Write an avatar as a bundle, as Gaussians for other programs, as a picture or for browsers.
 
     bundle: a folder that `Avatar.load` opens without nerfstudio, with what the avatar saw in
     training. ply, gltf, spz, compressed-ply, sog: the Gaussians of one frame, or a folder of
     several frames' (--frames), as viewers of 3D Gaussian splatting open them. texture: the head's
     colours as a picture to paint on, for --texture. web: one HTML file that plays and drives the
-    avatar in a browser, without a server or a network.
+    avatar in a browser, without a server or a network. web-module: a folder with the avatar's file,
+    an ES module that shows and drives it on a canvas of your own page, and examples.
 
     Args:
         run_folder: a run of ns-train, a checkpoint or an avatar bundle.
-        destination: the file to write; for bundle, and with --frames, the folder.
+        destination: the file to write; for bundle and web-module, and with --frames of Gaussians,
+            the folder.
         format: what to write.
         data: the dataset whose frames are meant; by default the one that the run names.
         frame: of Gaussians, the frame's place in the dataset; without it the head is at rest.
-        frames: of Gaussians and for web, first frame and the frame after the last one.
+        frames: of Gaussians and for browsers, first frame and the frame after the last one; by
+            default, for browsers, the first 30 seconds of the run's own film.
         head_inside: for bundle, put the head model inside. Without it the bundle only names its
             head model, as the licence of FLAME asks where it is passed on.
         texture: a PNG painted over what --format texture wrote of this avatar: its colours change
             as it was changed.
-        frames_per_second: for web, of the performance.
+        performance: for browsers, whether the avatar brings those frames to play.
+        frames_per_second: for browsers, of the performance.
         title: for web, the page's title.
+        origins: for web, other pages whose messages it takes, such as https://example.org.
+        servers: for web, what may drive it by ?ws= beside this machine, such as wss://example.org.
     """
     from rgbavatar_ns import Avatar
     from rgbavatar_ns.export import GAUSSIAN_FILES, read_texture, with_texture
@@ -71,8 +85,14 @@ def run(
     elif format == "texture":
         _write_texture(avatar, destination)
     else:
+        from rgbavatar_ns.export import PageOptions
+
+        options = PageOptions(title, frames_per_second, origins=origins, servers=servers)
         seen = _seen(avatar, run_folder, dataset)
-        _write_page(avatar, seen, dataset, frames, destination, frames_per_second, title)
+        if dataset is not None:
+            avatar = _as_filmed(avatar, dataset)
+        places = page_frames(dataset, frames, frames_per_second)
+        _write_web(format, avatar, seen, dataset, places, performance, destination, options)
 
 
 def _seen(
@@ -145,25 +165,63 @@ def _write_texture(avatar: "Avatar", destination: Path) -> None:
     print(f"{wires}: the head's mesh, to lay over it. --texture takes the painted picture.")
 
 
-def _write_page(
-    avatar: "Avatar",
-    seen: "TrainingStatistics | None",
-    dataset: "TrackedDataset | None",
-    frames: tuple[int, int] | None,
-    destination: Path,
-    frames_per_second: float,
-    title: str,
-) -> None:
+def _as_filmed(avatar: "Avatar", dataset: "TrackedDataset") -> "Avatar":
+    """The avatar without what lies beyond the film's edges."""
     import torch
 
-    from rgbavatar_ns.export import PageOptions, front_camera, write_web_page
+    from rgbavatar_ns.export import within_film
+
+    kept = torch.nonzero(within_film(avatar, dataset))[:, 0]
+    left_out = avatar.num_gaussians - len(kept)
+    if len(kept) == 0 or left_out == 0:  # without any, the data's cameras are not of this avatar
+        return avatar
+    print(f"{left_out} Gaussians lie beyond every picture's edge: left out.")
+    return avatar.with_gaussians(kept)
+
+
+def page_frames(
+    dataset: "TrackedDataset | None", frames: tuple[int, int] | None, frames_per_second: float
+) -> tuple[int, ...]:
+    """Places of the frames that a page plays: those named, or the film's beginning.
+
+    Of several cameras the first one's film: the others saw the same.
+    """
     from rgbavatar_ns.export.scenes import chosen_frames
 
     if dataset is None:
-        camera, theta = front_camera(avatar, 512, 512), torch.zeros(0, avatar.layout.size)
+        return ()
+    names = dataset.camera_names
+    film = [place for place in range(len(dataset)) if not names or names[place] == names[0]]
+    most = max(1, round(_LONGEST_SECONDS * frames_per_second))
+    return chosen_frames(len(dataset), frames, film[:most])
+
+
+def _write_web(
+    format: Format,
+    avatar: "Avatar",
+    seen: "TrainingStatistics | None",
+    dataset: "TrackedDataset | None",
+    places: tuple[int, ...],
+    performance: bool,
+    destination: Path,
+    options: "PageOptions",
+) -> None:
+    import torch
+
+    from rgbavatar_ns.export import calm_theta, front_camera, write_web_module, write_web_page
+
+    if dataset is None:
+        camera, theta = front_camera(avatar, 512, 512), torch.zeros(1, avatar.layout.size)
     else:
-        chosen = chosen_frames(len(dataset), frames, range(len(dataset)))
-        camera, theta = dataset.cameras.select([chosen[0]]), dataset.theta[list(chosen)]
-    options = PageOptions(title, frames_per_second)
-    size = write_web_page(avatar, destination, camera, theta, options, seen)
-    print(f"{destination}: {size / 1e6:.1f} MB; open it in a browser")
+        camera, theta = dataset.cameras.select([places[0]]), dataset.theta[list(places)]
+    neutral = calm_theta(seen, theta[0])
+    if dataset is None or not performance:
+        theta = theta[:0]
+    if format == "web":
+        size = write_web_page(avatar, destination, camera, theta, options, seen, neutral)
+        print(f"{destination}: {size / 1e6:.1f} MB; open it in a browser")
+    else:
+        rate = options.frames_per_second
+        size = write_web_module(avatar, destination, camera, theta, rate, seen, neutral)
+        print(f"{destination}: {size / 1e6:.1f} MB, the avatar; `python -m http.server` in there")
+        print("shows example.html at http://localhost:8000/example.html")

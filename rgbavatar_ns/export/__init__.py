@@ -3,6 +3,7 @@
 from rgbavatar_ns.export.bases import basis_grid
 from rgbavatar_ns.export.comparison import comparison_frames, write_comparison
 from rgbavatar_ns.export.drawing import draw, pictures
+from rgbavatar_ns.export.filmed import within_film
 from rgbavatar_ns.export.gaussian_files import (
     GAUSSIAN_FILES,
     write_gaussian_sequence,
@@ -19,12 +20,15 @@ from rgbavatar_ns.export.views import (
     resized,
     swing,
 )
+from rgbavatar_ns.export.web_manifest import calm_theta
+from rgbavatar_ns.export.web_module import write_web_module
 from rgbavatar_ns.export.web_page import PageOptions, write_web_page
 
 __all__ = [
     "GAUSSIAN_FILES",
     "PageOptions",
     "basis_grid",
+    "calm_theta",
     "color_texture",
     "comparison_frames",
     "dataset_folder",
@@ -37,6 +41,7 @@ __all__ = [
     "statistics_of",
     "swing",
     "with_texture",
+    "within_film",
     "write_comparison",
     "write_gaussian_sequence",
     "write_gaussians",
@@ -47,5 +52,6 @@ __all__ = [
     "write_pngs",
     "write_texture",
     "write_video",
+    "write_web_module",
     "write_web_page",
 ]

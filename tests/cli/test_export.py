@@ -2,6 +2,7 @@
 
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +14,11 @@ from plyfile import PlyData
 from rgbavatar_ns import Avatar
 from rgbavatar_ns.avatar.storage.bundle import load_statistics
 from rgbavatar_ns.cli import main as cli
+from rgbavatar_ns.cli.export import page_frames
 from rgbavatar_ns.data import load_dataset
 from rgbavatar_ns.data.png import encode_png_rgba, read_png_rgba
 from tests.data.small_dataset import NUM_FRAMES, NUM_TEST, small_dataset
+from tests.export.avatar_of_page import avatar_of_page
 from tests.export.subject import avatar_of
 
 
@@ -85,11 +88,53 @@ def test_colours_go_out_are_painted_and_come_back(bundle, tmp_path, capsys):
     assert torch.allclose(middle, torch.tensor([1.0, 0.0, 0.0]), atol=0.05)
 
 
+def _frames(page: Path) -> int:
+    """Of a page's performance."""
+    return len(avatar_of_page(page)[1]["theta"])
+
+
 def test_a_page_with_and_without_a_performance(bundle, data, tmp_path):
     _export(bundle, tmp_path / "still.html", "--format", "web")
     _export(bundle, tmp_path / "film.html", "--format", "web", "--data", data, "--title", "Me")
+    _export(bundle, tmp_path / "calm.html", "--format", "web", "--data", data, "--no-performance")
     assert "<title>Me</title>" in (tmp_path / "film.html").read_text()
-    assert '"theta": {"dtype": "float32"' in (tmp_path / "still.html").read_text()
+    counts = [_frames(tmp_path / f"{name}.html") for name in ("still", "film", "calm")]
+    assert counts == [0, NUM_FRAMES, 0]
+
+
+def test_a_performance_that_nobody_chose_is_of_thirty_seconds(bundle, data, tmp_path):
+    words = [bundle, tmp_path / "a.html", "--format", "web", "--data", data]
+    _export(*words, "--frames-per-second", 0.1)
+    assert _frames(tmp_path / "a.html") == 3
+
+
+def test_of_several_cameras_the_first_ones_film_is_played(data):
+    dataset = load_dataset(data)
+    names = tuple("ab"[place % 2] for place in range(len(dataset)))
+    several = replace(dataset, camera_names=names)
+    assert page_frames(several, None, 25.0) == tuple(range(0, len(dataset), 2))
+    assert page_frames(several, (1, 3), 25.0) == (1, 2)
+    assert page_frames(None, None, 25.0) == ()
+
+
+def test_a_page_is_told_who_may_speak_to_it(bundle, tmp_path):
+    _export(
+        *[bundle, tmp_path / "a.html", "--format", "web", "--origins", "https://example.org"],
+        *["http://localhost:8000", "--servers", "wss://drive.example.org:8443"],
+    )
+    page = (tmp_path / "a.html").read_text()
+    assert '"origins": ["https://example.org", "http://localhost:8000"]' in page
+    policy = re.search(r'content="(default-src[^"]*)"', page)
+    assert policy
+    assert policy[1].endswith(" wss://localhost:* wss://drive.example.org:8443")
+
+
+def test_a_module_is_a_folder_for_a_site(bundle, data, tmp_path, capsys):
+    _export(bundle, tmp_path / "site", "--format", "web-module", "--data", data)
+    names = {path.name for path in (tmp_path / "site").iterdir()}
+    examples = {"example.html", "example-mediapipe.html", "example-three.html"}
+    assert names == {"avatar.rgba", "rgbavatar.js", "rgbavatar.d.ts"} | examples
+    assert "example.html" in capsys.readouterr().out
 
 
 def test_the_runs_own_data_is_the_default(bundle, data, tmp_path, capsys):
@@ -98,9 +143,7 @@ def test_the_runs_own_data_is_the_default(bundle, data, tmp_path, capsys):
     described = {"data": None, "pipeline": {"datamanager": manager}}
     (run / "config.yml").write_text(yaml.safe_dump(described))
     _export(run, tmp_path / "film.html", "--format", "web", "--frames", 1, 4)
-    page = (tmp_path / "film.html").read_text()
-    size = load_dataset(data).theta.shape[1]
-    assert re.search(rf'"theta": {{"dtype": "float32", "offset": \d+, "length": {3 * size}}}', page)
+    assert _frames(tmp_path / "film.html") == 3
     manager["data"] = [str(tmp_path / "gone")]
     (run / "config.yml").write_text(yaml.safe_dump(described))
     _export(run, tmp_path / "still.html", "--format", "web")
@@ -118,6 +161,12 @@ def test_mistakes_are_told(bundle, data, tmp_path, refused):
         ([bundle, tmp_path / "a.html", "--format", "web", "--frames", 0, 2], "--data"),
         ([bundle, tmp_path / "a.html", "--format", "web", "--frames-per-second", "nan"], "is nan"),
         ([*framed, "--frame", 99], "no frames"),
+        ([bundle, tmp_path / "a.html", "--format", "web", "--origins", "null"], "is no origin"),
+        ([bundle, tmp_path / "a.html", "--format", "web", "--origins", "https://a.b/c"], "a path"),
+        (
+            [bundle, tmp_path / "a.html", "--format", "web", "--servers", "ws://a; x"],
+            "is no server",
+        ),
         ([bundle, data], "not an avatar bundle"),
     ):
         assert told in refused("export", *words)

@@ -48,7 +48,7 @@ def open_page(browser: Any, tmp_path: Path) -> Iterator[Any]:
         page.goto(file.as_uri())
         page.evaluate(
             """size => rgbavatar.then(async (app) => {
-              window.app = app; app.setSize(size, size); await app.complete;
+              window.avatar = app.avatar; avatar.setSize(size, size); await avatar.complete;
             })""",
             _SIZE,
         )
@@ -62,7 +62,7 @@ def open_page(browser: Any, tmp_path: Path) -> Iterator[Any]:
 
 def _shown(page: Any) -> np.ndarray:
     """The canvas [H, W, 3] in [0, 1], drawn now."""
-    text = page.evaluate("() => { app.draw(); return app.canvas.toDataURL('image/png'); }")
+    text = page.evaluate("() => { avatar.draw(); return avatar.canvas.toDataURL('image/png'); }")
     return picture_of(base64.b64decode(text.split(",")[1])).astype(np.float32) / 255
 
 
@@ -101,7 +101,7 @@ def test_the_page_shows_the_picture_that_render_draws(open_page, changes):
     theta = lively_theta(avatar, 2)
     page = open_page(avatar, theta)
     for frame in range(2):
-        page.evaluate("frame => app.showFrame(frame)", frame)
+        page.evaluate("frame => avatar.performance.seek(frame)", frame)
         ours = _ours(avatar, theta[frame : frame + 1])
         assert ours.std() > 0.1, "there is something to see"
         quality = psnr(_shown(page), ours)
@@ -118,7 +118,7 @@ def test_beyond_the_film_the_pages_weights_are_those_of_the_avatar(open_page):
     avatar.widen_film_range(0.2 * theta)
     page = open_page(avatar, theta)
     for frame in range(2):
-        page.evaluate("frame => app.showFrame(frame)", frame)
+        page.evaluate("frame => avatar.performance.seek(frame)", frame)
         assert psnr(_shown(page), _ours(avatar, theta[frame : frame + 1])) > 45
     assert psnr(unbound, _ours(avatar, theta[:1])) < 36, "the range changes something"
 
@@ -169,11 +169,11 @@ def test_playing_moves_the_performance_on_and_a_drag_turns_the_head(open_page):
     page = open_page(avatar, lively_theta(avatar, 20))
     assert page.title() == "<me> & you"
     page.locator("#play").click()
-    page.wait_for_function("() => app.performance.place > 1")
+    page.wait_for_function("() => avatar.performance.place > 1")
     page.locator("#play").click()
-    place = page.evaluate("() => app.performance.place")
+    place = page.evaluate("() => avatar.performance.place")
     before = _shown(page)
-    assert page.evaluate("() => app.performance.place") == place
+    assert page.evaluate("() => avatar.performance.place") == place
     box = page.locator("#view").bounding_box()
     page.mouse.move(box["x"] + 100, box["y"] + 200)
     page.mouse.down()
@@ -196,8 +196,8 @@ def _drag(page: Any, across: int, down: int = 0) -> None:
 
 def _degrees_seen(page: Any) -> np.ndarray:
     """Yaw and pitch, from the camera that draws."""
-    page.evaluate("() => app.draw()")
-    return np.degrees(page.evaluate("() => app.turnSeen"))
+    page.evaluate("() => avatar.draw()")
+    return np.degrees(page.evaluate("() => avatar.turnSeen"))
 
 
 def test_the_camera_gives_way_beyond_the_film_comes_back_and_says_so(open_page):
@@ -210,6 +210,7 @@ def test_the_camera_gives_way_beyond_the_film_comes_back_and_says_so(open_page):
             theta, avatar.weights(theta), avatar.layout, camera.world_to_camera
         )
     page = open_page(avatar, theta, seen)
+    page.evaluate("() => avatar.performance.seek(0)")
     ours = turn_seen(theta[:1], camera.world_to_camera, avatar.layout)[0, :2].numpy()
     assert np.allclose(_degrees_seen(page), ours, atol=0.01)
     said = page.locator("#beyond")
@@ -221,16 +222,16 @@ def test_the_camera_gives_way_beyond_the_film_comes_back_and_says_so(open_page):
     assert high[0] + 3 < pulled[0] < high[0] + 15, "it resists"
     assert "Beyond the film: seen from" in said.text_content()
     page.mouse.up()
-    page.wait_for_function("() => !app.orbit.settle(0)")
+    page.wait_for_function("() => !avatar.camera.settle(0)")
     assert _degrees_seen(page)[0] == pytest.approx(high[0], abs=0.1)
-    page.evaluate("() => app.orbit.reset()")
+    page.evaluate("() => avatar.camera.reset()")
     assert np.allclose(_degrees_seen(page), ours, atol=0.01)
     assert said.text_content() == ""
 
     # The same picture as ours from there, about the same centre.
     _drag(page, -40, 20)
     page.mouse.up()
-    yaw, pitch = torch.tensor(page.evaluate("() => app.orbit.angles()")).rad2deg()
+    yaw, pitch = torch.tensor(page.evaluate("() => avatar.camera.angles()")).rad2deg()
     there = orbit(camera, head_centre(avatar, theta[:1]), yaw[None], pitch[None])
     (expected,) = pictures(avatar, theta[:1], there, (1.0, 1.0, 1.0))
     assert psnr(_shown(page), expected / 255) > 40

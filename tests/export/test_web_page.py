@@ -1,6 +1,5 @@
 """What is inside the exported page, without a browser."""
 
-import base64
 import html
 import re
 from dataclasses import replace
@@ -8,11 +7,12 @@ from dataclasses import replace
 import pytest
 import torch
 
+from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
 from rgbavatar_ns.errors import UserError
-from rgbavatar_ns.export import PageOptions, front_camera, write_web_page
-from rgbavatar_ns.export.avatar_file import read_avatar_file
+from rgbavatar_ns.export import PageOptions, calm_theta, front_camera, write_web_page
 from rgbavatar_ns.head import HeadArrays
 
+from .avatar_of_page import avatar_of_page
 from .subject import avatar_of
 
 _NAMES = HeadArrays.embedded().expression_names
@@ -29,13 +29,17 @@ def test_the_page_is_one_file_that_names_no_other_place(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["page.html"]
     assert title not in page
     assert "{{" not in page
-    parts = re.findall(r'class="part">([^<]*)</script>', page)
     rest = re.sub(r'class="part">[^<]*</script>', "", page)
-    assert not re.search(r"https?://|//cdn|src=|import\s*\(|fetch\s*\(|<link", rest)
+    assert not re.search(r"https?://|//cdn|src=|import\s*\(|<link", rest)
+    # RGBAvatar.load takes an address, which a page of its own never gives it.
+    assert re.findall(r"fetch\s*\(\w*", rest) == ["fetch(source"]
     assert "default-src 'none'" in rest
-    (tmp_path / "me.rgbavatar").write_bytes(b"".join(map(base64.b64decode, parts)))
-    manifest, arrays = read_avatar_file(tmp_path / "me.rgbavatar")
-    assert len(parts) == len(manifest["parts"])
+    loopback = [
+        f"{kind}://{host}:*" for kind in ("ws", "wss") for host in ("127.0.0.1", "localhost")
+    ]
+    assert f'connect-src {" ".join(loopback)}"' in rest
+    manifest, arrays = avatar_of_page(path)
+    assert page.count('class="part"') == len(manifest["parts"])
     assert arrays["theta"].shape == theta.shape
 
 
@@ -52,6 +56,43 @@ def test_no_name_or_title_can_break_the_page(tmp_path):
     assert hostile not in page
     assert f"<title>{html.escape(hostile)}</title>" in page
     assert page.count("</style>") == 1
+
+
+def test_the_calm_face_is_the_films_expression_in_another_frames_pose():
+    layout = avatar_of().layout
+    theta = torch.zeros(2, layout.size)
+    expression, turn = layout.slice("expression").start, layout.slice("rotation").start
+    theta[:, expression] = torch.tensor([0.2, 0.9])
+    theta[:, turn] = torch.tensor([0.4, 0.1])
+    seen = TrainingStatistics.of(theta, torch.zeros(2, 1), layout)
+    calm = calm_theta(seen, theta[1])
+    assert (calm[expression], calm[turn]) == (theta[0, expression], theta[1, turn])
+    assert torch.equal(calm_theta(None, theta[1]), theta[1])
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "null",
+        "*",
+        "https://",
+        "https://Example.org",
+        "https://a.b/",
+        "https://a.b:443",
+        "ftp://a.b",
+        "https://a.b c",
+        "https://a.b;script-src",
+        "https://*.a.b",
+        "http://a:b",
+        "ws://a.b",
+        "",
+    ],
+)
+def test_what_is_no_origin_is_refused_before_anything_is_written(text):
+    with pytest.raises(UserError, match="is no origin"):
+        PageOptions(origins=(text,))
+    with pytest.raises(UserError, match="is no server"):
+        PageOptions(servers=(text.replace("ws:", "http:"),))
 
 
 def test_a_page_that_cannot_be_written_is_told(tmp_path):

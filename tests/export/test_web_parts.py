@@ -51,14 +51,17 @@ def _opened(browser: Any, address: str) -> Any:
     page = browser.new_page(viewport={"width": 500, "height": 400})
     page.goto(address, wait_until="commit")
     page.evaluate(
-        "size => rgbavatar.then((app) => { window.app = app; app.setSize(size, size); })", _SIZE
+        """size => rgbavatar.then((app) => {
+          window.avatar = app.avatar; avatar.setSize(size, size);
+        })""",
+        _SIZE,
     )
     return page
 
 
 def _shown(page: Any, share: dict[str, float] | None = None) -> np.ndarray:
     text = page.evaluate(
-        "(share) => { app.draw(share ?? undefined); return app.canvas.toDataURL('image/png'); }",
+        "(share) => { avatar._draw(share ?? WHOLE); return avatar.canvas.toDataURL('image/png'); }",
         share,
     )
     return picture_of(base64.b64decode(text.split(",")[1])).astype(np.float32) / 255
@@ -107,32 +110,32 @@ def test_a_coarse_head_is_there_before_the_rest_has_arrived(browser, subject, pa
     assert second < 300_000
     with _slow_server(content, second + 100) as (address, go_on):
         page = _opened(browser, address)
-        available = page.evaluate("() => app.renderer.data.available")
+        available = page.evaluate("() => avatar.data.available")
         assert 1000 < available < 0.7 * subject.num_gaussians
         coarse, ours = _shown(page), _ours(subject)
         assert 22 < psnr(coarse, ours) < 45
         solid = ours.min(-1) < 0.9
         assert (coarse[solid].min(-1) < 0.97).mean() > 0.98, "it is closed"
         go_on.set()
-        page.evaluate("() => app.complete")
-        assert page.evaluate("() => app.renderer.data.available") == subject.num_gaussians
+        page.evaluate("() => avatar.complete")
+        assert page.evaluate("() => avatar.data.available") == subject.num_gaussians
         assert psnr(_shown(page), ours) > 45
 
 
 def test_fewer_gaussians_are_larger_and_leave_no_holes(browser, subject, page_file):
     page = _opened(browser, page_file.as_uri())
-    page.evaluate("() => app.complete")
+    page.evaluate("() => avatar.complete")
     whole = _shown(page)
     solid = whole.min(-1) < 0.9
     # As measured, 33, 28 and 25 dB on an avatar of random bases; trained ones reach more.
     for share, least in ((0.5, 32), (0.25, 27), (0.125, 24)):
-        page.evaluate("share => { app.renderer.detail = share; }", share)
+        page.evaluate("share => { avatar.detail = share; }", share)
         less = _shown(page)
         assert least < psnr(less, whole) < 50, share
         assert (less[solid].min(-1) < 0.97).mean() > 0.98, "it is closed"
-        growth = page.evaluate("() => [...app.renderer.levels.growth]")[: int(share * 1000)]
+        growth = page.evaluate("() => [...avatar._renderer.levels.growth]")[: int(share * 1000)]
         assert 1 < np.mean(growth) < 2.5
-    page.evaluate("() => { app.renderer.detail = 1; }")
+    page.evaluate("() => { avatar.detail = 1; }")
     assert np.array_equal(_shown(page), whole)
     rounded = _shown(page, {"detail": 1, "resolution": 1, "bytes": True})
     assert 45 < psnr(rounded, whole) < 60
@@ -147,11 +150,11 @@ def test_what_has_arrived_in_the_browser_is_what_python_reads(browser, tmp_path)
     file = tmp_path / "avatar.html"
     write_web_page(avatar, file, front_camera(avatar, 32, 32), theta)
     page = _opened(browser, file.as_uri())
-    page.evaluate("() => app.complete")
+    page.evaluate("() => avatar.complete")
     (tmp_path / "me.rgbavatar").write_bytes(b"".join(avatar_parts(avatar, {}, theta, {})))
     manifest, arrays = read_avatar_file(tmp_path / "me.rgbavatar")
     for name, values in arrays.items():
-        found = np.array(page.evaluate("name => [...app.renderer.data.arrays[name]]", name))
+        found = np.array(page.evaluate("name => [...avatar.data.arrays[name]]", name))
         ours = values if manifest["arrays"][name]["by_item"] else values.T
         np.testing.assert_allclose(found, ours.reshape(-1), rtol=1e-6, err_msg=name)
 
@@ -188,7 +191,7 @@ def test_a_file_that_is_not_whole_is_told(browser, page_file, damage):
     expected = {"version": "version 9; this program reads 2", "manifest": "damaged"}
     assert expected.get(damage, damage) in said.text_content()
     # What has arrived stays to be seen.
-    drawn = page.evaluate("() => rgbavatar.then((app) => app.pictures, () => 0)")
+    drawn = page.evaluate("() => rgbavatar.then((app) => app.avatar.pictures, () => 0)")
     assert (drawn > 0) == (damage in ("cut off", "damaged"))
 
 

@@ -1,147 +1,129 @@
 "use strict";
-/* Glue: state of the page, one picture for each change, `window.rgbavatar` for scripts. */
+/* The page around an avatar: controls, what is told, `window.rgbavatar` for scripts. */
+
+const NARROW = "(max-width: 700px)"; // a phone's: the face first, the controls on request
 
 class App {
-  constructor(data, canvas, message) {
-    const { manifest } = data;
-    this.data = manifest;
-    this.canvas = canvas;
-    this.message = message;
-    this.head = new Head(data);
-    this.network = new WeightNetwork(data);
-    this.renderer = new Renderer(canvas, data);
-    this.pace = new Pace();
-    this.performance = new RecordedPerformance(data);
-    this.orbit = new OrbitCamera(manifest.camera, manifest.film.turn_reach);
-    this.background = manifest.background;
-    this.heldWeights = new Map(); // psi that a slider holds, by number
+  /** page: what the exporter said of the page, { origins, servers }. */
+  constructor(avatar, page) {
+    this.avatar = avatar;
+    this.message = document.getElementById("message");
     this.beyond = document.getElementById("beyond");
-    this.size = null; // of the picture in pixels, where a script has set it
-    this.theta = this.performance.length ? this.performance.current()
-      : new Array(this.performance.size).fill(0);
-    this.psi = [];
-    this.pictures = 0; // drawn so far
-    this.due = true;
     this.panel = new Panel(document.getElementById("panel"), this);
-    this.orbit.listen(canvas, () => this.changed());
-    new ResizeObserver(() => this.changed()).observe(canvas);
-    this.touched = false; // whether the theta shown is somebody's choice
-    data.onMore = () => {
-      if (!this.touched && this.performance.length) this.theta = this.performance.current();
-      this.changed();
-    };
-    this._last = null;
-    requestAnimationFrame((now) => this._tick(now));
+    this.driver = new Driver(avatar);
+    this._buttons();
+    if (window.matchMedia(NARROW).matches) this.fold();
+    listenToKeys(this);
+    avatar.addEventListener("drawn", () => this._follow());
+    avatar.addEventListener("lost", () => {
+      this.message.textContent = "The graphics were taken away; waiting for them.";
+    });
+    avatar.addEventListener("restored", () => { this.message.textContent = ""; });
+    this._frameMessages = new FrameMessages(page.origins, this.driver, (...said) => this._live(...said));
+    this._connect(page.servers);
   }
 
-  /** Have a new picture drawn. */
-  changed() {
-    this.due = true;
-  }
-
+  /** Play or pause the performance, in place of who drives. */
   play(on) {
-    this.touched = true;
-    this.performance.playing = on;
-    if (on) this.showFrame(this.performance.place);
-  }
-
-  showFrame(place) {
-    this.touched = true;
-    this.performance.place = place;
-    this.theta = this.performance.current();
+    this.takeOver();
+    if (on) this.avatar.performance.play();
+    else this.avatar.performance.pause();
+    this.avatar.changed();
   }
 
   /** Set one number of theta by hand, which stops the performance. */
   setParameter(place, value) {
-    this.touched = true;
-    this.performance.playing = false;
-    this.theta[place] = value;
-    this.changed();
+    this.takeOver();
+    const theta = this.avatar.theta;
+    theta[place] = value;
+    this.avatar.setTheta(theta);
   }
 
-  setTheta(theta) {
-    this.touched = true;
-    this.performance.playing = false;
-    this.theta = Array.from(theta);
-    this.changed();
+  /** The calm face from where the camera was first. */
+  reset() {
+    this.takeOver();
+    this.avatar.camera.reset();
+    this.avatar.setTheta(this.avatar.neutralTheta);
   }
 
-  /** Hold a basis weight against the network. */
-  setWeight(k, value) {
-    this.heldWeights.set(k, value);
-    this.changed();
+  /** Who is at the page goes before who drives it, until "Live" gives it back. */
+  takeOver() {
+    this.driver.active = !this.driver.driven;
+    this._showButtons();
   }
 
-  releaseWeights() {
-    this.heldWeights.clear();
-    this.changed();
-  }
-
-  /** Fix the picture's size in pixels, whatever the window's. */
-  setSize(width, height) {
-    this.size = [width, height];
-    this.changed();
-  }
-
-  /** Draw now; share: how much, where not all (`Pace`). */
-  draw(share) {
-    const pixels = window.devicePixelRatio || 1;
-    const [width, height] = this.size || [
-      Math.max(1, Math.round(this.canvas.clientWidth * pixels)),
-      Math.max(1, Math.round(this.canvas.clientHeight * pixels)),
-    ];
-    if (this.canvas.width !== width) this.canvas.width = width;
-    if (this.canvas.height !== height) this.canvas.height = height;
-    this.psi = this.network.evaluate(this.theta);
-    for (const [k, value] of this.heldWeights) this.psi[k] = value;
-    this.head.pose(this.theta);
-    this.orbit.seen = viewAngles(multiply3(this.data.camera.rotation, this.head.turn));
-    const camera = this.orbit.at(width, height, this.head.centre());
-    this.turnSeen = viewAngles(multiply3(camera.rotation, this.head.turn));
-    this.renderer.draw(this.head, this.psi, camera, this.background, share);
-    this.panel.show();
-    this._tellBeyond();
-    this.due = false;
-    this.pictures++;
+  /** Hide the controls, or show them again. */
+  fold() {
+    document.body.classList.toggle("full");
+    this._showButtons();
   }
 
   savePicture() {
-    this.draw();
+    this.avatar.draw();
     const link = document.createElement("a");
     link.download = "avatar.png";
-    link.href = this.canvas.toDataURL("image/png");
+    link.href = this.avatar.canvas.toDataURL("image/png");
     link.click();
-  }
-
-  _tick(now) {
-    const seconds = this._last === null ? 0 : Math.min((now - this._last) / 1000, 0.25);
-    this._last = now;
-    if (this.performance.playing) {
-      this.performance.advance(seconds);
-      this.theta = this.performance.current();
-      this.due = true;
-    }
-    if (this.orbit.settle(seconds)) this.due = true;
-    if (this.due) this.pace.moves(now);
-    else this.due = this.pace.rests(now);
-    if (this.due) {
-      this.draw(this.pace.share);
-      this._tellRate(now);
-    }
-    requestAnimationFrame((next) => this._tick(next));
   }
 
   /** Whether a number of theta is farther than in the film; there may be none to compare with. */
   isBeyond(place) {
-    const [low, high] = this.data.film.theta ?? [];
-    return low !== undefined && (this.theta[place] < low[place] || this.theta[place] > high[place]);
+    const [low, high] = this.avatar.data.manifest.film.theta ?? [], value = this.avatar.theta[place];
+    return low !== undefined && (value < low[place] || value > high[place]);
+  }
+
+  _buttons() {
+    const by = (id, act) => {
+      const button = document.getElementById(id);
+      button.addEventListener("click", act);
+      return button;
+    };
+    this.playButton = by("play", () => this.play(!this.avatar.performance.playing));
+    this.playButton.hidden = this.avatar.performance.length === 0;
+    this.liveButton = by("live-again", () => { this.driver.active = true; this._showButtons(); });
+    this.foldButton = by("fold", () => this.fold());
+    this._showButtons();
+  }
+
+  _showButtons() {
+    this.playButton.textContent = this.avatar.performance.playing ? "Pause" : "Play";
+    this.liveButton.hidden = this.driver.active;
+    const folded = document.body.classList.contains("full");
+    this.foldButton.textContent = folded ? "Controls" : "Hide controls";
+    this.foldButton.setAttribute("aria-expanded", String(!folded));
+  }
+
+  /** Be driven by the server that the page's address names. */
+  _connect(servers) {
+    const wanted = new URLSearchParams(window.location.search).get("ws");
+    if (wanted === null) return;
+    const tell = (...said) => this._live(...said);
+    try {
+      this.connection = new LiveConnection(driveAddress(wanted, servers), this.driver, tell);
+    } catch (error) {
+      tell(error.message, true);
+    }
+  }
+
+  _live(text, isProblem) {
+    const told = document.getElementById("live");
+    if (told.textContent !== text) told.textContent = text; // screen readers speak of changes
+    told.classList.toggle("problem", isProblem);
+  }
+
+  /** After a picture. */
+  _follow() {
+    this.panel.show();
+    this._showButtons();
+    this._tellBeyond();
+    this._tellRate(performance.now());
   }
 
   /** What of this picture the film did not show; what is seen then is a guess. */
   _tellBeyond() {
-    const { film, layout } = this.data, found = [];
+    const { film } = this.avatar.data.manifest, seen = this.avatar.turnSeen, found = [];
     const [low, high] = film.turn;
-    const away = this.turnSeen.map((angle, i) => {
+    const away = seen.map((angle, i) => {
       const off = angle - (low[i] + high[i]) / 2;
       return Math.abs(Math.atan2(Math.sin(off), Math.cos(off))) > (high[i] - low[i]) / 2;
     });
@@ -149,7 +131,7 @@ class App {
       const i = away[0] ? 0 : 1, sides = [["right", "left"], ["above", "below"]][i];
       const degrees = (angle) => `${Math.round(Math.abs((180 * angle) / Math.PI))}°`;
       const said = (angle) => `${degrees(angle)} ${sides[angle > 0 ? 1 : 0]}`;
-      found.push(`seen from ${said(this.turnSeen[i])}, filmed ${said(low[i])} to ${said(high[i])}`);
+      found.push(`seen from ${said(seen[i])}, filmed ${said(low[i])} to ${said(high[i])}`);
     }
     found.push(...this.panel.namesBeyond());
     this.beyond.textContent = found.length ? `Beyond the film: ${found.join("; ")}` : "";
@@ -158,15 +140,16 @@ class App {
   /** Pictures a second while the performance plays, told twice a second. */
   _tellRate(now) {
     if (this.message.className === "error") return;
-    if (!this._rateFrom || !this.performance.playing) {
-      this._rateFrom = { now, pictures: this.pictures };
-      if (!this.performance.playing) this.message.textContent = "";
+    const { pictures } = this.avatar, { playing } = this.avatar.performance;
+    if (!this._rateFrom || !playing) {
+      this._rateFrom = { now, pictures };
+      if (!playing) this.message.textContent = "";
     } else if (now - this._rateFrom.now > 500) {
-      const rate = (1000 * (this.pictures - this._rateFrom.pictures)) / (now - this._rateFrom.now);
+      const rate = (1000 * (pictures - this._rateFrom.pictures)) / (now - this._rateFrom.now);
       this.message.textContent = `${rate.toFixed(0)} pictures/s, `
-        + `${this.data.num_gaussians.toLocaleString("en")} Gaussians`
-        + (this.pace.told && `, ${this.pace.told}`);
-      this._rateFrom = { now, pictures: this.pictures };
+        + `${this.avatar.data.manifest.num_gaussians.toLocaleString("en")} Gaussians`
+        + (this.avatar.pace && `, ${this.avatar.pace}`);
+      this._rateFrom = { now, pictures };
     }
   }
 }
@@ -175,11 +158,12 @@ class App {
 window.rgbavatar = (async () => {
   const message = document.getElementById("message");
   try {
-    const data = await AvatarData.open(streamOfPage());
-    const app = new App(data, document.getElementById("view"), message);
-    app.draw();
+    const page = JSON.parse(document.getElementById("page").textContent);
+    const avatar = await RGBAvatar.load(streamOfPage(), document.getElementById("view"));
     message.textContent = "";
-    app.complete = data.complete.catch((error) => {
+    const app = new App(avatar, page);
+    avatar.draw();
+    avatar.complete.catch((error) => { // what is there of it stays
       message.className = "error";
       message.textContent = error.message;
     });

@@ -24,6 +24,7 @@ class Pace {
     this._fast = 0;
     this._patience = 1;
     this._last = null; // when the last moving picture was drawn
+    this._drew = null; // the same, if that was the frame before
   }
 
   /** What is to be drawn now. */
@@ -40,20 +41,27 @@ class Pace {
     return parts.length ? `while moving ${parts.join(", ")}` : "";
   }
 
-  /** Another moving picture is due now (milliseconds). */
+  /** Another moving picture is due in this frame of the browser (milliseconds). */
   moves(now) {
-    if (!this.resting && this._last !== null) this._judge(now - this._last);
+    this._frame(now);
     this.resting = false;
-    this._last = now;
+    this._last = this._drew = now;
   }
 
-  /** Nothing moves now; whether a picture in full is due. */
+  /** Nothing has moved before this frame; whether a picture in full is due. */
   rests(now) {
+    this._frame(now);
+    this._drew = null;
     if (this.resting || now - this._last < REST) return false;
     const reduced = this.place > 0;
     this.resting = true;
     this._recent = [];
     return reduced;
+  }
+
+  /** The browser's next frame is late where a picture took long; whoever drives may be slow too. */
+  _frame(now) {
+    if (!this.resting && this._drew !== null) this._judge(now - this._drew);
   }
 
   _judge(milliseconds) {

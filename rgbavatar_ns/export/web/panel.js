@@ -2,16 +2,19 @@
 /* The controls: performance, named expressions, jaw, eyes, head, learned bases, background. */
 
 class Panel {
-  /** app: see main.js. Every control writes to the app, and `show` reads it back. */
+  /** app: see main.js. Every control writes to it or its avatar, and `show` reads them back. */
   constructor(root, app) {
     this.root = root;
     this.app = app;
+    this.avatar = app.avatar;
+    this.manifest = app.avatar.data.manifest;
     this.readers = [];
     this.watched = []; // [name, places in theta] of sliders, to tell what is beyond the film
-    if (app.performance.length > 0) this._performance();
+    if (this.avatar.performance.length > 0) this._performance();
     for (const [title, open, entries] of this._thetaGroups()) this._theta(title, open, entries);
-    if (app.data.num_bases > 0) this._bases();
+    if (this.manifest.num_bases > 0) this._bases();
     this._picture();
+    this._help();
   }
 
   /** Bring all controls to the app's state. */
@@ -40,9 +43,8 @@ class Panel {
     const button = document.createElement("button");
     button.type = "button";
     button.textContent = text;
-    button.addEventListener("click", () => { act(); this.app.changed(); });
+    button.addEventListener("click", () => { act(); this.avatar.changed(); });
     group.append(button);
-    return button;
   }
 
   /** A labelled slider; `read` gives the app's value, `write` sets it. */
@@ -56,7 +58,7 @@ class Panel {
     Object.assign(input, { type: "range", min: low, max: high, step, id });
     label.htmlFor = output.htmlFor = id;
     label.textContent = label.title = name;
-    input.addEventListener("input", () => { write(Number(input.value)); this.app.changed(); });
+    input.addEventListener("input", () => { write(Number(input.value)); this.avatar.changed(); });
     this.readers.push(() => {
       const value = read();
       if (document.activeElement !== input || Number(input.value) !== value) input.value = value;
@@ -68,13 +70,9 @@ class Panel {
   }
 
   _performance() {
-    const { performance, app } = { performance: this.app.performance, app: this.app };
-    const group = this._group("Performance", true);
-    const play = this._button(group, "Play", () => app.play(!performance.playing));
-    play.id = "play";
-    this.readers.push(() => { play.textContent = performance.playing ? "Pause" : "Play"; });
-    this._slider(group, "Frame", [0, performance.length - 1],
-      () => Math.floor(performance.place), (value) => app.showFrame(value), 1);
+    const { performance } = this.avatar, group = this._group("Performance", true);
+    this._slider(group, "Frame", [0, performance.length - 1], () => Math.floor(performance.place),
+      (value) => { this.app.takeOver(); performance.seek(value); }, 1);
     this._slider(group, "Speed", [0.1, 2], () => performance.speed,
       (value) => { performance.speed = value; });
   }
@@ -82,9 +80,8 @@ class Panel {
   /** Sliders by group: [title, open, [name, place in theta, range, places moved along]]. */
   _thetaGroups() {
     const { layout, expression_names: names, expression_range: range, expression_order: order }
-      = this.app.data;
-    const start = {};
-    layout.reduce((sum, { name, size }) => { start[name] = sum; return sum + size; }, 0);
+      = this.manifest;
+    const { start } = new ThetaFields(layout);
     const turns = (field, reach) => ["nod", "turn", "tilt"].map(
       (name, axis) => [`${field} ${name}`, [start[field] + axis], [-reach, reach]]);
     const face = [["jaw open", [start.jaw], [0, 0.5]], ["jaw sideways", [start.jaw + 1], [-0.2, 0.2]]];
@@ -103,13 +100,15 @@ class Panel {
   }
 
   _theta(title, open, entries) {
-    const app = this.app, group = this._group(title, open);
+    const app = this.app, group = this._group(title, open), neutral = this.avatar.neutralTheta;
     this._button(group, "Reset", () => {
-      for (const [, places] of entries) for (const place of places) app.setParameter(place, 0);
+      for (const place of entries.flatMap(([, places]) => places)) {
+        app.setParameter(place, neutral[place]);
+      }
     });
-    const [low, high] = app.data.film.theta ?? [];
+    const [low, high] = this.manifest.film.theta ?? [];
     for (const [name, places, range] of entries) {
-      const row = this._slider(group, name, range, () => app.theta[places[0]], (value) => {
+      const row = this._slider(group, name, range, () => this.avatar.theta[places[0]], (value) => {
         for (const place of places) app.setParameter(place, value);
       });
       if (!low) continue;
@@ -127,37 +126,49 @@ class Panel {
   }
 
   _bases() {
-    const app = this.app, group = this._group("Learned bases", false);
-    this._button(group, "Back to the network", () => app.releaseWeights());
-    app.data.psi_range.forEach((reach, k) => {
+    const { avatar } = this, group = this._group("Learned bases", false);
+    this._button(group, "Back to the network", () => {
+      this.manifest.psi_range.forEach((_, k) => avatar.holdWeight(k, null));
+    });
+    this.manifest.psi_range.forEach((reach, k) => {
       const row = this._slider(group, `psi ${k}`, [-reach, reach],
-        () => app.psi[k] ?? 0, (value) => app.setWeight(k, value));
-      this.readers.push(() => row.classList.toggle("held", app.heldWeights.has(k)));
+        () => avatar.psi[k] ?? 0, (value) => avatar.holdWeight(k, value));
+      this.readers.push(() => row.classList.toggle("held", avatar.isHeld(k)));
     });
   }
 
   _picture() {
-    const app = this.app, group = this._group("Picture", false);
+    const { avatar } = this, group = this._group("Picture", false);
     const input = document.createElement("input");
     input.type = "color";
     input.id = "background";
     const byte = (value) => Math.round(255 * value).toString(16).padStart(2, "0");
-    input.value = `#${app.background.map(byte).join("")}`;
+    input.value = `#${avatar.background.map(byte).join("")}`;
     input.addEventListener("input", () => {
-      app.background = [1, 3, 5].map((i) => parseInt(input.value.slice(i, i + 2), 16) / 255);
-      app.changed();
+      avatar.background = [1, 3, 5].map((i) => parseInt(input.value.slice(i, i + 2), 16) / 255);
     });
     const label = document.createElement("label");
     label.textContent = "Background ";
     label.append(input);
     group.append(label, document.createElement("br"));
+    this._slider(group, "Detail", [0.1, 1], () => avatar.detail, (share) => { avatar.detail = share; });
     const free = document.createElement("input");
     Object.assign(free, { type: "checkbox", id: "turn-freely" });
-    free.addEventListener("input", () => { app.orbit.free = free.checked; app.changed(); });
+    free.addEventListener("input", () => { avatar.camera.free = free.checked; avatar.changed(); });
     const freely = document.createElement("label");
     freely.append(free, " Turn freely, beyond what was filmed");
     group.append(freely, document.createElement("br"));
-    this._button(group, "Camera back", () => app.orbit.reset());
-    this._button(group, "Save picture", () => app.savePicture());
+    this._button(group, "Camera back", () => avatar.camera.reset());
+    this._button(group, "Save picture", () => this.app.savePicture());
+  }
+
+  _help() {
+    const group = this._group("Keys and fingers", false), list = document.createElement("dl");
+    for (const [what, does] of HELP) {
+      const [term, text] = [document.createElement("dt"), document.createElement("dd")];
+      [term.textContent, text.textContent] = [what, does];
+      list.append(term, text);
+    }
+    group.append(list);
   }
 }

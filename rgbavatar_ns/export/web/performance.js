@@ -2,29 +2,71 @@
 /* The recorded performance: theta of frame after frame. */
 
 class RecordedPerformance {
-  constructor(data) {
-    this.size = data.manifest.layout.reduce((sum, { size }) => sum + size, 0);
-    this.theta = data.arrays.theta;
-    this.length = this.theta.length / this.size;
-    this.framesPerSecond = data.manifest.frames_per_second;
+  /** show: called with the theta of each new place. */
+  constructor(data, show) {
+    const { arrays, manifest } = data;
+    this.length = manifest.arrays.theta.items;
+    this.framesPerSecond = manifest.frames_per_second;
     this.speed = 1;
-    this.playing = false;
-    this.place = 0; // in frames
+    this._data = data;
+    this._part = manifest.parts.findIndex(({ slices }) => slices.some(([name]) => name === "theta"));
+    this._theta = arrays.theta;
+    this._size = manifest.arrays.theta.columns;
+    this._show = show;
+    this._place = 0;
+    this._playing = false;
   }
 
-  /** Go on by so many seconds; after the last frame comes the first. */
+  get playing() {
+    return this._playing;
+  }
+
+  /** In frames, with a fraction. */
+  get place() {
+    return this._place;
+  }
+
+  /** Go on from the current place; nothing where there is no performance. */
+  play() {
+    if (this.length === 0) return;
+    this._playing = true;
+    this._follow();
+  }
+
+  pause() {
+    this._playing = false;
+  }
+
+  /** Show the performance at a place in frames; beyond its ends, the nearest. */
+  seek(place) {
+    if (this.length === 0) return;
+    this._place = Math.min(Math.max(place, 0), this.length - 1);
+    this._follow();
+  }
+
+  /** Go on by so many seconds where it plays; after the last frame comes the first. */
   advance(seconds) {
-    const moved = this.place + seconds * this.framesPerSecond * this.speed;
-    this.place = this.length > 0 ? moved % this.length : 0;
+    if (!this._playing || !this._isThere()) return;
+    this._place = (this._place + seconds * this.framesPerSecond * this.speed) % this.length;
+    this._follow();
+  }
+
+  /** Of a file that is still arriving, the film comes after the first picture. */
+  _isThere() {
+    return this._data.spans.length > this._part;
+  }
+
+  _follow() {
+    if (this._isThere()) this._show(this._current());
   }
 
   /** theta at the current place, linear between frames. */
-  current() {
-    const first = Math.min(Math.floor(this.place), this.length - 1);
+  _current() {
+    const first = Math.min(Math.floor(this._place), this.length - 1);
     const second = Math.min(first + 1, this.length - 1);
-    const share = this.place - first;
-    return Array.from({ length: this.size }, (_, i) => {
-      const a = this.theta[first * this.size + i], b = this.theta[second * this.size + i];
+    const share = this._place - first, size = this._size;
+    return Array.from({ length: size }, (_, i) => {
+      const a = this._theta[first * size + i], b = this._theta[second * size + i];
       return share > 0 ? a + share * (b - a) : a;
     });
   }

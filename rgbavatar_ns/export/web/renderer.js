@@ -17,6 +17,7 @@ class Renderer {
     }
     this.gl = gl;
     this.data = data;
+    this._made = []; // what frees each object of the graphics memory
     this.detail = 1; // share of the Gaussians that is drawn, in (0, 1]
     this.total = data.manifest.num_gaussians;
     this.numBases = data.manifest.num_bases;
@@ -49,11 +50,13 @@ class Renderer {
       gl.shaderSource(shader, source);
       gl.compileShader(shader);
       gl.attachShader(program, shader);
+      gl.deleteShader(shader); // goes with its program
       if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS) && !gl.isContextLost()) {
         throw new Error(`A shader was refused: ${gl.getShaderInfoLog(shader)}`);
       }
     }
     gl.linkProgram(program);
+    this._made.push(() => gl.deleteProgram(program));
     const uniforms = {};
     const number = gl.getProgramParameter(program, gl.ACTIVE_UNIFORMS);
     for (let i = 0; i < number; i++) {
@@ -65,12 +68,25 @@ class Renderer {
 
   _texture(target = this.gl.TEXTURE_2D) {
     const gl = this.gl, texture = gl.createTexture();
+    this._made.push(() => gl.deleteTexture(texture));
     gl.bindTexture(target, texture);
     for (const [name, value] of [
       [gl.TEXTURE_MIN_FILTER, gl.NEAREST], [gl.TEXTURE_MAG_FILTER, gl.NEAREST],
       [gl.TEXTURE_WRAP_S, gl.CLAMP_TO_EDGE], [gl.TEXTURE_WRAP_T, gl.CLAMP_TO_EDGE],
     ]) gl.texParameteri(target, name, value);
     return { target, texture };
+  }
+
+  _framebuffer() {
+    const gl = this.gl, made = gl.createFramebuffer();
+    this._made.push(() => gl.deleteFramebuffer(made));
+    return made;
+  }
+
+  /** Free all graphics memory; another may draw on the canvas. */
+  dispose() {
+    for (const free of this._made) free();
+    this._made = [];
   }
 
   /** A texture of rows of 1,024 texels, each with some of these numbers. */
@@ -194,7 +210,7 @@ class Renderer {
   _makePlaceTarget() {
     const gl = this.gl, table = () => this._table("RGBA32F", TEXTURE_WIDTH, this.rows);
     this.placed = { place: table(), shape: table(), shade: table() };
-    this.placeTarget = gl.createFramebuffer();
+    this.placeTarget = this._framebuffer();
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.placeTarget);
     const attachments = Object.values(this.placed).map(({ texture }, i) => {
       const place = gl.COLOR_ATTACHMENT0 + i;
@@ -211,8 +227,10 @@ class Renderer {
       corners.set([4 * i, 4 * i + 1, 4 * i + 2, 4 * i + 2, 4 * i + 1, 4 * i + 3], 6 * i);
     }
     this.boxes = gl.createVertexArray();
+    const buffer = gl.createBuffer();
+    this._made.push(() => gl.deleteVertexArray(this.boxes), () => gl.deleteBuffer(buffer));
     gl.bindVertexArray(this.boxes);
-    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
+    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, buffer);
     gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, corners, gl.STATIC_DRAW);
     gl.bindVertexArray(null);
     this.orderTable = this._table("R32UI", TEXTURE_WIDTH, this.rows);
@@ -228,7 +246,7 @@ class Renderer {
     for (const name of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) {
       gl.texParameteri(gl.TEXTURE_2D, name, gl.LINEAR);
     }
-    this.pictureTarget = this.pictureTarget || gl.createFramebuffer();
+    this.pictureTarget = this.pictureTarget || this._framebuffer();
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.pictureTarget);
     gl.framebufferTexture2D(
       gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, this.picture.texture, 0);
@@ -347,7 +365,7 @@ class Renderer {
     gl.disable(gl.BLEND);
     gl.useProgram(program);
     this._bind(uniforms, { picture: this.picture });
-    gl.uniform3fv(uniforms.background, background);
+    gl.uniform4fv(uniforms.background, background ? [...background, 1] : [0, 0, 0, 0]);
     gl.uniform2f(uniforms.size, width, height);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }

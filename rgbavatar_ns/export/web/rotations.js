@@ -44,3 +44,16 @@ function apply3(m, [x, y, z]) {
 function viewAngles(m) {
   return [Math.atan2(-m[6], -m[8]), Math.atan2(m[7], Math.hypot(m[6], m[8]))];
 }
+
+/** Axis-angle vector in radians of a rotation matrix, of at most half a turn. */
+function matrixToAxisAngle(m) {
+  const sines = [(m[7] - m[5]) / 2, (m[2] - m[6]) / 2, (m[3] - m[1]) / 2]; // the axis, that long
+  const sine = Math.hypot(...sines), cosine = (m[0] + m[4] + m[8] - 1) / 2;
+  const angle = Math.atan2(sine, cosine);
+  if (sine > 1e-6) return sines.map((value) => (value * angle) / sine);
+  if (cosine > 0) return sines;
+  // Half a turn: the matrix is twice the axis's outer product less the identity.
+  const i = [m[0], m[4], m[8]].reduce((most, value, k, all) => (value > all[most] ? k : most), 0);
+  const length = Math.sqrt((m[4 * i] + 1) / 2);
+  return [0, 1, 2].map((k) => angle * (k === i ? length : (m[3 * i + k] + m[3 * k + i]) / (4 * length)));
+}

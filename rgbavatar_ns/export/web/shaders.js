@@ -166,16 +166,17 @@ void main() {
   result = vec4(colorOpacity.rgb * alpha, alpha);
 }`;
 
-/** The picture over its background. */
+/** The picture over its background, whose colour is premultiplied as the result's is. */
 const SHOW_FRAGMENT = `#version 300 es
 precision highp float;
 precision highp sampler2D;
 uniform sampler2D picture; // as large as the canvas or smaller
-uniform vec3 background;
+uniform vec4 background;
 uniform vec2 size;         // of the canvas
 out vec4 result;
 
 void main() {
   vec4 seen = texture(picture, gl_FragCoord.xy / size);
-  result = vec4(seen.rgb + (1.0 - seen.a) * background, 1.0);
+  seen += (1.0 - seen.a) * background;
+  result = vec4(clamp(seen.rgb, 0.0, seen.a), seen.a); // more than alpha would glow
 }`;

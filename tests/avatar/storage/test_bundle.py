@@ -10,7 +10,7 @@ from rgbavatar_ns import Avatar
 from rgbavatar_ns.avatar import AvatarConfig
 from rgbavatar_ns.avatar.storage import bundle
 from rgbavatar_ns.avatar.storage.bundle import load_statistics
-from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
+from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics, neutral_frame
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadArrays, HeadModel, ThetaLayout
 from rgbavatar_ns.head.flame import load_flame
@@ -311,6 +311,15 @@ def test_statistics_that_lack_a_part_are_refused(make_avatar, tmp_path):
     path.write_text(json.dumps(manifest))
     with pytest.raises(UserError, match=r"damaged.*lacks anchors"):
         Avatar.load(tmp_path / "me")
+
+
+def test_of_the_calm_frames_the_one_with_the_mouth_closed_is_neutral(make_avatar):
+    layout = make_avatar().layout
+    theta = torch.zeros(3, layout.size)
+    theta[:, 0] = torch.tensor([1.0, 1.15, 3.0])
+    theta[:, layout.slice("jaw").start] = torch.tensor([0.1, 0.01, 0.0])
+    # Sums 1.1, 1.16 and 3.0: the last one's jaw is closed, but its face is not calm.
+    assert torch.equal(neutral_frame(theta, layout), theta[1])
 
 
 def test_values_worked_by_hand(make_avatar):

@@ -1,0 +1,37 @@
+"""Which Gaussians a film could show at all; beyond its pictures' edges they are left to chance."""
+
+import numpy as np
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+from rgbavatar_ns.avatar.avatar import Avatar
+from rgbavatar_ns.data.native.dataset import TrackedDataset
+
+_MOST_FRAMES = 24
+"""Spread over the film: people sit as still as that."""
+_AT_ONCE = 8
+
+
+@torch.no_grad()
+def within_film(avatar: Avatar, dataset: TrackedDataset) -> Bool[Tensor, "N"]:
+    """Which Gaussians have their centre within some picture of the film, seen or behind others.
+
+    A body that the film cuts off goes on beyond the cut in the head model. Its Gaussians there
+    trained on no more than what of them reaches in: nothing else is known of them. Ours, because a
+    page that is taller than the film showed them.
+    """
+    last = len(dataset) - 1
+    frames = np.unique(np.linspace(0, last, min(len(dataset), _MOST_FRAMES)).round().astype(int))
+    kept = torch.zeros(avatar.num_gaussians, dtype=torch.bool)
+    size = torch.tensor([dataset.width, dataset.height], dtype=torch.float32)
+    for places in np.array_split(frames, -(-len(frames) // _AT_ONCE)):
+        theta = dataset.theta[places.tolist()].to(avatar.identity)
+        cameras = dataset.cameras.select(places.tolist())
+        camera = cameras.world_to_camera
+        seen = avatar.gaussians(theta).means.cpu() @ camera[:, :3, :3].mT + camera[:, None, :3, 3]
+        pixel = seen[..., :2] / seen[..., 2:].clamp(min=1e-6) * cameras.focal_px[:, None]
+        pixel = pixel + cameras.principal_point_px[:, None]
+        inside = ((pixel >= 0) & (pixel <= size)).all(-1) & (seen[..., 2] > 0)
+        kept |= inside.any(0)
+    return kept
