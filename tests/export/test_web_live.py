@@ -162,6 +162,13 @@ def test_arkit_and_status_messages_are_followed(driven, server, avatar):
     assert driven.locator("#live b").count() == 0
 
 
+def test_whoever_performs_can_be_calibrated_from_the_page(driven, server):
+    driven.locator("#calibrate").click()
+    assert server.received.get(timeout=20) == {"type": "calibrate"}
+    driven.locator("#view").press("c")
+    assert server.received.get(timeout=20) == {"type": "calibrate"}
+
+
 def test_a_lost_connection_is_told_and_comes_back(open_page, avatar, theta):
     first = DriveServer()
     page = open_page(f"?ws=ws://127.0.0.1:{first.port}")
@@ -173,6 +180,7 @@ def test_a_lost_connection_is_told_and_comes_back(open_page, avatar, theta):
     _says(page, "no answer from")
     _says(page, "trying again in 2 s")
     assert page.locator("#live.problem").count() == 1
+    assert page.locator("#calibrate").is_hidden()
     _shows(page, theta[0])
     second = DriveServer(first.port)
     second.wait_for_page()

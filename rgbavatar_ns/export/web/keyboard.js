@@ -11,6 +11,7 @@ const HELP = [
   ["space", "play and pause"],
   ["r, double click", "back to the start; r also brings the calm face"],
   ["f", "hide and show the controls"],
+  ["c", "driven live: whoever performs looks calm, mouth closed"],
 ];
 
 /** What a key does, by the name that the browser gives it. */
@@ -26,6 +27,7 @@ function keyActions(app) {
     "-": () => camera.zoom(1 / ZOOM_BY_KEY),
     r: () => app.reset(),
     f: () => app.fold(),
+    c: () => app.connection?.calibrate(),
   };
   actions["="] = actions["+"]; // the same key without Shift
   return actions;

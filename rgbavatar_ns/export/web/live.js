@@ -112,30 +112,44 @@ class LiveConnection {
     this._driver = driver;
     this._tell = tell;
     this._losses = 0; // since somebody spoke our language
+    this.connected = false; // to somebody who drives this head
     this._open();
+  }
+
+  /** Ask for the performer's face to be taken as the calm one. */
+  calibrate() {
+    this._send({ type: "calibrate" });
+  }
+
+  _send(message) {
+    if (this._socket.readyState === WebSocket.OPEN) this._socket.send(JSON.stringify(message));
   }
 
   _open() {
     const { host } = this._url, socket = new WebSocket(this._url);
-    const channel = new DriveChannel(this._driver, (message) => {
-      if (socket.readyState === WebSocket.OPEN) socket.send(JSON.stringify(message));
-    }, false);
+    const channel = new DriveChannel(this._driver, (message) => this._send(message), false);
+    this._socket = socket;
     let status = "", unusable = 0, opened = false;
     this._tell(`connecting to ${host} ...`, false);
     socket.onopen = () => { opened = true; };
     socket.onmessage = ({ data }) => {
       try {
         status = channel.take(parsed(data)) ?? status;
-        if (!channel.accepted) return;
+        this.connected = channel.accepted;
+        if (!this.connected) return;
         this._losses = 0;
         const left = unusable === 0 ? "" : `, ${unusable} messages could not be used`;
         this._tell(`connected to ${host}${left}${status && `: ${status}`}`, false);
       } catch (error) {
         unusable++;
+        this.connected = channel.accepted;
         this._tell(`${host} cannot be used: ${error.message}`, true);
       }
     };
-    socket.onclose = () => this._wait(opened ? "connection lost" : `no answer from ${host}`);
+    socket.onclose = () => {
+      this.connected = false;
+      this._wait(opened ? "connection lost" : `no answer from ${host}`);
+    };
   }
 
   /** Count the seconds down to the next try. */
