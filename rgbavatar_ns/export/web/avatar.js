@@ -64,7 +64,9 @@ class RGBAvatar extends EventTarget {
     };
     const { signal } = this._ended;
     if (controls) {
+      const { touchAction } = canvas.style;
       canvas.style.touchAction = "none"; // a finger turns the head and scrolls no page
+      signal.addEventListener("abort", () => { canvas.style.touchAction = touchAction; });
       this.camera.listen(canvas, () => this.changed(), signal);
     }
     const observer = new ResizeObserver(() => this.changed());

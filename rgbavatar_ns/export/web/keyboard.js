@@ -33,12 +33,12 @@ function keyActions(app) {
   return actions;
 }
 
-/** Keys act wherever they have no meaning of their own, as they have on a slider or a button. */
+/** Keys act wherever they have no meaning of their own: sliders have, and space on a button. */
 function listenToKeys(app) {
   const actions = keyActions(app);
   document.addEventListener("keydown", (event) => {
     const act = actions[event.key.length === 1 ? event.key.toLowerCase() : event.key];
-    const own = event.target.closest?.("input, button, summary");
+    const own = event.target.closest?.(event.key === " " ? "input, button, summary" : "input");
     if (!act || own || event.ctrlKey || event.metaKey || event.altKey) return;
     event.preventDefault();
     act();
