@@ -5,14 +5,13 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from rgbavatar_ns.driving.live_transfer import LiveTransfer
-from rgbavatar_ns.driving.source import PerformanceSource
+from rgbavatar_ns.driving.source import PerformanceFrame, PerformanceSource
 
 _PATIENCE_S = 0.2
 _SILENT_S = 1.5
@@ -34,7 +33,7 @@ class DrivenFrame:
     """When the performer's picture or packet was there, by time.monotonic()."""
     time_s: float
     """By the source's own clock."""
-    image_rgb: UInt8[np.ndarray, "H W 3"] | None = None
+    image_rgb: UInt8[np.ndarray, "height width 3"] | None = None
     """The performer's picture, where there is one."""
 
 
@@ -71,6 +70,7 @@ class Latencies:
         )
 
 
+@runtime_checkable
 class DriveOutput(Protocol):
     """What shows the avatar."""
 
@@ -85,6 +85,24 @@ class DriveOutput(Protocol):
         ...
 
 
+@runtime_checkable
+class FrameTransfer(Protocol):
+    """What makes the avatar's theta of a frame (`LiveTransfer`)."""
+
+    @property
+    def calibrating(self) -> bool:
+        """Whether the performer's rest is being learnt."""
+        ...
+
+    def calibrate(self) -> None:
+        """Learn it anew."""
+        ...
+
+    def __call__(self, frame: PerformanceFrame) -> Float[Tensor, "H"]:
+        """The avatar's theta."""
+        ...
+
+
 class LiveDrive:
     """Follows a source in a thread of its own and shows each frame from the caller's.
 
@@ -95,7 +113,7 @@ class LiveDrive:
     def __init__(
         self,
         source: PerformanceSource,
-        transfer: LiveTransfer,
+        transfer: FrameTransfer,
         outputs: Sequence[DriveOutput],
         real_time: bool = True,
         tell: Callable[[str], None] = lambda line: None,

@@ -2,7 +2,7 @@
 
 from collections import Counter
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -27,7 +27,7 @@ class PerformanceFrame:
     """In the order of `ARKIT_NAMES`."""
     head_rotation: Float[Tensor, "3"] | None = None
     """With `coefficients`: axis-angle in radians, x the subject's left, y up, z out of the face."""
-    image_rgb: UInt8[np.ndarray, "H W 3"] | None = None
+    image_rgb: UInt8[np.ndarray, "height width 3"] | None = None
     """The source's own picture, where it has one."""
 
 
@@ -39,6 +39,7 @@ class PerformerHead:
     arrays: HeadArrays
 
 
+@runtime_checkable
 class PerformanceSource(Protocol):
     """A performance as it comes. One thread calls it; `close` may come from another."""
 

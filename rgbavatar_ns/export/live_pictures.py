@@ -4,7 +4,7 @@ import os
 import sys
 import time
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -24,6 +24,7 @@ _MOST_REPEATS = 250
 """A pause of the performer stands still in the film for at most so many pictures."""
 
 
+@runtime_checkable
 class PictureSink(Protocol):
     """Where drawn pictures go."""
 
@@ -62,7 +63,9 @@ class PictureOutput:
         self._sink.add(picture, frame.time_s)
         self.latencies.add(frame.captured_s, time.monotonic())
 
-    def _performer(self, image_rgb: _Picture, picture: _Picture) -> _Picture:
+    def _performer(
+        self, image_rgb: UInt8[np.ndarray, "H W 3"], picture: _Picture
+    ) -> UInt8[np.ndarray, "height beside 3"]:
         """The performer's picture as high as the avatar's, and as wide as the first one was."""
         performer = scaled(image_rgb, len(picture) / len(image_rgb))
         self._beside_px = self._beside_px or performer.shape[1]
@@ -104,7 +107,7 @@ class FilmSink:
         if self._film.count == 0:
             nothing = UserError(f"{self._path} has no picture.", "The performer was never seen.")
             self._film.__exit__(UserError, nothing, None)
-            return
+            raise nothing
         self._film.__exit__(None, None, None)
 
 

@@ -1,8 +1,15 @@
 "use strict";
 /* How much is drawn while something moves, so that pictures follow one another fast enough. */
 
-/** Share of the Gaussians and of the resolution (of each side), from all to least. */
-const PACE_STEPS = [[1, 1], [1, 0.7], [0.5, 0.7], [0.5, 0.5], [0.25, 0.5]];
+/** From all to least: how the sums are kept, share of the Gaussians, of each side's pixels. */
+const PACE_STEPS = [
+  { bytes: false, detail: 1, resolution: 1 },
+  { bytes: true, detail: 1, resolution: 1 },
+  { bytes: true, detail: 1, resolution: 0.7 },
+  { bytes: true, detail: 0.5, resolution: 0.7 },
+  { bytes: true, detail: 0.5, resolution: 0.5 },
+  { bytes: true, detail: 0.25, resolution: 0.5 },
+];
 const SLOW = 40, FAST = 20; // milliseconds a picture: 25 and 50 a second
 const SLOW_PICTURES = 7; // whose middle one is slow, until less is drawn
 const FAST_PICTURES = 60; // in a row, until more is tried
@@ -20,10 +27,9 @@ class Pace {
     this._drew = null; // the same, if that was the frame before
   }
 
-  /** What is to be drawn now: { detail, resolution }. */
+  /** What is to be drawn now. */
   get share() {
-    const [detail, resolution] = PACE_STEPS[this.resting ? 0 : this.place];
-    return { detail, resolution };
+    return PACE_STEPS[this.resting ? 0 : this.place];
   }
 
   /** In words, empty where all is drawn. */

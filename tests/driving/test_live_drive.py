@@ -1,0 +1,134 @@
+"""From source to outputs: nothing lost offline, nothing late live, every end a clean one."""
+
+import threading
+import time
+from collections import Counter
+
+import pytest
+import torch
+
+from rgbavatar_ns.driving.live_drive import DrivenFrame, Latencies, LiveDrive
+from rgbavatar_ns.driving.source import PerformanceFrame
+from rgbavatar_ns.errors import UserError
+
+
+class _Transfer:
+    """In place of `LiveTransfer`: theta is the frame's number."""
+
+    calibrating = False
+
+    def __init__(self):
+        self.asked = 0
+
+    def __call__(self, frame):
+        return torch.tensor([float(frame.index)])
+
+    def calibrate(self):
+        self.asked += 1
+
+
+class _Source:
+    head, waits_for = None, "a face"
+
+    def __init__(self, count, every_s=0.0, error=None):
+        self.counts = Counter()
+        self.closed = False
+        self._count, self._every_s, self._error, self._next = count, every_s, error, 0
+
+    @property
+    def ended(self):
+        return self._next >= self._count and self._error is None
+
+    def next(self, timeout_s):
+        time.sleep(self._every_s)
+        if self._next >= self._count:
+            raise self._error
+        self._next += 1
+        return PerformanceFrame(self._next, time.monotonic(), self._next / 25)
+
+    def close(self):
+        self.closed = True
+
+
+class _Output:
+    def __init__(self, seconds=0.0, error=None):
+        self.latencies, self.seen, self.closed = Latencies(), [], False
+        self._seconds, self._error = seconds, error
+
+    def show(self, frame: DrivenFrame):
+        time.sleep(self._seconds)
+        if self._error is not None:
+            raise self._error
+        self.seen.append(int(frame.theta))
+        self.latencies.add(frame.captured_s, time.monotonic())
+
+    def close(self):
+        self.closed = True
+
+
+def test_offline_every_frame_is_shown_in_order():
+    source, output = _Source(50), _Output(0.002)
+    LiveDrive(source, _Transfer(), [output], real_time=False).run()
+    assert output.seen == list(range(1, 51))
+    assert source.closed
+    assert output.closed
+
+
+def test_live_a_slow_output_skips_and_never_falls_behind():
+    source, output = _Source(60, every_s=0.01), _Output(0.05)
+    drive = LiveDrive(source, _Transfer(), [output])
+    drive.run()
+    assert output.seen == sorted(output.seen)
+    assert 5 < len(output.seen) < 30
+    assert drive.not_drawn > 20
+    assert output.latencies.quantile_s(1.0) < 0.2
+
+
+def test_the_sources_error_is_told_after_everything_is_closed():
+    source, output = _Source(3, error=UserError("The camera is gone.", "Connect it.")), _Output()
+    with pytest.raises(UserError, match="camera is gone"):
+        LiveDrive(source, _Transfer(), [output], real_time=False).run()
+    assert output.seen == [1, 2, 3]
+    assert source.closed
+    assert output.closed
+
+
+def test_an_outputs_error_ends_the_source_too():
+    source, output = _Source(1000, every_s=0.001), _Output(error=BrokenPipeError())
+    with pytest.raises(BrokenPipeError):
+        LiveDrive(source, _Transfer(), [output]).run()
+    assert source.closed
+    assert output.closed
+
+
+def test_it_can_be_stopped_and_asked_to_calibrate_from_other_threads():
+    source, output, transfer = _Source(10_000, every_s=0.005), _Output(), _Transfer()
+    drive = LiveDrive(source, transfer, [output])
+    threading.Timer(0.1, drive.calibrate).start()
+    threading.Timer(0.4, drive.stop).start()
+    began_s = time.monotonic()
+    drive.run()
+    assert time.monotonic() - began_s < 3
+    assert transfer.asked == 1
+    assert output.closed
+
+
+def test_who_waits_is_told_for_what():
+    told = []
+    source = _Source(10_000)
+    source.next = lambda timeout_s: time.sleep(0.05)  # type: ignore[method-assign]
+    drive = LiveDrive(source, _Transfer(), [], tell=told.append)
+    threading.Timer(2.6, drive.stop).start()
+    drive.run()
+    assert told[-1] == "Waiting for a face; Ctrl-C ends."
+
+
+def test_latencies_are_kept_for_two_minutes_and_no_longer():
+    latencies = Latencies()
+    for k in range(10_000):
+        latencies.add(k / 25, k / 25 + (0.05 if k % 10 else 0.2))
+    assert latencies.shown == 10_000
+    assert latencies.frames_per_second() == pytest.approx(25, rel=0.01)
+    assert latencies.quantile_s(0.5) == pytest.approx(0.05)
+    assert latencies.quantile_s(0.95) == pytest.approx(0.2)
+    assert len(latencies._seconds) == 3000

@@ -1,0 +1,107 @@
+"""What pages are told, without a browser."""
+
+import json
+import threading
+import time
+import urllib.error
+import urllib.request
+
+import pytest
+import torch
+from websockets.sync.client import connect
+
+from rgbavatar_ns.driving.live_drive import DrivenFrame
+from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.export.live_page import PageOutput
+from rgbavatar_ns.head import HeadModel
+
+_LAYOUT = HeadModel.embedded().layout
+
+
+@pytest.fixture
+def output():
+    asked = threading.Event()
+    shown = PageOutput(_LAYOUT, "127.0.0.1:0", page=lambda: b"<html>it", calibrate=asked.set)
+    shown.asked = asked  # type: ignore[attr-defined]
+    yield shown
+    shown.close()
+
+
+def _frame(index, value=0.0):
+    theta = torch.full((_LAYOUT.size,), value)
+    return DrivenFrame(index, theta, time.monotonic(), index / 25)
+
+
+def _until(condition):
+    for _ in range(200):
+        if condition():
+            return
+        time.sleep(0.01)
+    raise AssertionError("it has not come to pass")
+
+
+def test_a_page_is_greeted_gets_frames_and_its_answers_make_the_latency(output):
+    with connect(f"ws://{output.address}") as page:
+        greeting = json.loads(page.recv(timeout=2))
+        assert (greeting["type"], greeting["version"]) == ("hello", 1)
+        assert greeting["layout"] == _LAYOUT.to_json()
+        _until(lambda: output.pages == 1)
+        output.show(_frame(5, 0.25))
+        frame = json.loads(page.recv(timeout=2))
+        assert (frame["type"], frame["index"]) == ("theta", 5)
+        assert frame["theta"] == [0.25] * _LAYOUT.size
+        time.sleep(0.05)
+        for text in ('{"type":"shown","index":5}', '{"type":"shown","index":99}', "garbage", "[]"):
+            page.send(text)
+        _until(lambda: output.latencies.shown == 1)
+        assert 0.05 <= output.latencies.quantile_s(0.5) < 0.5
+    _until(lambda: output.pages == 0)
+
+
+def test_a_slow_page_gets_the_newest(output):
+    with connect(f"ws://{output.address}") as page:
+        page.recv(timeout=2)
+        _until(lambda: output.pages == 1)
+        for index in range(200):
+            output.show(_frame(index))
+        time.sleep(0.2)
+        indices = []
+        while not indices or indices[-1] != 199:
+            indices.append(json.loads(page.recv(timeout=2))["index"])
+    assert indices == sorted(indices)
+    assert len(indices) < 200
+
+
+def test_a_page_may_ask_for_a_calibration(output):
+    with connect(f"ws://{output.address}") as page:
+        page.send('{"type":"calibrate"}')
+        assert output.asked.wait(2)
+
+
+def test_a_page_is_told_the_end(output):
+    with connect(f"ws://{output.address}") as page:
+        page.recv(timeout=2)
+        _until(lambda: output.pages == 1)
+        threading.Thread(target=output.close).start()
+        assert json.loads(page.recv(timeout=2))["text"] == "The performance has ended."
+
+
+def test_the_address_itself_is_the_page_and_nothing_else_is_there(output):
+    with urllib.request.urlopen(f"http://{output.address}/?ws=ws://{output.address}") as answer:
+        assert answer.read() == b"<html>it"
+        assert answer.headers["Content-Type"].startswith("text/html")
+    with pytest.raises(urllib.error.HTTPError, match="404"):
+        urllib.request.urlopen(f"http://{output.address}/etc/passwd")
+
+
+def test_other_machines_reach_it_only_when_asked_for(output):
+    with pytest.raises(UserError, match="Other machines could reach"):
+        PageOutput(_LAYOUT, "0.0.0.0:0")
+    with pytest.raises(UserError, match="Nothing can be served"):
+        PageOutput(_LAYOUT, output.address)
+
+
+def test_what_was_captured_is_not_remembered_for_ever(output):
+    for index in range(2000):
+        output.show(_frame(index))
+    assert len(output._captured_s) == 500

@@ -1,0 +1,145 @@
+"""Cameras and videos as performances, with a tracker of the tests' own and with the real one."""
+
+import time
+from collections import Counter
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.export import write_video
+from rgbavatar_ns.head import HeadModel
+from rgbavatar_ns.tracking.input.capture import (
+    CapturedFrame,
+    FileCapture,
+    LatestFrameCapture,
+)
+from rgbavatar_ns.tracking.performer import FilmedPerformer
+
+
+class _Tracker:
+    """Theta is the picture's mean level; the first `warm_up` pictures give the person."""
+
+    def __init__(self, warm_up=3, seconds=0.0):
+        self.head = HeadModel.embedded()
+        self.counts = Counter()
+        self.closed = 0
+        self._warm_up, self._seconds, self._kept = warm_up, seconds, []
+        self.ready = False
+
+    def pose(self, image_rgb, index=0):
+        if self.ready:
+            return self._theta(image_rgb)
+        self._kept.append((index, self._theta(image_rgb)))
+        if len(self._kept) == self._warm_up:
+            time.sleep(self._seconds)
+            self.ready = True
+        return None
+
+    def _theta(self, image_rgb):
+        return torch.full((self.head.layout.size,), float(image_rgb.mean()))
+
+    def pose_backlog(self):
+        kept, self._kept = self._kept, []
+        return kept
+
+    def close(self):
+        self.closed += 1
+
+
+@pytest.fixture
+def film(tmp_path):
+    """Forty frames at 25 a second, each brighter than the one before."""
+    path = tmp_path / "film.mp4"
+    write_video(path, (np.full((32, 32, 3), 40 + 5 * k, np.uint8) for k in range(40)), 25.0)
+    return path
+
+
+def _all(performer):
+    frames = []
+    while not performer.ended:
+        frame = performer.next(0.2)
+        if frame is not None:
+            frames.append(frame)
+    return frames
+
+
+def test_offline_no_frame_is_lost_not_even_those_that_give_the_person(film):
+    performer = FilmedPerformer(str(film), False, with_images=True, tracker=_Tracker(warm_up=12))
+    frames = _all(performer)
+    assert [frame.index for frame in frames] == list(range(40))
+    levels = [float(frame.theta[0]) for frame in frames]
+    assert np.allclose(levels, [40 + 5 * k for k in range(40)], atol=3)
+    assert [frame.image_rgb.shape for frame in frames] == [(32, 32, 3)] * 40
+    assert frames[25].time_s - frames[0].time_s == pytest.approx(1.0)
+
+
+def test_in_real_time_what_is_late_is_skipped_and_lateness_is_honest(film):
+    performer = FilmedPerformer(str(film), True, tracker=_Tracker(warm_up=3, seconds=0.5))
+    began_s, frames, late_s = time.monotonic(), [], []
+    while not performer.ended:
+        frame = performer.next(0.2)
+        if frame is not None:
+            frames.append(frame)
+            late_s.append(time.monotonic() - frame.captured_s)
+    assert 1.3 < time.monotonic() - began_s < 3.0
+    assert 8 <= performer.counts["skipped"] <= 20
+    assert np.median(late_s) < 0.06
+    assert frames[0].index >= 10
+
+
+def test_closing_twice_closes_once(film):
+    tracker = _Tracker()
+    performer = FilmedPerformer(str(film), False, tracker=tracker)
+    performer.close()
+    performer.close()
+    assert tracker.closed == 1
+    assert performer.ended
+
+
+def test_a_camera_that_is_not_there_is_told_at_once():
+    began_s = time.monotonic()
+    with pytest.raises(UserError, match=r"Camera 77 cannot be opened: it is not there, or another"):
+        FilmedPerformer("77", tracker=_Tracker())
+    assert time.monotonic() - began_s < 10
+
+
+def test_a_camera_that_shows_nothing_is_told(monkeypatch):
+    closed = SimpleNamespace(isOpened=lambda: False, release=lambda: None)
+    silent = LatestFrameCapture("0", opener=lambda source: closed)
+    performer = FilmedPerformer("0", tracker=_Tracker(), capture=silent)
+    assert performer.next(0.1) is None
+    assert "first picture of 0" in performer.waits_for
+    monkeypatch.setattr("rgbavatar_ns.tracking.performer._FIRST_PICTURE_S", 0.0)
+    with pytest.raises(UserError, match="0 has shown no picture for"):
+        performer.next(0.1)
+    performer.close()
+
+
+def test_what_is_waited_for_changes_with_what_is_known(film):
+    tracker = _Tracker(warm_up=2)
+    performer = FilmedPerformer(str(film), False, tracker=tracker)
+    performer.next(0.1)
+    assert "to be met" in performer.waits_for
+    _all(performer)
+    assert "to be found again" in performer.waits_for
+
+
+def test_a_missing_video_is_told(tmp_path):
+    with pytest.raises(UserError, match="There is no video"):
+        FilmedPerformer(str(tmp_path / "none.mp4"), tracker=_Tracker())
+
+
+def test_the_newest_due_frame_of_a_file_ends_with_its_last(film):
+    capture = FileCapture(film, "newest")
+    time.sleep(0)
+    first = capture.next(1.0)
+    time.sleep(3.0)
+    last = capture.next(1.0)
+    assert isinstance(last, CapturedFrame)
+    assert (first.index, last.index) == (0, 39)
+    assert capture.ended
+    assert capture.counts["skipped"] == 38
+    assert capture.next(0.1) is None
