@@ -178,6 +178,8 @@ def _read(content: bytes) -> tuple[dict[str, Any], dict[str, Shaped[np.ndarray, 
         for part in manifest["parts"]:
             slices = part["slices"]
             sizes = [_bytes(described[name]) * (last - first) for name, first, last in slices]
+            if not 0 <= min(sizes, default=0) <= sum(sizes) <= _MOST_BYTES:
+                raise DamagedFileError("it has parts of impossible sizes")
             block = _inflated(content[place : place + part["bytes"]], part["bytes"], sum(sizes))
             place += part["bytes"]
             starts = np.cumsum([0, *sizes])

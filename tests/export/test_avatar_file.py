@@ -1,6 +1,7 @@
 """The avatar's file: what is in it, in which order, and what is said where it is not whole."""
 
 import gzip
+import json
 import struct
 
 import numpy as np
@@ -111,6 +112,38 @@ def test_what_is_no_whole_avatar_of_this_version_is_told(subject, read):
     bomb = gzip.compress(bytes(1 << 25))
     with pytest.raises(UserError, match="damaged"):
         read(MAGIC + struct.pack("<II", 2, len(bomb)) + bomb)
+
+
+def _with_manifest(whole: bytes, change) -> bytes:
+    (length,) = struct.unpack_from("<I", whole, 12)
+    manifest = json.loads(gzip.decompress(whole[16 : 16 + length]))
+    change(manifest)
+    described = gzip.compress(json.dumps(manifest).encode())
+    return whole[:12] + struct.pack("<I", len(described)) + described + whole[16 + length :]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda manifest: manifest.pop("parts"),
+        lambda manifest: manifest["parts"][0].update(bytes=-5),
+        lambda manifest: manifest["parts"][0].update(bytes="many"),
+        lambda manifest: manifest["parts"][1].update(slices=[["position", 10**15, 0]]),
+        lambda manifest: manifest["parts"][1].update(slices=[["position", 0, 10**15]]),
+        lambda manifest: manifest["parts"][1].update(slices=[["nothing", 0, 1]]),
+        lambda manifest: manifest["arrays"]["position"].update(stored="object"),
+        lambda manifest: manifest["arrays"]["position"].update(columns=0),
+        lambda manifest: manifest["arrays"]["position"].update(columns=7),
+        lambda manifest: manifest["arrays"]["position"].update(unit=[1.0, None]),
+        lambda manifest: manifest["arrays"].update(position=None),
+    ],
+)
+def test_a_manifest_that_cannot_be_is_told(subject, read, change):
+    avatar, theta = subject
+    whole = b"".join(avatar_parts(avatar, {}, theta, {}))
+    assert read(_with_manifest(whole, lambda manifest: None))[0]["num_gaussians"] > 0
+    with pytest.raises(UserError, match="cannot be used"):
+        read(_with_manifest(whole, change))
 
 
 def test_the_films_ends_are_looked_at_with_the_head_at_rest():

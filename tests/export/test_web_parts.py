@@ -1,7 +1,10 @@
 """The page while it arrives, with less than all Gaussians, and where its file is not whole."""
 
 import base64
+import gzip
 import http.server
+import json
+import struct
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -156,7 +159,7 @@ def test_what_has_arrived_in_the_browser_is_what_python_reads(browser, tmp_path)
         np.testing.assert_allclose(found, ours.reshape(-1), rtol=1e-6, err_msg=name)
 
 
-@pytest.mark.parametrize("damage", ["cut off", "damaged", "version", "no avatar"])
+@pytest.mark.parametrize("damage", ["cut off", "damaged", "manifest", "version", "no avatar"])
 def test_a_file_that_is_not_whole_is_told(browser, page_file, damage):
     text = page_file.read_text()
     head, *parts = text.split('class="part">')
@@ -166,6 +169,16 @@ def test_a_file_that_is_not_whole_is_told(browser, page_file, damage):
         middle = len(parts[1]) // 2
         other = "A" if parts[1][middle] != "A" else "B"
         changed = [parts[0], parts[1][:middle] + other + parts[1][middle + 1 :], *parts[2:]]
+    elif damage == "manifest":
+        whole = base64.b64decode(parts[0].split("<")[0])
+        (length,) = struct.unpack_from("<I", whole, 12)
+        manifest = json.loads(gzip.decompress(whole[16 : 16 + length]))
+        manifest["arrays"]["position"]["items"] = 10**12
+        described = gzip.compress(json.dumps(manifest).encode())
+        size = struct.pack("<I", len(described))
+        first = whole[:12] + size + described + whole[16 + length :]
+        rest = parts[0].split("<", 1)[1]
+        changed = [base64.b64encode(first).decode() + "<" + rest, *parts[1:]]
     else:
         first = bytearray(base64.b64decode(parts[0][:64]))
         first[8 if damage == "version" else 0] = 9
@@ -175,8 +188,8 @@ def test_a_file_that_is_not_whole_is_told(browser, page_file, damage):
     page.goto(page_file.as_uri())
     said = page.locator("#message.error")
     said.wait_for()
-    expected = {"version": "version 9; this program reads 2"}.get(damage, damage)
-    assert expected in said.text_content()
+    expected = {"version": "version 9; this program reads 2", "manifest": "damaged"}
+    assert expected.get(damage, damage) in said.text_content()
     # What has arrived stays to be seen.
     drawn = page.evaluate("() => rgbavatar.then((app) => app.avatar.pictures, () => 0)")
     assert (drawn > 0) == (damage in ("cut off", "damaged"))

@@ -23,7 +23,7 @@ class AvatarData {
       return data;
     } catch (error) {
       bytes.cancel();
-      throw error;
+      throw told(error);
     }
   }
 
@@ -46,7 +46,7 @@ class AvatarData {
       }
     } catch (error) {
       bytes.cancel();
-      throw error;
+      throw told(error);
     }
   }
 
@@ -69,6 +69,12 @@ class AvatarData {
     this.available = part.available;
     this.spans.push([Math.min(from, to), to]);
   }
+}
+
+/** A manifest that asks for what cannot be fails with an error of the language's own. */
+function told(error) {
+  const own = error.constructor === Error || error.name === "AbortError";
+  return own ? error : new Error("The avatar's file is damaged.", { cause: error });
 }
 
 /** Takes pieces of any length from a stream. */
