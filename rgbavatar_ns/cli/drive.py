@@ -267,14 +267,16 @@ def _page(
 def _page_content(subject: "Subject", show: ShowOptions) -> bytes:
     import torch
 
-    from rgbavatar_ns.export import PageOptions, write_web_page
+    from rgbavatar_ns.export import PageOptions, calm_theta, write_web_page
 
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "page.html"
         options = PageOptions(background=show.background)
-        nothing = torch.zeros(0, subject.avatar.layout.size)
+        nothing = torch.zeros(1, subject.avatar.layout.size)
+        first = nothing if subject.dataset is None else subject.dataset.theta
+        calm = calm_theta(subject.seen, first[0])
         drawn = subject.avatar.without_undrawn()
-        write_web_page(drawn, path, subject.camera, nothing, options, subject.seen)
+        write_web_page(drawn, path, subject.camera, nothing[:0], options, subject.seen, calm)
         return path.read_bytes()
 
 

@@ -1,11 +1,14 @@
 """The page driven over a WebSocket, in a browser: what it follows, answers, tells and refuses."""
 
+import time
 from collections.abc import Iterator
 from typing import Any
 
 import pytest
 import torch
 
+from rgbavatar_ns.driving.live_drive import DrivenFrame
+from rgbavatar_ns.export.live_page import PageOutput
 from tests.browser import IN_BROWSER
 
 from .drive_server import DriveServer, hello
@@ -60,6 +63,18 @@ def test_arkit_and_status_messages_are_followed(driven, server, avatar):
     server.send({"type": "status", "text": "<b>calibrating</b>"})
     says(driven, ": <b>calibrating</b>")
     assert driven.locator("#live b").count() == 0
+
+
+def test_the_projects_own_server_drives_the_page_and_hears_of_it(open_page, avatar, theta):
+    output = PageOutput(avatar.layout, "127.0.0.1:0")
+    page = open_page(f"?ws=ws://{output.address}")
+    output.show(DrivenFrame(3, theta[3], time.monotonic(), 0.1))
+    shows(page, theta[3])
+    page.wait_for_function("() => avatar.pictures > 1")
+    while output.latencies.shown == 0:
+        time.sleep(0.01)
+    output.close()
+    says(page, "trying again")
 
 
 def test_whoever_performs_can_be_calibrated_from_the_page(driven, server):
