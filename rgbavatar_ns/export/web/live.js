@@ -55,7 +55,7 @@ class DriveChannel {
     if (!this._greeted) throw new Error(`its first message is no "hello" of ${DRIVE.format}`);
     if (message.type === "status") return this._status(message.text);
     if (message.type !== "theta" && message.type !== "arkit") {
-      throw new Error(`there is no message of type ${told(message.type)}`);
+      throw new Error(`there is no message of type ${inWords(message.type)}`);
     }
     const { index } = message;
     this._driver.show(message, () => {
@@ -68,7 +68,7 @@ class DriveChannel {
     this._greeted = true;
     this._refused = true;
     if (format !== DRIVE.format || version !== DRIVE.version) {
-      throw new Error(`it speaks another version, ${told(format)} ${told(version)}; `
+      throw new Error(`it speaks another version, ${inWords(format)} ${inWords(version)}; `
         + `this page speaks ${DRIVE.format} ${DRIVE.version}`);
     }
     const { avatar } = this._driver;
