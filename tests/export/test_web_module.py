@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from rgbavatar_ns.head.rotations import axis_angle_to_matrix
 from rgbavatar_ns.kernels import PinholeCameras
 from tests.browser import IN_BROWSER
 
@@ -112,6 +113,24 @@ def test_another_programs_camera_sees_what_render_draws_from_there(page, avatar,
     assert psnr(canvas_of(page)[..., :3], ours) > 45
     page.evaluate("() => avatar.setCamera(null)")
     assert psnr(canvas_of(page)[..., :3], drawn_by_us(avatar, theta[0])[0]) > 45
+
+
+def test_the_pose_of_a_matrix_turns_as_the_matrix_does(page):
+    half = torch.tensor([[0.0, 0.6, 0.8], [-1.0, 0.0, 0.0], [0.1, -2.0, 0.3]])
+    half = torch.pi * half / half.norm(dim=1, keepdim=True)
+    generator = torch.Generator().manual_seed(3)
+    drawn = torch.randn(20, 3, generator=generator, dtype=torch.float64)
+    turns = torch.cat([drawn, 1e-9 * drawn[:2], half.double(), torch.zeros(1, 3)])
+    matrices = 1.7 * axis_angle_to_matrix(turns)
+    for matrix in matrices:
+        whole = torch.eye(4, dtype=torch.float64)
+        whole[:3, :3], whole[:3, 3] = matrix, torch.tensor([3.0, -4.0, -50.0])
+        pose = page.evaluate(
+            "numbers => module.RGBAvatar.poseOfMatrix(numbers)", whole.T.flatten().tolist()
+        )
+        found = axis_angle_to_matrix(torch.tensor(pose["rotation"], dtype=torch.float64))
+        assert torch.allclose(1.7 * found, matrix, atol=1e-6)
+        assert pose["translation"] == pytest.approx([0.03, -0.04, -0.5])
 
 
 def test_a_transparent_picture_has_the_renderers_alpha(page, avatar, theta):
