@@ -265,18 +265,19 @@ def _page(
 
 
 def _page_content(subject: "Subject", show: ShowOptions) -> bytes:
+    """The avatar's page without a performance of its own, calm until it is driven."""
     import torch
 
-    from rgbavatar_ns.export import PageOptions, calm_theta, write_web_page
+    from rgbavatar_ns.export import PageOptions, as_filmed, calm_theta, write_web_page
 
+    avatar, dataset, seen = subject.avatar.without_undrawn(), subject.dataset, subject.seen
+    if dataset is not None:
+        avatar = as_filmed(avatar, dataset)
+    neutral = calm_theta(seen, seen.theta_mean)
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "page.html"
-        options = PageOptions(background=show.background)
-        nothing = torch.zeros(1, subject.avatar.layout.size)
-        first = nothing if subject.dataset is None else subject.dataset.theta
-        calm = calm_theta(subject.seen, first[0])
-        drawn = subject.avatar.without_undrawn()
-        write_web_page(drawn, path, subject.camera, nothing[:0], options, subject.seen, calm)
+        path, options = Path(folder) / "page.html", PageOptions(background=show.background)
+        nothing = torch.zeros(0, avatar.layout.size)
+        write_web_page(avatar, path, subject.camera, nothing, options, seen, neutral)
         return path.read_bytes()
 
 

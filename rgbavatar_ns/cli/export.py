@@ -166,17 +166,13 @@ def _write_texture(avatar: "Avatar", destination: Path) -> None:
 
 
 def _as_filmed(avatar: "Avatar", dataset: "TrackedDataset") -> "Avatar":
-    """The avatar without what lies beyond the film's edges."""
-    import torch
+    """The avatar without what lies beyond the film's edges, which is told."""
+    from rgbavatar_ns.export import as_filmed
 
-    from rgbavatar_ns.export import within_film
-
-    kept = torch.nonzero(within_film(avatar, dataset))[:, 0]
-    left_out = avatar.num_gaussians - len(kept)
-    if len(kept) == 0 or left_out == 0:  # without any, the data's cameras are not of this avatar
-        return avatar
-    print(f"{left_out} Gaussians lie beyond every picture's edge: left out.")
-    return avatar.with_gaussians(kept)
+    filmed = as_filmed(avatar, dataset)
+    if (left_out := avatar.num_gaussians - filmed.num_gaussians) > 0:
+        print(f"{left_out} Gaussians lie beyond every picture's edge: left out.")
+    return filmed
 
 
 def page_frames(

@@ -3,7 +3,7 @@
 from rgbavatar_ns.export.bases import basis_grid
 from rgbavatar_ns.export.comparison import comparison_frames, write_comparison
 from rgbavatar_ns.export.drawing import draw, pictures
-from rgbavatar_ns.export.filmed import within_film
+from rgbavatar_ns.export.filmed import as_filmed, within_film
 from rgbavatar_ns.export.gaussian_files import (
     GAUSSIAN_FILES,
     write_gaussian_sequence,
@@ -13,7 +13,7 @@ from rgbavatar_ns.export.gltf import write_gltf
 from rgbavatar_ns.export.ply import write_ply
 from rgbavatar_ns.export.run_data import dataset_folder, statistics_of
 from rgbavatar_ns.export.texture import color_texture, read_texture, with_texture, write_texture
-from rgbavatar_ns.export.video import write_gif, write_png, write_pngs, write_video
+from rgbavatar_ns.export.video import FilmWriter, write_gif, write_png, write_pngs, write_video
 from rgbavatar_ns.export.views import (
     front_camera,
     read_camera_path,
@@ -26,7 +26,9 @@ from rgbavatar_ns.export.web_page import PageOptions, write_web_page
 
 __all__ = [
     "GAUSSIAN_FILES",
+    "FilmWriter",
     "PageOptions",
+    "as_filmed",
     "basis_grid",
     "calm_theta",
     "color_texture",

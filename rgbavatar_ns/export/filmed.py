@@ -35,3 +35,11 @@ def within_film(avatar: Avatar, dataset: TrackedDataset) -> Bool[Tensor, "N"]:
         inside = ((pixel >= 0) & (pixel <= size)).all(-1) & (seen[..., 2] > 0)
         kept |= inside.any(0)
     return kept
+
+
+def as_filmed(avatar: Avatar, dataset: TrackedDataset) -> Avatar:
+    """The avatar without what lies beyond the film's edges (`within_film`)."""
+    kept = torch.nonzero(within_film(avatar, dataset))[:, 0]
+    if len(kept) in (0, avatar.num_gaussians):
+        return avatar  # without any, the data's cameras are not of this avatar
+    return avatar.with_gaussians(kept)

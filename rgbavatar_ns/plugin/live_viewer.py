@@ -6,9 +6,9 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import nerfstudio.viewer.viewer
 from nerfstudio.utils import writer
 from nerfstudio.utils.eval_utils import eval_setup
-from nerfstudio.viewer.viewer import Viewer
 
 from rgbavatar_ns.avatar.storage.checkpoint_file import newest_run
 from rgbavatar_ns.driving.live_drive import DrivenFrame, Latencies
@@ -39,7 +39,7 @@ class ViewerOutput:
         self._panel = pipeline.viewer_panel
         self._panel.listen_live(calibrate, self._drawn)
         folder = config.get_base_dir()
-        viewer = Viewer(
+        viewer = nerfstudio.viewer.viewer.Viewer(
             replace(config.viewer, make_share_url=False),
             log_filename=folder / config.viewer.relative_log_filename,
             datapath=pipeline.datamanager.get_datapath(),

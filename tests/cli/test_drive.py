@@ -1,0 +1,189 @@
+"""`rgbavatar drive`: what is performed is shown, every mistake is told."""
+
+import json
+import socket
+import subprocess
+import sys
+import threading
+import time
+import urllib.request
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+import torch
+from websockets.sync.client import connect
+
+from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
+from rgbavatar_ns.cli.drive import SourceOptions, _is_dataset
+from rgbavatar_ns.cli.main import main
+from rgbavatar_ns.data import DatasetWriter, TrackedFrame
+from rgbavatar_ns.export import front_camera, pictures
+from tests.driving.packets import packet
+from tests.export.subject import avatar_of, lively_theta
+
+_SIZE, _FRAMES = 32, 20
+
+
+@pytest.fixture(scope="module")
+def avatar(tmp_path_factory) -> Path:
+    """A bundle that knows its film."""
+    folder, made = tmp_path_factory.mktemp("avatar") / "me", avatar_of()
+    theta = lively_theta(made, 30)
+    views = front_camera(made, _SIZE, _SIZE).world_to_camera.expand(30, 4, 4)
+    seen = TrainingStatistics.of(theta, torch.zeros(30, 4), made.layout, views)
+    made.save(folder, statistics=seen)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def performer(tmp_path_factory) -> Path:
+    """Another person's dataset."""
+    other, folder = avatar_of(3), tmp_path_factory.mktemp("data") / "other"
+    theta, camera = lively_theta(other, _FRAMES, 3), front_camera(other, _SIZE, _SIZE)
+    writer = DatasetWriter(folder, "makehuman", other.identity, other.layout, _SIZE, _SIZE)
+    for index, image in enumerate(pictures(other, theta, camera, None)):
+        writer.add(TrackedFrame(index, theta[index], camera, image))
+    writer.finish(3)
+    return folder
+
+
+def _drive(*words: object) -> None:
+    main(["drive", *map(str, words)])
+
+
+def _film(path: Path) -> list[np.ndarray]:
+    with av.open(str(path)) as film:
+        return [frame.to_ndarray(format="rgb24") for frame in film.decode(video=0)]
+
+
+def test_a_dataset_drives_a_film_frame_by_frame(avatar, performer, tmp_path, capsys):
+    film = tmp_path / "film.mp4"
+    size = ("--width", 48, "--height", 40)
+    _drive(avatar, "--source", performer, "--out", film, "--beside", *size)
+    frames = _film(film)
+    assert [frame.shape for frame in frames] == [(40, 88, 3)] * _FRAMES
+    moving = np.stack(frames)[:, :, 40:].astype(float)
+    assert np.abs(np.diff(moving, axis=0)).mean() > 0.3, "the avatar moves"
+    told = capsys.readouterr()
+    assert f"{_FRAMES} frames" in told.err
+    assert str(film) in told.err
+    assert told.out == "", "standard output is for pictures"
+
+
+def test_curves_of_a_phone_drive_a_film(avatar, tmp_path):
+    rows = [f"{k % 5 / 5},{k % 3 / 3}" for k in range(30)]
+    (tmp_path / "take.csv").write_text("JawOpen,EyeBlinkLeft\n" + "\n".join(rows))
+    film = tmp_path / "film.mp4"
+    _drive(avatar, "--source", tmp_path / "take.csv", "--out", film, "--width", 32, "--height", 32)
+    # Sixty frames a second in a film of 25.
+    assert 12 <= len(_film(film)) <= 14
+
+
+def _free_port(kind: int) -> int:
+    with socket.socket(socket.AF_INET, kind) as taken:
+        taken.bind(("127.0.0.1", 0))
+        return taken.getsockname()[1]
+
+
+def test_packets_drive_raw_pictures_on_standard_output(avatar):
+    """As a stranger does it: one program sends, the command draws, another one reads."""
+    port = _free_port(socket.SOCK_DGRAM)
+    words = ["--source", "arkit", "--listen", f"127.0.0.1:{port}", "--out", "-", "--seconds", "4"]
+    command = [sys.executable, "-c", "from rgbavatar_ns.cli.main import main; main()", "drive"]
+    driven = subprocess.Popen(
+        [*command, str(avatar), *words, "--width", "24", "--height", "16"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    )
+    stop = threading.Event()
+
+    def send():
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+            for k in range(100_000):
+                if stop.wait(0.02):
+                    return
+                row = [0.0] * 52
+                row[17] = k % 20 / 20
+                sender.sendto(packet(row, frame=k), ("127.0.0.1", port))
+                sender.sendto(b"garbage", ("127.0.0.1", port))
+
+    sending = threading.Thread(target=send)
+    sending.start()
+    try:
+        content, told = driven.communicate(timeout=120)
+    finally:
+        stop.set()
+        sending.join()
+    assert driven.returncode == 0, told.decode()
+    assert len(content) % (24 * 16 * 3) == 0
+    shown = np.frombuffer(content, np.uint8).reshape(-1, 16, 24, 3)
+    assert len(shown) > 20
+    assert np.ptp(shown.astype(int), axis=0).max() > 20, "the jaw opens"
+    assert "unreadable" in told.decode() or "another version" in told.decode()
+    assert "ms from picture to picture" in told.decode()
+
+
+def test_the_page_is_served_and_driven(avatar, performer, capsys):
+    port = _free_port(socket.SOCK_STREAM)
+    words = ("--source", performer, "--show", "page", "--serve", f"127.0.0.1:{port}")
+    words = (*words, "--source-frames-per-second", 5)
+    driving = threading.Thread(target=_drive, args=(avatar, *words), daemon=True)
+    driving.start()
+    for _ in range(300):
+        try:
+            page = connect(f"ws://127.0.0.1:{port}", origin="null")  # type: ignore[arg-type]
+            break
+        except OSError:
+            time.sleep(0.05)
+    with page:
+        assert json.loads(page.recv(timeout=5))["type"] == "hello"
+        frames = [json.loads(page.recv(timeout=5)) for _ in range(5)]
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}/") as answer:
+            assert b"<canvas" in answer.read()
+    assert [frame["type"] for frame in frames] == ["theta"] * 5
+    assert frames[0]["theta"] != frames[-1]["theta"]
+    driving.join(timeout=60)
+    assert not driving.is_alive()
+    assert f"http://127.0.0.1:{port}/?ws=ws://127.0.0.1:{port}" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["--show", "none"], "Nothing would be shown"),
+        (["--source", "nothing.mp4", "--out", "f.mp4"], "There is no source nothing.mp4"),
+        (["--source", "77", "--out", "f.mp4"], "Camera 77 cannot be opened"),
+        (["--source", "arkit", "--listen", "0.0.0.0:0", "--out", "f.mp4"], "Other machines"),
+        (["--source", "arkit", "--listen", "here", "--out", "f.mp4"], "'here' is no address"),
+        (["--source", "websocket", "--listen", "0.0.0.0:0", "--out", "f.mp4"], "Other machines"),
+        (["--source", "camera", "--listen", "127.0.0.1:1", "--out", "f.mp4"], "listens to nobody"),
+    ],
+)
+def test_mistakes_are_told(avatar, refused, words, told):
+    assert told in refused("drive", avatar, *words)
+
+
+def test_what_cannot_be_written_is_told(avatar, performer, refused, tmp_path):
+    drive = ["drive", avatar, "--source", performer]
+    assert "Pictures cannot go to film.avi" in refused(*drive, "--out", "film.avi")
+    assert "is no run of ns-train" in refused(*drive, "--show", "viewer")
+    (tmp_path / "file").write_text("")
+    assert "Cannot write" in refused(*drive, "--out", tmp_path / "file" / "film.mp4")
+
+
+def test_a_bundle_that_knows_nothing_of_its_film_is_told(bundle, performer, refused):
+    told = refused("drive", bundle, "--source", performer, "--out", "f.mp4")
+    assert "does not name its dataset" in told
+
+
+def test_a_run_is_a_performance_and_pictures_are_none(performer, tmp_path):
+    assert _is_dataset(performer)
+    (tmp_path / "pictures").mkdir()
+    assert not _is_dataset(tmp_path / "pictures")
+
+
+def test_options_out_of_range_are_told(avatar, refused):
+    assert SourceOptions().source == "camera"
+    assert "calibrate" in refused("drive", avatar, "--calibrate-s", "-1", "--out", "f.mp4")
