@@ -205,7 +205,7 @@ def test_slow_moving_pictures_show_less_and_still_ones_all(browser, page_file):
             for (let i = 0; i < count; i++) { now += milliseconds; pace.moves(now); }
             found.push(pace.place);
           };
-          run(60, 16); run(30, 30); run(3, 200); // neither steady, middling nor a single stutter
+          run(60, 16); run(30, 30); run(2, 300); // neither steady, middling nor a stutter
           run(6, 100); // slow: less is drawn
           found.push(pace.rests(now + 50), pace.rests(now + 300), pace.share.detail,
             pace.share.resolution);
@@ -213,6 +213,9 @@ def test_slow_moving_pictures_show_less_and_still_ones_all(browser, page_file):
           run(7, 100); run(80, 16); run(200, 16); // it was too much: twice as patient
           run(500, 500); // as slow as can be: never below the floor
           found.push(pace.share.detail, pace.share.resolution, pace.told);
+          const crawling = new Pace();
+          for (let i = 0; i < 4; i++) crawling.moves(300 * i);
+          found.push(crawling.place); // three pictures were enough, for two steps
           return found;
         }"""
     )
@@ -221,5 +224,5 @@ def test_slow_moving_pictures_show_less_and_still_ones_all(browser, page_file):
     assert places[8:10] == [1, 0]
     assert places[10:13] == [1, 1, 0]
     assert places[13:] == [
-        5, 0.25, 0.5, "while moving 25% of the Gaussians, 50% of the resolution"
+        5, 0.25, 0.5, "while moving 25% of the Gaussians, 50% of the resolution", 2
     ]  # fmt: skip

@@ -23,7 +23,7 @@ class AvatarData {
       return data;
     } catch (error) {
       bytes.cancel();
-      throw told(error);
+      throw asDamage(error);
     }
   }
 
@@ -46,7 +46,7 @@ class AvatarData {
       }
     } catch (error) {
       bytes.cancel();
-      throw told(error);
+      throw asDamage(error);
     }
   }
 
@@ -72,7 +72,7 @@ class AvatarData {
 }
 
 /** A manifest that asks for what cannot be fails with an error of the language's own. */
-function told(error) {
+function asDamage(error) {
   const own = error.constructor === Error || error.name === "AbortError";
   return own ? error : new Error("The avatar's file is damaged.", { cause: error });
 }

@@ -12,6 +12,8 @@ const PACE_STEPS = [
 ];
 const SLOW = 40, FAST = 20; // milliseconds a picture: 25 and 50 a second
 const SLOW_PICTURES = 7; // whose middle one is slow, until less is drawn
+const CRAWLING = 160; // milliseconds; then fewer pictures are waited for, and two steps taken
+const CRAWLING_PICTURES = 3;
 const FAST_PICTURES = 60; // in a row, until more is tried
 const MOST_PATIENCE = 16; // times as many, where more was too much before
 const REST = 250; // milliseconds without a moving picture, until one is drawn in full
@@ -69,14 +71,22 @@ class Pace {
     this._recent.push(milliseconds);
     if (this._fast >= FAST_PICTURES * this._patience && this.place > 0) {
       this._go(-1);
-    } else if (this._recent.length === SLOW_PICTURES) {
-      const middle = [...this._recent].sort((a, b) => a - b)[SLOW_PICTURES >> 1];
-      this._recent.shift();
-      if (middle > SLOW && this.place < PACE_STEPS.length - 1) {
-        if (this._tried) this._patience = Math.min(2 * this._patience, MOST_PATIENCE);
-        this._go(1);
-      }
+      return;
     }
+    const steps = this._stepsDown();
+    if (this._recent.length === SLOW_PICTURES) this._recent.shift();
+    if (steps === 0) return;
+    if (this._tried) this._patience = Math.min(2 * this._patience, MOST_PATIENCE);
+    this._go(steps);
+  }
+
+  /** How many steps too much the last pictures were. */
+  _stepsDown() {
+    const last = this._recent.slice(-CRAWLING_PICTURES), room = PACE_STEPS.length - 1 - this.place;
+    if (last.length === CRAWLING_PICTURES && Math.min(...last) > CRAWLING) return Math.min(2, room);
+    if (this._recent.length < SLOW_PICTURES) return 0;
+    const middle = [...this._recent].sort((a, b) => a - b)[SLOW_PICTURES >> 1];
+    return middle > SLOW ? Math.min(1, room) : 0;
   }
 
   _go(step) {

@@ -30,7 +30,8 @@ class Renderer {
     this._makeTextures();
     this._makePlaceTarget();
     this._makeBoxes();
-    this.pictureIs = []; // width, height, format
+    this.pictures = new Map(); // textures by format
+    this.pictureTarget = this._framebuffer();
     this.filledParts = 0; // of the file, so many are in the textures
   }
 
@@ -239,18 +240,22 @@ class Renderer {
   /** Half floats hold the unrounded sums of many thin layers. */
   _fitPicture(width, height, bytes) {
     const gl = this.gl, format = bytes ? gl.RGBA8 : gl.RGBA16F;
-    if (this.pictureIs.join() === [width, height, format].join()) return;
-    if (this.picture) gl.deleteTexture(this.picture.texture);
-    this.picture = this._texture();
-    gl.texStorage2D(gl.TEXTURE_2D, 1, format, width, height);
-    for (const name of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) {
-      gl.texParameteri(gl.TEXTURE_2D, name, gl.LINEAR);
+    if (!this.pictures.has(format)) {
+      this.pictures.set(format, { ...this._texture(), width: 0, height: 0 });
+      for (const name of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) {
+        gl.texParameteri(gl.TEXTURE_2D, name, gl.LINEAR);
+      }
     }
-    this.pictureTarget = this.pictureTarget || this._framebuffer();
+    const picture = this.picture = this.pictures.get(format);
+    if (picture.width !== width || picture.height !== height) {
+      gl.bindTexture(gl.TEXTURE_2D, picture.texture);
+      gl.texImage2D(gl.TEXTURE_2D, 0, format, width, height, 0, gl.RGBA,
+        bytes ? gl.UNSIGNED_BYTE : gl.HALF_FLOAT, null);
+      Object.assign(picture, { width, height });
+    }
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.pictureTarget);
     gl.framebufferTexture2D(
-      gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, this.picture.texture, 0);
-    this.pictureIs = [width, height, format];
+      gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, picture.texture, 0);
   }
 
   /** Bind textures to a program's samplers by their names. */
