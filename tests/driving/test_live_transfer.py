@@ -14,7 +14,11 @@ from rgbavatar_ns.driving.sources.live_link_face import parse_packet
 from rgbavatar_ns.export import front_camera
 from rgbavatar_ns.head import EMBEDDED_BUST, HeadArrays, HeadModel, turn_seen
 from rgbavatar_ns.head.arkit import ARKIT_NAMES, arkit_map
+from rgbavatar_ns.head.flame import load_flame
+from rgbavatar_ns.head.landmarks import facemesh_landmarks
 from rgbavatar_ns.head.lips import LipGap
+from rgbavatar_ns.head.rotations import axis_angle_to_matrix
+from rgbavatar_ns.synthetic.flame import write_synthetic_flame
 from rgbavatar_ns.synthetic.performer.performance import perform, with_tracker_noise
 from tests.export.subject import avatar_of
 
@@ -252,3 +256,35 @@ def test_own_statistics_without_a_film_are_enough(avatar, own):
     few = replace(own, theta_min=own.theta_mean, theta_max=own.theta_mean)
     driven = _driven(_performance(1, 2.0), avatar, few)
     assert torch.isfinite(driven).all()
+
+
+def _lids(head: HeadModel, theta: torch.Tensor) -> torch.Tensor:
+    """How far apart the left eye's lids are along the face's height."""
+    still = theta.clone()
+    for name in ("rotation", "neck", "translation"):
+        still[:, head.layout.slice(name)] = 0
+    marks, at_rest = facemesh_landmarks(), _HEAD.v_template
+    rows = [int(np.flatnonzero(marks.facemesh_index == index)[0]) for index in (386, 374)]
+    corners = at_rest[_HEAD.faces[marks.triangle[rows]]]
+    points = np.einsum("pk,pkx->px", marks.barycentric[rows], corners)
+    # The made-up FLAME is the embedded head cut: the same vertices under other numbers.
+    nearest = np.linalg.norm(head.arrays.v_template[:, None] - points, axis=2).argmin(0)
+    upper, lower = head(still)[:, nearest.tolist(), 1].unbind(1)
+    return upper - lower
+
+
+def test_a_person_drives_flame(tmp_path):
+    """A performance of the embedded head moves an avatar of FLAME's: mouth, blinks and turns."""
+    avatar = avatar_of(arrays=load_flame(write_synthetic_flame(tmp_path)))
+    performed = _performance(2, noise=0.5)
+    known = arkit_map(_HEAD)
+    film = avatar.arkit.theta(known.coefficients(_performance(7)), known.head_rotation(performed))
+    driven = _driven(performed, avatar, _own(avatar, film))
+    flame = LipGap.of(avatar.head, avatar.identity)
+    assert flame is not None
+    assert _correlation(flame(driven), _gap(performed)) > 0.95
+    turns = axis_angle_to_matrix(driven[:, avatar.layout.slice("rotation")])
+    wanted = axis_angle_to_matrix(known.head_rotation(performed))
+    for axis in range(2):
+        assert _correlation(turns[:, axis, 2], wanted[:, axis, 2]) > 0.95
+    assert _correlation(_lids(avatar.head, driven), _lids(HeadModel(_HEAD), performed)) > 0.95
