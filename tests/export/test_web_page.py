@@ -10,6 +10,7 @@ import torch
 from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.export import PageOptions, calm_theta, front_camera, write_web_page
+from rgbavatar_ns.export.web_scripts import PAGE_SCRIPTS, sources
 from rgbavatar_ns.head import HeadArrays
 
 from .avatar_of_page import avatar_of_page
@@ -41,6 +42,14 @@ def test_the_page_is_one_file_that_names_no_other_place(tmp_path):
     manifest, arrays = avatar_of_page(path)
     assert page.count('class="part"') == len(manifest["parts"])
     assert arrays["theta"].shape == theta.shape
+
+
+def test_each_name_of_the_programs_is_declared_once():
+    # Plain scripts would take the last one, silently; the module would not start.
+    declared = re.compile(r"^(?:async )?(?:function|class|const|let) (\w+)", re.MULTILINE)
+    names = [name for source in sources(PAGE_SCRIPTS) for name in declared.findall(source)]
+    assert len(names) > 50
+    assert sorted(names) == sorted(set(names))
 
 
 def test_no_name_or_title_can_break_the_page(tmp_path):

@@ -23,12 +23,12 @@ class ARKitMap {
    */
   theta(coefficients, pose) {
     if (typeof coefficients !== "object" || coefficients === null || Array.isArray(coefficients)) {
-      throw new TypeError(`The coefficients are ${told(coefficients)}; expected { jawOpen: 0.4, ... }.`);
+      throw new TypeError(`The coefficients are ${inWords(coefficients)}; expected { jawOpen: 0.4, ... }.`);
     }
     const theta = this.neutral.slice(), size = theta.length;
     for (const [name, value] of Object.entries(coefficients)) {
       if (typeof value !== "number") {
-        throw new TypeError(`${name.slice(0, 30)} is ${told(value)}; expected a number.`);
+        throw new TypeError(`${name.slice(0, 30)} is ${inWords(value)}; expected a number.`);
       }
       const row = this._rowOf(name);
       if (row === undefined || Number.isNaN(value)) continue;
@@ -52,7 +52,7 @@ class ARKitMap {
   /** The head's turn takes the place of the neutral one; the whole avatar moves. */
   _pose(theta, pose) {
     if (typeof pose !== "object") {
-      throw new TypeError(`The pose is ${told(pose)}; expected { rotation, translation }.`);
+      throw new TypeError(`The pose is ${inWords(pose)}; expected { rotation, translation }.`);
     }
     const { rotation = null, translation = null } = pose, start = this._fields.start;
     if (rotation !== null) {

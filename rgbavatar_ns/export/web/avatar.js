@@ -30,7 +30,7 @@ class RGBAvatar extends EventTarget {
   constructor(data, canvas, { background, controls = true, automatic = true } = {}) {
     super();
     if (!(canvas instanceof HTMLCanvasElement)) {
-      throw new TypeError(`canvas is ${told(canvas)}; expected a canvas element.`);
+      throw new TypeError(`canvas is ${inWords(canvas)}; expected a canvas element.`);
     }
     const { manifest, arrays } = data;
     this.data = data;
@@ -64,7 +64,9 @@ class RGBAvatar extends EventTarget {
     };
     const { signal } = this._ended;
     if (controls) {
+      const { touchAction } = canvas.style;
       canvas.style.touchAction = "none"; // a finger turns the head and scrolls no page
+      signal.addEventListener("abort", () => { canvas.style.touchAction = touchAction; });
       this.camera.listen(canvas, () => this.changed(), signal);
     }
     const observer = new ResizeObserver(() => this.changed());
@@ -173,7 +175,7 @@ class RGBAvatar extends EventTarget {
   holdWeight(k, value) {
     const count = this.data.manifest.num_bases;
     if (!(Number.isInteger(k) && k >= 0 && k < count)) {
-      throw new RangeError(`k is ${told(k)}; expected 0 to ${count - 1}.`);
+      throw new RangeError(`k is ${inWords(k)}; expected 0 to ${count - 1}.`);
     }
     if (value === null) this._heldWeights.delete(k);
     else this._heldWeights.set(k, readNumbers([value], 1, "[value]")[0]);
@@ -197,7 +199,7 @@ class RGBAvatar extends EventTarget {
   }
 
   set detail(share) {
-    if (!(share > 0 && share <= 1)) throw new RangeError(`detail is ${told(share)}; expected (0, 1].`);
+    if (!(share > 0 && share <= 1)) throw new RangeError(`detail is ${inWords(share)}; expected (0, 1].`);
     this._detail = share;
     this.changed();
   }
@@ -304,5 +306,5 @@ async function dataOf(source) {
   }
   if (source instanceof ReadableStream) return AvatarData.open(source);
   if (source?.data instanceof AvatarData) return source.data;
-  throw new TypeError(`source is ${told(source)}; expected an address, a ReadableStream or { data }.`);
+  throw new TypeError(`source is ${inWords(source)}; expected an address, a ReadableStream or { data }.`);
 }

@@ -35,7 +35,7 @@ function openGLCamera(view, projection, width, height) {
 /** A camera of somebody else's, checked; throws TypeError or RangeError. */
 function readCamera(camera) {
   if (typeof camera !== "object" || camera === null) {
-    throw new TypeError(`The camera is ${told(camera)}; expected an object.`);
+    throw new TypeError(`The camera is ${inWords(camera)}; expected an object.`);
   }
   const read = (name, size) => readNumbers(camera[name], size, `camera.${name}`);
   const rotation = read("rotation", 9);

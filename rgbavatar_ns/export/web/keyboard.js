@@ -11,6 +11,7 @@ const HELP = [
   ["space", "play and pause"],
   ["r, double click", "back to the start; r also brings the calm face"],
   ["f", "hide and show the controls"],
+  ["c", "driven live: whoever performs looks calm, mouth closed"],
 ];
 
 /** What a key does, by the name that the browser gives it. */
@@ -26,17 +27,18 @@ function keyActions(app) {
     "-": () => camera.zoom(1 / ZOOM_BY_KEY),
     r: () => app.reset(),
     f: () => app.fold(),
+    c: () => app.connection?.calibrate(),
   };
   actions["="] = actions["+"]; // the same key without Shift
   return actions;
 }
 
-/** Keys act wherever they have no meaning of their own, as they have on a slider or a button. */
+/** Keys act wherever they have no meaning of their own: sliders have, and space on a button. */
 function listenToKeys(app) {
   const actions = keyActions(app);
   document.addEventListener("keydown", (event) => {
     const act = actions[event.key.length === 1 ? event.key.toLowerCase() : event.key];
-    const own = event.target.closest?.("input, button, summary");
+    const own = event.target.closest?.(event.key === " " ? "input, button, summary" : "input");
     if (!act || own || event.ctrlKey || event.metaKey || event.altKey) return;
     event.preventDefault();
     act();

@@ -55,7 +55,7 @@ class DriveChannel {
     if (!this._greeted) throw new Error(`its first message is no "hello" of ${DRIVE.format}`);
     if (message.type === "status") return this._status(message.text);
     if (message.type !== "theta" && message.type !== "arkit") {
-      throw new Error(`there is no message of type ${told(message.type)}`);
+      throw new Error(`there is no message of type ${inWords(message.type)}`);
     }
     const { index } = message;
     this._driver.show(message, () => {
@@ -68,7 +68,7 @@ class DriveChannel {
     this._greeted = true;
     this._refused = true;
     if (format !== DRIVE.format || version !== DRIVE.version) {
-      throw new Error(`it speaks another version, ${told(format)} ${told(version)}; `
+      throw new Error(`it speaks another version, ${inWords(format)} ${inWords(version)}; `
         + `this page speaks ${DRIVE.format} ${DRIVE.version}`);
     }
     const { avatar } = this._driver;
@@ -112,30 +112,44 @@ class LiveConnection {
     this._driver = driver;
     this._tell = tell;
     this._losses = 0; // since somebody spoke our language
+    this.connected = false; // to somebody who drives this head
     this._open();
+  }
+
+  /** Ask for the performer's face to be taken as the calm one. */
+  calibrate() {
+    this._send({ type: "calibrate" });
+  }
+
+  _send(message) {
+    if (this._socket.readyState === WebSocket.OPEN) this._socket.send(JSON.stringify(message));
   }
 
   _open() {
     const { host } = this._url, socket = new WebSocket(this._url);
-    const channel = new DriveChannel(this._driver, (message) => {
-      if (socket.readyState === WebSocket.OPEN) socket.send(JSON.stringify(message));
-    }, false);
+    const channel = new DriveChannel(this._driver, (message) => this._send(message), false);
+    this._socket = socket;
     let status = "", unusable = 0, opened = false;
     this._tell(`connecting to ${host} ...`, false);
     socket.onopen = () => { opened = true; };
     socket.onmessage = ({ data }) => {
       try {
         status = channel.take(parsed(data)) ?? status;
-        if (!channel.accepted) return;
+        this.connected = channel.accepted;
+        if (!this.connected) return;
         this._losses = 0;
         const left = unusable === 0 ? "" : `, ${unusable} messages could not be used`;
         this._tell(`connected to ${host}${left}${status && `: ${status}`}`, false);
       } catch (error) {
         unusable++;
+        this.connected = channel.accepted;
         this._tell(`${host} cannot be used: ${error.message}`, true);
       }
     };
-    socket.onclose = () => this._wait(opened ? "connection lost" : `no answer from ${host}`);
+    socket.onclose = () => {
+      this.connected = false;
+      this._wait(opened ? "connection lost" : `no answer from ${host}`);
+    };
   }
 
   /** Count the seconds down to the next try. */

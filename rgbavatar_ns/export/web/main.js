@@ -81,6 +81,7 @@ class App {
     this.playButton = by("play", () => this.play(!this.avatar.performance.playing));
     this.playButton.hidden = this.avatar.performance.length === 0;
     this.liveButton = by("live-again", () => { this.driver.active = true; this._showButtons(); });
+    this.calibrateButton = by("calibrate", () => this.connection.calibrate());
     this.foldButton = by("fold", () => this.fold());
     this._showButtons();
   }
@@ -88,6 +89,7 @@ class App {
   _showButtons() {
     this.playButton.textContent = this.avatar.performance.playing ? "Pause" : "Play";
     this.liveButton.hidden = this.driver.active;
+    this.calibrateButton.hidden = !this.connection?.connected;
     const folded = document.body.classList.contains("full");
     this.foldButton.textContent = folded ? "Controls" : "Hide controls";
     this.foldButton.setAttribute("aria-expanded", String(!folded));
@@ -109,6 +111,7 @@ class App {
     const told = document.getElementById("live");
     if (told.textContent !== text) told.textContent = text; // screen readers speak of changes
     told.classList.toggle("problem", isProblem);
+    this._showButtons();
   }
 
   /** After a picture. */

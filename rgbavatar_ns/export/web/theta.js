@@ -7,13 +7,13 @@ const LARGEST = { linear: 100, axis_angle: 4 * Math.PI, translation: 100 };
 /** A plain array of so many finite numbers; TypeError and RangeError say what was expected. */
 function readNumbers(values, size, name) {
   const listed = Array.isArray(values) || (ArrayBuffer.isView(values) && "length" in values);
-  if (!listed) throw new TypeError(`${name} is ${told(values)}; expected ${size} numbers.`);
+  if (!listed) throw new TypeError(`${name} is ${inWords(values)}; expected ${size} numbers.`);
   if (values.length !== size) {
     throw new RangeError(`${name} has ${values.length} numbers; expected ${size}.`);
   }
   return Array.from(values, (value, i) => {
     if (typeof value !== "number") {
-      throw new TypeError(`${name}[${i}] is ${told(value)}; expected a number.`);
+      throw new TypeError(`${name}[${i}] is ${inWords(value)}; expected a number.`);
     }
     if (!Number.isFinite(value)) {
       throw new RangeError(`${name}[${i}] is ${value}; expected a finite number.`);
@@ -23,7 +23,7 @@ function readNumbers(values, size, name) {
 }
 
 /** A value of somebody else's in a few words. */
-function told(value) {
+function inWords(value) {
   if (value === null || value === undefined) return String(value);
   if (typeof value === "string") return `the text "${value.slice(0, 30)}"`;
   return typeof value === "number" ? String(value) : `of type ${typeof value}`;
