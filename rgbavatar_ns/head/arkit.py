@@ -11,7 +11,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from rgbavatar_ns.errors import UserError
-from rgbavatar_ns.head.arkit_fit import fitted_table
 from rgbavatar_ns.head.arrays import NECK_SHIFTS, HeadArrays
 from rgbavatar_ns.head.layout import ThetaLayout
 from rgbavatar_ns.head.model import layout_of
@@ -109,6 +108,9 @@ def arkit_map(arrays: HeadArrays) -> ArkitMap:
         table[ARKIT_NAMES.index("jawOpen"), layout.slice("jaw").start] = _JAW_OPEN_RAD
         unexplained = np.zeros(len(ARKIT_NAMES))
     else:
+        # Takes trimesh and scipy, which drawing a bundle does not need.
+        from rgbavatar_ns.head.arkit_fit import fitted_table
+
         known = arkit_map(HeadArrays.embedded())
         looks = [name.startswith("eyeLook") for name in ARKIT_NAMES]
         faces = np.where(np.array(looks)[:, None], 0.0, known.theta_per_unit)
