@@ -223,11 +223,11 @@ class LiveTransfer:
         share = 1 - math.exp(-seconds / _SETTLES_IN_S)
         self._closed_m += share * min(gap_m - self._closed_m, 0.0)
         wanted_m = self._own_closed_m + gap_m - self._closed_m
+        jaw = float(theta[lips.jaw]) + (wanted_m - own_m) / lips.slope_m_per_rad
+        if self.options.keep_range:
+            low, high = (float(end[lips.jaw]) for end in self._own.film_range())
+            jaw = min(max(jaw, low), high + _ROOM_SHARE * (high - low))
         theta = theta.clone()
-        step = (wanted_m - own_m) / lips.slope_m_per_rad
-        low, high = (float(end[lips.jaw]) for end in self._own.film_range())
-        room = _ROOM_SHARE * (high - low)
-        jaw = min(max(float(theta[lips.jaw]) + step, low), high + room)
         theta[lips.jaw] = jaw
         return theta
 

@@ -103,6 +103,22 @@ def test_rows_without_numbers_are_passed_over_in_their_time(tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("codes", "seconds"),
+    [
+        (["10:00:00:58.000", "10:00:00:59.500", "10:00:01:06.000"], [0, 1.5 / 60, 8 / 60]),
+        (["10:00:00:58", "10:00:00:59", "10:00:01:00"], [0, 1 / 60, 2 / 60]),
+        (["10:00:00:58", "10:00:00:58", "10:00:01:00"], [0, 1 / 60, 2 / 60]),  # it stands
+        (["later", "", "10:00:01:00"], [0, 1 / 60, 2 / 60]),
+    ],
+)
+def test_timecodes_tell_the_time_where_they_can(tmp_path, codes, seconds):
+    rows = [f"{code},61,0.{k}" for k, code in enumerate(codes, 1)]
+    source = csv_source(_take(tmp_path, "Timecode,BlendShapeCount,JawOpen", rows), 60.0, False)
+    times_s = [source.next(0.0).time_s for _ in rows]
+    assert times_s == pytest.approx(seconds, abs=1e-6)
+
+
+@pytest.mark.parametrize(
     ("content", "told"),
     [
         ("a,b\n1,2\n", "has no ARKit columns: a, b"),

@@ -2,6 +2,7 @@
 
 import csv
 import io
+import itertools
 import math
 import re
 from collections.abc import Sequence
@@ -32,9 +33,9 @@ def csv_source(
 ) -> RecordedSource:
     """The rows of a CSV file; columns are known by their names, in any order and case.
 
-    Frames last 1 / `frames_per_second` seconds: the file's timecodes (hours:minutes:seconds:frames)
-    say how many frames lie between two rows, not how long one is. Rows without numbers, as the
-    app leaves where it lost the face, are passed over. angle_gain: of yaw, pitch and roll.
+    Timecodes (hours:minutes:seconds:frames, of a take with so many `frames_per_second`) tell the
+    time; where they are missing or stand still, each row is the next frame. Rows without numbers,
+    as the app leaves where it lost the face, are passed over. angle_gain: of yaw, pitch and roll.
     Raises UserError where the file cannot be read or has no such column.
     """
     names, rows = _read(path)
@@ -83,17 +84,31 @@ def _timed(
     """Each row's numbers (NaN where there is none) and its time; rows without any are left out."""
     clock = next((k for k, name in enumerate(names) if name.strip().lower() == "timecode"), None)
     found: list[tuple[list[float], float]] = []
-    last_s = -math.inf
     for place, row in enumerate(rows):
         values = [_number(text) for text in row] + [math.nan] * (len(names) - len(row))
         told = [value for k, value in enumerate(values) if k != clock and math.isfinite(value)]
         if len(told) < 2:  # the count of blend shapes alone
             continue
-        # Rows are frames, unless the timecode says that some between were lost.
-        time_s = max(place / frames_per_second, last_s + 1e-6)
-        found.append((values, time_s))
-        last_s = time_s
-    return found
+        found.append((values, place / frames_per_second))
+    if clock is None:
+        return found
+    codes = [_timecode_s(row[clock], frames_per_second) for row in rows if len(row) > clock]
+    if None in codes or len(codes) < len(rows):
+        return found
+    moments = [code - codes[0] for code in codes]  # type: ignore[operator]
+    if any(later <= earlier for earlier, later in itertools.pairwise(moments)):
+        return found  # a clock that stands or goes back tells nothing
+    return [(values, moments[round(at * frames_per_second)]) for values, at in found]
+
+
+def _timecode_s(text: str, frames_per_second: float) -> float | None:
+    """Seconds of hours:minutes:seconds:frames, with a part of a frame; None for anything else."""
+    read = _TIMECODE.fullmatch(text.strip())
+    if read is None:
+        return None
+    hours, minutes, seconds, frames = (int(part) for part in read.groups()[:4])
+    part = float(f"0.{read[5]}") if read[5] else 0.0
+    return 3600 * hours + 60 * minutes + seconds + (frames + part) / frames_per_second
 
 
 def _number(text: str) -> float:
