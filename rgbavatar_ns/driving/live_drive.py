@@ -80,6 +80,10 @@ class DriveOutput(Protocol):
         """Draw or pass on one frame; its latency counts once it can be seen."""
         ...
 
+    def tell(self, line: str) -> None:
+        """Show how it goes, where there is a place for it."""
+        ...
+
     def close(self) -> None:
         """Complete what was begun."""
         ...
@@ -154,7 +158,10 @@ class LiveDrive:
                     self.shown += 1
                 if time.monotonic() - told_s > _TOLD_EVERY_S:
                     told_s = time.monotonic()
-                    self._tell(self._told(told_s - silent_since_s))
+                    line = self._told(told_s - silent_since_s)
+                    self._tell(line)
+                    for output in self._outputs:
+                        output.tell(line)
         finally:
             self.stop()
             follower.join(timeout=10.0)

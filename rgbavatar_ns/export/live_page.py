@@ -41,7 +41,7 @@ class PageOutput:
         self._hello, self._calibrate = hello(layout), calibrate
         self._changed = threading.Condition()
         self._frame: DrivenFrame | None = None
-        self._message = ""
+        self._message = self._status = ""
         self._captured_s: OrderedDict[int, float] = OrderedDict()
         self._closed = False
         self.pages = 0
@@ -56,6 +56,12 @@ class PageOutput:
             self._captured_s[frame.index] = frame.captured_s
             while len(self._captured_s) > _REMEMBERED:
                 self._captured_s.popitem(last=False)
+            self._changed.notify_all()
+
+    def tell(self, line: str) -> None:
+        """Have all pages show how it goes."""
+        with self._changed:
+            self._status = line
             self._changed.notify_all()
 
     def close(self) -> None:
@@ -82,23 +88,27 @@ class PageOutput:
                     self.pages -= 1
 
     def _send(self, connection: ServerConnection) -> None:
-        """The newest frame, whenever there is one that this page has not got."""
+        """The newest frame and status, whenever there is one that this page has not got."""
         last: DrivenFrame | None = None
+        told = ""
 
         def is_new() -> bool:
-            return self._closed or self._frame is not last
+            return self._closed or self._frame is not last or self._status != told
 
         while not self._closed:
             with self._changed:
                 self._changed.wait_for(is_new, _WAIT_S)
-                frame, message = self._frame, self._message
+                frame, message, status = self._frame, self._message, self._status
             if self._closed:
                 connection.send(status_message("The performance has ended."))
-            elif frame is not last:
-                connection.send(message)
-            elif connection.close_code is not None:
                 return
-            last = frame
+            if frame is not last:
+                connection.send(message)
+            if status != told:
+                connection.send(status_message(status))
+            if connection.close_code is not None:
+                return
+            last, told = frame, status
 
     def _listen(self, connection: ServerConnection) -> None:
         """What the page says: what it has shown, and wishes."""

@@ -63,6 +63,9 @@ class PictureOutput:
         self._sink.add(picture, frame.time_s)
         self.latencies.add(frame.captured_s, time.monotonic())
 
+    def tell(self, line: str) -> None:
+        """Pictures are of the avatar alone."""
+
     def _performer(
         self, image_rgb: UInt8[np.ndarray, "H W 3"], picture: _Picture
     ) -> UInt8[np.ndarray, "height beside 3"]:

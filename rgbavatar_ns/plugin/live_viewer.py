@@ -63,6 +63,10 @@ class ViewerOutput:
         """Let the browsers draw it."""
         self._panel.show_live(frame)
 
+    def tell(self, line: str) -> None:
+        """Say it in the panel."""
+        self._panel.tell(line)
+
     def close(self) -> None:
         """End the viewer."""
         self._viewer.viser_server.stop()

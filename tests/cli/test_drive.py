@@ -139,10 +139,12 @@ def test_the_page_is_served_and_driven(avatar, performer, capsys):
             time.sleep(0.05)
     with page:
         assert json.loads(page.recv(timeout=5))["type"] == "hello"
-        frames = [json.loads(page.recv(timeout=5)) for _ in range(5)]
+        said = [json.loads(page.recv(timeout=5)) for _ in range(12)]
         with urllib.request.urlopen(f"http://127.0.0.1:{port}/") as answer:
             assert b"<canvas" in answer.read()
-    assert [frame["type"] for frame in frames] == ["theta"] * 5
+    frames = [message for message in said if message["type"] == "theta"]
+    assert len(frames) > 5
+    assert any("frames" in message.get("text", "") for message in said), "how it goes"
     assert frames[0]["theta"] != frames[-1]["theta"]
     driving.join(timeout=60)
     assert not driving.is_alive()

@@ -62,6 +62,9 @@ class _Output:
         self.seen.append(int(frame.theta))
         self.latencies.add(frame.captured_s, time.monotonic())
 
+    def tell(self, line):
+        self.told = line
+
     def close(self):
         self.closed = True
 
@@ -115,12 +118,12 @@ def test_it_can_be_stopped_and_asked_to_calibrate_from_other_threads():
 
 def test_who_waits_is_told_for_what():
     told = []
-    source = _Source(10_000)
+    source, output = _Source(10_000), _Output()
     source.next = lambda timeout_s: time.sleep(0.05)  # type: ignore[method-assign]
-    drive = LiveDrive(source, _Transfer(), [], tell=told.append)
+    drive = LiveDrive(source, _Transfer(), [output], tell=told.append)
     threading.Timer(2.6, drive.stop).start()
     drive.run()
-    assert told[-1] == "Waiting for a face; Ctrl-C ends."
+    assert told[-1] == output.told == "Waiting for a face; Ctrl-C ends."
 
 
 def test_latencies_are_kept_for_two_minutes_and_no_longer():

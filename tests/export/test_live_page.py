@@ -72,6 +72,17 @@ def test_a_slow_page_gets_the_newest(output):
     assert len(indices) < 200
 
 
+def test_a_page_is_told_how_it_goes_once(output):
+    with connect(f"ws://{output.address}") as page:
+        page.recv(timeout=2)
+        _until(lambda: output.pages == 1)
+        output.tell("25 pictures/s")
+        output.tell("25 pictures/s")
+        assert json.loads(page.recv(timeout=2)) == {"type": "status", "text": "25 pictures/s"}
+        output.show(_frame(1))
+        assert json.loads(page.recv(timeout=2))["type"] == "theta"
+
+
 def test_a_page_may_ask_for_a_calibration(output):
     with connect(f"ws://{output.address}") as page:
         page.send('{"type":"calibrate"}')
