@@ -18,6 +18,10 @@ _FLAGS = (
     "--disable-quic --no-first-run --disable-background-networking --disable-component-update "
     "--disable-sync"
 )
+_WEBGPU_FLAGS = (  # the page, too, is drawn by Vulkan, or a canvas of WebGPU would stay empty
+    "--enable-unsafe-webgpu --use-webgpu-adapter=swiftshader --enable-features=Vulkan "
+    "--use-vulkan=swiftshader"
+)
 IN_BROWSER = [
     pytest.mark.browser,
     pytest.mark.slow,
@@ -26,11 +30,12 @@ IN_BROWSER = [
 
 
 @contextmanager
-def chromium() -> Iterator[Any]:
-    """A headless browser of playwright's."""
+def chromium(webgpu: bool = False) -> Iterator[Any]:
+    """A headless browser of playwright's, with WebGL2 alone or with WebGPU as well."""
     playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
     with playwright.sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=_CHROMIUM, args=_FLAGS.split())
+        flags = [*_FLAGS.split(), *(_WEBGPU_FLAGS.split() if webgpu else ())]
+        browser = driver.chromium.launch(executable_path=_CHROMIUM, args=flags)
         yield browser
         browser.close()
 

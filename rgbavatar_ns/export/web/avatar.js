@@ -8,11 +8,16 @@ class RGBAvatar extends EventTarget {
    * Load an avatar and draw it once. source: the address of an avatar file, a ReadableStream of its
    * bytes, or { data } that was loaded before. options: background ([r, g, b] in 0..1; null is
    * transparent; by default the avatar's own), controls (pointers turn, move and zoom; true),
-   * automatic (draws by itself after every change; true). Rejects with an Error that says what is
-   * wrong with the file or the browser.
+   * automatic (draws by itself after every change; true), renderer ("webgpu" or "webgl2"; by default
+   * the first that the browser has). Rejects with an Error that says what is wrong with the file or
+   * the browser.
    */
   static async load(source, canvas, options = {}) {
-    const avatar = new RGBAvatar(await dataOf(source), canvas, options);
+    if (!(canvas instanceof HTMLCanvasElement)) {
+      throw new TypeError(`canvas is ${inWords(canvas)}; expected a canvas element.`);
+    }
+    const data = await dataOf(source);
+    const avatar = new RGBAvatar(await rendererFor(canvas, data, options.renderer), canvas, options);
     avatar.draw();
     return avatar;
   }
@@ -27,12 +32,9 @@ class RGBAvatar extends EventTarget {
     return openGLCamera(view, projection, width, height);
   }
 
-  constructor(data, canvas, { background, controls = true, automatic = true } = {}) {
+  constructor(renderer, canvas, { background, controls = true, automatic = true }) {
     super();
-    if (!(canvas instanceof HTMLCanvasElement)) {
-      throw new TypeError(`canvas is ${inWords(canvas)}; expected a canvas element.`);
-    }
-    const { manifest, arrays } = data;
+    const { data } = renderer, { manifest, arrays } = data;
     this.data = data;
     this.canvas = canvas;
     this._fields = new ThetaFields(manifest.layout);
@@ -40,7 +42,8 @@ class RGBAvatar extends EventTarget {
     this._network = new WeightNetwork(data);
     this._detail = 1;
     this._pace = new Pace();
-    this._renderer = new Renderer(canvas, data);
+    this._renderer = renderer;
+    this._kind = renderer.constructor.kind;
     this._neutral = Array.from(arrays.neutral_theta);
     this._arkit = manifest.arkit
       && new ARKitMap(manifest.arkit, arrays.arkit_theta, this._fields, this._neutral);
@@ -72,14 +75,18 @@ class RGBAvatar extends EventTarget {
     const observer = new ResizeObserver(() => this.changed());
     observer.observe(canvas);
     signal.addEventListener("abort", () => observer.disconnect());
-    canvas.addEventListener("webglcontextlost", (event) => this._loseContext(event), { signal });
-    canvas.addEventListener("webglcontextrestored", () => this._restoreContext(), { signal });
+    renderer.watch(() => this._lose(), (next) => this._restore(next), signal);
     this._frame = requestAnimationFrame((now) => this._tick(now));
   }
 
   /** Resolves when all of it has arrived; rejects with an Error where it does not. */
   get complete() {
     return this.data.complete;
+  }
+
+  /** Whether WebGPU or WebGL2 draws: "webgpu" or "webgl2". */
+  get rendererKind() {
+    return this._kind;
   }
 
   /** Theta's fields in order: { name, size, form }. */
@@ -276,16 +283,15 @@ class RGBAvatar extends EventTarget {
     if (this._due) this._draw(this._pace.share);
   }
 
-  /** The driver takes the graphics away; prevented from its default, it gives them back. */
-  _loseContext(event) {
-    event.preventDefault();
+  /** The driver takes the graphics away. */
+  _lose() {
     this._renderer = null;
     console.warn("rgbavatar: the graphics context was lost; the picture comes back with it.");
     this.dispatchEvent(new Event("lost"));
   }
 
-  _restoreContext() {
-    this._renderer = new Renderer(this.canvas, this.data);
+  _restore(renderer) {
+    this._renderer = renderer;
     this.changed();
     this.dispatchEvent(new Event("restored"));
   }

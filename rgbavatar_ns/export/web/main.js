@@ -162,7 +162,9 @@ window.rgbavatar = (async () => {
   const message = document.getElementById("message");
   try {
     const page = JSON.parse(document.getElementById("page").textContent);
-    const avatar = await RGBAvatar.load(streamOfPage(), document.getElementById("view"));
+    const renderer = new URLSearchParams(window.location.search).get("renderer") ?? undefined;
+    const avatar = await RGBAvatar.load(
+      streamOfPage(), document.getElementById("view"), { renderer });
     message.textContent = "";
     const app = new App(avatar, page);
     avatar.draw();

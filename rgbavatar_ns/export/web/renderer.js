@@ -1,14 +1,12 @@
 "use strict";
 /* WebGL2: places all Gaussians in one pass, draws them from far to near, shows the picture. */
 
-const TEXTURE_WIDTH = 1024;
-const VARIANTS = ["normalized", "raw", "orthonormal"];
-const LEAST_MOVING = 6000; // Gaussians; with fewer a face loses its eyes
-const WHOLE = { detail: 1, resolution: 1, bytes: false };
+class Renderer extends GaussianRenderer {
+  static kind = "webgl2";
 
-class Renderer {
   /** Throws an Error with a reason where the browser lacks what is needed. */
   constructor(canvas, data) {
+    super(data);
     // Kept after drawing, so that the picture can be saved and compared.
     const gl = canvas.getContext("webgl2", { antialias: false, preserveDrawingBuffer: true });
     if (!gl) throw new Error("This browser has no WebGL2, which the avatar is drawn with.");
@@ -16,14 +14,7 @@ class Renderer {
       throw new Error("This graphics driver cannot draw to float textures; try another browser.");
     }
     this.gl = gl;
-    this.data = data;
     this._made = []; // what frees each object of the graphics memory
-    this.detail = 1; // share of the Gaussians that is drawn, in (0, 1]
-    this.total = data.manifest.num_gaussians;
-    this.numBases = data.manifest.num_bases;
-    this.rows = Math.ceil(this.total / TEXTURE_WIDTH);
-    this.order = new GaussianOrder(data);
-    this.levels = new DetailLevels(data);
     this.placing = this._program(WHOLE_TARGET_VERTEX, PLACE_FRAGMENT);
     this.drawing = this._program(DRAW_VERTEX, DRAW_FRAGMENT);
     this.showing = this._program(WHOLE_TARGET_VERTEX, SHOW_FRAGMENT);
@@ -32,14 +23,6 @@ class Renderer {
     this._makeBoxes();
     this.pictures = new Map(); // textures by format
     this.pictureTarget = this._framebuffer();
-    this.filledParts = 0; // of the file, so many are in the textures
-  }
-
-  /** How many Gaussians are drawn for a share of `detail`; no more than have arrived. */
-  count({ detail }) {
-    const whole = Math.ceil(this.detail * this.total);
-    const moving = Math.max(Math.ceil(detail * whole), Math.min(whole, LEAST_MOVING));
-    return Math.min(moving, this.data.available);
   }
 
   _program(vertexSource, fragmentSource) {
@@ -84,6 +67,18 @@ class Renderer {
     return made;
   }
 
+  /** Tell when the context is lost, and give the renderer that takes this one's place. */
+  watch(lost, restored, signal) {
+    const { canvas } = this.gl;
+    canvas.addEventListener("webglcontextlost", (event) => {
+      event.preventDefault(); // else it is never given back
+      lost();
+    }, { signal });
+    canvas.addEventListener("webglcontextrestored", () => {
+      restored(new Renderer(canvas, this.data));
+    }, { signal });
+  }
+
   /** Free all graphics memory; another may draw on the canvas. */
   dispose() {
     for (const free of this._made) free();
@@ -118,94 +113,31 @@ class Renderer {
   }
 
   _makeTextures() {
-    const rows = this.rows, a = this.data.arrays, { scale_with_triangle: follows } = this.data.manifest;
-    const table = () => this._table("RGBA32F", TEXTURE_WIDTH, rows);
+    const table = () => this._table("RGBA32F", TEXTURE_WIDTH, this.rows);
     this.gaussians = {
       scaleOpacity: table(), baseRotation: table(), baseColor: table(), basePosition: table(),
       anchor: table(),
       basisRotation: this._layers(), basisColor: this._layers(), basisPosition: this._layers(),
     };
-    const faces = a.triangle_vertices.length / 3;
-    const faceRows = Math.ceil(faces / TEXTURE_WIDTH);
-    const corners = new Uint32Array(4 * TEXTURE_WIDTH * faceRows);
-    const lengths = new Float32Array(corners.buffer);
-    for (let f = 0; f < faces; f++) {
-      for (let i = 0; i < 3; i++) corners[4 * f + i] = a.triangle_vertices[3 * f + i];
-      if (follows) lengths[4 * f + 3] = a.rest_length[f];
-    }
-    const edges = new Float32Array(corners.length);
-    edges.set(edgesToFrame(a));
+    const { rows, corners, edges } = this._faces(), { neutral_vertices: n } = this.data.arrays;
     this.head = {
-      corners: this._table("RGBA32UI", TEXTURE_WIDTH, faceRows, corners),
-      edgesToFrame: this._table("RGBA32F", TEXTURE_WIDTH, faceRows, edges),
+      corners: this._table("RGBA32UI", TEXTURE_WIDTH, rows, corners),
+      edgesToFrame: this._table("RGBA32F", TEXTURE_WIDTH, rows, edges),
       vertex: this._table("RGBA32F", TEXTURE_WIDTH,
-        Math.ceil(a.neutral_vertices.length / 3 / TEXTURE_WIDTH)),
+        Math.ceil(n.length / 3 / TEXTURE_WIDTH)),
     };
-    this.weightValues = new Float32Array(12 * Math.max(this.numBases, 1));
     this.weights = this._table("RGBA32F", Math.max(this.numBases, 1), 3);
   }
 
-  /** Bring to the textures what has arrived since. */
-  _fill() {
-    const { spans } = this.data;
-    for (; this.filledParts < spans.length; this.filledParts++) {
-      const [from, to] = spans[this.filledParts];
-      if (to > from) this._fillRows(Math.floor(from / TEXTURE_WIDTH), Math.ceil(to / TEXTURE_WIDTH));
-    }
+  _putBase(table, values, row) {
+    this._renew(this.gaussians[table], values, row);
   }
 
-  _fillRows(top, bottom) {
-    const gl = this.gl, { manifest, arrays } = this.data, first = TEXTURE_WIDTH * top;
-    const texels = TEXTURE_WIDTH * (bottom - top), last = Math.min(first + texels, this.total);
-    /** Put columns of an array side by side into texels, from number `at` of each on. */
-    const fill = (texelValues, at, name, column, columns) => {
-      const source = arrays[name], described = manifest.arrays[name];
-      const [item, next] = described.by_item ? [described.columns, 1] : [1, described.items];
-      for (let c = 0; c < columns; c++) {
-        const place = (column + c) * next;
-        for (let i = first; i < last; i++) {
-          texelValues[4 * (i - first) + at + c] = source[place + i * item];
-        }
-      }
-    };
-    for (const [table, ...parts] of [
-      ["scaleOpacity", ["scale", 3], ["opacity", 1]], ["baseRotation", ["rotation", 4]],
-      ["baseColor", ["color", 3], ["triangle_of", 1]], ["basePosition", ["position", 3]],
-    ]) {
-      const values = new Float32Array(4 * texels);
-      let at = 0;
-      for (const [name, columns] of parts) {
-        fill(values, at, name, 0, columns);
-        at += columns;
-      }
-      this._renew(this.gaussians[table], values, top);
-    }
-    for (const [table, name, columns] of [
-      ["basisRotation", "basis_rotation", 4], ["basisColor", "basis_color", 3],
-      ["basisPosition", "basis_position", 3],
-    ]) {
-      const bytes = new Int8Array(4 * texels);
-      for (let k = 0; k < this.numBases; k++) {
-        fill(bytes, 0, name, columns * k, columns);
-        gl.bindTexture(gl.TEXTURE_2D_ARRAY, this.gaussians[table].texture);
-        gl.texSubImage3D(gl.TEXTURE_2D_ARRAY, 0, 0, top, k, TEXTURE_WIDTH, bottom - top, 1, gl.RGBA,
-          gl.BYTE, bytes);
-      }
-    }
-    this.levels.count = 0; // their anchors, too, are to be filled
-  }
-
-  /** Barycentric coordinates and growth of the Gaussians that are drawn. */
-  _fillAnchors(count) {
-    if (!this.levels.choose(count)) return;
-    const { barycentric } = this.data.arrays;
-    const values = new Float32Array(4 * TEXTURE_WIDTH * Math.ceil(count / TEXTURE_WIDTH));
-    for (let i = 0; i < count; i++) {
-      values[4 * i] = barycentric[2 * i];
-      values[4 * i + 1] = barycentric[2 * i + 1];
-      values[4 * i + 2] = this.levels.growth[i];
-    }
-    this._renew(this.gaussians.anchor, values);
+  _putBasis(table, k, bytes, row) {
+    const gl = this.gl, rows = bytes.length / (4 * TEXTURE_WIDTH);
+    gl.bindTexture(gl.TEXTURE_2D_ARRAY, this.gaussians[table].texture);
+    gl.texSubImage3D(
+      gl.TEXTURE_2D_ARRAY, 0, 0, row, k, TEXTURE_WIDTH, rows, 1, gl.RGBA, gl.BYTE, bytes);
   }
 
   _makePlaceTarget() {
@@ -221,18 +153,14 @@ class Renderer {
     gl.drawBuffers(attachments);
   }
 
-  /** Four corners and two triangles for each Gaussian; instances of four are slow to start. */
   _makeBoxes() {
-    const gl = this.gl, corners = new Uint32Array(6 * this.total);
-    for (let i = 0; i < this.total; i++) {
-      corners.set([4 * i, 4 * i + 1, 4 * i + 2, 4 * i + 2, 4 * i + 1, 4 * i + 3], 6 * i);
-    }
+    const gl = this.gl;
     this.boxes = gl.createVertexArray();
     const buffer = gl.createBuffer();
     this._made.push(() => gl.deleteVertexArray(this.boxes), () => gl.deleteBuffer(buffer));
     gl.bindVertexArray(this.boxes);
     gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, buffer);
-    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, corners, gl.STATIC_DRAW);
+    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, this._boxCorners(), gl.STATIC_DRAW);
     gl.bindVertexArray(null);
     this.orderTable = this._table("R32UI", TEXTURE_WIDTH, this.rows);
   }
@@ -281,11 +209,9 @@ class Renderer {
     // What is kept in bytes and is as large as the canvas needs no place of its own.
     const direct = share.bytes && share.resolution === 1 && background;
     if (!direct) this._fitPicture(camera.width, camera.height, share.bytes);
-    this.order.sort(head, psi, camera, count);
-    this._renew(this.orderTable, this.order.order.subarray(0, TEXTURE_WIDTH
-      * Math.ceil(count / TEXTURE_WIDTH)));
+    this._renew(this.orderTable, this._sorted(head, psi, camera, count));
     this._renew(this.head.vertex, head.vertices);
-    this._weigh(psi);
+    this._renew(this.weights, this._weigh(psi));
     this._placeAll(camera, count);
     if (direct) {
       this._drawAll(camera, count, null, [...background, 1]);
@@ -293,30 +219,6 @@ class Renderer {
       this._drawAll(camera, count, this.pictureTarget, [0, 0, 0, 0]);
       this._showOver(background, seen);
     }
-  }
-
-  /** The camera of the picture, which may have fewer pixels than the canvas. */
-  _reduced({ rotation, translation, focal, principal, width, height }, resolution) {
-    const size = [width, height].map((side) => Math.max(1, Math.round(resolution * side)));
-    const [x, y] = [size[0] / width, size[1] / height];
-    return {
-      rotation, translation, width: size[0], height: size[1],
-      focal: [focal[0] * x, focal[1] * y], principal: [principal[0] * x, principal[1] * y],
-    };
-  }
-
-  /** psi times the units of rotation, colour and position; a byte of 127 is read as 1. */
-  _weigh(psi) {
-    const { arrays } = this.data.manifest, row = 4 * Math.max(this.numBases, 1);
-    ["basis_rotation", "basis_color", "basis_position"].forEach((name, place) => {
-      for (let k = 0; k < this.numBases; k++) {
-        const { unit } = arrays[name], columns = unit.length / this.numBases;
-        for (let i = 0; i < columns; i++) {
-          this.weightValues[place * row + 4 * k + i] = 127 * psi[k] * unit[columns * k + i];
-        }
-      }
-    });
-    this._renew(this.weights, this.weightValues);
   }
 
   _placeAll(camera, count) {
@@ -329,18 +231,14 @@ class Renderer {
     gl.uniform1i(uniforms.count, count);
     gl.uniform1i(uniforms.numBases, this.numBases);
     gl.uniform1i(uniforms.variant, VARIANTS.indexOf(this.data.manifest.variant));
-    const { rotation, translation, focal, principal, width, height } = camera;
+    const { rotation, translation, focal, principal } = camera;
     gl.uniform3fv(uniforms.cameraX, rotation.slice(0, 3));
     gl.uniform3fv(uniforms.cameraY, rotation.slice(3, 6));
     gl.uniform3fv(uniforms.cameraZ, rotation.slice(6, 9));
     gl.uniform3fv(uniforms.cameraTranslation, translation);
     gl.uniform2fv(uniforms.focal, focal);
     gl.uniform2fv(uniforms.principal, principal);
-    // The projection is linearised no further outside the image than this.
-    const size = [width, height];
-    const margin = size.map((length, i) => (0.3 * 0.5 * length) / focal[i]);
-    const low = principal.map((centre, i) => -centre / focal[i] - margin[i]);
-    const high = principal.map((centre, i) => (size[i] - centre) / focal[i] + margin[i]);
+    const { low, high } = this._slopes(camera);
     gl.uniform2fv(uniforms.slopeLow, low);
     gl.uniform2fv(uniforms.slopeHigh, high);
     gl.drawArrays(gl.TRIANGLES, 0, 3);

@@ -37,6 +37,8 @@ export interface Options {
   controls?: boolean;
   /** Draws by itself after every change; true. Otherwise `draw` does. */
   automatic?: boolean;
+  /** What draws; by default WebGPU where the browser has it, and WebGL2 else. */
+  renderer?: "webgpu" | "webgl2";
 }
 
 /** The film that the avatar brings, if any. */
@@ -84,6 +86,8 @@ export class RGBAvatar extends EventTarget {
   readonly canvas: HTMLCanvasElement;
   /** For `load` on another canvas. */
   readonly data: unknown;
+  /** What draws. */
+  readonly rendererKind: "webgpu" | "webgl2";
   readonly performance: Performance;
   /** Resolves when all of the file is there; the first picture is drawn long before. */
   readonly complete: Promise<void>;
