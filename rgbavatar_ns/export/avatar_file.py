@@ -34,7 +34,7 @@ from rgbavatar_ns.reading import DamagedFileError, damage_told, parse_json, read
 MAGIC = b"rgbavatr"
 VERSION = 2
 """The first one was a page's block of arrays, without parts."""
-FIRST_BYTES = 138_000
+FIRST_BYTES = 123_000
 """Up to the end of the first part: as base64 behind the page's programs it ends before 300 kB."""
 _LEAST_FIRST = 1024
 _HEADER = struct.Struct("<8sII")

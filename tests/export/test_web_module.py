@@ -1,14 +1,12 @@
 """The ES module in a real browser: Python's pictures, whoever drives, whoever's camera."""
 
-import numpy as np
 import pytest
 import torch
 
 from rgbavatar_ns.head.rotations import axis_angle_to_matrix
-from rgbavatar_ns.kernels import PinholeCameras
 from tests.browser import IN_BROWSER
 
-from .module_page import SIZE, canvas_of, drawn_by_us, load_avatar
+from .module_page import SIZE, canvas_of, drawn_by_us, foreign_camera, load_avatar
 from .subject import psnr
 
 pytestmark = IN_BROWSER
@@ -61,46 +59,8 @@ def test_unknown_names_are_told_once(page):
     assert 'ARKit has no blend shape "smile"' in told[0]
 
 
-def _foreign_camera(width: int, height: int) -> tuple[PinholeCameras, list[float], list[float]]:
-    """A camera beside the head, with its view and projection matrices as OpenGL has them."""
-    right = np.array([0.9, 0.0, -0.4]) / np.hypot(0.9, 0.4)
-    up = np.array([0.0, 1.0, 0.0])
-    backward = np.cross(right, up)
-    view = np.eye(4)
-    view[:3, :3] = np.stack([right, up, backward])
-    view[:3, 3] = -view[:3, :3] @ (0.9 * backward + [0.01, 0.02, 0.03])
-    near, far, scale = 0.1, 10.0, 3.1
-    projection = np.zeros((4, 4))
-    projection[0] = [scale * height / width, 0, 0.1, 0]
-    projection[1] = [0, scale, -0.2, 0]
-    projection[2] = [0, 0, -(far + near) / (far - near), -2 * far * near / (far - near)]
-    projection[3, 2] = -1
-
-    # By hand: a pixel is (x' + 1) w / 2, (1 - y') h / 2 of the projected point (x', y').
-    def pixel(point: np.ndarray) -> np.ndarray:
-        clip = projection @ view @ np.append(point, 1)
-        x, y = clip[:2] / clip[3]
-        return np.array([(x + 1) * width / 2, (1 - y) * height / 2])
-
-    world_to_camera = np.diag([1.0, -1.0, -1.0, 1.0]) @ view
-    origin = np.linalg.inv(view)[:3, 3]
-    centre = pixel(origin - backward)
-    focal = (
-        pixel(origin - backward + right)[0] - centre[0],
-        centre[1] - pixel(origin - backward + up)[1],
-    )
-    cameras = PinholeCameras(
-        torch.from_numpy(world_to_camera)[None].float(),
-        torch.tensor([focal], dtype=torch.float32),
-        torch.from_numpy(centre)[None].float(),
-        width,
-        height,
-    )
-    return cameras, view.T.flatten().tolist(), projection.T.flatten().tolist()
-
-
 def test_another_programs_camera_sees_what_render_draws_from_there(page, avatar, theta):
-    cameras, view, projection = _foreign_camera(SIZE, SIZE)
+    cameras, view, projection = foreign_camera(SIZE, SIZE)
     page.evaluate("numbers => avatar.setTheta(numbers)", theta[0].double().tolist())
     # For a picture of half the size, which is stretched.
     page.evaluate(
