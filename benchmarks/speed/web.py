@@ -1,4 +1,5 @@
-"""What an avatar's page costs: kilobytes by part, work and milliseconds a picture, PSNR by detail.
+"""What an avatar's page costs: kilobytes by part, work and milliseconds a picture by WebGL2 and
+WebGPU, PSNR by detail.
 
     python benchmarks/speed/web.py RUN
 
@@ -31,7 +32,8 @@ from rgbavatar_ns.export.views import resized
 
 _FLAGS = (
     "--no-sandbox --use-angle=swiftshader --enable-unsafe-swiftshader --ignore-gpu-blocklist "
-    "--no-first-run --disable-background-networking"
+    "--no-first-run --disable-background-networking --enable-unsafe-webgpu "
+    "--use-webgpu-adapter=swiftshader --enable-features=Vulkan --use-vulkan=swiftshader"
 )
 _SIZES = ((1280, 800), (390, 844))
 """A laptop's window and a phone's screen."""
@@ -51,11 +53,13 @@ window.bench = (async () => {
   const theta = new Array(size).fill(0);
   const head = new Head(data), network = new WeightNetwork(data);
   const renderer = new Renderer(canvas, data), gl = renderer.gl;
+  const gpuCanvas = document.createElement("canvas");
+  const gpuRenderer = await GPURenderer.create(gpuCanvas, data).catch(() => null);
   const orbit = new OrbitCamera(manifest.camera, manifest.film.turn_reach);
   head.pose(theta);
   const psi = network.evaluate(theta), background = [1, 1, 1];
   const cameraOf = (width, height) => {
-    [canvas.width, canvas.height] = [width, height];
+    for (const one of [canvas, gpuCanvas]) [one.width, one.height] = [width, height];
     return orbit.at(width, height, head.centre());
   };
   const best = (count, work) => {
@@ -68,20 +72,32 @@ window.bench = (async () => {
     return least;
   };
   const pixel = new Uint8Array(4);
-  return {
-    picture(width, height, detail) {
-      renderer.detail = detail;
-      renderer.draw(head, psi, cameraOf(width, height), background);
-      renderer.detail = 1;
-      return canvas.toDataURL("image/png");
+  const finished = {
+    webgl2() {
+      gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+      gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, pixel); // waits for the picture
     },
-    milliseconds(width, height, share, count) {
-      const camera = cameraOf(width, height);
-      return best(count, () => {
-        renderer.draw(head, psi, camera, background, share);
-        gl.bindFramebuffer(gl.FRAMEBUFFER, null);
-        gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, pixel); // waits for the picture
-      });
+    webgpu: () => gpuRenderer.device.queue.onSubmittedWorkDone(),
+  };
+  return {
+    kinds: gpuRenderer ? ["webgl2", "webgpu"] : ["webgl2"],
+    picture(kind, width, height, detail) {
+      const [drawing, shown] = kind === "webgl2" ? [renderer, canvas] : [gpuRenderer, gpuCanvas];
+      drawing.detail = detail;
+      drawing.draw(head, psi, cameraOf(width, height), background);
+      drawing.detail = 1;
+      return shown.toDataURL("image/png");
+    },
+    async milliseconds(kind, width, height, share, count) {
+      const camera = cameraOf(width, height), drawing = kind === "webgl2" ? renderer : gpuRenderer;
+      let least = Infinity;
+      for (let i = 0; i < count; i++) {
+        const start = performance.now();
+        drawing.draw(head, psi, camera, background, share);
+        await finished[kind]();
+        least = Math.min(least, performance.now() - start);
+      }
+      return least;
     },
     processor(width, height, count) {
       const camera = cameraOf(width, height);
@@ -99,7 +115,7 @@ window.bench = (async () => {
       return head.vertices.byteLength + 4 * TEXTURE_WIDTH * rows + renderer.weightValues.byteLength;
     },
     fragments(width, height) {
-      this.picture(width, height, 1);
+      this.picture("webgl2", width, height, 1);
       const read = (place) => {
         const values = new Float32Array(4 * TEXTURE_WIDTH * renderer.rows);
         gl.bindFramebuffer(gl.FRAMEBUFFER, renderer.placeTarget);
@@ -162,8 +178,9 @@ def _tell_pictures(browser: Browser, page: Path, avatar: Avatar, count: int) -> 
     def asked(call: str) -> Any:
         return tab.evaluate(f"bench.then((bench) => bench.{call})")
 
-    def picture(width: int, height: int, detail: float) -> np.ndarray:
-        png = base64.b64decode(asked(f"picture({width}, {height}, {detail})").split(",")[1])
+    def picture(kind: str, width: int, height: int, detail: float) -> np.ndarray:
+        url = asked(f"picture('{kind}', {width}, {height}, {detail})")
+        png = base64.b64decode(url.split(",")[1])
         return np.asarray(Image.open(io.BytesIO(png)).convert("RGB")) / 255.0
 
     times = ", ".join(f"{k} {v:.2f}" for k, v in asked(f"processor(1280, 800, {count})").items())
@@ -172,15 +189,20 @@ def _tell_pictures(browser: Browser, page: Path, avatar: Avatar, count: int) -> 
         each = asked(f"fragments({width}, {height})") / (width * height)
         print(f"{width} x {height}: {each:.1f} fragments a pixel; ms a picture")
         for share in _SHARES:
-            milliseconds = asked(f"milliseconds({width}, {height}, {json.dumps(share)}, {count})")
             told = ", ".join(f"{name} {value}" for name, value in share.items())
-            print(f"  {told}: {milliseconds:.0f}")
+            given = f"{width}, {height}, {json.dumps(share)}, {count}"
+            times = (
+                f"{kind} {asked(f'milliseconds({kind!r}, {given})'):.0f}" for kind in asked("kinds")
+            )
+            print(f"  {told}: {', '.join(times)}")
     camera = resized(front_camera(avatar, 512, 512), *_SIZES[0])
     (ours,) = pictures(avatar, torch.zeros(1, avatar.layout.size), camera, (1.0, 1.0, 1.0))
-    whole = picture(*_SIZES[0], 1.0)
-    print(f"PSNR to Python's picture {_psnr(whole, ours / 255.0):.1f} dB; to the whole by detail:")
-    for detail in _DETAILS:
-        print(f"  {detail}: {_psnr(picture(*_SIZES[0], detail), whole):.1f} dB")
+    for kind in asked("kinds"):
+        whole = picture(kind, *_SIZES[0], 1.0)
+        print(f"{kind}, PSNR to Python's picture {_psnr(whole, ours / 255.0):.1f} dB; ", end="")
+        print("to the whole by detail:")
+        for detail in _DETAILS:
+            print(f"  {detail}: {_psnr(picture(kind, *_SIZES[0], detail), whole):.1f} dB")
 
 
 def _psnr(first: np.ndarray, second: np.ndarray) -> float:
