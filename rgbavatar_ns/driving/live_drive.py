@@ -102,6 +102,10 @@ class FrameTransfer(Protocol):
         """Learn it anew."""
         ...
 
+    def learn(self, frame: PerformanceFrame) -> None:
+        """Learn from a frame ahead of its turn."""
+        ...
+
     def __call__(self, frame: PerformanceFrame) -> Float[Tensor, "H"]:
         """The avatar's theta."""
         ...
@@ -189,7 +193,11 @@ class LiveDrive:
         return self._stopped or (self._followed and not self._waiting)
 
     def _follow(self) -> None:
-        """Take frames from the source as theta, until it ends."""
+        """Take frames from the source as theta, until it ends.
+
+        A film's beginning waits until the performer's rest is known from it.
+        """
+        ahead: list[PerformanceFrame] = []
         try:
             while not (self._stopped or self._source.ended):
                 performed = self._source.next(_PATIENCE_S)
@@ -198,22 +206,24 @@ class LiveDrive:
                 if self._asked:
                     self._asked = False
                     self._transfer.calibrate()
-                theta = self._transfer(performed)
-                self._put(
-                    DrivenFrame(
-                        performed.index,
-                        theta,
-                        performed.captured_s,
-                        performed.time_s,
-                        performed.image_rgb,
-                    )
-                )
+                if not self._real_time and self._transfer.calibrating and self.shown == 0:
+                    self._transfer.learn(performed)
+                    ahead.append(performed)
+                    continue
+                self._show_all([*ahead, performed])
+                ahead.clear()
+            self._show_all(ahead)
         except BaseException as error:
             self._trouble = error
         finally:
             with self._changed:
                 self._followed = True
                 self._changed.notify_all()
+
+    def _show_all(self, performed: Sequence[PerformanceFrame]) -> None:
+        for one in performed:
+            theta = self._transfer(one)
+            self._put(DrivenFrame(one.index, theta, one.captured_s, one.time_s, one.image_rgb))
 
     def _put(self, frame: DrivenFrame) -> None:
         with self._changed:

@@ -125,6 +125,10 @@ class LiveTransfer:
         if self._driving.relative == "off":
             self._driving = DrivingOptions(relative="neutral", pose=self.options.pose)
 
+    def learn(self, frame: PerformanceFrame) -> None:
+        """Take a frame into the calibration before its turn, as of a recording one can."""
+        self._learn(self._mapped(frame).theta[0], frame.time_s)
+
     def __call__(self, frame: PerformanceFrame) -> Float[Tensor, "H"]:
         """The avatar's theta for a frame."""
         mapped = self._mapped(frame)

@@ -26,6 +26,9 @@ class _Transfer:
     def calibrate(self):
         self.asked += 1
 
+    def learn(self, frame):
+        raise AssertionError("nothing is to be learnt")
+
 
 class _Source:
     head, waits_for = None, "a face"
@@ -75,6 +78,41 @@ def test_offline_every_frame_is_shown_in_order():
     assert output.seen == list(range(1, 51))
     assert source.closed
     assert output.closed
+
+
+class _Learning(_Transfer):
+    """Wants five frames before it knows the performer; tells what it knew of each."""
+
+    def __init__(self):
+        super().__init__()
+        self.learnt, self.knew = [], []
+
+    @property
+    def calibrating(self):
+        return len(self.learnt) < 5
+
+    def learn(self, frame):
+        self.learnt.append(frame.index)
+
+    def __call__(self, frame):
+        self.knew.append(len(self.learnt))
+        if self.calibrating:
+            self.learnt.append(frame.index)
+        return super().__call__(frame)
+
+
+@pytest.mark.parametrize("count", [20, 3])
+def test_a_film_begins_once_the_performers_rest_is_known(count):
+    transfer, output = _Learning(), _Output()
+    LiveDrive(_Source(count), transfer, [output], real_time=False).run()
+    assert output.seen == list(range(1, count + 1))
+    assert transfer.knew[0] == min(count, 5), "all that was to be learnt, or all there was"
+
+
+def test_live_nobody_waits_for_the_calibration():
+    transfer, output = _Learning(), _Output()
+    LiveDrive(_Source(20, every_s=0.01), transfer, [output]).run()
+    assert transfer.knew[0] == 0
 
 
 def test_live_a_slow_output_skips_and_never_falls_behind():

@@ -214,6 +214,28 @@ def test_a_phone_turns_a_head_upon_its_shoulders():
     assert torch.equal(driven[root], own.theta_mean[root])
 
 
+def test_what_is_learnt_ahead_holds_from_the_first_frame(avatar, own):
+    """A recording's first second is known before it is shown: nothing drifts while it is learnt."""
+    head = PerformerHead(HeadModel(_HEAD).layout, _HEAD)
+    frames = [
+        PerformanceFrame(k, k / _RATE, k / _RATE, theta=theta)
+        for k, theta in enumerate(_performance(9, 4.0))
+    ]
+    options = LiveOptions(smooth=False)
+    ahead, later = (
+        LiveTransfer(avatar, own, head, front_camera(avatar, 64, 64), options) for _ in range(2)
+    )
+    for frame in frames[:26]:
+        assert ahead.calibrating
+        ahead.learn(frame)
+    assert not ahead.calibrating
+    for frame in frames[:60]:
+        later(frame)
+    turn = avatar.layout.slice("neck")
+    once, again = ahead(frames[0]), later(replace(frames[0], time_s=9.0))
+    torch.testing.assert_close(once[turn], again[turn], atol=1e-5, rtol=0)
+
+
 def test_numbers_can_be_taken_as_they_are(avatar, own):
     performed = _performance(6)
     options = LiveOptions(calibrate_s=0.0, pose="absolute", keep_range=False, smooth=False)
