@@ -3,7 +3,6 @@
 
 const GPU_TABLES = [...Object.keys(BASE_TABLES), "anchor"]; // in the order of GPU_PLACE
 const GPU_BASES = Object.keys(BASIS_TABLES);
-const GROUP_SIZE = 64; // Gaussians, as GPU_PLACE has it
 const SCENE_NUMBERS = 32; // of four bytes, as GPU_SCENE has them
 const ASKED_LIMITS = ["maxTextureDimension2D", "maxBufferSize", "maxStorageBufferBindingSize"];
 const LOST_AGAIN = 1000; // milliseconds until a device is asked for again
@@ -86,13 +85,16 @@ class GPURenderer extends GaussianRenderer {
     const [place, draw, show] = [GPU_PLACE, GPU_DRAW, GPU_SHOW].map(
       (code) => device.createShaderModule({ code }));
     const drawn = (module, target) => device.createRenderPipelineAsync({
-      layout: "auto", vertex: { module }, fragment: { module, targets: [target] },
+      layout: "auto", vertex: { module, entryPoint: "corner" },
+      fragment: { module, entryPoint: "shade", targets: [target] },
     });
     const over = { srcFactor: "one", dstFactor: "one-minus-src-alpha" };
     const overAll = { color: over, alpha: over };
     // Half floats hold the unrounded sums of many thin layers.
     const [placing, exact, bytes, showing] = await Promise.all([
-      device.createComputePipelineAsync({ layout: "auto", compute: { module: place } }),
+      device.createComputePipelineAsync({
+        layout: "auto", compute: { module: place, entryPoint: "main" },
+      }),
       drawn(draw, { format: "rgba16float", blend: overAll }),
       drawn(draw, { format: "rgba8unorm", blend: overAll }),
       drawn(show, { format: this.format }),

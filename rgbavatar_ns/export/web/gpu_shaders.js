@@ -1,6 +1,8 @@
 "use strict";
 /* The same three programs as shaders.js for WebGPU, line by line where the languages allow it. */
 
+const GROUP_SIZE = 64; // Gaussians; what every GPU's groups are whole parts of
+
 /** What all three know of the picture; `GPURenderer._describe` fills it in this order. */
 const GPU_SCENE = `
 struct Scene {
@@ -55,7 +57,7 @@ fn weighted(table: u32, k: u32, gaussian: u32) -> vec4f {
   return weights[at] * unpack4x8snorm(bases[at * scene.stride + gaussian]);
 }
 
-@compute @workgroup_size(64)
+@compute @workgroup_size(${GROUP_SIZE})
 fn main(@builtin(global_invocation_id) id: vec3u) {
   let i = id.x;
   if (i >= scene.count) { return; }
