@@ -123,6 +123,7 @@ def test_both_renderers_draw_the_same(page, theta):
         "holdWeight(2, 1.5)",
         "detail = 0.5",
         "orbit(0.4, 0.1)",
+        "camera.zoom(4)",
         "setSize(70, 111)",
         "background = [0.1, 0.5, 0.9]",
         "background = null",
