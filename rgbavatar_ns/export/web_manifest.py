@@ -16,6 +16,8 @@ from rgbavatar_ns.kernels import PinholeCameras
 
 _LINEAR_RANGE = (-3.0, 3.0)
 _NAMED_RANGE = (0.0, 1.0)
+_NONE_BELOW = -0.05
+"""Below it a tracker's noise does not bring what only rises from rest."""
 
 
 def calm_theta(seen: TrainingStatistics | None, posed: Float[Tensor, "H"]) -> Float[Tensor, "H"]:
@@ -59,9 +61,11 @@ def avatar_manifest(
     shown = torch.cat([rest, theta]).to(avatar.identity)
     expression = shown[:, layout.slice("expression")]
     names = avatar.head.arrays.expression_names
-    # Blend shapes named after what they do run from 0 to 1; numbered components to both sides.
-    numbered = bool((expression < -0.05).any()) or all(n[-1:].isdigit() for n in names)
-    low, high = _LINEAR_RANGE if numbered else _NAMED_RANGE
+    # Blend shapes named after what they do run from 0 to 1; numbered components, and what goes
+    # below zero in the film, as a neck does, to both sides.
+    numbered = torch.tensor([name[-1:].isdigit() for name in names]).to(expression.device)
+    both = numbered | (expression < _NONE_BELOW).any(0)
+    low, high = (torch.where(both, *ends) for ends in zip(_LINEAR_RANGE, _NAMED_RANGE))
     strength = expression.std(0, unbiased=False)
     psi = avatar.weights(shown).abs().amax(0)
     arkit = _arkit(avatar)
@@ -76,8 +80,8 @@ def avatar_manifest(
         "parents": [int(parent) for parent in avatar.head.arrays.parents],
         "expression_names": list(names),
         "expression_range": [
-            expression.amin(0).clamp(max=low).tolist(),
-            expression.amax(0).clamp(min=high).tolist(),
+            torch.minimum(expression.amin(0), low).tolist(),
+            torch.maximum(expression.amax(0), high).tolist(),
         ],
         "expression_order": torch.argsort(strength, descending=True, stable=True).tolist(),
         "psi_range": (1.5 * psi).clamp(min=0.1).tolist(),

@@ -11,7 +11,7 @@ from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.export import PageOptions, calm_theta, front_camera, write_web_page
 from rgbavatar_ns.export.web_scripts import PAGE_SCRIPTS, sources
-from rgbavatar_ns.head import HeadArrays
+from rgbavatar_ns.head import EMBEDDED_BUST, HeadArrays
 
 from .avatar_of_page import avatar_of_page
 from .subject import avatar_of
@@ -110,3 +110,19 @@ def test_a_page_that_cannot_be_written_is_told(tmp_path):
     theta = torch.zeros(0, avatar.layout.size)
     with pytest.raises(UserError, match="Cannot write"):
         write_web_page(avatar, tmp_path / "file" / "page.html", front_camera(avatar, 8, 8), theta)
+
+
+def test_a_slider_goes_to_both_sides_only_where_its_number_does(tmp_path):
+    """A neck that moves to both sides does not make a smile go below rest."""
+    avatar = avatar_of(arrays=HeadArrays.embedded(EMBEDDED_BUST))
+    names = avatar.head.arrays.expression_names
+    theta = torch.zeros(4, avatar.layout.size)
+    theta[:, names.index("neckForward")] = torch.tensor([-0.4, 0.1, 0.2, 0.3])
+    theta[:, names.index("mouthSmileLeft")] = torch.tensor([-0.01, 0.2, 0.4, 1.2])
+    write_web_page(avatar, tmp_path / "a.html", front_camera(avatar, 8, 8), theta)
+    manifest, _ = avatar_of_page(tmp_path / "a.html")
+    low, high = manifest["expression_range"]
+    ends = {name: (a, b) for name, a, b in zip(names, low, high)}
+    assert ends["neckForward"] == (-3.0, 3.0)
+    assert ends["jawOpen"] == (0.0, 1.0)
+    assert ends["mouthSmileLeft"] == pytest.approx((-0.01, 1.2))
