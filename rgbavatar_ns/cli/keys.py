@@ -21,10 +21,13 @@ def on_keys(actions: Mapping[str, Callable[[], None]]) -> Iterator[bool]:
     try:
         import termios
         import tty
-
+    except ImportError:
+        yield False
+        return
+    try:
         terminal = sys.stdin.fileno()
         before = termios.tcgetattr(terminal)
-    except (ImportError, OSError, ValueError, termios.error):  # type: ignore[possibly-unbound]
+    except (OSError, ValueError, termios.error):
         yield False
         return
     ended = threading.Event()

@@ -108,7 +108,10 @@ class FilmSink:
     def close(self) -> None:
         """Complete the film; without a single picture there is none."""
         if self._film.count == 0:
-            nothing = UserError(f"{self._path} has no picture.", "The performer was never seen.")
+            nothing = UserError(
+                f"{self._path} has no picture.",
+                "The performer was not seen for long enough: a dozen pictures with a face.",
+            )
             self._film.__exit__(UserError, nothing, None)
             raise nothing
         self._film.__exit__(None, None, None)

@@ -27,7 +27,7 @@ class ViewerOutput:
     """
 
     def __init__(self, run: Path, calibrate: Callable[[], None]) -> None:
-        config_path = newest_run(run) / _CONFIG if run.is_dir() else run.parent / _CONFIG
+        config_path = (newest_run(run) if run.is_dir() else run) / _CONFIG
         if not config_path.is_file():
             raise UserError(
                 f"{run} is no run of ns-train, which nerfstudio's viewer needs.",

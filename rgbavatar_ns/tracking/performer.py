@@ -88,20 +88,20 @@ class FilmedPerformer:
             self._require_pictures()
             return None
         self._shown = True
-        met = self._tracker.ready
+        met, faceless = self._tracker.ready, self._tracker.counts["no face"]
         try:
             theta = self._tracker.pose(captured.image_rgb, captured.index)
         except UserError:
             self._counts["another resolution"] += 1
             return None
         if not met:
-            self._meet(captured)
+            self._meet(captured, self._tracker.counts["no face"] == faceless)
             return self._backlog.popleft() if self._backlog else None
         return None if theta is None else self._performed(captured, theta)
 
-    def _meet(self, captured: CapturedFrame) -> None:
-        """Keep a recording's first frames until the person is known; a camera's would be late."""
-        if self._keeps_all:
+    def _meet(self, captured: CapturedFrame, has_face: bool) -> None:
+        """Keep a recording's first faces until the person is known; a camera's would be late."""
+        if self._keeps_all and has_face:
             self._unmet[captured.index] = captured
         if not self._tracker.ready:
             return

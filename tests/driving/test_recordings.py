@@ -93,6 +93,17 @@ def test_mirrored_and_degree_senders_are_put_right(tmp_path):
     assert source.next(0.0).head_rotation[1] == pytest.approx(math.pi / 6, abs=1e-5)
 
 
+def test_where_a_row_tells_no_turn_the_head_stays(tmp_path):
+    rows = ["0.1,,,", "0.2,0.3,0,0", "0.3,,0,0", "0.4,inf,0,0", "0.5,0.1,0,0"]
+    take = _take(tmp_path, "jawOpen,HeadYaw,HeadPitch,HeadRoll", ["0.1,0,0,0", *rows])
+    source = csv_source(take, 60.0, False)
+    turns = []
+    while not source.ended:
+        turns.append(source.next(0.0).head_rotation)
+    yaws = [-float(turn[1]) for turn in turns]
+    assert yaws == pytest.approx([0.0, 0.0, 0.3, 0.3, 0.3, 0.1], abs=1e-6)
+
+
 def test_rows_without_numbers_are_passed_over_in_their_time(tmp_path):
     rows = ["00:00:00:01.000,61,0.1", "00:00:00:02.000,0,", "00:00:00:03.000,61,0.3"]
     source = csv_source(_take(tmp_path, "Timecode,BlendShapeCount,JawOpen", rows), 60.0, False)

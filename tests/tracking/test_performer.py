@@ -90,6 +90,19 @@ def test_in_real_time_what_is_late_is_skipped_and_lateness_is_honest(film):
     assert frames[0].index >= 10
 
 
+def test_pictures_without_a_face_are_not_kept_until_one_comes(film):
+    tracker = _Tracker()
+
+    def nobody(image_rgb, index=0):
+        tracker.counts["no face"] += 1
+
+    tracker.pose = nobody  # type: ignore[method-assign]
+    performer = FilmedPerformer(str(film), False, tracker=tracker)
+    assert _all(performer) == []
+    assert performer.counts["no face"] == 40
+    assert performer._unmet == {}
+
+
 def test_closing_twice_closes_once(film):
     tracker = _Tracker()
     performer = FilmedPerformer(str(film), False, tracker=tracker)

@@ -29,7 +29,10 @@ _REMEDY = (
 
 
 def csv_source(
-    path: Path, frames_per_second: float, real_time: bool, angle_gain: Sequence[float] = (1, 1, 1)
+    path: Path,
+    frames_per_second: float,
+    real_time: bool,
+    angle_gain: Sequence[float] = (1.0, 1.0, 1.0),
 ) -> RecordedSource:
     """The rows of a CSV file; columns are known by their names, in any order and case.
 
@@ -44,16 +47,16 @@ def csv_source(
     if all(place is None for place in places):
         raise UserError(f"{path} has no ARKit columns: {first_few(names, 4)}.", _REMEDY)
     angles = [columns.get(name.lower()) for name in HEAD_ANGLES]
-    frames = [(values, time_s) for values, time_s in _timed(names, rows, frames_per_second)]
+    frames = _timed(names, rows, places, frames_per_second)
     if not frames:
         raise UserError(f"{path} has no row of numbers.", _REMEDY)
 
+    turned = [place for place in angles if place is not None]
+    turns = _turns(frames, turned, angle_gain) if len(turned) == len(angles) else None
+
     def frame(place: int, captured_s: float) -> PerformanceFrame:
         values, time_s = frames[place]
-        turn = None
-        if None not in angles:
-            yaw, pitch, roll = (values[one] * gain for one, gain in zip(angles, angle_gain))  # type: ignore[index]
-            turn = head_rotation(yaw, pitch, roll)
+        turn = None if turns is None else turns[place]
         return PerformanceFrame(
             place,
             captured_s,
@@ -79,15 +82,20 @@ def _read(path: Path) -> tuple[list[str], list[list[str]]]:
 
 
 def _timed(
-    names: list[str], rows: list[list[str]], frames_per_second: float
+    names: list[str],
+    rows: list[list[str]],
+    places: Sequence[int | None],
+    frames_per_second: float,
 ) -> list[tuple[list[float], float]]:
-    """Each row's numbers (NaN where there is none) and its time; rows without any are left out."""
+    """Each row's numbers (NaN where there is none) and its time.
+
+    Rows without a number in one of `places`, ARKit's columns, are left out.
+    """
     clock = next((k for k, name in enumerate(names) if name.strip().lower() == "timecode"), None)
     found: list[tuple[list[float], float]] = []
     for place, row in enumerate(rows):
         values = [_number(text) for text in row] + [math.nan] * (len(names) - len(row))
-        told = [value for k, value in enumerate(values) if k != clock and math.isfinite(value)]
-        if len(told) < 2:  # the count of blend shapes alone
+        if not any(math.isfinite(values[at]) for at in places if at is not None):
             continue
         found.append((values, place / frames_per_second))
     if clock is None:
@@ -109,6 +117,18 @@ def _timecode_s(text: str, frames_per_second: float) -> float | None:
     hours, minutes, seconds, frames = (int(part) for part in read.groups()[:4])
     part = float(f"0.{read[5]}") if read[5] else 0.0
     return 3600 * hours + 60 * minutes + seconds + (frames + part) / frames_per_second
+
+
+def _turns(
+    frames: list[tuple[list[float], float]], places: Sequence[int], gain: Sequence[float]
+) -> list[Float[Tensor, "3"]]:
+    """The head's turn of each row; where a row tells none, it stays."""
+    told, turns = [0.0, 0.0, 0.0], []
+    for values, _ in frames:
+        new = [values[place] * factor for place, factor in zip(places, gain)]
+        told = new if all(map(math.isfinite, new)) else told
+        turns.append(head_rotation(*told))
+    return turns
 
 
 def _number(text: str) -> float:
