@@ -61,7 +61,7 @@ class Bench:
         chosen = frames_of or self.subject.offline().batch
         options = TrainingOptions(seed=self.subject.seed)
         if not color_init:
-            options = replace(options, color_init=None)
+            options = replace(options, first_colors=None)
         avatar = self.subject.avatar(config)
         bar = self.progress.add_task(f"seed {self.subject.seed}: {title}", total=steps)
 

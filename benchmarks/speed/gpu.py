@@ -103,7 +103,7 @@ class Training:
         self.frames = DeviceFrames(theta, cameras, images)
         self._order = torch.Generator().manual_seed(0)
         self._background = random_backgrounds(0, work.batch)
-        self._options = TrainingOptions(color_init=None, surface_prior=False, backend="cuda")
+        self._options = TrainingOptions(first_colors=None, surface_prior=False, backend="cuda")
 
     def fused(self) -> Callable[[], object]:
         """A step kernel by kernel, on frames drawn at random."""

@@ -106,7 +106,7 @@ def _bare_images_per_second(
         cameras = dataset.cameras.select(chosen)
         return on_device(TrainingBatch(dataset.theta[chosen], cameras, images[chosen]), device)
 
-    step = TrainingStep(avatar, options=TrainingOptions(seed=_SEED, color_init=None))
+    step = TrainingStep(avatar, options=TrainingOptions(seed=_SEED, first_colors=None))
     start = benchmark.timer()
     fit(step, batch_at, range(steps))
     return steps * batch / (benchmark.timer() - start)

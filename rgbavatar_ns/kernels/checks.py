@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from rgbavatar_ns.kernels.constants import MAX_AVERAGE_CHANNELS
-from rgbavatar_ns.kernels.types import PinholeCameras
+from rgbavatar_ns.kernels.types import SIGHT_SUMS, FirstSight, PinholeCameras
 
 
 def holds_nonfinite(tensor: Tensor) -> bool:
@@ -36,6 +36,21 @@ def check_target_images(images_rgba: Tensor, batch: int, cameras: PinholeCameras
             f"images are {list(images_rgba.shape)}. Pass one RGBA image for each of the "
             f"{batch} sets."
         )
+
+
+def check_sight(sight: FirstSight, count: int, like: Tensor) -> None:
+    """Raise ValueError unless first sights of `count` Gaussians can be summed beside `like`."""
+    wanted = {"known": (torch.bool, (count,)), "sums": (torch.int64, (count, SIGHT_SUMS))}
+    for name, (dtype, shape) in wanted.items():
+        tensor: Tensor = getattr(sight, name)
+        fits = tensor.dtype == dtype and tuple(tensor.shape) == shape and tensor.is_contiguous()
+        if not fits or tensor.device != like.device:
+            found = f"{tensor.dtype} {list(tensor.shape)} on {tensor.device}"
+            raise ValueError(
+                f"{name} is {found}. Pass contiguous {dtype} {list(shape)} on {like.device}."
+            )
+    if sight.num_images < 0:
+        raise ValueError(f"{sight.num_images} images cannot count. Pass 0 or more.")
 
 
 def _check_size(images: Tensor, dtype: torch.dtype, cameras: PinholeCameras) -> None:

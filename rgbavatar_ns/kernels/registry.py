@@ -12,6 +12,7 @@ from torch import Tensor
 
 from rgbavatar_ns.kernels.types import (
     AdamParameter,
+    FirstSight,
     GaussianSet,
     MorphedGaussians,
     MorphedGradient,
@@ -47,11 +48,15 @@ class MorphedRenderer(Protocol):
         ...
 
     def forward_loss(
-        self, images_rgba: UInt8[Tensor, "B H W 4"], background: Float[Tensor, "#B 3"]
+        self,
+        images_rgba: UInt8[Tensor, "B H W 4"],
+        background: Float[Tensor, "#B 3"],
+        sight: FirstSight | None = None,
     ) -> Float[Tensor, ""]:
         """The mean absolute difference to straight-alpha images over the background.
 
         Pixels that are marked `UNFILMED_RGBA` differ by 0; the divisor is that of all pixels.
+        `sight` is filled where it is given.
         """
         ...
 
@@ -96,8 +101,12 @@ class DeviceRenderer(MorphedRenderer, Protocol):
         images_rgba: UInt8[Tensor, "F H W 4"],
         image_of: Int[Tensor, " B"],
         background: Float[Tensor, "B 3"],
+        sight: FirstSight | None = None,
     ) -> Float[Tensor, ""]:
-        """As `forward_loss`, with each set's image chosen by its number."""
+        """As `forward_loss`, with each set's image chosen by its number.
+
+        Of `images_rgba` the first `num_images` count for `sight`, in whichever sets they are.
+        """
         ...
 
     def backward_adam_with(

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 
@@ -104,6 +104,29 @@ class WeightedColors:
     weighted_sum: Float[Tensor, "B N C"]
     weight_sum: Float[Tensor, "B N"]
     max_weight: Float[Tensor, "B N"]
+
+
+SIGHT_SUMS = 5
+"""Numbers that `FirstSight.sums` holds for each Gaussian."""
+SIGHT_UNIT = 2.0**-32
+"""What 1 stands for in `FirstSight.sums`."""
+
+
+@dataclass(frozen=True)
+class FirstSight:
+    """What a training step's pictures show of the Gaussians that wait for their first colour.
+
+    `sums`, filled by the step, holds for each Gaussian that is not `known` the sums of counted
+    colour (3) and of counted weight over the pixels, and the largest weight, in units of
+    `SIGHT_UNIT`: whole numbers, whose sums are the same in any order. Only the first `num_images`
+    pictures count. Counted is the weight times the picture's matte, or with `over_background` the
+    weight, and the colour then that of the picture over its background.
+    """
+
+    known: Bool[Tensor, "N"]
+    sums: Int[Tensor, "N 5"]
+    num_images: int
+    over_background: bool = False
 
 
 TANGENT_VARIANTS = ("normalized", "raw", "orthonormal")

@@ -15,7 +15,7 @@ from rgbavatar_ns.avatar import Avatar, AvatarConfig
 from rgbavatar_ns.avatar.metrics import LPIPSMetric, evaluate_images
 from rgbavatar_ns.avatar.prior import SurfacePrior
 from rgbavatar_ns.avatar.refinement import RefinementConfig
-from rgbavatar_ns.avatar.training.color_init import ColorInitSchedule
+from rgbavatar_ns.avatar.training.color_init import FirstColorsKind
 from rgbavatar_ns.avatar.training.losses import LPIPSLoss, image_losses
 from rgbavatar_ns.avatar.training.step import Orthogonality, TrainingOptions
 from rgbavatar_ns.drawing.compositing import error_strip, straight_alpha
@@ -45,6 +45,9 @@ class RGBAvatarModelConfig(ModelConfig):
     """Sizes, variants and initial values of the avatar."""
     initialize_colors: bool = True
     """Give each Gaussian the mean colour of the pixels it covers when it is first seen."""
+    first_colors: FirstColorsKind = "matted"
+    """How: paper, the mean of the training picture over its random background, in the first step in
+    which its weight exceeds .1; matted (ours), the mean of the person alone. (The release: .01.)"""
     surface_prior: bool = True
     """Keep what the film does not show on the person's surface, closed and plain: heads can be
     turned beyond their film. Ours; False leaves it to chance, as the paper does."""
@@ -188,7 +191,7 @@ class RGBAvatarModel(Model):
         return TrainingOptions(
             lpips_weight=config.lpips_weight,
             lpips_start_step=config.lpips_start_step,
-            color_init=ColorInitSchedule() if config.initialize_colors else None,
+            first_colors=config.first_colors if config.initialize_colors else None,
             surface_prior=config.surface_prior,
             orthogonality=config.orthogonality,
             fast=config.fast,

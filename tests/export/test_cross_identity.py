@@ -12,7 +12,7 @@ import torch
 
 from rgbavatar_ns.avatar import Avatar, AvatarConfig
 from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics, expressive_numbers
-from rgbavatar_ns.avatar.training.color_init import initialize_colors
+from rgbavatar_ns.avatar.training.color_init import FirstColors
 from rgbavatar_ns.driving import DrivingOptions, ThetaNames, drive, map_by_name
 from rgbavatar_ns.export import draw
 from rgbavatar_ns.synthetic.config import DemoConfig
@@ -71,7 +71,9 @@ def pair() -> _Pair:
     with torch.no_grad():
         avatar.blendshapes.opacity_logit.fill_(2.5)
     (image,) = target.draw(theta[:1])
-    initialize_colors(avatar, theta[:1], as_pinhole(target.camera), torch.from_numpy(image)[None])
+    colors, rgba = FirstColors(avatar), torch.from_numpy(image)[None]
+    black = torch.zeros(1, 3)
+    colors.give(colors.seen_in(theta[:1], as_pinhole(target.camera), rgba, black))
     tracked = theta + bias_of_target
     own = TrainingStatistics.of(tracked, torch.zeros(_FRAMES, 1), target.head.layout)
     truth = _performance(target, seed=5)

@@ -1,124 +1,137 @@
 """Colour initialisation: a Gaussian's first colour is the mean of the pixels it covers.
 
 Paper, sec. 3.2: c = sum w I / sum w, once for each Gaussian, when its splatting weight w (alpha
-times transmittance, the blending weight of the pixel) first exceeds .1.
+times transmittance, the blending weight of the pixel) first exceeds .1. Every step looks: what it
+draws is summed for the Gaussians that still wait, and those that it shows well are given their
+colour after it.
 """
 
-from dataclasses import dataclass
+from typing import Literal
 
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Float
 from torch import Tensor
 
 from rgbavatar_ns.avatar.avatar import Avatar
 from rgbavatar_ns.avatar.model.blendshapes import feature_from_color
 from rgbavatar_ns.avatar.training.losses import require_images_of
-from rgbavatar_ns.drawing.compositing import rgba_to_float
+from rgbavatar_ns.drawing.compositing import ImagesRGBA, is_unfilmed, rgba_to_float
 from rgbavatar_ns.kernels import (
+    FirstSight,
     GaussianSet,
     PinholeCameras,
     WeightedColors,
     weighted_color_average,
 )
+from rgbavatar_ns.kernels.types import SIGHT_SUMS, SIGHT_UNIT
+
+FirstColorsKind = Literal["matted", "paper"]
+"""paper: I is the training picture over its background. matted: each pixel counts by its matte
+alpha a too, c = sum w a I / sum w a. Ours, because what lies behind the person tints the
+silhouette else; where alpha is 1 both are the same."""
 
 WEIGHT_THRESHOLD = 0.1
 """The blending weight that a Gaussian must exceed in some pixel (paper: .1; its release: .01)."""
-_SMALLEST_MATTE_SUM = 1e-3
-"""Below this sum of weight times alpha a Gaussian saw background only."""
+_SMALLEST_WEIGHT_SUM = 1e-3
+"""Below this sum of counted weights a Gaussian saw background only."""
 
 
-@dataclass(frozen=True)
-class ColorEstimate:
-    """Colours of N Gaussians and which of them are seen well enough to trust."""
+class FirstColors:
+    """Gives an avatar's Gaussians their first colours, each once; `color_initialized` remembers.
 
-    color: Float[Tensor, "N 3"]
-    reliable: Bool[Tensor, "N"]
-
-
-@dataclass(frozen=True)
-class ColorInitSchedule:
-    """After which optimiser steps colours are initialised.
-
-    After each of the first `every_step_until` steps, in which nearly all Gaussians are seen, then
-    after every `interval`-th one up to step `regular_until`, and from there at intervals that
-    double (steps 200, 400, 800 ...). Ours: the paper does not say how often.
+    Only base colours change; optimiser state stays.
     """
 
-    every_step_until: int = 20
-    interval: int = 25
-    regular_until: int = 100
+    def __init__(self, avatar: Avatar, kind: FirstColorsKind = "matted") -> None:
+        self._avatar, self._kind = avatar, kind
 
-    def due(self, step: int) -> bool:
-        """Say whether colours are initialised after step `step` (counted from 0)."""
-        if step < self.every_step_until:
-            return True
-        if step <= self.regular_until:
-            return step % self.interval == 0
-        times, rest = divmod(step, max(1, self.regular_until))
-        return rest == 0 and times.bit_count() == 1
+    def sight(self, num_images: int) -> FirstSight | None:
+        """What a step is to sum over the first `num_images` of its pictures.
+
+        None where no Gaussian waits, which is not asked of a GPU: the question would stop it.
+        """
+        known = self._avatar.color_initialized
+        if known.device.type == "cpu" and bool(known.all()):
+            return None
+        sums = torch.empty(len(known), SIGHT_SUMS, dtype=torch.int64, device=known.device)
+        return FirstSight(known, sums, num_images, self._kind == "paper")
+
+    @torch.no_grad()
+    def seen_in(
+        self,
+        theta: Float[Tensor, "B H"],
+        cameras: PinholeCameras,
+        images_rgba: ImagesRGBA,
+        background: Float[Tensor, "B 3"],
+        *,
+        backend: str = "auto",
+    ) -> Float[Tensor, "N 5"]:
+        """The sums of `FirstSight`, of all Gaussians as they are now, by a pass of their own."""
+        require_images_of(images_rgba, len(theta), cameras)
+        avatar = self._avatar
+        images = counted(images_rgba, background.to(theta), self._kind)
+        images = images.to(avatar.blendshapes.position.dtype)
+        renderer = avatar.renderer(theta, cameras, backend=backend)
+        if renderer is not None:
+            return _joined(renderer.weighted_color_average(images))
+        gaussians = avatar.gaussians(theta)
+        return _joined(weighted_color_average(gaussians, cameras, images, backend=backend))
+
+    @torch.no_grad()
+    def give(self, seen: FirstSight | Float[Tensor, "N 5"]) -> None:
+        """Give those that wait, and were seen well, the mean colour under them.
+
+        Waits for no device.
+        """
+        sums = seen.sums * SIGHT_UNIT if isinstance(seen, FirstSight) else seen
+        avatar = self._avatar
+        fresh = is_seen_well(sums) & ~avatar.color_initialized
+        if fresh.device.type == "cpu" and not bool(fresh.any()):
+            return
+        feature = avatar.blendshapes.color_feature
+        first = feature_from_color(mean_color(sums)).to(feature)
+        feature.copy_(torch.where(fresh[:, None], first, feature))
+        avatar.color_initialized |= fresh
 
 
-@torch.no_grad()
-def estimate_colors(
+def is_seen_well(sums: Float[Tensor, "N 5"]) -> Tensor:
+    """Whether the mean colour under each Gaussian can be trusted: [N], bool."""
+    return (sums[:, 4] > WEIGHT_THRESHOLD) & (sums[:, 3] > _SMALLEST_WEIGHT_SUM)
+
+
+def mean_color(sums: Float[Tensor, "N 5"]) -> Float[Tensor, "N 3"]:
+    """The mean colour under each Gaussian."""
+    return sums[:, :3] / sums[:, 3:4].clamp(min=_SMALLEST_WEIGHT_SUM)
+
+
+def sums_of(
     gaussians: GaussianSet,
     cameras: PinholeCameras,
-    images_rgba: UInt8[Tensor, "B H W 4"] | Float[Tensor, "B H W 4"],
-) -> ColorEstimate:
-    """Average the straight-alpha images under each Gaussian as `color_estimate`, over the batch."""
-    images = premultiplied(images_rgba, gaussians.means.dtype)
-    return color_estimate(weighted_color_average(gaussians, cameras, images))
+    images_rgba: ImagesRGBA,
+    background: Float[Tensor, "B 3"],
+    kind: FirstColorsKind = "matted",
+) -> Float[Tensor, "N 5"]:
+    """As `FirstColors.seen_in`, of any Gaussians."""
+    images = counted(images_rgba, background, kind).to(gaussians.means.dtype)
+    return _joined(weighted_color_average(gaussians, cameras, images))
 
 
-def premultiplied(
-    images_rgba: UInt8[Tensor, "B H W 4"] | Float[Tensor, "B H W 4"], dtype: torch.dtype
+def counted(
+    images_rgba: ImagesRGBA, background: Float[Tensor, "B 3"], kind: FirstColorsKind
 ) -> Float[Tensor, "B H W 4"]:
-    """Return straight-alpha images with their colour multiplied by alpha, as one new tensor."""
-    images = rgba_to_float(images_rgba, dtype)
-    if images is images_rgba:
-        images = images.clone()
-    images[..., :3] *= images[..., 3:]
-    return images
+    """Straight-alpha images as what each pixel counts, its colour times its share, and the share.
 
-
-def color_estimate(sums: WeightedColors) -> ColorEstimate:
-    """Return the colours that follow from the sums over premultiplied RGBA images.
-
-    Each pixel also counts by its matte alpha: c = sum w a I / sum w a. Ours, because what stands in
-    the matted-out background would tint the silhouette. With alpha 1 it is the paper's sum.
+    What nobody filmed counts for nothing.
     """
-    total = sums.weighted_sum.sum(0)
-    matte_sum = total[:, 3:]
-    return ColorEstimate(
-        color=total[:, :3] / matte_sum.clamp(min=_SMALLEST_MATTE_SUM),
-        reliable=(sums.max_weight.amax(0) > WEIGHT_THRESHOLD)
-        & (matte_sum.squeeze(-1) > _SMALLEST_MATTE_SUM),
-    )
+    images = rgba_to_float(images_rgba, background.dtype)
+    matte = images[..., 3:]
+    if kind == "matted":
+        return torch.cat([images[..., :3] * matte, matte], -1)
+    filmed = (~is_unfilmed(images_rgba))[..., None].to(images.dtype)
+    behind = background[:, None, None]
+    return torch.cat([filmed * torch.lerp(behind, images[..., :3], matte), filmed], -1)
 
 
-@torch.no_grad()
-def initialize_colors(
-    avatar: Avatar,
-    theta: Float[Tensor, "B H"],
-    cameras: PinholeCameras,
-    images_rgba: UInt8[Tensor, "B H_px W_px 4"] | Float[Tensor, "B H_px W_px 4"],
-    *,
-    backend: str = "auto",
-) -> int:
-    """Give Gaussians seen well for the first time the mean colour under them; return how many.
-
-    Paper, sec. 3.2. Only base colours change, and each Gaussian's only once, which the avatar's
-    `color_initialized` remembers; optimiser state stays.
-    """
-    require_images_of(images_rgba, len(theta), cameras)
-    images = premultiplied(images_rgba, avatar.blendshapes.position.dtype)
-    renderer = avatar.renderer(theta, cameras, backend=backend)
-    if renderer is not None:
-        sums = renderer.weighted_color_average(images)
-    else:
-        sums = weighted_color_average(avatar.gaussians(theta), cameras, images, backend=backend)
-    estimate = color_estimate(sums)
-    fresh = estimate.reliable & ~avatar.color_initialized
-    feature = avatar.blendshapes.color_feature
-    feature[fresh] = feature_from_color(estimate.color[fresh]).to(feature.dtype)
-    avatar.color_initialized |= fresh
-    return int(fresh.sum())
+def _joined(colors: WeightedColors) -> Float[Tensor, "N 5"]:
+    """Over the batch: sums of colour and of share, and the largest weight."""
+    return torch.cat([colors.weighted_sum.sum(0), colors.max_weight.amax(0)[:, None]], -1)

@@ -13,7 +13,7 @@ from torch import Tensor
 from rgbavatar_ns.avatar.avatar import Avatar
 from rgbavatar_ns.avatar.training.losses import require_images_of
 from rgbavatar_ns.avatar.training.optimizer_states import AdamStates
-from rgbavatar_ns.kernels import MorphedGradient, MorphedRenderer, PinholeCameras
+from rgbavatar_ns.kernels import FirstSight, MorphedGradient, MorphedRenderer, PinholeCameras
 
 
 class FusedStep:
@@ -32,8 +32,9 @@ class FusedStep:
         images_rgba: UInt8[Tensor, "B H_px W_px 4"],
         background: Float[Tensor, "B 3"],
         before_loss: Callable[[MorphedRenderer], UInt8[Tensor, "B H_px W_px 4"]] | None = None,
+        sight: FirstSight | None = None,
     ) -> Float[Tensor, ""]:
-        """Take one step and return the loss.
+        """Take one step and return the loss; `sight`, where given, is filled.
 
         `before_loss`, where given, looks at what is about to be drawn and returns the images.
         Where theta requires a gradient, `theta.grad` gets that of the loss before the step, as
@@ -53,7 +54,7 @@ class FusedStep:
             raise ValueError("This backend's steps go through autograd. Use the eager step.")
         if before_loss is not None:
             images_rgba = before_loss(renderer)
-        loss = renderer.forward_loss(images_rgba, background)
+        loss = renderer.forward_loss(images_rgba, background, sight)
         gradient = self.update_gaussians(renderer, with_vertices=theta.requires_grad)
         self.update_network(psi, gradient.weights)
         if gradient.vertices is not None:

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from rgbavatar_ns.avatar.avatar import Avatar
 from rgbavatar_ns.avatar.training.batches import DeviceFrames
+from rgbavatar_ns.avatar.training.color_init import FirstColors
 from rgbavatar_ns.avatar.training.cuda_graph import Recorder, record_cuda_graph, supports
 from rgbavatar_ns.avatar.training.optimizer_states import AdamStates
 from rgbavatar_ns.kernels import UPDATED_ATTRIBUTES, DeviceRenderer
@@ -43,9 +44,12 @@ class RecordedStep:
         batch_size: int,
         *,
         backend: str = "auto",
+        first_colors: FirstColors | None = None,
+        num_filmed: int = 0,
         recorder: Recorder = record_cuda_graph,
     ) -> None:
         self._avatar, self.frames, self._backend = avatar, frames, backend
+        self._first_colors, self._num_filmed = first_colors, num_filmed
         self._states, self._recorder = AdamStates(avatar, optimizers), recorder
         self._replay: Callable[[], None] | None = None
         self._places: list[int] = []
@@ -122,14 +126,16 @@ class RecordedStep:
         index = chosen.long()
         renderer, psi = self._renderer(index)
         assert isinstance(renderer, DeviceRenderer)
-        self._loss.copy_(
-            renderer.forward_loss_of(self.frames.images_rgba, index, background.float().view(-1, 3))
-        )
+        images, behind = self.frames.images_rgba, background.float().view(-1, 3)
+        sight = self._first_colors.sight(self._num_filmed) if self._first_colors else None
+        self._loss.copy_(renderer.forward_loss_of(images, index, behind, sight))
         gradient = renderer.backward_adam_with(self._gaussian_states, rows[:-1])
         if self._network:
             grads = torch.autograd.grad(psi, self._network, gradient.weights)
             for state, grad in zip(self._network_states, grads):
                 renderer.update_parameter(state, grad, rows[-1])
+        if self._first_colors is not None and sight is not None:
+            self._first_colors.give(sight)
         self._states.add_one_to_all()
         self._overflows += renderer.overflowed
         torch.maximum(self._needed, renderer.needed, out=self._needed)

@@ -22,7 +22,7 @@ from rgbavatar_ns.avatar.training.batches import (
     TrainingBatch,
     each_its_own,
 )
-from rgbavatar_ns.avatar.training.color_init import ColorInitSchedule, initialize_colors
+from rgbavatar_ns.avatar.training.color_init import FirstColors, FirstColorsKind
 from rgbavatar_ns.avatar.training.cuda_graph import Recorder, record_cuda_graph
 from rgbavatar_ns.avatar.training.fused_step import FusedStep
 from rgbavatar_ns.avatar.training.losses import LPIPSLoss, image_losses, random_backgrounds
@@ -52,8 +52,8 @@ class TrainingOptions:
     """Weight of the LPIPS loss (paper's variant: .05); 0 needs no LPIPS network."""
     lpips_start_step: int = 0
     """First step with the LPIPS loss (release: after 20k images)."""
-    color_init: ColorInitSchedule | None = field(default_factory=ColorInitSchedule)
-    """When colours are initialised; None leaves them grey."""
+    first_colors: FirstColorsKind | None = "matted"
+    """How Gaussians are given their first colours; None leaves them grey."""
     surface_prior: bool = True
     """Keep what the film does not show on the person's surface, closed and plain (ours; the paper
     leaves it to chance)."""
@@ -130,6 +130,8 @@ class TrainingStep:
         if self.options.surface_prior and prior is None:
             self._prior = SurfacePrior(avatar).to(avatar.identity.device)
         self._lpips = LPIPSLoss() if lpips is None else lpips
+        kind = self.options.first_colors
+        self._first_colors = FirstColors(avatar, kind) if kind is not None else None
         self._orthogonality = self.options.orthogonality if avatar.config.num_bases else "free"
         self._fused: FusedStep | None = None
         self._frames: DeviceFrames | None = None
@@ -192,14 +194,14 @@ class TrainingStep:
         self.avatar.widen_film_range(theta)
         filmed = replace(batch, theta=theta)
         shown, view = self._with_view(filmed, step)
-        losses = self._losses(shown, step, partial(self._images, filmed, step, view))
+        count = len(theta) if view is None else len(theta) - 1
+        losses = self._losses(shown, step, count, partial(self._images, filmed, step, view))
         if self.refinement is not None and theta.grad is not None:
             assert batch.position is not None
-            count = len(theta) if view is None else len(theta) - 1
             # The batch's loss is a mean; each frame is to have the gradient of its own.
             own = theta.grad[:count] * len(theta)
             self.refinement.step(step, batch.position[:count], own)
-        self._finish(step, lambda: replace(filmed, theta=theta.detach()))
+        self._finish(step)
         return losses
 
     def _take_recorded(self, chosen: ChosenFrames, step: int) -> Losses:
@@ -221,6 +223,8 @@ class TrainingStep:
                 self._shown,
                 len(rows),
                 backend=self.options.backend,
+                first_colors=self._first_colors,
+                num_filmed=len(frames.theta),
                 recorder=self._recorder,
             )
         if self._prior is not None and self._prior.due(step):
@@ -233,7 +237,7 @@ class TrainingStep:
             self._shown.images_rgba[row].copy_(drawn.images_rgba[0])
             taken = [*rows[:-1], row]
         losses = {"l1": self._recorded(taken, chosen.background)}
-        self._finish(step, lambda: frames.batch(rows))
+        self._finish(step)
         return losses
 
     def _views(self) -> VirtualViews | None:
@@ -293,9 +297,13 @@ class TrainingStep:
         self,
         batch: TrainingBatch,
         step: int,
+        num_filmed: int,
         images_with: Callable[[MorphedRenderer | None], ImagesRGBA],
     ) -> Losses:
-        """Step with the optimisers; theta's gradient is left where it requires one."""
+        """Step with the optimisers, and give first colours by the first `num_filmed` images.
+
+        Theta's gradient is left where it requires one.
+        """
         theta, background = batch.theta, batch.background
         if background is None:
             background = random_backgrounds(step, len(theta), self.options.seed)
@@ -303,18 +311,42 @@ class TrainingStep:
         images, by_autograd = batch.images_rgba, self.options.lpips_counts(step)
         # Compiled loops read 8-bit images; others have more to say.
         if self._fused is not None and images.dtype == torch.uint8 and not by_autograd:
-            return {"l1": self._fused(theta, batch.cameras, images, background, images_with)}
+            sight = self._first_colors.sight(num_filmed) if self._first_colors else None
+            loss = self._fused(theta, batch.cameras, images, background, images_with, sight)
+            if self._first_colors is not None and sight is not None:
+                self._first_colors.give(sight)
+            return {"l1": loss}
         batch = replace(batch, images_rgba=images_with(None))
         for optimizer in self.optimizers:
             optimizer.zero_grad(set_to_none=True)
         losses = self.eager_losses(batch, theta, background, step)
         torch.stack(list(losses.values())).sum().backward()
+        seen = self._seen_first(batch, background, num_filmed)
         groups = self.avatar.parameter_groups()
         for name, norm in self.options.max_norm.items():
             torch.nn.utils.clip_grad_norm_(groups[name], norm)
         for optimizer in self.optimizers:
             optimizer.step()
+        if self._first_colors is not None and seen is not None:
+            self._first_colors.give(seen)
         return {name: loss.detach() for name, loss in losses.items()}
+
+    def _seen_first(
+        self, batch: TrainingBatch, background: Float[Tensor, "B 3"], num_filmed: int
+    ) -> Float[Tensor, "N 5"] | None:
+        """How the first images show what waits for its first colour; None where nothing does."""
+        if self._first_colors is None or self._first_colors.sight(num_filmed) is None:
+            return None
+        cameras = batch.cameras
+        if len(cameras.focal_px) > num_filmed:
+            cameras = cameras.select(range(num_filmed))
+        return self._first_colors.seen_in(
+            batch.theta.detach()[:num_filmed],
+            cameras,
+            batch.images_rgba[:num_filmed],
+            background[:num_filmed],
+            backend=self.options.backend,
+        )
 
     def eager_losses(
         self,
@@ -350,24 +382,13 @@ class TrainingStep:
             batch = shown()
             self._prior.begin(self.avatar, batch.theta, batch.cameras, batch.images_rgba)
 
-    def _finish(self, step: int, shown: Callable[[], TrainingBatch]) -> None:
-        """What is due after a step: orthogonal bases, first colours, what is not seen."""
-        method, schedule = self._orthogonality, self.options.color_init
+    def _finish(self, step: int) -> None:
+        """What is due after a step: orthogonal bases, what is not seen."""
+        method = self._orthogonality
         if (step + 1) % ORTHOGONALIZE_EVERY == 0 and method in ("qr", "gram_schmidt"):
             orthogonalize(self.avatar.blendshapes, method)
         if self._prior is not None and self._prior.due(step):
             self._prior.pull(self.avatar, step)
-        if schedule is None or not schedule.due(step):
-            return
-        if not bool(self.avatar.color_initialized.all()):
-            batch = shown()
-            initialize_colors(
-                self.avatar,
-                batch.theta,
-                batch.cameras,
-                batch.images_rgba,
-                backend=self.options.backend,
-            )
 
 
 def _probe(avatar: Avatar, backend: str) -> MorphedRenderer | None:

@@ -80,7 +80,15 @@ class MorphedSession(_Drawing):
         threads: int,
         instruction_set: str,
     ) -> None: ...
-    def forward_loss(self, images_rgba: Tensor, background: Tensor) -> float: ...
+    def forward_loss(
+        self,
+        images_rgba: Tensor,
+        background: Tensor,
+        known: Tensor | None = None,
+        sums: Tensor | None = None,
+        sight_images: int = 0,
+        over_background: bool = False,
+    ) -> float: ...
     def backward_adam(
         self,
         groups: list[tuple[Tensor, Tensor, Tensor, tuple[float, ...]]],

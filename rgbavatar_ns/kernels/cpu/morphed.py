@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from rgbavatar_ns.kernels.checks import check_average_images, check_target_images
+from rgbavatar_ns.kernels.checks import check_average_images, check_sight, check_target_images
 from rgbavatar_ns.kernels.cpu import (
     INSTRUCTION_SET_VARIABLE,
     _native,  # pyright: ignore[reportMissingModuleSource]
@@ -17,6 +17,7 @@ from rgbavatar_ns.kernels.functional import checked_background
 from rgbavatar_ns.kernels.types import (
     TANGENT_VARIANTS,
     AdamParameter,
+    FirstSight,
     MorphedGaussians,
     MorphedGradient,
     PinholeCameras,
@@ -99,17 +100,26 @@ class CpuMorphedRenderer:
         return WeightedColors(weighted_sum, weight_sum, max_weight)
 
     def forward_loss(
-        self, images_rgba: UInt8[Tensor, "B H W 4"], background: Float[Tensor, "#B 3"]
+        self,
+        images_rgba: UInt8[Tensor, "B H W 4"],
+        background: Float[Tensor, "#B 3"],
+        sight: FirstSight | None = None,
     ) -> Float[Tensor, ""]:
         """The mean absolute difference to straight-alpha images over the background.
 
         Pixels that are marked `UNFILMED_RGBA` differ by 0; the divisor is that of all pixels.
         """
         check_target_images(images_rgba, len(self._weights), self._cameras)
+        seen: dict[str, Any] = {}
+        if sight is not None:
+            check_sight(sight, self._count, self._weights)
+            seen = {"known": sight.known, "sums": sight.sums.zero_()}
+            seen["sight_images"] = min(sight.num_images, len(self._weights))
+            seen["over_background"] = sight.over_background
         background = checked_background(self._weights, background, len(self._weights))
         self._has_gradient = True
         loss = self._session.forward_loss(
-            images_rgba.contiguous(), background.detach().contiguous()
+            images_rgba.contiguous(), background.detach().contiguous(), **seen
         )
         return self._weights.new_tensor(loss)
 

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
-from rgbavatar_ns.kernels.checks import check_average_images, check_target_images
+from rgbavatar_ns.kernels.checks import check_average_images, check_sight, check_target_images
 from rgbavatar_ns.kernels.cuda.binning import Bins, Capacities, Images, blocks, camera_values
 from rgbavatar_ns.kernels.cuda.launcher import Launcher
 from rgbavatar_ns.kernels.cuda.source import constants
@@ -17,6 +17,7 @@ from rgbavatar_ns.kernels.types import (
     TANGENT_VARIANTS,
     UPDATED_ATTRIBUTES,
     AdamParameter,
+    FirstSight,
     MorphedGaussians,
     MorphedGradient,
     PinholeCameras,
@@ -128,7 +129,10 @@ class CudaMorphedRenderer:
         return WeightedColors(weighted_sum, weight_sum, max_weight)
 
     def forward_loss(
-        self, images_rgba: UInt8[Tensor, "B H W 4"], background: Float[Tensor, "#B 3"]
+        self,
+        images_rgba: UInt8[Tensor, "B H W 4"],
+        background: Float[Tensor, "#B 3"],
+        sight: FirstSight | None = None,
     ) -> Float[Tensor, ""]:
         """The mean absolute difference to straight-alpha images over the background.
 
@@ -136,7 +140,11 @@ class CudaMorphedRenderer:
         """
         check_target_images(images_rgba, self._images.batch, self._cameras)
         background = checked_background(self._weights, background, self._images.batch)
-        loss, self._slots = self._tiles.train(images_rgba.contiguous(), None, background.detach())
+        if sight is not None:
+            check_sight(sight, self._images.count, self._weights)
+        loss, self._slots = self._tiles.train(
+            images_rgba.contiguous(), None, background.detach(), sight
+        )
         return loss
 
     def forward_loss_of(
@@ -144,9 +152,10 @@ class CudaMorphedRenderer:
         images_rgba: UInt8[Tensor, "F H W 4"],
         image_of: Int[Tensor, " B"],
         background: Float[Tensor, "B 3"],
+        sight: FirstSight | None = None,
     ) -> Float[Tensor, ""]:
         """As `forward_loss`, with images chosen on the device: nothing is copied or waited for."""
-        loss, self._slots = self._tiles.train(images_rgba, image_of, background)
+        loss, self._slots = self._tiles.train(images_rgba, image_of, background, sight)
         return loss
 
     def backward_adam(

@@ -8,6 +8,7 @@ from torch import Tensor
 from rgbavatar_ns.kernels.cuda.binning import Bins, blocks
 from rgbavatar_ns.kernels.cuda.launcher import Launcher
 from rgbavatar_ns.kernels.cuda.source import constants
+from rgbavatar_ns.kernels.types import FirstSight
 
 
 class Tiles:
@@ -89,7 +90,11 @@ class Tiles:
         return slots
 
     def train(
-        self, images_rgba: Tensor, image_of: Tensor | None, background: Tensor
+        self,
+        images_rgba: Tensor,
+        image_of: Tensor | None,
+        background: Tensor,
+        sight: FirstSight | None,
     ) -> tuple[Tensor, Tensor]:
         """The mean absolute difference to the images, and the slots' moments; waits for nothing."""
         self.bins.sort(checked=False)
@@ -105,5 +110,9 @@ class Tiles:
             gradient=each,
             slots=slots,
             loss=loss,
+            known=None if sight is None else sight.known.view(torch.uint8),
+            sight=None if sight is None else sight.sums.zero_(),
+            sight_images=0 if sight is None else sight.num_images,
+            over_background=int(sight is not None and sight.over_background),
         )
         return loss.sum(dtype=torch.float64).float() * each, slots

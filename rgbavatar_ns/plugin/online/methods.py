@@ -1,10 +1,10 @@
-"""The methods that train while the frames arrive: `rgbavatar-online`, `rgbavatar-online-tiny`."""
+"""The methods that train while the frames arrive: `rgbavatar-online` and its variants."""
 
 import sys
 
 from nerfstudio.plugins.types import MethodSpecification
 
-from rgbavatar_ns.plugin.methods import preset, tiny_model
+from rgbavatar_ns.plugin.methods import paper_model, preset, tiny_model
 from rgbavatar_ns.plugin.online import datamanager, pipeline, sources, trainer
 from rgbavatar_ns.plugin.online.datamanager import OnlineDataManagerConfig
 from rgbavatar_ns.plugin.online.pipeline import OnlinePipelineConfig
@@ -18,6 +18,20 @@ for _module in (datamanager, pipeline, sources, trainer):
 rgbavatar_online = MethodSpecification(
     config=preset(OnlineTrainerConfig, "rgbavatar-online", steps_per_save=500),
     description="RGBAvatar from a stream: an avatar that grows while the frames arrive.",
+)
+
+rgbavatar_paper_online = MethodSpecification(
+    config=preset(
+        OnlineTrainerConfig,
+        "rgbavatar-paper-online",
+        pipeline=OnlinePipelineConfig(
+            model=paper_model(),
+            datamanager=OnlineDataManagerConfig(local_share=0.7, new_first=False),
+        ),
+        steps_after_stream=0,
+        steps_per_save=500,
+    ),
+    description="RGBAvatar from a stream to the letter of its paper: it ends with the stream.",
 )
 
 rgbavatar_online_tiny = MethodSpecification(

@@ -16,7 +16,7 @@ from rgbavatar_ns.avatar.training import (
     make_optimizer,
 )
 from rgbavatar_ns.avatar.training.batches import ChosenFrames
-from rgbavatar_ns.avatar.training.color_init import ColorInitSchedule
+from rgbavatar_ns.avatar.training.color_init import FirstColorsKind
 from rgbavatar_ns.avatar.training.losses import random_backgrounds
 from rgbavatar_ns.drawing.compositing import composite, rgba_to_float
 from rgbavatar_ns.errors import UserError
@@ -138,11 +138,12 @@ def test_optimizer_has_the_papers_rates(make_avatar):
 def test_color_initialisation_starts_nearer(make_avatar, batch_at):
     """Two steps in, initialised colours are nearer than grey ones moved by gradients."""
     losses = []
-    for schedule in (ColorInitSchedule(), None):
+    kinds: list[FirstColorsKind | None] = ["matted", "paper", None]
+    for kind in kinds:
         avatar = make_avatar(initial_scale_m=8e-3)
-        losses.append(losses_of(avatar, batch_at, 3, TrainingOptions(color_init=schedule))[-1])
-        assert bool(avatar.color_initialized.any()) is (schedule is not None)
-    assert losses[0] < losses[1]
+        losses.append(losses_of(avatar, batch_at, 3, TrainingOptions(first_colors=kind))[-1])
+        assert bool(avatar.color_initialized.any()) is (kind is not None)
+    assert max(losses[:2]) < losses[2]
 
 
 def test_hooks_surround_every_step_and_may_end_the_training(make_avatar, batch_at):
@@ -206,7 +207,7 @@ def test_a_clipped_group_steps_by_the_clipped_gradient(make_avatar, batch_at):
     for norm in ({}, {"color": 1e-3}):
         avatar = make_avatar()
         before = avatar.blendshapes.color_feature.detach().clone()
-        options = TrainingOptions(max_norm=norm, color_init=None)
+        options = TrainingOptions(max_norm=norm, first_colors=None)
         step = TrainingStep(avatar, torch.optim.SGD(avatar.parameters(), lr=1.0), options)
         step(batch_at(0), 0)
         moved.append(before - avatar.blendshapes.color_feature.detach())

@@ -230,7 +230,7 @@ def test_other_optimisers_are_refused_and_stepped_eagerly(stirred, make, reason)
         FusedStep(avatar, [optimizer])
     before = avatar.blendshapes.color_feature.detach().clone()
     batch, _ = far_batch(avatar, 2)
-    step = TrainingStep(avatar, optimizer, TrainingOptions(color_init=None))
+    step = TrainingStep(avatar, optimizer, TrainingOptions(first_colors=None))
     assert step.kind == "eager"
     assert reason in step.reason
     step(batch, 0)
@@ -248,7 +248,7 @@ def test_what_the_backend_cannot_take_is_stepped_eagerly(stirred):
     assert not optimizer.state
     wide = double(avatar)
     before = wide.blendshapes.color_feature.detach().clone()
-    step = TrainingStep(wide, options=TrainingOptions(color_init=None))
+    step = TrainingStep(wide, options=TrainingOptions(first_colors=None))
     assert (step.kind, step.reason.split()[:2]) == ("eager", ["the", "rasterizer's"])
     step(in_double(batch), 0)
     assert not torch.equal(wide.blendshapes.color_feature, before)
@@ -261,7 +261,7 @@ def test_the_training_step_is_the_fused_one_for_8_bit_images(stirred, floating):
     if floating:
         batch = dataclasses.replace(batch, images_rgba=rgba_to_float(batch.images_rgba))
     optimizers = make_optimizer(avatar), make_optimizer(expected)
-    options = TrainingOptions(color_init=None)
+    options = TrainingOptions(first_colors=None)
     loss = TrainingStep(avatar, optimizers[0], options)(batch, 4)["l1"]
     background = random_backgrounds(4, 3)
     step = eager_step if floating else fused_step

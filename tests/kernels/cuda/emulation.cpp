@@ -187,6 +187,16 @@ static T __shfl_up_sync(unsigned, T value, int distance) {
   const uint64_t* all = emulation::meet_warp(emulation::bits_of(value), "__shfl_up_sync");
   return emulation::value_of<T>(all[lane >= distance ? lane - distance : lane]);
 }
+static unsigned long long atomicAdd(unsigned long long* at, unsigned long long value) {
+  const unsigned long long old = *at;
+  *at += value;
+  return old;
+}
+static unsigned long long atomicMax(unsigned long long* at, unsigned long long value) {
+  const unsigned long long old = *at;
+  *at = old > value ? old : value;
+  return old;
+}
 static unsigned atomicAdd(unsigned* at, unsigned value) {
   const unsigned old = *at;
   *at += value;

@@ -28,7 +28,7 @@ struct alignas(64) Splat {
   uint64_t blocks;  // bit 8 y + x: it touches the block (x, y) counted from the first one of the
                     // bounds; kAllBlocks where the bounds do not fit the window
   uint32_t first_slot;  // of its sums: one for every tile that it touches, row by row
-  uint32_t unused;
+  uint32_t waiting;  // its number and one, where it waits for its first colour; else 0
 };
 constexpr uint64_t kAllBlocks = ~uint64_t(0);
 
@@ -174,11 +174,23 @@ struct BlendScratch {
   float scale_gradient[kBlendChunk * 3], opacity_gradient[kBlendChunk];
 };
 
+// What is summed for the Gaussians that wait for their first colour, in whole numbers, so that the
+// order in which tiles and pictures add to them does not matter.
+struct FirstSight {
+  const bool* known;     // [N]: those that do not wait
+  int64_t* sums;         // [N, kSightSums]: red, green, blue, weight; the largest weight
+  int images;            // how many pictures count, from the first on
+  bool over_background;  // the picture as it is drawn over, or what its matte leaves of it
+};
+constexpr int kSightSums = 5;
+constexpr float kSightUnit = 4294967296.0f;  // 2^32: sums stay below 2^63 in any picture
+
 // A tile's target for training: straight-alpha RGBA of 8 bits over the background.
 struct TrainingTarget {
   const uint8_t* rgba;
   const float* background;
   float gradient;  // of the loss by each absolute difference
+  const FirstSight* sight;  // null where no first colours are asked for
 };
 
 // The loops, compiled once per instruction set.

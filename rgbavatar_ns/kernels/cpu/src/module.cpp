@@ -24,6 +24,8 @@ namespace {
 using Input = nb::ndarray<const float, nb::c_contig, nb::device::cpu>;
 using Output = nb::ndarray<float, nb::c_contig, nb::device::cpu>;
 using Indices = nb::ndarray<const int64_t, nb::c_contig, nb::device::cpu>;
+using Flags = nb::ndarray<const bool, nb::c_contig, nb::device::cpu>;
+using Sums = nb::ndarray<int64_t, nb::c_contig, nb::device::cpu>;
 using Pixels = nb::ndarray<const uint8_t, nb::c_contig, nb::device::cpu>;
 
 template <class Array>
@@ -177,8 +179,14 @@ struct MorphedSession : Drawing<rgbavatar::MorphedRendering> {
         width(width),
         height(height) {}
 
-  double forward_loss(const Pixels& images, const Input& background) {
-    return rendering.forward_loss(images.data(), attribute(background), threads);
+  // known [N] and sums [N, 5] together, or neither.
+  double forward_loss(const Pixels& images, const Input& background,
+                      const std::optional<Flags>& known, const std::optional<Sums>& sums,
+                      int sight_images, bool over_background) {
+    const rgbavatar::FirstSight sight = {pointer(known), pointer(sums), sight_images,
+                                         over_background};
+    return rendering.forward_loss(images.data(), attribute(background), known ? &sight : nullptr,
+                                  threads);
   }
 
   void backward_adam(const std::vector<AdamArrays>& groups, const Output& weight_gradient,
@@ -268,7 +276,9 @@ NB_MODULE(_native, m) {
            "principal_point_px"_a.noconvert(), "width"_a, "height"_a, "threads"_a,
            "instruction_set"_a, Release())
       .def("forward_loss", &MorphedSession::forward_loss, "images_rgba"_a.noconvert(),
-           "background"_a.noconvert(), Release())
+           "background"_a.noconvert(), "known"_a.noconvert().none() = nb::none(),
+           "sums"_a.noconvert().none() = nb::none(), "sight_images"_a = 0,
+           "over_background"_a = false, Release())
       .def("backward_adam", &MorphedSession::backward_adam, "groups"_a, "weight_gradient"_a.noconvert(),
            "vertex_gradient"_a.noconvert().none() = nb::none(), Release());
 }

@@ -139,8 +139,9 @@ class MorphedRendering : public Rendering {
                    int threads);
 
   // The mean absolute difference to images [B, H, W, 4] of 8 bits over backgrounds [B or 1, 3];
-  // keeps what `backward_adam` needs.
-  double forward_loss(const uint8_t* images, const Attribute& background, int threads);
+  // keeps what `backward_adam` needs. With `sight`, adds what the waiting Gaussians are seen with.
+  double forward_loss(const uint8_t* images, const Attribute& background, const FirstSight* sight,
+                      int threads);
 
   // One step of Adam by the gradient of the last forward_loss, or none without an optimizer; writes
   // the gradients of the weights, [B, K], and, unless it is null, of the vertices, [B, V, 3].
@@ -148,6 +149,7 @@ class MorphedRendering : public Rendering {
               float* vertex_gradient, int threads);
 
  private:
+  void mark_waiting(const FirstSight& sight, class Team& team);
   void lay_out_blending(const MorphedScene& scene, const class Team& team);
 };
 

@@ -56,6 +56,53 @@ static Wide compare_block(const Tile& tile, const TrainingTarget& target, int bl
   return sum;
 }
 
+static int64_t in_sight_units(float sum) { return int64_t(double(sum) * kSightUnit); }
+
+// Adds a Gaussian's sums over a tile to those of its first sight.
+static void add_to_sight(float sums[kSightSums], int64_t* to) {
+  for (int k = 0; k + 1 < kSightSums; ++k)
+    __atomic_fetch_add(to + k, in_sight_units(sums[k]), __ATOMIC_RELAXED);
+  const int64_t largest = in_sight_units(sums[kSightSums - 1]);
+  int64_t known = __atomic_load_n(to + kSightSums - 1, __ATOMIC_RELAXED);
+  while (known < largest && !__atomic_compare_exchange_n(to + kSightSums - 1, &known, largest, true,
+                                                         __ATOMIC_RELAXED, __ATOMIC_RELAXED)) {
+  }
+}
+
+// What a group's waiting Gaussians are seen with.
+static void see_group(const Tile& tile, const TrainingTarget& target, const Group& group,
+                      const Kept& kept) {
+  const Wide zero(0.0f);
+  for (int place = 0; place < group.count; ++place) {
+    const Splat& s = group.splats[place];
+    if (!s.waiting) continue;
+    Wide sums[3] = {zero, zero, zero}, weight(0.0f), largest(0.0f);
+    const float* weight_row = kept.weight[group.first_job[place]];
+    for (uint64_t left = group.blocks[place]; left; left &= left - 1) {
+      const BlockPixels pixels(tile, __builtin_ctzll(left));
+      const WideInt rgba = load_rgba(tile, pixels, target.rgba);
+      const Wide unlike = to_floats(rgba - WideInt(C::kUnfilmed));  // 0 for the mark alone
+      const Wide matte = to_floats((rgba >> 24) & 255) * (1.0f / 255.0f);
+      const Wide whole = load_wide(weight_row);
+      const Wide w = select(unlike * unlike > zero, whole, zero);
+      const Wide counted = target.sight->over_background ? w : w * matte;
+      for (int k = 0; k < 3; ++k) {
+        Wide color = to_floats((rgba >> (8 * k)) & 255) * (1.0f / 255.0f);
+        if (target.sight->over_background)
+          color = target.background[k] + matte * (color - target.background[k]);
+        sums[k] = sums[k] + counted * color;
+      }
+      weight = weight + counted;
+      largest = max_of(largest, whole);
+      weight_row += kBlockPixels;
+    }
+    float all[kSightSums] = {sum_of(sums[0]), sum_of(sums[1]), sum_of(sums[2]), sum_of(weight),
+                             max_lane(largest)};
+    if (all[kSightSums - 1] > 0.0f)
+      add_to_sight(all, target.sight->sums + int64_t(s.waiting - 1) * kSightSums);
+  }
+}
+
 static double train_tile(const Tile& tile, const TrainingTarget& target, TileScratch& scratch,
                          float* slots) {
   const BlockGrid grid(tile);
@@ -68,6 +115,7 @@ static double train_tile(const Tile& tile, const TrainingTarget& target, TileScr
     sum = sum + compare_block(tile, target, block, scratch);
   groups.visit_back_to_front(tile, grid, scratch, [&](const Group& group, const Kept& kept) {
     sum_group(tile, grid, group, kept, scratch, slots);
+    if (target.sight) see_group(tile, target, group, kept);
   });
   return double(sum_of(sum));
 }

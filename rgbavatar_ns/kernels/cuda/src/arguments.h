@@ -135,6 +135,10 @@ struct TrainArguments {
   float gradient;           // of the loss by each absolute difference
   float* slots;             // [capacity, 9]
   float* loss;              // [B, P]: sums of absolute differences
+  const uint8_t* known;     // [N]: 0 for what waits for its first colour; null where none is asked for
+  int64_t* sight;           // [N, 5] for those, see FirstSight
+  int sight_images;         // how many of the images count for it
+  int over_background;
 };
 
 struct AverageArguments {

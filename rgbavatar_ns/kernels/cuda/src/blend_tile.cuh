@@ -29,15 +29,19 @@ constexpr int kBatch = 64;
 struct Batch {
   Splat splats[kBatch];
   uint32_t slots[kBatch];
+  uint32_t waiting[kBatch];  // a Gaussian's number and one, where it waits for its first colour
 };
 
 struct TileList {
   const Splat* splats;
   const uint32_t* slot_start;
   const uint64_t* entries;
+  const uint8_t* known;
   int count, tile_x, tile_y;
 
-  RGBAVATAR_FUNCTION TileList(const Frame& frame, const Bins& bins) {
+  RGBAVATAR_FUNCTION TileList(const Frame& frame, const Bins& bins,
+                              const uint8_t* known_colors = nullptr)
+      : known(known_colors) {
     const int image = int(blockIdx.y);
     const int64_t tile = int64_t(image) * gridDim.x + blockIdx.x;
     tile_x = int(blockIdx.x) % frame.tiles_x, tile_y = int(blockIdx.x) / frame.tiles_x;
@@ -55,6 +59,11 @@ struct TileList {
     slot = slot_start[gaussian] +
            uint32_t((tile_y - s.first_y()) * s.tiles_across() + tile_x - s.first_x());
     return s;
+  }
+
+  RGBAVATAR_FUNCTION uint32_t waiting(int entry) const {
+    const uint32_t gaussian = uint32_t(entries[entry]);
+    return known && !known[gaussian] ? gaussian + 1u : 0u;
   }
 };
 
@@ -90,7 +99,10 @@ RGBAVATAR_FUNCTION int walk(const TileList& list, const Pixel& pixel, Batch& bat
     if (!__syncthreads_or(is_open(transmittance))) break;
     const int number = list.count - first < kBatch ? list.count - first : kBatch;
     const int mine = int(threadIdx.x);
-    if (mine < number) batch.splats[mine] = list.read(first + mine, batch.slots[mine]);
+    if (mine < number) {
+      batch.splats[mine] = list.read(first + mine, batch.slots[mine]);
+      batch.waiting[mine] = list.waiting(first + mine);
+    }
     __syncthreads();
     for (int group = 0; group < number; group += 32) {
       const bool near = group + lane < number &&

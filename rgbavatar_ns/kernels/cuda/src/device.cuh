@@ -101,6 +101,12 @@ RGBAVATAR_FUNCTION float warp_sum(float value) {
   return value;
 }
 
+// Sums of first sights are whole numbers, which are the same in any order: units of 2^-32.
+constexpr int kSightSums = 5;
+RGBAVATAR_FUNCTION unsigned long long in_sight_units(float sum) {
+  return (unsigned long long)(double(sum) * 4294967296.0);
+}
+
 RGBAVATAR_FUNCTION float warp_max(float value) {
   for (int step = 16; step > 0; step /= 2)
     value = fmaxf(value, __shfl_xor_sync(kWholeWarp, value, step));

@@ -49,10 +49,30 @@ RGBAVATAR_FUNCTION void clear_rest(const TileList& list, int first, int width, f
   }
 }
 
+// What a pixel shows to those that wait for their first colour: its share, and the colour times it.
+struct SeenPixel {
+  Vec3<float> color = {0.0f, 0.0f, 0.0f};
+  float share = 0.0f;
+  int64_t* sums = nullptr;  // null where the image does not count
+
+  // Adds what a warp sees of a Gaussian, whose weight in the pixel is w; all its lanes together.
+  RGBAVATAR_FUNCTION void add(uint32_t waiting, float w) const {
+    const float largest = warp_max(w);
+    const float all[kSightSums] = {warp_sum(w * color.x), warp_sum(w * color.y),
+                                   warp_sum(w * color.z), warp_sum(w * share), largest};
+    if ((threadIdx.x & 31) || !(largest > 0.0f)) return;
+    unsigned long long* to =
+        reinterpret_cast<unsigned long long*>(sums) + int64_t(waiting - 1u) * kSightSums;
+    for (int k = 0; k + 1 < kSightSums; ++k) atomicAdd(to + k, in_sight_units(all[k]));
+    atomicMax(to + kSightSums - 1, in_sight_units(largest));
+  }
+};
+
 // The backward pass of the blending (gaussian_math.h) from g = dL/dimage and the remainder S.
 RGBAVATAR_FUNCTION void differentiate_tile(const TileList& list, const Pixel& pixel, Batch& batch,
                                            WarpSums<kMoments>& shared, const Vec3<float>& g,
-                                           float remainder, float* slots) {
+                                           float remainder, float* slots,
+                                           const SeenPixel& seen = {}) {
   const int lane = int(threadIdx.x) & 31, warp = int(threadIdx.x) >> 5;
   float transmittance = pixel.inside ? 1.0f : 0.0f;
   __syncthreads();
@@ -62,6 +82,8 @@ RGBAVATAR_FUNCTION void differentiate_tile(const TileList& list, const Pixel& pi
       [&](int place, const Splat& s, const Touch& touch) {
         if (!__ballot_sync(kWholeWarp, touch.alpha > 0.0f)) return;
         const float w = touch.alpha * transmittance;
+        const uint32_t waiting = batch.waiting[place];
+        if (waiting && seen.sums) seen.add(waiting, w);
         const float along = w * (g.x * s.red + g.y * s.green + g.z * s.blue);
         remainder -= along;
         transmittance -= w;
@@ -106,32 +128,37 @@ RGBAVATAR_KERNEL(train, TrainArguments, kTileThreads) {
   RGBAVATAR_SHARED Batch batch;
   RGBAVATAR_SHARED WarpSums<kMoments> shared;
   RGBAVATAR_SHARED float loss[kWarps];
-  const TileList list(a.frame, a.bins);
+  const TileList list(a.frame, a.bins, a.known);
   const Pixel pixel(a.frame, list.tile_x, list.tile_y);
   Blend blend(pixel);
   blend.run(list, pixel, batch);
   Vec3<float> g = {0.0f, 0.0f, 0.0f};
   float remainder = 0.0f, difference = 0.0f;
+  SeenPixel seen;
+  const int image = int(blockIdx.y);
+  const int64_t which = a.image_of ? a.image_of[image] : image;
+  if (a.known && which < a.sight_images) seen.sums = a.sight;
   if (pixel.inside) {
-    const int image = int(blockIdx.y);
-    const int64_t which = a.image_of ? a.image_of[image] : image;
     const int64_t at = which * a.frame.width * a.frame.height + pixel.index;
     const uint32_t rgba = reinterpret_cast<const uint32_t*>(a.images)[at];
     const bool filmed = rgba != uint32_t(C::kUnfilmed);
     const float matte = float(rgba >> 24) * (1.0f / 255.0f);
     const Vec3<float> behind = background_of(a.background, a.background_shared);
-    const auto channel = [&](float color, float back, int shift) {
+    seen.share = !filmed ? 0.0f : a.over_background ? 1.0f : matte;
+    const auto channel = [&](float color, float back, int shift, float& shown) {
       const float drawn = color + blend.transmittance * back;
       const float target = float(rgba >> shift & 255u) * (1.0f / 255.0f);
-      const float off = filmed ? drawn - (back + matte * (target - back)) : 0.0f;
+      const float over = back + matte * (target - back);
+      const float off = filmed ? drawn - over : 0.0f;
+      shown = seen.share * (a.over_background ? over : target);
       const float gradient = off > 0.0f ? a.gradient : off < 0.0f ? -a.gradient : 0.0f;
       difference += fabsf(off);
       remainder += gradient * drawn;
       return gradient;
     };
-    g.x = channel(blend.red, behind.x, 0);
-    g.y = channel(blend.green, behind.y, 8);
-    g.z = channel(blend.blue, behind.z, 16);
+    g.x = channel(blend.red, behind.x, 0, seen.color.x);
+    g.y = channel(blend.green, behind.y, 8, seen.color.y);
+    g.z = channel(blend.blue, behind.z, 16, seen.color.z);
   }
   const float sum = warp_sum(difference);
   if ((threadIdx.x & 31) == 0) loss[threadIdx.x >> 5] = sum;
@@ -141,7 +168,7 @@ RGBAVATAR_KERNEL(train, TrainArguments, kTileThreads) {
     for (int warp = 0; warp < kWarps; ++warp) all += loss[warp];
     a.loss[int64_t(blockIdx.y) * gridDim.x + blockIdx.x] = all;
   }
-  differentiate_tile(list, pixel, batch, shared, g, remainder, a.slots);
+  differentiate_tile(list, pixel, batch, shared, g, remainder, a.slots, seen);
 }
 
 // Sums of w I (C channels) and w, and the largest w.
