@@ -5,7 +5,10 @@ import copy
 import torch
 
 from rgbavatar_ns.avatar.training import make_optimizer
+from rgbavatar_ns.avatar.training.color_init import FirstColors, FirstColorsKind, is_seen_well
 from rgbavatar_ns.avatar.training.fused_step import FusedStep
+from rgbavatar_ns.kernels import DeviceRenderer
+from rgbavatar_ns.kernels.types import SIGHT_UNIT
 from tests.avatar.fused_scene import (
     assert_unfilmed_adds_nothing,
     eager_step,
@@ -16,6 +19,8 @@ from tests.avatar.fused_scene import (
     stir,
     values_by_group,
 )
+
+KINDS: tuple[FirstColorsKind, ...] = ("matted", "paper")
 
 
 def test_parameters_after_some_steps(emulated, make_avatar):
@@ -66,6 +71,33 @@ def test_any_order_of_threads_gives_the_same_bits(emulated, make_avatar):
         for name, value in moments.items():
             if name != "weight_network":
                 assert torch.equal(value, found[0][1][name]), name
+
+
+def test_first_colors_are_summed_as_by_a_pass_of_its_own(emulated, make_avatar):
+    """Of the pictures that count, in whichever sets they are, for those that wait."""
+    avatar = stir(make_avatar())
+    batch, background = far_batch(avatar, 3, cameras=3)
+    avatar.color_initialized[::3] = True
+    # The bank's third picture, a view that nobody filmed, is drawn first.
+    order = torch.tensor([2, 0, 1])
+    for kind in KINDS:
+        colors = FirstColors(avatar, kind)
+        renderer = avatar.renderer(batch.theta[order], batch.cameras.select(order.tolist()))
+        sight = colors.sight(2)
+        assert isinstance(renderer, DeviceRenderer)
+        assert sight is not None
+        found = []
+        for seed in (0, 1):
+            emulated.emulated.seed = seed
+            renderer.forward_loss_of(batch.images_rgba, order, background[order], sight)
+            found.append(sight.sums.clone())
+        filmed = batch.theta[:2], batch.cameras.select([0, 1]), batch.images_rgba[:2]
+        expected = colors.seen_in(*filmed, background[:2], backend="reference").double()
+        expected[::3] = 0
+        assert int(is_seen_well(expected).sum()) > 30
+        assert torch.equal(*found)
+        difference = found[0].double() * SIGHT_UNIT - expected
+        assert difference.abs().max() < 1e-4 * expected.abs().max()
 
 
 def _crowd(emulated, avatar, room: int):
