@@ -172,7 +172,9 @@ class Avatar(nn.Module):
 
     @torch.no_grad()
     def widen_film_range(self, theta: Float[Tensor, "B H"]) -> None:
-        """Count these frames' theta as what training saw."""
+        """Count these frames' theta as what training saw, where the config has that matter."""
+        if not self.config.theta_within_film:
+            return
         theta = theta.to(self.theta_low)
         torch.minimum(self.theta_low, theta.amin(0), out=self.theta_low)
         torch.maximum(self.theta_high, theta.amax(0), out=self.theta_high)

@@ -12,33 +12,40 @@ class AvatarConfig(CheckedOptions):
     """Choices that fix an avatar's parameters and how they become world-space Gaussians."""
 
     num_bases: Annotated[int, Between(0, 1000)] = 20
-    """Number K of Gaussian blendshapes (paper: 20); 0 leaves the base model alone."""
+    """Number K of Gaussian blendshapes (paper, release: 20); 0 leaves the base model alone."""
     uv_resolution: Annotated[int, Between(1, 4096)] = 256
-    """Side of the UV map whose covered texels carry one Gaussian each (paper: 256)."""
+    """Side of the UV map whose covered texels carry one Gaussian each (paper, release: 256)."""
     weight_network: Literal["mlp", "linear", "none"] = "mlp"
     """Map from theta to the blendshape weights (paper: mlp; linear is an ablation of it). With none
     the first num_bases expression coefficients are the weights (its "w/o reducing")."""
     hidden_width: Annotated[int, Between(1, 8192)] = 128
-    """Width of the weight network's two hidden layers."""
+    """Width of the weight network's two hidden layers (paper, release: 128)."""
     tangent_variant: Literal["normalized", "raw", "orthonormal"] = "normalized"
-    """Tangent frames: unit columns, the paper's Algorithm 1 to the letter, or Gram-Schmidt."""
+    """Tangent frames of a triangle: raw, columns as Algorithm 1 leaves them (paper); normalized,
+    unit columns (release); orthonormal, by Gram-Schmidt (ours)."""
     pose_input: bool = True
-    """Whether the weight network sees joint and head rotations (paper: yes)."""
+    """Whether the weight network sees joint and head rotations (paper, release: yes)."""
     translation_input: bool = False
-    """Whether it sees the head's translation; off, so that moving sideways changes nothing."""
+    """Whether it sees the head's translation (release: yes; the paper names expression coefficients
+    and joint poses alone): off, so that moving sideways changes nothing."""
+    theta_within_film: bool = True
+    """Hold theta near what training saw before the weight network takes it: ours, because weights
+    of what it never saw run away with the bases. False takes theta as it is (paper, release)."""
     carrier: Literal["mesh", "joints"] = "mesh"
     """What carries the Gaussians: tangent frames of the mesh that theta deforms, or of a mesh that
     only its joints move, not its expressions (the paper's ablation "w/o tangent space")."""
     scale_with_triangle: bool = False
-    """Whether Gaussians grow and shrink with their triangle (paper: no)."""
+    """Whether Gaussians grow and shrink with their triangle (paper, release: no)."""
     initial_scale_m: Annotated[float, Between(1e-7, 1)] = 8e-4
-    """Initial standard deviation of every Gaussian in metres."""
+    """Initial standard deviation of every Gaussian in metres (paper: "a default value"; release:
+    .0008)."""
     scale_from_texel_spacing: bool = False
-    """Take the initial scale from the distance of neighbouring texels on the head instead."""
+    """Take the initial scale from the distance of neighbouring texels on the head instead: ours,
+    for fewer Gaussians than the paper's."""
     initial_opacity: Annotated[float, Between(0, 1, open=True)] = 0.5
-    """Initial opacity, inside (0, 1)."""
+    """Initial opacity, inside (0, 1) (paper: "a default value"; release: .5)."""
     initial_color: Share = 0.5
-    """Initial grey value."""
+    """Initial grey value (paper: "a default value"; release: .5)."""
 
     def __post_init__(self) -> None:
         """Refuse values that cannot make an avatar."""

@@ -162,11 +162,10 @@ def time_parts(workload: AvatarWorkload, stopwatch: Stopwatch) -> dict[str, Spre
     initialized, colors = avatar.color_initialized.clone(), FirstColors(avatar)
     renderer = avatar.renderer(batch.theta, batch.cameras)
     assert renderer is not None
-    for _ in range(2):
-        sight = colors.sight(len(batch.theta))
-        renderer.forward_loss(images, background, sight)
-        if sight is not None:
-            colors.give(sight)
+    sight = colors.sight(len(batch.theta))
+    assert sight is not None
+    renderer.forward_loss(images, background, sight)
+    colors.give(sight)
     parts[FIRST_COLORS] = stopwatch.time(
         FIRST_COLORS, lambda: renderer.forward_loss(images, background, sight)
     )

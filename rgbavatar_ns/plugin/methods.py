@@ -60,8 +60,12 @@ def preset(kind: type[TrainerKind], method_name: str, **settings: Any) -> Traine
 
 def paper_model() -> RGBAvatarModelConfig:
     """The paper's model, and the release's where the paper is silent (docs/paper.md)."""
-    avatar = AvatarConfig(tangent_variant="raw")
-    return RGBAvatarModelConfig(avatar=avatar, surface_prior=False, first_colors="paper")
+    return RGBAvatarModelConfig(
+        avatar=AvatarConfig(tangent_variant="raw", theta_within_film=False),
+        surface_prior=False,
+        first_colors="paper",
+        hide_unseen=True,
+    )
 
 
 def tiny_model() -> RGBAvatarModelConfig:

@@ -15,7 +15,7 @@ from rgbavatar_ns.avatar import Avatar, AvatarConfig
 from rgbavatar_ns.avatar.metrics import LPIPSMetric, evaluate_images
 from rgbavatar_ns.avatar.prior import SurfacePrior
 from rgbavatar_ns.avatar.refinement import RefinementConfig
-from rgbavatar_ns.avatar.training.color_init import FirstColorsKind
+from rgbavatar_ns.avatar.training.color_init import FirstColorsKind, hide_unseen
 from rgbavatar_ns.avatar.training.losses import LPIPSLoss, image_losses
 from rgbavatar_ns.avatar.training.step import Orthogonality, TrainingOptions
 from rgbavatar_ns.drawing.compositing import error_strip, straight_alpha
@@ -51,15 +51,19 @@ class RGBAvatarModelConfig(ModelConfig):
     surface_prior: bool = True
     """Keep what the film does not show on the person's surface, closed and plain: heads can be
     turned beyond their film. Ours; False leaves it to chance, as the paper does."""
+    hide_unseen: bool = False
+    """At the end of a run make the Gaussians transparent that no training frame showed (release;
+    the paper is silent). Off in ours, where the surface prior looks after them."""
     lpips_weight: Weight = 0.0
-    """Weight of the LPIPS loss (paper: 0, and 0.05 for its sharper variant)."""
+    """Weight of the LPIPS loss (paper: 0, and 0.05 for its variant; release: 0.05)."""
     lpips_start_step: Counted = 0
-    """Step from which the LPIPS loss counts."""
+    """Step from which the LPIPS loss counts (paper: named without a start; release: 2000)."""
     lpips_metric: bool = True
     """Whether `ns-eval` computes LPIPS; its network is downloaded once (528 MB)."""
     orthogonality: Orthogonality = "free"
-    """Keep the bases orthogonal, by a loss of weight 10 or every 1,000 steps by QR decomposition or
-    Gram-Schmidt (paper, supplement, where none of them helps)."""
+    """Leave the bases as they are (paper, release: free), or keep them orthogonal, by a loss of
+    weight 10 or every 1,000 steps by QR decomposition or Gram-Schmidt (paper, supplement: none
+    helps)."""
     refine_tracking: bool = False
     """Correct each training frame's tracked pose, expression and translation a little, together
     with the avatar. Held-out frames take what a linear map learns from these corrections; their
@@ -107,6 +111,11 @@ class RGBAvatarModel(Model):
         self.avatar = Avatar(
             HeadModel(subject.arrays), subject.identity, self.config.avatar, seed=seed
         )
+        if self.config.hide_unseen and not self.config.initialize_colors:
+            raise UserError(
+                "What was never seen is known by its missing first colour, and these are off.",
+                "Leave out --pipeline.model.hide-unseen or --pipeline.model.initialize-colors.",
+            )
         self.register_buffer("frame_theta", subject.theta, persistent=False)
         self.refinement = None
         if self.config.refine_tracking:
@@ -198,6 +207,12 @@ class RGBAvatarModel(Model):
             batch_parallel=config.batch_parallel,
             backend=config.rasterizer,
         )
+
+    def finish(self) -> bool:
+        """Do what is due when all steps are done; whether that changed the avatar."""
+        if self.config.hide_unseen:
+            hide_unseen(self.avatar)
+        return self.config.hide_unseen
 
     def driving_theta(self, positions: list[int]) -> Tensor:
         """What drives the avatar in these frames: [F H], tracked, and corrected or calibrated."""

@@ -32,6 +32,8 @@ silhouette else; where alpha is 1 both are the same."""
 
 WEIGHT_THRESHOLD = 0.1
 """The blending weight that a Gaussian must exceed in some pixel (paper: .1; its release: .01)."""
+_HIDDEN_LOGIT = -12.0
+"""An opacity of 6e-6, far below what is drawn."""
 _SMALLEST_WEIGHT_SUM = 1e-3
 """Below this sum of counted weights a Gaussian saw background only."""
 
@@ -43,7 +45,8 @@ class FirstColors:
     """
 
     def __init__(self, avatar: Avatar, kind: FirstColorsKind = "matted") -> None:
-        self._avatar, self._kind = avatar, kind
+        self._avatar = avatar
+        self._kind: FirstColorsKind = kind
 
     def sight(self, num_images: int) -> FirstSight | None:
         """What a step is to sum over the first `num_images` of its pictures.
@@ -92,6 +95,12 @@ class FirstColors:
         first = feature_from_color(mean_color(sums)).to(feature)
         feature.copy_(torch.where(fresh[:, None], first, feature))
         avatar.color_initialized |= fresh
+
+
+@torch.no_grad()
+def hide_unseen(avatar: Avatar) -> None:
+    """Make the Gaussians transparent that never had a first colour (release, offline)."""
+    avatar.blendshapes.opacity_logit[~avatar.color_initialized] = _HIDDEN_LOGIT
 
 
 def is_seen_well(sums: Float[Tensor, "N 5"]) -> Tensor:

@@ -308,6 +308,8 @@ class RGBAvatarTrainer(Trainer, FitHooks):
     def _save_end(self) -> None:
         """Save, and say how it went."""
         self.training_state = "completed" if self.completed else "paused"
+        if self.completed and self.pipeline.model.finish():
+            self._saved_step = None
         if self.step >= 0 and self.step != self._saved_step:
             self.save_checkpoint(self.step)
         writer.write_out_storage()

@@ -9,6 +9,7 @@ from rgbavatar_ns.avatar.training import TrainingBatch, TrainingOptions, Trainin
 from rgbavatar_ns.avatar.training.color_init import (
     WEIGHT_THRESHOLD,
     FirstColors,
+    FirstColorsKind,
     is_seen_well,
     mean_color,
     sums_of,
@@ -157,7 +158,7 @@ def test_the_compiled_way_gives_the_same_colors(make_avatar, scale_with_triangle
 
 
 @pytest.mark.parametrize("kind", ["matted", "paper"])
-def test_a_step_sums_what_a_pass_of_its_own_does(make_avatar, kind):
+def test_a_step_sums_what_a_pass_of_its_own_does(make_avatar, kind: FirstColorsKind):
     """Over the first two of three pictures, for those that wait; the others are left at 0."""
     avatar, size = make_avatar(random=True), 48
     camera, theta, rgba = front_camera(size), random_theta(avatar.layout, 3), random_pictures(3, 48)
