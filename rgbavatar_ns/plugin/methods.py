@@ -76,7 +76,8 @@ def tiny_model() -> RGBAvatarModelConfig:
 
 rgbavatar = MethodSpecification(
     config=preset(RGBAvatarTrainerConfig, "rgbavatar", max_num_iterations=5000, steps_per_save=500),
-    description="RGBAvatar: head avatars of reduced Gaussian blendshapes.",
+    description="RGBAvatar: head avatars of reduced Gaussian blendshapes. Parts from its paper in "
+    "tangent frames, first colours and what the film does not show (docs/paper.md).",
 )
 
 rgbavatar_paper = MethodSpecification(
@@ -87,7 +88,7 @@ rgbavatar_paper = MethodSpecification(
         max_num_iterations=5000,
         steps_per_save=500,
     ),
-    description="RGBAvatar to the letter of its paper, to measure against.",
+    description="RGBAvatar to the letter of its paper, and as its release where that is silent.",
 )
 
 rgbavatar_tiny = MethodSpecification(
@@ -103,5 +104,5 @@ rgbavatar_tiny = MethodSpecification(
         learning_rate_steps=1500,
         steps_per_save=250,
     ),
-    description="RGBAvatar with fewer Gaussians and steps: minutes on a CPU.",
+    description="rgbavatar with fewer Gaussians and steps, and rates that fall: minutes on a CPU.",
 )

@@ -44,7 +44,8 @@ class RGBAvatarModelConfig(ModelConfig):
     avatar: AvatarConfig = field(default_factory=AvatarConfig)
     """Sizes, variants and initial values of the avatar."""
     initialize_colors: bool = True
-    """Give each Gaussian the mean colour of the pixels it covers when it is first seen."""
+    """Give each Gaussian the mean colour of the pixels it covers when it is first seen (paper,
+    release: yes)."""
     first_colors: FirstColorsKind = "matted"
     """How: paper, the mean of the training picture over its random background, in the first step in
     which its weight exceeds .1; matted (ours), the mean of the person alone. (The release: .01.)"""
@@ -55,19 +56,20 @@ class RGBAvatarModelConfig(ModelConfig):
     """At the end of a run make the Gaussians transparent that no training frame showed (release;
     the paper is silent). Off in ours, where the surface prior looks after them."""
     lpips_weight: Weight = 0.0
-    """Weight of the LPIPS loss (paper: 0, and 0.05 for its variant; release: 0.05)."""
+    """Weight of the LPIPS loss (paper: 0, and 0.05 for its sharper variant)."""
     lpips_start_step: Counted = 0
     """Step from which the LPIPS loss counts (paper: named without a start; release: 2000)."""
     lpips_metric: bool = True
-    """Whether `ns-eval` computes LPIPS; its network is downloaded once (528 MB)."""
+    """Whether `ns-eval` computes LPIPS (paper, release: yes); its network is downloaded once (528
+    MB)."""
     orthogonality: Orthogonality = "free"
     """Leave the bases as they are (paper, release: free), or keep them orthogonal, by a loss of
     weight 10 or every 1,000 steps by QR decomposition or Gram-Schmidt (paper, supplement: none
     helps)."""
     refine_tracking: bool = False
-    """Correct each training frame's tracked pose, expression and translation a little, together
-    with the avatar. Held-out frames take what a linear map learns from these corrections; their
-    images are not looked at."""
+    """Ours: correct each training frame's tracked pose, expression and translation a little,
+    together with the avatar. Held-out frames take what a linear map learns from these corrections;
+    their images are not looked at."""
     refine_held_out: Counted = 0
     """Steps of fitting held-out frames to their images with the avatar frozen; `ns-eval` then
     reports psnr_refined and others beside the plain ones. 0 leaves it out."""

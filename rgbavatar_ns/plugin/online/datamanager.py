@@ -37,9 +37,9 @@ class OnlineDataManagerConfig(RGBAvatarDataManagerConfig):
     """paper: a fixed share of each batch from the local pool; release: the global pool's share
     grows over the first 600 frames to .7, and local draws favour the newest."""
     local_size: Annotated[int, Between(1, 10**6)] = 150
-    """Newest frames, which make up the local pool."""
+    """Newest frames, which make up the local pool (paper: 150)."""
     global_size: Annotated[int, Between(0, 10**6)] = 1000
-    """Frames of the whole past, each equally likely, in the global pool."""
+    """Frames of the whole past, each equally likely, in the global pool (paper: 1,000)."""
     local_share: Share | None = None
     """The paper's eta, the part of a batch from the local pool: by default .7, and .3 for the
     release's strategy, which begins with 1."""

@@ -1,6 +1,7 @@
 """The methods that train while the frames arrive: `rgbavatar-online` and its variants."""
 
 import sys
+from dataclasses import replace
 
 from nerfstudio.plugins.types import MethodSpecification
 
@@ -17,7 +18,7 @@ for _module in (datamanager, pipeline, sources, trainer):
 
 rgbavatar_online = MethodSpecification(
     config=preset(OnlineTrainerConfig, "rgbavatar-online", steps_per_save=500),
-    description="RGBAvatar from a stream: an avatar that grows while the frames arrive.",
+    description="rgbavatar from a stream, new frames first, and 500 steps after it.",
 )
 
 rgbavatar_paper_online = MethodSpecification(
@@ -25,13 +26,15 @@ rgbavatar_paper_online = MethodSpecification(
         OnlineTrainerConfig,
         "rgbavatar-paper-online",
         pipeline=OnlinePipelineConfig(
-            model=paper_model(),
+            # A stream may go on to show what was not seen yet.
+            model=replace(paper_model(), hide_unseen=False),
             datamanager=OnlineDataManagerConfig(local_share=0.7, new_first=False),
         ),
         steps_after_stream=0,
+        final_learning_rate_factor=1.0,
         steps_per_save=500,
     ),
-    description="RGBAvatar from a stream to the letter of its paper: it ends with the stream.",
+    description="rgbavatar-paper from a stream, with which it ends.",
 )
 
 rgbavatar_online_tiny = MethodSpecification(
@@ -45,5 +48,5 @@ rgbavatar_online_tiny = MethodSpecification(
         ),
         steps_per_save=500,
     ),
-    description="RGBAvatar from a stream with fewer Gaussians: real time on a CPU.",
+    description="rgbavatar-online with fewer Gaussians: real time on a CPU.",
 )

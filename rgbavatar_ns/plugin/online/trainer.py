@@ -43,11 +43,13 @@ class OnlineTrainerConfig(RGBAvatarTrainerConfig):
     pipeline: OnlinePipelineConfig = field(default_factory=OnlinePipelineConfig)
     """Stream and model."""
     max_num_iterations: Count = 1_000_000_000
-    """Steps in all, if the run is to end before the stream does."""
+    """Steps in all, if the run is to end before the stream does (paper: it does not)."""
     steps_after_stream: Counted = 500
-    """Steps on all that the pools hold, each frame as likely, once the stream has ended."""
+    """Steps on all that the pools hold, each frame as likely, once the stream has ended (paper:
+    0)."""
     final_learning_rate_factor: Annotated[float, Between(1e-9, 1e3)] = 0.1
-    """What the learning rates fall to in these steps, times what they were; 1 keeps them."""
+    """What the learning rates fall to in these steps, times what they were; 1 keeps them
+    (paper)."""
 
 
 class OnlineStop(StopRequest):

@@ -63,14 +63,15 @@ class RGBAvatarTrainerConfig(TrainerConfig):
     pipeline: RGBAvatarPipelineConfig = field(default_factory=RGBAvatarPipelineConfig)
     """Data and model."""
     max_num_iterations: Count = 5000
-    """Steps in all, those before a resume included."""
+    """Steps in all, those before a resume included (paper: 5,000; release: 50,000 images)."""
     position_lr_final: Positive | None = None
-    """Let the learning rate of positions fall exponentially to this (the release: 8e-6)."""
+    """Let the learning rate of positions fall exponentially to this (paper: not; release: 8e-6)."""
     learning_rate_factor: Annotated[float, Between(1e-9, 1e3)] = 1.0
-    """Let all other learning rates fall exponentially to this multiple of the first one."""
+    """Let all other learning rates fall exponentially to this multiple of the first one (paper,
+    release: 1)."""
     learning_rate_steps: Count | None = None
-    """Steps over which learning rates fall; by default max_num_iterations. Name it where a run
-    is to be continued beyond its first end."""
+    """Steps over which learning rates fall (release: 3,000); by default max_num_iterations. Name it
+    where a run is to be continued beyond its first end."""
     keep_checkpoints: Count = 2
     """Newest checkpoints kept where save_only_latest_checkpoint is on: a second one, in case the
     newest is damaged."""
