@@ -16,7 +16,9 @@ Printed for each, as means over the seeds: held-out PSNR after the stream, PSNR 
 frames, PSNR of the newest second's frames while the stream runs (in its second half), and how much
 of each frame was forgotten (its L1 after the stream minus the lowest that it ever had, looked at
 twice a second for every tenth frame; looking takes longer than training where streams are long, and
-`--looks-per-second .2` spares it). Drawn: loss by frame and PSNR by time.
+`--looks-per-second .2` spares it), and how many Gaussians the avatar shows with a weight above .1
+in any streamed frame though they were never given a first colour. Drawn: loss by frame and PSNR by
+time.
 """
 
 import argparse
@@ -28,15 +30,19 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import torch
 from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 from subject import BATCH_SIZE, Subject, write_figures
+from torch import Tensor
 
 from rgbavatar_ns import Avatar
 from rgbavatar_ns.avatar import AvatarConfig
 from rgbavatar_ns.avatar.training import TrainingOptions, TrainingStep
+from rgbavatar_ns.avatar.training.color_init import WEIGHT_THRESHOLD
 from rgbavatar_ns.data import LocalGlobalPools, TrackedDataset, load_dataset
+from rgbavatar_ns.kernels import rasterize
 from rgbavatar_ns.synthetic import DemoConfig, make_demo_dataset
 
 FRAMES_PER_SECOND = 25.0
@@ -81,6 +87,8 @@ class Outcome:
     seconds: list[float] = field(default_factory=list)
     psnr: list[float] = field(default_factory=list)
     train_seconds: float = 0.0
+    visible: int = 0
+    colorless: int = 0
 
     @property
     def newest_psnr(self) -> float:
@@ -150,7 +158,24 @@ class Bench:
         outcome.loss_lowest = [min(lowest[p], after[p]) for p in self.looked_at]
         outcome.test_psnr = self.subject.psnr(avatar, self.dataset.test)
         outcome.streamed_psnr = self.subject.psnr(avatar, self.looked_at)
+        visible = self.visible(avatar)
+        outcome.visible = int(visible.sum())
+        outcome.colorless = int((visible & ~avatar.color_initialized).sum())
         return outcome
+
+    @torch.no_grad()
+    def visible(self, avatar: Avatar) -> Tensor:
+        """Which Gaussians the avatar, as it is now, shows well in any streamed frame."""
+        found = torch.zeros(avatar.num_gaussians, dtype=torch.bool)
+        for start in range(0, len(self.dataset.train), BATCH_SIZE):
+            chosen = list(self.dataset.train[start : start + BATCH_SIZE])
+            cameras = self.dataset.cameras.select(chosen)
+            drawn = rasterize(
+                avatar.gaussians(self.dataset.theta[chosen]), cameras, with_visibility=True
+            )
+            assert drawn.visibility is not None
+            found |= (drawn.visibility > WEIGHT_THRESHOLD).any(0)
+        return found
 
     def losses(self, avatar: Avatar, positions: list[int]) -> dict[int, float]:
         """L1 of each frame."""
@@ -209,7 +234,8 @@ def measure(seed: int, arguments: argparse.Namespace, folder: Path) -> dict[str,
             progress.console.print(
                 f"seed {seed}, {name}: held-out {one.test_psnr:.2f} dB, streamed "
                 f"{one.streamed_psnr:.2f} dB, newest {one.newest_psnr:.2f} dB, "
-                f"forgotten {one.forgotten:.5f}",
+                f"forgotten {one.forgotten:.5f}, {one.colorless} of {one.visible} Gaussians "
+                "without a first colour",
                 highlight=False,
             )
     return outcomes
@@ -225,6 +251,7 @@ def table(runs: list[dict[str, Outcome]], images: int) -> Table:
         "streamed PSNR",
         "newest PSNR",
         "forgotten L1",
+        "without colour",
     )
     for column in columns:
         drawn.add_column(column)
@@ -237,6 +264,7 @@ def table(runs: list[dict[str, Outcome]], images: int) -> Table:
             f"{statistics.fmean(one.streamed_psnr for one in mine):.2f}",
             f"{statistics.fmean(one.newest_psnr for one in mine):.2f}",
             f"{statistics.fmean(one.forgotten for one in mine):.5f}",
+            " ".join(str(one.colorless) for one in mine),
         )
     return drawn
 
