@@ -2,11 +2,13 @@
 
 import statistics
 from collections import defaultdict
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import torch
+from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from rich.progress import track
@@ -85,15 +87,12 @@ class RGBAvatarPipeline(VanillaPipeline):
         """What `step` is taken on; where steps are recorded, frames that lie on the device."""
         if kind == "recorded":
             return self.datamanager.next_choice(step)
-        cameras, batch = self.datamanager.next_train(step)
-        metadata = cameras.metadata or {}
-        return TrainingBatch(
-            metadata["theta"],
-            from_nerfstudio(cameras),
-            batch["image"],
-            metadata["background"],
-            metadata["position"][:, 0].long(),
-        )
+        return _as_batch(*self.datamanager.next_train(step))
+
+    def training_frames(self) -> Iterator[TrainingBatch]:
+        """All frames that there are to train on, once, in batches."""
+        for cameras, batch in self.datamanager.every_train():
+            yield _as_batch(cameras, batch)
 
     def get_average_eval_image_metrics(
         self, step: int | None = None, output_path: Path | None = None, get_std: bool = False
@@ -155,3 +154,15 @@ class RGBAvatarPipeline(VanillaPipeline):
                     if isinstance(value, float):
                         scores[f"{name}_refined"].append(value)
         return {name: statistics.fmean(values) for name, values in scores.items()}
+
+
+def _as_batch(cameras: Cameras, batch: dict[str, Any]) -> TrainingBatch:
+    """What the datamanager serves, as a step takes it."""
+    metadata = cameras.metadata or {}
+    return TrainingBatch(
+        metadata["theta"],
+        from_nerfstudio(cameras),
+        batch["image"],
+        metadata["background"],
+        metadata["position"][:, 0].long(),
+    )

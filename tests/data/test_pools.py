@@ -183,6 +183,20 @@ def test_held_frames_come_in_order_with_their_images(save_images: bool, encode: 
         assert np.array_equal(decode_png_rgba(frame.encoded(), ""), tracked(serial).image_rgba)
 
 
+def test_all_that_is_held_comes_once_in_order_in_batches():
+    frames = pools()
+    fill(frames, range(12), False)
+    batches = list(frames.in_order(3))
+    assert [len(batch.serial) for batch in batches] == [3, 3, 1]
+    assert [serial for batch in batches for serial in batch.serial] == [
+        serial for serial, _ in frames.held()
+    ]
+    for batch in batches:
+        for serial, theta, image in zip(batch.serial, batch.theta, batch.images_rgba):
+            assert torch.equal(theta, tracked(serial).theta)
+            assert np.array_equal(image, tracked(serial).image_rgba)
+
+
 def test_a_frame_has_its_image_once():
     one = tracked(0)
     for both in ({}, {"png": b"", "image_rgba": one.image_rgba}):

@@ -3,7 +3,7 @@
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -118,6 +118,17 @@ class ReplayBuffer:
                 if arrived_s is not None:
                     self._latencies_s.append(now - arrived_s)
             return self._gather(serials)
+
+    def in_order(self, batch_size: int) -> Iterator[ReplayBatch]:
+        """All that the pools hold now, in the order of arrival, in batches."""
+        with self._lock:
+            serials = sorted(self._held)
+        for first in range(0, len(serials), batch_size):
+            with self._lock:
+                kept = [s for s in serials[first : first + batch_size] if s in self._held]
+                batch = self._gather(kept) if kept else None
+            if batch is not None:
+                yield batch
 
     def recent(self, seconds: float, most: int) -> ReplayBatch | None:
         """Up to `most` of the local pool's frames of the last seconds, newest first; None: none."""

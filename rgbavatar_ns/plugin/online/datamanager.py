@@ -1,6 +1,7 @@
 """Batches from the pools of a running stream."""
 
 import dataclasses
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -13,7 +14,14 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from rgbavatar_ns.avatar.training.losses import random_backgrounds
 from rgbavatar_ns.data import DatasetWriter, LocalGlobalPools
 from rgbavatar_ns.data.sampling import PoolStrategy
-from rgbavatar_ns.data.streams import FrameStream, Ingest, ReplayBuffer, ReplayStream, Rewindable
+from rgbavatar_ns.data.streams import (
+    FrameStream,
+    Ingest,
+    ReplayBatch,
+    ReplayBuffer,
+    ReplayStream,
+    Rewindable,
+)
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.files import atomic_folder
 from rgbavatar_ns.options import Between, Share
@@ -152,8 +160,17 @@ class OnlineDataManager(RGBAvatarDataManager):
     def next_train(self, step: int) -> tuple[Cameras, dict[str, Any]]:
         """A batch drawn from the pools now; UserError while they are empty."""
         drawn = self.pools.batch(self.config.batch_size, evenly=self.ended_step is not None)
+        self.images_drawn += len(drawn.serial)
+        return self._served(drawn, step)
+
+    def every_train(self) -> Iterator[tuple[Cameras, dict[str, Any]]]:
+        """All that the pools hold once, in the form of training batches."""
+        for number, drawn in enumerate(self.pools.in_order(self.config.batch_size)):
+            yield self._served(drawn, number)
+
+    def _served(self, drawn: ReplayBatch, step: int) -> tuple[Cameras, dict[str, Any]]:
+        """Frames with the backgrounds of a step."""
         count = len(drawn.serial)
-        self.images_drawn += count
         cameras = to_nerfstudio(
             drawn.cameras,
             theta=drawn.theta,

@@ -15,6 +15,7 @@ from nerfstudio.utils import writer
 from nerfstudio.utils.misc import step_check
 from nerfstudio.utils.rich_utils import CONSOLE
 
+from rgbavatar_ns.avatar.training.batches import TrainingBatch
 from rgbavatar_ns.avatar.training.step import Losses
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.options import Between, Count, Counted
@@ -245,6 +246,10 @@ class OnlineTrainer(RGBAvatarTrainer):
     def _save_end(self) -> None:
         self.stream.record()
         super()._save_end()
+
+    def _frames_at_the_end(self) -> Iterator[TrainingBatch]:
+        """What the pools hold, however the run ends: a stream's frames are drawn a few times."""
+        return self.pipeline.training_frames()
 
     def _totals(self) -> dict[str, Any]:
         latency = self.stream.pools.median_latency_s()

@@ -309,13 +309,23 @@ class RGBAvatarTrainer(Trainer, FitHooks):
     def _save_end(self) -> None:
         """Save, and say how it went."""
         self.training_state = "completed" if self.completed else "paused"
-        if self.completed and self.pipeline.model.finish():
+        looked = self._take.look_back(self._frames_at_the_end())
+        if (self.completed and self.pipeline.model.finish()) or looked:
             self._saved_step = None
         if self.step >= 0 and self.step != self._saved_step:
             self.save_checkpoint(self.step)
         writer.write_out_storage()
         self._save_refined()
         self._tell_end(self._write_summary("completed" if self.completed else "stopped"))
+
+    def _frames_at_the_end(self) -> Iterable[TrainingBatch]:
+        """The frames to look back at when the run ends.
+
+        Offline each was drawn often: they are looked at only where what none shows is hidden.
+        """
+        if self.completed and self.config.pipeline.model.hide_unseen:
+            return self.pipeline.training_frames()
+        return ()
 
     def _stay(self) -> None:
         """Keep the viewer open if it is to stay."""
