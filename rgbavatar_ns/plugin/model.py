@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
+import tyro
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.models.base_model import Model, ModelConfig
@@ -87,7 +88,10 @@ class RGBAvatarModelConfig(ModelConfig):
     seed: Seed | None = None
     """Seed of the weight network's initial values; by default that of the run, `--machine.seed`."""
     enable_collider: bool = False
-    """Part of nerfstudio's ray-based models; not used."""
+    """Part of nerfstudio's ray-based models: refused."""
+    collider_params: tyro.conf.Suppress[dict[str, float] | None] = None
+    loss_coefficients: tyro.conf.Suppress[dict[str, float]] = field(default_factory=dict)
+    eval_num_rays_per_chunk: tyro.conf.Suppress[int] = 4096
 
 
 class RGBAvatarModel(Model):
