@@ -10,7 +10,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from rgbavatar_ns.errors import UserError
-from rgbavatar_ns.head.rotations import axis_angle_to_matrix, matrix_to_6d_rows
+from rgbavatar_ns.head.rotations import (
+    axis_angle_between,
+    axis_angle_to_matrix,
+    matrix_to_6d_rows,
+)
 
 ThetaForm = Literal["linear", "axis_angle", "translation"]
 """linear: blend weights; axis_angle: radians times unit axis; translation: metres."""
@@ -114,6 +118,24 @@ class ThetaLayout:
             for field in self.fields
         ]
         return torch.cat(pieces, dim=-1)
+
+    def between(
+        self, first: Float[Tensor, "*batch H"], second: Float[Tensor, "*batch H"], share: float
+    ) -> Float[Tensor, "*batch H"]:
+        """Theta a share in [0, 1] of the way from the first to the second, rotations by turning.
+
+        0 and 1 give the two as they are; raises UserError where the size differs.
+        """
+        if share in (0.0, 1.0):
+            return second if share else first
+        starts, ends = self.split(first), self.split(second)
+        parts = {
+            field.name: axis_angle_between(starts[field.name], ends[field.name], share)
+            if field.form == "axis_angle"
+            else torch.lerp(starts[field.name], ends[field.name], share)
+            for field in self.fields
+        }
+        return self.join(parts)
 
     def absurd(self, theta: Float[Tensor, "*batch H"]) -> str | None:
         """What no person can do, in words: a weight beyond 100, an angle beyond 4 pi, 100 m, NaN.

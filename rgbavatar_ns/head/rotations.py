@@ -48,6 +48,15 @@ def matrix_to_axis_angle(matrix: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "
     return roma.rotmat_to_rotvec(matrix)
 
 
+def axis_angle_between(
+    first: Float[Tensor, "*batch 3"], second: Float[Tensor, "*batch 3"], share: float
+) -> Float[Tensor, "*batch 3"]:
+    """The rotation after a share in [0, 1] of the shortest turn from the first to the second."""
+    start = axis_angle_to_matrix(first)
+    turn = matrix_to_axis_angle(start.transpose(-1, -2) @ axis_angle_to_matrix(second))
+    return matrix_to_axis_angle(start @ axis_angle_to_matrix(share * turn))
+
+
 def matrix_to_view_degrees(
     head_to_camera: Float[Tensor, "*batch 3 3"],
 ) -> Float[Tensor, "*batch 3"]:

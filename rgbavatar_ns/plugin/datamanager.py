@@ -28,6 +28,7 @@ from rgbavatar_ns.plugin.dataparser import (
     RGBAvatarDataParserConfig,
 )
 from rgbavatar_ns.plugin.errors import install_user_error_hook
+from rgbavatar_ns.plugin.film_path import FilmCameras, FilmPath
 
 _MIB = 1 << 20
 _DECODED_TOGETHER = 32
@@ -111,6 +112,8 @@ class RGBAvatarDataManager(DataManager):
         if config.check_data and test_mode == "val":
             for problem in quick_check(self.dataparser.tracked):
                 raise problem.as_error()
+        tracked = self.dataparser.tracked
+        self.film_path = FilmPath(len(tracked), tracked.train)
         self.train_dataparser_outputs = self.dataparser.get_dataparser_outputs("train")
         self.train_dataset = self._dataset("train", self.train_dataparser_outputs)
         self.eval_dataset = self._dataset(
@@ -119,7 +122,10 @@ class RGBAvatarDataManager(DataManager):
         super().__init__()
 
     def _dataset(self, split: str, outputs: DataparserOutputs) -> FrameDataset:
-        return FrameDataset(outputs, self.dataparser.tracked, self.dataparser.positions(split))
+        positions = self.dataparser.positions(split)
+        dataset = FrameDataset(outputs, self.dataparser.tracked, positions)
+        dataset.cameras = FilmCameras.of(dataset.cameras, positions, self.film_path)
+        return dataset
 
     def setup_train(self) -> None:
         """Put the frame order in place, a function of seed and step: resuming needs no state."""

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
+import tyro
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.models.base_model import Model, ModelConfig
@@ -21,7 +22,6 @@ from rgbavatar_ns.avatar.training.step import Orthogonality, TrainingOptions
 from rgbavatar_ns.drawing.compositing import error_strip, straight_alpha
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadModel
-from rgbavatar_ns.kernels import PinholeCameras
 from rgbavatar_ns.options import Counted, Seed, Weight
 from rgbavatar_ns.plugin.cameras import filled_depth, from_nerfstudio
 from rgbavatar_ns.plugin.checkpoint_state import (
@@ -88,20 +88,23 @@ class RGBAvatarModelConfig(ModelConfig):
     seed: Seed | None = None
     """Seed of the weight network's initial values; by default that of the run, `--machine.seed`."""
     enable_collider: bool = False
-    """Part of nerfstudio's ray-based models; not used."""
+    """Part of nerfstudio's ray-based models: refused."""
+    collider_params: tyro.conf.Suppress[dict[str, float] | None] = None
+    loss_coefficients: tyro.conf.Suppress[dict[str, float]] = field(default_factory=dict)
+    eval_num_rays_per_chunk: tyro.conf.Suppress[int] = 4096
 
 
 class RGBAvatarModel(Model):
     """Draws the avatar for nerfstudio's cameras, which carry theta as metadata.
 
-    A camera without theta (the viewer's, a camera path's) shows what the pipeline's viewer panel
-    has chosen.
+    A camera without theta (the viewer's, `ns-render`'s) shows what the pipeline's viewer panel has
+    chosen, or the moment of the film that is the camera's (`FilmPath`).
     """
 
     config: RGBAvatarModelConfig
     frame_theta: Tensor
-    view: Callable[[PinholeCameras, float | None], Outputs] | None = None
-    """Draws a camera that brings no theta, at a time in [0, 1]; set by the pipeline."""
+    view: Callable[[Cameras], Outputs] | None = None
+    """Draws a camera that brings no theta; set by the pipeline."""
 
     def populate_modules(self) -> None:
         """Build the avatar of the dataset's subject."""
@@ -141,7 +144,8 @@ class RGBAvatarModel(Model):
         if not isinstance(ray_bundle, Cameras):
             raise UserError(
                 "This method draws whole images and cannot render single rays.",
-                "Leave out options that trace rays, such as --render-nearest-camera.",
+                "Leave out options that trace rays, such as --render-nearest-camera. Files of the "
+                "avatar are written by `rgbavatar export RUN DST`, meshes by no command.",
             )
         return {**self._draw(ray_bundle)}
 
@@ -176,8 +180,7 @@ class RGBAvatarModel(Model):
         camera = camera.to(self.device)
         if (camera.metadata or {}).get("theta") is None:
             assert self.view is not None, "only a pipeline's model draws cameras without theta"
-            time = None if camera.times is None else float(camera.times.reshape(-1)[0])
-            return self.view(from_nerfstudio(camera), time)
+            return self.view(camera)
         return {name: image[0] for name, image in self._draw(camera).items()}
 
     def get_loss_dict(

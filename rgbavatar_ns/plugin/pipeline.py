@@ -12,6 +12,7 @@ from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from rich.progress import track
+from torch import Tensor
 
 from rgbavatar_ns.avatar.metrics import LPIPSMetric, evaluate_images
 from rgbavatar_ns.avatar.training.batches import ChosenFrames, TrainingBatch
@@ -52,12 +53,20 @@ class RGBAvatarPipeline(VanillaPipeline):
     ) -> None:
         super().__init__(config, str(device), **more)
         self.viewer_panel = ViewerPanel(self.model, self.film)
-        self.model.view = self.viewer_panel.draw
+        self.model.view = self._view
 
     @property
     def model(self) -> RGBAvatarModel:
         """The model; this method trains on one device, so it is never wrapped."""
         return self._model
+
+    def _view(self, camera: Cameras) -> dict[str, Tensor]:
+        """Draw a camera without theta: what the viewer's user has chosen, or the film's moment."""
+        if self.viewer_panel.attached:
+            time = None if camera.times is None else float(camera.times.reshape(-1)[0])
+        else:
+            time = self.datamanager.film_path.moment(camera)
+        return self.viewer_panel.draw(from_nerfstudio(camera), time)
 
     def training_step(self, optimizers: Optimizers) -> TrainingStep:
         """The step that trains the model, for a run."""

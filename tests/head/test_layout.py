@@ -36,6 +36,18 @@ def test_a_missing_field_is_zero_and_batch_axes_broadcast() -> None:
     assert theta.tolist() == wanted
 
 
+def test_between_is_linear_but_for_rotations_which_turn() -> None:
+    # The same turn, written the long way round: half a turn about x, and nearly so backwards.
+    first = LAYOUT.join({"jaw": torch.tensor([3.1, 0.0, 0.0]), "eyelids": torch.zeros(2)})
+    second = LAYOUT.join({"jaw": torch.tensor([-3.1, 0.0, 0.0]), "eyelids": torch.ones(2)})
+    assert LAYOUT.between(first, second, 0.0) is first
+    assert LAYOUT.between(first, second, 1.0) is second
+    middle = LAYOUT.split(LAYOUT.between(first, second, 0.5))
+    assert middle["eyelids"].tolist() == [0.5, 0.5]
+    assert middle["expression"].tolist() == [0.0] * 4
+    torch.testing.assert_close(middle["jaw"].abs(), torch.tensor([torch.pi, 0.0, 0.0]))
+
+
 def test_slices_follow_one_another() -> None:
     assert LAYOUT.slice("expression") == slice(0, 4)
     assert LAYOUT.slice("jaw") == slice(4, 7)

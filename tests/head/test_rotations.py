@@ -32,6 +32,17 @@ def test_conversions_agree_with_scipy() -> None:
     np.testing.assert_allclose(back, matrix, atol=1e-9)
 
 
+def test_between_two_rotations_turns_evenly_the_short_way() -> None:
+    first, second = ANGLES[:100], ANGLES[100:200]
+    known = [Rotation.from_rotvec(part.numpy()) for part in (first, second)]
+    turn = (known[0].inv() * known[1]).as_rotvec()
+    for share in (0.0, 0.3, 1.0):
+        between = rotations.axis_angle_between(first, second, share)
+        wanted = known[0] * Rotation.from_rotvec(share * turn)
+        matrix = rotations.axis_angle_to_matrix(between)
+        np.testing.assert_allclose(matrix, wanted.as_matrix(), atol=1e-9)
+
+
 def test_six_numbers_are_the_first_two_rows() -> None:
     matrix = rotations.axis_angle_to_matrix(ANGLES)
     rows = rotations.matrix_to_6d_rows(matrix)

@@ -107,6 +107,38 @@ def test_options_out_of_range_are_told_by_their_name_before_a_file_is_written(
     assert not (tmp_path / "runs").exists()
 
 
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [
+        ("gradient_accumulation_steps", {"color": 4}),
+        ("log_gradients", True),
+        ("mixed_precision", True),
+        ("use_grad_scaler", True),
+        ("prompt", "a head"),
+        ("pipeline.model.prompt", "a head"),
+        ("pipeline.model.enable_collider", True),
+        ("machine.num_machines", 2),
+        ("machine.machine_rank", 1),
+        ("machine.dist_url", "tcp://127.0.0.1:8686"),
+        ("logging.profiler", "pytorch"),
+        ("viewer.num_rays_per_chunk", 1024),
+        ("relative_model_dir", Path("elsewhere")),
+        ("vis", "viewer_legacy"),
+        ("start_paused", True),
+    ],
+)
+def test_options_that_would_change_nothing_are_refused_before_a_file_is_written(
+    tiny_data: Path, tmp_path: Path, option: str, value: Any
+):
+    config = copy.deepcopy(small_config(tiny_data, tmp_path / "runs"))
+    _set(config, option, value)
+    with pytest.raises(UserError) as told:
+        config.save_config()
+    assert told.value.cause.startswith(f"--{option.replace('_', '-')} ")
+    assert told.value.remedy
+    assert not (tmp_path / "runs").exists()
+
+
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
 def test_a_gpu_that_is_not_there_is_told(tiny_data: Path, tmp_path: Path):
     config = small_config(tiny_data, tmp_path / "runs")

@@ -25,7 +25,7 @@ def test_without_a_viewer_the_cameras_time_chooses_and_the_ground_is_black(
 ):
     model = pipeline.model
     camera = pipeline.datamanager.train_dataset.cameras[0:1]
-    camera.metadata = {"cam_idx": 0}
+    camera.metadata = {"cam_idx": None}
     for share, position in ((0.0, 0), (0.51, 7), (1.0, 13), (1.5, 13), (-1.0, 0)):
         camera.times = torch.tensor([[share]])
         drawn = model.get_outputs_for_camera(camera)
@@ -324,7 +324,7 @@ def test_viewer_starts_before_the_face_and_nearer_than_the_camera(desk: Desk):
 
 def test_nerfstudio_finds_the_panel_and_viser_shows_it(pipeline: RGBAvatarPipeline):
     ((_, panel),) = parse_object(pipeline, ViewerControl, "Custom Elements")
-    assert pipeline.model.view == panel.draw
+    assert pipeline.viewer_panel is panel
     panel = ViewerPanel(pipeline.model, pipeline.film)
     viewer = FakeViewer()
     viewer.viser_server = server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)

@@ -1,11 +1,17 @@
 """Which options a run can begin with, nerfstudio's included."""
 
 import torch
-from nerfstudio.configs.base_config import LoggingConfig, MachineConfig, ViewerConfig
+from nerfstudio.configs.base_config import (
+    LocalWriterConfig,
+    LoggingConfig,
+    MachineConfig,
+    ViewerConfig,
+)
 from nerfstudio.engine.trainer import TrainerConfig
 
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.options import Between, Ranges, check_options
+from rgbavatar_ns.plugin.training.refused import require_used
 
 _OFTEN = Between(1, 10**9)
 _HOST_RANGES: Ranges = {
@@ -19,15 +25,23 @@ _HOST_RANGES: Ranges = {
         _OFTEN,
     ),
     MachineConfig: {"seed": Between(0, 2**32 - 1), "num_devices": Between(1, 1)},
-    LoggingConfig: {"steps_per_log": _OFTEN},
-    ViewerConfig: {"websocket_port": Between(1, 65535), "jpeg_quality": Between(1, 100)},
+    LoggingConfig: {"steps_per_log": _OFTEN, "max_buffer_size": _OFTEN},
+    LocalWriterConfig: {"max_log_size": Between(0, 10**9)},
+    ViewerConfig: {
+        "websocket_port": Between(1, 65535),
+        "websocket_port_default": Between(1, 65535),
+        "jpeg_quality": Between(1, 100),
+        "max_num_display_images": Between(-1, 10**9),
+        "camera_frustum_scale": Between(0, 1e6),
+    },
 }
 """Of what nerfstudio declares."""
 
 
 def require_trainable(config: TrainerConfig) -> None:
-    """Raise UserError for an option out of its range, or a device that is not there."""
+    """Raise UserError for an option out of its range or without effect, or an absent device."""
     check_options(type(config), vars(config), more=_HOST_RANGES)
+    require_used(config)
     device = config.machine.device_type
     if device == "mps" or (device == "cuda" and not torch.cuda.is_available()):
         raise UserError(

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
+import tyro
 from nerfstudio.engine.callbacks import TrainingCallbackLocation
 from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
@@ -76,7 +77,8 @@ class RGBAvatarTrainerConfig(TrainerConfig):
     """Newest checkpoints kept where save_only_latest_checkpoint is on: a second one, in case the
     newest is damaged."""
     mixed_precision: bool = False
-    """Half precision is not used: the rasterizer computes in float32."""
+    """Half precision is refused: the rasterizer computes in float32."""
+    method_name: tyro.conf.Suppress[str | None] = None
 
     def get_checkpoint_dir(self) -> Path:
         """Where the run's checkpoints are; for who loads one from there, `load_step` is set.

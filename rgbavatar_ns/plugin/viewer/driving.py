@@ -9,6 +9,7 @@ from torch import Tensor
 from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
 from rgbavatar_ns.export.bases import basis_weights
 from rgbavatar_ns.plugin.checkpoint_state import film_statistics
+from rgbavatar_ns.plugin.film_path import FilmMoment, frame_at
 from rgbavatar_ns.plugin.model import RGBAvatarModel
 from rgbavatar_ns.plugin.viewer.viewer_state import ViewerState
 
@@ -31,9 +32,9 @@ def training_statistics(model: RGBAvatarModel) -> TrainingStatistics:
 
 @torch.no_grad()
 def driving_signal(
-    model: RGBAvatarModel, state: ViewerState, time: float | None = None
+    model: RGBAvatarModel, state: ViewerState, time: float | FilmMoment | None = None
 ) -> DrivingSignal:
-    """What drives the picture; `time` in [0, 1] counts where the state asks for it."""
+    """What drives the picture; `time` (in [0, 1], or a moment) counts where the state asks it."""
     avatar = model.avatar
     alone, used = state.basis_alone, state.bases_used
     if alone is not None and alone < avatar.config.num_bases:
@@ -51,7 +52,7 @@ def driving_signal(
 
 
 def _theta(
-    model: RGBAvatarModel, state: ViewerState, time: float | None
+    model: RGBAvatarModel, state: ViewerState, time: float | FilmMoment | None
 ) -> tuple[Float[Tensor, "H"], int | None]:
     last = len(model.frame_theta) - 1
     if state.driven_by == "by hand" and state.theta_by_hand is not None:
@@ -60,10 +61,12 @@ def _theta(
         return state.sequence[min(max(state.sequence_frame, 0), len(state.sequence) - 1)], None
     if state.driven_by == "live performer" and state.live is not None:
         return state.live.theta, None
-    frame = state.frame
+    frame = min(max(state.frame, 0), last)
     if state.driven_by == "viewer's time" and time is not None:
-        frame = round(time * last)
-    frame = min(max(frame, 0), last)
+        if isinstance(time, FilmMoment):
+            before, after = model.driving_theta([time.before, time.after])
+            return model.avatar.layout.between(before, after, time.share), time.nearest
+        frame = frame_at(time, last + 1)
     return model.driving_theta([frame])[0], frame
 
 

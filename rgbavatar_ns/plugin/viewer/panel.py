@@ -22,6 +22,7 @@ from rgbavatar_ns.export import dataset_folder
 from rgbavatar_ns.export.scenes import driven_by
 from rgbavatar_ns.head import turn_seen
 from rgbavatar_ns.kernels import PinholeCameras
+from rgbavatar_ns.plugin.film_path import FilmMoment
 from rgbavatar_ns.plugin.model import RGBAvatarModel
 from rgbavatar_ns.plugin.viewer.client import serve_sharp_client
 from rgbavatar_ns.plugin.viewer.driving import (
@@ -61,8 +62,8 @@ class _Report:
 class ViewerPanel(ViewerControl):
     """Draws what its controls ask for, where a camera brings no theta of its own.
 
-    Without a viewer (`ns-render`) the camera's time chooses the frame, over black. `film` is what
-    pictures are compared with, if there is anything; `clock` counts seconds.
+    Without a viewer (`ns-render`) the camera's time or moment chooses the frame, over black. `film`
+    is what pictures are compared with, if there is anything; `clock` counts seconds.
     """
 
     def __init__(
@@ -107,7 +108,14 @@ class ViewerPanel(ViewerControl):
         viewer.viser_server.scene.set_up_direction("+z")
         viewer.viser_server.on_client_connect(viewpoint.place)
 
-    def draw(self, camera: PinholeCameras, time_share: float | None) -> dict[str, Tensor]:
+    @property
+    def attached(self) -> bool:
+        """Whether there is a viewer."""
+        return self._viewer is not None
+
+    def draw(
+        self, camera: PinholeCameras, time_share: float | FilmMoment | None
+    ) -> dict[str, Tensor]:
         """The picture for one camera (C = 1): rgb, accumulation, depth [H W C].
 
         What cannot be shown is told in the panel, and the plain avatar stands in its place:
@@ -287,7 +295,7 @@ class ViewerPanel(ViewerControl):
         return self._model.avatar.weights(signal.theta) if signal.psi is None else signal.psi
 
     def _drawn(
-        self, state: ViewerState, camera: PinholeCameras, time_share: float | None
+        self, state: ViewerState, camera: PinholeCameras, time_share: float | FilmMoment | None
     ) -> tuple[DrivingSignal, ViewerRender]:
         model, signal = self._model, driving_signal(self._model, state, time_share)
         options: dict[str, Any] = {"film": self._film, "backend": model.config.rasterizer}

@@ -1,0 +1,85 @@
+"""Options of nerfstudio that this method has no use for: refused by name instead of ignored."""
+
+from dataclasses import dataclass
+from functools import reduce
+from pathlib import Path
+from typing import Any
+
+from nerfstudio.engine.trainer import TrainerConfig
+
+from rgbavatar_ns.avatar.storage.checkpoint_file import MODELS_FOLDER
+from rgbavatar_ns.errors import UserError
+
+_LEAVE_OUT = "Leave it out."
+
+
+@dataclass(frozen=True)
+class _Refused:
+    """An option that only counts for other methods, unless it is one of the values `taken`."""
+
+    option: str
+    taken: tuple[Any, ...]
+    because: str
+    remedy: str = _LEAVE_OUT
+
+
+_ONE_DEVICE = "this method trains on one device of one machine"
+_FLOAT32 = "the rasterizer computes in float32, which needs no scaling of gradients"
+_REFUSED = (
+    _Refused(
+        "gradient_accumulation_steps",
+        ({},),
+        "every step of this method ends with a step of all its optimizers",
+        "Leave it out; --pipeline.datamanager.batch-size takes more images in a step.",
+    ),
+    _Refused(
+        "log_gradients",
+        (False,),
+        "the steps take gradients straight into Adam and hold none to log",
+    ),
+    _Refused("mixed_precision", (False,), _FLOAT32),
+    _Refused("use_grad_scaler", (False,), _FLOAT32),
+    _Refused("prompt", (None,), "this method learns from a film, not from words"),
+    _Refused("pipeline.model.prompt", (None,), "this method learns from a film, not from words"),
+    _Refused("pipeline.model.enable_collider", (False,), "no rays are traced, so none collide"),
+    _Refused("machine.num_machines", (1,), _ONE_DEVICE),
+    _Refused("machine.machine_rank", (0,), _ONE_DEVICE),
+    _Refused("machine.dist_url", ("auto",), _ONE_DEVICE),
+    _Refused(
+        "logging.profiler",
+        ("none", "basic"),
+        "it traces nerfstudio's own training step, which this method replaces",
+        "Leave it out; `rgbavatar bench step` times the step by part.",
+    ),
+    _Refused(
+        # -1 is what ns-viewer brings.
+        "viewer.num_rays_per_chunk",
+        (32768, -1),
+        "whole images are drawn, not chunks of rays",
+    ),
+    _Refused(
+        "relative_model_dir",
+        (Path(MODELS_FOLDER),),
+        "the project's other commands find a run's checkpoints by that name",
+        "Leave it out; --output-dir chooses the place of the run.",
+    ),
+)
+
+
+def require_used(config: TrainerConfig) -> None:
+    """Raise UserError for an option of nerfstudio's that would change nothing, or wait for ever."""
+    for refused in _REFUSED:
+        value = reduce(getattr, refused.option.split("."), config)
+        if value not in refused.taken:
+            option = "--" + refused.option.replace("_", "-")
+            raise UserError(f"{option} is {value}, but {refused.because}.", refused.remedy)
+    if config.vis == "viewer_legacy":
+        raise UserError(
+            "--vis is viewer_legacy, but this method has its panel in nerfstudio's newer viewer.",
+            "Take --vis viewer, or viewer+tensorboard.",
+        )
+    if config.start_paused and not config.is_viewer_enabled():
+        raise UserError(
+            "--start-paused waits for the viewer's button, and --vis is without a viewer.",
+            "Leave it out, or take --vis viewer+tensorboard.",
+        )
