@@ -1,4 +1,4 @@
-"""A perfect copy scores 0, wherever data keep the head's pose, and whosever frame it counts from."""
+"""A perfect copy scores 0, wherever data keep the head's pose, whatever it counts from."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -97,6 +97,8 @@ def avatar() -> Avatar:
     with torch.no_grad():
         made.blendshapes.basis_position.normal_(0, 0.002)
         made.blendshapes.basis_color_feature.normal_(0, 0.05)
+        for weights in made.weight_network.parameters():
+            weights.normal_(0, 0.5)
         made.blendshapes.color_feature.normal_(0.0, 1.0)
     return made
 
