@@ -7,14 +7,17 @@ from typing import Any
 import numpy as np
 
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.experiments.runner import run_folder_of
 from rgbavatar_ns.experiments.spec import Experiment
-from rgbavatar_ns.experiments.streamed import read_streamed
+from rgbavatar_ns.experiments.streamed import StreamedCurve, read_streamed
 from rgbavatar_ns.experiments.sweep import CellStatus
 from rgbavatar_ns.experiments.tables import HEADINGS, ResultTable, Row
+from rgbavatar_ns.plugin.training.curve import CURVE_NAME, read_curve
 
 _COLOR = "tab:blue"
 # Values that spread by more than this factor get a logarithmic axis.
 _WIDE = 8
+_PANELS = 4
 
 
 def write_plots(experiment: Experiment, table: ResultTable, folder: Path, stem: str) -> list[Path]:
@@ -28,7 +31,7 @@ def write_plots(experiment: Experiment, table: ResultTable, folder: Path, stem: 
     figure = _figure(4.2 * len(metrics), 3.2)
     for place, metric in enumerate(metrics, 1):
         axes = figure.add_subplot(1, len(metrics), place)
-        axes.spines[["top", "right"]].set_visible(False)
+        _plain(axes)
         axes.set_title(HEADINGS[metric], fontsize=10)
         rows = [row for row in table.rows if metric in row.entries]
         if experiment.plot is not None:
@@ -45,27 +48,94 @@ def write_plots(experiment: Experiment, table: ResultTable, folder: Path, stem: 
 
 
 def write_forgetting_curves(statuses: Sequence[CellStatus], folder: Path, stem: str) -> list[Path]:
-    """Draw the loss of each streamed frame after the stream's end, a line for each variant.
+    """Draw what each streamed frame's loss is after the end, and the least it ever was.
 
-    Of the first cell of each that has such a curve; returns the PNG's path, or nothing where no
-    cell has one. Raises UserError where matplotlib is missing.
+    A panel for each variant, of its first cell that has such a curve (paper, supplement: with and
+    without global sampling). Returns the PNG's path, or nothing where no cell has a curve. Raises
+    UserError where matplotlib is missing.
     """
-    curves: dict[str, tuple[list[int], list[float]]] = {}
+    curves: dict[str, StreamedCurve] = {}
     for status in statuses:
         curve = read_streamed(status.folder) if status.result is not None else None
         if curve is not None:
             curves.setdefault(status.cell.variant, curve)
     if not curves:
         return []
-    figure = _figure(8.4, 3.6)
-    axes = figure.add_subplot()
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.set_xlabel("frame of the stream")
-    axes.set_ylabel("L1 after the stream's end")
-    for name, (frames, losses) in curves.items():
-        axes.plot(frames, _smooth(losses), linewidth=1, label=name)
-    axes.legend(frameon=False, fontsize=7)
+    columns = min(len(curves), _PANELS)
+    rows = -(-len(curves) // columns)
+    figure = _figure(4.2 * columns, 2.8 * rows)
+    panels = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).flat
+    for axes, (name, curve) in zip(panels, curves.items()):
+        shown = curve.least or curve.after
+        after = [curve.after[frame] for frame in shown]
+        axes.plot(list(shown), _smooth(after), linewidth=1, label="after the stream's end")
+        if curve.least:
+            least = _smooth(list(curve.least.values()))
+            axes.plot(list(shown), least, linewidth=1, label="the least in training")
+        forgotten = "" if curve.forgotten is None else f": {curve.forgotten:.5f} forgotten"
+        axes.set_title(f"{name}{forgotten}", fontsize=9)
+        axes.set_xlabel("frame of the stream")
+        axes.set_ylabel("L1")
+        _plain(axes)
+    panels[0].legend(frameon=False, fontsize=7)
+    for axes in panels[len(curves) :]:
+        axes.set_visible(False)
     return [_saved(figure, folder, f"{stem}_forgetting")]
+
+
+def write_convergence(
+    experiment: Experiment, statuses: Sequence[CellStatus], folder: Path, stem: str
+) -> list[Path]:
+    """Draw held-out PSNR against seconds of training, a line for each variant.
+
+    Cells have points where `steps_per_eval_all_images` asked for them; seconds are those of the
+    steps alone, and the last point is the end's. Of several subjects or seeds each is a thin line,
+    and the thick one is the mean at steps that all have. Raises UserError where matplotlib is
+    missing.
+    """
+    curves = {
+        variant.name: [
+            points
+            for status in statuses
+            if status.cell.variant == variant.name and (points := _convergence(status))
+        ]
+        for variant in experiment.variants
+    }
+    curves = {name: found for name, found in curves.items() if found}
+    if not curves:
+        return []
+    figure = _figure(6.4, 4.0)
+    axes = figure.add_subplot()
+    _plain(axes)
+    axes.set_xlabel("training, s")
+    axes.set_ylabel(HEADINGS["psnr"])
+    for place, (name, found) in enumerate(curves.items()):
+        color = f"C{place}"
+        if len(found) > 1:
+            for points in found:
+                axes.plot(*zip(*points.values()), color=color, linewidth=0.6, alpha=0.4)
+        steps = sorted(set.intersection(*(set(points) for points in found)))
+        means = np.mean([[points[step] for step in steps] for points in found], axis=0)
+        axes.plot(*means.reshape(-1, 2).T, color=color, label=name, marker=".", markersize=4)
+    axes.set_xlim(left=0)
+    axes.legend(frameon=False)
+    return [_saved(figure, folder, f"{stem}_convergence")]
+
+
+def _convergence(status: CellStatus) -> dict[int, tuple[float, float]]:
+    """Seconds and PSNR by step of a finished cell; empty without any evaluation in training."""
+    if status.result is None:
+        return {}
+    points = read_curve(run_folder_of(status.folder, status.cell) / CURVE_NAME)
+    seen = {int(point["step"]): (point["train_seconds"], point["psnr"]) for point in points}
+    ended = status.result["metrics"]
+    if seen and {"steps", "train_seconds", "psnr"} <= ended.keys():
+        seen[int(ended["steps"]) - 1] = (ended["train_seconds"], ended["psnr"])
+    return seen
+
+
+def _plain(axes: Any) -> None:
+    axes.spines[["top", "right"]].set_visible(False)
 
 
 def _smooth(values: Sequence[float]) -> np.ndarray:

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from rgbavatar_ns.experiments.plots import write_forgetting_curves, write_plots
+from rgbavatar_ns.experiments.plots import write_convergence, write_forgetting_curves, write_plots
 from rgbavatar_ns.experiments.spec import Experiment
 from rgbavatar_ns.experiments.sweep import CellStatus, read_statuses
 from rgbavatar_ns.experiments.tables import ResultTable, Row, result_table
@@ -44,6 +44,7 @@ def write_report(experiment: Experiment, folder: Path, *, plots: bool = True) ->
     drawn = []
     if plots:
         drawn = write_plots(experiment, table, out, experiment.name)
+        drawn += write_convergence(experiment, statuses, out, experiment.name)
         drawn += write_forgetting_curves(statuses, out, experiment.name)
     page = out / "index.html"
     page.write_text(_page(experiment, table, statuses, drawn), encoding="utf-8")
