@@ -215,3 +215,29 @@ def test_the_experiments_that_ship_fit_the_presets(path, tiny):
     experiment = read_experiment(path, tiny=tiny)
     check_experiment(experiment)
     assert cells_of(experiment)
+
+
+@pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
+def test_rows_with_the_papers_figures_run_the_papers_preset(path):
+    """Whoever runs them gets the paper; with --tiny nobody does, which the table then says."""
+    experiment = read_experiment(path)
+    for variant in experiment.variants:
+        if variant.paper or variant.paper_by_subject or variant.name in ("Ours", "paper"):
+            preset = variant.preset or experiment.preset
+            assert preset in ("rgbavatar-paper", "rgbavatar-paper-online"), variant.name
+
+
+def test_the_main_tables_means_are_of_the_papers_subjects():
+    """INSTA's eight; the four others are of the GaussianBlendShapes dataset."""
+    quality = next(path for path in CONFIGS if path.stem == "quality")
+    rows = {variant.name: variant for variant in read_experiment(quality).variants}
+    for name in ("Ours", "Ours (w/ LPIPS)", "Ours (online)"):
+        figures = rows[name].paper_by_subject
+        insta = [one for subject, one in figures.items() if not subject.startswith("subject")]
+        assert (len(insta), len(figures)) == (8, 12)
+        for metric, digits in (("psnr", 0.006), ("ssim", 6e-5), ("lpips_vgg", 6e-5)):
+            mean = sum(one[metric] for one in insta) / 8
+            assert mean == pytest.approx(rows[name].paper[metric], abs=digits)
+    assert rows["Ours"].paper["frames_per_second"] == 398
+    assert rows["Ours (w/ LPIPS)"].overrides["pipeline.model.lpips_weight"] == 0.05
+    assert "pipeline.model.lpips_start_step" not in rows["Ours (w/ LPIPS)"].overrides
