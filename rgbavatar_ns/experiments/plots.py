@@ -17,33 +17,33 @@ from rgbavatar_ns.plugin.training.curve import CURVE_NAME, read_curve
 _COLOR = "tab:blue"
 # Values that spread by more than this factor get a logarithmic axis.
 _WIDE = 8
-_PANELS = 4
+_COLUMNS = 3
 
 
 def write_plots(experiment: Experiment, table: ResultTable, folder: Path, stem: str) -> list[Path]:
-    """Draw the metrics against `experiment.plot`, or as bars by variant; returns the PNG paths.
+    """Draw the metrics against `experiment.plot`, or as points by variant; returns the PNG paths.
 
     Raises UserError where matplotlib is missing.
     """
     metrics = [m for m in table.metrics if any(m in row.entries for row in table.rows)]
     if not metrics:
         return []
-    figure = _figure(4.2 * len(metrics), 3.2)
-    for place, metric in enumerate(metrics, 1):
-        axes = figure.add_subplot(1, len(metrics), place)
-        _plain(axes)
+    figure, panels = _panels(len(metrics), 3.2, sharey=experiment.plot is None)
+    for axes, metric in zip(panels, metrics):
         axes.set_title(HEADINGS[metric], fontsize=10)
         rows = [row for row in table.rows if metric in row.entries]
         if experiment.plot is not None:
             _against(axes, experiment, rows, metric)
             continue
+        places = [table.rows.index(row) for row in rows]
         means = [row.entries[metric].mean for row in rows]
         spreads = [row.entries[metric].spread for row in rows]
-        axes.barh([row.name for row in rows], means, xerr=spreads, color=_COLOR, height=0.6)
-        axes.invert_yaxis()
-        low, high = min(means), max(means)
-        margin = max(high - low, 1e-3 * abs(high), 1e-9)
-        axes.set_xlim(low - 0.6 * margin, high + 0.3 * margin)
+        # Points, not bars: these would have to begin at 0, where differences do not show.
+        axes.errorbar(means, places, xerr=spreads, fmt="o", color=_COLOR, capsize=2)
+        axes.set_yticks(range(len(table.rows)), [row.name for row in table.rows])
+        axes.set_ylim(len(table.rows) - 0.5, -0.5)
+        axes.locator_params(axis="x", nbins=5)
+        axes.grid(axis="y", alpha=0.3)
     return [_saved(figure, folder, stem)]
 
 
@@ -61,10 +61,7 @@ def write_forgetting_curves(statuses: Sequence[CellStatus], folder: Path, stem: 
             curves.setdefault(status.cell.variant, curve)
     if not curves:
         return []
-    columns = min(len(curves), _PANELS)
-    rows = -(-len(curves) // columns)
-    figure = _figure(4.2 * columns, 2.8 * rows)
-    panels = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).flat
+    figure, panels = _panels(len(curves), 2.8, sharex=True, sharey=True)
     for axes, (name, curve) in zip(panels, curves.items()):
         shown = curve.least or curve.after
         after = [curve.after[frame] for frame in shown]
@@ -76,10 +73,7 @@ def write_forgetting_curves(statuses: Sequence[CellStatus], folder: Path, stem: 
         axes.set_title(f"{name}{forgotten}", fontsize=9)
         axes.set_xlabel("frame of the stream")
         axes.set_ylabel("L1")
-        _plain(axes)
     panels[0].legend(frameon=False, fontsize=7)
-    for axes in panels[len(curves) :]:
-        axes.set_visible(False)
     return [_saved(figure, folder, f"{stem}_forgetting")]
 
 
@@ -154,6 +148,19 @@ def _figure(width: float, height: float) -> Any:
             "Install it (pip install matplotlib), or pass --no-plots.",
         ) from error
     return Figure(figsize=(width, height), layout="constrained")
+
+
+def _panels(count: int, height: float, **shared: bool) -> tuple[Any, list[Any]]:
+    """A figure of so many panels, some in a row."""
+    columns = min(count, _COLUMNS)
+    rows = -(-count // columns)
+    figure = _figure(4.2 * columns, height * rows)
+    panels = list(figure.subplots(rows, columns, squeeze=False, **shared).flat)
+    for axes in panels[count:]:
+        axes.set_visible(False)
+    for axes in panels:
+        _plain(axes)
+    return figure, panels[:count]
 
 
 def _saved(figure: Any, folder: Path, stem: str) -> Path:

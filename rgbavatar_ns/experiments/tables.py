@@ -224,7 +224,8 @@ def _number(metric: str, value: float | None) -> str:
     if value is None or not math.isfinite(value):
         return _MISSING
     _, digits = METRICS[metric]
-    return f"{value:.1e}" if 0 < abs(value) < 10.0**-digits else f"{value:.{digits}f}"
+    small = digits > 0 and 0 < abs(value) < 10.0**-digits
+    return f"{value:.1e}" if small else f"{value:.{digits}f}"
 
 
 def _escaped(text: str) -> str:

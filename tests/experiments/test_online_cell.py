@@ -20,7 +20,7 @@ from rgbavatar_ns.experiments.sweep import sweep
 from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.plugin.online.least_losses import read_least
 from tests.plugin.online_run import online_config, online_trainer
-from tests.plugin.run import SMALL, before_each_step, before_step
+from tests.plugin.run import SMALL, before_each_step, before_step, parameters_of
 from tests.plugin.tiny import tiny_dataset
 
 TEXT = """
@@ -99,6 +99,27 @@ def test_watched_frames_keep_their_least_loss_also_when_resumed(dataset, tmp_pat
     least = read_least(resumed.base_dir)
     assert set(least) == {0, 3, 6, 9}
     assert all(least[frame] <= loss for frame, loss in first.items())
+
+
+def test_watching_changes_nothing_that_is_trained(dataset, tmp_path, monkeypatch):
+    trainer = online_trainer(online_config(tmp_path / "out", tmp_path / "data", watch_every=2))
+
+    watch = trainer._watch
+
+    def look():
+        before = parameters_of(trainer).clone()
+        states = torch.get_rng_state(), trainer.stream.pools.state_dict()["pools"]
+        watch_at_once(trainer)
+        watch()
+        after = torch.get_rng_state(), trainer.stream.pools.state_dict()["pools"]
+        assert torch.equal(parameters_of(trainer), before)
+        assert torch.equal(states[0], after[0])
+        assert torch.equal(states[1]["generator"], after[1]["generator"])
+
+    monkeypatch.setattr(trainer, "_watch", look)
+    trainer.train()
+    assert trainer.completed
+    assert trainer.stream.least.by_frame
 
 
 def watch_at_once(trainer):
