@@ -2,7 +2,7 @@
 
 import statistics
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -26,6 +26,9 @@ from rgbavatar_ns.plugin.cameras import from_nerfstudio
 from rgbavatar_ns.plugin.datamanager import RGBAvatarDataManager, RGBAvatarDataManagerConfig
 from rgbavatar_ns.plugin.model import RGBAvatarModel, RGBAvatarModelConfig
 from rgbavatar_ns.plugin.viewer.panel import ViewerPanel
+
+Evaluated = Callable[[int, Mapping[str, Any]], None]
+"""Told of the scores of all held-out frames after a step of training."""
 
 
 @dataclass
@@ -54,6 +57,7 @@ class RGBAvatarPipeline(VanillaPipeline):
         super().__init__(config, str(device), **more)
         self.viewer_panel = ViewerPanel(self.model, self.film)
         self.model.view = self._view
+        self.evaluated: Evaluated = lambda step, metrics: None
 
     @property
     def model(self) -> RGBAvatarModel:
@@ -121,7 +125,10 @@ class RGBAvatarPipeline(VanillaPipeline):
                 "Write it again with some held out, so that there is something to evaluate on.",
             )
         if self.test_mode != "test":
-            return super().get_average_eval_image_metrics(step, output_path, get_std)
+            metrics = super().get_average_eval_image_metrics(step, output_path, get_std)
+            if step is not None:
+                self.evaluated(step, metrics)
+            return metrics
         if self.config.model.lpips_metric:
             self.model.lpips_metric = LPIPSMetric()
         metrics = super().get_average_eval_image_metrics(step, output_path, get_std)

@@ -100,6 +100,27 @@ def test_newest_and_recent_frames():
     assert frames.recent(0.9, 2) is None
 
 
+def test_watched_frames_come_in_turn_and_change_no_draw():
+    def filled() -> ReplayBuffer:
+        frames = pools(local=8, old=2, clock=lambda: 0.0)
+        assert frames.watched(3, -1, 2) is None
+        fill(frames, range(7, 15))
+        return frames
+
+    watched, plain = filled(), filled()
+    seen, after = [], -1
+    for _ in range(3):
+        batch = watched.watched(3, after, 2)
+        assert batch is not None
+        seen.append(batch.serial)
+        after = batch.serial[-1]
+        # The stream's third frame is the one that its source calls 10.
+        assert batch.index == tuple(7 + serial for serial in batch.serial)
+    assert seen == [(0, 3), (6, 0), (3, 6)]
+    assert watched.median_latency_s() is None
+    assert [watched.batch(4).serial for _ in range(5)] == [plain.batch(4).serial for _ in range(5)]
+
+
 def test_latency_is_from_arrival_to_the_first_batch():
     clock = Clock()
     frames = pools(local=10, clock=clock)

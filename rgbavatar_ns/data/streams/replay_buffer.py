@@ -26,9 +26,13 @@ _CAMERA_PARTS = ("world_to_camera", "focal_px", "principal_point_px")
 
 @dataclass(frozen=True)
 class ReplayBatch:
-    """B different frames of the pools; `serial` counts the stream's frames from 0."""
+    """B different frames of the pools; `serial` counts the stream's frames from 0.
+
+    `index` is the frames' own numbers.
+    """
 
     serial: tuple[int, ...]
+    index: tuple[int, ...]
     theta: Float[Tensor, "B H"]
     cameras: PinholeCameras
     images_rgba: UInt8[Tensor, "B H_px W_px 4"]
@@ -139,6 +143,17 @@ class ReplayBuffer:
             chosen = late[:: -max(1, -(-len(late) // most))]
             return self._gather(chosen) if chosen else None
 
+    def watched(self, every: int, after: int, most: int) -> ReplayBatch | None:
+        """Up to `most` of each `every`-th frame that a pool holds, in turn; None: there are none.
+
+        after: the last one that was looked at before.
+        """
+        with self._lock:
+            held = sorted(serial for serial in self._held if serial % every == 0)
+            turn = sum(serial <= after for serial in held)
+            chosen = (held[turn:] + held[:turn])[:most]
+            return self._gather(chosen) if chosen else None
+
     def newest_theta(self) -> Float[Tensor, "H"] | None:
         """Theta of the newest frame; None before the first."""
         with self._lock:
@@ -181,8 +196,10 @@ class ReplayBuffer:
         columns = self._columns(serials)
         theta = columns.pop("theta")
         cameras = PinholeCameras(**columns, width=self._subject.width, height=self._subject.height)
-        images = np.stack([self._held[serial].frame.image_rgba for serial in serials])
-        return ReplayBatch(tuple(serials), theta, cameras, torch.from_numpy(images))
+        frames = [self._held[serial].frame for serial in serials]
+        images = torch.from_numpy(np.stack([frame.image_rgba for frame in frames]))
+        index = tuple(frame.index for frame in frames)
+        return ReplayBatch(tuple(serials), index, theta, cameras, images)
 
     def state_dict(self) -> dict[str, Any]:
         """Pools and frames, safe for `torch.load(weights_only=True)`."""

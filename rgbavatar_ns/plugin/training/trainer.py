@@ -4,7 +4,7 @@ import copy
 import math
 import os
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from dataclasses import dataclass, field
@@ -40,8 +40,10 @@ from rgbavatar_ns.plugin.training.checkpoints import (
     remove_leftover,
     save_checkpoint,
 )
+from rgbavatar_ns.plugin.training.curve import EvaluationCurve
 from rgbavatar_ns.plugin.training.interruption import StopRequest, stop_with_starter
 from rgbavatar_ns.plugin.training.optimizers import ExponentialConfig, require_fitting_states
+from rgbavatar_ns.plugin.training.peak_memory import peak_memory
 from rgbavatar_ns.plugin.training.progress import TrainingProgress
 from rgbavatar_ns.plugin.training.ranges import require_trainable
 from rgbavatar_ns.plugin.training.turns import TurnsLock
@@ -160,7 +162,9 @@ class RGBAvatarTrainer(Trainer, FitHooks):
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         """Build pipeline, optimisers, viewer and writers; load a checkpoint if one is named."""
+        self.curve = EvaluationCurve(self.base_dir)
         super().setup(test_mode)
+        self.pipeline.evaluated = self._add_to_curve
         if isinstance(self.viewer_state, Viewer):
             for line in self.viewer_state.viewer_info:
                 CONSOLE.print(line, highlight=False)
@@ -261,6 +265,10 @@ class RGBAvatarTrainer(Trainer, FitHooks):
         last = step == self.config.max_num_iterations - 1
         if last or step_check(step, self.config.logging.steps_per_log, run_at_zero=True):
             self._progress.show(step + 1, self._write_scalars(step, losses, seconds))
+
+    def _add_to_curve(self, step: int, scores: Mapping[str, Any]) -> None:
+        """A point of curve.json; `--steps-per-eval-all-images` says how often."""
+        self.curve.add(step, self._train_seconds, scores)
 
     def _run_callbacks(self, step: int, location: TrainingCallbackLocation) -> None:
         for callback in self.callbacks:
@@ -367,6 +375,7 @@ class RGBAvatarTrainer(Trainer, FitHooks):
             "train_seconds": seconds,
             "images_per_second": totals["images"] / seconds if seconds > 0 else 0.0,
             **totals,
+            **peak_memory(self.pipeline.device),
         }
         write_json(self.base_dir / SUMMARY_NAME, summary)
         return summary
@@ -396,6 +405,7 @@ class RGBAvatarTrainer(Trainer, FitHooks):
             self._start_step = state["step"] + 1
             self._saved_step = state["step"]
             self._train_seconds = float(state.get("train_seconds", 0.0))
+            self.curve.points = [dict(point) for point in state.get("curve", ())]
         self.pipeline.load_pipeline(state["pipeline"], state["step"])
         with damage_of(path):
             self.optimizers.load_optimizers(state["optimizers"])
@@ -418,6 +428,7 @@ class RGBAvatarTrainer(Trainer, FitHooks):
         state = {
             "step": step,
             "train_seconds": self._train_seconds,
+            "curve": self.curve.points,
             "pipeline": self.pipeline.state_dict(),
             "optimizers": {k: v.state_dict() for k, v in self.optimizers.optimizers.items()},
             "schedulers": {k: v.state_dict() for k, v in self.optimizers.schedulers.items()},
