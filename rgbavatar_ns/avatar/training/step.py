@@ -357,7 +357,9 @@ class TrainingStep:
         self, batch: TrainingBatch, background: Float[Tensor, "B 3"], num_filmed: int
     ) -> Float[Tensor, "N 5"] | None:
         """How the first images show what waits for its first colour; None where nothing does."""
-        if self._first_colors is None or self._first_colors.sight(num_filmed) is None:
+        if num_filmed == 0 or self._first_colors is None:
+            return None
+        if self._first_colors.sight(num_filmed) is None:
             return None
         cameras = batch.cameras
         if len(cameras.focal_px) > num_filmed:
