@@ -15,6 +15,7 @@ from nerfstudio.data.dataparsers.base_dataparser import (
 )
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from nerfstudio.data.scene_box import SceneBox
+from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from torch import Tensor
 
 from rgbavatar_ns.data import TrackedDataset, load_dataset
@@ -112,6 +113,13 @@ class RGBAvatarDataParser(DataParser):
                 )
             },
         )
+
+
+rgbavatar_data = DataParserSpecification(
+    config=RGBAvatarDataParserConfig(),
+    description="Tracked head videos as `rgbavatar track` writes them, or another system's.",
+)
+"""For nerfstudio's other methods, which see pictures over black and cameras, and no motion."""
 
 
 class FrameDataset(InputDataset):
