@@ -99,12 +99,9 @@ def test_a_refusal_of_the_host_names_the_command_that_does_it(
 
 def assertion_in(module: str) -> TracebackType:
     """Where an assertion of a module failed."""
-    try:
+    with pytest.raises(AssertionError) as caught:
         exec("def main():\n    assert False\nmain()", {"__name__": module})
-    except AssertionError as error:
-        assert error.__traceback__ is not None
-        return error.__traceback__
-    raise RuntimeError
+    return caught.tb
 
 
 @pytest.mark.slow
