@@ -33,6 +33,7 @@ because what lies behind the person tints the silhouette else, and late means un
 
 WEIGHT_THRESHOLD = 0.1
 """The blending weight that a Gaussian must exceed in some pixel (paper: .1; its release: .01)."""
+_THRESHOLD_UNITS = int(WEIGHT_THRESHOLD / SIGHT_UNIT)
 _LEARNED = 0.06
 """A colour feature that is so far from its initial grey was learned: five of Adam's steps."""
 _HIDDEN_LOGIT = -12.0
@@ -89,9 +90,13 @@ class FirstColors:
 
         Waits for no device.
         """
-        sums = seen.sums * SIGHT_UNIT if isinstance(seen, FirstSight) else seen
         avatar = self._avatar
-        feature = avatar.blendshapes.color_feature
+        if isinstance(seen, FirstSight):
+            # In most steps nothing new comes to light.
+            if seen.sums.device.type == "cpu" and int(seen.sums[:, 4].max()) <= _THRESHOLD_UNITS:
+                return
+            seen = seen.sums * SIGHT_UNIT
+        sums, feature = seen, avatar.blendshapes.color_feature
         given = is_seen_well(sums) & ~avatar.color_initialized
         if given.device.type == "cpu" and not bool(given.any()):
             return
