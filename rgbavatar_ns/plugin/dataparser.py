@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import torch
+import tyro
 from jaxtyping import Float
 from nerfstudio.data.dataparsers.base_dataparser import (
     DataParser,
@@ -53,6 +54,8 @@ class RGBAvatarDataParserConfig(DataParserConfig):
     """Folder that holds dataset.json, or another system's data."""
     importing: ImportOptions = field(default_factory=ImportOptions)
     """How another system's data is read."""
+    downscale_factor: tyro.conf.Suppress[float | None] = None
+    """Set by `ns-render dataset --downscale-factor`, and refused."""
 
 
 class RGBAvatarDataParser(DataParser):
@@ -66,6 +69,12 @@ class RGBAvatarDataParser(DataParser):
 
     def __init__(self, config: RGBAvatarDataParserConfig) -> None:
         super().__init__(config)
+        if config.downscale_factor not in (None, 1):
+            raise UserError(
+                f"--downscale-factor is {config.downscale_factor:g}, but frames of this method are "
+                "drawn in the size that they were filmed in.",
+                "Leave it out; `ns-render interpolate` takes it.",
+            )
         self._tracked: TrackedDataset | None = None
 
     @property

@@ -10,6 +10,7 @@ import torch
 
 from rgbavatar_ns.errors import UserError, told_as_user_error
 from rgbavatar_ns.kernels import DeviceError
+from rgbavatar_ns.plugin.host_commands import told_of_command
 
 _SMALLER = (
     "Take less of it: --pipeline.datamanager.device-mib 0 leaves the images in main memory, and "
@@ -23,8 +24,9 @@ Hook = Callable[[type[BaseException], BaseException, TracebackType | None], obje
 def install_user_error_hook() -> None:
     """Let an uncaught `UserError` or `DeviceError` end the process with its message and code 1.
 
-    So does what the system refuses: a full disk, a path, a right. Every other exception goes to
-    the hook that was there before. Installing twice changes nothing.
+    So does what the system refuses: a full disk, a path, a right; and what nerfstudio's commands
+    cannot do with this method. Every other exception goes to the hook that was there before.
+    Installing twice changes nothing.
     """
     if isinstance(sys.excepthook, _UserErrorHook):
         return
@@ -58,6 +60,7 @@ class _UserErrorHook:
     ) -> None:
         if isinstance(error, OSError):
             error = told_as_user_error(error) or error
+        error = told_of_command(error, trace) or error
         if isinstance(error, (UserError, DeviceError)):
             print(f"\nError: {error.cause}\n{error.remedy}", file=sys.stderr, flush=True)
         else:
