@@ -1,4 +1,8 @@
-"""nerfstudio's view of a dataset: the project's own, or another system's."""
+"""nerfstudio's view of a dataset: the project's own, or another system's.
+
+nerfstudio's list of dataparsers, which its datamanagers import, loads this module by its entry
+point: nothing here may import a datamanager.
+"""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,6 +20,7 @@ from nerfstudio.data.dataparsers.base_dataparser import (
 )
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from nerfstudio.data.scene_box import SceneBox
+from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from torch import Tensor
 
 from rgbavatar_ns.data import TrackedDataset, load_dataset
@@ -23,6 +28,7 @@ from rgbavatar_ns.data.importers import ImportOptions
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadArrays, ThetaLayout
 from rgbavatar_ns.plugin.cameras import to_nerfstudio
+from rgbavatar_ns.plugin.errors import install_user_error_hook
 
 _SCENE_RADIUS_M = 0.5
 
@@ -68,6 +74,7 @@ class RGBAvatarDataParser(DataParser):
     includes_time: bool = True
 
     def __init__(self, config: RGBAvatarDataParserConfig) -> None:
+        install_user_error_hook()
         super().__init__(config)
         if config.downscale_factor not in (None, 1):
             raise UserError(
@@ -121,6 +128,13 @@ class RGBAvatarDataParser(DataParser):
                 )
             },
         )
+
+
+rgbavatar_data = DataParserSpecification(
+    config=RGBAvatarDataParserConfig(),
+    description="Tracked heads of rgbavatar_ns and of the systems that it reads.",
+)
+"""For other methods, which see the cameras, and the images over black."""
 
 
 class FrameDataset(InputDataset):

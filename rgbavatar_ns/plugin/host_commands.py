@@ -16,12 +16,13 @@ def told_of_command(error: BaseException, trace: TracebackType | None) -> UserEr
     while trace is not None:
         frame = trace.tb_frame
         module, command = frame.f_globals.get("__name__"), frame.f_locals.get("self")
-        if module == _EXPORTER and isinstance(error, AssertionError):
+        ours = type(frame.f_locals.get("pipeline")).__module__.startswith("rgbavatar_ns.")
+        if module == _EXPORTER and ours and isinstance(error, AssertionError):
             return UserError(
                 "ns-export writes the fields of other methods; of this one it writes the cameras.",
                 "Use `rgbavatar export RUN DST --format ply` (or spz, sog, gltf, web, bundle).",
             )
-        if module == _RENDER:
+        if module == _RENDER and ours:
             told = _of_rendering(error, command)
             if told is not None:
                 return told
