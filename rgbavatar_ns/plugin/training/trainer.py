@@ -41,13 +41,19 @@ from rgbavatar_ns.plugin.training.checkpoints import (
     save_checkpoint,
 )
 from rgbavatar_ns.plugin.training.interruption import StopRequest, stop_with_starter
+from rgbavatar_ns.plugin.training.load_config import (
+    COMPLETED,
+    SUMMARY_NAME,
+    go_on_or_repeat,
+    loads_config,
+    require_loadable,
+)
 from rgbavatar_ns.plugin.training.optimizers import ExponentialConfig, require_fitting_states
 from rgbavatar_ns.plugin.training.progress import TrainingProgress
 from rgbavatar_ns.plugin.training.ranges import require_trainable
 from rgbavatar_ns.plugin.training.turns import TurnsLock
 from rgbavatar_ns.plugin.viewer.settings import is_of_ns_viewer, viewer_settings
 
-SUMMARY_NAME = "training.json"
 LATEST = "latest"
 
 
@@ -106,8 +112,17 @@ class RGBAvatarTrainerConfig(TrainerConfig):
             TrainerConfig.save_config(written)
         _link_latest(self.get_base_dir())
 
+    def set_timestamp(self) -> None:
+        """Called by `ns-train` alone, on its own config or on the one that it has loaded."""
+        super().set_timestamp()
+        if loads_config(sys.argv[1:]):
+            go_on_or_repeat(self, say)
+
     def __setattr__(self, name: str, value: Any) -> None:
         """Where `ns-viewer` puts its own settings in place of the run's, keep these."""
+        if name == "load_config" and value is not None:
+            install_user_error_hook()
+            require_loadable(value, sys.argv[1:])
         if name == "viewer" and is_of_ns_viewer(value):
             value = viewer_settings(self.viewer, value, sys.argv[1:])
         super().__setattr__(name, value)
@@ -317,7 +332,7 @@ class RGBAvatarTrainer(Trainer, FitHooks):
             self.save_checkpoint(self.step)
         writer.write_out_storage()
         self._save_refined()
-        self._tell_end(self._write_summary("completed" if self.completed else "stopped"))
+        self._tell_end(self._write_summary(COMPLETED if self.completed else "stopped"))
 
     def _stay(self) -> None:
         """Keep the viewer open if it is to stay."""
