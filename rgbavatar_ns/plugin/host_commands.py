@@ -5,14 +5,21 @@ from types import TracebackType
 from rgbavatar_ns.errors import UserError
 
 _EXPORTER, _RENDER = "nerfstudio.scripts.exporter", "nerfstudio.scripts.render"
+_WRITER = "nerfstudio.utils.writer"
+_SERVICES = {
+    "WandbWriter": "Run `wandb login`, or set WANDB_MODE=offline to log without network",
+    "CometWriter": "Set COMET_API_KEY",
+}
 
 
 def told_of_command(error: BaseException, trace: TracebackType | None) -> UserError | None:
-    """The user's error in place of what ends `ns-export` or `ns-render`; None for all else.
+    """The user's error in place of what ends one of nerfstudio's commands; None for all else.
 
-    nerfstudio's commands assert the methods that they know, and offer a method no other place to
-    answer in.
+    These assert the methods that they know, and offer a method no other place to answer in. And
+    services that keep logs may be absent, or want an account.
     """
+    if isinstance(error, UserError):
+        return None
     while trace is not None:
         frame = trace.tb_frame
         module, command = frame.f_globals.get("__name__"), frame.f_locals.get("self")
@@ -26,6 +33,11 @@ def told_of_command(error: BaseException, trace: TracebackType | None) -> UserEr
             told = _of_rendering(error, command)
             if told is not None:
                 return told
+        service = _SERVICES.get(type(command).__name__)
+        if module == _WRITER and service and frame.f_code.co_name == "__init__":
+            first_line = (str(error).splitlines() or [type(error).__name__])[0]
+            cause = f"The service that --vis names does not start: {first_line}"
+            return UserError(cause, f"{service}; or take --vis viewer+tensorboard.")
         trace = trace.tb_next
     return None
 
