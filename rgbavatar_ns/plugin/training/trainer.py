@@ -119,13 +119,16 @@ class RGBAvatarTrainerConfig(TrainerConfig):
             go_on_or_repeat(self, say)
 
     def __setattr__(self, name: str, value: Any) -> None:
-        """Where `ns-viewer` puts its own settings in place of the run's, keep these."""
-        if name == "load_config" and value is not None:
-            install_user_error_hook()
-            require_loadable(value, sys.argv[1:])
+        """Where `ns-viewer` puts its own settings in place of the run's, keep these.
+
+        And look at the file of `--load-config` before nerfstudio loads it.
+        """
         if name == "viewer" and is_of_ns_viewer(value):
             value = viewer_settings(self.viewer, value, sys.argv[1:])
         super().__setattr__(name, value)
+        if name == "load_config" and self.load_config is not None:
+            install_user_error_hook()
+            require_loadable(self.load_config, sys.argv[1:])
 
 
 def _link_latest(run: Path) -> None:
