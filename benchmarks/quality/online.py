@@ -6,11 +6,11 @@
 The frames of a performance at 25 frames/s are streamed in order; between two of them as many steps
 are taken as a trainer of `--images-per-second` manages, so that the figures do not depend on how
 busy the machine is; then follow `--steps-after-stream` steps on all that the pools hold, while the
-rates fall to a tenth, as in `ns-train rgbavatar-online`. Variants: the paper's pools (eta = .7),
+rates fall to a tenth, as in `ns-train rgbavatar-online`. Variants: the paper's share (eta = .7),
 eta = .3 (the tiny preset's), .1, 0 and 1, without the global and without the local pool, the
-release's strategy, new frames first (the default of `ns-train rgbavatar-online`), the paper's
-without those last steps, and offline training with as many images, with rates that fall in the
-same way at its end and with constant ones.
+release's strategy, new frames first (the default of `ns-train rgbavatar-online`), the paper's whole
+way, which has no steps after the stream, and offline training with as many images, with rates that
+fall in the same way at its end and with constant ones.
 
 Printed for each, as means over the seeds: held-out PSNR after the stream, PSNR over the streamed
 frames, PSNR of the newest second's frames while the stream runs (in its second half), and how much
@@ -52,7 +52,7 @@ FINAL_RATE = 0.1
 LOOKED_AT = 10
 NEWEST, NEWEST_EVERY = 25, 4
 OFFLINE, OFFLINE_CONSTANT = "offline", "offline, constant rates"
-UNFINISHED = "eta .7, no steps after"
+PAPER = "eta .7, no steps after (paper)"
 
 
 def variants(frames: int, seed: int) -> dict[str, Callable[[], LocalGlobalPools]]:
@@ -60,11 +60,11 @@ def variants(frames: int, seed: int) -> dict[str, Callable[[], LocalGlobalPools]
     part = min(1.0, frames / PAPER_STREAM_FRAMES)
     local, old = (max(BATCH_SIZE, round(size * part)) for size in (150, 1000))
     return {
-        "eta .7 (paper)": lambda: LocalGlobalPools(local, old, 0.7, seed),
+        "eta .7": lambda: LocalGlobalPools(local, old, 0.7, seed),
         "eta .1": lambda: LocalGlobalPools(local, old, 0.1, seed),
         "eta .3": lambda: LocalGlobalPools(local, old, 0.3, seed),
         "eta .3, new first": lambda: LocalGlobalPools(local, old, 0.3, seed, new_first=True),
-        UNFINISHED: lambda: LocalGlobalPools(local, old, 0.7, seed),
+        PAPER: lambda: LocalGlobalPools(local, old, 0.7, seed),
         "eta .7, new first": lambda: LocalGlobalPools(local, old, 0.7, seed, new_first=True),
         "eta 0": lambda: LocalGlobalPools(local, old, 0.0, seed),
         "eta 1": lambda: LocalGlobalPools(local, old, 1.0, seed),
@@ -152,6 +152,9 @@ class Bench:
             for group in take.optimizers[0].param_groups:
                 group["lr"] *= final_rate ** (1 / steps_after)
             step += 1
+        held = [] if pools is None else sorted([*pools.local_frames, *pools.global_frames])
+        parts = range(0, len(held), BATCH_SIZE)
+        take.look_back(self.subject.batch(held[k : k + BATCH_SIZE]) for k in parts)
         outcome.train_seconds += time.monotonic() - began
         after = self.losses(avatar, list(self.looked_at))
         outcome.loss_after = [after[p] for p in self.looked_at]
@@ -228,7 +231,7 @@ def measure(seed: int, arguments: argparse.Namespace, folder: Path) -> dict[str,
             outcomes[name] = one = bench.train(
                 make(),
                 lambda bar=bar: progress.advance(bar),
-                0 if name == UNFINISHED else bench.steps_after,
+                0 if name == PAPER else bench.steps_after,
                 1.0 if name == OFFLINE_CONSTANT else FINAL_RATE,
             )
             progress.console.print(

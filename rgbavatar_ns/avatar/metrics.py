@@ -33,6 +33,15 @@ def psnr(
     return -10 * ((error * inside).sum((1, 2)) / inside.sum((1, 2))).log10()
 
 
+def l1_over_black(
+    image: Float[Tensor, "B H W 3"], rgba: UInt8[Tensor, "B H W 4"]
+) -> Float[Tensor, "B"]:
+    """Return each image's mean absolute difference from a frame over black, both in [0, 1]."""
+    shown = image.clamp(0, 1)
+    truth = film_over(rgba.to(shown.device), shown.new_zeros(3), shown)
+    return (shown - truth).abs().mean(dim=(1, 2, 3))
+
+
 def ssim(image: Float[Tensor, "B H W 3"], target: Float[Tensor, "B H W 3"]) -> Float[Tensor, "B"]:
     """Return each image's structural similarity: Gaussian window, sigma 1.5, range 1."""
     from torchmetrics.functional.image import structural_similarity_index_measure

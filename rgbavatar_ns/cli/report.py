@@ -14,6 +14,7 @@ from rgbavatar_ns.experiments.report import write_report
 def run(
     folder: Annotated[Path, tyro.conf.Positional],
     file: Path,
+    subjects: tuple[str, ...] | None = None,
     tiny: bool = False,
     plots: bool = True,
 ) -> None:
@@ -22,10 +23,12 @@ def run(
     Args:
         folder: where `rgbavatar sweep` wrote.
         file: the experiment that was swept.
+        subjects: it was swept with these.
         tiny: it was swept with --tiny.
         plots: draw them too (needs matplotlib).
     """
-    report = write_report(read_experiment(file, tiny=tiny), folder, plots=plots)
+    experiment = read_experiment(file, tiny=tiny, subjects=subjects)
+    report = write_report(experiment, folder, plots=plots)
     console = Console()
     console.print(Markdown(report.table.to_markdown()))
     for path in report.paths:

@@ -1,5 +1,6 @@
 """`rgbavatar sweep`: every cell of an experiment that is not done yet."""
 
+import shlex
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -21,6 +22,7 @@ _STYLE = {"waiting": "dim", "running": "cyan", "done": "green", "failed": "bold 
 def run(
     file: Annotated[Path, tyro.conf.Positional],
     output: Path | None = None,
+    subjects: tuple[str, ...] | None = None,
     tiny: bool = False,
     engine: Literal["local", "ray"] = "local",
     at_once: Annotated[int, Between(1, 1024)] = 1,
@@ -35,6 +37,7 @@ def run(
     Args:
         file: the experiment, one of configs/*.yaml or your own.
         output: where everything is written; outputs/sweeps/NAME by default (NAME-tiny with --tiny).
+        subjects: in place of the file's: dataset folders, or demo:SEED:FRAMES:SIZE.
         tiny: take the file's `tiny` section: minutes on two cores.
         engine: processes of this machine, or a Ray cluster.
         at_once: cells at a time of the local engine.
@@ -42,7 +45,7 @@ def run(
         cpus: CPU cores that a cell asks Ray for.
         gpus: GPUs, or a share of one, that a cell asks Ray for.
     """
-    experiment = read_experiment(file, tiny=tiny)
+    experiment = read_experiment(file, tiny=tiny, subjects=subjects)
     name = f"{experiment.name}-tiny" if tiny else experiment.name
     folder = (output or Path("outputs") / "sweeps" / name).resolve()
     console = Console()
@@ -55,6 +58,7 @@ def run(
         console.print(f"[red]failed:[/red] {status.cell.variant}, {status.folder}", soft_wrap=True)
         console.print("\n".join(f"    {line}" for line in status.why), markup=False, soft_wrap=True)
     report = f"rgbavatar report {folder} --file {file}" + (" --tiny" if tiny else "")
+    report += f" --subjects {shlex.join(subjects)}" if subjects else ""
     console.print(
         f"{len(statuses) - len(failed)} of {len(statuses)} cells done; {report}",
         soft_wrap=True,

@@ -7,11 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from rgbavatar_ns.errors import UserError
-from rgbavatar_ns.experiments.spec import Experiment, Overrides
+from rgbavatar_ns.experiments.spec import Experiment, Overrides, is_demo
 from rgbavatar_ns.files import digest
 from rgbavatar_ns.synthetic import DemoConfig
-
-_DEMO = "demo"
 
 
 @dataclass(frozen=True)
@@ -56,7 +54,7 @@ def cells_of(experiment: Experiment) -> list[Cell]:
         Cell(
             experiment.name,
             variant.name,
-            experiment.preset,
+            variant.preset or experiment.preset,
             subject,
             seed,
             {**experiment.base, **variant.overrides},
@@ -73,9 +71,9 @@ def demo_config(subject: str) -> DemoConfig | None:
 
     A quarter of the frames is held out.
     """
-    kind, *numbers = subject.split(":")
-    if kind != _DEMO or len(numbers) > 3 or not all(number.isdigit() for number in numbers):
+    if not is_demo(subject):
         return None
+    numbers = subject.split(":")[1:]
     seed, frames, size = (int(n) for n in [*numbers, *("0", "240", "256")[len(numbers) :]])
     return DemoConfig(
         seed=seed, num_frames=frames, image_size=size, num_test_frames=max(1, frames // 4)

@@ -26,9 +26,14 @@ def _check(config: Any, key: str, value: Any, where: str) -> None:
     *path, last = key.split(".")
     part, walked = config, []
     for name in path:
-        part = getattr(_require_field(part, name, key, walked, where), name)
+        part = _require_field(part, name, key, walked, where)
+        part = part[name] if isinstance(part, Mapping) else getattr(part, name)
         walked.append(name)
     _require_field(part, last, key, walked, where)
+    if isinstance(part, Mapping):
+        raise UserError(
+            f"{where} sets {key}, which is no single option.", "Name one of its fields."
+        )
     hint = typing.get_type_hints(type(part))[last]
     try:
         check_type(_as_config(value, hint), hint)
@@ -40,7 +45,9 @@ def _check(config: Any, key: str, value: Any, where: str) -> None:
 
 
 def _require_field(part: Any, name: str, key: str, walked: list[str], where: str) -> Any:
-    names = [f.name for f in dataclasses.fields(part)] if dataclasses.is_dataclass(part) else []
+    names = list(map(str, part)) if isinstance(part, Mapping) else []
+    if dataclasses.is_dataclass(part):
+        names = [field.name for field in dataclasses.fields(part)]
     if name not in names:
         known = [".".join([*walked, field]) for field in names if not field.startswith("_")]
         raise UserError(

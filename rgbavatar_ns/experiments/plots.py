@@ -7,65 +7,129 @@ from typing import Any
 import numpy as np
 
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.experiments.runner import run_folder_of
 from rgbavatar_ns.experiments.spec import Experiment
-from rgbavatar_ns.experiments.streamed import read_streamed
+from rgbavatar_ns.experiments.streamed import StreamedCurve, read_streamed
 from rgbavatar_ns.experiments.sweep import CellStatus
 from rgbavatar_ns.experiments.tables import HEADINGS, ResultTable, Row
+from rgbavatar_ns.plugin.training.curve import CURVE_NAME, read_curve
 
 _COLOR = "tab:blue"
 # Values that spread by more than this factor get a logarithmic axis.
 _WIDE = 8
+_COLUMNS = 3
 
 
 def write_plots(experiment: Experiment, table: ResultTable, folder: Path, stem: str) -> list[Path]:
-    """Draw the metrics against `experiment.plot`, or as bars by variant; returns the PNG paths.
+    """Draw the metrics against `experiment.plot`, or as points by variant; returns the PNG paths.
 
     Raises UserError where matplotlib is missing.
     """
     metrics = [m for m in table.metrics if any(m in row.entries for row in table.rows)]
     if not metrics:
         return []
-    figure = _figure(4.2 * len(metrics), 3.2)
-    for place, metric in enumerate(metrics, 1):
-        axes = figure.add_subplot(1, len(metrics), place)
-        axes.spines[["top", "right"]].set_visible(False)
+    figure, panels = _panels(len(metrics), 3.2, sharey=experiment.plot is None)
+    for axes, metric in zip(panels, metrics):
         axes.set_title(HEADINGS[metric], fontsize=10)
         rows = [row for row in table.rows if metric in row.entries]
         if experiment.plot is not None:
             _against(axes, experiment, rows, metric)
             continue
+        places = [table.rows.index(row) for row in rows]
         means = [row.entries[metric].mean for row in rows]
         spreads = [row.entries[metric].spread for row in rows]
-        axes.barh([row.name for row in rows], means, xerr=spreads, color=_COLOR, height=0.6)
-        axes.invert_yaxis()
-        low, high = min(means), max(means)
-        margin = max(high - low, 1e-3 * abs(high), 1e-9)
-        axes.set_xlim(low - 0.6 * margin, high + 0.3 * margin)
+        # Points, not bars: these would have to begin at 0, where differences do not show.
+        axes.errorbar(means, places, xerr=spreads, fmt="o", color=_COLOR, capsize=2)
+        axes.set_yticks(range(len(table.rows)), [row.name for row in table.rows])
+        axes.set_ylim(len(table.rows) - 0.5, -0.5)
+        axes.locator_params(axis="x", nbins=5)
+        axes.grid(axis="y", alpha=0.3)
     return [_saved(figure, folder, stem)]
 
 
 def write_forgetting_curves(statuses: Sequence[CellStatus], folder: Path, stem: str) -> list[Path]:
-    """Draw the loss of each streamed frame after the stream's end, a line for each variant.
+    """Draw what each streamed frame's loss is after the end, and the least it ever was.
 
-    Of the first cell of each that has such a curve; returns the PNG's path, or nothing where no
-    cell has one. Raises UserError where matplotlib is missing.
+    A panel for each variant, of its first cell that has such a curve (paper, supplement: with and
+    without global sampling). Returns the PNG's path, or nothing where no cell has a curve. Raises
+    UserError where matplotlib is missing.
     """
-    curves: dict[str, tuple[list[int], list[float]]] = {}
+    curves: dict[str, StreamedCurve] = {}
     for status in statuses:
         curve = read_streamed(status.folder) if status.result is not None else None
         if curve is not None:
             curves.setdefault(status.cell.variant, curve)
     if not curves:
         return []
-    figure = _figure(8.4, 3.6)
-    axes = figure.add_subplot()
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.set_xlabel("frame of the stream")
-    axes.set_ylabel("L1 after the stream's end")
-    for name, (frames, losses) in curves.items():
-        axes.plot(frames, _smooth(losses), linewidth=1, label=name)
-    axes.legend(frameon=False, fontsize=7)
+    figure, panels = _panels(len(curves), 2.8, sharex=True, sharey=True)
+    for axes, (name, curve) in zip(panels, curves.items()):
+        shown = curve.least or curve.after
+        after = [curve.after[frame] for frame in shown]
+        axes.plot(list(shown), _smooth(after), linewidth=1, label="after the stream's end")
+        if curve.least:
+            least = _smooth(list(curve.least.values()))
+            axes.plot(list(shown), least, linewidth=1, label="the least in training")
+        forgotten = "" if curve.forgotten is None else f": {curve.forgotten:.5f} forgotten"
+        axes.set_title(f"{name}{forgotten}", fontsize=9)
+        axes.set_xlabel("frame of the stream")
+        axes.set_ylabel("L1")
+    panels[0].legend(frameon=False, fontsize=7)
     return [_saved(figure, folder, f"{stem}_forgetting")]
+
+
+def write_convergence(
+    experiment: Experiment, statuses: Sequence[CellStatus], folder: Path, stem: str
+) -> list[Path]:
+    """Draw held-out PSNR against seconds of training, a line for each variant.
+
+    Cells have points where `steps_per_eval_all_images` asked for them; seconds are those of the
+    steps alone, and the last point is the end's. Of several subjects or seeds each is a thin line,
+    and the thick one is the mean at steps that all have. Raises UserError where matplotlib is
+    missing.
+    """
+    curves = {
+        variant.name: [
+            points
+            for status in statuses
+            if status.cell.variant == variant.name and (points := _convergence(status))
+        ]
+        for variant in experiment.variants
+    }
+    curves = {name: found for name, found in curves.items() if found}
+    if not curves:
+        return []
+    figure = _figure(6.4, 4.0)
+    axes = figure.add_subplot()
+    _plain(axes)
+    axes.set_xlabel("training, s")
+    axes.set_ylabel(HEADINGS["psnr"])
+    for place, (name, found) in enumerate(curves.items()):
+        color = f"C{place}"
+        if len(found) > 1:
+            for points in found:
+                axes.plot(*zip(*points.values()), color=color, linewidth=0.6, alpha=0.4)
+        steps = sorted(set.intersection(*(set(points) for points in found)))
+        means = np.mean([[points[step] for step in steps] for points in found], axis=0)
+        axes.plot(*means.reshape(-1, 2).T, color=color, label=name, marker=".", markersize=4)
+    axes.set_xlim(left=0)
+    axes.legend(frameon=False)
+    return [_saved(figure, folder, f"{stem}_convergence")]
+
+
+def _convergence(status: CellStatus) -> dict[int, tuple[float, float]]:
+    """Seconds and PSNR by step of a finished cell; empty without any evaluation in training."""
+    if status.result is None:
+        return {}
+    points = read_curve(run_folder_of(status.folder, status.cell) / CURVE_NAME)
+    seen = {int(point["step"]): (point["train_seconds"], point["psnr"]) for point in points}
+    ended = status.result["metrics"]
+    if seen and {"steps", "train_seconds", "psnr"} <= ended.keys():
+        seen[int(ended["steps"]) - 1] = (ended["train_seconds"], ended["psnr"])
+    return seen
+
+
+def _plain(axes: Any) -> None:
+    axes.spines[["top", "right"]].set_visible(False)
 
 
 def _smooth(values: Sequence[float]) -> np.ndarray:
@@ -84,6 +148,19 @@ def _figure(width: float, height: float) -> Any:
             "Install it (pip install matplotlib), or pass --no-plots.",
         ) from error
     return Figure(figsize=(width, height), layout="constrained")
+
+
+def _panels(count: int, height: float, **shared: bool) -> tuple[Any, list[Any]]:
+    """A figure of so many panels, some in a row."""
+    columns = min(count, _COLUMNS)
+    rows = -(-count // columns)
+    figure = _figure(4.2 * columns, height * rows)
+    panels = list(figure.subplots(rows, columns, squeeze=False, **shared).flat)
+    for axes in panels[count:]:
+        axes.set_visible(False)
+    for axes in panels:
+        _plain(axes)
+    return figure, panels[:count]
 
 
 def _saved(figure: Any, folder: Path, stem: str) -> Path:

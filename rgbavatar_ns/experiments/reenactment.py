@@ -16,10 +16,10 @@ from rgbavatar_ns.data import TrackedDataset
 from rgbavatar_ns.drawing.compositing import composite_bytes
 from rgbavatar_ns.driving import DrivingOptions
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.experiments.seen_pose import as_seen, eyes_px
 from rgbavatar_ns.export import pictures, statistics_of
 from rgbavatar_ns.export.scenes import driven_by
-from rgbavatar_ns.head import HeadModel, ThetaLayout
-from rgbavatar_ns.kernels import PinholeCameras
+from rgbavatar_ns.head import ThetaLayout
 
 _Theta = Float[Tensor, "P"]
 _Picture = UInt8[np.ndarray, "H W 3"]
@@ -141,25 +141,6 @@ def aligned_face(picture_rgb: _Picture, eyes_px: _Eyes) -> _Face:
     return cv2.warpAffine(picture_rgb, matrix, (_SIDE_PX, _SIDE_PX))
 
 
-@torch.no_grad()
-def eyes_px(
-    head: HeadModel,
-    identity: Float[Tensor, "I"],
-    theta: Float[Tensor, "F H"],
-    cameras: PinholeCameras,
-) -> Float[np.ndarray, "F 2 2"]:
-    """The eyeballs' centres in pixels, the subject's right eye (the image's left) first.
-
-    In pixel indices, as OpenCV counts: the first pixel's centre is 0.
-    """
-    regressor = torch.from_numpy(head.arrays.joint_regressor[[4, 3]]).to(theta)
-    centres = torch.einsum("jv,fvc->fjc", regressor, head(theta, identity.to(theta)))
-    turn, move = cameras.world_to_camera[:, :3, :3], cameras.world_to_camera[:, None, :3, 3]
-    seen = centres @ turn.mT + move
-    pixels = seen[..., :2] / seen[..., 2:] * cameras.focal_px[:, None]
-    return (pixels + cameras.principal_point_px[:, None] - 0.5).double().numpy()
-
-
 def reenactment_scores(
     avatar: Avatar,
     own: TrackedDataset,
@@ -169,15 +150,16 @@ def reenactment_scores(
 ) -> tuple[dict[str, float], dict[str, str]]:
     """AED, APD and CSIM of an avatar driven by another's held-out frames; why some are missing.
 
-    The driver's numbers are taken as they are (mapped by name), as in the paper. Raises UserError
+    The driver's numbers are taken as they are (mapped by name), as in the paper, and the avatar is
+    seen as the driver was (`seen_pose.as_seen`), in pictures of the driver's size. Raises UserError
     where the driver has no expression that the avatar knows.
     """
     avatar = avatar.cpu()
     chosen = list(driver.test or driver.train)
     options = DrivingOptions(relative="off", pose="absolute")
-    theta = driven_by(avatar, driver, chosen, statistics_of(avatar, own), 25.0, options).theta
-    camera = own.cameras.select([0])
-    drawn = list(pictures(avatar, theta, camera, (0.0, 0.0, 0.0)))
+    mapped = driven_by(avatar, driver, chosen, statistics_of(avatar, own), 25.0, options)
+    theta, cameras = as_seen(mapped, avatar, own, driver, chosen)
+    drawn = list(pictures(avatar, theta, cameras, (0.0, 0.0, 0.0)))
     values, missing = {}, {}
     if tracker is None:
         missing |= dict.fromkeys(("aed", "apd"), "no tracker was named")
@@ -190,10 +172,10 @@ def reenactment_scores(
         return values, missing
     train = list(own.train)
     references = train[:: max(1, len(train) // _REFERENCES)][:_REFERENCES]
-    cameras = own.cameras.select(references)
-    at = eyes_px(avatar.head, avatar.identity, own.theta[references], cameras)
+    filmed_by = own.cameras.select(references)
+    at = eyes_px(avatar.head, avatar.identity, own.theta[references], filmed_by)
     faces = [aligned_face(_over_black(own, k), eyes) for k, eyes in zip(references, at)]
-    at = eyes_px(avatar.head, avatar.identity, theta, camera)
+    at = eyes_px(avatar.head, avatar.identity, theta, cameras)
     reenacted = [aligned_face(picture, eyes) for picture, eyes in zip(drawn, at)]
     values["csim"] = identity_similarity(faces, reenacted, recognition)
     return values, missing

@@ -1,13 +1,14 @@
 """The report of sweeps: tables as Markdown, CSV and LaTeX, plots, and a page that shows all."""
 
 import html
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from rgbavatar_ns.experiments.plots import write_forgetting_curves, write_plots
+from rgbavatar_ns.experiments.plots import write_convergence, write_forgetting_curves, write_plots
 from rgbavatar_ns.experiments.spec import Experiment
 from rgbavatar_ns.experiments.sweep import CellStatus, read_statuses
-from rgbavatar_ns.experiments.tables import HEADINGS, ResultTable, result_table
+from rgbavatar_ns.experiments.tables import ResultTable, Row, result_table
 
 _STYLE = (
     "body{font:15px/1.5 system-ui,sans-serif;max-width:70em;margin:2em auto;padding:0 1em}"
@@ -43,6 +44,7 @@ def write_report(experiment: Experiment, folder: Path, *, plots: bool = True) ->
     drawn = []
     if plots:
         drawn = write_plots(experiment, table, out, experiment.name)
+        drawn += write_convergence(experiment, statuses, out, experiment.name)
         drawn += write_forgetting_curves(statuses, out, experiment.name)
     page = out / "index.html"
     page.write_text(_page(experiment, table, statuses, drawn), encoding="utf-8")
@@ -52,16 +54,9 @@ def write_report(experiment: Experiment, folder: Path, *, plots: bool = True) ->
 def _page(
     experiment: Experiment, table: ResultTable, statuses: list[CellStatus], drawn: list[Path]
 ) -> str:
-    heading = ["Method", *(HEADINGS[metric] for metric in table.metrics), "cells"]
-    rows = []
-    for row in table.rows:
-        cells = [row.name]
-        for metric in table.metrics:
-            entry = row.entries.get(metric)
-            cells.append("-" if entry is None else f"{entry.mean:.4g} ± {entry.spread:.2g}")
-        links = " ".join(f'<a href="../cells/{key}/">{key[:6]}</a>' for key in row.cells)
-        text = "".join(f"<td>{html.escape(cell)}</td>" for cell in cells)
-        rows.append(f"<tr>{text}<td><code>{links}</code></td></tr>")
+    tables = _html_table(table, table.rows)
+    if table.subject_rows:
+        tables += "<h2>By subject</h2>" + _html_table(table, table.subject_rows)
     pictures = "".join(f'<p><img src="{path.name}" alt="plot"></p>' for path in drawn)
     notes = "".join(f'<p class="note">{html.escape(note)}</p>' for note in table.notes)
     failed = "".join(
@@ -70,10 +65,22 @@ def _page(
         for status in statuses
         if status.state == "failed"
     )
-    head = "".join(f"<th>{html.escape(cell)}</th>" for cell in heading)
     return (
         f'<!doctype html><html lang="en"><meta charset="utf-8"><title>'
         f"{html.escape(experiment.title)}</title><style>{_STYLE}</style>"
-        f"<h1>{html.escape(experiment.title)}</h1><table><tr>{head}</tr>{''.join(rows)}</table>"
+        f"<h1>{html.escape(experiment.title)}</h1>{tables}"
         f"{notes}{pictures}{failed}</html>\n"
     )
+
+
+def _html_table(table: ResultTable, rows: Sequence[Row]) -> str:
+    """Rows with the paper's figures beside them and links to their cells."""
+    by_subject = any(row.subject for row in rows)
+    heading = [*table.heading(by_subject=by_subject), "cells"]
+    lines = []
+    for row, cells in zip(rows, table.lines(by_subject=by_subject)):
+        links = " ".join(f'<a href="../cells/{key}/">{key[:6]}</a>' for key in row.cells)
+        text = "".join(f"<td>{html.escape(cell)}</td>" for cell in cells)
+        lines.append(f"<tr>{text}<td><code>{links}</code></td></tr>")
+    head = "".join(f"<th>{html.escape(cell)}</th>" for cell in heading)
+    return f"<table><tr>{head}</tr>{''.join(lines)}</table>"

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from rgbavatar_ns.avatar import Avatar
-from rgbavatar_ns.data import load_dataset
+from rgbavatar_ns.data import TrackedDataset, load_dataset
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.experiments import commands
 from rgbavatar_ns.experiments.cells import Cell
@@ -23,8 +23,10 @@ from rgbavatar_ns.experiments.reenactment import (
     load_tracker,
     reenactment_scores,
 )
+from rgbavatar_ns.experiments.rendering_speed import frames_per_second
 from rgbavatar_ns.experiments.streamed import write_streamed
 from rgbavatar_ns.files import read_json, write_json
+from rgbavatar_ns.plugin.online.least_losses import read_least
 
 CELL_FILE, RESULT_FILE, LOG_FILE = "cell.json", "result.json", "log.txt"
 _EVALUATION = "eval.json"
@@ -37,6 +39,11 @@ def write_cell(folder: Path, cell: Cell, data: Path, driver: Path | None = None)
     write_json(folder / CELL_FILE, {**cell.to_json(), **places})
 
 
+def run_folder_of(folder: Path, cell: Cell) -> Path:
+    """Where in the cell's folder its ns-train run lies."""
+    return folder / _RUN / "cell" / cell.preset / "run"
+
+
 def read_result(folder: Path) -> dict[str, Any] | None:
     """The metrics of a finished cell; None where it is not done."""
     return read_json(folder / RESULT_FILE)
@@ -47,20 +54,21 @@ def run_cell(folder: Path) -> dict[str, Any]:
     described = json.loads((folder / CELL_FILE).read_text())
     data, driver = Path(described.pop("data")), described.pop("driver_data")
     cell = Cell.from_json(described)
-    run_folder = folder / _RUN / "cell" / cell.preset / "run"
+    run_folder = run_folder_of(folder, cell)
     training = commands.train(cell.preset, data, run_folder, cell.seed, as_flags(cell.overrides))
     scores = commands.evaluate(run_folder, folder / _EVALUATION)
     found = {**training, **scores}
     numbers = {name: value for name, value in found.items() if isinstance(value, int | float)}
+    avatar, dataset = Avatar.load(run_folder), load_dataset(data)
+    numbers["frames_per_second"] = frames_per_second(avatar, dataset)
     if "stream" in training:
-        avatar, dataset = Avatar.load(run_folder), load_dataset(data)
-        numbers["l1_streamed"] = write_streamed(avatar, dataset, folder)
+        numbers |= write_streamed(avatar, dataset, folder, read_least(run_folder))
     result = {"key": cell.key, "metrics": numbers, "run": str(run_folder)}
     unavailable = {}
     if "lpips_unavailable" in scores:
         unavailable["lpips_vgg"] = scores["lpips_unavailable"]
     if cell.cross_identity is not None and driver is not None:
-        values, missing = _reenact(run_folder, data, Path(driver), cell.cross_identity)
+        values, missing = _reenact(avatar, dataset, Path(driver), cell.cross_identity)
         numbers |= values
         unavailable |= missing
     if unavailable:
@@ -70,12 +78,11 @@ def run_cell(folder: Path) -> dict[str, Any]:
 
 
 def _reenact(
-    run_folder: Path, data: Path, driver: Path, named: Mapping[str, str]
+    avatar: Avatar, own: TrackedDataset, driver: Path, named: Mapping[str, str]
 ) -> tuple[dict[str, float], dict[str, str]]:
     tracker = load_tracker(named["tracker"]) if "tracker" in named else None
     file = named.get("face_recognition")
     recognition = None if file is None else OnnxFaceRecognition(Path(file))
-    avatar, own = Avatar.load(run_folder), load_dataset(data)
     return reenactment_scores(avatar, own, load_dataset(driver), tracker, recognition)
 
 

@@ -3,47 +3,59 @@
 import difflib
 import itertools
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import yaml
 
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.files import digest
 
 METRICS = {
     "psnr": ("PSNR", 2),
     "ssim": ("SSIM", 4),
     "lpips_vgg": ("LPIPS (VGG)", 4),
     "l1_streamed": ("L1, streamed frames", 4),
+    "l1_forgotten": ("L1 forgotten", 5),
     "e_orth": ("e_orth", 4),
     "images_per_second": ("images/s", 1),
     "train_seconds": ("training, s", 0),
+    "frames_per_second": ("frames/s", 1),
+    "peak_mib": ("memory, MiB", 0),
+    "gpu_peak_mib": ("GPU memory, MiB", 0),
     "aed": ("AED", 4),
     "apd": ("APD", 4),
     "csim": ("CSIM", 4),
 }
 """Heading and digits of what a table may show; the first three are of the held-out frames,
-`l1_streamed` is of the frames that a stream brought, after its end; the last three need
-`cross_identity`."""
+`l1_streamed` is of the frames that a stream brought, after its end, and `l1_forgotten` how much
+more that is than each of them ever had; `frames_per_second` is from theta to the picture, and
+memory that of the training process; the last three need `cross_identity`."""
 
 _CROSS_IDENTITY = ("driver", "tracker", "face_recognition")
 
 Overrides = dict[str, Any]
 """Dotted fields of a preset's config, as on ns-train's command line, with their values."""
 
+Published = Mapping[str, float]
+"""Figures of the paper by metric."""
+
 
 @dataclass(frozen=True)
 class Variant:
     """One row of the table: what it changes, and what the paper published for it.
 
-    Rows that a grid made of one listed variant share its `family`, a line of a plot.
+    Rows that a grid made of one listed variant share its `family`, a line of a plot. `preset`
+    replaces the experiment's. `paper_by_subject` has published figures by a subject's name.
     """
 
     name: str
     overrides: Overrides = field(default_factory=dict)
-    paper: Mapping[str, float] = field(default_factory=dict)
+    paper: Published = field(default_factory=dict)
     family: str = ""
+    preset: str | None = None
+    paper_by_subject: Mapping[str, Published] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -82,13 +94,18 @@ class Experiment:
             raise _refusal(self.name, cause, "Give each its own name.")
 
 
-def read_experiment(path: Path, *, tiny: bool = False) -> Experiment:
+def read_experiment(
+    path: Path, *, tiny: bool = False, subjects: Sequence[str] | None = None
+) -> Experiment:
     """Read and check a YAML file; `tiny` applies its section of that name.
 
-    Keys: name, title, preset, variants (name, set, paper), grid (override -> values; each
-    combination is a variant), subjects, seeds, base, metrics, plot, paper_data, tiny (any of
-    these anew). Raises UserError naming the key for anything unknown, missing or of a wrong type.
-    Whether overrides fit the preset is checked by `overrides.check_overrides`.
+    `subjects` replace the file's: folders relative to the working directory, or the procedural
+    ones; the experiment's name then tells them. Keys: name, title, preset, variants (name, preset,
+    set, paper, paper_by_subject), grid (override -> values; each combination is a variant),
+    subjects, seeds, base, metrics, plot, paper_data, tiny (any of these anew). Options may be
+    written with - for _, as on command lines. Raises UserError naming the key for anything unknown,
+    missing or of a wrong type. Whether overrides fit the preset is checked by
+    `overrides.check_overrides`.
     """
     try:
         content = yaml.safe_load(path.read_text(encoding="utf-8"))
@@ -101,9 +118,36 @@ def read_experiment(path: Path, *, tiny: bool = False) -> Experiment:
     if tiny:
         if not isinstance(scale, dict):
             raise _refusal(path.name, "has no section `tiny`", "Leave out --tiny, or add one.")
-        base = {**(content.get("base") or {}), **(scale.get("base") or {})}
+        base = {
+            **_options(path.name, content.get("base")),
+            **_options(path.name, scale.get("base")),
+        }
         content = {**content, **scale, "base": base}
-    return _experiment(path, content)
+    experiment = _experiment(path, content)
+    return experiment if subjects is None else _of_subjects(experiment, subjects)
+
+
+def _of_subjects(experiment: Experiment, subjects: Sequence[str]) -> Experiment:
+    """The same on other subjects, by another name, so that results do not mix."""
+    placed = tuple(
+        name if is_demo(name) else str(Path(name).expanduser().absolute()) for name in subjects
+    )
+    # Two folders may have one name: the digest tells them apart.
+    parts = [name.replace(":", "-") if is_demo(name) else Path(name).name for name in placed]
+    told = "-".join(parts[:3]) + (f"-and-{len(parts) - 3}-more" if len(parts) > 3 else "")
+    name = f"{experiment.name}-{told}-{digest(placed)[:6]}"
+    return replace(experiment, name=name, subjects=placed)
+
+
+def is_demo(subject: str) -> bool:
+    """Whether it is "demo", "demo:SEED", "demo:SEED:FRAMES" or "demo:SEED:FRAMES:SIZE"."""
+    kind, *numbers = subject.split(":")
+    return kind == "demo" and len(numbers) <= 3 and all(number.isdigit() for number in numbers)
+
+
+def subject_name(subject: str) -> str:
+    """What tables call a subject: a folder's name, or the procedural one as it is."""
+    return subject if is_demo(subject) else Path(subject).name
 
 
 _KINDS: dict[str, type] = {
@@ -125,6 +169,11 @@ def _experiment(path: Path, content: Mapping[str, Any]) -> Experiment:
         if key not in given:
             raise _refusal(where, f"lacks `{key}`", f"Add `{key}: ...`.")
     given.setdefault("name", path.stem)
+    for key in ("base", "grid"):
+        if key in given:
+            given[key] = _options(where, given[key])
+    if "plot" in given:
+        given["plot"] = _option(given["plot"])
     variants = _variants(where, given.pop("variants", None), given.pop("grid", None))
     for key in ("subjects", "metrics"):
         if key in given and not all(isinstance(item, str) for item in given[key]):
@@ -165,7 +214,12 @@ def _variants(
             raise _refusal(where, f"has grid: {key}: {values!r}", "Give a list of values.")
     points = [dict(zip(grid, point)) for point in itertools.product(*grid.values())]
     return tuple(
-        Variant(_joined(row.name, point), {**row.overrides, **point}, row.paper, row.name)
+        replace(
+            row,
+            name=_joined(row.name, point),
+            overrides={**row.overrides, **point},
+            family=row.name,
+        )
         for row in rows
         for point in points
     )
@@ -179,13 +233,50 @@ def _joined(name: str, point: Overrides) -> str:
 def _variant(where: str, entry: Any) -> Variant:
     if not isinstance(entry, dict) or not isinstance(entry.get("name"), str):
         raise _refusal(where, f"has the variant {entry!r}", "Give each a `name` and a `set`.")
-    _require_known(f"{where}, variant {entry['name']!r}", entry, ("name", "set", "paper"))
-    overrides, paper = entry.get("set") or {}, entry.get("paper") or {}
-    if not isinstance(overrides, dict) or not isinstance(paper, dict):
-        cause = f"has the variant {entry['name']!r} with no mapping"
-        raise _refusal(where, cause, "`set` and `paper` are mappings.")
-    _require_known(f"{where}, paper of {entry['name']!r}", paper, METRICS)
-    return Variant(entry["name"], dict(overrides), {key: float(v) for key, v in paper.items()})
+    named = f"{where}, variant {entry['name']!r}"
+    _require_known(named, entry, ("name", "preset", "set", "paper", "paper_by_subject"))
+    preset = entry.get("preset")
+    if preset is not None and not isinstance(preset, str):
+        raise _refusal(named, f"has preset: {preset!r}", "Give text there.")
+    parts = {key: entry.get(key) or {} for key in ("set", "paper", "paper_by_subject")}
+    wrong = [key for key, value in parts.items() if not isinstance(value, dict)]
+    if wrong:
+        raise _refusal(named, f"has {wrong[0]}: {parts[wrong[0]]!r}", "Give a mapping there.")
+    return Variant(
+        entry["name"],
+        _options(named, parts["set"]),
+        _published(f"{where}, paper of {entry['name']!r}", parts["paper"]),
+        preset=preset,
+        paper_by_subject={
+            str(subject): _published(f"{named}, paper of {subject}", figures)
+            for subject, figures in parts["paper_by_subject"].items()
+        },
+    )
+
+
+def _published(where: str, figures: Any) -> dict[str, float]:
+    if not isinstance(figures, dict) or not all(
+        isinstance(value, int | float) for value in figures.values()
+    ):
+        raise _refusal(where, f"has {figures!r}", "Give figures by metric.")
+    _require_known(where, figures, METRICS)
+    return {key: float(value) for key, value in figures.items()}
+
+
+def _option(name: Any) -> str:
+    """An option's one spelling: fields are written with _, command lines with - too."""
+    return str(name).replace("-", "_")
+
+
+def _options(where: str, given: Mapping[Any, Any] | None) -> Overrides:
+    if given is not None and not isinstance(given, dict):
+        raise _refusal(where, f"has the options {given!r}", "Give a mapping there.")
+    options: Overrides = {}
+    for name, value in (given or {}).items():
+        if _option(name) in options:
+            raise _refusal(where, f"sets {_option(name)} twice", "Leave one of its spellings.")
+        options[_option(name)] = value
+    return options
 
 
 def _require_known(where: str, given: Collection[Any], known: Collection[str]) -> None:

@@ -42,19 +42,18 @@ def check_experiment(experiment: Experiment) -> None:
     found = [*vars(methods).values(), *vars(online_methods).values()]
     configs = [getattr(one, "config", None) for one in found]
     presets = {c.method_name: c for c in configs if c is not None and hasattr(c, "method_name")}
-    if experiment.preset not in presets:
-        raise UserError(
-            f"The experiment {experiment.name} names the preset {experiment.preset!r}.",
-            nearest(experiment.preset, list(presets)),
-        )
     tracker = (experiment.cross_identity or {}).get("tracker")
     if tracker is not None:
         load_tracker(tracker)
-    config = presets[experiment.preset]
-    check_overrides(config, experiment.base, f"The experiment {experiment.name}, base,")
     for variant in experiment.variants:
         where = f"The experiment {experiment.name}, variant {variant.name!r},"
-        check_overrides(config, variant.overrides, where)
+        preset = variant.preset or experiment.preset
+        if preset not in presets:
+            named = where if variant.preset else f"The experiment {experiment.name}"
+            raise UserError(f"{named} names the preset {preset!r}.", nearest(preset, list(presets)))
+        base = f"The experiment {experiment.name}, base,"
+        check_overrides(presets[preset], experiment.base, base)
+        check_overrides(presets[preset], variant.overrides, where)
 
 
 def sweep(

@@ -1,4 +1,4 @@
-"""Tables of an experiment: means and spreads over subjects and seeds, the paper's beside them."""
+"""Tables of an experiment: by variant and by subject, the paper's figures beside them."""
 
 import csv
 import io
@@ -7,7 +7,7 @@ import statistics
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass
 
-from rgbavatar_ns.experiments.spec import METRICS, Experiment
+from rgbavatar_ns.experiments.spec import METRICS, Experiment, Variant, subject_name
 from rgbavatar_ns.experiments.sweep import CellStatus
 
 HEADINGS = {metric: heading for metric, (heading, _) in METRICS.items()}
@@ -25,13 +25,16 @@ class Entry:
 
 @dataclass(frozen=True)
 class Row:
-    """A variant: its figures by metric, how many of its cells are done, the cells' keys."""
+    """A variant: its figures by metric, and the keys of the cells that are done.
+
+    Over all subjects and seeds, or over the seeds of one `subject`.
+    """
 
     name: str
     entries: dict[str, Entry]
     paper: dict[str, float]
-    done: int
     cells: tuple[str, ...]
+    subject: str = ""
 
 
 @dataclass(frozen=True)
@@ -43,82 +46,155 @@ class ResultTable:
     rows: tuple[Row, ...]
     paper_heading: str | None
     notes: tuple[str, ...]
+    subject_rows: tuple[Row, ...] = ()
+    """The same for each subject by itself, subject after subject; none where there is one."""
 
     def to_markdown(self) -> str:
-        """With the title above and notes below."""
-        heading = "| " + " | ".join(self._heading()) + " |"
-        rule = "| --- |" + " ---: |" * (len(self._heading()) - 1)
-        lines = ["| " + " | ".join(cells) + " |" for cells in self._lines()]
+        """With the title above and notes below, then the subjects' table."""
         notes = [f"- {note}" for note in self.notes]
-        text = "\n".join([f"### {self.title}", "", heading, rule, *lines, "", *notes])
-        return text.rstrip() + "\n"
+        lines = [f"### {self.title}", "", *_markdown(self.heading(), self.lines()), "", *notes]
+        if self.subject_rows:
+            lines += ["", "By subject:", ""]
+            lines += _markdown(self.heading(by_subject=True), self.lines(by_subject=True))
+        return "\n".join(lines).rstrip() + "\n"
 
     def to_csv(self) -> str:
-        """Every figure in full precision: mean, spread and count in columns of their own."""
+        """Every figure in full precision: mean, spread and count in columns of their own.
+
+        The column `subject` is empty where a row is over all of them.
+        """
         text = io.StringIO()
         writer = csv.writer(text, lineterminator="\n")
         paper = self.metrics if self.paper_heading else ()
         named = [f"{m}_{part}" for m in self.metrics for part in ("mean", "std", "count")]
-        writer.writerow(["variant", *named, *(f"paper_{m}" for m in paper), "cells"])
-        for row in self.rows:
+        published = [f"paper_{metric}" for metric in paper]
+        writer.writerow(["variant", "subject", *named, *published, "cells"])
+        for row in (*self.rows, *self.subject_rows):
             entries = [row.entries.get(metric) for metric in self.metrics]
             parts = [part for e in entries for part in (astuple(e) if e else ("", "", ""))]
-            published = [row.paper.get(metric, "") for metric in paper]
-            writer.writerow([row.name, *parts, *published, " ".join(row.cells)])
+            theirs = [row.paper.get(metric, "") for metric in paper]
+            writer.writerow([row.name, row.subject, *parts, *theirs, " ".join(row.cells)])
         return text.getvalue()
 
     def to_latex(self) -> str:
-        """A booktabs tabular, as the paper's tables."""
-        heading = " & ".join(_escaped(cell) for cell in self._heading())
-        lines = [" & ".join(_escaped(c) for c in cells) + r" \\" for cells in self._lines()]
-        columns = "l|" + "c" * (len(self._heading()) - 1)
-        begin = [rf"\begin{{tabular}}{{{columns}}}", r"\toprule", heading + r" \\", r"\midrule"]
-        return "\n".join([*begin, *lines, r"\bottomrule", r"\end{tabular}", ""])
+        """A booktabs tabular, as the paper's tables; a second one by subject."""
+        text = _latex(self.heading(), self.lines())
+        if self.subject_rows:
+            text += "\n" + _latex(self.heading(by_subject=True), self.lines(by_subject=True))
+        return text
 
-    def _heading(self) -> list[str]:
+    def heading(self, *, by_subject: bool = False) -> list[str]:
+        """What stands above the columns."""
         ours = [HEADINGS[metric] for metric in self.metrics]
+        first = ["Subject", "Method"] if by_subject else ["Method"]
         if self.paper_heading is None:
-            return ["Method", *ours]
-        return ["Method", *ours, *(f"{name}, {self.paper_heading}" for name in ours)]
+            return [*first, *ours]
+        return [*first, *ours, *(f"{name}, {self.paper_heading}" for name in ours)]
 
-    def _lines(self) -> list[list[str]]:
+    def lines(self, *, by_subject: bool = False) -> list[list[str]]:
+        """The table's cells as texts, row by row."""
         lines = []
-        for row in self.rows:
+        for row in self.subject_rows if by_subject else self.rows:
             cells = [_told(metric, row.entries.get(metric)) for metric in self.metrics]
             if self.paper_heading is not None:
                 cells += [_number(metric, row.paper.get(metric)) for metric in self.metrics]
-            lines.append([row.name, *cells])
+            lines.append([row.subject, row.name, *cells] if by_subject else [row.name, *cells])
         return lines
+
+
+def _markdown(heading: Sequence[str], lines: Sequence[Sequence[str]]) -> list[str]:
+    texts = sum(name in ("Subject", "Method") for name in heading)
+    rule = "|" + " --- |" * texts + " ---: |" * (len(heading) - texts)
+    return ["| " + " | ".join(heading) + " |", rule, *("| " + " | ".join(c) + " |" for c in lines)]
+
+
+def _latex(heading: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
+    texts = sum(name in ("Subject", "Method") for name in heading)
+    columns = "l" * texts + "|" + "c" * (len(heading) - texts)
+    above = " & ".join(map(_escaped, heading)) + r" \\"
+    rows = [" & ".join(map(_escaped, cells)) + r" \\" for cells in lines]
+    begin = [rf"\begin{{tabular}}{{{columns}}}", r"\toprule", above, r"\midrule"]
+    return "\n".join([*begin, *rows, r"\bottomrule", r"\end{tabular}", ""])
 
 
 def result_table(experiment: Experiment, statuses: Sequence[CellStatus]) -> ResultTable:
     """The table of what is done; notes say what is missing and why a metric is not available."""
-    rows = []
-    for variant in experiment.variants:
-        mine = [status for status in statuses if status.cell.variant == variant.name]
-        done = [status.result for status in mine if status.result is not None]
-        entries = {
-            metric: _entry([result["metrics"][metric] for result in done])
-            for metric in experiment.metrics
-            if done and all(metric in result["metrics"] for result in done)
-        }
-        keys = tuple(status.cell.key for status in mine if status.result is not None)
-        rows.append(Row(variant.name, entries, dict(variant.paper), len(done), keys))
-    heading = None
-    if any(row.paper for row in rows):
-        heading = "paper" + (f" ({experiment.paper_data})" if experiment.paper_data else "")
-    return ResultTable(
-        experiment.title, experiment.metrics, tuple(rows), heading, _notes(experiment, statuses)
+    named = _subject_names(statuses)
+    rows = tuple(
+        _row(experiment, variant, statuses, _published(variant, list(named.values())))
+        for variant in experiment.variants
     )
+    subject_rows = tuple(
+        _row(
+            experiment,
+            variant,
+            [status for status in statuses if status.cell.subject == subject],
+            dict(variant.paper_by_subject.get(name, {})),
+            name,
+        )
+        for subject, name in named.items()
+        for variant in experiment.variants
+        if len(named) > 1
+    )
+    heading = None
+    if any(row.paper for row in (*rows, *subject_rows)):
+        heading = "paper" + (f" ({experiment.paper_data})" if experiment.paper_data else "")
+    notes = _notes(experiment, statuses, list(named.values()))
+    return ResultTable(experiment.title, experiment.metrics, rows, heading, notes, subject_rows)
 
 
-def _notes(experiment: Experiment, statuses: Sequence[CellStatus]) -> tuple[str, ...]:
+def _row(
+    experiment: Experiment,
+    variant: Variant,
+    statuses: Sequence[CellStatus],
+    paper: dict[str, float],
+    subject: str = "",
+) -> Row:
+    mine = [status for status in statuses if status.cell.variant == variant.name]
+    done = [status.result for status in mine if status.result is not None]
+    entries = {
+        metric: _entry([result["metrics"][metric] for result in done])
+        for metric in experiment.metrics
+        if done and all(metric in result["metrics"] for result in done)
+    }
+    keys = tuple(status.cell.key for status in mine if status.result is not None)
+    return Row(variant.name, entries, paper, keys, subject)
+
+
+def _subject_names(statuses: Sequence[CellStatus]) -> dict[str, str]:
+    """What each subject is called: a folder's name, or its path where two have one name."""
+    subjects = list(dict.fromkeys(status.cell.subject for status in statuses))
+    short = [subject_name(subject) for subject in subjects]
+    return {
+        subject: name if short.count(name) == 1 else subject
+        for subject, name in zip(subjects, short)
+    }
+
+
+def _published(variant: Variant, subjects: Sequence[str]) -> dict[str, float]:
+    """The paper's figures: means over just these subjects where it has them all."""
+    known = [variant.paper_by_subject.get(name, {}) for name in subjects]
+    means = {
+        metric: statistics.fmean(figures[metric] for figures in known)
+        for metric in METRICS
+        if known and all(metric in figures for figures in known)
+    }
+    return {**variant.paper, **means}
+
+
+def _notes(
+    experiment: Experiment, statuses: Sequence[CellStatus], subjects: Sequence[str]
+) -> tuple[str, ...]:
     done = [status for status in statuses if status.result is not None]
-    subjects = ", ".join(sorted({status.cell.subject.rsplit("/", 1)[-1] for status in statuses}))
     seeds = ", ".join(str(seed) for seed in experiment.seeds)
     notes = [
         f"{len(done)} of {len(statuses)} cells done; preset {experiment.preset}; "
-        f"subjects {subjects}; seeds {seeds}; ± is the standard deviation over them."
+        f"subjects {', '.join(subjects)}; seeds {seeds}; ± is the standard deviation over them."
+    ]
+    notes += [
+        f"{variant.name}: preset {variant.preset}."
+        for variant in experiment.variants
+        if variant.preset not in (None, experiment.preset)
     ]
     unavailable: dict[str, str] = {}
     for status in done:
@@ -148,7 +224,8 @@ def _number(metric: str, value: float | None) -> str:
     if value is None or not math.isfinite(value):
         return _MISSING
     _, digits = METRICS[metric]
-    return f"{value:.1e}" if 0 < abs(value) < 10.0**-digits else f"{value:.{digits}f}"
+    small = digits > 0 and 0 < abs(value) < 10.0**-digits
+    return f"{value:.1e}" if small else f"{value:.{digits}f}"
 
 
 def _escaped(text: str) -> str:

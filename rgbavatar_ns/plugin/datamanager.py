@@ -1,6 +1,6 @@
 """Batches of whole frames for nerfstudio's pipeline, decoded in the background."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -160,6 +160,13 @@ class RGBAvatarDataManager(DataManager):
             rows = self._train_order.batch(step + ahead)
             self.image_cache.prefetch([positions[row] for row in rows])
         return batch
+
+    def every_train(self) -> Iterator[tuple[Cameras, dict[str, Any]]]:
+        """All training frames once, in the form of training batches."""
+        positions, size = self.dataparser.positions("train"), self.config.batch_size
+        for number, first in enumerate(range(0, len(positions), size)):
+            rows = list(range(first, min(first + size, len(positions))))
+            yield self._batch(rows, self._train_cameras, positions, number)
 
     def device_frames(self) -> DeviceFrames | None:
         """All training frames on the device; None without any, or beyond the budget."""

@@ -26,8 +26,9 @@ def told_of_command(error: BaseException, trace: TracebackType | None) -> UserEr
         ours = type(frame.f_locals.get("pipeline")).__module__.startswith("rgbavatar_ns.")
         if module == _EXPORTER and ours and isinstance(error, AssertionError):
             return UserError(
-                "ns-export writes the fields of other methods; of this one it writes the cameras.",
-                "Use `rgbavatar export RUN DST --format ply` (or spz, sog, gltf, web, bundle).",
+                "This kind of ns-export takes other methods; of this one `cameras` are written.",
+                "`rgbavatar export RUN DST --format ply` writes Gaussians of one frame or of many; "
+                "gltf, spz, sog, web and others: `rgbavatar export --help`. There is no mesh.",
             )
         if module == _RENDER and ours:
             told = _of_rendering(error, command)
@@ -48,7 +49,8 @@ def _of_rendering(error: BaseException, command: object) -> UserError | None:
         return UserError(
             "ns-render spiral moves a camera before a scene that stands still, and upside down "
             "before a face.",
-            "Use `rgbavatar render RUN OUT --show orbit`, or turntable.",
+            "`rgbavatar render RUN OUT --show turntable` turns the camera about the head, --show "
+            "orbit swings it around; `ns-render interpolate`, `camera-path` and `dataset` work.",
         )
     steps = getattr(command, "interpolation_steps", 1)
     if kind == "RenderInterpolated" and isinstance(error, ValueError) and steps < 1:

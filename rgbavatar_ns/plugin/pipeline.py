@@ -2,6 +2,7 @@
 
 import statistics
 from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,9 @@ from rgbavatar_ns.plugin.cameras import from_nerfstudio
 from rgbavatar_ns.plugin.datamanager import RGBAvatarDataManager, RGBAvatarDataManagerConfig
 from rgbavatar_ns.plugin.model import RGBAvatarModel, RGBAvatarModelConfig
 from rgbavatar_ns.plugin.viewer.panel import ViewerPanel
+
+Evaluated = Callable[[int, Mapping[str, Any]], None]
+"""Told of the scores of all held-out frames after a step of training."""
 
 
 @dataclass
@@ -53,6 +57,7 @@ class RGBAvatarPipeline(VanillaPipeline):
         super().__init__(config, str(device), **more)
         self.viewer_panel = ViewerPanel(self.model, self.film)
         self.model.view = self._view
+        self.evaluated: Evaluated = lambda step, metrics: None
 
     @property
     def model(self) -> RGBAvatarModel:
@@ -104,15 +109,12 @@ class RGBAvatarPipeline(VanillaPipeline):
         """What `step` is taken on; where steps are recorded, frames that lie on the device."""
         if kind == "recorded":
             return self.datamanager.next_choice(step)
-        cameras, batch = self.datamanager.next_train(step)
-        metadata = cameras.metadata or {}
-        return TrainingBatch(
-            metadata["theta"],
-            from_nerfstudio(cameras),
-            batch["image"],
-            metadata["background"],
-            metadata["position"][:, 0].long(),
-        )
+        return _as_batch(*self.datamanager.next_train(step))
+
+    def training_frames(self) -> Iterator[TrainingBatch]:
+        """All frames that there are to train on, once, in batches."""
+        for cameras, batch in self.datamanager.every_train():
+            yield _as_batch(cameras, batch)
 
     def get_average_eval_image_metrics(
         self, step: int | None = None, output_path: Path | None = None, get_std: bool = False
@@ -132,7 +134,10 @@ class RGBAvatarPipeline(VanillaPipeline):
                 "Write it again with some held out, so that there is something to evaluate on.",
             )
         if self.test_mode != "test":
-            return super().get_average_eval_image_metrics(step, output_path, get_std)
+            metrics = super().get_average_eval_image_metrics(step, output_path, get_std)
+            if step is not None:
+                self.evaluated(step, metrics)
+            return metrics
         if self.config.model.lpips_metric:
             self.model.lpips_metric = LPIPSMetric()
         metrics = super().get_average_eval_image_metrics(step, output_path, get_std)
@@ -174,3 +179,15 @@ class RGBAvatarPipeline(VanillaPipeline):
                     if isinstance(value, float):
                         scores[f"{name}_refined"].append(value)
         return {name: statistics.fmean(values) for name, values in scores.items()}
+
+
+def _as_batch(cameras: Cameras, batch: dict[str, Any]) -> TrainingBatch:
+    """What the datamanager serves, as a step takes it."""
+    metadata = cameras.metadata or {}
+    return TrainingBatch(
+        metadata["theta"],
+        from_nerfstudio(cameras),
+        batch["image"],
+        metadata["background"],
+        metadata["position"][:, 0].long(),
+    )

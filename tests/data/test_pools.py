@@ -100,6 +100,27 @@ def test_newest_and_recent_frames():
     assert frames.recent(0.9, 2) is None
 
 
+def test_watched_frames_come_in_turn_and_change_no_draw():
+    def filled() -> ReplayBuffer:
+        frames = pools(local=8, old=2, clock=lambda: 0.0)
+        assert frames.watched(3, -1, 2) is None
+        fill(frames, range(7, 15))
+        return frames
+
+    watched, plain = filled(), filled()
+    seen, after = [], -1
+    for _ in range(3):
+        batch = watched.watched(3, after, 2)
+        assert batch is not None
+        seen.append(batch.serial)
+        after = batch.serial[-1]
+        # The stream's third frame is the one that its source calls 10.
+        assert batch.index == tuple(7 + serial for serial in batch.serial)
+    assert seen == [(0, 3), (6, 0), (3, 6)]
+    assert watched.median_latency_s() is None
+    assert [watched.batch(4).serial for _ in range(5)] == [plain.batch(4).serial for _ in range(5)]
+
+
 def test_latency_is_from_arrival_to_the_first_batch():
     clock = Clock()
     frames = pools(local=10, clock=clock)
@@ -181,6 +202,20 @@ def test_held_frames_come_in_order_with_their_images(save_images: bool, encode: 
     assert [serial for serial, _ in held] == sorted(serial for serial, _ in held)
     for serial, frame in held:
         assert np.array_equal(decode_png_rgba(frame.encoded(), ""), tracked(serial).image_rgba)
+
+
+def test_all_that_is_held_comes_once_in_order_in_batches():
+    frames = pools()
+    fill(frames, range(12), False)
+    batches = list(frames.in_order(3))
+    assert [len(batch.serial) for batch in batches] == [3, 3, 1]
+    assert [serial for batch in batches for serial in batch.serial] == [
+        serial for serial, _ in frames.held()
+    ]
+    for batch in batches:
+        for serial, theta, image in zip(batch.serial, batch.theta, batch.images_rgba):
+            assert torch.equal(theta, tracked(serial).theta)
+            assert np.array_equal(image, tracked(serial).image_rgba)
 
 
 def test_a_frame_has_its_image_once():

@@ -12,13 +12,13 @@ from rgbavatar_ns.experiments import cells_of, read_experiment, reenactment, run
 from rgbavatar_ns.experiments.reenactment import (
     OnnxFaceRecognition,
     aligned_face,
-    eyes_px,
     identity_similarity,
     load_tracker,
     reenactment_scores,
     tracked_distances,
 )
 from rgbavatar_ns.experiments.runner import write_cell
+from rgbavatar_ns.experiments.seen_pose import eyes_px
 from rgbavatar_ns.experiments.sweep import CellStatus, check_experiment
 from rgbavatar_ns.experiments.tables import result_table
 from rgbavatar_ns.head import HeadModel, ThetaLayout

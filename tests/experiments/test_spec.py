@@ -68,6 +68,86 @@ def test_a_cell_is_known_by_what_decides_its_result(tmp_path):
     assert not {cell.key for cell in longer} & {cell.key for cell in first}
 
 
+def test_options_have_one_spelling(tmp_path):
+    """As in Python and as on command lines: one cell."""
+    dashed = GOOD.replace("max_num", "max-num").replace("hidden_width", "hidden-width")
+    assert dashed != GOOD
+    experiment = _read(tmp_path, dashed)
+    check_experiment(experiment)
+    assert cells_of(experiment) == cells_of(_read(tmp_path, GOOD))
+    text = """
+title: Grid
+preset: rgbavatar
+plot: pipeline.model.avatar.num-bases
+grid: {pipeline.model.avatar.num-bases: [5, 10]}
+"""
+    grid = _read(tmp_path, text)
+    assert grid.plot == "pipeline.model.avatar.num_bases"
+    assert [set(variant.overrides) for variant in grid.variants] == [{grid.plot}] * 2
+    tiny = GOOD.replace("{max_num_iterations: 2}", "{max-num-iterations: 2}")
+    assert _read(tmp_path, tiny, tiny=True).base == {"max_num_iterations": 2}
+
+
+def test_a_variant_may_have_a_preset_of_its_own(tmp_path):
+    text = """
+title: Two presets
+preset: rgbavatar-paper
+variants:
+  - name: offline
+  - name: online
+    preset: rgbavatar-paper-online
+    set: {steps_after_stream: 3, pipeline.datamanager.local-size: 20}
+"""
+    experiment = _read(tmp_path, text)
+    check_experiment(experiment)
+    cells = cells_of(experiment)
+    assert [cell.preset for cell in cells] == ["rgbavatar-paper", "rgbavatar-paper-online"]
+    assert len({cell.key for cell in cells}) == 2
+    for wrong, told in (
+        (text.replace("    preset: rgbavatar-paper-online\n", ""), "no field of the preset"),
+        (text.replace("paper-online", "paper-onlin"), "Did you mean 'rgbavatar-paper-online'"),
+        (text.replace("preset: rgbavatar-paper-online", "preset: 3"), "Give text there"),
+    ):
+        with pytest.raises(UserError) as refused:
+            check_experiment(_read(tmp_path, wrong))
+        assert told in str(refused.value)
+
+
+def test_optimisers_are_options_too(tmp_path):
+    rate = "optimizers.basis-color.optimizer.lr"
+    experiment = _read(tmp_path, GOOD.replace("{max_num_iterations: 10}", f"{{{rate}: 0.5}}"))
+    check_experiment(experiment)
+    assert cells_of(experiment)[0].overrides[rate.replace("-", "_")] == 0.5
+    unknown = _read(tmp_path, GOOD.replace("{max_num_iterations: 10}", "{optimizers.colour.lr: 1}"))
+    with pytest.raises(UserError, match=r"Did you mean 'optimizers\.color'"):
+        check_experiment(unknown)
+    whole = _read(tmp_path, GOOD.replace("{max_num_iterations: 10}", "{optimizers.color: 1}"))
+    with pytest.raises(UserError, match="no single option"):
+        check_experiment(whole)
+
+
+def test_subjects_of_the_command_line_make_another_experiment(tmp_path, monkeypatch):
+    (tmp_path / "films" / "bala").mkdir(parents=True)
+    (tmp_path / "more" / "bala").mkdir(parents=True)
+    plain = _read(tmp_path, GOOD)
+    monkeypatch.chdir(tmp_path / "films")
+    chosen = _read(tmp_path, GOOD, subjects=("bala", "demo:4:20:64"))
+    assert {cell.subject for cell in cells_of(chosen)} == {
+        str(tmp_path / "films" / "bala"),
+        "demo:4:20:64",
+    }
+    assert chosen.name.startswith("widths-bala-demo-4-20-64-")
+    monkeypatch.chdir(tmp_path / "more")
+    other = _read(tmp_path, GOOD, subjects=("bala", "demo:4:20:64"))
+    assert len({plain.name, chosen.name, other.name}) == 3
+    many = _read(tmp_path, GOOD, subjects=[f"demo:{k}" for k in range(9)])
+    assert "-and-6-more-" in many.name
+    with pytest.raises(UserError, match="does not exist"):
+        cells_of(_read(tmp_path, GOOD, subjects=("gone",)))
+    with pytest.raises(UserError, match="no subjects"):
+        _read(tmp_path, GOOD, subjects=())
+
+
 def test_a_grid_multiplies_the_variants(tmp_path):
     text = """
 title: Grid
@@ -99,6 +179,10 @@ grid: {pipeline.model.avatar.num_bases: [5, 10], machine.seed: [1]}
         ("seeds: [0, 1]", "seeds: [-1]", "0 or more"),
         ("seeds: [0, 1]", "seeds: 3", "Give a list"),
         ("psnr: 30.5", "psnrr: 30.5", "Did you mean 'psnr'"),
+        ("psnr: 30.5", "psnr: high", "Give figures by metric"),
+        ("paper: {psnr: 30.5}", "paper_by_subject: {bala: 3}", "Give figures by metric"),
+        ("paper: {psnr: 30.5}", "paper_by_subject: 3", "Give a mapping there"),
+        ("base: {max_num", "base: {max-num-iterations: 3, max_num", "twice"),
         ("name: wide", "name: narrow", "two variants named"),
         ("title: Two widths", "", "lacks `title`"),
         ("title: Two widths", "title: [", "cannot be read"),
@@ -131,3 +215,29 @@ def test_the_experiments_that_ship_fit_the_presets(path, tiny):
     experiment = read_experiment(path, tiny=tiny)
     check_experiment(experiment)
     assert cells_of(experiment)
+
+
+@pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
+def test_rows_with_the_papers_figures_run_the_papers_preset(path):
+    """Whoever runs them gets the paper; with --tiny nobody does, which the table then says."""
+    experiment = read_experiment(path)
+    for variant in experiment.variants:
+        if variant.paper or variant.paper_by_subject or variant.name in ("Ours", "paper"):
+            preset = variant.preset or experiment.preset
+            assert preset in ("rgbavatar-paper", "rgbavatar-paper-online"), variant.name
+
+
+def test_the_main_tables_means_are_of_the_papers_subjects():
+    """INSTA's eight; the four others are of the GaussianBlendShapes dataset."""
+    quality = next(path for path in CONFIGS if path.stem == "quality")
+    rows = {variant.name: variant for variant in read_experiment(quality).variants}
+    for name in ("Ours", "Ours (w/ LPIPS)", "Ours (online)"):
+        figures = rows[name].paper_by_subject
+        insta = [one for subject, one in figures.items() if not subject.startswith("subject")]
+        assert (len(insta), len(figures)) == (8, 12)
+        for metric, digits in (("psnr", 0.006), ("ssim", 6e-5), ("lpips_vgg", 6e-5)):
+            mean = sum(one[metric] for one in insta) / 8
+            assert mean == pytest.approx(rows[name].paper[metric], abs=digits)
+    assert rows["Ours"].paper["frames_per_second"] == 398
+    assert rows["Ours (w/ LPIPS)"].overrides["pipeline.model.lpips_weight"] == 0.05
+    assert "pipeline.model.lpips_start_step" not in rows["Ours (w/ LPIPS)"].overrides

@@ -2,6 +2,7 @@
 
 import csv
 import sys
+from dataclasses import replace
 
 import pytest
 
@@ -73,6 +74,60 @@ def test_the_report_has_means_spreads_and_the_papers_figures(experiment_of, tmp_
     assert "Bases &amp; more" in page
     assert (tmp_path / "out/report/bases.png").stat().st_size > 1000
     assert (tmp_path / "out/report/bases.svg").exists()
+
+
+def test_each_subject_has_its_rows_and_the_papers_figures_for_it(experiment_of, tmp_path):
+    paper = """    paper: {psnr: 1, train_seconds: 81}
+    paper_by_subject: {data: {psnr: 30}, more: {psnr: 40}, gone: {psnr: 50}}
+"""
+    (tmp_path / "more").mkdir()
+    experiment = experiment_of("a", "b", subjects="data, more", paper=paper)
+    experiment = replace(experiment, metrics=("psnr", "train_seconds"))
+    sweep(experiment, tmp_path / "out", LocalEngine(2))
+    table = write_report(experiment, tmp_path / "out").table
+    markdown = table.to_markdown()
+    # The paper's mean is over the two subjects that are there.
+    assert "| a | 32.00 ± 1.15 | - | 35.00 | 81 |" in markdown
+    assert "| Subject | Method | PSNR | training, s | PSNR, paper (INSTA) |" in markdown
+    assert "| data | a | 32.00 ± 1.41 | - | 30.00 | - |" in markdown
+    assert "| more | b | 33.00 ± 1.41 | - | 40.00 | - |" in markdown
+    rows = list(csv.DictReader((tmp_path / "out/report/bases.csv").open()))
+    assert [(row["variant"], row["subject"]) for row in rows] == [
+        *[("a", ""), ("b", "")],
+        *[("a", "data"), ("b", "data"), ("a", "more"), ("b", "more")],
+    ]
+    assert float(rows[4]["paper_psnr"]) == 40
+    assert (tmp_path / "out/report/bases.tex").read_text().count(r"\begin{tabular}") == 2
+    page = (tmp_path / "out/report/index.html").read_text()
+    assert "<h2>By subject</h2>" in page
+    assert "<td>40.00</td>" in page
+
+
+def test_subjects_of_one_name_are_told_by_their_paths(experiment_of, tmp_path):
+    for name in ("one", "two"):
+        (tmp_path / name / "bala").mkdir(parents=True)
+    experiment = experiment_of("a", subjects="one/bala, two/bala", seeds="0")
+    sweep(experiment, tmp_path / "out", LocalEngine(2))
+    rows = write_report(experiment, tmp_path / "out", plots=False).table.subject_rows
+    assert [row.subject for row in rows] == [str(tmp_path / n / "bala") for n in ("one", "two")]
+
+
+def test_other_subjects_do_not_mix_with_the_files(experiment_of, tmp_path, monkeypatch, capsys):
+    (tmp_path / "own").mkdir()
+    experiment_of("a")
+    monkeypatch.chdir(tmp_path)
+    file, out = ["--file", "bases.yaml"], ["--output", "out"]
+    cli.main(["sweep", "bases.yaml", *out])
+    cli.main(["sweep", "bases.yaml", *out, "--subjects", "own"])
+    assert "--file bases.yaml --subjects own" in capsys.readouterr().out
+    assert len(list((tmp_path / "out/cells").iterdir())) == 4
+    cli.main(["report", "out", *file, "--subjects", "own", "--no-plots"])
+    assert "subjects own;" in next((tmp_path / "out/report").glob("bases-own-*.md")).read_text()
+    cli.main(["report", "out", *file, "--no-plots"])
+    assert "subjects data;" in (tmp_path / "out/report/bases.md").read_text()
+    with pytest.raises(SystemExit):
+        cli.main(["report", "out", *file, "--subjects", "own", "data"])
+    assert "was not begun" in capsys.readouterr().err
 
 
 def test_the_command_says_what_failed_and_ends_with_1(experiment_of, tmp_path, capsys):

@@ -145,7 +145,7 @@ def told(work: Callable[[], object], kind: type[Exception]) -> str:
 def test_what_ns_render_cannot_do_is_told(config: Path, tmp_path: Path):
     out = tmp_path / "film.mp4"
     spiral = told(SpiralRender(config, out).main, AssertionError)
-    assert "rgbavatar render RUN OUT --show orbit" in spiral
+    assert "rgbavatar render RUN OUT --show turntable" in spiral
     no_steps = told(RenderInterpolated(config, out, interpolation_steps=0).main, ValueError)
     assert "--interpolation-steps is 0" in no_steps
     smaller = told(DatasetRender(config, out, downscale_factor=2.0).main, UserError)
@@ -185,15 +185,25 @@ def test_ns_export_writes_the_cameras(config: Path, tmp_path: Path, exporter: An
         assert count in (None, len(frames))
 
 
-def test_ns_export_ends_without_a_traceback(
-    config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("command", "instead"),
+    [
+        (("ns-export", "gaussian-splat", "--output-dir"), "rgbavatar export RUN DST --format ply"),
+        (("ns-render", "spiral", "--output-path"), "rgbavatar render RUN OUT --show turntable"),
+    ],
+)
+def test_a_refusal_ends_without_a_traceback(
+    config: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    command: tuple[str, ...],
+    instead: str,
 ):
     (tmp_path / "open3d.py").write_text("")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    arguments = ("--load-config", config, "--output-dir", tmp_path / "export")
-    ended = run_command("ns-export", "gaussian-splat", *arguments)
+    ended = run_command(*command, tmp_path / "out", "--load-config", config)
     assert ended.returncode == 1
-    assert "rgbavatar export RUN DST --format ply" in ended.stderr
+    assert instead in ended.stderr
     assert "Traceback" not in ended.stdout + ended.stderr
 
 

@@ -5,11 +5,12 @@ import dataclasses
 import re
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import pytest
 import yaml
 
+from rgbavatar_ns.cli import render
 from rgbavatar_ns.plugin import methods
 from rgbavatar_ns.plugin.online import methods as online_methods
 
@@ -132,6 +133,23 @@ def test_the_code_that_is_named_is_there():
     for file, name in named:
         text = (ROOT / "rgbavatar_ns" / file).read_text()
         assert re.search(rf"^\s*(?:def |class )?{name}\b", text, re.MULTILINE), (file, name)
+
+
+def test_every_table_and_figure_has_a_command_that_is_there():
+    """A file of configs/, all of which are named, or a command whose options exist."""
+    commands = [row[1] for row in rows("Tables and figures")[1:]]
+    assert len(commands) >= 20
+    spoken = [text for command in commands for text in re.findall(r"`([^`]+)`", command)]
+    files = {text for text in spoken if re.fullmatch(r"[a-z_]+", text)}
+    assert files == {path.stem for path in (ROOT / "configs").glob("*.yaml")}
+    assert all(re.search(r"`[a-z_]+`|`rgbavatar |`ns-train ", command) for command in commands)
+    shown = {text.partition("--show ")[2].split(" ")[0] for text in spoken if "--show" in text}
+    assert shown <= set(get_args(render.Show))
+    for text in spoken:
+        if text.startswith("ns-train"):
+            method, options = text.split()[1], re.findall(r"--([\w.-]+)", text)
+            for option in options:
+                value_of(PRESETS[method], option.replace("-", "_"))
 
 
 def test_constants_of_the_paper_that_are_no_options():

@@ -27,11 +27,15 @@ from rgbavatar_ns.kernels.types import SIGHT_SUMS, SIGHT_UNIT
 
 FirstColorsKind = Literal["matted", "paper"]
 """paper: I is the training picture over its background. matted: each pixel counts by its matte
-alpha a too, c = sum w a I / sum w a. Ours, because what lies behind the person tints the
-silhouette else; where alpha is 1 both are the same."""
+alpha a too, c = sum w a I / sum w a, and a colour that was learned from fainter sights stays. Ours,
+because what lies behind the person tints the silhouette else, and late means undo what was learned
+(docs/paper.md)."""
 
 WEIGHT_THRESHOLD = 0.1
 """The blending weight that a Gaussian must exceed in some pixel (paper: .1; its release: .01)."""
+_THRESHOLD_UNITS = int(WEIGHT_THRESHOLD / SIGHT_UNIT)
+_LEARNED = 0.06
+"""A colour feature that is so far from its initial grey was learned: five of Adam's steps."""
 _HIDDEN_LOGIT = -12.0
 """An opacity of 6e-6, far below what is drawn."""
 _SMALLEST_WEIGHT_SUM = 1e-3
@@ -86,15 +90,22 @@ class FirstColors:
 
         Waits for no device.
         """
-        sums = seen.sums * SIGHT_UNIT if isinstance(seen, FirstSight) else seen
         avatar = self._avatar
-        fresh = is_seen_well(sums) & ~avatar.color_initialized
-        if fresh.device.type == "cpu" and not bool(fresh.any()):
+        if isinstance(seen, FirstSight):
+            # In most steps nothing new comes to light.
+            if seen.sums.device.type == "cpu" and int(seen.sums[:, 4].max()) <= _THRESHOLD_UNITS:
+                return
+            seen = seen.sums * SIGHT_UNIT
+        sums, feature = seen, avatar.blendshapes.color_feature
+        given = is_seen_well(sums) & ~avatar.color_initialized
+        if given.device.type == "cpu" and not bool(given.any()):
             return
-        feature = avatar.blendshapes.color_feature
+        avatar.color_initialized |= given
+        if self._kind == "matted":
+            grey = feature_from_color(feature.new_full((3,), avatar.config.initial_color))
+            given = given & ((feature - grey).abs().amax(1) < _LEARNED)
         first = feature_from_color(mean_color(sums)).to(feature)
-        feature.copy_(torch.where(fresh[:, None], first, feature))
-        avatar.color_initialized |= fresh
+        feature.copy_(torch.where(given[:, None], first, feature))
 
 
 @torch.no_grad()

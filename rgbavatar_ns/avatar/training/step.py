@@ -204,6 +204,28 @@ class TrainingStep:
         self._finish(step)
         return losses
 
+    def look_back(self, frames: Iterable[TrainingBatch]) -> bool:
+        """Give first colours to what these frames show of the avatar as it is after a last step.
+
+        What a step's update brings to light is found when its frame is drawn again; after the last
+        step none is. Returns whether the avatar changed.
+        """
+        known = self.avatar.color_initialized
+        before = int(known.sum())
+        if self._first_colors is None or before == len(known):
+            return False
+        for number, batch in enumerate(frames):
+            if self.refinement is not None and batch.position is not None:
+                theta = self.refinement.corrected(batch.theta, batch.position).detach()
+                batch = replace(batch, theta=theta)
+            count, background = len(batch.theta), batch.background
+            if background is None:
+                background = random_backgrounds(number, count, self.options.seed)
+            seen = self._seen_first(batch, background.to(batch.theta), count)
+            if seen is not None:
+                self._first_colors.give(seen)
+        return int(known.sum()) > before
+
     def _take_recorded(self, chosen: ChosenFrames, step: int) -> Losses:
         frames, rows = self._frames, chosen.rows
         if frames is None:
@@ -335,7 +357,9 @@ class TrainingStep:
         self, batch: TrainingBatch, background: Float[Tensor, "B 3"], num_filmed: int
     ) -> Float[Tensor, "N 5"] | None:
         """How the first images show what waits for its first colour; None where nothing does."""
-        if self._first_colors is None or self._first_colors.sight(num_filmed) is None:
+        if num_filmed == 0 or self._first_colors is None:
+            return None
+        if self._first_colors.sight(num_filmed) is None:
             return None
         cameras = batch.cameras
         if len(cameras.focal_px) > num_filmed:

@@ -3,7 +3,7 @@
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,9 +26,13 @@ _CAMERA_PARTS = ("world_to_camera", "focal_px", "principal_point_px")
 
 @dataclass(frozen=True)
 class ReplayBatch:
-    """B different frames of the pools; `serial` counts the stream's frames from 0."""
+    """B different frames of the pools; `serial` counts the stream's frames from 0.
+
+    `index` is the frames' own numbers.
+    """
 
     serial: tuple[int, ...]
+    index: tuple[int, ...]
     theta: Float[Tensor, "B H"]
     cameras: PinholeCameras
     images_rgba: UInt8[Tensor, "B H_px W_px 4"]
@@ -119,6 +123,17 @@ class ReplayBuffer:
                     self._latencies_s.append(now - arrived_s)
             return self._gather(serials)
 
+    def in_order(self, batch_size: int) -> Iterator[ReplayBatch]:
+        """All that the pools hold now, in the order of arrival, in batches."""
+        with self._lock:
+            serials = sorted(self._held)
+        for first in range(0, len(serials), batch_size):
+            with self._lock:
+                kept = [s for s in serials[first : first + batch_size] if s in self._held]
+                batch = self._gather(kept) if kept else None
+            if batch is not None:
+                yield batch
+
     def recent(self, seconds: float, most: int) -> ReplayBatch | None:
         """Up to `most` of the local pool's frames of the last seconds, newest first; None: none."""
         with self._lock:
@@ -126,6 +141,17 @@ class ReplayBuffer:
             local = self._pools.local_frames
             late = [serial for serial in local if self._held[serial].arrived_s >= since]
             chosen = late[:: -max(1, -(-len(late) // most))]
+            return self._gather(chosen) if chosen else None
+
+    def watched(self, every: int, after: int, most: int) -> ReplayBatch | None:
+        """Up to `most` of each `every`-th frame that a pool holds, in turn; None: there are none.
+
+        after: the last one that was looked at before.
+        """
+        with self._lock:
+            held = sorted(serial for serial in self._held if serial % every == 0)
+            turn = sum(serial <= after for serial in held)
+            chosen = (held[turn:] + held[:turn])[:most]
             return self._gather(chosen) if chosen else None
 
     def newest_theta(self) -> Float[Tensor, "H"] | None:
@@ -170,8 +196,10 @@ class ReplayBuffer:
         columns = self._columns(serials)
         theta = columns.pop("theta")
         cameras = PinholeCameras(**columns, width=self._subject.width, height=self._subject.height)
-        images = np.stack([self._held[serial].frame.image_rgba for serial in serials])
-        return ReplayBatch(tuple(serials), theta, cameras, torch.from_numpy(images))
+        frames = [self._held[serial].frame for serial in serials]
+        images = torch.from_numpy(np.stack([frame.image_rgba for frame in frames]))
+        index = tuple(frame.index for frame in frames)
+        return ReplayBatch(tuple(serials), index, theta, cameras, images)
 
     def state_dict(self) -> dict[str, Any]:
         """Pools and frames, safe for `torch.load(weights_only=True)`."""

@@ -1,6 +1,7 @@
 """Batches from the pools of a running stream."""
 
 import dataclasses
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -13,7 +14,14 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from rgbavatar_ns.avatar.training.losses import random_backgrounds
 from rgbavatar_ns.data import DatasetWriter, LocalGlobalPools
 from rgbavatar_ns.data.sampling import PoolStrategy
-from rgbavatar_ns.data.streams import FrameStream, Ingest, ReplayBuffer, ReplayStream, Rewindable
+from rgbavatar_ns.data.streams import (
+    FrameStream,
+    Ingest,
+    ReplayBatch,
+    ReplayBuffer,
+    ReplayStream,
+    Rewindable,
+)
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.files import atomic_folder
 from rgbavatar_ns.options import Between, Share
@@ -23,6 +31,7 @@ from rgbavatar_ns.plugin.datamanager import (
     RGBAvatarDataManagerConfig,
 )
 from rgbavatar_ns.plugin.dataparser import Subject
+from rgbavatar_ns.plugin.online.least_losses import LeastLosses
 from rgbavatar_ns.plugin.online.sources import SourceConfig, await_subject, open_source
 
 
@@ -49,6 +58,10 @@ class OnlineDataManagerConfig(RGBAvatarDataManagerConfig):
     queue_frames: Annotated[int, Between(1, 10**5)] = 256
     """Frames that may wait to be decoded; beyond, the oldest is dropped, or the source waits
     where it keeps them (a video file)."""
+    watch_every: Annotated[int, Between(0, 10**6)] = 0
+    """Every so-manieth frame is looked at again and again while a pool holds it, and the least
+    loss that it ever had is kept in least.json, to tell what was forgotten (paper, supplement).
+    Takes a tenth of the time; 0 watches none."""
     recorded: tyro.conf.Suppress[Path | None] = None
     """Dataset of the frames that the pools held, which the trainer writes for later commands."""
 
@@ -71,6 +84,7 @@ class OnlineDataManager(RGBAvatarDataManager):
     ) -> None:
         self._ingest: Ingest | None = None
         self.images_drawn = 0
+        self.least = LeastLosses()
         self.ended_step: int | None = None
         """Step before which the stream ended; None while it goes on."""
         replayed = config.source.kind == "replay"
@@ -152,8 +166,17 @@ class OnlineDataManager(RGBAvatarDataManager):
     def next_train(self, step: int) -> tuple[Cameras, dict[str, Any]]:
         """A batch drawn from the pools now; UserError while they are empty."""
         drawn = self.pools.batch(self.config.batch_size, evenly=self.ended_step is not None)
+        self.images_drawn += len(drawn.serial)
+        return self._served(drawn, step)
+
+    def every_train(self) -> Iterator[tuple[Cameras, dict[str, Any]]]:
+        """All that the pools hold once, in the form of training batches."""
+        for number, drawn in enumerate(self.pools.in_order(self.config.batch_size)):
+            yield self._served(drawn, number)
+
+    def _served(self, drawn: ReplayBatch, step: int) -> tuple[Cameras, dict[str, Any]]:
+        """Frames with the backgrounds of a step."""
         count = len(drawn.serial)
-        self.images_drawn += count
         cameras = to_nerfstudio(
             drawn.cameras,
             theta=drawn.theta,
@@ -180,8 +203,12 @@ class OnlineDataManager(RGBAvatarDataManager):
         """Pools, frames, counters and random numbers: all of the stream that a run goes on from."""
         if self._ingest is None:
             return {}
-        stream = self._ingest.state_dict()
-        return {"stream": stream, "images": self.images_drawn, "ended_step": self.ended_step}
+        return {
+            "stream": self._ingest.state_dict(),
+            "images": self.images_drawn,
+            "ended_step": self.ended_step,
+            "least": self.least.by_frame,
+        }
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Go on from a checkpoint; nothing where there is no stream to go on with."""
@@ -189,6 +216,7 @@ class OnlineDataManager(RGBAvatarDataManager):
             return
         self._ingest.load_state_dict(state["stream"])
         self.images_drawn, self.ended_step = state["images"], state["ended_step"]
+        self.least = LeastLosses(state.get("least"))
         self._resumed = True
 
 

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import UInt8
 from torch import Tensor
 
-from rgbavatar_ns.avatar.metrics import psnr
+from rgbavatar_ns.avatar.metrics import l1_over_black, psnr
 from rgbavatar_ns.data.streams import ReplayBatch
 from rgbavatar_ns.drawing.compositing import (
     composite,
@@ -47,6 +47,14 @@ class OnlinePipeline(RGBAvatarPipeline):
     def film(self) -> None:
         """None: of a stream only the newest frame is shown."""
         return None
+
+    @torch.no_grad()
+    def losses_of(self, frames: ReplayBatch) -> list[float]:
+        """The mean absolute difference over black of frames that the pools hold."""
+        backend = self.config.model.rasterizer
+        theta = frames.theta.to(self.device)
+        drawn = self.model.avatar.render(theta, frames.cameras, backend=backend).image
+        return l1_over_black(drawn, frames.images_rgba).tolist()
 
     @torch.no_grad()
     def look_at(self, newest_first: ReplayBatch) -> tuple[float, UInt8[Tensor, "H W 3"]]:

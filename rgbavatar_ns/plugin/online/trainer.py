@@ -15,6 +15,7 @@ from nerfstudio.utils import writer
 from nerfstudio.utils.misc import step_check
 from nerfstudio.utils.rich_utils import CONSOLE
 
+from rgbavatar_ns.avatar.training.batches import TrainingBatch
 from rgbavatar_ns.avatar.training.step import Losses
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.options import Between, Count, Counted
@@ -33,6 +34,9 @@ _LOOK_INTERVAL_S = 1.0
 _LOOKED_AT = 2
 _LOOK_SHARE = 0.05
 """Of the time, at most, that looking at the newest frames may take."""
+_WATCHED_AT_ONCE = 4
+_WATCH_SHARE = 0.1
+"""The same of watched frames."""
 
 
 @dataclass
@@ -81,6 +85,7 @@ class OnlineTrainer(RGBAvatarTrainer):
         self.stop = OnlineStop()
         config.pipeline.datamanager.recorded = config.get_base_dir() / "stream"
         self._next_look_s = 0.0
+        self._next_watch_s, self._last_watched = 0.0, -1
         self._psnr: float | None = None
 
     @property
@@ -154,6 +159,7 @@ class OnlineTrainer(RGBAvatarTrainer):
             for name, value in self._report(loss).scalars().items():
                 writer.put_scalar(name=f"Stream/{name}", scalar=value, step=step)
         self._look_at_newest(losses, self._stream_progress)
+        self._watch()
 
     @property
     def _images_per_step(self) -> int:
@@ -225,6 +231,21 @@ class OnlineTrainer(RGBAvatarTrainer):
         took = time.monotonic() - began
         self._next_look_s = began + max(_LOOK_INTERVAL_S, took / _LOOK_SHARE)
 
+    def _watch(self) -> None:
+        """See what the losses of some watched frames are now; costs the training no more than time.
+
+        Some at a time, so that the least ones of all frames are known alike well.
+        """
+        began, every = time.monotonic(), self.stream.config.watch_every
+        if every == 0 or began < self._next_watch_s:
+            return
+        frames = self.stream.pools.watched(every, self._last_watched, _WATCHED_AT_ONCE)
+        if frames is not None:
+            with self.train_lock:
+                self.stream.least.see(frames.index, self.pipeline.losses_of(frames))
+            self._last_watched = frames.serial[-1]
+        self._next_watch_s = began + (time.monotonic() - began) / _WATCH_SHARE
+
     def save_checkpoint(self, step: int) -> None:
         """Write avatar, pools and frames atomically; raises UserError if they do not fit."""
         model = self.pipeline.model
@@ -244,7 +265,12 @@ class OnlineTrainer(RGBAvatarTrainer):
 
     def _save_end(self) -> None:
         self.stream.record()
+        self.stream.least.write(self.base_dir)
         super()._save_end()
+
+    def _frames_at_the_end(self) -> Iterator[TrainingBatch]:
+        """What the pools hold, however the run ends: a stream's frames are drawn a few times."""
+        return self.pipeline.training_frames()
 
     def _totals(self) -> dict[str, Any]:
         latency = self.stream.pools.median_latency_s()

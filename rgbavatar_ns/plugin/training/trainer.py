@@ -4,7 +4,7 @@ import copy
 import math
 import os
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from dataclasses import dataclass, field
@@ -40,6 +40,7 @@ from rgbavatar_ns.plugin.training.checkpoints import (
     remove_leftover,
     save_checkpoint,
 )
+from rgbavatar_ns.plugin.training.curve import EvaluationCurve
 from rgbavatar_ns.plugin.training.interruption import StopRequest, stop_with_starter
 from rgbavatar_ns.plugin.training.load_config import (
     COMPLETED,
@@ -49,6 +50,7 @@ from rgbavatar_ns.plugin.training.load_config import (
     require_loadable,
 )
 from rgbavatar_ns.plugin.training.optimizers import ExponentialConfig, require_fitting_states
+from rgbavatar_ns.plugin.training.peak_memory import peak_memory
 from rgbavatar_ns.plugin.training.progress import TrainingProgress
 from rgbavatar_ns.plugin.training.ranges import require_trainable
 from rgbavatar_ns.plugin.training.turns import TurnsLock
@@ -178,7 +180,9 @@ class RGBAvatarTrainer(Trainer, FitHooks):
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         """Build pipeline, optimisers, viewer and writers; load a checkpoint if one is named."""
+        self.curve = EvaluationCurve(self.base_dir)
         super().setup(test_mode)
+        self.pipeline.evaluated = self._add_to_curve
         if isinstance(self.viewer_state, Viewer):
             for line in self.viewer_state.viewer_info:
                 CONSOLE.print(line, highlight=False)
@@ -280,6 +284,10 @@ class RGBAvatarTrainer(Trainer, FitHooks):
         if last or step_check(step, self.config.logging.steps_per_log, run_at_zero=True):
             self._progress.show(step + 1, self._write_scalars(step, losses, seconds))
 
+    def _add_to_curve(self, step: int, scores: Mapping[str, Any]) -> None:
+        """A point of curve.json; `--steps-per-eval-all-images` says how often."""
+        self.curve.add(step, self._train_seconds, scores)
+
     def _run_callbacks(self, step: int, location: TrainingCallbackLocation) -> None:
         for callback in self.callbacks:
             callback.run_callback_at_location(step, location)
@@ -329,13 +337,23 @@ class RGBAvatarTrainer(Trainer, FitHooks):
     def _save_end(self) -> None:
         """Save, and say how it went."""
         self.training_state = "completed" if self.completed else "paused"
-        if self.completed and self.pipeline.model.finish():
+        looked = self._take.look_back(self._frames_at_the_end())
+        if (self.completed and self.pipeline.model.finish()) or looked:
             self._saved_step = None
         if self.step >= 0 and self.step != self._saved_step:
             self.save_checkpoint(self.step)
         writer.write_out_storage()
         self._save_refined()
         self._tell_end(self._write_summary(COMPLETED if self.completed else "stopped"))
+
+    def _frames_at_the_end(self) -> Iterable[TrainingBatch]:
+        """The frames to look back at when the run ends.
+
+        Offline each was drawn often: they are looked at only where what none shows is hidden.
+        """
+        if self.completed and self.config.pipeline.model.hide_unseen:
+            return self.pipeline.training_frames()
+        return ()
 
     def _stay(self) -> None:
         """Keep the viewer open if it is to stay."""
@@ -375,6 +393,7 @@ class RGBAvatarTrainer(Trainer, FitHooks):
             "train_seconds": seconds,
             "images_per_second": totals["images"] / seconds if seconds > 0 else 0.0,
             **totals,
+            **peak_memory(self.pipeline.device),
         }
         write_json(self.base_dir / SUMMARY_NAME, summary)
         return summary
@@ -404,6 +423,7 @@ class RGBAvatarTrainer(Trainer, FitHooks):
             self._start_step = state["step"] + 1
             self._saved_step = state["step"]
             self._train_seconds = float(state.get("train_seconds", 0.0))
+            self.curve.points = [dict(point) for point in state.get("curve", ())]
         self.pipeline.load_pipeline(state["pipeline"], state["step"])
         with damage_of(path):
             self.optimizers.load_optimizers(state["optimizers"])
@@ -426,6 +446,7 @@ class RGBAvatarTrainer(Trainer, FitHooks):
         state = {
             "step": step,
             "train_seconds": self._train_seconds,
+            "curve": self.curve.points,
             "pipeline": self.pipeline.state_dict(),
             "optimizers": {k: v.state_dict() for k, v in self.optimizers.optimizers.items()},
             "schedulers": {k: v.state_dict() for k, v in self.optimizers.schedulers.items()},

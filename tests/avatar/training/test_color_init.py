@@ -45,6 +45,12 @@ def initialise(avatar: Avatar, theta, camera, rgba, backend: str = "auto") -> in
     return int(avatar.color_initialized.sum()) - before
 
 
+def grey(avatar: Avatar) -> Avatar:
+    """As before training."""
+    torch.nn.init.zeros_(avatar.blendshapes.color_feature)
+    return avatar
+
+
 def random_pictures(count: int, size: int) -> torch.Tensor:
     """8-bit RGBA, with a stripe that nobody filmed."""
     generator = torch.Generator().manual_seed(3)
@@ -99,7 +105,7 @@ def test_sums_run_over_the_batch():
 
 
 def test_colors_are_initialised_once_and_nothing_else_changes(make_avatar):
-    avatar = make_avatar(random=True)
+    avatar = grey(make_avatar(random=True))
     camera, theta = front_camera(48), random_theta(avatar.layout, 2)
     before = {name: p.detach().clone() for name, p in avatar.named_parameters()}
     count = initialise(avatar, theta, camera, images([0.2, 0.4, 0.9, 1.0], 48, 2))
@@ -226,3 +232,53 @@ def test_every_gaussian_is_initialised_in_the_first_step_that_shows_it(make_avat
         assert not (avatar.color_initialized & ~had & (shown[:, 4] < WEIGHT_THRESHOLD - 1e-4)).any()
         counts.append(int(avatar.color_initialized.sum()))
     assert counts[0] < counts[5] < counts[-1]
+
+
+@pytest.mark.parametrize("kind", ["matted", "paper"])
+def test_a_color_learned_from_faint_sights_stays_but_in_the_paper(
+    make_avatar, kind: FirstColorsKind
+):
+    """Ten Gaussians whose colours steps have moved from grey, ten that one step has moved."""
+    avatar = make_avatar(initial_color=0.3)
+    colors, feature = FirstColors(avatar, kind), avatar.blendshapes.color_feature
+    bright = torch.zeros(avatar.num_gaussians, 5)
+    bright[:20] = torch.tensor([0.4, 0.8, 1.2, 2.0, 0.5])
+    with torch.no_grad():
+        feature[:10, 1] += 0.1
+        feature[10:20] -= 0.0125
+    before = feature.detach().clone()
+    colors.give(bright)
+    assert avatar.color_initialized.tolist() == [True] * 20 + [False] * (avatar.num_gaussians - 20)
+    given = color_from_feature(feature.detach())
+    replaced = 0 if kind == "paper" else 10
+    mean = torch.tensor([0.2, 0.4, 0.6]).expand(20 - replaced, 3)
+    torch.testing.assert_close(given[replaced:20], mean)
+    assert torch.equal(feature[:replaced], before[:replaced])
+    assert torch.equal(feature[20:], before[20:])
+
+
+def test_a_look_back_finds_what_the_last_step_brought_to_light(make_avatar):
+    """Its update lifts a faint Gaussian above the threshold; no step draws it any more."""
+    avatar, size = grey(make_avatar(random=True)), 48
+    theta, camera = random_theta(avatar.layout, 2), front_camera(size)
+    rgba = (images([0.3, 0.5, 0.8, 1.0], size, 2) * 255).round().to(torch.uint8)
+    step = TrainingStep(avatar, options=TrainingOptions(surface_prior=False))
+    with torch.no_grad():
+        avatar.blendshapes.opacity_logit.fill_(math.log(0.02 / 0.98))
+    batch = TrainingBatch(theta, camera, rgba)
+    step(batch, 0)
+    assert not avatar.color_initialized.any()
+    with torch.no_grad():
+        avatar.blendshapes.opacity_logit.fill_(3.0)
+    before = {name: value.detach().clone() for name, value in avatar.named_parameters()}
+    shown = is_seen_well(sums_of(avatar.gaussians(theta), camera, rgba, torch.zeros(2, 3)))
+    assert step.look_back([batch])
+    assert torch.equal(avatar.color_initialized, shown)
+    for name, value in avatar.named_parameters():
+        changed = (value != before[name]).flatten(1).any(1) if name.endswith("feature") else None
+        if changed is None:
+            assert torch.equal(value, before[name]), name
+        elif not name.endswith("basis_color_feature"):
+            assert torch.equal(changed, shown)
+    assert not step.look_back([batch])
+    assert not step.look_back([])

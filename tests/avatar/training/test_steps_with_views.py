@@ -1,5 +1,7 @@
 """Steps in which a view that nobody filmed takes a frame's place: every way takes the same."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -55,6 +57,22 @@ def test_recorded_fused_and_eager_steps_show_the_same_views(emulated, make_avata
         assert parting(trained(make_avatar, "fused"), fused) > 1e-2
     monkeypatch.setattr(SurfacePrior, "pull", lambda self, avatar, step: None)
     assert parting(trained(make_avatar, "fused"), fused) > 1e-3
+
+
+@pytest.mark.parametrize("fast", [True, False])
+def test_a_view_may_take_the_place_of_a_batchs_only_frame(make_avatar, fast):
+    """It gives no first colours: nobody filmed it."""
+    avatar, view_step = stir(make_avatar()), 2 * EVERY
+    batch, background = far_batch(avatar, 1, SIZE, SIZE)
+    prior = SurfacePrior(avatar)
+    take = TrainingStep(avatar, options=TrainingOptions(fast=fast), prior=prior)
+    for step in range(view_step):
+        take(replace(batch, background=background), step)
+    assert prior.views.due(view_step, 1) is not None
+    avatar.color_initialized.zero_()
+    losses = take(replace(batch, background=background), view_step)
+    assert losses["l1"].isfinite()
+    assert not avatar.color_initialized.any()
 
 
 def test_a_frame_that_a_view_displaced_is_not_refined_by_it(make_avatar):

@@ -26,6 +26,7 @@ from rgbavatar_ns.avatar.storage.checkpoint_file import list_checkpoints
 from rgbavatar_ns.data import TrackedFrame, load_dataset
 from rgbavatar_ns.data.streams import StreamClient, StreamSubject
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.kernels import rasterize
 from rgbavatar_ns.plugin.methods import rgbavatar
 from rgbavatar_ns.plugin.online.methods import rgbavatar_online, rgbavatar_online_tiny
 from rgbavatar_ns.plugin.online.sources import SourceConfig
@@ -134,6 +135,29 @@ def test_after_the_stream_all_kept_frames_are_drawn_alike(online: Online):
 
 def test_the_streamed_avatar_learns_and_colours_its_gaussians(online: Online):
     assert_learns(online(steps_after_stream=40))
+
+
+@pytest.mark.parametrize("steps_after_stream", [0, 5])
+def test_what_any_kept_frame_shows_at_the_end_has_had_its_first_color(
+    online: Online, tiny_data: Path, steps_after_stream: int
+):
+    """Of the avatar as it is saved, drawn without what the training uses for it."""
+    trainer = online(steps_after_stream=steps_after_stream)
+    trainer.train()
+    avatar, dataset = Avatar.load(trainer.checkpoint_dir), load_dataset(tiny_data)
+    held = [serial for serial, _ in trainer.stream.pools.held()]
+    assert held == list(range(len(dataset.train)))
+    frames = list(dataset.train)
+    drawn = rasterize(
+        avatar.gaussians(dataset.theta[frames]),
+        dataset.cameras.select(frames),
+        with_visibility=True,
+    )
+    assert drawn.visibility is not None
+    # A weight within rounding of the threshold may fall on either side.
+    shown = (drawn.visibility > 0.1 + 1e-4).any(0)
+    assert int(shown.sum()) > 50
+    assert avatar.color_initialized[shown].all()
 
 
 def test_training_begins_with_the_first_frame(
@@ -304,7 +328,9 @@ def test_a_fault_before_the_first_frame_is_told(online: Online):
     trainer.stream.start = lambda: setattr(trainer.stream.ingest, "failure", OSError("gone"))  # type: ignore[method-assign]
     with pytest.raises(OSError, match="gone"):
         trainer.train()
-    assert summary(trainer) | {"stream": {}} == {
+    told = summary(trainer)
+    assert told.pop("peak_mib") > 0
+    assert told | {"stream": {}} == {
         "ended": "failed: OSError gone",
         **{"steps": 0, "train_seconds": 0.0, "images_per_second": 0.0, "images": 0, "frames": 0},
         "stream": {},

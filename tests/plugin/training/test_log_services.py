@@ -1,4 +1,4 @@
-"""`--vis wandb` and `--vis comet`, with stand-ins for the packages of the two services."""
+"""`--vis wandb` and `--vis comet`: stand-ins for their packages, and wandb itself offline."""
 
 import sys
 import types
@@ -12,7 +12,7 @@ import torch
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.plugin.host_commands import told_of_command
 from rgbavatar_ns.plugin.training.trainer import RGBAvatarTrainer
-from tests.plugin.run import make_trainer, small_config
+from tests.plugin.run import make_trainer, run_command, small_config
 
 STEPS = 9
 EVALUATED = {"steps_per_eval_batch": 4, "steps_per_eval_image": 4, "steps_per_eval_all_images": 4}
@@ -132,3 +132,18 @@ def test_a_service_without_account_or_package_is_told(
     assert remedy in told
     monkeypatch.setitem(sys.modules, name, None)
     assert name in _told(lambda: make_trainer(small_config(tiny_data, tmp_path, vis=vis)))
+
+
+@pytest.mark.slow
+def test_wandb_itself_takes_a_run_offline(
+    tiny_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setenv("WANDB_MODE", "offline")
+    flags = "--pipeline.model.avatar.uv-resolution 16 --max-num-iterations 6 --timestamp run"
+    trained = run_command(
+        *("ns-train", "rgbavatar-tiny", "--data", tiny_data, "--output-dir", tmp_path),
+        *(*flags.split(), "--vis", "wandb", "--logging.steps-per-log", "2"),
+        *("--steps-per-eval-image", "2", "--steps-per-eval-batch", "2"),
+    )
+    assert trained.returncode == 0, trained.stdout + trained.stderr
+    assert list(tmp_path.glob("data/rgbavatar-tiny/run/wandb/offline-run-*/*.wandb"))

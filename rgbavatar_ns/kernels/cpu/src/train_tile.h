@@ -76,14 +76,20 @@ static void see_group(const Tile& tile, const TrainingTarget& target, const Grou
   for (int place = 0; place < group.count; ++place) {
     const Splat& s = group.splats[place];
     if (!s.waiting) continue;
-    Wide sums[3] = {zero, zero, zero}, weight(0.0f), largest(0.0f);
     const float* weight_row = kept.weight[group.first_job[place]];
-    for (uint64_t left = group.blocks[place]; left; left &= left - 1) {
+    Wide largest(0.0f);
+    const float* row = weight_row;
+    for (uint64_t left = group.blocks[place]; left; left &= left - 1, row += kBlockPixels)
+      largest = max_of(largest, load_wide(row));
+    const float most = max_lane(largest);
+    if (!(most > 0.0f)) continue;  // hidden by what lies before it
+    Wide sums[3] = {zero, zero, zero}, weight(0.0f);
+    for (uint64_t left = group.blocks[place]; left; left &= left - 1, weight_row += kBlockPixels) {
+      const Wide whole = load_wide(weight_row);
       const BlockPixels pixels(tile, __builtin_ctzll(left));
       const WideInt rgba = load_rgba(tile, pixels, target.rgba);
       const Wide unlike = to_floats(rgba - WideInt(C::kUnfilmed));  // 0 for the mark alone
       const Wide matte = to_floats((rgba >> 24) & 255) * (1.0f / 255.0f);
-      const Wide whole = load_wide(weight_row);
       const Wide w = select(unlike * unlike > zero, whole, zero);
       const Wide counted = target.sight->over_background ? w : w * matte;
       for (int k = 0; k < 3; ++k) {
@@ -93,13 +99,9 @@ static void see_group(const Tile& tile, const TrainingTarget& target, const Grou
         sums[k] = sums[k] + counted * color;
       }
       weight = weight + counted;
-      largest = max_of(largest, whole);
-      weight_row += kBlockPixels;
     }
-    float all[kSightSums] = {sum_of(sums[0]), sum_of(sums[1]), sum_of(sums[2]), sum_of(weight),
-                             max_lane(largest)};
-    if (all[kSightSums - 1] > 0.0f)
-      add_to_sight(all, target.sight->sums + int64_t(s.waiting - 1) * kSightSums);
+    float all[kSightSums] = {sum_of(sums[0]), sum_of(sums[1]), sum_of(sums[2]), sum_of(weight), most};
+    add_to_sight(all, target.sight->sums + int64_t(s.waiting - 1) * kSightSums);
   }
 }
 
