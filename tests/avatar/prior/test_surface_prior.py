@@ -7,6 +7,7 @@ from rgbavatar_ns.avatar.prior import SurfacePrior
 from rgbavatar_ns.avatar.training import TrainingBatch, TrainingOptions, TrainingStep, fit
 from rgbavatar_ns.kernels import weighted_color_average
 from rgbavatar_ns.kernels.constants import UNFILMED_RGBA
+from rgbavatar_ns.kernels.cpu import INSTRUCTION_SET_VARIABLE
 
 from .test_mesh_field import embedded_avatar
 from .test_outline import drawn_thicker, front_camera, turned
@@ -110,7 +111,10 @@ def test_its_memory_goes_on_from_its_state(filmed):
 
 
 @pytest.mark.slow
-def test_what_training_never_shows_does_not_walk_away():
+def test_what_training_never_shows_does_not_walk_away(monkeypatch):
+    # How far depends on how an instruction set rounds: the same one on every machine.
+    monkeypatch.setenv(INSTRUCTION_SET_VARIABLE, "generic")
+
     def walked_m(surface_prior: bool) -> float:
         avatar = embedded_avatar(uv_resolution=64)
         theta = turned(avatar, [-8.0, -4.0, 0.0, 4.0, 8.0])
@@ -127,6 +131,5 @@ def test_what_training_never_shows_does_not_walk_away():
         return float(across.norm(dim=-1).median())
 
     kept, left_to_chance = walked_m(True), walked_m(False)
-    # .0035 to .0043, as the machine's instructions round.
-    assert kept < 5e-3
+    assert kept < 4e-3
     assert left_to_chance > 2 * kept
