@@ -9,10 +9,13 @@ from nerfstudio.engine.trainer import TrainerConfig
 
 from rgbavatar_ns.avatar.storage.checkpoint_file import list_checkpoints
 from rgbavatar_ns.errors import UserError, first_few
-from rgbavatar_ns.reading import DamagedFileError, load_json
+from rgbavatar_ns.reading import DamagedFileError, damage_told, load_json, read_file
 
 SUMMARY_NAME = "training.json"
 COMPLETED = "completed"
+_MOST_BYTES = 1 << 22
+_TRAINER = re.compile(r"tag:yaml\.org,2002:python/object:[\w.]+TrainerConfig")
+"""What the root of a saved config names."""
 _LOAD_CONFIG = re.compile(r"--load[-_]config(=|$)")
 
 
@@ -22,7 +25,10 @@ def loads_config(command_line: Sequence[str]) -> bool:
 
 
 def require_loadable(path: Path, command_line: Sequence[str]) -> None:
-    """Raise UserError for options beside --load-config, and for a file that holds no config."""
+    """Raise UserError for options beside --load-config, and for a file that holds no config.
+
+    The file is parsed and nothing of it made: what it names is executed by nerfstudio alone.
+    """
     others = [
         word.partition("=")[0]
         for word in command_line
@@ -35,10 +41,11 @@ def require_loadable(path: Path, command_line: Sequence[str]) -> None:
             "Leave out one or the other; or change the option in a copy of the file.",
         )
     try:
-        held = yaml.load(path.read_text(encoding="utf-8"), yaml.Loader)
-    except (yaml.YAMLError, ImportError, UnicodeDecodeError, TypeError, AttributeError) as error:
-        held = error
-    if not isinstance(held, TrainerConfig):
+        with damage_told():
+            root = yaml.compose(read_file(path, _MOST_BYTES), yaml.SafeLoader)
+    except DamagedFileError:
+        root = None
+    if root is None or not _TRAINER.fullmatch(root.tag):
         raise UserError(f"{path} holds no config of a run.", "Name the config.yml of a run.")
 
 

@@ -114,6 +114,21 @@ def test_a_file_without_a_config_is_refused(
         RGBAvatarTrainerConfig(load_config=path)
 
 
+def test_looking_at_a_file_executes_nothing_of_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    path, trace = tmp_path / "config.yml", tmp_path / "trace"
+    harm = f"!!python/object/apply:os.mkdir ['{trace}']"
+    path.write_text(harm)
+    typed(monkeypatch, "--load-config", path)
+    with pytest.raises(UserError, match="holds no config"):
+        RGBAvatarTrainerConfig(load_config=path)
+    path.write_text(f"!!python/object:a.TrainerConfig {{x: {harm}}}")
+    RGBAvatarTrainerConfig(load_config=path)
+    assert not trace.exists()
+    # As nerfstudio loads it, the text does its harm.
+    yaml.load(harm, yaml.Loader)
+    assert trace.exists()
+
+
 @pytest.mark.slow
 def test_the_command_itself(tiny_data: Path, tmp_path: Path):
     config = finished_run(tiny_data, tmp_path, max_num_iterations=STEPS)
