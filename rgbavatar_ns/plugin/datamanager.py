@@ -45,6 +45,8 @@ class RGBAvatarDataManagerConfig(FullImageDatamanagerConfig):
     _target: type = field(default_factory=lambda: RGBAvatarDataManager)
     data: Path | None = None
     """Dataset folder; `--data` sets it."""
+    reader: tyro.conf.Positional[Literal["rgbavatar-data"]] = "rgbavatar-data"
+    """What reads the folder, under the name that other methods call it by; may be left out."""
     dataparser: RGBAvatarDataParserConfig = field(default_factory=RGBAvatarDataParserConfig)
     """How the folder is read."""
     batch_size: Annotated[int, Between(1, 4096)] = 10

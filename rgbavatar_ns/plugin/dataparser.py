@@ -1,4 +1,8 @@
-"""nerfstudio's view of a dataset: the project's own, or another system's."""
+"""nerfstudio's view of a dataset: the project's own, or another system's.
+
+nerfstudio's list of dataparsers, which its datamanagers import, loads this module by its entry
+point: nothing here may import a datamanager.
+"""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -7,6 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import torch
+import tyro
 from jaxtyping import Float
 from nerfstudio.data.dataparsers.base_dataparser import (
     DataParser,
@@ -23,6 +28,7 @@ from rgbavatar_ns.data.importers import ImportOptions
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadArrays, ThetaLayout
 from rgbavatar_ns.plugin.cameras import to_nerfstudio
+from rgbavatar_ns.plugin.errors import install_user_error_hook
 
 _SCENE_RADIUS_M = 0.5
 
@@ -54,6 +60,8 @@ class RGBAvatarDataParserConfig(DataParserConfig):
     """Folder that holds dataset.json, or another system's data."""
     importing: ImportOptions = field(default_factory=ImportOptions)
     """How another system's data is read."""
+    downscale_factor: tyro.conf.Suppress[float | None] = None
+    """Set by `ns-render dataset --downscale-factor`, and refused."""
 
 
 class RGBAvatarDataParser(DataParser):
@@ -66,7 +74,14 @@ class RGBAvatarDataParser(DataParser):
     includes_time: bool = True
 
     def __init__(self, config: RGBAvatarDataParserConfig) -> None:
+        install_user_error_hook()
         super().__init__(config)
+        if config.downscale_factor not in (None, 1):
+            raise UserError(
+                f"--downscale-factor is {config.downscale_factor:g}, but frames of this method are "
+                "drawn in the size that they were filmed in.",
+                "Leave it out; `ns-render interpolate` takes it.",
+            )
         self._tracked: TrackedDataset | None = None
 
     @property
@@ -117,9 +132,9 @@ class RGBAvatarDataParser(DataParser):
 
 rgbavatar_data = DataParserSpecification(
     config=RGBAvatarDataParserConfig(),
-    description="Tracked head videos as `rgbavatar track` writes them, or another system's.",
+    description="Tracked heads of rgbavatar_ns and of the systems that it reads.",
 )
-"""For nerfstudio's other methods, which see pictures over black and cameras, and no motion."""
+"""For other methods, which see the cameras, and the images over black."""
 
 
 class FrameDataset(InputDataset):

@@ -103,8 +103,9 @@ class RGBAvatarModel(Model):
 
     config: RGBAvatarModelConfig
     frame_theta: Tensor
-    view: Callable[[Cameras], Outputs] | None = None
-    """Draws a camera that brings no theta; set by the pipeline."""
+    view: Callable[[Cameras, bool], Outputs] | None = None
+    """Draws a camera that brings no theta, and whether a crop box is asked for; set by the
+    pipeline."""
 
     def populate_modules(self) -> None:
         """Build the avatar of the dataset's subject."""
@@ -144,8 +145,8 @@ class RGBAvatarModel(Model):
         if not isinstance(ray_bundle, Cameras):
             raise UserError(
                 "This method draws whole images and cannot render single rays.",
-                "Leave out options that trace rays, such as --render-nearest-camera. Files of the "
-                "avatar are written by `rgbavatar export RUN DST`, meshes by no command.",
+                "Leave out options that trace rays, such as --render-nearest-camera; in place of "
+                "ns-export take `rgbavatar export RUN DST --format ply` (or another).",
             )
         return {**self._draw(ray_bundle)}
 
@@ -173,14 +174,14 @@ class RGBAvatarModel(Model):
 
     @torch.no_grad()
     def get_outputs_for_camera(self, camera: Cameras, obb_box: Any = None) -> Outputs:
-        """Draw one camera: [H W C] images. nerfstudio's crop box does not apply and is ignored.
+        """Draw one camera: [H W C] images. nerfstudio's crop box does not apply.
 
         A camera without theta shows what `view` chooses.
         """
         camera = camera.to(self.device)
         if (camera.metadata or {}).get("theta") is None:
             assert self.view is not None, "only a pipeline's model draws cameras without theta"
-            return self.view(camera)
+            return self.view(camera, obb_box is not None)
         return {name: image[0] for name, image in self._draw(camera).items()}
 
     def get_loss_dict(

@@ -64,10 +64,19 @@ class RGBAvatarPipeline(VanillaPipeline):
         """The model; this method trains on one device, so it is never wrapped."""
         return self._model
 
-    def _view(self, camera: Cameras) -> dict[str, Tensor]:
-        """Draw a camera without theta: what the viewer's user has chosen, or the film's moment."""
+    def _view(self, camera: Cameras, cropped: bool) -> dict[str, Tensor]:
+        """Draw a camera without theta: what the viewer's user has chosen, or the film's moment.
+
+        The viewer's crop box is passed over; a camera path that brings one is a UserError.
+        """
         if self.viewer_panel.attached:
             time = None if camera.times is None else float(camera.times.reshape(-1)[0])
+        elif cropped:
+            raise UserError(
+                "The camera path has a crop box, and this method draws whole avatars.",
+                "Switch off 'Enable' under 'Crop Viewport' in the viewer and save the path again, "
+                'or put "crop": null into the file.',
+            )
         else:
             time = self.datamanager.film_path.moment(camera)
         return self.viewer_panel.draw(from_nerfstudio(camera), time)

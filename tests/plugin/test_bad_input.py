@@ -12,6 +12,7 @@ import torch
 import yaml
 
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.plugin.training.refused import REFUSED
 from rgbavatar_ns.plugin.training.trainer import RGBAvatarTrainerConfig
 from tests.plugin.run import make_trainer, small_config
 from tests.plugin.tiny import tiny_dataset
@@ -137,6 +138,12 @@ def test_options_that_would_change_nothing_are_refused_before_a_file_is_written(
     assert told.value.cause.startswith(f"--{option.replace('_', '-')} ")
     assert told.value.remedy
     assert not (tmp_path / "runs").exists()
+
+
+def test_the_page_names_every_option_that_is_refused():
+    page = (Path(__file__).parents[2] / "docs" / "nerfstudio.md").read_text()
+    for refused in REFUSED:
+        assert refused.option.rpartition(".")[2].replace("_", "-") in page
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")

@@ -14,7 +14,7 @@ _LEAVE_OUT = "Leave it out."
 
 
 @dataclass(frozen=True)
-class _Refused:
+class Refused:
     """An option that only counts for other methods, unless it is one of the values `taken`."""
 
     option: str
@@ -25,39 +25,39 @@ class _Refused:
 
 _ONE_DEVICE = "this method trains on one device of one machine"
 _FLOAT32 = "the rasterizer computes in float32, which needs no scaling of gradients"
-_REFUSED = (
-    _Refused(
+REFUSED = (
+    Refused(
         "gradient_accumulation_steps",
         ({},),
         "every step of this method ends with a step of all its optimizers",
         "Leave it out; --pipeline.datamanager.batch-size takes more images in a step.",
     ),
-    _Refused(
+    Refused(
         "log_gradients",
         (False,),
         "the steps take gradients straight into Adam and hold none to log",
     ),
-    _Refused("mixed_precision", (False,), _FLOAT32),
-    _Refused("use_grad_scaler", (False,), _FLOAT32),
-    _Refused("prompt", (None,), "this method learns from a film, not from words"),
-    _Refused("pipeline.model.prompt", (None,), "this method learns from a film, not from words"),
-    _Refused("pipeline.model.enable_collider", (False,), "no rays are traced, so none collide"),
-    _Refused("machine.num_machines", (1,), _ONE_DEVICE),
-    _Refused("machine.machine_rank", (0,), _ONE_DEVICE),
-    _Refused("machine.dist_url", ("auto",), _ONE_DEVICE),
-    _Refused(
+    Refused("mixed_precision", (False,), _FLOAT32),
+    Refused("use_grad_scaler", (False,), _FLOAT32),
+    Refused("prompt", (None,), "this method learns from a film, not from words"),
+    Refused("pipeline.model.prompt", (None,), "this method learns from a film, not from words"),
+    Refused("pipeline.model.enable_collider", (False,), "no rays are traced, so none collide"),
+    Refused("machine.num_machines", (1,), _ONE_DEVICE),
+    Refused("machine.machine_rank", (0,), _ONE_DEVICE),
+    Refused("machine.dist_url", ("auto",), _ONE_DEVICE),
+    Refused(
         "logging.profiler",
         ("none", "basic"),
         "it traces nerfstudio's own training step, which this method replaces",
         "Leave it out; `rgbavatar bench step` times the step by part.",
     ),
-    _Refused(
+    Refused(
         # -1 is what ns-viewer brings.
         "viewer.num_rays_per_chunk",
         (32768, -1),
         "whole images are drawn, not chunks of rays",
     ),
-    _Refused(
+    Refused(
         "relative_model_dir",
         (Path(MODELS_FOLDER),),
         "the project's other commands find a run's checkpoints by that name",
@@ -68,7 +68,7 @@ _REFUSED = (
 
 def require_used(config: TrainerConfig) -> None:
     """Raise UserError for an option of nerfstudio's that would change nothing, or wait for ever."""
-    for refused in _REFUSED:
+    for refused in REFUSED:
         value = reduce(getattr, refused.option.split("."), config)
         if value not in refused.taken:
             option = "--" + refused.option.replace("_", "-")

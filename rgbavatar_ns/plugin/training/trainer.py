@@ -42,6 +42,13 @@ from rgbavatar_ns.plugin.training.checkpoints import (
 )
 from rgbavatar_ns.plugin.training.curve import EvaluationCurve
 from rgbavatar_ns.plugin.training.interruption import StopRequest, stop_with_starter
+from rgbavatar_ns.plugin.training.load_config import (
+    COMPLETED,
+    SUMMARY_NAME,
+    go_on_or_repeat,
+    loads_config,
+    require_loadable,
+)
 from rgbavatar_ns.plugin.training.optimizers import ExponentialConfig, require_fitting_states
 from rgbavatar_ns.plugin.training.peak_memory import peak_memory
 from rgbavatar_ns.plugin.training.progress import TrainingProgress
@@ -49,7 +56,6 @@ from rgbavatar_ns.plugin.training.ranges import require_trainable
 from rgbavatar_ns.plugin.training.turns import TurnsLock
 from rgbavatar_ns.plugin.viewer.settings import is_of_ns_viewer, viewer_settings
 
-SUMMARY_NAME = "training.json"
 LATEST = "latest"
 
 
@@ -108,11 +114,23 @@ class RGBAvatarTrainerConfig(TrainerConfig):
             TrainerConfig.save_config(written)
         _link_latest(self.get_base_dir())
 
+    def set_timestamp(self) -> None:
+        """Called by `ns-train` alone, on its own config or on the one that it has loaded."""
+        super().set_timestamp()
+        if loads_config(sys.argv[1:]):
+            go_on_or_repeat(self, say)
+
     def __setattr__(self, name: str, value: Any) -> None:
-        """Where `ns-viewer` puts its own settings in place of the run's, keep these."""
+        """Where `ns-viewer` puts its own settings in place of the run's, keep these.
+
+        And look at the file of `--load-config` before nerfstudio loads it.
+        """
         if name == "viewer" and is_of_ns_viewer(value):
             value = viewer_settings(self.viewer, value, sys.argv[1:])
         super().__setattr__(name, value)
+        if name == "load_config" and self.load_config is not None:
+            install_user_error_hook()
+            require_loadable(self.load_config, sys.argv[1:])
 
 
 def _link_latest(run: Path) -> None:
@@ -326,7 +344,7 @@ class RGBAvatarTrainer(Trainer, FitHooks):
             self.save_checkpoint(self.step)
         writer.write_out_storage()
         self._save_refined()
-        self._tell_end(self._write_summary("completed" if self.completed else "stopped"))
+        self._tell_end(self._write_summary(COMPLETED if self.completed else "stopped"))
 
     def _frames_at_the_end(self) -> Iterable[TrainingBatch]:
         """The frames to look back at when the run ends.

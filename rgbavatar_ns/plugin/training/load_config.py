@@ -1,0 +1,76 @@
+"""`ns-train METHOD --load-config RUN/config.yml`: goes on with the run, or repeats it."""
+
+import re
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import yaml
+from nerfstudio.engine.trainer import TrainerConfig
+
+from rgbavatar_ns.avatar.storage.checkpoint_file import list_checkpoints
+from rgbavatar_ns.errors import UserError, first_few
+from rgbavatar_ns.reading import DamagedFileError, damage_told, load_json, read_file
+
+SUMMARY_NAME = "training.json"
+COMPLETED = "completed"
+_MOST_BYTES = 1 << 22
+_TRAINER = re.compile(r"tag:yaml\.org,2002:python/object:[\w.]+TrainerConfig")
+"""What the root of a saved config names."""
+_LOAD_CONFIG = re.compile(r"--load[-_]config(=|$)")
+
+
+def loads_config(command_line: Sequence[str]) -> bool:
+    """Whether a run's config is named, which then takes the place of all of the command's own."""
+    return any(map(_LOAD_CONFIG.match, command_line))
+
+
+def require_loadable(path: Path, command_line: Sequence[str]) -> None:
+    """Raise UserError for options beside --load-config, and for a file that holds no config.
+
+    The file is parsed and nothing of it made: what it names is executed by nerfstudio alone.
+    """
+    others = [
+        word.partition("=")[0]
+        for word in command_line
+        if word.startswith("--") and not _LOAD_CONFIG.match(word)
+    ]
+    if others and loads_config(command_line):
+        raise UserError(
+            f"--load-config takes every option from its file, so {first_few(others)} would not "
+            "count.",
+            "Leave out one or the other; or change the option in a copy of the file.",
+        )
+    try:
+        with damage_told():
+            root = yaml.compose(read_file(path, _MOST_BYTES), yaml.SafeLoader)
+    except DamagedFileError:
+        root = None
+    if root is None or not _TRAINER.fullmatch(root.tag):
+        raise UserError(f"{path} holds no config of a run.", "Name the config.yml of a run.")
+
+
+def go_on_or_repeat(config: TrainerConfig, tell: Callable[[str], object]) -> None:
+    """Let a config that was loaded go on with its run, if that has stopped before its end.
+
+    A complete run is repeated under a time of its own: it stays what it is.
+    """
+    run, checkpoints = config.get_base_dir(), TrainerConfig.get_checkpoint_dir(config)
+    if config.load_dir == checkpoints:
+        config.load_dir = None
+    if not list_checkpoints(checkpoints):
+        return
+    if _complete(run):
+        config.timestamp = "{timestamp}"
+        TrainerConfig.set_timestamp(config)
+        tell(f"{run} is complete and stays; repeating it in {config.get_base_dir()}.")
+    else:
+        config.load_dir, config.load_checkpoint = checkpoints, None
+        tell(f"Going on with {run}.")
+
+
+def _complete(run: Path) -> bool:
+    try:
+        summary = load_json(run / SUMMARY_NAME)
+    except DamagedFileError:
+        return False
+    return isinstance(summary, dict) and summary.get("ended") == COMPLETED
