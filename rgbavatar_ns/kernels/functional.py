@@ -17,11 +17,12 @@ _MAX_SIDE_PX = 65536
 def rasterize(
     gaussians: GaussianSet,
     cameras: PinholeCameras,
-    background: Float[Tensor, "3"] | Float[Tensor, "B 3"] | None = None,
+    background: Float[Tensor, "3"] | Float[Tensor, "#B 3"] | None = None,
     *,
     backend: str = "auto",
     with_depth: bool = False,
     with_visibility: bool = False,
+    screen_offset: Float[Tensor, "B N 2"] | None = None,
 ) -> RenderedBatch:
     """B images of B Gaussian sets: image = sum w_i c_i + (1 - alpha) background (None is black).
 
@@ -29,12 +30,20 @@ def rasterize(
     1 is shared by the batch and its gradient is summed. Gradients flow from image and alpha to
     means, quats_wxyz, scales, opacities, colors and background, not to the cameras.
 
+    `screen_offset` moves each image's projected means by so many pixels, x to the right and y
+    down; depths and projected shapes stay. Its gradient is that of the projected mean, which
+    density control asks for: pass zeros that require it. 3DGS compares its threshold with the
+    gradient in normalised device coordinates, whose unit is (width / 2, height / 2) px, of ONE
+    image's mean loss: of a mean over B images multiply it by B (width / 2, height / 2).
+
     "auto" takes the fastest backend for the tensors' device and type; float64 is drawn by the
     reference. Raises ValueError for shapes, types, devices or cameras that do not fit.
     Source: 3D Gaussian splatting (Kerbl et al. 2023); exact rule in `kernels/reference.py`.
     """
     batch = _check(gaussians, cameras)
     background = checked_background(gaussians.means, background, batch)
+    if screen_offset is not None:
+        _check_offset(gaussians.means, screen_offset, max(batch, len(background)))
     chosen = choose(backend, gaussians.means.device, gaussians.means.dtype)
     return chosen.rasterize(
         gaussians,
@@ -42,6 +51,7 @@ def rasterize(
         background,
         with_depth=with_depth,
         with_visibility=with_visibility,
+        screen_offset=screen_offset,
     )
 
 
@@ -98,6 +108,15 @@ def _check_like(like: Tensor, tensor: Tensor, name: str) -> None:
         raise ValueError(
             f"{name}: {tensor.dtype} on {tensor.device}, but the means are {like.dtype} on "
             f"{like.device}. Convert with .to(means)."
+        )
+
+
+def _check_offset(means: Tensor, screen_offset: Tensor, batch: int) -> None:
+    _check_like(means, screen_offset, "screen_offset")
+    if tuple(screen_offset.shape) != (batch, means.shape[1], 2):
+        raise ValueError(
+            f"screen_offset is {_shape(screen_offset)}. Pass [{batch}, {means.shape[1]}, 2]: "
+            "each image's own for every Gaussian."
         )
 
 

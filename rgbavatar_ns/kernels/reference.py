@@ -4,7 +4,7 @@ One Gaussian with mean m, rotation R(q) and standard deviations s is drawn by a 
 rotation W, translation t, focal lengths f and principal point c:
 
     (x, y, z) = W m + t                            camera space, z forward
-    mean_px   = (fx x / z + cx, fy y / z + cy)
+    mean_px   = (fx x / z + cx, fy y / z + cy) + screen_offset
     J         = [[fx / z, 0, -fx u / z],           u = x / z, v = y / z, both clamped to the image
                  [0, fy / z, -fy v / z]]           widened by FRUSTUM_MARGIN (EWA splatting)
     cov_px    = J W R diag(s^2) R^T W^T J^T + DILATION_PX2
@@ -18,6 +18,7 @@ backends can afford and it is nearer to the full sum.
 
 Gaussians that are not finite, have no orientation (MIN_QUAT_NORM) or overflow when projected
 contribute nothing and get a gradient of zero. The clamp of u and v has no gradient outside.
+`screen_offset`, 0 unless it is given, moves the drawn mean only: u, v and z are those of m.
 """
 
 import math
@@ -120,10 +121,14 @@ def _project_finite(
 
 
 @torch.no_grad()
-def _visible(gaussians: GaussianSet, cameras: PinholeCameras) -> Bool[Tensor, "B N"]:
+def _visible(
+    gaussians: GaussianSet, cameras: PinholeCameras, screen_offset: Tensor | None
+) -> Bool[Tensor, "B N"]:
     mean_px, covariance, z = _project_finite(
         gaussians.means, gaussians.quats_wxyz, gaussians.scales, cameras
     )
+    if screen_offset is not None:
+        mean_px = mean_px + screen_offset
     determinant = covariance[..., 0, 0] * covariance[..., 1, 1] - covariance[..., 0, 1] ** 2
     finite = torch.isfinite(mean_px).all(-1) & torch.isfinite(determinant) & (determinant > 0)
     finite = finite & torch.isfinite(gaussians.colors).all(-1) & torch.isfinite(gaussians.opacities)
@@ -132,9 +137,13 @@ def _visible(gaussians: GaussianSet, cameras: PinholeCameras) -> Bool[Tensor, "B
     return finite & oriented & (z >= NEAR_PLANE_M) & (gaussians.opacities >= MIN_ALPHA)
 
 
-def project(gaussians: GaussianSet, cameras: PinholeCameras) -> ProjectedGaussians:
+def project(
+    gaussians: GaussianSet,
+    cameras: PinholeCameras,
+    screen_offset: Float[Tensor, "B N 2"] | None = None,
+) -> ProjectedGaussians:
     """Gaussians as the cameras see them; those that are not visible hold harmless numbers."""
-    visible = _visible(gaussians, cameras)
+    visible = _visible(gaussians, cameras, screen_offset)
 
     def keep(values: Tensor, otherwise: Tensor) -> Tensor:
         mask = visible.reshape(*visible.shape, *[1] * (values.ndim - 2))
@@ -149,6 +158,8 @@ def project(gaussians: GaussianSet, cameras: PinholeCameras) -> ProjectedGaussia
         keep(gaussians.scales, torch.tensor(0.0)),
         cameras,
     )
+    if screen_offset is not None:
+        mean_px = mean_px + keep(screen_offset, torch.tensor(0.0))
     opacities = keep(gaussians.opacities, torch.tensor(0.0))
     colors = keep(gaussians.colors, torch.tensor(0.0))
     return ProjectedGaussians(mean_px, covariance, z, opacities, colors, visible)
@@ -254,6 +265,7 @@ def rasterize_reference(
     *,
     with_depth: bool = False,
     with_visibility: bool = False,
+    screen_offset: Float[Tensor, "B N 2"] | None = None,
     rules: BlendingRules | None = None,
 ) -> RenderedBatch:
     """Images by the rule at the top of this file; differentiable by autograd.
@@ -262,7 +274,7 @@ def rasterize_reference(
     that touch a tile times its 1024 pixels: meant for small scenes.
     """
     rules = rules or BlendingRules()
-    projected = project(gaussians, cameras)
+    projected = project(gaussians, cameras, screen_offset)
     batch = max(projected.mean_px.shape[0], background.shape[0])
     projected = _expand(projected, batch)
     background = background.expand(batch, 3)

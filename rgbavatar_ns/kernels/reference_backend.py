@@ -32,6 +32,7 @@ class ReferenceBackend:
         *,
         with_depth: bool,
         with_visibility: bool,
+        screen_offset: Float[Tensor, "B N 2"] | None,
     ) -> RenderedBatch:
         """As `functional.rasterize`."""
         return rasterize_reference(
@@ -40,6 +41,7 @@ class ReferenceBackend:
             background,
             with_depth=with_depth,
             with_visibility=with_visibility,
+            screen_offset=screen_offset,
         )
 
     def weighted_color_average(

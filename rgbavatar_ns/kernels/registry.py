@@ -141,6 +141,7 @@ class Backend(Protocol):
         *,
         with_depth: bool,
         with_visibility: bool,
+        screen_offset: Float[Tensor, "B N 2"] | None,
     ) -> RenderedBatch:
         """As `functional.rasterize`."""
         ...

@@ -14,13 +14,14 @@ ATTRIBUTES = ("means", "quats_wxyz", "scales", "opacities", "colors")
 
 @dataclass(frozen=True)
 class Scene:
-    """float64 inputs, and the gradients that arrive at image and alpha."""
+    """float64 inputs, and the gradients that arrive at image and alpha; offsets are [B, N, 2]."""
 
     gaussians: GaussianSet
     cameras: PinholeCameras
     background: Tensor
     image_grad: Tensor
     alpha_grad: Tensor
+    screen_offset: Tensor | None = None
 
 
 def to(value, like):
@@ -35,6 +36,14 @@ def to(value, like):
 def changed(scene: Scene, **attributes: Tensor) -> Scene:
     """The scene with these attributes of its Gaussians."""
     return replace(scene, gaussians=replace(scene.gaussians, **attributes))
+
+
+def moved(scene: Scene, spread_px: float = 6.0) -> Scene:
+    """The scene with offsets of its own for every Gaussian in every image."""
+    count = scene.gaussians.means.shape[1]
+    generator = torch.Generator().manual_seed(17)
+    offset = torch.randn(len(scene.image_grad), count, 2, generator=generator).double()
+    return replace(scene, screen_offset=spread_px * offset)
 
 
 def in_float32(scene: Scene) -> tuple[GaussianSet, PinholeCameras]:
@@ -112,7 +121,7 @@ def random_scene(
 
 def settled_pixels(scene: Scene, margin: float = 1e-4) -> Tensor:
     """Pixels [B, H, W, 1] where no alpha is so near the cut or cap that rounding decides."""
-    projected = project(scene.gaussians, scene.cameras)
+    projected = project(scene.gaussians, scene.cameras, scene.screen_offset)
     y, x = torch.meshgrid(
         torch.arange(scene.cameras.height), torch.arange(scene.cameras.width), indexing="ij"
     )
@@ -129,23 +138,28 @@ def settled_pixels(scene: Scene, margin: float = 1e-4) -> Tensor:
 def render_and_differentiate(
     scene: Scene, dtype: torch.dtype, backend: str, mask=None, device: str = "cpu"
 ):
-    """The rendering and the gradients of all attributes and the background, in float64."""
+    """The rendering and the gradients of all attributes, the background and offsets, in float64."""
     scene, mask = to(scene, device), None if mask is None else mask.to(device)
     gaussians, cameras = to(scene.gaussians, dtype), to(scene.cameras, dtype)
     background = scene.background.to(dtype).clone().requires_grad_()
-    leaves = [getattr(gaussians, name).requires_grad_() for name in ATTRIBUTES]
+    leaves = {name: getattr(gaussians, name).requires_grad_() for name in ATTRIBUTES}
+    leaves["background"] = background
+    if scene.screen_offset is not None:
+        leaves["screen_offset"] = to(scene.screen_offset, dtype).requires_grad_()
     rendered = rasterize(
-        gaussians, cameras, background, backend=backend, with_depth=True, with_visibility=True
+        gaussians,
+        cameras,
+        background,
+        backend=backend,
+        with_depth=True,
+        with_visibility=True,
+        screen_offset=leaves.get("screen_offset"),
     )
     mask = torch.ones_like(scene.alpha_grad) if mask is None else mask
     loss = (rendered.image * (mask * scene.image_grad).to(dtype)).sum()
     loss = loss + (rendered.alpha * (mask * scene.alpha_grad).to(dtype)).sum()
     loss.backward()
-    names = (*ATTRIBUTES, "background")
-    gradients = {
-        name: torch.as_tensor(leaf.grad).double().cpu()
-        for name, leaf in zip(names, [*leaves, background])
-    }
+    gradients = {name: torch.as_tensor(leaf.grad).double().cpu() for name, leaf in leaves.items()}
     return to(to(rendered, torch.float64), "cpu"), gradients
 
 

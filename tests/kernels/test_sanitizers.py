@@ -24,6 +24,7 @@ TESTS = (
     "kernels/test_extremes.py",
     "kernels/test_isolation.py",
     "kernels/test_laws.py",
+    "kernels/test_screen_offset.py",
     "kernels/test_sizes.py",
     "kernels/test_weighted_colors.py",
     "avatar/training/test_fused_step.py",

@@ -5,7 +5,13 @@ def constants() -> dict[str, float | tuple[int, ...]]: ...
 
 class Gaussians:
     def __init__(
-        self, means: Tensor, quats_wxyz: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor
+        self,
+        means: Tensor,
+        quats_wxyz: Tensor,
+        scales: Tensor,
+        opacities: Tensor,
+        colors: Tensor,
+        screen_offset: Tensor | None = None,
     ) -> None: ...
 
 class _Drawing:
@@ -39,12 +45,13 @@ class Session(_Drawing):
         background: Tensor,
         image_grad: Tensor | None,
         alpha_grad: Tensor | None,
+        threads: int,
         means: Tensor,
         quats_wxyz: Tensor,
         scales: Tensor,
         opacities: Tensor,
         colors: Tensor,
-        threads: int,
+        screen_offset: Tensor | None = None,
     ) -> None: ...
 
 class Morphed:

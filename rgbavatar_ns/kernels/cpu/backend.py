@@ -17,7 +17,12 @@ from rgbavatar_ns.kernels.cpu import (
     _native,  # pyright: ignore[reportMissingModuleSource]
 )
 from rgbavatar_ns.kernels.cpu.morphed import CpuMorphedRenderer
-from rgbavatar_ns.kernels.differentiable import Drawn, Gradients, draw_differentiably
+from rgbavatar_ns.kernels.differentiable import (
+    Drawn,
+    Gradients,
+    draw_differentiably,
+    gaussian_inputs,
+)
 from rgbavatar_ns.kernels.types import (
     GaussianSet,
     MorphedGaussians,
@@ -78,18 +83,14 @@ def _draw(
         image_grad: Tensor | None,
         alpha_grad: Tensor | None,
     ) -> list[Tensor]:
-        means, quats, scales, opacities, colors = filled = [torch.empty_like(t) for t in gaussians]
+        filled = [torch.empty_like(t) for t in gaussians]
         session.backward(
             _native.Gaussians(*gaussians),
             drawn.background,
             image_grad,
             alpha_grad,
-            means,
-            quats,
-            scales,
-            opacities,
-            colors,
             torch.get_num_threads(),
+            *filled,
         )
         return filled
 
@@ -113,9 +114,10 @@ class CpuBackend:
         *,
         with_depth: bool,
         with_visibility: bool,
+        screen_offset: Float[Tensor, "B N 2"] | None,
     ) -> RenderedBatch:
         """As `functional.rasterize`."""
-        inputs = _attributes(gaussians)
+        inputs = gaussian_inputs(gaussians, screen_offset)
         batch = max(t.shape[0] for t in (*inputs, background, cameras.focal_px))
         new = inputs[0].new_empty
         size = (batch, cameras.height, cameras.width, 1)
@@ -133,7 +135,7 @@ class CpuBackend:
         self, gaussians: GaussianSet, cameras: PinholeCameras, images: Float[Tensor, "#B H W C"]
     ) -> WeightedColors:
         """As `functional.weighted_color_average`."""
-        inputs = tuple(tensor.detach().contiguous() for tensor in _attributes(gaussians))
+        inputs = tuple(tensor.detach().contiguous() for tensor in gaussian_inputs(gaussians))
         batch = max(t.shape[0] for t in (*inputs, images, cameras.focal_px))
         count = inputs[0].shape[1]
         weighted_sum = images.new_empty(batch, count, images.shape[-1])
@@ -151,16 +153,6 @@ class CpuBackend:
     ) -> CpuMorphedRenderer:
         """As `morphed.morphed_renderer`."""
         return CpuMorphedRenderer(gaussians, weights, vertices, cameras)
-
-
-def _attributes(gaussians: GaussianSet) -> tuple[Tensor, ...]:
-    return (
-        gaussians.means,
-        gaussians.quats_wxyz,
-        gaussians.scales,
-        gaussians.opacities,
-        gaussians.colors,
-    )
 
 
 def load() -> CpuBackend:

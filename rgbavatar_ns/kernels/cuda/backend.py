@@ -1,8 +1,10 @@
 """The CUDA kernels behind torch's autograd."""
 
 import functools
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import zip_longest
 from typing import Any
 
 import torch
@@ -13,7 +15,12 @@ from rgbavatar_ns.kernels.cuda.binning import Bins, Capacities, Images, blocks, 
 from rgbavatar_ns.kernels.cuda.launcher import Launcher
 from rgbavatar_ns.kernels.cuda.morphed import CudaMorphedRenderer
 from rgbavatar_ns.kernels.cuda.tiles import Tiles
-from rgbavatar_ns.kernels.differentiable import Drawn, Gradients, draw_differentiably
+from rgbavatar_ns.kernels.differentiable import (
+    Drawn,
+    Gradients,
+    draw_differentiably,
+    gaussian_inputs,
+)
 from rgbavatar_ns.kernels.types import (
     GaussianSet,
     MorphedGaussians,
@@ -23,6 +30,7 @@ from rgbavatar_ns.kernels.types import (
 )
 
 _WORLD = ("means", "quats", "scales", "opacities", "colors")
+_INPUTS = (*_WORLD, "screen_offset")
 
 
 @dataclass
@@ -42,7 +50,12 @@ class _Request:
 def _world_values(gaussians: tuple[Tensor, ...]) -> dict[str, Any]:
     """The fields of `World` in arguments.h."""
     shared = {f"{name}_shared": int(len(t) == 1) for name, t in zip(_WORLD, gaussians)}
-    return {**dict(zip(_WORLD, gaussians)), **shared}
+    return {**_named(gaussians), **shared}
+
+
+def _named(inputs: Sequence[Tensor]) -> dict[str, Tensor | None]:
+    """`gaussian_inputs` or their gradients by the names that arguments.h gives them."""
+    return dict(zip_longest(_INPUTS, inputs))
 
 
 def _tiles(request: _Request, gaussians: tuple[Tensor, ...]) -> Tiles:
@@ -99,7 +112,7 @@ def _gradients(
         world=_world_values(gaussians),
         bins=tiles.bins.values(),
         slots=slots,
-        **dict(zip(_WORLD, filled)),
+        **_named(filled),
     )
     return filled
 
@@ -144,9 +157,10 @@ class CudaBackend:
         *,
         with_depth: bool,
         with_visibility: bool,
+        screen_offset: Float[Tensor, "B N 2"] | None,
     ) -> RenderedBatch:
         """As `functional.rasterize`; waits once for the length of the tiles' lists."""
-        inputs = _attributes(gaussians)
+        inputs = gaussian_inputs(gaussians, screen_offset)
         batch = max(t.shape[0] for t in (*inputs, background, cameras.focal_px))
         request = self._request(gaussians, cameras, batch, with_depth, with_visibility)
         image, alpha = draw_differentiably(partial(_draw, request), *inputs, background)
@@ -157,7 +171,7 @@ class CudaBackend:
         self, gaussians: GaussianSet, cameras: PinholeCameras, images: Float[Tensor, "#B H W C"]
     ) -> WeightedColors:
         """As `functional.weighted_color_average`."""
-        inputs = tuple(tensor.detach().contiguous() for tensor in _attributes(gaussians))
+        inputs = tuple(tensor.detach().contiguous() for tensor in gaussian_inputs(gaussians))
         batch = max(t.shape[0] for t in (*inputs, images, cameras.focal_px))
         tiles = _tiles(self._request(gaussians, cameras, batch), inputs)
         weighted_sum, weight_sum, max_weight = tiles.average(images.detach().contiguous())
@@ -176,16 +190,6 @@ class CudaBackend:
         return CudaMorphedRenderer(
             self.launcher(device), self.capacities(device), gaussians, weights, vertices, cameras
         )
-
-
-def _attributes(gaussians: GaussianSet) -> tuple[Tensor, ...]:
-    return (
-        gaussians.means,
-        gaussians.quats_wxyz,
-        gaussians.scales,
-        gaussians.opacities,
-        gaussians.colors,
-    )
 
 
 @functools.cache

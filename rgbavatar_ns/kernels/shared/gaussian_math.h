@@ -182,6 +182,13 @@ RGBAVATAR_FUNCTION Projection<F> project(const GaussianInput<F>& g, const Camera
   return q;
 }
 
+// Moves the mean in the image by so many pixels; depth and shape stay as they were projected.
+template <class F>
+RGBAVATAR_FUNCTION void move_mean(const F& x_px, const F& y_px, Projection<F>& q) {
+  q.mean_x = q.mean_x + x_px;
+  q.mean_y = q.mean_y + y_px;
+}
+
 // Whether the Gaussian can be drawn: finite, oriented, in front of the camera.
 template <class F>
 RGBAVATAR_FUNCTION auto is_drawable(const GaussianInput<F>& g, const Vec3<F>& color,
@@ -230,6 +237,7 @@ struct GaussianGradient {
   F quat[4];
   Vec3<F> scale;
   F opacity;
+  F mean_x, mean_y;  // of the mean in the image, in pixels
 };
 
 template <class F>
@@ -254,11 +262,8 @@ RGBAVATAR_FUNCTION void rotation_gradient(const Projection<F>& q, const Vec3<F>&
 
 template <class F>
 RGBAVATAR_FUNCTION Vec3<F> camera_mean_gradient(const Projection<F>& q, const Camera& c,
-                                                const Moments<F>& m, const Vec3<F>& v0,
-                                                const Vec3<F>& v1) {
-  constexpr float k = BlendingConstants::kHalfLog2E;
-  const F mean_x = 2.0f * k * (q.conic00 * m.x + q.conic01 * m.y);
-  const F mean_y = 2.0f * k * (q.conic01 * m.x + q.conic11 * m.y);
+                                                const F& mean_x, const F& mean_y,
+                                                const Vec3<F>& v0, const Vec3<F>& v1) {
   const F sx = q.inverse_z * c.fx, sy = q.inverse_z * c.fy;
   const F zero = F(0.0f);
   const F du = select(q.u == q.slope_x, zero - sx * dot(v0, q.a2), zero);
@@ -274,8 +279,10 @@ RGBAVATAR_FUNCTION GaussianGradient<F> project_backward(const GaussianInput<F>& 
                                                         const Moments<F>& m) {
   GaussianGradient<F> out;
   out.opacity = m.one / (g.opacity * BlendingConstants::kLn2);
-  // E = k Q M Q, then v = 2 E U.
   constexpr float k2 = 2.0f * BlendingConstants::kHalfLog2E;
+  out.mean_x = k2 * (q.conic00 * m.x + q.conic01 * m.y);
+  out.mean_y = k2 * (q.conic01 * m.x + q.conic11 * m.y);
+  // E = k Q M Q, then v = 2 E U.
   const F qm00 = q.conic00 * m.xx + q.conic01 * m.xy, qm01 = q.conic00 * m.xy + q.conic01 * m.yy;
   const F qm10 = q.conic01 * m.xx + q.conic11 * m.xy, qm11 = q.conic01 * m.xy + q.conic11 * m.yy;
   const F e00 = k2 * (qm00 * q.conic00 + qm01 * q.conic01);
@@ -283,7 +290,7 @@ RGBAVATAR_FUNCTION GaussianGradient<F> project_backward(const GaussianInput<F>& 
   const F e11 = k2 * (qm10 * q.conic01 + qm11 * q.conic11);
   const Vec3<F> v0 = add_scaled(scaled(q.u0, e00), q.u1, e01);
   const Vec3<F> v1 = add_scaled(scaled(q.u0, e01), q.u1, e11);
-  const Vec3<F> dp = camera_mean_gradient(q, c, m, v0, v1);
+  const Vec3<F> dp = camera_mean_gradient(q, c, out.mean_x, out.mean_y, v0, v1);
   out.mean = add_scaled(
       add_scaled(Vec3<F>{dp.x * c.row0.x, dp.x * c.row0.y, dp.x * c.row0.z},
                  Vec3<F>{F(c.row1.x), F(c.row1.y), F(c.row1.z)}, dp.y),

@@ -35,7 +35,7 @@ from tests.avatar.fused_scene import (
 )
 from tests.avatar.small_head import front_camera, random_theta
 from tests.kernels.agreement import assert_agrees, expect
-from tests.kernels.scenes import random_scene, to
+from tests.kernels.scenes import moved, random_scene, to
 from tests.kernels.test_backends_agree import SCENES
 
 GPU = pytest.param(
@@ -84,6 +84,10 @@ def gpu(request) -> torch.device:
 @pytest.mark.parametrize("name", SCENES)
 def test_values_and_gradients_match_the_reference(gpu, name, seed):
     assert_agrees(expect(random_scene(seed, **SCENES[name])), "cuda", device="cuda:0")
+
+
+def test_moved_means_match_the_reference(gpu):
+    assert_agrees(expect(moved(random_scene(0))), "cuda", device="cuda:0")
 
 
 @pytest.mark.parametrize("name", CASES)

@@ -42,11 +42,12 @@ struct Attribute {
 struct Scene {
   int batch, count, width, height;
   Attribute means, quats, scales, opacities, colors;
+  Attribute screen_offset;  // [B, N, 2], px that the projected means move by; null: none does
 };
 
-// Gradients like the attributes.
+// Gradients like the attributes; that of the offset is null where the scene has none.
 struct SceneGradient {
-  float *means, *quats, *scales, *opacities, *colors;
+  float *means, *quats, *scales, *opacities, *colors, *screen_offset;
 };
 
 // Which tiles a Gaussian touches: the first one << 2, and whether those to the right and below are

@@ -43,6 +43,7 @@ rgbavatar::Attribute attribute(const Input& array) {
 // Gaussians of a batch; keeps the tensors alive.
 struct Gaussians {
   Input means, quats, scales, opacities, colors;
+  std::optional<Input> screen_offset;
 
   rgbavatar::Scene scene(int batch, int width, int height) const {
     return {batch,
@@ -53,7 +54,8 @@ struct Gaussians {
             attribute(quats),
             attribute(scales),
             attribute(opacities),
-            attribute(colors)};
+            attribute(colors),
+            screen_offset ? attribute(*screen_offset) : rgbavatar::Attribute{nullptr, 0}};
   }
 };
 
@@ -109,12 +111,14 @@ struct Session : Drawing<rgbavatar::Rendering> {
 
   void backward(const Gaussians& gaussians, const Input& background,
                 const std::optional<Input>& image_grad, const std::optional<Input>& alpha_grad,
-                const Output& means, const Output& quats, const Output& scales,
-                const Output& opacities, const Output& colors, int threads) {
-    rendering.backward(
-        gaussians.scene(batch, width, height), attribute(background), pointer(image_grad),
-        pointer(alpha_grad),
-        {means.data(), quats.data(), scales.data(), opacities.data(), colors.data()}, threads);
+                int threads, const Output& means, const Output& quats, const Output& scales,
+                const Output& opacities, const Output& colors,
+                const std::optional<Output>& screen_offset) {
+    rendering.backward(gaussians.scene(batch, width, height), attribute(background),
+                       pointer(image_grad), pointer(alpha_grad),
+                       {means.data(), quats.data(), scales.data(), opacities.data(), colors.data(),
+                        pointer(screen_offset)},
+                       threads);
   }
 };
 
@@ -231,9 +235,10 @@ NB_MODULE(_native, m) {
   m.def("instruction_sets", &rgbavatar::instruction_sets);
   m.def("constants", &constants);
   nb::class_<Gaussians>(m, "Gaussians")
-      .def(nb::init<Input, Input, Input, Input, Input>(), "means"_a.noconvert(),
-           "quats_wxyz"_a.noconvert(), "scales"_a.noconvert(), "opacities"_a.noconvert(),
-           "colors"_a.noconvert());
+      .def(nb::init<Input, Input, Input, Input, Input, std::optional<Input>>(),
+           "means"_a.noconvert(), "quats_wxyz"_a.noconvert(), "scales"_a.noconvert(),
+           "opacities"_a.noconvert(), "colors"_a.noconvert(),
+           "screen_offset"_a.noconvert().none() = nb::none());
   using Release = nb::call_guard<nb::gil_scoped_release>;
   nb::class_<Drawing<rgbavatar::Rendering>> drawing(m, "Drawing");
   Drawing<rgbavatar::Rendering>::bind(drawing);
@@ -246,10 +251,10 @@ NB_MODULE(_native, m) {
            "principal_point_px"_a.noconvert(), "batch"_a, "width"_a, "height"_a, "threads"_a,
            "instruction_set"_a, Release())
       .def("backward", &Session::backward, "gaussians"_a, "background"_a.noconvert(),
-           "image_grad"_a.noconvert().none(),
-           "alpha_grad"_a.noconvert().none(), "means"_a.noconvert(), "quats_wxyz"_a.noconvert(),
-           "scales"_a.noconvert(), "opacities"_a.noconvert(), "colors"_a.noconvert(), "threads"_a,
-           Release());
+           "image_grad"_a.noconvert().none(), "alpha_grad"_a.noconvert().none(), "threads"_a,
+           "means"_a.noconvert(), "quats_wxyz"_a.noconvert(), "scales"_a.noconvert(),
+           "opacities"_a.noconvert(), "colors"_a.noconvert(),
+           "screen_offset"_a.noconvert().none() = nb::none(), Release());
   nb::class_<Morphed>(m, "Morphed")
       .def("__init__",
            [](Morphed* self, Input position, Input rotation, Input color, Input log_scale,

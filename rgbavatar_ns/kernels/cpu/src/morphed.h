@@ -208,8 +208,8 @@ static void project_morphed(const MorphedScene& scene, const float* cameras, int
     for (int first = 0; first < count; first += kLanes) {
       const int lanes = count - first < kLanes ? count - first : kLanes;
       const WorldLanes world = world_lanes(scene, image, begin, first, lanes, scratch);
-      project_lanes(scene.width, scene.height, camera, world.gaussian, world.color, begin + first,
-                    lanes, images[image]);
+      project_lanes(scene.width, scene.height, camera, world.gaussian, world.color, nullptr,
+                    begin + first, lanes, images[image]);
     }
   }
 }

@@ -74,6 +74,24 @@ static RGBAVATAR_MEMBER Wide load_column(const float* rows, int first, int lanes
   return load_wide(Rows<1>(rows, first, lanes).data);
 }
 
+// Moves sixteen means by what their rows of [N, 2] say.
+static RGBAVATAR_MEMBER void move_means(const float* screen_offset, int first, int lanes,
+                                        Projection<Wide>& q) {
+  const Rows<2> in(screen_offset, first, lanes);
+  float x[kLanes], y[kLanes];
+  for (int i = 0; i < kLanes; ++i) x[i] = in.data[2 * i], y[i] = in.data[2 * i + 1];
+  move_mean(load_wide(x), load_wide(y), q);
+}
+
+static RGBAVATAR_MEMBER void store_pairs(const Wide& x, const Wide& y, float* rows, int first,
+                                         int lanes) {
+  float columns[2][kLanes];
+  store(x, columns[0]);
+  store(y, columns[1]);
+  const OutputRows<2> out(rows, first, lanes);
+  for (int i = 0; i < 2 * kLanes; ++i) out.data[i] = columns[i % 2][i / 2];
+}
+
 static RGBAVATAR_MEMBER GaussianInput<Wide> load_gaussians(const Scene& scene, int image, int first,
                                                  int lanes) {
   GaussianInput<Wide> g;
@@ -167,12 +185,14 @@ static RGBAVATAR_MEMBER Wide tiles_of(const BlockSpan& x, const BlockSpan& y, in
                 bits_as_floats(WideInt(int32_t(kManyTiles))));
 }
 
-// Projects sixteen Gaussians and writes their splats.
+// Projects sixteen Gaussians, moves them where there are offsets [N, 2], and writes their splats.
 static inline void project_lanes(int width, int height, const Camera& camera,
-                                 const GaussianInput<Wide>& g, const Vec3<Wide>& color, int first,
-                                 int lanes, const Projected& out) {
+                                 const GaussianInput<Wide>& g, const Vec3<Wide>& color,
+                                 const float* screen_offset, int first, int lanes,
+                                 const Projected& out) {
   static_assert(sizeof(Splat) == 16 * sizeof(float), "a splat is sixteen columns");
-  const Projection<Wide> q = project(g, camera);
+  Projection<Wide> q = project(g, camera);
+  if (screen_offset) move_means(screen_offset, first, lanes, q);
   const WideMask drawable = is_drawable(g, color, q);
   const Wide log2_opacity = log2_of(select(drawable, g.opacity, Wide(1.0f)));
   const Extent<Wide> extent = extent_of(q, log2_opacity);
@@ -229,7 +249,8 @@ static void project_image(const Scene& scene, const float* camera_floats, int im
   for (int first = begin; first < end; first += kLanes) {
     const int lanes = end - first < kLanes ? end - first : kLanes;
     project_lanes(scene.width, scene.height, camera, load_gaussians(scene, image, first, lanes),
-                  load_vec3(scene.colors.of(image), first, lanes), first, lanes, out);
+                  load_vec3(scene.colors.of(image), first, lanes), scene.screen_offset.of(image),
+                  first, lanes, out);
   }
 }
 
@@ -278,7 +299,9 @@ static RGBAVATAR_MEMBER GaussianGradient<Wide> gradient_lanes(const GaussianInpu
   return {{keep(d.mean.x), keep(d.mean.y), keep(d.mean.z)},
           {keep(d.quat[0]), keep(d.quat[1]), keep(d.quat[2]), keep(d.quat[3])},
           {keep(d.scale.x), keep(d.scale.y), keep(d.scale.z)},
-          keep(d.opacity)};
+          keep(d.opacity),
+          keep(d.mean_x),
+          keep(d.mean_y)};
 }
 
 // Writes, or adds to what is there.
@@ -321,6 +344,9 @@ static void project_image_backward(const Scene& scene, const float* camera_float
     if (adds(scene.opacities)) d.opacity = d.opacity + load_column(opacities, first, lanes);
     const OutputRows<1> out(opacities, first, lanes);
     store(d.opacity, out.data);
+    if (gradient.screen_offset)
+      store_pairs(d.mean_x, d.mean_y, of_image(scene.screen_offset, gradient.screen_offset), first,
+                  lanes);
   }
 }
 

@@ -64,6 +64,7 @@ struct World {
   const float* scales;     // [B or 1, N, 3]
   const float* opacities;  // [B or 1, N]
   const float* colors;     // [B or 1, N, 3]
+  const float* screen_offset;  // [B, N, 2], px that the projected means move by, or null
   int means_shared;
   int quats_shared;
   int scales_shared;
@@ -171,6 +172,7 @@ struct ProjectBackwardArguments {
   float* scales;       // [B, N, 3]
   float* opacities;    // [B, N]
   float* colors;       // [B, N, 3]
+  float* screen_offset;  // [B, N, 2] or null
 };
 
 struct BlendBackwardArguments {

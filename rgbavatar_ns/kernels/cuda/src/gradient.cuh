@@ -63,6 +63,8 @@ RGBAVATAR_KERNEL(project_backward, ProjectBackwardArguments, kBlendThreads) {
   put_vec3(d.scale, a.scales, row);
   a.opacities[row] = d.opacity;
   put_vec3(color, a.colors, row);
+  if (a.screen_offset)
+    a.screen_offset[row * 2] = d.mean_x, a.screen_offset[row * 2 + 1] = d.mean_y;
 }
 
 // The gradient of one morphed Gaussian in one image.

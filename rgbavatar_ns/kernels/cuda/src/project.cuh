@@ -91,9 +91,14 @@ RGBAVATAR_KERNEL(project, ProjectArguments, kBlendThreads) {
   const bool exists = gaussian < a.frame.count;
   const int row = exists ? gaussian : 0;
   const GaussianInput<float> g = world_gaussian(a.world, a.frame, image, row);
-  const int64_t first = a.world.colors_shared ? 0 : int64_t(image) * a.frame.count;
-  emit(a.frame, a.bins, image, gaussian, exists, g, vec3_at(a.world.colors, first + row),
-       project(g, camera_of(a.cameras, a.frame, image)));
+  const int64_t first_row = int64_t(image) * a.frame.count;
+  Projection<float> q = project(g, camera_of(a.cameras, a.frame, image));
+  if (a.world.screen_offset) {
+    const float* offset = a.world.screen_offset + (first_row + row) * 2;
+    move_mean(offset[0], offset[1], q);
+  }
+  emit(a.frame, a.bins, image, gaussian, exists, g,
+       vec3_at(a.world.colors, (a.world.colors_shared ? 0 : first_row) + row), q);
 }
 
 // ---- Morphed Gaussians --------------------------------------------------------------------------
