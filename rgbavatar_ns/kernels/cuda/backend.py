@@ -53,7 +53,7 @@ def _world_values(gaussians: tuple[Tensor, ...]) -> dict[str, Any]:
     return {**_named(gaussians), **shared}
 
 
-def _named(inputs: Sequence[Tensor]) -> dict[str, Tensor | None]:
+def _named(inputs: Sequence[Tensor]) -> dict[str, Any]:
     """`gaussian_inputs` or their gradients by the names that arguments.h gives them."""
     return dict(zip_longest(_INPUTS, inputs))
 
