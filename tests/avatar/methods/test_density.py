@@ -2,6 +2,7 @@ import copy
 import dataclasses
 import math
 
+import numpy as np
 import pytest
 import torch
 
@@ -185,21 +186,31 @@ def test_step_and_seed_alone_decide():
     assert torch.equal(torch.random.get_rng_state(), state)
 
 
-def test_samples_are_not_the_backgrounds_of_the_step():
+def test_each_parents_children_lie_around_it():
+    splats, optimizer = ready()
+    parents = [2, 5, 7]
+    with torch.no_grad():
+        splats.position[:, 0] = torch.arange(12.0)
+        splats.log_scale[parents] = -4
+    want(splats, *parents)
+    assert run(splats, optimizer).split == 3
+    assert splats.position[-6:, 0].round().tolist() == [2, 2, 5, 5, 7, 7]
+    assert splats.triangle_of[-6:].tolist() == [2, 2, 1, 1, 3, 3]
+
+
+def test_samples_are_not_of_the_stream_that_backgrounds_are_of():
     splats, optimizer = ready(3)
-    changes = prune_and_refill(
-        splats.rows,
-        torch.tensor([True, False, False]),
-        2,
-        [optimizer],
-        jitter_m=1.0,
-        step=5,
-        seed=2,
-    )
-    assert changes.count == 2
-    moved = splats.position[1] - splats.position[0] + 0.5
+    keep = torch.tensor([True, False, False])
+    prune_and_refill(splats.rows, keep, 3, [optimizer], jitter_m=1.0, step=5, seed=2)
+    moved = (splats.position[1:] - splats.position[0] + 0.5).detach()
+
+    stream = np.random.Generator(np.random.Philox(key=np.array([2, 5], dtype=np.uint64)))
     background = random_backgrounds(5, 2, seed=2)
-    assert (moved - background).abs().amax(-1).min() > 1e-3
+    again = torch.from_numpy(stream.random((2, 3), dtype=np.float32))
+    assert torch.equal(background, again)
+    stream = np.random.Generator(np.random.Philox(key=np.array([2, 5], dtype=np.uint64)))
+    stream.integers(1, size=2)
+    assert (moved - torch.from_numpy(stream.random((2, 3)))).abs().max() > 1e-3
 
 
 def test_size_is_that_in_the_world():
@@ -211,6 +222,17 @@ def test_size_is_that_in_the_world():
     changes = run(splats, optimizer, controlled=splats.controlled(sizes_m))
     assert changes == DensityChanges(cloned=1, split=1, count=6)
     assert splats.triangle_of.tolist() == [0, 2, 3, 0, 1, 1]
+
+
+@pytest.mark.parametrize(("extent_m", "split"), [(0.5, 2), (1.0, 1), (2.0, 0)])
+def test_small_is_a_share_of_the_extent(extent_m, split):
+    splats, optimizer = ready()
+    want(splats, 0, 1)
+    with torch.no_grad():
+        splats.log_scale[:2] = torch.tensor([0.007, 0.015]).log()[:, None]
+    changes = run(splats, optimizer, dataclasses.replace(EVERY, extent_m=extent_m))
+    assert (changes.split, changes.cloned) == (split, 2 - split)
+    assert changes.count == 14
 
 
 def test_the_large_are_pruned_once_their_time_has_come():
