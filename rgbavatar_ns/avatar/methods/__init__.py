@@ -1,0 +1,1 @@
+"""Other methods' parts, each once: colours, carriers, fields, loss terms, density control."""
