@@ -59,9 +59,9 @@ def sh_basis(directions: Float[Tensor, "*n 3"], degree: int) -> Float[Tensor, "*
     values = [torch.full_like(x, COLOR_SCALE)]
     if degree > 0:
         values += [-_LINEAR * y, _LINEAR * z, -_LINEAR * x]
+    xx, yy, zz = x * x, y * y, z * z
+    xy, both, around = x * y, xx + yy, xx - yy
     if degree > 1:
-        xx, yy, zz = x * x, y * y, z * z
-        xy, both, around = x * y, xx + yy, xx - yy
         a, b, c = _SQUARE
         values += [a * xy, -a * (y * z), b * (2 * zz - both), -a * (x * z), c * around]
     if degree > 2:
