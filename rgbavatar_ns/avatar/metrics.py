@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
-from rgbavatar_ns.avatar.training.losses import LPIPSLoss
+from rgbavatar_ns.avatar.model.image_loss import LPIPSLoss
 from rgbavatar_ns.drawing.compositing import film_over, is_unfilmed, rgba_to_float
 from rgbavatar_ns.errors import UserError
 

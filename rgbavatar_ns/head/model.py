@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
@@ -86,23 +87,38 @@ class HeadModel(nn.Module):
         batch = theta.shape[:-1]
         parts = self.layout.split(theta.reshape(-1, theta.shape[-1]))
         person, person_joints = self._person(identity, batch)
-        expression = parts["expression"]
-        shaped = torch.addmm(person, expression, self._linear_dirs).unflatten(-1, (3, -1))
-        joints = torch.addmm(person_joints, expression, self._linear_joint_dirs)
-        joints = joints.unflatten(-1, (3, 5)).mT
-        turns = axis_angle_to_matrix(torch.stack([parts[name] for name in _JOINT_FIELDS], dim=1))
-        turns = turns - torch.eye(3, dtype=turns.dtype, device=turns.device)
+        shaped = torch.addmm(person, parts["expression"], self._linear_dirs).unflatten(-1, (3, -1))
+        turns, moves = self._bones(parts, person_joints)
         if "eyelids" in parts:
             shaped = shaped + (parts["eyelids"] @ self._eyelid_dirs).unflatten(-1, (3, -1))
         if len(self._pose_dirs):
             correctives = turns[:, 1:].flatten(1) @ self._pose_dirs
             shaped = shaped + correctives.unflatten(-1, (3, -1))
-        x, y, z, moved = self._skinned_offsets(joints, turns).unbind(2)
+        # Linear blend skinning moves each vertex by A x + s.
+        x, y, z, moved = (moves @ self._weights).unbind(2)
         posed = shaped + parts["translation"][..., None] + moved
         for row, along in zip((x, y, z), shaped[:, None].unbind(2)):
             posed = torch.addcmul(posed, row, along)
         vertices = posed.mT
         return vertices.reshape(*batch, *vertices.shape[1:])
+
+    def joint_transforms(
+        self,
+        theta: Float[Tensor, "*batch H"],
+        identity: Float[Tensor, "I"] | Float[Tensor, "*batch I"] | None = None,
+    ) -> Float[Tensor, "*batch 5 4 4"]:
+        """What each joint does to a point of the head at rest, in the order of `joints`.
+
+        Blended by the skinning weights they carry what is shaped already to where `forward` has it,
+        translation included; all zero theta gives identities to the bit. Raises as `forward`.
+        """
+        batch = theta.shape[:-1]
+        parts = self.layout.split(theta.reshape(-1, theta.shape[-1]))
+        _, moves = self._bones(parts, self._person(identity, batch)[1])
+        moves = F.pad(moves.movedim(-1, 1), (0, 0, 0, 1))
+        shift = F.pad(parts["translation"][:, None, :, None], (3, 0, 0, 1))
+        transforms = torch.eye(4, dtype=moves.dtype, device=moves.device) + moves + shift
+        return transforms.reshape(*batch, 5, 4, 4)
 
     def joints(self, identity: Float[Tensor, "I"] | None = None) -> Float[Tensor, "5 3"]:
         """Joints of the neutral head at rest: root, neck, jaw, left eye, right eye, metres."""
@@ -143,13 +159,17 @@ class HeadModel(nn.Module):
             return identity[None]
         return identity.expand(*batch, self.num_identity).reshape(-1, self.num_identity)
 
-    def _skinned_offsets(
-        self, joints: Float[Tensor, "B 5 3"], turns: Float[Tensor, "B 5 3 3"]
-    ) -> Float[Tensor, "B 3 4 V"]:
-        """How linear blend skinning moves each vertex: by A x + s; `turns` are R - I.
+    def _bones(
+        self, parts: dict[str, Tensor], person_joints: Float[Tensor, "#B 15"]
+    ) -> tuple[Float[Tensor, "B 5 3 3"], Float[Tensor, "B 3 4 5"]]:
+        """R - I of each joint's own turn, and how all that turns it moves a point: by A x + s.
 
         Everything is kept as a difference from rest, so that no rotation means exactly no motion.
         """
+        joints = torch.addmm(person_joints, parts["expression"], self._linear_joint_dirs)
+        joints = joints.unflatten(-1, (3, 5)).mT
+        turns = axis_angle_to_matrix(torch.stack([parts[name] for name in _JOINT_FIELDS], dim=1))
+        turns = turns - torch.eye(3, dtype=turns.dtype, device=turns.device)
         # About its joint j alone, a bone moves x by T (x - j).
         alone = torch.cat([turns, -(turns @ joints[..., None])], -1).unbind(1)
         moves: list[Tensor] = []
@@ -160,7 +180,7 @@ class HeadModel(nn.Module):
             above = moves[parent]
             # First the bone, then all above it: m + M(x + m) = M(x) + m + A m.
             moves.append(torch.baddbmm(above + local, above[..., :3], local))
-        return torch.stack(moves, -1) @ self._weights
+        return turns, torch.stack(moves, -1)
 
 
 @dataclass(frozen=True)

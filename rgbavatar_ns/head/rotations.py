@@ -5,10 +5,11 @@ Matrices act on columns, quaternions are real part first (wxyz), axis-angle is i
 
 import functools
 import math
+from typing import Any
 
 import roma
 import torch
-from jaxtyping import Float
+from jaxtyping import Complex, Float
 from torch import Tensor
 
 
@@ -122,3 +123,62 @@ def matrix_to_quat_wxyz(matrix: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*
         pick(wz, xz, yz, square) * factor,
     ]
     return torch.stack(quat).movedim(0, -1).contiguous()
+
+
+def multiply_quats_wxyz(
+    first: Float[Tensor, "*#batch 4"], second: Float[Tensor, "*#batch 4"]
+) -> Float[Tensor, "*batch 4"]:
+    """The Hamilton product of quaternions of any length: first the second turn, then the first."""
+    return _QuatProduct.apply(*torch.broadcast_tensors(first, second))
+
+
+def conjugate_quats_wxyz(quats_wxyz: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
+    """The turns back, of the same length."""
+    return torch.cat([quats_wxyz[..., :1], -quats_wxyz[..., 1:]], -1)
+
+
+class _QuatProduct(torch.autograd.Function):
+    """`multiply_quats_wxyz` of equal shapes, with its gradient written out.
+
+    A quaternion is a pair of complex numbers, q = (w + x i) + (y + z i) j, with j c = conj(c) j:
+    on a CPU a quarter of the time of the sixteen products through autograd.
+    """
+
+    @staticmethod
+    def forward(
+        ctx: Any, first: Float[Tensor, "*batch 4"], second: Float[Tensor, "*batch 4"]
+    ) -> Float[Tensor, "*batch 4"]:
+        ctx.save_for_backward(first, second)
+        return _product(_to_complex(first), _to_complex(second))
+
+    @staticmethod
+    def backward(
+        ctx: Any, *grad_outputs: Float[Tensor, "*batch 4"]
+    ) -> tuple[Float[Tensor, "*batch 4"] | None, Float[Tensor, "*batch 4"] | None]:
+        first, second = (_to_complex(quats) for quats in ctx.saved_tensors)
+        outer = _to_complex(grad_outputs[0])
+        need_first, need_second = ctx.needs_input_grad
+        return (
+            _product(outer, _conjugate(second)) if need_first else None,
+            _product(_conjugate(first), outer) if need_second else None,
+        )
+
+
+def _to_complex(quats_wxyz: Float[Tensor, "*batch 4"]) -> Complex[Tensor, "*batch 2"]:
+    return torch.view_as_complex(quats_wxyz.contiguous().unflatten(-1, (2, 2)))
+
+
+def _conjugate(quats: Complex[Tensor, "*batch 2"]) -> Complex[Tensor, "*batch 2"]:
+    """conj(a + b j) = conj(a) - b j."""
+    return torch.stack((quats[..., 0].conj(), -quats[..., 1]), dim=-1)
+
+
+def _product(
+    first: Complex[Tensor, "*batch 2"], second: Complex[Tensor, "*batch 2"]
+) -> Float[Tensor, "*batch 4"]:
+    """(a + b j)(c + d j) = (a c - b conj(d)) + (a d + b conj(c)) j."""
+    (a, b), (c, d) = first.unbind(-1), second.unbind(-1)
+    product = torch.empty_like(second)
+    torch.mul(a, c, out=product[..., 0]).addcmul_(b, d.conj(), value=-1)
+    torch.mul(a, d, out=product[..., 1]).addcmul_(b, c.conj())
+    return torch.view_as_real(product).flatten(-2)

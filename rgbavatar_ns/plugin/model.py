@@ -14,10 +14,11 @@ from torch.nn import Parameter
 
 from rgbavatar_ns.avatar import Avatar, AvatarConfig
 from rgbavatar_ns.avatar.metrics import LPIPSMetric, evaluate_images
+from rgbavatar_ns.avatar.model.image_loss import LPIPSLoss
 from rgbavatar_ns.avatar.prior import SurfacePrior
 from rgbavatar_ns.avatar.refinement import RefinementConfig
 from rgbavatar_ns.avatar.training.color_init import FirstColorsKind, hide_unseen
-from rgbavatar_ns.avatar.training.losses import LPIPSLoss, image_losses
+from rgbavatar_ns.avatar.training.losses import image_losses
 from rgbavatar_ns.avatar.training.step import Orthogonality, TrainingOptions
 from rgbavatar_ns.drawing.compositing import error_strip, straight_alpha
 from rgbavatar_ns.errors import UserError

@@ -9,7 +9,7 @@ from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from rgbavatar_ns.avatar import metrics
 from rgbavatar_ns.avatar.metrics import LPIPSMetric, evaluate_images, psnr, ssim
-from rgbavatar_ns.avatar.training.losses import LPIPSLoss
+from rgbavatar_ns.avatar.model.image_loss import LPIPSLoss
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.kernels.constants import UNFILMED_RGBA
 

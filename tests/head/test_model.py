@@ -1,3 +1,5 @@
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
@@ -161,3 +163,29 @@ def test_a_remembered_identity_is_not_mistaken_for_another(synthetic: HeadModel)
     theta.requires_grad_()
     synthetic(theta, identity).sum().backward()
     assert theta.grad is not None
+
+
+def test_blended_joint_transforms_carry_the_shaped_head_to_where_it_is(head: HeadModel) -> None:
+    theta, identity = random_theta(head, 2, 2), random_identity(head)
+    still = theta.clone()
+    for name in ("rotation", "neck", "jaw", "left_eye", "right_eye", "translation"):
+        still[..., head.layout.slice(name)] = 0
+    shaped = head(still, identity)
+    turned = theta.clone()
+    if head.arrays.posedirs.any():
+        # Correctives are shaped on, too, before the joints move anything: here they are left out.
+        arrays = dataclasses.replace(head.arrays, posedirs=np.zeros_like(head.arrays.posedirs))
+        head = HeadModel(arrays, torch.float64)
+    transforms = head.joint_transforms(turned, identity)
+    assert transforms.shape == (2, 2, 5, 4, 4)
+    weights = torch.tensor(head.arrays.skinning_weights, dtype=torch.float64)
+    blended = torch.einsum("vj,bcjxy->bcvxy", weights, transforms)
+    carried = (blended[..., :3, :3] @ shaped[..., None])[..., 0] + blended[..., :3, 3]
+    torch.testing.assert_close(carried, head(turned, identity), atol=1e-7, rtol=0)
+    assert torch.equal(blended[..., 3, :3], torch.zeros(2, 2, len(weights), 3).double())
+
+
+def test_joints_of_a_head_at_rest_move_nothing(head: HeadModel) -> None:
+    theta = torch.zeros(3, head.layout.size, dtype=torch.float64)
+    transforms = head.joint_transforms(theta, random_identity(head))
+    assert torch.equal(transforms, torch.eye(4, dtype=torch.float64).expand(3, 5, 4, 4))

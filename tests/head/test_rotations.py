@@ -95,3 +95,17 @@ def test_a_quaternion_of_any_length_is_the_matrix_that_it_came_from() -> None:
     turns = rotations.axis_angle_to_matrix(torch.randn(20, 3, dtype=torch.float64))
     quats_wxyz = rotations.matrix_to_quat_wxyz(turns)
     assert torch.allclose(rotations.quat_wxyz_to_matrix(3 * quats_wxyz), turns, atol=1e-12)
+
+
+def test_a_product_of_quaternions_turns_by_the_second_then_the_first() -> None:
+    generator = torch.Generator().manual_seed(5)
+    first = torch.randn(2, 7, 4, generator=generator, dtype=torch.float64)
+    second = torch.randn(1, 7, 4, generator=generator, dtype=torch.float64)
+    product = rotations.multiply_quats_wxyz(first, second)
+    wanted = rotations.quat_wxyz_to_matrix(first) @ rotations.quat_wxyz_to_matrix(second)
+    torch.testing.assert_close(rotations.quat_wxyz_to_matrix(product), wanted)
+    torch.testing.assert_close(product.norm(dim=-1), first.norm(dim=-1) * second.norm(dim=-1))
+    back = rotations.multiply_quats_wxyz(product, rotations.conjugate_quats_wxyz(second))
+    torch.testing.assert_close(back, first * second.square().sum(-1, keepdim=True))
+    inputs = (first.requires_grad_(), second.requires_grad_())
+    assert torch.autograd.gradcheck(rotations.multiply_quats_wxyz, inputs)

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import torch
-import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
@@ -16,6 +15,7 @@ from rgbavatar_ns.head import (
     frame_quats_wxyz,
     tangent_frames,
 )
+from rgbavatar_ns.head.surface import interpolated
 
 
 @dataclass(frozen=True)
@@ -132,13 +132,7 @@ class GaussianAnchors(nn.Module):
 
     def origins(self, vertices: Float[Tensor, "B V 3"]) -> Float[Tensor, "B N 3"]:
         """Return the anchors' world positions by barycentric interpolation (paper, supplement)."""
-        num_images = len(vertices)
-        # The batch lies innermost, so that each vertex is fetched once for all images.
-        table = vertices.transpose(0, 1).flatten(1)
-        summed = F.embedding_bag(
-            self._anchor_vertices, table, per_sample_weights=self.barycentric, mode="sum"
-        )
-        return summed.view(len(self), num_images, 3).transpose(0, 1).contiguous()
+        return interpolated(vertices, self._anchor_vertices, self.barycentric)
 
     def corners(self) -> tuple[Int[Tensor, "N 3"], Float[Tensor, "N 3"]]:
         """Return the vertices of each Gaussian's triangle, and its barycentric coordinates."""

@@ -29,14 +29,14 @@ class WeightNetwork(nn.Module):
     ) -> None:
         super().__init__()
         if kind == "linear":
-            self.layers = nn.Sequential(_linear(num_features, num_bases, generator))
+            self.layers = nn.Sequential(seeded_linear(num_features, num_bases, generator))
         else:
             self.layers = nn.Sequential(
-                _linear(num_features, hidden_width, generator),
+                seeded_linear(num_features, hidden_width, generator),
                 nn.ReLU(),
-                _linear(hidden_width, hidden_width, generator),
+                seeded_linear(hidden_width, hidden_width, generator),
                 nn.ReLU(),
-                _linear(hidden_width, num_bases, generator),
+                seeded_linear(hidden_width, num_bases, generator),
             )
 
     def forward(self, features: Float[Tensor, "B F"]) -> Float[Tensor, "B K"]:
@@ -58,7 +58,7 @@ def softly_within(
     return nearest + room * torch.tanh((theta - nearest) / room)
 
 
-def _linear(num_in: int, num_out: int, generator: torch.Generator) -> nn.Linear:
+def seeded_linear(num_in: int, num_out: int, generator: torch.Generator) -> nn.Linear:
     """Build a linear layer with torch's default initial values drawn from `generator`."""
     # On "meta" nothing is drawn; torch's own initialisation would move the global random state.
     layer = nn.Linear(num_in, num_out, device="meta").to_empty(device="cpu")

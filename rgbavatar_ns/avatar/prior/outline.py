@@ -16,6 +16,7 @@ from torch import Tensor
 from rgbavatar_ns.avatar.avatar import Avatar
 from rgbavatar_ns.avatar.prior.mesh_field import MeshField, Outline
 from rgbavatar_ns.drawing.compositing import unfilmed_pixels
+from rgbavatar_ns.head.surface import vertex_normals
 from rgbavatar_ns.kernels import PinholeCameras
 
 _GRAZING = 0.25
@@ -212,13 +213,3 @@ def _at(values: np.ndarray, px: Float[np.ndarray, "V 2"]) -> np.ndarray:
         values.astype(np.float32), column, row, cv2.INTER_LINEAR, borderValue=(-1, -1, -1, -1)
     )
     return found.reshape(len(px), *values.shape[2:])
-
-
-def vertex_normals(vertices: Float[Tensor, "B V 3"], faces: Tensor) -> Float[Tensor, "B V 3"]:
-    """Unit normals, each the mean of the faces around it by area."""
-    first, second, third = (vertices[:, faces[:, k]] for k in range(3))
-    normals = torch.linalg.cross(second - first, third - first)
-    sums = torch.zeros_like(vertices)
-    for corner in range(3):
-        sums.index_add_(1, faces[:, corner], normals)
-    return F.normalize(sums, dim=-1)

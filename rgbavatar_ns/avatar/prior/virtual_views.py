@@ -17,6 +17,7 @@ from rgbavatar_ns.avatar.avatar import Avatar
 from rgbavatar_ns.avatar.orbit import head_centre, orbit
 from rgbavatar_ns.avatar.prior.mesh_field import Outline
 from rgbavatar_ns.head import turn_seen
+from rgbavatar_ns.head.surface import vertex_normals
 from rgbavatar_ns.kernels import PinholeCameras, RenderedBatch
 from rgbavatar_ns.kernels.constants import UNFILMED_RGBA
 
@@ -193,12 +194,7 @@ class VirtualViews(nn.Module):
     def _draw(self, avatar: Avatar, view: int) -> "_Mask":
         import cv2
 
-        from rgbavatar_ns.avatar.prior.outline import (
-            PlacedMesh,
-            covered_pixels,
-            lower_rim,
-            vertex_normals,
-        )
+        from rgbavatar_ns.avatar.prior.outline import PlacedMesh, covered_pixels, lower_rim
 
         faces = avatar.head.faces.cpu().long()
         vertices = avatar.carrier_vertices(self.theta[[view]].to(avatar.identity)).cpu()

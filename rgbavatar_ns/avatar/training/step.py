@@ -14,6 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from rgbavatar_ns.avatar.avatar import LEARNING_RATES, Avatar
+from rgbavatar_ns.avatar.model.image_loss import LPIPSLoss
 from rgbavatar_ns.avatar.prior import SurfacePrior, VirtualViews
 from rgbavatar_ns.avatar.refinement.frames import FrameRefinement
 from rgbavatar_ns.avatar.training.batches import (
@@ -25,7 +26,7 @@ from rgbavatar_ns.avatar.training.batches import (
 from rgbavatar_ns.avatar.training.color_init import FirstColors, FirstColorsKind
 from rgbavatar_ns.avatar.training.cuda_graph import Recorder, record_cuda_graph
 from rgbavatar_ns.avatar.training.fused_step import FusedStep
-from rgbavatar_ns.avatar.training.losses import LPIPSLoss, image_losses, random_backgrounds
+from rgbavatar_ns.avatar.training.losses import image_losses, random_backgrounds
 from rgbavatar_ns.avatar.training.optimizer_states import unsupported_reason
 from rgbavatar_ns.avatar.training.orthogonality import (
     ORTHOGONALITY_WEIGHT,

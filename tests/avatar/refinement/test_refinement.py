@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 
+from rgbavatar_ns.avatar.model.image_loss import l1_loss
 from rgbavatar_ns.avatar.refinement import RefinementConfig, TrackingRefinement
 from rgbavatar_ns.avatar.refinement.calibration import fit_ridge
-from rgbavatar_ns.avatar.training.losses import l1_loss
 from rgbavatar_ns.avatar.training.theta_fit import fit_theta, frame_gradients
 from rgbavatar_ns.drawing.compositing import composite, rgba_to_float
 from rgbavatar_ns.head import ThetaField, ThetaLayout

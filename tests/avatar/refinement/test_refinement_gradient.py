@@ -3,9 +3,9 @@
 import pytest
 import torch
 
+from rgbavatar_ns.avatar.model.image_loss import l1_loss
 from rgbavatar_ns.avatar.training import make_optimizer
 from rgbavatar_ns.avatar.training.fused_step import FusedStep
-from rgbavatar_ns.avatar.training.losses import l1_loss
 from rgbavatar_ns.drawing.compositing import composite, rgba_to_float
 from rgbavatar_ns.kernels import available_backends
 from tests.avatar.fused_scene import AT_THE_CUT, VARIANTS, double, far_batch, in_double, stir

@@ -219,7 +219,7 @@ def test_an_lpips_loss_that_cannot_be_had_is_refused(make_avatar, batch_at, monk
     def unavailable(self):
         raise UserError("LPIPS (vgg) is unavailable: offline.", "Go online.")
 
-    monkeypatch.setattr("rgbavatar_ns.avatar.training.losses.LPIPSLoss.network", unavailable)
+    monkeypatch.setattr("rgbavatar_ns.avatar.model.image_loss.LPIPSLoss.network", unavailable)
     with pytest.raises(UserError, match="unavailable"):
         losses_of(make_avatar(), batch_at, 1, TrainingOptions(lpips_weight=0.05))
     # Before its first step it is not needed.

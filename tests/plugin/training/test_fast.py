@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 import torch
 
+from rgbavatar_ns.avatar.model.image_loss import LPIPSLoss
 from rgbavatar_ns.avatar.training.fused_step import FusedStep
-from rgbavatar_ns.avatar.training.losses import LPIPSLoss
 from rgbavatar_ns.kernels import available_backends
 from rgbavatar_ns.plugin.training.trainer import RGBAvatarTrainer, RGBAvatarTrainerConfig
 from tests.plugin.run import make_trainer, newest_state, parameters_of

@@ -1,0 +1,194 @@
+"""Terms that other methods add to a loss: of pictures, and of Gaussians.
+
+L1 and LPIPS are in `avatar.model.image_loss`. Pictures are compared with `film_over`'s, which is
+the drawn picture itself where nobody filmed: terms pixel by pixel add nothing there. For DSSIM,
+which looks around a pixel, the drawn picture is to be held there too (`torch.where` with
+`is_unfilmed`), or gradients reach what nobody filmed.
+"""
+
+import functools
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+_WINDOW, _SIGMA = 11, 1.5
+_C1, _C2 = 0.01**2, 0.03**2
+
+
+def mse_loss(
+    image: Float[Tensor, "B H W 3"], target: Float[Tensor, "B H W 3"]
+) -> Float[Tensor, ""]:
+    """The mean squared difference."""
+    return F.mse_loss(image, target)
+
+
+def huber_loss(
+    image: Float[Tensor, "B H W 3"],
+    target: Float[Tensor, "B H W 3"],
+    delta: float = 0.1,
+    weight: Float[Tensor, "B H W"] | Bool[Tensor, "B H W"] | None = None,
+) -> Float[Tensor, ""]:
+    """The mean of d^2 / 2, beyond `delta` of delta (|d| - delta / 2), each pixel times its weight.
+
+    The mean is over all pixels, whatever they weigh: a mask's pixels count as in the whole picture.
+    Source: FlashAvatar (`utils/loss_utils.py`; in the mouth's mask 40 times).
+    """
+    if weight is None:
+        return F.huber_loss(image, target, delta=delta)
+    error = F.huber_loss(image, target, delta=delta, reduction="none")
+    return (error * weight[..., None]).mean()
+
+
+def dssim_loss(
+    image: Float[Tensor, "B H W 3"], target: Float[Tensor, "B H W 3"]
+) -> Float[Tensor, ""]:
+    """1 - SSIM: Gaussian windows of 11 x 11 pixels, sigma 1.5, range 1, mean over windows.
+
+    Only windows that lie within the picture count; `avatar.metrics.ssim` continues pictures by
+    reflection, 3D Gaussian splatting's loss by zeros. Raises ValueError for pictures below 11 x 11.
+    """
+    if min(image.shape[1:3]) < _WINDOW:
+        raise ValueError(f"Pictures are {tuple(image.shape[1:3])}. Pass {_WINDOW} pixels or more.")
+    return 1 - _MeanSimilarity.apply(image, target)
+
+
+class _MeanSimilarity(torch.autograd.Function):
+    """Mean SSIM with its gradient written out, one image at a time to stay within the caches."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, image: Float[Tensor, "B H W 3"], target: Float[Tensor, "B H W 3"]
+    ) -> Float[Tensor, ""]:
+        found = [_similarity(x, y, ctx.needs_input_grad) for x, y in zip(image, target)]
+        means, *gradients = zip(*found)
+        ctx.gradients = [None if g[0] is None else torch.stack(g) / len(image) for g in gradients]
+        return torch.stack(means).mean()
+
+    @staticmethod
+    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, Tensor | None]:
+        first, second = (None if g is None else grad_outputs[0] * g for g in ctx.gradients)
+        return first, second
+
+
+def _similarity(
+    x: Float[Tensor, "H W 3"], y: Float[Tensor, "H W 3"], need: tuple[bool, bool]
+) -> tuple[Float[Tensor, ""], Float[Tensor, "H W 3"] | None, Float[Tensor, "H W 3"] | None]:
+    """Mean SSIM of two images (Wang et al. 2004, eq. 13) and its gradients where needed.
+
+    SSIM is a1 a2 / (b1 b2) of windowed means of x, y, x^2 + y^2 and x y.
+    """
+    mean_x, mean_y, squares, product = _blurred(torch.stack([x, y, x * x + y * y, x * y]))
+    means, mean_squares = mean_x * mean_y, mean_x.square() + mean_y.square()
+    a1, a2 = 2 * means + _C1, 2 * (product - means) + _C2
+    b1, b2 = mean_squares + _C1, squares - mean_squares + _C2
+    inverse = 1 / (b1 * b2)
+    similarity = a1 * a2 * inverse
+    if not any(need):
+        return similarity.mean(), None, None
+    of_squares, of_product = -similarity / b2, 2 * a1 * inverse
+    of_means = 2 * (a2 - a1) * inverse
+    of_mean_squares = 2 * (similarity / b1 + of_squares).neg_()
+    pairs = ((mean_y, mean_x), (mean_x, mean_y))
+    own = [of_means * b + of_mean_squares * a for (b, a), n in zip(pairs, need) if n]
+    stacked = torch.stack([of_squares, of_product, *own]) / similarity.numel()
+    from_squares, from_product, *from_means = _blurred(F.pad(stacked, _AROUND))
+    gradients: list[Tensor | None] = []
+    for (image, other), needed in zip(((x, y), (y, x)), need):
+        part = from_means.pop(0) if needed else None
+        if part is not None:
+            part = part + 2 * image * from_squares + other * from_product
+        gradients.append(part)
+    return similarity.mean(), gradients[0], gradients[1]
+
+
+_AROUND = (0, 0, *((_WINDOW - 1,) * 4))
+"""Zeros around rows and columns, with which the window gives back what it took."""
+
+
+def _blurred(maps: Float[Tensor, "M H W 3"]) -> Float[Tensor, "M h w 3"]:
+    """Each channel under the window, where it lies within the map."""
+    window = _window(maps.dtype, maps.device)
+    down, across = window.view(1, 1, -1, 1), window.view(1, 1, 1, -1)
+    # As seen by the convolution the channels lie innermost: ten times as fast as planes.
+    channels = F.conv2d(maps.movedim(-1, 1), down.expand(3, 1, -1, 1), groups=3)
+    return F.conv2d(channels, across.expand(3, 1, 1, -1), groups=3).movedim(1, -1)
+
+
+@functools.cache
+def _window(dtype: torch.dtype, device: torch.device) -> Float[Tensor, "K"]:
+    with torch.inference_mode(False):
+        place = torch.arange(_WINDOW, dtype=torch.float64) - _WINDOW // 2
+        weights = torch.exp(-place.square() / (2 * _SIGMA**2))
+        return (weights / weights.sum()).to(device, dtype)
+
+
+def coverage_loss(
+    alpha: Float[Tensor, "B H W 1"],
+    matte: Float[Tensor, "B H W"],
+    counted: Bool[Tensor, "B H W"] | None = None,
+) -> Float[Tensor, ""]:
+    """The mean squared difference of drawn opacity and matte; pixels not counted add nothing.
+
+    Source: GaussianBlendshapes (`train.py`: `alpha_loss`, 10 times).
+    """
+    error = (alpha[..., 0] - matte).square()
+    return (error if counted is None else error * counted).mean()
+
+
+def position_hinge(
+    position: Float[Tensor, "N 3"], most: float = 1.0, seen: Bool[Tensor, "N"] | None = None
+) -> Float[Tensor, ""]:
+    """How far local positions are farther than `most` from their frame's origin, on average.
+
+    Over those `seen`, if given; 0 where none is. Source: GaussianAvatars (eq. 4 and `train.py`: in
+    units of the triangle's size, .01 times).
+    """
+    return _mean_over(F.relu(torch.linalg.vector_norm(position, dim=-1) - most), seen)
+
+
+def scale_hinge(
+    scales: Float[Tensor, "N 3"], most: float = 0.6, seen: Bool[Tensor, "N"] | None = None
+) -> Float[Tensor, ""]:
+    """The length of what scales exceed `most` by, on average over those `seen`.
+
+    Source: GaussianAvatars (eq. 5 and `train.py`: in units of the triangle's size).
+    """
+    return _mean_over(torch.linalg.vector_norm(F.relu(scales - most), dim=-1), seen)
+
+
+def spike_term(
+    scales: Float[Tensor, "#B N 3"], largest: float, most_ratio: float = 10.0
+) -> Float[Tensor, ""]:
+    """The mean of Gaussians' largest scales, over those that are spikes; 0 where none is.
+
+    A spike's scale is above `largest` and more than `most_ratio` times its smallest one. Source:
+    SplattingAvatar (`model/loss_base.py`: .008 for a head four times as large, .002 m here).
+    """
+    longest, shortest = scales.amax(-1), scales.amin(-1)
+    return _mean_over(longest, (longest > largest) & (longest > most_ratio * shortest))
+
+
+def cylinder_term(
+    position: Float[Tensor, "N 3"],
+    centre: Float[Tensor, "3"],
+    radius: float,
+    half_height: float,
+) -> Float[Tensor, ""]:
+    """The mean squared distance to an upright cylinder (its axis is y), 0 within; square units.
+
+    Source: GaussianBlendshapes (`mouth_gs_model.py`: teeth stay in the mouth, 100 times).
+    """
+    x, y, z = (position - centre).unbind(-1)
+    beside = F.relu(torch.linalg.vector_norm(torch.stack([x, z], -1), dim=-1) - radius)
+    beyond = F.relu(y.abs() - half_height)
+    return (beside.square() + beyond.square()).mean()
+
+
+def _mean_over(values: Float[Tensor, "*n"], chosen: Bool[Tensor, "*n"] | None) -> Float[Tensor, ""]:
+    """The mean of the chosen, 0 where there are none."""
+    if chosen is None:
+        return values.mean()
+    return (values * chosen).sum() / chosen.sum().clamp(min=1)

@@ -1,0 +1,58 @@
+"""Where parts of the head's mesh are in pictures, for losses that weigh them."""
+
+from collections.abc import Iterable
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from rgbavatar_ns.drawing.wireframe import fixed_point, mesh_silhouette
+from rgbavatar_ns.head import HeadArrays
+from rgbavatar_ns.kernels import PinholeCameras
+
+MOUTH_GROUPS = ("upper_teeth", "lower_teeth", "tongue")
+"""Vertex groups of what is behind the lips."""
+
+
+def group_vertices(arrays: HeadArrays, names: Iterable[str]) -> Int[Tensor, "G"]:
+    """The vertices of those groups that this head has; of a head without any, none."""
+    found = [np.asarray(arrays.vertex_groups.get(name, []), np.int64) for name in names]
+    return torch.from_numpy(np.unique(np.concatenate([*found, np.zeros(0, np.int64)])))
+
+
+@torch.no_grad()
+def region_mask(
+    vertices: Float[Tensor, "B V 3"], faces: Int[Tensor, "G 3"], cameras: PinholeCameras
+) -> Bool[Tensor, "B H W"]:
+    """Pixels with their centre in one of these triangles that faces the camera, hidden or not."""
+    size = max(cameras.width, cameras.height)
+    corners = faces.cpu().numpy()
+    drawn = [mesh_silhouette(px, corners, size) for px in _pixels(vertices, cameras)]
+    masks = torch.from_numpy(np.stack(drawn) > 0.5)[:, : cameras.height, : cameras.width]
+    return masks.to(vertices.device)
+
+
+@torch.no_grad()
+def hull_mask(points: Float[Tensor, "B G 3"], cameras: PinholeCameras) -> Bool[Tensor, "B H W"]:
+    """Pixels within or touching the convex hull of points in the picture; none without points.
+
+    With the vertices of `MOUTH_GROUPS` it is the mouth, open or closed, as far as teeth reach: ours
+    in place of FlashAvatar's face parsing.
+    """
+    masks = np.zeros((len(points), cameras.height, cameras.width), np.uint8)
+    for mask, px in zip(masks, _pixels(points, cameras)):
+        if len(px):
+            # Within 16 bits, so that OpenCV's fixed point does not overflow.
+            hull = cv2.convexHull(px.clip(-(2**14), 2**14))
+            cv2.fillConvexPoly(mask, fixed_point(hull), (1,), shift=4)
+    return torch.from_numpy(masks > 0).to(points.device)
+
+
+def _pixels(points: Float[Tensor, "B G 3"], cameras: PinholeCameras) -> Float[np.ndarray, "B G 2"]:
+    """Where points are in pictures of one camera, or one each."""
+    pose = cameras.world_to_camera
+    seen = points @ pose[:, :3, :3].mT + pose[:, None, :3, 3]
+    px = seen[..., :2] / seen[..., 2:].clamp(min=1e-3) * cameras.focal_px[:, None]
+    return (px + cameras.principal_point_px[:, None]).cpu().numpy().astype(np.float32)

@@ -1,0 +1,133 @@
+"""Colours that depend on where they are seen from: real spherical harmonics up to degree 3.
+
+Order, signs and constants are those of 3D Gaussian splatting (Kerbl et al. 2023, `sh_utils.py` and
+`forward.cu`), so that coefficients mean the same in its files: degree after degree, order m from -l
+to l, with (-1)^m (Condon-Shortley). Directions go from the camera to the Gaussian.
+"""
+
+import functools
+import math
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor
+
+from rgbavatar_ns.avatar.model.blendshapes import COLOR_SCALE
+from rgbavatar_ns.kernels import PinholeCameras
+
+MAX_DEGREE = 3
+_LINEAR = 0.4886025119029199
+_SQUARE = (1.0925484305920792, 0.31539156525252005, 0.5462742152960396)
+_CUBE = (
+    *(0.5900435899266435, 2.890611442640554, 0.4570457994644658),
+    *(0.3731763325901154, 1.445305721320277),
+)
+
+
+def num_coefficients(degree: int) -> int:
+    """How many coefficients a colour channel has; raises ValueError beyond degree 0 to 3."""
+    if not 0 <= degree <= MAX_DEGREE:
+        raise ValueError(f"degree is {degree}. Pass 0 to {MAX_DEGREE}.")
+    return (degree + 1) ** 2
+
+
+def view_directions(
+    means: Float[Tensor, "#B N 3"], cameras: PinholeCameras
+) -> Float[Tensor, "#B N 3"]:
+    """Unit vectors from each image's camera to the Gaussians, in the world; cameras are 1 or B."""
+    rotation, shift = cameras.world_to_camera[:, :3, :3], cameras.world_to_camera[:, :3, 3:]
+    centres = -(rotation.mT @ shift).mT
+    return F.normalize(means - centres, dim=-1)
+
+
+def directions_in_frames(
+    directions: Float[Tensor, "#B N 3"], rotations: Float[Tensor, "#B N 3 3"]
+) -> Float[Tensor, "B N 3"]:
+    """R^-1 d: what turned colours show along d, unturned ones show along these directions.
+
+    The cheap way to turn colours with what carries them: 9 products a Gaussian, `rotate_sh` 768.
+    """
+    return (rotations * directions[..., :, None]).sum(-2)
+
+
+def sh_basis(directions: Float[Tensor, "*n 3"], degree: int) -> Float[Tensor, "*n C"]:
+    """Values of the (degree + 1)^2 harmonics along unit vectors."""
+    num_coefficients(degree)
+    x, y, z = directions.unbind(-1)
+    values = [torch.full_like(x, COLOR_SCALE)]
+    if degree > 0:
+        values += [-_LINEAR * y, _LINEAR * z, -_LINEAR * x]
+    xx, yy, zz = x * x, y * y, z * z
+    xy, both, around = x * y, xx + yy, xx - yy
+    if degree > 1:
+        a, b, c = _SQUARE
+        values += [a * xy, -a * (y * z), b * (2 * zz - both), -a * (x * z), c * around]
+    if degree > 2:
+        a, b, c, d, e = _CUBE
+        flat = 4 * zz - both
+        values += [-a * y * (3 * xx - yy), b * xy * z, -c * y * flat, d * z * (2 * zz - 3 * both)]
+        values += [-c * x * flat, e * z * around, -a * x * (xx - 3 * yy)]
+    return torch.stack(values, -1)
+
+
+def sh_colors(
+    coefficients: Float[Tensor, "N C 3"] | Float[Tensor, "#B N C 3"],
+    directions: Float[Tensor, "B N 3"],
+    degree: int,
+) -> Float[Tensor, "B N 3"]:
+    """Colours .5 + sum Y_k(d) c_k, not below 0 (as 3D Gaussian splatting), seen along unit vectors.
+
+    Of more coefficients than the degree has, the first ones count. Raises ValueError for fewer.
+    """
+    count = num_coefficients(degree)
+    if coefficients.shape[-2] < count:
+        raise ValueError(
+            f"{coefficients.shape[-2]} coefficients for degree {degree}. Pass {count} or more."
+        )
+    used = coefficients[..., :count, :]
+    shared = used[0] if used.ndim == 4 and len(used) == 1 else used
+    if degree == 0:
+        flat = COLOR_SCALE * shared[..., 0, :]
+        colors = flat.expand(len(directions), -1, -1)
+    else:
+        basis = sh_basis(directions, degree)
+        equation = "bnc,ncx->bnx" if shared.ndim == 3 else "bnc,bncx->bnx"
+        colors = torch.einsum(equation, basis, shared)
+    return (colors + 0.5).clamp(min=0)
+
+
+def rotate_sh(
+    coefficients: Float[Tensor, "*#n C 3"], rotations: Float[Tensor, "*#n 3 3"]
+) -> Float[Tensor, "*n C 3"]:
+    """Coefficients of the colours turned by proper rotations: along d they show what was at R^-1 d.
+
+    For what needs coefficients themselves, as files of Gaussians do: each harmonic, turned, is
+    projected upon all of its degree by a quadrature that is exact for their products. Raises
+    ValueError unless there are 1, 4, 9 or 16 coefficients.
+    """
+    count = coefficients.shape[-2]
+    degree = math.isqrt(count) - 1
+    if num_coefficients(max(degree, 0)) != count:
+        raise ValueError(f"{count} coefficients a colour. Pass 1, 4, 9 or 16.")
+    points, weights = (part.to(coefficients) for part in _quadrature())
+    # Row k: R^-1 d_k.
+    turned = sh_basis(points @ rotations, degree)
+    projection = sh_basis(points, degree).mT * weights
+    return (projection @ turned) @ coefficients
+
+
+@functools.cache
+def _quadrature() -> tuple[Float[Tensor, "Q 3"], Float[Tensor, "Q"]]:
+    """Points and weights on the unit sphere, exact for polynomials up to degree 7: Gauss-Legendre.
+
+    Of products of two harmonics of degree 3 the degree is 6.
+    """
+    heights, weights = np.polynomial.legendre.leggauss(4)
+    around = 2 * math.pi * np.arange(8) / 8
+    z, angle = (part.ravel() for part in np.meshgrid(heights, around, indexing="ij"))
+    radius = np.sqrt(1 - z**2)
+    points = np.stack([radius * np.cos(angle), radius * np.sin(angle), z], 1)
+    with torch.inference_mode(False):
+        return torch.from_numpy(points), torch.from_numpy(np.repeat(weights * math.pi / 4, 8))

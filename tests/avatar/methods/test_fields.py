@@ -1,0 +1,77 @@
+import math
+
+import pytest
+import torch
+
+from rgbavatar_ns.avatar.methods.fields import MLP, positional_encoding
+
+
+def seeded(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def normal(*shape: int, seed: int = 1) -> torch.Tensor:
+    return torch.randn(*shape, generator=seeded(seed), dtype=torch.float64)
+
+
+def test_encoding_by_hand() -> None:
+    code = positional_encoding(torch.tensor([[math.pi / 2, 0.0]]), 2)
+    wanted = [math.pi / 2, 0, 1, 0, 0, 1, 0, 0, -1, 1]
+    torch.testing.assert_close(code, torch.tensor([wanted]), atol=1e-6, rtol=0)
+    # FlashAvatar's: 8 octaves of three numbers.
+    assert positional_encoding(torch.zeros(4, 5, 3), 8).shape == (4, 5, 51)
+
+
+@pytest.mark.parametrize("activation", ["relu", "softplus"])
+@pytest.mark.parametrize("skip_at", [None, 2])
+def test_parts_give_what_their_concatenation_does(skip_at, activation) -> None:
+    network = MLP(
+        (3, 4), 8, 3, 2, generator=seeded(), skip_at=skip_at, activation=activation
+    ).double()
+    places, thetas = normal(1, 5, 3), normal(2, 1, 4, seed=2)
+    joined = torch.cat([places.expand(2, 5, 3), thetas.expand(2, 5, 4)], -1)
+    act = torch.nn.ReLU() if activation == "relu" else torch.nn.Softplus(beta=100)
+    values = joined
+    for index, layer in enumerate(network.hidden):
+        values = torch.cat([values, joined], -1) if index == skip_at else values
+        values = act(layer(values))
+    torch.testing.assert_close(network(places, thetas), network.output(values))
+
+
+def test_gradients_agree_with_differences() -> None:
+    network = MLP((3, 2), 6, 3, 2, generator=seeded(), skip_at=1, activation="softplus").double()
+    places, thetas = normal(1, 4, 3).requires_grad_(), normal(2, 1, 2, seed=2).requires_grad_()
+    weights = tuple(network.parameters())
+
+    def values(places, thetas, *_):
+        return network(positional_encoding(places, 0), thetas)
+
+    assert torch.autograd.gradcheck(values, (places, thetas, *weights), fast_mode=True)
+    encoded = lambda x: positional_encoding(x, 3)  # noqa: E731
+    assert torch.autograd.gradcheck(encoded, (places,))
+
+
+def test_the_seed_alone_decides_and_no_global_randomness_moves() -> None:
+    torch.manual_seed(3)
+    before = torch.get_rng_state()
+    first, same, other = (MLP((3,), 8, 2, 4, generator=seeded(s)) for s in (5, 5, 6))
+    assert torch.equal(before, torch.get_rng_state())
+    x = torch.ones(2, 3)
+    assert torch.equal(first(x), same(x))
+    assert not torch.equal(first(x), other(x))
+
+
+def test_a_field_may_begin_at_nothing_and_still_learn() -> None:
+    network = MLP((3,), 8, 2, 4, generator=seeded(), last_scale=0.0)
+    values = network(torch.ones(2, 3))
+    assert not values.any()
+    values.sum().backward()
+    assert network.output.weight.grad is not None
+    assert network.output.weight.grad.any()
+
+
+def test_what_does_not_fit_is_refused() -> None:
+    with pytest.raises(ValueError, match="skip_at is 2 of 2"):
+        MLP((3,), 8, 2, 4, generator=seeded(), skip_at=2)
+    with pytest.raises(ValueError, match=r"\(4,\) wide"):
+        MLP((3,), 8, 2, 4, generator=seeded())(torch.zeros(2, 4))
