@@ -1,6 +1,6 @@
 """Reduced Gaussian blendshapes: theta to Gaussians, their training losses and metrics."""
 
-from rgbavatar_ns.avatar.avatar import FILM_RANGE, LEARNING_RATES, Avatar, describe_layout
+from rgbavatar_ns.avatar.avatar import FILM_RANGE, LEARNING_RATES, Avatar
 from rgbavatar_ns.avatar.config import AvatarConfig
 from rgbavatar_ns.avatar.model.blendshapes import GaussianBlendshapes, TangentGaussians
 from rgbavatar_ns.avatar.model.weight_network import WeightNetwork
@@ -13,5 +13,4 @@ __all__ = [
     "GaussianBlendshapes",
     "TangentGaussians",
     "WeightNetwork",
-    "describe_layout",
 ]

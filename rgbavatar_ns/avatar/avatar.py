@@ -3,8 +3,7 @@
 import functools
 from collections.abc import Mapping
 from contextlib import nullcontext
-from dataclasses import fields, replace
-from pathlib import Path
+from dataclasses import fields
 from typing import Any
 
 import torch
@@ -12,15 +11,14 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from rgbavatar_ns.avatar.config import AvatarConfig
+from rgbavatar_ns.avatar.method import AvatarMethod
 from rgbavatar_ns.avatar.model.anchors import GaussianAnchors
 from rgbavatar_ns.avatar.model.blendshapes import GaussianBlendshapes
 from rgbavatar_ns.avatar.model.tangent_to_world import tangent_to_world
 from rgbavatar_ns.avatar.model.weight_network import WeightNetwork, softly_within
-from rgbavatar_ns.avatar.storage.bundle import load_any, save_bundle
-from rgbavatar_ns.avatar.storage.head_reference import reference_to
-from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
+from rgbavatar_ns.avatar.storage.stored_avatar import RGBAVATAR
 from rgbavatar_ns.errors import UserError
-from rgbavatar_ns.head import HeadArrays, HeadModel, ThetaLayout, UVAnchors, uv_anchors
+from rgbavatar_ns.head import HeadArrays, HeadModel, UVAnchors, uv_anchors
 from rgbavatar_ns.head.arkit import ArkitMap, arkit_coefficients, arkit_map
 from rgbavatar_ns.kernels import (
     GaussianSet,
@@ -31,7 +29,6 @@ from rgbavatar_ns.kernels import (
     morphed_renderer,
     rasterize,
 )
-from rgbavatar_ns.kernels.checks import holds_nonfinite
 from rgbavatar_ns.kernels.constants import MIN_ALPHA
 
 LEARNING_RATES: dict[str, float] = {
@@ -52,7 +49,7 @@ FILM_RANGE = ("theta_low", "theta_high")
 """An avatar's buffers with the range of theta that training saw."""
 
 
-class Avatar(nn.Module):
+class Avatar(AvatarMethod):
     """A head avatar of reduced Gaussian blendshapes, animated by theta (RGBAvatar, sec. 3.1).
 
     Everything that a picture needs is inside: head model, identity, anchors and Gaussians.
@@ -65,8 +62,9 @@ class Avatar(nn.Module):
         anchors: places of the Gaussians; by default every covered texel of the head's UV map.
     """
 
+    method = RGBAVATAR
+    config: AvatarConfig  # pyright: ignore[reportIncompatibleVariableOverride]
     color_initialized: Tensor
-    identity: Tensor
     theta_low: Float[Tensor, "H"]
     theta_high: Float[Tensor, "H"]
 
@@ -79,11 +77,8 @@ class Avatar(nn.Module):
         seed: int = 0,
         anchors: UVAnchors | None = None,
     ) -> None:
-        super().__init__()
         config = AvatarConfig() if config is None else config
-        self.head = head
-        self.config = config
-        self.register_buffer("identity", identity.detach().clone())
+        super().__init__(head, identity, config)
         with torch.no_grad():
             rest_vertices = head(identity.new_zeros(self.layout.size), identity)
         if anchors is None:
@@ -119,11 +114,6 @@ class Avatar(nn.Module):
             self.register_buffer(name, self.identity.new_full((self.layout.size,), end))
 
     @property
-    def layout(self) -> ThetaLayout:
-        """The names and sizes of theta's parts."""
-        return self.head.layout
-
-    @property
     def num_gaussians(self) -> int:
         """The number N of Gaussians."""
         return len(self.anchors)
@@ -139,7 +129,7 @@ class Avatar(nn.Module):
 
         Beyond what training saw, F hardly follows: nothing taught it what is there.
         """
-        theta = softly_within(self._checked(theta), self.theta_low, self.theta_high)
+        theta = softly_within(self.checked(theta), self.theta_low, self.theta_high)
         if self.weight_network is None:
             return theta[:, self.layout.slice("expression")][:, : self.config.num_bases]
         features = self.layout.network_features(
@@ -190,14 +180,18 @@ class Avatar(nn.Module):
         return self.head(theta, self.identity)
 
     def gaussians(
-        self, theta: Float[Tensor, "B H"], psi: Float[Tensor, "B K"] | None = None
+        self,
+        theta: Float[Tensor, "B H"],
+        psi: Float[Tensor, "B K"] | None = None,
+        *,
+        cameras: PinholeCameras | None = None,
     ) -> GaussianSet:
         """Return theta's Gaussians in the head's world; `psi` replaces the network's answer.
 
-        Differentiable in the parameters, theta and psi. Raises UserError where theta has another
-        size or holds NaN.
+        Differentiable in the parameters, theta and psi; the same for all cameras. Raises UserError
+        where theta has another size or holds NaN.
         """
-        theta = self._checked(theta)
+        theta = self.checked(theta)
         tangent = self.blendshapes.morph(self.weights(theta) if psi is None else psi)
         vertices = self.carrier_vertices(theta)
         frames = self.anchors.frames(vertices, with_length_ratio=self.config.scale_with_triangle)
@@ -220,7 +214,7 @@ class Avatar(nn.Module):
         Other options are those of `kernels.rasterize`. The picture carries no graph, unless it is
         to be `differentiable`: the same numbers through autograd, in several times as long.
         """
-        options = {"with_depth": with_depth, "with_visibility": with_visibility}
+        options: dict[str, Any] = {"with_depth": with_depth, "with_visibility": with_visibility}
         with nullcontext() if differentiable else torch.no_grad():
             renderer = None
             if not differentiable:
@@ -245,7 +239,7 @@ class Avatar(nn.Module):
         `psi` and `vertices` replace the answers of weight network and head model. Raises UserError
         where theta is unfit.
         """
-        theta = self._checked(theta)
+        theta = self.checked(theta)
         with torch.no_grad():
             weights = self.weights(theta) if psi is None else psi
             posed = self.carrier_vertices(theta) if vertices is None else vertices
@@ -275,59 +269,17 @@ class Avatar(nn.Module):
             groups["weight_network"] = list(self.weight_network.parameters())
         return groups
 
-    def require_layout(self, layout: ThetaLayout, source: str) -> None:
-        """Raise UserError, naming both layouts, where `source` has another than this avatar."""
-        if layout != self.layout:
-            raise UserError(
-                f"{source} has theta of {describe_layout(layout)}, but this avatar's head "
-                f"'{self.head.arrays.name}' takes {describe_layout(self.layout)}.",
-                "Use data of the same head model, or train an avatar on this data.",
-            )
+    def learning_rates(self) -> dict[str, float]:
+        """Return the paper's (supplement: implementation details)."""
+        return LEARNING_RATES
 
-    def save(
-        self,
-        path: str | Path,
-        *,
-        statistics: TrainingStatistics | None = None,
-        with_head: bool = True,
-    ) -> None:
-        """Write a bundle (a directory of avatar.safetensors and avatar.json), atomically.
-
-        Without `with_head` it only names its head model, as the licence of FLAME asks where the
-        bundle is passed on; `load` then wants the file (RGBAVATAR_HEAD).
-        """
-        state = self.to_state()
-        if not with_head:
-            state["head"] = reference_to(self.head.arrays)
-        save_bundle(state, self._own_state_dict(), Path(path), self.layout, statistics)
-
-    @classmethod
-    def load(cls, path: str | Path) -> "Avatar":
-        """Load a bundle, a nerfstudio checkpoint (.ckpt) or the newest one of a run's folder.
-
-        Needs no nerfstudio. Raises UserError where there is none or it cannot be read.
-        """
-        stored = load_any(Path(path))
-        stored.check()
-        with stored.damage_told():
-            avatar = cls.from_state(stored.state)
-            own = avatar._own_state_dict()
-            # Of an avatar that was trained before its range was kept, none is known.
-            parameters = {name: own[name] for name in FILM_RANGE} | stored.parameters
-            replace(stored, parameters=parameters).check_fits(own, avatar.layout.to_json())
-            avatar.load_state_dict({name: parameters[name] for name in own}, strict=False)
-        return avatar
-
-    def _own_state_dict(self) -> dict[str, Tensor]:
-        """Return the state dict without the head model's part, which `to_state` carries."""
-        return {k: v for k, v in self.state_dict().items() if not k.startswith("head.")}
+    def defaults_of_before(self) -> dict[str, Tensor]:
+        """Of an avatar that was trained before its range was kept, none is known."""
+        return {name: getattr(self, name) for name in FILM_RANGE}
 
     def to_state(self) -> dict[str, Any]:
         """Return what `from_state` needs beside the state dict, safe for `weights_only=True`."""
-        return {
-            "config": self.config.to_json(),
-            "head": self.head.arrays.to_state(),
-            "identity": self.identity.detach().cpu(),
+        return super().to_state() | {
             "anchors": {
                 name: value.cpu() if isinstance(value, Tensor) else value
                 for name, value in self.anchors.to_state().items()
@@ -366,30 +318,10 @@ class Avatar(nn.Module):
             if isinstance(value, Tensor):
                 state["anchors"][name] = value[places.cpu()]
         chosen = Avatar.from_state(state).to(self.identity)
-        own = self._own_state_dict()
+        own = self.own_state_dict()
         for name, value in own.items():
             if name.startswith(("anchors.", "blendshapes.", "color_initialized")):
                 axis = 1 if ".basis_" in name else 0
                 own[name] = value.index_select(axis, places)
         chosen.load_state_dict(own, strict=False)
         return chosen
-
-    def _checked(self, theta: Float[Tensor, "B H"]) -> Float[Tensor, "B H"]:
-        """Return theta in the parameters' dtype, or raise UserError with the reason."""
-        if theta.shape[-1] != self.layout.size:
-            raise UserError(
-                f"theta has {theta.shape[-1]} values, but this avatar's head "
-                f"'{self.head.arrays.name}' takes {describe_layout(self.layout)}.",
-                "Give theta of the head model that the avatar was trained with.",
-            )
-        # Of a GPU this is not asked; data is checked when loaded.
-        if holds_nonfinite(theta):
-            raise UserError(
-                "theta holds NaN or infinite values.", "Repair or leave out these frames."
-            )
-        return theta.to(self.blendshapes.position.dtype)
-
-
-def describe_layout(layout: ThetaLayout) -> str:
-    """Say a layout in words: its size, then each part's name and size."""
-    return f"{layout.size} values ({layout})"

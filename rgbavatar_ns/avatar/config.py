@@ -1,14 +1,30 @@
 """What an avatar is made of: sizes, variants and initial values."""
 
-from dataclasses import asdict, dataclass, fields
-from typing import Annotated, Any, Literal
+from dataclasses import asdict, dataclass, fields, is_dataclass
+from typing import Annotated, Any, Literal, TypeVar
 
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.options import Between, CheckedOptions, Share
 
+Kind = TypeVar("Kind", bound="MethodConfig")
+
 
 @dataclass(frozen=True)
-class AvatarConfig(CheckedOptions):
+class MethodConfig(CheckedOptions):
+    """The options of a method, each with a default, as its files keep them."""
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the fields as plain values."""
+        return asdict(self)
+
+    @classmethod
+    def from_json(cls: type[Kind], values: dict[str, Any]) -> Kind:
+        """Build from `to_json`; raises UserError on a field unknown to this version or misfit."""
+        return _from_json(cls, values)
+
+
+@dataclass(frozen=True)
+class AvatarConfig(MethodConfig):
     """Choices that fix an avatar's parameters and how they become world-space Gaussians."""
 
     num_bases: Annotated[int, Between(0, 1000)] = 20
@@ -62,25 +78,25 @@ class AvatarConfig(CheckedOptions):
                     f"Give {', '.join(others)} or {last}.",
                 )
 
-    def to_json(self) -> dict[str, Any]:
-        """Return the fields as plain values."""
-        return asdict(self)
 
-    @classmethod
-    def from_json(cls, values: dict[str, Any]) -> "AvatarConfig":
-        """Build from `to_json`; raises UserError on a field unknown to this version or misfit."""
-        kinds: dict[str, type] = {field.name: type(field.default) for field in fields(cls)}
-        unknown = sorted(set(values) - set(kinds))
-        if unknown:
+def _from_json(kind: type[Any], values: dict[str, Any]) -> Any:
+    defaults = kind()
+    known: dict[str, Any] = {field.name: getattr(defaults, field.name) for field in fields(kind)}
+    unknown = sorted(set(values) - set(known))
+    if unknown:
+        raise UserError(
+            f"The avatar's settings contain {', '.join(unknown)}, unknown to this version.",
+            "Update rgbavatar_ns to the version that wrote them.",
+        )
+    read = dict(values)
+    for name, value in values.items():
+        wanted = type(known[name])
+        if is_dataclass(wanted) and isinstance(value, dict):
+            read[name] = _from_json(wanted, value)
+        # JSON may write 1.0 as 1.
+        elif type(value) is not wanted and (type(value), wanted) != (int, float):
             raise UserError(
-                f"The avatar's settings contain {', '.join(unknown)}, unknown to this version.",
-                "Update rgbavatar_ns to the version that wrote them.",
+                f"The avatar's {name} is {value!r}, which is no {wanted.__name__}.",
+                "Save the avatar again, or use another copy.",
             )
-        for name, value in values.items():
-            # JSON may write 1.0 as 1.
-            if type(value) is not kinds[name] and (type(value), kinds[name]) != (int, float):
-                raise UserError(
-                    f"The avatar's {name} is {value!r}, which is no {kinds[name].__name__}.",
-                    "Save the avatar again, or use another copy.",
-                )
-        return cls(**values)
+    return kind(**read)

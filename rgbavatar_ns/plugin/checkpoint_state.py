@@ -6,7 +6,8 @@ from typing import Any
 
 import torch
 
-from rgbavatar_ns.avatar import FILM_RANGE, Avatar, describe_layout
+from rgbavatar_ns.avatar import FILM_RANGE, Avatar
+from rgbavatar_ns.avatar.method import describe_layout
 from rgbavatar_ns.avatar.prior import SurfacePrior
 from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
 from rgbavatar_ns.errors import UserError

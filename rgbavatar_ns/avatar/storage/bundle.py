@@ -38,7 +38,7 @@ CHECKPOINT_EXTRA_STATE = "_model._extra_state"
 """Where it keeps the model's extra state, whose `avatar` is `Avatar.to_state()`."""
 
 _TENSOR_MARK = "$tensor"
-_STATE_PARTS = ("config", "head", "identity", "anchors")
+_STATE_PARTS = ("config", "head", "identity")
 _CHECKSUMS = "sha256"
 _PARTS = ("format", "version", "layout", "state", "statistics", _CHECKSUMS)
 _MAX_MANIFEST_BYTES = 1 << 26

@@ -13,6 +13,8 @@ from rgbavatar_ns.avatar.config import AvatarConfig
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.reading import DamagedFileError, damage_told
 
+RGBAVATAR = "rgbavatar"
+"""The method of files that name none."""
 _MAX_RESOLUTION = 1 << 15
 _INTEGERS = (torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64)
 _FLOATS = (torch.float16, torch.float32, torch.float64)
@@ -57,6 +59,15 @@ class StoredAvatar:
     statistics: Any = None
     """What `TrainingStatistics.from_state` takes, if there is any."""
 
+    @property
+    def method(self) -> str:
+        """The method that made it; files of before there were others do not say."""
+        method = self.state.get("method", RGBAVATAR) if isinstance(self.state, dict) else RGBAVATAR
+        if not isinstance(method, str):
+            with self.damage_told():
+                raise DamagedFileError("its method has no name")
+        return method
+
     @contextmanager
     def damage_told(self) -> Iterator[None]:
         """Whatever goes wrong within is told as a UserError about this file."""
@@ -71,13 +82,15 @@ class StoredAvatar:
         """
         with self.damage_told():
             sizes: dict[str, int] = {}
-            head, anchors = (_mapping(self.state, name) for name in ("head", "anchors"))
-            _check_head(head, sizes)
+            _check_head(_mapping(self.state, "head"), sizes)
+            _check_tensors(self.state, {"identity": (_FLOATS, ("I",))}, sizes)
+            if self.method != RGBAVATAR:
+                return  # what it has beside is compared with what its config builds
+            anchors = _mapping(self.state, "anchors")
             _check_tensors(anchors, _ANCHORS, sizes)
             resolution = anchors.get("resolution")
             if type(resolution) is not int or not 0 < resolution <= _MAX_RESOLUTION:
                 raise DamagedFileError("its UV map has an impossible resolution")
-            _check_tensors(self.state, {"identity": (_FLOATS, ("I",))}, sizes)
             config = AvatarConfig.from_json(_mapping(self.state, "config"))
             sizes["K"], needed = config.num_bases, dict[str, Any](_GAUSSIANS)
             if config.num_bases > 0:

@@ -1,0 +1,130 @@
+"""One optimiser step of any method, eagerly: what the protocol of `AvatarMethod` asks for."""
+
+from collections.abc import Callable, Iterable, Mapping
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from rgbavatar_ns.avatar.method import (
+    AvatarMethod,
+    DrawnBatch,
+    FilmedBatch,
+    Losses,
+    WatchedStep,
+)
+from rgbavatar_ns.avatar.refinement.frames import FrameRefinement
+from rgbavatar_ns.avatar.training.batches import TrainingBatch
+from rgbavatar_ns.avatar.training.losses import random_backgrounds, require_images_of
+from rgbavatar_ns.drawing.compositing import film_over, is_unfilmed, rgba_to_float
+from rgbavatar_ns.kernels import rasterize
+
+Logged = Callable[[int, Mapping[str, float]], None]
+"""Told of what a method says of itself after a step."""
+
+
+def method_optimizers(method: AvatarMethod) -> list[torch.optim.Optimizer]:
+    """Adam for each parameter group, with the method's learning rates; epsilon as 3DGS's."""
+    rates = method.learning_rates()
+    return [
+        torch.optim.Adam(parameters, lr=rates[name], eps=1e-15)
+        for name, parameters in method.parameter_groups().items()
+    ]
+
+
+class MethodStep:
+    """Trains a method in place, a batch a call.
+
+    Args:
+        method: what is trained.
+        optimizers: those that hold its parameters; by default `method_optimizers`.
+        seed: of random backgrounds, and of what the method draws after a step.
+        refinement: corrects the frames' theta by the gradient that each step leaves there.
+        backend: of the rasterizer.
+        logged: told of the figures that `after_step` returns.
+    """
+
+    kind = "eager"
+    reason = "this method goes through autograd"
+
+    def __init__(
+        self,
+        method: AvatarMethod,
+        optimizers: Iterable[torch.optim.Optimizer] | None = None,
+        *,
+        seed: int = 0,
+        refinement: FrameRefinement | None = None,
+        backend: str = "auto",
+        logged: Logged = lambda step, figures: None,
+    ) -> None:
+        self.method, self.refinement = method, refinement
+        self.optimizers = list(method_optimizers(method) if optimizers is None else optimizers)
+        self._seed, self._backend, self._logged = seed, backend, logged
+        names = {p: name for name, group in method.parameter_groups().items() for p in group}
+        self._groups = [
+            (names[group["params"][0]], group) for o in self.optimizers for group in o.param_groups
+        ]
+
+    def __call__(self, batch: TrainingBatch, step: int) -> Losses:
+        """Take step `step` and what is due after it; returns the parts of the loss, detached."""
+        count, theta = len(batch.theta), batch.theta
+        require_images_of(batch.images_rgba, count, batch.cameras)
+        if self.refinement is not None:
+            assert batch.position is not None, "Refined tracking needs the frames' positions."
+            theta = self.refinement.corrected(theta, batch.position).requires_grad_()
+        background = batch.background
+        if background is None:
+            background = random_backgrounds(step, count, self._seed)
+        for optimizer in self.optimizers:
+            optimizer.zero_grad(set_to_none=True)
+        losses, drawn, offset = self._losses(batch, theta, background.to(theta), step)
+        torch.stack(list(losses.values())).sum().backward()
+        factors = self.method.rate_factors(step)
+        for name, group in self._groups:
+            if name in factors:
+                # Kept with the optimiser's state, so that a resumed run multiplies the same.
+                group["lr"] = group.setdefault("first_lr", group["lr"]) * factors[name]
+        for optimizer in self.optimizers:
+            optimizer.step()
+        if self.refinement is not None and theta.grad is not None:
+            assert batch.position is not None
+            # The batch's loss is a mean; each frame is to have the gradient of its own.
+            self.refinement.step(step, batch.position, theta.grad * count)
+        watched = None
+        if offset is not None and offset.grad is not None:
+            watched = WatchedStep(drawn.gaussians, batch.cameras, offset.grad)
+        figures = self.method.after_step(watched, self.optimizers, step, self._seed)
+        if figures:
+            self._logged(step, figures)
+        return {name: loss.detach() for name, loss in losses.items()}
+
+    def look_back(self, frames: Iterable[TrainingBatch]) -> bool:
+        """As `TrainingStep.look_back`: there is nothing to do."""
+        return False
+
+    def _losses(
+        self,
+        batch: TrainingBatch,
+        theta: Float[Tensor, "B H"],
+        background: Float[Tensor, "B 3"],
+        step: int,
+    ) -> tuple[Losses, DrawnBatch, Float[Tensor, "B N 2"] | None]:
+        """The parts of the loss with their graph, what was drawn, and where its means moved to."""
+        method, cameras, offset = self.method, batch.cameras, None
+        gaussians = method.gaussians(theta, cameras=cameras)
+        if method.watches(step):
+            size = (len(theta), gaussians.means.shape[1], 2)
+            offset = gaussians.means.new_zeros(size).requires_grad_()
+        rendered = rasterize(
+            gaussians, cameras, background, backend=self._backend, screen_offset=offset
+        )
+        drawn = DrawnBatch(theta, cameras, gaussians, rendered.image, rendered.alpha)
+        filmed = FilmedBatch(
+            batch.images_rgba,
+            background,
+            film_over(batch.images_rgba, background, rendered.image.detach()),
+            rgba_to_float(batch.images_rgba, background.dtype)[..., 3:],
+            is_unfilmed(batch.images_rgba),
+        )
+        losses = method.image_losses(drawn, filmed, step) | method.penalty(drawn, step)
+        return losses, drawn, offset
