@@ -229,8 +229,10 @@ class RGBAvatarTrainer(EndingTrainer, FitHooks):
     @contextmanager
     def _shown_progress(self) -> Iterator[None]:
         """Show how far training is, while it runs."""
-        total = self.config.max_num_iterations
-        with TrainingProgress(self._start_step, total, self._images_per_step) as self._progress:
+        total, seconds = self.config.max_num_iterations, self.config.max_train_seconds
+        with TrainingProgress(
+            self._start_step, total, self._images_per_step, seconds
+        ) as self._progress:
             yield
 
     @property
@@ -278,7 +280,8 @@ class RGBAvatarTrainer(EndingTrainer, FitHooks):
     def _tell_step(self, step: int, losses: Losses, seconds: float) -> None:
         """Curves and progress, every `steps_per_log` steps and at the end."""
         if self.completed or step_check(step, self.config.logging.steps_per_log, run_at_zero=True):
-            self._progress.show(step + 1, self._write_scalars(step, losses, seconds))
+            loss = self._write_scalars(step, losses, seconds)
+            self._progress.show(step + 1, loss, self._train_seconds)
 
     def _add_to_curve(self, step: int, scores: Mapping[str, Any]) -> None:
         """A point of curve.json; `--steps-per-eval-all-images` says how often."""

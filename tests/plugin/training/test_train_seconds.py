@@ -41,7 +41,9 @@ def test_it_ends_complete_with_the_step_that_uses_them_up(
     summary = _summary(_train(config_of(max_train_seconds=7.0)))
     assert (summary["ended"], summary["steps"], summary["images"]) == (COMPLETED, 4, 16)
     assert summary["train_seconds"] == 4 * TAKES
-    assert "Trained 4 steps in the 8 s that it was given" in capsys.readouterr().out
+    told = " ".join(capsys.readouterr().out.split())
+    assert ", 2 of 7 s" in told
+    assert "Trained 4 steps in the 8 s that it was given" in told
 
 
 def test_steps_that_are_done_sooner_end_it_as_ever(
