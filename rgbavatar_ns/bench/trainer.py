@@ -85,7 +85,7 @@ def _train(config: Any) -> dict[str, Any]:
     with warnings.catch_warnings():
         # nerfstudio's and torchvision's, about parts that are not used here.
         warnings.simplefilter("ignore")
-        from rgbavatar_ns.plugin.training.trainer import SUMMARY_NAME
+        from rgbavatar_ns.plugin.training.load_config import SUMMARY_NAME
 
         trainer = config.setup()
         trainer.setup()

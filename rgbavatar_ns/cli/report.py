@@ -7,29 +7,51 @@ import tyro
 from rich.console import Console
 from rich.markdown import Markdown
 
+from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.experiments import read_experiment
 from rgbavatar_ns.experiments.report import write_report
+from rgbavatar_ns.experiments.results import write_page, write_results
+from rgbavatar_ns.experiments.source import read_sources
 
 
 def run(
-    folder: Annotated[Path, tyro.conf.Positional],
-    file: Path,
+    folders: Annotated[tuple[Path, ...], tyro.conf.Positional] = (),
+    file: Path | None = None,
     subjects: tuple[str, ...] | None = None,
     tiny: bool = False,
     plots: bool = True,
+    into: Path | None = None,
 ) -> None:
-    """Write the experiment's table as Markdown, CSV and LaTeX, its plot, and a page with all.
+    """Write each sweep's table as Markdown, CSV and LaTeX, its plots, and a page with all.
 
     Args:
-        folder: where `rgbavatar sweep` wrote.
-        file: the experiment that was swept.
-        subjects: it was swept with these.
-        tiny: it was swept with --tiny.
+        folders: where `rgbavatar sweep` wrote.
+        file: the experiment that was swept; by default all that the folder says was swept there.
+        subjects: with --file: it was swept with these.
+        tiny: with --file: it was swept with --tiny.
         plots: draw them too (needs matplotlib).
+        into: instead, write what the folders tell as INTO/results/NAME.json with small pictures,
+            and INTO/results.md from all results that lie there; without folders that page alone.
     """
-    experiment = read_experiment(file, tiny=tiny, subjects=subjects)
-    report = write_report(experiment, folder, plots=plots)
     console = Console()
-    console.print(Markdown(report.table.to_markdown()))
-    for path in report.paths:
+    paths: list[Path] = []
+    if into is not None:
+        for folder in folders:
+            paths += write_results(folder, into)
+        paths.append(write_page(into))
+    elif not folders:
+        raise UserError(
+            "There is no sweep to report on.", "Name the folder that `rgbavatar sweep` wrote."
+        )
+    else:
+        for folder in folders:
+            if file is not None:
+                experiments = [read_experiment(file, tiny=tiny, subjects=subjects)]
+            else:
+                experiments = [source.experiment for source in read_sources(folder)]
+            for experiment in experiments:
+                report = write_report(experiment, folder, plots=plots)
+                console.print(Markdown(report.table.to_markdown()))
+                paths += report.paths
+    for path in paths:
         console.print(str(path), soft_wrap=True, highlight=False)

@@ -1,5 +1,6 @@
 """Plots of an experiment as PNG and SVG."""
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -7,11 +8,12 @@ from typing import Any
 import numpy as np
 
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.experiments.columns import COLUMNS
 from rgbavatar_ns.experiments.runner import run_folder_of
 from rgbavatar_ns.experiments.spec import Experiment
 from rgbavatar_ns.experiments.streamed import StreamedCurve, read_streamed
 from rgbavatar_ns.experiments.sweep import CellStatus
-from rgbavatar_ns.experiments.tables import HEADINGS, ResultTable, Row
+from rgbavatar_ns.experiments.tables import Entry, ResultTable, Row
 from rgbavatar_ns.plugin.training.curve import CURVE_NAME, read_curve
 
 _COLOR = "tab:blue"
@@ -30,18 +32,19 @@ def write_plots(experiment: Experiment, table: ResultTable, folder: Path, stem: 
         return []
     figure, panels = _panels(len(metrics), 3.2, sharey=experiment.plot is None)
     for axes, metric in zip(panels, metrics):
-        axes.set_title(HEADINGS[metric], fontsize=10)
+        axes.set_title(COLUMNS[metric].heading, fontsize=10)
         rows = [row for row in table.rows if metric in row.entries]
         if experiment.plot is not None:
             _against(axes, experiment, rows, metric)
             continue
         places = [table.rows.index(row) for row in rows]
-        means = [row.entries[metric].mean for row in rows]
-        spreads = [row.entries[metric].spread for row in rows]
+        means = [_mean(row.entries[metric]) for row in rows]
+        spreads = [_spread(row.entries[metric]) for row in rows]
         # Points, not bars: these would have to begin at 0, where differences do not show.
         axes.errorbar(means, places, xerr=spreads, fmt="o", color=_COLOR, capsize=2)
         axes.set_yticks(range(len(table.rows)), [row.name for row in table.rows])
         axes.set_ylim(len(table.rows) - 0.5, -0.5)
+        axes.set_xlim(*_fair_range(metric, axes.get_xlim()))
         axes.locator_params(axis="x", nbins=5)
         axes.grid(axis="y", alpha=0.3)
     return [_saved(figure, folder, stem)]
@@ -91,7 +94,7 @@ def write_convergence(
         variant.name: [
             points
             for status in statuses
-            if status.cell.variant == variant.name and (points := _convergence(status))
+            if status.cell.variant == variant.name and (points := convergence(status))
         ]
         for variant in experiment.variants
     }
@@ -102,7 +105,7 @@ def write_convergence(
     axes = figure.add_subplot()
     _plain(axes)
     axes.set_xlabel("training, s")
-    axes.set_ylabel(HEADINGS["psnr"])
+    axes.set_ylabel(COLUMNS["psnr"].heading)
     for place, (name, found) in enumerate(curves.items()):
         color = f"C{place}"
         if len(found) > 1:
@@ -112,11 +115,12 @@ def write_convergence(
         means = np.mean([[points[step] for step in steps] for points in found], axis=0)
         axes.plot(*means.reshape(-1, 2).T, color=color, label=name, marker=".", markersize=4)
     axes.set_xlim(left=0)
+    axes.set_ylim(*_fair_range("psnr", axes.get_ylim()))
     axes.legend(frameon=False)
     return [_saved(figure, folder, f"{stem}_convergence")]
 
 
-def _convergence(status: CellStatus) -> dict[int, tuple[float, float]]:
+def convergence(status: CellStatus) -> dict[int, tuple[float, float]]:
     """Seconds and PSNR by step of a finished cell; empty without any evaluation in training."""
     if status.result is None:
         return {}
@@ -126,6 +130,27 @@ def _convergence(status: CellStatus) -> dict[int, tuple[float, float]]:
     if seen and {"steps", "train_seconds", "psnr"} <= ended.keys():
         seen[int(ended["steps"]) - 1] = (ended["train_seconds"], ended["psnr"])
     return seen
+
+
+def _mean(entry: Entry) -> float:
+    return math.nan if entry.mean is None else entry.mean
+
+
+def _spread(entry: Entry) -> float:
+    """Of an error bar; NaN draws none."""
+    return math.nan if entry.spread is None else entry.spread
+
+
+def _fair_range(metric: str, shown: tuple[float, float]) -> tuple[float, float]:
+    """A range of an axis in which differences look no larger than they are.
+
+    From 0, or as wide as `Column.least_span` about the same middle.
+    """
+    least, (low, high) = COLUMNS[metric].least_span, shown
+    if least is None:
+        return min(low, 0.0), high
+    wider = max(0.0, least - (high - low)) / 2
+    return low - wider, high + wider
 
 
 def _plain(axes: Any) -> None:
@@ -184,13 +209,14 @@ def _against(axes: Any, experiment: Experiment, rows: Sequence[Row], metric: str
         mine = [k for k, row in enumerate(rows) if variants[row.name].family == family]
         axes.errorbar(
             [places[k] for k in mine],
-            [rows[k].entries[metric].mean for k in mine],
-            yerr=[rows[k].entries[metric].spread for k in mine],
+            [_mean(rows[k].entries[metric]) for k in mine],
+            yerr=[_spread(rows[k].entries[metric]) for k in mine],
             marker="o",
             linestyle="-" if places is numbers else "",
             capsize=2,
             label=family,
         )
+    axes.set_ylim(*_fair_range(metric, axes.get_ylim()))
     if places is numbers and min(numbers) > 0 and max(numbers) / min(numbers) > _WIDE:
         axes.set_xscale("log", base=2)
     shown = dict(zip(places, values))

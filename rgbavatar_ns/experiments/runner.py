@@ -12,9 +12,12 @@ from pathlib import Path
 from typing import Any
 
 from rgbavatar_ns.avatar import Avatar
+from rgbavatar_ns.bench.machine import machine_facts
 from rgbavatar_ns.data import TrackedDataset, load_dataset
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.experiments import commands
+from rgbavatar_ns.experiments.avatar_size import avatar_size
+from rgbavatar_ns.experiments.cell_pictures import write_pictures
 from rgbavatar_ns.experiments.cells import Cell
 from rgbavatar_ns.experiments.overrides import as_flags
 from rgbavatar_ns.experiments.process_lock import alone_in, end_with_parent
@@ -31,6 +34,9 @@ from rgbavatar_ns.plugin.online.least_losses import read_least
 CELL_FILE, RESULT_FILE, LOG_FILE = "cell.json", "result.json", "log.txt"
 _EVALUATION = "eval.json"
 _RUN = "run"
+_LPIPS = ("lpips_vgg", "lpips_vgg_refined")
+_MADE = ("processor", "gpu", "cores", "instruction_set", "torch", "commit", "date")
+"""Facts of the machine that a result is kept with."""
 
 
 def write_cell(folder: Path, cell: Cell, data: Path, driver: Path | None = None) -> None:
@@ -61,12 +67,16 @@ def run_cell(folder: Path) -> dict[str, Any]:
     numbers = {name: value for name, value in found.items() if isinstance(value, int | float)}
     avatar, dataset = Avatar.load(run_folder), load_dataset(data)
     numbers["frames_per_second"] = frames_per_second(avatar, dataset)
+    numbers |= avatar_size(avatar)
+    write_pictures(avatar, dataset, folder)
     if "stream" in training:
         numbers |= write_streamed(avatar, dataset, folder, read_least(run_folder))
-    result = {"key": cell.key, "metrics": numbers, "run": str(run_folder)}
+    facts = machine_facts()
+    made = {name: facts[name] for name in _MADE}
+    result = {"key": cell.key, "metrics": numbers, "run": str(run_folder), "made": made}
     unavailable = {}
     if "lpips_unavailable" in scores:
-        unavailable["lpips_vgg"] = scores["lpips_unavailable"]
+        unavailable = dict.fromkeys(_LPIPS, scores["lpips_unavailable"])
     if cell.cross_identity is not None and driver is not None:
         values, missing = _reenact(avatar, dataset, Path(driver), cell.cross_identity)
         numbers |= values

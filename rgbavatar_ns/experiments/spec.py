@@ -10,28 +10,8 @@ from typing import Any
 import yaml
 
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.experiments.columns import COLUMNS
 from rgbavatar_ns.files import digest
-
-METRICS = {
-    "psnr": ("PSNR", 2),
-    "ssim": ("SSIM", 4),
-    "lpips_vgg": ("LPIPS (VGG)", 4),
-    "l1_streamed": ("L1, streamed frames", 4),
-    "l1_forgotten": ("L1 forgotten", 5),
-    "e_orth": ("e_orth", 4),
-    "images_per_second": ("images/s", 1),
-    "train_seconds": ("training, s", 0),
-    "frames_per_second": ("frames/s", 1),
-    "peak_mib": ("memory, MiB", 0),
-    "gpu_peak_mib": ("GPU memory, MiB", 0),
-    "aed": ("AED", 4),
-    "apd": ("APD", 4),
-    "csim": ("CSIM", 4),
-}
-"""Heading and digits of what a table may show; the first three are of the held-out frames,
-`l1_streamed` is of the frames that a stream brought, after its end, and `l1_forgotten` how much
-more that is than each of them ever had; `frames_per_second` is from theta to the picture, and
-memory that of the training process; the last three need `cross_identity`."""
 
 _CROSS_IDENTITY = ("driver", "tracker", "face_recognition")
 
@@ -59,6 +39,17 @@ class Variant:
 
 
 @dataclass(frozen=True)
+class SpecText:
+    """The file of an experiment, and how it was read: what makes it again elsewhere."""
+
+    file: str
+    """As it was named; its name alone where that was an absolute path."""
+    text: str
+    tiny: bool = False
+    subjects: tuple[str, ...] | None = None
+
+
+@dataclass(frozen=True)
 class Experiment:
     """One table or figure: variants x subjects x seeds of one preset.
 
@@ -82,6 +73,8 @@ class Experiment:
     """A `driver` (a subject) whose held-out frames drive every avatar, a `tracker`
     (module:function) for AED and APD, and a `face_recognition` ONNX file for CSIM."""
     folder: Path = Path()
+    spec_text: SpecText | None = None
+    """What it was read from; None of one that was made in Python."""
 
     def __post_init__(self) -> None:
         for what in ("variants", "subjects", "seeds"):
@@ -108,10 +101,20 @@ def read_experiment(
     `overrides.check_overrides`.
     """
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        cause = f"{path} cannot be read: {error}."
-        raise UserError(cause, "Check the path and its YAML.") from None
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise _unreadable(path, error) from None
+    return parse_experiment(text, path, tiny=tiny, subjects=subjects)
+
+
+def parse_experiment(
+    text: str, path: Path, *, tiny: bool = False, subjects: Sequence[str] | None = None
+) -> Experiment:
+    """`read_experiment` of a file's text; `path` names it, and subjects are relative to it."""
+    try:
+        content = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise _unreadable(path, error) from None
     if not isinstance(content, dict):
         raise _refusal(path.name, "is no mapping", "Begin with `title: ...` and `preset: ...`.")
     scale = content.pop("tiny", None)
@@ -123,8 +126,14 @@ def read_experiment(
             **_options(path.name, scale.get("base")),
         }
         content = {**content, **scale, "base": base}
-    experiment = _experiment(path, content)
+    named = path.name if path.is_absolute() else path.as_posix()
+    spec_text = SpecText(named, text, tiny, None if subjects is None else tuple(subjects))
+    experiment = replace(_experiment(path, content), spec_text=spec_text)
     return experiment if subjects is None else _of_subjects(experiment, subjects)
+
+
+def _unreadable(path: Path, error: Exception) -> UserError:
+    return UserError(f"{path} cannot be read: {error}.", "Check the path and its YAML.")
 
 
 def _of_subjects(experiment: Experiment, subjects: Sequence[str]) -> Experiment:
@@ -180,7 +189,7 @@ def _experiment(path: Path, content: Mapping[str, Any]) -> Experiment:
             raise _refusal(where, f"has {key}: {given[key]!r}", "Give a list of texts.")
     if any(not isinstance(seed, int) or seed < 0 for seed in given.get("seeds", ())):
         raise _refusal(where, f"has seeds: {given['seeds']!r}", "Give whole numbers, 0 or more.")
-    _require_known(f"{where}, metrics", given.get("metrics", ()), METRICS)
+    _require_known(f"{where}, metrics", given.get("metrics", ()), COLUMNS)
     _check_cross_identity(where, given.get("cross_identity"), given.get("metrics", ()))
     lists = {key: tuple(value) for key, value in given.items() if isinstance(value, list)}
     return Experiment(variants=variants, folder=path.parent.resolve(), **{**given, **lists})
@@ -259,7 +268,7 @@ def _published(where: str, figures: Any) -> dict[str, float]:
         isinstance(value, int | float) for value in figures.values()
     ):
         raise _refusal(where, f"has {figures!r}", "Give figures by metric.")
-    _require_known(where, figures, METRICS)
+    _require_known(where, figures, COLUMNS)
     return {key: float(value) for key, value in figures.items()}
 
 

@@ -13,6 +13,7 @@ from rgbavatar_ns.experiments.engines import Engine
 from rgbavatar_ns.experiments.overrides import check_overrides
 from rgbavatar_ns.experiments.reenactment import load_tracker
 from rgbavatar_ns.experiments.runner import LOG_FILE, read_result, write_cell
+from rgbavatar_ns.experiments.source import keep_source
 from rgbavatar_ns.experiments.spec import Experiment, nearest
 from rgbavatar_ns.files import DiskError, atomic_folder, disk_errors, write_json
 from rgbavatar_ns.synthetic import make_demo_dataset
@@ -88,6 +89,7 @@ def _sweep(
 ) -> list[CellStatus]:
     statuses = [_status(cell, folder) for cell in cells]
     write_json(folder / f"{experiment.name}.json", [cell.to_json() for cell in cells])
+    keep_source(folder, experiment)
     progress(statuses)
     missing = {status.folder: status for status in statuses if status.state != "done"}
     subjects = {cell.subject for cell in cells} | {_driver(cell) for cell in cells}

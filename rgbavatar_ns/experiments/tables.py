@@ -4,22 +4,29 @@ import csv
 import io
 import math
 import statistics
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import astuple, dataclass
+from typing import Any
 
-from rgbavatar_ns.experiments.spec import METRICS, Experiment, Variant, subject_name
+from rgbavatar_ns.experiments.cells import Cell
+from rgbavatar_ns.experiments.columns import COLUMNS
+from rgbavatar_ns.experiments.spec import Experiment, Variant, subject_name
 from rgbavatar_ns.experiments.sweep import CellStatus
 
-HEADINGS = {metric: heading for metric, (heading, _) in METRICS.items()}
 _MISSING = "-"
 
 
 @dataclass(frozen=True)
 class Entry:
-    """One figure of the table: mean and standard deviation over `count` cells."""
+    """One figure of the table: the mean over `count` cells, and how far seeds part from it.
 
-    mean: float
-    spread: float
+    `spread` is the standard deviation over seeds of the means over subjects, which part by their
+    nature; None where there is one seed.
+    """
+
+    mean: float | None
+    """None where it is not finite."""
+    spread: float | None
     count: int
 
 
@@ -51,12 +58,40 @@ class ResultTable:
 
     def to_markdown(self) -> str:
         """With the title above and notes below, then the subjects' table."""
+        return f"### {self.title}\n\n{self.body_markdown()}"
+
+    def body_markdown(self) -> str:
+        """`to_markdown` without the title."""
         notes = [f"- {note}" for note in self.notes]
-        lines = [f"### {self.title}", "", *_markdown(self.heading(), self.lines()), "", *notes]
+        lines = [*_markdown(self.heading(), self.lines()), "", *notes]
         if self.subject_rows:
             lines += ["", "By subject:", ""]
             lines += _markdown(self.heading(by_subject=True), self.lines(by_subject=True))
         return "\n".join(lines).rstrip() + "\n"
+
+    @classmethod
+    def from_json(cls, values: Mapping[str, Any]) -> "ResultTable":
+        """Build from `dataclasses.asdict` as JSON keeps it.
+
+        Raises KeyError or TypeError where the values are not of that form.
+        """
+        rows, subject_rows = (
+            tuple(_row_from_json(row) for row in values[part]) for part in ("rows", "subject_rows")
+        )
+        return cls(
+            values["title"],
+            tuple(values["metrics"]),
+            rows,
+            values["paper_heading"],
+            tuple(values["notes"]),
+            subject_rows,
+        )
+
+    @property
+    def published(self) -> tuple[str, ...]:
+        """The metrics that the paper has a figure of."""
+        rows = (*self.rows, *self.subject_rows)
+        return tuple(m for m in self.metrics if any(m in row.paper for row in rows))
 
     def to_csv(self) -> str:
         """Every figure in full precision: mean, spread and count in columns of their own.
@@ -85,11 +120,12 @@ class ResultTable:
 
     def heading(self, *, by_subject: bool = False) -> list[str]:
         """What stands above the columns."""
-        ours = [HEADINGS[metric] for metric in self.metrics]
+        ours = [COLUMNS[metric].heading for metric in self.metrics]
         first = ["Subject", "Method"] if by_subject else ["Method"]
         if self.paper_heading is None:
             return [*first, *ours]
-        return [*first, *ours, *(f"{name}, {self.paper_heading}" for name in ours)]
+        theirs = [f"{COLUMNS[metric].heading}, {self.paper_heading}" for metric in self.published]
+        return [*first, *ours, *theirs]
 
     def lines(self, *, by_subject: bool = False) -> list[list[str]]:
         """The table's cells as texts, row by row."""
@@ -97,9 +133,14 @@ class ResultTable:
         for row in self.subject_rows if by_subject else self.rows:
             cells = [_told(metric, row.entries.get(metric)) for metric in self.metrics]
             if self.paper_heading is not None:
-                cells += [_number(metric, row.paper.get(metric)) for metric in self.metrics]
+                cells += [_number(metric, row.paper.get(metric)) for metric in self.published]
             lines.append([row.subject, row.name, *cells] if by_subject else [row.name, *cells])
         return lines
+
+
+def _row_from_json(values: Mapping[str, Any]) -> Row:
+    entries = {metric: Entry(**entry) for metric, entry in values["entries"].items()}
+    return Row(**{**values, "entries": entries, "cells": tuple(values["cells"])})
 
 
 def _markdown(heading: Sequence[str], lines: Sequence[Sequence[str]]) -> list[str]:
@@ -151,11 +192,11 @@ def _row(
     subject: str = "",
 ) -> Row:
     mine = [status for status in statuses if status.cell.variant == variant.name]
-    done = [status.result for status in mine if status.result is not None]
+    done = [(status.cell, status.result) for status in mine if status.result is not None]
     entries = {
-        metric: _entry([result["metrics"][metric] for result in done])
+        metric: _entry([(cell, result["metrics"][metric]) for cell, result in done])
         for metric in experiment.metrics
-        if done and all(metric in result["metrics"] for result in done)
+        if done and all(metric in result["metrics"] for _, result in done)
     }
     keys = tuple(status.cell.key for status in mine if status.result is not None)
     return Row(variant.name, entries, paper, keys, subject)
@@ -176,7 +217,7 @@ def _published(variant: Variant, subjects: Sequence[str]) -> dict[str, float]:
     known = [variant.paper_by_subject.get(name, {}) for name in subjects]
     means = {
         metric: statistics.fmean(figures[metric] for figures in known)
-        for metric in METRICS
+        for metric in COLUMNS
         if known and all(metric in figures for figures in known)
     }
     return {**variant.paper, **means}
@@ -189,8 +230,10 @@ def _notes(
     seeds = ", ".join(str(seed) for seed in experiment.seeds)
     notes = [
         f"{len(done)} of {len(statuses)} cells done; preset {experiment.preset}; "
-        f"subjects {', '.join(subjects)}; seeds {seeds}; ± is the standard deviation over them."
+        f"subjects {', '.join(subjects)}; seeds {seeds}"
+        + ("; ± is the standard deviation over seeds." if len(experiment.seeds) > 1 else ".")
     ]
+    notes += _told_columns(experiment.metrics)
     notes += [
         f"{variant.name}: preset {variant.preset}."
         for variant in experiment.variants
@@ -200,7 +243,7 @@ def _notes(
     for status in done:
         unavailable.update((status.result or {}).get("unavailable", {}))
     notes += [
-        f"{HEADINGS[metric]} is not available: {reason}"
+        f"{COLUMNS[metric].heading} is not available: {reason}"
         for metric, reason in sorted(unavailable.items())
         if metric in experiment.metrics
     ]
@@ -208,22 +251,38 @@ def _notes(
     return (*notes, *(f"{name}: a cell failed, see its log." for name in failed))
 
 
-def _entry(values: Sequence[float]) -> Entry:
-    spread = statistics.stdev(values) if len(values) > 1 else 0.0
-    return Entry(statistics.fmean(values), spread, len(values))
+def _told_columns(metrics: Sequence[str]) -> list[str]:
+    """What headings leave open, once for all that leave the same."""
+    told: dict[str, list[str]] = {}
+    for metric in metrics:
+        if COLUMNS[metric].told:
+            told.setdefault(COLUMNS[metric].told, []).append(COLUMNS[metric].heading)
+    return [f"{'; '.join(headings)}: {words}." for words, headings in told.items()]
+
+
+def _entry(found: Sequence[tuple[Cell, float]]) -> Entry:
+    subjects = {cell.subject for cell, _ in found}
+    by_seed: dict[int, dict[str, float]] = {}
+    for cell, value in found:
+        by_seed.setdefault(cell.seed, {})[cell.subject] = value
+    # A seed whose subjects are not all done would part for their sake.
+    whole = [statistics.fmean(of.values()) for of in by_seed.values() if of.keys() == subjects]
+    spread = statistics.stdev(whole) if len(whole) > 1 else None
+    mean = statistics.fmean(value for _, value in found)
+    return Entry(mean if math.isfinite(mean) else None, spread, len(found))
 
 
 def _told(metric: str, entry: Entry | None) -> str:
     if entry is None:
         return _MISSING
     mean = _number(metric, entry.mean)
-    return f"{mean} ± {_number(metric, entry.spread)}" if entry.count > 1 else mean
+    return mean if entry.spread is None else f"{mean} ± {_number(metric, entry.spread)}"
 
 
 def _number(metric: str, value: float | None) -> str:
     if value is None or not math.isfinite(value):
         return _MISSING
-    _, digits = METRICS[metric]
+    digits = COLUMNS[metric].digits
     small = digits > 0 and 0 < abs(value) < 10.0**-digits
     return f"{value:.1e}" if small else f"{value:.{digits}f}"
 

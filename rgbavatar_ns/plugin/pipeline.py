@@ -14,7 +14,7 @@ from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineC
 from rich.progress import track
 from torch import Tensor
 
-from rgbavatar_ns.avatar.metrics import LPIPSMetric, evaluate_images
+from rgbavatar_ns.avatar.metrics import LPIPSMetric, evaluate_images, with_sharpness
 from rgbavatar_ns.avatar.training.batches import ChosenFrames, TrainingBatch
 from rgbavatar_ns.avatar.training.cuda_graph import Recorder, record_cuda_graph
 from rgbavatar_ns.avatar.training.orthogonality import orthogonality_error
@@ -119,7 +119,7 @@ class RGBAvatarPipeline(VanillaPipeline):
     def get_average_eval_image_metrics(
         self, step: int | None = None, output_path: Path | None = None, get_std: bool = False
     ) -> dict[str, Any]:
-        """Means over the held-out frames.
+        """Means over the held-out frames, with their sharpness against the film's.
 
         Under `ns-eval` these contain LPIPS, or under `lpips_unavailable` the reason why not, and
         with `refine_held_out` the scores of frames fitted to their images, named `..._refined`;
@@ -135,12 +135,14 @@ class RGBAvatarPipeline(VanillaPipeline):
             )
         if self.test_mode != "test":
             metrics = super().get_average_eval_image_metrics(step, output_path, get_std)
+            metrics = with_sharpness(metrics)
             if step is not None:
                 self.evaluated(step, metrics)
             return metrics
         if self.config.model.lpips_metric:
             self.model.lpips_metric = LPIPSMetric()
         metrics = super().get_average_eval_image_metrics(step, output_path, get_std)
+        metrics = with_sharpness(metrics)
         if self.config.model.refine_held_out > 0:
             metrics |= self._refined_metrics()
         metrics["e_orth"] = orthogonality_error(self.model.avatar.blendshapes).item()
@@ -175,10 +177,12 @@ class RGBAvatarPipeline(VanillaPipeline):
             )
             drawn = self.model.avatar.render(theta, pinhole, backend=model.rasterizer).image
             for image, target in zip(drawn, images):
-                for name, value in evaluate_images(image[None], target[None]).items():
+                found = evaluate_images(image[None], target[None], self.model.lpips_metric)
+                for name, value in found.items():
                     if isinstance(value, float):
                         scores[f"{name}_refined"].append(value)
-        return {name: statistics.fmean(values) for name, values in scores.items()}
+        means = {name: statistics.fmean(values) for name, values in scores.items()}
+        return with_sharpness(means, "_refined")
 
 
 def _as_batch(cameras: Cameras, batch: dict[str, Any]) -> TrainingBatch:

@@ -52,7 +52,8 @@ def test_targets_are_laid_over_black_and_images_clamped():
     assert evaluate_images(image, target)["psnr"] == pytest.approx(20.0, abs=1e-3)
     white = torch.full((1, 16, 16, 4), 255, dtype=torch.uint8)
     assert evaluate_images(torch.full((1, 16, 16, 3), 7.0), white)["psnr"] == math.inf
-    assert evaluate_images(image, target).keys() == {"psnr", "psnr_head", "ssim"}
+    names = {"psnr", "psnr_head", "ssim", "detail", "detail_film"}
+    assert evaluate_images(image, target).keys() == names
 
 
 def test_psnr_of_the_head_counts_its_pixels_alone():

@@ -80,3 +80,12 @@ def test_forgetting_has_a_panel_a_variant_with_both_lines(experiment_of, tmp_pat
     assert second.get_title() == "b"
     assert [len(line.get_xdata()) for line in second.lines] == [3]
     assert first.get_ylim() == second.get_ylim()
+
+
+def test_axes_do_not_make_small_differences_large():
+    """0.1 dB do not fill an axis of PSNR; what is counted begins at 0; wide ranges stay."""
+    low, high = plots._fair_range("psnr", (30.0, 30.1))
+    assert (low + high) / 2 == pytest.approx(30.05)
+    assert high - low == pytest.approx(2)
+    assert plots._fair_range("psnr", (20.0, 30.0)) == (20.0, 30.0)
+    assert plots._fair_range("train_seconds", (80.0, 81.0)) == (0.0, 81.0)

@@ -9,6 +9,7 @@ import torch
 from rgbavatar_ns.avatar import Avatar
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.experiments import cells_of, read_experiment, reenactment, runner
+from rgbavatar_ns.experiments.cell_pictures import read_pictures
 from rgbavatar_ns.experiments.reenactment import (
     OnnxFaceRecognition,
     aligned_face,
@@ -204,7 +205,10 @@ def test_the_runner_scores_and_the_table_says_what_is_not_available(tmp_path, mo
     monkeypatch.setattr(runner.Avatar, "load", lambda path: avatar)
     monkeypatch.setattr(Ruler, "__call__", _Anywhere.__call__)
     result = runner.run_cell(tmp_path)
-    assert {"psnr", "aed", "apd"} <= set(result["metrics"])
+    assert {"psnr", "aed", "apd", "frames_per_second", "megabytes"} <= set(result["metrics"])
+    assert result["metrics"]["gaussians"] == avatar.num_gaussians
+    assert result["made"]["cores"] >= 1
+    assert len(read_pictures(tmp_path)) == 3
     assert result["unavailable"] == {"csim": "no face-recognition file was named"}
     status = CellStatus(cell, tmp_path, "done", result)
     table = result_table(experiment, [status]).to_markdown()

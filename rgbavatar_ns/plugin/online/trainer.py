@@ -24,11 +24,8 @@ from rgbavatar_ns.plugin.online.datamanager import OnlineDataManager
 from rgbavatar_ns.plugin.online.pipeline import OnlinePipeline, OnlinePipelineConfig
 from rgbavatar_ns.plugin.online.progress import OnlineProgress, StreamReport
 from rgbavatar_ns.plugin.training.interruption import StopRequest
-from rgbavatar_ns.plugin.training.trainer import (
-    RGBAvatarTrainer,
-    RGBAvatarTrainerConfig,
-    say,
-)
+from rgbavatar_ns.plugin.training.run_end import say
+from rgbavatar_ns.plugin.training.trainer import RGBAvatarTrainer, RGBAvatarTrainerConfig
 
 _LOOK_INTERVAL_S = 1.0
 _LOOKED_AT = 2
@@ -112,8 +109,8 @@ class OnlineTrainer(RGBAvatarTrainer):
 
     @property
     def completed(self) -> bool:
-        """Whether the steps after the stream's end are done."""
-        return self.step + 1 >= self._last_step()
+        """Whether the steps after the stream's end are done, or the seconds are used up."""
+        return self._out_of_time or self.step + 1 >= self._last_step()
 
     def _last_step(self) -> int:
         """Steps that the run has in all, as far as is known."""

@@ -11,11 +11,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import numpy as np
 import tyro
 from nerfstudio.engine.callbacks import TrainingCallbackLocation
 from nerfstudio.engine.optimizers import Optimizers
-from nerfstudio.engine.trainer import Trainer, TrainerConfig
+from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.utils import writer
 from nerfstudio.utils.misc import step_check
 from nerfstudio.utils.rich_utils import CONSOLE
@@ -27,11 +26,10 @@ from rgbavatar_ns.avatar.training.batches import ChosenFrames, TrainingBatch
 from rgbavatar_ns.avatar.training.loop import FitHooks, fit
 from rgbavatar_ns.avatar.training.step import Losses
 from rgbavatar_ns.errors import UserError
-from rgbavatar_ns.files import disk_errors, write_json
+from rgbavatar_ns.files import disk_errors
 from rgbavatar_ns.options import Between, Count, Positive
 from rgbavatar_ns.plugin.errors import device_errors_told, install_user_error_hook
 from rgbavatar_ns.plugin.pipeline import RGBAvatarPipeline, RGBAvatarPipelineConfig
-from rgbavatar_ns.plugin.refinement import REFINED_NAME
 from rgbavatar_ns.plugin.training.checkpoints import (
     checkpoint_of_step,
     load_newest,
@@ -43,25 +41,18 @@ from rgbavatar_ns.plugin.training.checkpoints import (
 from rgbavatar_ns.plugin.training.curve import EvaluationCurve
 from rgbavatar_ns.plugin.training.interruption import StopRequest, stop_with_starter
 from rgbavatar_ns.plugin.training.load_config import (
-    COMPLETED,
-    SUMMARY_NAME,
     go_on_or_repeat,
     loads_config,
     require_loadable,
 )
 from rgbavatar_ns.plugin.training.optimizers import ExponentialConfig, require_fitting_states
-from rgbavatar_ns.plugin.training.peak_memory import peak_memory
 from rgbavatar_ns.plugin.training.progress import TrainingProgress
 from rgbavatar_ns.plugin.training.ranges import require_trainable
+from rgbavatar_ns.plugin.training.run_end import EndingTrainer, say
 from rgbavatar_ns.plugin.training.turns import TurnsLock
 from rgbavatar_ns.plugin.viewer.settings import is_of_ns_viewer, viewer_settings
 
 LATEST = "latest"
-
-
-def say(line: str) -> None:
-    """Print a line as it is, however long and with any brackets."""
-    CONSOLE.print(line, highlight=False, soft_wrap=True, markup=False)
 
 
 @dataclass
@@ -73,6 +64,12 @@ class RGBAvatarTrainerConfig(TrainerConfig):
     """Data and model."""
     max_num_iterations: Count = 5000
     """Steps in all, those before a resume included (paper: 5,000; release: 50,000 images)."""
+    max_train_seconds: Positive | None = None
+    """End the run, complete, with the step that makes up so many seconds of training, those before
+    a resume included, even if steps are left: to compare methods at equal time. Counted as
+    training.json's train_seconds: the steps and their waiting for images, neither evaluation nor
+    saving. How many steps that makes depends on the machine; rates fall over learning_rate_steps
+    all the same."""
     position_lr_final: Positive | None = None
     """Let the learning rate of positions fall exponentially to this (paper: not; release: 8e-6)."""
     learning_rate_factor: Annotated[float, Between(1e-9, 1e3)] = 1.0
@@ -146,7 +143,7 @@ def _link_latest(run: Path) -> None:
 _IN_TRAINER = ContextVar("a trainer asks where to save", default=False)
 
 
-class RGBAvatarTrainer(Trainer, FitHooks):
+class RGBAvatarTrainer(EndingTrainer, FitHooks):
     """Trains with nerfstudio's parts around `fit`, whose hooks it is.
 
     What differs: `max_num_iterations` counts all steps also after a resume; checkpoints are
@@ -207,7 +204,7 @@ class RGBAvatarTrainer(Trainer, FitHooks):
         return Optimizers(settings, groups)
 
     def train(self) -> None:
-        """Train up to `max_num_iterations`, or until a stop is asked for; then save."""
+        """Train until steps or seconds are used up or a stop is asked for; then save."""
         outputs = self.pipeline.datamanager.train_dataparser_outputs
         outputs.save_dataparser_transform(self.base_dir / "dataparser_transforms.json")
         self._init_viewer_state()
@@ -232,8 +229,10 @@ class RGBAvatarTrainer(Trainer, FitHooks):
     @contextmanager
     def _shown_progress(self) -> Iterator[None]:
         """Show how far training is, while it runs."""
-        total = self.config.max_num_iterations
-        with TrainingProgress(self._start_step, total, self._images_per_step) as self._progress:
+        total, seconds = self.config.max_num_iterations, self.config.max_train_seconds
+        with TrainingProgress(
+            self._start_step, total, self._images_per_step, seconds
+        ) as self._progress:
             yield
 
     @property
@@ -252,7 +251,7 @@ class RGBAvatarTrainer(Trainer, FitHooks):
         """Wait while the viewer's pause button is on; False if training is to stop."""
         while self.training_state == "paused" and not self.stop.requested:
             self.stop.wait(0.01)
-        return not (self.stop.requested or self.stop_training)
+        return not (self.stop.requested or self.stop_training or self._out_of_time)
 
     @contextmanager
     def around_step(self, step: int) -> Iterator[None]:
@@ -280,9 +279,9 @@ class RGBAvatarTrainer(Trainer, FitHooks):
 
     def _tell_step(self, step: int, losses: Losses, seconds: float) -> None:
         """Curves and progress, every `steps_per_log` steps and at the end."""
-        last = step == self.config.max_num_iterations - 1
-        if last or step_check(step, self.config.logging.steps_per_log, run_at_zero=True):
-            self._progress.show(step + 1, self._write_scalars(step, losses, seconds))
+        if self.completed or step_check(step, self.config.logging.steps_per_log, run_at_zero=True):
+            loss = self._write_scalars(step, losses, seconds)
+            self._progress.show(step + 1, loss, self._train_seconds)
 
     def _add_to_curve(self, step: int, scores: Mapping[str, Any]) -> None:
         """A point of curve.json; `--steps-per-eval-all-images` says how often."""
@@ -320,93 +319,13 @@ class RGBAvatarTrainer(Trainer, FitHooks):
 
     @property
     def completed(self) -> bool:
-        """Whether all steps are done."""
-        return self.step >= self.config.max_num_iterations - 1
+        """Whether all steps are done, or the seconds for them are used up."""
+        return self._out_of_time or self.step >= self.config.max_num_iterations - 1
 
-    @contextmanager
-    def _failure_written(self) -> Iterator[None]:
-        """Say in training.json what has ended the run against its will."""
-        try:
-            yield
-        except BaseException as error:
-            with suppress(UserError):  # A full disk may be what has ended it.
-                first_line = (str(error).splitlines() or [""])[0]
-                self._write_summary(f"failed: {type(error).__name__} {first_line}".strip())
-            raise
-
-    def _save_end(self) -> None:
-        """Save, and say how it went."""
-        self.training_state = "completed" if self.completed else "paused"
-        looked = self._take.look_back(self._frames_at_the_end())
-        if (self.completed and self.pipeline.model.finish()) or looked:
-            self._saved_step = None
-        if self.step >= 0 and self.step != self._saved_step:
-            self.save_checkpoint(self.step)
-        writer.write_out_storage()
-        self._save_refined()
-        self._tell_end(self._write_summary(COMPLETED if self.completed else "stopped"))
-
-    def _frames_at_the_end(self) -> Iterable[TrainingBatch]:
-        """The frames to look back at when the run ends.
-
-        Offline each was drawn often: they are looked at only where what none shows is hidden.
-        """
-        if self.completed and self.config.pipeline.model.hide_unseen:
-            return self.pipeline.training_frames()
-        return ()
-
-    def _stay(self) -> None:
-        """Keep the viewer open if it is to stay."""
-        self._run_callbacks(self.step, TrainingCallbackLocation.AFTER_TRAIN)
-        if self.completed and not self.config.viewer.quit_on_train_completion:
-            self._train_complete_viewer()
-
-    def _tell_end(self, summary: dict[str, Any]) -> None:
-        steps, rate = summary["steps"], summary["images_per_second"]
-        if self.completed:
-            CONSOLE.print(f"Trained {steps} steps, {rate:.1f} images/s.", highlight=False)
-        else:
-            say(
-                f"Stopped after {steps} of {self.config.max_num_iterations} steps; resume with "
-                f"the same command and --load-dir {self.checkpoint_dir}"
-            )
-        say(f"Config: {self.base_dir / 'config.yml'}")
-        say(f"Checkpoints: {self.checkpoint_dir}")
-
-    def _save_refined(self) -> None:
-        """Write theta of all frames, corrected or calibrated, as float32 [F, H]."""
-        model = self.pipeline.model
-        if model.refinement is not None:
-            theta = model.refinement.all_frames(model.frame_theta).cpu().numpy()
-            np.save(self.base_dir / REFINED_NAME, theta.astype(np.float32))
-
-    def _totals(self) -> dict[str, Any]:
-        """What the run has seen over all its sessions: "images", and more by other names."""
-        return {"images": (self.step + 1) * self._images_per_step}
-
-    def _write_summary(self, ended: str) -> dict[str, Any]:
-        """How the run ended, its length and speed over all its sessions, as training.json."""
-        seconds, totals = self._train_seconds, self._totals()
-        summary = {
-            "ended": ended,
-            "steps": self.step + 1,
-            "train_seconds": seconds,
-            "images_per_second": totals["images"] / seconds if seconds > 0 else 0.0,
-            **totals,
-            **peak_memory(self.pipeline.device),
-        }
-        write_json(self.base_dir / SUMMARY_NAME, summary)
-        return summary
-
-    def _train_complete_viewer(self) -> None:
-        """Keep the viewer open until Ctrl-C, which then ends the run with exit code 0."""
-        if self.viewer_state is None:
-            return
-        self.viewer_state.training_complete()
-        CONSOLE.print("The viewer stays open; Ctrl-C ends it.")
-        while not self.stop.wait(1.0):
-            pass
-        self.stop.signal_number = None
+    @property
+    def _out_of_time(self) -> bool:
+        most = self.config.max_train_seconds
+        return most is not None and self._train_seconds >= most
 
     def _load_checkpoint(self) -> None:
         """Load what --load-dir (newest readable) or --load-checkpoint names, if anything."""

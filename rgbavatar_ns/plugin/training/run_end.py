@@ -1,0 +1,140 @@
+"""How a run ends: what is saved and told once no step follows, whatever the reason."""
+
+from abc import abstractmethod
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
+from typing import Any
+
+import numpy as np
+from nerfstudio.engine.callbacks import TrainingCallbackLocation
+from nerfstudio.engine.trainer import Trainer
+from nerfstudio.utils import writer
+from nerfstudio.utils.rich_utils import CONSOLE
+
+from rgbavatar_ns.avatar.training.batches import TrainingBatch
+from rgbavatar_ns.avatar.training.step import TrainingStep
+from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.files import write_json
+from rgbavatar_ns.plugin.pipeline import RGBAvatarPipeline
+from rgbavatar_ns.plugin.refinement import REFINED_NAME
+from rgbavatar_ns.plugin.training.interruption import StopRequest
+from rgbavatar_ns.plugin.training.load_config import COMPLETED, SUMMARY_NAME
+from rgbavatar_ns.plugin.training.peak_memory import peak_memory
+
+
+def say(line: str) -> None:
+    """Print a line as it is, however long and with any brackets."""
+    CONSOLE.print(line, highlight=False, soft_wrap=True, markup=False)
+
+
+class EndingTrainer(Trainer):
+    """The part of a trainer that comes after its last step."""
+
+    pipeline: RGBAvatarPipeline
+    stop: StopRequest
+    _take: TrainingStep
+    _train_seconds: float
+    """Of the steps alone, over all sessions of the run."""
+    _saved_step: int | None
+    """Step whose state lies on the disk as it is."""
+
+    @property
+    @abstractmethod
+    def completed(self) -> bool:
+        """Whether the run has all that its config asks for: steps, or seconds."""
+
+    @property
+    @abstractmethod
+    def _images_per_step(self) -> int: ...
+
+    @property
+    @abstractmethod
+    def _out_of_time(self) -> bool: ...
+
+    @contextmanager
+    def _failure_written(self) -> Iterator[None]:
+        """Say in training.json what has ended the run against its will."""
+        try:
+            yield
+        except BaseException as error:
+            with suppress(UserError):  # A full disk may be what has ended it.
+                first_line = (str(error).splitlines() or [""])[0]
+                self._write_summary(f"failed: {type(error).__name__} {first_line}".strip())
+            raise
+
+    def _save_end(self) -> None:
+        """Save, and say how it went."""
+        self.training_state = "completed" if self.completed else "paused"
+        looked = self._take.look_back(self._frames_at_the_end())
+        if (self.completed and self.pipeline.model.finish()) or looked:
+            self._saved_step = None
+        if self.step >= 0 and self.step != self._saved_step:
+            self.save_checkpoint(self.step)
+        writer.write_out_storage()
+        self._save_refined()
+        self._tell_end(self._write_summary(COMPLETED if self.completed else "stopped"))
+
+    def _frames_at_the_end(self) -> Iterable[TrainingBatch]:
+        """The frames to look back at when the run ends.
+
+        Offline each was drawn often: they are looked at only where what none shows is hidden.
+        """
+        if self.completed and self.pipeline.config.model.hide_unseen:
+            return self.pipeline.training_frames()
+        return ()
+
+    def _stay(self) -> None:
+        """Keep the viewer open if it is to stay."""
+        for callback in self.callbacks:
+            callback.run_callback_at_location(self.step, TrainingCallbackLocation.AFTER_TRAIN)
+        if self.completed and not self.config.viewer.quit_on_train_completion:
+            self._train_complete_viewer()
+
+    def _tell_end(self, summary: dict[str, Any]) -> None:
+        steps, rate = summary["steps"], summary["images_per_second"]
+        if self.completed:
+            seconds = summary["train_seconds"]
+            why = f" in the {seconds:.0f} s that it was given" if self._out_of_time else ""
+            CONSOLE.print(f"Trained {steps} steps{why}, {rate:.1f} images/s.", highlight=False)
+        else:
+            say(
+                f"Stopped after {steps} of {self.config.max_num_iterations} steps; resume with "
+                f"the same command and --load-dir {self.checkpoint_dir}"
+            )
+        say(f"Config: {self.base_dir / 'config.yml'}")
+        say(f"Checkpoints: {self.checkpoint_dir}")
+
+    def _save_refined(self) -> None:
+        """Write theta of all frames, corrected or calibrated, as float32 [F, H]."""
+        model = self.pipeline.model
+        if model.refinement is not None:
+            theta = model.refinement.all_frames(model.frame_theta).cpu().numpy()
+            np.save(self.base_dir / REFINED_NAME, theta.astype(np.float32))
+
+    def _totals(self) -> dict[str, Any]:
+        """What the run has seen over all its sessions: "images", and more by other names."""
+        return {"images": (self.step + 1) * self._images_per_step}
+
+    def _write_summary(self, ended: str) -> dict[str, Any]:
+        """How the run ended, its length and speed over all its sessions, as training.json."""
+        seconds, totals = self._train_seconds, self._totals()
+        summary = {
+            "ended": ended,
+            "steps": self.step + 1,
+            "train_seconds": seconds,
+            "images_per_second": totals["images"] / seconds if seconds > 0 else 0.0,
+            **totals,
+            **peak_memory(self.pipeline.device),
+        }
+        write_json(self.base_dir / SUMMARY_NAME, summary)
+        return summary
+
+    def _train_complete_viewer(self) -> None:
+        """Keep the viewer open until Ctrl-C, which then ends the run with exit code 0."""
+        if self.viewer_state is None:
+            return
+        self.viewer_state.training_complete()
+        CONSOLE.print("The viewer stays open; Ctrl-C ends it.")
+        while not self.stop.wait(1.0):
+            pass
+        self.stop.signal_number = None

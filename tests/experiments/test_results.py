@@ -1,0 +1,187 @@
+"""Results for the documentation: whole, the same when written again, nothing of this machine."""
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from rgbavatar_ns.cli import main as cli
+from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.experiments import read_experiment
+from rgbavatar_ns.experiments.cells import cells_of
+from rgbavatar_ns.experiments.runner import run_folder_of
+from rgbavatar_ns.experiments.source import keep_source
+from rgbavatar_ns.files import write_json
+
+TEXT = """
+title: Two of them
+preset: rgbavatar-tiny
+paper_data: INSTA
+metrics: [psnr, psnr_refined, sharpness, megabytes]
+subjects: [SUBJECTS]
+seeds: [0, 1]
+variants:
+  - name: one
+    paper: {psnr: 31.19}
+  - name: two
+    set: {pipeline.model.avatar.num_bases: 5}
+tiny: {seeds: [0]}
+"""
+MADE = {"processor": "A CPU", "gpu": None, "cores": 2, "instruction_set": "avx2", "torch": "2.4"}
+
+
+def _sweep(folder: Path, file: Path, **options) -> Path:
+    """A finished sweep of made-up figures; its LPIPS names a place of this machine."""
+    experiment = read_experiment(file, **options)
+    cells = cells_of(experiment)
+    write_json(folder / f"{experiment.name}.json", [cell.to_json() for cell in cells])
+    keep_source(folder, experiment)
+    for k, cell in enumerate(cells):
+        place = folder / "cells" / cell.key
+        metrics = {"psnr": 30.0 + k, "psnr_refined": 31.0 + k, "sharpness": 0.5, "megabytes": 7.25}
+        metrics |= {"steps": 11, "train_seconds": 9.0}
+        made = {**MADE, "commit": f"abc{k // 4}", "date": f"2030-01-0{1 + k // 4} 12:00"}
+        why = {"psnr_refined": f"no file {folder}/cache/vgg.pth; see https://a.org/b/vgg"}
+        result = {"metrics": metrics, "made": made, "run": str(place), "unavailable": why}
+        write_json(place / "result.json", result)
+        points = [{"step": s, "train_seconds": s / 2.0, "psnr": 20.0 + s + k} for s in (2, 6)]
+        write_json(run_folder_of(place, cell) / "curve.json", {"points": points})
+        rng = np.random.default_rng(k)
+        (place / "pictures").mkdir()
+        for number in (4, 9):
+            for kind in ("film", "avatar"):
+                picture = rng.integers(0, 255, (512, 512, 3), np.uint8)
+                cv2.imwrite(str(place / f"pictures/{kind}_{number:06d}.png"), picture)
+    return folder
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    for name in ("hannah", "otto"):
+        (tmp_path / "private" / name).mkdir(parents=True)
+    path = tmp_path / "two.yaml"
+    subjects = ", ".join(str(tmp_path / "private" / name) for name in ("hannah", "otto"))
+    path.write_text(TEXT.replace("SUBJECTS", subjects))
+    return path
+
+
+def _contents(docs: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(docs)): p.read_bytes() for p in docs.rglob("*") if p.is_file()}
+
+
+def test_the_page_tells_all_of_it_and_nothing_of_the_machines_paths(file, tmp_path):
+    docs = tmp_path / "docs"
+    cli.main(["report", str(_sweep(tmp_path / "out", file)), "--into", str(docs)])
+    written = _contents(docs)
+    sheets = {f"results/two_subject{k}.jpg" for k in (1, 2)}
+    assert written.keys() == {
+        "results.md",
+        "results/two.json",
+        "results/two_convergence.png",
+        *sheets,
+    }
+    assert all(len(content) < 300_000 for content in written.values())
+    page = written["results.md"].decode()
+    for told in (
+        "## Two of them\n\n`rgbavatar sweep two.yaml`",
+        "A CPU, 2 cores; torch 2.4; commit abc0, abc1; 2030-01-01 to 2030-01-02",
+        # Cells of one: 30, 31 on hannah, 32, 33 on otto; seeds part by 1, so by sqrt(1/2).
+        "| one | 31.50 ± 0.71 | 32.50 ± 0.71 | 0.50 ± 0.00 | 7.2 ± 0.0 | 31.19 |",
+        "| hannah | two | 34.50 ± 0.71 |",
+        "PSNR, theta fitted: theta fitted to each held-out picture first",
+        "no file vgg.pth; see https://a.org/b/vgg",
+        "![Two of them](results/two_convergence.png)",
+        "![Two of them](results/two_subject2.jpg)",
+    ):
+        assert told in page, told
+    for content in written.values():
+        assert str(tmp_path).encode() not in content
+        assert str(Path.home()).encode() + b"/" not in content
+    curves = json.loads(written["results/two.json"])["curves"]
+    assert curves[1] == {
+        "variant": "one",
+        "subject": "hannah",
+        "seed": 1,
+        "seconds_psnr": [[1.0, 23.0], [3.0, 27.0], [9.0, 31.0]],
+    }
+
+
+def test_written_again_it_is_the_same_and_others_stay(file, tmp_path):
+    docs = tmp_path / "docs"
+    folder = _sweep(tmp_path / "out", file)
+    cli.main(["report", str(folder), "--into", str(docs)])
+    first = _contents(docs)
+    cli.main(["report", str(folder), "--into", str(docs)])
+    assert _contents(docs) == first
+    tiny = _sweep(tmp_path / "tiny", file, tiny=True)
+    cli.main(["report", str(tiny), "--into", str(docs)])
+    second = _contents(docs)
+    assert all(second[name] == content for name, content in first.items() if "/" in name)
+    page = second["results.md"].decode()
+    assert page.index("## Two of them (--tiny)") < page.index("## Two of them\n")
+    assert "`rgbavatar sweep two.yaml --tiny`" in page
+    # One seed: no spread.
+    assert "| one | 30.50 | 31.50 | 0.50 | 7.2 | 31.19 |" in page
+    # The page alone, of what lies there.
+    (docs / "results.md").unlink()
+    cli.main(["report", "--into", str(docs)])
+    assert _contents(docs) == second
+
+
+def test_drawings_that_are_no_more_are_removed(file, tmp_path):
+    docs = tmp_path / "docs"
+    folder = _sweep(tmp_path / "out", file)
+    cli.main(["report", str(folder), "--into", str(docs)])
+    (docs / "results" / "others.png").write_bytes(b"")
+    for path in folder.glob("cells/*/pictures/*"):
+        path.unlink()
+    cli.main(["report", str(folder), "--into", str(docs)])
+    names = {path.name for path in (docs / "results").iterdir()}
+    assert names == {"two.json", "two_convergence.png", "others.png"}
+
+
+def test_subjects_of_the_command_line_are_told_by_name(file, tmp_path):
+    chosen = (str(tmp_path / "private" / "otto"),)
+    folder = _sweep(tmp_path / "out", file, subjects=chosen)
+    cli.main(["report", str(folder), "--into", str(tmp_path / "docs")])
+    page = (tmp_path / "docs" / "results.md").read_text()
+    assert "`rgbavatar sweep two.yaml --subjects otto`" in page
+    assert "subjects otto;" in page
+
+
+def test_a_folder_is_reported_without_its_file(file, tmp_path, capsys):
+    folder = _sweep(tmp_path / "out", file)
+    cli.main(["report", str(folder), "--no-plots"])
+    assert "31.50" in capsys.readouterr().out
+    assert (folder / "report" / "two.md").exists()
+
+
+@pytest.mark.parametrize(
+    ("damage", "told"),
+    [
+        ("none", "does not say what was swept there"),
+        ("source", "does not say what was swept"),
+        ("result", "holds no result of this version"),
+    ],
+)
+def test_what_cannot_be_read_is_named(file, tmp_path, damage, told):
+    from rgbavatar_ns.experiments.results import write_page, write_results
+
+    folder, docs = _sweep(tmp_path / "out", file), tmp_path / "docs"
+    if damage == "none":
+        (folder / "two.source.json").unlink()
+    if damage == "source":
+        (folder / "two.source.json").write_text('{"file": 3}')
+    (docs / "results").mkdir(parents=True)
+    (docs / "results" / "old.json").write_text("[]")
+    with pytest.raises(UserError, match=told):
+        write_page(docs) if damage == "result" else write_results(folder, docs)
+
+
+def test_nothing_to_report_on_is_told():
+    from rgbavatar_ns.cli.report import run
+
+    with pytest.raises(UserError, match="no sweep to report on"):
+        run()
