@@ -56,7 +56,7 @@ class MorphedRenderer(Protocol):
         """The mean absolute difference to straight-alpha images over the background.
 
         Pixels that are marked `UNFILMED_RGBA` differ by 0; the divisor is that of all pixels.
-        `sight` is filled where it is given.
+        `sight` is added to where it is given.
         """
         ...
 

@@ -116,16 +116,18 @@ SIGHT_UNIT = 2.0**-32
 class FirstSight:
     """What a training step's pictures show of the Gaussians that wait for their first colour.
 
-    `sums`, filled by the step, holds for each Gaussian that is not `known` the sums of counted
-    colour (3) and of counted weight over the pixels, and the largest weight, in units of
-    `SIGHT_UNIT`: whole numbers, whose sums are the same in any order. Only the first `num_images`
+    The step adds to `sums`, for each Gaussian that is not `known`, counted colour (3) and counted
+    weight over the pixels, and raises the last number to the largest weight; they begin at 0, in
+    units of `SIGHT_UNIT`: whole numbers, whose sums are the same in any order. Only the first `num_images`
     pictures count. Counted is the weight times the picture's matte, or with `over_background` the
-    weight, and the colour then that of the picture over its background.
+    weight, and the colour then that of the picture over its background. What cannot be seen with a
+    weight above `threshold`, since its opacity is not, may be passed over.
     """
 
     known: Bool[Tensor, "N"]
     sums: Int[Tensor, "N 5"]
     num_images: int
+    threshold: float = 0.0
     over_background: bool = False
 
 

@@ -9,7 +9,7 @@ colour after it.
 from typing import Literal
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from rgbavatar_ns.avatar.avatar import Avatar
@@ -51,17 +51,30 @@ class FirstColors:
     def __init__(self, avatar: Avatar, kind: FirstColorsKind = "matted") -> None:
         self._avatar = avatar
         self._kind: FirstColorsKind = kind
+        self._sums: Tensor | None = None
 
     def sight(self, num_images: int) -> FirstSight | None:
         """What a step is to sum over the first `num_images` of its pictures.
 
-        None where no Gaussian waits, which is not asked of a GPU: the question would stop it.
+        None where no Gaussian waits, which is not asked of a GPU: the question would stop it. What
+        it is summed in is the same memory each time, of which a CPU touches only what waits.
         """
         known = self._avatar.color_initialized
-        if known.device.type == "cpu" and bool(known.all()):
-            return None
-        sums = torch.empty(len(known), SIGHT_SUMS, dtype=torch.int64, device=known.device)
-        return FirstSight(known, sums, num_images, self._kind == "paper")
+        if self._sums is None or self._sums.device != known.device:
+            size = (len(known), SIGHT_SUMS)
+            self._sums = torch.zeros(size, dtype=torch.int64, device=known.device)
+        if known.device.type != "cpu":
+            self._sums.zero_()
+        else:
+            waiting = self._waiting()
+            if len(waiting) == 0:
+                return None
+            self._sums.index_fill_(0, waiting, 0)
+        return FirstSight(known, self._sums, num_images, WEIGHT_THRESHOLD, self._kind == "paper")
+
+    def _waiting(self) -> Int[Tensor, "W"]:
+        """The Gaussians that have no first colour yet."""
+        return (~self._avatar.color_initialized).nonzero()[:, 0]
 
     @torch.no_grad()
     def seen_in(
@@ -92,9 +105,10 @@ class FirstColors:
         """
         avatar = self._avatar
         if isinstance(seen, FirstSight):
-            # In most steps nothing new comes to light.
-            if seen.sums.device.type == "cpu" and int(seen.sums[:, 4].max()) <= _THRESHOLD_UNITS:
-                return
+            if seen.sums.device.type == "cpu":
+                largest = seen.sums[self._waiting(), 4]
+                if not bool((largest > _THRESHOLD_UNITS).any()):
+                    return  # in most steps nothing new comes to light
             seen = seen.sums * SIGHT_UNIT
         sums, feature = seen, avatar.blendshapes.color_feature
         given = is_seen_well(sums) & ~avatar.color_initialized

@@ -113,7 +113,8 @@ class CpuMorphedRenderer:
         seen: dict[str, Any] = {}
         if sight is not None:
             check_sight(sight, self._count, self._weights)
-            seen = {"known": sight.known, "sums": sight.sums.zero_()}
+            seen = {"known": sight.known, "sums": sight.sums}
+            seen["threshold"] = sight.threshold
             seen["sight_images"] = min(sight.num_images, len(self._weights))
             seen["over_background"] = sight.over_background
         background = checked_background(self._weights, background, len(self._weights))

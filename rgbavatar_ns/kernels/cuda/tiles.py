@@ -111,7 +111,7 @@ class Tiles:
             slots=slots,
             loss=loss,
             known=None if sight is None else sight.known.view(torch.uint8),
-            sight=None if sight is None else sight.sums.zero_(),
+            sight=None if sight is None else sight.sums,
             sight_images=0 if sight is None else sight.num_images,
             over_background=int(sight is not None and sight.over_background),
         )

@@ -79,8 +79,9 @@ struct BlockOffsets {
 static constexpr BlockOffsets kBlockOffsets = {};
 
 // The sums over the jobs of one Gaussian of the group, which are written to its slot. Then it stands
-// behind those in front of it.
-static RGBAVATAR_MEMBER void sum_moments(const Tile& tile, const BlockGrid& grid,
+// behind those in front of it. Returns each lane's largest weight, if that is asked for.
+template <bool kLargest>
+static RGBAVATAR_MEMBER Wide sum_moments(const Tile& tile, const BlockGrid& grid,
                                          const Group& group, int place, const Kept& kept,
                                          TileScratch& scratch, float* slots) {
   const Splat& s = group.splats[place];
@@ -88,7 +89,7 @@ static RGBAVATAR_MEMBER void sum_moments(const Tile& tile, const BlockGrid& grid
   const Wide zero(0.0f);
   const Wide x = load_wide(grid.x[0]) - s.mean_x, y = load_wide(grid.y[0]) - s.mean_y;
   Wide sum_red = zero, sum_green = zero, sum_blue = zero;
-  Wide sum_one = zero, sum_x = zero, sum_y = zero, sum_xx = zero, sum_xy = zero, sum_yy = zero;
+  Wide largest = zero, sum_one = zero, sum_x = zero, sum_y = zero, sum_xx = zero, sum_xy = zero, sum_yy = zero;
   const float *alpha_row = kept.alpha[group.first_job[place]],
               *weight_row = kept.weight[group.first_job[place]];
   for (uint64_t left = group.blocks[place]; left; left &= left - 1) {
@@ -99,6 +100,7 @@ static RGBAVATAR_MEMBER void sum_moments(const Tile& tile, const BlockGrid& grid
     const Wide blue = load_wide(row + (kColor + 2) * kBlockPixels);
     const Wide behind = load_wide(row + kBehind * kBlockPixels);
     const Wide alpha = load_wide(alpha_row), w = load_wide(weight_row);
+    if (kLargest) largest = max_of(largest, w);
     const Wide more = red * color_red + green * color_green + blue * color_blue - behind;
     store(behind + alpha * more, row + kBehind * kBlockPixels);
     // alpha dL/dalpha, whose ln 2 follows below; the cap has no gradient.
@@ -122,11 +124,13 @@ static RGBAVATAR_MEMBER void sum_moments(const Tile& tile, const BlockGrid& grid
   store_quad(sums_of(sum_red, sum_green, sum_blue, sum_one) * units, slot);
   store_quad(sums_of(sum_x, sum_y, sum_xx, sum_xy) * C::kLn2, slot + 4);
   slot[8] = sum_of(sum_yy) * C::kLn2;
+  return largest;
 }
 
 static void sum_group(const Tile& tile, const BlockGrid& grid, const Group& group, const Kept& kept,
                       TileScratch& scratch, float* slots) {
-  for (int i = group.count; i-- > 0;) sum_moments(tile, grid, group, i, kept, scratch, slots);
+  for (int i = group.count; i-- > 0;)
+    sum_moments<false>(tile, grid, group, i, kept, scratch, slots);
 }
 
 static void backward_tile(const Tile& tile, const BackwardInput& in, TileScratch& scratch,

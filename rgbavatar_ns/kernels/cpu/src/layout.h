@@ -28,7 +28,7 @@ struct alignas(64) Splat {
   uint64_t blocks;  // bit 8 y + x: it touches the block (x, y) counted from the first one of the
                     // bounds; kAllBlocks where the bounds do not fit the window
   uint32_t first_slot;  // of its sums: one for every tile that it touches, row by row
-  uint32_t waiting;  // its number and one, where it waits for its first colour; else 0
+  uint32_t index;  // its number
 };
 constexpr uint64_t kAllBlocks = ~uint64_t(0);
 
@@ -121,6 +121,7 @@ struct alignas(64) TileScratch {
   float alpha[kKeptJobs + kGroupSplats * kBlocksPerTile][kBlockPixels];
   float weight[kKeptJobs + kGroupSplats * kBlocksPerTile][kBlockPixels];
   Group groups[kKeptGroups + 1];
+  float counted[kBlocksPerTile * 4][kBlockPixels];  // what each pixel counts for a first colour
   Checkpoint* checkpoints;  // one for every kGroupSplats entries of the fullest tile, and one
 };
 
@@ -180,6 +181,7 @@ struct BlendScratch {
 struct FirstSight {
   const bool* known;     // [N]: those that do not wait
   int64_t* sums;         // [N, kSightSums]: red, green, blue, weight; the largest weight
+  float log2_threshold;  // of the largest weight: what cannot exceed it is passed over
   int images;            // how many pictures count, from the first on
   bool over_background;  // the picture as it is drawn over, or what its matte leaves of it
 };

@@ -8,6 +8,7 @@
 #include <nanobind/stl/vector.h>
 
 #include <array>
+#include <cmath>
 #include <optional>
 #include <tuple>
 
@@ -186,8 +187,8 @@ struct MorphedSession : Drawing<rgbavatar::MorphedRendering> {
   // known [N] and sums [N, 5] together, or neither.
   double forward_loss(const Pixels& images, const Input& background,
                       const std::optional<Flags>& known, const std::optional<Sums>& sums,
-                      int sight_images, bool over_background) {
-    const rgbavatar::FirstSight sight = {pointer(known), pointer(sums), sight_images,
+                      float threshold, int sight_images, bool over_background) {
+    const rgbavatar::FirstSight sight = {pointer(known), pointer(sums), std::log2(threshold), sight_images,
                                          over_background};
     return rendering.forward_loss(images.data(), attribute(background), known ? &sight : nullptr,
                                   threads);
@@ -282,8 +283,8 @@ NB_MODULE(_native, m) {
            "instruction_set"_a, Release())
       .def("forward_loss", &MorphedSession::forward_loss, "images_rgba"_a.noconvert(),
            "background"_a.noconvert(), "known"_a.noconvert().none() = nb::none(),
-           "sums"_a.noconvert().none() = nb::none(), "sight_images"_a = 0,
-           "over_background"_a = false, Release())
+           "sums"_a.noconvert().none() = nb::none(), "threshold"_a = 0.0f,
+           "sight_images"_a = 0, "over_background"_a = false, Release())
       .def("backward_adam", &MorphedSession::backward_adam, "groups"_a, "weight_gradient"_a.noconvert(),
            "vertex_gradient"_a.noconvert().none() = nb::none(), Release());
 }

@@ -52,16 +52,6 @@ void MorphedRendering::lay_out_blending(const MorphedScene& scene, const Team& t
   }
 }
 
-void MorphedRendering::mark_waiting(const FirstSight& sight, Team& team) {
-  Splat* splats = workspace_->splats.data();
-  team.run(blend_chunks_of(count_), [&](int64_t chunk, int) {
-    const int begin = int(chunk) * kBlendChunk, end = std::min(begin + kBlendChunk, count_);
-    for (int i = begin; i < end; ++i)
-      if (!sight.known[i])
-        for (int b = 0; b < sight.images; ++b) splats[size_t(b) * count_ + i].waiting = i + 1;
-  });
-}
-
 double MorphedRendering::forward_loss(const uint8_t* images, const Attribute& background,
                                       const FirstSight* sight, int threads) {
   Team team(threads);
@@ -72,11 +62,10 @@ double MorphedRendering::forward_loss(const uint8_t* images, const Attribute& ba
   const size_t pixels = size_t(width_) * height_;
   const double weight = 1.0 / (3.0 * double(pixels) * batch_);
   w.loss.reserve(size_t(batch_) * tiles);
-  if (sight) mark_waiting(*sight, team);
   team.run(int64_t(batch_) * tiles, [&](int64_t item, int thread) {
     const int b = int(item / tiles);
     const TrainingTarget target = {images + b * pixels * 4, background.of(b), float(weight),
-                                   sight};
+                                   sight && b < sight->images ? sight : nullptr};
     w.loss[item] = kernels_->train_tile(tile(b, int(item % tiles)), target, w.scratch[thread],
                                         w.slots.data() + w.slot_start[b] * kMoments);
   });

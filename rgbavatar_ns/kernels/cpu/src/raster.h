@@ -149,7 +149,6 @@ class MorphedRendering : public Rendering {
               float* vertex_gradient, int threads);
 
  private:
-  void mark_waiting(const FirstSight& sight, class Team& team);
   void lay_out_blending(const MorphedScene& scene, const class Team& team);
 };
 

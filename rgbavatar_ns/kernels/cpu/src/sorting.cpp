@@ -162,6 +162,7 @@ void Rendering::fill_part(int image, int part) {
   const int end = std::min((part + 1) * kPart, count_);
   for (int i = part * kPart; i < end; ++i) {
     slot_offset[i] = from.splats[i].first_slot = uint32_t(slot);
+    from.splats[i].index = uint32_t(i);
     uint32_t depth_bits;  // of a positive float: ordered like the float
     std::memcpy(&depth_bits, &from.depth[i], sizeof depth_bits);
     const uint64_t entry = uint64_t(depth_bits) << 32 | uint32_t(i);

@@ -27,25 +27,37 @@ static Wide lanes_inside(const Tile& tile, const BlockPixels& pixels) {
   return load_wide(within);
 }
 
+// A block's target: colour and matte of its pixels, and 1 where someone filmed in the image.
+struct TargetBlock {
+  Wide color[3], matte, filmed;
+
+  TargetBlock(const Tile& tile, const TrainingTarget& target, int block) {
+    const BlockPixels pixels(tile, block);
+    const WideInt rgba = load_rgba(tile, pixels, target.rgba);
+    const Wide zero(0.0f), one(1.0f), inside = pixels.whole() ? one : lanes_inside(tile, pixels);
+    const Wide unlike = to_floats(rgba - WideInt(C::kUnfilmed));  // 0 for the mark alone
+    filmed = select(unlike * unlike > zero, inside, zero);
+    matte = to_floats((rgba >> 24) & 255) * (1.0f / 255.0f);
+    for (int k = 0; k < 3; ++k) color[k] = to_floats((rgba >> (8 * k)) & 255) * (1.0f / 255.0f);
+  }
+  Wide over(const float* background, int k) const {
+    return background[k] + matte * (color[k] - background[k]);
+  }
+};
+
 // From the drawn rows to those of the backward pass: the channels become dL/dimage of the mean
 // absolute difference, and what is behind g . background; both are 0 where nobody filmed. Returns
 // the differences' sums.
 static Wide compare_block(const Tile& tile, const TrainingTarget& target, int block,
                           TileScratch& scratch) {
   float(*rows)[kBlockPixels] = block_rows<kBlendRows>(scratch, block);
-  const BlockPixels pixels(tile, block);
-  const WideInt rgba = load_rgba(tile, pixels, target.rgba);
+  const TargetBlock filmed(tile, target, block);
   const Wide zero(0.0f), one(1.0f), t = load_wide(rows[kTransmittance]);
-  const Wide inside = pixels.whole() ? one : lanes_inside(tile, pixels);
-  const Wide unlike = to_floats(rgba - WideInt(C::kUnfilmed));  // 0 for the mark alone
-  const Wide counts = select(unlike * unlike > zero, inside, zero);
-  const Wide matte = to_floats((rgba >> 24) & 255) * (1.0f / 255.0f);
   Wide behind = zero, sum = zero;
   for (int k = 0; k < 3; ++k) {
     const Wide background(target.background[k]);
-    const Wide color = to_floats((rgba >> (8 * k)) & 255) * (1.0f / 255.0f);
     const Wide image = load_wide(rows[kColor + k]) + t * background;
-    const Wide difference = (image - (background + matte * (color - background))) * counts;
+    const Wide difference = (image - filmed.over(target.background, k)) * filmed.filmed;
     const Wide sign = select(difference > zero, one, zero) - select(zero > difference, one, zero);
     const Wide g = sign * target.gradient;
     sum = sum + sign * difference;
@@ -59,50 +71,50 @@ static Wide compare_block(const Tile& tile, const TrainingTarget& target, int bl
 static int64_t in_sight_units(float sum) { return int64_t(double(sum) * kSightUnit); }
 
 // Adds a Gaussian's sums over a tile to those of its first sight.
-static void add_to_sight(float sums[kSightSums], int64_t* to) {
+static void add_to_sight(Quad sums, float most, int64_t* to) {
   for (int k = 0; k + 1 < kSightSums; ++k)
     __atomic_fetch_add(to + k, in_sight_units(sums[k]), __ATOMIC_RELAXED);
-  const int64_t largest = in_sight_units(sums[kSightSums - 1]);
+  const int64_t largest = in_sight_units(most);
   int64_t known = __atomic_load_n(to + kSightSums - 1, __ATOMIC_RELAXED);
   while (known < largest && !__atomic_compare_exchange_n(to + kSightSums - 1, &known, largest, true,
                                                          __ATOMIC_RELAXED, __ATOMIC_RELAXED)) {
   }
 }
 
-// What a group's waiting Gaussians are seen with.
-static void see_group(const Tile& tile, const TrainingTarget& target, const Group& group,
-                      const Kept& kept) {
+// What the pixels of a block count for a first colour: colour times share, and the share.
+static void count_block(const Tile& tile, const TrainingTarget& target, int block,
+                        TileScratch& scratch) {
+  float(*counted)[kBlockPixels] = scratch.counted + 4 * block;
+  const TargetBlock filmed(tile, target, block);
+  const bool whole = target.sight->over_background;
+  const Wide share = whole ? filmed.filmed : filmed.matte * filmed.filmed;
+  for (int k = 0; k < 3; ++k)
+    store(share * (whole ? filmed.over(target.background, k) : filmed.color[k]), counted[k]);
+  store(share, counted[3]);
+}
+
+static RGBAVATAR_MEMBER bool waits(const FirstSight& sight, const Splat& s) {
+  return !sight.known[s.index] && s.log2_opacity > sight.log2_threshold;
+}
+
+// What a group's Gaussian is seen with, whose largest weight is `most`; `counted` are the tile's
+// blocks that have been.
+static void see(const Tile& tile, const TrainingTarget& target, const Group& group, int place,
+                float most, const Kept& kept, TileScratch& scratch, uint64_t& counted) {
   const Wide zero(0.0f);
-  for (int place = 0; place < group.count; ++place) {
-    const Splat& s = group.splats[place];
-    if (!s.waiting) continue;
-    const float* weight_row = kept.weight[group.first_job[place]];
-    Wide largest(0.0f);
-    const float* row = weight_row;
-    for (uint64_t left = group.blocks[place]; left; left &= left - 1, row += kBlockPixels)
-      largest = max_of(largest, load_wide(row));
-    const float most = max_lane(largest);
-    if (!(most > 0.0f)) continue;  // hidden by what lies before it
-    Wide sums[3] = {zero, zero, zero}, weight(0.0f);
-    for (uint64_t left = group.blocks[place]; left; left &= left - 1, weight_row += kBlockPixels) {
-      const Wide whole = load_wide(weight_row);
-      const BlockPixels pixels(tile, __builtin_ctzll(left));
-      const WideInt rgba = load_rgba(tile, pixels, target.rgba);
-      const Wide unlike = to_floats(rgba - WideInt(C::kUnfilmed));  // 0 for the mark alone
-      const Wide matte = to_floats((rgba >> 24) & 255) * (1.0f / 255.0f);
-      const Wide w = select(unlike * unlike > zero, whole, zero);
-      const Wide counted = target.sight->over_background ? w : w * matte;
-      for (int k = 0; k < 3; ++k) {
-        Wide color = to_floats((rgba >> (8 * k)) & 255) * (1.0f / 255.0f);
-        if (target.sight->over_background)
-          color = target.background[k] + matte * (color - target.background[k]);
-        sums[k] = sums[k] + counted * color;
-      }
-      weight = weight + counted;
-    }
-    float all[kSightSums] = {sum_of(sums[0]), sum_of(sums[1]), sum_of(sums[2]), sum_of(weight), most};
-    add_to_sight(all, target.sight->sums + int64_t(s.waiting - 1) * kSightSums);
+  const uint64_t blocks = group.blocks[place];
+  const float* weight_row = kept.weight[group.first_job[place]];
+  for (uint64_t left = blocks & ~counted; left; left &= left - 1)
+    count_block(tile, target, __builtin_ctzll(left), scratch);
+  counted |= blocks;
+  Wide sums[4] = {zero, zero, zero, zero};
+  for (uint64_t left = blocks; left; left &= left - 1, weight_row += kBlockPixels) {
+    const float(*rows)[kBlockPixels] = scratch.counted + 4 * __builtin_ctzll(left);
+    const Wide weight = load_wide(weight_row);
+    for (int k = 0; k < 4; ++k) sums[k] = sums[k] + weight * load_wide(rows[k]);
   }
+  add_to_sight(sums_of(sums[0], sums[1], sums[2], sums[3]), most,
+               target.sight->sums + int64_t(group.splats[place].index) * kSightSums);
 }
 
 static double train_tile(const Tile& tile, const TrainingTarget& target, TileScratch& scratch,
@@ -113,11 +125,20 @@ static double train_tile(const Tile& tile, const TrainingTarget& target, TileScr
   groups.template blend<true>(tile, grid, scratch,
                               [&](const Splat& s) { clear_slot(tile, s, slots, kMoments); });
   Wide sum(0.0f);
+  uint64_t counted = 0;
   for (int block = 0; block < kBlocksPerTile; ++block)
     sum = sum + compare_block(tile, target, block, scratch);
   groups.visit_back_to_front(tile, grid, scratch, [&](const Group& group, const Kept& kept) {
-    sum_group(tile, grid, group, kept, scratch, slots);
-    if (target.sight) see_group(tile, target, group, kept);
+    for (int i = group.count; i-- > 0;) {
+      if (!target.sight || !waits(*target.sight, group.splats[i])) {
+        sum_moments<false>(tile, grid, group, i, kept, scratch, slots);
+        continue;
+      }
+      const float most =
+          max_lane(sum_moments<true>(tile, grid, group, i, kept, scratch, slots));
+      if (most > 0.0f)  // else hidden by what lies before it
+        see(tile, target, group, i, most, kept, scratch, counted);
+    }
   });
   return double(sum_of(sum));
 }
