@@ -2,9 +2,9 @@
 
     python benchmarks/speed/first_colors.py --size 256 --uv 128
 
-An avatar learns a procedural film. At some steps two copies of it part ways, one that goes on looking
-and one that looks for none, and take the same steps in turn, so that the machine's noise meets both.
-Told is the median over the pairs, and how many Gaussians wait for their colour.
+An avatar learns a procedural film. At some steps two copies of it part ways, one that goes on
+looking and one that looks for none, and take the same steps in turn, so that the machine's noise
+meets both. Told is the median over the pairs, and how many Gaussians wait for their colour.
 """
 
 import argparse

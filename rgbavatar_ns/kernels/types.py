@@ -117,11 +117,11 @@ class FirstSight:
     """What a training step's pictures show of the Gaussians that wait for their first colour.
 
     The step adds to `sums`, for each Gaussian that is not `known`, counted colour (3) and counted
-    weight over the pixels, and raises the last number to the largest weight; they begin at 0, in
-    units of `SIGHT_UNIT`: whole numbers, whose sums are the same in any order. Only the first `num_images`
-    pictures count. Counted is the weight times the picture's matte, or with `over_background` the
-    weight, and the colour then that of the picture over its background. What cannot be seen with a
-    weight above `threshold`, since its opacity is not, may be passed over.
+    weight over the pixels, and raises the last number to the largest weight. They begin at 0, in
+    units of `SIGHT_UNIT`: whole numbers, whose sums are the same in any order. Only the first
+    `num_images` pictures count. Counted is the weight times the picture's matte, or with
+    `over_background` the weight, and the colour then that of the picture over its background. What
+    cannot be seen with a weight above `threshold`, since its opacity is not, may be passed over.
     """
 
     known: Bool[Tensor, "N"]
