@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from rgbavatar_ns.avatar.avatar import Avatar
+from rgbavatar_ns.avatar.method import AvatarMethod
 from rgbavatar_ns.avatar.orbit import head_centre, orbit
 from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
 from rgbavatar_ns.data.native.dataset import TrackedDataset
@@ -77,7 +78,7 @@ def chosen_frames(
 
 
 def driven_by(
-    avatar: Avatar,
+    avatar: AvatarMethod,
     driver: TrackedDataset,
     chosen: Sequence[int],
     own: TrainingStatistics,

@@ -6,19 +6,19 @@ from typing import Any
 
 import torch
 
-from rgbavatar_ns.avatar import FILM_RANGE, Avatar
-from rgbavatar_ns.avatar.method import describe_layout
+from rgbavatar_ns.avatar.method import AvatarMethod, describe_layout
 from rgbavatar_ns.avatar.prior import SurfacePrior
 from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
+from rgbavatar_ns.avatar.storage.stored_avatar import RGBAVATAR
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import ThetaLayout
 from rgbavatar_ns.plugin.dataparser import Subject
 
 _EXTRA_STATE = "_extra_state"
-_AVATAR, _PRIOR = "avatar.", "prior."
+_PRIOR = "prior."
 
 
-def model_state(avatar: Avatar, subject: Subject) -> dict[str, Any]:
+def model_state(avatar: AvatarMethod, subject: Subject) -> dict[str, Any]:
     """Tensors and plain values only, so that checkpoints load with `weights_only=True`.
 
     `avatar` is what `Avatar.from_state` needs; `frames` lets another program play the training
@@ -35,7 +35,7 @@ def model_state(avatar: Avatar, subject: Subject) -> dict[str, Any]:
 
 
 @torch.no_grad()
-def film_statistics(avatar: Avatar, film: Subject) -> TrainingStatistics:
+def film_statistics(avatar: AvatarMethod, film: Subject) -> TrainingStatistics:
     """Statistics of the training frames, with the weights that the avatar's network gives now."""
     train = list(film.train) or [0]
     theta = film.theta[train].cpu()
@@ -43,7 +43,7 @@ def film_statistics(avatar: Avatar, film: Subject) -> TrainingStatistics:
     return TrainingStatistics.of(theta, psi, avatar.layout, film.world_to_camera[train].cpu())
 
 
-def require_same_layout(state_dict: Mapping[str, Any], avatar: Avatar) -> None:
+def require_same_layout(state_dict: Mapping[str, Any], avatar: AvatarMethod) -> None:
     """Raise UserError where the checkpoint's theta is not laid out as `avatar` takes it."""
     extra = state_dict.get(_EXTRA_STATE)
     extra = extra if isinstance(extra, dict) else {}
@@ -53,6 +53,12 @@ def require_same_layout(state_dict: Mapping[str, Any], avatar: Avatar) -> None:
         raise UserError(
             "The checkpoint holds no avatar of this method.",
             "Load a checkpoint that `ns-train rgbavatar` or `ns-train rgbavatar-tiny` wrote.",
+        )
+    method = make.get("method", RGBAVATAR) if isinstance(make, dict) else RGBAVATAR
+    if method != avatar.method:
+        raise UserError(
+            f"The checkpoint's avatar is one of {method}, not of {avatar.method}.",
+            f"Go on with `ns-train {method}`, or load a checkpoint of this method.",
         )
     saved = ThetaLayout.from_json(extra.get("layout"))
     if saved != avatar.layout:
@@ -65,20 +71,15 @@ def require_same_layout(state_dict: Mapping[str, Any], avatar: Avatar) -> None:
     _require_same_make(config, avatar)
 
 
-def of_this_version(
-    state_dict: Mapping[str, Any], avatar: Avatar, prior: SurfacePrior | None
-) -> dict[str, Any]:
-    """Return the state with all that the model has, and without a prior where it has none.
+def with_prior(state_dict: dict[str, Any], prior: SurfacePrior | None) -> dict[str, Any]:
+    """Return the state with all that a prior has, and without where the model has none.
 
     A run that began without a prior, or without its views, goes on without: a fresh one does
-    nothing. Of what an earlier version saw, nothing is known.
+    nothing.
     """
-    fresh = {_AVATAR + name: getattr(avatar, name) for name in FILM_RANGE}
     if prior is None:
-        state_dict = {k: v for k, v in state_dict.items() if not k.startswith(_PRIOR)}
-    else:
-        fresh |= {_PRIOR + name: value for name, value in prior.state_dict().items()}
-    return fresh | dict(state_dict)
+        return {k: v for k, v in state_dict.items() if not k.startswith(_PRIOR)}
+    return {_PRIOR + name: value for name, value in prior.state_dict().items()} | state_dict
 
 
 @contextmanager
@@ -97,11 +98,9 @@ def misfits_told() -> Iterator[None]:
         ) from error
 
 
-def _require_same_make(saved: dict[str, Any], avatar: Avatar) -> None:
+def _require_same_make(saved: dict[str, Any], avatar: AvatarMethod) -> None:
     mine = avatar.config.to_json()
-    shape = ("num_bases", "uv_resolution", "weight_network", "hidden_width", "tangent_variant")
-    shape += ("pose_input", "translation_input", "scale_with_triangle", "carrier")
-    different = [name for name in shape if saved.get(name) != mine[name]]
+    different = [name for name in avatar.make_options if saved.get(name) != mine[name]]
     if different:
         told = ", ".join(f"{name} {saved.get(name)}, not {mine[name]}" for name in different)
         flags = " ".join(

@@ -3,7 +3,7 @@
 import statistics
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -14,17 +14,20 @@ from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineC
 from rich.progress import track
 from torch import Tensor
 
+from rgbavatar_ns.avatar import Avatar
 from rgbavatar_ns.avatar.metrics import LPIPSMetric, evaluate_images, with_sharpness
 from rgbavatar_ns.avatar.training.batches import ChosenFrames, TrainingBatch
 from rgbavatar_ns.avatar.training.cuda_graph import Recorder, record_cuda_graph
+from rgbavatar_ns.avatar.training.method_step import MethodStep
 from rgbavatar_ns.avatar.training.orthogonality import orthogonality_error
 from rgbavatar_ns.avatar.training.step import StepKind, TrainingStep
 from rgbavatar_ns.avatar.training.theta_fit import fit_theta
 from rgbavatar_ns.data import TrackedDataset
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.plugin.avatar_model import AvatarModel, AvatarModelConfig
 from rgbavatar_ns.plugin.cameras import from_nerfstudio
 from rgbavatar_ns.plugin.datamanager import RGBAvatarDataManager, RGBAvatarDataManagerConfig
-from rgbavatar_ns.plugin.model import RGBAvatarModel, RGBAvatarModelConfig
+from rgbavatar_ns.plugin.model import RGBAvatarModelConfig
 from rgbavatar_ns.plugin.viewer.panel import ViewerPanel
 
 Evaluated = Callable[[int, Mapping[str, Any]], None]
@@ -38,7 +41,7 @@ class RGBAvatarPipelineConfig(VanillaPipelineConfig):
     _target: type = field(default_factory=lambda: RGBAvatarPipeline)
     datamanager: RGBAvatarDataManagerConfig = field(default_factory=RGBAvatarDataManagerConfig)
     """The data."""
-    model: RGBAvatarModelConfig = field(default_factory=RGBAvatarModelConfig)
+    model: AvatarModelConfig = field(default_factory=RGBAvatarModelConfig)
     """The model."""
 
 
@@ -47,7 +50,7 @@ class RGBAvatarPipeline(VanillaPipeline):
 
     config: RGBAvatarPipelineConfig
     datamanager: RGBAvatarDataManager
-    _model: RGBAvatarModel
+    _model: AvatarModel
     recorder: Recorder = staticmethod(record_cuda_graph)
     """How a step becomes one that the device takes by itself."""
 
@@ -60,7 +63,7 @@ class RGBAvatarPipeline(VanillaPipeline):
         self.evaluated: Evaluated = lambda step, metrics: None
 
     @property
-    def model(self) -> RGBAvatarModel:
+    def model(self) -> AvatarModel:
         """The model; this method trains on one device, so it is never wrapped."""
         return self._model
 
@@ -81,23 +84,15 @@ class RGBAvatarPipeline(VanillaPipeline):
             time = self.datamanager.film_path.moment(camera)
         return self.viewer_panel.draw(from_nerfstudio(camera), time)
 
-    def training_step(self, optimizers: Optimizers) -> TrainingStep:
+    def training_step(self, optimizers: Optimizers) -> TrainingStep | MethodStep:
         """The step that trains the model, for a run."""
         groups = {name: group["optimizer"] for name, group in optimizers.config.items()}
         norms = {name: group.max_norm for name, group in groups.items()}
-        options = replace(
-            self.model.training_options(),
-            max_norm={k: v for k, v in norms.items() if v is not None},
-        )
-        return TrainingStep(
-            self.model.avatar,
+        return self.model.training_step(
             optimizers.optimizers.values(),
-            options,
-            frames=self.datamanager.device_frames,
-            refinement=self.model.refinement,
-            prior=self.model.prior,
-            lpips=self.model.lpips_loss,
-            recorder=self.recorder,
+            {name: norm for name, norm in norms.items() if norm is not None},
+            self.datamanager.device_frames,
+            self.recorder,
         )
 
     @property
@@ -145,7 +140,8 @@ class RGBAvatarPipeline(VanillaPipeline):
         metrics = with_sharpness(metrics)
         if self.config.model.refine_held_out > 0:
             metrics |= self._refined_metrics()
-        metrics["e_orth"] = orthogonality_error(self.model.avatar.blendshapes).item()
+        if isinstance(self.model.avatar, Avatar):
+            metrics["e_orth"] = orthogonality_error(self.model.avatar.blendshapes).item()
         lpips = self.model.lpips_metric
         if lpips is None:
             metrics["lpips_unavailable"] = "switched off with --pipeline.model.lpips-metric False"

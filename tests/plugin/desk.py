@@ -7,8 +7,8 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 
 from rgbavatar_ns import Avatar
+from rgbavatar_ns.plugin.avatar_model import AvatarModel
 from rgbavatar_ns.plugin.cameras import from_nerfstudio
-from rgbavatar_ns.plugin.model import RGBAvatarModel
 from rgbavatar_ns.plugin.pipeline import RGBAvatarPipeline
 from rgbavatar_ns.plugin.viewer.panel import ViewerPanel
 from tests.plugin.fake_viewer import FakeViewer
@@ -18,7 +18,7 @@ class Desk:
     """A panel with its controls, in a viewer whose time passes when it is told to."""
 
     def __init__(self, pipeline: RGBAvatarPipeline) -> None:
-        self.model: RGBAvatarModel = pipeline.model
+        self.model: AvatarModel = pipeline.model
         self.cameras = pipeline.datamanager.train_dataset.cameras
         self.now_s = 0.0
         self.panel = ViewerPanel(self.model, pipeline.film, clock=lambda: self.now_s)

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from rgbavatar_ns.avatar.training.batches import ChosenFrames, TrainingBatch
+from rgbavatar_ns.avatar.training.method_step import MethodStep
 from rgbavatar_ns.avatar.training.step import Losses, TrainingStep
 
 
@@ -47,7 +48,7 @@ class LossCurve(FitHooks):
 
 
 def fit(
-    take: TrainingStep,
+    take: TrainingStep | MethodStep,
     batch_at: Callable[[int], TrainingBatch | ChosenFrames],
     steps: Iterable[int],
     hooks: FitHooks | None = None,

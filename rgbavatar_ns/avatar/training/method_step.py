@@ -14,8 +14,9 @@ from rgbavatar_ns.avatar.method import (
     WatchedStep,
 )
 from rgbavatar_ns.avatar.refinement.frames import FrameRefinement
-from rgbavatar_ns.avatar.training.batches import TrainingBatch
+from rgbavatar_ns.avatar.training.batches import ChosenFrames, TrainingBatch
 from rgbavatar_ns.avatar.training.losses import random_backgrounds, require_images_of
+from rgbavatar_ns.avatar.training.step import StepKind
 from rgbavatar_ns.drawing.compositing import film_over, is_unfilmed, rgba_to_float
 from rgbavatar_ns.kernels import rasterize
 
@@ -44,7 +45,7 @@ class MethodStep:
         logged: told of the figures that `after_step` returns.
     """
 
-    kind = "eager"
+    kind: StepKind = "eager"
     reason = "this method goes through autograd"
 
     def __init__(
@@ -65,8 +66,13 @@ class MethodStep:
             (names[group["params"][0]], group) for o in self.optimizers for group in o.param_groups
         ]
 
-    def __call__(self, batch: TrainingBatch, step: int) -> Losses:
-        """Take step `step` and what is due after it; returns the parts of the loss, detached."""
+    def __call__(self, batch: TrainingBatch | ChosenFrames, step: int) -> Losses:
+        """Take step `step` and what is due after it; returns the parts of the loss, detached.
+
+        Raises ValueError for `ChosenFrames`, which only recorded steps take.
+        """
+        if isinstance(batch, ChosenFrames):
+            raise ValueError(f"Steps are {self.kind}: {self.reason}. Pass a TrainingBatch.")
         count, theta = len(batch.theta), batch.theta
         require_images_of(batch.images_rgba, count, batch.cameras)
         if self.refinement is not None:

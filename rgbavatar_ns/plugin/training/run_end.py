@@ -12,6 +12,7 @@ from nerfstudio.utils import writer
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from rgbavatar_ns.avatar.training.batches import TrainingBatch
+from rgbavatar_ns.avatar.training.method_step import MethodStep
 from rgbavatar_ns.avatar.training.step import TrainingStep
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.files import write_json
@@ -32,7 +33,7 @@ class EndingTrainer(Trainer):
 
     pipeline: RGBAvatarPipeline
     stop: StopRequest
-    _take: TrainingStep
+    _take: TrainingStep | MethodStep
     _train_seconds: float
     """Of the steps alone, over all sessions of the run."""
     _saved_step: int | None
@@ -75,11 +76,8 @@ class EndingTrainer(Trainer):
         self._tell_end(self._write_summary(COMPLETED if self.completed else "stopped"))
 
     def _frames_at_the_end(self) -> Iterable[TrainingBatch]:
-        """The frames to look back at when the run ends.
-
-        Offline each was drawn often: they are looked at only where what none shows is hidden.
-        """
-        if self.completed and self.pipeline.config.model.hide_unseen:
+        """The frames to look back at when the run ends."""
+        if self.completed and self.pipeline.model.looks_back:
             return self.pipeline.training_frames()
         return ()
 

@@ -45,7 +45,11 @@ from rgbavatar_ns.plugin.training.load_config import (
     loads_config,
     require_loadable,
 )
-from rgbavatar_ns.plugin.training.optimizers import ExponentialConfig, require_fitting_states
+from rgbavatar_ns.plugin.training.optimizers import (
+    AdamConfig,
+    ExponentialConfig,
+    require_fitting_states,
+)
 from rgbavatar_ns.plugin.training.progress import TrainingProgress
 from rgbavatar_ns.plugin.training.ranges import require_trainable
 from rgbavatar_ns.plugin.training.run_end import EndingTrainer, say
@@ -190,8 +194,10 @@ class RGBAvatarTrainer(EndingTrainer, FitHooks):
         steps = self.config.learning_rate_steps or self.config.max_num_iterations
         model = self.config.pipeline.model
         settings: dict[str, Any] = {}
+        rates = self.pipeline.model.avatar.learning_rates()
         for name in groups:
-            settings[name] = dict(self.config.optimizers[name])
+            own = {"optimizer": AdamConfig(lr=rates[name]), "scheduler": None}
+            settings[name] = dict(self.config.optimizers.get(name, own))
             rate = settings[name]["optimizer"].lr
             factor = self.config.learning_rate_factor
             if name == "position" and self.config.position_lr_final is not None:

@@ -8,9 +8,9 @@ from torch import Tensor
 
 from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
 from rgbavatar_ns.export.bases import basis_weights
+from rgbavatar_ns.plugin.avatar_model import AvatarModel
 from rgbavatar_ns.plugin.checkpoint_state import film_statistics
 from rgbavatar_ns.plugin.film_path import FilmMoment, frame_at
-from rgbavatar_ns.plugin.model import RGBAvatarModel
 from rgbavatar_ns.plugin.viewer.viewer_state import ViewerState
 
 
@@ -24,7 +24,7 @@ class DrivingSignal:
     """The frame of the dataset that it can be compared with, if there is one."""
 
 
-def training_statistics(model: RGBAvatarModel) -> TrainingStatistics:
+def training_statistics(model: AvatarModel) -> TrainingStatistics:
     """What the avatar has seen, with the weights that its network gives now."""
     theta = model.driving_theta(list(range(len(model.frame_theta))))
     return film_statistics(model.avatar, replace(model.subject, theta=theta.cpu()))
@@ -32,19 +32,19 @@ def training_statistics(model: RGBAvatarModel) -> TrainingStatistics:
 
 @torch.no_grad()
 def driving_signal(
-    model: RGBAvatarModel, state: ViewerState, time: float | FilmMoment | None = None
+    model: AvatarModel, state: ViewerState, time: float | FilmMoment | None = None
 ) -> DrivingSignal:
     """What drives the picture; `time` (in [0, 1], or a moment) counts where the state asks it."""
     avatar = model.avatar
     alone, used = state.basis_alone, state.bases_used
-    if alone is not None and alone < avatar.config.num_bases:
+    if alone is not None and alone < avatar.num_bases:
         statistics = training_statistics(model)
         theta, frame = statistics.theta_neutral, None
         psi = basis_weights(statistics, state.gain)[alone + 1]
     else:
         theta, frame = _theta(model, state, time)
         psi = state.psi_by_hand
-        if used is not None and used < avatar.config.num_bases:
+        if used is not None and used < avatar.num_bases:
             psi = avatar.weights(theta[None].to(avatar.identity))[0] if psi is None else psi
             psi = torch.where(torch.arange(len(psi), device=psi.device) < used, psi, 0.0)
     like = avatar.identity
@@ -52,7 +52,7 @@ def driving_signal(
 
 
 def _theta(
-    model: RGBAvatarModel, state: ViewerState, time: float | FilmMoment | None
+    model: AvatarModel, state: ViewerState, time: float | FilmMoment | None
 ) -> tuple[Float[Tensor, "H"], int | None]:
     last = len(model.frame_theta) - 1
     if state.driven_by == "by hand" and state.theta_by_hand is not None:

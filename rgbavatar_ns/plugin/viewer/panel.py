@@ -22,8 +22,8 @@ from rgbavatar_ns.export import dataset_folder
 from rgbavatar_ns.export.scenes import driven_by
 from rgbavatar_ns.head import turn_seen
 from rgbavatar_ns.kernels import PinholeCameras
+from rgbavatar_ns.plugin.avatar_model import AvatarModel
 from rgbavatar_ns.plugin.film_path import FilmMoment
-from rgbavatar_ns.plugin.model import RGBAvatarModel
 from rgbavatar_ns.plugin.viewer.client import serve_sharp_client
 from rgbavatar_ns.plugin.viewer.driving import (
     DrivingSignal,
@@ -68,7 +68,7 @@ class ViewerPanel(ViewerControl):
 
     def __init__(
         self,
-        model: RGBAvatarModel,
+        model: AvatarModel,
         film: TrackedDataset | None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:

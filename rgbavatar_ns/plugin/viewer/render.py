@@ -12,6 +12,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from rgbavatar_ns.avatar import Avatar
+from rgbavatar_ns.avatar.method import AvatarMethod
 from rgbavatar_ns.avatar.metrics import psnr
 from rgbavatar_ns.data import TrackedDataset
 from rgbavatar_ns.data.check.sample import project
@@ -25,7 +26,7 @@ from rgbavatar_ns.drawing.compositing import (
 )
 from rgbavatar_ns.drawing.wireframe import with_wireframe
 from rgbavatar_ns.errors import UserError
-from rgbavatar_ns.kernels import PinholeCameras, RenderedBatch
+from rgbavatar_ns.kernels import GaussianSet, PinholeCameras, RenderedBatch
 from rgbavatar_ns.plugin.cameras import filled_depth
 from rgbavatar_ns.plugin.viewer.driving import DrivingSignal
 from rgbavatar_ns.plugin.viewer.viewer_state import ViewerState
@@ -55,7 +56,7 @@ class ViewerRender:
 
 @torch.no_grad()
 def viewer_render(
-    avatar: Avatar,
+    avatar: AvatarMethod,
     signal: DrivingSignal,
     state: ViewerState,
     camera: PinholeCameras,
@@ -83,7 +84,11 @@ def viewer_render(
 
 
 def _draw(
-    avatar: Avatar, signal: DrivingSignal, state: ViewerState, camera: PinholeCameras, backend: str
+    avatar: AvatarMethod,
+    signal: DrivingSignal,
+    state: ViewerState,
+    camera: PinholeCameras,
+    backend: str,
 ) -> RenderedBatch:
     return avatar.render(
         signal.theta,
@@ -97,7 +102,7 @@ def _draw(
 
 
 def _beside_film(
-    avatar: Avatar,
+    avatar: AvatarMethod,
     signal: DrivingSignal,
     state: ViewerState,
     camera: PinholeCameras,
@@ -172,14 +177,14 @@ def _colored(values: Float[Tensor, "H W 1"], color_map: int) -> _Image:
 
 def _with_overlays(
     image: _Image,
-    avatar: Avatar,
+    avatar: AvatarMethod,
     signal: DrivingSignal,
     state: ViewerState,
     camera: PinholeCameras,
     visibility: Tensor | None,
 ) -> _Image:
     if state.centres and visibility is not None:
-        means = avatar.gaussians(signal.theta, signal.psi).means[0, visibility[0] > _SEEN]
+        means = _gaussians(avatar, signal).means[0, visibility[0] > _SEEN]
         image = _over(image, lambda picture: _with_points(picture, _pixels(means, camera)))
     if state.mesh:
         vertices = avatar.carrier_vertices(signal.theta)[0]
@@ -189,6 +194,12 @@ def _with_overlays(
             image, lambda rgb: with_wireframe(rgb[..., ::-1].copy(), points, faces)[..., ::-1]
         )
     return image
+
+
+def _gaussians(avatar: AvatarMethod, signal: DrivingSignal) -> GaussianSet:
+    if isinstance(avatar, Avatar):
+        return avatar.gaussians(signal.theta, signal.psi)
+    return avatar.gaussians(signal.theta)
 
 
 def _pixels(points: Float[Tensor, "P 3"], camera: PinholeCameras) -> Float[np.ndarray, "P 2"]:

@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 
-from rgbavatar_ns.avatar import Avatar
+from rgbavatar_ns.avatar.method import AvatarMethod
 from rgbavatar_ns.plugin.cameras import head_to_nerfstudio
 from rgbavatar_ns.plugin.dataparser import Subject
 
@@ -28,7 +28,7 @@ class Viewpoint:
 
     @classmethod
     @torch.no_grad()
-    def before(cls, avatar: Avatar, subject: Subject) -> "Viewpoint":
+    def before(cls, avatar: AvatarMethod, subject: Subject) -> "Viewpoint":
         """From the first frame's camera, a little nearer than it, at the middle of the head."""
         means = avatar.gaussians(subject.theta[:1].to(avatar.identity)).means[0]
         middle = (means.amin(0) + means.amax(0)) / 2
