@@ -19,18 +19,24 @@ from rgbavatar_ns.avatar import AvatarConfig
 from rgbavatar_ns.kernels import available_backends
 from rgbavatar_ns.plugin.model import RGBAvatarModelConfig
 from rgbavatar_ns.plugin.pipeline import RGBAvatarPipelineConfig
-from rgbavatar_ns.plugin.training import optimizers, trainer
+from rgbavatar_ns.plugin.training import optimizers as optimizers_module
+from rgbavatar_ns.plugin.training import trainer
 from rgbavatar_ns.plugin.training.optimizers import paper_optimizers
 from rgbavatar_ns.plugin.training.trainer import RGBAvatarTrainerConfig
 
 # Earlier runs name their configs in config.yml by the modules that these then were.
-for _earlier, _module in {"trainer": trainer, "optimizers": optimizers}.items():
+for _earlier, _module in {"trainer": trainer, "optimizers": optimizers_module}.items():
     sys.modules.setdefault(f"rgbavatar_ns.plugin.{_earlier}", _module)
 
 TrainerKind = TypeVar("TrainerKind", bound=RGBAvatarTrainerConfig)
 
 
-def preset(kind: type[TrainerKind], method_name: str, **settings: Any) -> TrainerKind:
+def preset(
+    kind: type[TrainerKind],
+    method_name: str,
+    optimizers: dict[str, Any] | None = None,
+    **settings: Any,
+) -> TrainerKind:
     """A trainer's config with what all methods share."""
     # A GPU is used once the rasterizer has a backend for it.
     gpu = torch.cuda.is_available() and "cuda" in available_backends()
@@ -39,7 +45,7 @@ def preset(kind: type[TrainerKind], method_name: str, **settings: Any) -> Traine
         steps_per_eval_batch=500,
         steps_per_eval_image=500,
         steps_per_eval_all_images=1_000_000,
-        optimizers=paper_optimizers(),
+        optimizers=paper_optimizers() if optimizers is None else optimizers,
         machine=MachineConfig(device_type="cuda" if gpu else "cpu"),
         # The trainer shows its own progress; nerfstudio's table knows no images per second.
         logging=LoggingConfig(

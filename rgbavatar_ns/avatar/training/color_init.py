@@ -52,6 +52,8 @@ class FirstColors:
         self._avatar = avatar
         self._kind: FirstColorsKind = kind
         self._sums: Tensor | None = None
+        # Those that wait, on a CPU as the last `sight` found them.
+        self._waiting: Int[Tensor, W] = torch.empty(0, dtype=torch.int64)
 
     def sight(self, num_images: int) -> FirstSight | None:
         """What a step is to sum over the first `num_images` of its pictures.
@@ -66,15 +68,11 @@ class FirstColors:
         if known.device.type != "cpu":
             self._sums.zero_()
         else:
-            waiting = self._waiting()
-            if len(waiting) == 0:
+            self._waiting = (~known).nonzero()[:, 0]
+            if len(self._waiting) == 0:
                 return None
-            self._sums.index_fill_(0, waiting, 0)
+            self._sums.index_fill_(0, self._waiting, 0)
         return FirstSight(known, self._sums, num_images, WEIGHT_THRESHOLD, self._kind == "paper")
-
-    def _waiting(self) -> Int[Tensor, "W"]:
-        """The Gaussians that have no first colour yet."""
-        return (~self._avatar.color_initialized).nonzero()[:, 0]
 
     @torch.no_grad()
     def seen_in(
@@ -106,8 +104,8 @@ class FirstColors:
         avatar = self._avatar
         if isinstance(seen, FirstSight):
             if seen.sums.device.type == "cpu":
-                largest = seen.sums[self._waiting(), 4]
-                if not bool((largest > _THRESHOLD_UNITS).any()):
+                largest = seen.sums[self._waiting, 4].max()
+                if int(largest) <= _THRESHOLD_UNITS:
                     return  # in most steps nothing new comes to light
             seen = seen.sums * SIGHT_UNIT
         sums, feature = seen, avatar.blendshapes.color_feature

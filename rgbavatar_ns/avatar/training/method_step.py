@@ -61,10 +61,8 @@ class MethodStep:
         self.method, self.refinement = method, refinement
         self.optimizers = list(method_optimizers(method) if optimizers is None else optimizers)
         self._seed, self._backend, self._logged = seed, backend, logged
-        names = {p: name for name, group in method.parameter_groups().items() for p in group}
-        self._groups = [
-            (names[group["params"][0]], group) for o in self.optimizers for group in o.param_groups
-        ]
+        groups = method.parameter_groups()
+        self._name_of = {p: name for name, group in groups.items() for p in group}
 
     def __call__(self, batch: TrainingBatch | ChosenFrames, step: int) -> Losses:
         """Take step `step` and what is due after it; returns the parts of the loss, detached.
@@ -85,11 +83,7 @@ class MethodStep:
             optimizer.zero_grad(set_to_none=True)
         losses, drawn, offset = self._losses(batch, theta, background.to(theta), step)
         torch.stack(list(losses.values())).sum().backward()
-        factors = self.method.rate_factors(step)
-        for name, group in self._groups:
-            if name in factors:
-                # Kept with the optimiser's state, so that a resumed run multiplies the same.
-                group["lr"] = group.setdefault("first_lr", group["lr"]) * factors[name]
+        self._set_rates(step)
         for optimizer in self.optimizers:
             optimizer.step()
         if self.refinement is not None and theta.grad is not None:
@@ -103,6 +97,14 @@ class MethodStep:
         if figures:
             self._logged(step, figures)
         return {name: loss.detach() for name, loss in losses.items()}
+
+    def _set_rates(self, step: int) -> None:
+        factors = self.method.rate_factors(step)
+        for group in (group for o in self.optimizers for group in o.param_groups):
+            name = self._name_of[group["params"][0]]
+            if name in factors:
+                # Kept with the optimiser's state, so that a resumed run multiplies the same.
+                group["lr"] = group.setdefault("first_lr", group["lr"]) * factors[name]
 
     def look_back(self, frames: Iterable[TrainingBatch]) -> bool:
         """As `TrainingStep.look_back`: there is nothing to do."""
