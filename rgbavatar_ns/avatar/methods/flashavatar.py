@@ -1,13 +1,13 @@
-"""A FlashAvatar-style method: Gaussians on the mesh's UV map, moved by a network of place and theta.
+"""A FlashAvatar-style method: Gaussians on the mesh's UV map, moved by a network.
 
-Paper: Xiang et al., "FlashAvatar: High-fidelity Head Avatar with Efficient Gaussian Embedding", CVPR
-2024. Facts are from its release: train.py, arguments/__init__.py, src/deform_model.py,
+Paper: Xiang et al., "FlashAvatar: High-fidelity Head Avatar with Efficient Gaussian Embedding",
+CVPR 2024. Facts are from its release: train.py, arguments/__init__.py, src/deform_model.py,
 scene/gaussian_model.py, utils/loss_utils.py.
 
 Of what it does all is here: the UV map of 128 x 128 texels, head and neck alone; opacity .1 and
-scales by the nearest neighbours at first; the offset in the head's frame, the MLP of 6 x 256 with 8
-octaves of the place at rest, its ten numbers by tanh, scales as log-scale times exp; harmonics up to
-degree 3, raised every 500 steps; Huber, 40 times in the mouth; VGG-LPIPS after 15,000 steps, if
+scales by the nearest neighbours at first; the offset in the head's frame; the MLP of 6 x 256 with
+8 octaves of the place at rest, its ten numbers by tanh, scales as log-scale times exp; harmonics up
+to degree 3, raised every 500 steps; Huber, 40 times in the mouth; VGG-LPIPS after 15,000 steps, if
 asked for; the learning rates; no density control; one image a step.
 
 Different here, because the harness is: backgrounds are random colours (there green); Adam's epsilon
