@@ -1,7 +1,7 @@
 """Attributes as functions of place and theta: positional encoding and multilayer perceptrons."""
 
-from collections.abc import Sequence
-from typing import Literal
+from collections.abc import Iterator, Sequence
+from typing import Any, Literal
 
 import torch
 import torch.nn.functional as F
@@ -68,6 +68,11 @@ class MLP(nn.Module):
         found = tuple(part.shape[-1] for part in parts)
         if found != self.part_widths:
             raise ValueError(f"The parts are {found} wide. Pass {self.part_widths}.")
+        if self.activation == "relu" and self.skip_at is None:
+            first, *others = (
+                p for layer in (*self.hidden, self.output) for p in layer.parameters()
+            )
+            return _ReluLayers.apply(_of_parts(parts, first, others[0]), *others[1:])
         values = None
         for index, layer in enumerate(self.hidden):
             assert isinstance(layer, nn.Linear)
@@ -92,3 +97,56 @@ def _of_parts(parts: tuple[Tensor, ...], weight: Tensor, bias: Tensor | None) ->
     for part, piece in zip(parts[1:], pieces[1:]):
         total = total + F.linear(part, piece)
     return total
+
+
+_BLOCK_ROWS = 1024
+"""Rows that go through all layers together: what they hold stays within a core's cache."""
+
+
+class _ReluLayers(torch.autograd.Function):
+    """ReLU, then linear layers with ReLU between them, given as weight, bias, weight, bias ...
+
+    The gradient is written out, because most of its rows may be 0: no picture shows what is behind
+    the head, or covered. Such rows add exactly nothing, and are left out. Values and gradients are
+    those of autograd; there is no second derivative.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, first: Float[Tensor, "..."], *layers: Tensor) -> Float[Tensor, "..."]:
+        rows = first.flatten(0, -2)
+        hidden = [torch.empty_like(rows)]
+        hidden += [rows.new_empty(len(rows), len(bias)) for bias in layers[1:-2:2]]
+        output = rows.new_empty(len(rows), len(layers[-1]))
+        for block in _blocks(len(rows)):
+            torch.clamp(rows[block], min=0, out=hidden[0][block])
+            for weight, bias, below, above in zip(layers[::2], layers[1::2], hidden, hidden[1:]):
+                torch.addmm(bias, below[block], weight.mT, out=above[block]).clamp_(min=0)
+            torch.addmm(layers[-1], hidden[-1][block], layers[-2].mT, out=output[block])
+        ctx.save_for_backward(*hidden, *layers[::2])
+        return output.unflatten(0, first.shape[:-1])
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor, ...]:
+        saved, count = ctx.saved_tensors, len(ctx.saved_tensors) // 2
+        hidden, weights = saved[:count], saved[count:]
+        gradient = grad_outputs[0].flatten(0, -2)
+        alive = (gradient != 0).any(1).nonzero()[:, 0]
+        of_first = torch.zeros_like(hidden[0])
+        of_weights = [torch.zeros_like(weight) for weight in weights]
+        of_biases = [weight.new_zeros(len(weight)) for weight in weights]
+        for block in _blocks(len(alive)):
+            rows = alive[block]
+            above = gradient[rows]
+            for k in reversed(range(count)):
+                below = hidden[k][rows]
+                of_weights[k].addmm_(above.mT, below)
+                of_biases[k] += above.sum(0)
+                above = (above @ weights[k]).mul_(below > 0)
+            of_first[rows] = above
+        of_layers = (part for pair in zip(of_weights, of_biases) for part in pair)
+        return of_first.view(*grad_outputs[0].shape[:-1], -1), *of_layers
+
+
+def _blocks(count: int) -> Iterator[slice]:
+    return (slice(start, start + _BLOCK_ROWS) for start in range(0, count, _BLOCK_ROWS))

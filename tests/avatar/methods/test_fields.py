@@ -75,3 +75,22 @@ def test_what_does_not_fit_is_refused() -> None:
         MLP((3,), 8, 2, 4, generator=seeded(), skip_at=2)
     with pytest.raises(ValueError, match=r"\(4,\) wide"):
         MLP((3,), 8, 2, 4, generator=seeded())(torch.zeros(2, 4))
+
+
+@pytest.mark.parametrize("alive", [0.0, 0.3, 1.0])
+def test_rows_without_a_gradient_are_left_out_of_it_exactly(alive):
+    generator = torch.Generator().manual_seed(0)
+    field = MLP([3, 2], 7, 3, 4, generator=generator).double()
+    place = torch.randn(1, 1500, 3, generator=generator, dtype=torch.float64, requires_grad=True)
+    theta = torch.randn(2, 1, 2, generator=generator, dtype=torch.float64, requires_grad=True)
+    weight = torch.randn(2, 1500, 4, generator=generator, dtype=torch.float64)
+    weight *= torch.rand(2, 1500, 1, generator=generator, dtype=torch.float64) < alive
+    inputs = [place, theta, *field.parameters()]
+    found = torch.autograd.grad((field(place, theta) * weight).sum(), inputs)
+    values = torch.cat([place.expand(2, -1, -1), theta.expand(-1, 1500, -1)], -1)
+    for layer in field.hidden:
+        values = torch.relu(values @ layer.weight.mT + layer.bias)
+    values = values @ field.output.weight.mT + field.output.bias
+    torch.testing.assert_close(field(place, theta), values)
+    for own, expected in zip(found, torch.autograd.grad((values * weight).sum(), inputs)):
+        torch.testing.assert_close(own, expected)
