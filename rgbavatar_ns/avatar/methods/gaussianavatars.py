@@ -1,0 +1,283 @@
+"""A GaussianAvatars-style method: a Gaussian a triangle, which carries it by an edge, and more.
+
+Paper: Qian et al., "GaussianAvatars: Photorealistic Head Avatars with Rigged 3D Gaussians", CVPR
+2024. Facts are from its release: arguments/__init__.py, train.py, scene/gaussian_model.py,
+scene/flame_gaussian_model.py.
+
+Of what it does is here: a Gaussian in the middle of each triangle at first, as large as it, with
+opacity .1 and no colour, teeth included where the head has them (FLAME with
+`head.teeth.with_teeth(arrays, "blocks")` has the release's 168 triangles); frames from an edge, by
+whose size places and scales are multiplied; harmonics up to degree 3 in the world's axes, raised
+every 1,000 steps; .8 L1 + .2 DSSIM and the hinges of place and scale, over Gaussians in view; the
+learning rates, that of places falling over 600,000 steps; density control from 10,000 steps on, which
+keeps a Gaussian on each triangle; one image a step.
+
+The tracked parameters are learnt too there, with Adam at 1e-3 (expressions), 1e-5 (pose) and 1e-6
+(translation): here any method has this by `refine_tracking`, whose rates are its own.
+
+Different here: the extent that the places' rate and density control's bounds are multiplied by is
+given (there the spread of the cameras, 0 for one that stands still); sizes that density control
+compares are those at rest (there in the frame of the moment); children of a split lie around their
+parent, as the paper says (there around the middle of the triangle); backgrounds are random colours,
+so that opacities are not reset at 10,000 steps as with a white one. Left out: the terms whose weight
+is 0 there (offsets of vertices, Laplacian).
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+
+from rgbavatar_ns.avatar.config import MethodConfig
+from rgbavatar_ns.avatar.method import AvatarMethod, DrawnBatch, FilmedBatch, Losses, WatchedStep
+from rgbavatar_ns.avatar.methods.carriers import edge_frames
+from rgbavatar_ns.avatar.methods.density import (
+    ControlledGaussians,
+    DensityControl,
+    ScreenStatistics,
+    control,
+    in_view,
+    sampled_positions,
+)
+from rgbavatar_ns.avatar.methods.gaussian_rows import GaussianRows
+from rgbavatar_ns.avatar.methods.loss_terms import dssim_loss, position_hinge, scale_hinge
+from rgbavatar_ns.avatar.methods.sh import MAX_DEGREE, num_coefficients, sh_colors, view_directions
+from rgbavatar_ns.avatar.model.image_loss import l1_loss
+from rgbavatar_ns.avatar.model.tangent_to_world import carried
+from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.head import HeadArrays, HeadModel
+from rgbavatar_ns.kernels import GaussianSet, PinholeCameras
+from rgbavatar_ns.options import Between, Count, Share, Weight
+
+LEARNING_RATES: dict[str, float] = {
+    "position": 5e-3,
+    "rotation": 0.001,
+    "log_scale": 0.017,
+    "opacity": 0.05,
+    "color": 0.0025,
+    "color_rest": 0.0025 / 20,
+}
+"""Adam's learning rate of each parameter group, that of places a metre of extent."""
+_ROWS = (
+    *("position", "rotation_wxyz", "log_scale", "opacity_logit", "color", "color_rest"),
+    *("face_index", "statistics"),
+)
+
+
+@dataclass(frozen=True)
+class GaussianAvatarsConfig(MethodConfig):
+    """GaussianAvatars' choices; defaults are its release's."""
+
+    initial_opacity: Annotated[float, Between(0, 1, open=True)] = 0.1
+    """Opacity of every Gaussian at first."""
+    sh_degree: Annotated[int, Between(0, MAX_DEGREE)] = 3
+    """Degree of the harmonics that colours follow the view with."""
+    raise_degree_every: Count = 1000
+    """Steps after which one more degree counts, from 0 on."""
+    dssim_weight: Share = 0.2
+    """Weight of DSSIM; that of L1 is what is left of 1."""
+    position_weight: Weight = 0.01
+    """Weight of how far Gaussians are farther from their triangle's middle than `farthest`."""
+    farthest: Weight = 1.0
+    """In sizes of the triangle."""
+    scale_weight: Weight = 1.0
+    """Weight of how far scales are larger than `largest`."""
+    largest: Weight = 0.6
+    """In sizes of the triangle."""
+    last_position_rate: Share = 0.01
+    """What the learning rate of places falls to, as a share of the first."""
+    position_rate_steps: Count = 600_000
+    """Steps until it has."""
+    density: DensityControl = DensityControl(
+        from_step=10_000,
+        until_step=600_000,
+        every=2000,
+        largest_scale_from_step=60_000,
+        reset_every=60_000,
+        keep_one_per_face=True,
+    )
+    """When and where Gaussians are added and removed; its `extent_m` multiplies the rate of places
+    too."""
+
+
+class GaussianAvatars(AvatarMethod):
+    """Gaussians that keep their place, turn and size within their triangle's frame.
+
+    x = k R x_l + c, q = R q_l, s = k s_l, with `edge_frames`; theta moves nothing beside the mesh.
+
+    Args:
+        head: the head model; each of its triangles carries Gaussians.
+        identity: the subject's identity coefficients, fixed.
+        config: schedules, weights and density control.
+        seed: of nothing: what is drawn is drawn in training, by its own seed.
+    """
+
+    method = "gaussianavatars-style"
+    config: GaussianAvatarsConfig  # pyright: ignore[reportIncompatibleVariableOverride]
+    face_index: Int[Tensor, "N"]
+    degree_now: Int[Tensor, ""]
+    _face_size_m: Float[Tensor, "F"]
+
+    def __init__(
+        self,
+        head: HeadModel,
+        identity: Float[Tensor, "I"],
+        config: GaussianAvatarsConfig | None = None,
+        *,
+        seed: int = 0,
+    ) -> None:
+        config = GaussianAvatarsConfig() if config is None else config
+        super().__init__(head, identity, config)
+        count = len(head.faces)
+        self.register_buffer("face_index", torch.arange(count, device=identity.device))
+        self.register_buffer("degree_now", torch.zeros((), dtype=torch.int64))
+        with torch.no_grad():
+            rest = head(identity.new_zeros(1, self.layout.size), identity)
+            size_m = edge_frames(rest, head.faces, self.face_index).length_ratio
+        assert size_m is not None
+        self.register_buffer("_face_size_m", size_m[0], persistent=False)
+        self.position = nn.Parameter(identity.new_zeros(count, 3))
+        self.rotation_wxyz = nn.Parameter(identity.new_tensor([1.0, 0, 0, 0]).repeat(count, 1))
+        self.log_scale = nn.Parameter(identity.new_zeros(count, 3))
+        opacity = identity.new_full((count,), config.initial_opacity)
+        self.opacity_logit = nn.Parameter(opacity.logit())
+        self.color = nn.Parameter(identity.new_zeros(count, 1, 3))
+        others = num_coefficients(config.sh_degree) - 1
+        self.color_rest = nn.Parameter(identity.new_zeros(count, others, 3))
+        self.statistics = ScreenStatistics(count).to(identity)
+        self.rows = GaussianRows(self, _ROWS)
+        self.register_load_state_dict_post_hook(lambda module, _: module._check_places())
+
+    @property
+    def num_gaussians(self) -> int:
+        """The number N of Gaussians."""
+        return self.rows.count
+
+    def gaussians(
+        self, theta: Float[Tensor, "B H"], *, cameras: PinholeCameras | None = None
+    ) -> GaussianSet:
+        """Return theta's Gaussians in the head's world; without cameras, with degree 0 alone."""
+        vertices = self.head(self.checked(theta), self.identity)
+        frames = edge_frames(vertices, self.head.faces, self.face_index)
+        means, quats_wxyz, scales = carried(
+            self.position[None], self.rotation_wxyz[None], self.log_scale[None], frames
+        )
+        return GaussianSet(
+            means=means,
+            quats_wxyz=quats_wxyz,
+            scales=scales,
+            opacities=torch.sigmoid(self.opacity_logit)[None],
+            colors=self._colors(means, cameras),
+        )
+
+    def _colors(
+        self, means: Float[Tensor, "B N 3"], cameras: PinholeCameras | None
+    ) -> Float[Tensor, "#B N 3"]:
+        degree = 0 if cameras is None else int(self.degree_now)
+        if cameras is None or degree == 0:
+            return sh_colors(self.color, means[:1], 0)
+        used = self.color_rest[:, : num_coefficients(degree) - 1]
+        return sh_colors(torch.cat([self.color, used], 1), view_directions(means, cameras), degree)
+
+    def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
+        """Return what is trained, by the names in `LEARNING_RATES`."""
+        groups = {
+            "position": [self.position],
+            "rotation": [self.rotation_wxyz],
+            "log_scale": [self.log_scale],
+            "opacity": [self.opacity_logit],
+            "color": [self.color],
+        }
+        if self.config.sh_degree > 0:
+            groups["color_rest"] = [self.color_rest]
+        return groups
+
+    def learning_rates(self) -> dict[str, float]:
+        """Return the release's, for the extent of this head."""
+        extent_m = self.config.density.extent_m
+        return LEARNING_RATES | {"position": LEARNING_RATES["position"] * extent_m}
+
+    def rate_factors(self, step: int) -> dict[str, float]:
+        """Return how far the rate of places has fallen, exponentially (arguments/__init__.py)."""
+        share = min((step + 1) / self.config.position_rate_steps, 1.0)
+        return {"position": self.config.last_position_rate**share}
+
+    def image_losses(self, drawn: DrawnBatch, filmed: FilmedBatch, step: int) -> Losses:
+        """L1 and DSSIM by their weights (train.py)."""
+        weight = self.config.dssim_weight
+        losses = {"l1": (1 - weight) * l1_loss(drawn.image, filmed.target)}
+        if weight > 0:
+            # It looks around a pixel: what nobody filmed is the same in both, and fixed.
+            shown = torch.where(filmed.unfilmed[..., None], filmed.target, drawn.image)
+            losses["dssim"] = weight * dssim_loss(shown, filmed.target)
+        return losses
+
+    def penalty(self, drawn: DrawnBatch, step: int) -> Losses:
+        """The hinges of places and scales, in their triangles' sizes, of Gaussians in view."""
+        config = self.config
+        seen = in_view(drawn.gaussians.means.detach(), drawn.cameras).any(0)
+        far = position_hinge(self.position, config.farthest, seen)
+        large = scale_hinge(self.log_scale.exp(), config.largest, seen)
+        return {"position": config.position_weight * far, "scale": config.scale_weight * large}
+
+    def watches(self, step: int) -> bool:
+        """Whether density control still uses the gradient by the projected means."""
+        return self.config.density.watches(step)
+
+    def after_step(
+        self,
+        watched: WatchedStep | None,
+        optimizers: Sequence[torch.optim.Optimizer],
+        step: int,
+        seed: int,
+    ) -> Mapping[str, float]:
+        """Raise the degree of the harmonics, add and remove Gaussians, where that is due."""
+        # The release, whose first step is 1, raises it at a step's beginning.
+        reached = min((step + 2) // self.config.raise_degree_every, self.config.sh_degree)
+        self.degree_now.fill_(reached)
+        if watched is not None:
+            cameras, gradient = watched.cameras, watched.screen_gradient_px
+            seen = in_view(watched.gaussians.means.detach(), cameras)
+            self.statistics.add(gradient, cameras.width, cameras.height, seen)
+        known = ControlledGaussians(
+            self.rows, self.statistics, self._scale_m, self._children, face_of="face_index"
+        )
+        changes = control(known, self.config.density, optimizers, step=step, seed=seed)
+        return {} if changes is None else {k: float(v) for k, v in vars(changes).items()}
+
+    def _scale_m(self) -> Float[Tensor, "N 3"]:
+        """Standard deviations at rest."""
+        return self.log_scale.detach().exp() * self._face_size_m[self.face_index][:, None]
+
+    def _children(
+        self, chosen: Int[Tensor, "M"], samples: Float[Tensor, "M S 3"]
+    ) -> dict[str, Tensor]:
+        scale = self.log_scale[chosen].exp()
+        place = sampled_positions(self.position[chosen], self.rotation_wxyz[chosen], scale, samples)
+        return {"position": place}
+
+    def _check_places(self) -> None:
+        inside: Bool[Tensor, "N"] = (self.face_index >= 0) & (
+            self.face_index < len(self.head.faces)
+        )
+        if not bool(inside.all()):
+            raise UserError(
+                "A Gaussian's place points outside of the head's triangles.",
+                "Use another copy of the avatar or checkpoint.",
+            )
+
+    def fit_to(self, parameters: Mapping[str, Any], prefix: str = "") -> None:
+        """Make room for the Gaussians of a stored state dict."""
+        self.rows.fit_to(parameters, prefix)
+
+    @classmethod
+    def from_state(cls, state: dict[str, Any]) -> "GaussianAvatars":
+        """Build an untrained avatar of the same make; its parameters come by load_state_dict."""
+        return cls(
+            HeadModel(HeadArrays.from_state(state["head"])),
+            state["identity"],
+            GaussianAvatarsConfig.from_json(state["config"]),
+        )
