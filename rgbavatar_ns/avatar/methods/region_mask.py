@@ -22,6 +22,11 @@ def group_vertices(arrays: HeadArrays, names: Iterable[str]) -> Int[Tensor, "G"]
     return torch.from_numpy(np.unique(np.concatenate([*found, np.zeros(0, np.int64)])))
 
 
+def faces_within(arrays: HeadArrays, faces: Int[Tensor, "F 3"], name: str) -> Bool[Tensor, "F"]:
+    """Triangles with all corners in this group; of a head without it, none."""
+    return torch.isin(faces, group_vertices(arrays, [name]).to(faces)).all(1)
+
+
 @torch.no_grad()
 def region_mask(
     vertices: Float[Tensor, "B V 3"], faces: Int[Tensor, "G 3"], cameras: PinholeCameras
