@@ -60,7 +60,6 @@ class Avatar(AvatarMethod):
     """
 
     method = RGBAVATAR
-    config_type = AvatarConfig
     make_options = (
         "num_bases",
         "uv_resolution",

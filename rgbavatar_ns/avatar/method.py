@@ -76,8 +76,6 @@ class AvatarMethod(nn.Module, ABC):
 
     method: ClassVar[str]
     """The name that files bear."""
-    config_type: ClassVar[type[MethodConfig]]
-    """What `config` is."""
     make_options: ClassVar[tuple[str, ...]] = ()
     """The options that a checkpoint and the run that goes on with it must agree in."""
     config: MethodConfig

@@ -37,24 +37,21 @@ class CellStatus:
 def check_experiment(experiment: Experiment) -> None:
     """Raise UserError where the preset or an override does not exist or does not fit."""
     # Loads nerfstudio, which takes seconds.
-    from rgbavatar_ns.plugin import methods
-    from rgbavatar_ns.plugin.online import methods as online_methods
+    from rgbavatar_ns.plugin.presets import presets
 
-    found = [*vars(methods).values(), *vars(online_methods).values()]
-    configs = [getattr(one, "config", None) for one in found]
-    presets = {c.method_name: c for c in configs if c is not None and hasattr(c, "method_name")}
+    known = presets()
     tracker = (experiment.cross_identity or {}).get("tracker")
     if tracker is not None:
         load_tracker(tracker)
     for variant in experiment.variants:
         where = f"The experiment {experiment.name}, variant {variant.name!r},"
         preset = variant.preset or experiment.preset
-        if preset not in presets:
+        if preset not in known:
             named = where if variant.preset else f"The experiment {experiment.name}"
-            raise UserError(f"{named} names the preset {preset!r}.", nearest(preset, list(presets)))
+            raise UserError(f"{named} names the preset {preset!r}.", nearest(preset, list(known)))
         base = f"The experiment {experiment.name}, base,"
-        check_overrides(presets[preset], experiment.base, base)
-        check_overrides(presets[preset], variant.overrides, where)
+        check_overrides(known[preset], experiment.base, base)
+        check_overrides(known[preset], variant.overrides, where)
 
 
 def sweep(

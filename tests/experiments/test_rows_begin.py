@@ -8,18 +8,13 @@ from typing import Any
 import pytest
 
 from rgbavatar_ns.experiments import cells_of, read_experiment
-from rgbavatar_ns.plugin import methods
-from rgbavatar_ns.plugin.online import methods as online_methods
+from rgbavatar_ns.plugin.presets import presets
 from tests.plugin.run import make_trainer, set_up
 from tests.plugin.tiny import tiny_dataset
 
 CONFIGS = sorted((Path(__file__).parents[2] / "configs").glob("*.yaml"))
-PRESETS: dict[str, Any] = {
-    found.config.method_name: found.config
-    for module in (methods, online_methods)
-    for found in vars(module).values()
-    if hasattr(found, "config") and hasattr(found.config, "method_name")
-}
+# What makes an avatar of each kind small.
+SMALL: dict[str, Any] = {"uv_resolution": 16, "num_points": 300, "hidden_width": 16}
 
 
 def _with(config: Any, option: str, value: Any) -> Any:
@@ -37,16 +32,21 @@ def test_every_row_trains(path, tiny, tmp_path):
     tiny_dataset(tmp_path / "data")
     rows = {cell.variant: cell for cell in cells_of(read_experiment(path, tiny=tiny))}
     for place, cell in enumerate(rows.values()):
-        config = copy.deepcopy(PRESETS[cell.preset])
+        config = copy.deepcopy(presets()[cell.preset])
         for option, value in cell.overrides.items():
             config = _with(config, option, value)
         config.pipeline.datamanager.data = tmp_path / "data"
-        config = _with(config, "pipeline.model.avatar.uv_resolution", 16)
+        model: Any = config.pipeline.model
+        for name in SMALL.keys() & vars(model.avatar).keys():
+            config = _with(config, f"pipeline.model.avatar.{name}", SMALL[name])
+        if hasattr(model, "lpips_weight"):
+            config.pipeline.model.lpips_weight = 0.0
         small = {
             "max_num_iterations": 2,
             "batch_size": min(4, config.pipeline.datamanager.batch_size),
+            "refine_held_out": min(2, model.refine_held_out),
         }
-        set_up(config, tmp_path / str(place), **small, lpips_weight=0.0)
+        set_up(config, tmp_path / str(place), **small)
         trainer = make_trainer(config)
         trainer.train()
         assert trainer.completed, cell.variant

@@ -11,17 +11,11 @@ import pytest
 import yaml
 
 from rgbavatar_ns.cli import render
-from rgbavatar_ns.plugin import methods
-from rgbavatar_ns.plugin.online import methods as online_methods
+from rgbavatar_ns.plugin.presets import presets
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "paper.md").read_text()
-PRESETS: dict[str, Any] = {
-    found.config.method_name: found.config
-    for module in (methods, online_methods)
-    for found in vars(module).values()
-    if hasattr(found, "config") and hasattr(found.config, "method_name")
-}
+PRESETS: dict[str, Any] = dict(presets())
 OFFLINE = ("rgbavatar-paper", "rgbavatar", "rgbavatar-tiny")
 ONLINE = ("rgbavatar-paper-online", "rgbavatar-online", "rgbavatar-online-tiny")
 # How a run is named and how often it is saved changes no avatar.
@@ -78,9 +72,9 @@ def test_the_tables_hold_the_presets_values(title: str, presets: tuple[str, ...]
 def test_every_departure_is_on_the_page():
     told = {row[0].strip("`") for row in rows("Settings")[1:]}
     streamed = told | {row[0].strip("`") for row in rows("A stream's settings")[1:]}
-    for presets, known in ((OFFLINE, told), (ONLINE, streamed)):
-        for ours in presets[1:]:
-            found = set(differing(PRESETS[presets[0]], PRESETS[ours])) - IMMATERIAL
+    for names, known in ((OFFLINE, told), (ONLINE, streamed)):
+        for ours in names[1:]:
+            found = set(differing(PRESETS[names[0]], PRESETS[ours])) - IMMATERIAL
             assert found, ours
             assert found <= known, ours
 

@@ -260,9 +260,7 @@ class GaussianAvatars(AvatarMethod):
         return {"position": place}
 
     def _check_places(self) -> None:
-        inside: Bool[Tensor, "N"] = (self.face_index >= 0) & (
-            self.face_index < len(self.head.faces)
-        )
+        inside: Bool[Tensor, N] = (self.face_index >= 0) & (self.face_index < len(self.head.faces))
         if not bool(inside.all()):
             raise UserError(
                 "A Gaussian's place points outside of the head's triangles.",
