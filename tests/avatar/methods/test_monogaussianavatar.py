@@ -70,6 +70,14 @@ def test_points_begin_on_a_sphere_and_rest_there_with_theta_zero():
     torch.testing.assert_close(avatar.deformed().skinning_weights, torch.full((400, 6), 1 / 6))
 
 
+def test_places_differ_from_the_first_step_on():
+    """Or one opacity suits all, and all vanish; torch's own initial values give .0003."""
+    avatar = MonoGaussianAvatar(small_head(), small_identity())
+    gaussians = avatar.gaussians(torch.zeros(1, avatar.layout.size))
+    assert float(gaussians.opacities.std()) > 0.01
+    assert float(gaussians.colors.std(1).mean()) > 0.01
+
+
 @pytest.mark.parametrize("joint", range(5))
 def test_a_joint_carries_the_points_that_are_bound_to_it(joint):
     avatar = build(torch.float64)
