@@ -31,7 +31,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from torch import Tensor, nn
 
 from rgbavatar_ns.avatar.config import MethodConfig
@@ -161,7 +161,7 @@ class MonoGaussianAvatar(AvatarMethod):
         generator = torch.Generator().manual_seed(seed)
         with torch.no_grad():
             rest = head(identity.new_zeros(self.layout.size), identity)
-        self._vertex_tree = cKDTree(rest.cpu().numpy())
+        self._vertex_tree = KDTree(rest.cpu().numpy())
         self._turned = [f.name for f in self.layout.fields if f.form == "axis_angle"][1:]
         self._blended = [f.name for f in self.layout.fields if f.form == "linear"]
         for name, values in zip(
