@@ -7,6 +7,7 @@ import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
 
 from rgbavatar_ns.avatar.model.weight_network import seeded_linear
 
@@ -126,8 +127,10 @@ class _ReluLayers(torch.autograd.Function):
         return output.unflatten(0, first.shape[:-1])
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor, ...]:
+    @once_differentiable
+    def backward(  # pyright: ignore[reportIncompatibleMethodOverride]
+        ctx: Any, *grad_outputs: Tensor
+    ) -> tuple[Tensor, ...]:
         saved, count = ctx.saved_tensors, len(ctx.saved_tensors) // 2
         hidden, weights = saved[:count], saved[count:]
         gradient = grad_outputs[0].flatten(0, -2)

@@ -23,7 +23,7 @@ from typing import Annotated, Any
 import numpy as np
 import torch
 from jaxtyping import Float, Int
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from torch import Tensor, nn
 
 from rgbavatar_ns.avatar.config import MethodConfig
@@ -252,7 +252,7 @@ def neighbour_distance(
     """
     known = places.detach().cpu().double().numpy()
     others = min(3, len(known) - 1)
-    distance = cKDTree(known).query(known, k=range(2, others + 2))[0] if others else [[0.0]]
+    distance = KDTree(known).query(known, k=range(2, others + 2))[0] if others else [[0.0]]
     mean = np.sqrt(np.square(distance).mean(1))
     return torch.from_numpy(mean.clip(min=least)).to(places)
 

@@ -17,10 +17,10 @@ forgets that; here Adam's moments of points that stay go on).
 
 Left out: learning theta of the frames, which the harness's refinement does for any method alike;
 the variance of the film's expressions, which a method does not know, in the expressions' term (1/50
-stands for it); canonical jaw and expression, which are those at rest here; weight normalisation and
-the initial values of a signed distance; batches that shrink as points grow, which is the preset's;
-white backgrounds (random colours here). Rotations are the networks' alone, as there: bones move
-points, but do not turn what is drawn there.
+stands for it); canonical jaw and expression, which are those at rest here; weight normalisation;
+initial values of a signed distance (He's here); batches that shrink as points grow, which is the
+preset's; white backgrounds (random colours here). Rotations are the networks' alone, as there:
+bones move points, but do not turn what is drawn there.
 """
 
 from collections.abc import Mapping, Sequence
@@ -31,7 +31,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from torch import Tensor, nn
 
 from rgbavatar_ns.avatar.config import MethodConfig
@@ -161,7 +161,7 @@ class MonoGaussianAvatar(AvatarMethod):
         generator = torch.Generator().manual_seed(seed)
         with torch.no_grad():
             rest = head(identity.new_zeros(self.layout.size), identity)
-        self._vertex_tree = cKDTree(rest.cpu().numpy())
+        self._vertex_tree = KDTree(rest.cpu().numpy())
         self._turned = [f.name for f in self.layout.fields if f.form == "axis_angle"][1:]
         self._blended = [f.name for f in self.layout.fields if f.form == "linear"]
         for name, values in zip(
@@ -204,6 +204,8 @@ class MonoGaussianAvatar(AvatarMethod):
         self.attribute_heads = _Heads(wide, "softplus", generator)
         self.offsets = MLP([3], narrow, 2, narrow, generator=generator)
         self.offset_heads = _Heads(narrow, "relu", generator)
+        for network in (self.deformer, self.skinning.hidden, self.attributes):
+            _draw_he_normal(network, generator)
         self.to(identity)
 
     @property
@@ -370,6 +372,19 @@ def radius_m(epoch: int) -> float:
     shrunk += max(0, (epoch - 60) // 5)
     last = 0.9 if epoch >= 60 else 1.0
     return 0.15 * 0.75 ** (2 + shrunk) * last / _UNIT
+
+
+@torch.no_grad()
+def _draw_he_normal(network: nn.Module, generator: torch.Generator) -> None:
+    """Initial values with which places differ: those of torch give all points nearly the same.
+
+    Then what suits most pixels, transparency, takes all of them within sixty steps. Source: He et
+    al. 2015, eq. 10; the release's, but for the first layer and the last of the attributes.
+    """
+    for layer in network.modules():
+        if isinstance(layer, nn.Linear):
+            layer.weight.normal_(0, (2 / layer.in_features) ** 0.5, generator=generator)
+            layer.bias.zero_()
 
 
 def _halved(epoch: int, milestones: tuple[int, ...]) -> float:
