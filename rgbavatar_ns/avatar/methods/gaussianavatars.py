@@ -9,8 +9,8 @@ opacity .1 and no colour, teeth included where the head has them (FLAME with
 `head.teeth.with_teeth(arrays, "blocks")` has the release's 168 triangles); frames from an edge, by
 whose size places and scales are multiplied; harmonics up to degree 3 in the world's axes, raised
 every 1,000 steps; .8 L1 + .2 DSSIM and the hinges of place and scale, over Gaussians in view; the
-learning rates, that of places falling over 600,000 steps; density control from 10,000 steps on, which
-keeps a Gaussian on each triangle; one image a step.
+learning rates, that of places falling over 600,000 steps; density control from 10,000 steps on,
+which keeps a Gaussian on each triangle; one image a step.
 
 The tracked parameters are learnt too there, with Adam at 1e-3 (expressions), 1e-5 (pose) and 1e-6
 (translation): here any method has this by `refine_tracking`, whose rates are its own.
@@ -19,16 +19,16 @@ Different here: the extent that the places' rate and density control's bounds ar
 given (there the spread of the cameras, 0 for one that stands still); sizes that density control
 compares are those at rest (there in the frame of the moment); children of a split lie around their
 parent, as the paper says (there around the middle of the triangle); backgrounds are random colours,
-so that opacities are not reset at 10,000 steps as with a white one. Left out: the terms whose weight
-is 0 there (offsets of vertices, Laplacian).
+so that opacities are not reset at 10,000 steps as with a white one. Left out: the terms whose
+weight is 0 there (offsets of vertices, Laplacian).
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated, Any
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from rgbavatar_ns.avatar.config import MethodConfig
@@ -91,13 +91,15 @@ class GaussianAvatarsConfig(MethodConfig):
     """What the learning rate of places falls to, as a share of the first."""
     position_rate_steps: Count = 600_000
     """Steps until it has."""
-    density: DensityControl = DensityControl(
-        from_step=10_000,
-        until_step=600_000,
-        every=2000,
-        largest_scale_from_step=60_000,
-        reset_every=60_000,
-        keep_one_per_face=True,
+    density: DensityControl = field(
+        default_factory=lambda: DensityControl(
+            from_step=10_000,
+            until_step=600_000,
+            every=2000,
+            largest_scale_from_step=60_000,
+            reset_every=60_000,
+            keep_one_per_face=True,
+        )
     )
     """When and where Gaussians are added and removed; its `extent_m` multiplies the rate of places
     too."""
@@ -260,8 +262,9 @@ class GaussianAvatars(AvatarMethod):
         return {"position": place}
 
     def _check_places(self) -> None:
-        inside: Bool[Tensor, N] = (self.face_index >= 0) & (self.face_index < len(self.head.faces))
-        if not bool(inside.all()):
+        if len(self.face_index) and not (
+            0 <= int(self.face_index.min()) <= int(self.face_index.max()) < len(self.head.faces)
+        ):
             raise UserError(
                 "A Gaussian's place points outside of the head's triangles.",
                 "Use another copy of the avatar or checkpoint.",

@@ -59,7 +59,7 @@ def film(size: int = 32, frames: int = 4) -> list[TrainingBatch]:
     """Frames of another avatar of the same head, one a batch."""
     teacher, camera = make(), front_camera(size)
     with torch.no_grad():
-        teacher.opacity_logit += 3
+        teacher.opacity_logit.add_(3)
     theta = random_theta(teacher.layout, frames)
     drawn = teacher.render(theta, camera)
     color = (drawn.image / drawn.alpha.clamp(min=1e-3)).clamp(0, 1)
@@ -154,7 +154,7 @@ def test_degrees_come_one_by_one():
 def test_gradients_reach_every_group_and_agree_with_finite_differences():
     method = make(dtype=DOUBLE)
     with torch.no_grad():
-        method.opacity_logit += 2
+        method.opacity_logit.add_(2)
     theta, camera = random_theta(method.layout, 2, dtype=DOUBLE), front_camera(20, DOUBLE)
     weights = torch.rand(2, 20, 20, 3, generator=torch.Generator().manual_seed(0), dtype=DOUBLE)
 
@@ -198,7 +198,7 @@ def test_what_nobody_filmed_leaves_no_gradient():
     target = torch.where(unfilmed[..., None], image.detach(), filmed.target)
     filmed = dataclasses.replace(filmed, target=target, unfilmed=unfilmed)
     drawn = dataclasses.replace(drawn, image=image)
-    sum(method.image_losses(drawn, filmed, 0).values()).backward()
+    torch.stack(list(method.image_losses(drawn, filmed, 0).values())).sum().backward()
     assert image.grad is not None
     assert not image.grad[:, 12:].any()
     assert image.grad[:, :12].abs().max() > 0
