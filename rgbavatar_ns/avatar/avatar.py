@@ -1,7 +1,5 @@
 """The avatar: the one composition from a head model's parameters theta to Gaussians and images."""
 
-import functools
-from collections.abc import Mapping
 from contextlib import nullcontext
 from dataclasses import fields
 from typing import Any
@@ -19,7 +17,6 @@ from rgbavatar_ns.avatar.model.weight_network import WeightNetwork, softly_withi
 from rgbavatar_ns.avatar.storage.stored_avatar import RGBAVATAR
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadArrays, HeadModel, UVAnchors, uv_anchors
-from rgbavatar_ns.head.arkit import ArkitMap, arkit_coefficients, arkit_map
 from rgbavatar_ns.kernels import (
     GaussianSet,
     MorphedGaussians,
@@ -136,29 +133,6 @@ class Avatar(AvatarMethod):
             theta, self.config.pose_input, self.config.translation_input
         )
         return self.weight_network(features)
-
-    @functools.cached_property
-    def arkit(self) -> ArkitMap:
-        """How ARKit's 52 coefficients move this head; takes seconds the first time with FLAME."""
-        return arkit_map(self.head.arrays)
-
-    def theta_from_arkit(
-        self,
-        coefficients: Mapping[str, int | float] | Float[Tensor, "*batch 52"],
-        head_rotation: Float[Tensor, "*batch 3"] | None = None,
-    ) -> Float[Tensor, "*batch H"]:
-        """Return theta of ARKit coefficients in [0, 1] and the head's turn.
-
-        coefficients: by name, or in the order of `ARKIT_NAMES`. head_rotation: axis-angle, radians,
-        x the subject's left, y up, z out of the face. The head stays where it is at rest. Raises
-        UserError for an unknown name or a value that is no number.
-        """
-        if isinstance(coefficients, Mapping):
-            coefficients = arkit_coefficients(coefficients)
-        given = [coefficients] if head_rotation is None else [coefficients, head_rotation]
-        if not all(bool(torch.isfinite(part).all()) for part in given):
-            raise UserError("The ARKit values hold NaN.", "Give numbers from 0 to 1, and radians.")
-        return self.arkit.theta(coefficients.to(self.identity), head_rotation)
 
     @torch.no_grad()
     def widen_film_range(self, theta: Float[Tensor, "B H"]) -> None:

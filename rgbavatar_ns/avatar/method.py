@@ -1,5 +1,6 @@
 """What every method of head avatars is: from theta to Gaussians, and how it is trained and kept."""
 
+import functools
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
@@ -20,6 +21,7 @@ from rgbavatar_ns.avatar.storage.stored_avatar import StoredAvatar
 from rgbavatar_ns.drawing.compositing import ImagesRGBA
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadModel, ThetaLayout
+from rgbavatar_ns.head.arkit import ArkitMap, arkit_coefficients, arkit_map
 from rgbavatar_ns.kernels import GaussianSet, PinholeCameras, RenderedBatch, rasterize
 from rgbavatar_ns.kernels.checks import holds_nonfinite
 
@@ -145,6 +147,29 @@ class AvatarMethod(nn.Module, ABC):
     def weights(self, theta: Float[Tensor, "B H"]) -> Float[Tensor, "B K"]:
         """Return the weights of blendshape bases; K is 0 where the method has none."""
         return self.checked(theta).new_zeros(len(theta), 0)
+
+    @functools.cached_property
+    def arkit(self) -> ArkitMap:
+        """How ARKit's 52 coefficients move this head; takes seconds the first time with FLAME."""
+        return arkit_map(self.head.arrays)
+
+    def theta_from_arkit(
+        self,
+        coefficients: Mapping[str, int | float] | Float[Tensor, "*batch 52"],
+        head_rotation: Float[Tensor, "*batch 3"] | None = None,
+    ) -> Float[Tensor, "*batch H"]:
+        """Return theta of ARKit coefficients in [0, 1] and the head's turn.
+
+        coefficients: by name, or in the order of `ARKIT_NAMES`. head_rotation: axis-angle, radians,
+        x the subject's left, y up, z out of the face. The head stays where it is at rest. Raises
+        UserError for an unknown name or a value that is no number.
+        """
+        if isinstance(coefficients, Mapping):
+            coefficients = arkit_coefficients(coefficients)
+        given = [coefficients] if head_rotation is None else [coefficients, head_rotation]
+        if not all(bool(torch.isfinite(part).all()) for part in given):
+            raise UserError("The ARKit values hold NaN.", "Give numbers from 0 to 1, and radians.")
+        return self.arkit.theta(coefficients.to(self.identity), head_rotation)
 
     def render(
         self,

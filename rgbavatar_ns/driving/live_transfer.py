@@ -9,7 +9,7 @@ import tyro
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from rgbavatar_ns.avatar.avatar import Avatar
+from rgbavatar_ns.avatar.method import AvatarMethod
 from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics, expressive_numbers
 from rgbavatar_ns.driving.one_euro import OneEuroFilter, OneEuroOptions
 from rgbavatar_ns.driving.source import PerformanceFrame, PerformerHead
@@ -81,7 +81,7 @@ class LiveTransfer:
 
     def __init__(
         self,
-        avatar: Avatar,
+        avatar: AvatarMethod,
         own: TrainingStatistics,
         head: PerformerHead | None,
         camera: PinholeCameras,

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from rgbavatar_ns.avatar.avatar import Avatar
+from rgbavatar_ns.avatar.method import AvatarMethod
 from rgbavatar_ns.errors import UserError, first_few
 from rgbavatar_ns.head import HeadArrays, ThetaLayout
 from rgbavatar_ns.head.arkit import arkit_map, head_carrier, speaks_arkit
@@ -63,11 +63,11 @@ ThetaMap = Callable[[Float[Tensor, "F G"]], MappedTheta]
 """From a driver's theta to the avatar's."""
 
 
-def theta_map(layout: ThetaLayout, arrays: HeadArrays, avatar: Avatar) -> ThetaMap:
+def theta_map(layout: ThetaLayout, arrays: HeadArrays, avatar: AvatarMethod) -> ThetaMap:
     """The way from the theta of a driver's head (`layout`, `arrays`) to the avatar's.
 
     By name where a name is shared; from a head with ARKit's names to any other head through
-    ARKit's coefficients (`Avatar.arkit`). Raises UserError where neither is possible.
+    ARKit's coefficients (`AvatarMethod.arkit`). Raises UserError where neither is possible.
     """
     driver = ThetaNames.of(layout, arrays)
     own = ThetaNames.of(avatar.layout, avatar.head.arrays)
@@ -84,7 +84,7 @@ def theta_map(layout: ThetaLayout, arrays: HeadArrays, avatar: Avatar) -> ThetaM
 
 
 def arkit_theta(
-    avatar: Avatar,
+    avatar: AvatarMethod,
     coefficients: Float[Tensor, "F 52"],
     head_rotation: Float[Tensor, "F 3"] | None,
 ) -> MappedTheta:
