@@ -6,13 +6,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from rgbavatar_ns.avatar.avatar import Avatar
+from rgbavatar_ns.avatar.method import AvatarMethod
 from rgbavatar_ns.head.rotations import axis_angle_to_matrix
 from rgbavatar_ns.kernels import PinholeCameras
 
 
 @torch.no_grad()
-def head_centre(avatar: Avatar, theta: Float[Tensor, "F H"]) -> Float[Tensor, "F 3"]:
+def head_centre(avatar: AvatarMethod, theta: Float[Tensor, "F H"]) -> Float[Tensor, "F 3"]:
     """The middle of the posed head's box, without what the neck does not turn; in metres."""
     vertices = avatar.head(theta.to(avatar.identity), avatar.identity).cpu()
     head = vertices[:, torch.from_numpy(avatar.head.arrays.skinning_weights[:, 0] < 0.5)]

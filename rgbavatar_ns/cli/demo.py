@@ -150,7 +150,7 @@ def _film(run_folder: Path, data: Path, output: Path) -> Result:
     import numpy as np
     import torch
 
-    from rgbavatar_ns import Avatar
+    from rgbavatar_ns.avatar.loading import load_avatar
     from rgbavatar_ns.data import load_dataset
     from rgbavatar_ns.export import write_comparison
     from rgbavatar_ns.plugin.refinement import REFINED_NAME
@@ -160,7 +160,7 @@ def _film(run_folder: Path, data: Path, output: Path) -> Result:
     if refined.exists():
         theta = torch.from_numpy(np.load(refined, allow_pickle=False))
         dataset = replace(dataset, theta=theta)
-    count = write_comparison(Avatar.load(run_folder), dataset, video, picture)
+    count = write_comparison(load_avatar(run_folder), dataset, video, picture)
     return {"video": str(video), "picture": str(picture), "frames": count}
 
 

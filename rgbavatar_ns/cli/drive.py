@@ -16,6 +16,7 @@ from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.options import CheckedOptions, FrameRate, Pixels, Share
 
 if TYPE_CHECKING:
+    from rgbavatar_ns.avatar import Avatar
     from rgbavatar_ns.driving.live_drive import DriveOutput, LiveDrive
     from rgbavatar_ns.driving.source import PerformanceSource
     from rgbavatar_ns.export.subject import Subject
@@ -250,13 +251,15 @@ def _page(
     subject: "Subject", show: ShowOptions, allow_remote: bool, calibrate: Callable[[], None]
 ) -> "DriveOutput":
     """The page, served, and told what moves it."""
+    from rgbavatar_ns.avatar.loading import require_rgbavatar
     from rgbavatar_ns.export.live_page import DEFAULT_ADDRESS, PageOutput
 
+    avatar = require_rgbavatar(subject.avatar, "A page (--show page)")
     output = PageOutput(
-        subject.avatar.layout,
+        avatar.layout,
         show.serve or DEFAULT_ADDRESS,
         allow_remote,
-        functools.cache(lambda: _page_content(subject, show)),
+        functools.cache(lambda: _page_content(avatar, subject, show)),
         calibrate,
     )
     _tell(f"Open http://{output.address}/?ws=ws://{output.address}")
@@ -264,13 +267,13 @@ def _page(
     return output
 
 
-def _page_content(subject: "Subject", show: ShowOptions) -> bytes:
+def _page_content(avatar: "Avatar", subject: "Subject", show: ShowOptions) -> bytes:
     """The avatar's page without a performance of its own, calm until it is driven."""
     import torch
 
     from rgbavatar_ns.export import PageOptions, as_filmed, calm_theta, write_web_page
 
-    avatar, dataset, seen = subject.avatar.without_undrawn(), subject.dataset, subject.seen
+    avatar, dataset, seen = avatar.without_undrawn(), subject.dataset, subject.seen
     if dataset is not None:
         avatar = as_filmed(avatar, dataset)
     neutral = calm_theta(seen, seen.theta_mean)

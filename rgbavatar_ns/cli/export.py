@@ -11,6 +11,7 @@ from rgbavatar_ns.options import FrameRate
 
 if TYPE_CHECKING:
     from rgbavatar_ns.avatar import Avatar
+    from rgbavatar_ns.avatar.method import AvatarMethod
     from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
     from rgbavatar_ns.data import TrackedDataset
     from rgbavatar_ns.export import PageOptions
@@ -41,10 +42,11 @@ def run(
 
     bundle: a folder that `Avatar.load` opens without nerfstudio, with what the avatar saw in
     training. ply, gltf, spz, compressed-ply, sog: the Gaussians of one frame, or a folder of
-    several frames' (--frames), as viewers of 3D Gaussian splatting open them. texture: the head's
-    colours as a picture to paint on, for --texture. web: one HTML file that plays and drives the
-    avatar in a browser, without a server or a network. web-module: a folder with the avatar's file,
-    an ES module that shows and drives it on a canvas of your own page, and examples.
+    several frames' (--frames), as viewers of 3D Gaussian splatting open them. All these can be had
+    of other methods' avatars too. texture: the head's colours as a picture to paint on, for
+    --texture. web: one HTML file that plays and drives the avatar in a browser, without a server or
+    a network. web-module: a folder with the avatar's file, an ES module that shows and drives it on
+    a canvas of your own page, and examples.
 
     Args:
         run_folder: a run of ns-train, a checkpoint or an avatar bundle.
@@ -65,38 +67,49 @@ def run(
         origins: for web, other pages whose messages it takes, such as https://example.org.
         servers: for web, what may drive it by ?ws= beside this machine, such as wss://example.org.
     """
-    from rgbavatar_ns import Avatar
+    from rgbavatar_ns.avatar.loading import load_avatar, require_rgbavatar
     from rgbavatar_ns.export import GAUSSIAN_FILES, read_texture, with_texture
 
-    whole = Avatar.load(run_folder)
+    whole = load_avatar(run_folder)
     if texture is not None:
-        whole = with_texture(whole, read_texture(texture))
-    avatar = whole.without_undrawn()
-    if avatar.num_gaussians < whole.num_gaussians:
-        left_out = whole.num_gaussians - avatar.num_gaussians
-        print(f"{left_out} of {whole.num_gaussians} Gaussians show in no picture: left out.")
+        own = require_rgbavatar(whole, "A painted texture (--texture)")
+        whole = with_texture(own, read_texture(texture))
+    avatar = _without_undrawn(whole)
     dataset = _dataset(avatar, run_folder, data, needed=frame is not None or frames is not None)
     if format == "bundle":
         seen = _seen(avatar, run_folder, dataset)
         avatar.save(destination, statistics=seen, with_head=head_inside)
-        print(f"Avatar.load({str(destination)!r}) opens it.")
+        print(f"{type(avatar).__name__}.load({str(destination)!r}) opens it.")
     elif format in GAUSSIAN_FILES:
         _write_gaussians(avatar, dataset, format, frame, frames, destination)
     elif format == "texture":
-        _write_texture(avatar, destination)
+        _write_texture(require_rgbavatar(avatar, "--format texture"), destination)
     else:
         from rgbavatar_ns.export import PageOptions
 
+        own = require_rgbavatar(avatar, f"--format {format}")
         options = PageOptions(title, frames_per_second, origins=origins, servers=servers)
         seen = _seen(avatar, run_folder, dataset)
         if dataset is not None:
-            avatar = _as_filmed(avatar, dataset)
+            own = _as_filmed(own, dataset)
         places = page_frames(dataset, frames, frames_per_second)
-        _write_web(format, avatar, seen, dataset, places, performance, destination, options)
+        _write_web(format, own, seen, dataset, places, performance, destination, options)
+
+
+def _without_undrawn(whole: "AvatarMethod") -> "AvatarMethod":
+    """An RGBAvatar without the Gaussians that show in no picture, which is told; others whole."""
+    from rgbavatar_ns.avatar import Avatar
+
+    if not isinstance(whole, Avatar):
+        return whole
+    avatar = whole.without_undrawn()
+    if (left_out := whole.num_gaussians - avatar.num_gaussians) > 0:
+        print(f"{left_out} of {whole.num_gaussians} Gaussians show in no picture: left out.")
+    return avatar
 
 
 def _seen(
-    avatar: "Avatar", run_folder: Path, dataset: "TrackedDataset | None"
+    avatar: "AvatarMethod", run_folder: Path, dataset: "TrackedDataset | None"
 ) -> "TrainingStatistics | None":
     """What the avatar saw in training, if that is known."""
     from rgbavatar_ns.avatar.storage.bundle import load_statistics
@@ -106,7 +119,7 @@ def _seen(
 
 
 def _dataset(
-    avatar: "Avatar", run_folder: Path, data: Path | None, *, needed: bool
+    avatar: "AvatarMethod", run_folder: Path, data: Path | None, *, needed: bool
 ) -> "TrackedDataset | None":
     """The named dataset, or the run's own; None where there is none and none is needed."""
     from rgbavatar_ns.data import load_dataset
@@ -129,7 +142,7 @@ def _dataset(
 
 
 def _write_gaussians(
-    avatar: "Avatar",
+    avatar: "AvatarMethod",
     dataset: "TrackedDataset | None",
     format: Format,
     frame: int | None,

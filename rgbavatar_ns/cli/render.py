@@ -98,12 +98,14 @@ def run(
     """
     if driver is not None and show == "comparison":
         show = "performance"
+    from rgbavatar_ns.avatar.loading import require_rgbavatar
     from rgbavatar_ns.export import read_texture, with_texture
     from rgbavatar_ns.export.subject import load_subject
 
     subject = load_subject(run_folder, data, picture.width, picture.height)
     if texture is not None:
-        subject = replace(subject, avatar=with_texture(subject.avatar, read_texture(texture)))
+        own = require_rgbavatar(subject.avatar, "A painted texture (--texture)")
+        subject = replace(subject, avatar=with_texture(own, read_texture(texture)))
     if show == "comparison":
         _compare(subject, output, frames, picture)
     elif show == "bases":
@@ -143,13 +145,15 @@ def _compare(
 def _write_bases(
     subject: "Subject", output: Path, gain: float | None, picture: PictureOptions
 ) -> None:
+    from rgbavatar_ns.avatar.loading import require_rgbavatar
     from rgbavatar_ns.export import basis_grid, write_png
 
+    avatar = require_rgbavatar(subject.avatar, "The grid of bases (--show bases)")
     background = None if picture.transparent else picture.background
     with progress_bar("bases") as update:
-        grid = basis_grid(subject.avatar, subject.seen, subject.camera, background, gain, update)
+        grid = basis_grid(avatar, subject.seen, subject.camera, background, gain, update)
     write_png(output / "bases.png", grid)
-    print(f"base and {subject.avatar.config.num_bases} bases: {output / 'bases.png'}")
+    print(f"base and {avatar.config.num_bases} bases: {output / 'bases.png'}")
 
 
 def _scene(

@@ -67,7 +67,7 @@ def theta_map(layout: ThetaLayout, arrays: HeadArrays, avatar: AvatarMethod) -> 
     """The way from the theta of a driver's head (`layout`, `arrays`) to the avatar's.
 
     By name where a name is shared; from a head with ARKit's names to any other head through
-    ARKit's coefficients (`Avatar.arkit`). Raises UserError where neither is possible.
+    ARKit's coefficients (`AvatarMethod.arkit`). Raises UserError where neither is possible.
     """
     driver = ThetaNames.of(layout, arrays)
     own = ThetaNames.of(avatar.layout, avatar.head.arrays)

@@ -1,9 +1,9 @@
 """How much an avatar is: its Gaussians, and the megabytes that it is stored in."""
 
-from rgbavatar_ns.avatar import Avatar
+from rgbavatar_ns.avatar.method import AvatarMethod
 
 
-def avatar_size(avatar: Avatar) -> dict[str, int | float]:
+def avatar_size(avatar: AvatarMethod) -> dict[str, int | float]:
     """Return `gaussians`, their number, and `megabytes`: 10^6 bytes of all that was learnt.
 
     Of every parameter, of Gaussians and networks alike, in the precision in which it is trained and

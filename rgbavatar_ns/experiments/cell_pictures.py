@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from rgbavatar_ns.avatar import Avatar
+from rgbavatar_ns.avatar.method import AvatarMethod
 from rgbavatar_ns.data import TrackedDataset
 from rgbavatar_ns.drawing.compositing import composite_bytes
 from rgbavatar_ns.drawing.contact_sheet import contact_sheet, labelled, scaled
@@ -24,7 +24,7 @@ CellPictures = Mapping[int, tuple[Path, Path]]
 """By the frame's number: the film's picture and the avatar's."""
 
 
-def write_pictures(avatar: Avatar, dataset: TrackedDataset, folder: Path) -> None:
+def write_pictures(avatar: AvatarMethod, dataset: TrackedDataset, folder: Path) -> None:
     """Leave three held-out frames, evenly spread, over white in `folder`/pictures as PNG.
 
     Theta is as it was tracked. Of the film and of the avatar each; training frames where none are

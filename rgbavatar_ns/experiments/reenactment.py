@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from rgbavatar_ns.avatar import Avatar
+from rgbavatar_ns.avatar.method import AvatarMethod
 from rgbavatar_ns.data import TrackedDataset
 from rgbavatar_ns.drawing.compositing import composite_bytes
 from rgbavatar_ns.driving import DrivingOptions
@@ -142,7 +142,7 @@ def aligned_face(picture_rgb: _Picture, eyes_px: _Eyes) -> _Face:
 
 
 def reenactment_scores(
-    avatar: Avatar,
+    avatar: AvatarMethod,
     own: TrackedDataset,
     driver: TrackedDataset,
     tracker: PictureTracker | None,

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import torch
 
-from rgbavatar_ns.avatar import Avatar
+from rgbavatar_ns.avatar.method import AvatarMethod
 from rgbavatar_ns.data import TrackedDataset
 from rgbavatar_ns.kernels import available_backends
 
@@ -17,7 +17,7 @@ _MOST = 100
 
 @torch.no_grad()
 def frames_per_second(
-    avatar: Avatar, dataset: TrackedDataset, clock: Callable[[], float] = time.perf_counter
+    avatar: AvatarMethod, dataset: TrackedDataset, clock: Callable[[], float] = time.perf_counter
 ) -> float:
     """Pictures a second, one by one, by the median over up to 100 held-out frames.
 

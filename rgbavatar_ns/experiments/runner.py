@@ -11,7 +11,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from rgbavatar_ns.avatar import Avatar
+from rgbavatar_ns.avatar.loading import load_avatar
+from rgbavatar_ns.avatar.method import AvatarMethod
 from rgbavatar_ns.bench.machine import machine_facts
 from rgbavatar_ns.data import TrackedDataset, load_dataset
 from rgbavatar_ns.errors import UserError
@@ -65,7 +66,7 @@ def run_cell(folder: Path) -> dict[str, Any]:
     scores = commands.evaluate(run_folder, folder / _EVALUATION)
     found = {**training, **scores}
     numbers = {name: value for name, value in found.items() if isinstance(value, int | float)}
-    avatar, dataset = Avatar.load(run_folder), load_dataset(data)
+    avatar, dataset = load_avatar(run_folder), load_dataset(data)
     numbers["frames_per_second"] = frames_per_second(avatar, dataset)
     numbers |= avatar_size(avatar)
     write_pictures(avatar, dataset, folder)
@@ -88,7 +89,7 @@ def run_cell(folder: Path) -> dict[str, Any]:
 
 
 def _reenact(
-    avatar: Avatar, own: TrackedDataset, driver: Path, named: Mapping[str, str]
+    avatar: AvatarMethod, own: TrackedDataset, driver: Path, named: Mapping[str, str]
 ) -> tuple[dict[str, float], dict[str, str]]:
     tracker = load_tracker(named["tracker"]) if "tracker" in named else None
     file = named.get("face_recognition")

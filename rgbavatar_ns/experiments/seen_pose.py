@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from rgbavatar_ns.avatar import Avatar
+from rgbavatar_ns.avatar.method import AvatarMethod
 from rgbavatar_ns.data import TrackedDataset
 from rgbavatar_ns.driving.theta_map import MappedTheta
 from rgbavatar_ns.head import HeadModel, ThetaLayout, turn_seen
@@ -55,7 +55,7 @@ def eyes_px(
 @torch.no_grad()
 def as_seen(
     mapped: MappedTheta,
-    avatar: Avatar,
+    avatar: AvatarMethod,
     own: TrackedDataset,
     driver: TrackedDataset,
     chosen: list[int],

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import torch
 
-from rgbavatar_ns.avatar import Avatar
+from rgbavatar_ns.avatar.method import AvatarMethod
 from rgbavatar_ns.avatar.metrics import l1_over_black
 from rgbavatar_ns.data import TrackedDataset
 from rgbavatar_ns.export import draw
@@ -38,7 +38,7 @@ class StreamedCurve:
 
 
 @torch.no_grad()
-def streamed_losses(avatar: Avatar, dataset: TrackedDataset) -> list[float]:
+def streamed_losses(avatar: AvatarMethod, dataset: TrackedDataset) -> list[float]:
     """The mean absolute difference over black of each training frame, in the stream's order."""
     losses: list[float] = []
     frames = list(dataset.train)
@@ -51,7 +51,7 @@ def streamed_losses(avatar: Avatar, dataset: TrackedDataset) -> list[float]:
 
 
 def write_streamed(
-    avatar: Avatar, dataset: TrackedDataset, folder: Path, watched: Mapping[int, float]
+    avatar: AvatarMethod, dataset: TrackedDataset, folder: Path, watched: Mapping[int, float]
 ) -> dict[str, float]:
     """Leave the curve in `folder`/streamed.json; returns `l1_streamed` and `l1_forgotten`.
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from rgbavatar_ns.avatar.avatar import Avatar
+from rgbavatar_ns.avatar.method import AvatarMethod
 from rgbavatar_ns.data.native.dataset import TrackedDataset
 from rgbavatar_ns.drawing.compositing import error_strip, to_uint8
 from rgbavatar_ns.errors import UserError
@@ -15,7 +15,7 @@ from rgbavatar_ns.export.video import write_png, write_video
 
 
 def comparison_frames(
-    avatar: Avatar,
+    avatar: AvatarMethod,
     dataset: TrackedDataset,
     positions: Sequence[int],
     background: tuple[float, float, float] = (1.0, 1.0, 1.0),
@@ -34,7 +34,7 @@ def comparison_frames(
 
 
 def write_comparison(
-    avatar: Avatar,
+    avatar: AvatarMethod,
     dataset: TrackedDataset,
     video: Path,
     picture: Path,

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from rgbavatar_ns.avatar.avatar import Avatar
+from rgbavatar_ns.avatar.method import AvatarMethod
 from rgbavatar_ns.drawing.compositing import straight_alpha, to_uint8
 from rgbavatar_ns.kernels import PinholeCameras, RenderedBatch
 
@@ -20,7 +20,7 @@ _BATCH = 8
 
 @torch.no_grad()
 def draw(
-    avatar: Avatar,
+    avatar: AvatarMethod,
     theta: Float[Tensor, "B H"],
     cameras: PinholeCameras,
     background: Color | None = None,
@@ -34,7 +34,7 @@ def draw(
 
 
 def pictures(
-    avatar: Avatar,
+    avatar: AvatarMethod,
     theta: Float[Tensor, "F H"],
     cameras: PinholeCameras,
     background: Color | None,

@@ -6,6 +6,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from rgbavatar_ns.avatar.avatar import Avatar
+from rgbavatar_ns.avatar.method import AvatarMethod
 from rgbavatar_ns.data.native.dataset import TrackedDataset
 
 _MOST_FRAMES = 24
@@ -14,7 +15,7 @@ _AT_ONCE = 8
 
 
 @torch.no_grad()
-def within_film(avatar: Avatar, dataset: TrackedDataset) -> Bool[Tensor, "N"]:
+def within_film(avatar: AvatarMethod, dataset: TrackedDataset) -> Bool[Tensor, "N"]:
     """Which Gaussians have their centre within some picture of the film, seen or behind others.
 
     A body that the film cuts off goes on beyond the cut in the head model. Its Gaussians there

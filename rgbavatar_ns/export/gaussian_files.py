@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from rgbavatar_ns.avatar.avatar import Avatar
+from rgbavatar_ns.avatar.method import AvatarMethod
 from rgbavatar_ns.export.compressed import write_compressed
 from rgbavatar_ns.export.gltf import write_gltf
 from rgbavatar_ns.export.ply import write_ply
@@ -37,13 +37,15 @@ GAUSSIAN_FILES = {
 
 
 @torch.no_grad()
-def write_gaussians(avatar: Avatar, theta: Float[Tensor, "1 H"], path: Path, format: str) -> int:
+def write_gaussians(
+    avatar: AvatarMethod, theta: Float[Tensor, "1 H"], path: Path, format: str
+) -> int:
     """Write theta's Gaussians to this file and return how many there are; raises UserError."""
     return GAUSSIAN_FILES[format].write(path, avatar.gaussians(theta))
 
 
 def write_gaussian_sequence(
-    avatar: Avatar,
+    avatar: AvatarMethod,
     theta: Float[Tensor, "F H"],
     places: tuple[int, ...],
     folder: Path,

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from jaxtyping import UInt8
 
-from rgbavatar_ns.avatar.avatar import Avatar
+from rgbavatar_ns.avatar.method import AvatarMethod
 from rgbavatar_ns.drawing.compositing import to_uint8
 from rgbavatar_ns.drawing.contact_sheet import scaled
 from rgbavatar_ns.driving.live_drive import DrivenFrame, Latencies
@@ -42,7 +42,7 @@ class PictureOutput:
 
     def __init__(
         self,
-        avatar: Avatar,
+        avatar: AvatarMethod,
         camera: PinholeCameras,
         background: Color,
         sink: PictureSink,

@@ -6,7 +6,7 @@ from pathlib import Path
 import torch
 import yaml
 
-from rgbavatar_ns.avatar.avatar import Avatar
+from rgbavatar_ns.avatar.method import AvatarMethod
 from rgbavatar_ns.avatar.storage.checkpoint_file import newest_run
 from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
 from rgbavatar_ns.data.native.dataset import TrackedDataset
@@ -49,7 +49,7 @@ def dataset_folder(path: Path) -> Path:
 
 
 @torch.no_grad()
-def statistics_of(avatar: Avatar, dataset: TrackedDataset) -> TrainingStatistics:
+def statistics_of(avatar: AvatarMethod, dataset: TrackedDataset) -> TrainingStatistics:
     """Statistics over the dataset's training frames, with the avatar's own weights psi.
 
     Raises UserError where the dataset's theta does not fit the avatar.

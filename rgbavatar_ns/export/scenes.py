@@ -9,7 +9,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from rgbavatar_ns.avatar.avatar import Avatar
 from rgbavatar_ns.avatar.method import AvatarMethod
 from rgbavatar_ns.avatar.orbit import head_centre, orbit
 from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
@@ -94,7 +93,7 @@ def driven_by(
     return replace(mapped, theta=mapped.theta[list(chosen)])
 
 
-def room(avatar: Avatar, scene: Scene, seen: TrainingStatistics) -> Float[Tensor, "2 F 2"]:
+def room(avatar: AvatarMethod, scene: Scene, seen: TrainingStatistics) -> Float[Tensor, "2 F 2"]:
     """How far each frame's camera may turn about the head to stay where the avatar holds.
 
     Lowest and highest, yaw and pitch in degrees; zero is always among them.
@@ -105,7 +104,7 @@ def room(avatar: Avatar, scene: Scene, seen: TrainingStatistics) -> Float[Tensor
 
 
 def turned(
-    avatar: Avatar,
+    avatar: AvatarMethod,
     scene: Scene,
     seen: TrainingStatistics | None,
     yaw_degrees: Float[Tensor, "F"],
@@ -123,7 +122,7 @@ def turned(
     return replace(scene, cameras=orbit(scene.cameras, centre, *angles.unbind(1)))
 
 
-def orbiting(avatar: Avatar, scene: Scene, seen: TrainingStatistics) -> Scene:
+def orbiting(avatar: AvatarMethod, scene: Scene, seen: TrainingStatistics) -> Scene:
     """The camera swings to both sides and a little up and down, once over the scene."""
     sideways, upwards = _ORBIT_DEGREES
     to_and_fro = swing(len(scene))
@@ -132,7 +131,7 @@ def orbiting(avatar: Avatar, scene: Scene, seen: TrainingStatistics) -> Scene:
 
 
 def turntable(
-    avatar: Avatar, scene: Scene, seen: TrainingStatistics, arc_degrees: float | None
+    avatar: AvatarMethod, scene: Scene, seen: TrainingStatistics, arc_degrees: float | None
 ) -> Scene:
     """The camera goes to and fro about the head, as far as the avatar holds, once over the scene.
 
@@ -150,7 +149,7 @@ def turntable(
     return turned(avatar, scene, None, yaw, level)
 
 
-def told_beyond_film(avatar: Avatar, scene: Scene, seen: TrainingStatistics) -> str:
+def told_beyond_film(avatar: AvatarMethod, scene: Scene, seen: TrainingStatistics) -> str:
     """What of the scene goes beyond the film, in a line; empty where nothing does."""
     turns = turn_seen(scene.theta, scene.cameras.world_to_camera, avatar.layout)
     names = ThetaNames.of(avatar.layout, avatar.head.arrays).numbers
@@ -166,7 +165,7 @@ def along_path(path: Path, scene: Scene) -> Scene:
 
 
 def side_by_side(
-    avatar: Avatar, scene: Scene, seen: TrainingStatistics, background: Color | None
+    avatar: AvatarMethod, scene: Scene, seen: TrainingStatistics, background: Color | None
 ) -> Iterator[Picture]:
     """Four views of each frame in a row."""
     yaw, pitch = torch.tensor(FOUR_VIEWS_DEGREES).unbind(1)
@@ -177,7 +176,11 @@ def side_by_side(
 
 
 def beside_driver(
-    avatar: Avatar, scene: Scene, driver: TrackedDataset, chosen: Sequence[int], background: Color
+    avatar: AvatarMethod,
+    scene: Scene,
+    driver: TrackedDataset,
+    chosen: Sequence[int],
+    background: Color,
 ) -> Iterator[Picture]:
     """The driver's frame, brought to the scene's height, and the avatar beside it."""
     drawn = pictures(avatar, scene.theta, scene.cameras, background)

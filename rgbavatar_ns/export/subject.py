@@ -3,7 +3,8 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from rgbavatar_ns.avatar.avatar import Avatar
+from rgbavatar_ns.avatar.loading import load_avatar
+from rgbavatar_ns.avatar.method import AvatarMethod
 from rgbavatar_ns.avatar.storage.bundle import load_statistics
 from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
 from rgbavatar_ns.data.native.dataset import TrackedDataset
@@ -21,7 +22,7 @@ _SIDE_PX = 512
 class Subject:
     """An avatar and what is known about its training."""
 
-    avatar: Avatar
+    avatar: AvatarMethod
     dataset: TrackedDataset | None
     seen: TrainingStatistics
     camera: PinholeCameras
@@ -36,7 +37,7 @@ def load_subject(
     data: the dataset in place of the run's own. Raises UserError where the avatar or its dataset
     cannot be read, and for a bundle that knows nothing about its training.
     """
-    avatar, seen = Avatar.load(run_folder), load_statistics(run_folder)
+    avatar, seen = load_avatar(run_folder), load_statistics(run_folder)
     folder = dataset_folder(run_folder) if data is None else data
     if data is None and folder == run_folder:
         if seen is None:

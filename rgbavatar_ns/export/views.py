@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from rgbavatar_ns.avatar.avatar import Avatar
+from rgbavatar_ns.avatar.method import AvatarMethod
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.kernels import PinholeCameras
 from rgbavatar_ns.reading import DamagedFileError, json_numbers, load_json
@@ -25,7 +25,7 @@ _MOST_CAMERAS, _LARGEST_SIDE, _MOST_FRAMES_PER_SECOND = 100_000, 16384, 1000.0
 
 
 @torch.no_grad()
-def front_camera(avatar: Avatar, width: int, height: int) -> PinholeCameras:
+def front_camera(avatar: AvatarMethod, width: int, height: int) -> PinholeCameras:
     """A camera 1.1 m in front of the face that sees the whole head."""
     rest = avatar.identity.new_zeros(1, avatar.layout.size)
     x, y, z = avatar.head(rest, avatar.identity)[0].mean(0).tolist()

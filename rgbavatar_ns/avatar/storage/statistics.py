@@ -94,7 +94,8 @@ class TrainingStatistics:
             theta_max=theta.amax(0),
             theta_neutral=neutral_frame(theta, layout),
             psi_mean=psi.mean(0),
-            psi_std=psi.std(0, unbiased=False),
+            # Of no weights torch would warn.
+            psi_std=psi.std(0, unbiased=False) if psi.shape[1] else psi[0],
             psi_min=psi.amin(0),
             psi_max=psi.amax(0),
             expressive=expressive,
