@@ -4,12 +4,24 @@ from pathlib import Path
 
 from rgbavatar_ns.avatar.avatar import Avatar
 from rgbavatar_ns.avatar.method import AvatarMethod
+from rgbavatar_ns.avatar.methods.flashavatar import FlashAvatar
+from rgbavatar_ns.avatar.methods.gaussianavatars import GaussianAvatars
 from rgbavatar_ns.avatar.methods.gaussianblendshapes import GaussianBlendshapes
+from rgbavatar_ns.avatar.methods.monogaussianavatar import MonoGaussianAvatar
+from rgbavatar_ns.avatar.methods.splattingavatar import SplattingAvatar
 from rgbavatar_ns.avatar.storage.bundle import load_any
 from rgbavatar_ns.errors import UserError
 
 METHODS: dict[str, type[AvatarMethod]] = {
-    kind.method: kind for kind in (Avatar, GaussianBlendshapes)
+    kind.method: kind
+    for kind in (
+        Avatar,
+        GaussianAvatars,
+        SplattingAvatar,
+        FlashAvatar,
+        GaussianBlendshapes,
+        MonoGaussianAvatar,
+    )
 }
 """By the names that files bear."""
 

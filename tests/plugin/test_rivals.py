@@ -20,7 +20,7 @@ SMALL: dict[str, dict[str, Any]] = {
     "flashavatar-style": {"uv_resolution": 16, "hidden_width": 16},
     "gaussianblendshapes-style": {"num_points": 300, "num_bases": 3},
     "monogaussianavatar-style": {"steps_per_epoch": 2, "max_points": 500, "attribute_width": 16},
-    "splattingavatar-style": {"num_points": 300},
+    "splattingavatar-style": {"initial_count": 300},
 }
 
 

@@ -20,16 +20,15 @@ rotations and harmonics turn with the neck's joint, and the network sees the nec
 from dataclasses import dataclass
 from typing import Annotated, Any
 
-import numpy as np
 import torch
 from jaxtyping import Float, Int
-from scipy.spatial import KDTree
 from torch import Tensor, nn
 
 from rgbavatar_ns.avatar.config import MethodConfig
 from rgbavatar_ns.avatar.method import AvatarMethod, DrawnBatch, FilmedBatch, Losses
 from rgbavatar_ns.avatar.methods.fields import MLP, positional_encoding
 from rgbavatar_ns.avatar.methods.loss_terms import huber_loss
+from rgbavatar_ns.avatar.methods.neighbours import neighbour_distance
 from rgbavatar_ns.avatar.methods.region_mask import MOUTH_GROUPS, group_vertices, hull_mask
 from rgbavatar_ns.avatar.methods.sh import (
     MAX_DEGREE,
@@ -241,20 +240,6 @@ class FlashAvatar(AvatarMethod):
             state["identity"],
             FlashAvatarConfig.from_json(state["config"]),
         )
-
-
-def neighbour_distance(
-    places: Float[Tensor, "N 3"], least: float = 1e-7**0.5
-) -> Float[Tensor, "N"]:
-    """Root of the mean squared distance to the three nearest others (3DGS), at least `least`.
-
-    In the unit of the places; of fewer than four, to those that there are.
-    """
-    known = places.detach().cpu().double().numpy()
-    others = min(3, len(known) - 1)
-    distance = KDTree(known).query(known, k=range(2, others + 2))[0] if others else [[0.0]]
-    mean = np.sqrt(np.square(distance).mean(1))
-    return torch.from_numpy(mean.clip(min=least)).to(places)
 
 
 def _above_the_torso(head: HeadModel, resolution: int) -> UVAnchors:

@@ -52,7 +52,8 @@ from rgbavatar_ns.avatar.methods.loss_terms import (
     dssim_loss,
     upright_cylinder,
 )
-from rgbavatar_ns.avatar.methods.mesh_points import neighbour_spacing_m, spread_points
+from rgbavatar_ns.avatar.methods.mesh_points import spread_points
+from rgbavatar_ns.avatar.methods.neighbours import neighbour_distance
 from rgbavatar_ns.avatar.methods.region_mask import faces_within, group_vertices
 from rgbavatar_ns.avatar.methods.sh import (
     directions_in_frames,
@@ -140,7 +141,7 @@ class _Splats(nn.Module):
         further = num_coefficients(config.sh_degree) - 1
         self.position = nn.Parameter(position.clone())
         self.rotation_wxyz = nn.Parameter(rotation)
-        self.log_scale = nn.Parameter(neighbour_spacing_m(position).log()[:, None].repeat(1, 3))
+        self.log_scale = nn.Parameter(neighbour_distance(position).log()[:, None].repeat(1, 3))
         self.opacity_logit = nn.Parameter(logit)
         self.color = nn.Parameter(position.new_zeros(count, 1, 3))
         self.color_rest = nn.Parameter(position.new_zeros(count, further, 3))

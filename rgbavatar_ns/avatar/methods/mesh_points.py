@@ -1,4 +1,4 @@
-"""Where Gaussians begin on a mesh, and how large."""
+"""Where Gaussians begin on a mesh."""
 
 import numpy as np
 import torch
@@ -6,7 +6,6 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 from torch import Tensor
 
-_LEAST_SQUARE_M2 = 1e-7
 _CANDIDATES = 4
 _APART = 0.7
 """In roots of the area a point has; .83 is about the most that points at random reach."""
@@ -52,14 +51,3 @@ def _free_of_earlier(places: Float[np.ndarray, "M 3"], apart: float) -> Bool[np.
         open_[pairs[first[pairs[:, 0]], 1]] = False
         pairs = pairs[open_[pairs].all(1)]
     return kept
-
-
-def neighbour_spacing_m(position: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
-    """Root mean square distance to the three nearest neighbours, but not below .3 mm.
-
-    Source: 3D Gaussian splatting, whose Gaussians begin with this standard deviation.
-    """
-    places = position.detach().double().cpu().numpy()
-    distance, _ = KDTree(places).query(places, k=min(4, len(places)))
-    square = np.square(distance[:, 1:]).mean(1)
-    return torch.from_numpy(square).clamp(min=_LEAST_SQUARE_M2).sqrt().to(position)

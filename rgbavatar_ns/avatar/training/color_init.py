@@ -9,7 +9,7 @@ colour after it.
 from typing import Literal
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from rgbavatar_ns.avatar.avatar import Avatar
@@ -53,7 +53,7 @@ class FirstColors:
         self._kind: FirstColorsKind = kind
         self._sums: Tensor | None = None
         # Those that wait, on a CPU as the last `sight` found them.
-        self._waiting: Int[Tensor, W] = torch.empty(0, dtype=torch.int64)
+        self._waiting: Tensor = torch.empty(0, dtype=torch.int64)
 
     def sight(self, num_images: int) -> FirstSight | None:
         """What a step is to sum over the first `num_images` of its pictures.

@@ -11,8 +11,8 @@ from rgbavatar_ns.avatar.methods.flashavatar import (
     LEARNING_RATES,
     FlashAvatar,
     FlashAvatarConfig,
-    neighbour_distance,
 )
+from rgbavatar_ns.avatar.methods.neighbours import neighbour_distance
 from rgbavatar_ns.avatar.training.batches import TrainingBatch
 from rgbavatar_ns.avatar.training.method_step import MethodStep
 from rgbavatar_ns.errors import UserError
