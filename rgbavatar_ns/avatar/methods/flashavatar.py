@@ -251,8 +251,9 @@ def neighbour_distance(
     In the unit of the places; of fewer than four, to those that there are.
     """
     known = places.detach().cpu().double().numpy()
-    others = min(3, len(known) - 1)
-    distance = KDTree(known).query(known, k=range(2, others + 2))[0] if others else [[0.0]]
+    if len(known) < 2:
+        return torch.full_like(places[:, 0], least)
+    distance = KDTree(known).query(known, k=min(4, len(known)))[0][:, 1:]
     mean = np.sqrt(np.square(distance).mean(1))
     return torch.from_numpy(mean.clip(min=least)).to(places)
 
