@@ -41,6 +41,7 @@ from rgbavatar_ns.avatar.methods.fields import MLP, positional_encoding
 from rgbavatar_ns.avatar.methods.gaussian_rows import GaussianRows
 from rgbavatar_ns.avatar.methods.loss_terms import dssim_loss
 from rgbavatar_ns.avatar.model.image_loss import LPIPSLoss, l1_loss
+from rgbavatar_ns.avatar.model.weight_network import seeded_linear
 from rgbavatar_ns.head import HeadArrays, HeadModel
 from rgbavatar_ns.head.rotations import axis_angle_to_matrix
 from rgbavatar_ns.kernels import GaussianSet, PinholeCameras
@@ -181,16 +182,14 @@ class MonoGaussianAvatar(AvatarMethod):
         self._lpips = LPIPSLoss()
 
     def _make_networks(self, generator: torch.Generator) -> None:
-        config, identity = self.config, self.identity
-        deformer, wide, narrow = (
-            *(config.deformer_width, config.attribute_width, config.offset_width),
-        )
+        config = self.config
+        deformer, wide, narrow = config.deformer_width, config.attribute_width, config.offset_width
         # Their last layer's activation is applied where they are used, before the heads.
         self.deformer = MLP([3], deformer, 3, deformer, generator=generator, activation="softplus")
         directions = 3 * (self._expressions.shape[1] + self._correctives.shape[1] + 1)
-        self.blendshapes = nn.Linear(deformer, directions)
-        for parameter in self.blendshapes.parameters():
-            nn.init.zeros_(parameter)
+        self.blendshapes = seeded_linear(deformer, directions, generator)
+        nn.init.zeros_(self.blendshapes.weight)
+        nn.init.zeros_(self.blendshapes.bias)
         self.skinning = MLP(
             *([deformer], deformer, 1, self._skinning.shape[1]),
             generator=generator,
@@ -206,7 +205,7 @@ class MonoGaussianAvatar(AvatarMethod):
         self.offset_heads = _Heads(narrow, "relu", generator)
         for network in (self.deformer, self.skinning.hidden, self.attributes):
             _draw_he_normal(network, generator)
-        self.to(identity)
+        self.to(self.identity)
 
     @property
     def num_gaussians(self) -> int:
