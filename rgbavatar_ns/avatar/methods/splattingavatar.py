@@ -11,8 +11,8 @@ neighbours; barycentric coordinates and an offset along the interpolated normal,
 vertices' quaternions, log-scales times the change of area; colours without harmonics; L1 + 10 MSE,
 .01 LPIPS if asked for, and the mean of the spikes' largest scales; the learning rates, those of
 places falling a hundredfold over 30,000 steps; density control from step 600 to 29,000 with an
-extent of 2 (half a metre), opacities reset every 3,000; the walk over triangles every 100; one image
-a step.
+extent of 2 (half a metre), opacities reset every 3,000; the walk over triangles every 100; one
+image a step.
 
 Another version of its configuration (commit 1daab1a) has .2 DSSIM with .8 L1, LPIPS .05, no term of
 spikes for heads, and density control up to 15,000: `dssim_weight`, `lpips_weight`, `spike_weight`
