@@ -146,6 +146,9 @@ def test_a_scale_is_its_power_in_quarters_of_a_metre_as_its_triangle_grows():
         areas.append(torch.linalg.cross(sides[:, 0], sides[:, 1]).norm(dim=1) / 2 * 16 + 1e-4)
     expected = 0.04 ** (areas[0] / areas[1]) / 4
     torch.testing.assert_close(method.gaussians(theta).scales[0, :, 1], expected)
+    plain = make(random=False, area_changes_scale=False)
+    scales = plain.gaussians(theta.float()).scales
+    torch.testing.assert_close(scales, plain.log_scale.exp()[None])
 
 
 @pytest.mark.parametrize("by_area", [True, False])
