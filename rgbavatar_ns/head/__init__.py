@@ -2,7 +2,12 @@
 
 from rgbavatar_ns.head.anchors import UVAnchors, uv_anchors
 from rgbavatar_ns.head.arrays import EMBEDDED_BUST, EMBEDDED_HEAD, HeadArrays
-from rgbavatar_ns.head.frames import edges_to_frame, frame_quats_wxyz, tangent_frames
+from rgbavatar_ns.head.frames import (
+    edge_rotations,
+    edges_to_frame,
+    frame_quats_wxyz,
+    tangent_frames,
+)
 from rgbavatar_ns.head.landmarks import SPARSE_51, LandmarkMap, facemesh_landmarks
 from rgbavatar_ns.head.layout import ThetaField, ThetaLayout
 from rgbavatar_ns.head.model import HeadModel
@@ -18,6 +23,7 @@ __all__ = [
     "ThetaField",
     "ThetaLayout",
     "UVAnchors",
+    "edge_rotations",
     "edges_to_frame",
     "facemesh_landmarks",
     "frame_quats_wxyz",

@@ -32,11 +32,7 @@ def tangent_frames(
     Triangles without area in the UV map take their edges for T and B, triangles without area in
     space take the world's axes: always finite, gradients too.
     """
-    first, second = _edges(vertices, faces)
-    keep = _has_area(first, second)
-    # x, y, z lie in planes of their own up to the end: several times faster than rows of three.
-    first = (first[0] * keep + (1 - keep), first[1] * keep, first[2] * keep)
-    second = (second[0] * keep, second[1] * keep + (1 - keep), second[2] * keep)
+    first, second = _wide_edges(vertices, faces)
     normal = _scaled_to_one(_cross(first, second))
     inverse = edges_to_frame(uv, uv_faces).to(vertices.dtype)
 
@@ -51,8 +47,37 @@ def tangent_frames(
         bitangent = derivative(inverse[:, 1])
         if variant == "normalized":
             tangent, bitangent = _scaled_to_one(tangent), _scaled_to_one(bitangent)
-    rows = [entry for row in zip(tangent, bitangent, normal) for entry in row]
+    return _as_columns(tangent, bitangent, normal)
+
+
+def edge_rotations(
+    vertices: Float[Tensor, "*batch V 3"], faces: Int[Tensor, "F 3"]
+) -> Float[Tensor, "*batch F 3 3"]:
+    """Proper rotations with columns along each triangle's first edge, across it, outward normal.
+
+    `tangent_frames`' orthonormal ones of a mesh without a UV map, in a third of the time.
+    """
+    first, second = _wide_edges(vertices, faces)
+    normal, along = _scaled_to_one(_cross(first, second)), _scaled_to_one(first)
+    return _as_columns(along, _cross(normal, along), normal)
+
+
+def _as_columns(*columns: _Planes) -> Float[Tensor, "*batch F 3 3"]:
+    rows = [entry for row in zip(*columns) for entry in row]
     return torch.stack(rows).movedim(0, -1).contiguous().unflatten(-1, (3, 3))
+
+
+def _wide_edges(
+    vertices: Float[Tensor, "*batch V 3"], faces: Int[Tensor, "F 3"]
+) -> tuple[_Planes, _Planes]:
+    """Two edges of each triangle; the world's x and y for triangles without area.
+
+    x, y, z lie in planes of their own: several times faster than rows of three.
+    """
+    first, second = _edges(vertices, faces)
+    keep = _has_area(first, second)
+    first = (first[0] * keep + (1 - keep), first[1] * keep, first[2] * keep)
+    return first, (second[0] * keep, second[1] * keep + (1 - keep), second[2] * keep)
 
 
 def _edges(

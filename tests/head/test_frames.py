@@ -3,7 +3,7 @@ import pytest
 import torch
 import trimesh
 
-from rgbavatar_ns.head import HeadModel, frame_quats_wxyz, tangent_frames
+from rgbavatar_ns.head import HeadModel, edge_rotations, frame_quats_wxyz, tangent_frames
 from rgbavatar_ns.head.rotations import axis_angle_to_matrix
 from rgbavatar_ns.kernels.reference import rotation_matrices
 
@@ -69,6 +69,19 @@ def test_orthonormal_frames_are_rotations_that_keep_n_and_the_direction_of_t(
     torch.testing.assert_close(frames[..., [0, 2]], normalized[..., [0, 2]])
     # The embedded map is not mirrored: B keeps its side.
     assert (frames[..., 1] * normalized[..., 1]).sum(-1).min() > 0
+
+
+def test_rotations_by_edges_are_orthonormal_frames_without_a_map(
+    head: HeadModel, posed: torch.Tensor
+) -> None:
+    found = edge_rotations(posed, head.faces)
+    no_uv, no_faces = posed.new_zeros(1, 2), torch.zeros_like(head.faces)
+    expected = tangent_frames(posed, head.faces, no_uv, no_faces, "orthonormal")
+    torch.testing.assert_close(found, expected)
+    along = posed[:, head.faces[:, 1]] - posed[:, head.faces[:, 0]]
+    torch.testing.assert_close(found[..., 0], along / along.norm(dim=-1, keepdim=True))
+    nothing = edge_rotations(torch.zeros(1, 3, 3), torch.tensor([[0, 1, 2]]))
+    assert torch.equal(nothing[0, 0], torch.eye(3))
 
 
 def test_quaternions_of_orthonormal_frames_reproduce_them(

@@ -13,13 +13,13 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from rgbavatar_ns.avatar.model.anchors import AnchorFrames
-from rgbavatar_ns.head import frame_quats_wxyz, tangent_frames
+from rgbavatar_ns.head import edge_rotations
 from rgbavatar_ns.head.rotations import (
     conjugate_quats_wxyz,
     matrix_to_quat_wxyz,
     multiply_quats_wxyz,
 )
-from rgbavatar_ns.head.surface import interpolated, vertex_normals
+from rgbavatar_ns.head.surface import interpolated
 
 _LEAST_LENGTH_M = 1e-8
 
@@ -34,11 +34,7 @@ def edge_frames(
     it: `matrix` is k R, `length_ratio` k. Triangles without area have the world's axes. Source:
     GaussianAvatars (Qian et al. 2024, sec. 3.2; `compute_face_orientation` of its release).
     """
-    # Without area in the UV map, T is the direction of the first edge.
-    no_uv, no_uv_faces = vertices.new_zeros(1, 2), torch.zeros_like(faces)
-    along_edge, in_plane, normal = tangent_frames(
-        vertices, faces, no_uv, no_uv_faces, variant="orthonormal"
-    ).unbind(-1)
+    along_edge, in_plane, normal = edge_rotations(vertices, faces).unbind(-1)
     rotation = torch.stack([along_edge, normal, -in_plane], -1)
     corner, second, third = vertices[:, faces].unbind(2)
     height = ((third - corner) * in_plane).sum(-1).abs()
@@ -88,7 +84,6 @@ class SmoothSurface(nn.Module):
     _rest_area: Float[Tensor, "F"]
     _to_rest_wxyz: Float[Tensor, "F 4"]
     _corner_faces: Int[Tensor, "F3"]
-    _corner_weights: Float[Tensor, "F3"]
     _corner_starts: Int[Tensor, "V"]
 
     def __init__(
@@ -100,7 +95,7 @@ class SmoothSurface(nn.Module):
         super().__init__()
         self.damping_m2 = damping_m2
         rest = rest_vertices.detach()
-        area = _areas(rest[None], faces)[0]
+        area = torch.linalg.vector_norm(_area_normals(rest[None], faces)[0], dim=-1)
         # Corners in the order of their vertices, so that each vertex's lie together.
         order = torch.argsort(faces.flatten(), stable=True)
         around = torch.bincount(faces.flatten(), minlength=len(rest))
@@ -109,7 +104,6 @@ class SmoothSurface(nn.Module):
             ("_rest_area", area),
             ("_to_rest_wxyz", conjugate_quats_wxyz(_edge_quats_wxyz(rest[None], faces)[0])),
             ("_corner_faces", order // 3),
-            ("_corner_weights", area[order // 3]),
             ("_corner_starts", around.cumsum(0) - around),
         ):
             self.register_buffer(name, values, persistent=False)
@@ -121,12 +115,14 @@ class SmoothSurface(nn.Module):
         barycentric: Float[Tensor, "N 3"],
     ) -> SurfaceFrames:
         """The surface at N places of posed heads; gradients reach vertices and barycentrics."""
-        known = [vertices, vertex_normals(vertices, self.faces), self.vertex_quats_wxyz(vertices)]
+        area_normal, quats = _area_normals(vertices, self.faces), self._weighed_quats(vertices)
+        around = self._around_vertices(torch.cat([area_normal, quats], -1)).split([3, 4], -1)
+        known = torch.cat([vertices, *(F.normalize(mean, dim=-1) for mean in around)], -1)
         corners = self.faces[triangle_index]
-        found = interpolated(torch.cat(known, -1), corners, barycentric)
+        found = interpolated(known, corners, barycentric)
         origin, normal, quat_wxyz = found.split([3, 3, 4], -1)
-        ratio = _areas(vertices, self.faces) + self.damping_m2
-        ratio = ratio / (self._rest_area + self.damping_m2)
+        area = torch.linalg.vector_norm(area_normal, dim=-1)
+        ratio = (area + self.damping_m2) / (self._rest_area + self.damping_m2)
         return SurfaceFrames(
             origin=origin,
             normal=F.normalize(normal, dim=-1),
@@ -136,21 +132,24 @@ class SmoothSurface(nn.Module):
 
     def vertex_quats_wxyz(self, vertices: Float[Tensor, "B V 3"]) -> Float[Tensor, "B V 4"]:
         """How each vertex has turned since rest, as unit quaternions of neighbouring signs."""
+        return F.normalize(self._around_vertices(self._weighed_quats(vertices)), dim=-1)
+
+    def _weighed_quats(self, vertices: Float[Tensor, "B V 3"]) -> Float[Tensor, "B F 4"]:
+        """How triangles have turned, times their areas at rest."""
         quats = multiply_quats_wxyz(_edge_quats_wxyz(vertices, self.faces), self._to_rest_wxyz)
         with torch.no_grad():
+            weight = self._rest_area[:, None]
             largest = quats[:, int(self._rest_area.argmax()), None]
-            mean = (self._rest_area[:, None] * _towards(quats, largest) * quats).sum(1)
-            sign = _towards(quats, mean[:, None])
+            mean = (weight * _towards(quats, largest) * quats).sum(1)
+            weight = weight * _towards(quats, mean[:, None])
+        return weight * quats
+
+    def _around_vertices(self, values: Float[Tensor, "B F C"]) -> Float[Tensor, "B V C"]:
+        """Sums over the triangles that have a corner there."""
         # The batch lies innermost, as in `interpolated`.
-        table = (sign * quats).transpose(0, 1).flatten(1)
-        summed = F.embedding_bag(
-            self._corner_faces,
-            table,
-            self._corner_starts,
-            mode="sum",
-            per_sample_weights=self._corner_weights,
-        )
-        return F.normalize(summed.unflatten(1, (len(vertices), 4)).transpose(0, 1), dim=-1)
+        table = values.transpose(0, 1).flatten(1)
+        summed = F.embedding_bag(self._corner_faces, table, self._corner_starts, mode="sum")
+        return summed.unflatten(1, (len(values), -1)).transpose(0, 1)
 
 
 def skinning_frames(
@@ -172,15 +171,15 @@ def _edge_quats_wxyz(
     vertices: Float[Tensor, "B V 3"], faces: Int[Tensor, "F 3"]
 ) -> Float[Tensor, "B F 4"]:
     """Rotations of triangles, by their first edge and normal."""
-    no_uv, no_uv_faces = vertices.new_zeros(1, 2), torch.zeros_like(faces)
-    frames = tangent_frames(vertices, faces, no_uv, no_uv_faces, variant="orthonormal")
-    return frame_quats_wxyz(frames)
+    return matrix_to_quat_wxyz(edge_rotations(vertices, faces))
 
 
-def _areas(vertices: Float[Tensor, "B V 3"], faces: Int[Tensor, "F 3"]) -> Float[Tensor, "B F"]:
+def _area_normals(
+    vertices: Float[Tensor, "B V 3"], faces: Int[Tensor, "F 3"]
+) -> Float[Tensor, "B F 3"]:
+    """Outward normals as long as the triangles' areas."""
     corner, second, third = vertices[:, faces].unbind(2)
-    doubled = torch.linalg.cross(second - corner, third - corner, dim=-1)
-    return 0.5 * torch.linalg.vector_norm(doubled, dim=-1)
+    return 0.5 * torch.linalg.cross(second - corner, third - corner, dim=-1)
 
 
 def _towards(quats: Float[Tensor, "B F 4"], aim: Float[Tensor, "B 1 4"]) -> Float[Tensor, "B F 1"]:

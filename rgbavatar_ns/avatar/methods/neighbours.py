@@ -16,8 +16,7 @@ def neighbour_distance(
     """
     points = places.detach().cpu().double().numpy()
     count = min(4, len(points))
-    found = KDTree(points).query(points, k=count)[0]
-    distance = torch.from_numpy(found).reshape(len(points), count)
+    distance = torch.from_numpy(KDTree(points).query(points, k=count)[0]).reshape(-1, count)
     # The nearest is the point itself.
     mean = distance.square().sum(1) / max(count - 1, 1)
     return mean.sqrt().clamp(min=least).to(places)

@@ -84,6 +84,8 @@ class SplattingAvatarConfig(MethodConfig):
     """How many Gaussians there are at first."""
     by_area: bool = True
     """Whether large triangles get more of them: ours. Without, each as many (release)."""
+    area_changes_scale: bool = True
+    """Whether log-scales are multiplied by how triangles have grown (release: yes)."""
     initial_opacity: Annotated[float, Between(0, 1, open=True)] = 0.1
     """Opacity of every Gaussian at first."""
     mse_weight: Weight = 10.0
@@ -116,8 +118,8 @@ class SplattingAvatar(AvatarMethod):
     """Gaussians at places of a smooth surface, off it along its normal, turned as it turns.
 
     x = p(u, v) + d n(u, v), q = q(u, v) q_0, log s = r log s_0 in the release's units, where r is
-    how the triangle's area has grown (utils/map.py): what is below a quarter of a metre shrinks as
-    its triangle grows.
+    how the triangle's area has grown (utils/map.py), or 1: what is below a quarter of a metre
+    shrinks as its triangle grows.
 
     Args:
         head: the head model; any of its triangles carries Gaussians.
@@ -177,8 +179,9 @@ class SplattingAvatar(AvatarMethod):
         places = self.barycentric + self._change()
         surface = self.surface.frames(vertices, self.face_index, places)
         means = surface.means(self.offset_m[None])
-        unit = math.log(_UNITS_PER_M)
-        log_scale = (self.log_scale + unit) * surface.area_ratio[..., None] - unit
+        log_scale, unit = self.log_scale[None], math.log(_UNITS_PER_M)
+        if self.config.area_changes_scale:
+            log_scale = (log_scale + unit) * surface.area_ratio[..., None] - unit
         return GaussianSet(
             means=means,
             quats_wxyz=surface.turned(self.rotation_wxyz[None]),

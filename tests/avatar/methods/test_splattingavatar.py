@@ -45,7 +45,7 @@ BUSY = DensityControl(
 def make(
     random: bool = True, dtype: torch.dtype = torch.float32, seed: int = 0, **changes
 ) -> SplattingAvatar:
-    config = SplattingAvatarConfig(**{"initial_count": COUNT} | changes)
+    config = dataclasses.replace(SplattingAvatarConfig(initial_count=COUNT), **changes)
     method = SplattingAvatar(small_head(dtype), small_identity(dtype), config, seed=seed)
     if random:
         randomize(method, amounts=AMOUNTS)
@@ -146,6 +146,9 @@ def test_a_scale_is_its_power_in_quarters_of_a_metre_as_its_triangle_grows():
         areas.append(torch.linalg.cross(sides[:, 0], sides[:, 1]).norm(dim=1) / 2 * 16 + 1e-4)
     expected = 0.04 ** (areas[0] / areas[1]) / 4
     torch.testing.assert_close(method.gaussians(theta).scales[0, :, 1], expected)
+    plain = make(random=False, area_changes_scale=False)
+    scales = plain.gaussians(theta.float()).scales
+    torch.testing.assert_close(scales, plain.log_scale.exp()[None])
 
 
 @pytest.mark.parametrize("by_area", [True, False])
@@ -217,6 +220,27 @@ def test_losses_are_the_releases():
         other.image_losses(drawn, filmed, 0)["l1"], 0.8 * difference.abs().mean()
     )
     assert "dssim" in other.image_losses(drawn, filmed, 0)
+
+
+def test_lpips_counts_where_it_is_asked_for_and_nowhere_that_nobody_filmed(monkeypatch):
+    def lpips(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+        return (image.mean((1, 2)) - target.mean((1, 2))).square().sum()
+
+    method, batch = make(dssim_weight=0.2, lpips_weight=0.01), film(24)[0]
+    monkeypatch.setattr(method, "_lpips", lpips)
+    drawn, filmed = compared(method, batch)
+    image = drawn.image.detach().requires_grad_()
+    unfilmed = torch.zeros_like(filmed.unfilmed)
+    unfilmed[:, 12:] = True
+    target = torch.where(unfilmed[..., None], image.detach(), filmed.target)
+    filmed = dataclasses.replace(filmed, target=target, unfilmed=unfilmed)
+    losses = method.image_losses(dataclasses.replace(drawn, image=image), filmed, 0)
+    assert set(losses) == {"l1", "mse", "dssim", "lpips"}
+    torch.testing.assert_close(losses["lpips"], 0.01 * lpips(image, target))
+    total(losses).backward()
+    assert image.grad is not None
+    assert not image.grad[:, 12:].any()
+    assert image.grad[:, :12].abs().max() > 0
 
 
 def test_the_term_of_spikes_as_worked_by_hand():
