@@ -46,7 +46,7 @@ class ExpressionBases(nn.Module):
         for name, values in (("fixed", fixed), ("chosen", chosen), ("mask", mask)):
             self.register_buffer(name, values)
         for name, width in (_WIDTHS | {"color": 3 * num_coefficients}).items():
-            zeros = fixed.new_zeros(len(fixed), width, chosen.shape[1])
+            zeros = fixed.new_zeros(*chosen.shape, width)
             self.register_parameter(name, nn.Parameter(zeros))
 
     @classmethod
@@ -86,15 +86,15 @@ class ExpressionBases(nn.Module):
         position, rotation = moved.unflatten(0, (-1, 7)).movedim(-1, 0).split([3, 4], -1)
         return position, rotation
 
-    def own_weights(self, weights: Float[Tensor, "B P"]) -> Float[Tensor, "N M B"]:
+    def own_weights(self, weights: Float[Tensor, "B P"]) -> Float[Tensor, "N B M"]:
         """Each Gaussian's weights times its mask."""
-        return weights.mT[self.chosen] * self.mask[..., None]
+        return (weights[:, self.chosen] * self.mask).transpose(0, 1)
 
     def residual(
-        self, name: str, own: Float[Tensor, "N M B"], width: int | None = None
+        self, name: str, own: Float[Tensor, "N B M"], width: int | None = None
     ) -> Float[Tensor, "B N W"]:
         """What was learned of an attribute, or of its first `width` numbers, for `own_weights`."""
-        return torch.bmm(self.get_parameter(name)[:, :width], own).movedim(-1, 0)
+        return torch.bmm(own, self.get_parameter(name)[..., :width]).transpose(0, 1)
 
 
 def basis_weights(head: HeadModel, theta: Float[Tensor, "B H"]) -> Float[Tensor, "B P"]:
