@@ -8,6 +8,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from rgbavatar_ns.avatar.methods.carriers import SmoothSurface
+from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.head.rotations import axis_angle_to_matrix
 
@@ -48,6 +49,17 @@ class ExpressionBases(nn.Module):
         for name, width in (_WIDTHS | {"color": 3 * num_coefficients}).items():
             zeros = fixed.new_zeros(*chosen.shape, width)
             self.register_parameter(name, nn.Parameter(zeros))
+        self.register_load_state_dict_post_hook(lambda module, _: module._require_known())
+
+    def _require_known(self) -> None:
+        """Raise UserError where what was loaded names weights that there are not."""
+        if self.chosen.numel() and not (
+            int(self.chosen.min()) >= 0 and int(self.chosen.max()) < self.fixed.shape[2]
+        ):
+            raise UserError(
+                "A Gaussian has a basis of an expression that the head does not have.",
+                "Use another copy of the avatar or checkpoint.",
+            )
 
     @classmethod
     def of_head(
