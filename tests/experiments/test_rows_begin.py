@@ -14,7 +14,12 @@ from tests.plugin.tiny import tiny_dataset
 
 CONFIGS = sorted((Path(__file__).parents[2] / "configs").glob("*.yaml"))
 # What makes an avatar of each kind small.
-SMALL: dict[str, Any] = {"uv_resolution": 16, "num_points": 300, "initial_count": 300, "hidden_width": 16}
+SMALL: dict[str, Any] = {
+    "uv_resolution": 16,
+    "num_points": 300,
+    "initial_count": 300,
+    "hidden_width": 16,
+}
 
 
 def _with(config: Any, option: str, value: Any) -> Any:

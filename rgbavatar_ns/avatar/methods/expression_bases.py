@@ -8,6 +8,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from rgbavatar_ns.avatar.methods.carriers import SmoothSurface
+from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.head.rotations import axis_angle_to_matrix
 
@@ -46,8 +47,19 @@ class ExpressionBases(nn.Module):
         for name, values in (("fixed", fixed), ("chosen", chosen), ("mask", mask)):
             self.register_buffer(name, values)
         for name, width in (_WIDTHS | {"color": 3 * num_coefficients}).items():
-            zeros = fixed.new_zeros(len(fixed), width, chosen.shape[1])
+            zeros = fixed.new_zeros(*chosen.shape, width)
             self.register_parameter(name, nn.Parameter(zeros))
+        self.register_load_state_dict_post_hook(lambda module, _: module._require_known())
+
+    def _require_known(self) -> None:
+        """Raise UserError where what was loaded names weights that there are not."""
+        if self.chosen.numel() and not (
+            int(self.chosen.min()) >= 0 and int(self.chosen.max()) < self.fixed.shape[2]
+        ):
+            raise UserError(
+                "A Gaussian has a basis of an expression that the head does not have.",
+                "Use another copy of the avatar or checkpoint.",
+            )
 
     @classmethod
     def of_head(
@@ -86,15 +98,15 @@ class ExpressionBases(nn.Module):
         position, rotation = moved.unflatten(0, (-1, 7)).movedim(-1, 0).split([3, 4], -1)
         return position, rotation
 
-    def own_weights(self, weights: Float[Tensor, "B P"]) -> Float[Tensor, "N M B"]:
+    def own_weights(self, weights: Float[Tensor, "B P"]) -> Float[Tensor, "N B M"]:
         """Each Gaussian's weights times its mask."""
-        return weights.mT[self.chosen] * self.mask[..., None]
+        return (weights[:, self.chosen] * self.mask).transpose(0, 1)
 
     def residual(
-        self, name: str, own: Float[Tensor, "N M B"], width: int | None = None
+        self, name: str, own: Float[Tensor, "N B M"], width: int | None = None
     ) -> Float[Tensor, "B N W"]:
         """What was learned of an attribute, or of its first `width` numbers, for `own_weights`."""
-        return torch.bmm(self.get_parameter(name)[:, :width], own).movedim(-1, 0)
+        return torch.bmm(own, self.get_parameter(name)[..., :width]).transpose(0, 1)
 
 
 def basis_weights(head: HeadModel, theta: Float[Tensor, "B H"]) -> Float[Tensor, "B P"]:

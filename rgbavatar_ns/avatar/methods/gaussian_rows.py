@@ -77,8 +77,8 @@ class GaussianRows:
     def fit_to(self, stored: Mapping[str, Any], prefix: str = "") -> None:
         """Make room for the Gaussians of a `state_dict`, whose names begin with `prefix`.
 
-        UserError where one of the tensors is not there or has no row, or where their rows differ
-        in number.
+        UserError where one of the tensors is not there or has no row, where their rows differ in
+        number, or are not of the size of a row here: so room is made for what is really stored.
         """
         kept = self.module.state_dict().keys()
         names = [name for name in self.names if name in kept]
@@ -86,6 +86,10 @@ class GaussianRows:
         missing = [name for name in names if not _has_rows(stored.get(prefix + name))]
         if missing:
             raise UserError(f"What was stored has no Gaussians' {first_few(missing)}.", remedy)
+        other = [n for n in names if stored[prefix + n].shape[1:] != self[n].shape[1:]]
+        if other:
+            cause = f"Rows of Gaussians' {first_few(other)} are stored in another size"
+            raise UserError(f"{cause} than the settings beside them make.", remedy)
         counts = {name: len(stored[prefix + name]) for name in names}
         try:
             self._require_equal(counts)

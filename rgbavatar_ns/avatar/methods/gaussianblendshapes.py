@@ -279,7 +279,7 @@ class GaussianBlendshapes(AvatarMethod):
         theta = self.checked(theta)
         weights = basis_weights(self.head, theta)
         transforms = self.head.joint_transforms(theta, self.identity)
-        degree = 0 if cameras is None else int(self.shown_degree)
+        degree = 0 if cameras is None else int(self.shown_degree.clamp(0, self.config.sh_degree))
         sets = []
         for part in self._parts:
             frames = skinning_frames(part.skinning, transforms)

@@ -139,6 +139,7 @@ def test_a_checkpoint_of_another_number_continues_as_the_uninterrupted_run():
     ("change", "told"),
     [
         (lambda s: s.pop("color"), "has no Gaussians' color"),
+        (lambda s: s.update(color=torch.zeros(10**9, 2, 0)), "color are stored in another size"),
         (lambda s: s.update(color=torch.zeros(())), "has no Gaussians' color"),
         (lambda s: s.update(color="red"), "has no Gaussians' color"),
         (lambda s: s.update(color=torch.zeros(0, 2, 3)), "has no Gaussians' color"),

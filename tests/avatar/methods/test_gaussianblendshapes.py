@@ -12,6 +12,7 @@ from rgbavatar_ns.avatar.methods.gaussianblendshapes import (
     GaussianBlendshapes,
     GaussianBlendshapesConfig,
 )
+from rgbavatar_ns.avatar.methods.mesh_points import neighbour_spacing_m
 from rgbavatar_ns.avatar.storage.stored_avatar import StoredAvatar
 from rgbavatar_ns.avatar.training import TrainingBatch
 from rgbavatar_ns.avatar.training.method_step import MethodStep
@@ -140,20 +141,13 @@ def test_unlearned_gaussians_stay_where_they_lie_on_the_mesh():
     assert (means - start).norm(dim=-1).amax(1).min() > 5e-3
 
 
-def test_points_are_spread_evenly_over_the_area_and_begin_as_large_as_their_distance():
-    avatar = make(replace(SMALL, num_points=2000), vertex_groups={})
+def test_gaussians_begin_grey_and_as_large_as_their_distance():
+    avatar = make()
     start = avatar.face.position.detach()
-    halves = start[:, 0] > 0
-    assert halves.float().mean() == pytest.approx(0.5, abs=0.01)
-    apart = torch.cdist(start.double(), start.double()).topk(4, largest=False).values[:, 1:]
-    torch.testing.assert_close(
-        avatar.face.log_scale[:, 0].exp().double(),
-        apart.square().mean(1).sqrt().clamp(min=1e-7**0.5),
-    )
-    # Independent points would have a mean nearest distance of half the root of their area.
-    area = 1.05 * 0.16**2
-    assert apart[:, 0].mean() > 1.5 * 0.5 * math.sqrt(area / len(start))
-    assert avatar.gaussians(torch.zeros(1, avatar.layout.size)).colors.unique().tolist() == [0.5]
+    torch.testing.assert_close(avatar.face.log_scale[:, 1].exp(), neighbour_spacing_m(start))
+    found = avatar.gaussians(torch.zeros(1, avatar.layout.size), cameras=front_camera())
+    assert found.colors.unique().tolist() == [0.5]
+    torch.testing.assert_close(found.opacities, torch.full_like(found.opacities, 0.1))
 
 
 def test_an_expression_turns_what_lies_on_the_turned_mesh():
@@ -404,6 +398,9 @@ def test_files_of_another_degree_or_with_missing_rows_are_refused(tmp_path):
     wrong = StoredAvatar(tmp_path, other.to_state(), parameters, layout)
     with pytest.raises(UserError, match="color_rest"):
         GaussianBlendshapes.of_stored(wrong)
+    parameters["face.bases.chosen"] = parameters["face.bases.chosen"] + 99
+    with pytest.raises(UserError, match="an expression that the head does not have"):
+        GaussianBlendshapes.of_stored(StoredAvatar(tmp_path, state, parameters, layout))
     del parameters["face.color"]
     with pytest.raises(UserError, match="no Gaussians' color"):
         GaussianBlendshapes.of_stored(StoredAvatar(tmp_path, state, parameters, layout))

@@ -11,6 +11,7 @@ from rgbavatar_ns.avatar.methods.loss_terms import (
     position_hinge,
     scale_hinge,
     spike_term,
+    upright_cylinder,
 )
 from rgbavatar_ns.avatar.metrics import ssim
 from rgbavatar_ns.drawing.compositing import film_over
@@ -123,6 +124,17 @@ def test_distance_to_a_cylinder_by_hand() -> None:
     offsets = torch.tensor([[0.0, 0, 0], [3, 0, 4], [0, -2.5, 1], [2, 2, 0]])
     found = cylinder_term(centre + offsets, centre, radius=1.0, half_height=0.5)
     assert found.item() == pytest.approx((0 + 16 + 4 + (1 + 2.25)) / 4)
+
+
+def test_an_upright_cylinder_holds_its_points_and_no_more() -> None:
+    points = 0.1 * pictures(9, 3)
+    centre, radius, half_height = upright_cylinder(points)
+    assert cylinder_term(points, centre, radius, half_height).item() == pytest.approx(0, abs=1e-12)
+    assert cylinder_term(points, centre, 0.99 * radius, half_height) > 1e-9
+    assert cylinder_term(points, centre, radius, 0.99 * half_height) > 1e-9
+    low, high = points.amin(0), points.amax(0)
+    torch.testing.assert_close(centre, (low + high) / 2)
+    assert upright_cylinder(points[:0])[1:] == (0.0, 0.0)
 
 
 def test_gradients_of_terms_of_gaussians_agree_with_differences() -> None:

@@ -3,6 +3,7 @@ import torch
 
 from rgbavatar_ns.avatar.methods.region_mask import (
     MOUTH_GROUPS,
+    faces_within,
     group_vertices,
     hull_mask,
     region_mask,
@@ -70,6 +71,9 @@ def test_a_head_without_groups_has_no_mouth() -> None:
     arrays = small_head_arrays()
     found = group_vertices(arrays, MOUTH_GROUPS)
     assert found.shape == (0,)
+    faces = torch.from_numpy(arrays.faces)
+    assert not faces_within(arrays, faces, "upper_teeth").any()
+    assert faces_within(arrays, faces, "skin").all()
     assert group_vertices(arrays, ["skin"]).tolist() == list(range(len(arrays.v_template)))
     vertices = torch.from_numpy(arrays.v_template)[None]
     assert not hull_mask(vertices[:, found], front_camera()).any()
