@@ -96,7 +96,7 @@ def test_steps_equal_the_fused_ones(emulated, make_avatar, cameras, changes):
 def test_nothing_in_a_recorded_step_waits_for_the_device(emulated, make_avatar, monkeypatch):
     avatar = stir(make_avatar(scale_with_triangle=True))
     # These look at numbers on a CPU only, where looking costs nothing.
-    monkeypatch.setattr(avatar, "_checked", lambda theta: theta)
+    monkeypatch.setattr(avatar, "checked", lambda theta: theta)
     monkeypatch.setattr(kernels.morphed, "check_cameras", lambda _, cameras: len(cameras.focal_px))
     _, _, recorder, take = _recorded(avatar, 4, NothingWaits())
     reads = []
