@@ -202,7 +202,7 @@ def test_the_runner_scores_and_the_table_says_what_is_not_available(tmp_path, mo
     tiny_dataset(tmp_path / "driver")
     own = runner.load_dataset(tmp_path / "own")
     avatar = Avatar(HeadModel(own.arrays), own.identity, SMALL)
-    monkeypatch.setattr(runner.Avatar, "load", lambda path: avatar)
+    monkeypatch.setattr(runner, "load_avatar", lambda path: avatar)
     monkeypatch.setattr(Ruler, "__call__", _Anywhere.__call__)
     result = runner.run_cell(tmp_path)
     assert {"psnr", "aed", "apd", "frames_per_second", "megabytes"} <= set(result["metrics"])
