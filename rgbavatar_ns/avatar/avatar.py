@@ -60,6 +60,7 @@ class Avatar(AvatarMethod):
     """
 
     method = RGBAVATAR
+    config_type = AvatarConfig
     make_options = (
         "num_bases",
         "uv_resolution",

@@ -20,7 +20,7 @@ from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
 from rgbavatar_ns.avatar.storage.stored_avatar import StoredAvatar
 from rgbavatar_ns.drawing.compositing import ImagesRGBA
 from rgbavatar_ns.errors import UserError
-from rgbavatar_ns.head import HeadModel, ThetaLayout
+from rgbavatar_ns.head import HeadArrays, HeadModel, ThetaLayout
 from rgbavatar_ns.head.arkit import ArkitMap, arkit_coefficients, arkit_map
 from rgbavatar_ns.kernels import GaussianSet, PinholeCameras, RenderedBatch, rasterize
 from rgbavatar_ns.kernels.checks import holds_nonfinite
@@ -76,6 +76,8 @@ class AvatarMethod(nn.Module, ABC):
 
     method: ClassVar[str]
     """The name that files bear."""
+    config_type: ClassVar[type[MethodConfig]]
+    """What `config` is."""
     make_options: ClassVar[tuple[str, ...]] = ()
     """The options that a checkpoint and the run that goes on with it must agree in."""
     config: MethodConfig
@@ -245,9 +247,13 @@ class AvatarMethod(nn.Module, ABC):
         }
 
     @classmethod
-    @abstractmethod
     def from_state(cls: type[Kind], state: dict[str, Any]) -> Kind:
         """Build an untrained avatar of the same make; its parameters come by load_state_dict."""
+        return cls(
+            HeadModel(HeadArrays.from_state(state["head"])),
+            state["identity"],
+            cls.config_type.from_json(state["config"]),
+        )
 
     def fit_to(self, parameters: Mapping[str, Any], prefix: str = "") -> None:
         """Make room for a stored state dict whose number of Gaussians may be another."""

@@ -13,18 +13,17 @@ from nerfstudio.plugins.types import MethodSpecification
 from torch import Tensor
 
 from rgbavatar_ns.avatar.config import MethodConfig
+from rgbavatar_ns.avatar.loading import METHODS
 from rgbavatar_ns.avatar.method import AvatarMethod
-from rgbavatar_ns.avatar.methods.flashavatar import FlashAvatar, FlashAvatarConfig
-from rgbavatar_ns.avatar.methods.gaussianavatars import GaussianAvatars, GaussianAvatarsConfig
+from rgbavatar_ns.avatar.methods.flashavatar import FlashAvatarConfig
+from rgbavatar_ns.avatar.methods.gaussianavatars import GaussianAvatarsConfig
 from rgbavatar_ns.avatar.methods.gaussianblendshapes import (
-    GaussianBlendshapes,
     GaussianBlendshapesConfig,
 )
 from rgbavatar_ns.avatar.methods.monogaussianavatar import (
-    MonoGaussianAvatar,
     MonoGaussianAvatarConfig,
 )
-from rgbavatar_ns.avatar.methods.splattingavatar import SplattingAvatar, SplattingAvatarConfig
+from rgbavatar_ns.avatar.methods.splattingavatar import SplattingAvatarConfig
 from rgbavatar_ns.avatar.training.batches import DeviceFrames
 from rgbavatar_ns.avatar.training.cuda_graph import Recorder
 from rgbavatar_ns.avatar.training.method_step import MethodStep
@@ -37,11 +36,7 @@ from rgbavatar_ns.plugin.pipeline import RGBAvatarPipelineConfig
 from rgbavatar_ns.plugin.training.trainer import RGBAvatarTrainerConfig
 
 _METHOD_OF: dict[type[MethodConfig], Any] = {
-    GaussianAvatarsConfig: GaussianAvatars,
-    SplattingAvatarConfig: SplattingAvatar,
-    FlashAvatarConfig: FlashAvatar,
-    GaussianBlendshapesConfig: GaussianBlendshapes,
-    MonoGaussianAvatarConfig: MonoGaussianAvatar,
+    method.config_type: method for method in METHODS.values()
 }
 
 

@@ -13,6 +13,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from rgbavatar_ns.avatar.model.anchors import AnchorFrames
+from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import edge_rotations
 from rgbavatar_ns.head.rotations import (
     conjugate_quats_wxyz,
@@ -150,6 +151,15 @@ class SmoothSurface(nn.Module):
         table = values.transpose(0, 1).flatten(1)
         summed = F.embedding_bag(self._corner_faces, table, self._corner_starts, mode="sum")
         return summed.unflatten(1, (len(values), -1)).transpose(0, 1)
+
+
+def require_places(face_index: Int[Tensor, "N"], faces: Int[Tensor, "F 3"]) -> None:
+    """Raise UserError where a Gaussian, as a file may have it, lies on no triangle of the head."""
+    if len(face_index) and not 0 <= int(face_index.min()) <= int(face_index.max()) < len(faces):
+        raise UserError(
+            "A Gaussian's place points outside of the head's triangles.",
+            "Use another copy of the avatar or checkpoint.",
+        )
 
 
 def skinning_frames(

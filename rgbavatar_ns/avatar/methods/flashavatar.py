@@ -40,7 +40,7 @@ from rgbavatar_ns.avatar.methods.sh import (
 from rgbavatar_ns.avatar.model.anchors import GaussianAnchors
 from rgbavatar_ns.avatar.model.image_loss import LPIPSLoss
 from rgbavatar_ns.errors import UserError
-from rgbavatar_ns.head import HeadArrays, HeadModel, ThetaLayout, UVAnchors, uv_anchors
+from rgbavatar_ns.head import HeadModel, ThetaLayout, UVAnchors, uv_anchors
 from rgbavatar_ns.head.rotations import matrix_to_quat_wxyz, multiply_quats_wxyz
 from rgbavatar_ns.kernels import GaussianSet, PinholeCameras
 from rgbavatar_ns.options import Between, Count, Counted, Positive, Weight
@@ -103,6 +103,7 @@ class FlashAvatar(AvatarMethod):
     """
 
     method = "flashavatar-style"
+    config_type = FlashAvatarConfig
     config: FlashAvatarConfig  # pyright: ignore[reportIncompatibleVariableOverride]
     place_at_rest: Float[Tensor, "N 3"]
     degree_now: Int[Tensor, ""]
@@ -231,15 +232,6 @@ class FlashAvatar(AvatarMethod):
         reached = min((step + 2) // self.config.raise_degree_every, self.config.sh_degree)
         self.degree_now.fill_(reached)
         return {}
-
-    @classmethod
-    def from_state(cls, state: dict[str, Any]) -> "FlashAvatar":
-        """Build an untrained avatar of the same make; its parameters come by load_state_dict."""
-        return cls(
-            HeadModel(HeadArrays.from_state(state["head"])),
-            state["identity"],
-            FlashAvatarConfig.from_json(state["config"]),
-        )
 
 
 def _above_the_torso(head: HeadModel, resolution: int) -> UVAnchors:

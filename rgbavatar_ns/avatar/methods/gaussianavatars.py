@@ -33,7 +33,7 @@ from torch import Tensor, nn
 
 from rgbavatar_ns.avatar.config import MethodConfig
 from rgbavatar_ns.avatar.method import AvatarMethod, DrawnBatch, FilmedBatch, Losses, WatchedStep
-from rgbavatar_ns.avatar.methods.carriers import edge_frames
+from rgbavatar_ns.avatar.methods.carriers import edge_frames, require_places
 from rgbavatar_ns.avatar.methods.density import (
     ControlledGaussians,
     DensityControl,
@@ -47,8 +47,7 @@ from rgbavatar_ns.avatar.methods.loss_terms import dssim_loss, position_hinge, s
 from rgbavatar_ns.avatar.methods.sh import MAX_DEGREE, num_coefficients, sh_colors, view_directions
 from rgbavatar_ns.avatar.model.image_loss import l1_loss
 from rgbavatar_ns.avatar.model.tangent_to_world import carried
-from rgbavatar_ns.errors import UserError
-from rgbavatar_ns.head import HeadArrays, HeadModel
+from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.kernels import GaussianSet, PinholeCameras
 from rgbavatar_ns.options import Between, Count, Share, Weight
 
@@ -118,6 +117,7 @@ class GaussianAvatars(AvatarMethod):
     """
 
     method = "gaussianavatars-style"
+    config_type = GaussianAvatarsConfig
     config: GaussianAvatarsConfig  # pyright: ignore[reportIncompatibleVariableOverride]
     face_index: Int[Tensor, "N"]
     degree_now: Int[Tensor, ""]
@@ -151,7 +151,9 @@ class GaussianAvatars(AvatarMethod):
         self.color_rest = nn.Parameter(identity.new_zeros(count, others, 3))
         self.statistics = ScreenStatistics(count).to(identity)
         self.rows = GaussianRows(self, _ROWS)
-        self.register_load_state_dict_post_hook(lambda module, _: module._check_places())
+        self.register_load_state_dict_post_hook(
+            lambda module, _: require_places(module.face_index, module.head.faces)
+        )
 
     @property
     def num_gaussians(self) -> int:
@@ -261,24 +263,6 @@ class GaussianAvatars(AvatarMethod):
         place = sampled_positions(self.position[chosen], self.rotation_wxyz[chosen], scale, samples)
         return {"position": place}
 
-    def _check_places(self) -> None:
-        if len(self.face_index) and not (
-            0 <= int(self.face_index.min()) <= int(self.face_index.max()) < len(self.head.faces)
-        ):
-            raise UserError(
-                "A Gaussian's place points outside of the head's triangles.",
-                "Use another copy of the avatar or checkpoint.",
-            )
-
     def fit_to(self, parameters: Mapping[str, Any], prefix: str = "") -> None:
         """Make room for the Gaussians of a stored state dict."""
         self.rows.fit_to(parameters, prefix)
-
-    @classmethod
-    def from_state(cls, state: dict[str, Any]) -> "GaussianAvatars":
-        """Build an untrained avatar of the same make; its parameters come by load_state_dict."""
-        return cls(
-            HeadModel(HeadArrays.from_state(state["head"])),
-            state["identity"],
-            GaussianAvatarsConfig.from_json(state["config"]),
-        )

@@ -197,6 +197,7 @@ class GaussianBlendshapes(AvatarMethod):
     """
 
     method = "gaussianblendshapes-style"
+    config_type = GaussianBlendshapesConfig
     config: GaussianBlendshapesConfig  # pyright: ignore[reportIncompatibleVariableOverride]
     shown_degree: Int[Tensor, ""]
     mouth_centre: Float[Tensor, "3"]

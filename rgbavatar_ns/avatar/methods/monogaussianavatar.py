@@ -142,6 +142,7 @@ class MonoGaussianAvatar(AvatarMethod):
     """
 
     method = "monogaussianavatar-style"
+    config_type = MonoGaussianAvatarConfig
     config: MonoGaussianAvatarConfig  # pyright: ignore[reportIncompatibleVariableOverride]
     seen: Bool[Tensor, "N"]
     epoch: Int[Tensor, ""]
@@ -354,15 +355,6 @@ class MonoGaussianAvatar(AvatarMethod):
     def fit_to(self, parameters: Mapping[str, Any], prefix: str = "") -> None:
         """Make room for as many points as are stored."""
         self._rows.fit_to(parameters, prefix)
-
-    @classmethod
-    def from_state(cls, state: dict[str, Any]) -> "MonoGaussianAvatar":
-        """Build an untrained avatar of the same make; its parameters come by load_state_dict."""
-        return cls(
-            HeadModel(HeadArrays.from_state(state["head"])),
-            state["identity"],
-            MonoGaussianAvatarConfig.from_json(state["config"]),
-        )
 
 
 def radius_m(epoch: int) -> float:

@@ -37,7 +37,7 @@ from torch import Tensor, nn
 
 from rgbavatar_ns.avatar.config import MethodConfig
 from rgbavatar_ns.avatar.method import AvatarMethod, DrawnBatch, FilmedBatch, Losses, WatchedStep
-from rgbavatar_ns.avatar.methods.carriers import SmoothSurface
+from rgbavatar_ns.avatar.methods.carriers import SmoothSurface, require_places
 from rgbavatar_ns.avatar.methods.density import (
     ControlledGaussians,
     DensityControl,
@@ -52,8 +52,7 @@ from rgbavatar_ns.avatar.methods.neighbours import neighbour_distance
 from rgbavatar_ns.avatar.methods.sh import sh_colors
 from rgbavatar_ns.avatar.methods.triangle_walk import TriangleWalk
 from rgbavatar_ns.avatar.model.image_loss import LPIPSLoss, l1_loss
-from rgbavatar_ns.errors import UserError
-from rgbavatar_ns.head import HeadArrays, HeadModel
+from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.head.surface import interpolated
 from rgbavatar_ns.kernels import GaussianSet, PinholeCameras
 from rgbavatar_ns.options import Between, Count, Positive, Share, Weight
@@ -129,6 +128,7 @@ class SplattingAvatar(AvatarMethod):
     """
 
     method = "splattingavatar-style"
+    config_type = SplattingAvatarConfig
     config: SplattingAvatarConfig  # pyright: ignore[reportIncompatibleVariableOverride]
     face_index: Int[Tensor, "N"]
     barycentric: Float[Tensor, "N 3"]
@@ -164,7 +164,9 @@ class SplattingAvatar(AvatarMethod):
         self.statistics = ScreenStatistics(count).to(identity)
         self.rows = GaussianRows(self, _ROWS)
         self._lpips = LPIPSLoss()
-        self.register_load_state_dict_post_hook(lambda module, _: module._check_places())
+        self.register_load_state_dict_post_hook(
+            lambda module, _: require_places(module.face_index, module.head.faces)
+        )
 
     @property
     def num_gaussians(self) -> int:
@@ -293,27 +295,9 @@ class SplattingAvatar(AvatarMethod):
             "place": samples.new_zeros(*samples.shape[:2], 2),
         }
 
-    def _check_places(self) -> None:
-        if len(self.face_index) and not (
-            0 <= int(self.face_index.min()) <= int(self.face_index.max()) < len(self.head.faces)
-        ):
-            raise UserError(
-                "A Gaussian's place points outside of the head's triangles.",
-                "Use another copy of the avatar or checkpoint.",
-            )
-
     def fit_to(self, parameters: Mapping[str, Any], prefix: str = "") -> None:
         """Make room for the Gaussians of a stored state dict."""
         self.rows.fit_to(parameters, prefix)
-
-    @classmethod
-    def from_state(cls, state: dict[str, Any]) -> "SplattingAvatar":
-        """Build an untrained avatar of the same make; its parameters come by load_state_dict."""
-        return cls(
-            HeadModel(HeadArrays.from_state(state["head"])),
-            state["identity"],
-            SplattingAvatarConfig.from_json(state["config"]),
-        )
 
 
 def random_places(
