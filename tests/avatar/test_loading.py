@@ -37,7 +37,7 @@ def test_a_method_that_nobody_knows_is_told_with_those_that_are_known(tmp_path):
     avatar = rival()
     state = avatar.to_state() | {"method": "nobody's\x1b[31m"}
     save_bundle(state, avatar.own_state_dict(), tmp_path / "bundle", avatar.layout)
-    with pytest.raises(UserError, match=r"nobody's\\x1b\[31m.*rgbavatar, gaussianblend") as told:
+    with pytest.raises(UserError, match=r"nobody's\\x1b\[31m.*rgbavatar, gaussianavatars") as told:
         load_avatar(tmp_path / "bundle")
     assert "\x1b" not in str(told.value)
     with pytest.raises(UserError, match="There is no"):

@@ -52,7 +52,9 @@ class FirstColors:
         self._avatar = avatar
         self._kind: FirstColorsKind = kind
         self._sums: Tensor | None = None
-        # Those that wait, on a CPU as the last `sight` found them.
+        # Those that wait, on a CPU as `sight` last found them, and in which state of the buffer.
+        self._known: Tensor | None = None
+        self._version = 0
         self._waiting: Tensor = torch.empty(0, dtype=torch.int64)
 
     def sight(self, num_images: int) -> FirstSight | None:
@@ -68,7 +70,9 @@ class FirstColors:
         if known.device.type != "cpu":
             self._sums.zero_()
         else:
-            self._waiting = (~known).nonzero()[:, 0]
+            if self._known is not known or self._version != known._version:
+                self._known, self._version = known, known._version
+                self._waiting = (~known).nonzero()[:, 0]
             if len(self._waiting) == 0:
                 return None
             self._sums.index_fill_(0, self._waiting, 0)

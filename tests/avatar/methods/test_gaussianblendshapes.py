@@ -12,7 +12,7 @@ from rgbavatar_ns.avatar.methods.gaussianblendshapes import (
     GaussianBlendshapes,
     GaussianBlendshapesConfig,
 )
-from rgbavatar_ns.avatar.methods.mesh_points import neighbour_spacing_m
+from rgbavatar_ns.avatar.methods.neighbours import neighbour_distance
 from rgbavatar_ns.avatar.storage.stored_avatar import StoredAvatar
 from rgbavatar_ns.avatar.training import TrainingBatch
 from rgbavatar_ns.avatar.training.method_step import MethodStep
@@ -144,7 +144,7 @@ def test_unlearned_gaussians_stay_where_they_lie_on_the_mesh():
 def test_gaussians_begin_grey_and_as_large_as_their_distance():
     avatar = make()
     start = avatar.face.position.detach()
-    torch.testing.assert_close(avatar.face.log_scale[:, 1].exp(), neighbour_spacing_m(start))
+    torch.testing.assert_close(avatar.face.log_scale[:, 1].exp(), neighbour_distance(start))
     found = avatar.gaussians(torch.zeros(1, avatar.layout.size), cameras=front_camera())
     assert found.colors.unique().tolist() == [0.5]
     torch.testing.assert_close(found.opacities, torch.full_like(found.opacities, 0.1))

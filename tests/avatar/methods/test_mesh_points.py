@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from rgbavatar_ns.avatar.methods.mesh_points import neighbour_spacing_m, spread_points
+from rgbavatar_ns.avatar.methods.mesh_points import spread_points
 from rgbavatar_ns.head import HeadModel
 
 # Two rectangles apart, of 2 x 1 and 1 x 1 metres, of two triangles each, and one without area.
@@ -54,9 +54,3 @@ def test_the_whole_embedded_head_is_covered():
     area = 0.5 * torch.linalg.cross(sides[:, 0], sides[:, 1]).norm(dim=-1).sum()
     farthest = torch.cdist(corners.mean(1), places).amin(1).max()
     assert farthest < 2.5 * (area / 2000).sqrt()
-
-
-def test_the_spacing_is_the_root_mean_square_of_three_neighbours():
-    places = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 2], [50, 0, 0]])
-    assert neighbour_spacing_m(places)[0].item() == pytest.approx(((1 + 4 + 4) / 3) ** 0.5)
-    assert (neighbour_spacing_m(torch.zeros(5, 3)) ** 2).tolist() == pytest.approx([1e-7] * 5)

@@ -83,12 +83,12 @@ def test_first_colors_are_summed_as_by_a_pass_of_its_own(emulated, make_avatar):
     for kind in KINDS:
         colors = FirstColors(avatar, kind)
         renderer = avatar.renderer(batch.theta[order], batch.cameras.select(order.tolist()))
-        sight = colors.sight(2)
         assert isinstance(renderer, DeviceRenderer)
-        assert sight is not None
         found = []
         for seed in (0, 1):
             emulated.emulated.seed = seed
+            sight = colors.sight(2)
+            assert sight is not None
             renderer.forward_loss_of(batch.images_rgba, order, background[order], sight)
             found.append(sight.sums.clone())
         filmed = batch.theta[:2], batch.cameras.select([0, 1]), batch.images_rgba[:2]
