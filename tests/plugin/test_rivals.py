@@ -102,6 +102,14 @@ def test_clipped_gradients_are_told(data: Path, tmp_path: Path):
         trainer.train()
 
 
+def test_a_loss_that_is_not_finite_is_told_with_options_that_there_are(data: Path, tmp_path: Path):
+    trainer = make_trainer(rival_config(RIVALS[0], data, tmp_path))
+    with torch.no_grad():
+        next(trainer.pipeline.model.avatar.parameters()).fill_(torch.nan)
+    with pytest.raises(UserError, match=r"loss of step 0 is nan\..* --pipeline\.model\.avatar\.\*"):
+        trainer.train()
+
+
 @pytest.mark.slow
 def test_ns_train_knows_no_option_that_the_method_does_not_have(data: Path, tmp_path: Path):
     ran = run_command(

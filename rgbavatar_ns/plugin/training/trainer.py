@@ -301,10 +301,12 @@ class RGBAvatarTrainer(EndingTrainer, FitHooks):
         """The whole loss; raises UserError where it is not finite."""
         loss = sum(map(float, losses.values()))
         if not math.isfinite(loss):
+            changed = "smaller learning rates, for example --optimizers.color.optimizer.lr 0.005"
+            if not self.config.optimizers:  # the method's own rates
+                changed = "other options of the method, --pipeline.model.avatar.*"
             raise UserError(
                 f"The loss of step {step} is {loss}.",
-                f"Resume from the last checkpoint in {self.checkpoint_dir} with smaller learning "
-                "rates, for example --optimizers.color.optimizer.lr 0.005.",
+                f"Resume from the last checkpoint in {self.checkpoint_dir} with {changed}.",
             )
         return loss
 
