@@ -10,6 +10,7 @@ from typing import Any
 
 import torch
 from nerfstudio.plugins.types import MethodSpecification
+from nerfstudio.utils import writer
 from torch import Tensor
 
 from rgbavatar_ns.avatar.config import MethodConfig
@@ -78,7 +79,13 @@ class RivalModel(AvatarModel):
             seed=self.config.seed or 0,
             refinement=self.refinement,
             backend=self.config.rasterizer,
+            logged=_log,
         )
+
+
+def _log(step: int, figures: Mapping[str, float]) -> None:
+    """Write what followed a step, as how many Gaussians were added and removed, beside the loss."""
+    writer.put_dict(name="Gaussians", scalar_dict=dict(figures), step=step)
 
 
 def _rival(config: MethodConfig, steps: int, told: str, batch_size: int = 1) -> MethodSpecification:

@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 import torch
+from nerfstudio.utils import writer
 
 from rgbavatar_ns.avatar.loading import load_avatar
 from rgbavatar_ns.errors import UserError
@@ -92,6 +93,27 @@ def test_harmonics_of_another_degree_are_told(data: Path, tmp_path: Path):
     model.avatar = replace(model.avatar, sh_degree=1)
     with pytest.raises(UserError, match="parameters are not this model's"):
         make_trainer(going)
+
+
+def test_what_density_control_did_is_logged(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    config = rival_config("gaussianavatars-style", data, tmp_path)
+    avatar = config.pipeline.model.avatar
+    density = replace(avatar.density, from_step=0, every=2)
+    config.pipeline.model.avatar = replace(avatar, density=density)
+    trainer = make_trainer(config)
+    written: list[tuple[int, dict[str, Any]]] = []
+
+    def put_dict(name: str, scalar_dict: dict[str, Any], step: int) -> None:
+        if name == "Gaussians":
+            written.append((step, scalar_dict))
+
+    monkeypatch.setattr(writer, "put_dict", put_dict)
+    trainer.train()
+    assert [step for step, _ in written] == [1, 3, 5]
+    assert written[-1][1]["count"] == trainer.pipeline.model.avatar.num_gaussians
+    assert sum(figures["cloned"] + figures["split"] for _, figures in written) > 0
 
 
 def test_clipped_gradients_are_told(data: Path, tmp_path: Path):

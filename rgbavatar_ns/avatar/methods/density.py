@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
+from rgbavatar_ns.avatar.method import WatchedStep
 from rgbavatar_ns.avatar.methods.gaussian_rows import GaussianRows, Optimizers, forget_moments
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head.rotations import quat_wxyz_to_matrix
@@ -135,6 +136,12 @@ class ScreenStatistics(nn.Module):
         self.gradient_sum += torch.where(drawn, length, 0.0).sum(0)
         self.times_seen += drawn.sum(0)
 
+    def add_step(self, watched: WatchedStep) -> None:
+        """Add a step's gradient; as in 3DGS all count whose centre is in a picture (`in_view`)."""
+        cameras = watched.cameras
+        seen = in_view(watched.gaussians.means.detach(), cameras)
+        self.add(watched.screen_gradient_px, cameras.width, cameras.height, seen)
+
     def mean_gradient(self) -> Float[Tensor, "N"]:
         """Mean length of the gradient over the images that showed each; 0 for what none did."""
         return self.gradient_sum / self.times_seen.clamp(min=1)
@@ -202,6 +209,10 @@ class DensityChanges:
     kept_for_faces: int = 0
     opacity_reset: bool = False
     count: int = field(kw_only=True)
+
+    def figures(self) -> dict[str, float]:
+        """Each by its name, as `AvatarMethod.after_step` tells of them."""
+        return {name: float(value) for name, value in vars(self).items()}
 
 
 @torch.no_grad()

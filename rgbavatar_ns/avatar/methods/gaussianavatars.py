@@ -243,14 +243,12 @@ class GaussianAvatars(AvatarMethod):
         reached = min((step + 2) // self.config.raise_degree_every, self.config.sh_degree)
         self.degree_now.fill_(reached)
         if watched is not None:
-            cameras, gradient = watched.cameras, watched.screen_gradient_px
-            seen = in_view(watched.gaussians.means.detach(), cameras)
-            self.statistics.add(gradient, cameras.width, cameras.height, seen)
+            self.statistics.add_step(watched)
         known = ControlledGaussians(
             self.rows, self.statistics, self._scale_m, self._children, face_of="face_index"
         )
         changes = control(known, self.config.density, optimizers, step=step, seed=seed)
-        return {} if changes is None else {k: float(v) for k, v in vars(changes).items()}
+        return {} if changes is None else changes.figures()
 
     def _scale_m(self) -> Float[Tensor, "N 3"]:
         """Standard deviations at rest."""

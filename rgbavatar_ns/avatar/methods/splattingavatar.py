@@ -43,7 +43,6 @@ from rgbavatar_ns.avatar.methods.density import (
     DensityControl,
     ScreenStatistics,
     control,
-    in_view,
     sampled_positions,
 )
 from rgbavatar_ns.avatar.methods.gaussian_rows import GaussianRows, forget_moments
@@ -254,14 +253,12 @@ class SplattingAvatar(AvatarMethod):
         if (step + 1) % self.config.walk_every == 0:
             self._walk(optimizers)
         if watched is not None:
-            cameras, gradient = watched.cameras, watched.screen_gradient_px
-            seen = in_view(watched.gaussians.means.detach(), cameras)
-            self.statistics.add(gradient, cameras.width, cameras.height, seen)
+            self.statistics.add_step(watched)
         known = ControlledGaussians(
             self.rows, self.statistics, lambda: self.log_scale.detach().exp(), self._children
         )
         changes = control(known, self.config.density, optimizers, step=step, seed=seed)
-        return {} if changes is None else {k: float(v) for k, v in vars(changes).items()}
+        return {} if changes is None else changes.figures()
 
     @torch.no_grad()
     def _walk(self, optimizers: Sequence[torch.optim.Optimizer]) -> None:
