@@ -30,7 +30,7 @@ _SAME_SHARE, _SAME, _SAME_DEGREES = 0.1, 0.02, 5.0
 """Beyond is farther than this: of a number's range, in its own unit, of a turn."""
 _REACH_DEGREES = 30.0
 _CALM = 1.35
-"""Times the smallest expression: of the README's speakers half to two thirds of the frames, none of
+"""Times the smallest expression: of GRID's speakers half to two thirds of the frames, none of
 which blinks."""
 
 
