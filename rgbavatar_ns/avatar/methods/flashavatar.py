@@ -32,6 +32,7 @@ from rgbavatar_ns.avatar.methods.neighbours import neighbour_distance
 from rgbavatar_ns.avatar.methods.region_mask import MOUTH_GROUPS, group_vertices, hull_mask
 from rgbavatar_ns.avatar.methods.sh import (
     MAX_DEGREE,
+    ShownDegree,
     directions_in_frames,
     num_coefficients,
     sh_colors,
@@ -124,7 +125,7 @@ class FlashAvatar(AvatarMethod):
         anchors = _above_the_torso(head, config.uv_resolution)
         self.anchors = GaussianAnchors(head, anchors, rest, "normalized")
         self.register_buffer("place_at_rest", self.anchors.origins(rest[None])[0].contiguous())
-        self.register_buffer("degree_now", torch.zeros((), dtype=torch.int64))
+        self._shown = ShownDegree(self, "degree_now", config.sh_degree)
         self.register_buffer("_mouth", group_vertices(head.arrays, MOUTH_GROUPS), persistent=False)
         count, start = len(self.anchors), config.initial_opacity
         log_scale = neighbour_distance(self.place_at_rest).log()
@@ -187,7 +188,7 @@ class FlashAvatar(AvatarMethod):
         turn: Float[Tensor, "B 3 3"],
         cameras: PinholeCameras | None,
     ) -> Float[Tensor, "#B N 3"]:
-        degree = 0 if cameras is None else int(self.degree_now)
+        degree = 0 if cameras is None else self._shown.now
         if degree == 0:
             return sh_colors(self.color, means[:1], 0)
         directions = view_directions(means, cameras) if cameras is not None else means
@@ -230,7 +231,7 @@ class FlashAvatar(AvatarMethod):
     def after_step(self, watched: Any, optimizers: Any, step: int, seed: int) -> dict[str, float]:
         """Raise the degree of the harmonics where that is due: the release's first step is 1."""
         reached = min((step + 2) // self.config.raise_degree_every, self.config.sh_degree)
-        self.degree_now.fill_(reached)
+        self._shown.set(reached)
         return {}
 
 

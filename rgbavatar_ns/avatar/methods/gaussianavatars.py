@@ -44,7 +44,13 @@ from rgbavatar_ns.avatar.methods.density import (
 )
 from rgbavatar_ns.avatar.methods.gaussian_rows import GaussianRows
 from rgbavatar_ns.avatar.methods.loss_terms import dssim_loss, position_hinge, scale_hinge
-from rgbavatar_ns.avatar.methods.sh import MAX_DEGREE, num_coefficients, sh_colors, view_directions
+from rgbavatar_ns.avatar.methods.sh import (
+    MAX_DEGREE,
+    ShownDegree,
+    num_coefficients,
+    sh_colors,
+    view_directions,
+)
 from rgbavatar_ns.avatar.model.image_loss import l1_loss
 from rgbavatar_ns.avatar.model.tangent_to_world import carried
 from rgbavatar_ns.head import HeadModel
@@ -135,7 +141,7 @@ class GaussianAvatars(AvatarMethod):
         super().__init__(head, identity, config)
         count = len(head.faces)
         self.register_buffer("face_index", torch.arange(count, device=identity.device))
-        self.register_buffer("degree_now", torch.zeros((), dtype=torch.int64))
+        self._shown = ShownDegree(self, "degree_now", config.sh_degree)
         with torch.no_grad():
             rest = head(identity.new_zeros(1, self.layout.size), identity)
             size_m = edge_frames(rest, head.faces, self.face_index).length_ratio
@@ -180,7 +186,7 @@ class GaussianAvatars(AvatarMethod):
     def _colors(
         self, means: Float[Tensor, "B N 3"], cameras: PinholeCameras | None
     ) -> Float[Tensor, "#B N 3"]:
-        degree = 0 if cameras is None else int(self.degree_now)
+        degree = 0 if cameras is None else self._shown.now
         if cameras is None or degree == 0:
             return sh_colors(self.color, means[:1], 0)
         used = self.color_rest[:, : num_coefficients(degree) - 1]
@@ -241,7 +247,7 @@ class GaussianAvatars(AvatarMethod):
         """Raise the degree of the harmonics, add and remove Gaussians, where that is due."""
         # The release, whose first step is 1, raises it at a step's beginning.
         reached = min((step + 2) // self.config.raise_degree_every, self.config.sh_degree)
-        self.degree_now.fill_(reached)
+        self._shown.set(reached)
         if watched is not None:
             self.statistics.add_step(watched)
         known = ControlledGaussians(

@@ -56,6 +56,7 @@ from rgbavatar_ns.avatar.methods.mesh_points import spread_points
 from rgbavatar_ns.avatar.methods.neighbours import neighbour_distance
 from rgbavatar_ns.avatar.methods.region_mask import faces_within, group_vertices
 from rgbavatar_ns.avatar.methods.sh import (
+    ShownDegree,
     directions_in_frames,
     num_coefficients,
     sh_colors,
@@ -222,7 +223,7 @@ class GaussianBlendshapes(AvatarMethod):
             skin = ~torch.stack(list(teeth.values())).any(0)
             self.face = self._face(rest, head.faces[skin], generator)
             self.teeth = self._teeth(rest, teeth, generator)
-        self.register_buffer("shown_degree", torch.zeros((), dtype=torch.int64))
+        self._shown = ShownDegree(self, "shown_degree", config.sh_degree)
         rows = group_vertices(head.arrays, ("upper_teeth", "lower_teeth")).to(rest.device)
         centre, self.mouth_radius_m, self.mouth_half_height_m = upright_cylinder(rest[rows])
         self.register_buffer("mouth_centre", centre, persistent=False)
@@ -280,7 +281,7 @@ class GaussianBlendshapes(AvatarMethod):
         theta = self.checked(theta)
         weights = basis_weights(self.head, theta)
         transforms = self.head.joint_transforms(theta, self.identity)
-        degree = 0 if cameras is None else int(self.shown_degree.clamp(0, self.config.sh_degree))
+        degree = 0 if cameras is None else self._shown.now
         sets = []
         for part in self._parts:
             frames = skinning_frames(part.skinning, transforms)
@@ -361,7 +362,7 @@ class GaussianBlendshapes(AvatarMethod):
         if watched is not None:
             figures = self._control(watched, optimizers, step, seed)
         if (step + 1) % self.config.sh_degree_every == 0:
-            self.shown_degree.add_(1).clamp_(max=self.config.sh_degree)
+            self._shown.set(min(self._shown.now + 1, self.config.sh_degree))
         return figures
 
     def _control(

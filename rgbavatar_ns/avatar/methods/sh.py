@@ -12,9 +12,10 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
 
 from rgbavatar_ns.avatar.model.blendshapes import COLOR_SCALE
+from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.kernels import PinholeCameras
 
 MAX_DEGREE = 3
@@ -31,6 +32,48 @@ def num_coefficients(degree: int) -> int:
     if not 0 <= degree <= MAX_DEGREE:
         raise ValueError(f"degree is {degree}. Pass 0 to {MAX_DEGREE}.")
     return (degree + 1) ** 2
+
+
+class ShownDegree:
+    """The degree up to which a method shows its harmonics so far, kept as a buffer of the method.
+
+    Read where it changed only, so that a training step does not wait for a GPU.
+
+    Args:
+        owner: the method, which gets the buffer.
+        name: of the buffer, of kind int64 and shape [].
+        most: the degree of the stored coefficients.
+    """
+
+    def __init__(self, owner: nn.Module, name: str, most: int) -> None:
+        owner.register_buffer(name, torch.zeros((), dtype=torch.int64))
+        owner.register_load_state_dict_post_hook(
+            lambda module, _: _require_degree(int(getattr(module, name)), most)
+        )
+        self._owner, self._name = owner, name
+        self._read: tuple[Tensor, int, int] | None = None
+
+    @property
+    def now(self) -> int:
+        """The degree."""
+        buffer = getattr(self._owner, self._name)
+        if self._read is None or self._read[0] is not buffer or self._read[1] != buffer._version:
+            self._read = (buffer, buffer._version, int(buffer))
+        return self._read[2]
+
+    def set(self, degree: int) -> None:
+        """Show as many degrees from now on."""
+        if self.now != degree:
+            getattr(self._owner, self._name).fill_(degree)
+
+
+def _require_degree(degree: int, most: int) -> None:
+    """Raise UserError for a degree, as a file may have it, that its coefficients have not."""
+    if not 0 <= degree <= most:
+        raise UserError(
+            f"The avatar shows harmonics up to degree {degree}, and has those up to {most}.",
+            "Use another copy of the avatar or checkpoint.",
+        )
 
 
 def view_directions(

@@ -1,3 +1,4 @@
+import copy
 import math
 
 import numpy as np
@@ -7,6 +8,7 @@ import torch.nn.functional as F
 from scipy.special import lpmv
 
 from rgbavatar_ns.avatar.methods.sh import (
+    ShownDegree,
     directions_in_frames,
     rotate_sh,
     sh_basis,
@@ -14,6 +16,7 @@ from rgbavatar_ns.avatar.methods.sh import (
     view_directions,
 )
 from rgbavatar_ns.avatar.model.blendshapes import color_from_feature
+from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head.rotations import axis_angle_to_matrix
 from rgbavatar_ns.kernels import PinholeCameras
 
@@ -129,3 +132,43 @@ def test_what_does_not_fit_is_refused() -> None:
         sh_colors(normal(2, 4, 3), unit(1, 2), 2)
     with pytest.raises(ValueError, match="5 coefficients"):
         rotate_sh(normal(2, 5, 3), torch.eye(3, dtype=torch.float64))
+
+
+class Owner(torch.nn.Module):
+    """Shows harmonics up to degree 3."""
+
+    degree: torch.Tensor
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.shown = ShownDegree(self, "degree", 3)
+
+
+def test_the_shown_degree_is_the_buffers_wherever_it_changed():
+    owner = Owner()
+    shown = owner.shown
+    assert shown.now == 0
+    shown.set(2)
+    assert (shown.now, int(owner.degree)) == (2, 2)
+    owner.load_state_dict({"degree": torch.tensor(1)})
+    assert shown.now == 1
+    owner.to(torch.device("meta")).to_empty(device="cpu")  # another tensor by the same name
+    owner.degree.fill_(3)
+    assert shown.now == 3
+    before = owner.degree._version
+    shown.set(3)
+    assert owner.degree._version == before
+
+
+@pytest.mark.parametrize("degree", [-1, 4, 127])
+def test_a_stored_degree_that_coefficients_have_not_is_told(degree: int):
+    owner = Owner()
+    with pytest.raises(UserError, match=f"up to degree {degree}, and has those up to 3"):
+        owner.load_state_dict({"degree": torch.tensor(degree)})
+
+
+def test_a_copys_degree_is_its_own():
+    owner = Owner()
+    copied = copy.deepcopy(owner)
+    copied.shown.set(2)
+    assert (owner.shown.now, copied.shown.now, int(copied.degree)) == (0, 2, 2)
