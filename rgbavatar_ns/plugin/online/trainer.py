@@ -149,10 +149,10 @@ class OnlineTrainer(RGBAvatarTrainer):
                 self.pipeline.model.frame_theta[0] = theta.to(self.pipeline.device)
         super().after_step(step, losses, seconds)
 
-    def _tell_step(self, step: int, losses: Losses, seconds: float) -> None:
+    def _tell_step(self, step: int, losses: Losses) -> None:
         """TensorBoard's curves, and about once a second how things stand."""
         if step_check(step, self.config.logging.steps_per_log, run_at_zero=True):
-            loss = self._write_scalars(step, losses, seconds)
+            loss = self._write_scalars(step, losses)
             for name, value in self._report(loss).scalars().items():
                 writer.put_scalar(name=f"Stream/{name}", scalar=value, step=step)
         self._look_at_newest(losses, self._stream_progress)

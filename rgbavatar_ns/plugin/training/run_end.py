@@ -21,6 +21,7 @@ from rgbavatar_ns.plugin.refinement import REFINED_NAME
 from rgbavatar_ns.plugin.training.interruption import StopRequest
 from rgbavatar_ns.plugin.training.load_config import COMPLETED, SUMMARY_NAME
 from rgbavatar_ns.plugin.training.peak_memory import peak_memory
+from rgbavatar_ns.plugin.training.train_clock import TrainClock
 
 
 def say(line: str) -> None:
@@ -34,7 +35,7 @@ class EndingTrainer(Trainer):
     pipeline: RGBAvatarPipeline
     stop: StopRequest
     _take: TrainingStep | MethodStep
-    _train_seconds: float
+    clock: TrainClock
     """Of the steps alone, over all sessions of the run."""
     _saved_step: int | None
     """Step whose state lies on the disk as it is."""
@@ -115,7 +116,8 @@ class EndingTrainer(Trainer):
 
     def _write_summary(self, ended: str) -> dict[str, Any]:
         """How the run ended, its length and speed over all its sessions, as training.json."""
-        seconds, totals = self._train_seconds, self._totals()
+        self.clock.settle()
+        seconds, totals = self.clock.seconds, self._totals()
         summary = {
             "ended": ended,
             "steps": self.step + 1,

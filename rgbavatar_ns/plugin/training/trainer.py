@@ -53,6 +53,7 @@ from rgbavatar_ns.plugin.training.optimizers import (
 from rgbavatar_ns.plugin.training.progress import TrainingProgress
 from rgbavatar_ns.plugin.training.ranges import require_trainable
 from rgbavatar_ns.plugin.training.run_end import EndingTrainer, say
+from rgbavatar_ns.plugin.training.train_clock import TrainClock, waiting_for
 from rgbavatar_ns.plugin.training.turns import TurnsLock
 from rgbavatar_ns.plugin.viewer.settings import is_of_ns_viewer, viewer_settings
 
@@ -176,7 +177,7 @@ class RGBAvatarTrainer(EndingTrainer, FitHooks):
         self.train_lock: Any = TurnsLock()
         self.stop = StopRequest()
         self.stop_training = False
-        self._train_seconds = 0.0
+        self.clock = TrainClock(waiting_for(self.device))
         self._saved_step: int | None = None
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
@@ -273,25 +274,32 @@ class RGBAvatarTrainer(EndingTrainer, FitHooks):
     def after_step(self, step: int, losses: Losses, seconds: float) -> None:
         """Tell, evaluate and save what is due."""
         self.step = step
-        self._train_seconds += seconds
+        self.clock.add(seconds)
         self._update_viewer_state(step)
-        self._tell_step(step, losses, seconds)
+        self._tell_step(step, losses)
         if len(self.pipeline.datamanager.eval_dataset) > 0:
             with self.train_lock:
+                if self._evaluates(step):
+                    self.clock.settle()
                 self.eval_iteration(step)
         if step_check(step, self.config.steps_per_save):
             self.save_checkpoint(step)
         writer.write_out_storage()
 
-    def _tell_step(self, step: int, losses: Losses, seconds: float) -> None:
+    def _evaluates(self, step: int) -> bool:
+        own = self.config
+        every = (own.steps_per_eval_batch, own.steps_per_eval_image, own.steps_per_eval_all_images)
+        return any(step_check(step, steps) for steps in every)
+
+    def _tell_step(self, step: int, losses: Losses) -> None:
         """Curves and progress, every `steps_per_log` steps and at the end."""
         if self.completed or step_check(step, self.config.logging.steps_per_log, run_at_zero=True):
-            loss = self._write_scalars(step, losses, seconds)
-            self._progress.show(step + 1, loss, self._train_seconds)
+            loss = self._write_scalars(step, losses)
+            self._progress.show(step + 1, loss, self.clock.seconds)
 
     def _add_to_curve(self, step: int, scores: Mapping[str, Any]) -> None:
         """A point of curve.json; `--steps-per-eval-all-images` says how often."""
-        self.curve.add(step, self._train_seconds, scores)
+        self.curve.add(step, self.clock.seconds, scores)
 
     def _run_callbacks(self, step: int, location: TrainingCallbackLocation) -> None:
         for callback in self.callbacks:
@@ -310,8 +318,10 @@ class RGBAvatarTrainer(EndingTrainer, FitHooks):
             )
         return loss
 
-    def _write_scalars(self, step: int, losses: Losses, seconds: float) -> float:
+    def _write_scalars(self, step: int, losses: Losses) -> float:
         """TensorBoard's curves, and the speeds the viewer shares the device by; the loss."""
+        self.clock.settle()
+        seconds = self.clock.seconds_per_step
         loss = self._finite_loss(losses, step)
         pixels = self.pipeline.datamanager.get_train_rays_per_batch()
         rate = self._images_per_step / seconds
@@ -333,7 +343,7 @@ class RGBAvatarTrainer(EndingTrainer, FitHooks):
     @property
     def _out_of_time(self) -> bool:
         most = self.config.max_train_seconds
-        return most is not None and self._train_seconds >= most
+        return most is not None and self.clock.seconds >= most
 
     def _load_checkpoint(self) -> None:
         """Load what --load-dir (newest readable) or --load-checkpoint names, if anything."""
@@ -349,7 +359,7 @@ class RGBAvatarTrainer(EndingTrainer, FitHooks):
         with damage_of(path):
             self._start_step = state["step"] + 1
             self._saved_step = state["step"]
-            self._train_seconds = float(state.get("train_seconds", 0.0))
+            self.clock.resume(float(state.get("train_seconds", 0.0)))
             self.curve.points = [dict(point) for point in state.get("curve", ())]
         self.pipeline.load_pipeline(state["pipeline"], state["step"])
         with damage_of(path):
@@ -370,9 +380,10 @@ class RGBAvatarTrainer(EndingTrainer, FitHooks):
 
     def save_checkpoint(self, step: int) -> None:
         """Write a checkpoint atomically; raises UserError if it does not fit on the disk."""
+        self.clock.settle()
         state = {
             "step": step,
-            "train_seconds": self._train_seconds,
+            "train_seconds": self.clock.seconds,
             "curve": self.curve.points,
             "pipeline": self.pipeline.state_dict(),
             "optimizers": {k: v.state_dict() for k, v in self.optimizers.optimizers.items()},
