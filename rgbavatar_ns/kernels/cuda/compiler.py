@@ -1,15 +1,14 @@
 """CUDA C++ to machine code with NVRTC, kept on disk for the next time."""
 
 import contextlib
-import os
+import hashlib
 import re
-import tempfile
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 from cuda.bindings import nvrtc  # pyright: ignore[reportAttributeAccessIssue]
 
+from rgbavatar_ns.kernels.cuda.code_cache import cached
 from rgbavatar_ns.kernels.cuda.source import MAIN, source_hash, sources
 from rgbavatar_ns.kernels.types import DeviceError
 
@@ -21,14 +20,6 @@ _REINSTALL = "reinstall cuda-bindings and nvidia-cuda-nvrtc of one version."
 _CPU_INSTEAD = "Or train on the CPU: --machine.device-type cpu."
 
 
-def cache_folder() -> Path:
-    """Where compiled kernels are kept: RGBAVATAR_CACHE, or the user's cache folder."""
-    if "RGBAVATAR_CACHE" in os.environ:
-        return Path(os.environ["RGBAVATAR_CACHE"])
-    home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(home) / "rgbavatar_ns"
-
-
 def compile_kernels(architecture: str, *, cache: bool = True) -> bytes:
     """Return the machine code of all kernels for an architecture such as "sm_90".
 
@@ -38,15 +29,11 @@ def compile_kernels(architecture: str, *, cache: bool = True) -> bytes:
     """
     target = _target(architecture)
     version = "{}.{}".format(*_checked(nvrtc.nvrtcVersion(), "tell its version"))
-    path = cache_folder() / f"{source_hash()}-{target}-nvrtc{version}.bin"
-    if cache and path.is_file():
-        return path.read_bytes()
-    code = _compile(target)
-    if cache:
-        # A cache that cannot be written costs seconds at the next start, nothing else.
-        with contextlib.suppress(OSError):
-            _write_whole(path, code)
-    return code
+    if not cache:
+        return _compile(target)
+    options = hashlib.sha256(" ".join(_options(target)).encode()).hexdigest()[:8]
+    name = f"{source_hash()}-{target}-{options}-nvrtc{version}.bin"
+    return cached(name, lambda: _compile(target))
 
 
 def _target(architecture: str) -> str:
@@ -77,6 +64,10 @@ def _compile(target: str) -> bytes:
         return _output(program, nvrtc.nvrtcGetCUBINSize, nvrtc.nvrtcGetCUBIN)
 
 
+def _options(target: str) -> list[str]:
+    return [f"--gpu-architecture={target}", "--std=c++17"]
+
+
 @contextlib.contextmanager
 def _compiled(target: str, *more: str) -> Iterator[Any]:
     """NVRTC's program of all kernels."""
@@ -92,7 +83,7 @@ def _compiled(target: str, *more: str) -> Iterator[Any]:
         ),
         "take the sources",
     )
-    options = [f"--gpu-architecture={target}", "--std=c++17", *more]
+    options = [*_options(target), *more]
     try:
         (error,) = nvrtc.nvrtcCompileProgram(program, len(options), [o.encode() for o in options])
         if error != nvrtc.nvrtcResult.NVRTC_SUCCESS:
@@ -123,12 +114,3 @@ def _checked(result: tuple, doing: str) -> Any:
             f"NVRTC could not {doing} ({error}).", f"To mend it, {_REINSTALL} {_CPU_INSTEAD}"
         )
     return values[0] if len(values) == 1 else values
-
-
-def _write_whole(path: Path, content: bytes) -> None:
-    """Other processes see nothing or all of it."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(dir=path.parent)
-    with os.fdopen(handle, "wb") as file:
-        file.write(content)
-    os.replace(name, path)

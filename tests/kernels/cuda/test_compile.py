@@ -58,6 +58,15 @@ def test_what_was_compiled_is_kept(compiler, own_cache, monkeypatch):
         compiler.compile_kernels("sm_90")
 
 
+def test_what_was_compiled_with_other_options_is_not_taken(compiler, own_cache, monkeypatch):
+    options = compiler._options
+    monkeypatch.setattr(compiler, "_compile", lambda target: b"as ever")
+    compiler.compile_kernels("sm_90")
+    monkeypatch.setattr(compiler, "_options", lambda target: [*options(target), "--use_fast_math"])
+    monkeypatch.setattr(compiler, "_compile", lambda target: b"fast")
+    assert compiler.compile_kernels("sm_90") == b"fast"
+
+
 def test_a_cache_that_cannot_be_written_is_done_without(compiler, own_cache, monkeypatch):
     own_cache.write_text("a file where the folder should be")
     monkeypatch.setattr(compiler, "_compile", lambda target: b"code")
