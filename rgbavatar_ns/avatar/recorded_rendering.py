@@ -1,6 +1,5 @@
 """Theta to image as one CUDA graph, for pictures one after another."""
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import torch
@@ -8,7 +7,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from rgbavatar_ns.avatar.avatar import Avatar
-from rgbavatar_ns.avatar.training.cuda_graph import Recorder, record_cuda_graph, supports
+from rgbavatar_ns.avatar.training.cuda_graph import (
+    Recorder,
+    Recording,
+    lane,
+    record_cuda_graph,
+    supports,
+)
 from rgbavatar_ns.kernels import DeviceRenderer, PinholeCameras, RenderedBatch
 
 _EAGER_PICTURES = 2
@@ -34,12 +39,13 @@ class RecordedRendering:
     ) -> None:
         if not supports(avatar, theta[:1], cameras.select([0]), backend):
             raise ValueError("This backend's pictures need the host. Use Avatar.render.")
-        self._avatar, self._backend, self._recorder = avatar, backend, recorder
+        self._avatar, self._backend = avatar, backend
+        self._recording = Recording(avatar, self._draw, recorder)
+        self._lane = lane(theta.device)
         self._theta = theta.detach().clone()
         own = {name: getattr(cameras, name).clone() for name in _CAMERA_PARTS}
         self._cameras = replace(cameras, **own)
         self._background = torch.zeros(len(theta), 3, device=theta.device)
-        self._replay: Callable[[], None] | None = None
         self._pictures = 0
 
     @torch.no_grad()
@@ -50,17 +56,17 @@ class RecordedRendering:
         background: Float[Tensor, "3"] | Float[Tensor, "B 3"] | None = None,
     ) -> RenderedBatch:
         """Draw theta, without cameras by the last ones'; the next call uses the tensors again."""
-        self._take(theta, cameras, background)
-        if self._pictures < _EAGER_PICTURES:
-            self._pictures += 1
+        with self._lane():
+            self._take(theta, cameras, background)
+            if self._pictures < _EAGER_PICTURES:
+                self._pictures += 1
+                return self._drawn_by_the_host()
+            self._recording()
+            if not int(self._overflowed):
+                return self._picture
+            self._recording.forget()
+            self._pictures = 0
             return self._drawn_by_the_host()
-        if self._replay is None:
-            self._replay = self._recorder(self._draw)
-        self._replay()
-        if not int(self._overflowed):
-            return self._picture
-        self._replay, self._pictures = None, 0
-        return self._drawn_by_the_host()
 
     def _take(
         self, theta: Tensor, cameras: PinholeCameras | None, background: Tensor | None

@@ -125,6 +125,10 @@ class HeadModel(nn.Module):
         _, joints = self._person(identity, torch.Size())
         return joints.reshape(3, 5).mT
 
+    def remembered(self, identity: Float[Tensor, "I"]) -> tuple[Tensor, Tensor]:
+        """The neutral head's vertices and joints that calls with this steady identity share."""
+        return self._person(identity, torch.Size())
+
     def _person(
         self, identity: Float[Tensor, "*_"] | None, batch: torch.Size
     ) -> tuple[Float[Tensor, "#B V3"], Float[Tensor, "#B 15"]]:

@@ -5,7 +5,7 @@ backgrounds, Adam's numbers) from one small buffer; morphing, drawing, loss, gra
 weight network with its own gradients and Adam are in the graph.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -16,7 +16,13 @@ from torch import Tensor
 from rgbavatar_ns.avatar.avatar import Avatar
 from rgbavatar_ns.avatar.training.batches import DeviceFrames
 from rgbavatar_ns.avatar.training.color_init import FirstColors
-from rgbavatar_ns.avatar.training.cuda_graph import Recorder, record_cuda_graph, supports
+from rgbavatar_ns.avatar.training.cuda_graph import (
+    Recorder,
+    Recording,
+    lane,
+    record_cuda_graph,
+    supports,
+)
 from rgbavatar_ns.avatar.training.optimizer_states import AdamStates
 from rgbavatar_ns.kernels import UPDATED_ATTRIBUTES, DeviceRenderer
 
@@ -50,9 +56,9 @@ class RecordedStep:
     ) -> None:
         self._avatar, self.frames, self._backend = avatar, frames, backend
         self._first_colors, self._num_filmed = first_colors, num_filmed
-        self._states, self._recorder = AdamStates(avatar, optimizers), recorder
-        self._replay: Callable[[], None] | None = None
-        self._places: list[int] = []
+        self._states = AdamStates(avatar, optimizers)
+        self._recording = Recording(avatar, self._work, recorder, self._read)
+        self._lane = lane(frames.theta.device)
         self._optimizers_told = False
         self._steps = self.skipped_steps = 0
         device = frames.theta.device
@@ -74,20 +80,18 @@ class RecordedStep:
         """Take one step on `chosen`, backgrounds in main memory; ValueError for another size."""
         if len(chosen) != self._sizes[0] or len(background) != len(chosen):
             raise ValueError(f"{len(chosen)} frames in a step recorded for {self._sizes[0]}.")
-        self._gaussian_states = self._states.next_of_gaussians()
-        self._network_states = self._states.next_of_network()
-        self._forget_if_moved()
-        if not self._optimizers_told:
-            self._tell_optimizers()
-        news = [*map(float, chosen), *background.flatten().tolist(), *self._numbers()]
-        # From pageable memory: the driver keeps its own copy at once, whatever the device does.
-        self._step_inputs.copy_(torch.tensor(news, dtype=torch.float64), non_blocking=True)
-        if self._steps < _EAGER_STEPS:
-            self._work()
-        else:
-            if self._replay is None:
-                self._replay = self._recorder(self._work)
-            self._replay()
+        with self._lane():
+            self._gaussian_states = self._states.next_of_gaussians()
+            self._network_states = self._states.next_of_network()
+            if not self._optimizers_told:
+                self._tell_optimizers()
+            news = [*map(float, chosen), *background.flatten().tolist(), *self._numbers()]
+            # From pageable memory: the driver keeps its own copy at once, whatever the device does.
+            self._step_inputs.copy_(torch.tensor(news, dtype=torch.float64), non_blocking=True)
+            if self._steps < _EAGER_STEPS:
+                self._work()
+            else:
+                self._recording()
         self._states.recount_all()
         self._steps += 1
         if self._steps % _LOOK_EVERY == 0:
@@ -101,13 +105,14 @@ class RecordedStep:
             optimizer.step()
         self._optimizers_told = True
 
-    def _forget_if_moved(self) -> None:
-        """A recording names places in memory; a checkpoint that was loaded lies elsewhere."""
+    def _read(self) -> list[Tensor]:
+        """What a recorded step reads beside the avatar: Adam's state and the frames."""
         states = [*self._gaussian_states.values(), *self._network_states]
-        tensors = [t for s in states for t in (s.value, s.first_moment, s.second_moment)]
-        places = [t.data_ptr() for t in (*tensors, *self._states.steps())]
-        if places != self._places:
-            self._replay, self._places = None, places
+        moments = [t for s in states for t in (s.first_moment, s.second_moment)]
+        frames, cameras = self.frames, self.frames.cameras
+        filmed = [frames.theta, frames.images_rgba, cameras.world_to_camera]
+        seen = [cameras.focal_px, cameras.principal_point_px]
+        return [*moments, *self._states.steps(), *filmed, *seen]
 
     def _numbers(self) -> list[float]:
         """Adam's numbers, row by row: base and bases of each attribute, then the network's."""
@@ -163,4 +168,5 @@ class RecordedStep:
             self.skipped_steps += overflows
             self._overflows.zero_()
             self._renderer_of_last_step.make_room(int(self._needed))
-            self._replay, self._steps = None, 0
+            self._recording.forget()
+            self._steps = 0
