@@ -3,7 +3,7 @@
 import functools
 import importlib
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Protocol, runtime_checkable
 
 import torch
@@ -86,6 +86,10 @@ class DeviceRenderer(MorphedRenderer, Protocol):
     @property
     def needed(self) -> Int[Tensor, ""]:
         """How much room was needed, in units of `make_room`."""
+        ...
+
+    def read_later(self, numbers: Int[Tensor, " N"]) -> Callable[[], list[int] | None]:
+        """What gives the present numbers once they are here, and None until then."""
         ...
 
     def make_room(self, needed: int) -> None:

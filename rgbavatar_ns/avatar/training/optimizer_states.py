@@ -53,12 +53,20 @@ class AdamStates:
         self._recount(values)
 
     def add_one_to_all(self) -> None:
-        """Count a step of all in the optimisers' states: what of counting a device does."""
-        _add_one(self.steps())
+        """Count a step where the optimisers' states lie with what they train: recorded or not."""
+        _add_one([step for value, step in self._all() if step.device == value.device])
 
     def recount_all(self) -> None:
-        """Count a step of all on the host, after `add_one_to_all`, which may have been recorded."""
+        """Count a step of all on the host, after `add_one_to_all`, which may have been recorded.
+
+        Adam that is neither fused nor capturable has its numbers here, which no recording counts.
+        """
+        _add_one([step for value, step in self._all() if step.device != value.device])
         self._recount([*self._gaussians.values(), *self._network])
+
+    def _all(self) -> list[tuple[Tensor, Tensor]]:
+        values = [*self._gaussians.values(), *self._network]
+        return list(zip(values, self._steps(values)))
 
     def steps(self) -> list[Tensor]:
         """Where the optimisers' states count the steps of all tensors."""
@@ -112,6 +120,8 @@ _COUNTS: WeakKeyDictionary[torch.optim.Optimizer, dict[Tensor, _Count]] = WeakKe
 
 def _add_one(steps: list[Tensor]) -> None:
     """In one launch for all of them."""
+    if not steps:
+        return
     torch._foreach_add_(steps, 1)  # pyright: ignore[reportPrivateImportUsage]
 
 

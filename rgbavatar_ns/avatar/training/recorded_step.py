@@ -5,7 +5,7 @@ backgrounds, Adam's numbers) from one small buffer; morphing, drawing, loss, gra
 weight network with its own gradients and Adam are in the graph.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -60,6 +60,7 @@ class RecordedStep:
         self._recording = Recording(avatar, self._work, recorder, self._read)
         self._lane = lane(frames.theta.device)
         self._optimizers_told = False
+        self._overflows_read: Callable[[], list[int] | None] | None = None
         self._steps = self.skipped_steps = 0
         device = frames.theta.device
         self._network = avatar.parameter_groups().get("weight_network", [])
@@ -86,16 +87,19 @@ class RecordedStep:
             if not self._optimizers_told:
                 self._tell_optimizers()
             news = [*map(float, chosen), *background.flatten().tolist(), *self._numbers()]
-            # From pageable memory: the driver keeps its own copy at once, whatever the device does.
-            self._step_inputs.copy_(torch.tensor(news, dtype=torch.float64), non_blocking=True)
+            # torch keeps pinned memory until the copy is done, however far ahead the host is.
+            row = torch.tensor(news, dtype=torch.float64, pin_memory=self._loss.is_cuda)
+            self._step_inputs.copy_(row, non_blocking=True)
             if self._steps < _EAGER_STEPS:
                 self._work()
             else:
                 self._recording()
         self._states.recount_all()
         self._steps += 1
-        if self._steps % _LOOK_EVERY == 0:
-            self._look()
+        if self._steps % _LOOK_EVERY == 0 and self._overflows_read is None:
+            numbers = torch.stack([self._overflows, self._needed.long()])
+            self._overflows_read = self._renderer_of_last_step.read_later(numbers)
+        self._look()
         return self._loss.clone()
 
     def _tell_optimizers(self) -> None:
@@ -163,10 +167,18 @@ class RecordedStep:
         return renderer, psi
 
     def _look(self) -> None:
-        """Where steps overflowed: count them, make room, and record the step anew."""
-        if overflows := int(self._overflows):
+        """Where steps overflowed, as the device says by and by: count them, and make room.
+
+        The step is recorded anew then.
+        """
+        known = None if self._overflows_read is None else self._overflows_read()
+        if known is None:
+            return
+        self._overflows_read = None
+        overflows, needed = known
+        if overflows:
             self.skipped_steps += overflows
-            self._overflows.zero_()
-            self._renderer_of_last_step.make_room(int(self._needed))
+            self._overflows -= overflows
+            self._renderer_of_last_step.make_room(needed)
             self._recording.forget()
             self._steps = 0

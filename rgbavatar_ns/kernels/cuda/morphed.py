@@ -1,6 +1,6 @@
 """Morphed Gaussians drawn and trained on a GPU."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
@@ -91,6 +91,10 @@ class CudaMorphedRenderer:
     def needed(self) -> Int[Tensor, ""]:
         """How many entries or slots, whichever are more, were needed."""
         return self._tiles.bins.status[: constants()["kOverflow"]].amax()
+
+    def read_later(self, numbers: Int[Tensor, " N"]) -> Callable[[], list[int] | None]:
+        """See `Launcher`."""
+        return self._launcher.read_later(numbers)
 
     def make_room(self, needed: int) -> None:
         """Give later renderings of this kind room for at least so many."""

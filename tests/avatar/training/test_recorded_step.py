@@ -1,5 +1,7 @@
 """The recorded step, on the emulated CUDA backend: the same steps, and nothing that waits."""
 
+import weakref
+
 import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
@@ -168,6 +170,87 @@ def test_a_checkpoint_that_was_loaded_is_recorded_anew(emulated, make_avatar):
         state["exp_avg"] = state["exp_avg"].clone()
     take(ORDER[5])
     assert recorder.records == 2
+
+
+@pytest.mark.parametrize("moved", ["parameter", "anchors", "identity", "frames"])
+def test_what_lies_elsewhere_is_recorded_anew_and_the_old_place_is_kept(
+    emulated, make_avatar, moved
+):
+    avatar = stir(make_avatar())
+    step, _, recorder, take = _recorded(avatar)
+    for chosen in ORDER[:4]:
+        take(chosen)
+    assert recorder.records == 1
+    take(ORDER[4])
+    assert recorder.records == 1
+    if moved == "parameter":
+        avatar.blendshapes.position.data = avatar.blendshapes.position.data.clone()
+    elif moved == "anchors":
+        avatar.anchors.register_buffer("barycentric", avatar.anchors.barycentric.clone())
+    elif moved == "identity":
+        avatar.identity.mul_(1.01)  # in its place: what the head remembers is another
+    else:
+        frames = step.frames
+        step.frames = DeviceFrames(frames.theta, frames.cameras, frames.images_rgba.clone())
+    take(ORDER[5])
+    assert recorder.records == 2
+
+
+def test_what_a_recording_reads_lives_as_long_as_it(emulated, make_avatar):
+    avatar = stir(make_avatar())
+    _, _, _, take = _recorded(avatar)
+    for chosen in ORDER[:4]:
+        take(chosen)
+    vertices = weakref.ref(avatar.head.remembered(avatar.identity)[0].untyped_storage())
+    avatar.head.remembered(avatar.identity + 1)  # another person's take their place
+    assert vertices() is not None
+
+
+def test_numbers_of_adam_that_lie_with_the_host_are_counted_by_it(make_avatar):
+    avatar = make_avatar().to("meta")
+    optimizer = torch.optim.Adam(avatar.parameters(), lr=0.1, fused=False)
+    states = AdamStates(avatar, [optimizer])
+    states.next_of_gaussians(), states.next_of_network()
+    states.add_one_to_all()  # within a recording it would happen once
+    assert {float(step) for step in states.steps()} == {0.0}
+    states.recount_all()
+    assert {float(step) for step in states.steps()} == {1.0}
+    assert {state.step for state in states.next_of_gaussians().values()} == {2}
+
+
+def test_looking_for_overflows_waits_for_nothing(emulated, make_avatar, monkeypatch):
+    monkeypatch.setattr("rgbavatar_ns.avatar.training.recorded_step._LOOK_EVERY", 2)
+    avatar = stir(make_avatar())
+    step, _, _, take = _recorded(avatar)
+    arrived, asked = [], []
+
+    def read_later(renderer, numbers):
+        asked.append(numbers.tolist())
+        kept = asked[-1]
+        return lambda: kept if arrived else None
+
+    monkeypatch.setattr(type(step_renderer(step, take)), "read_later", read_later)
+    small = {(avatar.num_gaussians, 24, 24): 5}
+    capacities = emulated.capacities(torch.device("cpu"))
+    capacities.per_image |= small
+    for chosen in ORDER[:3]:
+        take(chosen)
+    assert asked == [[1, asked[0][1]]]
+    assert step.skipped_steps == 0
+    capacities.per_image |= small
+    take(ORDER[3])  # another one, before the first is known
+    arrived.append(True)
+    take(ORDER[4])
+    assert step.skipped_steps == 1
+    for chosen in ORDER:
+        take(chosen)
+    assert step.skipped_steps == 2
+
+
+def step_renderer(step, take):
+    """The renderer of a step's last work."""
+    take(ORDER[0])
+    return step._renderer_of_last_step
 
 
 def test_what_cannot_be_recorded_is_refused(make_avatar):
