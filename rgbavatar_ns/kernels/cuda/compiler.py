@@ -3,7 +3,7 @@
 import contextlib
 import hashlib
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 from cuda.bindings import nvrtc  # pyright: ignore[reportAttributeAccessIssue]
@@ -53,8 +53,14 @@ def _target(architecture: str) -> str:
 
 def resource_report(architecture: str) -> str:
     """What the assembler says of each kernel's registers, shared memory and spills."""
-    with _compiled(_target(architecture), "--ptxas-options=-v") as program:
-        return _log(program)
+    return compile_sources(sources(), architecture)[1]
+
+
+def compile_sources(texts: Mapping[str, str], architecture: str) -> tuple[bytes, str]:
+    """The machine code of these sources by name, and the assembler's report as above."""
+    with _compiled(_target(architecture), "--ptxas-options=-v", texts=texts) as program:
+        code = _output(program, nvrtc.nvrtcGetCUBINSize, nvrtc.nvrtcGetCUBIN)
+        return code, _log(program)
 
 
 def _compile(target: str) -> bytes:
@@ -69,9 +75,9 @@ def _options(target: str) -> list[str]:
 
 
 @contextlib.contextmanager
-def _compiled(target: str, *more: str) -> Iterator[Any]:
+def _compiled(target: str, *more: str, texts: Mapping[str, str] | None = None) -> Iterator[Any]:
     """NVRTC's program of all kernels."""
-    texts = dict(sources())
+    texts = dict(sources() if texts is None else texts)
     main = texts.pop(MAIN)
     program = _checked(
         nvrtc.nvrtcCreateProgram(

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 _HERE = Path(__file__).parent
-_FOLDERS = (_HERE / "src", _HERE.parent / "shared")
+FOLDERS = (_HERE / "src", _HERE.parent / "shared")
+"""Where the sources lie."""
 MAIN = "kernels.cu"
 """The translation unit; the other sources are included by it."""
 
@@ -46,7 +47,7 @@ class Kernel:
 @functools.cache
 def sources() -> dict[str, str]:
     """Every source by the name that it is included by."""
-    files = sorted(p for folder in _FOLDERS for p in folder.iterdir() if p.suffix != ".pyc")
+    files = sorted(p for folder in FOLDERS for p in folder.iterdir() if p.suffix != ".pyc")
     return {path.name: path.read_text() for path in files}
 
 
