@@ -19,12 +19,13 @@ from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[2]
-sys.path.insert(0, str(ROOT))
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from rgbavatar_ns.kernels import DeviceError
 from rgbavatar_ns.kernels.cuda.compiler import compile_sources
 from rgbavatar_ns.kernels.cuda.source import FOLDERS, sources
+
+ROOT = Path(__file__).resolve().parents[2]
 
 _KINDS = {
     "FP32": r"FADD|FMUL|FFMA|FMNMX|FSEL|FSET|FSETP|FCHK",
