@@ -42,9 +42,11 @@ def lane(device: torch.device) -> Callable[[], AbstractContextManager[None]]:
         with torch.cuda.device(device):
             around = torch.cuda.current_stream(device)
             stream.wait_stream(around)
-            with torch.cuda.stream(stream):
-                yield
-            around.wait_stream(stream)
+            try:
+                with torch.cuda.stream(stream):
+                    yield
+            finally:
+                around.wait_stream(stream)
 
     return entered
 

@@ -13,7 +13,6 @@ from rgbavatar_ns.kernels.cuda.source import constants
 from rgbavatar_ns.kernels.types import PinholeCameras
 
 _SPLAT_FLOATS = 12
-_STATUS_NUMBERS = 4
 _FIRST_GUESS = 4
 """Tiles a Gaussian is thought to touch, before anything was measured."""
 _ROOM = 1.5
@@ -80,10 +79,13 @@ class Capacities:
     def of(self, images: Images) -> int:
         """Entries to make room for."""
         each = self.per_image.get(self._key(images), max(_FIRST_GUESS * images.count, images.tiles))
-        return min(each * images.batch, 2**31 - 1)
+        return min(each * images.batch, constants()["kMostEntries"])
 
     def learn(self, images: Images, needed: int) -> None:
-        """Take the measurement of a whole batch."""
+        """Take the measurement of a whole batch.
+
+        Raises ValueError where no lists can be as long as that.
+        """
         self._learn(self._key(images), images.batch, needed)
 
     def await_report(self, images: Images, read: Callable[[], list[int] | None]) -> None:
@@ -91,6 +93,13 @@ class Capacities:
         self._reports.append((self._key(images), images.batch, read))
 
     def _learn(self, key: tuple[int, int, int], batch: int, needed: int) -> None:
+        if needed >= constants()["kMostEntries"]:
+            count, width, height = key
+            raise ValueError(
+                f"{batch} images of {width} x {height} px, in which {count} Gaussians touch "
+                f"{needed} tiles or more: lists cannot be as long as that. "
+                "Draw fewer or smaller images at a time, or look for Gaussians grown huge."
+            )
         room = math.ceil(needed / batch * _ROOM) + 1
         self.per_image[key] = max(self.per_image.get(key, 0), room)
 
@@ -103,10 +112,9 @@ class Capacities:
                 waiting.append((key, batch, read))
                 continue
             # Growth only: a smaller need leaves the room as it is.
-            needed = max(status[: constants()["kOverflow"]])
             if status[constants()["kOverflow"]]:
                 self.skipped_steps += 1
-                self._learn(key, batch, needed)
+                self._learn(key, batch, status[constants()["kSlotsNeeded"]])
         self._reports = waiting
 
     @staticmethod
@@ -139,7 +147,7 @@ class Bins:
             "tile_count": integers(images.batch * images.tiles).zero_(),
             "tile_start": integers(images.batch * images.tiles + 1),
             "entries": integers(self._capacity, torch.int64),
-            "status": integers(_STATUS_NUMBERS).zero_(),
+            "status": integers(constants()["kStatusNumbers"]).zero_(),
         }
         self._sorted = self._checked = False
         if images.count:  # a kernel that blends reads a Gaussian for every thread of a warp
@@ -178,7 +186,7 @@ class Bins:
         frame = self.images.values()
         self._launcher.launch("scan", (1, 1), frame=frame, bins=self.values())
         if checked:
-            needed = max(self.status.tolist()[: constants()["kOverflow"]])
+            needed = self.status.tolist()[constants()["kSlotsNeeded"]]
             self._capacities.learn(self.images, needed)
             if needed > self._capacity:
                 self._capacity = self._capacities.of(self.images)

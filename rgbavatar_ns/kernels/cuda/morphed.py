@@ -89,8 +89,8 @@ class CudaMorphedRenderer:
 
     @property
     def needed(self) -> Int[Tensor, ""]:
-        """How many entries or slots, whichever are more, were needed."""
-        return self._tiles.bins.status[: constants()["kOverflow"]].amax()
+        """How many slots were needed, which are never fewer than the entries."""
+        return self._tiles.bins.status[constants()["kSlotsNeeded"]]
 
     def read_later(self, numbers: Int[Tensor, " N"]) -> Callable[[], list[int] | None]:
         """See `Launcher`."""

@@ -160,6 +160,7 @@ static T value_of(uint64_t bits) {
 #define __forceinline__ inline
 
 static void __syncthreads() { emulation::meet_block(0, "__syncthreads"); }
+static void __syncwarp() { emulation::meet_warp(0, "__syncwarp"); }
 static int __syncthreads_or(int value) {
   const uint64_t* all = emulation::meet_block(value != 0, "__syncthreads_or");
   return std::any_of(all, all + emulation::threads, [](uint64_t v) { return v != 0; });

@@ -21,15 +21,16 @@ struct CameraArrays {
   int count;
 };
 
-// Gaussians by tile. `status` holds the entries that were needed, the slots that were needed,
-// whether either was more than the capacity, and how many launches have seen that.
+// Gaussians by tile. `status` holds the entries that were needed, the slots that were needed (never
+// fewer), whether they were more than the capacity, how many launches have seen that, and the
+// slots that were taken, in 64 bits.
 struct Bins {
   float* splats;         // [B, N, 12], see Splat
   uint32_t* slot_start;  // [B, N]: first (Gaussian, tile) slot of every Gaussian
-  uint32_t* tile_count;  // [B, P]: 0 before the projection and after the scatter
+  uint32_t* tile_count;  // [B, P]: 0 before the projection and, of lists that fit, after the scatter
   uint32_t* tile_start;  // [B P + 1]
   uint64_t* entries;     // [capacity]: depth << 32 | Gaussian
-  uint32_t* status;      // [4]
+  uint32_t* status;      // [6]
   int capacity;          // of entries and of slots
 };
 

@@ -35,9 +35,11 @@ RGBAVATAR_KERNEL(scan, ScanArguments, kScanThreads) {
   }
   if (thread != 0) return;
   a.bins.tile_start[count] = before;
-  a.bins.status[kEntriesNeeded] = before;
-  const uint32_t capacity = uint32_t(a.bins.capacity);
-  const bool overflow = before > capacity || a.bins.status[kSlotsNeeded] > capacity;
+  // Every entry has taken a slot: where the sum of the entries wraps, the slots are too many.
+  const uint64_t slots = *reinterpret_cast<const uint64_t*>(a.bins.status + kSlotsTaken);
+  const bool overflow = slots > uint64_t(a.bins.capacity);
+  a.bins.status[kEntriesNeeded] = uint32_t(slots < before ? slots : before);
+  a.bins.status[kSlotsNeeded] = uint32_t(slots < uint64_t(kMostEntries) ? slots : kMostEntries);
   a.bins.status[kOverflow] = overflow;
   a.bins.status[kOverflows] += overflow;
 }
@@ -47,51 +49,113 @@ RGBAVATAR_FUNCTION bool overflowed(const Bins& bins) { return bins.status[kOverf
 // Puts every Gaussian into the lists of its tiles, in any order.
 RGBAVATAR_KERNEL(scatter, ScatterArguments, kTileThreads) {
   const int gaussian = int(blockIdx.x * blockDim.x + threadIdx.x), image = int(blockIdx.y);
-  if (gaussian >= a.frame.count) return;
-  const Splat s = splats_of(a.frame, a.bins, image)[gaussian];
-  if (!s.drawn()) return;
-  const uint64_t key = uint64_t(__float_as_uint(s.depth)) << 32 | uint32_t(gaussian);
   const int64_t first = int64_t(image) * a.frame.tiles_x * a.frame.tiles_y;
-  for (int ty = s.first_y(); ty <= s.last_y(); ++ty)
-    for (int tx = s.first_x(); tx <= s.last_x(); ++tx) {
-      if (!touches_tile(s, a.frame, tx, ty)) continue;
-      const int64_t tile = first + ty * a.frame.tiles_x + tx;
-      const uint32_t left = atomicSub(a.bins.tile_count + tile, 1u) - 1u;
-      const uint64_t place = uint64_t(a.bins.tile_start[tile]) + left;
-      if (place < uint64_t(a.bins.capacity)) a.bins.entries[place] = key;
-    }
+  if (overflowed(a.bins)) return;
+  const Splat* splats = splats_of(a.frame, a.bins, image);
+  for_each_tile(a.frame, splats, gaussian, splat_at(splats, a.frame, gaussian),
+                [&](int which, const Splat& s, int x, int y) {
+                  const uint64_t depth = __float_as_uint(s.depth);
+                  const int64_t tile = first + y * a.frame.tiles_x + x;
+                  const uint32_t left = atomicSub(a.bins.tile_count + tile, 1u) - 1u;
+                  a.bins.entries[uint64_t(a.bins.tile_start[tile]) + left] =
+                      depth << 32 | uint32_t(which);
+                });
 }
 
+// ---- Sorting: Batcher's bitonic network. Its merges begin with a mirrored step, so that every
+// comparison puts the smaller key first and lists of any length are sorted; what would stand behind
+// a list's end is larger than any key.
+
+constexpr uint64_t kNoKey = ~uint64_t(0);
+
 RGBAVATAR_FUNCTION void sort_pair(uint64_t* keys, int low, int high, int count) {
-  if (high >= count) return;  // what would stand there is larger than any key
+  if (high >= count) return;
   const uint64_t a = keys[low], b = keys[high];
   if (a <= b) return;
   keys[low] = b, keys[high] = a;
 }
 
-// Batcher's bitonic sort whose merges begin with a mirrored step, so that every comparison puts the
-// smaller key first and lists of any length are sorted.
+// The first step of the merges into runs of 2^log_run keys.
+RGBAVATAR_FUNCTION void mirrored_step(uint64_t* keys, int count, int pairs, int log_run) {
+  const int log_half = log_run - 1, last = (1 << log_run) - 1;
+  for (int i = int(threadIdx.x); i < pairs; i += int(blockDim.x)) {
+    const int within = i & ((1 << log_half) - 1), first = i >> log_half << log_run;
+    sort_pair(keys, first + within, first + last - within, count);
+  }
+  __syncthreads();
+}
+
+// The step with partners 2^log_half apart.
+RGBAVATAR_FUNCTION void half_step(uint64_t* keys, int count, int pairs, int log_half) {
+  for (int i = int(threadIdx.x); i < pairs; i += int(blockDim.x)) {
+    const int low = (i >> log_half << (log_half + 1)) + (i & ((1 << log_half) - 1));
+    sort_pair(keys, low, low + (1 << log_half), count);
+  }
+  __syncthreads();
+}
+
+// The thread's key after it met that of the lane whose number differs by `mask`.
+RGBAVATAR_FUNCTION uint64_t meet_key(uint64_t mine, int mask, bool keeps_small) {
+  const uint64_t other =
+      __shfl_xor_sync(kWholeWarp, (unsigned long long)(mine), mask);
+  return (mine < other) == keeps_small ? mine : other;
+}
+
+// The steps with partners less than 32 apart, in registers: the last of a merge, or all the merges
+// into runs of 32.
+template <bool kWhole>
+RGBAVATAR_FUNCTION void steps_of_warps(uint64_t* keys, int count) {
+  const int lane = int(threadIdx.x) & 31;
+  for (int i = int(threadIdx.x); (i & ~31) < count; i += int(blockDim.x)) {
+    uint64_t key = i < count ? keys[i] : kNoKey;
+#pragma unroll
+    for (int run = kWhole ? 2 : 32; run <= 32; run *= 2) {
+      if (kWhole) key = meet_key(key, run - 1, !(lane & run / 2));
+#pragma unroll
+      for (int half = kWhole ? run / 4 : 16; half > 0; half /= 2)
+        key = meet_key(key, half, !(lane & half));
+    }
+    if (i < count) keys[i] = key;
+  }
+  __syncthreads();
+}
+
+// The steps of a merge with partners 2^log_half apart and less; both bounds count pairs.
+RGBAVATAR_FUNCTION void half_steps(uint64_t* keys, int count, int pairs, int log_half) {
+  for (; log_half >= 5; --log_half) half_step(keys, count, pairs, log_half);
+  steps_of_warps<false>(keys, count);
+}
+
+// Half the smallest power of two, 32 or more, that holds so many keys.
+RGBAVATAR_FUNCTION int pairs_of(int count) {
+  int pairs = 16;
+  while (2 * pairs < count) pairs *= 2;
+  return pairs;
+}
+
 RGBAVATAR_FUNCTION void sort_keys(uint64_t* keys, int count) {
-  int padded = 1;
-  while (padded < count) padded *= 2;
-  for (int run = 2; run <= padded; run *= 2) {
-    for (int i = int(threadIdx.x); i < padded / 2; i += int(blockDim.x)) {
-      const int half = run / 2, within = i % half, first = i / half * run;
-      sort_pair(keys, first + within, first + run - 1 - within, count);
-    }
-    __syncthreads();
-    for (int half = run / 4; half > 0; half /= 2) {
-      for (int i = int(threadIdx.x); i < padded / 2; i += int(blockDim.x)) {
-        const int low = i / half * 2 * half + i % half;
-        sort_pair(keys, low, low + half, count);
-      }
-      __syncthreads();
-    }
+  const int pairs = pairs_of(count);
+  steps_of_warps<true>(keys, count);
+  for (int log_run = 6; 1 << log_run <= 2 * pairs; ++log_run) {
+    mirrored_step(keys, count, pairs, log_run);
+    half_steps(keys, count, pairs, log_run - 2);
   }
 }
 
-// One block a tile. Lists that do not fit shared memory are sorted where they stand.
-constexpr int kSharedKeys = 2048;
+// A part of a list of at most kSharedKeys, in shared memory while `work` is done on it.
+constexpr int kLogSharedKeys = 11, kSharedKeys = 1 << kLogSharedKeys;
+template <class Work>
+RGBAVATAR_FUNCTION void in_shared_memory(uint64_t* list, int count, uint64_t* keys,
+                                         const Work& work) {
+  for (int i = int(threadIdx.x); i < count; i += int(blockDim.x)) keys[i] = list[i];
+  __syncthreads();
+  work(count);
+  for (int i = int(threadIdx.x); i < count; i += int(blockDim.x)) list[i] = keys[i];
+  __syncthreads();
+}
+
+// One block a tile. Of lists that do not fit shared memory only the steps with far partners are
+// taken where they stand: one pass of global memory for twice as many keys, three for four times.
 RGBAVATAR_KERNEL(sort, SortArguments, kTileThreads) {
   RGBAVATAR_SHARED uint64_t keys[kSharedKeys];
   if (overflowed(a.bins)) return;
@@ -100,9 +164,19 @@ RGBAVATAR_KERNEL(sort, SortArguments, kTileThreads) {
   const int count = int(a.bins.tile_start[tile + 1] - start);
   uint64_t* list = a.bins.entries + start;
   if (count < 2) return;
-  if (count > kSharedKeys) return sort_keys(list, count);
-  for (int i = int(threadIdx.x); i < count; i += int(blockDim.x)) keys[i] = list[i];
-  __syncthreads();
-  sort_keys(keys, count);
-  for (int i = int(threadIdx.x); i < count; i += int(blockDim.x)) list[i] = keys[i];
+  const auto for_each_part = [&](const auto& work) {
+    for (int first = 0; first < count; first += kSharedKeys)
+      in_shared_memory(list + first, count - first < kSharedKeys ? count - first : kSharedKeys,
+                       keys, work);
+  };
+  for_each_part([&](int part) { sort_keys(keys, part); });
+  const int pairs = pairs_of(count);
+  for (int log_run = kLogSharedKeys + 1; 1 << log_run <= 2 * pairs; ++log_run) {
+    mirrored_step(list, count, pairs, log_run);
+    for (int log_half = log_run - 2; log_half >= kLogSharedKeys; --log_half)
+      half_step(list, count, pairs, log_half);
+    for_each_part([&](int part) {
+      half_steps(keys, part, kSharedKeys / 2, kLogSharedKeys - 1);
+    });
+  }
 }

@@ -22,7 +22,10 @@ constexpr int kCarriedFloats = 12;
 constexpr int kBlendThreads = 128;
 constexpr int kBlendImages = 5;  // images whose sums stay in registers together
 constexpr float kColorScale = 0.28209479177387814f;  // of the zeroth spherical harmonic
-enum { kEntriesNeeded = 0, kSlotsNeeded = 1, kOverflow = 2, kOverflows = 3 };
+// `Bins::status`: 32-bit numbers, and in the last two one of 64 bits, which nothing can wrap.
+enum { kEntriesNeeded = 0, kSlotsNeeded = 1, kOverflow = 2, kOverflows = 3, kSlotsTaken = 4 };
+constexpr int kStatusNumbers = 6;
+constexpr int kMostEntries = 2147483647;  // a larger need says just this
 
 // 2^p for p from -8 to 0: within two units in the last place.
 RGBAVATAR_FUNCTION float power_of_two(float p) {
@@ -49,11 +52,22 @@ struct alignas(16) Splat {
   RGBAVATAR_FUNCTION int last_y() const { return int(last_tile >> 16); }
   RGBAVATAR_FUNCTION bool drawn() const { return first_x() <= last_x(); }
   RGBAVATAR_FUNCTION int tiles_across() const { return last_x() - first_x() + 1; }
+  RGBAVATAR_FUNCTION int tiles() const {
+    return drawn() ? tiles_across() * (last_y() - first_y() + 1) : 0;
+  }
 };
 static_assert(sizeof(Splat) == 48, "arguments.h gives a splat twelve floats");
 
 RGBAVATAR_FUNCTION const Splat* splats_of(const Frame& frame, const Bins& bins, int image) {
   return reinterpret_cast<const Splat*>(bins.splats) + int64_t(image) * frame.count;
+}
+
+// The Gaussian's splat; one that is not drawn behind the last Gaussian.
+RGBAVATAR_FUNCTION Splat splat_at(const Splat* splats, const Frame& frame, int gaussian) {
+  if (gaussian < frame.count) return splats[gaussian];
+  Splat none = {};
+  none.first_tile = 1u;
+  return none;
 }
 
 // Log2 of the alpha that a splat has at its best within the rectangle of pixel centres. The best
@@ -94,6 +108,51 @@ RGBAVATAR_FUNCTION bool touches_tile(const Splat& s, const Frame& frame, int til
   const float right = fminf(left + (kTileSide - 1.0f), float(frame.width) - 0.5f);
   const float bottom = fminf(top + (kTileSide - 1.0f), float(frame.height) - 0.5f);
   return touches(s, left, top, right, bottom);
+}
+
+// Calls visit(place, x, y) with the tiles that the splat touches: the place among the tiles of its
+// rectangle, row by row, of which every `step`th is looked at, and the tile.
+template <class Visit>
+RGBAVATAR_FUNCTION void walk_tiles(const Frame& frame, const Splat& s, int first, int step,
+                                   const Visit& visit) {
+  if (!s.drawn()) return;
+  const int across = s.tiles_across(), count = s.tiles();
+  int x = s.first_x() + first % across, y = s.first_y() + first / across;
+  for (int place = first; place < count; place += step) {
+    if (touches_tile(s, frame, x, y)) visit(place, x, y);
+    for (x += step; x > s.last_x(); x -= across) ++y;
+  }
+}
+
+// A thread walks the tiles of its own splat; a splat of many tiles is walked by the whole warp, so
+// that no thread is alone with one that fills the screen.
+constexpr int kTilesAlone = 64;
+
+// Calls visit(Gaussian, splat) in all threads of a warp with each that is to be walked by all of
+// them. All come here, with consecutive Gaussians; `own` is the thread's, and among `splats` for
+// the others.
+template <class Visit>
+RGBAVATAR_FUNCTION void for_each_shared(const Splat* splats, int gaussian, const Splat& own,
+                                        const Visit& visit) {
+  const int first = gaussian - (int(threadIdx.x) & 31);
+  unsigned left = __ballot_sync(kWholeWarp, own.tiles() > kTilesAlone);
+  for (; left; left &= left - 1) {
+    const int which = first + __ffs(int(left)) - 1;
+    visit(which, splats[which]);
+  }
+}
+
+// Calls visit(Gaussian, splat, x, y) with every tile that a warp's splats touch, in any order.
+template <class Visit>
+RGBAVATAR_FUNCTION void for_each_tile(const Frame& frame, const Splat* splats, int gaussian,
+                                      const Splat& own, const Visit& visit) {
+  const auto walk = [&](int which, const Splat& s, int first, int step) {
+    walk_tiles(frame, s, first, step, [&](int, int x, int y) { visit(which, s, x, y); });
+  };
+  if (own.tiles() <= kTilesAlone) walk(gaussian, own, 0, 1);
+  for_each_shared(splats, gaussian, own, [&](int which, const Splat& s) {
+    walk(which, s, int(threadIdx.x) & 31, 32);
+  });
 }
 
 RGBAVATAR_FUNCTION float warp_sum(float value) {

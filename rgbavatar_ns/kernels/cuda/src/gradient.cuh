@@ -1,40 +1,68 @@
 // From the slots to the gradients of Gaussians, and from these through Adam.
 
-// Calls visit(slot) with the slots of a Gaussian that a tile has written, in the tiles' order.
-template <class Visit>
-RGBAVATAR_FUNCTION void for_each_slot(const Frame& frame, const Bins& bins, const Splat& s,
-                                      int64_t row, const Visit& visit) {
-  int64_t slot = bins.slot_start[row];
-  for (int ty = s.first_y(); ty <= s.last_y(); ++ty)
-    for (int tx = s.first_x(); tx <= s.last_x(); ++tx, ++slot)
-      if (touches_tile(s, frame, tx, ty)) visit(slot);
+// Adds up what the tiles have written of a warp's Gaussians: take(sums, slot) a slot into the sums
+// of a thread, join(sum, which) those of a warp. In the order of the tiles, or, of a splat that the
+// warp shares, in an order that depends on nothing else either. All threads of a warp come here.
+template <int kSums, class Take, class Join>
+RGBAVATAR_FUNCTION void sum_tiles(const Frame& frame, const Bins& bins, int image, int gaussian,
+                                  const Splat& own, float (&sums)[kSums], const Take& take,
+                                  const Join& join) {
+  const int lane = int(threadIdx.x) & 31;
+  const uint32_t* slot_start = bins.slot_start + int64_t(image) * frame.count;
+  const auto add = [&](float(&to)[kSums], int which, const Splat& s, int first, int step) {
+    const int64_t start = slot_start[which];
+    walk_tiles(frame, s, first, step, [&](int place, int, int) { take(to, start + place); });
+  };
+  if (own.drawn() && own.tiles() <= kTilesAlone) add(sums, gaussian, own, 0, 1);
+  for_each_shared(splats_of(frame, bins, image), gaussian, own, [&](int which, const Splat& s) {
+    float part[kSums] = {};
+    add(part, which, s, lane, 32);
+#pragma unroll
+    for (int k = 0; k < kSums; ++k) {
+      const float sum = join(part[k], k);
+      if (which == gaussian) sums[k] = sum;
+    }
+  });
 }
 
-RGBAVATAR_FUNCTION Moments<float> sum_slots(const Frame& frame, const Bins& bins, const Splat& s,
-                                            int64_t row, const float* slots) {
+// The thread's splat in an image whose lists fit; one that is not drawn where they do not.
+RGBAVATAR_FUNCTION Splat blended_splat(const Frame& frame, const Bins& bins, int image,
+                                       int gaussian) {
+  return splat_at(splats_of(frame, bins, image), frame, overflowed(bins) ? frame.count : gaussian);
+}
+
+RGBAVATAR_FUNCTION Moments<float> sum_moments(const Frame& frame, const Bins& bins, int image,
+                                              int gaussian, const Splat& own, const float* slots) {
   float m[kMoments] = {};
-  for_each_slot(frame, bins, s, row, [&](int64_t slot) {
-    for (int k = 0; k < kMoments; ++k) m[k] += slots[slot * kMoments + k];
-  });
+  sum_tiles(
+      frame, bins, image, gaussian, own, m,
+      [&](float(&sums)[kMoments], int64_t slot) {
+        for (int k = 0; k < kMoments; ++k) sums[k] += slots[slot * kMoments + k];
+      },
+      [](float sum, int) { return warp_sum(sum); });
   return {{m[0], m[1], m[2]}, m[3], m[4], m[5], m[6], m[7], m[8]};
 }
 
 // Sums of `average` by Gaussian. Blocks of 128 Gaussians, by images.
 RGBAVATAR_KERNEL(collect, CollectArguments, kBlendThreads) {
   const int gaussian = int(blockIdx.x * blockDim.x + threadIdx.x), image = int(blockIdx.y);
-  if (gaussian >= a.frame.count) return;
   const int64_t row = int64_t(image) * a.frame.count + gaussian;
-  const Splat s = splats_of(a.frame, a.bins, image)[gaussian];
+  const Splat s = blended_splat(a.frame, a.bins, image, gaussian);
   float sums[kMaxSums] = {};
   const int width = a.channels + 2;
-  if (s.drawn() && !overflowed(a.bins))
-    for_each_slot(a.frame, a.bins, s, row, [&](int64_t slot) {
-      for (int k = 0; k < kMaxSums; ++k) {
-        if (k >= width) break;
-        const float value = a.slots[slot * width + k];
-        sums[k] = k == a.channels + 1 ? fmaxf(sums[k], value) : sums[k] + value;
-      }
-    });
+  sum_tiles(
+      a.frame, a.bins, image, gaussian, s, sums,
+      [&](float(&to)[kMaxSums], int64_t slot) {
+#pragma unroll
+        for (int k = 0; k < kMaxSums; ++k) {
+          if (k >= width) break;
+          const float value = a.slots[slot * width + k];
+          to[k] = k == a.channels + 1 ? fmaxf(to[k], value) : to[k] + value;
+        }
+      },
+      [&](float sum, int k) { return k == a.channels + 1 ? warp_max(sum) : warp_sum(sum); });
+  if (gaussian >= a.frame.count) return;
+#pragma unroll
   for (int k = 0; k < kMaxSums; ++k) {
     if (k < a.channels && a.weighted_sum) a.weighted_sum[row * a.channels + k] = sums[k];
     if (k == a.channels && a.weight_sum) a.weight_sum[row] = sums[k];
@@ -46,15 +74,15 @@ RGBAVATAR_KERNEL(collect, CollectArguments, kBlendThreads) {
 // anything. Blocks of 128 Gaussians, by images.
 RGBAVATAR_KERNEL(project_backward, ProjectBackwardArguments, kBlendThreads) {
   const int gaussian = int(blockIdx.x * blockDim.x + threadIdx.x), image = int(blockIdx.y);
-  if (gaussian >= a.frame.count) return;
   const int64_t row = int64_t(image) * a.frame.count + gaussian;
-  const Splat s = splats_of(a.frame, a.bins, image)[gaussian];
+  const Splat s = blended_splat(a.frame, a.bins, image, gaussian);
+  const Moments<float> moments = sum_moments(a.frame, a.bins, image, gaussian, s, a.slots);
+  if (gaussian >= a.frame.count) return;
   GaussianGradient<float> d = {};
   Vec3<float> color = {};
-  if (s.drawn() && !overflowed(a.bins)) {
+  if (s.drawn()) {
     const GaussianInput<float> g = world_gaussian(a.world, a.frame, image, gaussian);
     const Camera camera = camera_of(a.cameras, a.frame, image);
-    const Moments<float> moments = sum_slots(a.frame, a.bins, s, row, a.slots);
     d = project_backward(g, camera, project(g, camera), moments);
     color = moments.color;
   }
@@ -67,17 +95,18 @@ RGBAVATAR_KERNEL(project_backward, ProjectBackwardArguments, kBlendThreads) {
     a.screen_offset[row * 2] = d.mean_x, a.screen_offset[row * 2 + 1] = d.mean_y;
 }
 
-// The gradient of one morphed Gaussian in one image.
+// The gradient of one morphed Gaussian in one image. All threads of a warp come here.
 RGBAVATAR_FUNCTION void morphed_gradient(const BlendBackwardArguments& a, int image, int gaussian,
                                          const Carried& c) {
   const int64_t row = int64_t(image) * a.frame.count + gaussian;
-  const Splat s = splats_of(a.frame, a.bins, image)[gaussian];
+  const Splat s = blended_splat(a.frame, a.bins, image, gaussian);
+  const Moments<float> moments = sum_moments(a.frame, a.bins, image, gaussian, s, a.slots);
+  if (gaussian >= a.frame.count) return;
   Vec3<float> position = {}, color = {}, log_scale = {};
   float rotation[4] = {}, logit = 0.0f, carried[kCarriedFloats] = {};
-  if (s.drawn() && !overflowed(a.bins)) {
+  if (s.drawn()) {
     const GaussianInput<float>& g = c.gaussian;
     const Camera camera = camera_of(a.cameras, a.frame, image);
-    const Moments<float> moments = sum_slots(a.frame, a.bins, s, row, a.slots);
     const GaussianGradient<float> d = project_backward(g, camera, project(g, camera), moments);
     position = add_scaled(add_scaled(scaled(c.row0, d.mean.x), c.row1, d.mean.y), c.row2, d.mean.z);
     conjugate_product(c.frame_quat, d.quat, rotation);
@@ -106,15 +135,15 @@ RGBAVATAR_KERNEL(blend_backward, BlendBackwardArguments, kBlendThreads) {
   const int first_image = int(blockIdx.y) * kBlendImages;
   load_weights(a.blended, a.frame, first_image, weights);
   const int gaussian = int(blockIdx.x * blockDim.x + threadIdx.x);
-  if (gaussian >= a.frame.count) return;
+  const int row = gaussian < a.frame.count ? gaussian : 0;
   Tangent tangent;
-  blend_gaussian(a.blended, a.frame, weights, gaussian, tangent);
+  blend_gaussian(a.blended, a.frame, weights, row, tangent);
 #pragma unroll
   for (int i = 0; i < kBlendImages; ++i) {
     const int image = first_image + i;
     if (image >= a.frame.batch) break;
     morphed_gradient(a, image, gaussian,
-                     carry(a.blended, image, gaussian, tangent.position[i], tangent.rotation[i],
+                     carry(a.blended, image, row, tangent.position[i], tangent.rotation[i],
                            tangent.color[i]));
   }
 }

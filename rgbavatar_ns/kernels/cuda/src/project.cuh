@@ -13,8 +13,9 @@ RGBAVATAR_FUNCTION void put_vec3(const Vec3<float>& v, float* rows, int64_t row)
   rows[row * 3] = v.x, rows[row * 3 + 1] = v.y, rows[row * 3 + 2] = v.z;
 }
 
-// Slots for a warp's Gaussians, one atomic addition for all of them.
-RGBAVATAR_FUNCTION uint32_t warp_slots(uint32_t wanted, uint32_t* counter) {
+// Slots for a warp's Gaussians, one atomic addition for all of them. Beyond what fits, the numbers
+// say nothing and nobody reads them.
+RGBAVATAR_FUNCTION uint32_t warp_slots(uint32_t wanted, uint32_t* status) {
   const int lane = int(threadIdx.x) & 31;
   uint32_t sum = wanted;
   for (int step = 1; step < 32; step *= 2) {
@@ -22,7 +23,8 @@ RGBAVATAR_FUNCTION uint32_t warp_slots(uint32_t wanted, uint32_t* counter) {
     if (lane >= step) sum += below;
   }
   uint32_t start = 0;
-  if (lane == 31 && sum) start = atomicAdd(counter, sum);
+  auto* taken = reinterpret_cast<unsigned long long*>(status + kSlotsTaken);
+  if (lane == 31 && sum) start = uint32_t(atomicAdd(taken, (unsigned long long)(sum)));
   return __shfl_sync(kWholeWarp, start, 31) + sum - wanted;
 }
 
@@ -57,18 +59,15 @@ RGBAVATAR_FUNCTION void emit(const Frame& frame, const Bins& bins, int image, in
   s.red = color.x, s.green = color.y, s.blue = color.z;
   s.first_tile = seen ? uint32_t(x.first | y.first << 16) : 1u;
   s.last_tile = seen ? uint32_t(x.last | y.last << 16) : 0u;
-  const uint32_t wanted =
-      seen ? uint32_t(x.last - x.first + 1) * uint32_t(y.last - y.first + 1) : 0u;
-  const uint32_t start = warp_slots(wanted, bins.status + kSlotsNeeded);
-  if (!exists) return;
-  const int64_t row = int64_t(image) * frame.count + gaussian;
-  reinterpret_cast<Splat*>(bins.splats)[row] = s;
-  bins.slot_start[row] = start;
-  if (!seen) return;
+  const uint32_t start = warp_slots(uint32_t(s.tiles()), bins.status);
+  const int64_t first_row = int64_t(image) * frame.count;
+  Splat* splats = reinterpret_cast<Splat*>(bins.splats) + first_row;
+  if (exists) splats[gaussian] = s, bins.slot_start[first_row + gaussian] = start;
+  __syncwarp();
   uint32_t* counts = bins.tile_count + int64_t(image) * frame.tiles_x * frame.tiles_y;
-  for (int ty = y.first; ty <= y.last; ++ty)
-    for (int tx = x.first; tx <= x.last; ++tx)
-      if (touches_tile(s, frame, tx, ty)) atomicAdd(counts + ty * frame.tiles_x + tx, 1u);
+  for_each_tile(frame, splats, gaussian, s, [&](int, const Splat&, int x, int y) {
+    atomicAdd(counts + y * frame.tiles_x + x, 1u);
+  });
 }
 
 RGBAVATAR_FUNCTION GaussianInput<float> world_gaussian(const World& world, const Frame& frame,
