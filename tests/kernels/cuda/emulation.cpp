@@ -216,7 +216,7 @@ static unsigned __float_as_uint(float value) {
   return unsigned(emulation::bits_of(value));
 }
 
-#define RGBAVATAR_KERNEL(name, Arguments, threads)                                               \
+#define RGBAVATAR_KERNEL(name, Arguments, ...)                                                   \
   static void name##_body(const Arguments& a);                                                   \
   extern "C" void name##_emulated(const void* arguments, unsigned grid_x, unsigned grid_y,       \
                                   unsigned block_threads, unsigned seed) {                       \

@@ -24,12 +24,24 @@ struct Pixel {
   }
 };
 
-// A tile's list, and some of its Gaussians at a time in shared memory.
+// Some of a tile's Gaussians in shared memory: those that are blended, and the next, which are on
+// their way meanwhile.
 constexpr int kBatch = 64;
 struct Batch {
-  Splat splats[kBatch];
-  uint32_t slots[kBatch];
-  uint32_t waiting[kBatch];  // a Gaussian's number and one, where it waits for its first colour
+  Splat splats[2][kBatch];
+};
+
+// What passes that sum over pixels also need of them.
+struct SumBatch {
+  uint32_t slots[2][kBatch];
+  uint32_t waiting[2][kBatch];  // a Gaussian's number and one, where it waits for its first colour
+};
+
+// Which Gaussians of a list reach each warp's pixels, by groups of 32: found by one pass over the
+// list for the next. Behind kKeptGroups they are found again.
+constexpr int kKeptGroups = 32;
+struct KeptGroups {
+  uint32_t near[kTileThreads / 32][kKeptGroups];
 };
 
 struct TileList {
@@ -52,17 +64,14 @@ struct TileList {
     count = overflowed(bins) ? 0 : int(bins.tile_start[tile + 1] - start);
   }
 
-  // The entry's Gaussian and where its sums over this tile go.
-  RGBAVATAR_FUNCTION Splat read(int entry, uint32_t& slot) const {
-    const uint32_t gaussian = uint32_t(entries[entry]);
-    const Splat s = splats[gaussian];
-    slot = slot_start[gaussian] +
-           uint32_t((tile_y - s.first_y()) * s.tiles_across() + tile_x - s.first_x());
-    return s;
+  RGBAVATAR_FUNCTION uint32_t gaussian_of(int entry) const { return uint32_t(entries[entry]); }
+
+  // Where the sums of a Gaussian over this tile go; `start` is its first slot.
+  RGBAVATAR_FUNCTION uint32_t slot_of(const Splat& s, uint32_t start) const {
+    return start + uint32_t((tile_y - s.first_y()) * s.tiles_across() + tile_x - s.first_x());
   }
 
-  RGBAVATAR_FUNCTION uint32_t waiting(int entry) const {
-    const uint32_t gaussian = uint32_t(entries[entry]);
+  RGBAVATAR_FUNCTION uint32_t waiting(uint32_t gaussian) const {
     return known && !known[gaussian] ? gaussian + 1u : 0u;
   }
 };
@@ -86,37 +95,94 @@ struct Touch {
   }
 };
 
-// Calls visit(place, splat, touch) front to back with the Gaussians that may reach the warp's
+// The weight of a touch in its pixel. Rounded as it stands, so that every pass over a list finds the
+// same transmittances and ends at the same Gaussian.
+RGBAVATAR_FUNCTION float weight_of(const Touch& touch, float transmittance) {
+  return __fmul_rn(touch.alpha, transmittance);
+}
+
+// A pass over a tile's list, which a thread of a block begins by knowing its Gaussian of the first
+// batch. All threads of the block have left the pass before.
+struct Reader {
+  const TileList& list;
+  Batch& batch;
+  SumBatch* sums;  // null where no slots are wanted
+  uint32_t gaussian, after, start;  // of the batch on its way; of the one behind; its first slot
+
+  RGBAVATAR_FUNCTION Reader(const TileList& of, Batch& into, SumBatch* with)
+      : list(of), batch(into), sums(with), gaussian(0u), after(0u), start(0u) {
+    if (has(0)) after = list.gaussian_of(int(threadIdx.x));
+    begin(0);
+  }
+  RGBAVATAR_FUNCTION bool has(int first) const {
+    return int(threadIdx.x) < kBatch && first + int(threadIdx.x) < list.count;
+  }
+  // Sends for the batch at `first`, and learns the numbers of the one behind it.
+  RGBAVATAR_FUNCTION void begin(int first) {
+    if (!has(first)) return;
+    gaussian = after;
+    begin_copy(batch.splats[first / kBatch & 1][threadIdx.x], list.splats[gaussian]);
+    if (sums) start = list.slot_start[gaussian];
+    if (has(first + kBatch)) after = list.gaussian_of(first + kBatch + int(threadIdx.x));
+  }
+  // The batch is there for others after a barrier.
+  RGBAVATAR_FUNCTION void finish(int first) {
+    finish_copies();
+    if (!sums || !has(first)) return;
+    const int page = first / kBatch & 1;
+    sums->slots[page][threadIdx.x] = list.slot_of(batch.splats[page][threadIdx.x], start);
+    if (list.known) sums->waiting[page][threadIdx.x] = list.waiting(gaussian);
+  }
+};
+
+// Calls visit(page, place, splat, touch) front to back with the Gaussians that may reach the warp's
 // pixels, while one of these is open; the visitor changes the transmittance. All lanes of a warp
-// make every call together. After each batch, end(first entry, number) is called by all threads of
-// the block; the return value is the first entry that was not read.
-template <class Visit, class End>
-RGBAVATAR_FUNCTION int walk(const TileList& list, const Pixel& pixel, Batch& batch,
-                            float& transmittance, const Visit& visit, const End& end) {
-  const int lane = int(threadIdx.x) & 31;
+// make every call together; after each group of 32, group_end(its first place, bits of the visited).
+// After each batch, end(page, number) is called by all threads of the block. The return value is
+// the first entry that was not read.
+//
+// `kept` may be null; `known` is how many groups of it an earlier pass has found for this warp, and
+// becomes how many are found now.
+template <class Visit, class GroupEnd, class End>
+RGBAVATAR_FUNCTION int walk(Reader reader, const Pixel& pixel, float& transmittance,
+                            KeptGroups* kept, int& known, const Visit& visit,
+                            const GroupEnd& group_end, const End& end) {
+  const int lane = int(threadIdx.x) & 31, warp = int(threadIdx.x) >> 5, total = reader.list.count;
   int first = 0;
-  for (; first < list.count; first += kBatch) {
+  for (; first < total; first += kBatch) {
+    reader.finish(first);
     if (!__syncthreads_or(is_open(transmittance))) break;
-    const int number = list.count - first < kBatch ? list.count - first : kBatch;
-    const int mine = int(threadIdx.x);
-    if (mine < number) {
-      batch.splats[mine] = list.read(first + mine, batch.slots[mine]);
-      batch.waiting[mine] = list.waiting(first + mine);
-    }
-    __syncthreads();
+    reader.begin(first + kBatch);
+    __syncthreads();  // the compiler knows by it that warps are whole: 31 instructions a visit, else 42
+    const int page = first / kBatch & 1;
+    const Splat* splats = reader.batch.splats[page];
+    const int number = total - first < kBatch ? total - first : kBatch;
     for (int group = 0; group < number; group += 32) {
-      const bool near = group + lane < number &&
-                        touches(batch.splats[group + lane], pixel.left, pixel.top, pixel.right,
-                                pixel.bottom);
-      for (unsigned left = __ballot_sync(kWholeWarp, near); left; left &= left - 1) {
+      const int which = (first + group) / 32;
+      const bool found = kept && which < known;
+      bool reaches = false;
+      if (found) {
+        reaches = kept->near[warp][which] >> lane & 1u;
+      } else if (__ballot_sync(kWholeWarp, is_open(transmittance))) {
+        reaches = group + lane < number && touches(splats[group + lane], pixel.left, pixel.top,
+                                                   pixel.right, pixel.bottom);
+      }
+      const unsigned near = __ballot_sync(kWholeWarp, reaches);
+      if (kept && !found && which == known && known < kKeptGroups) {
+        if (lane == 0) kept->near[warp][which] = near;
+        ++known;
+      }
+      unsigned left = near;
+      for (; left; left &= left - 1) {
         const unsigned open = __ballot_sync(kWholeWarp, is_open(transmittance));
         if (!open) break;
         const int place = group + __ffs(int(left)) - 1;
-        const Splat& s = batch.splats[place];
-        visit(place, s, Touch(s, pixel, (open & pixel.half) != 0));
+        const Splat& s = splats[place];
+        visit(page, place, s, Touch(s, pixel, (open & pixel.half) != 0));
       }
+      group_end(group, near & ~left);
     }
-    end(first, number);
+    end(page, number);
   }
   return first;
 }
@@ -128,15 +194,16 @@ struct Blend {
 
   RGBAVATAR_FUNCTION explicit Blend(const Pixel& pixel)
       : transmittance(pixel.inside ? 1.0f : 0.0f) {}
-  RGBAVATAR_FUNCTION void run(const TileList& list, const Pixel& pixel, Batch& batch) {
+  RGBAVATAR_FUNCTION void run(const TileList& list, const Pixel& pixel, Batch& batch,
+                              KeptGroups* kept, int& known) {
     walk(
-        list, pixel, batch, transmittance,
-        [&](int, const Splat& s, const Touch& touch) {
-          const float w = touch.alpha * transmittance;
+        Reader(list, batch, nullptr), pixel, transmittance, kept, known,
+        [&](int, int, const Splat& s, const Touch& touch) {
+          const float w = weight_of(touch, transmittance);
           red += w * s.red, green += w * s.green, blue += w * s.blue, depth += w * s.depth;
           transmittance -= w;
         },
-        [](int, int) {});
+        [](int, unsigned) {}, [](int, int) {});
   }
 };
 
@@ -149,7 +216,8 @@ RGBAVATAR_KERNEL(draw, DrawArguments, kTileThreads) {
   const TileList list(a.frame, a.bins);
   const Pixel pixel(a.frame, list.tile_x, list.tile_y);
   Blend blend(pixel);
-  blend.run(list, pixel, batch);
+  int known = 0;
+  blend.run(list, pixel, batch, nullptr, known);
   if (!pixel.inside) return;
   const Vec3<float> behind = background_of(a.background, a.background_shared);
   const float t = blend.transmittance, alpha = 1.0f - t;

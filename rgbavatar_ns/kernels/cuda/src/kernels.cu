@@ -6,9 +6,10 @@ typedef unsigned int uint32_t;
 typedef long long int64_t;
 typedef unsigned long long uint64_t;
 
-// One launch: `a` holds its arguments. Shared memory is that of a block.
-#define RGBAVATAR_KERNEL(name, Arguments, threads) \
-  extern "C" __global__ void __launch_bounds__(threads) name##_kernel(const Arguments a)
+// One launch: `a` holds its arguments, after these the threads of a block and, where the compiler
+// would take more registers than they allow, the blocks of an SM. Shared memory is that of a block.
+#define RGBAVATAR_KERNEL(name, Arguments, ...) \
+  extern "C" __global__ void __launch_bounds__(__VA_ARGS__) name##_kernel(const Arguments a)
 #define RGBAVATAR_SHARED __shared__
 #define RGBAVATAR_DYNAMIC_SHARED(Type, name) extern __shared__ Type name[]
 #endif  // the tests define these for a processor

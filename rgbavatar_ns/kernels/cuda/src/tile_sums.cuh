@@ -8,43 +8,39 @@ constexpr int kWarps = kTileThreads / 32;
 
 template <int kSums>
 struct WarpSums {
+  SumBatch batch;
   float sums[kWarps][kBatch][kSums];
-  unsigned drawn[kWarps][kBatch / 32];  // which Gaussians of the batch each warp has summed
+  alignas(8) uint8_t visited[kBatch][kWarps];  // 1 where a warp has summed a Gaussian of the batch
 };
 
 template <int kSums>
-RGBAVATAR_FUNCTION void clear_drawn(WarpSums<kSums>& shared) {
-  if (threadIdx.x < kWarps * (kBatch / 32))
-    shared.drawn[threadIdx.x / (kBatch / 32)][threadIdx.x % (kBatch / 32)] = 0u;
+RGBAVATAR_FUNCTION void mark_visited(WarpSums<kSums>& shared, int group, unsigned visited) {
+  const int lane = int(threadIdx.x) & 31, warp = int(threadIdx.x) >> 5;
+  shared.visited[group + lane][warp] = uint8_t(visited >> lane & 1u);
 }
 
-template <int kSums>
-RGBAVATAR_FUNCTION void mark_drawn(WarpSums<kSums>& shared, int place) {
-  if ((threadIdx.x & 31) == 0) shared.drawn[threadIdx.x >> 5][place >> 5] |= 1u << (place & 31);
-}
-
-// Adds up the warps' sums of a batch and writes its slots; `join(sum, other, which)` joins two.
+// Adds up the warps' sums of a batch and writes its slots; `join(sum, other, which)` joins two. The
+// next batch's sums may be written after another barrier.
 template <int kSums, class Join>
-RGBAVATAR_FUNCTION void write_slots(WarpSums<kSums>& shared, const Batch& batch, int number,
-                                    int width, float* slots, const Join& join) {
+RGBAVATAR_FUNCTION void write_slots(WarpSums<kSums>& shared, int page, int number, int width,
+                                    float* slots, const Join& join) {
   __syncthreads();
   for (int i = int(threadIdx.x); i < number * width; i += kTileThreads) {
     const int place = i / width, which = i % width;
+    const uint64_t by = *reinterpret_cast<const uint64_t*>(shared.visited[place]);
     float sum = 0.0f;
+#pragma unroll
     for (int warp = 0; warp < kWarps; ++warp)
-      if (shared.drawn[warp][place >> 5] >> (place & 31) & 1u)
-        sum = join(sum, shared.sums[warp][place][which], which);
-    slots[int64_t(batch.slots[place]) * width + which] = sum;
+      if (by >> 8 * warp & 1u) sum = join(sum, shared.sums[warp][place][which], which);
+    slots[int64_t(shared.batch.slots[page][place]) * width + which] = sum;
   }
-  __syncthreads();
-  clear_drawn(shared);
 }
 
 // Zeros for the Gaussians that no pixel was open for any more.
 RGBAVATAR_FUNCTION void clear_rest(const TileList& list, int first, int width, float* slots) {
   for (int entry = first + int(threadIdx.x); entry < list.count; entry += kTileThreads) {
-    uint32_t slot;
-    list.read(entry, slot);
+    const uint32_t gaussian = list.gaussian_of(entry);
+    const uint32_t slot = list.slot_of(list.splats[gaussian], list.slot_start[gaussian]);
     for (int k = 0; k < width; ++k) slots[int64_t(slot) * width + k] = 0.0f;
   }
 }
@@ -68,38 +64,39 @@ struct SeenPixel {
   }
 };
 
-// The backward pass of the blending (gaussian_math.h) from g = dL/dimage and the remainder S.
+// The backward pass of the blending (gaussian_math.h) from g = dL/dimage and the remainder S. Some
+// Gaussians may wait for their first colour where kSight is true.
+template <bool kSight>
 RGBAVATAR_FUNCTION void differentiate_tile(const TileList& list, const Pixel& pixel, Batch& batch,
-                                           WarpSums<kMoments>& shared, const Vec3<float>& g,
-                                           float remainder, float* slots,
-                                           const SeenPixel& seen = {}) {
-  const int lane = int(threadIdx.x) & 31, warp = int(threadIdx.x) >> 5;
+                                           WarpSums<kMoments>& shared, KeptGroups* kept, int known,
+                                           const Vec3<float>& g, float remainder, float* slots,
+                                           const SeenPixel& seen) {
+  // Of nine sums lane 4k writes the kth, lane 1 the last.
+  const int lane = int(threadIdx.x) & 31;
+  const bool writes_last = lane == 1, writes = (lane & 3) == 0 || writes_last;
+  float* to = &shared.sums[threadIdx.x >> 5][0][writes_last ? kMoments - 1 : lane >> 2];
   float transmittance = pixel.inside ? 1.0f : 0.0f;
-  __syncthreads();
-  clear_drawn(shared);
   const int read = walk(
-      list, pixel, batch, transmittance,
-      [&](int place, const Splat& s, const Touch& touch) {
-        if (!__ballot_sync(kWholeWarp, touch.alpha > 0.0f)) return;
-        const float w = touch.alpha * transmittance;
-        const uint32_t waiting = batch.waiting[place];
-        if (waiting && seen.sums) seen.add(waiting, w);
+      Reader(list, batch, &shared.batch), pixel, transmittance, kept, known,
+      [&](int page, int place, const Splat& s, const Touch& touch) {
+        const float w = weight_of(touch, transmittance);
+        if (kSight && shared.batch.waiting[page][place])
+          seen.add(shared.batch.waiting[page][place], w);
         const float along = w * (g.x * s.red + g.y * s.green + g.z * s.blue);
         remainder -= along;
         transmittance -= w;
         // alpha dL/dalpha; the cap has no gradient.
-        const float d_alpha = along - remainder * touch.alpha / (1.0f - touch.alpha);
-        const float d = touch.capped ? 0.0f : C::kLn2 * d_alpha;
+        const float share = touch.alpha * quick_reciprocal(1.0f - touch.alpha);
+        const float d = touch.capped ? 0.0f : C::kLn2 * (along - remainder * share);
         const float d_x = d * touch.dx, d_y = d * touch.dy;
         const float moments[8] = {w * g.x, w * g.y, w * g.z,      d,
                                   d_x,     d_y,     d_x * touch.dx, d_x * touch.dy};
         const float sum = warp_sums_of_eight(moments), last = warp_sum(d_y * touch.dy);
-        if ((lane & 3) == 0) shared.sums[warp][place][lane >> 2] = sum;
-        if (lane == 0) shared.sums[warp][place][8] = last;
-        mark_drawn(shared, place);
+        if (writes) to[place * kMoments] = writes_last ? last : sum;
       },
-      [&](int, int number) {
-        write_slots(shared, batch, number, kMoments, slots,
+      [&](int group, unsigned visited) { mark_visited(shared, group, visited); },
+      [&](int page, int number) {
+        write_slots(shared, page, number, kMoments, slots,
                     [](float sum, float other, int) { return sum + other; });
       });
   clear_rest(list, read, kMoments, slots);
@@ -119,19 +116,21 @@ RGBAVATAR_KERNEL(differentiate, DifferentiateArguments, kTileThreads) {
     remainder = dot(g, vec3_at(a.image, at));
   }
   if (pixel.inside && a.alpha_gradient) remainder -= a.alpha_gradient[at] * (1.0f - a.alpha[at]);
-  differentiate_tile(list, pixel, batch, shared, g, remainder, a.slots);
+  differentiate_tile<false>(list, pixel, batch, shared, nullptr, 0, g, remainder, a.slots, {});
 }
 
 // Forward pass, mean absolute difference to 8-bit images over a background, and backward pass in
 // one go: no image is written. Pixels that nobody filmed add nothing.
-RGBAVATAR_KERNEL(train, TrainArguments, kTileThreads) {
+RGBAVATAR_KERNEL(train, TrainArguments, kTileThreads, 5) {
   RGBAVATAR_SHARED Batch batch;
   RGBAVATAR_SHARED WarpSums<kMoments> shared;
+  RGBAVATAR_SHARED KeptGroups kept;
   RGBAVATAR_SHARED float loss[kWarps];
   const TileList list(a.frame, a.bins, a.known);
   const Pixel pixel(a.frame, list.tile_x, list.tile_y);
   Blend blend(pixel);
-  blend.run(list, pixel, batch);
+  int known = 0;
+  blend.run(list, pixel, batch, &kept, known);
   Vec3<float> g = {0.0f, 0.0f, 0.0f};
   float remainder = 0.0f, difference = 0.0f;
   SeenPixel seen;
@@ -168,7 +167,10 @@ RGBAVATAR_KERNEL(train, TrainArguments, kTileThreads) {
     for (int warp = 0; warp < kWarps; ++warp) all += loss[warp];
     a.loss[int64_t(blockIdx.y) * gridDim.x + blockIdx.x] = all;
   }
-  differentiate_tile(list, pixel, batch, shared, g, remainder, a.slots, seen);
+  if (seen.sums)
+    differentiate_tile<true>(list, pixel, batch, shared, &kept, known, g, remainder, a.slots, seen);
+  else
+    differentiate_tile<false>(list, pixel, batch, shared, &kept, known, g, remainder, a.slots, {});
 }
 
 // Sums of w I (C channels) and w, and the largest w.
@@ -183,12 +185,11 @@ RGBAVATAR_KERNEL(average, AverageArguments, kTileThreads) {
   const float* values =
       a.images + (image * a.frame.width * a.frame.height + pixel.index) * a.channels;
   float transmittance = pixel.inside ? 1.0f : 0.0f;
-  clear_drawn(shared);
+  int known = 0;
   const int read = walk(
-      list, pixel, batch, transmittance,
-      [&](int place, const Splat&, const Touch& touch) {
-        if (!__ballot_sync(kWholeWarp, touch.alpha > 0.0f)) return;
-        const float w = touch.alpha * transmittance;
+      Reader(list, batch, &shared.batch), pixel, transmittance, nullptr, known,
+      [&](int, int place, const Splat&, const Touch& touch) {
+        const float w = weight_of(touch, transmittance);
         transmittance -= w;
         for (int k = 0; k < a.channels; ++k) {
           const float sum = warp_sum(w > 0.0f ? w * values[k] : 0.0f);
@@ -199,10 +200,10 @@ RGBAVATAR_KERNEL(average, AverageArguments, kTileThreads) {
           shared.sums[warp][place][a.channels] = sum;
           shared.sums[warp][place][a.channels + 1] = largest;
         }
-        mark_drawn(shared, place);
       },
-      [&](int, int number) {
-        write_slots(shared, batch, number, a.channels + 2, a.slots,
+      [&](int group, unsigned visited) { mark_visited(shared, group, visited); },
+      [&](int page, int number) {
+        write_slots(shared, page, number, a.channels + 2, a.slots,
                     [&](float sum, float other, int which) {
                       return which > a.channels ? fmaxf(sum, other) : sum + other;
                     });
