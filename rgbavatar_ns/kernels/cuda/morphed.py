@@ -1,6 +1,6 @@
 """Morphed Gaussians drawn and trained on a GPU."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -186,7 +186,7 @@ class CudaMorphedRenderer:
     ) -> None:
         """Take the same step with any other parameter; none where it overflowed."""
         flat = gradient.reshape(1, -1).contiguous()
-        self._update_columns(flat, None, parameter, None, numbers)
+        self._update([_columns(flat, parameter, numbers)], batch=1)
 
     def _updated(
         self,
@@ -197,18 +197,17 @@ class CudaMorphedRenderer:
         if self._slots is None:
             raise ValueError("There is no gradient yet. Call forward_loss() first.")
         gradients = self._differentiate(with_vertices)
-        weights = torch.zeros_like(self._weights)
+        together = []
         for row, name in enumerate(UPDATED_ATTRIBUTES):
+            gradient, base, basis = gradients[_SHORT[name]], None, None
+            if parameters is not None:
+                base, basis = parameters[name], parameters.get(f"basis_{name}")
+            values = _columns(gradient, base, None if numbers is None else numbers[row])
             bases = self._values[f"basis_{_SHORT[name]}"] if name in _BLENDED else None
-            if parameters is None and bases is None:
-                continue
-            weights += self._update_columns(
-                gradients[_SHORT[name]],
-                bases,
-                None if parameters is None else parameters[name],
-                None if parameters is None else parameters.get(f"basis_{name}"),
-                None if numbers is None else numbers[row],
-            )
+            if bases is not None:
+                values |= _bases(bases, basis)
+            together.append(values)
+        weights = self._update_bases(together)
         self._slots = None  # the parameters are others now
         vertices = self._vertex_gradient(gradients["carried"]) if with_vertices else None
         return MorphedGradient(weights, vertices)
@@ -229,43 +228,32 @@ class CudaMorphedRenderer:
         )
         return gradients
 
-    def _update_columns(
-        self,
-        gradient: Tensor,
-        bases: Tensor | None,
-        base: AdamParameter | None,
-        basis: AdamParameter | None,
-        numbers: Float[Tensor, "10"] | None,
-    ) -> Tensor | float:
-        """One step of Adam for an attribute (gradient [B, ...]) and its bases, where given.
+    def _update_bases(self, together: Sequence[dict[str, Any]]) -> Tensor:
+        """One step for all; the gradient of the weights [B, K]."""
+        blended = [values for values in together if values["bases"]]
+        counts = [blocks(values["columns"], "kTileThreads") for values in blended]
+        sums = self._weights.new_empty(sum(counts), *self._weights.shape)
+        for values, part in zip(blended, sums.split(counts)):
+            values["weight_sums"] = part
+        self._update(together, batch=self._images.batch)
+        return sums.sum(0)
 
-        Returns the gradient of the weights [B, K], 0 without bases.
-        """
-        batch, num_bases = len(gradient), 0 if bases is None else len(bases)
-        columns = gradient[0].numel()
-        count = blocks(columns, "kTileThreads")
-        sums = gradient.new_zeros(count, batch, num_bases) if num_bases else None
-        warps = constants()["kTileThreads"] // 32
+    def _update(self, together: Sequence[dict[str, Any]], *, batch: int) -> None:
+        """One step of Adam for some parameters and their bases."""
+        places = constants()["kUpdatedTogether"]
+        assert len(together) <= places
+        rest = [_NO_COLUMNS] * (places - len(together))
+        padded_batch = -(-batch // 4) * 4
+        most = max(values["columns"] for values in together)
         self._launcher.launch(
             "update",
-            (count, 1),
-            4 * (batch * num_bases + warps * batch),
+            (blocks(most, "kTileThreads"), len(together)),
+            4 * padded_batch * self._weights.shape[1],
             batch=batch,
-            columns=columns,
-            bases=num_bases,
-            gradient=gradient,
             weights=self._weights,
-            base=None if base is None else base.value.detach(),
-            base_first=None if base is None else base.first_moment,
-            base_second=None if base is None else base.second_moment,
-            basis=bases,
-            basis_first=None if basis is None else basis.first_moment,
-            basis_second=None if basis is None else basis.second_moment,
-            numbers=numbers,
-            weight_sums=sums,
             status=self._tiles.bins.status,
+            **{f"columns{i}": values for i, values in enumerate([*together, *rest])},
         )
-        return 0.0 if sums is None else sums.sum(0)
 
     def _vertex_gradient(self, carried: Tensor) -> Tensor:
         """Gradients of the frames' parts, then of the corners, then of the vertices."""
@@ -322,6 +310,33 @@ def _morphed_values(
         "vertex_count": vertices.shape[1],
         "variant": TANGENT_VARIANTS.index(gaussians.variant),
     }
+
+
+_NO_COLUMNS: dict[str, Any] = {
+    **{"columns": 0, "bases": 0, "gradient": None, "numbers": None, "weight_sums": None},
+    **{"base": None, "base_first": None, "base_second": None},
+    **{"basis": None, "basis_first": None, "basis_second": None},
+}
+"""The fields of `Columns` in arguments.h, of no parameter."""
+
+
+def _columns(
+    gradient: Tensor, base: AdamParameter | None, numbers: Tensor | None
+) -> dict[str, Any]:
+    """A parameter with its gradients [B, ...], to be updated where it is given."""
+    values = _NO_COLUMNS | {"columns": gradient[0].numel(), "gradient": gradient}
+    return values | {"numbers": numbers} | _moving("base", base)
+
+
+def _bases(bases: Tensor, state: AdamParameter | None) -> dict[str, Any]:
+    return {"bases": len(bases)} | _moving("basis", state) | {"basis": bases}
+
+
+def _moving(name: str, state: AdamParameter | None) -> dict[str, Tensor]:
+    if state is None:
+        return {}
+    moments = {f"{name}_first": state.first_moment, f"{name}_second": state.second_moment}
+    return {name: state.value.detach()} | moments
 
 
 def _numbers(parameter: AdamParameter | None) -> tuple[float, ...]:

@@ -197,19 +197,28 @@ struct FramesBackwardArguments {
   float* corner_gradient;       // [B, U, 3, 3]
 };
 
-struct UpdateArguments {
-  int batch;
-  int columns;            // N times the width of the attribute
-  int bases;              // 0 for attributes that no basis changes
+// A parameter, a column each of its numbers, and where it is what bases change, these.
+struct Columns {
+  int columns;            // 0: there is no such parameter
+  int bases;              // K, or 0
   const float* gradient;  // [B, columns]
-  const float* weights;   // [B, K]
   float* base;            // [columns]
   float* base_first;      // Adam's moments; null where nothing is to be updated
   float* base_second;
   float* basis;           // [K, columns]
   float* basis_first;
   float* basis_second;
-  const float* numbers;    // [2, 5]: of the base and of the bases, see AdamStep
-  float* weight_sums;      // [blocks, B, K] or null
+  const float* numbers;   // [2, 5]: of the base and of the bases, see AdamStep
+  float* weight_sums;     // [blocks, B, K]: a block's part of the weights' gradient, or null
+};
+
+struct UpdateArguments {
+  int batch;
+  const float* weights;    // [B, K]
   const uint32_t* status;  // as in Bins: after an overflow nothing is updated
+  Columns columns0;        // by the block's y, up to kUpdatedTogether
+  Columns columns1;
+  Columns columns2;
+  Columns columns3;
+  Columns columns4;
 };

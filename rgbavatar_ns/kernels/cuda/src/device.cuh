@@ -4,10 +4,25 @@
 RGBAVATAR_FUNCTION float select(bool mask, float a, float b) { return mask ? a : b; }
 RGBAVATAR_FUNCTION float min_of(float a, float b) { return fminf(a, b); }
 RGBAVATAR_FUNCTION float max_of(float a, float b) { return fmaxf(a, b); }
-RGBAVATAR_FUNCTION float square_root(float a) { return sqrtf(a); }
-RGBAVATAR_FUNCTION float inverse_root_of(float a) { return 1.0f / sqrtf(a); }
 RGBAVATAR_FUNCTION float log2_of(float a) { return log2f(a); }
-RGBAVATAR_FUNCTION float reciprocal_of(float a) { return 1.0f / a; }
+
+// One instruction each, for 0 and normal numbers within two units in the last place; the rounding
+// of IEEE would take about ten, and a subroutine for the rest.
+#if defined(__CUDA_ARCH__)
+#define RGBAVATAR_QUICK(name, instruction, exact)        \
+  RGBAVATAR_FUNCTION float name(float a) {               \
+    float out;                                           \
+    asm(instruction ".f32 %0, %1;" : "=f"(out) : "f"(a)); \
+    return out;                                          \
+  }
+#else
+#define RGBAVATAR_QUICK(name, instruction, exact) \
+  RGBAVATAR_FUNCTION float name(float a) { return exact; }
+#endif
+RGBAVATAR_QUICK(square_root, "sqrt.approx.ftz", sqrtf(a))
+RGBAVATAR_QUICK(inverse_root_of, "rsqrt.approx.ftz", 1.0f / sqrtf(a))
+RGBAVATAR_QUICK(reciprocal_of, "rcp.approx.ftz", 1.0f / a)
+RGBAVATAR_QUICK(power_of_two, "ex2.approx.ftz", exp2f(a))  // of exponents from -126 to 126
 
 #include "gaussian_math.h"
 #include "tangent_math.h"
@@ -26,29 +41,6 @@ constexpr float kColorScale = 0.28209479177387814f;  // of the zeroth spherical 
 enum { kEntriesNeeded = 0, kSlotsNeeded = 1, kOverflow = 2, kOverflows = 3, kSlotsTaken = 4 };
 constexpr int kStatusNumbers = 6;
 constexpr int kMostEntries = 2147483647;  // a larger need says just this
-
-// 2^p for p from -8 to 0: within two units in the last place.
-RGBAVATAR_FUNCTION float power_of_two(float p) {
-#if defined(__CUDA_ARCH__)
-  float out;
-  asm("ex2.approx.ftz.f32 %0, %1;" : "=f"(out) : "f"(p));
-  return out;
-#else
-  return exp2f(p);
-#endif
-}
-
-// 1 / a for normal numbers: within one unit in the last place, where a division takes ten
-// instructions and a subroutine for the rest.
-RGBAVATAR_FUNCTION float quick_reciprocal(float a) {
-#if defined(__CUDA_ARCH__)
-  float out;
-  asm("rcp.approx.ftz.f32 %0, %1;" : "=f"(out) : "f"(a));
-  return out;
-#else
-  return 1.0f / a;
-#endif
-}
 
 // A projected Gaussian as the blending wants it: three reads of sixteen bytes. The first and the
 // last tile that it may touch, x | y << 16; where it is not drawn the first lies behind the last.

@@ -21,3 +21,4 @@ typedef unsigned long long uint64_t;
 #include "blend_tile.cuh"
 #include "tile_sums.cuh"
 #include "gradient.cuh"
+#include "update.cuh"

@@ -117,8 +117,8 @@ RGBAVATAR_KERNEL(frames, FramesArguments, kBlendThreads) {
   float ratio = 1.0f;
   if (b.rest_length) {
     const Vec3<float> area = cross(e1, e2);
-    const float half = 0.5f * sqrtf(dot(area, area));
-    ratio = sqrtf(fmaxf(half, 1e-16f)) / b.rest_length[triangle];
+    const float half = 0.5f * square_root(dot(area, area));
+    ratio = square_root(fmaxf(half, 1e-16f)) * reciprocal_of(b.rest_length[triangle]);
   }
   const float row[kFrameFloats] = {
       f.tangent.x, f.bitangent.x, f.normal.x, f.tangent.y, f.bitangent.y, f.normal.y,
@@ -184,7 +184,7 @@ struct Carried {
 
 // exp2(-125) to exp2(125), as the CPU's.
 RGBAVATAR_FUNCTION float bounded_exp(float x) {
-  return exp2f(fminf(fmaxf(x * (2.0f * C::kHalfLog2E), -125.0f), 125.0f));
+  return power_of_two(fminf(fmaxf(x * (2.0f * C::kHalfLog2E), -125.0f), 125.0f));
 }
 
 RGBAVATAR_FUNCTION Carried carry(const Morphed& b, int image, int gaussian,
@@ -209,7 +209,7 @@ RGBAVATAR_FUNCTION Carried carry(const Morphed& b, int image, int gaussian,
   g.scale = scaled(Vec3<float>{bounded_exp(log_scale.x), bounded_exp(log_scale.y),
                                bounded_exp(log_scale.z)},
                    out.ratio);
-  g.opacity = 1.0f / (1.0f + bounded_exp(-b.opacity_logit[gaussian]));
+  g.opacity = reciprocal_of(1.0f + bounded_exp(-b.opacity_logit[gaussian]));
   out.color = {color[0] * kColorScale + 0.5f, color[1] * kColorScale + 0.5f,
                color[2] * kColorScale + 0.5f};
   return out;

@@ -86,7 +86,7 @@ RGBAVATAR_FUNCTION void differentiate_tile(const TileList& list, const Pixel& pi
         remainder -= along;
         transmittance -= w;
         // alpha dL/dalpha; the cap has no gradient.
-        const float share = touch.alpha * quick_reciprocal(1.0f - touch.alpha);
+        const float share = touch.alpha * reciprocal_of(1.0f - touch.alpha);
         const float d = touch.capped ? 0.0f : C::kLn2 * (along - remainder * share);
         const float d_x = d * touch.dx, d_y = d * touch.dy;
         const float moments[8] = {w * g.x, w * g.y, w * g.z,      d,
