@@ -78,53 +78,84 @@ struct BlockOffsets {
 };
 static constexpr BlockOffsets kBlockOffsets = {};
 
-// The sums over the jobs of one Gaussian of the group, which are written to its slot. Then it stands
-// behind those in front of it. Returns each lane's largest weight, if that is asked for.
+// Sums over a Gaussian's jobs, lane by lane: of w dL/dcolour, of alpha dL/dalpha, and of this times
+// dx, dy and their products.
+struct LaneSums {
+  Native red = 0.0f, green = 0.0f, blue = 0.0f, one = 0.0f, x = 0.0f, y = 0.0f, xx = 0.0f,
+         xy = 0.0f, yy = 0.0f, largest = 0.0f;
+
+  void add(const LaneSums& other) {
+    red = red + other.red, green = green + other.green, blue = blue + other.blue;
+    one = one + other.one, x = x + other.x, y = y + other.y;
+    xx = xx + other.xx, xy = xy + other.xy, yy = yy + other.yy;
+    largest = max_of(largest, other.largest);
+  }
+};
+
+static RGBAVATAR_MEMBER Native load_native(const float* from) {
+  Native a;
+  load(a, from);
+  return a;
+}
+
+// The sums of a register's lanes from `first` on. Afterwards the Gaussian stands, for these pixels,
+// behind those in front of it.
 template <bool kLargest>
-static RGBAVATAR_MEMBER Wide sum_moments(const Tile& tile, const BlockGrid& grid,
-                                         const Group& group, int place, const Kept& kept,
-                                         TileScratch& scratch, float* slots) {
+static RGBAVATAR_MEMBER LaneSums sum_lanes(const BlockGrid& grid, const Group& group, int place,
+                                           int first, const Kept& kept, TileScratch& scratch) {
   const Splat& s = group.splats[place];
-  const Wide color_red(s.red), color_green(s.green), color_blue(s.blue);
-  const Wide zero(0.0f);
-  const Wide x = load_wide(grid.x[0]) - s.mean_x, y = load_wide(grid.y[0]) - s.mean_y;
-  Wide sum_red = zero, sum_green = zero, sum_blue = zero;
-  Wide largest = zero, sum_one = zero, sum_x = zero, sum_y = zero, sum_xx = zero, sum_xy = zero, sum_yy = zero;
-  const float *alpha_row = kept.alpha[group.first_job[place]],
-              *weight_row = kept.weight[group.first_job[place]];
+  const Native color_red(s.red), color_green(s.green), color_blue(s.blue), zero(0.0f);
+  const Native x = load_native(grid.x[0] + first) - s.mean_x;
+  const Native y = load_native(grid.y[0] + first) - s.mean_y;
+  LaneSums sums;
+  const float* alpha_row = kept.alpha[group.first_job[place]] + first;
+  const float* weight_row = kept.weight[group.first_job[place]] + first;
   for (uint64_t left = group.blocks[place]; left; left &= left - 1) {
     const int block = __builtin_ctzll(left);
-    float* row = block_rows<kBlendRows>(scratch, block)[0];
-    const Wide red = load_wide(row + kColor * kBlockPixels);
-    const Wide green = load_wide(row + (kColor + 1) * kBlockPixels);
-    const Wide blue = load_wide(row + (kColor + 2) * kBlockPixels);
-    const Wide behind = load_wide(row + kBehind * kBlockPixels);
-    const Wide alpha = load_wide(alpha_row), w = load_wide(weight_row);
-    if (kLargest) largest = max_of(largest, w);
-    const Wide more = red * color_red + green * color_green + blue * color_blue - behind;
+    float* row = block_rows<kBlendRows>(scratch, block)[0] + first;
+    const Native red = load_native(row + kColor * kBlockPixels);
+    const Native green = load_native(row + (kColor + 1) * kBlockPixels);
+    const Native blue = load_native(row + (kColor + 2) * kBlockPixels);
+    const Native behind = load_native(row + kBehind * kBlockPixels);
+    const Native alpha = load_native(alpha_row), w = load_native(weight_row);
+    if (kLargest) sums.largest = max_of(sums.largest, w);
+    const Native more = red * color_red + green * color_green + blue * color_blue - behind;
     store(behind + alpha * more, row + kBehind * kBlockPixels);
     // alpha dL/dalpha, whose ln 2 follows below; the cap has no gradient.
-    const Wide d_p = select(Wide(C::kMaxAlpha) > alpha, w * more, zero);
-    const Wide dx = x + kBlockOffsets.x[block], dy = y + kBlockOffsets.y[block];
-    const Wide d_x = d_p * dx, d_y = d_p * dy;
-    sum_red = sum_red + w * red;
-    sum_green = sum_green + w * green;
-    sum_blue = sum_blue + w * blue;
-    sum_one = sum_one + d_p;
-    sum_x = sum_x + d_x;
-    sum_y = sum_y + d_y;
-    sum_xx = sum_xx + d_x * dx;
-    sum_xy = sum_xy + d_x * dy;
-    sum_yy = sum_yy + d_y * dy;
+    const Native d_p = select(Native(C::kMaxAlpha) > alpha, w * more, zero);
+    const Native dx = x + kBlockOffsets.x[block], dy = y + kBlockOffsets.y[block];
+    const Native d_x = d_p * dx, d_y = d_p * dy;
+    sums.red = sums.red + w * red;
+    sums.green = sums.green + w * green;
+    sums.blue = sums.blue + w * blue;
+    sums.one = sums.one + d_p;
+    sums.x = sums.x + d_x;
+    sums.y = sums.y + d_y;
+    sums.xx = sums.xx + d_x * dx;
+    sums.xy = sums.xy + d_x * dy;
+    sums.yy = sums.yy + d_y * dy;
     alpha_row += kBlockPixels;
     weight_row += kBlockPixels;
   }
-  float* slot = slot_of(tile, s, slots, kMoments);
+  return sums;
+}
+
+// The sums over the jobs of one Gaussian of the group, which are written to its slot. Returns the
+// largest weight, if that is asked for. The sums of a register's lanes are taken over all jobs before
+// the next lanes are: those of a whole block would not stay in AVX2's registers, or SSE's.
+template <bool kLargest>
+static RGBAVATAR_MEMBER float sum_moments(const Tile& tile, const BlockGrid& grid,
+                                          const Group& group, int place, const Kept& kept,
+                                          TileScratch& scratch, float* slots) {
+  LaneSums sums = sum_lanes<kLargest>(grid, group, place, 0, kept, scratch);
+  for (int first = kNativeLanes; first < kLanes; first += kNativeLanes)
+    sums.add(sum_lanes<kLargest>(grid, group, place, first, kept, scratch));
+  float* slot = slot_of(tile, group.splats[place], slots, kMoments);
   const Quad units = {1.0f, 1.0f, 1.0f, C::kLn2};
-  store_quad(sums_of(sum_red, sum_green, sum_blue, sum_one) * units, slot);
-  store_quad(sums_of(sum_x, sum_y, sum_xx, sum_xy) * C::kLn2, slot + 4);
-  slot[8] = sum_of(sum_yy) * C::kLn2;
-  return largest;
+  store_quad(sums_of(sums.red, sums.green, sums.blue, sums.one) * units, slot);
+  store_quad(sums_of(sums.x, sums.y, sums.xx, sums.xy) * C::kLn2, slot + 4);
+  slot[8] = sum_of(sums.yy) * C::kLn2;
+  return kLargest ? max_lane(sums.largest) : 0.0f;
 }
 
 static void sum_group(const Tile& tile, const BlockGrid& grid, const Group& group, const Kept& kept,

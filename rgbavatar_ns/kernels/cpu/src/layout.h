@@ -1,6 +1,7 @@
 // The data that the driver and the per-instruction-set loops share.
 #pragma once
 
+#include <cstddef>
 #include <cstdint>
 
 namespace rgbavatar {

@@ -9,7 +9,8 @@ typedef float Quad __attribute__((vector_size(16)));
 typedef float UnalignedQuad __attribute__((vector_size(16), aligned(4)));
 
 // The four sums of every fourth lane.
-RGBAVATAR_FUNCTION Quad sum_to_quad(Wide a) {
+template <int L>
+RGBAVATAR_FUNCTION Quad sum_to_quad(Floats<L> a) {
   const Native s = sum_to_register(a);
 #if defined(__AVX512F__)
   const __m256 half = _mm512_castps512_ps256(s.v) + _mm512_extractf32x8_ps(s.v, 1);
@@ -31,7 +32,8 @@ RGBAVATAR_FUNCTION Quad sums_of_quads(Quad a, Quad b, Quad c, Quad d) {
 }
 
 // Four sums of lanes at a time.
-RGBAVATAR_FUNCTION Quad sums_of(Wide a, Wide b, Wide c, Wide d) {
+template <int L>
+RGBAVATAR_FUNCTION Quad sums_of(Floats<L> a, Floats<L> b, Floats<L> c, Floats<L> d) {
 #if defined(__AVX512F__)
   const auto fold = [](__m512 x, __m512 y) __attribute__((always_inline)) {
     return _mm512_shuffle_f32x4(x, y, 0x44) + _mm512_shuffle_f32x4(x, y, 0xee);
@@ -50,7 +52,8 @@ RGBAVATAR_FUNCTION Quad sums_of(Wide a, Wide b, Wide c, Wide d) {
 }
 
 // The sum of the lanes.
-RGBAVATAR_FUNCTION float sum_of(Wide a) {
+template <int L>
+RGBAVATAR_FUNCTION float sum_of(Floats<L> a) {
   const Quad q = sum_to_quad(a);
   return (q[0] + q[2]) + (q[1] + q[3]);
 }
@@ -131,10 +134,11 @@ RGBAVATAR_FUNCTION void load_interleaved(const float* from, Quad& r, Quad& g, Qu
 }
 
 // The largest lane; all are at least 0.
-RGBAVATAR_FUNCTION float max_lane(Wide a) {
-  float lanes[kLanes], largest = 0.0f;
+template <int L>
+RGBAVATAR_FUNCTION float max_lane(Floats<L> a) {
+  float lanes[L], largest = 0.0f;
   store(a, lanes);
-  for (int i = 0; i < kLanes; ++i) largest = largest < lanes[i] ? lanes[i] : largest;
+  for (int i = 0; i < L; ++i) largest = largest < lanes[i] ? lanes[i] : largest;
   return largest;
 }
 

@@ -63,7 +63,7 @@ size_t for_each_tile(const Projected& image, int i, const Visit& visit) {
   visit(first);
   visit(right ? first + 1 : none);
   visit(below ? first + tiles_x : none);
-  visit(right & below ? first + tiles_x + 1 : none);
+  visit((right & below) ? first + tiles_x + 1 : none);
   return size_t(first != none) << (right + below);
 }
 

@@ -134,8 +134,7 @@ static double train_tile(const Tile& tile, const TrainingTarget& target, TileScr
         sum_moments<false>(tile, grid, group, i, kept, scratch, slots);
         continue;
       }
-      const float most =
-          max_lane(sum_moments<true>(tile, grid, group, i, kept, scratch, slots));
+      const float most = sum_moments<true>(tile, grid, group, i, kept, scratch, slots);
       if (most > 0.0f)  // else hidden by what lies before it
         see(tile, target, group, i, most, kept, scratch, counted);
     }
