@@ -50,27 +50,39 @@ class CudaMorphedRenderer:
         self._values = _morphed_values(gaussians, self._weights, vertices.detach().contiguous())
         self._images = Images(len(weights), len(gaussians.position), cameras.width, cameras.height)
         self._slots: Tensor | None = None
-        self._shared_bytes = 4 * constants()["kBlendImages"] * weights.shape[1]
         self._launch_by_triangle("frames")
+        if self._images.count:
+            self._morph()
         bins = Bins(
             launcher, capacities, self._images, lambda bins: self._launch("blend", bins=bins)
         )
         self._tiles = Tiles(launcher, bins)
 
     def _launch(self, kernel: str, **values: Any) -> None:
-        """Start a kernel by Gaussians and groups of images."""
+        """Start a kernel by Gaussians and images."""
         images = self._images
         self._launcher.launch(
             kernel,
-            (
-                blocks(images.count, "kBlendThreads"),
-                -(-images.batch // constants()["kBlendImages"]),
-            ),
-            self._shared_bytes,
+            (blocks(images.count, "kBlendThreads"), images.batch),
             frame=images.values(),
             cameras=camera_values(self._cameras),
             blended=self._values,
             **values,
+        )
+
+    @property
+    def _weights_bytes(self) -> int:
+        """Shared memory for the weights, images padded to fours."""
+        return 4 * (-(-len(self._weights) // 4) * 4) * self._weights.shape[1]
+
+    def _morph(self) -> None:
+        widest = max(self._values[f"tangent_{_SHORT[name]}"][0].numel() for name in _BLENDED)
+        self._launcher.launch(
+            "morph",
+            (blocks(widest, "kTileThreads"), len(_BLENDED)),
+            self._weights_bytes,
+            frame=self._images.values(),
+            blended=self._values,
         )
 
     def _launch_by_triangle(self, kernel: str, **values: Any) -> None:
@@ -243,12 +255,11 @@ class CudaMorphedRenderer:
         places = constants()["kUpdatedTogether"]
         assert len(together) <= places
         rest = [_NO_COLUMNS] * (places - len(together))
-        padded_batch = -(-batch // 4) * 4
         most = max(values["columns"] for values in together)
         self._launcher.launch(
             "update",
             (blocks(most, "kTileThreads"), len(together)),
-            4 * padded_batch * self._weights.shape[1],
+            self._weights_bytes,
             batch=batch,
             weights=self._weights,
             status=self._tiles.bins.status,
@@ -305,6 +316,12 @@ def _morphed_values(
         "rest_length": tensors["rest_length"],
         "vertices": vertices,
         "frames": weights.new_empty(len(weights), triangles, constants()["kFrameFloats"]),
+        **{
+            f"tangent_{_SHORT[name]}": weights.new_empty(
+                len(weights), *getattr(gaussians, name).shape
+            )
+            for name in _BLENDED
+        },
         "bases": weights.shape[1],
         "triangles": triangles,
         "vertex_count": vertices.shape[1],

@@ -52,6 +52,9 @@ struct Morphed {
   const float* rest_length;          // [U] or null: fixed scales
   const float* vertices;             // [B, V, 3]
   float* frames;                     // [B, U, 24]
+  float* tangent_position;           // [B, N, 3], like the next two what `morph` has summed
+  float* tangent_rotation;           // [B, N, 4]
+  float* tangent_color;              // [B, N, 3]
   int bases;
   int triangles;
   int vertex_count;
@@ -81,6 +84,11 @@ struct ProjectArguments {
 };
 
 struct FramesArguments {
+  Frame frame;
+  Morphed blended;
+};
+
+struct MorphArguments {
   Frame frame;
   Morphed blended;
 };

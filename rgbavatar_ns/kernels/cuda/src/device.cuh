@@ -35,7 +35,6 @@ constexpr int kMoments = 9;
 constexpr int kFrameFloats = 24;
 constexpr int kCarriedFloats = 12;
 constexpr int kBlendThreads = 128;
-constexpr int kBlendImages = 5;  // images whose sums stay in registers together
 constexpr float kColorScale = 0.28209479177387814f;  // of the zeroth spherical harmonic
 // `Bins::status`: 32-bit numbers, and in the last two one of 64 bits, which nothing can wrap.
 enum { kEntriesNeeded = 0, kSlotsNeeded = 1, kOverflow = 2, kOverflows = 3, kSlotsTaken = 4 };
@@ -177,6 +176,20 @@ RGBAVATAR_FUNCTION void for_each_tile(const Frame& frame, const Splat* splats, i
   for_each_shared(splats, gaussian, own, [&](int which, const Splat& s) {
     walk(which, s, int(threadIdx.x) & 31, 32);
   });
+}
+
+struct alignas(16) Four {
+  float x, y, z, w;
+};
+RGBAVATAR_FUNCTION Four four_at(const float* row) { return *reinterpret_cast<const Four*>(row); }
+
+// Copies weights [B, K] to shared memory as [K, B], rows padded to fours with zeros; others see them
+// after a barrier. Returns the length of a row.
+RGBAVATAR_FUNCTION int load_weights(const float* weights, int batch, int bases, float* to) {
+  const int row = (batch + 3) & ~3;
+  for (int i = int(threadIdx.x); i < bases * row; i += int(blockDim.x))
+    to[i] = i % row < batch ? weights[i % row * bases + i / row] : 0.0f;
+  return row;
 }
 
 RGBAVATAR_FUNCTION float warp_sum(float value) {

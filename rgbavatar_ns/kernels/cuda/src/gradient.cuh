@@ -117,7 +117,7 @@ RGBAVATAR_FUNCTION void morphed_gradient(const BlendBackwardArguments& a, int im
     product_conjugate(d.quat, c.rotation, quat);
     const float values[kCarriedFloats] = {
         d.mean.x, d.mean.y, d.mean.z, quat[0], quat[1], quat[2], quat[3],
-        dot(d.scale, g.scale) / c.ratio, c.position.x, c.position.y, c.position.z, 0.0f};
+        dot(d.scale, g.scale) * reciprocal_of(c.ratio), c.position.x, c.position.y, c.position.z, 0.0f};
     for (int k = 0; k < kCarriedFloats; ++k) carried[k] = values[k];
   }
   put_vec3(position, a.position, row);
@@ -129,23 +129,11 @@ RGBAVATAR_FUNCTION void morphed_gradient(const BlendBackwardArguments& a, int im
   for (int k = 0; k < kCarriedFloats; ++k) a.carried[row * kCarriedFloats + k] = carried[k];
 }
 
-// Blocks of 128 Gaussians, by groups of kBlendImages images.
+// Blocks of 128 Gaussians, by images.
 RGBAVATAR_KERNEL(blend_backward, BlendBackwardArguments, kBlendThreads) {
-  RGBAVATAR_DYNAMIC_SHARED(float, weights);
-  const int first_image = int(blockIdx.y) * kBlendImages;
-  load_weights(a.blended, a.frame, first_image, weights);
-  const int gaussian = int(blockIdx.x * blockDim.x + threadIdx.x);
+  const int gaussian = int(blockIdx.x * blockDim.x + threadIdx.x), image = int(blockIdx.y);
   const int row = gaussian < a.frame.count ? gaussian : 0;
-  Tangent tangent;
-  blend_gaussian(a.blended, a.frame, weights, row, tangent);
-#pragma unroll
-  for (int i = 0; i < kBlendImages; ++i) {
-    const int image = first_image + i;
-    if (image >= a.frame.batch) break;
-    morphed_gradient(a, image, gaussian,
-                     carry(a.blended, image, row, tangent.position[i], tangent.rotation[i],
-                           tangent.color[i]));
-  }
+  morphed_gradient(a, image, gaussian, carry(a.blended, a.frame, image, row));
 }
 
 // From the gradients of the triangles' frames to those of their corners.

@@ -129,47 +129,46 @@ RGBAVATAR_KERNEL(frames, FramesArguments, kBlendThreads) {
   for (int k = 0; k < kFrameFloats; ++k) out[k] = row[k];
 }
 
-// Base + sum_k psi_k basis_k of one Gaussian in up to kBlendImages images.
-struct Tangent {
-  float position[kBlendImages][3], rotation[kBlendImages][4], color[kBlendImages][3];
-};
-
-template <int kWidth>
-RGBAVATAR_FUNCTION void blend_attribute(const float* base, const float* basis, int count, int bases,
-                                        const float* weights, int gaussian,
-                                        float out[kBlendImages][kWidth]) {
-  for (int c = 0; c < kWidth; ++c) {
-    const float value = base[int64_t(gaussian) * kWidth + c];
-    for (int i = 0; i < kBlendImages; ++i) out[i][c] = value;
-  }
-  for (int k = 0; k < bases; ++k) {
-    const float* row = basis + (int64_t(k) * count + gaussian) * kWidth;
-    float value[kWidth];
-    for (int c = 0; c < kWidth; ++c) value[c] = row[c];
-    for (int i = 0; i < kBlendImages; ++i) {
-      const float psi = weights[i * bases + k];
-      for (int c = 0; c < kWidth; ++c) out[i][c] += psi * value[c];
+// Base + sum_k psi_k basis_k of an attribute, a column a thread, sixteen images at a time.
+constexpr int kMorphImages = 16;
+RGBAVATAR_FUNCTION void morph_columns(const float* base, const float* basis, int columns, int bases,
+                                      int batch, const float* weights, int row, float* out) {
+  const int column = int(blockIdx.x * blockDim.x + threadIdx.x);
+  if (column >= columns) return;
+  for (int first = 0; first < batch; first += kMorphImages) {
+    float sums[kMorphImages];
+    for (int i = 0; i < kMorphImages; ++i) sums[i] = base[column];
+#pragma unroll 4
+    for (int k = 0; k < bases; ++k) {
+      const float value = basis[int64_t(k) * columns + column];
+      const float* psi = weights + k * row + first;
+#pragma unroll
+      for (int i = 0; i < kMorphImages; i += 4) {
+        if (first + i >= batch) break;
+        const Four four = four_at(psi + i);
+        sums[i] += four.x * value, sums[i + 1] += four.y * value;
+        sums[i + 2] += four.z * value, sums[i + 3] += four.w * value;
+      }
     }
+#pragma unroll
+    for (int i = 0; i < kMorphImages; ++i)
+      if (first + i < batch) out[int64_t(first + i) * columns + column] = sums[i];
   }
 }
 
-// `weights` are those of the images that the block morphs, [kBlendImages, K].
-RGBAVATAR_FUNCTION void blend_gaussian(const Morphed& b, const Frame& frame, const float* weights,
-                                       int gaussian, Tangent& out) {
-  const int count = frame.count, bases = b.bases;
-  blend_attribute<3>(b.position, b.basis_position, count, bases, weights, gaussian, out.position);
-  blend_attribute<4>(b.rotation, b.basis_rotation, count, bases, weights, gaussian, out.rotation);
-  blend_attribute<3>(b.color, b.basis_color, count, bases, weights, gaussian, out.color);
-}
-
-// Copies the weights of a block's images to shared memory; 0 for images behind the batch's end.
-RGBAVATAR_FUNCTION void load_weights(const Morphed& b, const Frame& frame, int first_image,
-                                     float* weights) {
-  for (int i = int(threadIdx.x); i < kBlendImages * b.bases; i += int(blockDim.x)) {
-    const int image = first_image + i / b.bases;
-    weights[i] = image < frame.batch ? b.weights[image * b.bases + i % b.bases] : 0.0f;
-  }
+// Bases are read here alone. Blocks of 256 columns, by position, rotation and colour.
+RGBAVATAR_KERNEL(morph, MorphArguments, kTileThreads) {
+  RGBAVATAR_DYNAMIC_SHARED(float, weights);
+  const Morphed& b = a.blended;
+  const int row = load_weights(b.weights, a.frame.batch, b.bases, weights);
   __syncthreads();
+  const auto morph = [&](const float* base, const float* basis, int width, float* out) {
+    morph_columns(base, basis, a.frame.count * width, basis ? b.bases : 0, a.frame.batch, weights,
+                  row, out);
+  };
+  if (blockIdx.y == 0) morph(b.position, b.basis_position, 3, b.tangent_position);
+  else if (blockIdx.y == 1) morph(b.rotation, b.basis_rotation, 4, b.tangent_rotation);
+  else morph(b.color, b.basis_color, 3, b.tangent_color);
 }
 
 // A morphed Gaussian in the world of one image, and what carries it.
@@ -187,51 +186,41 @@ RGBAVATAR_FUNCTION float bounded_exp(float x) {
   return power_of_two(fminf(fmaxf(x * (2.0f * C::kHalfLog2E), -125.0f), 125.0f));
 }
 
-RGBAVATAR_FUNCTION Carried carry(const Morphed& b, int image, int gaussian,
-                                 const float position[3], const float rotation[4],
-                                 const float color[3]) {
+RGBAVATAR_FUNCTION Carried carry(const Morphed& b, const Frame& frame, int image, int gaussian) {
+  const int64_t row = int64_t(image) * frame.count + gaussian;
   const float* f =
       b.frames + (int64_t(image) * b.triangles + b.triangle_of[gaussian]) * kFrameFloats;
   Carried out;
   out.row0 = {f[0], f[1], f[2]}, out.row1 = {f[3], f[4], f[5]}, out.row2 = {f[6], f[7], f[8]};
-  for (int k = 0; k < 4; ++k) out.frame_quat[k] = f[9 + k], out.rotation[k] = rotation[k];
+  for (int k = 0; k < 4; ++k) out.frame_quat[k] = f[9 + k];
+  const Four q = four_at(b.tangent_rotation + row * 4);
+  out.rotation[0] = q.x, out.rotation[1] = q.y, out.rotation[2] = q.z, out.rotation[3] = q.w;
   out.ratio = f[22];
   const Vec3<float> along = vec3_at(b.barycentric, gaussian);
   const Vec3<float> origin =
       add_scaled(add_scaled(Vec3<float>{f[13], f[14], f[15]}, Vec3<float>{f[16], f[17], f[18]},
                             along.y),
                  Vec3<float>{f[19], f[20], f[21]}, along.z);
-  const Vec3<float> x = out.position = {position[0], position[1], position[2]};
+  const Vec3<float> x = out.position = vec3_at(b.tangent_position, row);
   GaussianInput<float>& g = out.gaussian;
   g.mean = {dot(out.row0, x) + origin.x, dot(out.row1, x) + origin.y, dot(out.row2, x) + origin.z};
-  quat_product(out.frame_quat, rotation, g.quat);
+  quat_product(out.frame_quat, out.rotation, g.quat);
   const Vec3<float> log_scale = vec3_at(b.log_scale, gaussian);
   g.scale = scaled(Vec3<float>{bounded_exp(log_scale.x), bounded_exp(log_scale.y),
                                bounded_exp(log_scale.z)},
                    out.ratio);
   g.opacity = reciprocal_of(1.0f + bounded_exp(-b.opacity_logit[gaussian]));
-  out.color = {color[0] * kColorScale + 0.5f, color[1] * kColorScale + 0.5f,
-               color[2] * kColorScale + 0.5f};
+  const Vec3<float> color = vec3_at(b.tangent_color, row);
+  out.color = {color.x * kColorScale + 0.5f, color.y * kColorScale + 0.5f,
+               color.z * kColorScale + 0.5f};
   return out;
 }
 
-// Morphs and projects. Blocks of 128 Gaussians, by groups of kBlendImages images.
+// Carries to the world and projects what was morphed. Blocks of 128 Gaussians, by images.
 RGBAVATAR_KERNEL(blend, BlendArguments, kBlendThreads) {
-  RGBAVATAR_DYNAMIC_SHARED(float, weights);
-  const int first_image = int(blockIdx.y) * kBlendImages;
-  load_weights(a.blended, a.frame, first_image, weights);
-  const int gaussian = int(blockIdx.x * blockDim.x + threadIdx.x);
+  const int gaussian = int(blockIdx.x * blockDim.x + threadIdx.x), image = int(blockIdx.y);
   const bool exists = gaussian < a.frame.count;
-  const int row = exists ? gaussian : 0;
-  Tangent tangent;
-  blend_gaussian(a.blended, a.frame, weights, row, tangent);
-#pragma unroll
-  for (int i = 0; i < kBlendImages; ++i) {
-    const int image = first_image + i;
-    if (image >= a.frame.batch) break;
-    const Carried c = carry(a.blended, image, row, tangent.position[i], tangent.rotation[i],
-                            tangent.color[i]);
-    emit(a.frame, a.bins, image, gaussian, exists, c.gaussian, c.color,
-         project(c.gaussian, camera_of(a.cameras, a.frame, image)));
-  }
+  const Carried c = carry(a.blended, a.frame, image, exists ? gaussian : 0);
+  emit(a.frame, a.bins, image, gaussian, exists, c.gaussian, c.color,
+       project(c.gaussian, camera_of(a.cameras, a.frame, image)));
 }

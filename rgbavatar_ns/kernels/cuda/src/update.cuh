@@ -16,10 +16,6 @@ struct UpdateTile {
   float product[kHeldImages * kBasesAtOnce];
 };
 
-struct alignas(16) Four {
-  float x, y, z, w;
-};
-RGBAVATAR_FUNCTION Four four_at(const float* row) { return *reinterpret_cast<const Four*>(row); }
 RGBAVATAR_FUNCTION float add_product(float sum, const Four& a, const Four& b) {
   return sum + a.x * b.x + a.y * b.y + (a.z * b.z + a.w * b.w);
 }
@@ -85,11 +81,7 @@ RGBAVATAR_KERNEL(update, UpdateArguments, kTileThreads, 4) {
     return;
   }
   const bool exists = column < c.columns;
-  const int row = (a.batch + 3) & ~3;
-  for (int i = int(threadIdx.x); i < c.bases * row; i += kTileThreads) {
-    const int b = i % row;
-    weights[i] = b < a.batch ? a.weights[b * c.bases + i / row] : 0.0f;
-  }
+  const int row = load_weights(a.weights, a.batch, c.bases, weights);
   const auto of_image = [&](int b) {
     return exists && b < a.batch ? c.gradient[int64_t(b) * c.columns + column] : 0.0f;
   };
