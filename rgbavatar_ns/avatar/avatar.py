@@ -143,13 +143,20 @@ class Avatar(AvatarMethod):
 
         Beyond what training saw, F hardly follows: nothing taught it what is there.
         """
+        return self.weights_of(self.weight_features(theta))
+
+    def weight_features(self, theta: Float[Tensor, "B H"]) -> Float[Tensor, "B _"]:
+        """Return what F is told of theta, psi itself where there is no F; raises as `weights`."""
         theta = softly_within(self.checked(theta), self.theta_low, self.theta_high)
         if self.weight_network is None:
             return theta[:, self.layout.slice("expression")][:, : self.config.num_bases]
-        features = self.layout.network_features(
+        return self.layout.network_features(
             theta, self.config.pose_input, self.config.translation_input
         )
-        return self.weight_network(features)
+
+    def weights_of(self, features: Float[Tensor, "B _"]) -> Float[Tensor, "B K"]:
+        """Return psi of `weight_features`."""
+        return features if self.weight_network is None else self.weight_network(features)
 
     @torch.no_grad()
     def widen_film_range(self, theta: Float[Tensor, "B H"]) -> None:

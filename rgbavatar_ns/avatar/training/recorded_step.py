@@ -1,8 +1,9 @@
 """The whole optimiser step as one CUDA graph: the host says which frames, and waits for nothing.
 
-Frames lie on the device as 8-bit images. A replay takes what changes from step to step (frames,
-backgrounds, Adam's numbers) from one small buffer; morphing, drawing, loss, gradients, Adam and the
-weight network with its own gradients and Adam are in the graph.
+Frames lie on the device as 8-bit images, with their heads, which are made once. A replay takes what
+changes from step to step (frames, backgrounds, Adam's numbers) from one small buffer; morphing,
+drawing, loss, gradients, Adam and the weight network with its own gradients and Adam are in the
+graph.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -23,6 +24,7 @@ from rgbavatar_ns.avatar.training.cuda_graph import (
     record_cuda_graph,
     supports,
 )
+from rgbavatar_ns.avatar.training.frame_heads import FrameHeads
 from rgbavatar_ns.avatar.training.optimizer_states import AdamStates
 from rgbavatar_ns.kernels import UPDATED_ATTRIBUTES, DeviceRenderer
 
@@ -57,6 +59,7 @@ class RecordedStep:
         self._avatar, self.frames, self._backend = avatar, frames, backend
         self._first_colors, self._num_filmed = first_colors, num_filmed
         self._states = AdamStates(avatar, optimizers)
+        self._heads = FrameHeads(avatar)
         self._recording = Recording(avatar, self._work, recorder, self._read)
         self._lane = lane(frames.theta.device)
         self._optimizers_told = False
@@ -82,6 +85,7 @@ class RecordedStep:
         if len(chosen) != self._sizes[0] or len(background) != len(chosen):
             raise ValueError(f"{len(chosen)} frames in a step recorded for {self._sizes[0]}.")
         with self._lane():
+            self._heads.know(self.frames.theta)
             self._gaussian_states = self._states.next_of_gaussians()
             self._network_states = self._states.next_of_network()
             if not self._optimizers_told:
@@ -116,6 +120,7 @@ class RecordedStep:
         frames, cameras = self.frames, self.frames.cameras
         filmed = [frames.theta, frames.images_rgba, cameras.world_to_camera]
         seen = [cameras.focal_px, cameras.principal_point_px]
+        filmed += [self._heads.vertices, self._heads.features]
         return [*moments, *self._states.steps(), *filmed, *seen]
 
     def _numbers(self) -> list[float]:
@@ -158,9 +163,8 @@ class RecordedStep:
             chosen = {name: getattr(cameras, name).index_select(0, index) for name in parts}
             cameras = replace(cameras, **chosen)
         with torch.enable_grad():
-            psi = self._avatar.weights(theta)
-        with torch.no_grad():
-            vertices = self._avatar.carrier_vertices(theta)
+            psi = self._avatar.weights_of(self._heads.features.index_select(0, index))
+        vertices = self._heads.vertices.index_select(0, index)
         renderer = self._avatar.renderer(
             theta, cameras, psi.detach(), vertices, backend=self._backend
         )
