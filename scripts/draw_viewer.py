@@ -65,7 +65,9 @@ def main() -> None:
         viewer.page.get_by_role("tab", name="Drive", exact=True).wait_for(timeout=120_000)
         for use in (drive, look, face, bases):
             use(viewer)
-            viewer.page.mouse.move(20, 450)  # away from the controls, whose hints would lie over them
+            viewer.page.mouse.move(
+                20, 450
+            )  # away from the controls, whose hints would lie over them
             viewer.page.wait_for_timeout(SETTLED_MS)
             place = DOCS / f"viewer_{use.__name__}.jpg"
             with atomic_write(place) as partial:

@@ -20,14 +20,14 @@ REASONS = ("DamagedFileError", "RefusedPickleError", "UnusableFrameError", "Miss
 class ErrorText:
     """What is said where an error is made."""
 
-    kind: Literal["told", "reason"]
-    """"told", of a cause and a remedy, or "reason"."""
+    kind: Literal["told", "reason", "warning"]
+    """"told", of a cause and a remedy, "reason" or "warning"."""
     module: str
     """Path in the package, as `cli/render.py`."""
     line: int
     cause: str
     remedy: str
-    """"" of a reason; a lone gap where it is put together elsewhere."""
+    """Empty where a cause stands alone; a lone gap where it is put together elsewhere."""
 
 
 def error_texts(package: Path) -> list[ErrorText]:
@@ -48,15 +48,18 @@ def _texts(tree: ast.Module, module: str) -> Iterator[ErrorText]:
         known = constants | _assigned(ast.walk(function))
         known_at |= {id(node): known for node in ast.walk(function)}
     for node in ast.walk(tree):
-        if not isinstance(node, ast.Call) or not isinstance(node.func, ast.Name):
+        if not isinstance(node, ast.Call):
             continue
+        name = ast.unparse(node.func)
         known = known_at.get(id(node), constants)
         words = [_words(argument, known) for argument in node.args]
-        first = PLACE_OF_CAUSE.get(node.func.id)
+        first = PLACE_OF_CAUSE.get(name)
         if first is not None and len(words) >= first + 2:
             yield ErrorText("told", module, node.lineno, words[first], words[first + 1])
-        elif node.func.id in REASONS and len(words) == 1:
+        elif name in REASONS and len(words) == 1:
             yield ErrorText("reason", module, node.lineno, words[0], "")
+        elif name == "warnings.warn":
+            yield ErrorText("warning", module, node.lineno, words[0], "")
 
 
 def _assigned(statements: Sequence[ast.stmt] | Iterator[ast.AST]) -> dict[str, str]:

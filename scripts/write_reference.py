@@ -19,6 +19,7 @@ GROUPS = (
     ("Making and tracking films", ("tracking/", "synthetic/")),
     ("Checking data", ("data/check/",)),
     ("Other systems' data", ("data/importers/",)),
+    ("Streams", ("data/streams/", "plugin/online/")),
     ("Datasets and images", ("data/native/", "data/png.py", "data/opening.py", "data/")),
     ("FLAME and head models", ("head/",)),
     ("Avatars and checkpoints", ("avatar/",)),
@@ -56,7 +57,7 @@ def errors_page() -> str:
     sections = []
     ordered = sorted(told, key=lambda text: _group(text))
     for number, group in groupby(ordered, key=_group):
-        rows = dict.fromkeys((_cell(text.cause), _remedy(text)) for text in group)
+        rows = dict.fromkeys((cell(text.cause), _remedy(text)) for text in group)
         lines = [f"| {cause} | {remedy} |" for cause, remedy in sorted(rows, key=_first_words)]
         head = "| it says | what to do |\n| --- | --- |\n"
         sections += [f"## {GROUPS[number][0]}", head + "\n".join(lines)]
@@ -67,11 +68,13 @@ def errors_page() -> str:
         "says itself what to do; why it happens, where that needs more words, is in "
         "[troubleshooting.md](troubleshooting.md).",
         *sections,
-        "## Reasons that they give",
+        "## Warnings",
+        "\n".join(f"- {cell(text.cause)}" for text in texts if text.kind == "warning"),
+        "## Reasons that errors give",
         'Where an error ends in a reason, as "cannot be read: it is cut off", the reason is one '
         "of these, or the system's own. The file was damaged, cut short, or made to do harm: get "
         "or write it anew.",
-        "\n".join(f"- {_cell(reason)}" for reason in reasons),
+        "\n".join(f"- {cell(reason)}" for reason in reasons),
     )
 
 
@@ -88,14 +91,18 @@ def _group(text: ErrorText) -> int:
 
 
 def _remedy(text: ErrorText) -> str:
-    return "(told with it)" if text.remedy.strip(f"{GAP} .") == "" else _cell(text.remedy)
+    return "(told with it)" if text.remedy.strip(f"{GAP} .") == "" else cell(text.remedy)
 
 
-def _cell(text: str) -> str:
-    """Text as Markdown shows it unchanged: in no code, so that `*` and `<` are marked."""
-    for sign in "\\*_<[|":
-        text = text.replace(sign, "\\" + sign)
-    return " ".join(text.split())
+def cell(text: str) -> str:
+    """Text as Markdown shows it unchanged: signs are marked where they are in no code."""
+    parts = text.split("`")
+    if len(parts) % 2 == 0:
+        parts = [text.replace("`", "\\`")]
+    for sign in "\\*_<[":
+        parts[::2] = [part.replace(sign, "\\" + sign) for part in parts[::2]]
+    marked = "`".join(parts).replace("\\\\`", "\\`")
+    return " ".join(marked.replace("|", "\\|").split())
 
 
 def _page(*blocks: str) -> str:

@@ -11,12 +11,12 @@ author = "The authors of rgbavatar_ns"
 root_doc = "docs/index"
 
 NAVIGATION = {
-    "Start": ("install", "filming", "tracking", "check", "train", "troubleshooting"),
-    "Use an avatar": ("look", "render", "driving", "web", "edit_and_export", "beyond"),
-    "More data": ("online", "formats", "flame", "dataset_format"),
+    "Start": ("install", "filming", "track", "check", "train", "troubleshooting"),
+    "Use an avatar": ("look", "render", "driving", "web", "edit_and_export"),
+    "More data": ("dataset_format", "flame", "online"),
     "Reference": ("tasks", "commands", "errors", "nerfstudio", "python", "python_reference"),
-    "Figures": ("quality", "speed", "gpu", "rivals", "results", "others", "../configs/README"),
-    "Inside": ("inside", "architecture", "paper", "extend"),
+    "Figures": ("quality", "speed", "gpu", "beyond", "rivals", "results", "others"),
+    "Inside": ("inside", "architecture", "paper", "tracking", "extend", "../configs/README"),
     "The project": ("../README", "upgrade", "../CHANGELOG", "../CONTRIBUTING"),
 }
 """Every page once, by title of its group; paths from docs/."""
