@@ -47,7 +47,7 @@ reference:  ## Write docs/commands.md and docs/errors.md anew, after a change of
 	@$(BIN)/python scripts/write_reference.py
 
 docs: setup  ## The documentation as a site in build/site, strictly (Python 3.11 or newer)
-	@$(BIN)/sphinx-build -q -W --keep-going -c docs/site -d build/site-trees . build/site
+	@$(BIN)/sphinx-build -q -a -E -W --keep-going -c docs/site -d build/site-trees . build/site
 	@echo "build/site/index.html"
 
 clean:  ## Remove the environment, builds and outputs
