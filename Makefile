@@ -44,7 +44,7 @@ format: setup  ## Format the code and mend what the linter can
 	@$(BIN)/ruff format .
 
 reference:  ## Write docs/commands.md and docs/errors.md anew, after a change of options or errors
-	@$(BIN)/python scripts/write_reference.py
+	@$(BIN)/python -m scripts.write_reference
 
 docs: setup  ## The documentation as a site in build/site, strictly (Python 3.11 or newer)
 	@$(BIN)/sphinx-build -q -a -E -W --keep-going -c docs/site -d build/site-trees . build/site

@@ -1,6 +1,6 @@
 """Write the pages that are read from the code, docs/commands.md and docs/errors.md.
 
-    python scripts/write_reference.py
+    python -m scripts.write_reference
 
 after options or errors have changed; a test compares the pages with what this writes.
 """
@@ -8,10 +8,9 @@ after options or errors have changed; a test compares the pages with what this w
 from itertools import groupby
 from pathlib import Path
 
-from command_tables import command_pages, method_pages
-from error_texts import GAP, ErrorText, error_texts
-
 from rgbavatar_ns.files import atomic_write
+from scripts.command_tables import command_pages, method_pages
+from scripts.error_texts import GAP, ErrorText, error_texts
 
 ROOT = Path(__file__).resolve().parents[1]
 COMMANDS_PAGE, ERRORS_PAGE = ROOT / "docs" / "commands.md", ROOT / "docs" / "errors.md"

@@ -1,19 +1,14 @@
 """The pages that are read from the code: whole, true, and as the code is now."""
 
 import re
-import sys
 from pathlib import Path
 
 import pytest
 
 from rgbavatar_ns.cli.main import COMMANDS
+from scripts import error_texts, write_reference
 
 ROOT = Path(__file__).parents[2]
-sys.path.insert(0, str(ROOT / "scripts"))
-
-import error_texts  # noqa: E402
-import write_reference  # noqa: E402
-
 MOST_UNTOLD = 0.02
 """Share of places whose error only passes on what another made: nothing of its words is there."""
 _QUOTED = re.compile(r'^\| "(.*?)" \|', flags=re.M)
