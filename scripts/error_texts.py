@@ -10,7 +10,13 @@ from pathlib import Path
 from typing import Literal
 
 GAP = "…"
-PLACE_OF_CAUSE = {"UserError": 0, "DiskError": 0, "FlameVersionError": 0, "Problem": 2}
+PLACE_OF_CAUSE = {
+    "UserError": 0,
+    "DiskError": 0,
+    "FlameVersionError": 0,
+    "DeviceError": 0,
+    "Problem": 2,
+}
 """What is made of a cause and, after it, a remedy: which argument the cause is."""
 REASONS = ("DamagedFileError", "RefusedPickleError", "UnusableFrameError", "MissingFileError")
 """Made of a reason, which an error of a user quotes."""

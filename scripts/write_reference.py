@@ -23,6 +23,7 @@ GROUPS = (
     ("FLAME and head models", ("head/",)),
     ("Avatars and checkpoints", ("avatar/",)),
     ("Training and the viewer", ("plugin/",)),
+    ("The GPU", ("kernels/",)),
     ("Driving", ("driving/",)),
     ("Films, pages and files", ("export/",)),
     ("Experiments and benchmarks", ("experiments/", "bench/")),

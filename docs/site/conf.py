@@ -39,6 +39,8 @@ autodoc_typehints = "signature"
 autodoc_typehints_format = "short"
 python_maximum_signature_line_length = 80
 maximum_signature_line_length = 80
+# "--flame" is to stay so, and quotes as a program prints them.
+smartquotes = False
 html_theme = "furo"
 html_title = project
 html_copy_source = False

@@ -23,4 +23,6 @@ def test_the_site_builds_without_a_warning_and_is_filled(tmp_path: Path) -> None
     described = re.findall(r'id="(rgbavatar_ns\.[\w.]+)"', reference)
     assert "rgbavatar_ns.Avatar.render" in described
     assert len(described) > 80
+    errors = (tmp_path / "site" / "docs" / "errors.html").read_text()
+    assert "with --flame; without it" in errors  # signs stay as a program prints them
     assert "http-equiv" in (tmp_path / "site" / "index.html").read_text()
