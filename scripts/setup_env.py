@@ -246,7 +246,7 @@ def main() -> None:
         install_torch()
         uv_install(
             "installing nerfstudio and the other packages",
-            "-r", "pyproject.toml", "--extra", "dev", "--extra", "track",
+            "-r", "pyproject.toml", "--extra", "dev", "--extra", "track", "--extra", "docs",
         )  # fmt: skip
         install_torchvision()
         install_tracker()
