@@ -58,7 +58,7 @@ def zig_commands(interpreter: Path) -> dict[str, Path]:
 
 def build(python: str, tools: Path, zig: dict[str, Path], output: Path) -> None:
     """One Python's wheel, built, checked against the platform's symbols, and tried."""
-    interpreter = new_venv(python, WORK / Path(python).name, "numpy<2")
+    interpreter = new_venv(python, WORK / Path(python).name, "pip>=24", "numpy<2")
     raw = WORK / f"raw-{Path(python).name}"
     shutil.rmtree(raw, ignore_errors=True)
     run(

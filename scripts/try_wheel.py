@@ -39,14 +39,15 @@ def draw(native: ModuleType, instruction_set: str, means: Any, scale_m: float, t
     """
     count = len(means)
     gaussians = native.Gaussians(
-        np.float32(means)[None],
-        np.float32([[[1, 0, 0, 0]]]).repeat(count, 1),
+        np.array(means, np.float32)[None],
+        np.array([[[1, 0, 0, 0]]], np.float32).repeat(count, 1),
         np.full((1, count, 3), scale_m, np.float32),
         np.full((1, count), 0.5, np.float32),
-        np.float32(np.abs(means) % 1)[None],
+        np.array(np.abs(means) % 1, np.float32)[None],
     )
     camera = np.eye(4, dtype=np.float32)[None]
-    focal_px, centre_px = np.float32([[FOCAL_PX] * 2]), np.float32([[WIDTH / 2, HEIGHT / 2]])
+    focal_px = np.full((1, 2), FOCAL_PX, np.float32)
+    centre_px = np.array([[WIDTH / 2, HEIGHT / 2]], np.float32)
     session = native.Session(
         gaussians, camera, focal_px, centre_px, 1, WIDTH, HEIGHT, threads, instruction_set
     )
@@ -68,7 +69,7 @@ def main() -> None:
         for name, picture in known.items():
             # A wide Gaussian before the camera: at its middle alpha is its opacity, farther off
             # it falls by exp(-d^2 / 2 sigma^2). The rasterizer adds .3 px^2 to sigma^2.
-            alone = draw(native, name, np.float32([[0, 0, 2]]), 0.25, threads=1)[..., 3]
+            alone = draw(native, name, np.array([[0, 0, 2]]), 0.25, threads=1)[..., 3]
             sigma_squared = (0.25 / 2 * FOCAL_PX) ** 2 + 0.3
             assert abs(alone[HEIGHT // 2, WIDTH // 2] - 0.5 * np.exp(-0.25 / sigma_squared)) < 1e-4
             far = alone[HEIGHT // 2, WIDTH // 2 + 8]

@@ -86,3 +86,16 @@ def test_the_workflows_run_commands_that_are_there() -> None:
     scripts = re.findall(r"scripts/\w+\.py", text)
     assert scripts
     assert all((ROOT / script).is_file() for script in scripts)
+
+
+def test_the_lines_of_install_md_take_the_torch_that_setup_takes() -> None:
+    page = (ROOT / "docs/install.md").read_text()
+    setup = (ROOT / "scripts/setup_env.py").read_text()
+    torch = re.search(r'^TORCH = "(.*)"', setup, flags=re.M)
+    assert torch is not None
+    assert f"torch=={torch[1]}" in (ROOT / "requirements/constraints.txt").read_text().split()
+    lines = re.findall(r"^pip install .* torch torchvision==(\S+) && .*$", page, flags=re.M)
+    assert len(lines) == 2
+    assert all(f"torchvision=={version}" in setup for version in lines)
+    for path in re.findall(r"(?:-r|-c|--override) (requirements/\S+)", page):
+        assert (ROOT / path).is_file()
