@@ -3,10 +3,14 @@
 import subprocess
 import sys
 from dataclasses import dataclass, fields
+from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
 
 from rgbavatar_ns.plugin.option_order import led_by
+from rgbavatar_ns.plugin.presets import presets
+from rgbavatar_ns.plugin.training.run_end import EndingTrainer
 
 HEAVY = ("mediapipe", "trimesh", "embreex", "matplotlib.pyplot", "skimage", "gaussforge", "ray")
 
@@ -64,3 +68,18 @@ def test_an_order_of_options_changes_neither_values_nor_positions() -> None:
     assert led(10, 20) == led(a=10, b=20, c=3)
     with pytest.raises(KeyError):
         led_by("d")(led)
+
+
+def test_the_viewer_that_stays_open_says_how_it_ends_and_how_not_to_have_it(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    trainer = SimpleNamespace(viewer_state=Mock(), stop=Mock(signal_number=2))
+    trainer.stop.wait.side_effect = [False, True]
+    EndingTrainer._train_complete_viewer(trainer)  # type: ignore[arg-type]
+    told = capsys.readouterr().out
+    assert "stays open; Ctrl-C ends it" in told
+    option, value = "--viewer.quit-on-train-completion", "True"
+    assert f"{option} {value}" in told
+    assert hasattr(presets()["rgbavatar"].viewer, option.partition(".")[2].replace("-", "_"))
+    assert trainer.stop.signal_number is None, "the run has ended well"
+    assert trainer.stop.wait.call_count == 2
