@@ -98,6 +98,7 @@ class Runner:
             ended = heard and _waited(process, min(patience.to_end_s, limit_s))
             left_behind = None if ended else _leave(process, patience)
             if ended:
+                _end_group(process)
                 state, why = _judge(process.returncode, report.sections[name]["rows"])
             else:
                 late = "it had told all and did not end" if heard else "it did not end"
@@ -210,10 +211,15 @@ def _leave(process: "subprocess.Popen[bytes]", patience: Patience) -> int | None
         with suppress(ProcessLookupError, PermissionError):
             os.killpg(process.pid, how)
         if _waited(process, seconds):
-            with suppress(ProcessLookupError, PermissionError):
-                os.killpg(process.pid, signal.SIGKILL)
+            _end_group(process)
             return None
     return process.pid
+
+
+def _end_group(process: "subprocess.Popen[bytes]") -> None:
+    """End what a process that has ended started and left."""
+    with suppress(ProcessLookupError, PermissionError):
+        os.killpg(process.pid, signal.SIGKILL)
 
 
 def _waited(process: "subprocess.Popen[bytes]", seconds: float) -> bool:
