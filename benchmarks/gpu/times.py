@@ -68,7 +68,7 @@ def rendering(rows: Rows) -> None:
     work = Workload.here()
     training = Training(work)
     avatar, cameras = training.avatar, training.frames.cameras
-    for size in (1, work.batch):
+    for size in sorted({1, work.batch}):
         theta = training.frames.theta[:size]
         recorded = RecordedRendering(avatar, theta, cameras, backend="cuda", recorder=work.recorder)
         ways = {

@@ -54,6 +54,7 @@ class Workload:
     batch: int = 10
     frames: int = 60
     uv_resolution: int = 256
+    crowd: int = 8_000
 
     @classmethod
     def here(cls) -> "Workload":
@@ -62,11 +63,14 @@ class Workload:
 
     def small(self) -> "Workload":
         """A case that a tool which slows everything down gets through."""
-        return replace(self, gaussians=300, size_px=48, batch=2, frames=4, uv_resolution=12)
+        most = {"gaussians": 300, "size_px": 48, "batch": 2, "frames": 4, "uv_resolution": 12}
+        return replace(
+            self, **{name: min(getattr(self, name), size) for name, size in most.items()}
+        )
 
     def crowded(self) -> "Workload":
         """One picture whose tiles' lists are longer than shared memory sorts."""
-        return replace(self, gaussians=12_000, size_px=32, batch=1)
+        return replace(self, gaussians=self.crowd, size_px=min(self.size_px, 32), batch=1)
 
     @property
     def on_gpu(self) -> bool:

@@ -1,0 +1,52 @@
+"""Sections of the GPU's check on an emulated GPU, in a process that lacks what a bare machine does.
+
+    python -m tests.bench.gpu_stand_in SECTION ...
+
+Prints the rows of each as the check's child would send them, after a line with its name.
+"""
+
+import sys
+
+ABSENT = (
+    *("nerfstudio", "tyro", "trimesh", "roma", "cv2", "av", "torchmetrics", "gsplat"),
+    "rgbavatar_ns.kernels.cpu._native",
+)
+
+
+def main(names: list[str]) -> None:
+    sys.modules.update(dict.fromkeys(ABSENT))  # type: ignore[arg-type]
+
+    import torch
+
+    from benchmarks.gpu import small_case, times
+    from benchmarks.gpu.child import run_section
+    from benchmarks.gpu.rows import Rows
+    from benchmarks.gpu.sections import chosen_sections
+    from benchmarks.gpu.workload import Workload
+    from rgbavatar_ns.bench.roofline import measure_speed
+    from rgbavatar_ns.kernels import registry
+    from tests.kernels.cuda import emulator
+
+    backend, real = emulator.load(), registry._load
+    registry._load = lambda name: backend if name == "cuda" else real(name)  # type: ignore
+    speed = measure_speed(matrix_side=64, copy_mib=1, seconds=0.001)
+    times.measure_speed = lambda device: speed
+    tiny = Workload(
+        *(torch.device("cpu"), 0.001, 0.001, 2, lambda work: work, 60, 16),
+        batch=1,
+        frames=2,
+        uv_resolution=12,
+        crowd=200,
+    )
+    Workload.here = classmethod(lambda cls: tiny)  # type: ignore[assignment]
+    for name in names:
+        if name in small_case.CASES:
+            small_case.main(name, tiny)
+            continue
+        print(name)
+        (section,) = chosen_sections(name)
+        assert run_section(section, Rows(lambda line: print(line, end=""))) == 0
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
