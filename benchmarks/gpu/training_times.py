@@ -1,5 +1,6 @@
 """Training as it is: with all that is due beside a step, with corrected tracking, from a stream."""
 
+import importlib.util
 import time
 
 import torch
@@ -17,9 +18,12 @@ def whole_run(rows: Rows) -> None:
     """An avatar of 50,000 images with the preset's options, or as many as there is time for."""
     work = Workload.here()
     training = Training(work)
+    # It measures outlines by OpenCV, which a bare machine lacks.
+    surface_prior = importlib.util.find_spec("cv2") is not None
     with rows.row("whole_run") as figures:
         start = time.perf_counter()
-        take = training.unrecorded(TrainingOptions(backend="cuda"))
+        options = TrainingOptions(surface_prior=surface_prior, backend="cuda")
+        take = training.unrecorded(options)
         losses, number = [], 0
 
         def step() -> None:
@@ -41,6 +45,7 @@ def whole_run(rows: Rows) -> None:
         whole_s = ready - start + AVATAR_IMAGES / rate
         figures |= {
             "step": f"{take.kind}: {take.reason}",
+            "surface_prior": surface_prior,
             "images": number * work.batch,
             "ready_s": ready - start,
             "images_per_second": rate,

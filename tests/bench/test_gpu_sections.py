@@ -14,7 +14,7 @@ from benchmarks.gpu.counters import counters
 from benchmarks.gpu.kernel_times import kernel_times, shares
 from benchmarks.gpu.rows import LeftOut
 from benchmarks.gpu.sections import SECTIONS
-from benchmarks.gpu.small_case import DONE
+from benchmarks.gpu.small_case import CASES, DONE
 from benchmarks.gpu.tools import Ran
 from benchmarks.gpu.workload import Workload
 from tests.kernels.cuda import emulator
@@ -29,19 +29,21 @@ needs_a_compiler = pytest.mark.skipif(
 )
 
 
-def stand_in(*names: str) -> str:
-    command = [sys.executable, "-m", "tests.bench.gpu_stand_in", *names]
+@pytest.fixture(scope="module")
+def stand_in() -> list[str]:
+    """What sections and small cases print, one after another."""
+    command = [sys.executable, "-m", "tests.bench.gpu_stand_in", *EMULATED, *CASES]
     ran = subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
     assert ran.returncode == 0, ran.stdout + ran.stderr
-    return ran.stdout
+    return ran.stdout.splitlines()
 
 
-@pytest.fixture(scope="module")
-def emulated() -> dict[str, dict[str, Any]]:
+@pytest.fixture
+def emulated(stand_in) -> dict[str, dict[str, Any]]:
     """The rows of every section that an emulated GPU can answer."""
     sections: dict[str, dict[str, Any]] = {}
     rows: dict[str, Any] = {}
-    for line in stand_in(*EMULATED).splitlines():
+    for line in stand_in:
         if line in EMULATED:
             rows = sections[line] = {}
         elif line.startswith("{"):
@@ -104,8 +106,8 @@ def test_lists_and_replays_among_other_memory(emulated):
 
 
 @needs_a_compiler
-def test_the_tools_small_cases_run_to_their_last_word():
-    assert stand_in("fused", "recorded", "profiled").splitlines() == [DONE] * 3
+def test_the_tools_small_cases_run_to_their_last_word(stand_in):
+    assert [line for line in stand_in if line == DONE] == [DONE] * len(CASES)
 
 
 def test_targets_are_reached_at_one():
@@ -289,11 +291,11 @@ def test_a_sanitizer_that_has_not_seen_all_fails(ran):
 
 
 RAW = """==PROF== Connected to process 12
-"ID","Process ID","Kernel Name","Block Size","gpu__time_duration.sum","sm__throughput.avg.pct_of_peak_sustained_elapsed"
-"","","","","ns","%"
-"0","12","train_kernel(TrainArguments)","(256, 1, 1)","1,203,400","61.5"
-"1","12","update_kernel","(256, 1, 1)","100","10"
-"2","12","update_kernel","(256, 1, 1)","300","20"
+"ID","Kernel Name","gpu__time_duration.sum","sm__throughput.avg.pct_of_peak_sustained_elapsed"
+"","","ns","%"
+"0","train_kernel(TrainArguments)","1,203,400","61.5"
+"1","update_kernel","100","10"
+"2","update_kernel","300","20"
 """
 LONG = """small case: done
 "ID","Kernel Name","Metric Name","Metric Unit","Metric Value"
