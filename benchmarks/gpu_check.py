@@ -10,8 +10,10 @@ failed.
 """
 
 import argparse
+import os
 import signal
 import sys
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -67,7 +69,10 @@ def checked(options: argparse.Namespace, command: Sequence[str] = ()) -> int:
     for number in _ENDS:
         signal.signal(number, _interrupt)
     try:
-        Runner(report, own_command, options.budget).run(options.chosen)
+        with tempfile.TemporaryDirectory() as cache:
+            # Kernels are compiled by the first section, and kept for the others of this check.
+            os.environ.setdefault("RGBAVATAR_CACHE", cache)
+            Runner(report, own_command, options.budget).run(options.chosen)
     except KeyboardInterrupt:
         print(f"Interrupted; what was found is in {options.json}.")
         return INTERRUPTED

@@ -4,6 +4,7 @@ import json
 import os
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -54,7 +55,8 @@ class Report:
         return [name for name, found in self.sections.items() if found["state"] in BAD]
 
     def _print(self, line: str) -> None:
-        print(f"[{time.monotonic() - self._start:4.0f} s] {line}", flush=True)
+        with suppress(BrokenPipeError):  # nobody listens any more; the file tells
+            print(f"[{time.monotonic() - self._start:4.0f} s] {line}", flush=True)
 
     def _save(self) -> None:
         try:

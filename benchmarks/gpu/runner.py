@@ -12,7 +12,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import IO, Any
 
-from benchmarks.gpu.report import Report
+from benchmarks.gpu.report import BAD, Report
 from benchmarks.gpu.sections import PREFLIGHT, SMOKE, Section
 
 Command = Callable[[Section, int], Sequence[str]]
@@ -29,7 +29,7 @@ class Patience:
     """Seconds that a process is given: to end by itself after its last row, and when told to."""
 
     to_end_s: float = 10.0
-    to_terminate_s: float = 3.0
+    to_terminate_s: float = 2.0
     to_be_killed_s: float = 3.0
 
 
@@ -103,6 +103,8 @@ class Runner:
             else:
                 late = "it had told all and did not end" if heard else "it did not end"
                 state, why = "timed out", f"{late} within {limit_s:.0f} s"
+            if section.guest and state in BAD:
+                state, why = "left out", f"{state}: {why}"
             if left_behind is not None:
                 why = f"{why}; process {left_behind} cannot be ended and may slow what follows"
             report.end(
@@ -111,7 +113,7 @@ class Runner:
                 why=why,
                 doing=listener.doing,
                 left_behind=left_behind,
-                log=None if state in ("done", "left out") else _tail(log),
+                log=None if state == "done" else _tail(log),
                 seconds=round(self.clock() - start, 1),
             )
 

@@ -14,6 +14,7 @@ class Section:
         does: the questions, in a line.
         limit_s: seconds after which its process is left behind.
         explains: whether it finds the cause where the smoke test failed, and is then asked first.
+        guest: whether it runs what is not ours, whose failure is none of ours.
     """
 
     name: str
@@ -21,6 +22,7 @@ class Section:
     does: str
     limit_s: float
     explains: bool = False
+    guest: bool = False
 
 
 SECTIONS = (
@@ -34,7 +36,7 @@ SECTIONS = (
     Section("training", "training_times:whole_run", "50,000 images with all that is due", 60),
     Section("refinement", "training_times:refinement", "a step that corrects tracking", 30),
     Section("stream", "training_times:stream", "a step on frames from main memory", 30),
-    Section("gsplat", "beside_gsplat:gsplat", "gsplat's kernels on the same Gaussians", 60),
+    Section("gsplat", "beside_gsplat:gsplat", "gsplat's kernels beside ours", 60, guest=True),
     Section("lists", "lists:lists", "lengths of tiles' lists, use of capacity", 30),
     Section("churn", "churn:churn", "replays while other memory comes and goes", 45, True),
     *(

@@ -34,7 +34,7 @@ def sleeping(work: Workload) -> tuple[Sleep, int]:
     if not work.on_gpu:
         return lambda: None, 0
     sleep: Any = torch.cuda._sleep
-    sleep(_TRIED_CYCLES)
+    sleep(1)  # what a first call loads
     work.wait()
     start = time.perf_counter()
     sleep(_TRIED_CYCLES)

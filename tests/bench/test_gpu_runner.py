@@ -93,6 +93,13 @@ def test_what_hangs_is_left_behind_and_the_next_section_runs(report):
     assert report.sections["ends"]["state"] == "done"
 
 
+def test_a_guest_s_failure_is_none_of_ours(report):
+    Runner(report, stub, 1e6).run([Section("dies", "dies", "a stub", 100.0, guest=True)])
+    assert report.sections["dies"]["state"] == "left out"
+    assert report.sections["dies"]["why"] == "died: by SIGKILL"
+    assert report.failed() == []
+
+
 def test_what_cannot_be_killed_is_told_and_not_waited_for(report, monkeypatch):
     monkeypatch.setattr(runners.os, "killpg", lambda group, how: None)
     clock = late_once(report, "hangs", "deaf")
