@@ -90,7 +90,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             print(f"{section.name:12}{section.limit_s:4.0f} s  {section.does}")
         return 0
     if options.child is not None:
-        return child(options.chosen[0], options.rows_file)
+        child(options.chosen[0], options.rows_file)
+        return 0
     return checked(options, sys.argv[1:] if arguments is None else arguments)
 
 

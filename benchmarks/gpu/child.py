@@ -5,31 +5,32 @@ import importlib
 import os
 import signal
 import traceback
+from contextlib import suppress
 
 from benchmarks.gpu.rows import Rows, SectionEnded
 from benchmarks.gpu.sections import Section
 
 
-def run_section(section: Section, rows: Rows) -> int:
-    """Ask the section's questions; 1 where it ended early without saying why in a row."""
+def run_section(section: Section, rows: Rows) -> None:
+    """Ask the section's questions; what is raised between its rows becomes one."""
     module, function = section.place.split(":")
-    try:
-        getattr(importlib.import_module(f"benchmarks.gpu.{module}"), function)(rows)
-    except SectionEnded:
-        return 0
-    except Exception:
-        traceback.print_exc()
-        return 1
-    return 0
+    with suppress(SectionEnded):
+        try:
+            getattr(importlib.import_module(f"benchmarks.gpu.{module}"), function)(rows)
+        except SectionEnded:
+            raise
+        except Exception:
+            traceback.print_exc()
+            with rows.row("between_rows"):
+                raise
 
 
-def child(section: Section, rows_file: int) -> int:
+def child(section: Section, rows_file: int) -> None:
     """As `run_section`, with rows written to an open file.
 
     A process that is told to end where it hangs says where that is.
     """
     faulthandler.enable()
     faulthandler.register(signal.SIGTERM, chain=True)
-    status = run_section(section, Rows(lambda line: os.write(rows_file, line.encode())))
+    run_section(section, Rows(lambda line: os.write(rows_file, line.encode())))
     os.close(rows_file)
-    return status

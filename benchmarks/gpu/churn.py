@@ -10,7 +10,7 @@ from benchmarks.gpu.workload import Training, Workload
 from rgbavatar_ns.avatar.recorded_rendering import RecordedRendering
 
 _SIZES = (1 << 7, 1 << 12, 1 << 18, 1 << 22)
-"""Floats of a tensor: one for each kind of block that torch's allocator keeps."""
+"""Floats of a tensor: one for each kind of block that torch's allocator keeps, on a GPU."""
 _OFTEN = 4
 """Calls between two times that all free memory is handed back to the driver."""
 MOST_OF_THE_SAME = 1e-6
@@ -52,12 +52,15 @@ def _difference(left: list[Tensor], right: list[Tensor]) -> float:
 
 
 def disturb(work: Workload, number: int) -> None:
-    """Take memory of many sizes, fill it with NaN, and free it."""
+    """Take memory of many sizes, fill it with NaN, and free it.
+
+    At times what other streams have freed is handed back before, so that it may be taken here.
+    """
+    if work.on_gpu and number % _OFTEN == 0:
+        torch.cuda.empty_cache()
     sizes = _SIZES if work.on_gpu else _SIZES[:2]
     taken = [torch.full((size,), torch.nan, device=work.device) for size in sizes for _ in range(3)]
     del taken
-    if work.on_gpu and number % _OFTEN == 0:
-        torch.cuda.empty_cache()
 
 
 def trained(work: Workload, between: Callable[[int], None]) -> list[Tensor]:

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.gpu import runner as runners
+from benchmarks.gpu.child import run_section
 from benchmarks.gpu.report import Report
 from benchmarks.gpu.rows import LeftOut, Rows, SectionEnded, check
 from benchmarks.gpu.runner import Patience, Runner
@@ -198,6 +199,12 @@ def test_sections_are_listed_and_chosen_by_name():
     for wrong in ("smoke,xyz", ""):
         with pytest.raises(ValueError, match="There is no section"):
             chosen_sections(wrong)
+
+
+def test_what_is_raised_between_rows_becomes_one():
+    lines: list[str] = []
+    run_section(Section("gone", "no_such_module:anything", "", 1.0), Rows(lines.append))
+    assert "no_such_module" in json.loads(lines[-1])["figures"]["failed"]
 
 
 def test_rows_are_valid_json_and_say_why_a_section_ends_early():

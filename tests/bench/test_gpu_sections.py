@@ -76,6 +76,8 @@ def test_times_come_with_how_far_their_targets_are(emulated):
     recorded = emulated["steps"]["recorded"]
     assert recorded["of_3000"] == pytest.approx(recorded["images_per_second"] / 3000, rel=1e-4)
     assert emulated["steps"]["fused"]["images_per_second"] > 0
+    assert recorded["peak_mib"] == 5
+    assert recorded["in_use_on_the_gpu_mib"] == 3 << 10
     drawn = emulated["rendering"]["recorded_by_1"]
     assert drawn["of_1500"] == pytest.approx(drawn["frames_per_second"] / 1500, rel=1e-4)
     run = emulated["training"]["whole_run"]
@@ -93,7 +95,10 @@ def test_times_come_with_how_far_their_targets_are(emulated):
 @needs_a_compiler
 def test_what_cannot_be_asked_on_a_processor_says_how_it_could(emulated):
     assert "pip install gsplat" in emulated["gsplat"]["ours_before"]["remedy"]
+    assert emulated["kernels"]["whole"]["median_us"] == 1000
     assert "nvidia-cuda-cupti" in emulated["kernels"]["by_name"]["remedy"]
+    # An emulated step is over when it returns, as one that waits is.
+    assert all("failed" in emulated["waits"][kind] for kind in ("recorded", "fused"))
 
 
 @needs_a_compiler
