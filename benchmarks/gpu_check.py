@@ -2,11 +2,11 @@
 
     python benchmarks/gpu_check.py --json gpu.json
 
-Run it from a checkout. It needs torch, numpy, scipy, cuda-bindings, nvidia-cuda-nvrtc, jaxtyping
-and safetensors, neither nerfstudio nor a network, and says what of them is missing. Each row is
-printed, and the JSON written anew, as soon as it is there. Each section has a process of its own
-and a limit: what hangs or dies is told by name and left behind. The exit status is 1 where a check
-failed.
+Run it from a checkout, on Linux. It needs torch, numpy, scipy, cuda-bindings, nvidia-cuda-nvrtc,
+jaxtyping and safetensors, neither nerfstudio nor a network, and says what of them is missing. Each
+row is printed, and the JSON written anew, as soon as it is there. Each section has a process of its
+own and a limit: what hangs or dies is told by name and left behind. The exit status is 1 where a
+check failed.
 """
 
 import argparse
@@ -69,7 +69,7 @@ def checked(options: argparse.Namespace, command: Sequence[str] = ()) -> int:
     for number in _ENDS:
         signal.signal(number, _interrupt)
     try:
-        with tempfile.TemporaryDirectory() as cache:
+        with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as cache:
             # Kernels are compiled by the first section, and kept for the others of this check.
             os.environ.setdefault("RGBAVATAR_CACHE", cache)
             Runner(report, own_command, options.budget).run(options.chosen)

@@ -18,15 +18,16 @@ _TIMES = ("forward", "both")
 def gsplat(rows: Rows) -> None:
     """All images in one call, where its version can, and one after another."""
     work = Workload.here()
-    with rows.row("ours_before") as figures:
+    with rows.row("library") as figures:
         library = _library()
+        figures["version"] = library.__version__
+    with rows.row("ours_before") as figures:
         gaussians, cameras = work.scene()
         before = time_draw(work, gaussians, ours(cameras))
         figures |= before
     found: dict[str, Figures] = {}
     for name, draw in _ways(library, cameras, work.batch).items():
         with rows.row(name) as figures:
-            figures["version"] = library.__version__
             try:
                 with torch.no_grad():
                     difference = (draw(gaussians) - ours(cameras)(gaussians)).abs().mean()

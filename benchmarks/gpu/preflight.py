@@ -24,7 +24,7 @@ from benchmarks.gpu.tools import REMEDIES, tool
 
 _HERE = Path(__file__).parent
 _KERNELS = _HERE.parents[1] / "rgbavatar_ns" / "kernels" / "cuda" / "source.py"
-_PACKAGES = ("numpy", "scipy", "jaxtyping", "safetensors", "filelock")
+_PACKAGES = ("numpy", "scipy", "jaxtyping", "safetensors", "filelock", "setuptools")
 _OLDEST = (7, 5)
 _TILES = 10_000
 _SMI_SECONDS = 15.0

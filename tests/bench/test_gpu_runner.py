@@ -101,6 +101,33 @@ def test_a_guest_s_failure_is_none_of_ours(report):
     assert report.failed() == []
 
 
+STUCK = f"""
+import sys, time, types
+sys.path.insert(0, {str(ROOT)!r})
+from benchmarks.gpu.child import child
+from benchmarks.gpu.sections import Section
+def a_kernel_without_end(rows):
+    with rows.row("ready"):
+        pass
+    while True:
+        time.sleep(60)
+sys.modules["benchmarks.gpu.stuck"] = module = types.ModuleType("stuck")
+module.question = a_kernel_without_end
+child(Section("stuck", "stuck:question", "", 1.0), int(sys.argv[1]))
+"""
+
+
+def test_a_process_that_is_told_to_end_says_where_it_was(report):
+    def command(section: Section, rows_file: int) -> list[str]:
+        return [sys.executable, "-S", "-c", STUCK, str(rows_file)]
+
+    clock = late_once(report, "stuck", "ready")
+    Runner(report, command, 1e6, clock=clock).run(sections("stuck"))
+    stuck = report.sections["stuck"]
+    assert stuck["state"] == "timed out"
+    assert "a_kernel_without_end" in stuck["log"]
+
+
 def test_what_cannot_be_killed_is_told_and_not_waited_for(report, monkeypatch):
     monkeypatch.setattr(runners.os, "killpg", lambda group, how: None)
     clock = late_once(report, "hangs", "deaf")

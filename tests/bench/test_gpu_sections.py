@@ -94,7 +94,7 @@ def test_times_come_with_how_far_their_targets_are(emulated):
 
 @needs_a_compiler
 def test_what_cannot_be_asked_on_a_processor_says_how_it_could(emulated):
-    assert "pip install gsplat" in emulated["gsplat"]["ours_before"]["remedy"]
+    assert "pip install gsplat" in emulated["gsplat"]["library"]["remedy"]
     assert emulated["kernels"]["whole"]["median_us"] == 1000
     assert "nvidia-cuda-cupti" in emulated["kernels"]["by_name"]["remedy"]
     # An emulated step is over when it returns, as one that waits is.
