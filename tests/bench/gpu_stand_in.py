@@ -5,13 +5,18 @@
 Prints the rows of each as the check's child would send them, after a line with its name.
 """
 
+import json
 import re
 import sys
+from collections.abc import Callable
 from contextlib import suppress
 from importlib import metadata
 from pathlib import Path
+from typing import Any
 
 import setuptools
+
+from benchmarks.gpu.rows import Rows, SectionEnded
 
 ENOUGH = (
     *("torch", "numpy", "scipy", "jaxtyping", "safetensors"),
@@ -44,6 +49,15 @@ def _plain(name: str) -> str:
     return re.sub(r"[-_.]+", "-", name).lower()
 
 
+def rows_from(section: Callable[[Rows], object]) -> dict[str, Any]:
+    """The rows that a section sends."""
+    lines: list[str] = []
+    with suppress(SectionEnded):
+        section(Rows(lines.append))
+    messages = [message for message in map(json.loads, lines) if "row" in message]
+    return {message["row"]: message["figures"] for message in messages}
+
+
 def main(names: list[str]) -> None:
     missing = absent()
     assert {"nerfstudio", "cv2", "roma", "rich", "pytest"} <= missing
@@ -54,7 +68,6 @@ def main(names: list[str]) -> None:
 
     from benchmarks.gpu import small_case, times
     from benchmarks.gpu.child import run_section
-    from benchmarks.gpu.rows import Rows
     from benchmarks.gpu.sections import chosen_sections
     from benchmarks.gpu.workload import Workload
     from rgbavatar_ns.bench.roofline import measure_speed

@@ -12,7 +12,7 @@ import pytest
 
 from benchmarks.gpu import preflight as asked
 from benchmarks.gpu.bare_driver import BareDriver, BareError, compiler_libraries
-from benchmarks.gpu.rows import Rows
+from tests.bench.gpu_stand_in import rows_from
 from tests.kernels.cuda import emulator
 
 ROOT = Path(__file__).parents[2]
@@ -210,14 +210,11 @@ def test_without_a_compiler_it_is_told_and_others_may_go_on(monkeypatch):
 
 
 def rows_of(monkeypatch, **changes) -> dict[str, dict]:
-    lines: list[str] = []
     for name in ("carried_kernel", "compiled_kernel", "machine"):
         monkeypatch.setattr(asked, name, lambda: {})
     for name, change in changes.items():
         monkeypatch.setattr(asked, name, change)
-    asked.preflight(Rows(lines.append))
-    messages = map(json.loads, lines)
-    return {m["row"]: m["figures"] for m in messages if "row" in m}
+    return rows_from(asked.preflight)
 
 
 class FakeTorch:
