@@ -6,7 +6,7 @@ import statistics
 from collections.abc import Iterator
 
 from benchmarks.gpu.rows import Figures, LeftOut, Rows, check
-from benchmarks.gpu.tools import required_tool, run_case
+from benchmarks.gpu.tools import CASES_SECONDS, required_tool, run_case
 from rgbavatar_ns.kernels.cuda.source import kernels
 
 NAME = "ncu"
@@ -28,7 +28,7 @@ def ncu(rows: Rows) -> None:
         options = ["--csv", "--page", "raw", "--print-units", "base", "--profile-from-start", "off"]
         options += ["--target-processes", "all", "--metrics", ",".join(METRICS)]
         options += ["--kernel-name", f"regex:^({names})_kernel$"]
-        ran = run_case([program, *options], "profiled", {})
+        ran = run_case([program, *options], "profiled", {}, CASES_SECONDS)
         if _FORBIDDEN in ran.text:
             raise LeftOut(
                 "The driver shows its counters to administrators only.",

@@ -49,7 +49,6 @@ def preflight(rows: Rows) -> None:
     questions: dict[str, Callable[[], Figures]] = {
         "python": python,
         "driver": driver,
-        "nvidia_smi": nvidia_smi,
         "carried_kernel": carried_kernel,
         "compiled_kernel": compiled_kernel,
         "packages": packages,
@@ -57,6 +56,7 @@ def preflight(rows: Rows) -> None:
         "torch": torch,
         "machine": machine,
         "tools": tools,
+        "nvidia_smi": nvidia_smi,  # of a broken driver it may hang
     }
     for name, question in questions.items():
         with suppress(SectionEnded), rows.row(name) as figures:

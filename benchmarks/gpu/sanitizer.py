@@ -1,17 +1,20 @@
 """compute-sanitizer over small cases: wrong addresses, races, barriers, what was never written."""
 
 import re
+import time
 from collections import Counter
 from collections.abc import Sequence
 from functools import partial
 
 from benchmarks.gpu.rows import Figures, Rows, check
 from benchmarks.gpu.small_case import DONE
-from benchmarks.gpu.tools import Ran, required_tool, run_case
+from benchmarks.gpu.tools import CASES_SECONDS, Ran, required_tool, run_case
 from rgbavatar_ns.kernels.cuda.source import kernels
 
 NAME = "compute-sanitizer"
-_OPTIONS = ("--print-limit", "50", "--show-backtrace", "no", "--report-api-errors", "no")
+_OPTIONS = ("--print-limit", "50", "--show-backtrace", "no")
+# Libraries try calls that a driver need not know.
+_ONLY_KERNELS = ("--report-api-errors", "no")
 # Each tensor is an allocation of its own, so that what lies beside it belongs to nobody.
 _APART = {"PYTORCH_NO_CUDA_MEMORY_CACHING": "1"}
 _MARK = re.compile(r"^={9} ?(.*)$", re.MULTILINE)
@@ -28,12 +31,14 @@ _MOST = 20
 
 def _asked(kind: str, cases: Sequence[str], rows: Rows) -> None:
     """A row for each case under the tool."""
+    end = time.monotonic() + CASES_SECONDS
     for case in cases:
         with rows.row(case) as figures:
             program = required_tool(NAME)
             apart = kind in ("memcheck", "initcheck") and case == "fused"
-            options = (*_OPTIONS, "--tool", kind)
-            ran = run_case([program, *options], case, _APART if apart else {})
+            options = ["--tool", kind, *_OPTIONS, *(_ONLY_KERNELS if kind == "memcheck" else ())]
+            environment, left_s = _APART if apart else {}, end - time.monotonic()
+            ran = run_case([program, *options], case, environment, left_s)
             figures |= judged(ran)
 
 

@@ -32,6 +32,9 @@ from rgbavatar_ns.kernels.registry import choose
 Step = Callable[[], Mapping[str, Tensor]]
 """Takes a training step and gives the parts of its loss."""
 
+_LARGER, _FAINTER = 300.0, 0.2
+"""Of a head-sized ellipsoid's Gaussians, so that one fills the picture and hides nothing."""
+
 WARM_UP_STEPS = 6
 """Steps until one is recorded and has been repeated."""
 
@@ -56,6 +59,7 @@ class Workload:
     frames: int = 60
     uv_resolution: int = 256
     crowd: int = 8_000
+    screen_filling: int = 0
 
     @classmethod
     def here(cls) -> "Workload":
@@ -70,8 +74,9 @@ class Workload:
         )
 
     def crowded(self) -> "Workload":
-        """One picture whose tiles' lists are longer than shared memory sorts."""
-        return replace(self, gaussians=self.crowd, size_px=min(self.size_px, 32), batch=1)
+        """One picture with long lists, and with Gaussians that fill it."""
+        size_px = min(self.size_px, 32)
+        return replace(self, gaussians=self.crowd, size_px=size_px, batch=1, screen_filling=4)
 
     @property
     def on_gpu(self) -> bool:
@@ -89,8 +94,10 @@ class Workload:
         return backend.launcher(self.device)
 
     def scene(self) -> tuple[GaussianSet, PinholeCameras]:
-        """The rasterizer's common workload."""
+        """The rasterizer's common workload, the first Gaussians made large and faint."""
         gaussians, cameras = ellipsoid_scene(self.gaussians, self.size_px, self.batch)
+        gaussians.scales[:, : self.screen_filling] *= _LARGER
+        gaussians.opacities[:, : self.screen_filling] *= _FAINTER
         return on_device(gaussians, self.device), on_device(cameras, self.device)
 
     def time(self, call: Callable[[], Any]) -> Measurement:

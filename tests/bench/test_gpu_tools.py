@@ -153,14 +153,11 @@ def test_tools_are_found_in_path_toolkits_and_packages(tmp_path, monkeypatch):
         assert tools.required_tool("compute-sanitizer") == str(made)
 
 
-def test_a_tool_that_does_not_end_is_ended_and_what_it_said_is_kept(tmp_path, monkeypatch):
-    monkeypatch.setattr(tools, "CASE_SECONDS", 0.0)
+def test_a_tool_that_does_not_end_is_ended_and_what_it_said_is_kept(tmp_path):
     made = executable(tmp_path / "tool", "exec sleep 600")
-    ran = tools.run_case([str(made)], "fused", {})
-    assert not ran.ended
+    assert not tools.run_case([str(made)], "fused", {}, 0.0).ended
     said = executable(tmp_path / "says", 'echo "asked for $*"; echo "$ONE"')
-    monkeypatch.setattr(tools, "CASE_SECONDS", 60.0)
-    told = tools.run_case([str(said), "--tool"], "fused", {"ONE": "two"})
+    told = tools.run_case([str(said), "--tool"], "fused", {"ONE": "two"}, 60.0)
     assert told.ended
     assert told.text.splitlines()[1] == "two"
     assert "benchmarks.gpu.small_case fused" in told.text
