@@ -161,12 +161,18 @@ def compiled_kernel(library: Any = None, compiler: Any = None) -> Figures:
     total, arguments = sum(counts), scan.arguments()
     frame, bins = arguments.frame, arguments.bins
     frame.batch, frame.tiles_x, frame.tiles_y = 1, len(counts), 1
-    starts, status = device.array([0] * (len(counts) + 1)), device.array([0] * 4)
+    # As many slots as entries have been taken; the number has 64 bits.
+    named = kernels.constants()
+    before = [0] * named["kStatusNumbers"]
+    before[named["kSlotsTaken"]] = total
+    after = list(before)
+    after[named["kEntriesNeeded"]] = after[named["kSlotsNeeded"]] = total
+    starts, status = device.array([0] * (len(counts) + 1)), device.array(before)
     bins.tile_count, bins.tile_start, bins.status = device.array(counts), starts, status
     bins.capacity = total
     device.start(code, "scan_kernel", scan.threads, arguments)
     right = device.read(starts, len(counts) + 1) == _sums_of(counts)
-    right &= device.read(status, 4) == [total, 0, 0, 0]
+    right &= device.read(status, len(after)) == after
     return {"compile_s": seconds, "code_bytes": len(code), **_told(right, start)}
 
 
