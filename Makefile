@@ -10,7 +10,7 @@ STARTED := $(shell date +%s)
 
 PYTEST := PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
 
-.PHONY: help setup demo test test-fast test-nightly lint format clean
+.PHONY: help setup demo test test-fast test-nightly lint format reference docs clean
 
 help:  ## Show this list
 	@grep -hE '^[a-z-]+:.*##' Makefile | sed -E 's/:.*## /\t/' | expand -t 14
@@ -42,6 +42,13 @@ lint: setup  ## Format check, lint, import rules, types
 format: setup  ## Format the code and mend what the linter can
 	@$(BIN)/ruff check --fix .
 	@$(BIN)/ruff format .
+
+reference:  ## Write docs/commands.md and docs/errors.md anew, after a change of options or errors
+	@$(BIN)/python -m scripts.write_reference
+
+docs: setup  ## The documentation as a site in build/site, strictly (Python 3.11 or newer)
+	@$(BIN)/sphinx-build -q -a -E -W --keep-going -c docs/site -d build/site-trees . build/site
+	@echo "build/site/index.html"
 
 clean:  ## Remove the environment, builds and outputs
 	rm -rf .venv build outputs

@@ -22,7 +22,6 @@ PYTHON = VENV / "bin" / "python"
 STAMP = VENV / "rgbavatar-setup.json"
 TORCH = "2.13.0"
 PYTORCH_CPU_INDEX = "https://download.pytorch.org/whl/cpu"
-MEDIAPIPE = "mediapipe==0.10.21"
 FIRST_IMPORTS = (
     "nerfstudio.scripts.train, nerfstudio.scripts.eval, nerfstudio.scripts.viewer.run_viewer",
     "torchmetrics.image, matplotlib.pyplot, scipy.optimize, av, rgbavatar_ns.cli.main",
@@ -156,19 +155,6 @@ def install_torchvision() -> None:
     )
 
 
-def install_tracker() -> None:
-    """Install mediapipe for `rgbavatar track`, without its own OpenCV; it may be absent."""
-    installed = f"import mediapipe as m; assert 'mediapipe==' + m.__version__ == '{MEDIAPIPE}'"
-    if run(PYTHON, "-c", installed, quiet=True):
-        return
-    say(f"installing {MEDIAPIPE} for the tracker")
-    if not pip("install", "--no-deps", MEDIAPIPE, quiet=True):
-        say(
-            f"{MEDIAPIPE} cannot be installed here: `rgbavatar track` will not work (x86-64 Linux, "
-            "macOS and Windows with Python 3.10 to 3.12 have builds); everything else does."
-        )
-
-
 def link_ffmpeg() -> None:
     """Put imageio-ffmpeg's binary on the environment's PATH where the system has no ffmpeg."""
     link = VENV / "bin" / "ffmpeg"
@@ -246,10 +232,9 @@ def main() -> None:
         install_torch()
         uv_install(
             "installing nerfstudio and the other packages",
-            "-r", "pyproject.toml", "--extra", "dev", "--extra", "track",
+            "-r", "pyproject.toml", "--extra", "dev", "--extra", "track", "--extra", "docs",
         )  # fmt: skip
         install_torchvision()
-        install_tracker()
         link_ffmpeg()
         STAMP.write_text(json.dumps({"packages": wanted["packages"]}))
     install_project()

@@ -14,7 +14,7 @@ if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # What no package brings: a GPU or its absence, and films that are not in the repository.
-_NOT_OF_PACKAGES = re.compile(r"there is a GPU|no clips? |the clip ")
+_NOT_OF_PACKAGES = re.compile(r"there is a GPU|no clips? |the clip |the site is built by Python")
 
 
 @pytest.fixture

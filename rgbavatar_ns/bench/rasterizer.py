@@ -36,7 +36,7 @@ from rgbavatar_ns.kernels import GaussianSet, PinholeCameras, rasterize
 FORWARD, BACKWARD = "forward, no gradients", "backward"
 WHOLE = "forward and backward"
 GSPLAT = "gsplat torch"
-_NOT_ON_GPUS = "drawn on a CPU only; benchmarks/speed/gpu.py has gsplat's kernels"
+_NOT_ON_GPUS = "drawn on a CPU only; benchmarks/gpu_check.py has gsplat's kernels"
 
 Draw = Callable[[GaussianSet], Float[Tensor, "B H W 3"]]
 

@@ -31,6 +31,11 @@ _MODULES = {"import": "import_data"}
 """Of commands whose name cannot be a module's."""
 
 
+def module_name(command: str) -> str:
+    """The module in `rgbavatar_ns.cli` whose `run` a command is."""
+    return _MODULES.get(command, command.replace("-", "_"))
+
+
 def _help() -> str:
     width = max(map(len, COMMANDS))
     rows = "\n".join(f"  {name:<{width}}  {text}" for name, text in COMMANDS.items())
@@ -55,13 +60,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if name not in COMMANDS:
         print(f"There is no command {name!r}.\n\n{_help()}", file=sys.stderr)
         sys.exit(2)
-    module_name = _MODULES.get(name, name.replace("-", "_"))
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, _terminate)
     try:
         import tyro
 
-        module = importlib.import_module(f"rgbavatar_ns.cli.{module_name}")
+        module = importlib.import_module(f"rgbavatar_ns.cli.{module_name(name)}")
         tyro.cli(_checked(module.run), prog=f"rgbavatar {name}", args=arguments[1:])
     except UserError as error:
         _tell(name, error)

@@ -178,7 +178,7 @@ _LOADERS = {
 
 _REMEDIES = {
     "cpu": "Reinstall the package with a C++17 compiler.",
-    "cuda": "Install what is missing: pip install 'rgbavatar-ns[cuda]'.",
+    "cuda": "Install what is missing: pip install cuda-bindings.",
 }
 
 

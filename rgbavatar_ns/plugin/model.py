@@ -20,8 +20,10 @@ from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.options import Counted, Weight
 from rgbavatar_ns.plugin.avatar_model import AvatarModel, AvatarModelConfig, Outputs
 from rgbavatar_ns.plugin.checkpoint_state import with_prior
+from rgbavatar_ns.plugin.option_order import led_by
 
 
+@led_by("avatar", "refine_tracking", "surface_prior", "lpips_weight", "rasterizer")
 @dataclass
 class RGBAvatarModelConfig(AvatarModelConfig):
     """The avatar and how it is trained."""

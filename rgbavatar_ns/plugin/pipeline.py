@@ -28,12 +28,14 @@ from rgbavatar_ns.plugin.avatar_model import AvatarModel, AvatarModelConfig
 from rgbavatar_ns.plugin.cameras import from_nerfstudio
 from rgbavatar_ns.plugin.datamanager import RGBAvatarDataManager, RGBAvatarDataManagerConfig
 from rgbavatar_ns.plugin.model import RGBAvatarModelConfig
+from rgbavatar_ns.plugin.option_order import led_by
 from rgbavatar_ns.plugin.viewer.panel import ViewerPanel
 
 Evaluated = Callable[[int, Mapping[str, Any]], None]
 """Told of the scores of all held-out frames after a step of training."""
 
 
+@led_by("model", "datamanager")
 @dataclass
 class RGBAvatarPipelineConfig(VanillaPipelineConfig):
     """Where the data comes from and what is trained on it."""

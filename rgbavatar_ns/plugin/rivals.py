@@ -33,6 +33,7 @@ from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.plugin.avatar_model import AvatarModel, AvatarModelConfig
 from rgbavatar_ns.plugin.datamanager import RGBAvatarDataManagerConfig
 from rgbavatar_ns.plugin.methods import preset
+from rgbavatar_ns.plugin.option_order import led_by
 from rgbavatar_ns.plugin.pipeline import RGBAvatarPipelineConfig
 from rgbavatar_ns.plugin.training.trainer import RGBAvatarTrainerConfig
 
@@ -41,6 +42,7 @@ _METHOD_OF: dict[type[MethodConfig], Any] = {
 }
 
 
+@led_by("avatar", "refine_tracking", "rasterizer")
 @dataclass
 class RivalModelConfig(AvatarModelConfig):
     """A rival's avatar, and what all methods have beside it."""

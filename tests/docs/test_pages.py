@@ -66,11 +66,41 @@ def commands(text: str) -> Iterator[list[str]]:
             yield shlex.split(words.replace("'", " "))
 
 
+METHODS_OPTIONS = re.compile(r"^\| `(--[\w.-]+)", flags=re.M)
+OF_NO_METHOD = {"collider-params"}
+"""Named on a page because they are not there."""
+
+
+def ns_train_options(text: str) -> Iterator[str]:
+    """The options of each `ns-train METHOD ...` in code, and those named by their path."""
+    code = "\n".join(re.findall(r"```.*?```|`[^`]*`", text, flags=re.S)).replace("\\\n", " ")
+    for words in re.findall(r"ns-train [\w-]+-?[\w]*((?:[^\n`|>&;#]| \n)*)", code):
+        yield from re.findall(r"(?<=\s)--[\w.-]+", words)
+    yield from re.findall(r"--(?:pipeline|machine|viewer|logging)\.[\w.-]*\w", code)
+
+
+def test_options_of_ns_train_are_found() -> None:
+    text = "`ns-train rgbavatar --data D --viw x`\n`--pipeline.model.seed 3`\n"
+    text += "```sh\nns-train a-b \\\n  --vis wandb  # --no\n```\n"
+    assert list(ns_train_options(text)) == ["--data", "--viw", "--vis", "--pipeline.model.seed"]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_options_of_ns_train_are_there(name: str) -> None:
+    """By docs/commands.md, which another test compares with the parsers."""
+    known = set(METHODS_OPTIONS.findall((ROOT / "docs" / "commands.md").read_text()))
+    assert len(known) > 100
+    for option in ns_train_options((ROOT / name).read_text()):
+        if option != "--help" and option.split(".")[-1] not in OF_NO_METHOD:
+            parts = {whole for whole in known if whole.startswith(f"{option}.")}
+            assert option in known or parts, option
+
+
 @cache
 def help_of(command: str) -> str:
     told = io.StringIO()
     with contextlib.redirect_stdout(told), pytest.raises(SystemExit):
-        main([command, "--help"])
+        main([*command.split(), "--help"])
     return told.getvalue()
 
 
@@ -80,11 +110,12 @@ def test_commands_and_their_options_are_there(name: str) -> None:
         if command == "COMMAND":
             continue
         assert command in COMMANDS, f"rgbavatar {command}"
+        helped = f"bench {words[0]}" if command == "bench" and words else command
         for word in words:
             option = word.split("=")[0]
             if option.startswith("--") and option != "--help":
                 known = re.escape(option.replace("--no-", "--"))
-                assert re.search(rf"{known}(?![\w-])", help_of(command)), f"{command} {option}"
+                assert re.search(rf"{known}(?![\w-])", help_of(helped)), f"{helped} {option}"
 
 
 @pytest.mark.parametrize("name", NAMES)

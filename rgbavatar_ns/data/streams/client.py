@@ -23,7 +23,7 @@ _KEPT_BYTES = 16 << 20
 
 
 class StreamClient:
-    """Sends tracked frames to an `ns-train rgbavatar-online` whose source.kind is socket.
+    """Sends tracked frames to an `ns-train rgbavatar-online` whose source.kind is socket::
 
         head = HeadModel.embedded()
         subject = StreamSubject(head.arrays, identity, head.layout, width, height)

@@ -16,12 +16,14 @@ from rgbavatar_ns.drawing.compositing import (
     rgba_to_float,
 )
 from rgbavatar_ns.plugin.online.datamanager import OnlineDataManager, OnlineDataManagerConfig
+from rgbavatar_ns.plugin.option_order import led_by
 from rgbavatar_ns.plugin.pipeline import RGBAvatarPipeline, RGBAvatarPipelineConfig
 from rgbavatar_ns.plugin.viewer.status_panel import StatusPanel
 
 _BEST_DB = 100.0
 
 
+@led_by("datamanager", "model")
 @dataclass
 class OnlinePipelineConfig(RGBAvatarPipelineConfig):
     """The stream and what is trained on it."""

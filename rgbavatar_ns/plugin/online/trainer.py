@@ -23,9 +23,14 @@ from rgbavatar_ns.plugin.errors import install_user_error_hook
 from rgbavatar_ns.plugin.online.datamanager import OnlineDataManager
 from rgbavatar_ns.plugin.online.pipeline import OnlinePipeline, OnlinePipelineConfig
 from rgbavatar_ns.plugin.online.progress import OnlineProgress, StreamReport
+from rgbavatar_ns.plugin.option_order import led_by
 from rgbavatar_ns.plugin.training.interruption import StopRequest
 from rgbavatar_ns.plugin.training.run_end import say
-from rgbavatar_ns.plugin.training.trainer import RGBAvatarTrainer, RGBAvatarTrainerConfig
+from rgbavatar_ns.plugin.training.trainer import (
+    CHANGED_FIRST,
+    RGBAvatarTrainer,
+    RGBAvatarTrainerConfig,
+)
 
 _LOOK_INTERVAL_S = 1.0
 _LOOKED_AT = 2
@@ -36,6 +41,7 @@ _WATCH_SHARE = 0.1
 """The same of watched frames."""
 
 
+@led_by(*CHANGED_FIRST)
 @dataclass
 class OnlineTrainerConfig(RGBAvatarTrainerConfig):
     """A run on a stream, which ends some steps after it."""

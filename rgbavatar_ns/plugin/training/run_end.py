@@ -134,7 +134,10 @@ class EndingTrainer(Trainer):
         if self.viewer_state is None:
             return
         self.viewer_state.training_complete()
-        CONSOLE.print("The viewer stays open; Ctrl-C ends it.")
+        say(
+            "The viewer stays open; Ctrl-C ends it. (--viewer.quit-on-train-completion True ends "
+            "with the training, --vis tensorboard has none.)"
+        )
         while not self.stop.wait(1.0):
             pass
         self.stop.signal_number = None

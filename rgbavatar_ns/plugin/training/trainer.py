@@ -29,6 +29,7 @@ from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.files import disk_errors
 from rgbavatar_ns.options import Between, Count, Positive
 from rgbavatar_ns.plugin.errors import device_errors_told, install_user_error_hook
+from rgbavatar_ns.plugin.option_order import led_by
 from rgbavatar_ns.plugin.pipeline import RGBAvatarPipeline, RGBAvatarPipelineConfig
 from rgbavatar_ns.plugin.training.checkpoints import (
     checkpoint_of_step,
@@ -58,8 +59,15 @@ from rgbavatar_ns.plugin.training.turns import TurnsLock
 from rgbavatar_ns.plugin.viewer.settings import is_of_ns_viewer, viewer_settings
 
 LATEST = "latest"
+CHANGED_FIRST = (
+    "data", "experiment_name", "output_dir", "max_num_iterations", "max_train_seconds", "vis",
+    "load_dir", "load_config", "steps_per_save", "keep_checkpoints",
+    "pipeline", "viewer", "machine", "logging", "optimizers",
+)  # fmt: skip
+"""A run's options in the order in which people change them, for help."""
 
 
+@led_by(*CHANGED_FIRST)
 @dataclass
 class RGBAvatarTrainerConfig(TrainerConfig):
     """A run of this method; learning rates are in `optimizers`, one group a kind of parameter."""

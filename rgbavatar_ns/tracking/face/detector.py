@@ -34,14 +34,17 @@ _MOST_FACES = 3
 # renders it is off by 1 mm and more there, beyond the second share by .4 mm.
 _IRIS_HIDDEN, _IRIS_SHOWN = 0.1, 0.2
 
+INSTALL_MEDIAPIPE = (
+    "pip install --no-deps mediapipe==0.10.21 protobuf==4.25.9 absl-py attrs flatbuffers"
+)
+"""Without the other packages that it names: a second OpenCV, and what the tracker does not ask of
+it."""
+
 
 def load_mediapipe() -> ModuleType:
     """mediapipe, imported on first use; UserError with the remedy where it is absent."""
     os.environ.setdefault("GLOG_minloglevel", "2")
-    remedy = (
-        "Install it without its second OpenCV: "
-        "pip install --no-deps mediapipe==0.10.21 protobuf==4.25.9 absl-py attrs flatbuffers"
-    )
+    remedy = f"Install it without its second OpenCV: {INSTALL_MEDIAPIPE}"
     try:
         mediapipe = importlib.import_module("mediapipe")
         protobuf = importlib.import_module("google.protobuf").__version__

@@ -1,6 +1,10 @@
 // Which copy of the loops runs.
 #include <stdexcept>
 
+#if defined(RGBAVATAR_X86)
+#include <cpuid.h>
+#endif
+
 #include "raster.h"
 
 namespace rgbavatar {
@@ -24,16 +28,32 @@ struct InstructionSet {
   const Kernels* kernels;
 };
 
+#if defined(RGBAVATAR_X86)
+// Asked of the processor and of what the system saves of its registers (Intel's manual, volume 1,
+// 14.3 and 15.2): __builtin_cpu_supports, which tells the same, knows nothing where zig links.
+struct Processor {
+  bool avx2 = false, avx512 = false;
+
+  Processor() {
+    unsigned a, b, c, d, saved, high;
+    if (!__get_cpuid(1, &a, &b, &c, &d) || !(c & bit_OSXSAVE)) return;
+    const bool fma = c & bit_FMA;
+    __asm__("xgetbv" : "=a"(saved), "=d"(high) : "c"(0));
+    if (!__get_cpuid_count(7, 0, &a, &b, &c, &d)) return;
+    const unsigned wide = bit_AVX512F | bit_AVX512DQ | bit_AVX512VL | bit_AVX512BW;
+    avx2 = fma && (b & bit_AVX2) && (saved & 0x06) == 0x06;
+    avx512 = avx2 && (b & wide) == wide && (saved & 0xe6) == 0xe6;
+  }
+};
+#endif
+
 // The sets this processor runs, the fastest first.
 std::vector<InstructionSet> supported() {
   std::vector<InstructionSet> sets;
 #if defined(RGBAVATAR_X86)
-  __builtin_cpu_init();
-  const bool avx2 = __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma");
-  if (avx2 && __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512dq") &&
-      __builtin_cpu_supports("avx512vl") && __builtin_cpu_supports("avx512bw"))
-    sets.push_back({"avx512", &avx512::kernels});
-  if (avx2) sets.push_back({"avx2", &avx2::kernels});
+  const Processor processor;
+  if (processor.avx512) sets.push_back({"avx512", &avx512::kernels});
+  if (processor.avx2) sets.push_back({"avx2", &avx2::kernels});
 #endif
   sets.push_back({"generic", &generic::kernels});
   return sets;
