@@ -52,7 +52,7 @@ _REPORT = re.compile(
     r"Used (\d+) registers[^\n]*",
     re.DOTALL,
 )
-_THREADS = re.compile(r"^RGBAVATAR_KERNEL\((\w+), \w+, (\w+)(?:, \d+)?\)", re.MULTILINE)
+_THREADS = re.compile(r"^RGBAVATAR_KERNEL\((\w+), \w+, (\w+)(?:, \w+)?\)", re.MULTILINE)
 # Of an SM: threads, blocks, bytes of shared memory, and those that each block loses of it (CUDA
 # programming guide, "Compute capabilities"). All have 65,536 registers, given to warps by 256.
 _SM = {

@@ -51,13 +51,11 @@ def _target(architecture: str) -> str:
     return f"compute_{max(n for n in known if n <= max(int(match[1]), OLDEST))}"
 
 
-def resource_report(architecture: str) -> str:
-    """What the assembler says of each kernel's registers, shared memory and spills."""
-    return compile_sources(sources(), architecture)[1]
-
-
 def compile_sources(texts: Mapping[str, str], architecture: str) -> tuple[bytes, str]:
-    """The machine code of these sources by name, and the assembler's report as above."""
+    """The machine code of these sources by name, and what the assembler says of each kernel.
+
+    It tells registers, shared memory and spills.
+    """
     with _compiled(_target(architecture), "--ptxas-options=-v", texts=texts) as program:
         code = _output(program, nvrtc.nvrtcGetCUBINSize, nvrtc.nvrtcGetCUBIN)
         return code, _log(program)

@@ -17,7 +17,7 @@ MAIN = "kernels.cu"
 _SCALARS = {"int": ctypes.c_int32, "float": ctypes.c_float}
 _STRUCT = re.compile(r"^struct (\w+) \{\n(.*?)^\};", re.MULTILINE | re.DOTALL)
 _FIELD = re.compile(r"^  (?:const )?(\w+)(\*?) (\w+);")
-_KERNEL = re.compile(r"^RGBAVATAR_KERNEL\((\w+), (\w+), (\w+)(?:, \d+)?\)", re.MULTILINE)
+_KERNEL = re.compile(r"^RGBAVATAR_KERNEL\((\w+), (\w+), (\w+)(?:, \w+)?\)", re.MULTILINE)
 _CONSTANT = re.compile(r"\b(k[A-Z]\w*) = (\d+)[,; ]")
 
 

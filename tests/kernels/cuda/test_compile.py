@@ -25,18 +25,14 @@ def own_cache(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("architecture", ARCHITECTURES)
-def test_compiles(compiler, architecture):
-    code = compiler.compile_kernels(architecture, cache=False)
+def test_compiles_and_nothing_spills(compiler, architecture):
+    """A value that leaves the registers costs more than what is computed with it."""
+    code, log = compiler.compile_sources(source.sources(), architecture)
     assert code.startswith(b"\x7fELF")
     for kernel in source.kernels():
         assert f"{kernel}_kernel".encode() in code
-
-
-def test_nothing_spills(compiler):
-    """A value that leaves the registers costs more than what is computed with it."""
-    log = compiler.resource_report("sm_90")
     spills = re.findall(r"(\d+) bytes spill stores", log)
-    assert len(spills) == len(source.kernels())
+    assert len(spills) >= len(source.kernels())
     assert set(spills) == {"0"}
 
 

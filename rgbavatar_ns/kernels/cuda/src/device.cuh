@@ -35,6 +35,13 @@ constexpr int kMoments = 9;
 constexpr int kFrameFloats = 24;
 constexpr int kCarriedFloats = 12;
 constexpr int kBlendThreads = 128;
+// Blocks of an SM, where the compiler would take more registers than they allow. On sm_120 shared
+// memory holds fewer of `train`, and more of `update` would spill.
+#if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 1200
+constexpr int kTrainBlocks = 3, kUpdateBlocks = 2;
+#else
+constexpr int kTrainBlocks = 5, kUpdateBlocks = 4;
+#endif
 constexpr float kColorScale = 0.28209479177387814f;  // of the zeroth spherical harmonic
 // `Bins::status`: 32-bit numbers, and in the last two one of 64 bits, which nothing can wrap.
 enum { kEntriesNeeded = 0, kSlotsNeeded = 1, kOverflow = 2, kOverflows = 3, kSlotsTaken = 4 };

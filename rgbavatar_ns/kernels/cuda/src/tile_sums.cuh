@@ -121,7 +121,7 @@ RGBAVATAR_KERNEL(differentiate, DifferentiateArguments, kTileThreads) {
 
 // Forward pass, mean absolute difference to 8-bit images over a background, and backward pass in
 // one go: no image is written. Pixels that nobody filmed add nothing.
-RGBAVATAR_KERNEL(train, TrainArguments, kTileThreads, 5) {
+RGBAVATAR_KERNEL(train, TrainArguments, kTileThreads, kTrainBlocks) {
   RGBAVATAR_SHARED Batch batch;
   RGBAVATAR_SHARED WarpSums<kMoments> shared;
   RGBAVATAR_SHARED KeptGroups kept;

@@ -66,7 +66,7 @@ RGBAVATAR_FUNCTION void multiply_tile(UpdateTile& tile, int images) {
   for (int i = 0; i < kHeldImages / 4; ++i) tile.product[(4 * i + b) * kBasesAtOnce + k] = own[i];
 }
 
-RGBAVATAR_KERNEL(update, UpdateArguments, kTileThreads, 4) {
+RGBAVATAR_KERNEL(update, UpdateArguments, kTileThreads, kUpdateBlocks) {
   RGBAVATAR_DYNAMIC_SHARED(float, weights);  // [K, B], rows padded to fours with zeros
   RGBAVATAR_SHARED UpdateTile tiles[kTileThreads / 32];
   alignas(16) RGBAVATAR_SHARED float numbers[5];  // of the bases
