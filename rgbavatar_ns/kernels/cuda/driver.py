@@ -14,7 +14,8 @@ from rgbavatar_ns.kernels.cuda.compiler import compile_kernels
 from rgbavatar_ns.kernels.cuda.source import kernels
 from rgbavatar_ns.kernels.types import DeviceError
 
-_SHARED_WITHOUT_ASKING = 48 << 10
+_SHARED_WITHOUT_ASKING = 16 << 10
+"""A block has 48 KiB without asking, of which the kernels' own arrays take up to 32."""
 
 
 class CudaLauncher:
@@ -35,7 +36,7 @@ class CudaLauncher:
                 for name in kernels()
             }
         self._seen = threading.local()
-        self._large: set[str] = set()
+        self._asked: dict[str, int] = {}
 
     @property
     def device(self) -> torch.device:
@@ -51,8 +52,8 @@ class CudaLauncher:
         # One parameter: an array of one address.
         parameters = (ctypes.c_void_p * 1)(ctypes.addressof(arguments))
         function = self._functions[kernel]
-        if shared_bytes > _SHARED_WITHOUT_ASKING and kernel not in self._large:
-            self._enlarge_shared_memory(kernel)
+        if shared_bytes > self._asked.get(kernel, _SHARED_WITHOUT_ASKING):
+            self._ask_for_shared_memory(kernel, shared_bytes)
         stream = torch.cuda.current_stream(self._device).cuda_stream
         with torch.cuda.device(self._device):
             self._enter_thread()
@@ -76,12 +77,11 @@ class CudaLauncher:
             _checked(driver.cuCtxSetCurrent(self._context), "enter its context")
             self._seen.entered = True
 
-    def _enlarge_shared_memory(self, kernel: str) -> None:
+    def _ask_for_shared_memory(self, kernel: str, shared_bytes: int) -> None:
         attribute = driver.CUfunction_attribute.CU_FUNC_ATTRIBUTE_MAX_DYNAMIC_SHARED_SIZE_BYTES
-        most = torch.cuda.get_device_properties(self._device).shared_memory_per_block_optin
-        result = driver.cuFuncSetAttribute(self._functions[kernel], attribute, most)
+        result = driver.cuFuncSetAttribute(self._functions[kernel], attribute, shared_bytes)
         _checked(result, "enlarge shared memory")
-        self._large.add(kernel)
+        self._asked[kernel] = shared_bytes
 
     def read_later(self, numbers: Tensor) -> Callable[[], list[int] | None]:
         """See `Launcher`."""

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from rgbavatar_ns.kernels import DeviceError
-from rgbavatar_ns.kernels.cuda import source
+from rgbavatar_ns.kernels.cuda import morphed, source
 
 driver = pytest.importorskip("rgbavatar_ns.kernels.cuda.driver", exc_type=ImportError)
 
@@ -66,16 +66,14 @@ def launcher(monkeypatch):
     monkeypatch.setattr(cuda, "get_device_capability", lambda device: (9, 0))
     monkeypatch.setattr(cuda, "device", lambda device: contextlib.nullcontext())
     monkeypatch.setattr(cuda, "current_stream", lambda device: SimpleNamespace(cuda_stream=77))
-    properties = SimpleNamespace(shared_memory_per_block_optin=99)
-    monkeypatch.setattr(cuda, "get_device_properties", lambda device: properties)
     return driver.CudaLauncher(CPU), fake
 
 
 def _update(batch: int) -> dict:
-    tensors = ("gradient", "weights", "base", "base_first", "base_second", "basis")
-    empty = dict.fromkeys([*tensors, "basis_first", "basis_second", "numbers", "weight_sums"])
-    status = torch.zeros(4, dtype=torch.int32)
-    return {**empty, "batch": batch, "columns": 11, "bases": 0, "status": status}
+    columns = morphed._NO_COLUMNS | {"columns": 11}
+    status = torch.zeros(6, dtype=torch.int32)
+    together = {f"columns{place}": columns for place in range(5)}
+    return {**together, "batch": batch, "weights": None, "status": status}
 
 
 def test_a_launch_brings_its_structure_stream_and_sizes(launcher):
@@ -84,13 +82,14 @@ def test_a_launch_brings_its_structure_stream_and_sizes(launcher):
     ((function, sizes, seen, extra),) = fake.launched
     assert function == b"update_kernel"
     assert sizes == [3, 1, 1, 256, 1, 1, 64, 77]
-    assert (seen.batch, seen.columns, seen.bases, extra) == (5, 11, 0, 0)
-    assert seen.gradient is None
+    assert (seen.batch, seen.columns4.columns, seen.columns4.bases, extra) == (5, 11, 0, 0)
+    assert seen.columns0.gradient is None
     assert seen.status
     assert fake.contexts == ["context"]
     made.launch("update", (3, 1), 50 << 10, **_update(5))
     made.launch("update", (3, 1), 50 << 10, **_update(5))
-    assert fake.attributes == [(b"update_kernel", "dynamic shared bytes", 99)]
+    made.launch("update", (3, 1), 20 << 10, **_update(5))
+    assert fake.attributes == [(b"update_kernel", "dynamic shared bytes", 50 << 10)]
     assert fake.contexts == ["context"]
 
 
