@@ -52,11 +52,15 @@ class Batches:
         """`10`, or `4-10:20`."""
         sizes, _, seconds = text.partition(":")
         first, _, then = sizes.partition("-")
+        most = _FRAMES - _HELD_OUT
         try:
-            return cls(text, int(first), float(seconds or 0), int(then or first))
+            parsed = cls(text, int(first), float(seconds or 0), int(then or first))
         except ValueError as error:
             wrong = f"{text!r} is neither like 10 nor like 4-10:20"
             raise argparse.ArgumentTypeError(wrong) from error
+        if not (1 <= parsed.first <= most and 1 <= parsed.then <= most):
+            raise argparse.ArgumentTypeError(f"{text!r}: a step takes 1 to {most} images")
+        return parsed
 
 
 class Subject:

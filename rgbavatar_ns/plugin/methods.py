@@ -47,8 +47,8 @@ def preset(
         steps_per_eval_all_images=1_000_000,
         optimizers=paper_optimizers() if optimizers is None else optimizers,
         machine=MachineConfig(device_type="cuda" if gpu else "cpu"),
-        # The trainer shows its own progress; nerfstudio's table knows no images per second. Each
-        # time a GPU is waited for, which takes hundreds of steps a second.
+        # The trainer shows its own progress; nerfstudio's table knows no images per second. Reading
+        # a loss waits for the device, and a GPU takes hundreds of steps a second.
         logging=LoggingConfig(
             steps_per_log=50 if gpu else 10,
             local_writer=LocalWriterConfig(enable=False),

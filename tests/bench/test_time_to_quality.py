@@ -20,3 +20,6 @@ def test_batch_sizes_as_they_are_written():
     assert Batches.parsed("4-10:20") == Batches("4-10:20", 4, 20.0, 10)
     with pytest.raises(argparse.ArgumentTypeError, match=r"'ten' is neither like 10 nor like"):
         Batches.parsed("ten")
+    for wrong in ("0", "145", "4-0:2"):
+        with pytest.raises(argparse.ArgumentTypeError, match="takes 1 to 144 images"):
+            Batches.parsed(wrong)

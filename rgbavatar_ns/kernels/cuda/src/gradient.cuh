@@ -117,7 +117,8 @@ RGBAVATAR_FUNCTION void morphed_gradient(const BlendBackwardArguments& a, int im
     product_conjugate(d.quat, c.rotation, quat);
     const float values[kCarriedFloats] = {
         d.mean.x, d.mean.y, d.mean.z, quat[0], quat[1], quat[2], quat[3],
-        dot(d.scale, g.scale) * reciprocal_of(c.ratio), c.position.x, c.position.y, c.position.z, 0.0f};
+        dot(d.scale, g.scale) * reciprocal_of(c.ratio),
+        c.position.x, c.position.y, c.position.z, 0.0f};
     for (int k = 0; k < kCarriedFloats; ++k) carried[k] = values[k];
   }
   put_vec3(position, a.position, row);
