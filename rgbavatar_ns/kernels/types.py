@@ -5,7 +5,7 @@ coordinates are pixels with the centre of the first pixel at (0.5, 0.5).
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import torch
@@ -121,7 +121,8 @@ class FirstSight:
     units of `SIGHT_UNIT`: whole numbers, whose sums are the same in any order. Only the first
     `num_images` pictures count. Counted is the weight times the picture's matte, or with
     `over_background` the weight, and the colour then that of the picture over its background. What
-    cannot be seen with a weight above `threshold`, since its opacity is not, may be passed over.
+    no pixel shows with a weight above `threshold` may be passed over. `shown` receives the rows
+    that were filled, where the backend knows them without waiting for a device: on a CPU.
     """
 
     known: Bool[Tensor, "N"]
@@ -129,6 +130,7 @@ class FirstSight:
     num_images: int
     threshold: float = 0.0
     over_background: bool = False
+    shown: list[int] = field(default_factory=list)
 
 
 TANGENT_VARIANTS = ("normalized", "raw", "orthonormal")

@@ -2,10 +2,14 @@
 
 import math
 from dataclasses import dataclass
+from typing import TypeVar, cast
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+
+_Array = TypeVar("_Array", Tensor, np.ndarray, float)
 
 COLOR_SCALE = 0.28209479177387814
 """The constant of the zeroth spherical harmonic: colour = .5 + COLOR_SCALE * feature."""
@@ -32,9 +36,9 @@ def color_from_feature(feature: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
     return torch.add(half, feature, alpha=COLOR_SCALE)
 
 
-def feature_from_color(color: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
-    """Invert `color_from_feature`."""
-    return (color - 0.5) / COLOR_SCALE
+def feature_from_color(color: _Array) -> _Array:
+    """Invert `color_from_feature`: [*n, 3] or one number."""
+    return cast(_Array, (color - 0.5) / COLOR_SCALE)
 
 
 class GaussianBlendshapes(nn.Module):

@@ -6,8 +6,9 @@ draws is summed for the Gaussians that still wait, and those that it shows well 
 colour after it.
 """
 
-from typing import Literal
+from typing import Literal, TypeVar, cast
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -25,6 +26,9 @@ from rgbavatar_ns.kernels import (
 )
 from rgbavatar_ns.kernels.types import SIGHT_SUMS, SIGHT_UNIT
 
+_Sums = TypeVar("_Sums", Tensor, np.ndarray)
+"""[N, 5]: counted colour, its weight, the largest weight."""
+
 FirstColorsKind = Literal["matted", "paper"]
 """paper: I is the training picture over its background. matted: each pixel counts by its matte
 alpha a too, c = sum w a I / sum w a, and a colour that was learned from fainter sights stays. Ours,
@@ -33,7 +37,6 @@ because what lies behind the person tints the silhouette else, and late means un
 
 WEIGHT_THRESHOLD = 0.1
 """The blending weight that a Gaussian must exceed in some pixel (paper: .1; its release: .01)."""
-_THRESHOLD_UNITS = int(WEIGHT_THRESHOLD / SIGHT_UNIT)
 _LEARNED = 0.06
 """A colour feature that is so far from its initial grey was learned: five of Adam's steps."""
 _HIDDEN_LOGIT = -12.0
@@ -51,32 +54,29 @@ class FirstColors:
     def __init__(self, avatar: Avatar, kind: FirstColorsKind = "matted") -> None:
         self._avatar = avatar
         self._kind: FirstColorsKind = kind
+        self._grey = feature_from_color(avatar.config.initial_color)
         self._sums: Tensor | None = None
-        # Those that wait, on a CPU as `sight` last found them, and in which state of the buffer.
-        self._known: Tensor | None = None
-        self._version = 0
-        self._waiting: Tensor = torch.empty(0, dtype=torch.int64)
+        self._last: FirstSight | None = None
 
     def sight(self, num_images: int) -> FirstSight | None:
         """What a step is to sum over the first `num_images` of its pictures.
 
         None where no Gaussian waits, which is not asked of a GPU: the question would stop it. What
-        it is summed in is the same memory each time, of which a CPU touches only what waits.
+        it is summed in is the same memory each time, of which a CPU clears what it filled.
         """
         known = self._avatar.color_initialized
         if self._sums is None or self._sums.device != known.device:
             size = (len(known), SIGHT_SUMS)
-            self._sums = torch.zeros(size, dtype=torch.int64, device=known.device)
+            self._sums, self._last = torch.zeros(size, dtype=torch.int64).to(known.device), None
         if known.device.type != "cpu":
             self._sums.zero_()
-        else:
-            if self._known is not known or self._version != known._version:
-                self._known, self._version = known, known._version
-                self._waiting = (~known).nonzero()[:, 0]
-            if len(self._waiting) == 0:
-                return None
-            self._sums.index_fill_(0, self._waiting, 0)
-        return FirstSight(known, self._sums, num_images, WEIGHT_THRESHOLD, self._kind == "paper")
+        elif known.numpy().all():
+            return None
+        elif self._last is not None:
+            self._sums.numpy()[self._last.shown] = 0
+        over_background = self._kind == "paper"
+        self._last = FirstSight(known, self._sums, num_images, WEIGHT_THRESHOLD, over_background)
+        return self._last
 
     @torch.no_grad()
     def seen_in(
@@ -108,20 +108,34 @@ class FirstColors:
         avatar = self._avatar
         if isinstance(seen, FirstSight):
             if seen.sums.device.type == "cpu":
-                largest = seen.sums[self._waiting, 4].max()
-                if int(largest) <= _THRESHOLD_UNITS:
-                    return  # in most steps nothing new comes to light
+                return self._give_few(seen)
             seen = seen.sums * SIGHT_UNIT
-        sums, feature = seen, avatar.blendshapes.color_feature
-        given = is_seen_well(sums) & ~avatar.color_initialized
-        if given.device.type == "cpu" and not bool(given.any()):
-            return
+        feature = avatar.blendshapes.color_feature
+        given = is_seen_well(seen) & ~avatar.color_initialized
         avatar.color_initialized |= given
         if self._kind == "matted":
-            grey = feature_from_color(feature.new_full((3,), avatar.config.initial_color))
-            given = given & ((feature - grey).abs().amax(1) < _LEARNED)
-        first = feature_from_color(mean_color(sums)).to(feature)
+            given = given & ((feature - self._grey).abs().amax(1) < _LEARNED)
+        first = feature_from_color(mean_color(seen)).to(feature)
         feature.copy_(torch.where(given[:, None], first, feature))
+
+    def _give_few(self, sight: FirstSight) -> None:
+        """As `give`, of the few that a step on a CPU shows first.
+
+        Numpy, because twenty of torch's calls cost as much as a hundredth of the step.
+        """
+        if not sight.shown:
+            return
+        avatar, rows = self._avatar, np.array(sight.shown)
+        seen = sight.sums.numpy()[rows] * SIGHT_UNIT
+        well = is_seen_well(seen)
+        rows, seen = rows[well], seen[well]
+        avatar.color_initialized.index_fill_(0, torch.from_numpy(rows), True)
+        feature = avatar.blendshapes.color_feature
+        if self._kind == "matted":
+            grey = np.abs(feature.numpy()[rows] - self._grey).max(1) < _LEARNED
+            rows, seen = rows[grey], seen[grey]
+        first = torch.from_numpy(feature_from_color(mean_color(seen)))
+        feature.index_copy_(0, torch.from_numpy(rows), first.to(feature))
 
 
 @torch.no_grad()
@@ -130,14 +144,14 @@ def hide_unseen(avatar: Avatar) -> None:
     avatar.blendshapes.opacity_logit[~avatar.color_initialized] = _HIDDEN_LOGIT
 
 
-def is_seen_well(sums: Float[Tensor, "N 5"]) -> Tensor:
-    """Whether the mean colour under each Gaussian can be trusted: [N], bool."""
+def is_seen_well(sums: _Sums) -> _Sums:
+    """Whether the mean colour under each Gaussian can be trusted: [N, 5] -> [N], bool."""
     return (sums[:, 4] > WEIGHT_THRESHOLD) & (sums[:, 3] > _SMALLEST_WEIGHT_SUM)
 
 
-def mean_color(sums: Float[Tensor, "N 5"]) -> Float[Tensor, "N 3"]:
-    """The mean colour under each Gaussian."""
-    return sums[:, :3] / sums[:, 3:4].clamp(min=_SMALLEST_WEIGHT_SUM)
+def mean_color(sums: _Sums) -> _Sums:
+    """The mean colour under each Gaussian: [N, 5] -> [N, 3]."""
+    return cast(_Sums, sums[:, :3] / sums[:, 3:4].clip(min=_SMALLEST_WEIGHT_SUM))
 
 
 def sums_of(

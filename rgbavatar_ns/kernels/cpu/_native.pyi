@@ -93,9 +93,10 @@ class MorphedSession(_Drawing):
         background: Tensor,
         known: Tensor | None = None,
         sums: Tensor | None = None,
+        threshold: float = 0.0,
         sight_images: int = 0,
         over_background: bool = False,
-    ) -> float: ...
+    ) -> tuple[float, list[int]]: ...
     def backward_adam(
         self,
         groups: list[tuple[Tensor, Tensor, Tensor, tuple[float, ...]]],

@@ -119,9 +119,11 @@ class CpuMorphedRenderer:
             seen["over_background"] = sight.over_background
         background = checked_background(self._weights, background, len(self._weights))
         self._has_gradient = True
-        loss = self._session.forward_loss(
+        loss, shown = self._session.forward_loss(
             images_rgba.contiguous(), background.detach().contiguous(), **seen
         )
+        if sight is not None:
+            sight.shown.extend(shown)
         return self._weights.new_tensor(loss)
 
     def backward_adam(

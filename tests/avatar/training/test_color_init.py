@@ -165,7 +165,7 @@ def test_the_compiled_way_gives_the_same_colors(make_avatar, scale_with_triangle
 
 @pytest.mark.parametrize("kind", ["matted", "paper"])
 def test_a_step_sums_what_a_pass_of_its_own_does(make_avatar, kind: FirstColorsKind):
-    """Over the first two of three pictures, for those that wait; the others are left at 0."""
+    """Over the first two of three pictures, for those that wait and are shown; others stay at 0."""
     avatar, size = make_avatar(random=True), 48
     camera, theta, rgba = front_camera(size), random_theta(avatar.layout, 3), random_pictures(3, 48)
     background = torch.rand(3, 3, generator=torch.Generator().manual_seed(4))
@@ -180,6 +180,8 @@ def test_a_step_sums_what_a_pass_of_its_own_does(make_avatar, kind: FirstColorsK
     expected = colors.seen_in(theta[:2], camera, rgba[:2], background[:2]).double()
     expected[::3] = 0
     assert int(is_seen_well(expected).sum()) > 30
+    expected[expected[:, 4] <= WEIGHT_THRESHOLD] = 0
+    assert sorted(sight.shown) == expected[:, 4].nonzero()[:, 0].tolist()
     torch.testing.assert_close(found, expected, atol=2e-6, rtol=2e-6)
 
 

@@ -10,6 +10,6 @@ namespace rgbavatar::RGBAVATAR_ISA {
 extern const Kernels kernels;
 const Kernels kernels = {project_image, forward_tile, backward_tile, average_tile,
                          project_image_backward, fill_frames, project_morphed, train_tile,
-                         update_morphed, mesh_gradient};
+                         see_tile, update_morphed, mesh_gradient};
 
 }  // namespace rgbavatar::RGBAVATAR_ISA

@@ -108,6 +108,17 @@ struct Kept {
   float (*alpha)[kBlockPixels], (*weight)[kBlockPixels];
 };
 
+// A Gaussian that waits for its first colour, as a tile shows it: what it counts there is summed at
+// once where that is well enough, else only if another tile shows it so, which is rare.
+struct Sighting {
+  uint64_t blocks;  // of the tile
+  uint32_t index;
+  float most;     // its largest weight there
+  float sums[4];  // of red, green, blue and weight
+  int64_t tile;   // the batch's tiles counted through
+  bool summed;
+};
+
 // Where a group begins that was not kept.
 struct alignas(64) Checkpoint {
   float transmittance[kBlocksPerTile][kBlockPixels];
@@ -116,13 +127,14 @@ struct alignas(64) Checkpoint {
 
 // Scratch memory of one thread: what a pass keeps for every block, a few rows each, the
 // transmittance first; groups with their jobs, and room for one more that is made again.
-constexpr int kKeptGroups = 128, kKeptJobs = 24576;
+constexpr int kKeptGroups = 128, kKeptJobs = 24576, kKeptSightings = 128;
 struct alignas(64) TileScratch {
   float rows[kBlocksPerTile * (1 + kMaxChannels)][kBlockPixels];
   float alpha[kKeptJobs + kGroupSplats * kBlocksPerTile][kBlockPixels];
   float weight[kKeptJobs + kGroupSplats * kBlocksPerTile][kBlockPixels];
   Group groups[kKeptGroups + 1];
   float counted[kBlocksPerTile * 4][kBlockPixels];  // what each pixel counts for a first colour
+  Sighting sightings[kKeptSightings];               // those not yet handed over
   Checkpoint* checkpoints;  // one for every kGroupSplats entries of the fullest tile, and one
 };
 
@@ -182,12 +194,19 @@ struct BlendScratch {
 struct FirstSight {
   const bool* known;     // [N]: those that do not wait
   int64_t* sums;         // [N, kSightSums]: red, green, blue, weight; the largest weight
-  float log2_threshold;  // of the largest weight: what cannot exceed it is passed over
+  float threshold;       // of the largest weight: what stays below it has no sums
+  float log2_threshold;  // whose opacity is not above it is passed over
   int images;            // how many pictures count, from the first on
   bool over_background;  // the picture as it is drawn over, or what its matte leaves of it
 };
 constexpr int kSightSums = 5;
 constexpr float kSightUnit = 4294967296.0f;  // 2^32: sums stay below 2^63 in any picture
+
+// Where sightings go.
+struct Sightings {
+  Sighting* seen;  // room for all pairs of a Gaussian and a tile
+  int64_t count;
+};
 
 // A tile's target for training: straight-alpha RGBA of 8 bits over the background.
 struct TrainingTarget {
@@ -195,6 +214,8 @@ struct TrainingTarget {
   const float* background;
   float gradient;  // of the loss by each absolute difference
   const FirstSight* sight;  // null where no first colours are asked for
+  Sightings* sightings;     // what is found then
+  int64_t tile;
 };
 
 // The loops, compiled once per instruction set.
@@ -220,6 +241,8 @@ struct Kernels {
   // Draws the tile, compares it with the target and writes its slots; returns the sum of absolute
   // differences.
   double (*train_tile)(const Tile&, const TrainingTarget&, TileScratch&, float* slots);
+  // Fills the sums of `count` sightings, all of this tile.
+  void (*see_tile)(const Tile&, const TrainingTarget&, TileScratch&, Sighting*, int count);
   // Updates the parameters of Gaussians [begin, end), where there is an optimizer, and writes the
   // gradient of the weights that comes from them, [B, K], and, where it is asked for, what
   // `mesh_gradient` needs of them, [B, N, kCarriedFloats].

@@ -184,14 +184,15 @@ struct MorphedSession : Drawing<rgbavatar::MorphedRendering> {
         width(width),
         height(height) {}
 
-  // known [N] and sums [N, 5] together, or neither.
-  double forward_loss(const Pixels& images, const Input& background,
+  // known [N] and sums [N, 5] together, or neither. Returns the loss and the rows that were filled.
+  std::tuple<double, std::vector<int64_t>> forward_loss(const Pixels& images, const Input& background,
                       const std::optional<Flags>& known, const std::optional<Sums>& sums,
                       float threshold, int sight_images, bool over_background) {
-    const rgbavatar::FirstSight sight = {pointer(known), pointer(sums), std::log2(threshold), sight_images,
+    const rgbavatar::FirstSight sight = {pointer(known), pointer(sums), threshold, std::log2(threshold), sight_images,
                                          over_background};
-    return rendering.forward_loss(images.data(), attribute(background), known ? &sight : nullptr,
-                                  threads);
+    const double loss = rendering.forward_loss(images.data(), attribute(background),
+                                               known ? &sight : nullptr, threads);
+    return {loss, rendering.shown()};
   }
 
   void backward_adam(const std::vector<AdamArrays>& groups, const Output& weight_gradient,

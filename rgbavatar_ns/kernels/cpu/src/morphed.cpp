@@ -52,6 +52,48 @@ void MorphedRendering::lay_out_blending(const MorphedScene& scene, const Team& t
   }
 }
 
+// Fills the sums of the Gaussians that some tile shows well enough, from all tiles that show them; the
+// few that do so faintly are looked at again. Those Gaussians are left in `shown_`.
+template <class TargetOf>
+void MorphedRendering::add_sightings(const FirstSight& sight, Sightings found,
+                                     const TargetOf& target_of, Team& team) {
+  Workspace& w = *workspace_;
+  w.largest.reserve(count_);
+  float* const largest = w.largest.data();
+  std::fill(largest, largest + count_, 0.0f);
+  Sighting* const end = found.seen + found.count;
+  for (Sighting* seen = found.seen; seen < end; ++seen)
+    largest[seen->index] = std::max(largest[seen->index], seen->most);
+  Sighting* const shown = std::partition(found.seen, end, [&](const Sighting& seen) {
+    return largest[seen.index] >= sight.threshold;
+  });
+  Sighting* const faint =
+      std::partition(found.seen, shown, [](const Sighting& seen) { return seen.summed; });
+  std::sort(faint, shown, [](const Sighting& a, const Sighting& b) { return a.tile < b.tile; });
+  std::vector<Sighting*> starts;  // of the tiles to look at again
+  for (Sighting* seen = faint; seen < shown; ++seen)
+    if (seen == faint || seen->tile != seen[-1].tile) starts.push_back(seen);
+  starts.push_back(shown);
+  const int tiles = tiles_per_image();
+  if (faint < shown)
+    team.run(int64_t(starts.size()) - 1, [&](int64_t item, int thread) {
+      Sighting* const first = starts[item];
+      kernels_->see_tile(tile(int(first->tile / tiles), int(first->tile % tiles)),
+                         target_of(first->tile), w.scratch[thread], first,
+                         int(starts[item + 1] - first));
+    });
+  const auto in_units = [](float sum) { return int64_t(double(sum) * kSightUnit); };
+  for (const Sighting* seen = found.seen; seen < shown; ++seen) {
+    int64_t* sums = sight.sums + seen->index * size_t(kSightSums);
+    for (int k = 0; k + 1 < kSightSums; ++k) sums[k] += in_units(seen->sums[k]);
+    float& most = largest[seen->index];
+    if (most < 0.0f) continue;  // told before
+    sums[kSightSums - 1] = std::max(sums[kSightSums - 1], in_units(most));
+    shown_.push_back(seen->index);
+    most = -1.0f;
+  }
+}
+
 double MorphedRendering::forward_loss(const uint8_t* images, const Attribute& background,
                                       const FirstSight* sight, int threads) {
   Team team(threads);
@@ -62,13 +104,21 @@ double MorphedRendering::forward_loss(const uint8_t* images, const Attribute& ba
   const size_t pixels = size_t(width_) * height_;
   const double weight = 1.0 / (3.0 * double(pixels) * batch_);
   w.loss.reserve(size_t(batch_) * tiles);
+  if (sight) w.sightings.reserve(w.slot_start[std::min(sight->images, batch_)]);
+  Sightings found = {w.sightings.data(), 0};
+  const auto target_of = [&](int64_t item) -> TrainingTarget {
+    const int b = int(item / tiles);
+    return {images + b * pixels * 4, background.of(b), float(weight),
+            sight && b < sight->images ? sight : nullptr, &found, item};
+  };
   team.run(int64_t(batch_) * tiles, [&](int64_t item, int thread) {
     const int b = int(item / tiles);
-    const TrainingTarget target = {images + b * pixels * 4, background.of(b), float(weight),
-                                   sight && b < sight->images ? sight : nullptr};
-    w.loss[item] = kernels_->train_tile(tile(b, int(item % tiles)), target, w.scratch[thread],
+    w.loss[item] = kernels_->train_tile(tile(b, int(item % tiles)), target_of(item),
+                                        w.scratch[thread],
                                         w.slots.data() + w.slot_start[b] * kMoments);
   });
+  shown_.clear();
+  if (sight) add_sightings(*sight, found, target_of, team);
   double sum = 0.0;
   for (int64_t item = 0; item < int64_t(batch_) * tiles; ++item) sum += w.loss[item];
   return sum * weight;

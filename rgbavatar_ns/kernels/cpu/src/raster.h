@@ -75,6 +75,8 @@ struct Workspace {
   Buffer<float> carried;           // [B, N, kCarriedFloats]
   Buffer<float> frame_gradient;    // [threads, U, kFrameFloats]
   Buffer<double> loss;             // [B, tiles]
+  Buffer<Sighting> sightings;      // those of the last forward_loss that asked for them
+  Buffer<float> largest;           // [N]: their largest weight
 };
 
 struct Cameras {
@@ -139,9 +141,12 @@ class MorphedRendering : public Rendering {
                    int threads);
 
   // The mean absolute difference to images [B, H, W, 4] of 8 bits over backgrounds [B or 1, 3];
-  // keeps what `backward_adam` needs. With `sight`, adds what the waiting Gaussians are seen with.
+  // keeps what `backward_adam` needs. With `sight`, adds what the waiting Gaussians are seen with of
+  // which some pixel shows enough: these are `shown` then, each once.
   double forward_loss(const uint8_t* images, const Attribute& background, const FirstSight* sight,
                       int threads);
+
+  const std::vector<int64_t>& shown() const { return shown_; }
 
   // One step of Adam by the gradient of the last forward_loss, or none without an optimizer; writes
   // the gradients of the weights, [B, K], and, unless it is null, of the vertices, [B, V, 3].
@@ -150,6 +155,11 @@ class MorphedRendering : public Rendering {
 
  private:
   void lay_out_blending(const MorphedScene& scene, const class Team& team);
+  template <class TargetOf>
+  void add_sightings(const FirstSight& sight, Sightings found, const TargetOf& target_of,
+                     class Team& team);
+
+  std::vector<int64_t> shown_;
 };
 
 }  // namespace rgbavatar

@@ -68,19 +68,6 @@ static Wide compare_block(const Tile& tile, const TrainingTarget& target, int bl
   return sum;
 }
 
-static int64_t in_sight_units(float sum) { return int64_t(double(sum) * kSightUnit); }
-
-// Adds a Gaussian's sums over a tile to those of its first sight.
-static void add_to_sight(Quad sums, float most, int64_t* to) {
-  for (int k = 0; k + 1 < kSightSums; ++k)
-    __atomic_fetch_add(to + k, in_sight_units(sums[k]), __ATOMIC_RELAXED);
-  const int64_t largest = in_sight_units(most);
-  int64_t known = __atomic_load_n(to + kSightSums - 1, __ATOMIC_RELAXED);
-  while (known < largest && !__atomic_compare_exchange_n(to + kSightSums - 1, &known, largest, true,
-                                                         __ATOMIC_RELAXED, __ATOMIC_RELAXED)) {
-  }
-}
-
 // What the pixels of a block count for a first colour: colour times share, and the share.
 static void count_block(const Tile& tile, const TrainingTarget& target, int block,
                         TileScratch& scratch) {
@@ -97,24 +84,29 @@ static RGBAVATAR_MEMBER bool waits(const FirstSight& sight, const Splat& s) {
   return !sight.known[s.index] && s.log2_opacity > sight.log2_threshold;
 }
 
-// What a group's Gaussian is seen with, whose largest weight is `most`; `counted` are the tile's
-// blocks that have been.
-static void see(const Tile& tile, const TrainingTarget& target, const Group& group, int place,
-                float most, const Kept& kept, TileScratch& scratch, uint64_t& counted) {
-  const Wide zero(0.0f);
+// Sums what a group's Gaussian counts in the tile; `counted` are the blocks whose pixels have been.
+static void sum_counted(const Tile& tile, const TrainingTarget& target, const Group& group,
+                        int place, const Kept& kept, TileScratch& scratch, uint64_t& counted,
+                        float sums[4]) {
   const uint64_t blocks = group.blocks[place];
-  const float* weight_row = kept.weight[group.first_job[place]];
   for (uint64_t left = blocks & ~counted; left; left &= left - 1)
     count_block(tile, target, __builtin_ctzll(left), scratch);
   counted |= blocks;
-  Wide sums[4] = {zero, zero, zero, zero};
+  const Wide zero(0.0f);
+  Wide lanes[4] = {zero, zero, zero, zero};
+  const float* weight_row = kept.weight[group.first_job[place]];
   for (uint64_t left = blocks; left; left &= left - 1, weight_row += kBlockPixels) {
     const float(*rows)[kBlockPixels] = scratch.counted + 4 * __builtin_ctzll(left);
     const Wide weight = load_wide(weight_row);
-    for (int k = 0; k < 4; ++k) sums[k] = sums[k] + weight * load_wide(rows[k]);
+    for (int k = 0; k < 4; ++k) lanes[k] = lanes[k] + weight * load_wide(rows[k]);
   }
-  add_to_sight(sums_of(sums[0], sums[1], sums[2], sums[3]), most,
-               target.sight->sums + int64_t(group.splats[place].index) * kSightSums);
+  store_quad(sums_of(lanes[0], lanes[1], lanes[2], lanes[3]), sums);
+}
+
+// Hands a tile's sightings over, to where those of all tiles are.
+static void hand_over(const TileScratch& scratch, int count, Sightings& to) {
+  const int64_t first = __atomic_fetch_add(&to.count, count, __ATOMIC_RELAXED);
+  __builtin_memcpy(to.seen + first, scratch.sightings, count * sizeof(Sighting));
 }
 
 static double train_tile(const Tile& tile, const TrainingTarget& target, TileScratch& scratch,
@@ -126,6 +118,7 @@ static double train_tile(const Tile& tile, const TrainingTarget& target, TileScr
                               [&](const Splat& s) { clear_slot(tile, s, slots, kMoments); });
   Wide sum(0.0f);
   uint64_t counted = 0;
+  int sightings = 0;
   for (int block = 0; block < kBlocksPerTile; ++block)
     sum = sum + compare_block(tile, target, block, scratch);
   groups.visit_back_to_front(tile, grid, scratch, [&](const Group& group, const Kept& kept) {
@@ -135,11 +128,46 @@ static double train_tile(const Tile& tile, const TrainingTarget& target, TileScr
         continue;
       }
       const float most = sum_moments<true>(tile, grid, group, i, kept, scratch, slots);
-      if (most > 0.0f)  // else hidden by what lies before it
-        see(tile, target, group, i, most, kept, scratch, counted);
+      if (!(most > 0.0f)) continue;  // hidden by what lies before it
+      if (sightings == kKeptSightings) {
+        hand_over(scratch, sightings, *target.sightings);
+        sightings = 0;
+      }
+      Sighting& seen = scratch.sightings[sightings++];
+      seen.blocks = group.blocks[i];
+      seen.index = group.splats[i].index;
+      seen.most = most;
+      seen.tile = target.tile;
+      seen.summed = most >= target.sight->threshold;
+      if (seen.summed) sum_counted(tile, target, group, i, kept, scratch, counted, seen.sums);
     }
   });
+  if (sightings) hand_over(scratch, sightings, *target.sightings);
   return double(sum_of(sum));
+}
+
+// Blends again, in the blocks of these sightings, what lies before them and themselves.
+static void see_tile(const Tile& tile, const TrainingTarget& target, TileScratch& scratch,
+                     Sighting* sightings, int count) {
+  const BlockGrid grid(tile);
+  GroupReader reader(tile);
+  Group& group = scratch.groups[0];
+  const Kept kept = kept_from(scratch, 0);
+  start_rows<kBlendRows>(tile, scratch);
+  uint64_t open = 0, counted = 0;
+  for (int i = 0; i < count; ++i) open |= sightings[i].blocks;
+  for (int left = count; left && reader.next(group, open, kNoLimit, [](const Splat&) {});) {
+    open &= ~blend_group<kBlendRows, false, false, true>(grid, group, scratch, kept);
+    for (int i = 0; i < group.count; ++i) {
+      if (!waits(*target.sight, group.splats[i])) continue;
+      for (int k = 0; k < count; ++k) {
+        if (sightings[k].index != uint32_t(group.splats[i].index)) continue;
+        sum_counted(tile, target, group, i, kept, scratch, counted, sightings[k].sums);
+        sightings[k].summed = true;
+        --left;
+      }
+    }
+  }
 }
 
 }  // namespace rgbavatar::RGBAVATAR_ISA
