@@ -179,12 +179,15 @@ class _Tracking:
         clock.begin("report", frames)
         with disk_errors(dst, GO_ON):
             clock.done(0)
-            write_tracking_sheet(dst, clip.tracker, clip.fit, found, clip.crop)
+            bare_px = clip.tracker.fitted_px(clip.fit, with_offsets=False)
+            write_tracking_sheet(dst, clip.tracker, clip.fit, bare_px, found, clip.crop)
             clock.done(frames // 4)
             test = frames // 5 if config.test_frames is None else config.test_frames
             dataset = writer.finish(test)
             clock.done(frames // 2)
-            report = self._report(clip, background, [noted[k] for k in found.frame_index])
+            quality = fit_quality(clip.tracker, clip.fit, bare_px, found.points_px, found.irises)
+            shares = [noted[index] for index in found.frame_index]
+            report = self._report(clip, background, quality, shares)
             clock.done(3 * frames // 4)
             report["film"] = _film_shown(dataset, report).to_json()
             write_json(dst / "tracking.json", report)
@@ -238,7 +241,11 @@ class _Tracking:
         self.clock.end()
 
     def _report(
-        self, clip: _FittedClip, background: Background | None, shares: Sequence[dict[str, Any]]
+        self,
+        clip: _FittedClip,
+        background: Background | None,
+        quality: dict[str, Any],
+        shares: Sequence[dict[str, Any]],
     ) -> dict[str, Any]:
         """What `tracking.json` holds."""
         seen, found, crop = clip.seen, clip.found, clip.crop
@@ -259,7 +266,7 @@ class _Tracking:
             "other_faces": list(seen.with_others),
             "blurred": [index for index in seen.blurred if index in tracked],
             "notes": list(self.source.notes),
-            **fit_quality(clip.tracker, clip.fit, found.points_px, found.irises),
+            **quality,
             **silhouette_summary(shares),
             "unfilmed_share": sum(one["unfilmed"] for one in shares) / len(shares),
             "matte": given if own_mattes else "selfie segmentation",
