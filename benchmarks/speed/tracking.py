@@ -12,50 +12,12 @@ import argparse
 import json
 import tempfile
 import time
-from dataclasses import dataclass, field
 from pathlib import Path
 
-import av
-import numpy as np
+from procedural_film import film_config, write_film
+from stage_times import StageTimes
 
-from rgbavatar_ns.synthetic import DemoConfig, film_demo
 from rgbavatar_ns.tracking import TrackConfig, track_video
-
-_FRAMES_PER_SECOND = 24
-_ROOM_CELLS = 64
-"""The procedural room is so many patches wide: something for a camera's motion to show in."""
-
-
-@dataclass
-class _Costs:
-    """CPU seconds of each stage, from the calls that tell its progress."""
-
-    cpu_s: dict[str, float] = field(default_factory=dict)
-    _last_s: float = field(default_factory=time.process_time)
-
-    def __call__(self, stage: str, _done: int, _total: int | None) -> None:
-        """What passed since the last call is this stage's."""
-        now = time.process_time()
-        self.cpu_s[stage] = self.cpu_s.get(stage, 0.0) + now - self._last_s
-        self._last_s = now
-
-
-def procedural_film(path: Path, config: DemoConfig) -> None:
-    """A procedural person before a still wall, as a video."""
-    film = film_demo(config)
-    cells = np.random.default_rng(config.seed).integers(60, 200, (_ROOM_CELLS, _ROOM_CELLS, 3))
-    row = np.arange(config.image_size) * _ROOM_CELLS // config.image_size
-    room = cells[row][:, row].astype(np.float32)
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream("mpeg4", rate=_FRAMES_PER_SECOND)
-        stream.width = stream.height = config.image_size
-        stream.pix_fmt, stream.bit_rate = "yuv420p", 8_000_000
-        for frame in film.frames():
-            alpha = frame.image_rgba[..., 3:].astype(np.float32) / 255
-            image = frame.image_rgba[..., :3] * alpha + room * (1 - alpha)
-            picture = av.VideoFrame.from_ndarray(image.astype(np.uint8), format="rgb24")
-            container.mux(stream.encode(picture))
-        container.mux(stream.encode())
 
 
 def main() -> None:
@@ -71,19 +33,8 @@ def main() -> None:
         video = given.video
         if video is None:
             video = Path(folder) / "film.mp4"
-            film = DemoConfig(
-                image_size=given.size,
-                num_frames=given.frames,
-                num_test_frames=4,
-                seed=given.seed,
-                frames_per_second=float(_FRAMES_PER_SECOND),
-                theta_noise=0.0,
-                supersampling=1,
-                glasses=False,
-                body=given.body,
-            )
-            procedural_film(video, film)
-        costs, began = _Costs(), time.perf_counter()
+            write_film(video, film_config(given.frames, given.size, given.seed, given.body))
+        costs, began = StageTimes(), time.perf_counter()
         dataset = Path(folder) / "dataset"
         track_video(video, dataset, TrackConfig(max_frames=given.frames), costs)
         wall_s = time.perf_counter() - began

@@ -11,6 +11,7 @@ from typing import Any
 import cv2
 import torch
 from jaxtyping import Float
+from threadpoolctl import threadpool_limits
 from torch import Tensor
 
 from rgbavatar_ns.data import DatasetWriter, TrackedDataset
@@ -114,7 +115,7 @@ class _Tracking:
             seen = followed_face(faces, width, height)
             if self.mattes is not None:
                 self.mattes.require_count(seen.frames_read, config.max_frames is not None)
-            clock.begin("fit", len(seen))
+            clock.begin("outlines", seen.frames_read)
             tracker = subject_tracker(config, self.own_head)
             calls = count(1)  # two for each frame
 
@@ -123,7 +124,10 @@ class _Tracking:
 
             alpha = self.mattes is None and bool(faces.has_alpha.any())
             keys = tracker.key_positions(seen.points_px)
-            outlines = key_outlines(self.source, self.mattes, alpha, seen, keys, self.run)
+            outlines = key_outlines(
+                self.source, self.mattes, alpha, seen, keys, self.run, clock.done
+            )
+            clock.begin("fit", len(seen))
             follows = seen.follows()
             fit = tracker.fit(
                 seen.points_px, follows, width, height, half_done, outlines, seen.irises
@@ -138,11 +142,8 @@ class _Tracking:
                 )
         body = None
         if tracker.head.arrays.has_torso:
-            clock.begin("body", len(found))
             with closing(PersonMatte()) as person:
-                body = find_body(
-                    self.source, self.run, tracker, fit, found, person.coarse, clock.done
-                )
+                body = find_body(self.source, self.run, tracker, fit, found, person.coarse, clock)
             arrays, heads = tracker.head.arrays, tracker.thetas(fit)
             alone = fit.subject.identity
             identity, upon = on_body(tracker.mesh_landmarks, arrays, alone, heads, body)
@@ -174,13 +175,24 @@ class _Tracking:
             size, keep = clip.crop.size, bool(noted)
             writer = DatasetWriter(dst, arrays, identity, layout, size, size, True, keep)
         self._write_images(clip, thetas, images, background, writer, noted)
+        frames, clock = len(found), self.clock
+        clock.begin("report", frames)
         with disk_errors(dst, GO_ON):
-            write_tracking_sheet(dst, clip.tracker, clip.fit, found, clip.crop)
-            test = len(found) // 5 if config.test_frames is None else config.test_frames
+            clock.done(0)
+            bare_px = clip.tracker.fitted_px(clip.fit, with_offsets=False)
+            write_tracking_sheet(dst, clip.tracker, clip.fit, bare_px, found, clip.crop)
+            clock.done(frames // 4)
+            test = frames // 5 if config.test_frames is None else config.test_frames
             dataset = writer.finish(test)
-            report = self._report(clip, background, [noted[k] for k in found.frame_index])
+            clock.done(frames // 2)
+            quality = fit_quality(clip.tracker, clip.fit, bare_px, found.points_px, found.irises)
+            shares = [noted[index] for index in found.frame_index]
+            report = self._report(clip, background, quality, shares)
+            clock.done(3 * frames // 4)
             report["film"] = _film_shown(dataset, report).to_json()
             write_json(dst / "tracking.json", report)
+            clock.done(frames)
+        clock.end()
         self.run.close()
         return dataset
 
@@ -229,7 +241,11 @@ class _Tracking:
         self.clock.end()
 
     def _report(
-        self, clip: _FittedClip, background: Background | None, shares: Sequence[dict[str, Any]]
+        self,
+        clip: _FittedClip,
+        background: Background | None,
+        quality: dict[str, Any],
+        shares: Sequence[dict[str, Any]],
     ) -> dict[str, Any]:
         """What `tracking.json` holds."""
         seen, found, crop = clip.seen, clip.found, clip.crop
@@ -250,7 +266,7 @@ class _Tracking:
             "other_faces": list(seen.with_others),
             "blurred": [index for index in seen.blurred if index in tracked],
             "notes": list(self.source.notes),
-            **fit_quality(clip.tracker, clip.fit, found.points_px, found.irises),
+            **quality,
             **silhouette_summary(shares),
             "unfilmed_share": sum(one["unfilmed"] for one in shares) / len(shares),
             "matte": given if own_mattes else "selfie segmentation",
@@ -297,11 +313,15 @@ def _settings(
 
 @contextmanager
 def _one_thread_a_call() -> Iterator[None]:
-    """OpenCV keeps to one thread: frames are what is done side by side, and the sums of its
-    filters depend on how many threads share them."""
+    """OpenCV and the matrices keep to one thread: frames are what is done side by side.
+
+    The sums of filters depend on how many threads share them, and matrices are so small that more
+    threads only wait for each other: on a busy machine for most of the time.
+    """
     before = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:
-        yield
+        with threadpool_limits(1):
+            yield
     finally:
         cv2.setNumThreads(before)

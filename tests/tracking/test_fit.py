@@ -35,7 +35,8 @@ def test_known_performance_is_recovered_from_its_own_landmarks(head: HeadModel) 
     away = np.linalg.norm((ours - true)[..., :2], axis=-1)
     assert away.mean() < 0.002, "metres across the image, face"
 
-    quality = fit_quality(tracker, fit, noisy, FoundIrises.unseen(noisy))
+    bare_px = tracker.fitted_px(fit, with_offsets=False)
+    quality = fit_quality(tracker, fit, bare_px, noisy, FoundIrises.unseen(noisy))
     assert quality["reprojection_error_share"] < 0.01
     assert quality["mouth_opening_correlation"] > 0.95
     assert quality["eyelid_opening_correlation"] > 0.95

@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_info
 
 from rgbavatar_ns.drawing.compositing import unfilmed_pixels
 from rgbavatar_ns.errors import UserError
@@ -50,7 +51,8 @@ def test_a_written_clip_becomes_a_dataset_without_its_faceless_frames(
     assert (tmp_path / "set" / "overlay.png").stat().st_size > 10_000
     assert len(dataset.test) == len(dataset) // 5
     stages = list(dict.fromkeys(call[0] for call in calls))
-    assert stages == ["faces", "fit", "body", "background", "pictures"]
+    expected = ["faces", "outlines", "fit", "body", "place", "background", "pictures", "report"]
+    assert stages == expected
     assert report["background"] in ("still", "covered", "too short")
     for stage in stages:
         done = [call[1] for call in calls if call[0] == stage]
@@ -62,6 +64,28 @@ def test_a_written_clip_becomes_a_dataset_without_its_faceless_frames(
     assert image[64, 64, 3] == 255, "the face is solid"
     assert image[2, 2, 3] == 0, "the background is gone"
     assert (image[..., 3] > 0).mean() < 0.7
+
+
+def test_every_frame_is_told_of_and_matrices_keep_to_one_thread(
+    portrait: tuple[Path, list[int]], tmp_path: Path
+) -> None:
+    """Else a long film would seem to stand, and a busy machine would wait for idle threads."""
+    told: dict[str, set[int]] = {}
+    threads: set[int] = set()
+
+    def watch(stage: str, done: int, _total: int | None) -> None:
+        told.setdefault(stage, set()).add(done)
+        pools = threadpool_info()
+        threads.update(pool["num_threads"] for pool in pools if pool["user_api"] == "blas")
+
+    config = TrackConfig(image_size=64, key_frames=2, focal_px=500.0)
+    dataset = track_video(portrait[0], tmp_path / "set", config, watch)
+
+    for stage in ("fit", "body", "place", "pictures"):
+        assert told[stage] == set(range(min(told[stage]), len(dataset) + 1)), stage
+    read = max(told["outlines"] - {9}) + 1  # up to the last key frame
+    assert told["outlines"] == {*range(read), 9}
+    assert threads == {1}
 
 
 def test_the_body_is_left_out_only_when_asked_for(

@@ -150,8 +150,9 @@ class SubjectTracker:
 
         `outlines` and `irises` as in `fit`; without any, landmarks alone decide.
         """
-        targets = self.targets(landmarks_px, irises)
-        keys = [targets[position] for position in self.key_positions(landmarks_px)]
+        positions = self.key_positions(landmarks_px)
+        key_irises = None if irises is None else irises.of(positions)
+        keys = self.targets(landmarks_px[positions], key_irises)
         shared = min(self.config.identity_components, self.cost.head.num_identity)
         subject = fit_subject(self.cost, keys, width, height, shared, self.config.focal_px)
         if outlines:

@@ -1,6 +1,6 @@
 """The person's outline in the key frames, which the fit asks for before there are any crops."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from typing import Any
 
@@ -68,23 +68,26 @@ def key_outlines(
     found: ClipLandmarks,
     positions: Sequence[int],
     run: ResumableRun,
+    advance: Callable[[int], None] = lambda frames: None,
 ) -> list[PersonOutline | None]:
     """The outlines in these frames, from the user's own mattes, the source's alpha, or found.
 
-    The frames are read once more; what was found is kept in `run`.
+    The frames are read once more, and `advance` is told how many; what was found is kept in `run`.
     """
     crop = steady_crop(found.points_px, found.width, found.height, OUTLINE_PX)
     place = {found.frame_index[position]: position for position in positions}
     path = run.folder / "key_mattes.npz"
 
     def look(key: str) -> dict[str, Any]:
-        made = dict(_mattes(source, mattes, source_alpha, found, frozenset(place), crop))
+        advance(0)
+        made = dict(_mattes(source, mattes, source_alpha, found, frozenset(place), crop, advance))
         with atomic_write(path, remedy=GO_ON) as partial:
             np.savez(partial, matte=np.stack([made[index] for index in sorted(place)]))
         return {"file": path.name}
 
     made_from = [sorted(place), crop.left, crop.top, crop.side]
     run.stages.run("mattes of key frames", made_from, look)
+    advance(found.frames_read)
     with stage_damage_told(path, "mattes of key frames"):
         kept = load_arrays(path, _MOST_BYTES)["matte"]
         if kept.shape != (len(place), OUTLINE_PX, OUTLINE_PX) or kept.dtype != np.uint8:
@@ -102,6 +105,7 @@ def _mattes(
     found: ClipLandmarks,
     wanted: frozenset[int],
     crop: SquareCrop,
+    advance: Callable[[int], None],
 ) -> Iterator[tuple[int, UInt8[np.ndarray, "s s"]]]:
     """The mattes' crops, in the frames' order."""
     if mattes is not None:
@@ -109,8 +113,13 @@ def _mattes(
             yield index, crop.apply(level)
         return
     last = max(wanted)
+
+    def read(index: int) -> bool:
+        advance(index + 1)
+        return index in wanted
+
     with closing(PersonMatte()) as matte:
-        for frame in source.read(wanted.__contains__):
+        for frame in source.read(read):
             if source_alpha:
                 alpha = frame.alpha
                 if alpha is None:

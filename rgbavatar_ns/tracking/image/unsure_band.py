@@ -194,7 +194,7 @@ def _revealed(differs: _Values, room: RoomColors, inward: _Values) -> _Mask:
     count, found = cv2.connectedComponents((alone | person).astype(np.uint8))
     labels = np.asarray(found, np.int64)
     hangs = np.zeros(count, bool)
-    hangs[np.unique(labels[person])] = True
+    hangs[labels[person]] = True
     whole = np.asarray(cv2.erode(alone.astype(np.uint8), _AROUND)) > 0
     return whole & hangs[labels]
 

@@ -4,10 +4,10 @@ from collections.abc import Callable, Generator
 from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import count
 
 import numpy as np
 from jaxtyping import Float
-from threadpoolctl import threadpool_limits
 
 from rgbavatar_ns.files import digest
 from rgbavatar_ns.tracking.face.clip import ClipLandmarks
@@ -15,11 +15,12 @@ from rgbavatar_ns.tracking.fit.fit import ClipFit
 from rgbavatar_ns.tracking.fit.subject import SubjectTracker
 from rgbavatar_ns.tracking.input.video import FrameSource
 from rgbavatar_ns.tracking.resumable_run import ResumableRun
+from rgbavatar_ns.tracking.stage_clock import StageClock
 from rgbavatar_ns.tracking.threads import in_background
 from rgbavatar_ns.tracking.torso.body_blocks import BodyBlock
 from rgbavatar_ns.tracking.torso.body_mesh import NECK, BodyMesh
 from rgbavatar_ns.tracking.torso.follow import BodyFollower, BodySighting, FollowerState, MatteOf
-from rgbavatar_ns.tracking.torso.place import BodyPlaces, SeenShoulders, place_body
+from rgbavatar_ns.tracking.torso.place import ROUNDS, BodyPlaces, SeenShoulders, place_body
 from rgbavatar_ns.tracking.torso.shape import ShoulderLine, shoulder_line, shoulders_up_cm
 from rgbavatar_ns.tracking.torso.shoulders import ShoulderFinder
 from rgbavatar_ns.tracking.torso.shown import BodyShown, beside_share, body_shown, seen_cm2
@@ -41,19 +42,22 @@ def find_body(
     fit: ClipFit,
     found: ClipLandmarks,
     matte_of: MatteOf,
-    advance: Callable[[int], None],
+    clock: StageClock,
     block_frames: int = BLOCK_FRAMES,
 ) -> BodyPlaces:
     """Where the body under the fitted heads is in every frame.
 
-    `matte_of` gives the person's alpha of a picture. `advance` is told how many frames are done.
-    Each block of frames is a stage of `run`, and one that is done is not looked at again.
+    `matte_of` gives the person's alpha of a picture. The film is read in the clock's stage "body",
+    what was seen is put together in its stage "place". Each block of frames is a stage of `run`,
+    and one that is done is not looked at again.
     """
+    clock.begin("body", len(found))
     heads, identity = tracker.thetas(fit), fit.subject.identity
     body = BodyMesh.of(tracker.head, identity)
-    chains = [tracker.mesh_landmarks.chain(theta, identity) for theta in heads]
-    neck_m = np.array([chain.placed[NECK] for chain in chains])
-    reading = _Reading(tracker, fit, found, body, neck_m, matte_of, advance)
+    neck_m = np.array(
+        [tracker.mesh_landmarks.chain(theta, identity).placed[NECK] for theta in heads]
+    )
+    reading = _Reading(tracker, fit, found, body, neck_m, matte_of, clock.done)
     made_from = digest([repr(found.frame_index), heads, identity])
     blocks: list[BodyBlock] = []
     reads: Generator[BodyBlock, None, None] | None = None
@@ -62,12 +66,10 @@ def find_body(
     def look(key: str) -> str:
         nonlocal reads
         if reads is None:
-            advance(start)
+            clock.done(start)
             state = blocks[-1].state if blocks else FollowerState.before_the_first()
             reads = reading.blocks(source, start, state, block_frames)
-        # The matrices are small: more threads would only wait for each other.
-        with threadpool_limits(1):
-            block = next(reads)
+        block = next(reads)
         name = f"body_{key[:16]}.npz"
         block.save(run.folder / name)
         return name
@@ -80,14 +82,20 @@ def find_body(
     finally:
         if reads is not None:
             reads.close()
-    advance(len(found))
+    clock.done(len(found))
     seen, camera = BodyBlock.joined(blocks), fit.subject.camera
     beside = beside_share(seen.shown)
     # Who else is in the picture pulls at the shoulders that are found, also where no matte says so.
     shoulders = seen.shoulders if beside <= _OTHERS_SHARE else ()
-    with threadpool_limits(1):
-        places = place_body(body, camera, seen.sightings, neck_m, shoulders)
-        up_cm = shoulders_up_cm(body, camera, seen.lines, places.rotation)
+    clock.begin("place", len(found))
+    visits = count()
+
+    def visited() -> None:
+        clock.done(next(visits) // ROUNDS)
+
+    places = place_body(body, camera, seen.sightings, neck_m, shoulders, visited)
+    up_cm = shoulders_up_cm(body, camera, seen.lines, places.rotation)
+    clock.done(len(found))
     return replace(
         places,
         shoulders_up_cm=up_cm,

@@ -1,6 +1,6 @@
 """Where the body is in every frame, out of how it moves, where the head is, and the shoulders."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -28,7 +28,8 @@ _DOUBTED_YAW_RAD, _DOUBTED_ROLL_RAD = 0.2, 0.035
 # Where so much of the clothes looks otherwise, something is before them: folds are less.
 _COVERED = 0.05
 _LEAST_FRAMES = 10
-_ROUNDS = 5
+ROUNDS = 5
+"""How often each frame is visited."""
 
 
 @dataclass(frozen=True)
@@ -84,8 +85,11 @@ def place_body(
     sightings: Sequence[BodySighting],
     head_neck_m: Float[np.ndarray, "F 3"],
     shoulders: Sequence[SeenShoulders],
+    visited: Callable[[], None] = lambda: None,
 ) -> BodyPlaces:
     """The body's place in every frame; `head_neck_m` is where the heads say the neck's joint is.
+
+    `visited` is called at each of the `ROUNDS` visits of a frame.
 
     The clothes' pattern says how the body moves, never the head's turn. What they do not say is
     where it stood: upright and turned to the camera on the whole, unless the shoulders say plainly
@@ -101,7 +105,7 @@ def place_body(
         seen = [sightings[k] for k in own]
         motions, start, count = _Run(
             body, camera, seen, head_neck_m[own], near, int(own[0])
-        ).solved()
+        ).solved(visited)
         still &= all(motion is motions[0] for motion in motions)
         followed += count
         for motion, k in zip(motions, own):
@@ -131,7 +135,7 @@ class _Run:
     shoulders: Sequence[SeenShoulders]
     first: int
 
-    def solved(self) -> tuple[list[RigidMotion], RigidMotion, int]:
+    def solved(self, visited: Callable[[], None]) -> tuple[list[RigidMotion], RigidMotion, int]:
         """Motions since the first frame, where the body is in that, and in how many it was found.
 
         How far a turn moves points follows from how deep they lie, and that from how the body
@@ -139,8 +143,8 @@ class _Run:
         """
         start = RigidMotion(np.eye(3), self.neck_m[0] - self.body.neck_m)
         motions, count = [RigidMotion.none()] * len(self.sightings), 0
-        for _ in range(_ROUNDS):
-            found = run_motions(self.body, self.camera, self.sightings, start)
+        for _ in range(ROUNDS):
+            found = run_motions(self.body, self.camera, self.sightings, start, visited)
             pivot = start(self.body.neck_m)
             found = self._near_the_head(found, pivot)
             count = sum(motion is not None for motion in found)

@@ -1,6 +1,6 @@
 """The body's motion out of the points that were followed, once it is known how it stands."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -11,18 +11,23 @@ from rgbavatar_ns.tracking.torso.rigid_motion import LEAST_POINTS, RigidMotion, 
 
 
 def run_motions(
-    body: BodyMesh, camera: StillCamera, run: Sequence[BodySighting], start: RigidMotion
+    body: BodyMesh,
+    camera: StillCamera,
+    run: Sequence[BodySighting],
+    start: RigidMotion,
+    visited: Callable[[], None],
 ) -> list[RigidMotion | None]:
     """How the body moves from the first frame of a run to each; None where it was not found.
 
     `start` places the body at rest in the first frame: how deep points lie follows from it, and so
-    how far a turn carries them.
+    how far a turn carries them. `visited` is called at each frame.
     """
     motions: list[RigidMotion | None] = []
     last, pivot = RigidMotion.none(), start(body.neck_m)
     places_m, near, certainty = np.zeros((0, 3)), np.zeros(0, bool), np.zeros((0, 2, 2))
     first = None
     for sighting in run:
+        visited()
         if sighting.of_first and first is not None:
             places_m, near, certainty = first
         chosen = sighting.chosen_px

@@ -25,12 +25,19 @@ _SIDES, _NOSE_TIP = (234, 454), 4
 
 
 def write_tracking_sheet(
-    dst: Path, tracker: SubjectTracker, fit: ClipFit, found: ClipLandmarks, crop: SquareCrop
+    dst: Path,
+    tracker: SubjectTracker,
+    fit: ClipFit,
+    bare_px: Float[np.ndarray, "F L 2"],
+    found: ClipLandmarks,
+    crop: SquareCrop,
 ) -> None:
-    """`overlay.png` in the dataset `dst`, whose images are there."""
+    """`overlay.png` in the dataset `dst`, whose images are there.
+
+    `bare_px` are the tracker's fitted points without the subject's offsets.
+    """
     found_px = found.points_px[:, tracker.facemesh_index]
-    fitted_px = tracker.fitted_px(fit, with_offsets=False)
-    error = np.linalg.norm(fitted_px - found_px, axis=-1).mean(1)
+    error = np.linalg.norm(bare_px - found_px, axis=-1).mean(1)
     tiles = []
     for position, why in sheet_frames(found.points_px, error).items():
         index = found.frame_index[position]
@@ -41,7 +48,7 @@ def write_tracking_sheet(
                 crop.points(tracker.vertices_px(fit, position)),
                 tracker.head.arrays.faces,
                 crop.points(found_px[position]),
-                crop.points(fitted_px[position]),
+                crop.points(bare_px[position]),
             )
         )
     write_contact_sheet(dst / "overlay.png", tiles)

@@ -44,6 +44,7 @@ _RIM = 0.1
 def fit_quality(
     tracker: SubjectTracker,
     fit: ClipFit,
+    bare_px: Float[np.ndarray, "F L 2"],
     landmarks_px: Float[np.ndarray, "F 478 2"],
     irises: FoundIrises,
 ) -> dict[str, Any]:
@@ -51,14 +52,14 @@ def fit_quality(
 
     Errors are mean distances over all landmarks and frames: `reprojection` with the subject's
     constant landmark offsets, which is what the fit minimises, and `mesh` without them. Shares
-    are of the face's height (forehead to chin).
+    are of the face's height (forehead to chin). `bare_px` are the tracker's fitted points without
+    these offsets.
     """
     found = landmarks_px[:, tracker.facemesh_index]
     height = face_height_px(landmarks_px)
     fitted = tracker.fitted_px(fit)
-    bare = tracker.fitted_px(fit, with_offsets=False)
     error = np.linalg.norm(fitted - found, axis=-1).mean(1)
-    mesh_error = np.linalg.norm(bare - found, axis=-1).mean(1)
+    mesh_error = np.linalg.norm(bare_px - found, axis=-1).mean(1)
     gaps = {
         name: [mean_gap(points, tracker.facemesh_index, pairs) for points in (fitted, found)]
         for name, pairs in (("mouth", LIP_PAIRS), ("eyelid", LID_PAIRS))
