@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from rgbavatar_ns.kernels.functional import check_cameras
-from rgbavatar_ns.kernels.registry import MorphedRenderer, choose
+from rgbavatar_ns.kernels.registry import MorphedRenderer, PackedGaussians, choose
 from rgbavatar_ns.kernels.types import MorphedGaussians, PinholeCameras
 
 
@@ -36,3 +36,14 @@ def morphed_renderer(
     return choose(backend, tensor.device, tensor.dtype).morphed_renderer(
         gaussians, weights, vertices, cameras
     )
+
+
+def packed_gaussians(
+    gaussians: MorphedGaussians, backend: str = "auto"
+) -> PackedGaussians | None:
+    """The chosen backend's copy for pictures one after another; None where it has none.
+
+    Raises ValueError where there is no such backend.
+    """
+    tensor = gaussians.position
+    return choose(backend, tensor.device, tensor.dtype).packed_gaussians(gaussians)
