@@ -5,7 +5,7 @@ from rgbavatar_ns.kernels.functional import (
     rasterize,
     weighted_color_average,
 )
-from rgbavatar_ns.kernels.morphed import morphed_renderer, packed_gaussians
+from rgbavatar_ns.kernels.morphed import morphed_renderer, packed_gaussians, picture_renderer
 from rgbavatar_ns.kernels.registry import (
     DeviceRenderer,
     MorphedRenderer,
@@ -44,6 +44,7 @@ __all__ = [
     "available_backends",
     "morphed_renderer",
     "packed_gaussians",
+    "picture_renderer",
     "rasterize",
     "unavailable_backends",
     "weighted_color_average",

@@ -40,10 +40,15 @@ def native_gaussians(gaussians: MorphedGaussians) -> Any:
     return _native.Morphed(**tensors, variant=TANGENT_VARIANTS.index(gaussians.variant))
 
 
-def native_cameras(cameras: PinholeCameras) -> tuple[Any, ...]:
+def native_cameras(cameras: PinholeCameras) -> tuple[Tensor, Tensor, Tensor, int, int]:
     """Cameras as the arguments of a native session, from their tensors to the height."""
-    tensors = (cameras.world_to_camera, cameras.focal_px, cameras.principal_point_px)
-    return *(tensor.detach().contiguous() for tensor in tensors), cameras.width, cameras.height
+    return (
+        cameras.world_to_camera.detach().contiguous(),
+        cameras.focal_px.detach().contiguous(),
+        cameras.principal_point_px.detach().contiguous(),
+        cameras.width,
+        cameras.height,
+    )
 
 
 class CpuMorphedRenderer:

@@ -19,14 +19,10 @@ class CpuPackedGaussians:
     """See `kernels.registry.PackedGaussians`."""
 
     def __init__(self, gaussians: MorphedGaussians) -> None:
-        bases, triangles = gaussians.basis_position, gaussians.triangle_vertices
-        num_vertices = int(triangles.max()) + 1 if triangles.numel() else 0
-        new = gaussians.position.new_zeros
+        bases, new = gaussians.basis_position, gaussians.position.new_empty
+        weights, vertices = new(1, 0 if bases is None else len(bases)), new(1, 0, 3)
         self._packed = _native.Packed(
-            native_gaussians(gaussians),
-            new(1, 0 if bases is None else len(bases)),
-            new(1, num_vertices, 3),
-            torch.get_num_threads(),
+            native_gaussians(gaussians), weights, vertices, torch.get_num_threads()
         )
 
     @property
