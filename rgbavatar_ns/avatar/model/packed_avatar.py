@@ -10,7 +10,7 @@ from rgbavatar_ns.kernels import MorphedGaussians, PackedGaussians, packed_gauss
 class PackedAvatar:
     """Packs Gaussians when they are asked for a second time and have not changed since.
 
-    So what is trained is never packed between two steps. Copies and pickles of it are empty.
+    So what is trained is never packed between two steps. A copy of it is empty.
     """
 
     def __init__(self) -> None:
@@ -36,7 +36,3 @@ class PackedAvatar:
     def __deepcopy__(self, memo: object) -> "PackedAvatar":
         """Begin anew: a copy's tensors are others."""
         return PackedAvatar()
-
-    def __reduce__(self) -> tuple[type["PackedAvatar"], tuple[()]]:
-        """Begin anew in another process."""
-        return PackedAvatar, ()

@@ -32,6 +32,16 @@ uint16_t half_of(float x) {
   return uint16_t(sign | (bits + 0xfffu + (bits >> 13 & 1) - (112u << 23)) >> 13);
 }
 
+// As the loops have it: within what a float holds, and what is no number counts as the least.
+float exponential(float x) {
+  const float p = x * 1.4426950408889634f;
+  return std::exp2(p > -125.0f ? std::min(p, 125.0f) : -125.0f);
+}
+
+float opacity_of(const MorphedScene& scene, int64_t i) {
+  return 1.0f / (1.0f + exponential(-scene.opacity_logit[i]));
+}
+
 }  // namespace
 
 PackedGaussians::PackedGaussians(const MorphedScene& scene, int threads) : bases_(scene.bases) {
@@ -60,13 +70,11 @@ size_t PackedGaussians::bytes() const {
 // theirs with an error of their own, and have the last word near the cut.
 void PackedGaussians::choose(const MorphedScene& scene) {
   for (int i = 0; i < scene.count; ++i) {
-    const float opacity = 1.0f / (1.0f + std::exp(-scene.opacity_logit[i]));
-    float all = scene.opacity_logit[i];
-    for (int axis = 0; axis < 3; ++axis) all += scene.log_scale[int64_t(i) * 3 + axis] * 0.0f;
+    float all = 0.0f;
     for (int kind = 0; kind < kMorphedKinds; ++kind)
       for (int c = 0; c < kMorphedWidth[kind]; ++c)
         all += scene.base[kind][int64_t(i) * kMorphedWidth[kind] + c] * 0.0f;
-    drawn_[i] = opacity >= kMinAlpha * 0.9999f && is_finite(all);
+    drawn_[i] = opacity_of(scene, i) >= kMinAlpha * 0.9999f && is_finite(all);
   }
 }
 
@@ -99,9 +107,8 @@ void PackedGaussians::pack_block(const MorphedScene& scene, int block) {
     const int64_t i = chosen_[lane < lanes ? first + lane : first];
     const auto put = [&](int column, float value) { base[column * kPackedLanes + lane] = value; };
     for (int axis = 0; axis < 3; ++axis)
-      put(kPackedScale + axis, std::exp(scene.log_scale[i * 3 + axis]));
-    const float opacity = 1.0f / (1.0f + std::exp(-scene.opacity_logit[i]));
-    put(kPackedOpacity, lane < lanes ? opacity : 0.0f);
+      put(kPackedScale + axis, exponential(scene.log_scale[i * 3 + axis]));
+    put(kPackedOpacity, lane < lanes ? opacity_of(scene, i) : 0.0f);
     put(kPackedBarycentric, scene.barycentric[i * 3 + 1]);
     put(kPackedBarycentric + 1, scene.barycentric[i * 3 + 2]);
     triangle_[first + lane] = int32_t(scene.triangle_of[i]);
