@@ -61,12 +61,12 @@ def watch(words: list[str], log: Path) -> Watched:
             [str(_BIN / words[0]), *words[1:]], stdout=told, stderr=subprocess.STDOUT
         )
         handle = psutil.Process(process.pid)
-        ended: tuple[int, int, Any] = (0, 0, None)
-        while ended[0] == 0:
+        used: Any = None
+        pid = status = 0
+        while pid == 0:
             memory.sample(handle)
             time.sleep(_EVERY_S)
-            ended = os.wait4(process.pid, os.WNOHANG)
-    _, status, used = ended
+            pid, status, used = os.wait4(process.pid, os.WNOHANG)
     process.returncode = os.waitstatus_to_exitcode(status)
     if process.returncode:
         said = log.read_text(errors="replace")[-1500:]

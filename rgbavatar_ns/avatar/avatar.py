@@ -12,6 +12,7 @@ from rgbavatar_ns.avatar.config import AvatarConfig
 from rgbavatar_ns.avatar.method import AvatarMethod
 from rgbavatar_ns.avatar.model.anchors import GaussianAnchors
 from rgbavatar_ns.avatar.model.blendshapes import GaussianBlendshapes
+from rgbavatar_ns.avatar.model.packed_avatar import PackedAvatar
 from rgbavatar_ns.avatar.model.tangent_to_world import tangent_to_world
 from rgbavatar_ns.avatar.model.weight_network import WeightNetwork, softly_within
 from rgbavatar_ns.avatar.storage.stored_avatar import RGBAVATAR
@@ -21,9 +22,11 @@ from rgbavatar_ns.kernels import (
     GaussianSet,
     MorphedGaussians,
     MorphedRenderer,
+    PictureRenderer,
     PinholeCameras,
     RenderedBatch,
     morphed_renderer,
+    picture_renderer,
     rasterize,
 )
 from rgbavatar_ns.kernels.constants import MIN_ALPHA
@@ -88,6 +91,7 @@ class Avatar(AvatarMethod):
     ) -> None:
         config = AvatarConfig() if config is None else config
         super().__init__(head, identity, config)
+        self._packed = PackedAvatar()
         with torch.no_grad():
             rest_vertices = head(identity.new_zeros(self.layout.size), identity)
         if anchors is None:
@@ -206,14 +210,21 @@ class Avatar(AvatarMethod):
         with_depth: bool = False,
         with_visibility: bool = False,
         differentiable: bool = False,
+        to_be_seen: bool = False,
     ) -> RenderedBatch:
         """Draw a batch of theta; `psi` replaces the weight network's answer.
 
         Other options are those of `kernels.rasterize`. The picture carries no graph, unless it is
-        to be `differentiable`: the same numbers through autograd, in several times as long.
+        to be `differentiable`: the same numbers through autograd, in several times as long. One
+        picture that is only `to_be_seen` may come from Gaussians in half precision
+        (`kernels.PackedGaussians`), which are packed once the avatar is drawn again unchanged.
         """
         options: dict[str, Any] = {"with_depth": with_depth, "with_visibility": with_visibility}
         with nullcontext() if differentiable else torch.no_grad():
+            if to_be_seen and len(theta) == 1 and not (differentiable or with_visibility):
+                picture = self.picture_renderer(theta, cameras, psi, backend=backend)
+                if picture is not None:
+                    return picture.draw(background, with_depth=with_depth)
             renderer = None
             if not differentiable:
                 renderer = self.renderer(theta, cameras, psi, backend=backend)
@@ -242,6 +253,30 @@ class Avatar(AvatarMethod):
             weights = self.weights(theta) if psi is None else psi
             posed = self.carrier_vertices(theta) if vertices is None else vertices
         return morphed_renderer(self._morphed_gaussians(), weights, posed, cameras, backend)
+
+    def picture_renderer(
+        self,
+        theta: Float[Tensor, "1 H"],
+        cameras: PinholeCameras,
+        psi: Float[Tensor, "1 K"] | None = None,
+        vertices: Float[Tensor, "1 V 3"] | None = None,
+        *,
+        backend: str = "auto",
+    ) -> PictureRenderer | None:
+        """Return the backend's way to a picture that is to be seen; None where it has none.
+
+        Nor has it one the first time after the avatar has changed. Arguments and errors are those
+        of `renderer`.
+        """
+        gaussians = self._morphed_gaussians()
+        packed = self._packed.of(gaussians, backend)
+        if packed is None:
+            return None
+        theta = self.checked(theta)
+        with torch.no_grad():
+            weights = self.weights(theta) if psi is None else psi
+            posed = self.carrier_vertices(theta) if vertices is None else vertices
+        return picture_renderer(packed, gaussians, weights, posed, cameras)
 
     def _morphed_gaussians(self) -> MorphedGaussians:
         names = [field.name for field in fields(MorphedGaussians)]

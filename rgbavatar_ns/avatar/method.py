@@ -195,11 +195,13 @@ class AvatarMethod(nn.Module, ABC):
         with_depth: bool = False,
         with_visibility: bool = False,
         differentiable: bool = False,
+        to_be_seen: bool = False,
     ) -> RenderedBatch:
         """Draw a batch of theta; `psi` replaces the blendshape weights, where there are any.
 
         Other options are those of `kernels.rasterize`. The picture carries no graph, unless it is
-        to be `differentiable`.
+        to be `differentiable`. Where it is only `to_be_seen`, a method may draw it more quickly and
+        within 1/512.
         """
         if psi is not None and psi.shape[-1] > 0:
             raise ValueError(f"{self.method} has no blendshape weights. Leave out psi.")

@@ -1,6 +1,7 @@
 """`rgbavatar bench render`: from theta to the image, one image at a time."""
 
 from collections.abc import Callable
+from functools import partial
 from itertools import cycle
 from typing import Any
 
@@ -64,7 +65,10 @@ def _frames_in_turn(avatar: Avatar, batch: TrainingBatch) -> Callable[[], Any]:
     theta, camera = next(frames)
     # Where a device can take whole pictures by itself, that is how they are drawn in a row.
     recorded = supports(avatar, theta, camera)
-    draw = RecordedRendering(avatar, theta, camera) if recorded else avatar.render
+    if recorded:
+        draw = RecordedRendering(avatar, theta, camera)
+    else:
+        draw = partial(avatar.render, to_be_seen=True)
     return lambda: draw(*next(frames))
 
 
@@ -78,10 +82,12 @@ def _time_parts(workload: AvatarWorkload, stopwatch: Stopwatch) -> dict[str, Spr
         lap("head")
         psi = avatar.weights(theta)
         lap("network")
-        renderer = avatar.renderer(theta, camera, psi, vertices)
+        renderer = avatar.picture_renderer(theta, camera, psi, vertices)
+        if renderer is None:
+            renderer = avatar.renderer(theta, camera, psi, vertices)
         lap("prepare")
         assert renderer is not None
-        renderer.draw(background, with_depth=False, with_visibility=False)
+        renderer.draw(background, with_depth=False)
         lap("draw")
 
     parts = stopwatch.laps("parts", once)

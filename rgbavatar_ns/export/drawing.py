@@ -25,12 +25,15 @@ def draw(
     cameras: PinholeCameras,
     background: Color | None = None,
     psi: Float[Tensor, "B K"] | None = None,
+    *,
+    to_be_seen: bool = False,
 ) -> RenderedBatch:
-    """Draw a batch, without gradients; `psi` replaces the weight network's answer."""
+    """Draw a batch, without gradients; other options are those of `AvatarMethod.render`."""
     like = avatar.identity
     theta = theta.to(like)
     ground = like.new_tensor((0.0, 0.0, 0.0) if background is None else background)
-    return avatar.render(theta, cameras, ground, psi=None if psi is None else psi.to(like))
+    weights = None if psi is None else psi.to(like)
+    return avatar.render(theta, cameras, ground, psi=weights, to_be_seen=to_be_seen)
 
 
 def pictures(

@@ -56,7 +56,8 @@ class PictureOutput:
     @torch.no_grad()
     def show(self, frame: DrivenFrame) -> None:
         """Draw and hand on."""
-        drawn = draw(self._avatar, frame.theta[None], self._camera, self._background)
+        theta = frame.theta[None]
+        drawn = draw(self._avatar, theta, self._camera, self._background, to_be_seen=True)
         picture = to_uint8(drawn.image[0])
         if self._beside and frame.image_rgb is not None:
             picture = np.concatenate([self._performer(frame.image_rgb, picture), picture], axis=1)

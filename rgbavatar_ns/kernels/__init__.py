@@ -5,8 +5,14 @@ from rgbavatar_ns.kernels.functional import (
     rasterize,
     weighted_color_average,
 )
-from rgbavatar_ns.kernels.morphed import morphed_renderer
-from rgbavatar_ns.kernels.registry import DeviceRenderer, MorphedRenderer, unavailable_backends
+from rgbavatar_ns.kernels.morphed import morphed_renderer, packed_gaussians, picture_renderer
+from rgbavatar_ns.kernels.registry import (
+    DeviceRenderer,
+    MorphedRenderer,
+    PackedGaussians,
+    PictureRenderer,
+    unavailable_backends,
+)
 from rgbavatar_ns.kernels.types import (
     UPDATED_ATTRIBUTES,
     AdamParameter,
@@ -30,11 +36,15 @@ __all__ = [
     "MorphedGaussians",
     "MorphedGradient",
     "MorphedRenderer",
+    "PackedGaussians",
+    "PictureRenderer",
     "PinholeCameras",
     "RenderedBatch",
     "WeightedColors",
     "available_backends",
     "morphed_renderer",
+    "packed_gaussians",
+    "picture_renderer",
     "rasterize",
     "unavailable_backends",
     "weighted_color_average",

@@ -8,7 +8,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from rgbavatar_ns.kernels.functional import check_cameras
-from rgbavatar_ns.kernels.registry import MorphedRenderer, choose
+from rgbavatar_ns.kernels.registry import (
+    MorphedRenderer,
+    PackedGaussians,
+    PictureRenderer,
+    choose,
+)
 from rgbavatar_ns.kernels.types import MorphedGaussians, PinholeCameras
 
 
@@ -24,15 +29,48 @@ def morphed_renderer(
     Raises ValueError where there is no such backend, for weights and vertices that do not fit, and
     for cameras as `rasterize`.
     """
-    tensor, bases = gaussians.position, gaussians.basis_position
+    if _num_cameras(gaussians, weights, vertices, cameras) not in (1, len(weights)):
+        return None
+    tensor = gaussians.position
+    return choose(backend, tensor.device, tensor.dtype).morphed_renderer(
+        gaussians, weights, vertices, cameras
+    )
+
+
+def packed_gaussians(gaussians: MorphedGaussians, backend: str = "auto") -> PackedGaussians | None:
+    """The chosen backend's copy for pictures one after another; None where it has none.
+
+    Raises ValueError where there is no such backend.
+    """
+    tensor = gaussians.position
+    return choose(backend, tensor.device, tensor.dtype).packed_gaussians(gaussians)
+
+
+def picture_renderer(
+    packed: PackedGaussians,
+    gaussians: MorphedGaussians,
+    weights: Float[Tensor, "1 K"],
+    vertices: Float[Tensor, "1 V 3"],
+    cameras: PinholeCameras,
+) -> PictureRenderer:
+    """One picture of Gaussians that have been packed; raises ValueError as `morphed_renderer`."""
+    if _num_cameras(gaussians, weights, vertices, cameras) != 1 or len(weights) != 1:
+        raise ValueError("Packed Gaussians are drawn one picture at a time. Pass one camera.")
+    return packed.renderer(weights, vertices, cameras)
+
+
+def _num_cameras(
+    gaussians: MorphedGaussians,
+    weights: Float[Tensor, "B K"],
+    vertices: Float[Tensor, "B V 3"],
+    cameras: PinholeCameras,
+) -> int:
+    """How many cameras there are; raises ValueError where the parts do not fit one another."""
+    bases = gaussians.basis_position
     num_bases = 0 if bases is None else len(bases)
     if weights.shape[1] != num_bases or len(vertices) != len(weights):
         raise ValueError(
             f"weights are {list(weights.shape)} and vertices {list(vertices.shape)}. Pass "
             f"[B, {num_bases}] and [B, V, 3]."
         )
-    if check_cameras(tensor, cameras) not in (1, len(weights)):
-        return None
-    return choose(backend, tensor.device, tensor.dtype).morphed_renderer(
-        gaussians, weights, vertices, cameras
-    )
+    return check_cameras(gaussians.position, cameras)

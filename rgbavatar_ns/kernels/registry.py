@@ -130,6 +130,49 @@ class DeviceRenderer(MorphedRenderer, Protocol):
 
 
 @runtime_checkable
+class PictureRenderer(Protocol):
+    """One posed set of Gaussians, projected; for pictures alone."""
+
+    def draw(
+        self,
+        background: Float[Tensor, "3"] | Float[Tensor, "1 3"] | None = None,
+        *,
+        with_depth: bool = False,
+    ) -> RenderedBatch:
+        """As `rasterize`, without gradients."""
+        ...
+
+
+@runtime_checkable
+class PackedGaussians(Protocol):
+    """A copy of morphed Gaussians for pictures one after another.
+
+    Bases are in half precision and what no picture shows is left out, so that pictures are those
+    of the Gaussians to 1/512, but for single pixels where a Gaussian's edge falls to the other
+    side. It does not follow when the Gaussians change, and holds their memory meanwhile.
+    """
+
+    @property
+    def count(self) -> int:
+        """How many Gaussians a picture can show."""
+        ...
+
+    @property
+    def num_bytes(self) -> int:
+        """The memory that the copy takes."""
+        ...
+
+    def renderer(
+        self,
+        weights: Float[Tensor, "1 K"],
+        vertices: Float[Tensor, "1 V 3"],
+        cameras: PinholeCameras,
+    ) -> PictureRenderer:
+        """Prepare one picture."""
+        ...
+
+
+@runtime_checkable
 class Backend(Protocol):
     """What a rasterizer offers; shapes have been checked when its methods are called."""
 
@@ -164,6 +207,10 @@ class Backend(Protocol):
         cameras: PinholeCameras,
     ) -> MorphedRenderer | None:
         """As `morphed.morphed_renderer`; None where this backend has none."""
+        ...
+
+    def packed_gaussians(self, gaussians: MorphedGaussians) -> PackedGaussians | None:
+        """As `morphed.packed_gaussians`; None where this backend has none."""
         ...
 
 

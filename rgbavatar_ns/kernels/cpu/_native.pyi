@@ -14,10 +14,12 @@ class Gaussians:
         screen_offset: Tensor | None = None,
     ) -> None: ...
 
-class _Drawing:
+class PackedDrawing:
     def draw(
         self, background: Tensor, first: int, image: Tensor, alpha: Tensor, depth: Tensor | None
     ) -> None: ...
+
+class _Drawing(PackedDrawing):
     def average(
         self,
         images: Tensor | None,
@@ -102,4 +104,28 @@ class MorphedSession(_Drawing):
         groups: list[tuple[Tensor, Tensor, Tensor, tuple[float, ...]]],
         weight_gradient: Tensor,
         vertex_gradient: Tensor | None = None,
+    ) -> None: ...
+
+class Packed:
+    def __init__(
+        self, blended: Morphed, weights: Tensor, vertices: Tensor, threads: int
+    ) -> None: ...
+    @property
+    def count(self) -> int: ...
+    @property
+    def bytes(self) -> int: ...
+
+class PackedSession(PackedDrawing):
+    def __init__(
+        self,
+        packed: Packed,
+        weights: Tensor,
+        vertices: Tensor,
+        world_to_camera: Tensor,
+        focal_px: Tensor,
+        principal_point_px: Tensor,
+        width: int,
+        height: int,
+        threads: int,
+        instruction_set: str,
     ) -> None: ...

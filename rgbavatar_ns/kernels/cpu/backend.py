@@ -17,6 +17,7 @@ from rgbavatar_ns.kernels.cpu import (
     _native,  # pyright: ignore[reportMissingModuleSource]
 )
 from rgbavatar_ns.kernels.cpu.morphed import CpuMorphedRenderer
+from rgbavatar_ns.kernels.cpu.packed import CpuPackedGaussians
 from rgbavatar_ns.kernels.differentiable import (
     Drawn,
     Gradients,
@@ -153,6 +154,10 @@ class CpuBackend:
     ) -> CpuMorphedRenderer:
         """As `morphed.morphed_renderer`."""
         return CpuMorphedRenderer(gaussians, weights, vertices, cameras)
+
+    def packed_gaussians(self, gaussians: MorphedGaussians) -> CpuPackedGaussians:
+        """As `morphed.packed_gaussians`."""
+        return CpuPackedGaussians(gaussians)
 
 
 def load() -> CpuBackend:

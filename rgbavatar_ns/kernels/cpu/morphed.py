@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
+from torch.autograd.graph import increment_version
 
 from rgbavatar_ns.kernels.checks import check_average_images, check_sight, check_target_images
 from rgbavatar_ns.kernels.cpu import (
@@ -29,6 +30,27 @@ _BASE = ("position", "rotation_wxyz", "color_feature", "log_scale", "opacity_log
 _BASES = ("basis_position", "basis_rotation_wxyz", "basis_color_feature")
 
 
+def native_gaussians(gaussians: MorphedGaussians) -> Any:
+    """Morphed Gaussians as compiled code takes them; holds their memory."""
+    tensors: dict[str, Any] = {
+        name: None if value is None else value.detach().contiguous()
+        for name, value in vars(gaussians).items()
+        if name != "variant"
+    }
+    return _native.Morphed(**tensors, variant=TANGENT_VARIANTS.index(gaussians.variant))
+
+
+def native_cameras(cameras: PinholeCameras) -> tuple[Tensor, Tensor, Tensor, int, int]:
+    """Cameras as the arguments of a native session, from their tensors to the height."""
+    return (
+        cameras.world_to_camera.detach().contiguous(),
+        cameras.focal_px.detach().contiguous(),
+        cameras.principal_point_px.detach().contiguous(),
+        cameras.width,
+        cameras.height,
+    )
+
+
 class CpuMorphedRenderer:
     """See `kernels.morphed.MorphedRenderer`."""
 
@@ -43,20 +65,11 @@ class CpuMorphedRenderer:
         self._weights = weights.detach().contiguous()
         self._vertices = vertices.detach().contiguous()
         self._has_gradient = False
-        tensors: dict[str, Any] = {
-            name: None if value is None else value.detach().contiguous()
-            for name, value in vars(gaussians).items()
-            if name != "variant"
-        }
         self._session = _native.MorphedSession(
-            _native.Morphed(**tensors, variant=TANGENT_VARIANTS.index(gaussians.variant)),
+            native_gaussians(gaussians),
             self._weights,
             self._vertices,
-            cameras.world_to_camera.detach().contiguous(),
-            cameras.focal_px.detach().contiguous(),
-            cameras.principal_point_px.detach().contiguous(),
-            cameras.width,
-            cameras.height,
+            *native_cameras(cameras),
             torch.get_num_threads(),
             os.environ.get(INSTRUCTION_SET_VARIABLE, ""),
         )
@@ -138,6 +151,8 @@ class CpuMorphedRenderer:
         weights = torch.empty_like(self._weights)
         vertices = torch.empty_like(self._vertices) if with_vertices else None
         self._session.backward_adam(groups, weights, vertices)
+        if parameters is not None:  # what remembers a tensor asks torch whether it has changed
+            increment_version([parameters[name].value for name in names])
         return MorphedGradient(weights, vertices)
 
 

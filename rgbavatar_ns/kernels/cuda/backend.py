@@ -191,6 +191,10 @@ class CudaBackend:
             self.launcher(device), self.capacities(device), gaussians, weights, vertices, cameras
         )
 
+    def packed_gaussians(self, gaussians: MorphedGaussians) -> None:
+        """None: a GPU draws the Gaussians as they are."""
+        return None
+
 
 @functools.cache
 def _cuda_launcher(device: torch.device) -> Launcher:

@@ -98,6 +98,7 @@ def _draw(
         backend=backend,
         with_depth=True,
         with_visibility=state.centres,
+        to_be_seen=True,
     )
 
 

@@ -218,6 +218,8 @@ struct TrainingTarget {
   int64_t tile;
 };
 
+struct PackedScene;  // packed_layout.h
+
 // The loops, compiled once per instruction set.
 struct Kernels {
   // Projects Gaussians [begin, end) of an image.
@@ -253,6 +255,9 @@ struct Kernels {
   // [U, kFrameFloats].
   void (*mesh_gradient)(const MorphedScene&, int image, const float* carried,
                         float* frame_gradient, float* vertex_gradient);
+  // Morphs and projects the packed Gaussians [begin, end), whole blocks.
+  void (*project_packed)(const PackedScene&, const float* camera, int begin, int end,
+                         const Projected&);
 };
 
 // world_to_camera [4, 4], focal [2] and principal point [2] in one row of floats.

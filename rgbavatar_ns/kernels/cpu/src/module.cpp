@@ -12,7 +12,7 @@
 #include <optional>
 #include <tuple>
 
-#include "raster.h"
+#include "packed_drawing.h"
 
 namespace nb = nanobind;
 using namespace nb::literals;
@@ -80,11 +80,16 @@ struct Drawing {
                       pointer(weight_sum), max_weight.data(), threads);
   }
 
+  static void bind_draw(nb::class_<Drawing>& type) {
+    type.def("draw", &Drawing::draw, "background"_a.noconvert(), "first"_a,
+             "image"_a.noconvert(), "alpha"_a.noconvert(), "depth"_a.noconvert().none(),
+             nb::call_guard<nb::gil_scoped_release>());
+  }
+
   static void bind(nb::class_<Drawing>& type) {
     using Release = nb::call_guard<nb::gil_scoped_release>;
-    type.def("draw", &Drawing::draw, "background"_a.noconvert(), "first"_a,
-             "image"_a.noconvert(), "alpha"_a.noconvert(), "depth"_a.noconvert().none(), Release())
-        .def("average", &Drawing::average, "images"_a.noconvert().none(),
+    bind_draw(type);
+    type.def("average", &Drawing::average, "images"_a.noconvert().none(),
              "weighted_sum"_a.noconvert().none(), "weight_sum"_a.noconvert().none(),
              "max_weight"_a.noconvert(), Release());
   }
@@ -213,6 +218,30 @@ struct MorphedSession : Drawing<rgbavatar::MorphedRendering> {
   }
 };
 
+// Packed Gaussians; keeps what places them on the mesh.
+struct Packed {
+  Morphed mesh;
+  rgbavatar::PackedGaussians gaussians;
+
+  Packed(const Morphed& blended, const Input& weights, const Input& vertices, int threads)
+      : mesh(blended), gaussians(blended.scene(weights, vertices, 1, 1), threads) {}
+
+  size_t count() const { return gaussians.count(); }
+  size_t bytes() const { return gaussians.bytes(); }
+};
+
+// A PackedRendering.
+struct PackedSession : Drawing<rgbavatar::PackedRendering> {
+  PackedSession(const Packed& packed, const Input& weights, const Input& vertices,
+                const Input& world_to_camera, const Input& focal_px,
+                const Input& principal_point_px, int width, int height, int threads,
+                const std::string& instruction_set)
+      : Drawing{threads,
+                {packed.gaussians, packed.mesh.scene(weights, vertices, width, height),
+                 cameras(world_to_camera, focal_px, principal_point_px), instruction_set, threads}} {
+  }
+};
+
 nb::dict constants() {
   using C = BlendingConstants;
   nb::dict out;
@@ -288,4 +317,18 @@ NB_MODULE(_native, m) {
            "sight_images"_a = 0, "over_background"_a = false, Release())
       .def("backward_adam", &MorphedSession::backward_adam, "groups"_a, "weight_gradient"_a.noconvert(),
            "vertex_gradient"_a.noconvert().none() = nb::none(), Release());
+  nb::class_<Packed>(m, "Packed")
+      .def(nb::init<const Morphed&, const Input&, const Input&, int>(), "blended"_a,
+           "weights"_a.noconvert(), "vertices"_a.noconvert(), "threads"_a, Release())
+      .def_prop_ro("count", &Packed::count)
+      .def_prop_ro("bytes", &Packed::bytes);
+  nb::class_<Drawing<rgbavatar::PackedRendering>> packed_drawing(m, "PackedDrawing");
+  Drawing<rgbavatar::PackedRendering>::bind_draw(packed_drawing);
+  nb::class_<PackedSession, Drawing<rgbavatar::PackedRendering>>(m, "PackedSession")
+      .def(nb::init<const Packed&, const Input&, const Input&, const Input&, const Input&,
+                    const Input&, int, int, int, const std::string&>(),
+           "packed"_a, "weights"_a.noconvert(), "vertices"_a.noconvert(),
+           "world_to_camera"_a.noconvert(), "focal_px"_a.noconvert(),
+           "principal_point_px"_a.noconvert(), "width"_a, "height"_a, "threads"_a,
+           "instruction_set"_a, Release());
 }

@@ -57,12 +57,9 @@ struct FrameLanes {
   Wide ratio;
 };
 
-static RGBAVATAR_MEMBER FrameLanes load_frames(const MorphedScene& scene, int image, int first,
-                                               int lanes, const Vec3<Wide>& barycentric) {
-  const float* frames = scene.frames + int64_t(image) * scene.triangles * kFrameFloats;
-  const float* rows[kLanes];
-  for (int lane = 0; lane < kLanes; ++lane)
-    rows[lane] = frames + scene.triangle_of[first + (lane < lanes ? lane : 0)] * kFrameFloats;
+// Of rows of kFrameFloats, and the second and third barycentric coordinate.
+static RGBAVATAR_MEMBER FrameLanes frames_of_rows(const float* const rows[kLanes], const Wide& second,
+                                                  const Wide& third) {
   Wide c[kFrameFloats];
   for (int k = 0; k < kFrameFloats; k += 4)
     load_columns([&](int i) { return rows[i] + k; }, c + k);
@@ -72,8 +69,17 @@ static RGBAVATAR_MEMBER FrameLanes load_frames(const MorphedScene& scene, int im
           {c[3], c[4], c[5]},
           {c[6], c[7], c[8]},
           {c[9], c[10], c[11], c[12]},
-          add_scaled(add_scaled(corner, e1, barycentric.y), e2, barycentric.z),
+          add_scaled(add_scaled(corner, e1, second), e2, third),
           c[22]};
+}
+
+static RGBAVATAR_MEMBER FrameLanes load_frames(const MorphedScene& scene, int image, int first,
+                                               int lanes, const Vec3<Wide>& barycentric) {
+  const float* frames = scene.frames + int64_t(image) * scene.triangles * kFrameFloats;
+  const float* rows[kLanes];
+  for (int lane = 0; lane < kLanes; ++lane)
+    rows[lane] = frames + scene.triangle_of[first + (lane < lanes ? lane : 0)] * kFrameFloats;
+  return frames_of_rows(rows, barycentric.y, barycentric.z);
 }
 
 // ---- Morphing -----------------------------------------------------------------------------------
@@ -164,6 +170,21 @@ static void activate_chunk(const MorphedScene& scene, int begin, int count,
 
 constexpr float kColorScale = 0.28209479177387814f;  // of the zeroth spherical harmonic
 
+// Sixteen morphed Gaussians of a frame in the world, but for their opacities.
+static RGBAVATAR_MEMBER void to_world(const FrameLanes& f, const Vec3<Wide>& x,
+                                      const Wide rotation[4], const Vec3<Wide>& scale,
+                                      GaussianInput<Wide>& out) {
+  out.mean = {dot(f.row0, x) + f.origin.x, dot(f.row1, x) + f.origin.y,
+              dot(f.row2, x) + f.origin.z};
+  quat_product(f.quat, rotation, out.quat);
+  out.scale = scaled(scale, f.ratio);
+}
+
+static RGBAVATAR_MEMBER Vec3<Wide> color_of_feature(const Vec3<Wide>& feature) {
+  return {feature.x * kColorScale + 0.5f, feature.y * kColorScale + 0.5f,
+          feature.z * kColorScale + 0.5f};
+}
+
 struct WorldLanes {
   Vec3<Wide> position;  // in the tangent frame, like the rotation
   Wide rotation[4];
@@ -181,20 +202,13 @@ static RGBAVATAR_MEMBER WorldLanes world_lanes(const MorphedScene& scene, int im
   WorldLanes out;
   const Vec3<Wide> barycentric = load_vec3(scene.barycentric, begin + first, lanes);
   out.frame = load_frames(scene, image, begin + first, lanes, barycentric);
-  const FrameLanes& f = out.frame;
   out.position = load_vec3(tangent(0), first, kLanes);
   load_quats(tangent(1), first, kLanes, out.rotation);
-  const Vec3<Wide>& x = out.position;
-  const Vec3<Wide> feature = load_vec3(tangent(2), first, kLanes);
-  out.gaussian.mean = {dot(f.row0, x) + f.origin.x, dot(f.row1, x) + f.origin.y,
-                       dot(f.row2, x) + f.origin.z};
-  quat_product(f.quat, out.rotation, out.gaussian.quat);
-  out.gaussian.scale = {load_wide(scratch.scale[0] + first) * f.ratio,
-                        load_wide(scratch.scale[1] + first) * f.ratio,
-                        load_wide(scratch.scale[2] + first) * f.ratio};
+  const Vec3<Wide> scale = {load_wide(scratch.scale[0] + first), load_wide(scratch.scale[1] + first),
+                            load_wide(scratch.scale[2] + first)};
+  to_world(out.frame, out.position, out.rotation, scale, out.gaussian);
   out.gaussian.opacity = load_wide(scratch.opacity + first);
-  out.color = {feature.x * kColorScale + 0.5f, feature.y * kColorScale + 0.5f,
-               feature.z * kColorScale + 0.5f};
+  out.color = color_of_feature(load_vec3(tangent(2), first, kLanes));
   return out;
 }
 

@@ -117,20 +117,29 @@ class Rendering {
   Rendering(int batch, int count, int width, int height, const Cameras& cameras,
             const std::string& instruction_set);
   void sort(class Team& team);
+  void make_room_for_entries();
+  // How many of a part's Gaussians touch each tile; once for each part of the image.
+  void count_part(int image, int part);
+  // What was counted goes into tiles, and each Gaussian's slots are laid out unless no sums follow.
+  void put_into_tiles(class Team& team, bool with_slots);
+  void sort_tile(int image, int tile, int thread);
+  int parts_per_image() const;
   void lay_out_slots(int width);
   void make_scratch(int threads);
   Tile tile(int image, int index) const;
   int tiles_per_image() const { return tiles_x_ * tiles_y_; }
+
+  // Gaussians that one thread puts into tiles at a time; a multiple of the SIMD lanes.
+  static constexpr int kPart = 4096;
 
   int batch_, count_, width_, height_, tiles_x_, tiles_y_;
   const Kernels* kernels_;
   std::unique_ptr<Workspace> workspace_;
 
  private:
-  int parts_per_image() const;
   uint32_t* part_start(int image, int part);
-  void count_part(int image, int part);
   void lay_out_entries(int image);
+  template <bool kWithSlots>
   void fill_part(int image, int part);
 };
 

@@ -10,9 +10,6 @@ namespace rgbavatar {
 
 namespace {
 
-// Gaussians that one thread puts into tiles at a time.
-constexpr int kPart = 8192;
-
 // Sorts keys by their upper half, keeping the order of equal ones. Only the bits that differ from
 // the smallest key are sorted: within a tile that a head's Gaussians touch, two or three passes.
 void radix_sort(uint64_t* keys, uint64_t* spare, size_t count) {
@@ -79,6 +76,17 @@ uint32_t* Rendering::part_start(int image, int part) {
 // First into tiles, in the order of memory, which is often that of the surface; then front to back
 // within each tile, whose entries lie in the nearest cache.
 void Rendering::sort(Team& team) {
+  make_room_for_entries();
+  const int tiles = tiles_per_image(), parts = parts_per_image();
+  team.run(int64_t(batch_) * parts,
+           [&](int64_t item, int) { count_part(int(item / parts), int(item % parts)); });
+  put_into_tiles(team, true);
+  team.run(int64_t(batch_) * tiles, [&](int64_t item, int thread) {
+    sort_tile(int(item / tiles), int(item % tiles), thread);
+  });
+}
+
+void Rendering::make_room_for_entries() {
   Workspace& w = *workspace_;
   const int tiles = tiles_per_image(), parts = parts_per_image();
   w.slot_offset.reserve(size_t(batch_) * (count_ + 1));
@@ -87,8 +95,11 @@ void Rendering::sort(Team& team) {
   w.part_start.reserve(size_t(batch_) * parts * (tiles + 1));
   w.part_slots.reserve(size_t(batch_) * parts);
   if (int(w.entries.size()) < batch_) w.entries.resize(batch_);
-  team.run(int64_t(batch_) * parts,
-           [&](int64_t item, int) { count_part(int(item / parts), int(item % parts)); });
+}
+
+void Rendering::put_into_tiles(Team& team, bool with_slots) {
+  Workspace& w = *workspace_;
+  const int tiles = tiles_per_image(), parts = parts_per_image();
   w.slot_start[0] = 0;
   for (int image = 0; image < batch_; ++image) {
     const size_t* slots = w.part_slots.data() + size_t(image) * parts;
@@ -102,8 +113,10 @@ void Rendering::sort(Team& team) {
     w.entries[image].reserve(total + 1);  // `none` writes behind the last one
   }
   team.run(batch_, [&](int64_t image, int) { lay_out_entries(int(image)); });
-  team.run(int64_t(batch_) * parts,
-           [&](int64_t item, int) { fill_part(int(item / parts), int(item % parts)); });
+  team.run(int64_t(batch_) * parts, [&](int64_t item, int) {
+    const int image = int(item / parts), part = int(item % parts);
+    with_slots ? fill_part<true>(image, part) : fill_part<false>(image, part);
+  });
   w.most_entries = 0;
   for (int image = 0; image < batch_; ++image) {
     const uint32_t* start = &w.tile_start[size_t(image) * (tiles + 1)];
@@ -111,15 +124,15 @@ void Rendering::sort(Team& team) {
       w.most_entries = std::max(w.most_entries, start[tile + 1] - start[tile]);
   }
   w.sort_keys.reserve(size_t(team.size()) * w.most_entries);
-  team.run(int64_t(batch_) * tiles, [&](int64_t item, int thread) {
-    const int image = int(item / tiles), tile = int(item % tiles);
-    const uint32_t* start = &w.tile_start[size_t(image) * (tiles + 1) + tile];
-    radix_sort(w.entries[image].data() + start[0],
-               w.sort_keys.data() + size_t(thread) * w.most_entries, start[1] - start[0]);
-  });
 }
 
-// How many of a part's Gaussians touch each tile.
+void Rendering::sort_tile(int image, int tile, int thread) {
+  Workspace& w = *workspace_;
+  const uint32_t* start = &w.tile_start[size_t(image) * (tiles_per_image() + 1) + tile];
+  radix_sort(w.entries[image].data() + start[0],
+             w.sort_keys.data() + size_t(thread) * w.most_entries, start[1] - start[0]);
+}
+
 void Rendering::count_part(int image, int part) {
   const Projected& from = workspace_->projected[image];
   uint32_t* counts = part_start(image, part);
@@ -148,7 +161,8 @@ void Rendering::lay_out_entries(int image) {
   for (int part = 0; part < parts; ++part) part_start(image, part)[tiles] = total;
 }
 
-// Writes a part's entries, and where its Gaussians' slots begin.
+// Writes a part's entries, and where its Gaussians' slots begin where that is asked for.
+template <bool kWithSlots>
 void Rendering::fill_part(int image, int part) {
   Workspace& w = *workspace_;
   const Projected& from = w.projected[image];
@@ -161,8 +175,10 @@ void Rendering::fill_part(int image, int part) {
   for (int i = 0; i < part; ++i) slot += slots[i];
   const int end = std::min((part + 1) * kPart, count_);
   for (int i = part * kPart; i < end; ++i) {
-    slot_offset[i] = from.splats[i].first_slot = uint32_t(slot);
-    from.splats[i].index = uint32_t(i);
+    if (kWithSlots) {
+      slot_offset[i] = from.splats[i].first_slot = uint32_t(slot);
+      from.splats[i].index = uint32_t(i);
+    }
     uint32_t depth_bits;  // of a positive float: ordered like the float
     std::memcpy(&depth_bits, &from.depth[i], sizeof depth_bits);
     const uint64_t entry = uint64_t(depth_bits) << 32 | uint32_t(i);
@@ -171,7 +187,7 @@ void Rendering::fill_part(int image, int part) {
       start[tile] += tile != none;
     });
   }
-  if (end == count_) slot_offset[count_] = uint32_t(slot);
+  if (kWithSlots && end == count_) slot_offset[count_] = uint32_t(slot);
 }
 
 }  // namespace rgbavatar
