@@ -35,7 +35,11 @@ class ImageSource(Protocol):
 
 
 class ImageCache:
-    """Images of a dataset as uint8, the most recently used kept as long as the budget allows.
+    """Images of a dataset as uint8, as many as the budget allows.
+
+    Where they are more, the one that was read last gives way: training shows every frame once an
+    epoch, so that one comes again latest. Of a film that is twice too long half the images stay;
+    where the least recently used gave way, nearly all would be decoded anew each time.
 
     Safe to use from several threads. A batch that `get` hands out is the caller's own and does
     not count; everything the cache holds, images still being decoded included, does.
@@ -101,17 +105,19 @@ class ImageCache:
         return future
 
     def _make_room(self, keep_unread: bool) -> bool:
-        """Drop the least recently used image where the budget is full; say if one more fits."""
+        """Give up the image that was read last where the budget is full; say if one more fits."""
         if len(self._images) < self._capacity:
             return True
-        candidates = (p for p in self._images if not (keep_unread and p in self._unread))
-        oldest = next(candidates, None)
-        if oldest is None:
-            return False
-        dropped = self._images.pop(oldest)
-        if oldest in self._unread:  # else somebody may be waiting for it
+        newest_first = reversed(self._images)
+        given_up = next((p for p in newest_first if p not in self._unread), None)
+        if given_up is None:
+            if keep_unread or not self._images:
+                return False
+            given_up = next(reversed(self._images))
+        dropped = self._images.pop(given_up)
+        if given_up in self._unread:  # else somebody may be waiting for it
             dropped.cancel()
-            self._unread.discard(oldest)
+            self._unread.discard(given_up)
         return True
 
     def _forget_failures(self) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from rgbavatar_ns.data import ImageCache
+from rgbavatar_ns.data import ImageCache, OfflineOrder
 from rgbavatar_ns.errors import UserError
 from tests.data.small_dataset import HEIGHT, WIDTH, noise_image, small_dataset
 from tests.data.streaming import until
@@ -54,14 +54,30 @@ def test_images_come_in_the_order_asked_for(tmp_path, head, make_cache):
         assert np.array_equal(image.numpy(), noise_image(index))
 
 
-def test_the_least_recently_used_image_gives_way(make_cache):
+def test_what_was_read_last_gives_way(make_cache):
     dataset = CountingDataset()
     cache = make_cache(dataset, 2)
-    for position in (0, 1, 0, 2, 0):
+    for position in (0, 1, 2, 0):
         cache.get([position])
     assert dataset.reads == [0, 1, 2]
     cache.get([1])
     assert dataset.reads == [0, 1, 2, 1]
+
+
+@pytest.mark.parametrize("kept", [0.25, 0.5, 0.8])
+def test_of_a_film_beyond_the_budget_what_fits_is_not_decoded_again(make_cache, kept):
+    """Over epochs that show every frame once, in an order of their own, as training has them."""
+    frames, epochs, ahead = 200, 6, 2
+    dataset, order = CountingDataset(), OfflineOrder(range(frames), 10, seed=0)
+    cache = make_cache(dataset, kept * frames)
+    steps = frames * epochs // 10
+    for step in range(steps):
+        cache.get(order.batch(step))
+        for later in range(step + 1, min(step + 1 + ahead, steps)):
+            cache.prefetch(order.batch(later))
+    anew = (len(dataset.reads) - frames) / (frames * (epochs - 1))
+    # Frames on their way and the border of two epochs cost a little.
+    assert anew < 1 - kept + 0.1
 
 
 @pytest.mark.parametrize("images", [0, 0.9, 1, 2.5, 4])
