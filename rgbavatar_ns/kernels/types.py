@@ -5,7 +5,7 @@ coordinates are pixels with the centre of the first pixel at (0.5, 0.5).
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Literal
 
 import torch
@@ -112,7 +112,7 @@ SIGHT_UNIT = 2.0**-32
 """What 1 stands for in `FirstSight.sums`."""
 
 
-@dataclass(frozen=True)
+@dataclass
 class FirstSight:
     """What a training step's pictures show of the Gaussians that wait for their first colour.
 
@@ -121,8 +121,8 @@ class FirstSight:
     units of `SIGHT_UNIT`: whole numbers, whose sums are the same in any order. Only the first
     `num_images` pictures count. Counted is the weight times the picture's matte, or with
     `over_background` the weight, and the colour then that of the picture over its background. What
-    no pixel shows with a weight above `threshold` may be passed over. `shown` receives the rows
-    that were filled, where the backend knows them without waiting for a device: on a CPU.
+    no pixel shows with a weight above `threshold` may be passed over. A backend that knows the rows
+    it filled without waiting for a device leaves them in `shown`, None at first.
     """
 
     known: Bool[Tensor, "N"]
@@ -130,7 +130,7 @@ class FirstSight:
     num_images: int
     threshold: float = 0.0
     over_background: bool = False
-    shown: list[int] = field(default_factory=list)
+    shown: list[int] | None = None
 
 
 TANGENT_VARIANTS = ("normalized", "raw", "orthonormal")

@@ -43,7 +43,7 @@ def test_what_is_shown_is_the_avatars_picture():
     for k, row in enumerate(theta):
         output.show(_frame(k, row))
     for drawn, wanted in zip(kept.pictures, pictures(avatar, theta, camera, _WHITE)):
-        assert np.array_equal(drawn, wanted)
+        assert np.abs(drawn.astype(int) - wanted).max() <= 1, "to the eye: one of 255 levels"
     assert output.latencies.shown == 3
 
 

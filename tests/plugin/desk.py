@@ -26,6 +26,7 @@ class Desk:
         self.panel.attach(self.viewer)
         browser = SimpleNamespace(client=None, action=self.asked.append)
         self.viewer.render_statemachines[0] = browser
+        self.white(self.model.frame_theta[:1])  # packs the Gaussians: all pictures are of one kind
 
     def set(self, label: str, value: Any) -> None:
         self.viewer.gui[label].user_sets(value)
@@ -54,6 +55,11 @@ class Desk:
 
 
 @torch.no_grad()
-def rendered(avatar: Avatar, theta: torch.Tensor, camera: Cameras, white=False, psi=None):
-    ground = torch.ones(3) if white else torch.zeros(3)
-    return avatar.render(theta, from_nerfstudio(camera), ground, psi=psi).image[0].clamp(0, 1)
+def rendered(
+    avatar: Avatar, theta: torch.Tensor, camera: Cameras, white=False, psi=None, *, to_be_seen=True
+) -> torch.Tensor:
+    """As the avatar is seen from its second picture on, or as it is measured."""
+    ground, pinhole = torch.full((3,), float(white)), from_nerfstudio(camera)
+    for _ in range(2):
+        drawn = avatar.render(theta, pinhole, ground, psi=psi, to_be_seen=to_be_seen)
+    return drawn.image[0].clamp(0, 1)

@@ -18,7 +18,8 @@ def test_film_avatar_and_error_stand_in_a_row(desk: Desk, pipeline: RGBAvatarPip
     truth = rgba[..., :3] * rgba[..., 3:]
     assert torch.allclose(row[:, :SIZE], truth, atol=1e-6)
     camera = pipeline.datamanager.dataparser.tracked.cameras.select([4])
-    avatar = desk.model.avatar.render(desk.model.frame_theta[4:5], camera).image[0]
+    theta = desk.model.frame_theta[4:5]
+    avatar = desk.model.avatar.render(theta, camera, to_be_seen=True).image[0]
     assert torch.allclose(row[:, SIZE : 2 * SIZE], avatar.clamp(0, 1), atol=1e-5)
     # The error is bright where the two differ most.
     error, difference = row[:, 2 * SIZE :].sum(-1), (avatar - truth).abs().mean(-1)

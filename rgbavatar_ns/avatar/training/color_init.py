@@ -62,16 +62,17 @@ class FirstColors:
         """What a step is to sum over the first `num_images` of its pictures.
 
         None where no Gaussian waits, which is not asked of a GPU: the question would stop it. What
-        it is summed in is the same memory each time, of which a CPU clears what it filled.
+        it is summed in is the same memory each time, cleared where it was filled.
         """
         known = self._avatar.color_initialized
         if self._sums is None or self._sums.device != known.device:
             size = (len(known), SIGHT_SUMS)
-            self._sums, self._last = torch.zeros(size, dtype=torch.int64).to(known.device), None
-        if known.device.type != "cpu":
-            self._sums.zero_()
-        elif known.numpy().all():
+            self._sums = torch.zeros(size, dtype=torch.int64, device=known.device)
+            self._last = None
+        if known.device.type == "cpu" and known.numpy().all():
             return None
+        if self._last is not None and self._last.shown is None:
+            self._sums.zero_()
         elif self._last is not None:
             self._sums.numpy()[self._last.shown] = 0
         over_background = self._kind == "paper"
@@ -107,8 +108,8 @@ class FirstColors:
         """
         avatar = self._avatar
         if isinstance(seen, FirstSight):
-            if seen.sums.device.type == "cpu":
-                return self._give_few(seen)
+            if seen.shown is not None:
+                return self._give_few(seen.sums.numpy(), np.array(seen.shown, np.int64))
             seen = seen.sums * SIGHT_UNIT
         feature = avatar.blendshapes.color_feature
         given = is_seen_well(seen) & ~avatar.color_initialized
@@ -118,15 +119,14 @@ class FirstColors:
         first = feature_from_color(mean_color(seen)).to(feature)
         feature.copy_(torch.where(given[:, None], first, feature))
 
-    def _give_few(self, sight: FirstSight) -> None:
-        """As `give`, of the few that a step on a CPU shows first.
+    def _give_few(self, sums: np.ndarray, rows: np.ndarray) -> None:
+        """As `give`, of the few rows that a step on a CPU shows first.
 
         Numpy, because twenty of torch's calls cost as much as a hundredth of the step.
         """
-        if not sight.shown:
+        if len(rows) == 0:
             return
-        avatar, rows = self._avatar, np.array(sight.shown)
-        seen = sight.sums.numpy()[rows] * SIGHT_UNIT
+        avatar, seen = self._avatar, sums[rows] * SIGHT_UNIT
         well = is_seen_well(seen)
         rows, seen = rows[well], seen[well]
         avatar.color_initialized.index_fill_(0, torch.from_numpy(rows), True)

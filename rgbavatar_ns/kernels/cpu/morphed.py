@@ -136,7 +136,7 @@ class CpuMorphedRenderer:
             images_rgba.contiguous(), background.detach().contiguous(), **seen
         )
         if sight is not None:
-            sight.shown.extend(shown)
+            sight.shown = shown
         return self._weights.new_tensor(loss)
 
     def backward_adam(
