@@ -15,11 +15,14 @@ from rgbavatar_ns.files import Stages, write_json
 from rgbavatar_ns.options import Between, Count, Seed
 
 Result = dict[str, Any]
-METHOD = "rgbavatar-tiny"
-HELD_OUT_STEPS = 40
-"""Steps of fitting a video's held-out frames, for the score that looks at their images."""
+TINY, FULL = "rgbavatar-tiny", "rgbavatar-quick"
+HELD_OUT_STEPS, HELD_OUT_FRAMES = 40, 24
+"""Steps of fitting a video's held-out frames, for the score that looks at their images, and how
+many at most are fitted."""
 
 _SIZE_PX = 256
+_TINY_PX, _TINY_HEAD_PX = 384, 256
+"""Pixels of a small avatar's images, with a body and without."""
 
 
 def run(
@@ -28,6 +31,7 @@ def run(
     frames: Annotated[int, Between(2, 100_000)] = 240,
     image_size: Annotated[int, Between(16, 4096)] | None = None,
     head_only: bool = False,
+    tiny: bool = False,
     steps: Count | None = None,
     seed: Seed = 0,
     fresh: bool = False,
@@ -40,9 +44,13 @@ def run(
         video: your own video (several clips of one person may be given) in place of the demo
             subject.
         frames: frames of the demo subject; its last quarter is held out.
-        image_size: width and height of the images in pixels; by default the head has 256.
+        image_size: width and height of the images in pixels; by default 256 for the demo subject
+            and up to 512, as many as the film has, for a video.
         head_only: track the head of a video without its body.
-        steps: training steps; by default those of the method rgbavatar-tiny.
+        tiny: for a slow machine, an avatar of a quarter of the Gaussians from smaller images of
+            your video, in half the time; the demo subject's is always so.
+        steps: training steps; by default those of the method, rgbavatar-quick for a video, else
+            rgbavatar-tiny.
         seed: of the demo subject and of the training.
         fresh: do every stage again, also those that are done.
         started_at: Unix time from which total_seconds counts; now by default.
@@ -55,7 +63,10 @@ def run(
         output = Path("outputs") / (video[0].stem if video else "demo")
     output = output.resolve()
     stages = Stages(output, fresh=fresh, tell=_tell_stage)
+    method = FULL if video and not tiny else TINY
     if video:
+        if tiny and image_size is None:
+            image_size = _TINY_HEAD_PX if head_only else _TINY_PX
         settings: dict[str, Any] = {"video": [_fingerprint(clip) for clip in video]}
         settings |= {"image_size": image_size, "head_only": head_only}
         data = stages.run(
@@ -69,8 +80,8 @@ def run(
     folder = Path(data["data"])
     trained = stages.run(
         "train",
-        {"steps": steps, "seed": seed, "refine_tracking": bool(video)},
-        lambda key: _train(folder, output, key, steps, seed, refine_tracking=bool(video)),
+        {"method": method, "steps": steps, "seed": seed, "refine_tracking": bool(video)},
+        lambda key: _train(folder, output, key, method, steps, seed, refine_tracking=bool(video)),
     )
     run_folder = Path(trained["run"])
     scores = stages.run(
@@ -129,16 +140,24 @@ def _track(
 
 
 def _train(
-    data: Path, output: Path, key: str, steps: int | None, seed: int, *, refine_tracking: bool
+    data: Path,
+    output: Path,
+    key: str,
+    method: str,
+    steps: int | None,
+    seed: int,
+    *,
+    refine_tracking: bool,
 ) -> Result:
-    run_folder = output / "runs" / "demo" / METHOD / key
+    run_folder = output / "runs" / "demo" / method / key
     options: list[str] = []
     if refine_tracking:
         options += ["--pipeline.model.refine-tracking", "True"]
         options += ["--pipeline.model.refine-held-out", str(HELD_OUT_STEPS)]
+        options += ["--pipeline.model.refine-held-out-frames", str(HELD_OUT_FRAMES)]
     if steps is not None:
         options += ["--max-num-iterations", str(steps)]
-    facts = commands.train(METHOD, data, run_folder, seed, options)
+    facts = commands.train(method, data, run_folder, seed, options)
     return {
         "run": str(run_folder),
         "train_seconds": facts["train_seconds"],

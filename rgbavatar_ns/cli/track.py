@@ -59,7 +59,7 @@ def run(
         console.print(f"note: {note}")
     print(f"{len(dataset.train)} frames to train on, {len(dataset.test)} held out, in {dst}")
     print(f"Look at {dst / 'overlay.png'}: the mesh should lie on the face.")
-    print(f"Then: ns-train rgbavatar-tiny --data {dst}")
+    print(f"Then: ns-train rgbavatar-quick --data {dst}")
 
 
 def summary_table(report: Mapping[str, Any]) -> Table:

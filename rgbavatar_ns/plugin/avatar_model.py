@@ -47,6 +47,8 @@ class AvatarModelConfig(ModelConfig):
     refine_held_out: Counted = 0
     """Steps of fitting held-out frames to their images with the avatar frozen; `ns-eval` then
     reports psnr_refined and others beside the plain ones. 0 leaves it out."""
+    refine_held_out_frames: Counted = 0
+    """So many of them, evenly spread, where fitting all would take too long; 0 fits all."""
     refinement: RefinementConfig = field(default_factory=RefinementConfig)
     """How far and how quickly tracking is corrected."""
     rasterizer: str = "auto"

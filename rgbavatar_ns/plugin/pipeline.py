@@ -156,10 +156,11 @@ class RGBAvatarPipeline(VanillaPipeline):
         """Means over held-out frames whose theta was fitted to the image, the avatar frozen."""
         tracked, model = self.datamanager.dataparser.tracked, self.config.model
         size, scores = self.datamanager.config.batch_size, defaultdict[str, list[float]](list)
-        positions = list(tracked.test)
-        for first in track(range(0, len(positions), size), "Fitting held-out frames..."):
-            chosen = positions[first : first + size]
-            rows = torch.arange(first, first + len(chosen))
+        count = len(tracked.test)
+        fitted = min(model.refine_held_out_frames or count, count)
+        every = torch.linspace(0, count - 1, fitted).round().long()
+        for rows in track(every.split(size), "Fitting held-out frames..."):
+            chosen = [tracked.test[row] for row in rows.tolist()]
             cameras = self.datamanager.eval_dataset.cameras[rows].to(self.device)
             pinhole = from_nerfstudio(cameras)
             images = self.datamanager.image_cache.get(chosen).to(self.device)

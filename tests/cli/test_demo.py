@@ -5,6 +5,7 @@ import av
 import cv2
 import pytest
 
+from rgbavatar_ns.cli import demo
 from rgbavatar_ns.cli.main import main
 
 OPTIONS = ["--frames", "12", "--image-size", "48", "--steps", "12"]
@@ -36,3 +37,38 @@ def test_demo_goes_from_nothing_to_a_film_and_the_second_time_only_tells(tmp_pat
     again = json.loads((tmp_path / "summary.json").read_text())
     assert again["psnr"] == summary["psnr"]
     assert again["total_seconds"] < summary["total_seconds"]
+
+
+@pytest.mark.parametrize(
+    ("options", "method", "size"),
+    [
+        ([], "rgbavatar-quick", None),
+        (["--tiny"], "rgbavatar-tiny", 384),
+        (["--tiny", "--head-only"], "rgbavatar-tiny", 256),
+        (["--tiny", "--image-size", "320"], "rgbavatar-tiny", 320),
+    ],
+)
+def test_a_video_is_made_sharp_and_small_when_asked_for(
+    tmp_path, monkeypatch, options, method, size
+):
+    asked = {}
+
+    def track(video, destination, image_size, head_only):
+        asked["size"] = image_size
+        return {"data": str(destination)}
+
+    def train(method, data, run_folder, seed, options):
+        asked["method"], asked["options"] = method, options
+        return {"train_seconds": 1.0, "images_per_second": 1.0}
+
+    scores = {"psnr": 30.0, "psnr_head": 30.0, "ssim": 0.9}
+    shown = {"frames": 1, "video": "film", "picture": "picture"}
+    monkeypatch.setattr(demo, "_track", track)
+    monkeypatch.setattr(demo.commands, "train", train)
+    monkeypatch.setattr(demo.commands, "evaluate", lambda *given: scores)
+    monkeypatch.setattr(demo, "_film", lambda *given: shown)
+    clip = tmp_path / "me.mp4"
+    clip.touch()
+    main(["demo", "--video", str(clip), "--output", str(tmp_path / "out"), *options])
+    assert (asked["method"], asked["size"]) == (method, size)
+    assert "--pipeline.model.refine-tracking" in asked["options"]

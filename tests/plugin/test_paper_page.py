@@ -16,7 +16,7 @@ from rgbavatar_ns.plugin.presets import presets
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "paper.md").read_text()
 PRESETS: dict[str, Any] = dict(presets())
-OFFLINE = ("rgbavatar-paper", "rgbavatar", "rgbavatar-tiny")
+OFFLINE = ("rgbavatar-paper", "rgbavatar", "rgbavatar-quick", "rgbavatar-tiny")
 ONLINE = ("rgbavatar-paper-online", "rgbavatar-online", "rgbavatar-online-tiny")
 # How a run is named and how often it is saved changes no avatar.
 IMMATERIAL = {"method_name", "steps_per_save"}

@@ -154,3 +154,23 @@ def test_held_out_frames_are_fitted_apart_from_the_plain_score(tiny_data, tmp_pa
         assert scores[steps]["psnr"] == plain["psnr"]
         assert {"psnr_refined", "psnr_head_refined", "ssim_refined"} <= scores[steps].keys()
     assert scores[40]["psnr_refined"] > scores[1]["psnr_refined"] + 0.3
+
+
+def test_so_many_held_out_frames_are_fitted_as_are_asked_for(pipeline, monkeypatch):
+    """The first, the last and what lies evenly between; or all."""
+    count, fitted = len(pipeline.datamanager.dataparser.tracked.test), []
+    assert count > 2
+
+    def keep(avatar, theta, *_, **__):
+        fitted.extend(theta)
+        return theta
+
+    monkeypatch.setattr("rgbavatar_ns.plugin.pipeline.fit_theta", keep)
+    held_out = pipeline.model.driving_theta(list(pipeline.datamanager.dataparser.tracked.test))
+    for asked, expected in ((2, 2), (0, count), (99, count)):
+        fitted.clear()
+        monkeypatch.setattr(pipeline.config.model, "refine_held_out_frames", asked)
+        pipeline._refined_metrics()
+        assert len(fitted) == expected
+        assert torch.equal(fitted[0], held_out[0])
+        assert torch.equal(fitted[-1], held_out[-1])

@@ -51,6 +51,19 @@ def test_crop_holds_every_landmark_and_stays_inside_where_it_fits() -> None:
     assert inside.max() < 128
 
 
+@pytest.mark.parametrize(("face_px", "size"), [(50, 256), (200, 384), (400, 512)])
+def test_without_a_size_a_crop_keeps_the_films_pixels_within_bounds(face_px: int, size: int):
+    """Of a head that keeps still: 1.95 faces high, at least 256 pixels and at most 512."""
+    low, high = np.array([2000.0 - face_px / 4, 2000]), np.array([2000 + face_px / 4, 2000])
+    points = np.broadcast_to((low + high) / 2, (1, 478, 2)).copy()
+    points[:, 0], points[:, 1] = low, high
+    points[:, 10] = 2000, 2000 - face_px / 2
+    points[:, 152] = 2000, 2000 + face_px / 2
+    crop = steady_crop(points, 4000, 4000, None)
+    assert crop.side == pytest.approx(1.95 * face_px, abs=1)
+    assert crop.size == size
+
+
 def test_crop_beyond_the_frame_repeats_the_border_and_says_so() -> None:
     crop = SquareCrop(left=-4, top=0, side=16, size=16)
     image = np.arange(12 * 16 * 3, dtype=np.uint8).reshape(12, 16, 3)

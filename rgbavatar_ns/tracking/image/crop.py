@@ -18,7 +18,7 @@ _ABOVE, _SIDES, _BELOW = 0.6, 0.3, 0.35
 _BODY_SIDES, _BODY_BELOW = 0.95, 1.3
 # How much larger than the head's own square a following crop is: so much may the head move.
 _ROOM = 1.25
-_HEAD_PX, _MULTIPLE_PX = 256, 16
+_HEAD_PX, _FULL_PX, _MULTIPLE_PX = 256, 512, 16
 
 
 @dataclass(frozen=True)
@@ -99,12 +99,14 @@ def steady_crop(
 
     With the body there is room for shoulders and chest too, as far as the frame shows them. It is
     pushed inside the frame where it fits. One crop for the clip, so that the camera stands still
-    and only the person moves. A size of None gives the head's own square 256 pixels.
+    and only the person moves. A size of None keeps the film's own pixels, up to 512, and gives
+    the head's own square 256 where they are fewer.
     """
     head = _head_square(landmarks_px, width, height)
     square = _body_square(landmarks_px, head, width, height) if with_body else head
     if size is None:
-        size = round(_HEAD_PX * square.side / head.side / _MULTIPLE_PX) * _MULTIPLE_PX
+        enough = round(_HEAD_PX * square.side / head.side / _MULTIPLE_PX) * _MULTIPLE_PX
+        size = max(enough, min(_FULL_PX, square.side // _MULTIPLE_PX * _MULTIPLE_PX))
     return replace(square, size=size)
 
 
