@@ -13,6 +13,7 @@ from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.experiments import commands
 from rgbavatar_ns.files import Stages, write_json
 from rgbavatar_ns.options import Between, Count, Seed
+from rgbavatar_ns.tracking.image.crop import SHARP_PX
 
 Result = dict[str, Any]
 TINY, FULL = "rgbavatar-tiny", "rgbavatar-quick"
@@ -44,13 +45,13 @@ def run(
         video: your own video (several clips of one person may be given) in place of the demo
             subject.
         frames: frames of the demo subject; its last quarter is held out.
-        image_size: width and height of the images in pixels; by default 256 for the demo subject
-            and up to 512, as many as the film has, for a video.
+        image_size: width and height of the images in pixels; by default 256, and up to 512
+            of a video that has as many.
         head_only: track the head of a video without its body.
         tiny: for a slow machine, an avatar of a quarter of the Gaussians from smaller images of
             your video, in half the time; the demo subject's is always so.
-        steps: training steps; by default those of the method, rgbavatar-quick for a video, else
-            rgbavatar-tiny.
+        steps: training steps; by default those of the method: rgbavatar-quick where images of a
+            video have 400 pixels or more, else rgbavatar-tiny.
         seed: of the demo subject and of the training.
         fresh: do every stage again, also those that are done.
         started_at: Unix time from which total_seconds counts; now by default.
@@ -63,7 +64,6 @@ def run(
         output = Path("outputs") / (video[0].stem if video else "demo")
     output = output.resolve()
     stages = Stages(output, fresh=fresh, tell=_tell_stage)
-    method = FULL if video and not tiny else TINY
     if video:
         if tiny and image_size is None:
             image_size = _TINY_HEAD_PX if head_only else _TINY_PX
@@ -78,6 +78,7 @@ def run(
         settings = {"frames": frames, "image_size": image_size or _SIZE_PX, "seed": seed}
         data = stages.run("demo subject", settings, lambda key: _demo(output / "data", settings))
     folder = Path(data["data"])
+    method = TINY if tiny or data.get("image_size", 0) < SHARP_PX else FULL
     trained = stages.run(
         "train",
         {"method": method, "steps": steps, "seed": seed, "refine_tracking": bool(video)},
@@ -135,8 +136,8 @@ def _track(
     # What an interrupted run has done is gone on with.
     config = TrackConfig(image_size=image_size, head_only=head_only, overwrite=True)
     with stage_bars("frames") as update:
-        track_video(video, destination, config, progress=update)
-    return {"data": str(destination)}
+        dataset = track_video(video, destination, config, progress=update)
+    return {"data": str(destination), "image_size": dataset.width}
 
 
 def _train(

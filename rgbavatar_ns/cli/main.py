@@ -42,7 +42,7 @@ def _help() -> str:
     return (
         f"usage: rgbavatar COMMAND [options]\n\n{rows}\n\n"
         "rgbavatar COMMAND --help shows the options. Training, evaluation and the viewer are\n"
-        "nerfstudio's: ns-train rgbavatar, ns-train rgbavatar-tiny, ns-eval, ns-viewer, ns-render."
+        "nerfstudio's: ns-train rgbavatar, ns-train rgbavatar-quick, ns-eval, ns-viewer, ns-render."
     )
 
 

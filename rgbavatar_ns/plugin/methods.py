@@ -94,15 +94,15 @@ rgbavatar_quick = MethodSpecification(
     config=preset(
         RGBAvatarTrainerConfig,
         "rgbavatar-quick",
-        # Four images a step reach in 45 % of the images what ten do (docs/speed.md).
+        # Six images a step reach with 7,500 what ten do with 20,000 (docs/speed.md).
         pipeline=RGBAvatarPipelineConfig(
-            datamanager=RGBAvatarDataManagerConfig(batch_size=4),
+            datamanager=RGBAvatarDataManagerConfig(batch_size=6),
             model=RGBAvatarModelConfig(lpips_metric=False),
         ),
-        max_num_iterations=1600,
+        max_num_iterations=1250,
         position_lr_final=8e-5,
         learning_rate_factor=0.1,
-        learning_rate_steps=1600,
+        learning_rate_steps=1250,
         steps_per_save=250,
     ),
     description="rgbavatar in small batches, rates falling: sharp within two minutes on a CPU.",

@@ -12,8 +12,8 @@ class TrackConfig(CheckedOptions):
     """Options of `track_video`; the defaults suit a webcam or phone clip of one person."""
 
     image_size: Annotated[int, Between(16, 4096)] | None = None
-    """Side of the square images of the dataset, pixels. None keeps the film's own, up to 512, and
-    gives the head at least 256, and so more to a picture that shows shoulders too."""
+    """Side of the square images of the dataset, pixels. None keeps the film's own, up to 512, where
+    they are 400 or more, and else gives the head 256, and so more to what shows shoulders too."""
     test_frames: Counted | None = None
     """Last frames held out for evaluation; None holds out a fifth of the tracked frames."""
     max_frames: Count | None = None

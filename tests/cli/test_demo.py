@@ -40,22 +40,23 @@ def test_demo_goes_from_nothing_to_a_film_and_the_second_time_only_tells(tmp_pat
 
 
 @pytest.mark.parametrize(
-    ("options", "method", "size"),
+    ("options", "film_px", "method", "size"),
     [
-        ([], "rgbavatar-quick", None),
-        (["--tiny"], "rgbavatar-tiny", 384),
-        (["--tiny", "--head-only"], "rgbavatar-tiny", 256),
-        (["--tiny", "--image-size", "320"], "rgbavatar-tiny", 320),
+        ([], 512, "rgbavatar-quick", None),
+        ([], 288, "rgbavatar-tiny", None),
+        (["--tiny"], 512, "rgbavatar-tiny", 384),
+        (["--tiny", "--head-only"], 512, "rgbavatar-tiny", 256),
+        (["--tiny", "--image-size", "480"], 512, "rgbavatar-tiny", 480),
     ],
 )
-def test_a_video_is_made_sharp_and_small_when_asked_for(
-    tmp_path, monkeypatch, options, method, size
+def test_a_video_is_made_sharp_where_it_shows_enough_and_small_when_asked_for(
+    tmp_path, monkeypatch, options, film_px, method, size
 ):
     asked = {}
 
     def track(video, destination, image_size, head_only):
         asked["size"] = image_size
-        return {"data": str(destination)}
+        return {"data": str(destination), "image_size": image_size or film_px}
 
     def train(method, data, run_folder, seed, options):
         asked["method"], asked["options"] = method, options

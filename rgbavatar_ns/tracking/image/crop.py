@@ -18,7 +18,10 @@ _ABOVE, _SIDES, _BELOW = 0.6, 0.3, 0.35
 _BODY_SIDES, _BODY_BELOW = 0.95, 1.3
 # How much larger than the head's own square a following crop is: so much may the head move.
 _ROOM = 1.25
-_HEAD_PX, _FULL_PX, _MULTIPLE_PX = 256, 512, 16
+_HEAD_PX, _MOST_PX, _MULTIPLE_PX = 256, 512, 16
+SHARP_PX = 400
+"""From so many pixels on a film shows more than images of a head of 256 pixels hold; one of fewer
+is better made smaller, which takes its noise out."""
 
 
 @dataclass(frozen=True)
@@ -99,14 +102,15 @@ def steady_crop(
 
     With the body there is room for shoulders and chest too, as far as the frame shows them. It is
     pushed inside the frame where it fits. One crop for the clip, so that the camera stands still
-    and only the person moves. A size of None keeps the film's own pixels, up to 512, and gives
-    the head's own square 256 where they are fewer.
+    and only the person moves. A size of None keeps the film's own pixels, up to 512, where
+    there are `SHARP_PX`, and else gives the head's own square 256.
     """
     head = _head_square(landmarks_px, width, height)
     square = _body_square(landmarks_px, head, width, height) if with_body else head
     if size is None:
-        enough = round(_HEAD_PX * square.side / head.side / _MULTIPLE_PX) * _MULTIPLE_PX
-        size = max(enough, min(_FULL_PX, square.side // _MULTIPLE_PX * _MULTIPLE_PX))
+        size = round(_HEAD_PX * square.side / head.side / _MULTIPLE_PX) * _MULTIPLE_PX
+        if square.side >= SHARP_PX:
+            size = max(size, min(_MOST_PX, square.side // _MULTIPLE_PX * _MULTIPLE_PX))
     return replace(square, size=size)
 
 
