@@ -21,9 +21,8 @@ HELD_OUT_STEPS, HELD_OUT_FRAMES = 40, 24
 """Steps of fitting a video's held-out frames, for the score that looks at their images, and how
 many at most are fitted."""
 
-_SIZE_PX = 256
-_TINY_PX, _TINY_HEAD_PX = 384, 256
-"""Pixels of a small avatar's images, with a body and without."""
+_TINY_PX = 256
+"""Pixels of a small avatar's images."""
 
 
 def run(
@@ -48,8 +47,8 @@ def run(
         image_size: width and height of the images in pixels; by default 256, and up to 512
             of a video that has as many.
         head_only: track the head of a video without its body.
-        tiny: for a slow machine, an avatar of a quarter of the Gaussians from smaller images of
-            your video, in half the time; the demo subject's is always so.
+        tiny: for a slow machine, an avatar of a quarter of the Gaussians from images of 256 pixels
+            of your video, in three quarters of the time; the demo subject's is always so.
         steps: training steps; by default those of the method: rgbavatar-quick where images of a
             video have 400 pixels or more, else rgbavatar-tiny.
         seed: of the demo subject and of the training.
@@ -66,7 +65,7 @@ def run(
     stages = Stages(output, fresh=fresh, tell=_tell_stage)
     if video:
         if tiny and image_size is None:
-            image_size = _TINY_HEAD_PX if head_only else _TINY_PX
+            image_size = _TINY_PX
         settings: dict[str, Any] = {"video": [_fingerprint(clip) for clip in video]}
         settings |= {"image_size": image_size, "head_only": head_only}
         data = stages.run(
@@ -75,7 +74,7 @@ def run(
             lambda key: _track(video, output / "data", image_size, head_only),
         )
     else:
-        settings = {"frames": frames, "image_size": image_size or _SIZE_PX, "seed": seed}
+        settings = {"frames": frames, "image_size": image_size or _TINY_PX, "seed": seed}
         data = stages.run("demo subject", settings, lambda key: _demo(output / "data", settings))
     folder = Path(data["data"])
     method = TINY if tiny or data.get("image_size", 0) < SHARP_PX else FULL
@@ -208,7 +207,10 @@ def _tell(summary: dict[str, Any], output: Path) -> None:
         f"{Path(summary['run']) / 'config.yml'}",
     }
     if summary["psnr_head_refined"] is not None:
-        rows["head, fitted"] = f"{summary['psnr_head_refined']:.2f} dB, pose fitted to each image"
+        fitted = min(HELD_OUT_FRAMES, summary["held_out_frames"])
+        rows["head, fitted"] = (
+            f"{summary['psnr_head_refined']:.2f} dB, pose fitted to each of {fitted} images"
+        )
     if lpips is not None:
         rows["held-out LPIPS"] = f"{lpips:.4f} (VGG)"
     console = Console(soft_wrap=True, highlight=False)

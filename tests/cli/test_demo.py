@@ -44,8 +44,7 @@ def test_demo_goes_from_nothing_to_a_film_and_the_second_time_only_tells(tmp_pat
     [
         ([], 512, "rgbavatar-quick", None),
         ([], 288, "rgbavatar-tiny", None),
-        (["--tiny"], 512, "rgbavatar-tiny", 384),
-        (["--tiny", "--head-only"], 512, "rgbavatar-tiny", 256),
+        (["--tiny"], 512, "rgbavatar-tiny", 256),
         (["--tiny", "--image-size", "480"], 512, "rgbavatar-tiny", 480),
     ],
 )

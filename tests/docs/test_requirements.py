@@ -65,7 +65,7 @@ def test_pips_list_has_what_a_run_needs_at_the_tested_versions(platform: dict[st
 def test_one_version_everywhere() -> None:
     version = rgbavatar_ns.__version__
     assert yaml.safe_load((ROOT / "CITATION.cff").read_text())["version"] == version
-    newest = re.search(r"^## (\S+)", (ROOT / "CHANGELOG.md").read_text(), flags=re.M)
+    newest = re.search(r"^## (\d\S+)", (ROOT / "CHANGELOG.md").read_text(), flags=re.M)
     assert newest is not None
     assert newest[1] == version
 
