@@ -69,7 +69,7 @@ class PageOutput:
         with self._changed:
             self._closed = True
             self._changed.notify_all()
-        time.sleep(0.05)  # for the farewell
+            self._changed.wait_for(lambda: self.pages == 0, _WAIT_S)
         self._server.close()
 
     def _talk(self, connection: ServerConnection) -> None:
@@ -86,6 +86,7 @@ class PageOutput:
             finally:
                 with self._changed:
                     self.pages -= 1
+                    self._changed.notify_all()
 
     def _send(self, connection: ServerConnection) -> None:
         """The newest frame and status, whenever there is one that this page has not got."""
@@ -95,7 +96,7 @@ class PageOutput:
         def is_new() -> bool:
             return self._closed or self._frame is not last or self._status != told
 
-        while not self._closed:
+        while True:
             with self._changed:
                 self._changed.wait_for(is_new, _WAIT_S)
                 frame, message, status = self._frame, self._message, self._status

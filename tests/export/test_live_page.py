@@ -97,6 +97,13 @@ def test_a_page_is_told_the_end(output):
         assert json.loads(page.recv(timeout=2))["text"] == "The performance has ended."
 
 
+def test_a_page_that_comes_with_the_end_is_told_it_too(output):
+    output._closed = True
+    with connect(f"ws://{output.address}") as page:
+        page.recv(timeout=2)
+        assert json.loads(page.recv(timeout=2))["text"] == "The performance has ended."
+
+
 def test_the_address_itself_is_the_page_and_nothing_else_is_there(output):
     with urllib.request.urlopen(f"http://{output.address}/?ws=ws://{output.address}") as answer:
         assert answer.read() == b"<html>it"
