@@ -9,14 +9,14 @@ from typing import Annotated, Any
 from rich.console import Console
 
 from rgbavatar_ns.cli.progress import progress_bar, stage_bars
+from rgbavatar_ns.cli.track import suited_method
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.experiments import commands
 from rgbavatar_ns.files import Stages, write_json
 from rgbavatar_ns.options import Between, Count, Seed
-from rgbavatar_ns.tracking.image.crop import SHARP_PX
 
 Result = dict[str, Any]
-TINY, FULL = "rgbavatar-tiny", "rgbavatar-quick"
+TINY = "rgbavatar-tiny"
 HELD_OUT_STEPS, HELD_OUT_FRAMES = 40, 24
 """Steps of fitting a video's held-out frames, for the score that looks at their images, and how
 many at most are fitted."""
@@ -77,7 +77,7 @@ def run(
         settings = {"frames": frames, "image_size": image_size or _TINY_PX, "seed": seed}
         data = stages.run("demo subject", settings, lambda key: _demo(output / "data", settings))
     folder = Path(data["data"])
-    method = TINY if tiny or data.get("image_size", 0) < SHARP_PX else FULL
+    method = TINY if tiny else suited_method(data.get("image_size", 0))
     trained = stages.run(
         "train",
         {"method": method, "steps": steps, "seed": seed, "refine_tracking": bool(video)},

@@ -59,7 +59,14 @@ def run(
         console.print(f"note: {note}")
     print(f"{len(dataset.train)} frames to train on, {len(dataset.test)} held out, in {dst}")
     print(f"Look at {dst / 'overlay.png'}: the mesh should lie on the face.")
-    print(f"Then: ns-train rgbavatar-quick --data {dst}")
+    print(f"Then: ns-train {suited_method(dataset.width)} --data {dst}")
+
+
+def suited_method(image_size: int) -> str:
+    """The method for a tracked video's images of so many pixels."""
+    from rgbavatar_ns.tracking.image.crop import SHARP_PX
+
+    return "rgbavatar-quick" if image_size >= SHARP_PX else "rgbavatar-tiny"
 
 
 def summary_table(report: Mapping[str, Any]) -> Table:
