@@ -158,6 +158,11 @@ class Avatar(AvatarMethod):
             theta, self.config.pose_input, self.config.translation_input
         )
 
+    def spread_weights(self, theta: Float[Tensor, "B H"]) -> None:
+        """Begin with weights that vary alike over these frames (`WeightNetwork.spread`)."""
+        if self.weight_network is not None:
+            self.weight_network.spread(self.weight_features(theta))
+
     def weights_of(self, features: Float[Tensor, "B _"]) -> Float[Tensor, "B K"]:
         """Return psi of `weight_features`."""
         return features if self.weight_network is None else self.weight_network(features)

@@ -73,6 +73,7 @@ def paper_model() -> RGBAvatarModelConfig:
     return RGBAvatarModelConfig(
         avatar=AvatarConfig(tangent_variant="raw", theta_within_film=False),
         surface_prior=False,
+        first_weights="drawn",
         first_colors="paper",
         hide_unseen=True,
     )
