@@ -46,13 +46,12 @@ class Variant:
     """How an avatar is trained."""
 
     surface_prior: bool = True
-    spread_weights: bool = True
     num_bases: int = 20
     on_everything: bool = False
 
 
 VARIANTS = {
-    "paper": Variant(surface_prior=False, spread_weights=False),
+    "paper": Variant(surface_prior=False),
     "ours": Variant(),
     "K = 0": Variant(num_bases=0),
     "everything": Variant(on_everything=True),
@@ -66,8 +65,6 @@ def train(filmed: FilmedPerson, variant: Variant, steps: int, seed: int) -> Avat
         uv_resolution=128, scale_from_texel_spacing=True, num_bases=variant.num_bases
     )
     avatar = Avatar(filmed.person.head, filmed.person.identity, config, seed=seed)
-    if variant.spread_weights:
-        avatar.spread_weights(shots.theta)
     optimizer = make_optimizer(avatar)
     first_rates = [group["lr"] for group in optimizer.param_groups]
     order = OfflineOrder(range(len(shots.theta)), BATCH_SIZE, seed)

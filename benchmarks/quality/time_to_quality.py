@@ -2,13 +2,13 @@
 
     python benchmarks/quality/time_to_quality.py --batches 10 5 4 3 --seconds 24 --seeds 0 1 2
     python benchmarks/quality/time_to_quality.py --batches 10 4 --seconds 60 --size-px 512 --uv 256
-    python benchmarks/quality/time_to_quality.py --batches 10@drawn 10
+    python benchmarks/quality/time_to_quality.py --batches 10@1 10
 
 Procedural films; PSNR of frames held out. Seconds are those of the processor, of one thread, in
 steps alone, so that what else runs changes little. Learning rates fall to a tenth over the time.
-`4-10:20` takes batches of four for 20 seconds and of ten from then on; `10@drawn` begins with
-weights as torch draws the network, as the paper's preset does. Time to quality is when the curve
-is within .5 dB of the first one's end.
+`4-10:20` takes batches of four for 20 seconds and of ten from then on; `10@1` begins with the
+weight network as torch draws it (`initial_weight_gain` 1). Time to quality is when the curve is
+within .5 dB of the first one's end.
 """
 
 import argparse
@@ -42,18 +42,18 @@ _RATES_END, _WITHIN_DB = 0.1, 0.5
 
 @dataclass(frozen=True)
 class Batches:
-    """Images a step: `first` for some seconds, then `then`; and the first weights."""
+    """Images a step: `first` for some seconds, then `then`; and the weights' first gain."""
 
     name: str
     first: int
     until_s: float
     then: int
-    spread: bool
+    gain: float
 
     @classmethod
     def parsed(cls, text: str) -> "Batches":
-        """`10`, `4-10:20`, or either with `@drawn`."""
-        images = text.removesuffix("@drawn")
+        """`10`, `4-10:20`, or either with `@1`."""
+        images, _, gain = text.partition("@")
         sizes, _, seconds = images.partition(":")
         first, _, then = sizes.partition("-")
         most = _FRAMES - _HELD_OUT
@@ -63,13 +63,15 @@ class Batches:
                 int(first),
                 float(seconds or 0),
                 int(then or first),
-                spread=images == text,
+                float(gain or AvatarConfig.initial_weight_gain),
             )
         except ValueError as error:
-            wrong = f"{text!r} is like none of 10, 4-10:20, 10@drawn"
+            wrong = f"{text!r} is like none of 10, 4-10:20, 10@1"
             raise argparse.ArgumentTypeError(wrong) from error
         if not (1 <= parsed.first <= most and 1 <= parsed.then <= most):
             raise argparse.ArgumentTypeError(f"{text!r}: a step takes 1 to {most} images")
+        if not parsed.gain > 0:
+            raise argparse.ArgumentTypeError(f"{text!r}: A gain is above 0")
         return parsed
 
 
@@ -102,10 +104,10 @@ def curve(
 ) -> dict[float, float]:
     """Held-out PSNR by seconds of training."""
     film = subject.film
-    config = AvatarConfig(uv_resolution=uv, scale_from_texel_spacing=uv < 256)
+    config = AvatarConfig(
+        uv_resolution=uv, scale_from_texel_spacing=uv < 256, initial_weight_gain=batches.gain
+    )
     avatar = Avatar(film.person.head, film.person.identity, config, seed=0)
-    if batches.spread:
-        avatar.spread_weights(film.tracked[list(subject.train)])
     optimizer = make_optimizer(avatar)
     rates = [group["lr"] for group in optimizer.param_groups]
     take = TrainingStep(avatar, [optimizer], TrainingOptions(seed=0))

@@ -120,6 +120,7 @@ class Avatar(AvatarMethod):
                 config.num_bases,
                 kind=config.weight_network,
                 hidden_width=config.hidden_width,
+                gain=config.initial_weight_gain,
                 generator=torch.Generator().manual_seed(seed),
             )
         self.register_buffer("color_initialized", torch.zeros(len(self.anchors), dtype=torch.bool))
@@ -157,11 +158,6 @@ class Avatar(AvatarMethod):
         return self.layout.network_features(
             theta, self.config.pose_input, self.config.translation_input
         )
-
-    def spread_weights(self, theta: Float[Tensor, "B H"]) -> None:
-        """Begin with weights that vary alike over these frames (`WeightNetwork.spread`)."""
-        if self.weight_network is not None:
-            self.weight_network.spread(self.weight_features(theta))
 
     def weights_of(self, features: Float[Tensor, "B _"]) -> Float[Tensor, "B K"]:
         """Return psi of `weight_features`."""

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -37,10 +37,6 @@ class RGBAvatarModelConfig(AvatarModelConfig):
     first_colors: FirstColorsKind = "matted"
     """How: paper, the mean of the training picture over its random background, in the first step in
     which its weight exceeds .1; matted (ours), the mean of the person alone. (The release: .01.)"""
-    first_weights: Literal["spread", "drawn"] = "spread"
-    """Initial values of the weight network: drawn (release; the paper is silent), or the last layer
-    set so that the film's weights vary alike and are decorrelated (ours: a better avatar in as many
-    steps where these are few)."""
     surface_prior: bool = True
     """Keep what the film does not show on the person's surface, closed and plain: heads can be
     turned beyond their film. Ours; False leaves it to chance, as the paper does."""
@@ -84,10 +80,7 @@ class RGBAvatarModel(AvatarModel):
 
     def make_avatar(self, head: HeadModel, identity: Tensor, seed: int) -> Avatar:
         """A fresh avatar of the subject."""
-        avatar = Avatar(head, identity, self.config.avatar, seed=seed)
-        if self.config.first_weights == "spread":
-            avatar.spread_weights(self.subject.theta[list(self.subject.train)])
-        return avatar
+        return Avatar(head, identity, self.config.avatar, seed=seed)
 
     def get_loss_dict(
         self,

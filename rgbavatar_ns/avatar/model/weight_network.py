@@ -7,10 +7,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-FIRST_DEVIATION = 0.1
-"""Of a fresh avatar's weights over its film, where they are spread."""
-_STILL = 1e-4
-"""Axes that move less, beside the first, do not move."""
 _ROOM = 0.05
 """Of a number that never moved: radians, or shares of an expression."""
 
@@ -19,7 +15,7 @@ class WeightNetwork(nn.Module):
     """Three linear layers with ReLU between them, or a single one; no output activation.
 
     Paper, supplement: three layers, 128 wide; "linear" is its ablation. Initial values are those of
-    `torch.nn.Linear`, drawn from `generator`.
+    `torch.nn.Linear`, drawn from `generator`; the last layer's weights are `gain` times as large.
     """
 
     def __init__(
@@ -29,6 +25,7 @@ class WeightNetwork(nn.Module):
         *,
         kind: Literal["mlp", "linear"] = "mlp",
         hidden_width: int = 128,
+        gain: float = 1.0,
         generator: torch.Generator,
     ) -> None:
         super().__init__()
@@ -42,33 +39,14 @@ class WeightNetwork(nn.Module):
                 nn.ReLU(),
                 seeded_linear(hidden_width, num_bases, generator),
             )
+        last = self.layers[-1]
+        assert isinstance(last, nn.Linear)
+        with torch.no_grad():
+            last.weight.mul_(gain)
 
     def forward(self, features: Float[Tensor, "B F"]) -> Float[Tensor, "B K"]:
         """Map features to blendshape weights."""
         return self.layers(features)
-
-    @torch.no_grad()
-    def spread(self, features: Float[Tensor, "B F"]) -> None:
-        """Set the last layer so that weights of these features are decorrelated and vary alike.
-
-        They become principal components of what the last layer sees, with mean 0 and standard
-        deviation `FIRST_DEVIATION`; features that have fewer leave the rest as drawn. Ours, because
-        weights as drawn hardly vary (.01) and vary together, and bases learn as fast as their
-        weights move (docs/paper.md).
-        """
-        last = self.layers[-1]
-        assert isinstance(last, nn.Linear)
-        seen = self.layers[:-1](features).double()
-        mean = seen.mean(0)
-        _, amounts, directions = torch.linalg.svd(seen - mean, full_matrices=False)
-        deviations = amounts / max(len(seen), 1) ** 0.5
-        # An axis has no sign of its own; the libraries that find it differ in theirs.
-        largest = directions.gather(1, directions.abs().argmax(1, keepdim=True))
-        directions = directions * largest.sign()
-        count = min(last.out_features, int((deviations > _STILL * deviations.amax()).sum()))
-        axes = directions[:count] * (FIRST_DEVIATION / deviations[:count, None])
-        last.weight[:count] = axes.to(last.weight)
-        last.bias[:count] = -(axes @ mean).to(last.bias)
 
 
 def softly_within(

@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from rgbavatar_ns.avatar import Avatar, WeightNetwork
-from rgbavatar_ns.avatar.model.weight_network import FIRST_DEVIATION, softly_within
+from rgbavatar_ns.avatar.model.weight_network import softly_within
 from tests.avatar.small_head import random_theta
 
 
@@ -36,6 +36,21 @@ def test_initial_values_follow_torchs_distribution_and_the_generator_alone():
     weight = next(first.parameters())
     assert weight.abs().max() <= 0.1
     assert abs(weight.std().item() - 0.1 / 3**0.5) < 2e-3
+
+
+@pytest.mark.parametrize("kind", ["mlp", "linear"])
+def test_a_gain_makes_the_weights_of_the_last_layer_larger_and_nothing_else(kind):
+    drawn, wider = (
+        WeightNetwork(5, 3, kind=kind, gain=gain, generator=torch.Generator().manual_seed(0))
+        for gain in (1.0, 8.0)
+    )
+    x = torch.randn(4, 5)
+    # Differences of two inputs do not see the bias.
+    torch.testing.assert_close(wider(x) - wider(x[:1]), 8 * (drawn(x) - drawn(x[:1])))
+    *below, last, bias = zip(drawn.parameters(), wider.parameters())
+    for before, after in (*below, bias):
+        assert torch.equal(before, after)
+    assert torch.equal(8 * last[0], last[1])
 
 
 @pytest.mark.parametrize(
@@ -96,37 +111,3 @@ def test_what_training_saw_is_kept_in_the_file(make_avatar, tmp_path):
     avatar.widen_film_range(random_theta(avatar.layout, 4))
     avatar.save(tmp_path / "me")
     assert torch.equal(Avatar.load(tmp_path / "me").theta_high, avatar.theta_high)
-
-
-@pytest.mark.parametrize("kind", ["mlp", "linear"])
-def test_spread_weights_of_a_film_are_decorrelated_and_vary_alike(kind):
-    network = WeightNetwork(12, 5, kind=kind, generator=torch.Generator().manual_seed(0))
-    features = torch.randn(200, 12, generator=torch.Generator().manual_seed(1)) * 0.1
-    features[:, 1] += features[:, 0]
-    network.spread(features)
-    psi = network(features).double().detach()
-    torch.testing.assert_close(psi.mean(0), torch.zeros(5).double(), atol=1e-6, rtol=0)
-    covariance = psi.T @ psi / len(psi)
-    expected = FIRST_DEVIATION**2 * torch.eye(5, dtype=torch.float64)
-    torch.testing.assert_close(covariance, expected, atol=1e-6, rtol=0)
-
-
-def test_the_first_spread_weight_is_the_largest_axis_of_a_linear_networks_features():
-    network = WeightNetwork(3, 2, kind="linear", generator=torch.Generator().manual_seed(0))
-    along, across = torch.tensor([0.6, 0.0, 0.8]), torch.tensor([0.8, 0.0, -0.6])
-    first, second = torch.tensor([3.0, -3, 3, -3]), torch.tensor([1.0, 1, -1, -1])
-    network.spread(7 + first[:, None] * along + second[:, None] * across)
-    step = network(along[None]) - network(torch.zeros(1, 3))
-    torch.testing.assert_close(step[0].detach(), torch.tensor([FIRST_DEVIATION / 3, 0]))
-
-
-@pytest.mark.parametrize(("frames", "spread"), [(1, 0), (3, 2)])
-def test_weights_that_few_frames_say_nothing_of_stay_as_drawn(frames, spread):
-    network = WeightNetwork(12, 5, generator=torch.Generator().manual_seed(0))
-    last = network.layers[-1]
-    assert isinstance(last, torch.nn.Linear)
-    weight, bias = last.weight.clone(), last.bias.clone()
-    network.spread(torch.randn(frames, 12, generator=torch.Generator().manual_seed(1)))
-    assert torch.equal(last.weight[spread:], weight[spread:])
-    assert torch.equal(last.bias[spread:], bias[spread:])
-    assert not (last.weight[:spread] == weight[:spread]).any()
