@@ -2,13 +2,11 @@
 
     python benchmarks/quality/time_to_quality.py --batches 10 5 4 3 --seconds 24 --seeds 0 1 2
     python benchmarks/quality/time_to_quality.py --batches 10 4 --seconds 60 --size-px 512 --uv 256
-    python benchmarks/quality/time_to_quality.py --batches 10@1 10
 
 Procedural films; PSNR of frames held out. Seconds are those of the processor, of one thread, in
 steps alone, so that what else runs changes little. Learning rates fall to a tenth over the time.
-`4-10:20` takes batches of four for 20 seconds and of ten from then on; `10@1` begins with the
-weight network as torch draws it (`initial_weight_gain` 1). Time to quality is when the curve is
-within .5 dB of the first one's end.
+`4-10:20` takes batches of four for 20 seconds and of ten from then on. Time to quality is when the
+curve is within .5 dB of the first batch size's end.
 """
 
 import argparse
@@ -42,36 +40,26 @@ _RATES_END, _WITHIN_DB = 0.1, 0.5
 
 @dataclass(frozen=True)
 class Batches:
-    """Images a step: `first` for some seconds, then `then`; and the weights' first gain."""
+    """Images a step: `first` for some seconds, then `then`."""
 
     name: str
     first: int
     until_s: float
     then: int
-    gain: float
 
     @classmethod
     def parsed(cls, text: str) -> "Batches":
-        """`10`, `4-10:20`, or either with `@1`."""
-        images, _, gain = text.partition("@")
-        sizes, _, seconds = images.partition(":")
+        """`10`, or `4-10:20`."""
+        sizes, _, seconds = text.partition(":")
         first, _, then = sizes.partition("-")
         most = _FRAMES - _HELD_OUT
         try:
-            parsed = cls(
-                text,
-                int(first),
-                float(seconds or 0),
-                int(then or first),
-                float(gain or AvatarConfig.initial_weight_gain),
-            )
+            parsed = cls(text, int(first), float(seconds or 0), int(then or first))
         except ValueError as error:
-            wrong = f"{text!r} is like none of 10, 4-10:20, 10@1"
+            wrong = f"{text!r} is neither like 10 nor like 4-10:20"
             raise argparse.ArgumentTypeError(wrong) from error
         if not (1 <= parsed.first <= most and 1 <= parsed.then <= most):
             raise argparse.ArgumentTypeError(f"{text!r}: a step takes 1 to {most} images")
-        if not parsed.gain > 0:
-            raise argparse.ArgumentTypeError(f"{text!r}: A gain is above 0")
         return parsed
 
 
@@ -104,9 +92,7 @@ def curve(
 ) -> dict[float, float]:
     """Held-out PSNR by seconds of training."""
     film = subject.film
-    config = AvatarConfig(
-        uv_resolution=uv, scale_from_texel_spacing=uv < 256, initial_weight_gain=batches.gain
-    )
+    config = AvatarConfig(uv_resolution=uv, scale_from_texel_spacing=uv < 256)
     avatar = Avatar(film.person.head, film.person.identity, config, seed=0)
     optimizer = make_optimizer(avatar)
     rates = [group["lr"] for group in optimizer.param_groups]

@@ -120,7 +120,6 @@ class Avatar(AvatarMethod):
                 config.num_bases,
                 kind=config.weight_network,
                 hidden_width=config.hidden_width,
-                gain=config.initial_weight_gain,
                 generator=torch.Generator().manual_seed(seed),
             )
         self.register_buffer("color_initialized", torch.zeros(len(self.anchors), dtype=torch.bool))

@@ -39,10 +39,6 @@ class AvatarConfig(MethodConfig):
     tangent_variant: Literal["normalized", "raw", "orthonormal"] = "normalized"
     """Tangent frames of a triangle: raw, columns as Algorithm 1 leaves them (paper); normalized,
     unit columns (release); orthonormal, by Gram-Schmidt (ours)."""
-    initial_weight_gain: Annotated[float, Between(1e-3, 1e3)] = 8.0
-    """Times torch's initial values of the network's last layer (paper: silent; release: 1). Ours,
-    because with 1 the blendshape weights hardly vary at first, and bases learn as fast as theirs
-    do (docs/paper.md)."""
     pose_input: bool = True
     """Whether the weight network sees joint and head rotations (paper, release: yes)."""
     translation_input: bool = False

@@ -71,9 +71,7 @@ def preset(
 def paper_model() -> RGBAvatarModelConfig:
     """The paper's model, and the release's where the paper is silent (docs/paper.md)."""
     return RGBAvatarModelConfig(
-        avatar=AvatarConfig(
-            initial_weight_gain=1.0, tangent_variant="raw", theta_within_film=False
-        ),
+        avatar=AvatarConfig(tangent_variant="raw", theta_within_film=False),
         surface_prior=False,
         first_colors="paper",
         hide_unseen=True,

@@ -5,7 +5,6 @@ import argparse
 import pytest
 
 from benchmarks.quality.time_to_quality import Batches, seconds_to
-from rgbavatar_ns.avatar import AvatarConfig
 
 
 def test_time_to_quality_lies_between_the_curve_s_points():
@@ -17,15 +16,10 @@ def test_time_to_quality_lies_between_the_curve_s_points():
 
 
 def test_batch_sizes_as_they_are_written():
-    ours = AvatarConfig.initial_weight_gain
-    assert Batches.parsed("10") == Batches("10", 10, 0.0, 10, ours)
-    assert Batches.parsed("4-10:20") == Batches("4-10:20", 4, 20.0, 10, ours)
-    assert Batches.parsed("4-10:20@1") == Batches("4-10:20@1", 4, 20.0, 10, 1.0)
-    for wrong in ("ten", "10@many"):
-        with pytest.raises(argparse.ArgumentTypeError, match=f"'{wrong}' is like none of 10, 4-10"):
-            Batches.parsed(wrong)
-    with pytest.raises(argparse.ArgumentTypeError, match="A gain is above 0"):
-        Batches.parsed("10@0")
+    assert Batches.parsed("10") == Batches("10", 10, 0.0, 10)
+    assert Batches.parsed("4-10:20") == Batches("4-10:20", 4, 20.0, 10)
+    with pytest.raises(argparse.ArgumentTypeError, match=r"'ten' is neither like 10 nor like"):
+        Batches.parsed("ten")
     for wrong in ("0", "145", "4-0:2"):
         with pytest.raises(argparse.ArgumentTypeError, match="takes 1 to 144 images"):
             Batches.parsed(wrong)

@@ -15,7 +15,7 @@ class WeightNetwork(nn.Module):
     """Three linear layers with ReLU between them, or a single one; no output activation.
 
     Paper, supplement: three layers, 128 wide; "linear" is its ablation. Initial values are those of
-    `torch.nn.Linear`, drawn from `generator`; the last layer's weights are `gain` times as large.
+    `torch.nn.Linear`, drawn from `generator`.
     """
 
     def __init__(
@@ -25,7 +25,6 @@ class WeightNetwork(nn.Module):
         *,
         kind: Literal["mlp", "linear"] = "mlp",
         hidden_width: int = 128,
-        gain: float = 1.0,
         generator: torch.Generator,
     ) -> None:
         super().__init__()
@@ -39,10 +38,6 @@ class WeightNetwork(nn.Module):
                 nn.ReLU(),
                 seeded_linear(hidden_width, num_bases, generator),
             )
-        last = self.layers[-1]
-        assert isinstance(last, nn.Linear)
-        with torch.no_grad():
-            last.weight.mul_(gain)
 
     def forward(self, features: Float[Tensor, "B F"]) -> Float[Tensor, "B K"]:
         """Map features to blendshape weights."""

@@ -38,21 +38,6 @@ def test_initial_values_follow_torchs_distribution_and_the_generator_alone():
     assert abs(weight.std().item() - 0.1 / 3**0.5) < 2e-3
 
 
-@pytest.mark.parametrize("kind", ["mlp", "linear"])
-def test_a_gain_makes_the_weights_of_the_last_layer_larger_and_nothing_else(kind):
-    drawn, wider = (
-        WeightNetwork(5, 3, kind=kind, gain=gain, generator=torch.Generator().manual_seed(0))
-        for gain in (1.0, 8.0)
-    )
-    x = torch.randn(4, 5)
-    # Differences of two inputs do not see the bias.
-    torch.testing.assert_close(wider(x) - wider(x[:1]), 8 * (drawn(x) - drawn(x[:1])))
-    *below, last, bias = zip(drawn.parameters(), wider.parameters())
-    for before, after in (*below, bias):
-        assert torch.equal(before, after)
-    assert torch.equal(8 * last[0], last[1])
-
-
 @pytest.mark.parametrize(
     ("field", "blind", "watching"),
     [
