@@ -76,7 +76,7 @@ def subject_message(subject: StreamSubject) -> bytes:
 
 def frame_message(frame: TrackedFrame, png: bytes | None = None) -> bytes:
     """The message of a frame; `png` is its image where that is encoded already."""
-    png = encode_png_rgba(frame.image_rgba, compression=1) if png is None else png
+    png = encode_png_rgba(frame.image_rgba) if png is None else png
     theta, camera = frame.theta.tolist(), camera_to_json(frame.camera, 0)
     return encode({"type": "frame", "index": frame.index, "theta": theta, "camera": camera}, png)
 

@@ -31,8 +31,6 @@ from rgbavatar_ns.tracking.input.video import FrameSource
 from rgbavatar_ns.tracking.threads import in_background, map_in_order
 
 _AHEAD, _WORKERS = 2, 2
-# A fast level: the files grow by a few hundredths and take a third of the time.
-_PNG_LEVEL = 1
 # No edge is sharper than the film's own: an avatar would learn how it flickers. A found matte's
 # edges are so wide by themselves, and so are those that a renderer draws; by what the film's are
 # wider they are softened, and a quarter more: held-out frames of two real clips, which come to .9
@@ -246,7 +244,7 @@ class FrameImages:
         )
         image = self._cut_out(matted, outline)
         unfilmed = float(unfilmed_pixels(image).mean())
-        png = encode_png_rgba(image, _PNG_LEVEL)
+        png = encode_png_rgba(image)
         return FrameImage(crop.position, png, outline, matte, inside, unfilmed)
 
     def _steadied(self, crop: _Cropped, around: tuple[_Cropped, ...]) -> Float[np.ndarray, "S S"]:
