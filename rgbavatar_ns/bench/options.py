@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from rgbavatar_ns.errors import UserError
-from rgbavatar_ns.options import Between, CheckedOptions, Count, Counted, Pixels
+from rgbavatar_ns.options import Between, CheckedOptions, Count, Counted, Pixels, Seed
 
 _Threads = Annotated[int, Between(1, 4096)]
 _Batch = Annotated[int, Between(1, 4096)]
@@ -112,3 +112,70 @@ class RenderOptions(AvatarOptions):
     """Different theta that are drawn in turn."""
     repetitions: Count = 50
     """Timings of each kind, after a warm-up."""
+
+
+@dataclass(frozen=True)
+class Batches:
+    """Images a step: `first` for some seconds, then `then`."""
+
+    name: str
+    first: int
+    until_s: float
+    then: int
+
+    @classmethod
+    def parsed(cls, text: str) -> "Batches":
+        """`10`, or `4-10:20`; raises UserError for anything else."""
+        sizes, _, seconds = text.partition(":")
+        first, _, then = sizes.partition("-")
+        try:
+            found = cls(text, int(first), float(seconds or 0), int(then or first))
+        except ValueError:
+            found = None
+        if found is None or min(found.first, found.then) < 1 or not found.until_s >= 0:
+            raise UserError(
+                f"--batches {text!r} is no number of images a step.",
+                "Pass one like 10, or 4-10:20 for 4 in the first 20 seconds and 10 from then on.",
+            )
+        return found
+
+
+@dataclass(frozen=True)
+class QualityOptions(CheckedOptions):
+    """How good an avatar is after so many seconds, by images a step: curves and time to quality.
+
+    PSNR of frames held out, of procedural people or of your own dataset. Seconds are those of
+    training steps alone; on a CPU the processor's, so that what else runs changes little. Learning
+    rates fall to a tenth. Time to quality is when a curve is within .5 dB of its end.
+    """
+
+    json: Path | None = None
+    """Also write the figures here, curve by curve as they come."""
+    data: Path | None = None
+    """Dataset to learn and its held-out frames, in place of procedural people."""
+    seeds: tuple[Seed, ...] = (0, 1, 2)
+    """Procedural people, or with --data seeds of what is random in training."""
+    batches: tuple[str, ...] = ("10", "4")
+    """Images a step: 10, or 4-10:20 for 4 in the first 20 seconds and 10 from then on."""
+    seconds: Annotated[float, Between(0, 1e6, open=True)] = 24.0
+    """How long each avatar is trained."""
+    size: Pixels | None = None
+    """Side of the procedural images in pixels: 256."""
+    uv: Annotated[int, Between(1, 4096)] = 128
+    """Side of the avatars' UV map: root of about the number of Gaussians."""
+    threads: _Threads = 1
+    """Threads to use; with more than one, seconds are those of the clock."""
+    device: Literal["cpu", "cuda"] | None = None
+    """Where to train; the GPU where it can be used, else the CPU."""
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be measured or would be ignored."""
+        super().__post_init__()
+        for text in self.batches:
+            Batches.parsed(text)
+        if not self.batches or not self.seeds:
+            raise UserError("Nothing is to be trained.", "Name at least one of --batches, --seeds.")
+        if self.data is not None and self.size is not None:
+            raise UserError(
+                "--size belongs to the procedural people, not to a dataset.", "Leave it out."
+            )

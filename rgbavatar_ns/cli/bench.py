@@ -1,4 +1,4 @@
-"""`rgbavatar bench`: how fast the rasterizer, a training step and rendering are here."""
+"""`rgbavatar bench`: how fast rasterizer, training step and rendering are, and how soon good."""
 
 import tempfile
 import time
@@ -10,7 +10,12 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from rgbavatar_ns.bench.options import RasterizerOptions, RenderOptions, StepOptions
+from rgbavatar_ns.bench.options import (
+    QualityOptions,
+    RasterizerOptions,
+    RenderOptions,
+    StepOptions,
+)
 from rgbavatar_ns.errors import UserError
 
 if TYPE_CHECKING:
@@ -21,6 +26,7 @@ Options = (
     Annotated[RasterizerOptions, tyro.conf.subcommand("rasterizer", prefix_name=False)]
     | Annotated[StepOptions, tyro.conf.subcommand("step", prefix_name=False)]
     | Annotated[RenderOptions, tyro.conf.subcommand("render", prefix_name=False)]
+    | Annotated[QualityOptions, tyro.conf.subcommand("quality", prefix_name=False)]
 )
 
 _SECONDS_PER_REFRESH = 0.2
@@ -36,6 +42,8 @@ def run(options: Annotated[Options, tyro.conf.arg(name="")]) -> None:
 
     if options.json is not None:
         _require_writable(options.json)
+    if isinstance(options, QualityOptions):
+        return _measure_quality(options)
     with _progress() as told:
         report = _measure(options, told)
     print_report(report)
@@ -55,6 +63,20 @@ def _measure(options: RasterizerOptions | StepOptions | RenderOptions, told: "To
     from rgbavatar_ns.bench.render import bench_render
 
     return bench_render(options, told)
+
+
+def _measure_quality(options: QualityOptions) -> None:
+    from rgbavatar_ns.bench.quality import QualityReport, bench_quality, print_quality
+    from rgbavatar_ns.files import write_json
+
+    def keep(report: QualityReport) -> None:
+        # It takes minutes: what is there is not lost when the next curve is interrupted.
+        if options.json is not None:
+            write_json(options.json, report.to_json())
+
+    with _progress() as told:
+        report = bench_quality(options, told, keep)
+    print_quality(report)
 
 
 def _require_writable(path: Path) -> None:
