@@ -227,17 +227,13 @@ def print_quality(report: QualityReport, console: Console | None = None) -> None
     means, reached = report.means(), report.seconds_to_quality()
     first = next(iter(means.values()))
     end_db = first[max(first)] - report.within_db
-    headings = [f"{mark:g} s" for mark in sorted(first)]
-    headings += [f"within {report.within_db:g} dB of its end", f"to {end_db:.1f} dB"]
-    table = Table("images a step", *(Column(one, justify="right") for one in headings))
-    for name, mean in means.items():
-        to_first = seconds_to(end_db, mean)
-        table.add_row(
-            name,
-            *(f"{mean[mark]:.2f}" for mark in sorted(mean)),
-            f"{reached[name]:.1f} s",
-            "not reached" if to_first is None else f"{to_first:.1f} s",
-        )
+    table = Table("images a step", *(Column(name, justify="right") for name in means))
+    for mark in sorted(first):
+        table.add_row(f"after {mark:g} s", *(f"{mean[mark]:.2f} dB" for mean in means.values()))
+    near = f"within {report.within_db:g} dB of its end after"
+    table.add_row(near, *(f"{reached[name]:.1f} s" for name in means), end_section=True)
+    to_first = [seconds_to(end_db, mean) for mean in means.values()]
+    told = ("not reached" if one is None else f"{one:.1f} s" for one in to_first)
+    table.add_row(f"{end_db:.1f} dB (so near the first's) after", *told)
     console.print(table)
-    console.print("PSNR of held-out frames in dB, mean of the subjects; the last column is the")
-    console.print(f"first row's end less {report.within_db:g} dB.")
+    console.print("PSNR of held-out frames, mean of the subjects.")

@@ -31,9 +31,11 @@ from rgbavatar_ns.bench.timing import (
     using_threads,
 )
 from rgbavatar_ns.bench.workloads import AvatarWorkload, avatar_workload, parameters_of
+from rgbavatar_ns.drawing.compositing import to_uint8
 from rgbavatar_ns.kernels import rasterize
 
 WHOLE_FRAME = "whole frame"
+VIEWER_FRAME = "(the viewer's picture: with depth, as bytes)"
 EAGER_FRAME = "whole frame, eager"
 
 
@@ -51,6 +53,7 @@ def bench_render(options: RenderOptions, progress: Progress | None = None) -> Re
         growth_bytes = peak_growth_bytes(frame, device)
         whole = stopwatch.time(WHOLE_FRAME, frame)
         spread = {WHOLE_FRAME: whole} | _time_parts(workload, stopwatch)
+        spread[VIEWER_FRAME] = stopwatch.time(VIEWER_FRAME, _viewer_frames_in_turn(workload))
         avatar, theta = workload.avatar, workload.batch.theta[:1]
         camera = one_camera(workload.batch.cameras, 0)
         spread[EAGER_FRAME] = stopwatch.time(
@@ -70,6 +73,23 @@ def _frames_in_turn(avatar: Avatar, batch: TrainingBatch) -> Callable[[], Any]:
     else:
         draw = partial(avatar.render, to_be_seen=True)
     return lambda: draw(*next(frames))
+
+
+def _viewer_frames_in_turn(workload: AvatarWorkload) -> Callable[[], Any]:
+    """What nerfstudio's viewer shows of each frame, before it is compressed and sent."""
+    from rgbavatar_ns.plugin.viewer.driving import DrivingSignal
+    from rgbavatar_ns.plugin.viewer.render import viewer_render
+    from rgbavatar_ns.plugin.viewer.viewer_state import ViewerState
+
+    thetas, state = workload.batch.theta.split(1), ViewerState()
+    frames = cycle([(DrivingSignal(one), k) for k, one in enumerate(thetas)])
+
+    def frame() -> Any:
+        signal, number = next(frames)
+        camera = one_camera(workload.batch.cameras, number)
+        return to_uint8(viewer_render(workload.avatar, signal, state, camera).image)
+
+    return frame
 
 
 def _time_parts(workload: AvatarWorkload, stopwatch: Stopwatch) -> dict[str, Spread]:

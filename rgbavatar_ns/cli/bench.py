@@ -33,7 +33,7 @@ _SECONDS_PER_REFRESH = 0.2
 
 
 def run(options: Annotated[Options, tyro.conf.arg(name="")]) -> None:
-    """Measure on this machine: medians, parts, roofline, and what else draws the same.
+    """Measure on this machine: medians, parts, roofline, what else draws the same; quality by time.
 
     Other programs that run meanwhile make every figure worse.
     """

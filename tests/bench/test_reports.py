@@ -7,7 +7,7 @@ import torch
 from rgbavatar_ns.bench import machine, step
 from rgbavatar_ns.bench.options import RasterizerOptions, RenderOptions, StepOptions
 from rgbavatar_ns.bench.rasterizer import bench_rasterizer
-from rgbavatar_ns.bench.render import bench_render
+from rgbavatar_ns.bench.render import VIEWER_FRAME, bench_render
 from rgbavatar_ns.bench.roofline import measure_speed
 from rgbavatar_ns.bench.scenes import ellipsoid_scene
 from rgbavatar_ns.bench.step import bench_step
@@ -155,6 +155,8 @@ def test_render_report(bundle):
     figures = checked_json(bench_render(RenderOptions(avatar=bundle, size=64, repetitions=2)))
     assert figures["frames_per_second"] == pytest.approx(1e3 / figures["parts"]["whole frame"])
     assert {"head", "network", "prepare", "draw"} < set(figures["parts"])
+    # It has depth and bytes beside what a frame has.
+    assert figures["parts"][VIEWER_FRAME] > 0
     eager = figures["peers"]["whole frame, eager"]
     assert eager["ratio"] == pytest.approx(
         figures["parts"]["whole frame, eager"] / figures["parts"]["whole frame"]

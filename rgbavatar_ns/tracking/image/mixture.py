@@ -55,6 +55,13 @@ def spread_colors(
     return cv2.resize(totals[0] / held, (size, size))
 
 
+def row_products(
+    first: Float[np.ndarray, "N 3"], second: Float[np.ndarray, "N 3"]
+) -> Float[np.ndarray, "N"]:
+    """Scalar products; numpy's own sums over so few channels take several times as long."""
+    return np.einsum("nc,nc->n", first, second)
+
+
 @dataclass(frozen=True)
 class Guess:
     """What is known of alpha at the open pixels before their colours are asked."""
@@ -144,8 +151,8 @@ def _explained(pixels: _OpenPixels, few: _Sampled, radii_px: Sequence[int]) -> _
     row, column = (place // _EVERY for place in pixels.row_column)
     varies, beside = varies[row, column].T
     off, across, guess = pixels.color - pixels.room, color[row, column] - pixels.room, pixels.guess
-    length = (across * across).sum(1) + np.float32(1e-3)
-    share = (off * across).sum(1) / length
+    length = row_products(across, across) + np.float32(1e-3)
+    share = row_products(off, across) / length
     alpha, precision = guess.alpha, guess.precision
     # The person's variance counts as far as the person is seen, which is to be found.
     for _ in range(2):
@@ -153,7 +160,7 @@ def _explained(pixels: _OpenPixels, few: _Sampled, radii_px: Sequence[int]) -> _
         total = precision + guess.precision
         alpha = np.clip((precision * share + guess.precision * guess.alpha) / total, 0, 1)
     surprise = (share - guess.alpha) ** 2 * precision * guess.precision
-    aside = np.maximum((off * off).sum(1) - share * share * length, 0)
+    aside = np.maximum(row_products(off, off) - share * share * length, 0)
     aside = aside / (pixels.variance + alpha * alpha * beside / 2)
     return _Explanation(alpha, precision, surprise / (precision + guess.precision) + aside)
 

@@ -19,6 +19,7 @@ from rgbavatar_ns.tracking.image.mixture import (
     PERSON_PX,
     Guess,
     mixed_alpha,
+    row_products,
     spread_colors,
 )
 
@@ -163,12 +164,12 @@ def _tinted(apart: _Colors, towards: _Colors, room: RoomColors, inward: _Values)
         part - part.mean(1, keepdims=True)
         for part in (colors.reshape(-1, 3)[asked] for colors in (apart, towards, room.color))
     )
-    length, variance = (across * across).sum(1), room.variance.flat[asked]
-    plain = (variance < _SMOOTH_LEVELS**2) & ((behind * behind).sum(1) > _COLORED_LEVELS**2)
+    length, variance = row_products(across, across), room.variance.flat[asked]
+    plain = (variance < _SMOOTH_LEVELS**2) & (row_products(behind, behind) > _COLORED_LEVELS**2)
     telling = length > np.maximum(_HUE_LEVELS**2, _HUE_SIGMAS**2 * variance)
     telling &= room.known.flat[asked] | plain
     found = np.zeros(inward.shape, bool)
-    found.flat[asked] = telling & ((hue * across).sum(1) < _PURE * length)
+    found.flat[asked] = telling & (row_products(hue, across) < _PURE * length)
     return found
 
 
@@ -177,8 +178,8 @@ def _unmixed(apart: _Colors, towards: _Colors, differs: _Values, inward: _Values
     alone = cv2.erode((differs > _NOT_ROOM**2).astype(np.uint8), _AROUND) > 0
     asked = np.flatnonzero(alone & (inward > 0) & (inward <= _CORE_PX))
     off, across = (colors.reshape(-1, 3)[asked] for colors in (apart, towards))
-    along, size = (off * across).sum(1), (off * off).sum(1)
-    length = (across * across).sum(1) + np.float32(1e-3)
+    along, size = row_products(off, across), row_products(off, off)
+    length = row_products(across, across) + np.float32(1e-3)
     aside = 1 - along * np.abs(along) / (length * size + np.float32(1e-3))
     found = np.zeros(inward.shape, bool)
     found.flat[asked] = (aside > _ASIDE) | (along > _WHOLE * length)
