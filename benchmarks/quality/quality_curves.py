@@ -4,8 +4,8 @@
     rgbavatar bench quality --data speaker --json speaker.json
     python benchmarks/quality/quality_curves.py demo.json speaker.json
 
-Thick lines are means over the subjects, thin ones single subjects; a dot is where the mean comes
-within half a decibel of its end.
+Thick lines are means over the subjects, thin ones single subjects; dots are where means come
+within half a decibel of the first way's end.
 """
 
 import argparse
@@ -16,7 +16,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from rgbavatar_ns.bench.quality import QualityReport
+from rgbavatar_ns.bench.quality import QualityReport, seconds_to
 
 
 def read(path: Path) -> QualityReport:
@@ -46,15 +46,19 @@ def draw(reports: Sequence[QualityReport], path: Path) -> None:
 
 
 def _panel(axes: Any, report: QualityReport) -> None:
-    reached = report.seconds_to_quality()
-    for number, (name, mean) in enumerate(report.means().items()):
-        color = f"C{number}"
+    means = report.means()
+    first = next(iter(means.values()))
+    end_db = first[max(first)] - report.within_db
+    axes.axhline(end_db, color="0.7", lw=0.8, ls="--")
+    for number, (name, mean) in enumerate(means.items()):
+        color, reached = f"C{number}", seconds_to(end_db, mean)
         for single in report.curves[name]:
             axes.plot(*zip(*sorted(single.items())), color=color, lw=0.6, alpha=0.5)
-        end_db = mean[max(mean)] - report.within_db
-        label = f"{name} images a step: {reached[name]:.0f} s"
+        label = f"{name} images a step"
+        if reached is not None:
+            label += f": {reached:.1f} s"
+            axes.plot(reached, end_db, "o", color=color, ms=5)
         axes.plot(*zip(*sorted(mean.items())), color=color, lw=2, label=label)
-        axes.plot(reached[name], end_db, "o", color=color)
     axes.set(xlabel="seconds of training steps", ylabel="held-out PSNR, dB")
     axes.set_title(Path(str(report.workload["data"])).name, fontsize=9)
     axes.spines[["top", "right"]].set_visible(False)
