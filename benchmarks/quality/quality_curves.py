@@ -9,7 +9,6 @@ within half a decibel of the first way's end.
 """
 
 import argparse
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -20,13 +19,11 @@ from rgbavatar_ns.bench.quality import QualityReport, seconds_to
 
 
 def read(path: Path) -> QualityReport:
-    """A report as it was written: JSON has names where curves have seconds."""
-    told = json.loads(path.read_text())
-    curves = {
-        name: [{float(second): value for second, value in one.items()} for one in of]
-        for name, of in told["curves"].items()
-    }
-    return QualityReport(told["workload"], curves, told["machine"])
+    """A report as it was written."""
+    report = QualityReport.read(path)
+    if report is None:
+        raise SystemExit(f"{path} is no report of `rgbavatar bench quality --json`.")
+    return report
 
 
 def draw(reports: Sequence[QualityReport], path: Path) -> None:

@@ -150,7 +150,7 @@ class QualityOptions(CheckedOptions):
     """
 
     json: Path | None = None
-    """Also write the figures here, curve by curve as they come."""
+    """Also write the figures here, curve by curve; interrupted, the command goes on from them."""
     data: Path | None = None
     """Dataset to learn and its held-out frames, in place of procedural people."""
     seeds: tuple[Seed, ...] = (0, 1, 2)

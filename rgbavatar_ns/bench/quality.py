@@ -3,7 +3,7 @@
 import statistics
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -26,15 +26,16 @@ from rgbavatar_ns.bench.machine import chosen_device, machine_facts, require_bac
 from rgbavatar_ns.bench.options import Batches, QualityOptions
 from rgbavatar_ns.bench.scenes import on_device
 from rgbavatar_ns.bench.timing import CPU, Progress, using_threads
-from rgbavatar_ns.bench.workloads import read_images
-from rgbavatar_ns.data import OfflineOrder, TrackedDataset, load_dataset
+from rgbavatar_ns.data import ImageCache, OfflineOrder, TrackedDataset, load_dataset
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.files import read_json
 from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.synthetic import DemoConfig, make_demo_dataset
 
 _MARKS_S = (1.0, 2.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0, 32.0, 48.0, 64.0, 96.0, 128.0, 192.0)
 _FRAMES, _HELD_OUT, _SIZE_PX = 160, 16, 256
 _RATES_END = 0.1
+_CACHE_BYTES = 1 << 30
 _OWN_TEXELS_BELOW = 256
 """Gaussians of a smaller UV map begin as large as its texels (the preset rgbavatar-tiny)."""
 
@@ -70,15 +71,37 @@ class QualityReport:
         told = {"benchmark": "quality", "seconds_to_quality": self.seconds_to_quality()}
         return told | asdict(self)
 
+    @classmethod
+    def read(cls, path: Path) -> "QualityReport | None":
+        """What `to_json` wrote; None where there is no such file or it holds something else."""
+        told = read_json(path)
+        try:
+            curves = {
+                name: [{float(second): float(psnr) for second, psnr in one.items()} for one in of]
+                for name, of in told["curves"].items()
+            }
+            workload, machine = dict(told["workload"]), dict(told["machine"])
+            return cls(workload, curves, machine, float(told["within_db"]))
+        except (LookupError, TypeError, ValueError, AttributeError):
+            return None
+
+    def is_begun_of(self, workload: dict[str, Any], names: Collection[str]) -> bool:
+        """Whether this measures the same and has curves still to come."""
+        counts = [len(of) for of in self.curves.values()]
+        same = self.workload == workload and self.curves.keys() == set(names)
+        return same and min(counts) < len(workload["seeds"])
+
 
 def bench_quality(
     options: QualityOptions,
     progress: Progress | None = None,
     found: Callable[[QualityReport], None] = lambda report: None,
+    begun: QualityReport | None = None,
 ) -> QualityReport:
     """Train each way on each subject; `found` is told whenever a curve is there.
 
-    Raises UserError for data that cannot be read, has no frames held out or too few for a step.
+    What was `begun` with the same options and not finished is gone on with. Raises UserError for
+    data that cannot be read, has no frames held out or too few for a step.
     """
     tell = progress or (lambda what, done, total: None)
     device = chosen_device(options.device)
@@ -95,13 +118,19 @@ def bench_quality(
         "backend": backend,
     }
     with using_threads(options.threads) as threads:
-        for seed in options.seeds:
+        facts["threads"] = threads
+        if begun is not None and begun.is_begun_of(facts, curves):
+            curves = begun.curves
+        for number, seed in enumerate(options.seeds):
+            missing = [way for way in ways if len(curves[way.name]) <= number]
+            if not missing:
+                continue
             with _dataset(options.data, seed, size, tell) as dataset:
                 subject = _Subject(dataset, seed, device)
-                for way in ways:
+                for way in missing:
                     curves[way.name].append(_curve(subject, way, options, threads, tell))
-                    found(QualityReport(facts | {"threads": threads}, curves))
-    return QualityReport(facts | {"threads": threads}, curves)
+                    found(QualityReport(facts, curves))
+    return QualityReport(facts, curves)
 
 
 @contextmanager
@@ -123,7 +152,7 @@ def _dataset(
 
 
 class _Subject:
-    """A dataset with its images in memory."""
+    """A dataset to train on and to measure with."""
 
     def __init__(self, dataset: TrackedDataset, seed: int, device: torch.device) -> None:
         if not dataset.test:
@@ -132,7 +161,7 @@ class _Subject:
                 "Track it with --test-frames, or pass another dataset.",
             )
         self.dataset, self.seed, self.device = dataset, seed, device
-        self.images = read_images(dataset, range(len(dataset)))
+        self._images = ImageCache(dataset, _CACHE_BYTES)
 
     def avatar(self, uv: int) -> Avatar:
         """A fresh one."""
@@ -154,7 +183,7 @@ class _Subject:
         """Frames as a step takes them."""
         chosen = list(positions)
         cameras = self.dataset.cameras.select(chosen)
-        batch = TrainingBatch(self.dataset.theta[chosen], cameras, self.images[chosen])
+        batch = TrainingBatch(self.dataset.theta[chosen], cameras, self._images.get(chosen))
         return on_device(batch, self.device)
 
     @torch.no_grad()

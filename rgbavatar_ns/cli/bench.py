@@ -70,12 +70,12 @@ def _measure_quality(options: QualityOptions) -> None:
     from rgbavatar_ns.files import write_json
 
     def keep(report: QualityReport) -> None:
-        # It takes minutes: what is there is not lost when the next curve is interrupted.
         if options.json is not None:
             write_json(options.json, report.to_json())
 
+    begun = None if options.json is None else QualityReport.read(options.json)
     with _progress() as told:
-        report = bench_quality(options, told, keep)
+        report = bench_quality(options, told, keep, begun)
     print_quality(report)
 
 

@@ -1,5 +1,6 @@
 """How soon an avatar is good: curves, when they reach a quality, and what cannot be measured."""
 
+import dataclasses
 import json
 
 import cv2
@@ -9,6 +10,7 @@ from rgbavatar_ns.bench.options import Batches, QualityOptions
 from rgbavatar_ns.bench.quality import QualityReport, bench_quality, print_quality, seconds_to
 from rgbavatar_ns.cli import bench
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.files import write_json
 from tests.plugin.tiny import tiny_dataset
 
 CURVE = {4.0: 30.0, 1.0: 26.0, 2.0: 28.0}
@@ -81,6 +83,44 @@ def test_a_report_is_told_after_every_curve(dataset):
         options, found=lambda report: counts.append(sum(map(len, report.curves.values())))
     )
     assert counts == [1, 2]
+
+
+def test_an_interrupted_measurement_goes_on_and_a_finished_one_begins_anew(dataset, tmp_path):
+    path = tmp_path / "quality.json"
+    options = QualityOptions(
+        json=path, data=dataset, seeds=(0, 1), batches=("1", "2"), seconds=0.1, uv=16
+    )
+
+    def stop(report: QualityReport) -> None:
+        write_json(path, report.to_json())
+        if sum(map(len, report.curves.values())) == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        bench_quality(options, found=stop)
+    begun = QualityReport.read(path)
+    assert begun is not None
+    first = {name: list(of) for name, of in begun.curves.items()}
+    whole = bench_quality(options, begun=begun)
+    assert {name: len(of) for name, of in whole.curves.items()} == {"1": 2, "2": 2}
+    assert whole.curves["1"] == first["1"]
+    assert whole.curves["2"][:1] == first["2"]
+    # Nothing is kept of other options, nor of what is there whole.
+    told = []
+    bench_quality(options, found=told.append, begun=whole)
+    assert len(told) == 4
+    other = dataclasses.replace(options, seconds=0.2, seeds=(0,), batches=("1",))
+    told.clear()
+    bench_quality(other, found=told.append, begun=begun)
+    assert len(told) == 1
+
+
+@pytest.mark.parametrize("content", ["", "[]", "{}", '{"curves": {"10": 3}}'])
+def test_other_files_are_no_reports(content, tmp_path):
+    path = tmp_path / "quality.json"
+    path.write_text(content)
+    assert QualityReport.read(path) is None
+    assert QualityReport.read(tmp_path / "missing.json") is None
 
 
 def test_a_dataset_without_held_out_frames_is_told(tmp_path):
