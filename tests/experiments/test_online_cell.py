@@ -144,7 +144,7 @@ def test_training_may_end_with_the_stream(dataset, tmp_path):
     assert trainer.completed
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_sweep_of_an_online_preset_ends_in_a_curve(dataset, tmp_path):
     path = tmp_path / "online.yaml"
     path.write_text(TEXT)

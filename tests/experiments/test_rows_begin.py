@@ -31,7 +31,9 @@ def _with(config: Any, option: str, value: Any) -> Any:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
-@pytest.mark.parametrize("tiny", [False, True], ids=["full", "tiny"])
+@pytest.mark.parametrize(
+    "tiny", [pytest.param(False, marks=pytest.mark.nightly), True], ids=["full", "tiny"]
+)
 def test_every_row_trains(path, tiny, tmp_path):
     """Two steps of few Gaussians; LPIPS, whose network is downloaded, is left out."""
     tiny_dataset(tmp_path / "data")

@@ -30,16 +30,22 @@ def test_nerfstudio_lists_it_from_the_entry_point():
     assert isinstance(all_dataparsers[NAME], RGBAvatarDataParserConfig)
 
 
+# A process each: the day has one of theirs and one of ours.
+_BY_NIGHT = (
+    "nerfstudio.data.datamanagers.base_datamanager",
+    "nerfstudio.data.dataparsers.base_dataparser",
+    "rgbavatar_ns.plugin.datamanager",
+    "rgbavatar_ns.plugin.methods",
+)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "first",
     [
         "nerfstudio.configs.dataparser_configs",
-        "nerfstudio.data.datamanagers.base_datamanager",
-        "nerfstudio.data.dataparsers.base_dataparser",
         "rgbavatar_ns.plugin.dataparser",
-        "rgbavatar_ns.plugin.datamanager",
-        "rgbavatar_ns.plugin.methods",
+        *(pytest.param(name, marks=pytest.mark.nightly) for name in _BY_NIGHT),
     ],
 )
 def test_whatever_is_imported_first_nothing_goes_in_a_circle(first: str):

@@ -189,7 +189,11 @@ def test_ns_export_writes_the_cameras(config: Path, tmp_path: Path, exporter: An
     ("command", "instead"),
     [
         (("ns-export", "gaussian-splat", "--output-dir"), "rgbavatar export RUN DST --format ply"),
-        (("ns-render", "spiral", "--output-path"), "rgbavatar render RUN OUT --show turntable"),
+        pytest.param(
+            ("ns-render", "spiral", "--output-path"),
+            "rgbavatar render RUN OUT --show turntable",
+            marks=pytest.mark.nightly,
+        ),
     ],
 )
 def test_a_refusal_ends_without_a_traceback(

@@ -110,7 +110,7 @@ def test_its_memory_goes_on_from_its_state(filmed):
         assert torch.equal(value, copy.state_dict()[name])
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_what_training_never_shows_does_not_walk_away(monkeypatch):
     # How far depends on how an instruction set rounds: the same one on every machine.
     monkeypatch.setenv(INSTRUCTION_SET_VARIABLE, "generic")

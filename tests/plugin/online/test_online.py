@@ -404,7 +404,9 @@ def kill_while_it_runs(data: Path, output: Path, delay_s: float) -> Path:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize(
+    "seed", [0, *(pytest.param(seed, marks=pytest.mark.nightly) for seed in (1, 2, 3))]
+)
 def test_a_run_that_is_killed_at_any_moment_goes_on(
     online: Online, tiny_data: Path, tmp_path: Path, seed: int
 ):

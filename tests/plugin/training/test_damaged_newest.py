@@ -97,8 +97,10 @@ def test_training_chooses_nothing_and_writes_nothing_into_its_config(run: Path, 
     "command",
     [
         ("ns-eval", "--output-path", "scores.json"),
-        ("ns-viewer",),
-        ("ns-render", "dataset", "--output-path", "pictures"),
+        pytest.param(("ns-viewer",), marks=pytest.mark.nightly),
+        pytest.param(
+            ("ns-render", "dataset", "--output-path", "pictures"), marks=pytest.mark.nightly
+        ),
     ],
     ids=lambda command: command[0],
 )

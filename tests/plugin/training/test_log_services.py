@@ -134,7 +134,7 @@ def test_a_service_without_account_or_package_is_told(
     assert name in _told(lambda: make_trainer(small_config(tiny_data, tmp_path, vis=vis)))
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_wandb_itself_takes_a_run_offline(
     tiny_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
