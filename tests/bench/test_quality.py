@@ -6,9 +6,12 @@ import json
 import cv2
 import pytest
 
+from rgbavatar_ns.bench import quality
 from rgbavatar_ns.bench.options import Batches, QualityOptions
 from rgbavatar_ns.bench.quality import QualityReport, bench_quality, print_quality, seconds_to
+from rgbavatar_ns.bench.timing import CPU
 from rgbavatar_ns.cli import bench
+from rgbavatar_ns.data import load_dataset
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.files import write_json
 from tests.plugin.tiny import tiny_dataset
@@ -74,6 +77,13 @@ def test_the_command_writes_curves_of_ones_own_dataset(dataset, tmp_path, capsys
         assert all(10 < value < 60 for one in of for value in one.values())
     assert set(told["seconds_to_quality"]) == {"2", "1-2:.2"}
     assert "rgbavatar bench quality" in printed
+
+
+def test_of_many_held_out_frames_some_from_all_over_are_scored(dataset, monkeypatch):
+    film = load_dataset(dataset)
+    assert quality._Subject(film, 0, CPU).scored == film.test
+    monkeypatch.setattr(quality, "_MOST_SCORED", 2)
+    assert quality._Subject(film, 0, CPU).scored == (film.test[0], film.test[2])
 
 
 def test_a_report_is_told_after_every_curve(dataset):
