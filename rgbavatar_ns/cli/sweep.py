@@ -24,6 +24,7 @@ def run(
     output: Path | None = None,
     subjects: tuple[str, ...] | None = None,
     tiny: bool = False,
+    known: tuple[Path, ...] = (),
     engine: Literal["local", "ray"] = "local",
     at_once: Annotated[int, Between(1, 1024)] = 1,
     address: str | None = None,
@@ -39,6 +40,8 @@ def run(
         output: where everything is written; outputs/sweeps/NAME by default (NAME-tiny with --tiny).
         subjects: in place of the file's: dataset folders, or demo:SEED:FRAMES:SIZE.
         tiny: take the file's `tiny` section: minutes on two cores.
+        known: files DOCS/results/NAME.json of `rgbavatar report --into DOCS`: their cells are done,
+            wherever they ran. Datasets are told apart by their names alone.
         engine: processes of this machine, or a Ray cluster.
         at_once: cells at a time of the local engine.
         address: of the Ray cluster; without it one is started here.
@@ -51,7 +54,13 @@ def run(
     console = Console()
     chosen: Engine = LocalEngine(at_once) if engine == "local" else RayEngine(address, cpus, gpus)
     with Live(console=console, refresh_per_second=1) as live:
-        statuses = sweep(experiment, folder, chosen, lambda statuses: live.update(_table(statuses)))
+        statuses = sweep(
+            experiment,
+            folder,
+            chosen,
+            lambda statuses: live.update(_table(statuses)),
+            known=known,
+        )
     console.print()
     failed = {status.folder: status for status in statuses if status.state != "done"}
     for status in failed.values():

@@ -9,6 +9,7 @@ import numpy as np
 
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.experiments.columns import COLUMNS
+from rgbavatar_ns.experiments.kept import kept_curve
 from rgbavatar_ns.experiments.runner import run_folder_of
 from rgbavatar_ns.experiments.spec import Experiment
 from rgbavatar_ns.experiments.streamed import StreamedCurve, read_streamed
@@ -124,6 +125,9 @@ def convergence(status: CellStatus) -> dict[int, tuple[float, float]]:
     """Seconds and PSNR by step of a finished cell; empty without any evaluation in training."""
     if status.result is None:
         return {}
+    kept = kept_curve(status.result)
+    if kept is not None:
+        return kept
     points = read_curve(run_folder_of(status.folder, status.cell) / CURVE_NAME)
     seen = {int(point["step"]): (point["train_seconds"], point["psnr"]) for point in points}
     ended = status.result["metrics"]

@@ -7,14 +7,16 @@ when it was made, and nothing of where on that machine.
 import math
 import re
 import shutil
+import string
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.experiments.cell_pictures import comparison, read_pictures
+from rgbavatar_ns.experiments.kept import kept_curve, kept_form, kept_results, portable_keys
 from rgbavatar_ns.experiments.plots import (
     convergence,
     write_convergence,
@@ -22,7 +24,6 @@ from rgbavatar_ns.experiments.plots import (
     write_plots,
 )
 from rgbavatar_ns.experiments.source import Source, read_sources
-from rgbavatar_ns.experiments.spec import subject_name
 from rgbavatar_ns.experiments.sweep import CellStatus, read_statuses
 from rgbavatar_ns.experiments.tables import ResultTable, result_table
 from rgbavatar_ns.files import atomic_write, read_json, write_json
@@ -47,9 +48,10 @@ def write_results(folder: Path, docs: Path) -> list[Path]:
     """Write or renew what a sweep's folder has to tell as `docs`/results/NAME.json.
 
     With its curves as PNG, and as JPEG the same held-out frames by each variant, of the first seed
-    and up to three subjects, below 300 kB each. Cells that are missing are told. Written again from
-    the same folder the files are the same. Returns all paths. Raises UserError where nothing was
-    swept there, or matplotlib is missing.
+    and up to three subjects, below 300 kB each. Cells that are missing are told. Those that the
+    file had and the folder lacks stay in it, with their pictures: a sweep may be made in parts, on
+    several machines. Written again from the same folder the files are the same. Returns all paths.
+    Raises UserError where nothing was swept there, or matplotlib is missing.
     """
     written: list[Path] = []
     for source in read_sources(folder):
@@ -73,30 +75,33 @@ def write_page(docs: Path) -> Path:
 def _write_result(source: Source, statuses: Sequence[CellStatus], place: Path) -> list[Path]:
     place.mkdir(parents=True, exist_ok=True)
     path = place / f"{source.name}.json"
+    kept = kept_results(path) if path.exists() else {}
+    portable = portable_keys([status.cell for status in statuses])
+    for status in statuses:
+        if status.result is None:
+            status.result = kept.get(portable[status.cell.key])
     title = source.experiment.title + (" (--tiny)" if source.tiny else "")
     table = asdict(result_table(source.experiment, statuses)) | {"title": title}
-    drawings = [*_draw_plots(source, statuses, place), *_draw_sheets(source, statuses, place)]
+    before = (read_json(path) or {}).get("drawings", [])
+    drawings = _draw_plots(source, statuses, place)
+    seen = _draw_what_cells_saw(source, statuses, portable, before, place)
     content = {
         "command": source.command,
         "made": _made(statuses),
         "table": table,
-        "curves": [
-            {
-                "variant": status.cell.variant,
-                "subject": subject_name(status.cell.subject),
-                "seed": status.cell.seed,
-                "seconds_psnr": list(points.values()),
-            }
+        "cells": {
+            portable[status.cell.key]: kept_form(status.cell, status.result, convergence(status))
             for status in statuses
-            if (points := convergence(status))
-        ],
-        "drawings": [drawing.name for drawing in drawings],
+            if status.result is not None
+        },
+        "drawings": [{"file": drawing.name, "cells": []} for drawing in drawings] + seen,
     }
-    before = read_json(path) or {}
     write_json(path, _told(content))
-    for name in set(before.get("drawings", ())) - set(content["drawings"]):
-        (place / Path(name).name).unlink(missing_ok=True)
-    return [path, *drawings]
+    shown = [drawing["file"] for drawing in content["drawings"]]
+    for drawing in before:
+        if drawing["file"] not in shown:
+            (place / Path(drawing["file"]).name).unlink(missing_ok=True)
+    return [path, *(place / name for name in shown)]
 
 
 def _made(statuses: Sequence[CellStatus]) -> dict[str, list[str]]:
@@ -121,30 +126,49 @@ def _draw_plots(source: Source, statuses: Sequence[CellStatus], place: Path) -> 
     experiment, name = source.experiment, source.name
     with tempfile.TemporaryDirectory() as made:
         drawn = write_convergence(experiment, statuses, Path(made), name)
-        drawn += write_forgetting_curves(statuses, Path(made), name)
         if experiment.plot is not None:
             table = result_table(experiment, statuses)
             drawn += write_plots(experiment, table, Path(made), name)
         return [Path(shutil.copyfile(path, place / path.name)) for path in drawn]
 
 
-def _draw_sheets(source: Source, statuses: Sequence[CellStatus], place: Path) -> list[Path]:
-    seed = source.experiment.seeds[0]
+def _draw_what_cells_saw(
+    source: Source,
+    statuses: Sequence[CellStatus],
+    portable: Mapping[str, str],
+    before: Sequence[Any],
+    place: Path,
+) -> list[dict[str, Any]]:
+    """Pictures and streams' curves: of cells that ran here, and those of `before` of other cells.
+
+    Each with its file's name and the portable keys of the cells that it shows.
+    """
+    done = [status for status in statuses if status.result is not None]
+    here = [status for status in done if kept_curve(status.result or {}) is None]
+    elsewhere = {portable[status.cell.key] for status in done if status not in here}
+    drawings = [drawing for drawing in before if elsewhere & set(drawing["cells"])]
+    taken = {drawing["file"] for drawing in drawings}
+
+    def leave(content: bytes, stem: str, suffix: str, shown: Sequence[CellStatus]) -> None:
+        names = (f"{source.name}_{stem}{part}{suffix}" for part in ("", *string.ascii_lowercase))
+        path = place / next(name for name in names if name not in taken)
+        with atomic_write(path) as partial:
+            partial.write_bytes(content)
+        keys = [portable[status.cell.key] for status in shown]
+        drawings.append({"file": path.name, "cells": keys})
+
+    with tempfile.TemporaryDirectory() as made:
+        for path in write_forgetting_curves(here, Path(made), source.name):
+            leave(path.read_bytes(), "forgetting", path.suffix, here)
     subjects = list(dict.fromkeys(status.cell.subject for status in statuses))
-    sheets = []
     for number, subject in enumerate(subjects[:_MOST_SHEETS], start=1):
-        shown = {
-            status.cell.variant: found
-            for status in statuses
-            if (status.cell.subject, status.cell.seed) == (subject, seed)
-            and (found := read_pictures(status.folder))
-        }
-        sheet = comparison(shown, _MOST_BYTES)
+        one = (subject, source.experiment.seeds[0])
+        mine = [status for status in here if (status.cell.subject, status.cell.seed) == one]
+        seen = {status.cell.variant: read_pictures(status.folder) for status in mine}
+        sheet = comparison({name: found for name, found in seen.items() if found}, _MOST_BYTES)
         if sheet is not None:
-            sheets.append(place / f"{source.name}_subject{number}.jpg")
-            with atomic_write(sheets[-1]) as partial:
-                partial.write_bytes(sheet)
-    return sheets
+            leave(sheet, f"subject{number}", ".jpg", mine)
+    return sorted(drawings, key=lambda drawing: drawing["file"])
 
 
 def _told(value: Any) -> Any:
@@ -163,7 +187,8 @@ def _section(path: Path) -> str:
     try:
         table = ResultTable.from_json(content["table"])
         body = table.body_markdown()
-        made, drawings, command = content["made"], content["drawings"], content["command"]
+        made, command = content["made"], content["command"]
+        files = [drawing["file"] for drawing in content["drawings"]]
         when = " to ".join(dict.fromkeys([*made["days"][:1], *made["days"][-1:]]))
         facts = [*made["machines"], *(f"torch {version}" for version in made["torch"])]
         facts += (
@@ -174,5 +199,5 @@ def _section(path: Path) -> str:
             f"{path} holds no result of this version.",
             "Delete it, or write it again with `rgbavatar report FOLDER --into DOCS`.",
         ) from None
-    pictures = "".join(f"\n![{table.title}]({RESULTS}/{name})\n" for name in drawings)
+    pictures = "".join(f"\n![{table.title}]({RESULTS}/{name})\n" for name in files)
     return f"## {table.title}\n\n`{command}`  \n{'; '.join(facts)}\n\n{body}{pictures}"

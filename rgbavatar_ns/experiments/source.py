@@ -5,7 +5,13 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from rgbavatar_ns.errors import UserError
-from rgbavatar_ns.experiments.spec import Experiment, SpecText, parse_experiment, subject_name
+from rgbavatar_ns.experiments.spec import (
+    Experiment,
+    SpecText,
+    name_on,
+    parse_experiment,
+    subject_name,
+)
 from rgbavatar_ns.files import read_json, write_json
 
 _SUFFIX = ".source.json"
@@ -19,11 +25,8 @@ class Source:
     tiny: bool
     command: str
     """Without this machine's paths: datasets by their names."""
-
-    @property
-    def name(self) -> str:
-        """Of its results: the experiment's, of which `tiny` makes another one."""
-        return f"{self.experiment.name}-tiny" if self.tiny else self.experiment.name
+    name: str
+    """Of its results: the same on every machine, where the experiment's tells this one's paths."""
 
 
 def keep_source(folder: Path, experiment: Experiment) -> None:
@@ -52,8 +55,9 @@ def _read(path: Path) -> Source:
     try:
         subjects = None if content["subjects"] is None else tuple(content["subjects"])
         spec = SpecText(**{**content, "subjects": subjects})
-        experiment = parse_experiment(
-            spec.text, Path(spec.file), tiny=spec.tiny, subjects=spec.subjects
+        experiment, of_file = (
+            parse_experiment(spec.text, Path(spec.file), tiny=spec.tiny, subjects=named)
+            for named in (spec.subjects, None)
         )
     except (TypeError, KeyError, AttributeError):
         raise UserError(
@@ -61,7 +65,11 @@ def _read(path: Path) -> Source:
         ) from None
     # The name tells subjects of the command line by their paths from where it was called.
     experiment = replace(experiment, name=path.name.removesuffix(_SUFFIX))
-    command = f"rgbavatar sweep {spec.file}" + (" --tiny" if spec.tiny else "")
+    command, name = f"rgbavatar sweep {spec.file}", of_file.name
+    if spec.tiny:
+        command += " --tiny"
     if spec.subjects is not None:
-        command += f" --subjects {shlex.join(map(subject_name, spec.subjects))}"
-    return Source(experiment, spec.tiny, command)
+        names = [subject_name(subject) for subject in spec.subjects]
+        command += f" --subjects {shlex.join(names)}"
+        name = name_on(name, names)
+    return Source(experiment, spec.tiny, command, f"{name}-tiny" if spec.tiny else name)

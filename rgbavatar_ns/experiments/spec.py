@@ -141,11 +141,14 @@ def _of_subjects(experiment: Experiment, subjects: Sequence[str]) -> Experiment:
     placed = tuple(
         name if is_demo(name) else str(Path(name).expanduser().absolute()) for name in subjects
     )
-    # Two folders may have one name: the digest tells them apart.
-    parts = [name.replace(":", "-") if is_demo(name) else Path(name).name for name in placed]
+    return replace(experiment, name=name_on(experiment.name, placed), subjects=placed)
+
+
+def name_on(name: str, subjects: Sequence[str]) -> str:
+    """An experiment's name on other subjects; two folders of one name part by the digest in it."""
+    parts = [part.replace(":", "-") if is_demo(part) else Path(part).name for part in subjects]
     told = "-".join(parts[:3]) + (f"-and-{len(parts) - 3}-more" if len(parts) > 3 else "")
-    name = f"{experiment.name}-{told}-{digest(placed)[:6]}"
-    return replace(experiment, name=name, subjects=placed)
+    return f"{name}-{told}-{digest(subjects)[:6]}"
 
 
 def is_demo(subject: str) -> bool:

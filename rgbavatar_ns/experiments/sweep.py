@@ -10,9 +10,10 @@ from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.experiments.cells import Cell, cells_of, demo_config
 from rgbavatar_ns.experiments.commands import killed_by
 from rgbavatar_ns.experiments.engines import Engine
+from rgbavatar_ns.experiments.kept import kept_results, portable_keys
 from rgbavatar_ns.experiments.overrides import check_overrides
 from rgbavatar_ns.experiments.reenactment import load_tracker
-from rgbavatar_ns.experiments.runner import LOG_FILE, read_result, write_cell
+from rgbavatar_ns.experiments.runner import LOG_FILE, RESULT_FILE, read_result, write_cell
 from rgbavatar_ns.experiments.source import keep_source
 from rgbavatar_ns.experiments.spec import Experiment, nearest
 from rgbavatar_ns.files import DiskError, atomic_folder, disk_errors, write_json
@@ -59,19 +60,29 @@ def sweep(
     folder: Path,
     engine: Engine,
     progress: Callable[[Sequence[CellStatus]], None] = lambda statuses: None,
+    *,
+    known: Sequence[Path] = (),
 ) -> list[CellStatus]:
     """Train and evaluate every cell that has no result yet, and return where all stand.
 
     A cell lives in `folder/cells/HASH`; a second call does only what is missing and resumes what
-    was interrupted. A failed cell is tried once more, then left with the last lines of its log;
-    the others go on. Raises UserError, before anything runs, for what `check_experiment` finds,
-    and where `folder` cannot be written, such as on a full disk.
+    was interrupted. Cells whose results `known` holds, files of `report --into`, are done too: such
+    a file tells a dataset by its name alone. A failed cell is tried once more, then left with the
+    last lines of its log; the others go on. Raises UserError, before anything runs, for what
+    `check_experiment` finds and for a file of `known` that holds no results; and where `folder`
+    cannot be written, such as on a full disk.
     """
     check_experiment(experiment)
+    kept = {key: result for path in known for key, result in kept_results(path).items()}
     remedy = "Make room or mend the permissions, then call it again: finished cells are kept."
     try:
         with disk_errors(folder, remedy):
-            return _sweep(experiment, cells_of(experiment), folder, engine, progress)
+            cells = cells_of(experiment)
+            for key, portable in portable_keys(cells).items() if kept else ():
+                place = folder / "cells" / key
+                if portable in kept and read_result(place) is None:
+                    write_json(place / RESULT_FILE, kept[portable])
+            return _sweep(experiment, cells, folder, engine, progress)
     except DiskError as error:
         cause = f"The sweep of {experiment.name} cannot go on: {error.cause}"
         raise DiskError(cause, remedy) from error
@@ -88,7 +99,11 @@ def _sweep(
     write_json(folder / f"{experiment.name}.json", [cell.to_json() for cell in cells])
     keep_source(folder, experiment)
     progress(statuses)
-    missing = {status.folder: status for status in statuses if status.state != "done"}
+    # All variants of one subject first, so that there is a comparison before the next begins.
+    places = list(dict.fromkeys((cell.seed, cell.subject) for cell in cells))
+    places.sort(key=lambda place: experiment.seeds.index(place[0]))
+    by_subject = sorted(statuses, key=lambda s: places.index((s.cell.seed, s.cell.subject)))
+    missing = {status.folder: status for status in by_subject if status.state != "done"}
     subjects = {cell.subject for cell in cells} | {_driver(cell) for cell in cells}
     data = {name: _dataset(name, folder) for name in sorted(subjects - {""}) if missing}
     for status in missing.values():

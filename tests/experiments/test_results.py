@@ -1,6 +1,7 @@
 """Results for the documentation: whole, the same when written again, nothing of this machine."""
 
 import json
+import shutil
 from pathlib import Path
 
 import cv2
@@ -11,8 +12,10 @@ from rgbavatar_ns.cli import main as cli
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.experiments import read_experiment
 from rgbavatar_ns.experiments.cells import cells_of
+from rgbavatar_ns.experiments.engines import LocalEngine
 from rgbavatar_ns.experiments.runner import run_folder_of
 from rgbavatar_ns.experiments.source import keep_source
+from rgbavatar_ns.experiments.sweep import sweep
 from rgbavatar_ns.files import write_json
 
 TEXT = """
@@ -32,13 +35,15 @@ tiny: {seeds: [0]}
 MADE = {"processor": "A CPU", "gpu": None, "cores": 2, "instruction_set": "avx2", "torch": "2.4"}
 
 
-def _sweep(folder: Path, file: Path, **options) -> Path:
-    """A finished sweep of made-up figures; its LPIPS names a place of this machine."""
+def _sweep(folder: Path, file: Path, done=lambda cell: True, **options) -> Path:
+    """A sweep of made-up figures, as far as `done`; its LPIPS names a place of this machine."""
     experiment = read_experiment(file, **options)
     cells = cells_of(experiment)
     write_json(folder / f"{experiment.name}.json", [cell.to_json() for cell in cells])
     keep_source(folder, experiment)
     for k, cell in enumerate(cells):
+        if not done(cell):
+            continue
         place = folder / "cells" / cell.key
         metrics = {"psnr": 30.0 + k, "psnr_refined": 31.0 + k, "sharpness": 0.5, "megabytes": 7.25}
         metrics |= {"steps": 11, "train_seconds": 9.0}
@@ -99,12 +104,13 @@ def test_the_page_tells_all_of_it_and_nothing_of_the_machines_paths(file, tmp_pa
     for content in written.values():
         assert str(tmp_path).encode() not in content
         assert str(Path.home()).encode() + b"/" not in content
-    curves = json.loads(written["results/two.json"])["curves"]
-    assert curves[1] == {
+    kept = json.loads(written["results/two.json"])["cells"].values()
+    (cell,) = (cell for cell in kept if cell["metrics"]["psnr"] == 31.0)
+    assert {name: cell[name] for name in ("variant", "subject", "seed", "curve")} == {
         "variant": "one",
         "subject": "hannah",
         "seed": 1,
-        "seconds_psnr": [[1.0, 23.0], [3.0, 27.0], [9.0, 31.0]],
+        "curve": {"2": [1.0, 23.0], "6": [3.0, 27.0], "10": [9.0, 31.0]},
     }
 
 
@@ -140,6 +146,64 @@ def test_drawings_that_are_no_more_are_removed(file, tmp_path):
     cli.main(["report", str(folder), "--into", str(docs)])
     names = {path.name for path in (docs / "results").iterdir()}
     assert names == {"two.json", "two_convergence.png", "others.png"}
+
+
+@pytest.fixture
+def in_parts(file, tmp_path, monkeypatch):
+    """Docs of one sweep in two parts, a subject on each of two machines, and the whole's docs.
+
+    The second machine has its datasets elsewhere; its folder is the third that is returned.
+    """
+    elsewhere = tmp_path / "elsewhere"
+    shutil.copytree(tmp_path / "private", elsewhere / "private")
+    subjects = ("private/hannah", "private/otto")
+    parts, whole = tmp_path / "parts", tmp_path / "whole"
+    for at, subject in ((tmp_path, "hannah"), (elsewhere, "otto")):
+        monkeypatch.chdir(at)
+        mine = lambda cell, name=subject: Path(cell.subject).name == name  # noqa: E731
+        folder = _sweep(at / "out", file, mine, subjects=subjects)
+        cli.main(["report", str(folder), "--into", str(parts)])
+    cli.main(
+        ["report", str(_sweep(elsewhere / "all", file, subjects=subjects)), "--into", str(whole)]
+    )
+    return parts, whole, folder
+
+
+def test_a_sweep_in_parts_on_two_machines_is_told_as_one(in_parts):
+    parts, whole, folder = in_parts
+    told, expected = _contents(parts), _contents(whole)
+    assert told.keys() == expected.keys()
+    (name,) = (name for name in expected if name.endswith(".json"))
+    got, wanted = json.loads(told.pop(name)), json.loads(expected.pop(name))
+    for content in (got, wanted):
+        # Links to a machine's cells: those of datasets are of their places there.
+        for row in (*content["table"]["rows"], *content["table"]["subject_rows"]):
+            row["cells"] = len(row["cells"])
+    assert got == wanted
+    assert told == expected
+    # Once more from the second machine's folder, which still has its own half alone.
+    cli.main(["report", str(folder), "--into", str(parts)])
+    assert {n: c for n, c in _contents(parts).items() if n != name} == told
+
+
+def test_what_another_machine_finished_is_not_run_again(in_parts, file, tmp_path):
+    parts, _, folder = in_parts
+    (known,) = (parts / "results").glob("*.json")
+    experiment = read_experiment(file, subjects=("private/hannah", "private/otto"))
+
+    class Idle(LocalEngine):
+        def run(self, folders, finished):
+            raise AssertionError(folders)
+
+    statuses = sweep(experiment, folder, Idle(), known=[known])
+    assert [status.state for status in statuses] == ["done"] * 8
+    # Of a third machine, that has nothing yet: all figures are those that were kept.
+    third = sweep(experiment, tmp_path / "third", Idle(), known=[known])
+    assert [(s.result or {})["metrics"] for s in third] == [
+        (s.result or {})["metrics"] for s in statuses
+    ]
+    with pytest.raises(UserError, match=r"two.yaml holds no results of cells"):
+        sweep(experiment, folder, Idle(), known=[file])
 
 
 def test_subjects_of_the_command_line_are_told_by_name(file, tmp_path):
