@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 
+import tests.nerfstudio_loaded  # noqa: F401  first of all: see there
 from rgbavatar_ns.experiments import engines, read_experiment
 from rgbavatar_ns.experiments.spec import Experiment
 

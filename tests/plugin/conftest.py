@@ -2,6 +2,7 @@ from pathlib import Path
 
 import pytest
 
+import tests.nerfstudio_loaded  # noqa: F401  first of all: see there
 from rgbavatar_ns.plugin.pipeline import RGBAvatarPipeline
 from tests.plugin.desk import Desk
 from tests.plugin.run import small_config, trained
