@@ -56,7 +56,8 @@ def kept_results(path: Path) -> dict[str, dict[str, Any]]:
     except (TypeError, KeyError, AttributeError):
         raise UserError(
             f"{path} holds no results of cells.",
-            "Name a file that `rgbavatar report FOLDER --into DOCS` wrote, DOCS/results/NAME.json.",
+            "Name a file DOCS/results/NAME.json that `rgbavatar report FOLDER --into DOCS` wrote; "
+            "delete one of an earlier version.",
         ) from None
 
 
