@@ -408,12 +408,13 @@ class TrainingStep:
             self._prior.begin(self.avatar, batch.theta, batch.cameras, batch.images_rgba)
 
     def _finish(self, step: int) -> None:
-        """What is due after a step: orthogonal bases, what is not seen."""
+        """What is due after a step: what is not seen, orthogonal bases."""
+        if self._prior is not None and self._prior.due(step):
+            self._prior.pull(self.avatar, step)
+        # Last, since what is not seen is drawn to the surface with its bases.
         method = self._orthogonality
         if (step + 1) % ORTHOGONALIZE_EVERY == 0 and method in ("qr", "gram_schmidt"):
             orthogonalize(self.avatar.blendshapes, method)
-        if self._prior is not None and self._prior.due(step):
-            self._prior.pull(self.avatar, step)
 
 
 def _probe(avatar: Avatar, backend: str) -> MorphedRenderer | None:
