@@ -206,6 +206,21 @@ def test_what_another_machine_finished_is_not_run_again(in_parts, file, tmp_path
         sweep(experiment, folder, Idle(), known=[file])
 
 
+def test_all_variants_of_one_subject_run_before_the_next_subject(file, tmp_path):
+    ordered: list[tuple[int, str, str]] = []
+
+    class Listing(LocalEngine):
+        def run(self, folders, finished):
+            cells = [json.loads((folder / "cell.json").read_text()) for folder in folders]
+            told = [(cell["seed"], Path(cell["subject"]).name, cell["variant"]) for cell in cells]
+            ordered.extend(told)
+
+    sweep(read_experiment(file), tmp_path / "out", Listing())
+    # Tried twice, since none of them is done by it.
+    assert len(ordered) == 16
+    assert ordered[:8] == sorted(ordered[:8])
+
+
 def test_subjects_of_the_command_line_are_told_by_name(file, tmp_path):
     chosen = (str(tmp_path / "private" / "otto"),)
     folder = _sweep(tmp_path / "out", file, subjects=chosen)
