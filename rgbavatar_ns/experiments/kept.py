@@ -1,5 +1,6 @@
 """Results as the documentation's JSON keeps them, by cell: what was finished elsewhere counts."""
 
+import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -49,11 +50,8 @@ def kept_results(path: Path) -> dict[str, dict[str, Any]]:
     """
     content = read_json(path)
     try:
-        return {
-            key: {name: kept[name] for name in (*_RESULT, "curve") if name in kept}
-            for key, kept in content["cells"].items()
-        }
-    except (TypeError, KeyError, AttributeError):
+        return {key: _result(kept) for key, kept in content["cells"].items()}
+    except (TypeError, ValueError, KeyError, AttributeError):
         raise UserError(
             f"{path} holds no results of cells.",
             "Name a file DOCS/results/NAME.json that `rgbavatar report FOLDER --into DOCS` wrote; "
@@ -61,9 +59,19 @@ def kept_results(path: Path) -> dict[str, dict[str, Any]]:
         ) from None
 
 
+def _result(kept: Mapping[str, Any]) -> dict[str, Any]:
+    result = {name: kept[name] for name in _RESULT if name in kept}
+    # JSON has no NaN: a figure that is not finite was kept as null.
+    result["metrics"] = {
+        name: math.nan if value is None else float(value) for name, value in kept["metrics"].items()
+    }
+    return {**result, "curve": dict(kept["curve"])}
+
+
 def kept_curve(result: Mapping[str, Any]) -> dict[int, tuple[float, float]] | None:
     """The curve in a result that was kept; None in one of a cell that ran here."""
     curve = result.get("curve")
     if curve is None:
         return None
-    return {int(step): (seconds, psnr) for step, (seconds, psnr) in curve.items()}
+    points = {int(step): point for step, point in curve.items()}
+    return {step: (seconds, math.nan if p is None else p) for step, (seconds, p) in points.items()}

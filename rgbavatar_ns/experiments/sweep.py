@@ -100,12 +100,13 @@ def _sweep(
     keep_source(folder, experiment)
     progress(statuses)
     # All variants of one subject first, so that there is a comparison before the next begins.
-    places = list(dict.fromkeys((cell.seed, cell.subject) for cell in cells))
-    places.sort(key=lambda place: experiment.seeds.index(place[0]))
-    by_subject = sorted(statuses, key=lambda s: places.index((s.cell.seed, s.cell.subject)))
+    seeds, subjects = experiment.seeds, list(dict.fromkeys(cell.subject for cell in cells))
+    by_subject = sorted(
+        statuses, key=lambda s: (seeds.index(s.cell.seed), subjects.index(s.cell.subject))
+    )
     missing = {status.folder: status for status in by_subject if status.state != "done"}
-    subjects = {cell.subject for cell in cells} | {_driver(cell) for cell in cells}
-    data = {name: _dataset(name, folder) for name in sorted(subjects - {""}) if missing}
+    shown = {*subjects, *map(_driver, cells)} - {""}
+    data = {name: _dataset(name, folder) for name in sorted(shown) if missing}
     for status in missing.values():
         status.folder.mkdir(parents=True, exist_ok=True)
         (status.folder / LOG_FILE).unlink(missing_ok=True)

@@ -267,7 +267,9 @@ def _entry(found: Sequence[tuple[Cell, float]]) -> Entry:
         by_seed.setdefault(cell.seed, {})[cell.subject] = value
     # A seed whose subjects are not all done would part for their sake.
     whole = [statistics.fmean(of.values()) for of in by_seed.values() if of.keys() == subjects]
-    spread = statistics.stdev(whole) if len(whole) > 1 else None
+    # statistics.stdev fails on NaN, as a diverged run leaves it.
+    spreads = len(whole) > 1 and all(map(math.isfinite, whole))
+    spread = statistics.stdev(whole) if spreads else None
     mean = statistics.fmean(value for _, value in found)
     return Entry(mean if math.isfinite(mean) else None, spread, len(found))
 

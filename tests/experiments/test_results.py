@@ -13,6 +13,7 @@ from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.experiments import read_experiment
 from rgbavatar_ns.experiments.cells import cells_of
 from rgbavatar_ns.experiments.engines import LocalEngine
+from rgbavatar_ns.experiments.kept import kept_results
 from rgbavatar_ns.experiments.runner import run_folder_of
 from rgbavatar_ns.experiments.source import keep_source
 from rgbavatar_ns.experiments.sweep import sweep
@@ -204,6 +205,29 @@ def test_what_another_machine_finished_is_not_run_again(in_parts, file, tmp_path
     ]
     with pytest.raises(UserError, match=r"two.yaml holds no results of cells"):
         sweep(experiment, folder, Idle(), known=[file])
+
+
+def test_a_kept_figure_that_is_not_finite_stays_a_gap(in_parts, file, tmp_path):
+    parts, _, folder = in_parts
+    (path,) = (parts / "results").glob("*.json")
+    content = json.loads(path.read_text())
+    for cell in content["cells"].values():
+        cell["metrics"]["psnr"] = None
+        cell["curve"]["6"][1] = None
+    path.write_text(json.dumps(content))
+    cli.main(["report", str(folder), "--into", str(parts)])
+    # Hannah's cells are kept ones, Otto's ran in the folder.
+    page = (parts / "results.md").read_text()
+    assert "| hannah | two | - |" in page
+    assert "| otto | two | 36.50 ± 0.71 |" in page
+
+
+@pytest.mark.parametrize("damage", [{}, {"metrics": {"psnr": "good"}, "curve": {}}])
+def test_kept_cells_without_figures_are_told(damage, tmp_path):
+    path = tmp_path / "x.json"
+    path.write_text(json.dumps({"cells": {"abc": damage}}))
+    with pytest.raises(UserError, match="holds no results of cells"):
+        kept_results(path)
 
 
 def test_all_variants_of_one_subject_run_before_the_next_subject(file, tmp_path):
