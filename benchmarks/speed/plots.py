@@ -22,8 +22,9 @@ from rgbavatar_ns.bench.machine import machine_facts
 from rgbavatar_ns.bench.options import RasterizerOptions
 from rgbavatar_ns.bench.rasterizer import WHOLE, bench_rasterizer, time_rasterizer
 from rgbavatar_ns.bench.scenes import DEFAULT_COUNT, DEFAULT_SIZE_PX, ellipsoid_scene
-from rgbavatar_ns.bench.timing import Stopwatch, using_threads
+from rgbavatar_ns.bench.timing import Stopwatch
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.kernels.threads import using_threads
 
 Points = list[tuple[float, float, float, float]]
 """(what is varied, median, lower and upper quartile in milliseconds)."""

@@ -30,6 +30,7 @@ from rgbavatar_ns.kernels import (
     rasterize,
 )
 from rgbavatar_ns.kernels.constants import MIN_ALPHA
+from rgbavatar_ns.kernels.threads import using_threads
 
 LEARNING_RATES: dict[str, float] = {
     "position": 8e-4,
@@ -248,10 +249,7 @@ class Avatar(AvatarMethod):
         `psi` and `vertices` replace the answers of weight network and head model. Raises UserError
         where theta is unfit.
         """
-        theta = self.checked(theta)
-        with torch.no_grad():
-            weights = self.weights(theta) if psi is None else psi
-            posed = self.carrier_vertices(theta) if vertices is None else vertices
+        weights, posed = self._driven(theta, psi, vertices)
         return morphed_renderer(self._morphed_gaussians(), weights, posed, cameras, backend)
 
     def picture_renderer(
@@ -272,11 +270,19 @@ class Avatar(AvatarMethod):
         packed = self._packed.of(gaussians, backend)
         if packed is None:
             return None
+        weights, posed = self._driven(theta, psi, vertices)
+        return picture_renderer(packed, gaussians, weights, posed, cameras)
+
+    @torch.no_grad()
+    def _driven(
+        self, theta: Float[Tensor, "B H"], psi: Tensor | None, vertices: Tensor | None
+    ) -> tuple[Float[Tensor, "B K"], Float[Tensor, "B V 3"]]:
+        """Weights and posed mesh, unless they are there; compiled loops follow at once."""
         theta = self.checked(theta)
-        with torch.no_grad():
+        with using_threads(1):
             weights = self.weights(theta) if psi is None else psi
             posed = self.carrier_vertices(theta) if vertices is None else vertices
-        return picture_renderer(packed, gaussians, weights, posed, cameras)
+        return weights, posed
 
     def _morphed_gaussians(self) -> MorphedGaussians:
         names = [field.name for field in fields(MorphedGaussians)]

@@ -28,11 +28,11 @@ from rgbavatar_ns.bench.timing import (
     Spread,
     Stopwatch,
     peak_growth_bytes,
-    using_threads,
 )
 from rgbavatar_ns.bench.workloads import AvatarWorkload, avatar_workload, parameters_of
 from rgbavatar_ns.drawing.compositing import to_uint8
 from rgbavatar_ns.kernels import rasterize
+from rgbavatar_ns.kernels.threads import using_threads
 
 WHOLE_FRAME = "whole frame"
 VIEWER_FRAME = "(the viewer's picture: with depth, as bytes)"
@@ -98,10 +98,11 @@ def _time_parts(workload: AvatarWorkload, stopwatch: Stopwatch) -> dict[str, Spr
     camera, background = one_camera(workload.batch.cameras, 0), theta.new_zeros(1, 3)
 
     def once(lap: Lap) -> None:
-        vertices = avatar.head(theta, avatar.identity)
-        lap("head")
-        psi = avatar.weights(theta)
-        lap("network")
+        with using_threads(1):  # as `Avatar.picture_renderer` does
+            vertices = avatar.carrier_vertices(theta)
+            lap("head")
+            psi = avatar.weights(theta)
+            lap("network")
         renderer = avatar.picture_renderer(theta, camera, psi, vertices)
         if renderer is None:
             renderer = avatar.renderer(theta, camera, psi, vertices)

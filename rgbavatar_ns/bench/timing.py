@@ -3,8 +3,8 @@
 import ctypes
 import re
 import statistics
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -84,18 +84,6 @@ class Stopwatch:
     def _tell(self, what: str, done: int) -> None:
         if self.progress is not None:
             self.progress(what, done, self.repetitions)
-
-
-@contextmanager
-def using_threads(count: int | None) -> Iterator[int]:
-    """Let torch use this many threads within; gives the number used."""
-    before = torch.get_num_threads()
-    if count is not None:
-        torch.set_num_threads(count)
-    try:
-        yield torch.get_num_threads()
-    finally:
-        torch.set_num_threads(before)
 
 
 def peak_growth_bytes(call: Callable[[], Any], device: torch.device = CPU) -> int | None:

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from rgbavatar_ns.kernels.constants import UNFILMED_RGBA
+from rgbavatar_ns.kernels.threads import using_threads
 
 ImagesRGBA = UInt8[Tensor, "*batch height width 4"] | Float[Tensor, "*batch height width 4"]
 """Straight-alpha images, of 8 bits or in [0, 1]."""
@@ -74,7 +75,9 @@ def straight_alpha(
 
 def to_uint8(image: Float[Tensor, "*batch H W C"]) -> UInt8[np.ndarray, "*batch H W C"]:
     """Values in [0, 1] as bytes, rounded; what lies outside is cut."""
-    return (image.clamp(0, 1) * 255 + 0.5).to(torch.uint8).cpu().numpy()
+    with using_threads(1):  # The next picture's loops are about to begin.
+        levels = torch.add(0.5, image, alpha=255).clamp_(0, 255)  # One copy: its pages cost most.
+        return levels.to(torch.uint8).cpu().numpy()
 
 
 def composite_bytes(

@@ -7,9 +7,11 @@ import pytest
 import torch
 
 from rgbavatar_ns.avatar.training import make_optimizer
-from rgbavatar_ns.bench.timing import using_threads
+from rgbavatar_ns.drawing.compositing import to_uint8
+from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.kernels import available_backends, packed_gaussians
 from rgbavatar_ns.kernels.constants import MIN_ALPHA
+from rgbavatar_ns.kernels.threads import using_threads
 from tests.avatar.fused_scene import VARIANTS, far_batch, fused_step, stir
 from tests.avatar.small_head import front_camera, random_theta
 from tests.kernels.conftest import instruction_set  # noqa: F401
@@ -158,6 +160,36 @@ def test_the_copy_takes_half_of_the_bases_and_a_little_more(stirred):
     assert packed is not None
     bases = 10 * 21 * avatar.num_gaussians
     assert 2 * bases <= packed.num_bytes < 2.5 * bases
+
+
+@torch.no_grad()
+def test_what_a_picture_asks_of_torch_wakes_no_other_threads(stirred):
+    avatar = stirred()
+    theta, camera = random_theta(avatar.layout, 1), front_camera()
+    used = []
+
+    def look(*_) -> None:
+        used.append(torch.get_num_threads())
+
+    with using_threads(3):
+        seen(avatar, theta, camera)
+        hooks = [part.register_forward_hook(look) for part in (avatar.head, avatar.weight_network)]
+        avatar.render(theta, camera, to_be_seen=True)
+        to_uint8(torch.zeros(4, 4, 3))
+        assert used == [1, 1]
+        assert torch.get_num_threads() == 3
+        with pytest.raises(UserError, match="theta"):
+            avatar.render(theta[:, 1:], camera, to_be_seen=True)
+        hooks.append(avatar.head.register_forward_hook(_fail))
+        with pytest.raises(RuntimeError, match="no head"):
+            avatar.render(theta, camera, to_be_seen=True)
+        assert torch.get_num_threads() == 3
+    for hook in hooks:
+        hook.remove()
+
+
+def _fail(*_) -> None:
+    raise RuntimeError("no head today")
 
 
 def test_packed_gaussians_draw_one_picture_at_a_time(stirred):

@@ -8,8 +8,8 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 import torch
 
-from rgbavatar_ns.bench.timing import using_threads
 from rgbavatar_ns.kernels import available_backends, rasterize
+from rgbavatar_ns.kernels.threads import using_threads
 from tests.kernels.scenes import random_scene, to
 
 pytestmark = pytest.mark.skipif("cpu" not in available_backends(), reason="not compiled")

@@ -27,6 +27,7 @@ from rgbavatar_ns.drawing.compositing import (
 from rgbavatar_ns.drawing.wireframe import with_wireframe
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.kernels import GaussianSet, PinholeCameras, RenderedBatch
+from rgbavatar_ns.kernels.threads import using_threads
 from rgbavatar_ns.plugin.cameras import filled_depth
 from rgbavatar_ns.plugin.viewer.driving import DrivingSignal
 from rgbavatar_ns.plugin.viewer.viewer_state import ViewerState
@@ -72,9 +73,10 @@ def viewer_render(
         return _beside_film(avatar, signal, state, camera, film, backend)
     drawn = _draw(avatar, signal, state, camera, backend)
     assert drawn.depth is not None
-    alpha, depth = drawn.alpha[0], filled_depth(drawn.depth, drawn.alpha)[0]
-    # nerfstudio's viewer makes bytes of it, where 1.01 would be black.
-    image = drawn.image[0].clamp(0, 1)
+    with using_threads(1):
+        alpha, depth = drawn.alpha[0], filled_depth(drawn.depth, drawn.alpha)[0]
+        # nerfstudio's viewer makes bytes of it, where 1.01 would be black.
+        image = drawn.image[0].clamp_(0, 1)
     if state.picture == "alpha":
         image = alpha.expand(-1, -1, 3)
     elif state.picture == "depth":

@@ -14,6 +14,8 @@ from nerfstudio.viewer.render_state_machine import RenderAction, RenderStateMach
 from nerfstudio.viewer.utils import get_camera
 from torch import Tensor
 
+from rgbavatar_ns.kernels.threads import using_threads
+
 _BUDGET_S = 1 / 25
 """A moving picture may take so long to draw and to send."""
 _LEAST_HEIGHT_PX = 256
@@ -73,7 +75,8 @@ class RenderThread(RenderStateMachine):
                 return
         outputs = self._draw()
         began_s = self._clock()
-        self._send_output_to_viewer(outputs, static_render=self._sharp)
+        with using_threads(1):
+            self._send_output_to_viewer(outputs, static_render=self._sharp)
         if not self._sharp:
             sent_s = self._clock()
             self._fit(self._drawn_in_s + sent_s - began_s)

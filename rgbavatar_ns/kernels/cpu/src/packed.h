@@ -7,14 +7,17 @@
 
 namespace rgbavatar::RGBAVATAR_ISA {
 
-// base + sum_k weight_k basis_k of kColumns columns.
+// base + sum_k weight_k basis_k of kColumns columns; meanwhile begins to fetch the same of the next
+// block, which is `stride` on: processors by themselves fetch ahead within a page only.
 template <int kColumns>
 static RGBAVATAR_MEMBER void morph_columns(const float* base, const uint16_t* basis, int bases,
-                                           const float* weights, Wide out[kColumns]) {
+                                           int64_t stride, const float* weights,
+                                           Wide out[kColumns]) {
   for (int c = 0; c < kColumns; ++c) out[c] = load_wide(base + c * kLanes);
   for (int k = 0; k < bases; ++k, basis += kColumns * kLanes) {
     const Wide weight(weights[k]);
     for (int c = 0; c < kColumns; ++c) {
+      __builtin_prefetch(basis + stride + c * kLanes);
       Wide value;
       load_halves(value, basis + c * kLanes);
       out[c] = out[c] + value * weight;
@@ -27,16 +30,18 @@ static void project_packed(const PackedScene& scene, const float* camera_floats,
   static_assert(kLanes == kPackedLanes, "a block is as wide as the loops");
   const Camera camera = camera_from(camera_floats, scene.width, scene.height);
   const int bases = scene.bases;
+  const int64_t stride = int64_t(bases) * kPackedMorphed * kLanes;
   for (int first = begin; first < end; first += kLanes) {
     const int64_t block = first / kLanes;
     const float* base = scene.base + block * kPackedColumns * kLanes;
-    const uint16_t* basis = scene.basis + block * bases * kPackedMorphed * kLanes;
+    const uint16_t* basis = scene.basis + block * stride;
     Wide position[3], rotation[4], color[3];
-    morph_columns<3>(base + kPackedPosition * kLanes, basis, bases, scene.weights, position);
+    const float* weights = scene.weights;
+    morph_columns<3>(base + kPackedPosition * kLanes, basis, bases, stride, weights, position);
     basis += bases * 3 * kLanes;
-    morph_columns<4>(base + kPackedRotation * kLanes, basis, bases, scene.weights + bases, rotation);
+    morph_columns<4>(base + kPackedRotation * kLanes, basis, bases, stride, weights + bases, rotation);
     basis += bases * 4 * kLanes;
-    morph_columns<3>(base + kPackedColor * kLanes, basis, bases, scene.weights + 2 * bases, color);
+    morph_columns<3>(base + kPackedColor * kLanes, basis, bases, stride, weights + 2 * bases, color);
     const auto column = [&](int c) __attribute__((always_inline)) {
       return load_wide(base + c * kLanes);
     };
