@@ -372,6 +372,22 @@ static void write_block(const Tile& tile, const ForwardOutput& out, int block,
   });
 }
 
+// The background alone, where no Gaussian is.
+static void write_background(const Tile& tile, const ForwardOutput& out) {
+  constexpr int kTileSide = kTileBlocks * kBlockSide;
+  const int left = tile.tile_x * kTileSide, top = tile.tile_y * kTileSide;
+  const int columns = tile.width - left < kTileSide ? tile.width - left : kTileSide;
+  const int bottom = tile.height - top < kTileSide ? tile.height : top + kTileSide;
+  float colors[kTileSide * 3];
+  for (int i = 0; i < kTileSide * 3; ++i) colors[i] = out.background[i % 3];
+  for (int y = top; y < bottom; ++y) {
+    const int64_t pixel = int64_t(y) * tile.width + left;
+    __builtin_memcpy(out.image + pixel * 3, colors, columns * 3 * sizeof(float));
+    __builtin_memset(out.alpha + pixel, 0, columns * sizeof(float));
+    if (out.depth) __builtin_memset(out.depth + pixel, 0, columns * sizeof(float));
+  }
+}
+
 template <bool kWithDepth>
 static void forward_rows(const Tile& tile, const ForwardOutput& out, TileScratch& scratch) {
   constexpr int kRows = kWithDepth ? kDepth + 1 : kDepth;
@@ -387,7 +403,9 @@ static void forward_rows(const Tile& tile, const ForwardOutput& out, TileScratch
 }
 
 static void forward_tile(const Tile& tile, const ForwardOutput& out, TileScratch& scratch) {
-  if (out.depth)
+  if (tile.entry_count == 0)
+    write_background(tile, out);
+  else if (out.depth)
     forward_rows<true>(tile, out, scratch);
   else
     forward_rows<false>(tile, out, scratch);
