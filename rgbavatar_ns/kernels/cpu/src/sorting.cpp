@@ -113,10 +113,18 @@ void Rendering::put_into_tiles(Team& team, bool with_slots) {
     w.entries[image].reserve(total + 1);  // `none` writes behind the last one
   }
   team.run(batch_, [&](int64_t image, int) { lay_out_entries(int(image)); });
-  team.run(int64_t(batch_) * parts, [&](int64_t item, int) {
-    const int image = int(item / parts), part = int(item % parts);
+  const auto fill = [&](int image, int part) {
     with_slots ? fill_part<true>(image, part) : fill_part<false>(image, part);
-  });
+  };
+  // A tile's entries lie side by side, so that two threads take longer over one image than one.
+  if (2 * batch_ >= team.size())
+    team.run(batch_, [&](int64_t image, int) {
+      for (int part = 0; part < parts; ++part) fill(int(image), part);
+    });
+  else
+    team.run(parts, [&](int64_t part, int) {
+      for (int image = 0; image < batch_; ++image) fill(image, int(part));
+    });
   w.most_entries = 0;
   for (int image = 0; image < batch_; ++image) {
     const uint32_t* start = &w.tile_start[size_t(image) * (tiles + 1)];
