@@ -18,6 +18,7 @@ from rgbavatar_ns.head.landmarks import (
     facemesh_noise,
     facemesh_response,
 )
+from rgbavatar_ns.kernels.threads import using_threads
 from rgbavatar_ns.tracking.config import TrackConfig
 from rgbavatar_ns.tracking.face.detector import (
     FACE_OVAL,
@@ -208,7 +209,7 @@ class SubjectTracker:
         known = fit.upon_body
         row = self.cost.theta(fit.values[position]) if known is None else known[position]
         theta = torch.from_numpy(row)
-        with torch.no_grad():
+        with torch.no_grad(), using_threads(1):  # Other threads are busy with faces and mattes.
             vertices = self.head(theta, self._person(fit.subject.identity))
         return fit.subject.camera.project(vertices.numpy())
 
