@@ -26,6 +26,7 @@ from rgbavatar_ns.head.arkit import head_carrier
 from rgbavatar_ns.head.lips import LipGap
 from rgbavatar_ns.head.rotations import axis_angle_to_matrix, matrix_to_axis_angle
 from rgbavatar_ns.kernels import PinholeCameras
+from rgbavatar_ns.kernels.threads import using_threads
 from rgbavatar_ns.options import CheckedOptions, Weight
 
 _LOWEST = 0.1
@@ -99,9 +100,12 @@ class LiveTransfer:
         upon = head_carrier(avatar.head.arrays.expression_names) == "neck"
         names = ("neck",) if upon else ("rotation", "neck")
         self._carriers = [avatar.layout.slice(name) for name in names]
+        self._start_turns = [axis_angle_to_matrix(own.theta_mean[one]) for one in self._carriers]
+        self._start_seen = self._turn(own.theta_mean)
         self._expressive = expressive_numbers(avatar.layout)
-        low, high = own.film_range()
-        self._unit = (high - low).clamp(min=_LEAST_UNIT)
+        self._low, self._high = own.film_range()
+        self._room = _ROOM_SHARE * (self._high - self._low)
+        self._unit = (self._high - self._low).clamp(min=_LEAST_UNIT)
         self._lips = LipGap.of(avatar.head, avatar.identity)
         if self._lips is not None:
             self._closed_m = self._lips.at_rest_m
@@ -129,8 +133,13 @@ class LiveTransfer:
         """Take a frame into the calibration before its turn, as of a recording one can."""
         self._learn(self._mapped(frame).theta[0], frame.time_s)
 
+    @torch.no_grad()
     def __call__(self, frame: PerformanceFrame) -> Float[Tensor, "H"]:
         """The avatar's theta for a frame."""
+        with using_threads(1):  # Numbers are few, and others are busy with faces and pictures.
+            return self._transferred(frame)
+
+    def _transferred(self, frame: PerformanceFrame) -> Float[Tensor, "H"]:
         mapped = self._mapped(frame)
         performed = mapped.theta[0]
         seconds = 0.0 if self._last_s is None else frame.time_s - self._last_s
@@ -205,9 +214,7 @@ class LiveTransfer:
         What only rises from rest never falls below it; everything else goes ever less far beyond
         the film: half the range for expressions, 20 degrees for the head.
         """
-        low, high = self._own.film_range()
-        room = _ROOM_SHARE * (high - low)
-        held = _softly(theta, low, high, room)
+        held = _softly(theta, self._low, self._high, self._room)
         held = torch.where(self._rises, torch.maximum(held, self._own.theta_min), held)
         return self._turned_back(torch.where(self._expressive, held, theta))
 
@@ -229,7 +236,7 @@ class LiveTransfer:
         wanted_m = self._own_closed_m + gap_m - self._closed_m
         jaw = float(theta[lips.jaw]) + (wanted_m - own_m) / lips.slope_m_per_rad
         if self.options.keep_range:
-            low, high = (float(end[lips.jaw]) for end in self._own.film_range())
+            low, high = float(self._low[lips.jaw]), float(self._high[lips.jaw])
             jaw = min(max(jaw, low), high + _ROOM_SHARE * (high - low))
         theta = theta.clone()
         theta[lips.jaw] = jaw
@@ -239,22 +246,20 @@ class LiveTransfer:
         """With the head's turn as the camera sees it softly within those filmed."""
         low, high = self._own.filmed_turns()
         room = torch.full_like(low, _TURN_ROOM_DEGREES)
-        wanted = _softly(self._turn(theta), low, high, room)
-        mean = self._own.theta_mean
-        start_seen = self._turn(mean)
-        starts = [axis_angle_to_matrix(mean[carrier]) for carrier in self._carriers]
+        start_seen, seen = self._start_seen, self._turn(theta)
+        wanted = _softly(seen, low, high, room)
         # Angles of large turns do not add: what is left is taken back again.
         for _ in range(_MOST_TURNS_BACK):
-            seen = self._turn(theta)
             kept = (wanted - start_seen) / torch.where(seen == start_seen, 1.0, seen - start_seen)
             share = float(torch.where((seen - wanted).abs() > _SAME_DEGREES, kept, 1.0).min())
             if share >= 1.0:
                 break
             theta = theta.clone()
-            for carrier, start in zip(self._carriers, starts):
+            for carrier, start in zip(self._carriers, self._start_turns):
                 moved = matrix_to_axis_angle(axis_angle_to_matrix(theta[carrier]) @ start.mT)
                 held = axis_angle_to_matrix(max(share, 0.0) * moved) @ start
                 theta[carrier] = matrix_to_axis_angle(held)
+            seen = self._turn(theta)
         return theta
 
     def _turn(self, theta: Float[Tensor, "H"]) -> Float[Tensor, "2"]:

@@ -72,8 +72,7 @@ def theta_map(layout: ThetaLayout, arrays: HeadArrays, avatar: AvatarMethod) -> 
     driver = ThetaNames.of(layout, arrays)
     own = ThetaNames.of(avatar.layout, avatar.head.arrays)
     if set(driver.expression_names) & set(own.expression_names) or not speaks_arkit(arrays):
-        _require_a_shared_name(driver, own)
-        return lambda theta: map_by_name(theta, driver, own)
+        return NamedMap(driver, own)
     theirs, ours = arkit_map(arrays), avatar.arkit
 
     def by_arkit(theta: Float[Tensor, "F G"]) -> MappedTheta:
@@ -95,40 +94,50 @@ def arkit_theta(
     return MappedTheta(avatar.arkit.theta(coefficients, head_rotation), known)
 
 
-def map_by_name(theta: Float[Tensor, "F G"], driver: ThetaNames, avatar: ThetaNames) -> MappedTheta:
+class NamedMap:
     """Theta of one head model in the layout of another, number by number by its name.
 
     Between a head and one upon shoulders the head's whole turn goes to the joint that carries it;
     what a head alone says of place and turn is nothing that shoulders have to follow. Raises
     UserError where not a single expression has a name that the avatar knows.
     """
-    if theta.shape[-1] != driver.layout.size:
-        raise UserError(
-            f"The driver's theta has {theta.shape[-1]} numbers, its layout {driver.layout.size}.",
-            "Write the driver's dataset again.",
-        )
-    _require_a_shared_name(driver, avatar)
-    place_of = {name: place for place, name in enumerate(driver.numbers)}
-    result = theta.new_zeros(len(theta), avatar.layout.size)
-    wanted = avatar.numbers
-    known = torch.tensor([name in place_of for name in wanted])
-    result[:, known] = theta[:, [place_of[name] for name in wanted if name in place_of]]
-    if driver.has_shoulders != avatar.has_shoulders:
-        parts = driver.layout.split(theta)
-        root, neck = (axis_angle_to_matrix(parts[name]) for name in _CARRIERS)
-        carrier, other = reversed(_CARRIERS) if avatar.has_shoulders else _CARRIERS
-        result[:, avatar.layout.slice(carrier)] = matrix_to_axis_angle(root @ neck)
-        result[:, avatar.layout.slice(other)] = 0
-        if avatar.has_shoulders:
-            for name in ("rotation", "translation"):
-                known[avatar.layout.slice(name)] = False
-                result[:, avatar.layout.slice(name)] = 0
-    return MappedTheta(
-        result,
-        known,
-        unmapped=tuple(name for name in driver.numbers if name not in wanted),
-        missing=tuple(name for name in wanted if name not in place_of),
-    )
+
+    def __init__(self, driver: ThetaNames, avatar: ThetaNames) -> None:
+        _require_a_shared_name(driver, avatar)
+        self._driver, self._avatar = driver.layout, avatar.layout
+        place_of = {name: place for place, name in enumerate(driver.numbers)}
+        wanted = avatar.numbers
+        named = torch.tensor([name in place_of for name in wanted])
+        self._to = torch.nonzero(named)[:, 0]
+        self._from = torch.tensor([place_of[name] for name in wanted if name in place_of])
+        self._unmapped = tuple(name for name in driver.numbers if name not in wanted)
+        self._missing = tuple(name for name in wanted if name not in place_of)
+        self._known, self._carrier = named, None
+        if driver.has_shoulders != avatar.has_shoulders:
+            self._carrier, other = reversed(_CARRIERS) if avatar.has_shoulders else _CARRIERS
+            self._stays = [avatar.layout.slice(other)]
+            if avatar.has_shoulders:
+                for name in ("rotation", "translation"):
+                    self._known[avatar.layout.slice(name)] = False
+                    self._stays.append(avatar.layout.slice(name))
+
+    def __call__(self, theta: Float[Tensor, "F G"]) -> MappedTheta:
+        """Each frame in the avatar's layout; raises UserError where theta has another size."""
+        size = self._driver.size
+        if theta.shape[-1] != size:
+            raise UserError(
+                f"The driver's theta has {theta.shape[-1]} numbers, its layout {size}.",
+                "Write the driver's dataset again.",
+            )
+        result = theta.new_zeros(len(theta), self._avatar.size)
+        result[:, self._to] = theta[:, self._from]
+        if self._carrier is not None:
+            parts = self._driver.split(theta)
+            root, neck = (axis_angle_to_matrix(parts[name]) for name in _CARRIERS)
+            result[:, self._avatar.slice(self._carrier)] = matrix_to_axis_angle(root @ neck)
+            for numbers in self._stays:
+                result[:, numbers] = 0
+        return MappedTheta(result, self._known, self._unmapped, self._missing)
 
 
 def _require_a_shared_name(driver: ThetaNames, avatar: ThetaNames) -> None:

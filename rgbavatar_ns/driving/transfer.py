@@ -49,14 +49,14 @@ def make_relative(
     that the reference itself becomes the avatar's own exactly.
     """
     result = own_reference + (theta - driver_reference)
-    for part in layout.fields:
-        if part.form == "axis_angle":
-            numbers = layout.slice(part.name)
-            turns, reference, own = (
-                axis_angle_to_matrix(values[..., numbers])
-                for values in (theta, driver_reference, own_reference)
-            )
-            result[..., numbers] = matrix_to_axis_angle(turns @ reference.mT @ own)
+    turning = [layout.slice(field.name) for field in layout.fields if field.form == "axis_angle"]
+    if turning:
+        # All at once: single ones are too small for a tensor operation each.
+        all_rows = torch.cat([driver_reference[None], own_reference[None], theta])
+        turns = axis_angle_to_matrix(torch.stack([all_rows[:, numbers] for numbers in turning], 1))
+        turned = matrix_to_axis_angle(turns[2:] @ (turns[0].mT @ turns[1]))
+        for numbers, turn in zip(turning, turned.unbind(1)):
+            result[:, numbers] = turn
     return result
 
 

@@ -31,7 +31,7 @@ class LipGap:
         weights: Float[np.ndarray, "2 K"],
     ) -> None:
         self._head, self._identity = head, identity
-        self._vertices = torch.from_numpy(vertices.astype(np.int64))
+        self._vertices = torch.from_numpy(vertices.astype(np.int64)).flatten()
         self._weights = torch.from_numpy(weights).to(identity)
         self._moves = torch.ones(head.layout.size)
         for name in _STILL:
@@ -53,8 +53,8 @@ class LipGap:
     def __call__(self, theta: Float[Tensor, "F H"]) -> Float[Tensor, "F"]:
         """The gap of each theta."""
         still = (theta * self._moves).to(self._identity)
-        places = self._head(still, self._identity)[:, self._vertices, 1]
-        upper, lower = (places * self._weights).sum(-1).unbind(1)
+        heights = self._head(still, self._identity, self._vertices)[..., 1]
+        upper, lower = (heights.unflatten(1, (2, -1)) * self._weights).sum(-1).unbind(1)
         return upper - lower
 
 

@@ -75,9 +75,11 @@ class HeadModel(nn.Module):
         self,
         theta: Float[Tensor, "*batch H"],
         identity: Float[Tensor, "I"] | Float[Tensor, "*batch I"] | None = None,
-    ) -> Float[Tensor, "*batch V 3"]:
+        only: Int[Tensor, "N"] | None = None,
+    ) -> Float[Tensor, "*batch V 3"] | Float[Tensor, "*batch N 3"]:
         """Vertices in world space in metres; all zero gives `v_template` to the bit.
 
+        All of them, or `only` some, which takes a fraction of the time.
         The global rotation turns about the root joint, then the translation is added. Eyelid
         offsets are added before skinning and after the joints are found, as in the release, so
         that a blink turns with the head and shifts no joint; metrical-tracker adds them after
@@ -87,15 +89,20 @@ class HeadModel(nn.Module):
         batch = theta.shape[:-1]
         parts = self.layout.split(theta.reshape(-1, theta.shape[-1]))
         person, person_joints = self._person(identity, batch)
-        shaped = torch.addmm(person, parts["expression"], self._linear_dirs).unflatten(-1, (3, -1))
+        expressed = _some(self._linear_dirs, only)
+        shaped = torch.addmm(_some(person, only), parts["expression"], expressed)
+        shaped = shaped.unflatten(-1, (3, -1))
         turns, moves = self._bones(parts, person_joints)
         if "eyelids" in parts:
-            shaped = shaped + (parts["eyelids"] @ self._eyelid_dirs).unflatten(-1, (3, -1))
+            shaped = shaped + (parts["eyelids"] @ _some(self._eyelid_dirs, only)).unflatten(
+                -1, (3, -1)
+            )
         if len(self._pose_dirs):
-            correctives = turns[:, 1:].flatten(1) @ self._pose_dirs
+            correctives = turns[:, 1:].flatten(1) @ _some(self._pose_dirs, only)
             shaped = shaped + correctives.unflatten(-1, (3, -1))
         # Linear blend skinning moves each vertex by A x + s.
-        x, y, z, moved = (moves @ self._weights).unbind(2)
+        weights = self._weights if only is None else self._weights[:, only]
+        x, y, z, moved = (moves @ weights).unbind(2)
         posed = shaped + parts["translation"][..., None] + moved
         for row, along in zip((x, y, z), shaped[:, None].unbind(2)):
             posed = torch.addcmul(posed, row, along)
@@ -221,6 +228,15 @@ def _flat_directions(directions: Float[np.ndarray, "V 3 C"]) -> Float[np.ndarray
     """Directions as rows over all x, then all y, then all z, for one matrix product."""
     num_vertices, _, count = directions.shape
     return np.ascontiguousarray(directions.transpose(2, 1, 0)).reshape(count, 3 * num_vertices)
+
+
+def _some(
+    directions: Float[Tensor, "C V3"], vertices: Int[Tensor, "N"] | None
+) -> Float[Tensor, "C _"]:
+    """Flat directions of these vertices; None: of all."""
+    if vertices is None:
+        return directions
+    return directions.unflatten(-1, (3, -1))[..., vertices].flatten(1)
 
 
 def layout_of(arrays: HeadArrays) -> ThetaLayout:

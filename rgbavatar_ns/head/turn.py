@@ -17,9 +17,10 @@ def turn_seen(
     """
     parts = layout.split(theta)
     seen = world_to_camera[:, :3, :3].to(theta)
-    for name in ("rotation", "neck"):
-        if name in parts and parts[name].shape[1] == 3:
-            seen = seen @ axis_angle_to_matrix(parts[name])
+    turns = [parts[n] for n in ("rotation", "neck") if n in parts and parts[n].shape[1] == 3]
+    if turns:
+        for turn in axis_angle_to_matrix(torch.stack(turns)):
+            seen = seen @ turn
     return matrix_to_view_degrees(seen)
 
 

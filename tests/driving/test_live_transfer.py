@@ -18,6 +18,7 @@ from rgbavatar_ns.head.flame import load_flame
 from rgbavatar_ns.head.landmarks import facemesh_landmarks
 from rgbavatar_ns.head.lips import LipGap
 from rgbavatar_ns.head.rotations import axis_angle_to_matrix
+from rgbavatar_ns.kernels.threads import using_threads
 from rgbavatar_ns.synthetic.flame import write_synthetic_flame
 from rgbavatar_ns.synthetic.performer.performance import perform, with_tracker_noise
 from tests.export.subject import avatar_of
@@ -128,6 +129,22 @@ def test_expressions_and_turns_stay_where_the_avatar_holds(avatar, own):
     assert (turned <= rightmost + 21).all()
     assert (turned >= leftmost - 21).all()
     assert (turn_seen(free, camera, avatar.layout)[:, 0].abs() > rightmost[0] + 25).any()
+
+
+def test_numbers_are_few_and_wake_no_other_threads(avatar, own, monkeypatch):
+    used, at_lips = [], LipGap.__call__
+
+    def look(lips: LipGap, theta: torch.Tensor) -> torch.Tensor:
+        used.append(torch.get_num_threads())
+        return at_lips(lips, theta)
+
+    with using_threads(3):
+        head = PerformerHead(HeadModel(_HEAD).layout, _HEAD)
+        transfer = LiveTransfer(avatar, own, head, front_camera(avatar, 64, 64))
+        monkeypatch.setattr(LipGap, "__call__", look)
+        transfer(PerformanceFrame(0, 0.0, 0.0, theta=own.theta_mean))
+        assert torch.get_num_threads() == 3
+    assert used == [1]
 
 
 def test_at_rest_an_avatar_is_its_own_neutral(avatar, own):

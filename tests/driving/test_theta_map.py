@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
-from rgbavatar_ns.driving.theta_map import ThetaNames, arkit_theta, map_by_name, theta_map
+from rgbavatar_ns.driving.theta_map import NamedMap, ThetaNames, arkit_theta, theta_map
 from rgbavatar_ns.driving.transfer import (
     DrivingOptions,
     own_reference,
@@ -35,7 +35,7 @@ def _turn(theta: torch.Tensor, names: ThetaNames) -> torch.Tensor:
 def test_a_head_upon_shoulders_turns_on_them():
     head, bust = _names(_HEAD), _names(_BUST)
     theta = lively_theta(avatar_of(), 5)
-    mapped = map_by_name(theta, head, bust)
+    mapped = NamedMap(head, bust)(theta)
     torch.testing.assert_close(_turn(mapped.theta, bust), _turn(theta, head))
     still = bust.layout.split(mapped.theta)
     assert not still["rotation"].any()
@@ -49,7 +49,7 @@ def test_the_shoulders_of_the_avatar_stay_where_its_film_had_them():
     film = lively_theta(avatar, 20, seed=3)
     own = TrainingStatistics.of(film, torch.zeros(20, 1), avatar.layout)
     performed = lively_theta(avatar_of(), 8, seed=4)
-    mapped = map_by_name(performed, _names(_HEAD), _names(_BUST))
+    mapped = NamedMap(_names(_HEAD), _names(_BUST))(performed)
     driver = reference_of(mapped.theta, avatar.layout)
     for pose in ("relative", "absolute"):
         driven = relative_theta(
@@ -70,7 +70,7 @@ def test_the_shoulders_of_the_avatar_stay_where_its_film_had_them():
 def test_a_person_with_shoulders_turns_a_head_alone_as_the_head_turned():
     head, bust = _names(_HEAD), _names(_BUST)
     theta = lively_theta(avatar_of(arrays=_BUST), 5)
-    mapped = map_by_name(theta, bust, head)
+    mapped = NamedMap(bust, head)(theta)
     torch.testing.assert_close(_turn(mapped.theta, head), _turn(theta, bust))
     assert mapped.known[head.layout.slice("neck")].all()
     assert not mapped.theta[:, head.layout.slice("neck")].any()

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
-from rgbavatar_ns.driving.theta_map import ThetaNames, map_by_name
+from rgbavatar_ns.driving.theta_map import NamedMap, ThetaNames
 from rgbavatar_ns.driving.transfer import DrivingOptions, drive, make_relative
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import ThetaField, ThetaLayout
@@ -37,13 +37,13 @@ def _statistics(theta: torch.Tensor, names: ThetaNames = _OURS) -> TrainingStati
 
 
 def _driven(theta: torch.Tensor, own: TrainingStatistics, **options: Any) -> torch.Tensor:
-    mapped = map_by_name(theta, _OURS, _OURS)
+    mapped = NamedMap(_OURS, _OURS)(theta)
     return drive(mapped, _OURS.layout, own, 25.0, DrivingOptions(**options)).theta
 
 
 def test_numbers_go_to_the_same_name_and_what_has_none_is_listed():
     theta = _theta(_THEIRS, 4)
-    mapped = map_by_name(theta, _THEIRS, _OURS)
+    mapped = NamedMap(_THEIRS, _OURS)(theta)
     driver, ours = _THEIRS.layout.split(theta), _OURS.layout.split(mapped.theta)
     assert torch.equal(ours["expression"][:, 1], driver["expression"][:, 0])
     assert not ours["expression"][:, [0, 2]].any()
@@ -56,7 +56,7 @@ def test_numbers_go_to_the_same_name_and_what_has_none_is_listed():
 
 def test_the_same_layout_maps_to_itself():
     theta = _theta(_OURS, 3)
-    mapped = map_by_name(theta, _OURS, _OURS)
+    mapped = NamedMap(_OURS, _OURS)(theta)
     assert torch.equal(mapped.theta, theta)
     assert mapped.unmapped == mapped.missing == ()
 
@@ -64,9 +64,9 @@ def test_the_same_layout_maps_to_itself():
 def test_a_driver_without_a_known_expression_or_of_another_size_is_refused():
     other = ThetaNames(_layout(2), ("expression_0", "expression_1"))
     with pytest.raises(UserError, match=r"expression_0, expression_1.*smile, frown, blink"):
-        map_by_name(_theta(other, 2), other, _OURS)
+        NamedMap(other, _OURS)(_theta(other, 2))
     with pytest.raises(UserError, match="has 5 numbers"):
-        map_by_name(torch.zeros(2, 5), _THEIRS, _OURS)
+        NamedMap(_THEIRS, _OURS)(torch.zeros(2, 5))
 
 
 @settings(max_examples=15, deadline=None)

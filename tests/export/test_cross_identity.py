@@ -13,7 +13,7 @@ import torch
 from rgbavatar_ns.avatar import Avatar, AvatarConfig
 from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics, expressive_numbers
 from rgbavatar_ns.avatar.training.color_init import FirstColors
-from rgbavatar_ns.driving import DrivingOptions, ThetaNames, drive, map_by_name
+from rgbavatar_ns.driving import DrivingOptions, NamedMap, ThetaNames, drive
 from rgbavatar_ns.export import draw
 from rgbavatar_ns.synthetic.config import DemoConfig
 from rgbavatar_ns.synthetic.make import DemoPerson, as_pinhole
@@ -84,7 +84,7 @@ def pair() -> _Pair:
 def _driven(pair: _Pair, options: DrivingOptions) -> torch.Tensor:
     """The avatar's theta, without what its own tracker adds: comparable with the truth."""
     names = ThetaNames.of(pair.target.head.layout, pair.target.head.arrays)
-    mapped = map_by_name(pair.tracked_of_driver, names, names)
+    mapped = NamedMap(names, names)(pair.tracked_of_driver)
     mapped = drive(mapped, names.layout, pair.own, 8.0, options)
     assert mapped.unmapped == mapped.missing == ()
     return mapped.theta - pair.bias_of_target

@@ -97,6 +97,13 @@ def test_batch_equals_loop(synthetic: HeadModel, batch: tuple[int, ...]) -> None
         torch.testing.assert_close(together[index], synthetic(theta[index], identity[index]))
 
 
+def test_some_vertices_are_those_of_all(head: HeadModel) -> None:
+    theta, identity = random_theta(head, 3), random_identity(head)
+    only = torch.tensor([7, 0, 7, len(head.arrays.v_template) - 1])
+    some, every = head(theta, identity, only), head(theta, identity)
+    torch.testing.assert_close(some, every[:, only])
+
+
 @pytest.mark.parametrize("scale", [0.0, 1.0])
 def test_gradients_agree_with_differences_in_every_parameter(
     synthetic: HeadModel, scale: float

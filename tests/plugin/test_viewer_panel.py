@@ -50,6 +50,21 @@ def test_frame_slider_shows_that_frame_over_the_background(desk: Desk):
     assert torch.allclose(desk.picture()[0, 0], torch.tensor([1.0, 0.2, 0.0]), atol=1e-6)
 
 
+def test_a_picture_asks_the_network_once_and_what_nobody_reads_is_not_told(desk: Desk, monkeypatch):
+    asked, told, weights = [], [], desk.model.avatar.weights
+    monkeypatch.setattr(
+        desk.model.avatar, "weights", lambda theta: asked.append(1) or weights(theta)
+    )
+    monkeypatch.setattr(desk.panel, "_beyond", lambda *_: told.append(1) or "far out")
+    for frame in (2, 5, 7):
+        desk.panel.change(frame=frame)
+        desk.picture()
+    assert len(asked) == 3
+    assert not told
+    assert "Far out" in desk.told()
+    assert len(told) == 1
+
+
 def test_moving_a_face_slider_drives_by_hand_from_what_is_shown_and_back(desk: Desk):
     desk.set("Frame", 5)
     before = desk.picture()

@@ -20,8 +20,9 @@ from rgbavatar_ns.driving.transfer import DrivingOptions, told_beyond
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.export import dataset_folder
 from rgbavatar_ns.export.scenes import driven_by
-from rgbavatar_ns.head import turn_seen
+from rgbavatar_ns.head import ThetaLayout, turn_seen
 from rgbavatar_ns.kernels import PinholeCameras
+from rgbavatar_ns.kernels.threads import using_threads
 from rgbavatar_ns.plugin.avatar_model import AvatarModel
 from rgbavatar_ns.plugin.film_path import FilmMoment
 from rgbavatar_ns.plugin.viewer.client import serve_sharp_client
@@ -49,14 +50,25 @@ _ALL_BASES: dict[str, Any] = {"basis_alone": None, "bases_used": None}
 
 @dataclass(frozen=True)
 class _Report:
-    """What is told about a picture."""
+    """What is to be told about a picture, some of them; on the CPU."""
 
-    text: str
     trouble: str
     seconds: float
-    longer_side_px: int
-    theta: Float[Tensor, "H"]
-    psi: Float[Tensor, "K"]
+    width_px: int
+    height_px: int
+    psnr_db: float | None
+    world_to_camera: Float[Tensor, "1 4 4"]
+    theta: Float[Tensor, "1 H"]
+    psi: Float[Tensor, "1 K"]
+
+    def text(self, layout: ThetaLayout, beyond: Callable[..., str]) -> str:
+        """Size, speed, score, and what goes `beyond` the film."""
+        size = f"{self.width_px} x {self.height_px}"
+        rate = f"{1 / max(self.seconds, 1e-6):.0f} frames/s"
+        psnr = "" if self.psnr_db is None else f"  \nPSNR of this frame {self.psnr_db:.2f} dB"
+        told = beyond(self.theta, turn_seen(self.theta, self.world_to_camera, layout))
+        told = f"  \n{told[:1].upper()}{told[1:]}" if told else ""
+        return f"{size} in {1e3 * self.seconds:.0f} ms: {rate}{psnr}{told}"
 
 
 class ViewerPanel(ViewerControl):
@@ -131,18 +143,16 @@ class ViewerPanel(ViewerControl):
             trouble = _in_words(error)
             plain = ViewerState(state.driven_by, state.frame, background=state.background)
             signal, drawn = self._drawn(plain, camera, time_share)
-        seconds = self._clock() - began_s
-        size = f"{camera.width} x {camera.height}"
-        rate = f"{1 / max(seconds, 1e-6):.0f} frames/s"
-        psnr = "" if drawn.psnr is None else f"  \nPSNR of this frame {drawn.psnr:.2f} dB"
-        layout = self._model.avatar.layout
-        turns = turn_seen(signal.theta, camera.world_to_camera, layout).cpu()
-        beyond = self._beyond(signal.theta.cpu(), turns)
-        beyond = f"  \n{beyond[:1].upper()}{beyond[1:]}" if beyond else ""
-        text = f"{size} in {1e3 * seconds:.0f} ms: {rate}{psnr}{beyond}"
-        theta, psi = (part[0].cpu() for part in (signal.theta, self._psi_of(signal)))
-        longer_px = max(camera.width, camera.height)
-        self._report = _Report(text, trouble, seconds, longer_px, theta, psi)
+        self._report = _Report(
+            trouble,
+            self._clock() - began_s,
+            camera.width,
+            camera.height,
+            drawn.psnr,
+            camera.world_to_camera.cpu(),
+            signal.theta.cpu(),
+            self._psi_of(signal).cpu(),
+        )
         self._drawn_live(state)
         return drawn.outputs()
 
@@ -161,8 +171,8 @@ class ViewerPanel(ViewerControl):
         self._hide_training()
         if report is not None and report is not self._told and now_s >= self._next_told_s:
             self._told, self._next_told_s = report, now_s + _TOLD_EVERY_S
-            self._widgets.report(report.text)
-            self._widgets.show_driving(report.theta, report.psi)
+            self._widgets.report(report.text(self._model.avatar.layout, self._beyond))
+            self._widgets.show_driving(report.theta[0], report.psi[0])
             self._refine(report)
             if report.trouble:
                 self._widgets.tell(report.trouble)
@@ -292,12 +302,14 @@ class ViewerPanel(ViewerControl):
 
     @torch.no_grad()
     def _psi_of(self, signal: DrivingSignal) -> Float[Tensor, "1 K"]:
-        return self._model.avatar.weights(signal.theta) if signal.psi is None else signal.psi
+        with using_threads(1):
+            return self._model.avatar.weights(signal.theta) if signal.psi is None else signal.psi
 
     def _drawn(
         self, state: ViewerState, camera: PinholeCameras, time_share: float | FilmMoment | None
     ) -> tuple[DrivingSignal, ViewerRender]:
         model, signal = self._model, driving_signal(self._model, state, time_share)
+        signal = replace(signal, psi=self._psi_of(signal))
         options: dict[str, Any] = {"film": self._film, "backend": model.config.rasterizer}
         return signal, viewer_render(model.avatar, signal, state, camera, **options)
 
@@ -336,7 +348,7 @@ class ViewerPanel(ViewerControl):
     def _refine(self, report: _Report) -> None:
         """Once a picture of nerfstudio's own size was quick, draw twice as fine."""
         resolution = self._viewer.control_panel._max_res
-        if self._may_refine and report.longer_side_px == resolution.value:
+        if self._may_refine and max(report.width_px, report.height_px) == resolution.value:
             quick = report.seconds < _QUICK_S
             self._may_refine = not quick and resolution.value == _PLAIN_PX
             if quick and resolution.value == _PLAIN_PX:
