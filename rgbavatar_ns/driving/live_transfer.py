@@ -100,6 +100,7 @@ class LiveTransfer:
         upon = head_carrier(avatar.head.arrays.expression_names) == "neck"
         names = ("neck",) if upon else ("rotation", "neck")
         self._carriers = [avatar.layout.slice(name) for name in names]
+        matrix_to_axis_angle(torch.eye(3))  # brings a library within a second: now, not then
         self._start_turns = [axis_angle_to_matrix(own.theta_mean[one]) for one in self._carriers]
         self._start_seen = self._turn(own.theta_mean)
         self._expressive = expressive_numbers(avatar.layout)

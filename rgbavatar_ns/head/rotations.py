@@ -1,5 +1,6 @@
 """Every conversion of rotations in the project; roma inside, whose quaternions are xyzw.
 
+roma is imported where it is used: it brings torch's compiler, which takes as long as torch.
 Matrices act on columns, quaternions are real part first (wxyz), axis-angle is in radians.
 """
 
@@ -7,7 +8,6 @@ import functools
 import math
 from typing import Any
 
-import roma
 import torch
 from jaxtyping import Complex, Float
 from torch import Tensor
@@ -46,6 +46,8 @@ def axis_angle_to_matrix(axis_angle: Float[Tensor, "*batch 3"]) -> Float[Tensor,
 
 def matrix_to_axis_angle(matrix: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3"]:
     """Axis-angle vectors, of length at most pi, of proper rotations."""
+    import roma
+
     return roma.rotmat_to_rotvec(matrix)
 
 
@@ -85,12 +87,16 @@ def matrix_to_6d_rows(matrix: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*ba
 
 def rows_6d_to_matrix(rows: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch 3 3"]:
     """Proper rotation whose first rows are these six numbers after Gram-Schmidt."""
+    import roma
+
     columns = rows.unflatten(-1, (2, 3)).transpose(-1, -2)
     return roma.special_gramschmidt(columns).transpose(-1, -2)
 
 
 def quat_wxyz_to_matrix(quat_wxyz: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3 3"]:
     """Rotation matrices of quaternions of any length but zero."""
+    import roma
+
     unit = torch.nn.functional.normalize(quat_wxyz, dim=-1)
     return roma.unitquat_to_rotmat(unit.roll(-1, -1))
 
