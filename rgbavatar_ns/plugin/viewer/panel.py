@@ -302,8 +302,10 @@ class ViewerPanel(ViewerControl):
 
     @torch.no_grad()
     def _psi_of(self, signal: DrivingSignal) -> Float[Tensor, "1 K"]:
-        with using_threads(1):
-            return self._model.avatar.weights(signal.theta) if signal.psi is None else signal.psi
+        if signal.psi is not None:
+            return signal.psi
+        with using_threads(1):  # A picture is about to be drawn.
+            return self._model.avatar.weights(signal.theta)
 
     def _drawn(
         self, state: ViewerState, camera: PinholeCameras, time_share: float | FilmMoment | None
