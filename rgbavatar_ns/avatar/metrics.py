@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 import torch
 from jaxtyping import Bool, Float, UInt8
-from torch import Tensor
+from torch import Tensor, channels_last
 from torch.nn.functional import conv2d, max_pool2d, pad
 
 from rgbavatar_ns.avatar.model.image_loss import LPIPSLoss
@@ -50,15 +50,17 @@ def l1_over_black(
 
 
 def ssim(image: Float[Tensor, "B H W 3"], target: Float[Tensor, "B H W 3"]) -> Float[Tensor, "B"]:
-    """Return each image's structural similarity: Gaussian window, sigma 1.5, range 1."""
-    from torchmetrics.functional.image import structural_similarity_index_measure
+    """Return each image's structural similarity: Gaussian window, sigma 1.5, range 1.
 
-    similarity = structural_similarity_index_measure(
-        image.movedim(-1, 1), target.movedim(-1, 1), data_range=1.0, reduction="none"
-    )
-    if not isinstance(similarity, Tensor):
-        similarity = similarity[0]
-    return similarity.reshape(len(image))
+    A mean over all pixels, beyond the border the image's reflection, as torchmetrics has it, whose
+    windows of 11 x 11 taps take twice as long as pytorch_msssim's of 11 + 11.
+    """
+    from pytorch_msssim import ssim as similarity_within
+
+    whole = [pad(one.movedim(-1, 1), (5,) * 4, mode="reflect") for one in (image, target)]
+    # Half the time of a batch of planes, as in `detail_energy`.
+    whole = [one.contiguous(memory_format=channels_last) for one in whole]
+    return similarity_within(*whole, data_range=1.0, size_average=False)
 
 
 def detail_energy(

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
+from torchmetrics.functional.image import structural_similarity_index_measure
 
 from rgbavatar_ns.avatar import metrics
 from rgbavatar_ns.avatar.metrics import LPIPSMetric, evaluate_images, psnr, ssim
@@ -44,6 +45,18 @@ def test_psnr_and_ssim_equal_scikit_images(pair):
     pairs = zip(target, image)
     expected = [structural_similarity(*pair, **options)[1].mean() for pair in pairs]
     np.testing.assert_allclose(similarity.numpy(), expected, rtol=1e-4)
+
+
+def test_ssim_is_torchmetrics_up_to_the_border():
+    """Also where a picture goes on to its border, in flat parts, and of equal pictures."""
+    draw = torch.Generator().manual_seed(0)
+    image = torch.rand(3, 24, 33, 3, generator=draw)
+    target = (image + 0.2 * torch.rand(3, 24, 33, 3, generator=draw)).clamp(0, 1)
+    image[1, :12], target[1, :12] = 0.5, 0.5
+    target[2] = image[2]
+    planes = (one.movedim(-1, 1) for one in (image, target))
+    wanted = structural_similarity_index_measure(*planes, data_range=1.0, reduction="none")
+    torch.testing.assert_close(ssim(image, target), wanted, atol=1e-5, rtol=0)
 
 
 def test_targets_are_laid_over_black_and_images_clamped():
