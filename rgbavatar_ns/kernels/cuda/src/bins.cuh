@@ -142,16 +142,21 @@ RGBAVATAR_FUNCTION void sort_keys(uint64_t* keys, int count) {
   }
 }
 
-// A part of a list of at most kSharedKeys, in shared memory while `work` is done on it.
+// A list's parts of at most kSharedKeys, one after another in shared memory while `work` is done on
+// them.
 constexpr int kLogSharedKeys = 11, kSharedKeys = 1 << kLogSharedKeys;
 template <class Work>
-RGBAVATAR_FUNCTION void in_shared_memory(uint64_t* list, int count, uint64_t* keys,
-                                         const Work& work) {
-  for (int i = int(threadIdx.x); i < count; i += int(blockDim.x)) keys[i] = list[i];
-  __syncthreads();
-  work(count);
-  for (int i = int(threadIdx.x); i < count; i += int(blockDim.x)) list[i] = keys[i];
-  __syncthreads();
+RGBAVATAR_FUNCTION void for_each_part(uint64_t* list, int count, uint64_t* keys,
+                                      const Work& work) {
+  for (int first = 0; first < count; first += kSharedKeys) {
+    uint64_t* const part = list + first;
+    const int length = count - first < kSharedKeys ? count - first : kSharedKeys;
+    for (int i = int(threadIdx.x); i < length; i += int(blockDim.x)) keys[i] = part[i];
+    __syncthreads();
+    work(length);
+    for (int i = int(threadIdx.x); i < length; i += int(blockDim.x)) part[i] = keys[i];
+    __syncthreads();
+  }
 }
 
 // One block a tile. Of lists that do not fit shared memory only the steps with far partners are
@@ -164,18 +169,13 @@ RGBAVATAR_KERNEL(sort, SortArguments, kTileThreads) {
   const int count = int(a.bins.tile_start[tile + 1] - start);
   uint64_t* list = a.bins.entries + start;
   if (count < 2) return;
-  const auto for_each_part = [&](const auto& work) {
-    for (int first = 0; first < count; first += kSharedKeys)
-      in_shared_memory(list + first, count - first < kSharedKeys ? count - first : kSharedKeys,
-                       keys, work);
-  };
-  for_each_part([&](int part) { sort_keys(keys, part); });
+  for_each_part(list, count, keys, [&](int part) { sort_keys(keys, part); });
   const int pairs = pairs_of(count);
   for (int log_run = kLogSharedKeys + 1; 1 << log_run <= 2 * pairs; ++log_run) {
     mirrored_step(list, count, pairs, log_run);
     for (int log_half = log_run - 2; log_half >= kLogSharedKeys; --log_half)
       half_step(list, count, pairs, log_half);
-    for_each_part([&](int part) {
+    for_each_part(list, count, keys, [&](int part) {
       half_steps(keys, part, kSharedKeys / 2, kLogSharedKeys - 1);
     });
   }
