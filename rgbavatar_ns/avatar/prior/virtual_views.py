@@ -18,7 +18,7 @@ from rgbavatar_ns.avatar.orbit import head_centre, orbit
 from rgbavatar_ns.avatar.prior.mesh_field import Outline
 from rgbavatar_ns.head import turn_seen
 from rgbavatar_ns.head.surface import vertex_normals
-from rgbavatar_ns.kernels import PinholeCameras, RenderedBatch
+from rgbavatar_ns.kernels import DeviceRenderer, PinholeCameras, RenderedBatch
 from rgbavatar_ns.kernels.constants import UNFILMED_RGBA
 
 TURNS_DEGREES = (
@@ -91,11 +91,12 @@ class VirtualViews(nn.Module):
         self.register_buffer("filmed_high_degrees", torch.full((3,), -torch.inf))
         self._drawn: dict[int, _Mask] = {}
         self._beyond: list[int] | None = None
+        self._size: tuple[int, int] | None = None
         self.register_load_state_dict_post_hook(lambda module, _: module._forget())
 
     def _forget(self) -> None:
         """Drop what follows from the state."""
-        self._drawn, self._beyond = {}, None
+        self._drawn, self._beyond, self._size = {}, None, None
 
     @torch.no_grad()
     def begin(
@@ -149,25 +150,29 @@ class VirtualViews(nn.Module):
     def frames(self, avatar: Avatar, views: Sequence[int]) -> ViewedFrames:
         """Some of the W views, with nothing known within the outlines yet."""
         images = torch.cat([self._mask(avatar, view).image_rgba for view in views])
-        return ViewedFrames(self.theta[list(views)], self._cameras(list(views)), images)
+        return ViewedFrames(_chosen(self.theta, list(views)), self._cameras(list(views)), images)
 
     def completed(
         self, avatar: Avatar, view: int, own: RenderedBatch
     ) -> UInt8[Tensor, "1 height width 4"]:
         """A view's image as the avatar is to show it: its `own` picture, closed and smoothed."""
         # Here, as below, so that timing steps on a bare machine needs no OpenCV.
-        from rgbavatar_ns.avatar.prior.closing import closed
+        from rgbavatar_ns.avatar.prior.closing import closed, closed_on_device
 
         mask = self._mask(avatar, view)
-        if not mask.inner.any():
+        if mask.is_empty:
             return mask.image_rgba
         rows, columns = mask.box
-        parts = own.image[0, rows, columns], own.alpha[0, rows, columns]
-        picture = closed(torch.cat(parts, -1).cpu().numpy(), own.image.shape[2])
+        part = torch.cat([own.image[0, rows, columns], own.alpha[0, rows, columns]], -1)
+        width = own.image.shape[2]
+        if part.is_cuda:
+            picture = closed_on_device(part, width)
+        else:
+            picture = torch.from_numpy(closed(part.numpy(), width))
         image = mask.image_rgba.clone()
         there = image[0, rows, columns]
         inner = mask.inner[rows, columns, None]
-        there.copy_(torch.where(inner, torch.from_numpy(picture).to(there), there))
+        there.copy_(torch.where(inner, picture.to(there), there))
         return image
 
     @torch.no_grad()
@@ -178,17 +183,38 @@ class VirtualViews(nn.Module):
         own = avatar.render(known.theta.to(avatar.identity), here, backend=backend)
         return replace(known, images_rgba=self.completed(avatar, view, own))
 
+    @torch.no_grad()
+    def redraw(
+        self,
+        avatar: Avatar,
+        view: int,
+        image_rgba: UInt8[Tensor, "height width 4"],
+        backend: str = "auto",
+    ) -> None:
+        """Complete a view's image where it lies.
+
+        A device is not waited for: where its picture finds no room, the image stays as it was.
+        """
+        here, theta = self._cameras([view]).to(avatar.identity), _chosen(self.theta, [view])
+        renderer = avatar.renderer(theta.to(avatar.identity), here, backend=backend)
+        if isinstance(renderer, DeviceRenderer):
+            own = renderer.draw_at_once(theta.new_zeros(1, 3))
+            drawn = self.completed(avatar, view, own)[0]
+            image_rgba.copy_(torch.where(renderer.overflowed > 0, image_rgba, drawn))
+        else:
+            image_rgba.copy_(self.frame(avatar, view, backend).images_rgba[0])
+
     def _mask(self, avatar: Avatar, view: int) -> "_Mask":
         if view not in self._drawn:
             self._drawn[view] = self._draw(avatar, view)
         return self._drawn[view]
 
     def _cameras(self, views: list[int]) -> PinholeCameras:
-        width, height = self.size_px.tolist()
-        focal_px, principal_point_px = self.focal_px[views], self.principal_point_px[views]
-        return PinholeCameras(
-            self.world_to_camera[views], focal_px, principal_point_px, width, height
-        )
+        if self._size is None:  # asked once, for a device would be waited for
+            width, height = self.size_px.tolist()
+            self._size = width, height
+        places = self.world_to_camera, self.focal_px, self.principal_point_px
+        return PinholeCameras(*(_chosen(values, views) for values in places), *self._size)
 
     @torch.no_grad()
     def _draw(self, avatar: Avatar, view: int) -> "_Mask":
@@ -228,6 +254,16 @@ class _Mask:
     """Where the person is, for certain."""
     box: tuple[slice, slice]
     """The rows and columns of that."""
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether nobody is there for certain."""
+        return any(part.start == part.stop for part in self.box)
+
+
+def _chosen(values: Float[Tensor, "W ..."], rows: list[int]) -> Tensor:
+    """Some rows; one without a list of numbers, which a device would be waited for to take."""
+    return values[rows[0] : rows[0] + 1] if len(rows) == 1 else values[rows]
 
 
 def _reach(places: Int[np.ndarray, "P"]) -> slice:

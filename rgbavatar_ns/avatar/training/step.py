@@ -256,8 +256,7 @@ class TrainingStep:
         if views is not None and view is not None:
             assert self._shown is not None
             row = len(frames.theta) + view
-            drawn = views.frame(self.avatar, view, self.options.backend)
-            self._shown.images_rgba[row].copy_(drawn.images_rgba[0])
+            views.redraw(self.avatar, view, self._shown.images_rgba[row], self.options.backend)
             taken = [*rows[:-1], row]
         losses = {"l1": self._recorded(taken, chosen.background)}
         self._finish(step)

@@ -1,8 +1,10 @@
 """Closed pictures: holes take the colour around them, noise goes, a plain picture stays."""
 
 import numpy as np
+import pytest
+import torch
 
-from rgbavatar_ns.avatar.prior.closing import closed
+from rgbavatar_ns.avatar.prior.closing import closed, closed_on_device
 
 WIDTH, HEIGHT = 256, 40
 
@@ -43,3 +45,17 @@ def test_the_blur_follows_the_pictures_width():
         return int(((hue > 0.05) & (hue < 0.95)).sum())
 
     assert 1.7 < reach(512) / reach(256) < 2.3
+
+
+@pytest.mark.parametrize(
+    ("rows", "columns", "width"), [(40, 256, 256), (123, 77, 512), (9, 31, 800)]
+)
+def test_a_device_closes_as_opencv_does(rows, columns, width):
+    random = np.random.default_rng(0)
+    alpha = (random.random((rows, columns, 1)) > 0.3) * random.random((rows, columns, 1))
+    image = np.dstack([random.random((rows, columns, 3)) * alpha, alpha]).astype(np.float32)
+    expected = closed(image, width).astype(int)
+    found = closed_on_device(torch.from_numpy(image), width).numpy().astype(int)
+    assert found.shape == expected.shape
+    assert np.abs(found - expected).max() <= 1
+    assert (found != expected).mean() < 0.1
