@@ -188,21 +188,16 @@ class VirtualViews(nn.Module):
         self,
         avatar: Avatar,
         view: int,
+        renderer: DeviceRenderer,
         image_rgba: UInt8[Tensor, "height width 4"],
-        backend: str = "auto",
     ) -> None:
-        """Complete a view's image where it lies.
+        """Complete a view's image where it lies; `renderer` is the view's, by itself.
 
-        A device is not waited for: where its picture finds no room, the image stays as it was.
+        The device is not waited for: where its picture finds no room, the image stays as it was.
         """
-        here, theta = self._cameras([view]).to(avatar.identity), _chosen(self.theta, [view])
-        renderer = avatar.renderer(theta.to(avatar.identity), here, backend=backend)
-        if isinstance(renderer, DeviceRenderer):
-            own = renderer.draw_at_once(theta.new_zeros(1, 3))
-            drawn = self.completed(avatar, view, own)[0]
-            image_rgba.copy_(torch.where(renderer.overflowed > 0, image_rgba, drawn))
-        else:
-            image_rgba.copy_(self.frame(avatar, view, backend).images_rgba[0])
+        own = renderer.draw_at_once(avatar.identity.new_zeros(1, 3))
+        drawn = self.completed(avatar, view, own)[0]
+        image_rgba.copy_(torch.where(renderer.overflowed > 0, image_rgba, drawn))
 
     def _mask(self, avatar: Avatar, view: int) -> "_Mask":
         if view not in self._drawn:
@@ -213,8 +208,12 @@ class VirtualViews(nn.Module):
         if self._size is None:  # asked once, for a device would be waited for
             width, height = self.size_px.tolist()
             self._size = width, height
-        places = self.world_to_camera, self.focal_px, self.principal_point_px
-        return PinholeCameras(*(_chosen(values, views) for values in places), *self._size)
+        return PinholeCameras(
+            _chosen(self.world_to_camera, views),
+            _chosen(self.focal_px, views),
+            _chosen(self.principal_point_px, views),
+            *self._size,
+        )
 
     @torch.no_grad()
     def _draw(self, avatar: Avatar, view: int) -> "_Mask":

@@ -8,7 +8,6 @@ graph.
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
-from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -71,6 +70,7 @@ class RecordedStep:
         # One buffer, so that one copy brings a step's inputs: frames, backgrounds, Adam's numbers.
         self._sizes = (batch_size, 3 * batch_size, rows * 2 * _NUMBERS)
         self._step_inputs = torch.zeros(sum(self._sizes), dtype=torch.float64, device=device)
+        self._rows = torch.arange(len(frames.theta), device=device)
         self._loss = torch.zeros((), device=device)
         self._overflows = torch.zeros((), dtype=torch.int64, device=device)
         self._needed = torch.zeros((), dtype=torch.int32, device=device)
@@ -139,7 +139,6 @@ class RecordedStep:
         rows = numbers.float().view(-1, 2 * _NUMBERS)
         index = chosen.long()
         renderer, psi = self._renderer(index)
-        assert isinstance(renderer, DeviceRenderer)
         images, behind = self.frames.images_rgba, background.float().view(-1, 3)
         sight = self._first_colors.sight(self._num_filmed) if self._first_colors else None
         self._loss.copy_(renderer.forward_loss_of(images, index, behind, sight))
@@ -155,7 +154,12 @@ class RecordedStep:
         torch.maximum(self._needed, renderer.needed, out=self._needed)
         self._renderer_of_last_step = renderer
 
-    def _renderer(self, index: Tensor) -> tuple[Any, Tensor]:
+    def renderer_of(self, row: int) -> DeviceRenderer:
+        """What draws one of the frames as the avatar is now."""
+        self._heads.know(self.frames.theta)
+        return self._renderer(self._rows[row : row + 1])[0]
+
+    def _renderer(self, index: Tensor) -> tuple[DeviceRenderer, Tensor]:
         frames = self.frames
         theta, cameras = frames.theta.index_select(0, index), frames.cameras
         if len(cameras.focal_px) > 1:
@@ -168,6 +172,7 @@ class RecordedStep:
         renderer = self._avatar.renderer(
             theta, cameras, psi.detach(), vertices, backend=self._backend
         )
+        assert isinstance(renderer, DeviceRenderer)
         return renderer, psi
 
     def _look(self) -> None:

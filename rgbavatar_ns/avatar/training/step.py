@@ -256,7 +256,8 @@ class TrainingStep:
         if views is not None and view is not None:
             assert self._shown is not None
             row = len(frames.theta) + view
-            views.redraw(self.avatar, view, self._shown.images_rgba[row], self.options.backend)
+            renderer = self._recorded.renderer_of(row)
+            views.redraw(self.avatar, view, renderer, self._shown.images_rgba[row])
             taken = [*rows[:-1], row]
         losses = {"l1": self._recorded(taken, chosen.background)}
         self._finish(step)

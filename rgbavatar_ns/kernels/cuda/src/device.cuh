@@ -189,6 +189,9 @@ struct alignas(16) Four {
   float x, y, z, w;
 };
 RGBAVATAR_FUNCTION Four four_at(const float* row) { return *reinterpret_cast<const Four*>(row); }
+RGBAVATAR_FUNCTION void put_four(const Four& four, float* row) {
+  *reinterpret_cast<Four*>(row) = four;
+}
 
 // Copies weights [B, K] to shared memory as [K, B], rows padded to fours with zeros; others see them
 // after a barrier. Returns the length of a row.

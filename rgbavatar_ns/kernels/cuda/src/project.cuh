@@ -126,7 +126,8 @@ RGBAVATAR_KERNEL(frames, FramesArguments, kBlendThreads) {
       f.quat[3],   corner.x,      corner.y,   corner.z,    e1.x,          e1.y,
       e1.z,        e2.x,          e2.y,       e2.z,        ratio,         0.0f};
   float* out = b.frames + (int64_t(image) * b.triangles + triangle) * kFrameFloats;
-  for (int k = 0; k < kFrameFloats; ++k) out[k] = row[k];
+  for (int k = 0; k < kFrameFloats; k += 4)
+    put_four({row[k], row[k + 1], row[k + 2], row[k + 3]}, out + k);
 }
 
 // Base + sum_k psi_k basis_k of an attribute, a column a thread, sixteen images at a time.
