@@ -49,7 +49,7 @@ class Desk:
         self.panel.tick()
 
     def camera(self) -> Cameras:
-        camera = self.cameras[0:1]
+        camera = self.cameras[0:1].to(self.model.device)
         camera.metadata = {}
         return camera
 
@@ -59,7 +59,7 @@ def rendered(
     avatar: Avatar, theta: torch.Tensor, camera: Cameras, white=False, psi=None, *, to_be_seen=True
 ) -> torch.Tensor:
     """As the avatar is seen from its second picture on, or as it is measured."""
-    ground, pinhole = torch.full((3,), float(white)), from_nerfstudio(camera)
+    ground, pinhole = theta.new_full((3,), float(white)), from_nerfstudio(camera)
     for _ in range(2):
         drawn = avatar.render(theta, pinhole, ground, psi=psi, to_be_seen=to_be_seen)
     return drawn.image[0].clamp(0, 1)

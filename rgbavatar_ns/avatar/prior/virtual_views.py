@@ -165,10 +165,10 @@ class VirtualViews(nn.Module):
         rows, columns = mask.box
         part = torch.cat([own.image[0, rows, columns], own.alpha[0, rows, columns]], -1)
         width = own.image.shape[2]
-        if part.is_cuda:
-            picture = closed_on_device(part, width)
-        else:
+        if part.device.type == "cpu":
             picture = torch.from_numpy(closed(part.numpy(), width))
+        else:
+            picture = closed_on_device(part, width)
         image = mask.image_rgba.clone()
         there = image[0, rows, columns]
         inner = mask.inner[rows, columns, None]

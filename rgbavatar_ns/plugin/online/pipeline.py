@@ -15,6 +15,7 @@ from rgbavatar_ns.drawing.compositing import (
     is_unfilmed,
     rgba_to_float,
 )
+from rgbavatar_ns.kernels import RenderedBatch
 from rgbavatar_ns.plugin.online.datamanager import OnlineDataManager, OnlineDataManagerConfig
 from rgbavatar_ns.plugin.option_order import led_by
 from rgbavatar_ns.plugin.pipeline import RGBAvatarPipeline, RGBAvatarPipelineConfig
@@ -53,10 +54,8 @@ class OnlinePipeline(RGBAvatarPipeline):
     @torch.no_grad()
     def losses_of(self, frames: ReplayBatch) -> list[float]:
         """The mean absolute difference over black of frames that the pools hold."""
-        backend = self.config.model.rasterizer
-        theta = frames.theta.to(self.device)
-        drawn = self.model.avatar.render(theta, frames.cameras, backend=backend).image
-        return l1_over_black(drawn, frames.images_rgba).tolist()
+        drawn = self._drawn(frames).image
+        return l1_over_black(drawn, frames.images_rgba.to(self.device)).tolist()
 
     @torch.no_grad()
     def look_at(self, newest_first: ReplayBatch) -> tuple[float, UInt8[Tensor, "H W 3"]]:
@@ -64,11 +63,7 @@ class OnlinePipeline(RGBAvatarPipeline):
 
         The picture is the frame with the avatar, driven by it, on its right.
         """
-        drawn = self.model.avatar.render(
-            newest_first.theta.to(self.device),
-            newest_first.cameras,
-            backend=self.config.model.rasterizer,
-        ).image.clamp(0, 1)
+        drawn = self._drawn(newest_first).image.clamp(0, 1)
         black = drawn.new_zeros(len(drawn), 3)
         rgba = newest_first.images_rgba.to(self.device)
         filmed = ~is_unfilmed(rgba)
@@ -76,3 +71,7 @@ class OnlinePipeline(RGBAvatarPipeline):
         score = float(psnr(drawn, truth, filmed).clamp(max=_BEST_DB).mean())
         pair = torch.cat([composite(rgba_to_float(rgba[0]), black[0]), drawn[0]], dim=1)
         return score, (pair * 255).round().to(torch.uint8).cpu()
+
+    def _drawn(self, frames: ReplayBatch) -> RenderedBatch:
+        theta, cameras = frames.theta.to(self.device), frames.cameras.to(self.device)
+        return self.model.avatar.render(theta, cameras, backend=self.config.model.rasterizer)
