@@ -2,10 +2,13 @@
 
 import ctypes
 import re
+import sys
+from pathlib import Path
 
 import pytest
 import torch
 
+from benchmarks.gpu import bare_driver
 from rgbavatar_ns.kernels import DeviceError, constants
 from rgbavatar_ns.kernels.cuda import arguments, source
 from tests.kernels.cuda import emulator
@@ -34,6 +37,22 @@ def test_compiles_and_nothing_spills(compiler, architecture):
     spills = re.findall(r"(\d+) bytes spill stores", log)
     assert len(spills) >= len(source.kernels())
     assert set(spills) == {"0"}
+
+
+@pytest.mark.parametrize("architecture", ["sm_75", "sm_90"])
+def test_the_oldest_compiler_takes_the_kernels(architecture):
+    """CUDA builds of torch bring NVRTC of their own version, from 12.6 on."""
+    pattern = "nvidia/cuda_nvrtc/lib/libnvrtc.so.12"
+    places = [path for folder in sys.path for path in Path(folder).glob(pattern)]
+    if not places:
+        pytest.skip("no nvidia-cuda-nvrtc-cu12")
+    library = ctypes.CDLL(str(places[0]))
+    version = [ctypes.c_int(), ctypes.c_int()]
+    assert library.nvrtcVersion(*map(ctypes.byref, version)) == 0
+    assert [number.value for number in version] == [12, 6]
+    code = bare_driver.compiled(library, source.sources(), source.MAIN, architecture)
+    for kernel in source.kernels():
+        assert f"{kernel}_kernel".encode() in code
 
 
 def test_a_newer_gpu_gets_ptx_and_an_older_one_the_reason(compiler):
