@@ -1,13 +1,11 @@
 """The weight network F: theta's features to the blendshape weights psi (paper, eq. 2)."""
 
 import math
-from typing import Any, Literal
+from typing import Literal
 
 import torch
-import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
-from torch.autograd.function import once_differentiable
 
 _ROOM = 0.05
 """Of a number that never moved: radians, or shares of an expression."""
@@ -43,40 +41,7 @@ class WeightNetwork(nn.Module):
 
     def forward(self, features: Float[Tensor, "B F"]) -> Float[Tensor, "B K"]:
         """Map features to blendshape weights."""
-        if not features.is_cuda:
-            return self.layers(features)
-        for layer in self.layers:
-            if isinstance(layer, nn.Linear):
-                features = GpuLinear.apply(features, layer.weight, layer.bias)
-            else:
-                features = layer(features)
-        return features
-
-
-class GpuLinear(torch.autograd.Function):
-    """A linear layer, whose backward pass multiplies by transposed weights as they lie in memory.
-
-    Ours: left to itself cuBLAS takes 54 us for that product of ten rows, as long as morphing 60,000
-    Gaussians; this way it is one of its quick ones (H100; docs/gpu.md).
-    """
-
-    @staticmethod
-    def forward(
-        ctx: Any, rows: Float[Tensor, "B I"], weight: Float[Tensor, "O I"], bias: Float[Tensor, "O"]
-    ) -> Float[Tensor, "B O"]:
-        """As `torch.nn.functional.linear`."""
-        ctx.save_for_backward(rows, weight)
-        return F.linear(rows, weight, bias)
-
-    @staticmethod
-    @once_differentiable
-    def backward(  # pyright: ignore[reportIncompatibleMethodOverride]
-        ctx: Any, *grad_outputs: Float[Tensor, "B O"]
-    ) -> tuple[Float[Tensor, "B I"] | None, Float[Tensor, "O I"], Float[Tensor, "O"]]:
-        """The gradients of rows, weights and biases."""
-        (gradient,), (rows, weight) = grad_outputs, ctx.saved_tensors
-        of_rows = F.linear(gradient, weight.T.contiguous()) if ctx.needs_input_grad[0] else None
-        return of_rows, gradient.T @ rows, gradient.sum(0)
+        return self.layers(features)
 
 
 def softly_within(

@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from rgbavatar_ns.avatar import Avatar, WeightNetwork
-from rgbavatar_ns.avatar.model.weight_network import GpuLinear, softly_within
+from rgbavatar_ns.avatar.model.weight_network import softly_within
 from tests.avatar.small_head import random_theta
 
 
@@ -14,18 +14,6 @@ def test_mlp_is_three_layers_with_relu_between():
     torch.testing.assert_close(network(x), hidden @ w3.T + b3)
     assert w1.shape == (7, 5)
     assert w2.shape == (7, 7)
-
-
-def test_the_layer_of_a_gpu_has_the_values_and_gradients_of_a_linear_layer():
-    rows, weight, bias = (
-        torch.randn(*size, dtype=torch.float64, requires_grad=True)
-        for size in ((3, 5), (4, 5), (4,))
-    )
-    expected = torch.nn.functional.linear(rows, weight, bias)
-    torch.testing.assert_close(GpuLinear.apply(rows, weight, bias), expected)
-    assert torch.autograd.gradcheck(GpuLinear.apply, (rows, weight, bias))
-    # Features ask for no gradient.
-    assert torch.autograd.gradcheck(GpuLinear.apply, (rows.detach(), weight, bias))
 
 
 def test_linear_variant_is_affine():
