@@ -12,6 +12,7 @@ import torch
 
 from rgbavatar_ns.avatar.prior.mesh_field import MeshField
 from rgbavatar_ns.avatar.refinement.corrections import RefinementConfig
+from rgbavatar_ns.avatar.training import step
 from rgbavatar_ns.plugin.online.trainer import OnlineTrainer
 from rgbavatar_ns.plugin.training.trainer import RGBAvatarTrainer, RGBAvatarTrainerConfig
 from rgbavatar_ns.plugin.viewer.viewer_state import PictureKind
@@ -19,7 +20,7 @@ from tests.kernels.cuda import emulator
 from tests.plugin import elsewhere
 from tests.plugin.desk import Desk
 from tests.plugin.online_run import online_config
-from tests.plugin.run import make_trainer, small_config
+from tests.plugin.run import SMALL, make_trainer, small_config
 from tests.plugin.test_rivals import RIVALS, rival_config
 
 pytestmark = [
@@ -84,6 +85,25 @@ def test_a_run_trains_and_is_scored_and_looked_at(tiny_data, tmp_path, refine_tr
     # As `ns-eval`, `ns-render` and `ns-viewer` begin.
     config = small_config(tiny_data, tmp_path, **options, load_dir=trainer.checkpoint_dir)
     trained_there(replace(config, timestamp="more", max_num_iterations=6))
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"orthogonality": "loss", "first_colors": "paper", "hide_unseen": True},
+        {"orthogonality": "gram_schmidt", "surface_prior": False},
+        {"batch_parallel": False, "avatar": replace(SMALL, carrier="joints", num_bases=0)},
+        {"avatar": replace(SMALL, weight_network="none", scale_with_triangle=True)},
+        {"refine_tracking": True, "refine_held_out": 2},
+    ],
+)
+def test_options_of_training(tiny_data, tmp_path, monkeypatch, options):
+    monkeypatch.setattr(step, "ORTHOGONALIZE_EVERY", 1)
+    trainer = trained_there(small_config(tiny_data, tmp_path, max_num_iterations=2, **options))
+    trainer.pipeline.test_mode = "test"
+    found = trainer.pipeline.eval().get_average_eval_image_metrics()
+    assert found["psnr"] > 0
+    assert ("psnr_refined" in found) == ("refine_held_out" in options)
 
 
 def test_a_stream_trains(tiny_data, tmp_path):
