@@ -1,122 +1,24 @@
-"""On a device that is not the host's, everything lies where it is asked for.
+"""What every method asks of a device that is not the processor's: other_device_cases.py."""
 
-Its memory is the processor's and so are its operations, but a tensor there and one in main memory
-do not meet: what would fail on a GPU for that fails here, where there is none.
-"""
-
-from dataclasses import replace
-from typing import Any, get_args
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
-import torch
 
-from rgbavatar_ns.avatar.prior.mesh_field import MeshField
-from rgbavatar_ns.avatar.refinement.corrections import RefinementConfig
-from rgbavatar_ns.avatar.training import step
-from rgbavatar_ns.plugin.online.trainer import OnlineTrainer
-from rgbavatar_ns.plugin.training.trainer import RGBAvatarTrainer, RGBAvatarTrainerConfig
-from rgbavatar_ns.plugin.viewer.viewer_state import PictureKind
 from tests.kernels.cuda import emulator
-from tests.plugin import elsewhere
-from tests.plugin.desk import Desk
-from tests.plugin.online_run import online_config
-from tests.plugin.run import SMALL, make_trainer, small_config
-from tests.plugin.test_rivals import RIVALS, rival_config
 
-pytestmark = [
-    pytest.mark.nightly,
-    pytest.mark.skipif(emulator.compiler() is None, reason="no g++ to make a device with"),
-]
+_CASES = Path(__file__).with_name("other_device_cases.py")
+_MOST_SECONDS = 1200
 
 
-@pytest.fixture(scope="module", autouse=True)
-def device(tmp_path_factory) -> None:
-    elsewhere.begin(tmp_path_factory.mktemp("elsewhere"))
-
-
-@pytest.fixture(autouse=True)
-def dense(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The device has no sparse tensors."""
-
-    def matrix(self: MeshField, entries: torch.Tensor) -> torch.Tensor:
-        full = entries.new_zeros(self.num_vertices, self.num_vertices)
-        return full.index_put((self.edges[:, 0], self.edges[:, 1]), entries)
-
-    monkeypatch.setattr(MeshField, "_matrix", matrix)
-
-
-def trained_there(config: RGBAvatarTrainerConfig) -> RGBAvatarTrainer:
-    """Train on the other device, to the end."""
-    config.machine.device_type = elsewhere.NAME
-    trainer = make_trainer(config)
-    trainer.train()
-    assert {p.device.type for p in trainer.pipeline.model.avatar.parameters()} == {elsewhere.NAME}
-    return trainer
-
-
-def test_the_other_device_does_not_meet_main_memory():
-    there = torch.ones(2).to(elsewhere.NAME)
-    assert (there + there).tolist() == [2, 2]
-    for mixed in (lambda: there + torch.ones(2), lambda: torch.stack([there, torch.ones(2)])):
-        with pytest.raises(RuntimeError, match="same device"):
-            mixed()
-    with pytest.raises(TypeError, match="numpy"):
-        there.numpy()
-
-
-@pytest.mark.parametrize("refine_tracking", [False, True])
-def test_a_run_trains_and_is_scored_and_looked_at(tiny_data, tmp_path, refine_tracking):
-    options: dict[str, Any] = {"refine_tracking": refine_tracking, "max_num_iterations": 4}
-    options |= {"refinement": RefinementConfig(start_step=1), "steps_per_eval_batch": 2}
-    trainer = trained_there(small_config(tiny_data, tmp_path, **options))
-    pipeline = trainer.pipeline.eval()
-    assert pipeline.get_average_eval_image_metrics()["psnr"] > 0
-    desk = Desk(pipeline)
-    for picture in get_args(PictureKind):
-        desk.set("Picture", picture)
-        assert desk.picture().isfinite().all()
-    for label, value in (
-        *(("Mesh", True), ("Gaussian centres", True), ("Basis 2", 0.9), ("Bases used", 1)),
-        *(("Show one alone", "2"), ("Jaw opens (°)", 20.0), ("Frame", 3), ("Play", True)),
-    ):
-        desk.set(label, value)
-        assert desk.picture().isfinite().all()
-        assert desk.told()
-    # As `ns-eval`, `ns-render` and `ns-viewer` begin.
-    config = small_config(tiny_data, tmp_path, **options, load_dir=trainer.checkpoint_dir)
-    trained_there(replace(config, timestamp="more", max_num_iterations=6))
-
-
-@pytest.mark.parametrize(
-    "options",
-    [
-        {"orthogonality": "loss", "first_colors": "paper", "hide_unseen": True},
-        {"orthogonality": "gram_schmidt", "surface_prior": False},
-        {"batch_parallel": False, "avatar": replace(SMALL, carrier="joints", num_bases=0)},
-        {"avatar": replace(SMALL, weight_network="none", scale_with_triangle=True)},
-        {"refine_tracking": True, "refine_held_out": 2},
-    ],
-)
-def test_options_of_training(tiny_data, tmp_path, monkeypatch, options):
-    monkeypatch.setattr(step, "ORTHOGONALIZE_EVERY", 1)
-    trainer = trained_there(small_config(tiny_data, tmp_path, max_num_iterations=2, **options))
-    trainer.pipeline.test_mode = "test"
-    found = trainer.pipeline.eval().get_average_eval_image_metrics()
-    assert found["psnr"] > 0
-    assert ("psnr_refined" in found) == ("refine_held_out" in options)
-
-
-def test_a_stream_trains(tiny_data, tmp_path):
-    trainer = trained_there(online_config(tmp_path, tiny_data, max_num_iterations=4, watch_every=1))
-    assert isinstance(trainer, OnlineTrainer)
-    recent = trainer.stream.pools.recent(1e6, 2)
-    assert recent is not None
-    score, picture = trainer.pipeline.look_at(recent)
-    assert score > 0
-    assert picture.device.type == "cpu"
-    assert trainer.stream.least.by_frame
-
-
-@pytest.mark.parametrize("name", RIVALS)
-def test_a_rival_trains(name, tiny_data, tmp_path):
-    trained_there(rival_config(name, tiny_data, tmp_path, max_num_iterations=2))
+@pytest.mark.nightly
+@pytest.mark.skipif(emulator.compiler() is None, reason="no g++ to make a device with")
+def test_everything_lies_where_it_is_asked_for():
+    """In a process of its own: torch must know the device before the first backward pass."""
+    command = [sys.executable, "-m", "pytest", "-n", "0", "-q", "-p", "no:cacheprovider", _CASES]
+    ran = subprocess.run(
+        command, capture_output=True, text=True, timeout=_MOST_SECONDS, check=False
+    )
+    assert ran.returncode == 0, ran.stdout[-8000:]
+    assert " passed" in ran.stdout
