@@ -55,6 +55,8 @@ class MeshField:
         first, second = self.edges.unbind(1)
         ends_of_rows = torch.bincount(first, minlength=self.num_vertices).cumsum(0)
         self._row_starts = torch.cat([ends_of_rows.new_zeros(1), ends_of_rows])
+        # A GPU's library reads them as they lie, one behind the other.
+        self._columns = second.contiguous()
         across = self.scalp[first] != self.scalp[second]
         self.links = torch.where(across, _HAIRLINE, 1.0).to(template)
 
@@ -113,11 +115,13 @@ class MeshField:
 
     def _matrix(self, entries: Float[Tensor, "E"]) -> Tensor:
         """The matrix [V, V] with an entry for each edge, sparse by rows."""
-        with warnings.catch_warnings():  # torch calls the format new
-            warnings.filterwarnings("ignore", message="Sparse CSR tensor support")
+        with warnings.catch_warnings():  # torch calls the format new, and its checks left out
+            warnings.filterwarnings(
+                "ignore", message="Sparse (CSR tensor support|invariant checks)"
+            )
             return torch.sparse_csr_tensor(
                 self._row_starts,
-                self.edges[:, 1],
+                self._columns,
                 entries,
                 (self.num_vertices, self.num_vertices),
                 check_invariants=False,

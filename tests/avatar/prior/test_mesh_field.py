@@ -62,3 +62,16 @@ def test_what_one_side_of_the_face_shows_tells_of_the_other():
     )[:, 0]
     right = x_m < -0.02
     assert float((found - x_m.abs())[right].abs().median()) < 2e-3
+
+
+def test_the_matrix_of_the_edges_is_one_that_every_library_reads():
+    """Not contiguous indices are read wrong on a GPU, and nobody checks them there."""
+    field = MeshField(embedded_avatar())
+    entries = torch.rand(len(field.edges))
+    matrix = field._matrix(entries)
+    parts = matrix.crow_indices(), matrix.col_indices(), matrix.values()
+    torch.sparse_csr_tensor(*parts, matrix.shape, check_invariants=True)
+    assert matrix.shape == (field.num_vertices, field.num_vertices)
+    first, second = field.edges.unbind(1)
+    expected = torch.zeros(matrix.shape).index_put((first, second), entries)
+    assert torch.equal(matrix.to_dense(), expected)
