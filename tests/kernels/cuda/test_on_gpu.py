@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from rgbavatar_ns.avatar import Avatar
+from rgbavatar_ns.avatar.prior.mesh_field import MeshField
 from rgbavatar_ns.avatar.training import make_optimizer
 from rgbavatar_ns.avatar.training import recorded_step as recorded_steps
 from rgbavatar_ns.avatar.training.batches import DeviceFrames
@@ -33,6 +34,7 @@ from tests.avatar.fused_scene import (
     relative_differences,
     stir,
 )
+from tests.avatar.prior.test_mesh_field import embedded_avatar
 from tests.avatar.small_head import front_camera, random_theta
 from tests.kernels.agreement import assert_agrees, expect
 from tests.kernels.scenes import moved, random_scene, to
@@ -314,3 +316,23 @@ def test_a_whole_fit_recorded_and_fused(place, make_avatar):
     assert losses["recorded"][-10:].mean() < 0.5 * losses["recorded"][:10].mean()
     assert float(apart[:10].abs().max()) < ROUNDING_OF_EARLY_LOSSES
     assert abs(float(apart[-steps // 4 :].mean())) < ROUNDING_OF_LATE_LOSSES
+
+
+def test_a_surface_is_continued_as_on_a_processor(place):
+    """By sparse products, of libraries that read their indices each in its own way."""
+    avatar = embedded_avatar()
+    random = torch.Generator().manual_seed(0)
+    values = torch.rand(len(avatar.head.arrays.v_template), 3, generator=random)
+    confidence = (values[:, 0] > 0.5).float()
+    found = [
+        MeshField(avatar.to(device))
+        .continued(
+            *(part.to(device) for part in (values, confidence, values)),
+            stiffness=0.1,
+            rest=1e-3,
+            iterations=30,
+        )
+        .cpu()
+        for device in (torch.device("cpu"), place.device)
+    ]
+    torch.testing.assert_close(found[1], found[0], atol=1e-4, rtol=1e-3)
