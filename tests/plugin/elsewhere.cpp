@@ -1,14 +1,15 @@
 // A device whose memory is the processor's, but which no other tensor meets: as on a GPU.
 #include <ATen/EmptyTensor.h>
-#include <ATen/InferSize.h>
 #include <ATen/detail/PrivateUse1HooksInterface.h>
 #include <ATen/native/CPUFallback.h>
-#include <ATen/native/Resize.h>
+#include <ATen/ops/_reshape_alias_native.h>
 #include <ATen/ops/as_strided_cpu_dispatch.h>
 #include <ATen/ops/view_native.h>
-#include <ATen/ops/_reshape_alias_native.h>
 #include <c10/core/impl/DeviceGuardImplInterface.h>
 #include <torch/extension.h>
+
+#include <cstdlib>
+#include <cstring>
 
 namespace {
 constexpr auto kThere = c10::DeviceType::PrivateUse1;
