@@ -50,6 +50,7 @@ def page_file(subject: Avatar, tmp_path: Path) -> Path:
 def _opened(browser: Any, address: str) -> Any:
     page = browser.new_page(viewport={"width": 500, "height": 400})
     page.goto(address, wait_until="commit")
+    page.wait_for_function("() => window.rgbavatar")  # the page may not have been read so far
     page.evaluate(
         """size => rgbavatar.then((app) => {
           window.avatar = app.avatar; avatar.setSize(size, size);
