@@ -217,7 +217,7 @@ class Avatar(AvatarMethod):
 
         Other options are those of `kernels.rasterize`. The picture carries no graph, unless it is
         to be `differentiable`: the same numbers through autograd, in several times as long. One
-        picture that is only `to_be_seen` may come from Gaussians in half precision
+        picture that is only `to_be_seen` may come from Gaussians in fewer bits
         (`kernels.PackedGaussians`), which are packed once the avatar is drawn again unchanged.
         """
         options: dict[str, Any] = {"with_depth": with_depth, "with_visibility": with_visibility}

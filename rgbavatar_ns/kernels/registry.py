@@ -147,7 +147,7 @@ class PictureRenderer(Protocol):
 class PackedGaussians(Protocol):
     """A copy of morphed Gaussians for pictures one after another.
 
-    Bases are in half precision and what no picture shows is left out, so that pictures are those
+    Bases are in 16, 10 and 8 bits and what no picture shows is left out, so that pictures are those
     of the Gaussians to 1/512, but for single pixels where a Gaussian's edge falls to the other
     side. It does not follow when the Gaussians change, and holds their memory meanwhile.
     """

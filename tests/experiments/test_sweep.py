@@ -2,6 +2,7 @@
 
 import csv
 import sys
+import time
 from dataclasses import replace
 
 import pytest
@@ -38,18 +39,26 @@ def test_a_failed_cell_is_tried_once_more_and_stops_nobody(experiment_of, tmp_pa
 
 
 def test_an_interruption_ends_the_cells_and_is_gone_on_from(experiment_of, tmp_path):
-    experiment = experiment_of("fine", "broken", break_="time.sleep(60)")
+    experiment = experiment_of("fine", "broken", break_="time.sleep(300)")
 
     def stop(statuses):
-        if sum(status.state == "done" for status in statuses) == 2:
+        if statuses[0].state == "done":  # and so the first seed's other cell has begun
+            _wait_for(statuses[2].folder / "calls.txt")
             raise KeyboardInterrupt
 
+    began_s = time.monotonic()
     with pytest.raises(KeyboardInterrupt):
         sweep(experiment, tmp_path / "out", LocalEngine(1), stop)
+    assert time.monotonic() - began_s < 60, "the cell was interrupted, not waited for"
     experiment = experiment_of("fine", "broken", break_="pass")
     statuses = sweep(experiment, tmp_path / "out", LocalEngine(2))
     assert [status.state for status in statuses] == ["done"] * 4
-    assert _calls(statuses)[:2] == ["x", "x"]
+    assert _calls(statuses) == ["x", "x", "xx", "x"]
+
+
+def _wait_for(path):
+    while not path.exists():
+        time.sleep(0.01)
 
 
 def test_the_report_has_means_spreads_and_the_papers_figures(experiment_of, tmp_path):

@@ -63,3 +63,11 @@ def rendered(
     for _ in range(2):
         drawn = avatar.render(theta, pinhole, ground, psi=psi, to_be_seen=to_be_seen)
     return drawn.image[0].clamp(0, 1)
+
+
+@torch.no_grad()
+def rendered_depth(avatar: Avatar, theta: torch.Tensor, camera: Cameras) -> torch.Tensor:
+    """As it is seen, in metres, of an avatar that was drawn before."""
+    drawn = avatar.render(theta, from_nerfstudio(camera), with_depth=True, to_be_seen=True)
+    assert drawn.depth is not None
+    return drawn.depth[0]

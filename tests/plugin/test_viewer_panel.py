@@ -15,7 +15,7 @@ from rgbavatar_ns.plugin.viewer.driving import training_statistics
 from rgbavatar_ns.plugin.viewer.panel import ViewerPanel
 from rgbavatar_ns.plugin.viewer.sliders import on_step
 from rgbavatar_ns.plugin.viewer.viewpoint import Viewpoint
-from tests.plugin.desk import Desk, rendered
+from tests.plugin.desk import Desk, rendered, rendered_depth
 from tests.plugin.fake_viewer import FakeViewer
 from tests.plugin.tiny import NUM_FRAMES, tiny_dataset
 
@@ -32,6 +32,23 @@ def test_without_a_viewer_the_cameras_time_chooses_and_the_ground_is_black(
         drawn = model.get_outputs_for_camera(camera)
         assert torch.equal(drawn["rgb"], expected)
         assert drawn["depth"].shape == drawn["accumulation"].shape == (*expected.shape[:2], 1)
+
+
+@pytest.mark.parametrize(
+    "shown", [{"layer_depth": True}, {"output_render": "depth"}, {"split": True}]
+)
+def test_depth_is_found_where_the_viewer_shows_it_and_no_output_goes_away(desk: Desk, shown: dict):
+    camera = from_nerfstudio(desk.camera())
+    plain = desk.panel.draw(camera, None)
+    assert plain["depth"].isnan().all()
+    vars(desk.viewer.control_panel).update(shown)
+    drawn = desk.panel.draw(camera, None)
+    assert list(drawn) == list(plain)
+    assert drawn["depth"].shape == plain["depth"].shape
+    covered = drawn["accumulation"] > 0.5
+    depth = rendered_depth(desk.model.avatar, desk.model.frame_theta[:1], desk.camera())
+    assert torch.equal(drawn["depth"][covered], depth[covered])
+    assert torch.equal(drawn["rgb"], plain["rgb"])
 
 
 def test_a_cameras_own_theta_comes_before_the_panel(pipeline: RGBAvatarPipeline):

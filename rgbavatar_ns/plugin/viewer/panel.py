@@ -313,7 +313,16 @@ class ViewerPanel(ViewerControl):
         model, signal = self._model, driving_signal(self._model, state, time_share)
         signal = replace(signal, psi=self._psi_of(signal))
         options: dict[str, Any] = {"film": self._film, "backend": model.config.rasterizer}
+        options["with_depth"] = self._depth_is_wanted()
         return signal, viewer_render(model.avatar, signal, state, camera, **options)
+
+    def _depth_is_wanted(self) -> bool:
+        """Whether nerfstudio's controls show the output or lay other things behind the avatar."""
+        if self._viewer is None:
+            return True
+        panel = self._viewer.control_panel
+        shown = [panel.output_render, *([panel.split_output_render] if panel.split else [])]
+        return panel.layer_depth or "depth" in shown
 
     def _present(self) -> ViewerState:
         """The state, but a camera path that is previewed shows what `ns-render` will."""

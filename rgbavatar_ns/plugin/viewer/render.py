@@ -45,14 +45,20 @@ class ViewerRender:
 
     image: _Image
     alpha: Float[Tensor, "H W 1"]
-    depth: Float[Tensor, "H W 1"]
-    """In metres along the camera's z."""
+    depth: Float[Tensor, "H W 1"] | None
+    """In metres along the camera's z; None where nobody asked for it."""
     psnr: float | None = None
     """Against the film in dB, where it is beside."""
 
     def outputs(self) -> dict[str, Tensor]:
-        """By the names that nerfstudio's viewer and `ns-render` use."""
-        return {"rgb": self.image, "accumulation": self.alpha, "depth": self.depth}
+        """By the names that nerfstudio's viewer and `ns-render` use.
+
+        The names are always the same, since the viewer offers them; a depth that is not there is
+        NaN everywhere.
+        """
+        unknown = self.alpha.new_full((), math.nan).expand_as(self.alpha)
+        depth = unknown if self.depth is None else self.depth
+        return {"rgb": self.image, "accumulation": self.alpha, "depth": depth}
 
 
 @torch.no_grad()
@@ -64,22 +70,25 @@ def viewer_render(
     *,
     film: TrackedDataset | None = None,
     backend: str = "auto",
+    with_depth: bool = False,
 ) -> ViewerRender:
     """Draw what the state asks for from one camera (C = 1); images beside the film from its own.
 
-    Raises UserError where there is no film to compare with.
+    Depth, which takes time, is found where it is asked for or shown. Raises UserError where there
+    is no film to compare with.
     """
     if state.picture in ("beside the film", "error"):
         return _beside_film(avatar, signal, state, camera, film, backend)
-    drawn = _draw(avatar, signal, state, camera, backend)
-    assert drawn.depth is not None
+    drawn = _draw(avatar, signal, state, camera, backend, with_depth or state.picture == "depth")
+    alpha, depth = drawn.alpha[0], None
     with using_threads(1):
-        alpha, depth = drawn.alpha[0], filled_depth(drawn.depth, drawn.alpha)[0]
+        if drawn.depth is not None:
+            depth = filled_depth(drawn.depth, drawn.alpha)[0]
         # nerfstudio's viewer makes bytes of it, where 1.01 would be black.
         image = drawn.image[0].clamp_(0, 1)
     if state.picture == "alpha":
         image = alpha.expand(-1, -1, 3)
-    elif state.picture == "depth":
+    elif state.picture == "depth" and depth is not None:
         image = _depth_colors(depth, alpha)
     image = _with_overlays(image, avatar, signal, state, camera, drawn.visibility)
     return ViewerRender(image, alpha, depth)
@@ -91,6 +100,7 @@ def _draw(
     state: ViewerState,
     camera: PinholeCameras,
     backend: str,
+    with_depth: bool,
 ) -> RenderedBatch:
     return avatar.render(
         signal.theta,
@@ -98,7 +108,7 @@ def _draw(
         signal.theta.new_tensor(state.background),
         psi=signal.psi,
         backend=backend,
-        with_depth=True,
+        with_depth=with_depth,
         with_visibility=state.centres,
         to_be_seen=True,
     )
@@ -119,7 +129,7 @@ def _beside_film(
             "Choose another picture, or drive the avatar by a dataset frame.",
         )
     own = film.cameras.select([signal.frame]).to(signal.theta.device)
-    drawn = _draw(avatar, signal, state, own, backend)
+    drawn = _draw(avatar, signal, state, own, backend, with_depth=False)
     rgba = torch.from_numpy(film.read_image(signal.frame)).to(signal.theta.device)
     background = signal.theta.new_tensor(state.background)
     image = drawn.image[0].clamp(0, 1)

@@ -142,6 +142,7 @@ struct alignas(64) TileScratch {
 
 // Position, rotation and colour: what the bases change.
 constexpr int kMorphedKinds = 3;
+enum { kPositionKind, kRotationKind, kColorKind };
 constexpr int kMorphedWidth[kMorphedKinds] = {3, 4, 3};
 // Gaussians that are morphed at a time: many, because each basis is a stretch of memory of its own,
 // which a processor has to find first; the columns of a batch still fit the second cache.

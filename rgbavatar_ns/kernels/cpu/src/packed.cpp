@@ -13,6 +13,7 @@ namespace {
 
 constexpr int kFrameChunk = 512;
 constexpr float kMinAlpha = 1.0f / 255.0f;
+constexpr float kLeastUnit = 1e-37f;  // below, floats lose digits; too little to be seen
 
 bool is_finite(float x) { return x * 0.0f == 0.0f; }
 
@@ -47,23 +48,32 @@ float opacity_of(const MorphedScene& scene, int64_t i) {
 PackedGaussians::PackedGaussians(const MorphedScene& scene, int threads) : bases_(scene.bases) {
   Team team(threads);
   drawn_.assign(scene.count, 1);
-  unit_.assign(size_t(kMorphedKinds) * bases_, 1.0f);
+  half_unit_.assign(bases_, 1.0f);
   choose(scene);
   for (int kind = 0; kind < kMorphedKinds; ++kind)
-    for (int k = 0; k < bases_; ++k) measure(scene, kind, k);
+    for (int k = 0; k < bases_; ++k) {
+      const float size = largest(scene, kind, k);
+      if (kind != kPositionKind || size == 0.0f) continue;
+      int exponent;
+      std::frexp(size, &exponent);  // size < 2^exponent, which becomes 2^15
+      half_unit_[k] = std::ldexp(1.0f, std::min(std::max(exponent - 15, -100), 100));
+    }
   for (int i = 0; i < scene.count; ++i)
     if (drawn_[i]) chosen_.push_back(i);
   blocks_ = int((chosen_.size() + kPackedLanes - 1) / kPackedLanes);
-  base_.reserve(size_t(blocks_) * kPackedColumns * kPackedLanes);
-  basis_.reserve(size_t(blocks_) * bases_ * kPackedMorphed * kPackedLanes);
-  triangle_.reserve(size_t(blocks_) * kPackedLanes);
+  const size_t lanes = size_t(blocks_) * kPackedLanes;
+  base_.reserve(lanes * kPackedColumns);
+  halves_.reserve(lanes * bases_ * kPackedHalves);
+  words_.reserve(lanes * bases_ * kPackedWords);
+  word_unit_.reserve(size_t(blocks_) * bases_ * kPackedWords);
+  triangle_.reserve(lanes);
   team.run(blocks_, [&](int64_t block, int) { pack_block(scene, int(block)); });
 }
 
 size_t PackedGaussians::bytes() const {
-  const size_t lane = kPackedColumns * sizeof(float) + sizeof(int32_t) +
-                      size_t(bases_) * kPackedMorphed * sizeof(uint16_t);
-  return size_t(blocks_) * kPackedLanes * lane;
+  const size_t basis = kPackedHalves * sizeof(uint16_t) + kPackedWords * sizeof(int32_t);
+  const size_t lane = kPackedColumns * sizeof(float) + sizeof(int32_t) + bases_ * basis;
+  return size_t(blocks_) * (kPackedLanes * lane + bases_ * kPackedWords * sizeof(float));
 }
 
 // Opacities change with nothing, so that those below the cut show in no picture. The loops make
@@ -78,8 +88,8 @@ void PackedGaussians::choose(const MorphedScene& scene) {
   }
 }
 
-// A basis' unit, and which Gaussians it makes invisible.
-void PackedGaussians::measure(const MorphedScene& scene, int kind, int k) {
+// A basis' largest number; the Gaussians that it makes invisible are not drawn.
+float PackedGaussians::largest(const MorphedScene& scene, int kind, int k) {
   const int width = kMorphedWidth[kind];
   const float* basis = scene.basis[kind] + int64_t(k) * scene.count * width;
   float largest = 0.0f;
@@ -91,23 +101,24 @@ void PackedGaussians::measure(const MorphedScene& scene, int kind, int k) {
       else
         largest = std::max(largest, size);
     }
-  if (largest == 0.0f) return;
-  int exponent;
-  std::frexp(largest, &exponent);  // largest < 2^exponent, which becomes 2^15
-  unit_[size_t(kind) * bases_ + k] = std::ldexp(1.0f, std::min(std::max(exponent - 15, -100), 100));
+  return largest;
+}
+
+int64_t PackedGaussians::of_lane(int block, int lane) const {
+  const size_t first = size_t(block) * kPackedLanes;
+  return chosen_[first + lane < chosen_.size() ? first + lane : first];
 }
 
 void PackedGaussians::pack_block(const MorphedScene& scene, int block) {
   float* base = base_.data() + size_t(block) * kPackedColumns * kPackedLanes;
-  uint16_t* basis = basis_.data() + size_t(block) * bases_ * kPackedMorphed * kPackedLanes;
   const int first = block * kPackedLanes;
   const int lanes = std::min(int(chosen_.size()) - first, kPackedLanes);
   for (int lane = 0; lane < kPackedLanes; ++lane) {
-    // What fills the last block is the first Gaussian, made invisible.
-    const int64_t i = chosen_[lane < lanes ? first + lane : first];
+    const int64_t i = of_lane(block, lane);
     const auto put = [&](int column, float value) { base[column * kPackedLanes + lane] = value; };
     for (int axis = 0; axis < 3; ++axis)
       put(kPackedScale + axis, exponential(scene.log_scale[i * 3 + axis]));
+    // What fills the last block is invisible.
     put(kPackedOpacity, lane < lanes ? opacity_of(scene, i) : 0.0f);
     put(kPackedBarycentric, scene.barycentric[i * 3 + 1]);
     put(kPackedBarycentric + 1, scene.barycentric[i * 3 + 2]);
@@ -117,25 +128,52 @@ void PackedGaussians::pack_block(const MorphedScene& scene, int block) {
       for (int c = 0; c < kMorphedWidth[kind]; ++c)
         put(column++, scene.base[kind][i * kMorphedWidth[kind] + c]);
   }
-  for (int kind = 0; kind < kMorphedKinds; ++kind)
-    for (int k = 0; k < bases_; ++k) {
-      const int width = kMorphedWidth[kind];
-      const float* from = scene.basis[kind] + int64_t(k) * scene.count * width;
-      const float inverse = 1.0f / unit_[size_t(kind) * bases_ + k];
+  pack_halves(scene, block);
+  pack_words<kRotationBits>(scene, block, kRotationKind);
+  pack_words<kColorBits>(scene, block, kColorKind);
+}
+
+void PackedGaussians::pack_halves(const MorphedScene& scene, int block) {
+  uint16_t* half = halves_.data() + size_t(block) * bases_ * kPackedHalves * kPackedLanes;
+  for (int k = 0; k < bases_; ++k) {
+    const float* from = scene.basis[kPositionKind] + int64_t(k) * scene.count * kPackedHalves;
+    for (int c = 0; c < kPackedHalves; ++c)
+      for (int lane = 0; lane < kPackedLanes; ++lane)
+        *half++ = half_of(from[of_lane(block, lane) * kPackedHalves + c] / half_unit_[k]);
+  }
+}
+
+template <int kBits>
+void PackedGaussians::pack_words(const MorphedScene& scene, int block, int kind) {
+  constexpr int kLargest = (1 << (kBits - 1)) - 1;
+  const int width = kMorphedWidth[kind];
+  const size_t row = (size_t(block) * kPackedWords + (kind == kColorKind)) * bases_;
+  for (int k = 0; k < bases_; ++k) {
+    const float* from = scene.basis[kind] + int64_t(k) * scene.count * width;
+    float size = 0.0f;
+    for (int lane = 0; lane < kPackedLanes; ++lane)
       for (int c = 0; c < width; ++c)
-        for (int lane = 0; lane < kPackedLanes; ++lane) {
-          const int64_t i = chosen_[lane < lanes ? first + lane : first];
-          *basis++ = half_of(from[i * width + c] * inverse);
-        }
+        size = std::max(size, std::fabs(from[of_lane(block, lane) * width + c]));
+    const float unit = size / kLargest;
+    word_unit_[row + k] = unit;
+    for (int lane = 0; lane < kPackedLanes; ++lane) {
+      uint32_t word = 0;
+      for (int c = 0; unit > kLeastUnit && c < width; ++c) {
+        const long number = std::lrint(from[of_lane(block, lane) * width + c] / unit);
+        word |= (uint32_t(number) & ((1u << kBits) - 1)) << (kBits * c);
+      }
+      words_[(row + k) * kPackedLanes + lane] = int32_t(word);
     }
+  }
 }
 
 PackedScene PackedGaussians::scene(const MorphedScene& scene, const float* frames,
-                                   std::vector<float>& weights) const {
-  weights.resize(unit_.size());
-  for (size_t i = 0; i < unit_.size(); ++i) weights[i] = scene.weights[i % bases_] * unit_[i];
-  return {bases_, scene.width, scene.height, base_.data(), basis_.data(), triangle_.data(),
-          weights.data(), frames};
+                                   std::vector<float>& half_weights) const {
+  half_weights.resize(bases_);
+  for (int k = 0; k < bases_; ++k) half_weights[k] = scene.weights[k] * half_unit_[k];
+  return {bases_,         scene.width,          scene.height,    base_.data(),
+          halves_.data(), words_.data(),        word_unit_.data(), triangle_.data(),
+          half_weights.data(), scene.weights, frames};
 }
 
 PackedRendering::PackedRendering(const PackedGaussians& gaussians, MorphedScene scene,
@@ -151,8 +189,8 @@ PackedRendering::PackedRendering(const PackedGaussians& gaussians, MorphedScene 
     const int begin = int(item) * kFrameChunk;
     kernels_->fill_frames(scene, 0, begin, std::min(begin + kFrameChunk, scene.triangles));
   });
-  std::vector<float> weights;
-  const PackedScene packed = gaussians.scene(scene, w.frames.data(), weights);
+  std::vector<float> half_weights;
+  const PackedScene packed = gaussians.scene(scene, w.frames.data(), half_weights);
   team.run(parts_per_image(), [&](int64_t part, int) {
     const int begin = int(part) * kPart;
     kernels_->project_packed(packed, w.cameras.data(), begin, std::min(begin + kPart, count_),

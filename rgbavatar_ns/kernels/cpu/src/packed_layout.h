@@ -1,5 +1,5 @@
 // Morphed Gaussians as pictures alone need them: what no picture shows is left out, and what the
-// bases change is kept in half precision, in the order in which it is read.
+// bases change is kept in 16 bits or less a number, in the order in which it is read.
 #pragma once
 
 #include "layout.h"
@@ -18,17 +18,25 @@ enum {
   kPackedBarycentric = 14,
   kPackedColumns = 16
 };
-// What the bases change, as many columns of sixteen halves for each of them.
-constexpr int kPackedMorphed = 10;
+// What each basis changes: where a Gaussian is, as columns of sixteen halves, since a sharp edge shows
+// a tenth of a pixel; its rotation and its colour feature as sixteen words each, whose bits are a
+// signed number for each component, the first one in the lowest.
+constexpr int kPackedHalves = 3;
+constexpr int kPackedWords = 2;
+constexpr int kRotationBits = 8;
+constexpr int kColorBits = 10;
 
 // One picture of such Gaussians.
 struct PackedScene {
   int bases, width, height;
-  const float* base;        // [blocks, kPackedColumns, 16]
-  const uint16_t* basis;    // of a block, one kind after the other: [K, 3 or 4, 16]
-  const int32_t* triangle;  // [blocks, 16]
-  const float* weights;     // [kinds, K], over the bases' units
-  const float* frames;      // [U, kFrameFloats]
+  const float* base;          // [blocks, kPackedColumns, 16]
+  const uint16_t* halves;     // [blocks, K, kPackedHalves, 16]
+  const int32_t* words;       // [blocks, kPackedWords, K, 16]
+  const float* word_units;    // [blocks, kPackedWords, K]: how much a number's 1 is
+  const int32_t* triangle;    // [blocks, 16]
+  const float* half_weights;  // [K], over the halves' units
+  const float* weights;       // [K]
+  const float* frames;        // [U, kFrameFloats]
 };
 
 }  // namespace rgbavatar
