@@ -12,7 +12,8 @@ from rgbavatar_ns.avatar.config import AvatarConfig
 from rgbavatar_ns.avatar.method import AvatarMethod
 from rgbavatar_ns.avatar.model.anchors import GaussianAnchors
 from rgbavatar_ns.avatar.model.blendshapes import GaussianBlendshapes
-from rgbavatar_ns.avatar.model.packed_avatar import PackedAvatar
+from rgbavatar_ns.avatar.model.kept_copy import KeptCopy
+from rgbavatar_ns.avatar.model.posing_parameters import posing_parameters, posing_tensors
 from rgbavatar_ns.avatar.model.tangent_to_world import tangent_to_world
 from rgbavatar_ns.avatar.model.weight_network import WeightNetwork, softly_within
 from rgbavatar_ns.avatar.storage.stored_avatar import RGBAVATAR
@@ -22,11 +23,15 @@ from rgbavatar_ns.kernels import (
     GaussianSet,
     MorphedGaussians,
     MorphedRenderer,
+    PackedGaussians,
     PictureRenderer,
     PinholeCameras,
+    Posing,
     RenderedBatch,
     morphed_renderer,
+    packed_gaussians,
     picture_renderer,
+    posing_of,
     rasterize,
 )
 from rgbavatar_ns.kernels.constants import MIN_ALPHA
@@ -92,7 +97,7 @@ class Avatar(AvatarMethod):
     ) -> None:
         config = AvatarConfig() if config is None else config
         super().__init__(head, identity, config)
-        self._packed = PackedAvatar()
+        self._packed, self._posing = KeptCopy[PackedGaussians](), KeptCopy[Posing]()
         with torch.no_grad():
             rest_vertices = head(identity.new_zeros(self.layout.size), identity)
         if anchors is None:
@@ -218,7 +223,8 @@ class Avatar(AvatarMethod):
         Other options are those of `kernels.rasterize`. The picture carries no graph, unless it is
         to be `differentiable`: the same numbers through autograd, in several times as long. One
         picture that is only `to_be_seen` may come from Gaussians in fewer bits
-        (`kernels.PackedGaussians`), which are packed once the avatar is drawn again unchanged.
+        (`kernels.PackedGaussians`), its mesh and weights from compiled loops (`kernels.Posing`);
+        both are made once the avatar is drawn again unchanged.
         """
         options: dict[str, Any] = {"with_depth": with_depth, "with_visibility": with_visibility}
         with nullcontext() if differentiable else torch.no_grad():
@@ -267,10 +273,24 @@ class Avatar(AvatarMethod):
         of `renderer`.
         """
         gaussians = self._morphed_gaussians()
-        packed = self._packed.of(gaussians, backend)
+        tensors = [value for value in vars(gaussians).values() if isinstance(value, Tensor)]
+        packed = self._packed.of(
+            tensors, (backend, gaussians.variant), lambda: packed_gaussians(gaussians, backend)
+        )
+        parts = self.head, self.identity, (self.theta_low, self.theta_high), self.weight_network
+        posing = self._posing.of(
+            posing_tensors(*parts),
+            backend,
+            lambda: posing_of(posing_parameters(*parts, self.config), backend),
+        )
         if packed is None:
             return None
-        weights, posed = self._driven(theta, psi, vertices)
+        if posing is None or not (psi is None or vertices is None):
+            weights, posed = self._driven(theta, psi, vertices)
+        else:
+            weights, posed = posing(self.checked(theta))
+            weights = weights if psi is None else psi
+            posed = posed if vertices is None else vertices
         return picture_renderer(packed, gaussians, weights, posed, cameras)
 
     @torch.no_grad()

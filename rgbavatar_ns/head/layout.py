@@ -190,20 +190,22 @@ class ThetaLayout:
         when the head moves sideways.
         """
         parts = self.split(theta)
-        features = [theta[..., :0]]
+        read = self.feature_parts(include_pose, include_translation)
         # All rotations at once: single ones are too small for a tensor operation each.
-        turning = [f.name for f in self.fields if f.form == "axis_angle"] if include_pose else []
+        turning = [name for name, turned in read if turned]
         rows_6d = {}
         if turning:
             matrices = axis_angle_to_matrix(torch.stack([parts[name] for name in turning], -2))
             rows_6d = dict(zip(turning, matrix_to_6d_rows(matrices).unbind(-2)))
-        for field in self.fields:
-            part = parts[field.name]
-            if field.name in rows_6d:
-                features.append(rows_6d[field.name])
-            elif field.form == "linear" or (field.form == "translation" and include_translation):
-                features.append(part)
-        return torch.cat(features, dim=-1)
+        features = [rows_6d[name] if turned else parts[name] for name, turned in read]
+        return torch.cat([theta[..., :0], *features], dim=-1)
+
+    def feature_parts(
+        self, include_pose: bool = True, include_translation: bool = False
+    ) -> list[tuple[str, bool]]:
+        """The fields that `network_features` reads, in order, and whether by their matrix' rows."""
+        forms = {"linear": True, "axis_angle": include_pose, "translation": include_translation}
+        return [(f.name, f.form == "axis_angle") for f in self.fields if forms[f.form]]
 
     def __str__(self) -> str:
         """Names and sizes in a line."""

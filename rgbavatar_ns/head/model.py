@@ -1,6 +1,7 @@
 """The head model: theta and identity to posed vertices, for FLAME and the embedded head alike."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -135,6 +136,22 @@ class HeadModel(nn.Module):
     def remembered(self, identity: Float[Tensor, "I"]) -> tuple[Tensor, Tensor]:
         """The neutral head's vertices and joints that calls with this steady identity share."""
         return self._person(identity, torch.Size())
+
+    def loop_arrays(self, identity: Float[Tensor, "I"]) -> dict[str, Any]:
+        """What `forward` computes with, of one identity, for loops that do the same.
+
+        By the names of `kernels.PosingParameters`.
+        """
+        vertices, joints = self._person(identity, torch.Size())
+        return {
+            "rest": vertices.unflatten(-1, (3, -1))[0],
+            "directions": torch.cat([self._linear_dirs, self._eyelid_dirs, self._pose_dirs]),
+            "joints": joints.unflatten(-1, (3, 5))[0],
+            "joint_directions": self._linear_joint_dirs,
+            "skinning": self._weights,
+            "parents": tuple(self._parents),
+            "turns": tuple(self.layout.slice(name).start for name in _JOINT_FIELDS),
+        }
 
     def _person(
         self, identity: Float[Tensor, "*_"] | None, batch: torch.Size

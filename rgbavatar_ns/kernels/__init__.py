@@ -5,7 +5,13 @@ from rgbavatar_ns.kernels.functional import (
     rasterize,
     weighted_color_average,
 )
-from rgbavatar_ns.kernels.morphed import morphed_renderer, packed_gaussians, picture_renderer
+from rgbavatar_ns.kernels.morphed import (
+    morphed_renderer,
+    packed_gaussians,
+    picture_renderer,
+    posing_of,
+)
+from rgbavatar_ns.kernels.posing import Posing, PosingParameters
 from rgbavatar_ns.kernels.registry import (
     DeviceRenderer,
     MorphedRenderer,
@@ -39,12 +45,15 @@ __all__ = [
     "PackedGaussians",
     "PictureRenderer",
     "PinholeCameras",
+    "Posing",
+    "PosingParameters",
     "RenderedBatch",
     "WeightedColors",
     "available_backends",
     "morphed_renderer",
     "packed_gaussians",
     "picture_renderer",
+    "posing_of",
     "rasterize",
     "unavailable_backends",
     "weighted_color_average",

@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from rgbavatar_ns.kernels.functional import check_cameras
+from rgbavatar_ns.kernels.posing import Posing, PosingParameters
 from rgbavatar_ns.kernels.registry import (
     MorphedRenderer,
     PackedGaussians,
@@ -44,6 +45,15 @@ def packed_gaussians(gaussians: MorphedGaussians, backend: str = "auto") -> Pack
     """
     tensor = gaussians.position
     return choose(backend, tensor.device, tensor.dtype).packed_gaussians(gaussians)
+
+
+def posing_of(parameters: PosingParameters, backend: str = "auto") -> Posing | None:
+    """The chosen backend's way from theta to weights and vertices; None where it has none.
+
+    Raises ValueError where there is no such backend.
+    """
+    tensor = parameters.rest
+    return choose(backend, tensor.device, tensor.dtype).posing(parameters)
 
 
 def picture_renderer(

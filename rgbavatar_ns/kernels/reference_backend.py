@@ -4,6 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from rgbavatar_ns.kernels.posing import PosingParameters
 from rgbavatar_ns.kernels.reference import (
     rasterize_reference,
     weighted_color_average_reference,
@@ -61,6 +62,10 @@ class ReferenceBackend:
         return None
 
     def packed_gaussians(self, gaussians: MorphedGaussians) -> None:
+        """None: nothing here is to be fast."""
+        return None
+
+    def posing(self, parameters: PosingParameters) -> None:
         """None: nothing here is to be fast."""
         return None
 

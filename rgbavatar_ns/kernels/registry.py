@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
+from rgbavatar_ns.kernels.posing import Posing, PosingParameters
 from rgbavatar_ns.kernels.types import (
     AdamParameter,
     FirstSight,
@@ -211,6 +212,10 @@ class Backend(Protocol):
 
     def packed_gaussians(self, gaussians: MorphedGaussians) -> PackedGaussians | None:
         """As `morphed.packed_gaussians`; None where this backend has none."""
+        ...
+
+    def posing(self, parameters: PosingParameters) -> Posing | None:
+        """As `morphed.posing_of`; None where this backend has none."""
         ...
 
 

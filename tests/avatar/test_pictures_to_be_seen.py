@@ -2,11 +2,12 @@
 
 import copy
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 
-from rgbavatar_ns.avatar.training import make_optimizer
+from rgbavatar_ns.avatar.training import TrainingOptions, TrainingStep, make_optimizer
 from rgbavatar_ns.drawing.compositing import to_uint8
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.kernels import available_backends, packed_gaussians
@@ -33,7 +34,7 @@ def seen(avatar, theta, camera, *background, **options):
     with torch.no_grad():
         for _ in range(2):
             drawn = avatar.render(theta, camera, *background, to_be_seen=True, **options)
-    assert avatar._packed._packed is not None
+    assert avatar._packed._made is not None
     return drawn
 
 
@@ -80,7 +81,9 @@ def test_pictures_to_measure_stay_exact_beside_those_to_see(stirred):
     assert torch.equal(visible, avatar.render(theta, camera, with_visibility=True).visibility)
 
 
-@pytest.mark.parametrize("change", ["in place", "fused step", "loaded", "another tensor"])
+@pytest.mark.parametrize(
+    "change", ["in place", "fused step", "eager step", "loaded", "another tensor"]
+)
 def test_a_changed_avatar_is_shown_as_it_is_now(stirred, change):
     avatar = stirred()
     theta, camera = random_theta(avatar.layout, 1), front_camera()
@@ -90,6 +93,10 @@ def test_a_changed_avatar_is_shown_as_it_is_now(stirred, change):
             avatar.blendshapes.basis_color_feature.mul_(3)
     elif change == "fused step":
         assert fused_step(avatar, make_optimizer(avatar), *far_batch(avatar, 2)) is not None
+    elif change == "eager step":
+        options = TrainingOptions(fast=False)
+        batch, background = far_batch(avatar, 2)
+        TrainingStep(avatar, options=options)(replace(batch, background=background), 0)
     elif change == "loaded":
         avatar.load_state_dict(stirred(4).state_dict())
     else:
@@ -177,13 +184,16 @@ def test_what_a_picture_asks_of_torch_wakes_no_other_threads(stirred):
         hooks = [part.register_forward_hook(look) for part in (avatar.head, avatar.weight_network)]
         avatar.render(theta, camera, to_be_seen=True)
         to_uint8(torch.zeros(4, 4, 3))
+        assert not used, "neither is asked"
+        avatar.render(theta, camera)
         assert used == [1, 1]
         assert torch.get_num_threads() == 3
-        with pytest.raises(UserError, match="theta"):
-            avatar.render(theta[:, 1:], camera, to_be_seen=True)
+        for to_be_seen in (True, False):
+            with pytest.raises(UserError, match="theta"):
+                avatar.render(theta[:, 1:], camera, to_be_seen=to_be_seen)
         hooks.append(avatar.head.register_forward_hook(_fail))
         with pytest.raises(RuntimeError, match="no head"):
-            avatar.render(theta, camera, to_be_seen=True)
+            avatar.render(theta, camera)
         assert torch.get_num_threads() == 3
     for hook in hooks:
         hook.remove()
@@ -208,5 +218,5 @@ def test_a_copy_begins_without_packed_gaussians(stirred):
     theta, camera = random_theta(avatar.layout, 1), front_camera()
     drawn = seen(avatar, theta, camera).image
     other = copy.deepcopy(avatar)
-    assert other._packed._packed is None
+    assert other._packed._made is None
     assert torch.equal(seen(other, theta, camera).image, drawn)

@@ -43,6 +43,10 @@ class WeightNetwork(nn.Module):
         """Map features to blendshape weights."""
         return self.layers(features)
 
+    def linear_layers(self) -> list[nn.Linear]:
+        """The layers with weights, in order."""
+        return [layer for layer in self.layers if isinstance(layer, nn.Linear)]
+
 
 def softly_within(
     theta: Float[Tensor, "*batch H"], low: Float[Tensor, "H"], high: Float[Tensor, "H"]

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from rgbavatar_ns.avatar.avatar import Avatar
 from rgbavatar_ns.avatar.training.losses import require_images_of
-from rgbavatar_ns.avatar.training.optimizer_states import AdamStates
+from rgbavatar_ns.avatar.training.optimizer_states import AdamStates, take_steps
 from rgbavatar_ns.kernels import FirstSight, MorphedGradient, MorphedRenderer, PinholeCameras
 
 
@@ -79,5 +79,4 @@ class FusedStep:
         if psi.requires_grad:
             psi.backward(weight_gradient)
         # Of the Gaussians they find no gradient; hooks and schedules still see each take its step.
-        for optimizer in self._states.optimizers:
-            optimizer.step()
+        take_steps(self._states.optimizers)

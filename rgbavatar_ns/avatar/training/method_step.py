@@ -16,6 +16,7 @@ from rgbavatar_ns.avatar.method import (
 from rgbavatar_ns.avatar.refinement.frames import FrameRefinement
 from rgbavatar_ns.avatar.training.batches import ChosenFrames, TrainingBatch
 from rgbavatar_ns.avatar.training.losses import random_backgrounds, require_images_of
+from rgbavatar_ns.avatar.training.optimizer_states import take_steps
 from rgbavatar_ns.avatar.training.step import StepKind
 from rgbavatar_ns.drawing.compositing import film_over, is_unfilmed, rgba_to_float
 from rgbavatar_ns.kernels import rasterize
@@ -85,8 +86,7 @@ class MethodStep:
         losses, drawn, offset = self._losses(batch, theta, background.to(theta), step)
         torch.stack(list(losses.values())).sum().backward()
         self._set_rates(step)
-        for optimizer in self.optimizers:
-            optimizer.step()
+        take_steps(self.optimizers)
         if self.refinement is not None and theta.grad is not None:
             assert batch.position is not None
             # The batch's loss is a mean; each frame is to have the gradient of its own.

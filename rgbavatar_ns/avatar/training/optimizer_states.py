@@ -6,6 +6,7 @@ from weakref import WeakKeyDictionary
 
 import torch
 from torch import Tensor
+from torch.autograd.graph import increment_version
 
 from rgbavatar_ns.avatar.avatar import Avatar
 from rgbavatar_ns.kernels import AdamParameter
@@ -148,3 +149,14 @@ def _homes(
 ) -> dict[Tensor, tuple[torch.optim.Optimizer, dict]]:
     """Each parameter's optimiser and group."""
     return {p: (o, g) for o in optimizers for g in o.param_groups for p in g["params"]}
+
+
+def take_steps(optimizers: Iterable[torch.optim.Optimizer]) -> None:
+    """Step with each, and count their parameters as changed, which torch's fused ones do not.
+
+    Copies that are kept for pictures (`model/kept_copy.py`) would stay what they were.
+    """
+    for optimizer in optimizers:
+        optimizer.step()
+        parameters = [p for group in optimizer.param_groups for p in group["params"]]
+        increment_version([p for p in parameters if p.grad is not None])

@@ -27,7 +27,7 @@ from rgbavatar_ns.avatar.training.color_init import FirstColors, FirstColorsKind
 from rgbavatar_ns.avatar.training.cuda_graph import Recorder, record_cuda_graph
 from rgbavatar_ns.avatar.training.fused_step import FusedStep
 from rgbavatar_ns.avatar.training.losses import image_losses, random_backgrounds
-from rgbavatar_ns.avatar.training.optimizer_states import unsupported_reason
+from rgbavatar_ns.avatar.training.optimizer_states import take_steps, unsupported_reason
 from rgbavatar_ns.avatar.training.orthogonality import (
     ORTHOGONALITY_WEIGHT,
     ORTHOGONALIZE_EVERY,
@@ -348,8 +348,7 @@ class TrainingStep:
         groups = self.avatar.parameter_groups()
         for name, norm in self.options.max_norm.items():
             torch.nn.utils.clip_grad_norm_(groups[name], norm)
-        for optimizer in self.optimizers:
-            optimizer.step()
+        take_steps(self.optimizers)
         if self._first_colors is not None and seen is not None:
             self._first_colors.give(seen)
         return {name: loss.detach() for name, loss in losses.items()}

@@ -129,3 +129,28 @@ class PackedSession(PackedDrawing):
         threads: int,
         instruction_set: str,
     ) -> None: ...
+
+class Posing:
+    def __init__(
+        self,
+        parts: tuple[int, int, int, int, int, int],
+        joints: tuple[int, ...],
+        parents: tuple[int, ...],
+        rest: Tensor,
+        directions: Tensor,
+        joints_at_rest: Tensor,
+        joint_directions: Tensor,
+        skinning: Tensor,
+        only_joints: bool,
+        low: Tensor,
+        high: Tensor,
+        features: list[tuple[int, int, bool]],
+        layers: list[tuple[Tensor, Tensor]],
+    ) -> None: ...
+    @property
+    def num_weights(self) -> int: ...
+    @property
+    def num_vertices(self) -> int: ...
+    def run(
+        self, theta: Tensor, weights: Tensor, vertices: Tensor, threads: int, instruction_set: str
+    ) -> None: ...

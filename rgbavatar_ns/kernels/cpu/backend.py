@@ -18,12 +18,14 @@ from rgbavatar_ns.kernels.cpu import (
 )
 from rgbavatar_ns.kernels.cpu.morphed import CpuMorphedRenderer
 from rgbavatar_ns.kernels.cpu.packed import CpuPackedGaussians
+from rgbavatar_ns.kernels.cpu.posing import CpuPosing
 from rgbavatar_ns.kernels.differentiable import (
     Drawn,
     Gradients,
     draw_differentiably,
     gaussian_inputs,
 )
+from rgbavatar_ns.kernels.posing import PosingParameters
 from rgbavatar_ns.kernels.types import (
     GaussianSet,
     MorphedGaussians,
@@ -158,6 +160,10 @@ class CpuBackend:
     def packed_gaussians(self, gaussians: MorphedGaussians) -> CpuPackedGaussians:
         """As `morphed.packed_gaussians`."""
         return CpuPackedGaussians(gaussians)
+
+    def posing(self, parameters: PosingParameters) -> CpuPosing:
+        """As `morphed.posing_of`."""
+        return CpuPosing(parameters)
 
 
 def load() -> CpuBackend:

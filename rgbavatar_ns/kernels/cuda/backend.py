@@ -21,6 +21,7 @@ from rgbavatar_ns.kernels.differentiable import (
     draw_differentiably,
     gaussian_inputs,
 )
+from rgbavatar_ns.kernels.posing import PosingParameters
 from rgbavatar_ns.kernels.types import (
     GaussianSet,
     MorphedGaussians,
@@ -193,6 +194,10 @@ class CudaBackend:
 
     def packed_gaussians(self, gaussians: MorphedGaussians) -> None:
         """None: a GPU draws the Gaussians as they are."""
+        return None
+
+    def posing(self, parameters: PosingParameters) -> None:
+        """None: a GPU's pictures are recorded, torch's operations with them."""
         return None
 
 

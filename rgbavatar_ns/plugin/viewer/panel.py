@@ -50,7 +50,7 @@ _ALL_BASES: dict[str, Any] = {"basis_alone": None, "bases_used": None}
 
 @dataclass(frozen=True)
 class _Report:
-    """What is to be told about a picture, some of them; on the CPU."""
+    """What is to be told about a picture, some of them."""
 
     trouble: str
     seconds: float
@@ -58,15 +58,15 @@ class _Report:
     height_px: int
     psnr_db: float | None
     world_to_camera: Float[Tensor, "1 4 4"]
-    theta: Float[Tensor, "1 H"]
-    psi: Float[Tensor, "1 K"]
+    signal: DrivingSignal
 
     def text(self, layout: ThetaLayout, beyond: Callable[..., str]) -> str:
         """Size, speed, score, and what goes `beyond` the film."""
         size = f"{self.width_px} x {self.height_px}"
         rate = f"{1 / max(self.seconds, 1e-6):.0f} frames/s"
         psnr = "" if self.psnr_db is None else f"  \nPSNR of this frame {self.psnr_db:.2f} dB"
-        told = beyond(self.theta, turn_seen(self.theta, self.world_to_camera, layout))
+        theta = self.signal.theta.cpu()
+        told = beyond(theta, turn_seen(theta, self.world_to_camera, layout))
         told = f"  \n{told[:1].upper()}{told[1:]}" if told else ""
         return f"{size} in {1e3 * self.seconds:.0f} ms: {rate}{psnr}{told}"
 
@@ -150,8 +150,7 @@ class ViewerPanel(ViewerControl):
             camera.height,
             drawn.psnr,
             camera.world_to_camera.cpu(),
-            signal.theta.cpu(),
-            self._psi_of(signal).cpu(),
+            signal,
         )
         self._drawn_live(state)
         return drawn.outputs()
@@ -172,7 +171,8 @@ class ViewerPanel(ViewerControl):
         if report is not None and report is not self._told and now_s >= self._next_told_s:
             self._told, self._next_told_s = report, now_s + _TOLD_EVERY_S
             self._widgets.report(report.text(self._model.avatar.layout, self._beyond))
-            self._widgets.show_driving(report.theta[0], report.psi[0])
+            signal = report.signal
+            self._widgets.show_driving(signal.theta[0].cpu(), self._psi_of(signal)[0].cpu())
             self._refine(report)
             if report.trouble:
                 self._widgets.tell(report.trouble)
@@ -311,7 +311,6 @@ class ViewerPanel(ViewerControl):
         self, state: ViewerState, camera: PinholeCameras, time_share: float | FilmMoment | None
     ) -> tuple[DrivingSignal, ViewerRender]:
         model, signal = self._model, driving_signal(self._model, state, time_share)
-        signal = replace(signal, psi=self._psi_of(signal))
         options: dict[str, Any] = {"film": self._film, "backend": model.config.rasterizer}
         options["with_depth"] = self._depth_is_wanted()
         return signal, viewer_render(model.avatar, signal, state, camera, **options)

@@ -4,6 +4,7 @@
 #include "morphed.h"
 #include "mesh_gradient.h"
 #include "packed.h"
+#include "pose.h"
 #include "train_tile.h"
 
 namespace rgbavatar::RGBAVATAR_ISA {
@@ -11,6 +12,6 @@ namespace rgbavatar::RGBAVATAR_ISA {
 extern const Kernels kernels;
 const Kernels kernels = {project_image, forward_tile, backward_tile, average_tile,
                          project_image_backward, fill_frames, project_morphed, train_tile,
-                         see_tile, update_morphed, mesh_gradient, project_packed};
+                         see_tile, update_morphed, mesh_gradient, project_packed, pose_vertices};
 
 }  // namespace rgbavatar::RGBAVATAR_ISA

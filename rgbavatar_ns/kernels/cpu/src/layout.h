@@ -220,6 +220,7 @@ struct TrainingTarget {
 };
 
 struct PackedScene;  // packed_layout.h
+struct PosedMesh;    // posing_layout.h
 
 // The loops, compiled once per instruction set.
 struct Kernels {
@@ -259,6 +260,8 @@ struct Kernels {
   // Morphs and projects the packed Gaussians [begin, end), whole blocks.
   void (*project_packed)(const PackedScene&, const float* camera, int begin, int end,
                          const Projected&);
+  // Writes the vertices [V, 3] of the blocks [begin, end).
+  void (*pose_vertices)(const PosedMesh&, int begin, int end, float* vertices);
 };
 
 // world_to_camera [4, 4], focal [2] and principal point [2] in one row of floats.

@@ -17,6 +17,8 @@
 namespace nb = nanobind;
 using namespace nb::literals;
 
+void bind_posing(nb::module_& m);  // posing_module.cpp
+
 namespace {
 
 #define RGBAVATAR_FUNCTION static inline
@@ -331,4 +333,5 @@ NB_MODULE(_native, m) {
            "world_to_camera"_a.noconvert(), "focal_px"_a.noconvert(),
            "principal_point_px"_a.noconvert(), "width"_a, "height"_a, "threads"_a,
            "instruction_set"_a, Release());
+  bind_posing(m);
 }
