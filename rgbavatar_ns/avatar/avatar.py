@@ -12,8 +12,8 @@ from rgbavatar_ns.avatar.config import AvatarConfig
 from rgbavatar_ns.avatar.method import AvatarMethod
 from rgbavatar_ns.avatar.model.anchors import GaussianAnchors
 from rgbavatar_ns.avatar.model.blendshapes import GaussianBlendshapes
-from rgbavatar_ns.avatar.model.kept_copy import KeptCopy
-from rgbavatar_ns.avatar.model.posing_parameters import posing_parameters, posing_tensors
+from rgbavatar_ns.avatar.model.kept_copy import KeptCopy, PictureCopy, own_tensors
+from rgbavatar_ns.avatar.model.posing_parameters import posing_parameters
 from rgbavatar_ns.avatar.model.tangent_to_world import tangent_to_world
 from rgbavatar_ns.avatar.model.weight_network import WeightNetwork, softly_within
 from rgbavatar_ns.avatar.storage.stored_avatar import RGBAVATAR
@@ -23,15 +23,11 @@ from rgbavatar_ns.kernels import (
     GaussianSet,
     MorphedGaussians,
     MorphedRenderer,
-    PackedGaussians,
     PictureRenderer,
     PinholeCameras,
-    Posing,
     RenderedBatch,
     morphed_renderer,
-    packed_gaussians,
     picture_renderer,
-    posing_of,
     rasterize,
 )
 from rgbavatar_ns.kernels.constants import MIN_ALPHA
@@ -97,7 +93,7 @@ class Avatar(AvatarMethod):
     ) -> None:
         config = AvatarConfig() if config is None else config
         super().__init__(head, identity, config)
-        self._packed, self._posing = KeptCopy[PackedGaussians](), KeptCopy[Posing]()
+        self._for_pictures = KeptCopy[PictureCopy]()
         with torch.no_grad():
             rest_vertices = head(identity.new_zeros(self.layout.size), identity)
         if anchors is None:
@@ -272,26 +268,29 @@ class Avatar(AvatarMethod):
         Nor has it one the first time after the avatar has changed. Arguments and errors are those
         of `renderer`.
         """
-        gaussians = self._morphed_gaussians()
-        tensors = [value for value in vars(gaussians).values() if isinstance(value, Tensor)]
-        packed = self._packed.of(
-            tensors, (backend, gaussians.variant), lambda: packed_gaussians(gaussians, backend)
-        )
-        parts = self.head, self.identity, (self.theta_low, self.theta_high), self.weight_network
-        posing = self._posing.of(
-            posing_tensors(*parts),
-            backend,
-            lambda: posing_of(posing_parameters(*parts, self.config), backend),
-        )
-        if packed is None:
+        network = () if self.weight_network is None else self.weight_network.linear_layers()
+        parts = self, self.head, self.anchors, self.blendshapes, *network
+        state = (backend, self.config, self.anchors.variant)
+        copy = self._for_pictures.of(own_tensors(parts), state, lambda: self._copied(backend))
+        if copy is None:
             return None
-        if posing is None or not (psi is None or vertices is None):
+        if copy.posing is None or not (psi is None or vertices is None):
             weights, posed = self._driven(theta, psi, vertices)
         else:
-            weights, posed = posing(self.checked(theta))
+            weights, posed = copy.posing(self.checked(theta))
             weights = weights if psi is None else psi
             posed = posed if vertices is None else vertices
-        return picture_renderer(packed, gaussians, weights, posed, cameras)
+        return picture_renderer(copy.packed, copy.gaussians, weights, posed, cameras)
+
+    def _copied(self, backend: str) -> PictureCopy | None:
+        posing = posing_parameters(
+            self.head,
+            self.identity,
+            (self.theta_low, self.theta_high),
+            self.weight_network,
+            self.config,
+        )
+        return PictureCopy.of(self._morphed_gaussians(), posing, backend)
 
     @torch.no_grad()
     def _driven(

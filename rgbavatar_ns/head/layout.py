@@ -1,5 +1,6 @@
 """What the numbers of a theta vector mean: named fields with a size and a form."""
 
+import functools
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -65,7 +66,7 @@ class ThetaLayout:
         """The fields' names in order."""
         return tuple(field.name for field in self.fields)
 
-    @property
+    @functools.cached_property
     def size(self) -> int:
         """How many numbers theta has."""
         return sum(field.size for field in self.fields)

@@ -34,7 +34,7 @@ def seen(avatar, theta, camera, *background, **options):
     with torch.no_grad():
         for _ in range(2):
             drawn = avatar.render(theta, camera, *background, to_be_seen=True, **options)
-    assert avatar._packed._made is not None
+    assert avatar._for_pictures._made is not None
     return drawn
 
 
@@ -218,5 +218,5 @@ def test_a_copy_begins_without_packed_gaussians(stirred):
     theta, camera = random_theta(avatar.layout, 1), front_camera()
     drawn = seen(avatar, theta, camera).image
     other = copy.deepcopy(avatar)
-    assert other._packed._made is None
+    assert other._for_pictures._made is None
     assert torch.equal(seen(other, theta, camera).image, drawn)

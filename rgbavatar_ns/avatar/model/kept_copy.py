@@ -2,9 +2,19 @@
 
 import threading
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from typing import Generic, TypeVar
 
-from torch import Tensor
+from torch import Tensor, nn
+
+from rgbavatar_ns.kernels import (
+    MorphedGaussians,
+    PackedGaussians,
+    Posing,
+    PosingParameters,
+    packed_gaussians,
+    posing_of,
+)
 
 Made = TypeVar("Made")
 
@@ -28,10 +38,12 @@ class KeptCopy(Generic[Made]):
         And where `make` has none, or torch cannot tell whether a tensor has changed.
         """
         tensors = list(tensors)
-        if any(tensor.is_inference() for tensor in tensors):
+        try:
+            # What a tensor is and whether it changed; the tensors themselves are kept, so that no
+            # other can take their memory meanwhile.
+            versions = [x for t in tensors for x in (id(t), t.data_ptr(), t._version)]
+        except RuntimeError:  # inference tensors do not count their changes
             return None
-        # The tensors themselves are kept, so that no other can take their memory meanwhile.
-        versions = [(id(tensor), tensor.data_ptr(), tensor._version) for tensor in tensors]
         state = (key, versions, tensors)
         with self._lock:
             if state[:2] != self._state[:2]:
@@ -43,3 +55,31 @@ class KeptCopy(Generic[Made]):
     def __deepcopy__(self, memo: object) -> "KeptCopy[Made]":
         """Begin anew: a copy's tensors are others."""
         return KeptCopy()
+
+
+def own_tensors(modules: Iterable[nn.Module]) -> list[Tensor]:
+    """The parameters and buffers of these modules, without those of modules inside."""
+    return [
+        tensor
+        for module in modules
+        for tensors in (module._parameters, module._buffers)
+        for tensor in tensors.values()
+        if tensor is not None
+    ]
+
+
+@dataclass(frozen=True)
+class PictureCopy:
+    """What one picture after another is drawn from: Gaussians and what poses them."""
+
+    gaussians: MorphedGaussians
+    packed: PackedGaussians
+    posing: Posing | None
+
+    @classmethod
+    def of(
+        cls, gaussians: MorphedGaussians, posing: PosingParameters, backend: str
+    ) -> "PictureCopy | None":
+        """Copied for a backend; None where it has nothing of the kind."""
+        packed = packed_gaussians(gaussians, backend)
+        return None if packed is None else cls(gaussians, packed, posing_of(posing, backend))

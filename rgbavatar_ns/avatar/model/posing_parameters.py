@@ -1,7 +1,5 @@
 """The head and the weight network of an avatar as compiled loops take them."""
 
-from collections.abc import Iterator
-
 from jaxtyping import Float
 from torch import Tensor
 
@@ -9,20 +7,6 @@ from rgbavatar_ns.avatar.config import AvatarConfig
 from rgbavatar_ns.avatar.model.weight_network import WeightNetwork
 from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.kernels import PosingParameters
-
-
-def posing_tensors(
-    head: HeadModel,
-    identity: Float[Tensor, "I"],
-    film_range: tuple[Float[Tensor, "H"], Float[Tensor, "H"]],
-    network: WeightNetwork | None,
-) -> Iterator[Tensor]:
-    """All that `posing_parameters` reads: where none of it has changed, nor has that."""
-    yield from head.buffers()
-    yield identity
-    yield from film_range
-    for layer in () if network is None else network.linear_layers():
-        yield from (layer.weight, layer.bias)
 
 
 def posing_parameters(
