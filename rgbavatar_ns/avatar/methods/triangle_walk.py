@@ -4,6 +4,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from rgbavatar_ns.head.surface import MeshEdges
+
 _MOST_TRIANGLES = 200
 """That one walk crosses; what has not arrived by then stays where it is."""
 
@@ -117,10 +119,8 @@ def triangle_neighbours(
 
     Triangles that are not `usable` are nobody's neighbours.
     """
-    ends = torch.stack([faces[:, [1, 2]], faces[:, [2, 0]], faces[:, [0, 1]]], 1).sort(-1).values
-    _, edge, count = torch.unique(
-        ends.flatten(0, 1), dim=0, return_inverse=True, return_counts=True
-    )
+    edges = MeshEdges.of(faces)
+    edge, count = edges.of_faces[:, [1, 2, 0]].flatten(), edges.num_faces
     owner = torch.arange(len(faces), device=faces.device).repeat_interleave(3)
     # Of the two triangles of an edge the other one is the sum less oneself.
     total = torch.zeros_like(count).index_add_(0, edge, owner)

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from rgbavatar_ns.avatar.avatar import Avatar
 from rgbavatar_ns.head import HeadArrays
+from rgbavatar_ns.head.surface import MeshEdges
 
 _BEHIND_EYES_M, _BELOW_EYES_M = 0.095, 0.05
 """Hair grows behind the ears, down to about their lobes; and from there up to the crown."""
@@ -47,8 +48,10 @@ class MeshField:
         faces = avatar.head.faces.long()
         template = torch.as_tensor(avatar.head.arrays.v_template).to(self._barycentric)
         self.num_vertices = len(template)
-        ends = torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-        self.edges = torch.unique(torch.cat([ends, ends.flip(1)]), dim=0)
+        ends = MeshEdges.of(faces).ends
+        first, second = torch.cat([ends, ends.flip(1)]).unbind(1)
+        numbers = torch.unique(first * self.num_vertices + second)
+        self.edges = torch.stack([numbers // self.num_vertices, numbers % self.num_vertices], 1)
         self._mirror, self._mirrored = _mirror_of(template)
         self.scalp = _scalp_of(avatar.head.arrays).to(template.device)
         self.body = _body_of(avatar.head.arrays).to(template.device)

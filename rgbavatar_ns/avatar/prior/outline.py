@@ -16,7 +16,7 @@ from torch import Tensor
 from rgbavatar_ns.avatar.avatar import Avatar
 from rgbavatar_ns.avatar.prior.mesh_field import MeshField, Outline
 from rgbavatar_ns.drawing.compositing import unfilmed_pixels
-from rgbavatar_ns.head.surface import vertex_normals
+from rgbavatar_ns.head.surface import MeshEdges, vertex_normals
 from rgbavatar_ns.kernels import PinholeCameras
 
 _GRAZING = 0.25
@@ -175,10 +175,8 @@ def _signed_distance_px(
 
 def lower_rim(avatar: Avatar) -> Int[np.ndarray, "R"]:
     """The vertices at the mesh's border that lie below its middle."""
-    faces = avatar.head.faces.cpu().long()
-    ends = torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).sort(1).values
-    edges, counts = torch.unique(ends, dim=0, return_counts=True)
-    border = torch.unique(edges[counts == 1]).numpy()
+    edges = MeshEdges.of(avatar.head.faces.cpu().long())
+    border = torch.unique(edges.ends[edges.num_faces == 1]).numpy()
     height = np.asarray(avatar.head.arrays.v_template)[:, 1]
     return border[height[border] < (height.min() + height.max()) / 2]
 
