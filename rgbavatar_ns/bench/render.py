@@ -35,7 +35,7 @@ from rgbavatar_ns.kernels import rasterize
 from rgbavatar_ns.kernels.threads import using_threads
 
 WHOLE_FRAME = "whole frame"
-VIEWER_FRAME = "(the viewer's picture: with depth, as bytes)"
+VIEWER_FRAME = "(the viewer's picture, as bytes)"
 EAGER_FRAME = "whole frame, eager"
 
 
