@@ -27,7 +27,9 @@ from rgbavatar_ns.kernels import (
     PinholeCameras,
     RenderedBatch,
     morphed_renderer,
+    packed_gaussians,
     picture_renderer,
+    posing_of,
     rasterize,
 )
 from rgbavatar_ns.kernels.constants import MIN_ALPHA
@@ -283,14 +285,15 @@ class Avatar(AvatarMethod):
         return picture_renderer(copy.packed, copy.gaussians, weights, posed, cameras)
 
     def _copied(self, backend: str) -> PictureCopy | None:
+        gaussians = self._morphed_gaussians()
+        packed = packed_gaussians(gaussians, backend)
+        if packed is None:
+            return None
+        film_range = self.theta_low, self.theta_high
         posing = posing_parameters(
-            self.head,
-            self.identity,
-            (self.theta_low, self.theta_high),
-            self.weight_network,
-            self.config,
+            self.head, self.identity, film_range, self.weight_network, self.config
         )
-        return PictureCopy.of(self._morphed_gaussians(), posing, backend)
+        return PictureCopy(gaussians, packed, posing_of(posing, backend))
 
     @torch.no_grad()
     def _driven(

@@ -7,14 +7,7 @@ from typing import Generic, TypeVar
 
 from torch import Tensor, nn
 
-from rgbavatar_ns.kernels import (
-    MorphedGaussians,
-    PackedGaussians,
-    Posing,
-    PosingParameters,
-    packed_gaussians,
-    posing_of,
-)
+from rgbavatar_ns.kernels import MorphedGaussians, PackedGaussians, Posing
 
 Made = TypeVar("Made")
 
@@ -75,11 +68,3 @@ class PictureCopy:
     gaussians: MorphedGaussians
     packed: PackedGaussians
     posing: Posing | None
-
-    @classmethod
-    def of(
-        cls, gaussians: MorphedGaussians, posing: PosingParameters, backend: str
-    ) -> "PictureCopy | None":
-        """Copied for a backend; None where it has nothing of the kind."""
-        packed = packed_gaussians(gaussians, backend)
-        return None if packed is None else cls(gaussians, packed, posing_of(posing, backend))
