@@ -130,8 +130,8 @@ class ViewerPage:
     def set_number(self, label: str, value: str) -> None:
         """Type a slider's number."""
         number = self.number_beside(label)
+        self.note_change()  # before: what is filled in is drawn at once
         number.fill(value)
-        self.note_change()
         number.press("Enter")
 
     def number_beside(self, label: str) -> Any:
