@@ -27,6 +27,8 @@ TESTS = (
     "kernels/test_screen_offset.py",
     "kernels/test_sizes.py",
     "kernels/test_weighted_colors.py",
+    "avatar/test_pictures_to_be_seen.py",
+    "avatar/test_posing.py",
     "avatar/training/test_fused_step.py",
     "avatar/refinement/test_refinement_gradient.py",
 )
