@@ -28,7 +28,8 @@ def test_without_a_viewer_the_cameras_time_chooses_and_the_ground_is_black(
     camera.metadata = {"cam_idx": None}
     for share, position in ((0.0, 0), (0.51, 7), (1.0, 13), (1.5, 13), (-1.0, 0)):
         camera.times = torch.tensor([[share]])
-        expected = rendered(model.avatar, model.frame_theta[position : position + 1], camera)
+        theta = model.frame_theta[position : position + 1]
+        expected = rendered(model.avatar, theta, camera, to_be_seen=False)
         drawn = model.get_outputs_for_camera(camera)
         assert torch.equal(drawn["rgb"], expected)
         assert drawn["depth"].shape == drawn["accumulation"].shape == (*expected.shape[:2], 1)

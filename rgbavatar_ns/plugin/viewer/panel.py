@@ -313,6 +313,8 @@ class ViewerPanel(ViewerControl):
         model, signal = self._model, driving_signal(self._model, state, time_share)
         options: dict[str, Any] = {"film": self._film, "backend": model.config.rasterizer}
         options["with_depth"] = self._depth_is_wanted()
+        # Films of `ns-render` are exact.
+        options["to_be_seen"] = self._viewer is not None
         return signal, viewer_render(model.avatar, signal, state, camera, **options)
 
     def _depth_is_wanted(self) -> bool:

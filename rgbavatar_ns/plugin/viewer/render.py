@@ -1,7 +1,7 @@
 """Images for the viewer: the avatar, what helps to judge it, and the film beside it."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -71,15 +71,18 @@ def viewer_render(
     film: TrackedDataset | None = None,
     backend: str = "auto",
     with_depth: bool = False,
+    to_be_seen: bool = True,
 ) -> ViewerRender:
     """Draw what the state asks for from one camera (C = 1); images beside the film from its own.
 
-    Depth, which takes time, is found where it is asked for or shown. Raises UserError where there
-    is no film to compare with.
+    Depth, which takes time, is found where it is asked for or shown; `to_be_seen` as in
+    `AvatarMethod.render`. Raises UserError where there is no film to compare with.
     """
+    options = {"backend": backend, "to_be_seen": to_be_seen}
     if state.picture in ("beside the film", "error"):
-        return _beside_film(avatar, signal, state, camera, film, backend)
-    drawn = _draw(avatar, signal, state, camera, backend, with_depth or state.picture == "depth")
+        return _beside_film(avatar, signal, state, camera, film, options)
+    with_depth = with_depth or state.picture == "depth"
+    drawn = _draw(avatar, signal, state, camera, options, with_depth)
     alpha, depth = drawn.alpha[0], None
     with using_threads(1):
         if drawn.depth is not None:
@@ -99,7 +102,7 @@ def _draw(
     signal: DrivingSignal,
     state: ViewerState,
     camera: PinholeCameras,
-    backend: str,
+    options: Mapping[str, Any],
     with_depth: bool,
 ) -> RenderedBatch:
     return avatar.render(
@@ -107,10 +110,9 @@ def _draw(
         camera,
         signal.theta.new_tensor(state.background),
         psi=signal.psi,
-        backend=backend,
         with_depth=with_depth,
         with_visibility=state.centres,
-        to_be_seen=True,
+        **options,
     )
 
 
@@ -120,7 +122,7 @@ def _beside_film(
     state: ViewerState,
     camera: PinholeCameras,
     film: TrackedDataset | None,
-    backend: str,
+    options: Mapping[str, Any],
 ) -> ViewerRender:
     """Film, avatar and error, or the error alone, as large as the viewer's window allows."""
     if film is None or signal.frame is None:
@@ -129,7 +131,7 @@ def _beside_film(
             "Choose another picture, or drive the avatar by a dataset frame.",
         )
     own = film.cameras.select([signal.frame]).to(signal.theta.device)
-    drawn = _draw(avatar, signal, state, own, backend, with_depth=False)
+    drawn = _draw(avatar, signal, state, own, options, with_depth=False)
     rgba = torch.from_numpy(film.read_image(signal.frame)).to(signal.theta.device)
     background = signal.theta.new_tensor(state.background)
     image = drawn.image[0].clamp(0, 1)

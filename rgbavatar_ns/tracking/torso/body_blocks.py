@@ -133,7 +133,10 @@ def _state_packed(state: FollowerState) -> dict[str, np.ndarray]:
 
 def _state_unpacked(held: _Arrays) -> FollowerState:
     run, plain_frames = held["state_counts"].tolist()
-    start, motion = map(RigidMotion, held["state_turns"], held["state_shifts_m"])
+    # In memory of their own, as while following: at odd places of an array, some processors'
+    # BLAS multiplies matrices to other last bits.
+    turns, shifts_m = held["state_turns"], held["state_shifts_m"]
+    start, motion = (RigidMotion(turns[k].copy(), shifts_m[k].copy()) for k in (0, 1))
     key = _key_unpacked("key", held)
     first = _key_unpacked("first", held) or key
     near_px, beside_px = held["near_px"], held["beside_px"]
