@@ -19,6 +19,7 @@ from rgbavatar_ns.kernels.registry import (
     PictureRenderer,
     unavailable_backends,
 )
+from rgbavatar_ns.kernels.similarity import mean_similarity
 from rgbavatar_ns.kernels.types import (
     UPDATED_ATTRIBUTES,
     AdamParameter,
@@ -50,6 +51,7 @@ __all__ = [
     "RenderedBatch",
     "WeightedColors",
     "available_backends",
+    "mean_similarity",
     "morphed_renderer",
     "packed_gaussians",
     "picture_renderer",

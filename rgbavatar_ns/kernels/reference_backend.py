@@ -69,6 +69,18 @@ class ReferenceBackend:
         """None: nothing here is to be fast."""
         return None
 
+    def mean_similarity(
+        self,
+        image: Float[Tensor, "B H W 3"],
+        target: Float[Tensor, "B H W 3"],
+        window: Float[Tensor, "11"],
+        stabilizers: tuple[float, float],
+        *,
+        with_gradient: bool,
+    ) -> None:
+        """None: nothing here is to be fast."""
+        return None
+
 
 def load() -> ReferenceBackend:
     """The backend."""

@@ -218,6 +218,18 @@ class Backend(Protocol):
         """As `morphed.posing_of`; None where this backend has none."""
         ...
 
+    def mean_similarity(
+        self,
+        image: Float[Tensor, "B H W 3"],
+        target: Float[Tensor, "B H W 3"],
+        window: Float[Tensor, "11"],
+        stabilizers: tuple[float, float],
+        *,
+        with_gradient: bool,
+    ) -> tuple[Float[Tensor, "B"], Float[Tensor, "B H W 3"] | None] | None:
+        """As `similarity.mean_similarity`; None where this backend has none."""
+        ...
+
 
 # Name -> module with `load() -> Backend`, which raises ImportError with the reason; the order is
 # the order of preference.

@@ -25,6 +25,7 @@ TESTS = (
     "kernels/test_isolation.py",
     "kernels/test_laws.py",
     "kernels/test_screen_offset.py",
+    "kernels/test_similarity.py",
     "kernels/test_sizes.py",
     "kernels/test_weighted_colors.py",
     "avatar/test_pictures_to_be_seen.py",

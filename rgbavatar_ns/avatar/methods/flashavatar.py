@@ -27,7 +27,7 @@ from torch import Tensor, nn
 from rgbavatar_ns.avatar.config import MethodConfig
 from rgbavatar_ns.avatar.method import AvatarMethod, DrawnBatch, FilmedBatch, Losses
 from rgbavatar_ns.avatar.methods.fields import MLP, positional_encoding
-from rgbavatar_ns.avatar.methods.loss_terms import huber_loss
+from rgbavatar_ns.avatar.methods.loss_terms import held_where, huber_loss
 from rgbavatar_ns.avatar.methods.neighbours import neighbour_distance
 from rgbavatar_ns.avatar.methods.region_mask import MOUTH_GROUPS, group_vertices, hull_mask
 from rgbavatar_ns.avatar.methods.sh import (
@@ -224,7 +224,7 @@ class FlashAvatar(AvatarMethod):
             losses["mouth"] = weight * huber_loss(drawn.image, filmed.target, delta, mouth)
         if self.config.lpips_weight > 0 and step >= self.config.lpips_from_step:
             # The network looks around a pixel: what nobody filmed is the same in both, and fixed.
-            shown = torch.where(filmed.unfilmed[..., None], filmed.target, drawn.image)
+            shown = held_where(drawn.image, filmed.unfilmed)
             losses["lpips"] = self.config.lpips_weight * self._lpips(shown, filmed.target)
         return losses
 

@@ -43,7 +43,12 @@ from rgbavatar_ns.avatar.methods.density import (
     sampled_positions,
 )
 from rgbavatar_ns.avatar.methods.gaussian_rows import GaussianRows
-from rgbavatar_ns.avatar.methods.loss_terms import dssim_loss, position_hinge, scale_hinge
+from rgbavatar_ns.avatar.methods.loss_terms import (
+    dssim_loss,
+    held_where,
+    position_hinge,
+    scale_hinge,
+)
 from rgbavatar_ns.avatar.methods.sh import (
     MAX_DEGREE,
     ShownDegree,
@@ -220,8 +225,7 @@ class GaussianAvatars(AvatarMethod):
         weight = self.config.dssim_weight
         losses = {"l1": (1 - weight) * l1_loss(drawn.image, filmed.target)}
         if weight > 0:
-            # It looks around a pixel: what nobody filmed is the same in both, and fixed.
-            shown = torch.where(filmed.unfilmed[..., None], filmed.target, drawn.image)
+            shown = held_where(drawn.image, filmed.unfilmed)
             losses["dssim"] = weight * dssim_loss(shown, filmed.target)
         return losses
 

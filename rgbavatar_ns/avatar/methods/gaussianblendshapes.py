@@ -50,6 +50,7 @@ from rgbavatar_ns.avatar.methods.loss_terms import (
     coverage_loss,
     cylinder_term,
     dssim_loss,
+    held_where,
     upright_cylinder,
 )
 from rgbavatar_ns.avatar.methods.mesh_points import spread_points
@@ -328,7 +329,7 @@ class GaussianBlendshapes(AvatarMethod):
     def image_losses(self, drawn: DrawnBatch, filmed: FilmedBatch, step: int) -> Losses:
         """.8 L1 + .2 DSSIM + 10 times the squared difference of opacity and matte."""
         config, unfilmed = self.config, filmed.unfilmed
-        held = torch.where(unfilmed[..., None], filmed.target, drawn.image)
+        held = held_where(drawn.image, unfilmed)
         covered = coverage_loss(drawn.alpha, filmed.matte[..., 0], ~unfilmed)
         return {
             "l1": (1 - config.dssim_weight) * l1_loss(drawn.image, filmed.target),

@@ -1,9 +1,9 @@
 """Terms that other methods add to a loss: of pictures, and of Gaussians.
 
 L1 and LPIPS are in `avatar.model.image_loss`. Pictures are compared with `film_over`'s, which is
-the drawn picture itself where nobody filmed: terms pixel by pixel add nothing there. For DSSIM,
-which looks around a pixel, the drawn picture is to be held there too (`torch.where` with
-`is_unfilmed`), or gradients reach what nobody filmed.
+the drawn picture itself where nobody filmed: terms pixel by pixel add nothing there. For DSSIM and
+LPIPS, which look around a pixel, the drawn picture is to be held there too (`held_where`), or
+gradients reach what nobody filmed.
 """
 
 import functools
@@ -13,6 +13,8 @@ import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
+
+from rgbavatar_ns.kernels import mean_similarity
 
 _WINDOW, _SIGMA = 11, 1.5
 _C1, _C2 = 0.01**2, 0.03**2
@@ -42,6 +44,16 @@ def huber_loss(
     return (error * weight[..., None]).mean()
 
 
+def held_where(
+    image: Float[Tensor, "B H W 3"], unfilmed: Bool[Tensor, "B H W"]
+) -> Float[Tensor, "B H W 3"]:
+    """The same pictures, but no gradient reaches them where nobody filmed."""
+    held = image.view_as(image)
+    if held.requires_grad:
+        held.register_hook(lambda gradient: gradient.masked_fill(unfilmed[..., None], 0.0))
+    return held
+
+
 def dssim_loss(
     image: Float[Tensor, "B H W 3"], target: Float[Tensor, "B H W 3"]
 ) -> Float[Tensor, ""]:
@@ -56,16 +68,18 @@ def dssim_loss(
 
 
 class _MeanSimilarity(torch.autograd.Function):
-    """Mean SSIM with its gradient written out, one image at a time to stay within the caches."""
+    """Mean SSIM with its gradient written out, in a backend's loops where there are any."""
 
     @staticmethod
     def forward(
         ctx: Any, image: Float[Tensor, "B H W 3"], target: Float[Tensor, "B H W 3"]
     ) -> Float[Tensor, ""]:
-        found = [_similarity(x, y, ctx.needs_input_grad) for x, y in zip(image, target)]
-        means, *gradients = zip(*found)
-        ctx.gradients = [None if g[0] is None else torch.stack(g) / len(image) for g in gradients]
-        return torch.stack(means).mean()
+        needed, needed_there = ctx.needs_input_grad
+        means, of_image = _similarities(image, target, needed)
+        of_target = _similarities(target, image, True)[1] if needed_there else None
+        count = len(image)
+        ctx.gradients = [None if g is None else g / count for g in (of_image, of_target)]
+        return means.mean()
 
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, Tensor | None]:
@@ -73,10 +87,24 @@ class _MeanSimilarity(torch.autograd.Function):
         return first, second
 
 
+def _similarities(
+    x: Float[Tensor, "B H W 3"], y: Float[Tensor, "B H W 3"], with_gradient: bool
+) -> tuple[Float[Tensor, "B"], Float[Tensor, "B H W 3"] | None]:
+    """Each pair's mean SSIM and, if asked, its gradient by x."""
+    window = _window(x.dtype, x.device)
+    found = mean_similarity(x, y, window, (_C1, _C2), with_gradient=with_gradient)
+    if found is not None:
+        return found
+    # One image at a time, to stay within the caches.
+    pairs = [_similarity(*pair, with_gradient) for pair in zip(x, y)]
+    gradients = [gradient for _, gradient in pairs if gradient is not None]
+    return torch.stack([mean for mean, _ in pairs]), torch.stack(gradients) if gradients else None
+
+
 def _similarity(
-    x: Float[Tensor, "H W 3"], y: Float[Tensor, "H W 3"], need: tuple[bool, bool]
-) -> tuple[Float[Tensor, ""], Float[Tensor, "H W 3"] | None, Float[Tensor, "H W 3"] | None]:
-    """Mean SSIM of two images (Wang et al. 2004, eq. 13) and its gradients where needed.
+    x: Float[Tensor, "H W 3"], y: Float[Tensor, "H W 3"], with_gradient: bool
+) -> tuple[Float[Tensor, ""], Float[Tensor, "H W 3"] | None]:
+    """Mean SSIM of two images (Wang et al. 2004, eq. 13) and, if asked, its gradient by x.
 
     SSIM is a1 a2 / (b1 b2) of windowed means of x, y, x^2 + y^2 and x y.
     """
@@ -86,22 +114,15 @@ def _similarity(
     b1, b2 = mean_squares + _C1, squares - mean_squares + _C2
     inverse = 1 / (b1 * b2)
     similarity = a1 * a2 * inverse
-    if not any(need):
-        return similarity.mean(), None, None
+    if not with_gradient:
+        return similarity.mean(), None
     of_squares, of_product = -similarity / b2, 2 * a1 * inverse
     of_means = 2 * (a2 - a1) * inverse
     of_mean_squares = 2 * (similarity / b1 + of_squares).neg_()
-    pairs = ((mean_y, mean_x), (mean_x, mean_y))
-    own = [of_means * b + of_mean_squares * a for (b, a), n in zip(pairs, need) if n]
-    stacked = torch.stack([of_squares, of_product, *own]) / similarity.numel()
-    from_squares, from_product, *from_means = _blurred(F.pad(stacked, _AROUND))
-    gradients: list[Tensor | None] = []
-    for (image, other), needed in zip(((x, y), (y, x)), need):
-        part = from_means.pop(0) if needed else None
-        if part is not None:
-            part = part + 2 * image * from_squares + other * from_product
-        gradients.append(part)
-    return similarity.mean(), gradients[0], gradients[1]
+    own = of_means * mean_y + of_mean_squares * mean_x
+    stacked = torch.stack([own, of_squares, of_product]) / similarity.numel()
+    from_mean, from_squares, from_product = _blurred(F.pad(stacked, _AROUND))
+    return similarity.mean(), from_mean + 2 * x * from_squares + y * from_product
 
 
 _AROUND = (0, 0, *((_WINDOW - 1,) * 4))

@@ -37,9 +37,9 @@ from torch import Tensor, nn
 from rgbavatar_ns.avatar.config import MethodConfig
 from rgbavatar_ns.avatar.method import AvatarMethod, DrawnBatch, FilmedBatch, Losses, WatchedStep
 from rgbavatar_ns.avatar.methods.density import prune_and_refill
-from rgbavatar_ns.avatar.methods.fields import MLP, positional_encoding
+from rgbavatar_ns.avatar.methods.fields import MLP, positional_encoding, sharp_softplus
 from rgbavatar_ns.avatar.methods.gaussian_rows import GaussianRows
-from rgbavatar_ns.avatar.methods.loss_terms import dssim_loss
+from rgbavatar_ns.avatar.methods.loss_terms import dssim_loss, held_where
 from rgbavatar_ns.avatar.model.image_loss import LPIPSLoss, l1_loss
 from rgbavatar_ns.avatar.model.weight_network import seeded_linear
 from rgbavatar_ns.head import HeadArrays, HeadModel
@@ -220,7 +220,7 @@ class MonoGaussianAvatar(AvatarMethod):
 
     def deformed(self) -> DeformedPoints:
         """Ask the deformer about every point."""
-        features = F.softplus(self.deformer(_UNIT * self.position), beta=100)
+        features = sharp_softplus(self.deformer(_UNIT * self.position))
         directions = self.blendshapes(features).unflatten(-1, (-1, 3)) / _UNIT
         sizes = (self._expressions.shape[1], self._correctives.shape[1], 1)
         expressions, correctives, offset = directions.split(sizes, 1)
@@ -238,7 +238,7 @@ class MonoGaussianAvatar(AvatarMethod):
         with torch.no_grad():
             moved = means - self._translation(theta)[:, None] - deformed.place_at_rest
         code = positional_encoding(_UNIT * self.position.detach(), self.config.octaves)
-        own = self.attribute_heads(F.softplus(self.attributes(code), beta=100))
+        own = self.attribute_heads(sharp_softplus(self.attributes(code)))
         offsets = self.offset_heads(self.offsets(_UNIT * moved))
         found = {name: own[name] + offsets[name] for name in _ATTRIBUTES}
         largest = self.config.largest_scale_m
@@ -295,8 +295,7 @@ class MonoGaussianAvatar(AvatarMethod):
         """L1, DSSIM and LPIPS (loss.py)."""
         config = self.config
         losses = {"l1": l1_loss(drawn.image, filmed.target)}
-        # Both look around a pixel: what nobody filmed is the same in both pictures, and fixed.
-        shown = torch.where(filmed.unfilmed[..., None], filmed.target, drawn.image)
+        shown = held_where(drawn.image, filmed.unfilmed)
         if config.dssim_weight > 0:
             losses["dssim"] = config.dssim_weight * dssim_loss(shown, filmed.target)
         if config.lpips_weight > 0:

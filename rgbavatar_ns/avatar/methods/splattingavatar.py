@@ -46,7 +46,7 @@ from rgbavatar_ns.avatar.methods.density import (
     sampled_positions,
 )
 from rgbavatar_ns.avatar.methods.gaussian_rows import GaussianRows, forget_moments
-from rgbavatar_ns.avatar.methods.loss_terms import dssim_loss, mse_loss, spike_term
+from rgbavatar_ns.avatar.methods.loss_terms import dssim_loss, held_where, mse_loss, spike_term
 from rgbavatar_ns.avatar.methods.neighbours import neighbour_distance
 from rgbavatar_ns.avatar.methods.sh import sh_colors
 from rgbavatar_ns.avatar.methods.triangle_walk import TriangleWalk
@@ -222,8 +222,7 @@ class SplattingAvatar(AvatarMethod):
             "l1": (1 - config.dssim_weight) * l1_loss(image, target),
             "mse": config.mse_weight * mse_loss(image, target),
         }
-        # These look around a pixel: what nobody filmed is the same in both, and fixed.
-        shown = torch.where(filmed.unfilmed[..., None], target, image)
+        shown = held_where(image, filmed.unfilmed)
         if config.dssim_weight > 0:
             losses["dssim"] = config.dssim_weight * dssim_loss(shown, target)
         if config.lpips_weight > 0:

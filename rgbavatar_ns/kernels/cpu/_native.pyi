@@ -2,6 +2,16 @@ from torch import Tensor
 
 def instruction_sets() -> list[str]: ...
 def constants() -> dict[str, float | tuple[int, ...]]: ...
+def mean_similarity(
+    image: Tensor,
+    target: Tensor,
+    window: Tensor,
+    c1: float,
+    c2: float,
+    gradient: Tensor | None,
+    threads: int,
+    instruction_set: str,
+) -> list[float]: ...
 
 class Gaussians:
     def __init__(

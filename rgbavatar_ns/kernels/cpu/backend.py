@@ -165,6 +165,28 @@ class CpuBackend:
         """As `morphed.posing_of`."""
         return CpuPosing(parameters)
 
+    def mean_similarity(
+        self,
+        image: Float[Tensor, "B H W 3"],
+        target: Float[Tensor, "B H W 3"],
+        window: Float[Tensor, "11"],
+        stabilizers: tuple[float, float],
+        *,
+        with_gradient: bool,
+    ) -> tuple[Float[Tensor, "B"], Float[Tensor, "B H W 3"] | None]:
+        """As `similarity.mean_similarity`."""
+        pair = [picture.detach().contiguous() for picture in (image, target)]
+        gradient = torch.empty_like(pair[0]) if with_gradient else None
+        means = _native.mean_similarity(
+            *pair,
+            window.detach().contiguous(),
+            *stabilizers,
+            gradient,
+            torch.get_num_threads(),
+            os.environ.get(INSTRUCTION_SET_VARIABLE, ""),
+        )
+        return image.new_tensor(means), gradient
+
 
 def load() -> CpuBackend:
     """The backend; raises ImportError with the reason when it was not compiled."""

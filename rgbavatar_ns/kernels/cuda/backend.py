@@ -200,6 +200,18 @@ class CudaBackend:
         """None: a GPU's pictures are recorded, torch's operations with them."""
         return None
 
+    def mean_similarity(
+        self,
+        image: Float[Tensor, "B H W 3"],
+        target: Float[Tensor, "B H W 3"],
+        window: Float[Tensor, "11"],
+        stabilizers: tuple[float, float],
+        *,
+        with_gradient: bool,
+    ) -> None:
+        """None: torch's convolutions are fast on a GPU."""
+        return None
+
 
 @functools.cache
 def _cuda_launcher(device: torch.device) -> Launcher:

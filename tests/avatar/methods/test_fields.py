@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from rgbavatar_ns.avatar.methods.fields import MLP, positional_encoding
+from rgbavatar_ns.avatar.methods.fields import MLP, positional_encoding, sharp_softplus
 
 
 def seeded(seed: int = 0) -> torch.Generator:
@@ -36,6 +36,16 @@ def test_parts_give_what_their_concatenation_does(skip_at, activation) -> None:
         values = torch.cat([values, joined], -1) if index == skip_at else values
         values = act(layer(values))
     torch.testing.assert_close(network(places, thetas), network.output(values))
+
+
+def test_sharp_softplus_is_softplus_without_its_tail() -> None:
+    x = torch.linspace(-2, 2, 4001, dtype=torch.float64).requires_grad_()
+    found, wanted = sharp_softplus(x), torch.nn.functional.softplus(x, beta=100)
+    torch.testing.assert_close(found, wanted, atol=1e-10, rtol=0)
+    slopes = [torch.autograd.grad(values.sum(), x)[0] for values in (found, wanted)]
+    torch.testing.assert_close(*slopes, atol=1e-8, rtol=0)
+    assert not slopes[0][x < -0.2].any()
+    assert float(found.detach().min()) > 1e-12
 
 
 def test_gradients_agree_with_differences() -> None:

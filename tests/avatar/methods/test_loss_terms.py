@@ -6,6 +6,7 @@ from rgbavatar_ns.avatar.methods.loss_terms import (
     coverage_loss,
     cylinder_term,
     dssim_loss,
+    held_where,
     huber_loss,
     mse_loss,
     position_hinge,
@@ -52,6 +53,19 @@ def test_dssim_is_one_less_the_metric(shape) -> None:
         torch.testing.assert_close(dssim_loss(first, second), wanted, atol=1e-9, rtol=1e-9)
     single = dssim_loss(smooth.float(), target.float())
     assert single.item() == pytest.approx(dssim_loss(smooth, target).item(), abs=1e-5)
+
+
+def test_what_is_held_is_the_same_picture_without_a_gradient() -> None:
+    image, target = pictures(1, 14, 13, 3).requires_grad_(), pictures(1, 14, 13, 3, seed=1)
+    unfilmed = torch.zeros(1, 14, 13, dtype=torch.bool)
+    unfilmed[:, 3:9, 2:] = True
+    held = held_where(image, unfilmed)
+    assert torch.equal(held, image)
+    (found,) = torch.autograd.grad(dssim_loss(held, target), image)
+    (wanted,) = torch.autograd.grad(dssim_loss(image, target), image)
+    assert torch.equal(found[~unfilmed], wanted[~unfilmed])
+    assert not found[unfilmed].any()
+    assert not held_where(image.detach(), unfilmed).requires_grad
 
 
 def test_at_a_films_size_dssim_is_the_evaluations() -> None:

@@ -78,6 +78,16 @@ def test_places_differ_from_the_first_step_on():
     assert float(gaussians.colors.std(1).mean()) > 0.01
 
 
+def test_its_networks_numbers_are_none_that_processors_are_slow_with():
+    avatar = MonoGaussianAvatar(small_head(), small_identity())
+    gaussians = avatar.gaussians(random_theta(avatar.layout, 1))
+    (gaussians.colors.sum() + gaussians.means.square().sum()).backward()
+    smallest = torch.finfo(torch.float32).tiny
+    for network in (avatar.deformer, avatar.attributes):
+        gradient = torch.cat([p.grad.flatten() for p in network.parameters() if p.grad is not None])
+        assert not ((gradient != 0) & (gradient.abs() < smallest)).any()
+
+
 @pytest.mark.parametrize("joint", range(5))
 def test_a_joint_carries_the_points_that_are_bound_to_it(joint):
     avatar = build(torch.float64)

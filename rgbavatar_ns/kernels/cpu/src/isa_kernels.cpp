@@ -5,6 +5,7 @@
 #include "mesh_gradient.h"
 #include "packed.h"
 #include "pose.h"
+#include "similarity_rows.h"
 #include "train_tile.h"
 
 namespace rgbavatar::RGBAVATAR_ISA {
@@ -12,6 +13,7 @@ namespace rgbavatar::RGBAVATAR_ISA {
 extern const Kernels kernels;
 const Kernels kernels = {project_image, forward_tile, backward_tile, average_tile,
                          project_image_backward, fill_frames, project_morphed, train_tile,
-                         see_tile, update_morphed, mesh_gradient, project_packed, pose_vertices};
+                         see_tile, update_morphed, mesh_gradient, project_packed, pose_vertices,
+                         similarity_rows, similarity_gradient_rows};
 
 }  // namespace rgbavatar::RGBAVATAR_ISA

@@ -221,6 +221,7 @@ struct TrainingTarget {
 
 struct PackedScene;  // packed_layout.h
 struct PosedMesh;    // posing_layout.h
+struct SimilarityScene;  // similarity_layout.h
 
 // The loops, compiled once per instruction set.
 struct Kernels {
@@ -262,6 +263,12 @@ struct Kernels {
                          const Projected&);
   // Writes the vertices [V, 3] of the blocks [begin, end).
   void (*pose_vertices)(const PosedMesh&, int begin, int end, float* vertices);
+  // Returns the sum of SSIM over the rows [begin, end) of windows, and writes their slopes where
+  // they are wanted; `scratch` has similarity_scratch floats.
+  double (*similarity_rows)(const SimilarityScene&, int begin, int end, float* scratch);
+  // Writes the rows [begin, end) of the gradient by x from all slopes.
+  void (*similarity_gradient_rows)(const SimilarityScene&, int begin, int end, float* scratch,
+                                   float* gradient);
 };
 
 // world_to_camera [4, 4], focal [2] and principal point [2] in one row of floats.

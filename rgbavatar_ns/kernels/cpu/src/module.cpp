@@ -13,6 +13,7 @@
 #include <tuple>
 
 #include "packed_drawing.h"
+#include "similarity.h"
 
 namespace nb = nanobind;
 using namespace nb::literals;
@@ -244,6 +245,23 @@ struct PackedSession : Drawing<rgbavatar::PackedRendering> {
   }
 };
 
+// Pictures [B, H, W, 3] and a window [11]; the gradient by the first, like it, where one is given.
+std::vector<double> mean_similarity(const Input& image, const Input& target, const Input& window,
+                                    float c1, float c2, const std::optional<Output>& gradient,
+                                    int threads, const std::string& instruction_set) {
+  const rgbavatar::SimilarityScene scene = {int(image.shape(2)) * rgbavatar::kChannels,
+                                            int(image.shape(1)),
+                                            image.data(),
+                                            target.data(),
+                                            window.data(),
+                                            c1,
+                                            c2,
+                                            0,
+                                            nullptr};
+  return rgbavatar::mean_similarity(scene, int(image.shape(0)), pointer(gradient), threads,
+                                    instruction_set);
+}
+
 nb::dict constants() {
   using C = BlendingConstants;
   nb::dict out;
@@ -273,6 +291,9 @@ NB_MODULE(_native, m) {
            "opacities"_a.noconvert(), "colors"_a.noconvert(),
            "screen_offset"_a.noconvert().none() = nb::none());
   using Release = nb::call_guard<nb::gil_scoped_release>;
+  m.def("mean_similarity", &mean_similarity, "image"_a.noconvert(), "target"_a.noconvert(),
+        "window"_a.noconvert(), "c1"_a, "c2"_a, "gradient"_a.noconvert().none(), "threads"_a,
+        "instruction_set"_a, Release());
   nb::class_<Drawing<rgbavatar::Rendering>> drawing(m, "Drawing");
   Drawing<rgbavatar::Rendering>::bind(drawing);
   nb::class_<Drawing<rgbavatar::MorphedRendering>> morphed_drawing(m, "MorphedDrawing");
