@@ -175,12 +175,15 @@ class CpuBackend:
         with_gradient: bool,
     ) -> tuple[Float[Tensor, "B"], Float[Tensor, "B H W 3"] | None]:
         """As `similarity.mean_similarity`."""
-        pair = [picture.detach().contiguous() for picture in (image, target)]
-        gradient = torch.empty_like(pair[0]) if with_gradient else None
+        image, target = image.detach().contiguous(), target.detach().contiguous()
+        gradient = torch.empty_like(image) if with_gradient else None
+        c1, c2 = stabilizers
         means = _native.mean_similarity(
-            *pair,
+            image,
+            target,
             window.detach().contiguous(),
-            *stabilizers,
+            c1,
+            c2,
             gradient,
             torch.get_num_threads(),
             os.environ.get(INSTRUCTION_SET_VARIABLE, ""),
