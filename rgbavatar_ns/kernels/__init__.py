@@ -5,6 +5,7 @@ from rgbavatar_ns.kernels.functional import (
     rasterize,
     weighted_color_average,
 )
+from rgbavatar_ns.kernels.harmonics import harmonic_colors
 from rgbavatar_ns.kernels.morphed import (
     morphed_renderer,
     packed_gaussians,
@@ -51,6 +52,7 @@ __all__ = [
     "RenderedBatch",
     "WeightedColors",
     "available_backends",
+    "harmonic_colors",
     "mean_similarity",
     "morphed_renderer",
     "packed_gaussians",

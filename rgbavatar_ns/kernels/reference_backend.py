@@ -81,6 +81,12 @@ class ReferenceBackend:
         """None: nothing here is to be fast."""
         return None
 
+    def harmonic_colors(
+        self, coefficients: Float[Tensor, "#B N C 3"], directions: Float[Tensor, "B N 3"]
+    ) -> None:
+        """None: nothing here is to be fast."""
+        return None
+
 
 def load() -> ReferenceBackend:
     """The backend."""

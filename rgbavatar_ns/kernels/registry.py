@@ -230,6 +230,12 @@ class Backend(Protocol):
         """As `similarity.mean_similarity`; None where this backend has none."""
         ...
 
+    def harmonic_colors(
+        self, coefficients: Float[Tensor, "#B N C 3"], directions: Float[Tensor, "B N 3"]
+    ) -> Float[Tensor, "B N 3"] | None:
+        """As `harmonics.harmonic_colors`; None where this backend has none."""
+        ...
+
 
 # Name -> module with `load() -> Backend`, which raises ImportError with the reason; the order is
 # the order of preference.

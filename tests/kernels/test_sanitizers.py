@@ -22,6 +22,7 @@ TESTS = (
     "kernels/test_backends_agree.py",
     "kernels/test_bad_input.py",
     "kernels/test_extremes.py",
+    "kernels/test_harmonics.py",
     "kernels/test_isolation.py",
     "kernels/test_laws.py",
     "kernels/test_screen_offset.py",

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from rgbavatar_ns.avatar.model.blendshapes import COLOR_SCALE
 from rgbavatar_ns.errors import UserError
-from rgbavatar_ns.kernels import PinholeCameras
+from rgbavatar_ns.kernels import PinholeCameras, harmonic_colors
 
 MAX_DEGREE = 3
 _LINEAR = 0.4886025119029199
@@ -130,14 +130,16 @@ def sh_colors(
             f"{coefficients.shape[-2]} coefficients for degree {degree}. Pass {count} or more."
         )
     used = coefficients[..., :count, :]
-    shared = used[0] if used.ndim == 4 and len(used) == 1 else used
+    used = used if used.ndim == 4 else used[None]
     if degree == 0:
-        flat = COLOR_SCALE * shared[..., 0, :]
-        colors = flat.expand(len(directions), -1, -1)
-    else:
-        basis = sh_basis(directions, degree)
-        equation = "bnc,ncx->bnx" if shared.ndim == 3 else "bnc,bncx->bnx"
-        colors = torch.einsum(equation, basis, shared)
+        flat = COLOR_SCALE * used[..., 0, :] + 0.5
+        return flat.clamp(min=0).expand(len(directions), -1, -1)
+    found = harmonic_colors(used, directions)
+    if found is not None:
+        return found
+    shared = used[0] if len(used) == 1 else used
+    equation = "bnc,ncx->bnx" if shared.ndim == 3 else "bnc,bncx->bnx"
+    colors = torch.einsum(equation, sh_basis(directions, degree), shared)
     return (colors + 0.5).clamp(min=0)
 
 

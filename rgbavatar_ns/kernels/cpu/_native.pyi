@@ -12,6 +12,18 @@ def mean_similarity(
     threads: int,
     instruction_set: str,
 ) -> list[float]: ...
+def harmonic_colors(
+    coefficients: Tensor, directions: Tensor, colors: Tensor, threads: int, instruction_set: str
+) -> None: ...
+def harmonic_gradient(
+    coefficients: Tensor,
+    directions: Tensor,
+    color_gradient: Tensor,
+    coefficient_gradient: Tensor,
+    direction_gradient: Tensor,
+    threads: int,
+    instruction_set: str,
+) -> None: ...
 
 class Gaussians:
     def __init__(

@@ -16,6 +16,7 @@ from rgbavatar_ns.kernels.cpu import (
     INSTRUCTION_SET_VARIABLE,
     _native,  # pyright: ignore[reportMissingModuleSource]
 )
+from rgbavatar_ns.kernels.cpu.harmonics import compiled_harmonic_colors
 from rgbavatar_ns.kernels.cpu.morphed import CpuMorphedRenderer
 from rgbavatar_ns.kernels.cpu.packed import CpuPackedGaussians
 from rgbavatar_ns.kernels.cpu.posing import CpuPosing
@@ -189,6 +190,12 @@ class CpuBackend:
             os.environ.get(INSTRUCTION_SET_VARIABLE, ""),
         )
         return image.new_tensor(means), gradient
+
+    def harmonic_colors(
+        self, coefficients: Float[Tensor, "#B N C 3"], directions: Float[Tensor, "B N 3"]
+    ) -> Float[Tensor, "B N 3"]:
+        """As `harmonics.harmonic_colors`."""
+        return compiled_harmonic_colors(coefficients, directions)
 
 
 def load() -> CpuBackend:

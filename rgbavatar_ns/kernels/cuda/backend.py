@@ -212,6 +212,12 @@ class CudaBackend:
         """None: torch's convolutions are fast on a GPU."""
         return None
 
+    def harmonic_colors(
+        self, coefficients: Float[Tensor, "#B N C 3"], directions: Float[Tensor, "B N 3"]
+    ) -> None:
+        """None: other methods take their steps through autograd."""
+        return None
+
 
 @functools.cache
 def _cuda_launcher(device: torch.device) -> Launcher:

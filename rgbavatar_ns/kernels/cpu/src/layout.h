@@ -222,6 +222,7 @@ struct TrainingTarget {
 struct PackedScene;  // packed_layout.h
 struct PosedMesh;    // posing_layout.h
 struct SimilarityScene;  // similarity_layout.h
+struct HarmonicScene;    // harmonics_layout.h
 
 // The loops, compiled once per instruction set.
 struct Kernels {
@@ -269,6 +270,11 @@ struct Kernels {
   // Writes the rows [begin, end) of the gradient by x from all slopes.
   void (*similarity_gradient_rows)(const SimilarityScene&, int begin, int end, float* scratch,
                                    float* gradient);
+  // Writes the colours of Gaussians [begin, end) in all images.
+  void (*harmonic_colors)(const HarmonicScene&, int begin, int end, float* colors);
+  // Writes the gradients of their coefficients, summed where images share them, and directions.
+  void (*harmonic_gradient)(const HarmonicScene&, int begin, int end, const float* color_gradient,
+                            float* coefficient_gradient, float* direction_gradient);
 };
 
 // world_to_camera [4, 4], focal [2] and principal point [2] in one row of floats.

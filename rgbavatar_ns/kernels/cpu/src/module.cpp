@@ -18,7 +18,8 @@
 namespace nb = nanobind;
 using namespace nb::literals;
 
-void bind_posing(nb::module_& m);  // posing_module.cpp
+void bind_harmonics(nb::module_& m);  // harmonics_module.cpp
+void bind_posing(nb::module_& m);     // posing_module.cpp
 
 namespace {
 
@@ -354,5 +355,6 @@ NB_MODULE(_native, m) {
            "world_to_camera"_a.noconvert(), "focal_px"_a.noconvert(),
            "principal_point_px"_a.noconvert(), "width"_a, "height"_a, "threads"_a,
            "instruction_set"_a, Release());
+  bind_harmonics(m);
   bind_posing(m);
 }

@@ -14,14 +14,20 @@ RGBAVATAR_FUNCTION Wide windowed(const float* first, int64_t step, const float* 
   return sum;
 }
 
-// The window's sum over rows of a ring; `row` is the first of them.
-RGBAVATAR_FUNCTION Wide windowed_down(const float* ring, int64_t row_floats, int row, int64_t at,
-                                      const float* window) {
-  Wide sum(0.0f);
-  for (int k = 0, slot = row % kTaps; k < kTaps; ++k, slot = slot + 1 == kTaps ? 0 : slot + 1)
-    sum = sum + load_wide(ring + slot * row_floats + at) * Wide(window[k]);
-  return sum;
-}
+// The last rows of a ring, from the row `first` on.
+struct RingRows {
+  const float* row[kTaps];
+
+  RGBAVATAR_MEMBER RingRows(const float* ring, int64_t row_floats, int first) {
+    for (int k = 0; k < kTaps; ++k) row[k] = ring + (first + k) % kTaps * row_floats;
+  }
+  // The window's sum over them.
+  RGBAVATAR_MEMBER Wide windowed(int64_t at, const float* window) const {
+    Wide sum = load_wide(row[0] + at) * Wide(window[0]);
+    for (int k = 1; k < kTaps; ++k) sum = sum + load_wide(row[k] + at) * Wide(window[k]);
+    return sum;
+  }
+};
 
 RGBAVATAR_FUNCTION WideMask first_lanes(int count) {
   static const float lanes[kLanes] = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15};
@@ -60,11 +66,11 @@ static double similarity_rows(const SimilarityScene& s, int begin, int end, floa
   for (int row = begin; row < end; ++row) {
     const int last = row + kTaps - 1;
     blur_pictures(s, last, rows, ring + (last % kTaps) * row_floats);
+    const RingRows lines(ring, row_floats, row);
     Wide sum(0.0f);
     for (int i = 0; i < s.columns(); i += kLanes) {
       Wide mean[kMeans];
-      for (int m = 0; m < kMeans; ++m)
-        mean[m] = windowed_down(ring, row_floats, row, m * stride + i, s.window);
+      for (int m = 0; m < kMeans; ++m) mean[m] = lines.windowed(m * stride + i, s.window);
       const Wide means = mean[0] * mean[1], squares = mean[0] * mean[0] + mean[1] * mean[1];
       const Wide a1 = two * means + c1, a2 = two * (mean[3] - means) + c2;
       const Wide b1 = squares + c1, b2 = mean[2] - squares + c2;
@@ -111,10 +117,10 @@ static void similarity_gradient_rows(const SimilarityScene& s, int begin, int en
     const int64_t from = int64_t(row) * s.width;
     __builtin_memcpy(x, s.x + from, s.width * sizeof(float));
     __builtin_memcpy(y, s.y + from, s.width * sizeof(float));
+    const RingRows lines(ring, row_floats, row + 1);
     for (int i = 0; i < s.width; i += kLanes) {
       Wide sums[kSlopes];
-      for (int m = 0; m < kSlopes; ++m)
-        sums[m] = windowed_down(ring, row_floats, row + 1, m * stride + i, s.window);
+      for (int m = 0; m < kSlopes; ++m) sums[m] = lines.windowed(m * stride + i, s.window);
       store(sums[0] + two * load_wide(x + i) * sums[1] + load_wide(y + i) * sums[2], out + i);
     }
     __builtin_memcpy(gradient + from, out, s.width * sizeof(float));
