@@ -4,11 +4,14 @@
 
 Both learn the same procedural film on one image a step and take turns, on one thread; what counts
 is the processor's time, the median over the turns. The first three steps of each are not counted.
+With --all-harmonics methods whose colours follow the view show all degrees at once, as they do from
+some thousand steps on.
 """
 
 import argparse
 import statistics
 import time
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -37,6 +40,7 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=256, help="pixels of the pictures")
     parser.add_argument("--steps", type=int, default=10)
     parser.add_argument("--methods", nargs="+", default=[n for n in METHODS if n != Avatar.method])
+    parser.add_argument("--all-harmonics", action="store_true")
     given = parser.parse_args()
     torch.set_num_threads(1)
     film = film_demo(DemoConfig(image_size=given.size, num_frames=_FRAMES, num_test_frames=0))
@@ -48,10 +52,13 @@ def main() -> None:
     print("| method | Gaussians | ms | RGBAvatar's | Gaussians | ratio |")
     for name in given.methods:
         kind: Any = METHODS[name]
-        rival = kind(head, identity, kind.config_type())
+        config = kind.config_type()
+        if given.all_harmonics and hasattr(config, "raise_degree_every"):
+            config = replace(config, raise_degree_every=1)
+        rival = kind(head, identity, config)
         resolution = _resolution_of(rival.num_gaussians, head)
-        config = AvatarConfig(uv_resolution=resolution, scale_from_texel_spacing=True)
-        avatar = Avatar(head, identity, config)
+        own_config = AvatarConfig(uv_resolution=resolution, scale_from_texel_spacing=True)
+        avatar = Avatar(head, identity, own_config)
         taken: list[tuple[Any, list[float]]] = [
             (MethodStep(rival), []),
             (TrainingStep(avatar, options=_EAGER), []),
