@@ -4,22 +4,21 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from rgbavatar_ns.kernels.posing import PosingParameters
 from rgbavatar_ns.kernels.reference import (
     rasterize_reference,
     weighted_color_average_reference,
 )
+from rgbavatar_ns.kernels.registry import Backend
 from rgbavatar_ns.kernels.types import (
     GaussianSet,
-    MorphedGaussians,
     PinholeCameras,
     RenderedBatch,
     WeightedColors,
 )
 
 
-class ReferenceBackend:
-    """Runs everywhere torch does."""
+class ReferenceBackend(Backend):
+    """Runs everywhere torch does; nothing else here is to be fast."""
 
     def unsupported_reason(self, device: torch.device, dtype: torch.dtype) -> str | None:
         """None: every device and floating type is taken."""
@@ -50,42 +49,6 @@ class ReferenceBackend:
     ) -> WeightedColors:
         """As `functional.weighted_color_average`."""
         return weighted_color_average_reference(gaussians, cameras, images)
-
-    def morphed_renderer(
-        self,
-        gaussians: MorphedGaussians,
-        weights: Float[Tensor, "B K"],
-        vertices: Float[Tensor, "B V 3"],
-        cameras: PinholeCameras,
-    ) -> None:
-        """None: morphing in torch and `rasterize` are the specification."""
-        return None
-
-    def packed_gaussians(self, gaussians: MorphedGaussians) -> None:
-        """None: nothing here is to be fast."""
-        return None
-
-    def posing(self, parameters: PosingParameters) -> None:
-        """None: nothing here is to be fast."""
-        return None
-
-    def mean_similarity(
-        self,
-        image: Float[Tensor, "B H W 3"],
-        target: Float[Tensor, "B H W 3"],
-        window: Float[Tensor, "11"],
-        stabilizers: tuple[float, float],
-        *,
-        with_gradient: bool,
-    ) -> None:
-        """None: nothing here is to be fast."""
-        return None
-
-    def harmonic_colors(
-        self, coefficients: Float[Tensor, "#B N C 3"], directions: Float[Tensor, "B N 3"]
-    ) -> None:
-        """None: nothing here is to be fast."""
-        return None
 
 
 def load() -> ReferenceBackend:

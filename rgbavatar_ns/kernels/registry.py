@@ -175,7 +175,11 @@ class PackedGaussians(Protocol):
 
 @runtime_checkable
 class Backend(Protocol):
-    """What a rasterizer offers; shapes have been checked when its methods are called."""
+    """What a rasterizer offers; shapes have been checked when its methods are called.
+
+    Backends derive from it: what returns None here has a readable path in torch, which is taken
+    where a backend has nothing faster.
+    """
 
     def unsupported_reason(self, device: torch.device, dtype: torch.dtype) -> str | None:
         """Why tensors of this device and type cannot be taken; None if they can."""
@@ -208,15 +212,15 @@ class Backend(Protocol):
         cameras: PinholeCameras,
     ) -> MorphedRenderer | None:
         """As `morphed.morphed_renderer`; None where this backend has none."""
-        ...
+        return None
 
     def packed_gaussians(self, gaussians: MorphedGaussians) -> PackedGaussians | None:
         """As `morphed.packed_gaussians`; None where this backend has none."""
-        ...
+        return None
 
     def posing(self, parameters: PosingParameters) -> Posing | None:
         """As `morphed.posing_of`; None where this backend has none."""
-        ...
+        return None
 
     def mean_similarity(
         self,
@@ -228,13 +232,13 @@ class Backend(Protocol):
         with_gradient: bool,
     ) -> tuple[Float[Tensor, "B"], Float[Tensor, "B H W 3"] | None] | None:
         """As `similarity.mean_similarity`; None where this backend has none."""
-        ...
+        return None
 
     def harmonic_colors(
         self, coefficients: Float[Tensor, "#B N C 3"], directions: Float[Tensor, "B N 3"]
     ) -> Float[Tensor, "B N 3"] | None:
         """As `harmonics.harmonic_colors`; None where this backend has none."""
-        ...
+        return None
 
 
 # Name -> module with `load() -> Backend`, which raises ImportError with the reason; the order is

@@ -27,6 +27,7 @@ from rgbavatar_ns.kernels.differentiable import (
     gaussian_inputs,
 )
 from rgbavatar_ns.kernels.posing import PosingParameters
+from rgbavatar_ns.kernels.registry import Backend
 from rgbavatar_ns.kernels.types import (
     GaussianSet,
     MorphedGaussians,
@@ -101,7 +102,7 @@ def _draw(
     return image, alpha, gradients
 
 
-class CpuBackend:
+class CpuBackend(Backend):
     """Runs float32 tensors in main memory, on as many threads as torch uses."""
 
     def unsupported_reason(self, device: torch.device, dtype: torch.dtype) -> str | None:

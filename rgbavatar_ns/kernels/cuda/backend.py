@@ -21,7 +21,7 @@ from rgbavatar_ns.kernels.differentiable import (
     draw_differentiably,
     gaussian_inputs,
 )
-from rgbavatar_ns.kernels.posing import PosingParameters
+from rgbavatar_ns.kernels.registry import Backend
 from rgbavatar_ns.kernels.types import (
     GaussianSet,
     MorphedGaussians,
@@ -118,7 +118,7 @@ def _gradients(
     return filled
 
 
-class CudaBackend:
+class CudaBackend(Backend):
     """Runs float32 tensors on NVIDIA GPUs; the kernels are compiled at a GPU's first use."""
 
     def __init__(self) -> None:
@@ -191,32 +191,6 @@ class CudaBackend:
         return CudaMorphedRenderer(
             self.launcher(device), self.capacities(device), gaussians, weights, vertices, cameras
         )
-
-    def packed_gaussians(self, gaussians: MorphedGaussians) -> None:
-        """None: a GPU draws the Gaussians as they are."""
-        return None
-
-    def posing(self, parameters: PosingParameters) -> None:
-        """None: a GPU's pictures are recorded, torch's operations with them."""
-        return None
-
-    def mean_similarity(
-        self,
-        image: Float[Tensor, "B H W 3"],
-        target: Float[Tensor, "B H W 3"],
-        window: Float[Tensor, "11"],
-        stabilizers: tuple[float, float],
-        *,
-        with_gradient: bool,
-    ) -> None:
-        """None: torch's convolutions are fast on a GPU."""
-        return None
-
-    def harmonic_colors(
-        self, coefficients: Float[Tensor, "#B N C 3"], directions: Float[Tensor, "B N 3"]
-    ) -> None:
-        """None: other methods take their steps through autograd."""
-        return None
 
 
 @functools.cache
