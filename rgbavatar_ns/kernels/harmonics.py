@@ -23,7 +23,9 @@ def harmonic_colors(
     coefficients for each direction, and where there is no such backend.
     """
     own, along = tuple(coefficients.shape), tuple(directions.shape)
-    if own[2] not in _COUNTS or own[1] != along[1] or own[0] not in (1, along[0]):
+    images = along[0] if along else 0
+    fits = own in {(b, *along[1:2], c, 3) for b in (1, images) for c in _COUNTS}
+    if not fits or len(along) != 3 or along[2] != 3:
         raise ValueError(
             f"Coefficients are {list(own)}, directions {list(along)}. Pass [B or 1, N, C, 3] and "
             "[B, N, 3], with C one of 4, 9 and 16."

@@ -9,6 +9,8 @@ from torch import Tensor
 
 from rgbavatar_ns.kernels.registry import choose
 
+_TAPS = 11
+
 
 def mean_similarity(
     image: Float[Tensor, "B H W 3"],
@@ -23,12 +25,16 @@ def mean_similarity(
 
     None where the chosen backend has no loops for it. `window` is symmetric and taken along both
     sides, `stabilizers` are C1 and C2 of Wang et al. 2004, eq. 13. Raises ValueError for pictures
-    below 11 x 11 or of two shapes, and where there is no such backend.
+    below 11 x 11, of two shapes or not of three channels, for another window's length, and where
+    there is no such backend.
     """
-    if image.shape != target.shape or min(image.shape[1:3]) < len(window):
+    if window.shape != (_TAPS,):
+        raise ValueError(f"The window is {list(window.shape)}. Pass [{_TAPS}].")
+    shape = tuple(image.shape)
+    if shape != target.shape or len(shape) != 4 or shape[3] != 3 or min(shape[1:3]) < _TAPS:
         raise ValueError(
-            f"Pictures are {list(image.shape)} and {list(target.shape)}. Pass pairs of one shape, "
-            f"of {len(window)} x {len(window)} pixels or more."
+            f"Pictures are {list(shape)} and {list(target.shape)}. Pass pairs [B, H, W, 3], of "
+            f"{_TAPS} x {_TAPS} pixels or more."
         )
     chosen = choose(backend, image.device, image.dtype)
     return chosen.mean_similarity(image, target, window, stabilizers, with_gradient=with_gradient)

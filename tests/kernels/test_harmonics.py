@@ -47,7 +47,15 @@ def test_they_are_the_same_over_threads_and_in_another_order_of_memory() -> None
 
 
 @pytest.mark.parametrize(
-    "shapes", [((1, 5, 7, 3), (2, 5, 3)), ((1, 5, 9, 3), (2, 6, 3)), ((2, 5, 9, 3), (3, 5, 3))]
+    "shapes",
+    [
+        ((1, 5, 7, 3), (2, 5, 3)),
+        ((1, 5, 9, 3), (2, 6, 3)),
+        ((2, 5, 9, 3), (3, 5, 3)),
+        ((1, 5, 9, 2), (2, 5, 3)),
+        ((1, 5, 9, 3), (2, 5, 2)),
+        ((1, 5, 9, 3), (5, 3)),
+    ],
 )
 def test_what_does_not_fit_is_refused_before_loops_read_it(shapes) -> None:
     # As users have it, without the tests' checks of shapes.

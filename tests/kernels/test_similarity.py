@@ -47,7 +47,12 @@ def test_it_is_the_same_over_threads_and_of_pictures_in_another_order_of_memory(
 
 
 @pytest.mark.parametrize(
-    "shapes", [((1, 10, 20, 3), (1, 10, 20, 3)), ((1, 12, 12, 3), (2, 12, 12, 3))]
+    "shapes",
+    [
+        ((1, 10, 20, 3), (1, 10, 20, 3)),
+        ((1, 12, 12, 3), (2, 12, 12, 3)),
+        ((1, 12, 12, 4), (1, 12, 12, 4)),
+    ],
 )
 def test_pictures_that_do_not_fit_are_refused_before_loops_read_them(shapes) -> None:
     image, target = (torch.zeros(*shape) for shape in shapes)
@@ -55,6 +60,8 @@ def test_pictures_that_do_not_fit_are_refused_before_loops_read_them(shapes) -> 
     unchecked = inspect.unwrap(mean_similarity)
     with pytest.raises(ValueError, match="11 x 11 pixels or more"):
         unchecked(image, target, WINDOW, (1e-4, 9e-4))
+    with pytest.raises(ValueError, match="window"):
+        unchecked(*torch.zeros(2, 1, 12, 12, 3), WINDOW[:10], (1e-4, 9e-4))
 
 
 def test_a_backend_without_loops_says_so_and_an_unknown_one_is_refused() -> None:

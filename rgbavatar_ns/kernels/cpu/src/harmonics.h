@@ -64,51 +64,55 @@ RGBAVATAR_FUNCTION void summed_colors(const Harmonics& along, const float* coeff
     colors[c] = 0.5f + ((sums[c] + sums[c + 3]) + (sums[c + 6] + sums[c + 9]));
 }
 
-// Writes the colours [images, count, 3] of the Gaussians [begin, end).
-static void harmonic_colors(const HarmonicScene& s, int begin, int end, float* colors) {
+// Calls each(harmonics, place of the direction, place of the coefficients, whether they come for the
+// first time) for the Gaussians [begin, end) of all images.
+template <class Each>
+RGBAVATAR_FUNCTION void for_directions(const HarmonicScene& s, int begin, int end,
+                                       const Each& each) {
   Harmonics basis;
   for (int image = 0; image < s.images; ++image)
     for (int n = begin; n < end; ++n) {
       const int64_t at = (int64_t(image) * s.count + n) * 3;
-      harmonics_along(s.directions + at, s.harmonics, basis);
       const int64_t row = image * s.image_stride + int64_t(n) * s.harmonics * 3;
-      float found[3];
-      summed_colors(basis, s.coefficients + row, s.harmonics, found);
-      for (int c = 0; c < 3; ++c) colors[at + c] = found[c] < 0.0f ? 0.0f : found[c];
+      harmonics_along(s.directions + at, s.harmonics, basis);
+      each(basis, at, row, image == 0 || s.image_stride != 0);
     }
+}
+
+// Writes the colours [images, count, 3] of the Gaussians [begin, end).
+static void harmonic_colors(const HarmonicScene& s, int begin, int end, float* colors) {
+  for_directions(s, begin, end, [&](const Harmonics& basis, int64_t at, int64_t row, bool) {
+    float found[3];
+    summed_colors(basis, s.coefficients + row, s.harmonics, found);
+    for (int c = 0; c < 3; ++c) colors[at + c] = found[c] < 0.0f ? 0.0f : found[c];
+  });
 }
 
 // Writes the gradients of the coefficients and directions of the Gaussians [begin, end).
 static void harmonic_gradient(const HarmonicScene& s, int begin, int end,
                               const float* color_gradient, float* coefficient_gradient,
                               float* direction_gradient) {
-  Harmonics basis;
-  for (int image = 0; image < s.images; ++image)
-    for (int n = begin; n < end; ++n) {
-      const int64_t at = (int64_t(image) * s.count + n) * 3;
-      harmonics_along(s.directions + at, s.harmonics, basis);
-      const int64_t row = image * s.image_stride + int64_t(n) * s.harmonics * 3;
-      const float* own = s.coefficients + row;
-      float gradient[3], repeated[3 * kMostHarmonics], by_value[kMostHarmonics];
-      summed_colors(basis, own, s.harmonics, gradient);
-      for (int c = 0; c < 3; ++c)
-        gradient[c] = gradient[c] < 0.0f ? 0.0f : color_gradient[at + c];
-      for (int k = 0; k < s.harmonics; ++k) {
-        for (int c = 0; c < 3; ++c) repeated[3 * k + c] = gradient[c];
-        by_value[k] = own[3 * k] * gradient[0] + own[3 * k + 1] * gradient[1] +
-                      own[3 * k + 2] * gradient[2];
-      }
-      float* out = coefficient_gradient + row;
-      if (image == 0 || s.image_stride != 0)
-        for (int i = 0; i < 3 * s.harmonics; ++i) out[i] = basis.value[i] * repeated[i];
-      else
-        for (int i = 0; i < 3 * s.harmonics; ++i) out[i] += basis.value[i] * repeated[i];
-      for (int axis = 0; axis < 3; ++axis) {
-        float sum = 0.0f;
-        for (int k = 0; k < s.harmonics; ++k) sum += by_value[k] * basis.slope[axis][k];
-        direction_gradient[at + axis] = sum;
-      }
+  for_directions(s, begin, end, [&](const Harmonics& basis, int64_t at, int64_t row, bool first) {
+    const float* own = s.coefficients + row;
+    float gradient[3], repeated[3 * kMostHarmonics], by_value[kMostHarmonics];
+    summed_colors(basis, own, s.harmonics, gradient);
+    for (int c = 0; c < 3; ++c) gradient[c] = gradient[c] < 0.0f ? 0.0f : color_gradient[at + c];
+    for (int k = 0; k < s.harmonics; ++k) {
+      for (int c = 0; c < 3; ++c) repeated[3 * k + c] = gradient[c];
+      by_value[k] =
+          own[3 * k] * gradient[0] + own[3 * k + 1] * gradient[1] + own[3 * k + 2] * gradient[2];
     }
+    float* out = coefficient_gradient + row;
+    if (first)
+      for (int i = 0; i < 3 * s.harmonics; ++i) out[i] = basis.value[i] * repeated[i];
+    else
+      for (int i = 0; i < 3 * s.harmonics; ++i) out[i] += basis.value[i] * repeated[i];
+    for (int axis = 0; axis < 3; ++axis) {
+      float sum = 0.0f;
+      for (int k = 0; k < s.harmonics; ++k) sum += by_value[k] * basis.slope[axis][k];
+      direction_gradient[at + axis] = sum;
+    }
+  });
 }
 
 }  // namespace rgbavatar::RGBAVATAR_ISA
