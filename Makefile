@@ -8,7 +8,9 @@ BIN := .venv/bin
 export OMP_WAIT_POLICY ?= PASSIVE
 STARTED := $(shell date +%s)
 
-PYTEST := PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
+# Bytecode is kept, also where Python is told to write none: of each run's start it is the half.
+PYTEST := PYTHONDONTWRITEBYTECODE= PATH="$(CURDIR)/$(BIN):$$PATH" \
+	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
 
 .PHONY: help setup demo test test-fast test-nightly lint format reference docs clean
 

@@ -3,7 +3,8 @@
 import dataclasses
 import inspect
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from functools import cache
 from typing import Annotated, Any, get_args, get_origin, get_type_hints
 
 from rgbavatar_ns.errors import UserError
@@ -57,16 +58,23 @@ def check_options(
     classes whose declarations are not ours. Tuples are checked item by item, dataclasses and
     mappings within as well. prefix: of the options' names in an error.
     """
-    hints = get_type_hints(owner, include_extras=True)
+    declared = _declared_bounds(owner)
     others: dict[str, Between] = {}
     for kind in inspect.getmro(owner) if isinstance(owner, type) else ():
         others.update((more or {}).get(kind, {}))
     for name, value in values.items():
-        bounds = [others[name]] if name in others else _bounds(hints.get(name))
+        bounds = [others[name]] if name in others else declared.get(name, ())
         for item in value if isinstance(value, tuple | list) else (value,):
             for bound in bounds:
                 _check(prefix + name, item, bound)
             _check_within(item, f"{prefix}{name}.", more)
+
+
+@cache
+def _declared_bounds(owner: Any) -> Mapping[str, Sequence[Between]]:
+    """The bounds of each name that a class or function annotates."""
+    hints = get_type_hints(owner, include_extras=True)
+    return {name: _bounds(hint) for name, hint in hints.items()}
 
 
 def _check_within(value: Any, prefix: str, more: Ranges | None) -> None:

@@ -2,13 +2,13 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Float16, Int
 from torch import Tensor
 
 from rgbavatar_ns.errors import UserError
@@ -145,6 +145,18 @@ class HeadArrays:
         """Whether the mesh goes on below the neck, where the root joint carries it."""
         return "torso" in self.vertex_groups
 
+    @cached_property
+    def flat_shapedirs(self) -> Float[np.ndarray, "C V3"]:
+        """`shapedirs` as `flat_directions`, found once for all models that are made of these."""
+        return flat_directions(self.shapedirs)
+
+    @cached_property
+    def joint_directions(self) -> Float[np.ndarray, "E 15"]:
+        """How each expression moves the joints: all x, then all y, then all z; found once."""
+        expressions = self.shapedirs[..., self.num_identity :].astype(np.float64)
+        moved = np.einsum("jv,vcx->xcj", self.joint_regressor.astype(np.float64), expressions)
+        return moved.reshape(len(moved), 15)
+
     @classmethod
     def embedded(cls, name: str = EMBEDDED_HEAD) -> "HeadArrays":
         """MakeHuman's head (assets/LICENSE), or its bust; UserError for another name."""
@@ -196,6 +208,10 @@ class HeadArrays:
 
     def digest(self) -> str:
         """SHA-256 of all arrays and names: what tells one head model from another."""
+        return self._digest
+
+    @cached_property
+    def _digest(self) -> str:
         parts: list[str | np.ndarray] = []
         for name, value in sorted(self._items(), key=lambda item: item[0]):
             parts += [name, value if isinstance(value, np.ndarray) else repr(value)]
@@ -211,11 +227,20 @@ class HeadArrays:
             elif entry.name == "expression_names":
                 items.append((entry.name, list(value)))
             elif value is not None:
-                if entry.name in _MAY_BE_HALF:
-                    half = value.astype(np.float16)
-                    value = half if np.array_equal(half.astype(value.dtype), value) else value
-                items.append((entry.name, value))
+                items.append((entry.name, self._halves.get(entry.name, value)))
         return items
+
+    @cached_property
+    def _halves(self) -> dict[str, Float16[np.ndarray, "V 3 _"]]:
+        """Offsets that lose nothing as float16; found once, since writing and digests need it."""
+        found = {}
+        for name in _MAY_BE_HALF:
+            value = getattr(self, name)
+            if value is not None:
+                half = value.astype(np.float16)
+                if np.array_equal(half.astype(value.dtype), value):
+                    found[name] = half
+        return found
 
     @classmethod
     def _from_items(cls, items: Mapping[str, Any]) -> "HeadArrays":
@@ -232,6 +257,12 @@ class HeadArrays:
             if name.startswith(_GROUP)
         }
         return cls(**values, vertex_groups=groups)
+
+
+def flat_directions(directions: Float[np.ndarray, "V 3 C"]) -> Float[np.ndarray, "C V3"]:
+    """Directions as rows over all x, then all y, then all z, for one matrix product."""
+    num_vertices, _, count = directions.shape
+    return np.ascontiguousarray(directions.transpose(2, 1, 0)).reshape(count, 3 * num_vertices)
 
 
 @cache

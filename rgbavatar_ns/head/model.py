@@ -3,14 +3,13 @@
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from rgbavatar_ns.errors import UserError
-from rgbavatar_ns.head.arrays import EMBEDDED_HEAD, HeadArrays
+from rgbavatar_ns.head.arrays import EMBEDDED_HEAD, HeadArrays, flat_directions
 from rgbavatar_ns.head.layout import ThetaField, ThetaLayout
 from rgbavatar_ns.head.rotations import axis_angle_to_matrix
 
@@ -40,7 +39,7 @@ class HeadModel(nn.Module):
         super().__init__()
         self.arrays = arrays
         self._parents = [int(parent) for parent in arrays.parents]
-        directions = _flat_directions(arrays.shapedirs)
+        directions = arrays.flat_shapedirs
         eyelids = arrays.eyelid_dirs
         posedirs = arrays.posedirs if arrays.posedirs.any() else arrays.posedirs[..., :0]
         eyelid_dirs = arrays.posedirs[..., :0] if eyelids is None else eyelids
@@ -48,9 +47,9 @@ class HeadModel(nn.Module):
             ("_template", arrays.v_template.T),
             ("_identity_dirs", directions[: arrays.num_identity]),
             ("_linear_dirs", directions[arrays.num_identity :]),
-            ("_eyelid_dirs", _flat_directions(eyelid_dirs)),
-            ("_pose_dirs", _flat_directions(posedirs)),
-            ("_linear_joint_dirs", _joint_directions(arrays)),
+            ("_eyelid_dirs", flat_directions(eyelid_dirs)),
+            ("_pose_dirs", flat_directions(posedirs)),
+            ("_linear_joint_dirs", arrays.joint_directions),
             ("_regressor", arrays.joint_regressor.T),
             ("_weights", arrays.skinning_weights.T),
             ("uv", arrays.uv),
@@ -232,19 +231,6 @@ def _is_steady(identity: Tensor | None) -> bool:
     if identity is None or identity.ndim != 1 or identity.requires_grad:
         return False
     return not (identity.is_inference() or torch.is_inference_mode_enabled())
-
-
-def _joint_directions(arrays: HeadArrays) -> Float[np.ndarray, "E 15"]:
-    """How each expression moves the joints: all x, then all y, then all z."""
-    expressions = arrays.shapedirs[..., arrays.num_identity :].astype(np.float64)
-    moved = np.einsum("jv,vcx->xcj", arrays.joint_regressor.astype(np.float64), expressions)
-    return moved.reshape(len(moved), 15)
-
-
-def _flat_directions(directions: Float[np.ndarray, "V 3 C"]) -> Float[np.ndarray, "C V3"]:
-    """Directions as rows over all x, then all y, then all z, for one matrix product."""
-    num_vertices, _, count = directions.shape
-    return np.ascontiguousarray(directions.transpose(2, 1, 0)).reshape(count, 3 * num_vertices)
 
 
 def _some(

@@ -17,6 +17,7 @@ from rgbavatar_ns.avatar import AvatarConfig
 from rgbavatar_ns.avatar.storage.checkpoint_file import list_checkpoints, read_checkpoint
 from rgbavatar_ns.plugin.methods import rgbavatar_tiny
 from rgbavatar_ns.plugin.training.trainer import RGBAvatarTrainer, RGBAvatarTrainerConfig
+from tests.plugin.forked import run_forked
 
 SMALL = AvatarConfig(uv_resolution=16, num_bases=3, hidden_width=16, scale_from_texel_spacing=True)
 # Entry points exist only once the package is installed; the variable works without.
@@ -122,11 +123,4 @@ def environment() -> Mapping[str, str]:
 
 def run_command(*command: str | Path) -> "subprocess.CompletedProcess[str]":
     """Run one of nerfstudio's commands to its end."""
-    return subprocess.run(
-        [program(str(command[0])), *map(str, command[1:])],
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=600,
-        env=environment(),
-    )
+    return run_forked([program(str(command[0])), *map(str, command[1:])], environment())

@@ -17,7 +17,7 @@ from tests.plugin.viewer_page import Picture, ViewerPage, started, viewer_page
 _WIDTH, _HEIGHT = 900, 950
 _SECONDS_UNTIL_DRAWN = 120.0
 _LOOK_MS = 250
-_SAME_PICTURES = 10
+_STAYS_S = 2.5
 _SHARP_PX = 512
 _SAME = 1e-4
 
@@ -51,12 +51,13 @@ def _colored(picture: Picture) -> float:
 def _wait_for(viewer: ViewerPage, wanted: Callable[[Picture], bool]) -> Picture:
     """The first picture that stays and for which `wanted` holds; it has to be sharp."""
     deadline = time.monotonic() + _SECONDS_UNTIL_DRAWN
-    picture, same = viewer.view(), 0
-    while time.monotonic() < deadline:
+    picture, since = viewer.view(), time.monotonic()
+    while (now := time.monotonic()) < deadline:
         viewer.page.wait_for_timeout(_LOOK_MS)
         before, picture = picture, viewer.view()
-        same = same + 1 if np.array_equal(before, picture) else 0
-        if same >= _SAME_PICTURES and wanted(picture):
+        if not np.array_equal(before, picture):
+            since = time.monotonic()
+        elif now - since >= _STAYS_S and wanted(picture):
             last = viewer.pictures()[-1]
             assert max(last.width, last.height) >= _SHARP_PX
             assert viewer.canvas_share > 0.99

@@ -87,9 +87,12 @@ def _dots(
     rest = head(torch.zeros_like(theta), identity)
     shade = (rest - rest.amin(0)) / (rest.amax(0) - rest.amin(0))
     image = np.zeros((camera.height, camera.width, 4), dtype=np.uint8)
-    column, row = pixel.floor().long().T
-    for i in torch.argsort(seen[:, 2], descending=True).tolist():
-        if 0 <= row[i] < camera.height and 0 <= column[i] < camera.width:
-            color = (shade[i] * 200 + 40).to(torch.uint8).numpy()
-            image[row[i], column[i]] = [*color, 255]
+    # Of what is written to one place the last stays: the nearest.
+    nearer = torch.argsort(seen[:, 2], descending=True)
+    column, row = pixel[nearer].floor().long().T
+    within = (row >= 0) & (row < camera.height) & (column >= 0) & (column < camera.width)
+    color = (shade[nearer] * 200 + 40).to(torch.uint8)
+    opaque = torch.full((len(color), 1), 255, dtype=torch.uint8)
+    color_rgba = torch.cat([color, opaque], 1)[within].numpy()
+    image[row[within].numpy(), column[within].numpy()] = color_rgba
     return image

@@ -26,6 +26,13 @@ namespace emulation {
 constexpr size_t kStackBytes = 64 << 10;
 constexpr int kWarp = 32;
 
+// Where threads meet: what each brought, for this meeting and the next.
+struct Meeting {
+  uint64_t arrivals = 0;
+  uint64_t brought[2][1024];
+  const char* kind[2] = {};
+};
+
 struct Fiber {
   ucontext_t context;
   jmp_buf at;
@@ -33,13 +40,10 @@ struct Fiber {
   bool started = false, done = false;
   uint64_t warp_meetings = 0, block_meetings = 0;
   const char* waits_for = nullptr;
-};
+  const Meeting* meeting = nullptr;
+  uint64_t complete = 0;
 
-// Where threads meet: what each brought, for this meeting and the next.
-struct Meeting {
-  uint64_t arrivals = 0;
-  uint64_t brought[2][1024];
-  const char* kind[2] = {};
+  bool can_go_on() const { return !done && (!meeting || meeting->arrivals >= complete); }
 };
 
 static std::vector<Fiber> fibers(1024);
@@ -58,10 +62,13 @@ static void yield() {
   if (!_setjmp(fibers[current].at)) _longjmp(scheduler, 1);
 }
 
+// A fiber is made once and serves block after block: making one asks the system twice.
 static void enter() {
-  (*body)();
-  fibers[current].done = true;
-  _longjmp(scheduler, 1);
+  for (;;) {
+    (*body)();
+    fibers[current].done = true;
+    yield();
+  }
 }
 
 // Brings a value to a meeting of `number` threads; returns what all brought, by thread.
@@ -69,13 +76,20 @@ static const uint64_t* meet(Meeting& meeting, uint64_t& mine, unsigned place, un
                             uint64_t value, const char* kind) {
   const uint64_t which = mine++;
   const int page = int(which & 1);
-  if (meeting.arrivals % number == 0) meeting.kind[page] = kind;
-  if (std::strcmp(meeting.kind[page], kind)) fail("threads met at different collectives", kind);
+  const uint64_t complete = (which + 1) * number;
+  if (meeting.arrivals + number == complete) meeting.kind[page] = kind;
+  const char* const first = meeting.kind[page];
+  if (first != kind && std::strcmp(first, kind))
+    fail("threads met at different collectives", kind);
   meeting.brought[page][place] = value;
   ++meeting.arrivals;
-  fibers[current].waits_for = kind;
-  while (meeting.arrivals < (which + 1) * number) yield();
-  fibers[current].waits_for = nullptr;
+  Fiber& fiber = fibers[current];
+  fiber.waits_for = kind;
+  fiber.meeting = &meeting;
+  fiber.complete = complete;
+  if (!fiber.can_go_on()) yield();
+  fiber.waits_for = nullptr;
+  fiber.meeting = nullptr;
   return meeting.brought[page];
 }
 
@@ -92,9 +106,10 @@ static void run_block(std::mt19937& random) {
   for (Meeting& warp : warps) warp.arrivals = 0;
   for (unsigned i = 0; i < threads; ++i) {
     Fiber& fiber = fibers[i];
-    fiber.started = fiber.done = false;
+    fiber.done = false;
     fiber.warp_meetings = fiber.block_meetings = 0;
     fiber.waits_for = nullptr;
+    fiber.meeting = nullptr;
   }
   std::vector<unsigned> order(threads);
   std::iota(order.begin(), order.end(), 0u);
@@ -107,7 +122,7 @@ static void run_block(std::mt19937& random) {
     for (volatile unsigned i = 0; i < threads; i = i + 1) {
       current = order[i];
       Fiber& fiber = fibers[current];
-      if (fiber.done) continue;
+      if (!fiber.can_go_on()) continue;
       threadIdx.x = current;
       if (!_setjmp(scheduler)) {
         if (fiber.started) _longjmp(fiber.at, 1);
