@@ -149,7 +149,8 @@ def _train(
     *,
     refine_tracking: bool,
 ) -> Result:
-    run_folder = output / "runs" / "demo" / method / key
+    # Where ns-train puts an experiment of this name: what takes a run takes `output` too.
+    run_folder = output / method / key
     options: list[str] = []
     if refine_tracking:
         options += ["--pipeline.model.refine-tracking", "True"]
@@ -193,7 +194,7 @@ def _tell_stage(name: str, seconds: float | None) -> None:
 
 def _tell(summary: dict[str, Any], output: Path) -> None:
     """Print where things are, the metrics and how to open the viewer."""
-    lpips = summary["lpips_vgg"]
+    lpips, programs = summary["lpips_vgg"], Path(sys.executable).parent
     rows = {
         "held-out PSNR": f"{summary['psnr']:.2f} dB over {summary['held_out_frames']} frames",
         "of the head": f"{summary['psnr_head']:.2f} dB",
@@ -203,8 +204,9 @@ def _tell(summary: dict[str, Any], output: Path) -> None:
         "picture": summary["picture"],
         "film": summary["video"],
         "figures": str(output / "summary.json"),
-        "viewer": f"{Path(sys.executable).with_name('ns-viewer')} --load-config "
-        f"{Path(summary['run']) / 'config.yml'}",
+        "viewer": f"{programs / 'ns-viewer'} --load-config {Path(summary['run']) / 'config.yml'}",
+        "drive it": f"{programs / 'rgbavatar'} drive {output}",
+        "web page": f"{programs / 'rgbavatar'} export {output} {output / 'me.html'} --format web",
     }
     if summary["psnr_head_refined"] is not None:
         fitted = min(HELD_OUT_FRAMES, summary["held_out_frames"])

@@ -1,12 +1,15 @@
 import json
 from importlib.metadata import entry_points
+from pathlib import Path
 
 import av
 import cv2
 import pytest
 
+from rgbavatar_ns.avatar.loading import load_avatar
 from rgbavatar_ns.cli import demo
 from rgbavatar_ns.cli.main import main
+from rgbavatar_ns.export.run_data import dataset_folder
 
 OPTIONS = ["--frames", "12", "--image-size", "48", "--steps", "12"]
 
@@ -31,6 +34,14 @@ def test_demo_goes_from_nothing_to_a_film_and_the_second_time_only_tells(tmp_pat
     assert cv2.imread(summary["picture"]).shape[0] == 3 * 48
     assert "ns-viewer" in told
     assert str(summary["picture"]) in told.replace("\n", "")
+    # The folder is an experiment's as ns-train makes them, which other commands take.
+    assert (tmp_path / demo.TINY / "latest" / "config.yml").is_file()
+    assert load_avatar(tmp_path).num_gaussians == load_avatar(Path(summary["run"])).num_gaussians
+    assert dataset_folder(tmp_path) == Path(summary["data"])
+    (command,) = (line for line in told.splitlines() if line.startswith("web page"))
+    _, *arguments = command.removeprefix("web page").split()
+    main(arguments)
+    assert (tmp_path / "me.html").is_file()
 
     main(["demo", "--output", str(tmp_path), *OPTIONS])
     assert capsys.readouterr().out.count("done before") == 4
