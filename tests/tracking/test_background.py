@@ -72,6 +72,34 @@ def test_a_few_mattes_that_miss_the_person_leave_no_ghost() -> None:
     assert (off[found.plate.known] > 20).mean() < 0.01
 
 
+def test_mattes_that_lose_the_person_do_not_count() -> None:
+    room, film = _room(), _film(_room(), mistaken=FRAMES // 3)
+    found = find_background(film, INSIDE)
+    assert found.plate is not None
+    off = np.abs(found.plate.color.astype(float) - room).max(-1)
+    assert (off[found.plate.known] > 20).mean() < 0.01
+
+
+@pytest.mark.parametrize("brim_px", [26, 30])
+def test_what_every_matte_leaves_out_of_the_person_is_no_plain_wall(brim_px: int) -> None:
+    """A dark brim to both sides, which moves with the person."""
+    wall = np.full((SIZE, SIZE, 3), 200, np.float32)
+    film = []
+    for k, (image, mask) in enumerate(_film(wall)):
+        middle = round(48 + 20 * np.sin(2 * np.pi * k / FRAMES))
+        picture = image.copy()
+        brim = np.zeros((SIZE, SIZE), bool)
+        brim[44:50, max(0, middle - brim_px) : middle + brim_px] = True
+        picture[brim & (mask < 0.02)] = (40, 50, 45)
+        film.append((picture, mask))
+    found = find_background(film, INSIDE)
+    assert found.kind == "still", "what moves is no room"
+    assert found.plate is not None
+    off = np.abs(found.plate.color.astype(float) - wall).max(-1)
+    assert (off[found.plate.known] > 20).mean() < 0.001
+    assert found.plate.known.mean() > 0.9
+
+
 @pytest.mark.parametrize("sway_px", [1.5, 6.0])
 def test_a_moving_camera_is_noticed(sway_px: float) -> None:
     found = find_background(_film(_room(), sway_px=sway_px), INSIDE)

@@ -2,12 +2,13 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, get_args
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Float16, UInt8
 
 from rgbavatar_ns.files import atomic_write
 from rgbavatar_ns.reading import DamagedFileError, load_arrays
@@ -23,6 +24,13 @@ _SAMPLES_BYTES, _FEWEST = 256 * 2**20, 8
 _UNCOVERED = 0.3
 # A plate's colour is known where so many frames show it, and agree to so many levels (0 to 255).
 _SEEN, _AGREE_LEVELS = 4, 6.0
+# A frame counts as it is where the person is this share of the image away, and what lies so much
+# farther is surely none of it. What is nearer is no room where it differs by more levels and
+# deviations from what is sure so far around, if that is a twentieth at least of what is there.
+_WELL_AWAY, _SURE, _AROUND, _ENOUGH_AROUND = 0.08, 1.5, 0.1, 0.05
+_UNLIKE_LEVELS, _UNLIKE_SIGMAS = 25.0, 4.0
+# A matte has lost the person where it holds less than this share of what the median one does.
+_LOST_SHARE = 0.5
 # Sorting is done by so many rows at a time, so that little is held beside the samples.
 _ROWS = 32
 _QUARTILE_SIGMAS = 1.349
@@ -132,21 +140,24 @@ def find_background(
 ) -> Background:
     """Judge the background by (image, matte of the person) of frames spread over a clip.
 
-    Each pixel's colour is the median over the frames that do not show the person there, which a
-    matte's errors leave alone as long as most of these frames are right. `inside` is where the
-    images show what was filmed.
+    Each pixel's colour is the median over the frames that have the person well away from it, or
+    the farthest away that there are, which a matte's errors leave alone as long as most of these
+    frames are right there. `inside` is where the images show what was filmed.
     """
-    images, free, edges = [], [], []
+    images, clear_px, edges = [], [], []
     for image, matte in samples:
         images.append(image)
         edges.append(edge_width_px(image, matte))
-        free.append((matte <= _UNCOVERED) & inside)
+        clear_px.append(_clear_of_person(matte) * inside)
     told = [edge for edge in edges if edge is not None]
     edge_px = float(np.median(told)) if told else None
     if len(images) < _FEWEST:
         return Background("too short", None, 0.0, None, edge_px)
+    free, away = _farthest(_of_whole_mattes(clear_px))
     color, spread, count = _medians(images, free)
     often = count >= _SEEN
+    unlike = _unlike_room(color, often & away)
+    often &= ~unlike
     light = _light_changes(images, free, color, often)
     motion = _motion_px(color, spread, often)
     kind: BackgroundKind = "still"
@@ -158,8 +169,65 @@ def find_background(
         kind = "moves"
     if kind != "still":
         return Background(kind, motion, light, None, edge_px)
-    seen = np.where(spread < _AGREE_LEVELS, count, 0).astype(np.uint8)
+    seen = np.where((spread < _AGREE_LEVELS) & ~unlike, count, 0).astype(np.uint8)
     return Background(kind, motion, light, CleanPlate(color, seen, spread), edge_px)
+
+
+def _clear_of_person(matte: Float[np.ndarray, "S S"]) -> Float16[np.ndarray, "S S"]:
+    """How far each pixel lies from what a matte takes for the person, pixels; 0 on the person."""
+    uncovered = (matte <= _UNCOVERED).astype(np.uint8)
+    if uncovered.all():
+        return np.full(matte.shape, len(matte), np.float16)
+    return cv2.distanceTransform(uncovered, cv2.DIST_L2, 5).astype(np.float16)
+
+
+def _of_whole_mattes(
+    clear_px: list[Float16[np.ndarray, "S S"]],
+) -> list[Float16[np.ndarray, "S S"]]:
+    """The same, 0 all over where a matte has lost the person: all frames here show one."""
+    areas = [float((clear == 0).mean()) for clear in clear_px]
+    least = _LOST_SHARE * np.median(areas)
+    return [clear * (area >= least) for clear, area in zip(clear_px, areas)]
+
+
+def _farthest(
+    clear_px: list[Float16[np.ndarray, "S S"]],
+) -> tuple[list[Bool[np.ndarray, "S S"]], Bool[np.ndarray, "S S"]]:
+    """For each pixel the frames that count: with the person well away, or else the farthest few.
+
+    What a segmentation misses in every frame, the brim of a hat, lies close to what it finds. Also
+    returns where enough frames have the person well away.
+    """
+    margin = _WELL_AWAY * len(clear_px[0])
+    enough = min(_SEEN, len(clear_px))
+    least = np.zeros_like(clear_px[0])
+    for top in range(0, len(least), _ROWS):
+        rows = slice(top, top + _ROWS)
+        sizes = np.stack([clear[rows] for clear in clear_px])
+        least[rows] = np.partition(sizes, -enough, axis=0)[-enough]
+    counts = np.clip(least, np.finfo(least.dtype).tiny, margin)
+    return [clear >= counts for clear in clear_px], least >= _SURE * margin
+
+
+def _unlike_room(
+    color: UInt8[np.ndarray, "S S 3"],
+    sure: Bool[np.ndarray, "S S"],
+) -> Bool[np.ndarray, "S S"]:
+    """What differs from the room around it by far more than that room does in itself.
+
+    What every matte leaves out of the person, before a plain wall; a busy room tells nothing.
+    """
+    blur = partial(cv2.GaussianBlur, ksize=(0, 0), sigmaX=_AROUND * len(sure))
+    share = blur(sure.astype(np.float32))[..., None]
+
+    def around(values: np.ndarray) -> np.ndarray:
+        return blur(np.where(sure[..., None], values, 0)) / np.maximum(share, 1e-6)
+
+    levels = color.astype(np.float32)
+    middle = around(levels)
+    varies = np.sqrt(around((levels - middle) ** 2))
+    unlike = np.abs(levels - middle) > _UNLIKE_LEVELS + _UNLIKE_SIGMAS * varies
+    return unlike.any(-1) & ~sure & (share[..., 0] > _ENOUGH_AROUND)
 
 
 def _medians(
