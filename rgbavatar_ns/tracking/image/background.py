@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -24,11 +23,9 @@ _SAMPLES_BYTES, _FEWEST = 256 * 2**20, 8
 _UNCOVERED = 0.3
 # A plate's colour is known where so many frames show it, and agree to so many levels (0 to 255).
 _SEEN, _AGREE_LEVELS = 4, 6.0
-# A frame counts as it is where the person is this share of the image away, and what lies so much
-# farther is surely none of it. What is nearer is no room where it differs by more levels and
-# deviations from what is sure so far around, if that is a twentieth at least of what is there.
-_WELL_AWAY, _SURE, _AROUND, _ENOUGH_AROUND = 0.08, 1.5, 0.1, 0.05
-_UNLIKE_LEVELS, _UNLIKE_SIGMAS = 25.0, 4.0
+# What lies farther from the person than this share of the image is surely none of it, and tells of
+# motion by itself where it is so large a part of the image.
+_WELL_AWAY, _AWAY_SHARE = 0.08, 0.1
 # A matte has lost the person where it holds less than this share of what the median one does.
 _LOST_SHARE = 0.5
 # Sorting is done by so many rows at a time, so that little is held beside the samples.
@@ -156,10 +153,8 @@ def find_background(
     free, away = _farthest(_of_whole_mattes(clear_px))
     color, spread, count = _medians(images, free)
     often = count >= _SEEN
-    unlike = _unlike_room(color, often & away)
-    often &= ~unlike
     light = _light_changes(images, free, color, often)
-    motion = _motion_px(color, spread, often)
+    motion = _motion_px(color, spread, away if away.mean() >= _AWAY_SHARE else often)
     kind: BackgroundKind = "still"
     if often.mean() < _TEXTURE_SHARE:
         kind = "covered"
@@ -169,7 +164,8 @@ def find_background(
         kind = "moves"
     if kind != "still":
         return Background(kind, motion, light, None, edge_px)
-    seen = np.where((spread < _AGREE_LEVELS) & ~unlike, count, 0).astype(np.uint8)
+    known = _hanging_together(often & (spread < _AGREE_LEVELS), away)
+    seen = np.where(known, count, 0).astype(np.uint8)
     return Background(kind, motion, light, CleanPlate(color, seen, spread), edge_px)
 
 
@@ -206,28 +202,19 @@ def _farthest(
         sizes = np.stack([clear[rows] for clear in clear_px])
         least[rows] = np.partition(sizes, -enough, axis=0)[-enough]
     counts = np.clip(least, np.finfo(least.dtype).tiny, margin)
-    return [clear >= counts for clear in clear_px], least >= _SURE * margin
+    return [clear >= counts for clear in clear_px], least >= margin
 
 
-def _unlike_room(
-    color: UInt8[np.ndarray, "S S 3"],
-    sure: Bool[np.ndarray, "S S"],
+def _hanging_together(
+    known: Bool[np.ndarray, "S S"], away: Bool[np.ndarray, "S S"]
 ) -> Bool[np.ndarray, "S S"]:
-    """What differs from the room around it by far more than that room does in itself.
+    """What is known as far as it hangs together with what is surely room; all of it without such.
 
-    What every matte leaves out of the person, before a plain wall; a busy room tells nothing.
+    Islands in the person's outline are what every matte leaves out of it.
     """
-    blur = partial(cv2.GaussianBlur, ksize=(0, 0), sigmaX=_AROUND * len(sure))
-    share = blur(sure.astype(np.float32))[..., None]
-
-    def around(values: np.ndarray) -> np.ndarray:
-        return blur(np.where(sure[..., None], values, 0)) / np.maximum(share, 1e-6)
-
-    levels = color.astype(np.float32)
-    middle = around(levels)
-    varies = np.sqrt(around((levels - middle) ** 2))
-    unlike = np.abs(levels - middle) > _UNLIKE_LEVELS + _UNLIKE_SIGMAS * varies
-    return unlike.any(-1) & ~sure & (share[..., 0] > _ENOUGH_AROUND)
+    _, piece = cv2.connectedComponents(known.astype(np.uint8), connectivity=4)
+    reaching = np.unique(piece[away & known])
+    return np.isin(piece, reaching) if len(reaching) else known
 
 
 def _medians(
