@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from rgbavatar_ns.errors import UserError
-from rgbavatar_ns.head import HeadArrays, HeadModel
+from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.tracking.config import TrackConfig
 from rgbavatar_ns.tracking.face.detector import (
     EYE_CORNERS,
@@ -120,7 +120,7 @@ def test_a_head_without_eyeballs_is_refused(head: HeadModel) -> None:
     arrays = head.arrays
     without = np.array(arrays.skinning_weights)
     without[:, 3:] = 0
-    bare = HeadArrays(**{**vars(arrays), "skinning_weights": without})
+    bare = replace(arrays, skinning_weights=without)
     with pytest.raises(UserError, match="no eyeball"):
         iris_places(bare)
 
