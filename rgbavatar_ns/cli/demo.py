@@ -1,5 +1,6 @@
 """`rgbavatar demo`: from nothing (or from a video) to a trained avatar, through nerfstudio."""
 
+import shlex
 import sys
 import time
 from dataclasses import replace
@@ -194,7 +195,7 @@ def _tell_stage(name: str, seconds: float | None) -> None:
 
 def _tell(summary: dict[str, Any], output: Path) -> None:
     """Print where things are, the metrics and how to open the viewer."""
-    lpips, programs = summary["lpips_vgg"], Path(sys.executable).parent
+    lpips, run_folder = summary["lpips_vgg"], Path(summary["run"])
     rows = {
         "held-out PSNR": f"{summary['psnr']:.2f} dB over {summary['held_out_frames']} frames",
         "of the head": f"{summary['psnr_head']:.2f} dB",
@@ -204,9 +205,11 @@ def _tell(summary: dict[str, Any], output: Path) -> None:
         "picture": summary["picture"],
         "film": summary["video"],
         "figures": str(output / "summary.json"),
-        "viewer": f"{programs / 'ns-viewer'} --load-config {Path(summary['run']) / 'config.yml'}",
-        "drive it": f"{programs / 'rgbavatar'} drive {output}",
-        "web page": f"{programs / 'rgbavatar'} export {output} {output / 'me.html'} --format web",
+        "viewer": _command("ns-viewer", "--load-config", run_folder / "config.yml"),
+        "drive it": _command("rgbavatar", "drive", run_folder),
+        "web page": _command(
+            "rgbavatar", "export", run_folder, output / "me.html", "--format", "web"
+        ),
     }
     if summary["psnr_head_refined"] is not None:
         fitted = min(HELD_OUT_FRAMES, summary["held_out_frames"])
@@ -219,3 +222,8 @@ def _tell(summary: dict[str, Any], output: Path) -> None:
     console.rule("done")
     for name, value in rows.items():
         console.print(f"{name:<15} {value}")
+
+
+def _command(program: str, *words: str | Path) -> str:
+    """As a shell takes it, of this environment, also where a path has spaces."""
+    return shlex.join([str(Path(sys.executable).with_name(program)), *map(str, words)])

@@ -46,7 +46,8 @@ class HeadArrays:
     """FLAME and the embedded head differ only in these; raises UserError if they fit no head.
 
     Metres, y up, z forward, +x the subject's left; triangles are wound outward. Source: FLAME's
-    model files; uv has u to the right and v up.
+    model files; uv has u to the right and v up. Not to be written to: what follows from the arrays
+    is found once.
     """
 
     name: str

@@ -1,4 +1,5 @@
 import json
+import shlex
 from importlib.metadata import entry_points
 from pathlib import Path
 
@@ -21,6 +22,8 @@ def test_the_command_is_installed():
 
 @pytest.mark.slow
 def test_demo_goes_from_nothing_to_a_film_and_the_second_time_only_tells(tmp_path, capsys):
+    # As of a film "my head.mp4".
+    tmp_path = tmp_path / "my head"
     main(["demo", "--output", str(tmp_path), *OPTIONS])
     told = capsys.readouterr().out
     summary = json.loads((tmp_path / "summary.json").read_text())
@@ -39,7 +42,7 @@ def test_demo_goes_from_nothing_to_a_film_and_the_second_time_only_tells(tmp_pat
     assert load_avatar(tmp_path).num_gaussians == load_avatar(Path(summary["run"])).num_gaussians
     assert dataset_folder(tmp_path) == Path(summary["data"])
     (command,) = (line for line in told.splitlines() if line.startswith("web page"))
-    _, *arguments = command.removeprefix("web page").split()
+    _, *arguments = shlex.split(command.removeprefix("web page"))
     main(arguments)
     assert (tmp_path / "me.html").is_file()
 
