@@ -52,6 +52,10 @@ def trained_there(config: RGBAvatarTrainerConfig) -> RGBAvatarTrainer:
 def test_the_other_device_does_not_meet_main_memory():
     there = torch.ones(2).to(elsewhere.NAME)
     assert (there + there).tolist() == [2, 2]
+    assert torch.empty_like(there).isnan().all(), "what nobody wrote is no number"
+    pairs = torch.zeros(2, 2).to(elsewhere.NAME)
+    torch.add(there, 1, out=pairs[:, 1])
+    assert pairs.tolist() == [[0, 2], [0, 2]]
     for mixed in (lambda: there + torch.ones(2), lambda: torch.stack([there, torch.ones(2)])):
         with pytest.raises(RuntimeError, match="same device"):
             mixed()
