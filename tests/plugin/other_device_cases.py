@@ -29,15 +29,20 @@ def device(tmp_path_factory) -> None:
     elsewhere.begin(tmp_path_factory.mktemp("elsewhere"))
 
 
+class EdgeMatrix:
+    """A sparse matrix as the entries of its edges: the device has no sparse tensors."""
+
+    def __init__(self, field: MeshField, entries: torch.Tensor) -> None:
+        (self._rows, self._columns), self._entries = field.edges.T, entries
+
+    def __matmul__(self, values: torch.Tensor) -> torch.Tensor:
+        at_edges = self._entries[:, None] * values[self._columns]
+        return torch.zeros_like(values).index_add(0, self._rows, at_edges)
+
+
 @pytest.fixture(autouse=True)
-def dense(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The device has no sparse tensors."""
-
-    def matrix(self: MeshField, entries: torch.Tensor) -> torch.Tensor:
-        full = entries.new_zeros(self.num_vertices, self.num_vertices)
-        return full.index_put((self.edges[:, 0], self.edges[:, 1]), entries)
-
-    monkeypatch.setattr(MeshField, "_matrix", matrix)
+def without_sparse_tensors(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(MeshField, "_matrix", lambda self, entries: EdgeMatrix(self, entries))
 
 
 def trained_there(config: RGBAvatarTrainerConfig) -> RGBAvatarTrainer:
