@@ -35,7 +35,9 @@ class FilmWriter:
         """Begin the file."""
         with ExitStack() as opening:
             partial = opening.enter_context(atomic_write(self._path))
-            self._container = opening.enter_context(av.open(str(partial), "w", format="mp4"))
+            self._container = opening.enter_context(
+                av.open(str(partial.absolute()), "w", format="mp4")
+            )
             self._open = opening.pop_all()
         return self
 
@@ -83,7 +85,10 @@ def write_gif(path: Path, frames: Iterable[np.ndarray], frames_per_second: float
         picture.pts = place
         graph.push(picture)
     graph.push(None)
-    with atomic_write(path) as partial, av.open(str(partial), "w", format="gif") as container:
+    with (
+        atomic_write(path) as partial,
+        av.open(str(partial.absolute()), "w", format="gif") as container,
+    ):
         stream = container.add_stream("gif", rate=rate)
         stream.height, stream.width, stream.pix_fmt = height, width, "pal8"
         for place in range(len(kept)):

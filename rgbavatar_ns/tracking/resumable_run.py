@@ -3,7 +3,7 @@
 import json
 import shutil
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,15 @@ from rgbavatar_ns.data.native.format import INDEX_FILE, image_path
 from rgbavatar_ns.data.native.writer import make_room
 from rgbavatar_ns.data.png import png_size
 from rgbavatar_ns.errors import UserError
-from rgbavatar_ns.files import DiskError, Stages, atomic_write, disk_errors, read_json, write_json
+from rgbavatar_ns.files import (
+    DiskError,
+    Stages,
+    atomic_write,
+    disk_errors,
+    hold_lock,
+    read_json,
+    write_json,
+)
 from rgbavatar_ns.reading import DamagedFileError
 
 WORK_FOLDER = ".tracking"
@@ -29,6 +37,32 @@ def stage_damage_told(path: Path, what: str) -> Iterator[None]:
             f"{path} holds no {what}: {error}.",
             "Remove the folder's unfinished tracking, or track with --overwrite.",
         ) from None
+
+
+@contextmanager
+def alone_in(dst: Path) -> Iterator[None]:
+    """Keep other processes from tracking into the folder; UserError where one does."""
+
+    def refuse() -> None:
+        raise UserError(
+            f"Another process is tracking into {dst}.",
+            "Wait for it or stop it; the same command then goes on. Or name another folder.",
+        )
+
+    if dst.exists() and not dst.is_dir():
+        yield  # It is refused as what it is.
+        return
+    lock = dst / f"{WORK_FOLDER}.lock"
+    with ExitStack() as held:
+        with disk_errors(dst, "Name a folder that you may write to."):
+            dst.mkdir(parents=True, exist_ok=True)
+            held.enter_context(hold_lock(lock, refuse))
+        try:
+            yield
+        finally:
+            lock.unlink(missing_ok=True)
+            if dst.is_dir() and not any(dst.iterdir()):
+                dst.rmdir()
 
 
 class ResumableRun:
@@ -109,6 +143,4 @@ class ResumableRun:
             raise
         except UserError:
             self.close()
-            if self.dst.is_dir() and not any(self.dst.iterdir()):
-                self.dst.rmdir()
             raise

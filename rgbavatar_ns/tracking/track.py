@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from threadpoolctl import threadpool_limits
 from torch import Tensor
 
@@ -37,7 +38,7 @@ from rgbavatar_ns.tracking.image.outlines import key_outlines
 from rgbavatar_ns.tracking.input.image_files import source_digest
 from rgbavatar_ns.tracking.input.mattes import UserMattes
 from rgbavatar_ns.tracking.input.video import FrameSource
-from rgbavatar_ns.tracking.resumable_run import GO_ON, ResumableRun
+from rgbavatar_ns.tracking.resumable_run import GO_ON, ResumableRun, alone_in
 from rgbavatar_ns.tracking.stage_clock import Progress, StageClock
 from rgbavatar_ns.tracking.torso.compose import on_body
 from rgbavatar_ns.tracking.torso.find_body import find_body
@@ -75,9 +76,10 @@ def track_video(
     source = FrameSource.open(videos, config.max_frames)
     mattes = None if config.mattes is None else UserMattes.open(config.mattes, source)
     load_mediapipe()
-    run = ResumableRun.open(Path(dst), _settings(source, config, own_head), config.overwrite)
-    tracking = _Tracking(source, mattes, own_head, config, run, StageClock(progress))
-    with _one_thread_a_call():
+    settings = _settings(source, config, own_head)
+    with alone_in(Path(dst)), _one_thread_a_call():
+        run = ResumableRun.open(Path(dst), settings, config.overwrite)
+        tracking = _Tracking(source, mattes, own_head, config, run, StageClock(progress))
         return tracking.write(tracking.fitted_clip())
 
 
@@ -93,6 +95,7 @@ class _FittedClip:
     body: BodyPlaces | None
     crop: SquareCrop
     source_alpha: bool
+    notes: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -122,7 +125,8 @@ class _Tracking:
             def half_done() -> None:
                 clock.done(next(calls) // 2)
 
-            alpha = self.mattes is None and bool(faces.has_alpha.any())
+            alpha = self.mattes is None and bool(faces.has_alpha.mean() > 0.5)
+            notes = (*self.source.notes, *_alpha_notes(faces.has_alpha, alpha))
             keys = tracker.key_positions(seen.points_px)
             outlines = key_outlines(
                 self.source, self.mattes, alpha, seen, keys, self.run, clock.done
@@ -140,6 +144,7 @@ class _Tracking:
                     "The head model fits none of the faces that were found.",
                     "Use a video in which the face is seen larger and more from the front.",
                 )
+        self._held_out(len(found))
         body = None
         if tracker.head.arrays.has_torso:
             with closing(PersonMatte()) as person:
@@ -152,11 +157,21 @@ class _Tracking:
             found.points_px, width, height, config.image_size, with_body=body is not None
         )
         left_out = tuple(seen.frame_index[position] for position in lost)
-        return _FittedClip(seen, found, left_out, tracker, fit, body, crop, alpha)
+        return _FittedClip(seen, found, left_out, tracker, fit, body, crop, alpha, notes)
+
+    def _held_out(self, frames: int) -> int:
+        """How many of the last frames are held out; UserError where none would be left."""
+        test = frames // 5 if self.config.test_frames is None else self.config.test_frames
+        if test >= frames:
+            raise UserError(
+                f"{test} of {frames} tracked frames cannot be held out.",
+                "Name a smaller --test-frames: what was found so far is kept.",
+            )
+        return test
 
     def write(self, clip: _FittedClip) -> TrackedDataset:
         """Make the images that are missing, and the dataset with its report."""
-        found, config, dst = clip.found, self.config, self.run.dst
+        found, dst = clip.found, self.run.dst
         arrays, layout = clip.tracker.head.arrays, clip.tracker.head.layout
         thetas = torch.from_numpy(clip.tracker.thetas(clip.fit)).float()
         identity = torch.from_numpy(clip.fit.subject.identity).float()
@@ -182,8 +197,7 @@ class _Tracking:
             bare_px = clip.tracker.fitted_px(clip.fit, with_offsets=False)
             write_tracking_sheet(dst, clip.tracker, clip.fit, bare_px, found, clip.crop)
             clock.done(frames // 4)
-            test = frames // 5 if config.test_frames is None else config.test_frames
-            dataset = writer.finish(test)
+            dataset = writer.finish(self._held_out(frames))
             clock.done(frames // 2)
             quality = fit_quality(clip.tracker, clip.fit, bare_px, found.points_px, found.irises)
             shares = [noted[index] for index in found.frame_index]
@@ -265,7 +279,7 @@ class _Tracking:
             "segments": found.segments(),
             "other_faces": list(seen.with_others),
             "blurred": [index for index in seen.blurred if index in tracked],
-            "notes": list(self.source.notes),
+            "notes": list(clip.notes),
             **quality,
             **silhouette_summary(shares),
             "unfilmed_share": sum(one["unfilmed"] for one in shares) / len(shares),
@@ -277,6 +291,15 @@ class _Tracking:
             "crop": {"left": crop.left, "top": crop.top, "side": crop.side},
         }
         return {"verdict": verdict(tracking_findings(report)), **report}
+
+
+def _alpha_notes(has_alpha: Bool[np.ndarray, "F"], used: bool) -> list[str]:
+    """What is to be known where some frames are transparent around the person and others not."""
+    count, frames = int(has_alpha.sum()), len(has_alpha)
+    if count in (0, frames):
+        return []
+    rest = "of the others all is taken for the person" if used else "so it is not used"
+    return [f"{count} of {frames} frames have an alpha channel; {rest}"]
 
 
 def _film_shown(dataset: TrackedDataset, report: dict[str, Any]) -> FilmFacts:
@@ -299,8 +322,9 @@ def _settings(
     source: FrameSource, config: TrackConfig, own_head: HeadArrays | None
 ) -> dict[str, Any]:
     """What must be alike for a run to go on with what another one has done."""
-    by_content = ("overwrite", "mattes", "flame")
-    options = {name: value for name, value in asdict(config).items() if name not in by_content}
+    # By their content, or decided at the end.
+    apart = ("overwrite", "mattes", "flame", "test_frames")
+    options = {name: value for name, value in asdict(config).items() if name not in apart}
     mattes = config.mattes
     return {
         "the video": [source_digest(path) for path in source.paths],

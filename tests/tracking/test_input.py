@@ -3,6 +3,8 @@
 import struct
 import subprocess
 import sys
+import threading
+from collections.abc import Iterator
 from fractions import Fraction
 from pathlib import Path
 
@@ -15,6 +17,7 @@ from scipy.io import wavfile
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.tracking.input.image_files import image_files, read_image_rgba
 from rgbavatar_ns.tracking.input.video import FrameSource
+from rgbavatar_ns.tracking.threads import in_background
 
 from .clips import gradient_images, write_clip
 
@@ -29,6 +32,16 @@ def test_frames_come_in_order_and_the_same_on_every_reading(tmp_path: Path) -> N
         assert np.abs(frame.image_rgb.astype(int) - image).mean() < 6
     for frame, again in zip(first, source):
         np.testing.assert_array_equal(frame.image_rgb, again.image_rgb)
+
+
+def test_a_name_with_a_colon_is_no_network_address(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_clip(tmp_path / "clip.mkv", gradient_images(3)).rename(tmp_path / "2026-11-27T10:30.mkv")
+    monkeypatch.chdir(tmp_path)
+    source = FrameSource.open("2026-11-27T10:30.mkv")
+    assert source.count_hint() in (3, None)
+    assert len(list(source)) == 3
 
 
 def test_clips_are_concatenated_and_numbered(tmp_path: Path) -> None:
@@ -304,3 +317,27 @@ def test_memory_does_not_grow_with_the_length_of_a_4k_clip(tmp_path: Path) -> No
     told = subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()
     assert told[:4] == ["20", "2160", "3840", "3"]
     assert float(told[4]) < 60, "12 frames more would take 285 MiB"
+
+
+def test_digits_that_are_no_decimal_numbers_are_letters_of_a_name(tmp_path: Path) -> None:
+    for name in ("②", "a²10", "a²9", "①"):
+        cv2.imencode(".png", gradient_images(1)[0])[1].tofile(tmp_path / f"{name}.png")
+    assert [path.stem for path in image_files(tmp_path)] == ["a²9", "a²10", "①", "②"]
+
+
+def test_closing_from_another_thread_ends_it_while_it_waits_for_a_slow_reader() -> None:
+    asked, answered = threading.Event(), threading.Event()
+
+    def slow() -> Iterator[int]:
+        yield 0
+        asked.set()
+        answered.wait(20)
+        yield 1
+
+    inner = in_background(slow(), 1)
+    outer = in_background((item for item in inner), 1)
+    assert next(outer) == 0
+    assert asked.wait(10)
+    inner.close()  # Its consumer is another thread, which is waiting in it.
+    assert list(outer) == []
+    answered.set()

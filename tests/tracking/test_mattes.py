@@ -1,5 +1,6 @@
 """The user's own mattes are taken as they are; ours do not flicker and drag nothing along."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import pytest
 
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.tracking import TrackConfig, track_video
+from rgbavatar_ns.tracking.image.crop import SquareCrop
 from rgbavatar_ns.tracking.image.steady_matte import CoarseMatte, head_motion, steadied
 from rgbavatar_ns.tracking.input.mattes import UserMattes
 from rgbavatar_ns.tracking.input.video import FrameSource
@@ -170,3 +172,60 @@ def test_a_users_matte_and_an_alpha_channel_end_up_in_the_dataset(tmp_path: Path
     short = _folder(tmp_path / "s", {"0.png": own})
     with pytest.raises(UserError, match="no matte named 1"):
         track_video(frames, tmp_path / "z", replace(CONFIG, mattes=short))
+
+
+def test_a_mask_video_of_varying_rate_is_counted_by_its_frames_and_not_by_its_length(
+    tmp_path: Path,
+) -> None:
+    times = [33 * k + (33 * (k // 2)) for k in range(30)]
+    film = write_clip(tmp_path / "f.mkv", gradient_images(14), "ffv1", times_ms=times[:14])
+    mask = write_clip(tmp_path / "m.mkv", gradient_images(14), "ffv1", times_ms=times[:14])
+    mattes = UserMattes.open(mask, FrameSource.open(film))
+    mattes.require_count(14, limited=False)
+    assert len(_levels(mattes, set(range(14)), 64, 48)) == 14
+    short = write_clip(tmp_path / "s.mkv", gradient_images(9), "ffv1", times_ms=times[:9])
+    with pytest.raises(UserError, match="ends before frame 13"):
+        _levels(UserMattes.open(short, FrameSource.open(film)), set(range(14)), 64, 48)
+
+
+def test_mattes_of_the_first_images_are_enough_where_no_more_are_read(tmp_path: Path) -> None:
+    black = np.zeros((4, 6, 3), np.uint8)
+    frames = _folder(tmp_path / "f", {f"{k}.png": black for k in range(3)})
+    mask = _folder(tmp_path / "m", {"0.png": black[..., 0] + 7})
+    mattes = UserMattes.open(mask, FrameSource.open(frames, max_frames=1))
+    mattes.require_count(1, limited=True)
+    assert _levels(mattes, {0}, 6, 4) == {0: 7}
+
+
+@pytest.mark.parametrize("size", [85, 256, 400])
+def test_what_an_alpha_channel_hides_does_not_colour_the_edge(size: int) -> None:
+    rows, columns = np.mgrid[:256, :256]
+    disc = np.hypot(rows - 128, columns - 128) < 90
+    alpha = (255 * disc).astype(np.uint8)
+    image = np.where(disc[..., None], np.uint8(200), np.uint8(0)).repeat(3, -1)
+    color, level = SquareCrop(0, 0, 256, size).matted(image, alpha)
+    assert (np.abs(color.astype(int) - 200).max(-1) <= 2)[level > 8 / 255].all()
+    assert level.mean() == pytest.approx(disc.mean(), abs=0.005)
+
+
+def test_round_corners_are_no_matte(tmp_path: Path) -> None:
+    pytest.importorskip("mediapipe", reason="the tracker's optional extra is not installed")
+    alpha = np.full((200, 200, 1), 255, np.uint8)
+    alpha[:2, :2] = 0
+    image = np.concatenate([astronaut()[::2, ::2, ::-1], alpha], -1)
+    screenshots = _folder(tmp_path / "f", {f"{k}.png": image for k in range(2)})
+    track_video(screenshots, tmp_path / "x", CONFIG)
+    assert json.loads((tmp_path / "x/tracking.json").read_text())["matte"] == "selfie segmentation"
+
+
+def test_a_matte_in_a_few_frames_is_told_and_not_used(tmp_path: Path) -> None:
+    pytest.importorskip("mediapipe", reason="the tracker's optional extra is not installed")
+    image = astronaut()[::2, ::2, ::-1]
+    alpha = np.full((200, 200, 1), 255, np.uint8)
+    cut_out = np.concatenate([image, alpha], -1)
+    cut_out[:50, :, 3] = 0
+    frames = _folder(tmp_path / "f", {"0.png": image, "1.png": cut_out, "2.png": image})
+    track_video(frames, tmp_path / "x", CONFIG)
+    report = json.loads((tmp_path / "x/tracking.json").read_text())
+    assert report["matte"] == "selfie segmentation"
+    assert report["notes"] == ["1 of 3 frames have an alpha channel; so it is not used"]

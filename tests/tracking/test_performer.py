@@ -11,6 +11,7 @@ import torch
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.export import write_video
 from rgbavatar_ns.head import HeadModel
+from rgbavatar_ns.tracking.input import capture as capture_module
 from rgbavatar_ns.tracking.input.capture import (
     CapturedFrame,
     FileCapture,
@@ -145,7 +146,25 @@ def test_a_missing_video_is_told(tmp_path):
         FilmedPerformer(str(tmp_path / "none.mp4"), tracker=_Tracker())
 
 
-def test_the_newest_due_frame_of_a_file_ends_with_its_last(film):
+def test_a_film_that_is_read_more_slowly_than_it_plays_is_shown_all_along(film, monkeypatch):
+    read = FileCapture._read
+
+    def slowly(self):
+        time.sleep(0.06)  # of frames of .04
+        return read(self)
+
+    monkeypatch.setattr(FileCapture, "_read", slowly)
+    capture, shown = FileCapture(film, "newest"), []
+    while not capture.ended:
+        if (frame := capture.next(1.0)) is not None:
+            shown.append(frame.index)
+    assert shown == sorted(shown)
+    assert len(shown) > 8
+    assert shown[-1] == 39
+
+
+def test_the_newest_due_frame_of_a_file_ends_with_its_last(film, monkeypatch):
+    monkeypatch.setattr(capture_module, "_LONGEST_SKIP_S", 60.0)
     capture = FileCapture(film, "newest")
     time.sleep(0)
     first = capture.next(1.0)

@@ -4,6 +4,7 @@ import errno
 import json
 import os
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from rgbavatar_ns.tracking import TrackConfig, track_video
 from rgbavatar_ns.tracking import track as track_module
 from rgbavatar_ns.tracking.face.find_faces import find_faces
 from rgbavatar_ns.tracking.image import outlines
+from rgbavatar_ns.tracking.input.video import FrameSource
 from rgbavatar_ns.tracking.resumable_run import WORK_FOLDER, ResumableRun
 from rgbavatar_ns.tracking.torso.find_body import find_body
 
@@ -308,3 +310,52 @@ def test_a_run_begun_before_irises_were_found_looks_for_faces_anew(
         np.savez(path, **before)  # pyright: ignore[reportArgumentType]
     track_video(clip, dst, CONFIG)
     assert _files(dst) == _files(uninterrupted)
+
+
+def test_a_second_process_is_kept_out_of_the_folder(clip: Path, tmp_path: Path) -> None:
+    dst = tmp_path / "set"
+    small = TrackConfig(image_size=48, key_frames=1, focal_px=500.0, max_frames=2)
+    refused: list[str] = []
+
+    def meanwhile(stage: str, done: int, total: int | None) -> None:
+        if stage == "fit" and not refused:
+            with pytest.raises(UserError, match="Another process is tracking") as told:
+                track_video(clip, dst, small)
+            refused.append(str(told.value))
+
+    assert len(track_video(clip, dst, small, meanwhile)) == 2
+    assert refused
+    assert not list(dst.glob(".*")), "nothing of it stays"
+
+
+def test_too_many_held_out_frames_are_told_before_images_and_cost_nothing(
+    clip: Path, tmp_path: Path
+) -> None:
+    dst = tmp_path / "set"
+    small = TrackConfig(image_size=48, key_frames=1, focal_px=500.0, max_frames=3)
+    stages: list[str] = []
+    with pytest.raises(UserError, match="3 of 3 tracked frames cannot be held out"):
+        track_video(clip, dst, replace(small, test_frames=3), lambda *done: stages.append(done[0]))
+    assert "pictures" not in stages
+    faces = {path: path.stat().st_mtime_ns for path in (dst / WORK_FOLDER).glob("faces_*")}
+    with pytest.raises(KeyboardInterrupt):
+        track_video(clip, dst, replace(small, test_frames=1), _interrupting("pictures", 0))
+    assert faces == {path: path.stat().st_mtime_ns for path in (dst / WORK_FOLDER).glob("faces_*")}
+    assert faces
+    assert len(track_video(clip, dst, replace(small, test_frames=1)).test) == 1
+
+
+def test_damage_of_the_film_stands_in_the_report(clip: Path, tmp_path: Path) -> None:
+    image = astronaut()[::2, ::2]
+    frames = [np.roll(image, k, axis=1) for k in range(8)]
+    cut = write_clip(tmp_path / "clip.avi", frames, "png", "rgb24")
+    data = cut.read_bytes()
+    place = data.index(b"\x89PNG", data.index(b"\x89PNG", data.index(b"\x89PNG") + 1) + 1)
+    cut.write_bytes(data[:place] + bytes(64) + data[place + 64 :])
+    notes = (source := FrameSource.open(cut)).notes
+    read = len(list(source))
+    assert 1 < read < 8
+    track_video(cut, tmp_path / "set", TrackConfig(image_size=48, key_frames=1, focal_px=500.0))
+    report = json.loads((tmp_path / "set/tracking.json").read_text())
+    assert report["notes"] == notes
+    assert notes

@@ -32,7 +32,7 @@ class SeenFaces:
 
     `points` and `irises` are shares of the frame's width and height; `iris_sigma` are the irises'
     standard errors as `FoundIrises` has them; `sharpness` has any unit; `time_s` is NaN where the
-    source has no clock; `has_alpha` tells frames that bring their own matte.
+    source has no clock; `has_alpha` tells frames whose alpha may be a matte.
     """
 
     count: Int[np.ndarray, "F"]
@@ -100,7 +100,8 @@ class ClipLandmarks:
 
     def without(self, positions: Collection[int]) -> "ClipLandmarks":
         """The same without the frames at these positions."""
-        keep = [k for k in range(len(self)) if k not in set(positions)]
+        left_out = frozenset(positions)
+        keep = [k for k in range(len(self)) if k not in left_out]
         return replace(
             self,
             points_px=self.points_px[keep],

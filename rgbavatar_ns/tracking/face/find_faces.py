@@ -22,6 +22,8 @@ from rgbavatar_ns.tracking.threads import in_background
 BLOCK_FRAMES, _WARM_UP = 256, 8
 _AGREE_SHARE = 0.03
 _AHEAD = 4
+# Share of a picture that is transparent where its alpha is a matte: round corners are none.
+_LEAST_ROOM = 0.02
 _SHARPNESS_PX = 96
 _Block = tuple[SeenFaces, tuple[int, int] | None]
 """Some frames' faces; the last block tells the frames' width and height."""
@@ -121,7 +123,7 @@ def _faces_in(frame: SourceFrame, faces: Float[np.ndarray, "N 478 2"]) -> SeenFa
         np.array([len(faces)], dtype=np.int64),
         np.array([frame.clip], dtype=np.int64),
         np.array([np.nan if frame.time_s is None else frame.time_s], dtype=np.float64),
-        np.array([frame.alpha is not None]),
+        np.array([frame.alpha is not None and bool((frame.alpha < 128).mean() > _LEAST_ROOM)]),
         faces,
         irises.centers / size,
         irises.sigma,

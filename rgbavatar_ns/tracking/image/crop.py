@@ -1,11 +1,12 @@
 """Square crops that hold head and neck: one for a whole clip, or one that follows a stream."""
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Shaped, UInt8
 
 from rgbavatar_ns.kernels.types import PinholeCameras
 from rgbavatar_ns.tracking.face.detector import face_height_px
@@ -18,6 +19,8 @@ _ABOVE, _SIDES, _BELOW = 0.6, 0.3, 0.35
 _BODY_SIDES, _BODY_BELOW = 0.95, 1.3
 # How much larger than the head's own square a following crop is: so much may the head move.
 _ROOM = 1.25
+# Of alpha: below it a pixel has no colour of its own.
+_HARDLY = 0.5 / 255
 _HEAD_PX, _MOST_PX, _MULTIPLE_PX = 256, 512, 16
 SHARP_PX = 400
 """From so many pixels on a film shows more than images of a head of 256 pixels hold; one of fewer
@@ -45,6 +48,26 @@ class SquareCrop:
         self, image: UInt8[np.ndarray, "H W *channels"]
     ) -> UInt8[np.ndarray, "size size *channels"]:
         """The square part of the frame (of an image or a mask) at the output size."""
+        return self._resized(self._part(image))
+
+    def matted(
+        self, image_rgb: UInt8[np.ndarray, "H W 3"], alpha: UInt8[np.ndarray, "H W"]
+    ) -> tuple[UInt8[np.ndarray, "size size 3"], Float[np.ndarray, "size size"]]:
+        """The same of an image with straight alpha, which is in [0, 1] afterwards.
+
+        A pixel's colour counts as far as it is opaque, so that what is hidden stays so.
+        """
+        color, weight = self._part(image_rgb), self._part(alpha).astype(np.float32)[..., None] / 255
+        mean = self._resized(np.concatenate([color * weight, weight], -1))
+        level = mean[..., 3]
+        shown = level > _HARDLY
+        own = mean[..., :3] / np.where(shown, level, 1)[..., None]
+        straight = np.where(shown[..., None], own.round().clip(0, 255), self._resized(color))
+        return straight.astype(np.uint8), level.clip(0, 1)
+
+    def _part(
+        self, image: UInt8[np.ndarray, "H W *channels"]
+    ) -> UInt8[np.ndarray, "S S *channels"]:
         height, width = image.shape[:2]
         top, bottom = _within(self.top, self.side, height)
         left, right = _within(self.left, self.side, width)
@@ -53,6 +76,9 @@ class SquareCrop:
         beside = (left - self.left, self.left + self.side - right)
         if any(beyond + beside):
             part = cv2.copyMakeBorder(part, *beyond, *beside, cv2.BORDER_REPLICATE)
+        return part
+
+    def _resized(self, part: Shaped[np.ndarray, "S S *channels"]) -> Any:
         method = cv2.INTER_AREA if self.size <= self.side else cv2.INTER_CUBIC
         return cv2.resize(part, (self.size, self.size), interpolation=method)
 

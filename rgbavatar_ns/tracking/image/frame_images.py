@@ -133,7 +133,8 @@ class FrameImages:
 
         The `background`'s plate, if it has one, tells the person from the room.
         """
-        wanted = [k for k in range(len(self._found)) if k not in set(without)]
+        there = frozenset(without)
+        wanted = [k for k in range(len(self._found)) if k not in there]
         read = sorted({near for k in wanted for near in self._window(k)})
         if not wanted:
             return
@@ -173,20 +174,16 @@ class FrameImages:
         if self._mattes is not None:
             mattes = self._mattes.levels(wanted, self._found.width, self._found.height)
         for frame in source.read(wanted.__contains__):
-            alpha, clean = None, False
-            if mattes is not None:
-                alpha = next(mattes)[1]
-            elif self._source_alpha:
-                clean = frame.alpha is not None
-                alpha = frame.alpha
-                if alpha is None:
-                    alpha = np.full((frame.height, frame.width), 255, np.uint8)
-            yield _Cropped(
-                place[frame.index],
-                self._crop.apply(frame.image_rgb),
-                None if alpha is None else self._crop.apply(alpha).astype(np.float32) / 255,
-                clean,
-            )
+            position, crop = place[frame.index], self._crop
+            if self._source_alpha and frame.alpha is not None:
+                yield _Cropped(position, *crop.matted(frame.image_rgb, frame.alpha), True)
+            else:
+                alpha = None
+                if mattes is not None:
+                    alpha = crop.apply(next(mattes)[1]).astype(np.float32) / 255
+                elif self._source_alpha:
+                    alpha = np.ones((crop.size, crop.size), np.float32)
+                yield _Cropped(position, crop.apply(frame.image_rgb), alpha)
             if frame.index == last:
                 return
 

@@ -18,6 +18,7 @@ from rgbavatar_ns.tracking.input.video import FrameSource
 _FRAMES_PER_SECOND = 25.0
 """Of a folder of images, which has no clock."""
 _TIMEOUT_MS = 5000
+_LONGEST_SKIP_S = 0.1
 Pace = Literal["each", "newest", "at once"]
 
 
@@ -64,8 +65,9 @@ class FileCapture:
         assert due is not None
         if self._pace != "newest":
             return replace(due, captured_s=time.monotonic())
-        due_s = self._due_s
-        while self._read() and self._due_s <= time.monotonic():
+        due_s, now = self._due_s, time.monotonic()
+        # A film that is read more slowly than it plays is shown late rather than not at all.
+        while self._read() and self._due_s <= now and time.monotonic() < now + _LONGEST_SKIP_S:
             assert self._waiting is not None
             due, due_s, self._waiting = self._waiting, self._due_s, None
             self.counts["skipped"] += 1

@@ -93,6 +93,5 @@ def last_number(path: Path) -> int | None:
 
 
 def _natural(text: str) -> list[tuple[int, str]]:
-    return [
-        (int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"([0-9]+)", text)
-    ]
+    parts = re.split(r"([0-9]+)", text)  # Every other one is a number.
+    return [(int(part), "") if k % 2 else (-1, part) for k, part in enumerate(parts)]

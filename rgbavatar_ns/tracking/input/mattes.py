@@ -15,7 +15,7 @@ from rgbavatar_ns.tracking.input.image_files import (
     read_image_rgba,
     require_image_files,
 )
-from rgbavatar_ns.tracking.input.video import FrameSource
+from rgbavatar_ns.tracking.input.video import FrameSource, announced_frames
 
 _AS_MANY = "Give one matte a frame: white (or opaque) is the person."
 
@@ -40,7 +40,7 @@ class UserMattes:
             return cls(path, None)
         files = require_image_files(path)
         if len(source.paths) == 1 and source.paths[0].is_dir():
-            named = _by_name(files, image_files(source.paths[0]))
+            named = _by_name(files, image_files(source.paths[0])[: source.max_frames])
             if named is not None:
                 return cls(path, named)
         numbers = [last_number(file) for file in files]
@@ -51,10 +51,11 @@ class UserMattes:
     def require_count(self, frames: int, limited: bool) -> None:
         """UserError unless each frame has a matte; too many are right if frames are limited.
 
-        A mask video may announce its length inexactly: one in a hundred is let pass here.
+        A mask video may announce its length inexactly: one in a hundred is let pass here. One that
+        does not announce it is told by `levels` where it ends too soon.
         """
         if self.files is None:
-            count, slack = FrameSource.open(self.path).count_hint() or frames, 1 + frames // 100
+            count, slack = announced_frames(self.path) or frames, 1 + frames // 100
         else:
             count, slack = len(self.files), 0
         if count < frames - slack or (count > frames + slack and not limited):

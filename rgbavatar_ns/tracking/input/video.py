@@ -117,7 +117,7 @@ class FrameSource:
         """How many frames to expect, for a progress bar; None where a file does not say."""
         total = 0
         for path in self.paths:
-            count = len(image_files(path)) if path.is_dir() else _declared_frames(path)
+            count = len(image_files(path)) if path.is_dir() else _expected_frames(path)
             if not count:
                 return None
             total += count
@@ -133,7 +133,7 @@ class FrameSource:
     def _video(self, path: Path) -> Iterator[_Undecoded]:
         decoded, damaged, broken = 0, 0, None
         try:
-            with av.open(str(path)) as container:
+            with _opened(path) as container:
                 stream = _image_stream(container, path)
                 stream.thread_type = "AUTO"
                 aspect = stream.sample_aspect_ratio or Fraction(1)
@@ -179,6 +179,11 @@ def _image_of_size(
     return cv2.resize(image, smaller, interpolation=cv2.INTER_AREA)
 
 
+def _opened(path: Path) -> InputContainer:
+    # A relative name with a colon would be taken for a protocol.
+    return av.open(str(path.absolute()))
+
+
 def _image_stream(container: InputContainer, path: Path) -> VideoStream:
     """The first stream of images; a cover image in a sound file is none."""
     for stream in container.streams.video:
@@ -216,12 +221,22 @@ def _unreadable(path: Path, error: Exception) -> UserError:
     )
 
 
-def _declared_frames(path: Path) -> int:
+def announced_frames(path: Path) -> int:
+    """How many frames a video says that it holds; 0 where it does not say, or is none."""
     try:
-        with av.open(str(path)) as container:
+        with _opened(path) as container:
+            return _image_stream(container, path).frames
+    except (FFmpegError, OSError, UserError):
+        return 0
+
+
+def _expected_frames(path: Path) -> int:
+    """As announced, or by the mean rate, which is wrong where rates vary; 0 where unknown."""
+    if announced := announced_frames(path):
+        return announced
+    try:
+        with _opened(path) as container:
             stream = _image_stream(container, path)
-            if stream.frames:
-                return stream.frames
             if stream.average_rate is None or container.duration is None:
                 return 0
             return round(container.duration / av.time_base * float(stream.average_rate))
