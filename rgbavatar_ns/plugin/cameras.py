@@ -5,6 +5,8 @@ the head's turned by a quarter about x: the face looks along -y, the subject's l
 Both worlds are in metres.
 """
 
+import copy
+
 import torch
 from jaxtyping import Float
 from nerfstudio.cameras.cameras import Cameras, CameraType
@@ -52,6 +54,18 @@ def to_nerfstudio(
     )
 
 
+def is_perspective(cameras: Cameras) -> bool:
+    """Whether nerfstudio's cameras are all of the one kind that can be rendered."""
+    return bool((cameras.camera_type == CameraType.PERSPECTIVE.value).all())
+
+
+def as_perspective(cameras: Cameras) -> Cameras:
+    """The same places, directions and focal lengths, as perspective cameras."""
+    changed = copy.copy(cameras)
+    changed.camera_type = torch.full_like(cameras.camera_type, CameraType.PERSPECTIVE.value)
+    return changed
+
+
 def from_nerfstudio(cameras: Cameras) -> PinholeCameras:
     """The project's cameras of nerfstudio's, one image size for all.
 
@@ -59,7 +73,7 @@ def from_nerfstudio(cameras: Cameras) -> PinholeCameras:
         UserError: the cameras are not perspective, or differ in image size.
     """
     flat = cameras if cameras.shape else cameras.reshape((1,))
-    if not bool((flat.camera_type == CameraType.PERSPECTIVE.value).all()):
+    if not is_perspective(flat):
         raise UserError(
             "Only perspective cameras can be rendered.",
             "Choose the camera type 'perspective' in the viewer's render panel or camera path.",

@@ -25,7 +25,7 @@ from rgbavatar_ns.avatar.training.theta_fit import fit_theta
 from rgbavatar_ns.data import TrackedDataset
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.plugin.avatar_model import AvatarModel, AvatarModelConfig
-from rgbavatar_ns.plugin.cameras import from_nerfstudio
+from rgbavatar_ns.plugin.cameras import as_perspective, from_nerfstudio, is_perspective
 from rgbavatar_ns.plugin.datamanager import RGBAvatarDataManager, RGBAvatarDataManagerConfig
 from rgbavatar_ns.plugin.model import RGBAvatarModelConfig
 from rgbavatar_ns.plugin.option_order import led_by
@@ -84,6 +84,10 @@ class RGBAvatarPipeline(VanillaPipeline):
             )
         else:
             time = self.datamanager.film_path.moment(camera)
+        if self.viewer_panel.attached and not is_perspective(camera):
+            # An error would end the browser's thread.
+            self.viewer_panel.tell("Other cameras than perspective ones are shown as if they were.")
+            camera = as_perspective(camera)
         return self.viewer_panel.draw(from_nerfstudio(camera), time)
 
     def training_step(self, optimizers: Optimizers) -> TrainingStep | MethodStep:

@@ -139,3 +139,22 @@ def test_ns_train_knows_no_option_that_the_method_does_not_have(data: Path, tmp_
     )
     assert ran.returncode != 0
     assert "surface-prior" in ran.stdout + ran.stderr
+
+
+def test_rates_that_a_method_lets_fall_itself_are_left_to_it_or_refused(data: Path, tmp_path: Path):
+    def begin(name: str, **fields: Any):
+        return make_trainer(rival_config(name, data, tmp_path / name, **fields))
+
+    trainer = begin("gaussianavatars-style", learning_rate_factor=0.1, learning_rate_steps=2)
+    trainer.train()
+    rates = trainer.pipeline.model.avatar.learning_rates()
+    now = {n: o.param_groups[0]["lr"] for n, o in trainer.optimizers.optimizers.items()}
+    assert now["color"] == pytest.approx(0.1 * rates["color"])
+    assert now["position"] > 0.9 * rates["position"], "it falls over 600,000 steps"
+    for name, option in (
+        ("gaussianavatars-style", {"position_lr_final": 1e-5}),
+        ("flashavatar-style", {"position_lr_final": 1e-5}),
+        ("monogaussianavatar-style", {"learning_rate_factor": 0.1}),
+    ):
+        with pytest.raises(UserError, match="but the method"):
+            begin(name, **option)

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from nerfstudio.cameras.cameras import CameraType
 
 from rgbavatar_ns.plugin.cameras import from_nerfstudio
 from rgbavatar_ns.plugin.pipeline import RGBAvatarPipeline
@@ -67,3 +68,14 @@ def test_overlays_lie_on_the_head(desk: Desk, label: str):
     changed = (desk.picture() - plain).abs().amax(-1) > 0.05
     assert 0.02 < changed.float().mean() < 0.95
     assert alpha[..., 0][changed].mean() > alpha[..., 0][~changed].mean() + 0.2
+
+
+def test_another_lens_of_the_render_panel_does_not_end_the_pictures(
+    desk: Desk, pipeline: RGBAvatarPipeline, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(pipeline, "viewer_panel", desk.panel)
+    camera = desk.camera()
+    camera.camera_type = torch.full_like(camera.camera_type, CameraType.FISHEYE.value)
+    shown = pipeline.model.get_outputs_for_camera(camera)["rgb"]
+    assert torch.equal(shown, pipeline.model.get_outputs_for_camera(desk.camera())["rgb"])
+    assert "perspective" in "\n".join(desk.viewer.gui.texts())

@@ -84,6 +84,12 @@ class OnlineTrainer(RGBAvatarTrainer):
                 "for.",
                 "Leave out --pipeline.model.refine-tracking, or train offline.",
             )
+        falls = config.position_lr_final is not None or config.learning_rate_factor != 1.0
+        if falls and config.learning_rate_steps is None:
+            raise UserError(
+                "Learning rates are to fall, but nobody knows how long the stream is.",
+                "Say over how many steps by --learning-rate-steps.",
+            )
         super().__init__(config, local_rank, world_size)
         self.stop = OnlineStop()
         config.pipeline.datamanager.recorded = config.get_base_dir() / "stream"
@@ -195,13 +201,15 @@ class OnlineTrainer(RGBAvatarTrainer):
         """After the stream, take the rates a little down after each step.
 
         They are part of the optimizers' state, so that a resumed run falls on from there. Where
-        the user has named schedules these decide.
+        the user has named a schedule that decides.
         """
-        if self.stream.ended_step is None or self.optimizers.schedulers:
+        if self.stream.ended_step is None:
             return
         # The stream's end is seen before a step, so that one comes after it in any case.
         share = 1 / max(1, self.config.steps_after_stream)
-        for optimizer in self.optimizers.optimizers.values():
+        for name, optimizer in self.optimizers.optimizers.items():
+            if name in self.optimizers.schedulers:
+                continue
             for group in optimizer.param_groups:
                 group["lr"] *= self.config.final_learning_rate_factor**share
 

@@ -1,12 +1,12 @@
 """Adam and learning-rate schedules whose checkpoints hold nothing but tensors and numbers."""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field
 from typing import Annotated, Any
 
 import torch
-from nerfstudio.engine.optimizers import OptimizerConfig
+from nerfstudio.engine.optimizers import OptimizerConfig, Optimizers
 from nerfstudio.engine.schedulers import Scheduler, SchedulerConfig
 from torch.optim.lr_scheduler import LambdaLR
 
@@ -15,6 +15,7 @@ from rgbavatar_ns.options import Between, Counted, Positive, Weight
 
 _MOMENTS = ("exp_avg", "exp_avg_sq")
 _MAX_STEP = 1 << 40
+_ASKED, _RATES = "asked_lr", ("lr", "initial_lr", "first_lr")
 
 
 @dataclass
@@ -72,6 +73,38 @@ def paper_optimizers() -> dict[str, Any]:
         name: {"optimizer": AdamConfig(lr=rate), "scheduler": None}
         for name, rate in LEARNING_RATES.items()
     }
+
+
+def note_asked_rates(optimizers: Optimizers) -> None:
+    """Keep in each optimiser's state the rate that was asked for, before any schedule."""
+    for name, optimizer in optimizers.optimizers.items():
+        for group in optimizer.param_groups:
+            group[_ASKED] = optimizers.config[name]["optimizer"].lr
+
+
+def go_on_as_asked(optimizers: Optimizers, resumed: Collection[str], step: int) -> None:
+    """Let loaded optimisers go on from `step` at the rates that the config asks for now.
+
+    What a loaded state has done to its rate (schedules, a stream's end) stays done, times the new
+    rate by the old one. `resumed` names the schedules that were loaded; others begin as if they had
+    been there from the first step on.
+    """
+    for name, optimizer in optimizers.optimizers.items():
+        adam, schedule = optimizers.config[name]["optimizer"], optimizers.schedulers.get(name)
+        for number, group in enumerate(optimizer.param_groups):
+            before = group.get(_ASKED, group.get("initial_lr", group.get("first_lr", group["lr"])))
+            if adam.lr != before:
+                change = adam.lr / before if before > 0 else 0.0
+                group |= {key: group[key] * change or adam.lr for key in _RATES if key in group}
+                if schedule is not None and name in resumed:
+                    schedule.base_lrs[number] = adam.lr
+            group |= {_ASKED: adam.lr, "eps": adam.eps}
+            if schedule is None and group.pop("initial_lr", None) is not None:
+                group["lr"] = adam.lr
+            if schedule is not None and name not in resumed:
+                schedule.last_epoch = step
+                share = schedule.lr_lambdas[number](step)
+                group |= {"initial_lr": adam.lr, "lr": adam.lr * share}
 
 
 def require_fitting_states(optimizers: Iterable[torch.optim.Optimizer]) -> None:

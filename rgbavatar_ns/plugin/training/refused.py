@@ -1,5 +1,6 @@
 """Options of nerfstudio that this method has no use for: refused by name instead of ignored."""
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from functools import reduce
 from pathlib import Path
@@ -64,6 +65,18 @@ REFUSED = (
         "Leave it out; --output-dir chooses the place of the run.",
     ),
 )
+
+
+def require_rates_to_fall(config: Any, groups: Collection[str], scheduled: Collection[str]) -> None:
+    """Raise UserError where rates are to fall that the method has not, or lets fall by itself."""
+    final, factor = config.position_lr_final, config.learning_rate_factor
+    if final is not None and ("position" in scheduled or "position" not in groups):
+        own = "the method lets that rate fall by itself"
+        because = own if "position" in groups else "the method learns no positions by that name"
+        raise UserError(f"--position-lr-final is {final}, but {because}.", _LEAVE_OUT)
+    if factor != 1.0 and set(groups) <= set(scheduled):
+        because = "the method lets all of its rates fall by itself"
+        raise UserError(f"--learning-rate-factor is {factor}, but {because}.", _LEAVE_OUT)
 
 
 def require_used(config: TrainerConfig) -> None:

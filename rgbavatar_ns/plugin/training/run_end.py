@@ -67,14 +67,19 @@ class EndingTrainer(Trainer):
     def _save_end(self) -> None:
         """Save, and say how it went."""
         self.training_state = "completed" if self.completed else "paused"
+        # First of all, since looking back at many frames takes a while.
+        self._save_if_unsaved()
         looked = self._take.look_back(self._frames_at_the_end())
         if (self.completed and self.pipeline.model.finish()) or looked:
             self._saved_step = None
-        if self.step >= 0 and self.step != self._saved_step:
-            self.save_checkpoint(self.step)
+            self._save_if_unsaved()
         writer.write_out_storage()
         self._save_refined()
         self._tell_end(self._write_summary(COMPLETED if self.completed else "stopped"))
+
+    def _save_if_unsaved(self) -> None:
+        if self.step >= 0 and self.step != self._saved_step:
+            self.save_checkpoint(self.step)
 
     def _frames_at_the_end(self) -> Iterable[TrainingBatch]:
         """The frames to look back at when the run ends."""

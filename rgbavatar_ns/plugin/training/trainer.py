@@ -49,10 +49,13 @@ from rgbavatar_ns.plugin.training.load_config import (
 from rgbavatar_ns.plugin.training.optimizers import (
     AdamConfig,
     ExponentialConfig,
+    go_on_as_asked,
+    note_asked_rates,
     require_fitting_states,
 )
 from rgbavatar_ns.plugin.training.progress import TrainingProgress
 from rgbavatar_ns.plugin.training.ranges import require_trainable
+from rgbavatar_ns.plugin.training.refused import require_rates_to_fall
 from rgbavatar_ns.plugin.training.run_end import EndingTrainer, say
 from rgbavatar_ns.plugin.training.train_clock import TrainClock, waiting_for
 from rgbavatar_ns.plugin.training.turns import TurnsLock
@@ -204,11 +207,13 @@ class RGBAvatarTrainer(EndingTrainer, FitHooks):
         model = self.config.pipeline.model
         settings: dict[str, Any] = {}
         rates = self.pipeline.model.avatar.learning_rates()
+        scheduled = self.pipeline.model.avatar.rate_factors(0).keys()
+        require_rates_to_fall(self.config, groups.keys(), scheduled)
         for name in groups:
             own = {"optimizer": AdamConfig(lr=rates[name]), "scheduler": None}
             settings[name] = dict(self.config.optimizers.get(name, own))
             rate = settings[name]["optimizer"].lr
-            factor = self.config.learning_rate_factor
+            factor = 1.0 if name in scheduled else self.config.learning_rate_factor
             if name == "position" and self.config.position_lr_final is not None:
                 factor = self.config.position_lr_final / rate
             start = model.refinement.first_step_of(name, steps) if model.refine_tracking else 0
@@ -216,7 +221,9 @@ class RGBAvatarTrainer(EndingTrainer, FitHooks):
                 settings[name]["scheduler"] = ExponentialConfig(
                     factor=factor, steps=steps, start_step=start
                 )
-        return Optimizers(settings, groups)
+        optimizers = Optimizers(settings, groups)
+        note_asked_rates(optimizers)
+        return optimizers
 
     def train(self) -> None:
         """Train until steps or seconds are used up or a stop is asked for; then save."""
@@ -375,9 +382,9 @@ class RGBAvatarTrainer(EndingTrainer, FitHooks):
             require_fitting_states(self.optimizers.optimizers.values())
             if config.load_scheduler:
                 known = self.optimizers.schedulers
-                self.optimizers.load_schedulers(
-                    {name: saved for name, saved in state["schedulers"].items() if name in known}
-                )
+                resumed = {n: saved for n, saved in state["schedulers"].items() if n in known}
+                self.optimizers.load_schedulers(resumed)
+                go_on_as_asked(self.optimizers, resumed, self._start_step)
         say(f"Resuming after step {state['step']} from {path}")
 
     def _choose(self, folder: Path) -> tuple[dict[str, Any], Path]:

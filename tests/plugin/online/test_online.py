@@ -450,3 +450,27 @@ def test_a_killed_run_goes_on_from_its_last_checkpoint(
     assert torch.equal(again.stream.pools.parameters()[0], state["frames"]["theta"])
     again.train()
     assert summary(again)["frames"] == STREAMED
+
+
+def test_rates_that_are_to_fall_need_to_know_over_how_many_steps(online: Online):
+    with pytest.raises(UserError, match="learning-rate-steps"):
+        online(learning_rate_factor=0.1)
+    scheduled = {"position_lr_final": 1e-6, "learning_rate_steps": 10**6}
+    trainer = online("s", steps_after_stream=3, final_learning_rate_factor=0.1, **scheduled)
+    first = trainer.pipeline.model.avatar.learning_rates()["color"]
+    trainer.train()
+    last = trainer.optimizers.optimizers["color"].param_groups[0]["lr"]
+    assert last < 0.2 * first, "what has no schedule falls after the stream"
+
+
+def test_what_interrupts_looking_back_costs_no_step(online: Online):
+    trainer = online()
+    before_step(2, trainer, trainer.stop.request)
+
+    def interrupted() -> Any:
+        raise KeyboardInterrupt
+
+    trainer.pipeline.training_frames = interrupted  # type: ignore[method-assign]
+    with pytest.raises(KeyboardInterrupt):
+        trainer.train()
+    assert list_checkpoints(trainer.checkpoint_dir)[-1][0] == trainer.step
