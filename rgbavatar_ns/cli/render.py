@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
@@ -21,6 +21,18 @@ if TYPE_CHECKING:
 
 Show = Literal["comparison", "performance", "views", "orbit", "camera-path", "turntable", "bases"]
 Kind = Literal["mp4", "png", "gif"]
+_ALL_BUT_STILLS: tuple[Show, ...] = (
+    *("performance", "views", "orbit", "camera-path", "turntable"),
+)
+_USED_BY: dict[str, tuple[Show, ...]] = {
+    **dict.fromkeys(("driver", "hold", "kind"), _ALL_BUT_STILLS),
+    **dict.fromkeys(("width", "height", "transparent"), (*_ALL_BUT_STILLS, "bases")),
+    "frames": ("comparison", *_ALL_BUT_STILLS),
+    "camera-path": ("camera-path",),
+    "gain": ("bases",),
+    "arc": ("turntable",),
+}
+"""What each option counts for."""
 
 
 @dataclass(frozen=True)
@@ -98,6 +110,8 @@ def run(
     """
     if driver is not None and show == "comparison":
         show = "performance"
+    given = {"driver": driver, "frames": frames, "hold": hold, "camera-path": camera_path}
+    _require_used(show, {**given, "gain": gain, "arc": arc, **vars(picture)})
     from rgbavatar_ns.avatar.loading import require_rgbavatar
     from rgbavatar_ns.export import read_texture, with_texture
     from rgbavatar_ns.export.subject import load_subject
@@ -115,6 +129,17 @@ def run(
         scene, beside = _scene(subject, driver, frames, picture, driving)
         total, drawn = _drawn(subject, scene, beside, show, hold, arc, camera_path, picture)
         _write(drawn, total, output, show, kind, picture.frames_per_second)
+
+
+def _require_used(show: Show, given: dict[str, Any]) -> None:
+    """Raise UserError for an option that would change nothing of what is shown."""
+    for name, counts_for in _USED_BY.items():
+        is_given = given[name] is not None and given[name] is not False
+        if is_given and show not in counts_for:
+            shown = " or ".join(f"--show {other}" for other in counts_for)
+            raise UserError(
+                f"--{name} changes nothing of --show {show}.", f"Leave it out, or take {shown}."
+            )
 
 
 def _compare(

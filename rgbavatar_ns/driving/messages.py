@@ -85,7 +85,8 @@ def parse_performance(message: dict[str, Any], layout: ThetaLayout) -> SentPerfo
         pose = message.get("pose")
         if pose is not None and not isinstance(pose, dict):
             raise UserError("pose is no object with a rotation.", _REMEDY)
-        turn = None if pose is None else _numbers(pose.get("rotation"), 3, "pose.rotation")
+        rotation = None if pose is None else pose.get("rotation")
+        turn = None if rotation is None else _numbers(rotation, 3, "pose.rotation")
         if turn is not None and float(turn.norm()) > _LONGEST_TURN:
             raise UserError("pose.rotation is longer than two turns.", "Give radians.")
         outside = int(((row < 0) | (row > 1)).sum())

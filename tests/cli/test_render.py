@@ -156,6 +156,12 @@ def test_mistakes_are_told(bundle, data, tmp_path, refused):
         ("--show views --hold 7", "no frame 7 to hold"),
         ("--show camera-path", "--camera-path"),
         ("--width 0", "--width is 0"),
+        ("--kind gif", "--kind changes nothing of --show comparison"),
+        ("--hold 0", "--hold changes nothing of --show comparison"),
+        ("--transparent", "--transparent changes nothing of --show comparison"),
+        ("--show bases --frames 1 2", "--frames changes nothing of --show bases"),
+        ("--show views --arc 20", "--arc changes nothing of --show views"),
+        ("--show orbit --gain 2", "take --show bases"),
     ):
         assert told in refused("render", bundle, tmp_path, "--data", data, *words.split())
 

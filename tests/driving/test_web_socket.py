@@ -32,8 +32,11 @@ def test_coefficients_and_pose_come_in(source):
         pose = {"rotation": [0.1, 0.2, 0.3]}
         _say(client, type="arkit", coefficients={"jawOpen": 0.4}, pose=pose)
         frame = source.next(2.0)
+        _say(client, type="arkit", pose={"translation": [0.1, 0, 0]})
+        moved = source.next(2.0)
     assert frame.coefficients[ARKIT_NAMES.index("jawOpen")] == pytest.approx(0.4)
     torch.testing.assert_close(frame.head_rotation, torch.tensor([0.1, 0.2, 0.3]))
+    assert moved.head_rotation is None
 
 
 def test_the_avatars_own_theta_comes_in(source):
