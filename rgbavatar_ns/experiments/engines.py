@@ -6,8 +6,10 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
+from contextlib import suppress
 from pathlib import Path
 from types import ModuleType
 
@@ -61,8 +63,7 @@ class LocalEngine:
             running = list(self._running)
         for future in waiting:
             future.cancel()
-        for process in running:
-            end_cell(process)
+        end_cells(running)
 
 
 def start_cell(folder: Path, log: int) -> "subprocess.Popen[bytes]":
@@ -76,16 +77,17 @@ def start_cell(folder: Path, log: int) -> "subprocess.Popen[bytes]":
     )
 
 
-def end_cell(process: "subprocess.Popen[bytes]") -> None:
-    """Interrupt the cell and all below it; kill what has not saved within a minute."""
+def end_cells(processes: "Sequence[subprocess.Popen[bytes]]") -> None:
+    """Interrupt all cells and what is below them; kill what has not saved within a minute."""
     for number, seconds in ((signal.SIGINT, _SECONDS_TO_SAVE), (signal.SIGKILL, 5.0)):
-        try:
-            os.killpg(process.pid, number)
-            process.wait(seconds)
-        except (ProcessLookupError, PermissionError):
-            return
-        except subprocess.TimeoutExpired:
-            continue
+        running = [process for process in processes if process.poll() is None]
+        for process in running:
+            with suppress(ProcessLookupError, PermissionError):
+                os.killpg(process.pid, number)
+        until_s = time.monotonic() + seconds
+        for process in running:
+            with suppress(subprocess.TimeoutExpired):
+                process.wait(max(0.0, until_s - time.monotonic()))
 
 
 class RayEngine:
@@ -131,7 +133,7 @@ def _run_on_node(folder: str) -> int:
     try:
         return process.wait()
     except BaseException:
-        end_cell(process)
+        end_cells([process])
         raise
 
 

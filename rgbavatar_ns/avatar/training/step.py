@@ -239,7 +239,8 @@ class TrainingStep:
             if views is not None:
                 bank = views.frames(self.avatar, range(len(views.theta)))
                 others = DeviceFrames(bank.theta, bank.cameras, bank.images_rgba)
-                self._shown = frames.joined(others)
+                if bank.images_rgba.shape[1:] == frames.images_rgba.shape[1:]:
+                    self._shown = frames.joined(others)
             self._recorded = RecordedStep(
                 self.avatar,
                 self.optimizers,
@@ -252,7 +253,9 @@ class TrainingStep:
             )
         if self._prior is not None and self._prior.due(step):
             self._look(frames.batch(rows))
-        taken, view = rows, views.due(step, len(rows)) if views is not None else None
+        # Of a run on images of another size the views are of no use.
+        used = views is not None and self._shown is not frames
+        taken, view = rows, views.due(step, len(rows)) if views is not None and used else None
         if views is not None and view is not None:
             assert self._shown is not None
             row = len(frames.theta) + view

@@ -1,6 +1,7 @@
 """Steps in which a view that nobody filmed takes a frame's place: every way takes the same."""
 
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
@@ -57,6 +58,24 @@ def test_recorded_fused_and_eager_steps_show_the_same_views(emulated, make_avata
         assert parting(trained(make_avatar, "fused"), fused) > 1e-2
     monkeypatch.setattr(SurfacePrior, "pull", lambda self, avatar, step: None)
     assert parting(trained(make_avatar, "fused"), fused) > 1e-3
+
+
+@pytest.mark.parametrize("kind", ["recorded", "fused", "eager"])
+def test_views_of_another_size_than_the_films_are_left_out(emulated, make_avatar, kind):
+    avatar, colors = stir(make_avatar()), torch.rand(2, 3)
+    prior, optimizer = SurfacePrior(avatar), make_optimizer(avatar)
+    options = TrainingOptions(fast=kind != "eager")
+    for size, first in ((SIZE, 0), (SIZE + 8, 4)):
+        batch, _ = far_batch(avatar, 4, size, size, cameras=4)
+        frames = DeviceFrames(batch.theta, batch.cameras, batch.images_rgba)
+        given = None if kind != "recorded" else partial(lambda them: them, frames)
+        take = TrainingStep(
+            avatar, optimizer, options, frames=given, recorder=lambda work: work, prior=prior
+        )
+        for step in range(first, first + 4):
+            images = replace(frames.batch([0, 2]), background=colors)
+            losses = take(ChosenFrames([0, 2], colors) if kind == "recorded" else images, step)
+            assert losses["l1"].isfinite()
 
 
 @pytest.mark.parametrize("fast", [True, False])
