@@ -8,7 +8,9 @@ nobody filmed do not count: PSNR leaves them out, SSIM and LPIPS see the predict
 Sharpness says what these do not: a blurred picture, which errs nowhere by much, has a high PSNR.
 """
 
-from collections.abc import Mapping
+import math
+import statistics
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 import torch
@@ -90,6 +92,16 @@ def detail_energy(
     along, window = (1, 2 * radius + 1), (2 * radius + 1, 1)
     whole = max_pool2d(max_pool2d(outside, along, stride=1), window, stride=1)[:, 0] == 0
     return (energy * whole).mean((1, 2))
+
+
+def mean_scores(frames: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    """Each score's mean over the frames that have it; NaN where none has.
+
+    A frame without the person has no `psnr_head`, one that nobody filmed has no score at all.
+    """
+    names = dict.fromkeys(name for scores in frames for name in scores)
+    known = {n: [s[n] for s in frames if n in s and not math.isnan(s[n])] for n in names}
+    return {name: statistics.fmean(them) if them else math.nan for name, them in known.items()}
 
 
 def with_sharpness(means: Mapping[str, Any], suffix: str = "") -> dict[str, Any]:

@@ -15,8 +15,8 @@ _LOOK_S = 0.2
 def on_keys(actions: Mapping[str, Callable[[], None]]) -> Iterator[bool]:
     """Call an action for each key that is pressed; the value given is whether keys are heard.
 
-    Nothing is heard where standard input is no terminal, or the system knows no terminals. Ctrl-C
-    stays what it is.
+    Nothing is heard where standard input is no terminal, or another program's, or the system knows
+    no terminals. Ctrl-C stays what it is.
     """
     try:
         import termios
@@ -28,6 +28,9 @@ def on_keys(actions: Mapping[str, Callable[[], None]]) -> Iterator[bool]:
         terminal = sys.stdin.fileno()
         before = termios.tcgetattr(terminal)
     except (OSError, ValueError, termios.error):
+        yield False
+        return
+    if _in_background(terminal):
         yield False
         return
     ended = threading.Event()
@@ -47,3 +50,11 @@ def on_keys(actions: Mapping[str, Callable[[], None]]) -> Iterator[bool]:
         ended.set()
         with contextlib.suppress(termios.error):
             termios.tcsetattr(terminal, termios.TCSADRAIN, before)
+
+
+def _in_background(terminal: int) -> bool:
+    """Whether the terminal is another program's now, so that changing it would stop this one."""
+    try:
+        return os.tcgetpgrp(terminal) != os.getpgrp()
+    except OSError:  # It controls no process here.
+        return False

@@ -26,7 +26,8 @@ _ALL_BUT_STILLS: tuple[Show, ...] = (
 )
 _USED_BY: dict[str, tuple[Show, ...]] = {
     **dict.fromkeys(("driver", "hold", "kind"), _ALL_BUT_STILLS),
-    **dict.fromkeys(("width", "height", "transparent"), (*_ALL_BUT_STILLS, "bases")),
+    "transparent": (*_ALL_BUT_STILLS, "bases"),
+    **dict.fromkeys(("width", "height"), ("performance", "views", "orbit", "turntable", "bases")),
     "frames": ("comparison", *_ALL_BUT_STILLS),
     "camera-path": ("camera-path",),
     "gain": ("bases",),
@@ -50,7 +51,7 @@ class PictureOptions(CheckedOptions):
     transparent: bool = False
     """No background: PNG files keep the alpha."""
     frames_per_second: FrameRate = 25.0
-    """Of the film, and of the performance for smoothing."""
+    """Of the film (along a camera path: the path's), and of the performance for smoothing."""
 
     def kind_for(self, show: Show) -> Kind:
         """What is written; raises UserError for a film that would lose its alpha."""
@@ -127,8 +128,8 @@ def run(
     else:
         kind = picture.kind_for(show)
         scene, beside = _scene(subject, driver, frames, picture, driving)
-        total, drawn = _drawn(subject, scene, beside, show, hold, arc, camera_path, picture)
-        _write(drawn, total, output, show, kind, picture.frames_per_second)
+        scene, drawn = _drawn(subject, scene, beside, show, hold, arc, camera_path, picture)
+        _write(drawn, len(scene), output, show, kind, scene.frames_per_second)
 
 
 def _require_used(show: Show, given: dict[str, Any]) -> None:
@@ -219,8 +220,8 @@ def _drawn(
     arc: float | None,
     camera_path: Path | None,
     picture: PictureOptions,
-) -> "tuple[int, Iterator[np.ndarray]]":
-    """How many pictures there will be, and the pictures."""
+) -> "tuple[Scene, Iterator[np.ndarray]]":
+    """What is shown, frame by frame, and its pictures."""
     from rgbavatar_ns.export import pictures, scenes
 
     avatar, seen = subject.avatar, subject.seen
@@ -230,7 +231,7 @@ def _drawn(
         scene = scene.held(hold or 0, scenes.TURNTABLE_FRAMES if moving else 1)
         beside = None
     if show == "views":
-        return len(scene), scenes.side_by_side(avatar, scene, seen, background)
+        return scene, scenes.side_by_side(avatar, scene, seen, background)
     if show == "orbit":
         scene = scenes.orbiting(avatar, scene, seen)
     elif show == "turntable":
@@ -242,8 +243,8 @@ def _drawn(
     if told := scenes.told_beyond_film(avatar, scene, seen):
         print(told)
     if show == "performance" and beside is not None and background is not None:
-        return len(scene), scenes.beside_driver(avatar, scene, *beside, background)
-    return len(scene), pictures(avatar, scene.theta, scene.cameras, background)
+        return scene, scenes.beside_driver(avatar, scene, *beside, background)
+    return scene, pictures(avatar, scene.theta, scene.cameras, background)
 
 
 def _write(

@@ -22,6 +22,7 @@ LOCAL_ORIGINS = (
     re.compile(r"https?://(localhost|127\.0\.0\.1|\[::1\])(:\d+)?"),
 )
 """Programs name no origin, a page from the disk "null"; of the web only pages of this machine."""
+_LOCAL_HOST = re.compile(r"(localhost|127(\.\d+){3}|\[::1\])(:\d+)?", re.IGNORECASE)
 _OPEN_S, _CLOSE_S, _PING_S = 3.0, 1.0, 10.0
 # Port scanners and browsers are no news to the user.
 _log = logging.getLogger(f"{__name__}.websockets")
@@ -62,7 +63,7 @@ class LocalServer:
                 f"Nothing can be served at {address}: {error.strerror}.",
                 "Choose another address, or end the program that uses this one.",
             ) from None
-        self._page = page
+        self._page, self._is_local = page, address.is_local
         self._server = serve(
             talk,
             sock=self._listener,
@@ -81,7 +82,13 @@ class LocalServer:
         ).start()
 
     def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
-        """The page for a browser; a WebSocket goes on."""
+        """The page for a browser; a WebSocket goes on.
+
+        Who asks for another name was sent here by it: a web site's, that has been pointed at this
+        machine, would count as this page's own.
+        """
+        if self._is_local and not _LOCAL_HOST.fullmatch(request.headers.get("Host", "localhost")):
+            return connection.respond(HTTPStatus.MISDIRECTED_REQUEST, "Ask for 127.0.0.1.\n")
         if request.headers.get("Upgrade", "").lower() == "websocket":
             return None
         if self._page is None or request.path.split("?")[0] != "/":

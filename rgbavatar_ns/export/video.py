@@ -117,10 +117,16 @@ def _palette_graph(width: int, height: int, rate: int) -> Graph:
 
 
 def write_pngs(folder: Path, frames: Iterable[np.ndarray]) -> int:
-    """Write frames as 00000.png and so on, RGB or RGBA with straight alpha; return their number."""
+    """Write frames as 00000.png and so on, RGB or RGBA with straight alpha; return their number.
+
+    Later numbers, of a longer sequence that was here before, are removed.
+    """
     count = 0
     for count, frame in enumerate(frames, start=1):
         write_png(folder / f"{count - 1:05d}.png", frame)
+    for path in folder.glob("[0-9][0-9][0-9][0-9][0-9].png"):
+        if int(path.stem) >= count:
+            path.unlink()
     return count
 
 

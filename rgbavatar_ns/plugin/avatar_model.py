@@ -89,6 +89,7 @@ class AvatarModel(Model):
         if self.config.refine_tracking:
             self.refinement = frame_refinement(subject, self.config.refinement)
         self.lpips_metric: LPIPSMetric | None = None
+        self.scores: list[dict[str, float]] = []  # of each frame since they were last cleared
 
     @abstractmethod
     def make_avatar(self, head: HeadModel, identity: Tensor, seed: int) -> AvatarMethod:
@@ -189,6 +190,7 @@ class AvatarModel(Model):
         rgba = batch["image_rgba"].to(self.device)[None]
         scores = evaluate_images(image, rgba, self.lpips_metric)
         metrics = {name: value for name, value in scores.items() if isinstance(value, float)}
+        self.scores.append(dict(metrics))
         row = torch.cat([*error_strip(rgba, image, image.new_zeros(3))], dim=2)[0]
         return metrics, {"truth_avatar_error": row}
 

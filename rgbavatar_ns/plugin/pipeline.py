@@ -1,7 +1,6 @@
 """nerfstudio's pipeline with this method's data and model, and LPIPS at evaluation."""
 
-import statistics
-from collections import defaultdict
+import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,7 +14,7 @@ from rich.progress import track
 from torch import Tensor
 
 from rgbavatar_ns.avatar import Avatar
-from rgbavatar_ns.avatar.metrics import LPIPSMetric, evaluate_images, with_sharpness
+from rgbavatar_ns.avatar.metrics import LPIPSMetric, evaluate_images, mean_scores, with_sharpness
 from rgbavatar_ns.avatar.training.batches import ChosenFrames, TrainingBatch
 from rgbavatar_ns.avatar.training.cuda_graph import Recorder, record_cuda_graph
 from rgbavatar_ns.avatar.training.method_step import MethodStep
@@ -155,11 +154,20 @@ class RGBAvatarPipeline(VanillaPipeline):
             metrics["lpips_unavailable"] = lpips.unavailable
         return metrics
 
+    def get_average_image_metrics(self, *given: Any, **named: Any) -> dict[str, Any]:
+        """As nerfstudio's, but scores that some frames have not are the mean of the others'."""
+        self.model.scores.clear()
+        metrics = super().get_average_image_metrics(*given, **named)
+        spreads = [name for name in metrics if name.endswith("_std") and math.isnan(metrics[name])]
+        return {
+            n: v for n, v in (metrics | mean_scores(self.model.scores)).items() if n not in spreads
+        }
+
     @torch.no_grad()
     def _refined_metrics(self) -> dict[str, float]:
         """Means over held-out frames whose theta was fitted to the image, the avatar frozen."""
         tracked, model = self.datamanager.dataparser.tracked, self.config.model
-        size, scores = self.datamanager.config.batch_size, defaultdict[str, list[float]](list)
+        size, scores = self.datamanager.config.batch_size, list[dict[str, float]]()
         count = len(tracked.test)
         fitted = min(model.refine_held_out_frames or count, count)
         every = torch.linspace(0, count - 1, fitted).round().long()
@@ -181,11 +189,9 @@ class RGBAvatarPipeline(VanillaPipeline):
             drawn = self.model.avatar.render(theta, pinhole, backend=model.rasterizer).image
             for image, target in zip(drawn, images):
                 found = evaluate_images(image[None], target[None], self.model.lpips_metric)
-                for name, value in found.items():
-                    if isinstance(value, float):
-                        scores[f"{name}_refined"].append(value)
-        means = {name: statistics.fmean(values) for name, values in scores.items()}
-        return with_sharpness(means, "_refined")
+                numbers = {n: value for n, value in found.items() if isinstance(value, float)}
+                scores.append({f"{name}_refined": value for name, value in numbers.items()})
+        return with_sharpness(mean_scores(scores), "_refined")
 
 
 def _as_batch(cameras: Cameras, batch: dict[str, Any]) -> TrainingBatch:

@@ -34,3 +34,30 @@ def test_where_there_is_no_terminal_nothing_is_heard(monkeypatch):
         assert not listening
     os.close(read)
     os.close(write)
+
+
+_IN_BACKGROUND = """
+import os, sys
+from rgbavatar_ns.cli.keys import on_keys
+if os.fork() == 0:
+    os.setpgid(0, 0)  # as a shell does for a job with &
+    with on_keys({}) as listening:
+        os._exit(7 if listening else 3)
+_, status = os.waitpid(-1, os.WUNTRACED)
+print("stopped" if os.WIFSTOPPED(status) else os.WEXITSTATUS(status), flush=True)
+"""
+
+
+def test_in_the_background_nothing_is_heard_and_nothing_stops():
+    child, ours = pty.fork()
+    if child == 0:
+        os.execv(sys.executable, [sys.executable, "-c", _IN_BACKGROUND])
+    told = b""
+    try:
+        while not told.strip():
+            told += os.read(ours, 1000)
+    finally:
+        os.kill(child, 9)
+        os.waitpid(child, 0)
+        os.close(ours)
+    assert told.strip() == b"3"

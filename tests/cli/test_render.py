@@ -68,6 +68,8 @@ def test_pngs_of_any_size_keep_the_alpha(bundle, data, tmp_path):
     ]
     picture = read_png_rgba(files[0])
     assert picture.shape == (40, 50, 4)
+    _render(bundle, tmp_path, "--data", data, *words[:-1], 2, "--width", 50)
+    assert [f.name for f in tmp_path.rglob("*.png")] == ["00000.png"], "no frame of before"
     assert (picture[0, 0, 3], picture[..., 3].max()) == (0, 255)
 
 
@@ -100,6 +102,8 @@ def test_a_camera_path_sets_size_rate_and_length(bundle, data, tmp_path):
     film = _film(tmp_path / "camera-path.mp4")
     assert len(film) == 5
     assert film[0].shape == (20, 30, 3)
+    with av.open(str(tmp_path / "camera-path.mp4")) as container:
+        assert container.streams.video[0].average_rate == 12
 
 
 def test_a_painted_texture_shows(bundle, data, tmp_path, refused):

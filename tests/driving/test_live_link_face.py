@@ -28,7 +28,7 @@ def test_a_packet_is_read_by_its_bytes():
     assert (read.device, read.subject, read.frame) == ("A1B2", "phone", 90)
     assert read.time_s == pytest.approx(1.5)
     torch.testing.assert_close(read.coefficients, torch.tensor(_ROW))
-    assert read.angles_rad == pytest.approx((0.1, -0.2, 0.3))
+    assert read.angles == pytest.approx((0.1, -0.2, 0.3))
     jaw = ARKIT_NAMES.index("jawOpen")
     assert jaw == 17, "Unreal's order"
     assert read.coefficients[jaw] == pytest.approx(0.17)
@@ -80,7 +80,7 @@ def test_a_damaged_packet_never_gives_what_is_no_number(seed, at):
         return
     assert torch.isfinite(read.coefficients).all()
     assert 0 <= read.coefficients.min() <= read.coefficients.max() <= 1
-    assert all(math.isfinite(angle) for angle in read.angles_rad)
+    assert all(math.isfinite(angle) for angle in read.angles)
     assert math.isfinite(read.time_s)
 
 
@@ -177,3 +177,16 @@ def test_a_taken_port_is_told():
             LiveLinkFaceSource(first.address)
     finally:
         first.close()
+
+
+@pytest.mark.parametrize("sent", [30.0, -170.0, 400.0])
+def test_a_sender_of_degrees_turns_the_head_by_degrees(sent):
+    source = LiveLinkFaceSource("127.0.0.1:0", angle_gain=[math.radians(1)] * 3)
+    host, port = source.address.rsplit(":", 1)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        sender.sendto(packet(_ROW, (sent, 0.0, 0.0)), (host, int(port)))
+        frame = source.next(2.0)
+    source.close()
+    turned = axis_angle_to_matrix(frame.head_rotation)
+    wanted = axis_angle_to_matrix(head_rotation(math.radians(sent), 0.0, 0.0))
+    torch.testing.assert_close(turned, wanted, atol=1e-5, rtol=0)

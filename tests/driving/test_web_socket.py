@@ -1,4 +1,5 @@
 import json
+import socket
 import time
 
 import pytest
@@ -59,6 +60,10 @@ def test_the_avatars_own_theta_comes_in(source):
         ('{"type": "arkit", "pose": {"rotation": [1, 2]}}', "not 3 numbers, but 2"),
         ('{"type": "arkit", "pose": {"rotation": [90, 0, 0]}}', "longer than two turns"),
         ('{"type": "arkit", "pose": 3}', "pose"),
+        (
+            '{"type": "arkit", "coefficients": {"jawOpen": 1' + "0" * 400 + "}}",
+            "no numbers by name",
+        ),
         ('{"type": "theta", "theta": [1, 2]}', "numbers, but 2 values"),
         ('{"type": "theta", "theta": [' + ",".join(["1e30"] * 70) + "]}", "No head does this"),
     ],
@@ -107,3 +112,26 @@ def test_other_machines_reach_it_only_when_asked_for():
     own = PerformerHead(_HEAD.layout, HeadArrays.embedded())
     with pytest.raises(UserError, match="Other machines could reach"):
         WebSocketSource(own, "0.0.0.0:0")
+
+
+def test_who_comes_and_goes_leaves_the_one_who_stays(source):
+    with connect(f"ws://{source.address}") as first:
+        _say(first, type="arkit", coefficients={"jawOpen": 0.1})
+        assert source.next(2.0) is not None
+        with connect(f"ws://{source.address}") as second:
+            _say(second, type="arkit", coefficients={"jawOpen": 0.2})
+            assert source.next(2.0) is not None
+        frame, until_s = None, time.monotonic() + 5
+        while frame is None and time.monotonic() < until_s:
+            _say(first, type="arkit", coefficients={"jawOpen": 0.3})
+            frame = source.next(0.2)
+    assert frame is not None
+    assert frame.coefficients.max() == pytest.approx(0.3)
+
+
+def test_a_name_that_was_pointed_at_this_machine_is_refused(source):
+    host, port = source.address.rsplit(":", 1)
+    for name, answer in (("evil.example", b"421"), ("localhost", b"404"), ("[::1]", b"404")):
+        with socket.create_connection((host, int(port)), 5) as asking:
+            asking.sendall(f"GET / HTTP/1.1\r\nHost: {name}:{port}\r\n\r\n".encode())
+            assert asking.recv(100).split()[1] == answer

@@ -48,7 +48,7 @@ class LiveLinkPacket:
     time_s: float
     """By the device's own count of frames and rate."""
     coefficients: Float[Tensor, "52"]
-    angles_rad: tuple[float, float, float]
+    angles: tuple[float, float, float]
     """Yaw, pitch and roll of the head as sent."""
     out_of_range: int
     """How many coefficients were below 0 or above 1; they are held to it."""
@@ -88,7 +88,7 @@ def parse_packet(packet: bytes) -> LiveLinkPacket:
     if not all(math.isfinite(value) for value in values):
         raise UserError("A packet holds NaN.", "Check the sender.")
     told = torch.tensor(values[: len(ARKIT_NAMES)])
-    yaw, pitch, roll = (math.remainder(value, 2 * math.pi) for value in values[52:55])
+    yaw, pitch, roll = values[52:55]
     rate = numerator / denominator if denominator > 0 else 0.0
     known_rate = rate if 0 < rate <= _MOST_RATE else 60.0
     moment = frame + (part if math.isfinite(part) else 0.0)
@@ -152,7 +152,8 @@ class LiveLinkFaceSource:
             self.counts["values beyond 0..1"] += read.out_of_range
             self.counts["skipped"] += len(waiting) - 1 - place
             self._index += 1
-            turn = head_rotation(*(a * g for a, g in zip(read.angles_rad, self._gain)))
+            angles = (a * g for a, g in zip(read.angles, self._gain))
+            turn = head_rotation(*(math.remainder(angle, 2 * math.pi) for angle in angles))
             return PerformanceFrame(
                 self._index,
                 captured_s,

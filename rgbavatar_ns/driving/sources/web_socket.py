@@ -4,6 +4,7 @@ import contextlib
 import threading
 import time
 from collections import Counter
+from collections.abc import Iterator
 
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.server import ServerConnection
@@ -44,7 +45,7 @@ class WebSocketSource:
         self.counts = Counter[str]()
         self._changed = threading.Condition()
         self._newest: tuple[float, SentPerformance] | None = None
-        self._follows: ServerConnection | None = None
+        self._senders: list[ServerConnection] = []
         self._index = 0
         self._server = LocalServer(listen, allow_remote, self._talk)
         self.waits_for = f'messages "arkit" or "theta" at ws://{self._server.address}'
@@ -74,9 +75,7 @@ class WebSocketSource:
 
     def _talk(self, connection: ServerConnection) -> None:
         told: set[str] = set()
-        with self._changed:
-            self._follows = connection
-        with contextlib.suppress(ConnectionClosed):
+        with self._heard(connection), contextlib.suppress(ConnectionClosed):
             for text in connection:
                 try:
                     message = parse_json(text)
@@ -92,9 +91,20 @@ class WebSocketSource:
                     continue
                 self._take(connection, sent)
 
+    @contextlib.contextmanager
+    def _heard(self, connection: ServerConnection) -> Iterator[None]:
+        """The sender that came last counts, and once it has gone the one before it again."""
+        with self._changed:
+            self._senders.append(connection)
+        try:
+            yield
+        finally:
+            with self._changed:
+                self._senders.remove(connection)
+
     def _take(self, connection: ServerConnection, sent: SentPerformance) -> None:
         with self._changed:
-            if connection is not self._follows:
+            if connection is not self._senders[-1]:
                 self.counts["another sender"] += 1
                 return
             self.counts["skipped"] += self._newest is not None
