@@ -21,14 +21,12 @@ if TYPE_CHECKING:
 
 Show = Literal["comparison", "performance", "views", "orbit", "camera-path", "turntable", "bases"]
 Kind = Literal["mp4", "png", "gif"]
-_ALL_BUT_STILLS: tuple[Show, ...] = (
-    *("performance", "views", "orbit", "camera-path", "turntable"),
-)
+_OF_A_SCENE: tuple[Show, ...] = ("performance", "views", "orbit", "camera-path", "turntable")
 _USED_BY: dict[str, tuple[Show, ...]] = {
-    **dict.fromkeys(("driver", "hold", "kind"), _ALL_BUT_STILLS),
-    "transparent": (*_ALL_BUT_STILLS, "bases"),
+    **dict.fromkeys(("driver", "hold", "kind"), _OF_A_SCENE),
+    "transparent": (*_OF_A_SCENE, "bases"),
     **dict.fromkeys(("width", "height"), ("performance", "views", "orbit", "turntable", "bases")),
-    "frames": ("comparison", *_ALL_BUT_STILLS),
+    "frames": ("comparison", *_OF_A_SCENE),
     "camera-path": ("camera-path",),
     "gain": ("bases",),
     "arc": ("turntable",),

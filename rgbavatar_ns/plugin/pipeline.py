@@ -159,9 +159,9 @@ class RGBAvatarPipeline(VanillaPipeline):
         self.model.scores.clear()
         metrics = super().get_average_image_metrics(*given, **named)
         spreads = [name for name in metrics if name.endswith("_std") and math.isnan(metrics[name])]
-        return {
-            n: v for n, v in (metrics | mean_scores(self.model.scores)).items() if n not in spreads
-        }
+        metrics |= mean_scores(self.model.scores)
+        # Of a single frame, or of scores that are missing: JSON knows no NaN.
+        return {name: value for name, value in metrics.items() if name not in spreads}
 
     @torch.no_grad()
     def _refined_metrics(self) -> dict[str, float]:
