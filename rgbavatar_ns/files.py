@@ -222,6 +222,11 @@ class Stages:
         self.seconds[name] = known["seconds"]
         return known["result"]
 
+    def known(self, name: str) -> Any:
+        """The stage's last result, whatever it was made from; None where it was never done."""
+        known = self._done.get(name)
+        return None if known is None else known["result"]
+
     def _next_key(self, name: str, made_from: Any) -> str:
         text = json.dumps([self._key, name, made_from], sort_keys=True, default=str)
         return digest([text])[:_DIGEST_DIGITS]

@@ -1,14 +1,12 @@
 """`rgbavatar demo`: from nothing (or from a video) to a trained avatar, through nerfstudio."""
 
-import shlex
 import sys
 import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
-from rich.console import Console
-
+from rgbavatar_ns.cli.console import command_line, plain_console
 from rgbavatar_ns.cli.progress import progress_bar, stage_bars
 from rgbavatar_ns.cli.track import suited_method
 from rgbavatar_ns.errors import UserError
@@ -65,6 +63,7 @@ def run(
     output = output.resolve()
     stages = Stages(output, fresh=fresh, tell=_tell_stage)
     if video:
+        _require_same_people(stages, video, output)
         if tiny and image_size is None:
             image_size = _TINY_PX
         settings: dict[str, Any] = {"video": [_fingerprint(clip) for clip in video]}
@@ -109,6 +108,16 @@ def run(
     _tell(summary, output)
 
 
+def _require_same_people(stages: Stages, video: tuple[Path, ...], output: Path) -> None:
+    """Raise UserError where the folder has the avatar of another film, which reads its data."""
+    films = (stages.known("track") or {}).get("films")
+    if films is not None and films != [str(clip.resolve()) for clip in video]:
+        raise UserError(
+            f"{output} has the avatar of another film, {', '.join(films)}.",
+            "Name another folder (--output), or replace that avatar (--fresh).",
+        )
+
+
 def _fingerprint(path: Path) -> tuple[str, int, float]:
     facts = path.stat()
     return str(path.resolve()), facts.st_size, facts.st_mtime
@@ -137,7 +146,8 @@ def _track(
     config = TrackConfig(image_size=image_size, head_only=head_only, overwrite=True)
     with stage_bars("frames") as update:
         dataset = track_video(video, destination, config, progress=update)
-    return {"data": str(destination), "image_size": dataset.width}
+    films = [str(clip.resolve()) for clip in video]
+    return {"data": str(destination), "image_size": dataset.width, "films": films}
 
 
 def _train(
@@ -186,11 +196,11 @@ def _film(run_folder: Path, data: Path, output: Path) -> Result:
 
 
 def _tell_stage(name: str, seconds: float | None) -> None:
-    console = Console()
+    console = plain_console()
     if seconds is None:
         console.rule(name)
     else:
-        console.print(f"[dim]{name}: done before ({seconds:.0f} s)[/dim]")
+        console.print(f"{name}: done before ({seconds:.0f} s)", style="dim")
 
 
 def _tell(summary: dict[str, Any], output: Path) -> None:
@@ -218,12 +228,12 @@ def _tell(summary: dict[str, Any], output: Path) -> None:
         )
     if lpips is not None:
         rows["held-out LPIPS"] = f"{lpips:.4f} (VGG)"
-    console = Console(soft_wrap=True, highlight=False)
+    console = plain_console()
     console.rule("done")
     for name, value in rows.items():
         console.print(f"{name:<15} {value}")
 
 
 def _command(program: str, *words: str | Path) -> str:
-    """As a shell takes it, of this environment, also where a path has spaces."""
-    return shlex.join([str(Path(sys.executable).with_name(program)), *map(str, words)])
+    """Of this environment."""
+    return command_line(Path(sys.executable).with_name(program), *words)

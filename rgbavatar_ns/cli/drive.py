@@ -1,6 +1,5 @@
 """`rgbavatar drive`: an avatar moved by a camera, a phone, a film or any program."""
 
-import functools
 import sys
 import tempfile
 import threading
@@ -113,12 +112,12 @@ def run(
     outputs: list[DriveOutput] = []
     drive = LiveDrive(performer, transfer, outputs, real_time, _tell)
     try:
-        if show.out is not None:
-            outputs.append(_pictures(subject, show))
         if shown == "page":
             outputs.append(_page(subject, show, source.allow_remote, drive.calibrate))
         if shown == "viewer":
             outputs.append(_viewer(run_folder, drive))
+        if show.out is not None:  # The last: nothing is left half-written where another fails.
+            outputs.append(_pictures(subject, show))
         with on_keys({"c": drive.calibrate, "q": drive.stop}) as heard:
             _tell("c: learn the neutral face again, q: end." if heard else "Ctrl-C ends.")
             _run(drive, show.seconds)
@@ -180,12 +179,11 @@ def _performer(
 
         rate = options.source_frames_per_second or _CSV_FRAMES_PER_SECOND
         return csv_source(path, rate, real_time, options.head_angles)
-    if path.is_dir() and _is_dataset(path):
+    if path.is_dir() and (folder := _dataset_of(path)) is not None:
         from rgbavatar_ns.driving.sources.dataset import dataset_source
-        from rgbavatar_ns.export import dataset_folder
 
         rate = options.source_frames_per_second or _FRAMES_PER_SECOND
-        return dataset_source(dataset_folder(path), rate, real_time, with_images)
+        return dataset_source(folder, rate, real_time, with_images)
     try:
         from rgbavatar_ns.tracking.performer import FilmedPerformer
     except ImportError as error:
@@ -195,16 +193,13 @@ def _performer(
     return FilmedPerformer(_camera(name), real_time, with_images)
 
 
-def _is_dataset(folder: Path) -> bool:
-    """Whether it is a dataset or a run rather than a folder of images."""
-    from rgbavatar_ns.data import load_dataset
+def _dataset_of(folder: Path) -> Path | None:
+    """The dataset that the folder is, or as a run names; None for a folder of images."""
+    from rgbavatar_ns.data import is_dataset
     from rgbavatar_ns.export import dataset_folder
 
-    try:
-        load_dataset(dataset_folder(folder))
-    except UserError:
-        return False
-    return True
+    named = dataset_folder(folder)
+    return named if named != folder or is_dataset(named) else None
 
 
 def _camera(name: str) -> str:
@@ -255,15 +250,12 @@ def _page(
     from rgbavatar_ns.export.live_page import DEFAULT_ADDRESS, PageOutput
 
     avatar = require_rgbavatar(subject.avatar, "A page (--show page)")
+    content = _page_content(avatar, subject, show)  # Now: nobody who asks has to wait for it.
     output = PageOutput(
-        avatar.layout,
-        show.serve or DEFAULT_ADDRESS,
-        allow_remote,
-        functools.cache(lambda: _page_content(avatar, subject, show)),
-        calibrate,
+        avatar.layout, show.serve or DEFAULT_ADDRESS, allow_remote, lambda: content, calibrate
     )
     _tell(f"Open http://{output.address}/?ws=ws://{output.address}")
-    _tell(f"or a page of this avatar (rgbavatar export) with ?ws=ws://{output.address}")
+    _tell(f"or a page of this avatar (rgbavatar export) with ?ws=ws://{output.keyed_address}")
     return output
 
 
@@ -278,7 +270,8 @@ def _page_content(avatar: "Avatar", subject: "Subject", show: ShowOptions) -> by
         avatar = as_filmed(avatar, dataset)
     neutral = calm_theta(seen, seen.theta_mean)
     with tempfile.TemporaryDirectory() as folder:
-        path, options = Path(folder) / "page.html", PageOptions(background=show.background)
+        path = Path(folder) / "page.html"
+        options = PageOptions(background=show.background, own_server=True)
         nothing = torch.zeros(0, avatar.layout.size)
         write_web_page(avatar, path, subject.camera, nothing, options, seen, neutral)
         return path.read_bytes()

@@ -4,8 +4,8 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
-from rich.console import Console
 
+from rgbavatar_ns.cli.console import command_line, plain_console
 from rgbavatar_ns.cli.progress import stage_bars
 from rgbavatar_ns.data.importers import ImportOptions, import_dataset
 
@@ -29,14 +29,16 @@ def run(
     """
     with stage_bars("files") as update:
         dataset = import_dataset(src, dst, options, overwrite=overwrite, progress=update)
-    console = Console(soft_wrap=True, highlight=False)
+    console = plain_console()
     console.print(f"recognised: {dataset.source.get('format')}, head {dataset.arrays.name}")
     for note in dataset.source.get("notes", ()):
-        console.print(f"note: {note}", markup=False)
+        console.print(f"note: {note}")
     cameras = len(set(dataset.camera_names))
     seen_by = f" of {cameras} cameras" if cameras else ""
     console.print(
         f"{len(dataset.train)} frames{seen_by} to train on, {len(dataset.test)} held out, "
         f"{dataset.width} x {dataset.height} pixels, in {dst}"
     )
-    console.print(f"Then: rgbavatar check {dst}; ns-train rgbavatar --data {dst}")
+    look = command_line("rgbavatar", "check", dst)
+    train = command_line("ns-train", "rgbavatar", "--data", dst)
+    console.print(f"Then: {look}; {train}")

@@ -1,8 +1,10 @@
 """The `rgbavatar` command: finds the sub-command and imports only what that one needs."""
 
+import contextlib
 import functools
 import importlib
 import inspect
+import os
 import signal
 import sys
 import threading
@@ -47,6 +49,17 @@ def _help() -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
+    """Run one sub-command; whoever reads its output may leave (`| head`)."""
+    try:
+        _run(arguments)
+    finally:
+        try:
+            sys.stdout.flush()
+        except BrokenPipeError:  # Python would complain when it ends.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def _run(arguments: Sequence[str] | None) -> None:
     """Run one sub-command; a mistake of the user's is told without a traceback (exit code 1).
 
     So is what the system refuses: a full disk, a path, a right. SIGTERM ends like Ctrl-C, so that
@@ -55,7 +68,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     name = arguments[0] if arguments else "--help"
     if name in ("--help", "-h"):
-        print(_help())
+        with contextlib.suppress(BrokenPipeError):
+            print(_help())
         return
     if name not in COMMANDS:
         print(f"There is no command {name!r}.\n\n{_help()}", file=sys.stderr)

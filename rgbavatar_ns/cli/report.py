@@ -4,9 +4,9 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
-from rich.console import Console
 from rich.markdown import Markdown
 
+from rgbavatar_ns.cli.console import plain_console
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.experiments import read_experiment
 from rgbavatar_ns.experiments.report import write_report
@@ -33,7 +33,7 @@ def run(
         into: instead, write what the folders tell as INTO/results/NAME.json with small pictures,
             and INTO/results.md from all results that lie there; without folders that page alone.
     """
-    console = Console()
+    console = plain_console()
     paths: list[Path] = []
     if into is not None:
         for folder in folders:
@@ -51,7 +51,7 @@ def run(
                 experiments = [source.experiment for source in read_sources(folder)]
             for experiment in experiments:
                 report = write_report(experiment, folder, plots=plots)
-                console.print(Markdown(report.table.to_markdown()))
+                console.print(Markdown(report.table.to_markdown()), soft_wrap=False)
                 paths += report.paths
     for path in paths:
-        console.print(str(path), soft_wrap=True, highlight=False)
+        console.print(str(path))

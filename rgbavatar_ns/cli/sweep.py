@@ -1,16 +1,16 @@
 """`rgbavatar sweep`: every cell of an experiment that is not done yet."""
 
-import shlex
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
-from rich.console import Console
 from rich.live import Live
 from rich.table import Table
+from rich.text import Text
 
+from rgbavatar_ns.cli.console import command_line, plain_console
 from rgbavatar_ns.experiments import read_experiment
 from rgbavatar_ns.experiments.engines import Engine, LocalEngine, RayEngine
 from rgbavatar_ns.experiments.sweep import CellStatus, sweep
@@ -51,9 +51,9 @@ def run(
     experiment = read_experiment(file, tiny=tiny, subjects=subjects)
     name = f"{experiment.name}-tiny" if tiny else experiment.name
     folder = (output or Path("outputs") / "sweeps" / name).resolve()
-    console = Console()
+    console = plain_console()
     chosen: Engine = LocalEngine(at_once) if engine == "local" else RayEngine(address, cpus, gpus)
-    with Live(console=console, refresh_per_second=1) as live:
+    with Live(console=plain_console(soft_wrap=False), refresh_per_second=1) as live:
         statuses = sweep(
             experiment,
             folder,
@@ -64,15 +64,12 @@ def run(
     console.print()
     failed = {status.folder: status for status in statuses if status.state != "done"}
     for status in failed.values():
-        console.print(f"[red]failed:[/red] {status.cell.variant}, {status.folder}", soft_wrap=True)
-        console.print("\n".join(f"    {line}" for line in status.why), markup=False, soft_wrap=True)
-    report = f"rgbavatar report {folder} --file {file}" + (" --tiny" if tiny else "")
-    report += f" --subjects {shlex.join(subjects)}" if subjects else ""
-    console.print(
-        f"{len(statuses) - len(failed)} of {len(statuses)} cells done; {report}",
-        soft_wrap=True,
-        highlight=False,
-    )
+        console.print("failed:", style="red", end=" ")
+        console.print(f"{status.cell.variant}, {status.folder}")
+        console.print("\n".join(f"    {line}" for line in status.why))
+    options = [*["--tiny"] * tiny, *(["--subjects", *subjects] if subjects else [])]
+    report = command_line("rgbavatar", "report", folder, "--file", file, *options)
+    console.print(f"{len(statuses) - len(failed)} of {len(statuses)} cells done; {report}")
     if failed:
         sys.exit(1)
 
@@ -81,12 +78,11 @@ def _table(statuses: Sequence[CellStatus]) -> Table:
     table = Table("variant", "subject", "seed", "state", "PSNR")
     for status in statuses:
         score = (status.result or {}).get("metrics", {}).get("psnr")
-        style = _STYLE[status.state]
         table.add_row(
             status.cell.variant,
             Path(status.cell.subject).name,
             str(status.cell.seed),
-            f"[{style}]{status.state}[/{style}]",
+            Text(status.state, style=_STYLE[status.state]),
             "" if score is None else f"{score:.2f}",
         )
     return table

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
-from rich.console import Console
 from rich.table import Table
 
+from rgbavatar_ns.cli.console import command_line, plain_console
 from rgbavatar_ns.cli.progress import stage_bars
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.tracking import TrackConfig, track_video
@@ -50,16 +50,19 @@ def run(
         )
         sys.exit(130)
     report = json.loads((dst / "tracking.json").read_text())
-    console = Console(soft_wrap=True, highlight=False)
+    console = plain_console()
     console.print(summary_table(report))
     console.print(f"{report['verdict']}", style="bold")
     for line in report["film"]["in_words"]:
         console.print(line)
     for note in report["notes"]:
         console.print(f"note: {note}")
-    print(f"{len(dataset.train)} frames to train on, {len(dataset.test)} held out, in {dst}")
-    print(f"Look at {dst / 'overlay.png'}: the mesh should lie on the face.")
-    print(f"Then: ns-train {suited_method(dataset.width)} --data {dst}")
+    console.print(
+        f"{len(dataset.train)} frames to train on, {len(dataset.test)} held out, in {dst}"
+    )
+    console.print(f"Look at {dst / 'overlay.png'}: the mesh should lie on the face.")
+    train = command_line("ns-train", suited_method(dataset.width), "--data", dst)
+    console.print(f"Then: {train}")
 
 
 def suited_method(image_size: int) -> str:

@@ -25,12 +25,19 @@ def load_dataset(
     """
     root, options = Path(path), options or ImportOptions()
     own = os.path.exists(root / INDEX_FILE) and options.format is None
-    if own or not os.path.isdir(root) or find_format(root, options) is None:
+    if own or not is_dataset(root, options):
         return load_native(root)
     if progress is not None:
         return open_foreign(root, options, progress)
     with _bars() as shown:
         return open_foreign(root, options, shown)
+
+
+def is_dataset(path: Path, options: ImportOptions | None = None) -> bool:
+    """Whether the folder is one of ours or of a known system, damaged or not."""
+    if os.path.exists(path / INDEX_FILE):
+        return True
+    return os.path.isdir(path) and find_format(path, options or ImportOptions()) is not None
 
 
 @contextmanager

@@ -1,9 +1,10 @@
 """From a performance to whatever shows the avatar, as it happens; how late it is."""
 
+import contextlib
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -111,6 +112,20 @@ class FrameTransfer(Protocol):
         ...
 
 
+@contextlib.contextmanager
+def _closed_after(one: PerformanceSource | DriveOutput) -> Iterator[None]:
+    """Close it at the end; an error under way goes before what closing has to say."""
+    failed = False
+    try:
+        yield
+    except Exception:
+        failed = True
+        raise
+    finally:
+        with contextlib.suppress(Exception) if failed else contextlib.nullcontext():
+            one.close()
+
+
 class LiveDrive:
     """Follows a source in a thread of its own and shows each frame from the caller's.
 
@@ -151,29 +166,33 @@ class LiveDrive:
         """Show the performance until its end, `stop`, or Ctrl-C; raises what the source raised."""
         follower = threading.Thread(target=self._follow, name="rgbavatar performer", daemon=True)
         follower.start()
+        with contextlib.ExitStack() as closing:
+            for one in (self._source, *self._outputs):
+                closing.enter_context(_closed_after(one))
+            try:
+                self._show_performance()
+            finally:
+                self.stop()
+                follower.join(timeout=10.0)
+            if self._trouble is not None:
+                raise self._trouble
+
+    def _show_performance(self) -> None:
+        """Until it is over; tells how it goes."""
         silent_since_s = told_s = time.monotonic()
-        try:
-            while (frame := self._next()) is not None or not self._over():
-                now_s = time.monotonic()
-                if frame is not None:
-                    silent_since_s = now_s
-                    for output in self._outputs:
-                        output.show(frame)
-                    self.shown += 1
-                if time.monotonic() - told_s > _TOLD_EVERY_S:
-                    told_s = time.monotonic()
-                    line = self._told(told_s - silent_since_s)
-                    self._tell(line)
-                    for output in self._outputs:
-                        output.tell(line)
-        finally:
-            self.stop()
-            follower.join(timeout=10.0)
-            self._source.close()
-            for output in self._outputs:
-                output.close()
-        if self._trouble is not None:
-            raise self._trouble
+        while (frame := self._next()) is not None or not self._over():
+            now_s = time.monotonic()
+            if frame is not None:
+                silent_since_s = now_s
+                for output in self._outputs:
+                    output.show(frame)
+                self.shown += 1
+            if time.monotonic() - told_s > _TOLD_EVERY_S:
+                told_s = time.monotonic()
+                line = self._told(told_s - silent_since_s)
+                self._tell(line)
+                for output in self._outputs:
+                    output.tell(line)
 
     def _told(self, silent_s: float) -> str:
         if silent_s > _SILENT_S:

@@ -1,7 +1,10 @@
 """A WebSocket server for programs and pages of this machine."""
 
+import ipaddress
 import logging
 import re
+import secrets
+import socket
 import threading
 from collections.abc import Callable
 from http import HTTPStatus
@@ -9,20 +12,15 @@ from http import HTTPStatus
 from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 from websockets.sync.server import ServerConnection, serve
-from websockets.typing import Origin
 
 from rgbavatar_ns.data.streams.address import StreamAddress
 from rgbavatar_ns.data.streams.listener import BoundedListener
 from rgbavatar_ns.driving.messages import LARGEST_MESSAGE
 from rgbavatar_ns.errors import UserError
 
-LOCAL_ORIGINS = (
-    None,
-    Origin("null"),
-    re.compile(r"https?://(localhost|127\.0\.0\.1|\[::1\])(:\d+)?"),
-)
-"""Programs name no origin, a page from the disk "null"; of the web only pages of this machine."""
-_LOCAL_HOST = re.compile(r"(localhost|127(\.\d+){3}|\[::1\])(:\d+)?", re.IGNORECASE)
+_LOCAL_NAME = r"(localhost|127(\.\d+){3}|\[::1\])(:\d+)?"
+_LOCAL_HOST = re.compile(_LOCAL_NAME, re.IGNORECASE)
+_LOCAL_ORIGIN = re.compile(f"https?://{_LOCAL_NAME}", re.IGNORECASE)
 _OPEN_S, _CLOSE_S, _PING_S = 3.0, 1.0, 10.0
 # Port scanners and browsers are no news to the user.
 _log = logging.getLogger(f"{__name__}.websockets")
@@ -31,6 +29,10 @@ _log.setLevel(logging.CRITICAL)
 
 class LocalServer:
     """Listens and runs `talk` for each connection in a thread of its own.
+
+    Programs are welcome, and so are pages of this machine and this server's own. A page from the
+    disk has the origin "null", but so has any web site's sandboxed frame: it shows that it is the
+    user's by the key in the address (`keyed_address`), which is another each time.
 
     Args:
         listen: HOST:PORT (port 0: any that is free, see `address`).
@@ -63,11 +65,10 @@ class LocalServer:
                 f"Nothing can be served at {address}: {error.strerror}.",
                 "Choose another address, or end the program that uses this one.",
             ) from None
-        self._page, self._is_local = page, address.is_local
+        self._page, self._is_local, self._origins = page, address.is_local, origins
         self._server = serve(
             talk,
             sock=self._listener,
-            origins=[*LOCAL_ORIGINS, *map(Origin, origins)],
             process_request=self._answer,
             compression=None,
             open_timeout=_OPEN_S,
@@ -76,21 +77,36 @@ class LocalServer:
             max_size=LARGEST_MESSAGE,
             logger=_log,
         )
-        self.address = str(StreamAddress(*self._server.socket.getsockname()[:2]))
+        host, port = self._server.socket.getsockname()[:2]
+        number = ipaddress.ip_address(host)
+        reached = _own_number(number.version) if number.is_unspecified else host
+        self.address = str(StreamAddress(reached, port))
+        """As a browser takes it; other machines' too, where they can reach it."""
+        self._key = secrets.token_urlsafe(9)
+        at_home = "127.0.0.1" if number.version == 4 else "localhost"
+        own = at_home if number.is_unspecified or number.is_loopback else reached
+        self.keyed_address = f"{StreamAddress(own, port)}/{self._key}"
+        """The same for a page from this machine's disk."""
         threading.Thread(
             target=self._server.serve_forever, name="rgbavatar pages", daemon=True
         ).start()
 
     def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
-        """The page for a browser; a WebSocket goes on.
+        """The page for a browser; a WebSocket of somebody who is welcome goes on.
 
         Who asks for another name was sent here by it: a web site's, that has been pointed at this
         machine, would count as this page's own.
         """
-        if self._is_local and not _LOCAL_HOST.fullmatch(request.headers.get("Host", "localhost")):
-            return connection.respond(HTTPStatus.MISDIRECTED_REQUEST, "Ask for 127.0.0.1.\n")
+        host = request.headers.get("Host", "localhost")
+        if not (_LOCAL_HOST.fullmatch(host) or (not self._is_local and _is_this_machine(host))):
+            return connection.respond(
+                HTTPStatus.MISDIRECTED_REQUEST,
+                "Ask for this machine's number, such as 127.0.0.1.\n",
+            )
         if request.headers.get("Upgrade", "").lower() == "websocket":
-            return None
+            if self._is_welcome(request.headers.get("Origin"), host, request.path):
+                return None
+            return connection.respond(HTTPStatus.FORBIDDEN, "Not from this page.\n")
         if self._page is None or request.path.split("?")[0] != "/":
             return connection.respond(HTTPStatus.NOT_FOUND, "Nothing is here.\n")
         content = self._page()
@@ -104,7 +120,43 @@ class LocalServer:
         )
         return Response(HTTPStatus.OK, "OK", headers, content)
 
+    def _is_welcome(self, origin: str | None, host: str, path: str) -> bool:
+        """Whether who asked for this host and path may speak; programs name no origin."""
+        if origin == "null":
+            return secrets.compare_digest(path.encode(), f"/{self._key}".encode())
+        if origin is None or origin in self._origins or _LOCAL_ORIGIN.fullmatch(origin):
+            return True
+        return not self._is_local and origin == f"http://{host}"
+
     def close(self) -> None:
         """Hang up on all and stop listening."""
         self._listener.hang_up_on_all()
         self._server.shutdown()
+
+
+def _own_number(version: int) -> str:
+    """The number by which others of its network know this machine; nothing is sent to find it."""
+    family, elsewhere, home = (
+        (socket.AF_INET, "192.0.2.1", "127.0.0.1")
+        if version == 4
+        else (socket.AF_INET6, "2001:db8::1", "::1")
+    )
+    try:
+        with socket.socket(family, socket.SOCK_DGRAM) as unsent:
+            unsent.connect((elsewhere, 9))
+            return unsent.getsockname()[0]
+    except OSError:
+        return home
+
+
+def _is_this_machine(host: str) -> bool:
+    """Whether a browser that asks for it can only mean this machine: a number, or its own name."""
+    name = re.sub(r":\d+$", "", host).lower()
+    own = socket.gethostname().lower()
+    if name in {own, f"{own}.local"}:
+        return True
+    try:
+        ipaddress.ip_address(name.strip("[]"))
+    except ValueError:
+        return False
+    return True

@@ -24,7 +24,8 @@ _REMEMBERED = 500
 class PageOutput:
     """Sends each driven frame's theta to all pages that are open, the newest to slow ones.
 
-    Browsers that ask for the address itself get `page`. A page answers with what it has shown,
+    Browsers that ask for the address itself get `page`; one from the disk connects to
+    `keyed_address`. A page answers with what it has shown,
     which makes the latency, and may ask for a calibration. Raises UserError as `LocalServer`.
     """
 
@@ -46,7 +47,7 @@ class PageOutput:
         self._closed = False
         self.pages = 0
         self._server = LocalServer(listen, allow_remote, self._talk, page, origins)
-        self.address = self._server.address
+        self.address, self.keyed_address = self._server.address, self._server.keyed_address
 
     def show(self, frame: DrivenFrame) -> None:
         """Send the frame to all pages."""

@@ -39,6 +39,8 @@ class PageOptions:
     """Of other pages whose messages (postMessage) it takes, such as https://example.org."""
     servers: tuple[str, ...] = ()
     """That may drive it (`?ws=`) beside programs on its own machine, such as wss://example.org."""
+    own_server: bool = False
+    """Whether the server that a browser has it from may drive it too."""
 
     def __post_init__(self) -> None:
         """Raise UserError for what is no origin or no server."""
@@ -100,12 +102,17 @@ def _assemble(parts: list[bytes], options: PageOptions) -> str:
         for part in parts
     )
     loopback = [f"{scheme}://{host}:*" for scheme in ("ws", "wss") for host in _LOOPBACK]
+    page = {
+        "origins": options.origins,
+        "servers": options.servers,
+        "own_server": options.own_server,
+    }
     filled = {
         "title": html.escape(options.title),
-        "connect": " ".join([*loopback, *options.servers]),
+        "connect": " ".join([*loopback, *options.servers, *["'self'"] * options.own_server]),
         "style": web_text("style.css"),
         "scripts": scripts,
-        "page": _within_script({"origins": options.origins, "servers": options.servers}),
+        "page": _within_script(page),
         "parts": payload,
     }
     # In one pass: what is filled in is not looked at again.

@@ -11,6 +11,7 @@ from rgbavatar_ns.avatar.loading import load_avatar
 from rgbavatar_ns.cli import demo
 from rgbavatar_ns.cli.main import main
 from rgbavatar_ns.export.run_data import dataset_folder
+from rgbavatar_ns.files import write_json
 
 OPTIONS = ["--frames", "12", "--image-size", "48", "--steps", "12"]
 
@@ -86,3 +87,22 @@ def test_a_video_is_made_sharp_where_it_shows_enough_and_small_when_asked_for(
     main(["demo", "--video", str(clip), "--output", str(tmp_path / "out"), *options])
     assert (asked["method"], asked["size"]) == (method, size)
     assert "--pipeline.model.refine-tracking" in asked["options"]
+
+
+def test_another_film_of_the_same_name_does_not_replace_an_avatars_data(
+    tmp_path, monkeypatch, refused
+):
+    """Cameras count their films, so that two people's may both be IMG_0001."""
+    clips = [tmp_path / place / "IMG_0001.mp4" for place in ("a", "b")]
+    for clip in clips:
+        clip.parent.mkdir()
+        clip.touch()
+    done = {"key": "", "seconds": 1.0}
+    film = str(clips[0].resolve())
+    output = tmp_path / "outputs" / "IMG_0001"
+    stage = done | {"result": {"data": "data", "image_size": 256, "films": [film]}}
+    write_json(output / "stages.json", {"track": stage})
+    monkeypatch.chdir(tmp_path)
+    told = refused("demo", "--video", clips[1])
+    assert f"has the avatar of another film, {film}" in told
+    assert "--output" in told

@@ -1,6 +1,8 @@
 """`rgbavatar drive`: what is performed is shown, every mistake is told."""
 
 import json
+import re
+import shutil
 import socket
 import subprocess
 import sys
@@ -16,7 +18,7 @@ import torch
 from websockets.sync.client import connect
 
 from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
-from rgbavatar_ns.cli.drive import SourceOptions, _is_dataset
+from rgbavatar_ns.cli.drive import SourceOptions
 from rgbavatar_ns.cli.main import main
 from rgbavatar_ns.data import DatasetWriter, TrackedFrame
 from rgbavatar_ns.export import front_camera, pictures
@@ -133,7 +135,7 @@ def test_the_page_is_served_and_driven(avatar, performer, capsys):
     driving.start()
     for _ in range(300):
         try:
-            page = connect(f"ws://127.0.0.1:{port}", origin="null")  # type: ignore[arg-type]
+            page = connect(f"ws://127.0.0.1:{port}", origin=f"http://127.0.0.1:{port}")  # type: ignore[arg-type]
             break
         except OSError:
             time.sleep(0.05)
@@ -148,7 +150,9 @@ def test_the_page_is_served_and_driven(avatar, performer, capsys):
     assert frames[0]["theta"] != frames[-1]["theta"]
     driving.join(timeout=60)
     assert not driving.is_alive()
-    assert f"http://127.0.0.1:{port}/?ws=ws://127.0.0.1:{port}" in capsys.readouterr().err
+    told = capsys.readouterr().err
+    assert f"http://127.0.0.1:{port}/?ws=ws://127.0.0.1:{port}\n" in told
+    assert re.search(f"[?]ws=ws://127.0.0.1:{port}/[-_A-Za-z0-9]{{12}}\n", told), "for the disk's"
 
 
 @pytest.mark.parametrize(
@@ -167,6 +171,17 @@ def test_mistakes_are_told(avatar, refused, words, told):
     assert told in refused("drive", avatar, *words)
 
 
+def test_a_damaged_dataset_is_told_as_one_and_is_no_folder_of_images(
+    avatar, performer, refused, tmp_path
+):
+    damaged = tmp_path / "damaged"
+    shutil.copytree(performer, damaged)
+    (damaged / "dataset.json").write_text("{")
+    told = refused("drive", avatar, "--source", damaged, "--out", tmp_path / "f.mp4")
+    assert "dataset.json" in told
+    assert not (tmp_path / "f.mp4").exists()
+
+
 def test_what_cannot_be_written_is_told(avatar, performer, refused, tmp_path):
     drive = ["drive", avatar, "--source", performer]
     assert "Pictures cannot go to film.avi" in refused(*drive, "--out", "film.avi")
@@ -178,12 +193,6 @@ def test_what_cannot_be_written_is_told(avatar, performer, refused, tmp_path):
 def test_a_bundle_that_knows_nothing_of_its_film_is_told(bundle, performer, refused):
     told = refused("drive", bundle, "--source", performer, "--out", "f.mp4")
     assert "does not name its dataset" in told
-
-
-def test_a_run_is_a_performance_and_pictures_are_none(performer, tmp_path):
-    assert _is_dataset(performer)
-    (tmp_path / "pictures").mkdir()
-    assert not _is_dataset(tmp_path / "pictures")
 
 
 def test_options_out_of_range_are_told(avatar, refused):

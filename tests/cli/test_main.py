@@ -1,3 +1,7 @@
+import os
+import subprocess
+import sys
+
 import pytest
 
 from rgbavatar_ns.cli import main as cli
@@ -20,6 +24,18 @@ def test_a_users_mistake_is_told_in_one_line_without_a_traceback(refused, tmp_pa
     told = refused("demo", "--output", tmp_path, "--video", tmp_path / "none.mp4")
     assert "none.mp4" in told
     assert len(told.strip().splitlines()) == 1
+
+
+@pytest.mark.parametrize("buffered", [True, False])
+def test_who_reads_the_output_may_leave(buffered):
+    program = "from rgbavatar_ns.cli.main import main; main(['--help'])"
+    env = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
+    reader, writer = os.pipe()
+    os.close(reader)
+    words = [sys.executable, *["-u"] * (not buffered), "-c", program]
+    ended = subprocess.run(words, stdout=writer, stderr=subprocess.PIPE, env=env, check=False)
+    os.close(writer)
+    assert (ended.returncode, ended.stderr) == (0, b"")
 
 
 @pytest.mark.parametrize("name", list(cli.COMMANDS))

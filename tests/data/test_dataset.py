@@ -10,7 +10,7 @@ import pytest
 import torch
 from PIL import Image
 
-from rgbavatar_ns.data import DatasetWriter, load_dataset
+from rgbavatar_ns.data import DatasetWriter, is_dataset, load_dataset
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.kernels.constants import UNFILMED_RGBA
@@ -327,3 +327,14 @@ def test_other_kinds_of_png_become_rgba(folder, stored, expected):
     picture = np.broadcast_to(stored, (HEIGHT, WIDTH, *stored.shape)).copy()
     cv2.imwrite(str(folder / "images/00001.png"), picture)
     assert tuple(load_dataset(folder).read_image(1)[2, 2]) == expected
+
+
+def test_a_dataset_is_known_by_its_index_also_a_damaged_one(folder):
+    pictures = folder.parent / "pictures"
+    pictures.mkdir()
+    (pictures / "0.png").touch()
+    assert not is_dataset(pictures)
+    assert not is_dataset(folder.parent / "nothing")
+    assert is_dataset(folder)
+    (folder / "dataset.json").write_text("{")
+    assert is_dataset(folder)

@@ -72,6 +72,14 @@ class _Output:
         self.closed = True
 
 
+class _Empty(_Output):
+    """As a film: without a picture it fails when it is closed."""
+
+    def close(self):
+        super().close()
+        raise UserError("film.mp4 has no picture.", "Show a face.")
+
+
 def test_offline_every_frame_is_shown_in_order():
     source, output = _Source(50), _Output(0.002)
     LiveDrive(source, _Transfer(), [output], real_time=False).run()
@@ -132,6 +140,24 @@ def test_the_sources_error_is_told_after_everything_is_closed():
     assert output.seen == [1, 2, 3]
     assert source.closed
     assert output.closed
+
+
+def test_what_ends_it_is_told_rather_than_the_film_that_it_leaves_empty():
+    gone = UserError("The camera is gone.", "Connect it.")
+    source, film, page = _Source(0, error=gone), _Empty(), _Output()
+    with pytest.raises(UserError, match="camera is gone"):
+        LiveDrive(source, _Transfer(), [film, page]).run()
+    assert source.closed
+    assert film.closed
+    assert page.closed
+
+
+def test_an_empty_film_is_told_after_everything_is_closed():
+    source, film, page = _Source(0), _Empty(), _Output()
+    with pytest.raises(UserError, match="has no picture"):
+        LiveDrive(source, _Transfer(), [page, film, page]).run()
+    assert source.closed
+    assert page.closed
 
 
 def test_an_outputs_error_ends_the_source_too():

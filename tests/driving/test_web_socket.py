@@ -99,13 +99,36 @@ def test_the_newest_message_counts_and_the_last_who_came(source):
 
 
 def test_pages_of_this_machine_may_speak_and_others_may_not(source):
-    for origin in ("null", "http://localhost:3000", "http://127.0.0.1:8000"):
+    for origin in ("http://localhost:3000", "http://127.0.0.1:8000"):
         with connect(f"ws://{source.address}", origin=origin) as client:
             _say(client, type="arkit", coefficients={})
             assert source.next(2.0) is not None
     for origin in ("https://example.com", "http://localhost.example.com", "http://127.0.0.1.evil"):
         with pytest.raises(InvalidStatus), connect(f"ws://{source.address}", origin=origin):
             pass
+
+
+def test_a_page_without_an_origin_speaks_by_the_key_alone(source):
+    """A page from the disk has none, and so has a sandboxed frame of any web site."""
+    with connect(f"ws://{source.keyed_address}", origin="null") as client:
+        _say(client, type="arkit", coefficients={})
+        assert source.next(2.0) is not None
+    for address in (source.address, f"{source.address}/", f"{source.keyed_address[:-1]}.", "é"):
+        url = f"ws://{source.address}/{address}" if address == "é" else f"ws://{address}"
+        with pytest.raises(InvalidStatus, match="403"), connect(url, origin="null"):
+            pass
+    with (
+        pytest.raises(InvalidStatus),
+        connect(f"ws://{source.keyed_address}", origin="https://a.b"),
+    ):
+        pass
+
+
+def test_the_key_is_another_each_time(source):
+    own = PerformerHead(_HEAD.layout, HeadArrays.embedded())
+    other = WebSocketSource(own, "127.0.0.1:0")
+    other.close()
+    assert source.keyed_address.split("/")[1] != other.keyed_address.split("/")[1]
 
 
 def test_other_machines_reach_it_only_when_asked_for():

@@ -25,10 +25,11 @@ def browser() -> Iterator[Any]:
         yield browser
 
 
-def _page(path: Path) -> bytes:
+def _page(path: Path, own_server: bool = False) -> bytes:
     avatar = avatar_of()
     nothing = torch.zeros(0, avatar.layout.size)
-    write_web_page(avatar, path, front_camera(avatar, 64, 64), nothing, PageOptions())
+    options = PageOptions(own_server=own_server)
+    write_web_page(avatar, path, front_camera(avatar, 64, 64), nothing, options)
     return path.read_bytes()
 
 
@@ -76,3 +77,42 @@ def test_a_served_page_follows_and_comes_back_after_a_loss(browser, tmp_path):
         context.close()
         output.close()
     assert not problems
+
+
+def test_a_page_from_the_disk_is_driven_by_the_whole_address_alone(browser, tmp_path):
+    avatar = avatar_of()
+    _page(tmp_path / "page.html")
+    output = PageOutput(avatar.layout, "127.0.0.1:0")
+    context = browser.new_context(viewport={"width": 390, "height": 844})
+    url = (tmp_path / "page.html").as_uri()
+    try:
+        page = context.new_page()
+        page.goto(f"{url}?ws=ws://{output.address}")
+        page.wait_for_function("() => /whole address with its key/.test(document.body.innerText)")
+        page.goto(f"{url}?ws=ws://{output.keyed_address}")
+        page.evaluate("() => rgbavatar.then((app) => app.avatar.setSize(48, 48))")
+        _show_until_answered(output, lively_theta(avatar, 20), 0)
+    finally:
+        context.close()
+        output.close()
+
+
+def test_a_page_that_another_machine_gets_is_driven_by_its_server(browser, tmp_path):
+    """By a number that is not 127.0.0.1, as on a phone; a page for the disk is kept from it."""
+    avatar = avatar_of()
+    contents = [_page(tmp_path / "served.html", own_server=True), _page(tmp_path / "disk.html")]
+    context = browser.new_context(viewport={"width": 390, "height": 844})
+    output = PageOutput(avatar.layout, "0.0.0.0:0", allow_remote=True, page=lambda: contents[0])
+    try:
+        page = context.new_page()
+        # Linux answers at all of 127/8, which for the browser is not the name of this machine.
+        address = output.keyed_address.split("/")[0].replace("127.0.0.1", "127.0.0.2")
+        page.goto(f"http://{address}/?ws=ws://{address}")
+        page.evaluate("() => rgbavatar.then((app) => app.avatar.setSize(48, 48))")
+        _show_until_answered(output, lively_theta(avatar, 20), 0)
+        contents[0] = contents[1]
+        page.goto(f"http://{address}/?ws=ws://{address}")
+        page.wait_for_function("() => /is not driven from/.test(document.body.innerText)")
+    finally:
+        context.close()
+        output.close()

@@ -1,6 +1,7 @@
 """What pages are told, without a browser."""
 
 import json
+import socket
 import threading
 import time
 import urllib.error
@@ -117,6 +118,42 @@ def test_other_machines_reach_it_only_when_asked_for(output):
         PageOutput(_LAYOUT, "0.0.0.0:0")
     with pytest.raises(UserError, match="Nothing can be served"):
         PageOutput(_LAYOUT, output.address)
+
+
+def _answer_to(address, host, **headers):
+    """The status of a WebSocket's handshake that asks for this host."""
+    number, port = address.rsplit(":", 1)
+    headers |= {
+        "Host": host,
+        "Upgrade": "websocket",
+        "Connection": "Upgrade",
+        "Sec-WebSocket-Version": "13",
+        "Sec-WebSocket-Key": "AAAAAAAAAAAAAAAAAAAAAA==",
+    }
+    lines = "".join(f"{name}: {value}\r\n" for name, value in headers.items())
+    with socket.create_connection((number, int(port)), 5) as asking:
+        asking.sendall(f"GET / HTTP/1.1\r\n{lines}\r\n".encode())
+        return int(asking.recv(100).split()[1])
+
+
+def test_other_machines_get_the_page_and_may_be_driven_where_it_is_allowed():
+    """By this machine's number or name; a name of the web's may have been pointed here."""
+    shown = PageOutput(_LAYOUT, "0.0.0.0:0", allow_remote=True, page=lambda: b"<html>it")
+    try:
+        here = f"127.0.0.1:{shown.address.rsplit(':', 1)[1]}"
+        assert not shown.address.startswith("0.0.0.0")
+        assert shown.keyed_address.startswith(f"{here}/")
+        for host in ("192.168.7.7:80", socket.gethostname(), f"{socket.gethostname()}.local:7072"):
+            assert _answer_to(here, host, Origin=f"http://{host}") == 101
+            assert _answer_to(here, host, Origin="http://192.168.7.8") == 403
+            assert _answer_to(here, host, Origin="null") == 403
+        assert _answer_to(here, "evil.example", Origin="http://evil.example") == 421
+    finally:
+        shown.close()
+
+
+def test_a_server_for_this_machine_is_not_asked_by_another_number(output):
+    assert _answer_to(output.address, "192.168.7.7", Origin="http://192.168.7.7") == 421
 
 
 def test_what_was_captured_is_not_remembered_for_ever(output):

@@ -48,12 +48,20 @@ class WebSocketSource:
         self._senders: list[ServerConnection] = []
         self._index = 0
         self._server = LocalServer(listen, allow_remote, self._talk)
-        self.waits_for = f'messages "arkit" or "theta" at ws://{self._server.address}'
+        self.waits_for = (
+            f'messages "arkit" or "theta" at ws://{self._server.address} '
+            f"(from a page of the disk: ws://{self._server.keyed_address})"
+        )
 
     @property
     def address(self) -> str:
         """Where it listens."""
         return self._server.address
+
+    @property
+    def keyed_address(self) -> str:
+        """The same for a page from the disk."""
+        return self._server.keyed_address
 
     def next(self, timeout_s: float) -> PerformanceFrame | None:
         """The newest message."""

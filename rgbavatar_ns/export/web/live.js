@@ -148,8 +148,14 @@ class LiveConnection {
     };
     socket.onclose = () => {
       this.connected = false;
-      this._wait(opened ? "connection lost" : `no answer from ${host}`);
+      this._wait(opened ? "connection lost" : `no answer from ${host}${this._hint()}`);
     };
+  }
+
+  /** Servers of ours tell a page from the disk by the key in the address that they print. */
+  _hint() {
+    const keyless = window.origin === "null" && this._url.pathname === "/";
+    return keyless ? " (opened from the disk, a page needs the whole address with its key)" : "";
   }
 
   /** Count the seconds down to the next try. */

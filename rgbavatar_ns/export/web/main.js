@@ -4,7 +4,7 @@
 const NARROW = "(max-width: 700px)"; // a phone's: the face first, the controls on request
 
 class App {
-  /** page: what the exporter said of the page, { origins, servers }. */
+  /** page: what the exporter said of the page, { origins, servers, own_server }. */
   constructor(avatar, page) {
     this.avatar = avatar;
     this.message = document.getElementById("message");
@@ -20,7 +20,7 @@ class App {
     });
     avatar.addEventListener("restored", () => { this.message.textContent = ""; });
     this._frameMessages = new FrameMessages(page.origins, this.driver, (...said) => this._live(...said));
-    this._connect(page.servers);
+    this._connect(page.own_server ? [...page.servers, `ws://${window.location.host}`] : page.servers);
   }
 
   /** Play or pause the performance, in place of who drives. */

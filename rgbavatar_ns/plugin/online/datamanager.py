@@ -87,6 +87,8 @@ class OnlineDataManager(RGBAvatarDataManager):
         self.least = LeastLosses()
         self.ended_step: int | None = None
         """Step before which the stream ended; None while it goes on."""
+        self.begins_anew = False
+        """Whether a resumed run whose stream had ended goes on with another one."""
         replayed = config.source.kind == "replay"
         if test_mode == "val" and not replayed:
             # Then --data is no dataset; the first frame makes one.
@@ -216,6 +218,9 @@ class OnlineDataManager(RGBAvatarDataManager):
             return
         self._ingest.load_state_dict(state["stream"])
         self.images_drawn, self.ended_step = state["images"], state["ended_step"]
+        if self.ended_step is not None and not isinstance(self._stream, Rewindable):
+            # What is sent or filmed now is no part of the stream that had ended.
+            self.ended_step, self.begins_anew = None, True
         self.least = LeastLosses(state.get("least"))
         self._resumed = True
 

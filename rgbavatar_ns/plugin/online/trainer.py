@@ -25,6 +25,7 @@ from rgbavatar_ns.plugin.online.pipeline import OnlinePipeline, OnlinePipelineCo
 from rgbavatar_ns.plugin.online.progress import OnlineProgress, StreamReport
 from rgbavatar_ns.plugin.option_order import led_by
 from rgbavatar_ns.plugin.training.interruption import StopRequest
+from rgbavatar_ns.plugin.training.optimizers import ASKED_RATE
 from rgbavatar_ns.plugin.training.run_end import say
 from rgbavatar_ns.plugin.training.trainer import (
     CHANGED_FIRST,
@@ -257,22 +258,33 @@ class OnlineTrainer(RGBAvatarTrainer):
             self._last_watched = frames.serial[-1]
         self._next_watch_s = began + (time.monotonic() - began) / _WATCH_SHARE
 
-    def save_checkpoint(self, step: int) -> None:
-        """Write avatar, pools and frames atomically; raises UserError if they do not fit."""
+    def _state(self, step: int) -> dict[str, Any]:
+        """With all frames that the pools hold; the viewer goes on knowing the newest alone."""
         model = self.pipeline.model
         theta, views, index = self.stream.pools.parameters()
-        newest = model.subject
-        model.subject = dataclasses.replace(
-            newest,
-            theta=theta,
-            frame_index=index,
-            train=tuple(range(len(theta))),
-            world_to_camera=views,
-        )
-        try:
-            super().save_checkpoint(step)
-        finally:
-            model.subject = newest
+        with self.train_lock:
+            newest = model.subject
+            model.subject = dataclasses.replace(
+                newest,
+                theta=theta,
+                frame_index=index,
+                train=tuple(range(len(theta))),
+                world_to_camera=views,
+            )
+            try:
+                return super()._state(step)
+            finally:
+                model.subject = newest
+
+    def _load_checkpoint(self) -> None:
+        """As offline; for a new stream after an ended one the rates are the first ones again."""
+        super()._load_checkpoint()
+        if not self.stream.begins_anew:
+            return
+        for name, optimizer in self.optimizers.optimizers.items():
+            if name not in self.optimizers.schedulers:
+                for group in optimizer.param_groups:
+                    group["lr"] = group[ASKED_RATE]
 
     def _save_end(self) -> None:
         self.stream.record()

@@ -396,7 +396,15 @@ class RGBAvatarTrainer(EndingTrainer, FitHooks):
     def save_checkpoint(self, step: int) -> None:
         """Write a checkpoint atomically; raises UserError if it does not fit on the disk."""
         self.clock.settle()
-        state = {
+        keep = self.config.keep_checkpoints
+        if not self.config.save_only_latest_checkpoint:
+            keep = self.config.max_num_iterations
+        save_checkpoint(self._state(step), self.checkpoint_dir, step, keep)
+        self._saved_step = step
+
+    def _state(self, step: int) -> dict[str, Any]:
+        """What a checkpoint holds."""
+        return {
             "step": step,
             "train_seconds": self.clock.seconds,
             "curve": self.curve.points,
@@ -405,11 +413,6 @@ class RGBAvatarTrainer(EndingTrainer, FitHooks):
             "schedulers": {k: v.state_dict() for k, v in self.optimizers.schedulers.items()},
             "scalers": self.grad_scaler.state_dict(),
         }
-        keep = self.config.keep_checkpoints
-        if not self.config.save_only_latest_checkpoint:
-            keep = self.config.max_num_iterations
-        save_checkpoint(state, self.checkpoint_dir, step, keep)
-        self._saved_step = step
 
 
 def _use_run_seed(config: RGBAvatarTrainerConfig) -> None:
