@@ -29,11 +29,12 @@ from rgbavatar_ns.experiments.reenactment import (
 )
 from rgbavatar_ns.experiments.rendering_speed import frames_per_second
 from rgbavatar_ns.experiments.streamed import write_streamed
-from rgbavatar_ns.files import read_json, write_json
+from rgbavatar_ns.files import digest, digest_of_file, read_json, write_json
 from rgbavatar_ns.plugin.online.least_losses import read_least
 
 CELL_FILE, RESULT_FILE, LOG_FILE = "cell.json", "result.json", "log.txt"
 _EVALUATION = "eval.json"
+_STATES, _DESCRIBING = "dataset_states", {".json", ".npy", ".npz"}
 _RUN = "run"
 _LPIPS = ("lpips_vgg", "lpips_vgg_refined")
 _MADE = ("processor", "gpu", "cores", "instruction_set", "torch", "commit", "date")
@@ -43,7 +44,28 @@ _MADE = ("processor", "gpu", "cores", "instruction_set", "torch", "commit", "dat
 def write_cell(folder: Path, cell: Cell, data: Path, driver: Path | None = None) -> None:
     """Leave in `folder` what `run_cell` needs: the cell, its dataset and its driver's."""
     places = {"data": str(data), "driver_data": None if driver is None else str(driver)}
-    write_json(folder / CELL_FILE, {**cell.to_json(), **places})
+    states = {_STATES: dataset_states(data, driver)}
+    write_json(folder / CELL_FILE, {**cell.to_json(), **places, **states})
+
+
+def dataset_states(data: Path, driver: Path | None = None) -> list[str]:
+    """What a cell's datasets are now, as digests of what their folders hold beside the images."""
+    return [
+        digest(
+            part
+            for path in sorted(folder.glob("*"))
+            if path.suffix in _DESCRIBING
+            for part in (path.name, digest_of_file(path))
+        )
+        for folder in (data, driver)
+        if folder is not None
+    ]
+
+
+def is_of_other_data(folder: Path, data: Path, driver: Path | None = None) -> bool:
+    """Whether a cell was begun on another state of its datasets; False where it is not known."""
+    known = (read_json(folder / CELL_FILE) or {}).get(_STATES)
+    return known is not None and known != dataset_states(data, driver)
 
 
 def run_folder_of(folder: Path, cell: Cell) -> Path:
@@ -60,6 +82,7 @@ def run_cell(folder: Path) -> dict[str, Any]:
     """Train and evaluate; returns what result.json then holds."""
     described = json.loads((folder / CELL_FILE).read_text())
     data, driver = Path(described.pop("data")), described.pop("driver_data")
+    described.pop(_STATES, None)
     cell = Cell.from_json(described)
     run_folder = run_folder_of(folder, cell)
     training = commands.train(cell.preset, data, run_folder, cell.seed, as_flags(cell.overrides))

@@ -13,7 +13,13 @@ from rgbavatar_ns.experiments.engines import Engine
 from rgbavatar_ns.experiments.kept import kept_results, portable_keys
 from rgbavatar_ns.experiments.overrides import check_overrides
 from rgbavatar_ns.experiments.reenactment import load_tracker
-from rgbavatar_ns.experiments.runner import LOG_FILE, RESULT_FILE, read_result, write_cell
+from rgbavatar_ns.experiments.runner import (
+    LOG_FILE,
+    RESULT_FILE,
+    is_of_other_data,
+    read_result,
+    write_cell,
+)
 from rgbavatar_ns.experiments.source import keep_source
 from rgbavatar_ns.experiments.spec import Experiment, nearest
 from rgbavatar_ns.files import DiskError, atomic_folder, disk_errors, write_json
@@ -69,8 +75,9 @@ def sweep(
     was interrupted. Cells whose results `known` holds, files of `report --into`, are done too: such
     a file tells a dataset by its name alone. A failed cell is tried once more, then left with the
     last lines of its log; the others go on. Raises UserError, before anything runs, for what
-    `check_experiment` finds and for a file of `known` that holds no results; and where `folder`
-    cannot be written, such as on a full disk.
+    `check_experiment` finds, for a dataset that has changed since its cells were trained and for a
+    file of `known` that holds no results; and where `folder` cannot be written, such as on a full
+    disk.
     """
     check_experiment(experiment)
     kept = {key: result for path in known for key, result in kept_results(path).items()}
@@ -96,6 +103,7 @@ def _sweep(
     progress: Callable[[Sequence[CellStatus]], None],
 ) -> list[CellStatus]:
     statuses = [_status(cell, folder) for cell in cells]
+    _require_same_data(statuses, folder)
     write_json(folder / f"{experiment.name}.json", [cell.to_json() for cell in cells])
     keep_source(folder, experiment)
     progress(statuses)
@@ -171,14 +179,33 @@ def _driver(cell: Cell) -> str:
     return "" if cell.cross_identity is None else cell.cross_identity["driver"]
 
 
-def _dataset(subject: str, folder: Path) -> Path:
-    """The subject's dataset; a procedural one is made once, whole or not at all."""
+def _require_same_data(statuses: Sequence[CellStatus], folder: Path) -> None:
+    """Raise UserError where a dataset is another than its cells were trained on."""
+    for status in statuses:
+        cell = status.cell
+        data, driver = _place(cell.subject, folder), _driver(cell)
+        driver_data = _place(driver, folder) if driver else None
+        there = data.exists() and (driver_data is None or driver_data.exists())
+        if there and is_of_other_data(status.folder, data, driver_data):
+            raise UserError(
+                f"{data} has changed since {status.folder} was trained on it"
+                + (f", or its driver {driver_data}." if driver_data else "."),
+                f"Sweep into another --output, or delete {folder / 'cells'} to train all anew.",
+            )
+
+
+def _place(subject: str, folder: Path) -> Path:
+    """Where the subject's dataset lies, or will."""
     config = demo_config(subject)
     if config is None:
         return Path(subject)
-    name = f"demo-{config.seed}-{config.num_frames}-{config.image_size}"
-    path = folder / "data" / name
-    if not path.exists():
+    return folder / "data" / f"demo-{config.seed}-{config.num_frames}-{config.image_size}"
+
+
+def _dataset(subject: str, folder: Path) -> Path:
+    """The subject's dataset; a procedural one is made once, whole or not at all."""
+    config, path = demo_config(subject), _place(subject, folder)
+    if config is not None and not path.exists():
         with atomic_folder(path) as partial:
             make_demo_dataset(partial, config)
     return path

@@ -31,6 +31,24 @@ def test_a_second_call_does_only_what_is_missing(experiment_of, tmp_path):
     assert _calls(wider) == ["x", "xx", "x", "x", "x", "x"]
 
 
+def test_figures_of_a_dataset_as_it_was_are_not_given_for_what_it_is_now(experiment_of, tmp_path):
+    """A film that is tracked anew has the same path."""
+    theta, out = tmp_path / "data" / "theta.npy", tmp_path / "out"
+    theta.write_bytes(b"first")
+    statuses = sweep(experiment_of("a"), out, LocalEngine(2))
+    (tmp_path / "data" / "look.png").touch()
+    (statuses[1].folder / "result.json").unlink()
+    sweep(experiment_of("a"), out, LocalEngine(2))
+    theta.write_bytes(b"again")
+    with pytest.raises(UserError, match=r"data has changed since .* was trained") as refused:
+        sweep(experiment_of("a", "b"), out, LocalEngine(2))
+    assert "--output" in refused.value.remedy
+    assert _calls(statuses) == ["x", "xx"]
+    assert {s.state for s in sweep(experiment_of("a"), tmp_path / "other", LocalEngine(2))} == {
+        "done"
+    }
+
+
 def test_a_failed_cell_is_tried_once_more_and_stops_nobody(experiment_of, tmp_path):
     statuses = sweep(experiment_of("broken", "shaky", "fine"), tmp_path / "out", LocalEngine(2))
     assert [status.state for status in statuses] == ["failed"] * 2 + ["done"] * 4
