@@ -94,17 +94,18 @@ class LocalServer:
     def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
         """The page for a browser; a WebSocket of somebody who is welcome goes on.
 
-        Who asks for another name was sent here by it: a web site's, that has been pointed at this
-        machine, would count as this page's own.
+        Which browser asks for another name was sent here by it: a web site's, that has been
+        pointed at this machine, would count as this page's own.
         """
-        host = request.headers.get("Host", "localhost")
+        host, origin = request.headers.get("Host", "localhost"), request.headers.get("Origin")
+        is_socket = request.headers.get("Upgrade", "").lower() == "websocket"
+        if is_socket and origin is None:
+            return None  # A program; browsers name one.
         if not (_LOCAL_HOST.fullmatch(host) or (not self._is_local and _is_this_machine(host))):
-            return connection.respond(
-                HTTPStatus.MISDIRECTED_REQUEST,
-                "Ask for this machine's number, such as 127.0.0.1.\n",
-            )
-        if request.headers.get("Upgrade", "").lower() == "websocket":
-            if self._is_welcome(request.headers.get("Origin"), host, request.path):
+            remedy = "Ask for this machine's number, such as 127.0.0.1.\n"
+            return connection.respond(HTTPStatus.MISDIRECTED_REQUEST, remedy)
+        if is_socket and origin is not None:
+            if self._is_welcome(origin, host, request.path):
                 return None
             return connection.respond(HTTPStatus.FORBIDDEN, "Not from this page.\n")
         if self._page is None or request.path.split("?")[0] != "/":
@@ -120,11 +121,11 @@ class LocalServer:
         )
         return Response(HTTPStatus.OK, "OK", headers, content)
 
-    def _is_welcome(self, origin: str | None, host: str, path: str) -> bool:
-        """Whether who asked for this host and path may speak; programs name no origin."""
+    def _is_welcome(self, origin: str, host: str, path: str) -> bool:
+        """Whether a page of this origin that asked for this host and path may speak."""
         if origin == "null":
             return secrets.compare_digest(path.encode(), f"/{self._key}".encode())
-        if origin is None or origin in self._origins or _LOCAL_ORIGIN.fullmatch(origin):
+        if origin in self._origins or _LOCAL_ORIGIN.fullmatch(origin):
             return True
         return not self._is_local and origin == f"http://{host}"
 

@@ -148,6 +148,7 @@ def test_other_machines_get_the_page_and_may_be_driven_where_it_is_allowed():
             assert _answer_to(here, host, Origin="http://192.168.7.8") == 403
             assert _answer_to(here, host, Origin="null") == 403
         assert _answer_to(here, "evil.example", Origin="http://evil.example") == 421
+        assert _answer_to(here, "host.docker.internal") == 101, "a program"
     finally:
         shown.close()
 

@@ -63,6 +63,33 @@ def test_what_is_no_avatars_file_is_told(bare_page, folder, change, said):
     assert told.startswith(said)
 
 
+@pytest.mark.parametrize(
+    ("before", "read", "said"),
+    [
+        ("", "controller.error(new TypeError('network error'))", "connection was lost after 3000"),
+        ("delete window.DecompressionStream", "controller.close()", "no DecompressionStream"),
+    ],
+    ids=["network", "old browser"],
+)
+def test_what_is_no_fault_of_the_file_is_not_called_damage(bare_page, folder, before, read, said):
+    told = bare_page.evaluate(
+        f"""async () => {{
+          const whole = new Uint8Array(await (await fetch("avatar.rgba")).arrayBuffer());
+          {before};
+          let begun = false;
+          const source = new ReadableStream({{ pull(controller) {{
+            if (begun) {read};
+            else controller.enqueue(whole.slice(0, 3000));
+            begun = true;
+          }} }});
+          return module.RGBAvatar.load(source, document.querySelector("canvas"))
+            .then((avatar) => avatar.complete)
+            .then(() => "", (error) => error.message);
+        }}"""
+    )
+    assert said in told
+
+
 def test_the_types_name_what_the_module_has(page, folder):
     types = (folder / "rgbavatar.d.ts").read_text()
     body = types[types.index("export class RGBAvatar") :]

@@ -196,6 +196,24 @@ def test_a_file_that_is_not_whole_is_told(browser, page_file, damage):
     assert (drawn > 0) == (damage in ("cut off", "damaged"))
 
 
+def test_too_little_memory_is_not_called_damage(browser, page_file):
+    """A manifest that asks for what no machine has is; see above."""
+    page = _opened(browser, page_file.as_uri())
+    told = page.evaluate(
+        """() => {
+          class Full {
+            static BYTES_PER_ELEMENT = 4;
+            constructor() { throw new RangeError("Array buffer allocation failed"); }
+          }
+          return [1e6, 1e12].map((length) => {
+            try { allocated(Full, length); } catch (error) { return error.message; }
+          });
+        }"""
+    )
+    assert "not enough memory" in told[0]
+    assert told[1] == "Array buffer allocation failed"
+
+
 def test_slow_moving_pictures_show_less_and_still_ones_all(browser, page_file):
     page = _opened(browser, page_file.as_uri())
     places = page.evaluate(

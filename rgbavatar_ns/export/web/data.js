@@ -2,7 +2,7 @@
 /* The avatar's file (avatar_file.py says what it is like), read while it arrives. */
 
 const FILE_NAME = "rgbavatr", FILE_VERSION = 2, HEADER_BYTES = 16;
-const MOST_MANIFEST_BYTES = 1 << 24;
+const MOST_MANIFEST_BYTES = 1 << 24, MOST_ARRAY_BYTES = 2 ** 31;
 const ARRAY_TYPES = {
   int8: Int8Array, uint8: Uint8Array, int16: Int16Array, uint16: Uint16Array, uint32: Uint32Array,
   float32: Float32Array,
@@ -16,6 +16,10 @@ class AvatarData {
   static async open(source) {
     const bytes = new ByteReader(source);
     try {
+      if (typeof DecompressionStream === "undefined") {
+        throw new Error("This browser cannot unpack the avatar's file (it has no "
+          + "DecompressionStream). Use one of 2023 or later.");
+      }
       const data = new AvatarData(await readManifest(bytes));
       await data._readPart(bytes);
       data.complete = data._readOn(bytes);
@@ -34,7 +38,7 @@ class AvatarData {
     this.spans = []; // first and last Gaussian that each part so far brought something of
     this.onMore = (from, to) => {};
     for (const [name, { dtype, columns, items }] of Object.entries(manifest.arrays)) {
-      this.arrays[name] = new ARRAY_TYPES[dtype](columns * items);
+      this.arrays[name] = allocated(ARRAY_TYPES[dtype], columns * items);
     }
   }
 
@@ -71,6 +75,17 @@ class AvatarData {
   }
 }
 
+/** An array of zeros; what is too much for this machine alone is no damage of the file's. */
+function allocated(Type, length) {
+  try {
+    return new Type(length);
+  } catch (error) {
+    const bytes = length * Type.BYTES_PER_ELEMENT;
+    if (!(error instanceof RangeError) || !(bytes >= 0 && bytes <= MOST_ARRAY_BYTES)) throw error;
+    throw new Error("There is not enough memory left for the avatar. Close other pages.");
+  }
+}
+
 /** A manifest that asks for what cannot be fails with an error of the language's own. */
 function asDamage(error) {
   const own = error.constructor === Error || error.name === "AbortError";
@@ -89,7 +104,7 @@ class ByteReader {
   /** Exactly so many bytes. */
   async read(count) {
     while (this.length < count) {
-      const { value, done } = await this.reader.read();
+      const { value, done } = await this._next();
       if (done) throw new Error(`The avatar's file is cut off after ${this.total} bytes.`);
       this.chunks.push(value);
       this.length += value.length;
@@ -105,6 +120,16 @@ class ByteReader {
     }
     this.length -= count;
     return bytes;
+  }
+
+  async _next() {
+    try {
+      return await this.reader.read();
+    } catch (error) {
+      if (error.constructor === Error || error.name === "AbortError") throw error;
+      throw new Error(`The connection was lost after ${this.total} bytes of the avatar's file. `
+        + "Load the page again.", { cause: error });
+    }
   }
 
   cancel() {
@@ -163,7 +188,12 @@ function unpackInto(target, described, first, block) {
 
 /** Bytes of a base64 text. */
 function bytesOfBase64(text) {
-  const binary = atob(text.trim());
+  let binary;
+  try {
+    binary = atob(text.trim());
+  } catch {
+    throw new Error("The avatar's file is damaged.");
+  }
   const bytes = new Uint8Array(binary.length);
   for (let i = 0; i < binary.length; i++) bytes[i] = binary.charCodeAt(i);
   return bytes;
