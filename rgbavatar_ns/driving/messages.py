@@ -2,7 +2,6 @@
 
 import json
 import math
-import sys
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,6 +17,7 @@ FORMAT, VERSION = "rgbavatar-drive", 1
 LARGEST_MESSAGE = 1 << 16
 """Bytes; a theta of a thousand numbers has 20 kB."""
 _LONGEST_TURN = 4 * math.pi
+_LARGEST = torch.finfo(torch.float32).max
 _REMEDY = "See docs/driving.md for the messages."
 
 
@@ -111,6 +111,6 @@ def _numbers(values: Any, count: int, name: str) -> Float[Tensor, "N"]:
 
 
 def _is_number(value: Any) -> bool:
-    # Whole numbers of JSON may be too long for a float.
+    # JSON's may be too large for a float.
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
-    return is_number and abs(value) <= sys.float_info.max
+    return is_number and abs(value) <= _LARGEST

@@ -15,7 +15,7 @@ _POLL_S = 0.05
 _LEAVE_S = 5.0
 
 
-class in_background(Iterator[Item]):
+class InBackground(Iterator[Item]):
     """The same items, made by another thread up to `ahead` of them early.
 
     The thread begins with the first item that is asked for. An error in the making is raised here,

@@ -17,7 +17,7 @@ from scipy.io import wavfile
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.tracking.input.image_files import image_files, read_image_rgba
 from rgbavatar_ns.tracking.input.video import FrameSource
-from rgbavatar_ns.tracking.threads import in_background
+from rgbavatar_ns.tracking.threads import InBackground
 
 from .clips import gradient_images, write_clip
 
@@ -301,10 +301,10 @@ def test_damage_in_the_middle_costs_those_frames_and_is_noted(tmp_path: Path) ->
 
 _MEMORY = """
 import resource, sys
-from rgbavatar_ns.tracking.threads import in_background
+from rgbavatar_ns.tracking.threads import InBackground
 from rgbavatar_ns.tracking.input.video import FrameSource
 peak = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-for frame in in_background(FrameSource.open(sys.argv[1]), 2):
+for frame in InBackground(FrameSource.open(sys.argv[1]), 2):
     early = peak() if frame.index <= 8 else early
 print(frame.index, *frame.image_rgb.shape, peak() - early)
 """
@@ -334,8 +334,8 @@ def test_closing_from_another_thread_ends_it_while_it_waits_for_a_slow_reader() 
         answered.wait(20)
         yield 1
 
-    inner = in_background(slow(), 1)
-    outer = in_background((item for item in inner), 1)
+    inner = InBackground(slow(), 1)
+    outer = InBackground((item for item in inner), 1)
     assert next(outer) == 0
     assert asked.wait(10)
     inner.close()  # Its consumer is another thread, which is waiting in it.

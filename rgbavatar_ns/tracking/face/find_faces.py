@@ -13,7 +13,7 @@ from rgbavatar_ns.tracking.face.detector import MAX_SIDE_PX, FaceLandmarker
 from rgbavatar_ns.tracking.face.iris import FoundIrises, find_irises
 from rgbavatar_ns.tracking.input.video import FrameSource, SourceFrame
 from rgbavatar_ns.tracking.resumable_run import GO_ON, ResumableRun
-from rgbavatar_ns.tracking.threads import in_background
+from rgbavatar_ns.tracking.threads import InBackground
 
 # FaceMesh goes on from the frame before, so a run that was interrupted could not be continued
 # alike. About every so many frames a fresh FaceMesh takes over: it looks at the last few frames
@@ -83,9 +83,7 @@ def _blocks(
     border, size = start + block_frames, (0, 0)
     seen: list[SeenFaces] = []
     landmarker, fresh = FaceLandmarker(), None
-    frames = in_background(
-        source.read(lambda index: index >= start - _WARM_UP, MAX_SIDE_PX), _AHEAD
-    )
+    frames = InBackground(source.read(lambda index: index >= start - _WARM_UP, MAX_SIDE_PX), _AHEAD)
     try:
         for frame in frames:
             faces = landmarker.faces(frame.image_rgb)

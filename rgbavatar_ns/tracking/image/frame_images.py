@@ -28,7 +28,7 @@ from rgbavatar_ns.tracking.image.steady_matte import NEIGHBOURS, CoarseMatte, he
 from rgbavatar_ns.tracking.image.unsure_band import RoomColors, band_matte
 from rgbavatar_ns.tracking.input.mattes import UserMattes
 from rgbavatar_ns.tracking.input.video import FrameSource
-from rgbavatar_ns.tracking.threads import in_background, map_in_order
+from rgbavatar_ns.tracking.threads import InBackground, map_in_order
 
 _AHEAD, _WORKERS = 2, 2
 # No edge is sharper than the film's own: an avatar would learn how it flickers. A found matte's
@@ -117,9 +117,9 @@ class FrameImages:
                 done(count)
 
         with ExitStack() as closed:
-            crops = in_background(self._crops(source, positions), _AHEAD)
+            crops = InBackground(self._crops(source, positions), _AHEAD)
             closed.enter_context(closing(crops))
-            segmented = in_background(self._segmented(crops), _AHEAD)
+            segmented = InBackground(self._segmented(crops), _AHEAD)
             closed.enter_context(closing(segmented))
             return find_background(looked_at(), self._inside)
 
@@ -139,9 +139,9 @@ class FrameImages:
         if not wanted:
             return
         with ExitStack() as closed:
-            crops = in_background(self._crops(source, read), _AHEAD)
+            crops = InBackground(self._crops(source, read), _AHEAD)
             closed.enter_context(closing(crops))
-            segmented = in_background(self._segmented(crops), _AHEAD)
+            segmented = InBackground(self._segmented(crops), _AHEAD)
             closed.enter_context(closing(segmented))
             windows = self._windows(segmented, frozenset(wanted))
             plate = None if background is None else background.plate

@@ -16,7 +16,7 @@ from rgbavatar_ns.tracking.fit.subject import SubjectTracker
 from rgbavatar_ns.tracking.input.video import FrameSource
 from rgbavatar_ns.tracking.resumable_run import ResumableRun
 from rgbavatar_ns.tracking.stage_clock import StageClock
-from rgbavatar_ns.tracking.threads import in_background
+from rgbavatar_ns.tracking.threads import InBackground
 from rgbavatar_ns.tracking.torso.body_blocks import BodyBlock
 from rgbavatar_ns.tracking.torso.body_mesh import NECK, BodyMesh
 from rgbavatar_ns.tracking.torso.follow import BodyFollower, BodySighting, FollowerState, MatteOf
@@ -132,7 +132,7 @@ class _Reading:
         shown: list[BodyShown] = []
         pose = ShoulderFinder()
         try:
-            frames = in_background(source.read(place.__contains__, _SIDE_PX), _AHEAD)
+            frames = InBackground(source.read(place.__contains__, _SIDE_PX), _AHEAD)
             with closing(frames):
                 for k, frame in enumerate(frames, start):
                     cut = k == 0 or found.clip[k] != found.clip[k - 1]
