@@ -1,11 +1,13 @@
 """`rgbavatar sweep`: every cell of an experiment that is not done yet."""
 
 import sys
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
+from rich.console import Console, Group
 from rich.live import Live
 from rich.table import Table
 from rich.text import Text
@@ -17,6 +19,7 @@ from rgbavatar_ns.experiments.sweep import CellStatus, sweep
 from rgbavatar_ns.options import Between
 
 _STYLE = {"waiting": "dim", "running": "cyan", "done": "green", "failed": "bold red"}
+_SECONDS_PER_LINE = 30.0
 
 
 def run(
@@ -53,14 +56,9 @@ def run(
     folder = (output or Path("outputs") / "sweeps" / name).resolve()
     console = plain_console()
     chosen: Engine = LocalEngine(at_once) if engine == "local" else RayEngine(address, cpus, gpus)
-    with Live(console=plain_console(soft_wrap=False), refresh_per_second=1) as live:
-        statuses = sweep(
-            experiment,
-            folder,
-            chosen,
-            lambda statuses: live.update(_table(statuses)),
-            known=known,
-        )
+    shown = _Progress(console)
+    with Live(shown, console=plain_console(soft_wrap=False), refresh_per_second=1):
+        statuses = sweep(experiment, folder, chosen, shown.cells, known=known, making=shown.subject)
     console.print()
     failed = {status.folder: status for status in statuses if status.state != "done"}
     for status in failed.values():
@@ -74,15 +72,55 @@ def run(
         sys.exit(1)
 
 
+class _Progress:
+    """The table as it is now; a line for whatever happens where nobody could see it change."""
+
+    def __init__(self, console: Console) -> None:
+        self._console = console
+        self._statuses: Sequence[CellStatus] = ()
+        self._told: dict[Path, str] = {}
+        self._making = ""
+        self._next_line_s = 0.0
+
+    def __rich__(self) -> Group:
+        return Group(_table(self._statuses), self._making)
+
+    def cells(self, statuses: Sequence[CellStatus]) -> None:
+        """Where the cells stand now."""
+        self._statuses, self._making = statuses, ""
+        ended = {s.folder: s for s in statuses if s.state in ("done", "failed")}
+        for folder, status in ended.items():
+            if self._told.get(folder) != status.state:
+                self._told[folder] = status.state
+                cell = status.cell
+                name = f"{cell.variant}, {Path(cell.subject).name}, seed {cell.seed}"
+                self._line(f"{name}: {status.state} {_score(status)}".rstrip())
+
+    def subject(self, name: str, done: int, total: int) -> None:
+        """How far a procedural subject is drawn."""
+        self._making = f"drawing {name}: {done} of {total} frames"
+        if time.monotonic() >= self._next_line_s or done == total:
+            self._next_line_s = time.monotonic() + _SECONDS_PER_LINE
+            self._line(self._making)
+
+    def _line(self, text: str) -> None:
+        if not self._console.is_terminal:
+            self._console.print(text)
+
+
+def _score(status: CellStatus) -> str:
+    score = (status.result or {}).get("metrics", {}).get("psnr")
+    return "" if score is None else f"{score:.2f}"
+
+
 def _table(statuses: Sequence[CellStatus]) -> Table:
     table = Table("variant", "subject", "seed", "state", "PSNR")
     for status in statuses:
-        score = (status.result or {}).get("metrics", {}).get("psnr")
         table.add_row(
             status.cell.variant,
             Path(status.cell.subject).name,
             str(status.cell.seed),
-            Text(status.state, style=_STYLE[status.state]),
-            "" if score is None else f"{score:.2f}",
+            Text(status.shown_state, style=_STYLE[status.shown_state]),
+            _score(status),
         )
     return table

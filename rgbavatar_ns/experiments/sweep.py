@@ -40,6 +40,12 @@ class CellStatus:
     result: dict[str, Any] | None = None
     why: list[str] = field(default_factory=list)
 
+    @property
+    def shown_state(self) -> State:
+        """As `state`; of the cells that are given to the engine those are running that began."""
+        waits = self.state == "running" and not (self.folder / LOG_FILE).exists()
+        return "waiting" if waits else self.state
+
 
 def check_experiment(experiment: Experiment) -> None:
     """Raise UserError where the preset or an override does not exist or does not fit."""
@@ -68,9 +74,12 @@ def sweep(
     progress: Callable[[Sequence[CellStatus]], None] = lambda statuses: None,
     *,
     known: Sequence[Path] = (),
+    making: Callable[[str, int, int], None] = lambda subject, done, total: None,
 ) -> list[CellStatus]:
     """Train and evaluate every cell that has no result yet, and return where all stand.
 
+    `progress` is called whenever that changes, `making` with a procedural subject and how many of
+    its frames are drawn.
     A cell lives in `folder/cells/HASH`; a second call does only what is missing and resumes what
     was interrupted. Cells whose results `known` holds, files of `report --into`, are done too: such
     a file tells a dataset by its name alone. A failed cell is tried once more, then left with the
@@ -89,7 +98,7 @@ def sweep(
                 place = folder / "cells" / key
                 if portable in kept and read_result(place) is None:
                     write_json(place / RESULT_FILE, kept[portable])
-            return _sweep(experiment, cells, folder, engine, progress)
+            return _sweep(experiment, cells, folder, engine, progress, making)
     except DiskError as error:
         cause = f"The sweep of {experiment.name} cannot go on: {error.cause}"
         raise DiskError(cause, remedy) from error
@@ -101,6 +110,7 @@ def _sweep(
     folder: Path,
     engine: Engine,
     progress: Callable[[Sequence[CellStatus]], None],
+    making: Callable[[str, int, int], None],
 ) -> list[CellStatus]:
     statuses = [_status(cell, folder) for cell in cells]
     _require_same_data(statuses, folder)
@@ -114,7 +124,7 @@ def _sweep(
     )
     missing = {status.folder: status for status in by_subject if status.state != "done"}
     shown = {*subjects, *map(_driver, cells)} - {""}
-    data = {name: _dataset(name, folder) for name in sorted(shown) if missing}
+    data = {name: _dataset(name, folder, making) for name in sorted(shown) if missing}
     for status in missing.values():
         status.folder.mkdir(parents=True, exist_ok=True)
         (status.folder / LOG_FILE).unlink(missing_ok=True)
@@ -202,10 +212,12 @@ def _place(subject: str, folder: Path) -> Path:
     return folder / "data" / f"demo-{config.seed}-{config.num_frames}-{config.image_size}"
 
 
-def _dataset(subject: str, folder: Path) -> Path:
+def _dataset(subject: str, folder: Path, making: Callable[[str, int, int], None]) -> Path:
     """The subject's dataset; a procedural one is made once, whole or not at all."""
     config, path = demo_config(subject), _place(subject, folder)
     if config is not None and not path.exists():
         with atomic_folder(path) as partial:
-            make_demo_dataset(partial, config)
+            make_demo_dataset(
+                partial, config, progress=lambda done, total: making(subject, done, total)
+            )
     return path

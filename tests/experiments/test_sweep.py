@@ -164,6 +164,10 @@ def test_the_command_says_what_failed_and_ends_with_1(experiment_of, tmp_path, c
         cli.main(arguments)
     assert ended.value.code == 1
     told = capsys.readouterr().out
+    # No terminal: a line for each cell as it ends, not only the table at the end.
+    lines = told.split("variant")[0].splitlines()
+    assert [line for line in lines if line.startswith("fine, data, seed 2: done 33.00")]
+    assert [line for line in lines if line.startswith("broken, data, seed 0: failed")]
     assert "2 of 4 cells done" in told
     assert "CUDA out of memory, so to speak" in told
     assert "rgbavatar report" in told
