@@ -67,7 +67,7 @@ def test_arkit_and_status_messages_are_followed(driven, server, avatar):
 
 def test_the_projects_own_server_drives_the_page_and_hears_of_it(open_page, avatar, theta):
     output = PageOutput(avatar.layout, "127.0.0.1:0")
-    page = open_page(f"?ws=ws://{output.address}")
+    page = open_page(f"?ws=ws://{output.keyed_address}")
     output.show(DrivenFrame(3, theta[3], time.monotonic(), 0.1))
     shows(page, theta[3])
     page.wait_for_function("() => avatar.pictures > 1")
