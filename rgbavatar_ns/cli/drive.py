@@ -250,6 +250,7 @@ def _page(
     from rgbavatar_ns.export.live_page import DEFAULT_ADDRESS, PageOutput
 
     avatar = require_rgbavatar(subject.avatar, "A page (--show page)")
+    _tell("The page is being made ...")
     content = _page_content(avatar, subject, show)  # Now: nobody who asks has to wait for it.
     output = PageOutput(
         avatar.layout, show.serve or DEFAULT_ADDRESS, allow_remote, lambda: content, calibrate

@@ -94,7 +94,7 @@ class LocalServer:
     def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
         """The page for a browser; a WebSocket of somebody who is welcome goes on.
 
-        Which browser asks for another name was sent here by it: a web site's, that has been
+        A browser that asks for another name was sent here by it: a web site's, that has been
         pointed at this machine, would count as this page's own.
         """
         host, origin = request.headers.get("Host", "localhost"), request.headers.get("Origin")
@@ -104,7 +104,7 @@ class LocalServer:
         if not (_LOCAL_HOST.fullmatch(host) or (not self._is_local and _is_this_machine(host))):
             remedy = "Ask for this machine's number, such as 127.0.0.1.\n"
             return connection.respond(HTTPStatus.MISDIRECTED_REQUEST, remedy)
-        if is_socket and origin is not None:
+        if origin is not None and is_socket:
             if self._is_welcome(origin, host, request.path):
                 return None
             return connection.respond(HTTPStatus.FORBIDDEN, "Not from this page.\n")

@@ -49,7 +49,7 @@ def write_cell(folder: Path, cell: Cell, data: Path, driver: Path | None = None)
 
 
 def dataset_states(data: Path, driver: Path | None = None) -> list[str]:
-    """What a cell's datasets are now, as digests of what their folders hold beside the images."""
+    """What a cell's datasets are now: digests of the tables and arrays at each folder's top."""
     return [
         digest(
             part

@@ -1,6 +1,7 @@
 """Run what is missing of an experiment; what is there already is kept."""
 
 import json
+import shlex
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -191,17 +192,21 @@ def _driver(cell: Cell) -> str:
 
 def _require_same_data(statuses: Sequence[CellStatus], folder: Path) -> None:
     """Raise UserError where a dataset is another than its cells were trained on."""
+    outdated: dict[Path, str] = {}
     for status in statuses:
         cell = status.cell
         data, driver = _place(cell.subject, folder), _driver(cell)
         driver_data = _place(driver, folder) if driver else None
         there = data.exists() and (driver_data is None or driver_data.exists())
         if there and is_of_other_data(status.folder, data, driver_data):
-            raise UserError(
-                f"{data} has changed since {status.folder} was trained on it"
-                + (f", or its driver {driver_data}." if driver_data else "."),
-                f"Sweep into another --output, or delete {folder / 'cells'} to train all anew.",
-            )
+            outdated[status.folder] = f"{data} or {driver_data}" if driver_data else str(data)
+    if outdated:
+        changed = ", ".join(dict.fromkeys(outdated.values()))
+        raise UserError(
+            f"{changed} has changed since cells were trained on it.",
+            "Sweep into another --output, or delete what was trained before: "
+            f"{shlex.join(map(str, outdated))}.",
+        )
 
 
 def _place(subject: str, folder: Path) -> Path:

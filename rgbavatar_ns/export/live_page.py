@@ -25,8 +25,8 @@ class PageOutput:
     """Sends each driven frame's theta to all pages that are open, the newest to slow ones.
 
     Browsers that ask for the address itself get `page`; one from the disk connects to
-    `keyed_address`. A page answers with what it has shown,
-    which makes the latency, and may ask for a calibration. Raises UserError as `LocalServer`.
+    `keyed_address`. A page answers with what it has shown, which makes the latency, and may ask
+    for a calibration. Raises UserError as `LocalServer`.
     """
 
     def __init__(

@@ -40,9 +40,11 @@ def test_figures_of_a_dataset_as_it_was_are_not_given_for_what_it_is_now(experim
     (statuses[1].folder / "result.json").unlink()
     sweep(experiment_of("a"), out, LocalEngine(2))
     theta.write_bytes(b"again")
-    with pytest.raises(UserError, match=r"data has changed since .* was trained") as refused:
+    with pytest.raises(UserError, match="data has changed since cells were trained") as refused:
         sweep(experiment_of("a", "b"), out, LocalEngine(2))
     assert "--output" in refused.value.remedy
+    for status in statuses:
+        assert str(status.folder) in refused.value.remedy
     assert _calls(statuses) == ["x", "xx"]
     assert {s.state for s in sweep(experiment_of("a"), tmp_path / "other", LocalEngine(2))} == {
         "done"

@@ -3,9 +3,9 @@
 import pytest
 
 from rgbavatar_ns.errors import UserError
-from tests.fuzz import heads, importers, native, pickles
+from tests.fuzz import heads, importers, native, performances, pickles
 
-QUICK = {pickles: 120, heads: 200, native: 120, importers: 120}
+QUICK = {pickles: 120, heads: 200, native: 120, importers: 120, performances: 600}
 
 
 @pytest.mark.parametrize("module", QUICK, ids=lambda module: module.NAME)

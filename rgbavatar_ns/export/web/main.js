@@ -20,7 +20,8 @@ class App {
     });
     avatar.addEventListener("restored", () => { this.message.textContent = ""; });
     this._frameMessages = new FrameMessages(page.origins, this.driver, (...said) => this._live(...said));
-    this._connect(page.own_server ? [...page.servers, `ws://${window.location.host}`] : page.servers);
+    const own = page.own_server ? [`ws://${window.location.host}`] : [];
+    this._connect([...page.servers, ...own]);
   }
 
   /** Play or pause the performance, in place of who drives. */

@@ -25,7 +25,6 @@ from rgbavatar_ns.plugin.online.pipeline import OnlinePipeline, OnlinePipelineCo
 from rgbavatar_ns.plugin.online.progress import OnlineProgress, StreamReport
 from rgbavatar_ns.plugin.option_order import led_by
 from rgbavatar_ns.plugin.training.interruption import StopRequest
-from rgbavatar_ns.plugin.training.optimizers import ASKED_RATE
 from rgbavatar_ns.plugin.training.run_end import say
 from rgbavatar_ns.plugin.training.trainer import (
     CHANGED_FIRST,
@@ -284,7 +283,7 @@ class OnlineTrainer(RGBAvatarTrainer):
         for name, optimizer in self.optimizers.optimizers.items():
             if name not in self.optimizers.schedulers:
                 for group in optimizer.param_groups:
-                    group["lr"] = group[ASKED_RATE]
+                    group["lr"] = self.optimizers.config[name]["optimizer"].lr
 
     def _save_end(self) -> None:
         self.stream.record()

@@ -15,9 +15,7 @@ from rgbavatar_ns.options import Between, Counted, Positive, Weight
 
 _MOMENTS = ("exp_avg", "exp_avg_sq")
 _MAX_STEP = 1 << 40
-ASKED_RATE = "asked_lr"
-"""Key of an optimizer's group: the rate that was asked for, before any schedule."""
-_RATES = ("lr", "initial_lr", "first_lr")
+_ASKED, _RATES = "asked_lr", ("lr", "initial_lr", "first_lr")
 
 
 @dataclass
@@ -81,7 +79,7 @@ def note_asked_rates(optimizers: Optimizers) -> None:
     """Keep in each optimiser's state the rate that was asked for, before any schedule."""
     for name, optimizer in optimizers.optimizers.items():
         for group in optimizer.param_groups:
-            group[ASKED_RATE] = optimizers.config[name]["optimizer"].lr
+            group[_ASKED] = optimizers.config[name]["optimizer"].lr
 
 
 def go_on_as_asked(optimizers: Optimizers, resumed: Collection[str], step: int) -> None:
@@ -94,15 +92,13 @@ def go_on_as_asked(optimizers: Optimizers, resumed: Collection[str], step: int) 
     for name, optimizer in optimizers.optimizers.items():
         adam, schedule = optimizers.config[name]["optimizer"], optimizers.schedulers.get(name)
         for number, group in enumerate(optimizer.param_groups):
-            before = group.get(
-                ASKED_RATE, group.get("initial_lr", group.get("first_lr", group["lr"]))
-            )
+            before = group.get(_ASKED, group.get("initial_lr", group.get("first_lr", group["lr"])))
             if adam.lr != before:
                 change = adam.lr / before if before > 0 else 0.0
                 group |= {key: group[key] * change or adam.lr for key in _RATES if key in group}
                 if schedule is not None and name in resumed:
                     schedule.base_lrs[number] = adam.lr
-            group |= {ASKED_RATE: adam.lr, "eps": adam.eps}
+            group |= {_ASKED: adam.lr, "eps": adam.eps}
             if schedule is None and group.pop("initial_lr", None) is not None:
                 group["lr"] = adam.lr
             if schedule is not None and name not in resumed:
