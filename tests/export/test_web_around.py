@@ -120,6 +120,12 @@ def test_keys_turn_zoom_reset_play_and_fold(open_page):
     page.locator("#slider-jaw-open").press("ArrowRight")
     assert page.evaluate("() => avatar.camera.angles()") == [0, 0]
     assert page.evaluate("() => avatar.theta") != at_rest
+    # Other keys mean nothing to it.
+    page.locator("#slider-jaw-open").press("f")
+    assert page.locator("#panel").is_hidden()
+    page.locator("body").press("f")
+    page.locator("#slider-jaw-open").press(" ")
+    assert page.evaluate("() => avatar.performance.playing")
 
 
 def test_on_a_phone_the_face_comes_first_and_fingers_turn_and_zoom(browser, site, tmp_path):

@@ -74,7 +74,7 @@ def test_the_projects_own_server_drives_the_page_and_hears_of_it(open_page, avat
     while output.latencies.shown == 0:
         time.sleep(0.01)
     output.close()
-    says(page, "trying again")
+    says(page, "The performance has ended, trying again in")
 
 
 def test_whoever_performs_can_be_calibrated_from_the_page(driven, server):

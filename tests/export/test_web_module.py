@@ -51,6 +51,40 @@ def test_arkit_is_shown_as_avatar_theta_from_arkit_is_drawn(page, avatar, neutra
     assert page.evaluate("() => avatar.theta") == pytest.approx(neutral.tolist(), abs=1e-6)
 
 
+def test_a_canvas_without_a_style_keeps_its_place_at_any_pixel_density(page):
+    page.evaluate(
+        """async () => {
+          window.devicePixelRatio = 1.5;
+          const canvas = document.createElement("canvas");
+          [canvas.width, canvas.height] = [120, 80];
+          document.body.append(canvas);
+          window.bare = await module.RGBAvatar.load({ data: avatar.data }, canvas);
+        }"""
+    )
+    sizes = """() => {
+      const { width, height, clientWidth, clientHeight } = bare.canvas;
+      return [width, height, clientWidth, clientHeight];
+    }"""
+    for _ in range(4):
+        page.evaluate("() => bare.draw()")
+        assert page.evaluate(sizes) == [180, 120, 120, 80]
+    page.evaluate("() => { window.devicePixelRatio = 2; }")
+    page.wait_for_function("() => bare.canvas.width === 240")
+    assert page.evaluate(sizes) == [240, 160, 120, 80]
+
+
+def test_what_is_disposed_of_is_kept_by_nobody_who_shares_its_data(page):
+    page.evaluate(
+        """async () => {
+          const canvas = document.querySelectorAll("canvas")[1];
+          window.second = await module.RGBAvatar.load({ data: avatar.data }, canvas);
+        }"""
+    )
+    assert page.evaluate("() => avatar.data.arrivals.size") == 2
+    page.evaluate("() => second.dispose()")
+    assert page.evaluate("() => avatar.data.arrivals.size") == 1
+
+
 def test_unknown_names_are_told_once(page):
     told: list[str] = []
     page.on("console", lambda message: told.append(message.text))

@@ -60,12 +60,10 @@ class RGBAvatar extends EventTarget {
     this._automatic = automatic;
     this._ended = new AbortController();
     this._last = null;
-    const { onMore } = data; // of another avatar with the same data
-    data.onMore = (from, to) => {
-      onMore(from, to);
-      this.changed();
-    };
-    const { signal } = this._ended;
+    this._pixelRatio = window.devicePixelRatio;
+    const { signal } = this._ended, arrived = () => this.changed();
+    data.arrivals.add(arrived);
+    signal.addEventListener("abort", () => data.arrivals.delete(arrived));
     if (controls) {
       const { touchAction } = canvas.style;
       canvas.style.touchAction = "none"; // a finger turns the head and scrolls no page
@@ -266,8 +264,13 @@ class RGBAvatar extends EventTarget {
       Math.max(1, Math.round(canvas.clientWidth * pixels)),
       Math.max(1, Math.round(canvas.clientHeight * pixels)),
     ];
-    if (canvas.width !== width) canvas.width = width;
-    if (canvas.height !== height) canvas.height = height;
+    if (canvas.width === width && canvas.height === height) return [width, height];
+    const { clientWidth, clientHeight } = canvas;
+    canvas.width = width;
+    canvas.height = height;
+    // Where no style gives it a place, its pixels would: it would grow with every picture.
+    if (Math.abs(canvas.clientWidth - clientWidth) > 1) canvas.style.width = `${clientWidth}px`;
+    if (Math.abs(canvas.clientHeight - clientHeight) > 1) canvas.style.height = `${clientHeight}px`;
     return [width, height];
   }
 
@@ -276,6 +279,10 @@ class RGBAvatar extends EventTarget {
     const seconds = this._last === null ? 0 : Math.min((now - this._last) / 1000, 0.25);
     this._last = now;
     this.performance.advance(seconds);
+    if (window.devicePixelRatio !== this._pixelRatio) { // on another screen, or magnified
+      this._pixelRatio = window.devicePixelRatio;
+      this._due = true;
+    }
     if (this.camera.settle(seconds)) this._due = true;
     if (!this._automatic) return;
     if (this._due) this._pace.moves(now);

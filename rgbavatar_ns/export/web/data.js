@@ -36,7 +36,7 @@ class AvatarData {
     this.arrays = {}; // in full from the start, zero where nothing has arrived
     this.available = 0; // so many Gaussians are there
     this.spans = []; // first and last Gaussian that each part so far brought something of
-    this.onMore = (from, to) => {};
+    this.arrivals = new Set(); // called after each further part
     for (const [name, { dtype, columns, items }] of Object.entries(manifest.arrays)) {
       this.arrays[name] = allocated(ARRAY_TYPES[dtype], columns * items);
     }
@@ -46,7 +46,7 @@ class AvatarData {
     try {
       while (this.spans.length < this.manifest.parts.length) {
         await this._readPart(bytes);
-        this.onMore(...this.spans[this.spans.length - 1]);
+        for (const arrived of this.arrivals) arrived();
       }
     } catch (error) {
       bytes.cancel();

@@ -33,12 +33,18 @@ function keyActions(app) {
   return actions;
 }
 
-/** Keys act wherever they have no meaning of their own: sliders have, and space on a button. */
+/** What has a meaning of its own for a key. */
+function ownersOf(key) {
+  if (key === " ") return "input:not([type=range]), button, summary";
+  return key.length === 1 ? "input:not([type=range], [type=checkbox])" : "input";
+}
+
+/** Keys act wherever they have no meaning of their own: arrows on sliders have, space on buttons. */
 function listenToKeys(app) {
   const actions = keyActions(app);
   document.addEventListener("keydown", (event) => {
     const act = actions[event.key.length === 1 ? event.key.toLowerCase() : event.key];
-    const own = event.target.closest?.(event.key === " " ? "input, button, summary" : "input");
+    const own = event.target.closest?.(ownersOf(event.key));
     if (!act || own || event.ctrlKey || event.metaKey || event.altKey) return;
     event.preventDefault();
     act();

@@ -5,6 +5,7 @@ const DRIVE = { format: "rgbavatar-drive", version: 1 };
 const RETRY_SECONDS = [1, 2, 4, 5]; // from loss to loss; the last one again and again
 const LONGEST_MESSAGE = 1 << 17; // characters: hundreds of thetas
 const LONGEST_STATUS = 200;
+const GOING_IN_ORDER = 1000; // of who hangs up, and has said why
 
 /** What reaches the avatar from outside, unless somebody at the page has taken over. */
 class Driver {
@@ -146,9 +147,10 @@ class LiveConnection {
         this._tell(`${host} cannot be used: ${error.message}`, true);
       }
     };
-    socket.onclose = () => {
+    socket.onclose = ({ code }) => {
       this.connected = false;
-      this._wait(opened ? "connection lost" : `no answer from ${host}${this._hint()}`);
+      const farewell = code === GOING_IN_ORDER && status.replace(/\.$/, "");
+      this._wait(farewell || (opened ? "connection lost" : `no answer from ${host}${this._hint()}`));
     };
   }
 
