@@ -10,18 +10,23 @@ import av
 import numpy as np
 from av.container import OutputContainer
 from av.filter import Graph
+from av.video.reformatter import ColorRange, Colorspace
 from av.video.stream import VideoStream
 from jaxtyping import UInt8
 
 from rgbavatar_ns.data.png import encode_png_rgba
 from rgbavatar_ns.files import atomic_write
 
+_BT709 = 1
+"""Primaries and transfer, as H.264 numbers them."""
+
 
 class FilmWriter:
     """Encodes RGB frames as H.264, as they come; within `with`.
 
     The file appears under its name only when it is complete, and not at all where an error ends
-    it. All frames have one size; an odd one is padded by a pixel, as the codec asks.
+    it. All frames have one size; of an odd one the last row or column is there twice, as the codec
+    asks. Colours are those of BT.709, and said to be.
     """
 
     def __init__(self, path: Path, frames_per_second: float = 25.0) -> None:
@@ -44,15 +49,29 @@ class FilmWriter:
     def add(self, frame: UInt8[np.ndarray, "H W 3"]) -> None:
         """Encode one more frame."""
         assert self._container is not None
-        frame = np.pad(frame, ((0, frame.shape[0] % 2), (0, frame.shape[1] % 2), (0, 0)))
+        sides = [(0, side % 2) for side in frame.shape[:2]]
+        frame = np.pad(frame, (*sides, (0, 0)), mode="edge")
         if self._stream is None:
-            self._stream = self._container.add_stream("libx264", rate=self._rate)
-            self._stream.height, self._stream.width = frame.shape[:2]
-            self._stream.pix_fmt = "yuv420p"
-            self._stream.options = {"crf": "18"}
+            self._stream = self._begun(*frame.shape[:2])
         picture = av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format="rgb24")
-        self._container.mux(self._stream.encode(picture))
+        coded = picture.reformat(
+            format="yuv420p",
+            dst_colorspace=Colorspace.ITU709,
+            dst_color_range=ColorRange.MPEG,
+        )
+        self._container.mux(self._stream.encode(coded))
         self.count += 1
+
+    def _begun(self, height: int, width: int) -> VideoStream:
+        """A stream that says how its colours are coded: players guess otherwise, and differ."""
+        assert self._container is not None
+        stream = self._container.add_stream("libx264", rate=self._rate)
+        stream.height, stream.width, stream.pix_fmt = height, width, "yuv420p"
+        stream.options = {"crf": "18"}
+        stream.codec_context.colorspace = Colorspace.ITU709
+        stream.codec_context.color_range = ColorRange.MPEG
+        stream.codec_context.color_primaries = stream.codec_context.color_trc = _BT709
+        return stream
 
     def __exit__(self, *raised: Any) -> bool | None:
         """Complete the file, or leave none."""

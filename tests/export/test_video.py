@@ -1,5 +1,7 @@
 import av
 import numpy as np
+import pytest
+from av.video.reformatter import ColorRange, Colorspace
 
 from rgbavatar_ns.export import write_video
 
@@ -15,4 +17,17 @@ def test_a_film_holds_the_frames_it_was_given(tmp_path):
     assert [f.shape for f in read] == [(32, 48, 3)] * 3
     for frame, shade in zip(read, shades):
         assert abs(int(np.median(frame)) - shade) <= 3
+        assert np.abs(frame[31].astype(int) - frame[30]).max() <= 3, "the row more is no dark line"
     assert [p.name for p in tmp_path.iterdir()] == ["film.mp4"]
+
+
+def test_a_film_says_how_its_colours_are_coded_and_keeps_to_it(tmp_path):
+    color = np.array([200, 30, 40])
+    path = tmp_path / "film.mp4"
+    write_video(path, [np.full((32, 32, 3), color, dtype=np.uint8)] * 2)
+    with av.open(str(path)) as container:
+        frame = next(container.decode(video=0))
+    assert (frame.colorspace, frame.color_range) == (Colorspace.ITU709, ColorRange.MPEG)
+    # BT.709's luma by hand, from 16 to 235.
+    luma = 16 + 219 / 255 * (np.array([0.2126, 0.7152, 0.0722]) @ color)
+    assert frame.to_ndarray()[16, 16] == pytest.approx(luma, abs=2)
