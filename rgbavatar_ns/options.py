@@ -39,7 +39,8 @@ Pixels = Annotated[int, Between(1, 8192)]
 """The side of an image."""
 Seed = Annotated[int, Between(0, 2**32 - 1)]
 """As NumPy takes it."""
-FrameRate = Annotated[float, Between(0.01, 1000.0)]
+FRAME_RATES = Between(0.01, 1000.0)
+FrameRate = Annotated[float, FRAME_RATES]
 """Frames per second."""
 Share = Annotated[float, Between(0.0, 1.0)]
 """A part of a whole."""

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from rgbavatar_ns.cli.progress import progress_bar
+from rgbavatar_ns.cli.used_options import require_used
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.options import FrameRate
 
@@ -19,6 +20,26 @@ if TYPE_CHECKING:
 Format = Literal[
     "bundle", "ply", "gltf", "spz", "compressed-ply", "sog", "texture", "web", "web-module"
 ]
+_GAUSSIANS: tuple[Format, ...] = ("ply", "gltf", "spz", "compressed-ply", "sog")
+_BROWSERS: tuple[Format, ...] = ("web", "web-module")
+_USED_BY: dict[str, tuple[Format, ...]] = {
+    "frame": _GAUSSIANS,
+    "frames": (*_GAUSSIANS, *_BROWSERS),
+    "no-head-inside": ("bundle",),
+    **dict.fromkeys(("no-performance", "frames-per-second"), _BROWSERS),
+    **dict.fromkeys(("title", "origins", "servers"), ("web",)),
+}
+"""What each option counts for."""
+_ENDINGS: dict[str, Format] = {
+    ".compressed.ply": "compressed-ply",
+    ".ply": "ply",
+    ".glb": "gltf",
+    ".spz": "spz",
+    ".sog": "sog",
+    ".html": "web",
+    ".png": "texture",
+}
+"""What a destination's ending asks for, the longer ones first."""
 _LONGEST_SECONDS = 30.0
 """Of a performance that nobody chose: a minute of film would double the size of a page."""
 
@@ -26,15 +47,15 @@ _LONGEST_SECONDS = 30.0
 def run(
     run_folder: Annotated[Path, tyro.conf.Positional],
     destination: Annotated[Path, tyro.conf.Positional],
-    format: Format = "bundle",
+    format: Format | None = None,
     data: Path | None = None,
     frame: int | None = None,
     frames: tuple[int, int] | None = None,
     head_inside: bool = True,
     texture: Path | None = None,
     performance: bool = True,
-    frames_per_second: FrameRate = 25.0,
-    title: str = "Avatar",
+    frames_per_second: FrameRate | None = None,
+    title: str | None = None,
     origins: tuple[str, ...] = (),
     servers: tuple[str, ...] = (),
 ) -> None:
@@ -52,7 +73,8 @@ def run(
         run_folder: a run of ns-train, a checkpoint or an avatar bundle.
         destination: the file to write; for bundle and web-module, and with --frames of Gaussians,
             the folder.
-        format: what to write.
+        format: what to write; by default what the destination's ending says (.ply, .glb, .spz,
+            .sog, .compressed.ply, .html, .png), or a bundle where it has none of these.
         data: the dataset whose frames are meant; by default the one that the run names.
         frame: of Gaussians, the frame's place in the dataset; without it the head is at rest.
         frames: of Gaussians and for browsers, first frame and the frame after the last one; by
@@ -62,14 +84,27 @@ def run(
         texture: a PNG painted over what --format texture wrote of this avatar: its colours change
             as it was changed.
         performance: for browsers, whether the avatar brings those frames to play.
-        frames_per_second: for browsers, of the performance.
-        title: for web, the page's title.
+        frames_per_second: for browsers, of the performance; by default the film's own, or 25 where
+            that is not known.
+        title: for web, the page's title, "Avatar" by default.
         origins: for web, other pages whose messages it takes, such as https://example.org.
         servers: for web, what may drive it by ?ws= beside this machine, such as wss://example.org.
     """
     from rgbavatar_ns.avatar.loading import load_avatar, require_rgbavatar
     from rgbavatar_ns.export import GAUSSIAN_FILES, read_texture, with_texture
 
+    format = format or _format_of(destination)
+    given = {
+        "frame": frame is not None,
+        "frames": frames is not None,
+        "no-head-inside": not head_inside,
+        "no-performance": not performance,
+        "frames-per-second": frames_per_second is not None,
+        "title": title is not None,
+        "origins": bool(origins),
+        "servers": bool(servers),
+    }
+    require_used("format", format, _USED_BY, [name for name, is_given in given.items() if is_given])
     whole = load_avatar(run_folder)
     if texture is not None:
         own = require_rgbavatar(whole, "A painted texture (--texture)")
@@ -88,12 +123,28 @@ def run(
         from rgbavatar_ns.export import PageOptions
 
         own = require_rgbavatar(avatar, f"--format {format}")
-        options = PageOptions(title, frames_per_second, origins=origins, servers=servers)
+        rate = frames_per_second or _rate_of(dataset)
+        options = PageOptions(title or "Avatar", rate, origins=origins, servers=servers)
         seen = _seen(avatar, run_folder, dataset)
         if dataset is not None:
             own = _as_filmed(own, dataset)
-        places = page_frames(dataset, frames, frames_per_second)
+        places = page_frames(dataset, frames, rate)
         _write_web(format, own, seen, dataset, places, performance, destination, options)
+
+
+def _format_of(destination: Path) -> Format:
+    """What the destination's ending asks for; a bundle where it asks for nothing."""
+    for ending, asked in _ENDINGS.items():
+        if destination.name.lower().endswith(ending):
+            return asked
+    return "bundle"
+
+
+def _rate_of(dataset: "TrackedDataset | None") -> float:
+    """At which the film is shown."""
+    from rgbavatar_ns.data.native.dataset import USUAL_FRAMES_PER_SECOND
+
+    return USUAL_FRAMES_PER_SECOND if dataset is None else dataset.playback_rate
 
 
 def _without_undrawn(whole: "AvatarMethod") -> "AvatarMethod":
@@ -199,8 +250,7 @@ def page_frames(
 
     if dataset is None:
         return ()
-    names = dataset.camera_names
-    film = [place for place in range(len(dataset)) if not names or names[place] == names[0]]
+    film = dataset.of_one_camera(range(len(dataset)))
     most = max(1, round(_LONGEST_SECONDS * frames_per_second))
     return chosen_frames(len(dataset), frames, film[:most])
 

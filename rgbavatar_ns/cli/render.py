@@ -3,11 +3,12 @@
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
 from rgbavatar_ns.cli.progress import progress_bar
+from rgbavatar_ns.cli.used_options import require_used
 from rgbavatar_ns.driving.transfer import DrivingOptions
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.options import Between, CheckedOptions, Counted, FrameRate, Pixels, Share, Weight
@@ -48,8 +49,9 @@ class PictureOptions(CheckedOptions):
     """Colour behind the head, red, green and blue in [0, 1]."""
     transparent: bool = False
     """No background: PNG files keep the alpha."""
-    frames_per_second: FrameRate = 25.0
-    """Of the film (along a camera path: the path's), and of the performance for smoothing."""
+    frames_per_second: FrameRate | None = None
+    """Of the film (along a camera path: the path's), and of the performance for smoothing; by
+    default the performance's own, or 25 where that is not known."""
 
     def kind_for(self, show: Show) -> Kind:
         """What is written; raises UserError for a film that would lose its alpha."""
@@ -110,7 +112,14 @@ def run(
     if driver is not None and show == "comparison":
         show = "performance"
     given = {"driver": driver, "frames": frames, "hold": hold, "camera-path": camera_path}
-    _require_used(show, {**given, "gain": gain, "arc": arc, **vars(picture)})
+    given |= {"gain": gain, "arc": arc, **vars(picture)}
+    named = [name for name, value in given.items() if value is not None and value is not False]
+    require_used("show", show, _USED_BY, named)
+    if driver is None and driving != _DRIVING:
+        raise UserError(
+            "There are options of driving, but nobody drives the avatar.",
+            "Name who does with --driver, or leave them out.",
+        )
     from rgbavatar_ns.avatar.loading import require_rgbavatar
     from rgbavatar_ns.export import read_texture, with_texture
     from rgbavatar_ns.export.subject import load_subject
@@ -128,17 +137,6 @@ def run(
         scene, beside = _scene(subject, driver, frames, picture, driving)
         scene, drawn = _drawn(subject, scene, beside, show, hold, arc, camera_path, picture)
         _write(drawn, len(scene), output, show, kind, scene.frames_per_second)
-
-
-def _require_used(show: Show, given: dict[str, Any]) -> None:
-    """Raise UserError for an option that would change nothing of what is shown."""
-    for name, counts_for in _USED_BY.items():
-        is_given = given[name] is not None and given[name] is not False
-        if is_given and show not in counts_for:
-            shown = " or ".join(f"--show {other}" for other in counts_for)
-            raise UserError(
-                f"--{name} changes nothing of --show {show}.", f"Leave it out, or take {shown}."
-            )
 
 
 def _compare(
@@ -189,24 +187,41 @@ def _scene(
 ) -> "tuple[Scene, tuple[TrackedDataset, tuple[int, ...]] | None]":
     """The performance seen by the avatar's own camera, and the driver's frames if there is one."""
     from rgbavatar_ns.data import load_dataset
-    from rgbavatar_ns.export import dataset_folder, resized
+    from rgbavatar_ns.export import dataset_folder
     from rgbavatar_ns.export.scenes import Scene, chosen_frames, driven_by
 
-    rate, camera, dataset = picture.frames_per_second, subject.camera, subject.dataset
     if driver is None:
-        if dataset is None:
-            return Scene(subject.seen.theta_neutral[None], camera, rate), None
-        chosen = chosen_frames(len(dataset), frames, dataset.test or dataset.train)
-        cameras = resized(dataset.cameras.select(chosen), camera.width, camera.height)
-        return Scene(dataset.theta[list(chosen)], cameras, rate), None
+        return _own_scene(subject, frames, picture), None
     other = load_dataset(dataset_folder(driver))
-    chosen = chosen_frames(len(other), frames, range(len(other)))
+    rate = picture.frames_per_second or other.playback_rate
+    chosen = chosen_frames(len(other), frames, other.of_one_camera(range(len(other))))
     mapped = driven_by(subject.avatar, other, chosen, subject.seen, rate, driving)
     if mapped.unmapped:
         print(f"not known to the avatar, left out: {', '.join(mapped.unmapped)}")
     if mapped.missing:
         print(f"not known to the driver, left at rest: {', '.join(mapped.missing)}")
-    return Scene(mapped.theta, camera, rate), (other, chosen)
+    return Scene(mapped.theta, subject.camera, rate), (other, chosen)
+
+
+def _own_scene(
+    subject: "Subject", frames: tuple[int, int] | None, picture: PictureOptions
+) -> "Scene":
+    """The avatar's own film, or its neutral face where there is none."""
+    from rgbavatar_ns.data.native.dataset import USUAL_FRAMES_PER_SECOND
+    from rgbavatar_ns.export import resized
+    from rgbavatar_ns.export.scenes import Scene, chosen_frames
+
+    camera, dataset = subject.camera, subject.dataset
+    if dataset is None:
+        if frames is not None:
+            raise UserError("Frames are those of a dataset.", "Name it with --data or --driver.")
+        rate = picture.frames_per_second or USUAL_FRAMES_PER_SECOND
+        return Scene(subject.seen.theta_neutral[None], camera, rate)
+    film = dataset.of_one_camera(dataset.test or dataset.train)
+    chosen = chosen_frames(len(dataset), frames, film)
+    cameras = resized(dataset.cameras.select(chosen), camera.width, camera.height)
+    rate = picture.frames_per_second or dataset.playback_rate
+    return Scene(dataset.theta[list(chosen)], cameras, rate)
 
 
 def _drawn(
@@ -220,13 +235,18 @@ def _drawn(
     picture: PictureOptions,
 ) -> "tuple[Scene, Iterator[np.ndarray]]":
     """What is shown, frame by frame, and its pictures."""
+    from rgbavatar_ns.data.native.dataset import USUAL_FRAMES_PER_SECOND
     from rgbavatar_ns.export import pictures, scenes
 
     avatar, seen = subject.avatar, subject.seen
     background = None if picture.transparent else picture.background
-    if hold is not None or show == "turntable":
+    one_picture = show == "orbit" and len(scene) == 1
+    if hold is not None or show == "turntable" or one_picture:
         moving = show in ("orbit", "turntable")
         scene = scene.held(hold or 0, scenes.TURNTABLE_FRAMES if moving else 1)
+        if moving:  # The camera is all that moves, and does not care for the film's rate.
+            rate = picture.frames_per_second or USUAL_FRAMES_PER_SECOND
+            scene = replace(scene, frames_per_second=rate)
         beside = None
     if show == "views":
         return scene, scenes.side_by_side(avatar, scene, seen, background)

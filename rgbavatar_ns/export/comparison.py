@@ -40,17 +40,20 @@ def write_comparison(
     picture: Path,
     positions: Sequence[int] | None = None,
     columns: int = 5,
-    frames_per_second: float = 25.0,
+    frames_per_second: float | None = None,
     background: tuple[float, float, float] = (1.0, 1.0, 1.0),
     progress: Callable[[int, int], None] | None = None,
 ) -> int:
     """Write the film (truth, avatar, error side by side) and a picture of a few frames.
 
-    positions: the held-out frames by default. The picture has one column for each of `columns`
+    positions: the held-out frames by default, of one camera after the other. frames_per_second:
+    by default the film's own. The picture has one column for each of `columns`
     evenly spread frames: truth above, avatar in the middle, error (times 4) below. Returns the
     number of frames. Raises UserError where no frames are held out.
     """
-    chosen = tuple(dataset.test if positions is None else positions)
+    names = dataset.camera_names
+    held_out = sorted(dataset.test, key=lambda position: names[position]) if names else dataset.test
+    chosen = tuple(held_out if positions is None else positions)
     if not chosen:
         raise UserError(
             f"The dataset {dataset.root} holds out no frames.", "Name the frames to compare."
@@ -67,6 +70,6 @@ def write_comparison(
             if progress is not None:
                 progress(done, len(chosen))
 
-    count = write_video(video, film(), frames_per_second)
+    count = write_video(video, film(), frames_per_second or dataset.playback_rate)
     write_png(picture, np.concatenate(kept, axis=1))
     return count

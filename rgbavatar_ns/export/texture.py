@@ -206,8 +206,13 @@ def uv_wires(avatar: Avatar, side_px: int) -> UInt8[np.ndarray, "R R 4"]:
 def write_texture(path: Path, avatar: Avatar, side_px: int | None = None) -> Path:
     """Write `color_texture` as a PNG and, beside it, its wires; return where those are.
 
-    Raises UserError where they cannot be written.
+    Raises UserError where they cannot be written, or would replace a picture that was painted on.
     """
+    if path.exists():
+        raise UserError(
+            f"{path} is there already, and may have been painted on.",
+            "Name another file, or move it away.",
+        )
     texture = color_texture(avatar, side_px)
     wires = path.with_name(f"{path.stem}_wires.png")
     for place, picture in ((path, texture), (wires, uv_wires(avatar, len(texture)))):

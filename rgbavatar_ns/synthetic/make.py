@@ -231,7 +231,14 @@ def make_demo_dataset(
     film = film_demo(config)
     head, size = film.person.head, config.image_size
     writer = DatasetWriter(
-        dst, head.arrays, film.person.identity, head.layout, size, size, overwrite=overwrite
+        dst,
+        head.arrays,
+        film.person.identity,
+        head.layout,
+        size,
+        size,
+        overwrite=overwrite,
+        frames_per_second=config.frames_per_second,
     )
     for frame in film.frames():
         writer.add(frame)

@@ -188,7 +188,10 @@ class _Tracking:
         background = self._background(images, made_from) if images.finds_mattes else None
         with disk_errors(dst, GO_ON):
             size, keep = clip.crop.size, bool(noted)
-            writer = DatasetWriter(dst, arrays, identity, layout, size, size, True, keep)
+            rate = found.frames_per_second
+            writer = DatasetWriter(
+                dst, arrays, identity, layout, size, size, True, keep, frames_per_second=rate
+            )
         self._write_images(clip, thetas, images, background, writer, noted)
         frames, clock = len(found), self.clock
         clock.begin("report", frames)

@@ -1,5 +1,6 @@
 """`rgbavatar export`: each format opens elsewhere, mistakes are told."""
 
+import json
 import re
 import shutil
 from dataclasses import replace
@@ -137,6 +138,42 @@ def test_a_module_is_a_folder_for_a_site(bundle, data, tmp_path, capsys):
     assert "example.html" in capsys.readouterr().out
 
 
+def test_the_destinations_ending_says_what_is_written(bundle, tmp_path):
+    names = ("a.ply", "a.compressed.ply", "a.glb", "a.HTML", "a.png", "a")
+    for name in names:
+        _export(bundle, tmp_path / name)
+    begins = [(tmp_path / name).read_bytes()[:9] for name in names[:-1]]
+    assert [text[:3] for text in begins[:2]] == [b"ply"] * 2
+    compressed, plain = ((tmp_path / name).stat().st_size for name in names[1::-1])
+    assert compressed < plain / 2
+    assert begins[2][:4] == b"glTF"
+    assert begins[3] == b"<!doctype"
+    assert begins[4][1:4] == b"PNG"
+    Avatar.load(tmp_path / "a")
+
+
+def test_a_film_is_played_at_its_own_rate(bundle, tmp_path):
+    film = small_dataset(tmp_path / "film", avatar_of().head)
+    index = tmp_path / "film" / "dataset.json"
+    index.write_text(json.dumps(json.loads(index.read_text()) | {"frames_per_second": 30}))
+    words = ("--data", tmp_path / "film")
+    _export(bundle, tmp_path / "own.html", *words)
+    _export(bundle, tmp_path / "slow.html", *words, "--frames-per-second", 10)
+    rates = [
+        avatar_of_page(tmp_path / name)[0]["frames_per_second"]
+        for name in ("own.html", "slow.html")
+    ]
+    assert rates == [30, 10]
+    assert film.playback_rate == 25, "of a dataset that does not say"
+
+
+def test_a_picture_to_paint_on_is_not_written_over(bundle, tmp_path, refused):
+    _export(bundle, tmp_path / "me.png")
+    before = (tmp_path / "me.png").read_bytes()
+    assert "may have been painted on" in refused("export", bundle, tmp_path / "me.png")
+    assert (tmp_path / "me.png").read_bytes() == before
+
+
 def test_the_runs_own_data_is_the_default(bundle, data, tmp_path, capsys):
     run = Path(shutil.copytree(bundle, tmp_path / "run"))
     manager = {"dataparser": {"data": None}, "data": [str(data)]}
@@ -168,5 +205,14 @@ def test_mistakes_are_told(bundle, data, tmp_path, refused):
             "is no server",
         ),
         ([bundle, data], "not an avatar bundle"),
+        ([bundle, tmp_path / "b.ply", "--no-head-inside"], "--no-head-inside changes nothing of"),
+        ([bundle, tmp_path / "b.html", "--frame", 1], "--frame changes nothing of --format web."),
+        ([bundle, tmp_path / "b.png", "--frames", 0, 1], "--frames changes nothing of"),
+        ([bundle, tmp_path / "b", "--frames-per-second", 25], "--frames-per-second changes"),
+        ([bundle, tmp_path / "b", "--no-performance"], "or take --format web or --format web-m"),
+        (
+            [bundle, tmp_path / "b", "--format", "web-module", "--title", "Me"],
+            "--title changes nothing of --format web-module",
+        ),
     ):
         assert told in refused("export", *words)

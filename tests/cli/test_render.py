@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 from pathlib import Path
 
 import av
@@ -150,6 +151,46 @@ def test_a_bundle_with_statistics_needs_no_dataset(bundle, data, tmp_path, refus
     _render(tmp_path / "me", tmp_path, "--driver", data, "--frames", 0, 2)
     assert len(_film(tmp_path / "performance.mp4")) == 2
     assert "own dataset" in refused("render", tmp_path / "me", tmp_path)
+    _render(tmp_path / "me", tmp_path, "--show", "orbit", "--width", 20, "--height", 20)
+    assert len(_film(tmp_path / "orbit.mp4")) == 72, "of one face the camera's way is the film"
+    words = ["--show", "performance", "--frames", 0, 2]
+    assert "are those of a dataset" in refused("render", tmp_path / "me", tmp_path, *words)
+
+
+def _rate(path: Path) -> float:
+    with av.open(str(path)) as container:
+        return float(container.streams.video[0].average_rate)
+
+
+def test_films_keep_the_rate_of_the_performance(bundle, data, tmp_path):
+    driver = _write_dataset(tmp_path / "driver", seed=1)
+    for folder, rate in ((driver, 50.0), (Path(shutil.copytree(data, tmp_path / "own")), 12.5)):
+        index = folder / "dataset.json"
+        index.write_text(json.dumps(json.loads(index.read_text()) | {"frames_per_second": rate}))
+    own = ["--data", tmp_path / "own", "--width", 24, "--height", 24]
+    _render(bundle, tmp_path, *own[:2])
+    assert _rate(tmp_path / "comparison.mp4") == 12.5
+    _render(bundle, tmp_path, *own, "--show", "performance")
+    assert _rate(tmp_path / "performance.mp4") == 12.5
+    _render(bundle, tmp_path, *own, "--driver", driver)
+    assert _rate(tmp_path / "performance.mp4") == 50
+    _render(bundle, tmp_path, *own, "--show", "orbit", "--hold", 0)
+    assert _rate(tmp_path / "orbit.mp4") == 25, "a held face has no rate of its own"
+    _render(bundle, tmp_path, *own, "--show", "orbit", "--frames-per-second", 30)
+    assert _rate(tmp_path / "orbit.mp4") == 30
+
+
+def test_of_several_cameras_one_is_shown(bundle, data, tmp_path):
+    folder = Path(shutil.copytree(data, tmp_path / "several"))
+    index = json.loads((folder / "dataset.json").read_text())
+    frames = [dict(f, camera_name="ab"[f["index"] % 2]) for f in index["frames"]]
+    described = index | {"version": 2, "frames": frames}
+    (folder / "dataset.json").write_text(json.dumps(described))
+    words = ["--data", folder, "--show", "performance"]
+    _render(bundle, tmp_path, *words)
+    assert len(_film(tmp_path / "performance.mp4")) == 2, "frames 4 and 6 of 4 to 6"
+    _render(bundle, tmp_path, *words, "--driver", folder)
+    assert len(_film(tmp_path / "performance.mp4")) == 4
 
 
 def test_mistakes_are_told(bundle, data, tmp_path, refused):
@@ -166,6 +207,7 @@ def test_mistakes_are_told(bundle, data, tmp_path, refused):
         ("--show bases --frames 1 2", "--frames changes nothing of --show bases"),
         ("--show views --arc 20", "--arc changes nothing of --show views"),
         ("--show orbit --gain 2", "take --show bases"),
+        ("--show performance --smooth", "nobody drives the avatar"),
     ):
         assert told in refused("render", bundle, tmp_path, "--data", data, *words.split())
 

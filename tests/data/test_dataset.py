@@ -54,6 +54,32 @@ def error_of(folder: Path) -> UserError:
     return caught.value
 
 
+def test_the_films_rate_is_kept_and_25_where_there_is_none(tmp_path, head, folder):
+    plain = load_dataset(folder)
+    assert (plain.frames_per_second, plain.playback_rate) == (None, 25)
+    size = (WIDTH, HEIGHT)
+    writer = DatasetWriter(
+        tmp_path / "film", head.arrays, plain.identity, head.layout, *size, frames_per_second=29.97
+    )
+    writer.add(frame(head, 0))
+    film = writer.finish(0)
+    assert (film.frames_per_second, film.playback_rate) == (29.97, 29.97)
+
+
+@pytest.mark.parametrize("rate", [0, -25, 1e9, "25", None, True, [25]])
+def test_a_rate_that_is_none_is_told(folder, rate):
+    edit_index(folder, frames_per_second=rate)
+    assert "frames_per_second" in error_of(folder).cause
+
+
+def test_of_several_cameras_one_film_is_taken(folder):
+    dataset = load_dataset(folder)
+    assert dataset.of_one_camera([1, 0]) == (1, 0)
+    several = replace(dataset, camera_names=tuple("ab"[k % 2] for k in range(len(dataset))))
+    assert several.of_one_camera(range(1, len(dataset))) == tuple(range(1, len(dataset), 2))
+    assert several.of_one_camera([]) == ()
+
+
 def test_what_is_written_is_read_bit_for_bit(tmp_path, head):
     small_dataset(tmp_path / "data", head, per_frame_camera=True)
     dataset = load_dataset(tmp_path / "data")

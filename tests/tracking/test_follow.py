@@ -112,6 +112,24 @@ def _seen(faces: list[np.ndarray | None], **changes: np.ndarray) -> SeenFaces:
     return SeenFaces(**(plain | changes))
 
 
+def test_the_films_rate_comes_from_its_clock() -> None:
+    faces: list[np.ndarray | None] = [_face(300 + 3 * k, 240) for k in range(10)]
+
+    def rate(times_s: np.ndarray, clip: list[int]) -> float | None:
+        seen = _seen(faces, time_s=times_s, clip=np.array(clip))
+        return followed_face(seen, WIDTH, HEIGHT).frames_per_second
+
+    one, two = [0] * 10, [0] * 5 + [1] * 5
+    rounded = np.round(np.arange(10) / 30, 3)  # as WebM and MKV do: steps of 33 and 34 ms
+    assert rate(rounded, one) == pytest.approx(30)
+    assert rate(rounded % 0.1667, two) == pytest.approx(30, abs=0.2), "each clip begins anew"
+    paused = np.arange(10) / 50.0
+    paused[4:] += 7.0
+    assert rate(paused, one) == pytest.approx(50)
+    assert rate(np.full(10, np.nan), one) is None, "pictures in a folder"
+    assert rate(np.zeros(10), one) is None
+
+
 def test_gaps_jumps_pauses_and_new_clips_begin_segments() -> None:
     faces: list[np.ndarray | None] = [_face(300 + 3 * k, 240) for k in range(10)]
     plain = followed_face(_seen(faces), WIDTH, HEIGHT)

@@ -2,7 +2,7 @@
 
 import os
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any, TypeGuard
@@ -25,6 +25,7 @@ from rgbavatar_ns.drawing.compositing import all_filmed
 from rgbavatar_ns.errors import UserError, first_few
 from rgbavatar_ns.head import HeadArrays, HeadModel, ThetaLayout
 from rgbavatar_ns.kernels.types import PinholeCameras
+from rgbavatar_ns.options import FRAME_RATES
 from rgbavatar_ns.reading import DamagedFileError, json_numbers, load_array, load_json
 
 _MAKE_ONE = (
@@ -33,6 +34,8 @@ _MAKE_ONE = (
 )
 _WRITE_AGAIN = "Write the dataset again, or mend this file."
 _LARGEST_NUMBER = 10**15
+USUAL_FRAMES_PER_SECOND = 25.0
+"""Of a film whose rate is not known: the paper's."""
 _SHOWN = 200
 
 
@@ -66,6 +69,8 @@ class TrackedDataset:
     """Where an imported dataset came from: `format`, `path`, `notes`."""
     marks_unfilmed: bool = False
     """Whether `UNFILMED_RGBA` says something in its files; else it is background by chance."""
+    frames_per_second: float | None = None
+    """The film's rate; None where nobody said it."""
 
     def __len__(self) -> int:
         return len(self.image_paths)
@@ -75,6 +80,16 @@ class TrackedDataset:
         """Positions of the frames to train from."""
         held_out = set(self.test)
         return tuple(position for position in range(len(self)) if position not in held_out)
+
+    @property
+    def playback_rate(self) -> float:
+        """Frames per second to show it at: the film's own, or 25 where it is not known."""
+        return self.frames_per_second or USUAL_FRAMES_PER_SECOND
+
+    def of_one_camera(self, positions: Iterable[int]) -> tuple[int, ...]:
+        """Those of the positions that the first one's camera saw: the others saw the same."""
+        listed, names = tuple(positions), self.camera_names
+        return tuple(p for p in listed if not names or names[p] == names[listed[0]])
 
     def read_image(self, position: int) -> UInt8[np.ndarray, "height width 4"]:
         """Decode one frame to RGBA, straight alpha, `UNFILMED_RGBA` where nobody filmed.
@@ -120,6 +135,7 @@ def load_native(path: str | Path) -> TrackedDataset:
         _column(root, frames, "timestep", int),
         source if isinstance(source, dict) else {},
         index["version"] >= 3 and index.get("unfilmed") is True,
+        _read_rate(root, index),
     )
 
 
@@ -158,6 +174,20 @@ def _whole(index: dict[str, Any], name: str) -> int:
             _WRITE_AGAIN,
         )
     return value
+
+
+def _read_rate(root: Path, index: dict[str, Any]) -> float | None:
+    """The film's rate; None where the index has none."""
+    if "frames_per_second" not in index:
+        return None
+    rate = index["frames_per_second"]
+    if type(rate) not in (int, float) or not FRAME_RATES.holds(rate):
+        raise UserError(
+            f"{root / INDEX_FILE} has frames_per_second = {str(rate)[:_SHOWN]}; a number "
+            f"{FRAME_RATES} is needed.",
+            "Mend it, or leave it out: the film is then shown at 25.",
+        )
+    return float(rate)
 
 
 def _is_whole(value: Any) -> TypeGuard[int]:

@@ -73,6 +73,7 @@ class DatasetWriter:
         keep_images: go on with an unfinished dataset: images that are there stay, for
             `add_encoded`. Implies overwrite.
         source: where the frames came from, for people to read.
+        frames_per_second: the film's rate, if it is known.
     """
 
     def __init__(
@@ -86,6 +87,7 @@ class DatasetWriter:
         overwrite: bool = False,
         keep_images: bool = False,
         source: Mapping[str, Any] | None = None,
+        frames_per_second: float | None = None,
     ) -> None:
         self._root = Path(dst)
         self._arrays = arrays
@@ -96,6 +98,7 @@ class DatasetWriter:
         self._frames: list[dict[str, Any]] = []
         self._numbers: set[int] = set()
         self._source = dict(source or {})
+        self._rate = frames_per_second
         self._unfilmed = False
         self._clear(overwrite, keep_images)
 
@@ -212,6 +215,8 @@ class DatasetWriter:
         index |= self._split(test) | self._shared_cameras()
         if self._source:
             index["source"] = self._source
+        if self._rate is not None:
+            index["frames_per_second"] = self._rate
         of_version_2 = {"test", "cameras", "source"} & index.keys()
         if of_version_2 or any(len(frame) > 3 for frame in self._frames):
             index["version"] = 2

@@ -11,15 +11,21 @@ _WHITE = (1.0, 1.0, 1.0)
 
 
 def dataset_source(
-    folder: Path, frames_per_second: float, real_time: bool, with_images: bool
+    folder: Path, frames_per_second: float | None, real_time: bool, with_images: bool
 ) -> RecordedSource:
-    """All frames of a dataset, as many a second; raises UserError where it cannot be read."""
+    """A dataset's frames of its first camera, at this rate or, by default, at the film's own.
+
+    Raises UserError where it cannot be read.
+    """
     dataset = load_dataset(folder)
+    places, rate = dataset.of_one_camera(range(len(dataset))), frames_per_second
+    times_s = [number / (rate or dataset.playback_rate) for number in range(len(places))]
 
-    def frame(place: int, captured_s: float) -> PerformanceFrame:
+    def frame(number: int, captured_s: float) -> PerformanceFrame:
+        place = places[number]
         seen = composite_bytes(dataset.read_image(place), _WHITE) if with_images else None
-        theta, time_s = dataset.theta[place], place / frames_per_second
-        return PerformanceFrame(place, captured_s, time_s, theta=theta, image_rgb=seen)
+        return PerformanceFrame(
+            number, captured_s, times_s[number], theta=dataset.theta[place], image_rgb=seen
+        )
 
-    times_s = [place / frames_per_second for place in range(len(dataset))]
     return RecordedSource(times_s, frame, PerformerHead(dataset.layout, dataset.arrays), real_time)

@@ -109,13 +109,16 @@ class ViewerPanel(ViewerControl):
         self._viewer = viewer
         draw_by_render_threads(viewer)
         self.state = ViewerState(background=(1.0, 1.0, 1.0))
+        if self._film is not None:
+            self.state = replace(self.state, frames_per_second=self._film.playback_rate)
         arrays, statistics = self._model.avatar.head.arrays, training_statistics(self._model)
         sliders = number_sliders(ThetaNames.of(self._model.avatar.layout, arrays), statistics)
         labels = {slider.place: slider.label for slider in sliders}
         names = [labels[place] for place in range(len(labels))]
         self._beyond = partial(told_beyond, statistics, names)
         gui = viewer.viser_server.gui
-        self._widgets = Widgets(gui, self, sliders, statistics, self._num_frames)
+        rate = self.state.frames_per_second
+        self._widgets = Widgets(gui, self, sliders, statistics, self._num_frames, rate)
         viewpoint = Viewpoint.before(self._model.avatar, self._model.subject)
         viewer.viser_server.scene.set_up_direction("+z")
         viewer.viser_server.on_client_connect(viewpoint.place)
@@ -246,7 +249,7 @@ class ViewerPanel(ViewerControl):
                 driver,
                 range(len(driver)),
                 training_statistics(self._model),
-                self.state.frames_per_second,
+                driver.playback_rate,
                 DrivingOptions(relative=relative),  # type: ignore[arg-type]
             )
         except Exception as error:  # In one of the viewer's threads nobody would see it.

@@ -43,6 +43,7 @@ class Widgets:
         sliders: list[NumberSlider],
         statistics: TrainingStatistics,
         num_frames: int,
+        frames_per_second: float,
     ) -> None:
         self._gui, self._do = gui, actions
         self._numbers: list[tuple[NumberSlider, Any]] = []
@@ -53,7 +54,7 @@ class Widgets:
             self._said = gui.add_markdown("", visible=False)
             tabs = gui.add_tab_group()
             with tabs.add_tab("Drive"):
-                self._add_driving(num_frames)
+                self._add_driving(num_frames, frames_per_second)
             with tabs.add_tab("Face"):
                 self._add_numbers(sliders)
             with tabs.add_tab("Bases"):
@@ -103,7 +104,7 @@ class Widgets:
         self._said.content = text
         self._said.visible = bool(text)
 
-    def _add_driving(self, num_frames: int) -> None:
+    def _add_driving(self, num_frames: int, frames_per_second: float) -> None:
         gui, do = self._gui, self._do
         hint = "What chooses expression and pose; moving a slider of the face does it by hand"
         driven_by = gui.add_dropdown("Driven by", get_args(DrivenBy), hint=hint)
@@ -115,7 +116,7 @@ class Widgets:
         hint = "Frames one after the other, round and round"
         play = gui.add_checkbox("Play", False, hint=hint)
         _on(play, do.play)
-        rate = round(ViewerState.frames_per_second)
+        rate = min(max(round(frames_per_second), 1), 60)
         self._slider("Frames/s", (1, 60, 1), rate, lambda v: do.change(frames_per_second=float(v)))
         self._button("Neutral", do.show_neutral, "Drive by hand from the most neutral frame")
         hint = "Within what was seen in training"

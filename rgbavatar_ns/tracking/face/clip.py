@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.options import FRAME_RATES
 from rgbavatar_ns.reading import DamagedFileError, load_arrays
 from rgbavatar_ns.tracking.face.detector import face_height_px
 from rgbavatar_ns.tracking.face.follow import FaceFollower
@@ -76,7 +77,8 @@ class ClipLandmarks:
 
     `frame_index` counts all frames read, `clip` says from which file each one is, `segment` counts
     up at each gap, cut or jump. `with_others` lists frames in which another face was seen too,
-    `blurred` those whose face is far less sharp than usual.
+    `blurred` those whose face is far less sharp than usual. `frames_per_second` is None where the
+    source has no clock.
     """
 
     points_px: Float[np.ndarray, "F 478 2"]
@@ -89,6 +91,7 @@ class ClipLandmarks:
     height: int
     with_others: tuple[int, ...]
     blurred: tuple[int, ...]
+    frames_per_second: float | None = None
 
     def __len__(self) -> int:
         return len(self.frame_index)
@@ -168,7 +171,22 @@ def followed_face(seen: SeenFaces, width: int, height: int) -> ClipLandmarks:
         height,
         tuple(others),
         _blurred(np.array(sharpness), index),
+        _frames_per_second(seen),
     )
+
+
+def _frames_per_second(seen: SeenFaces) -> float | None:
+    """The film's rate, over the steps between frames of a clip that are no pauses.
+
+    Their mean, since many files round times to milliseconds; None without a clock, or beyond what
+    a dataset takes.
+    """
+    steps = np.diff(seen.time_s)[np.diff(seen.clip) == 0]
+    steps = steps[steps > 0]
+    if not len(steps):
+        return None
+    rate = 1 / float(steps[steps <= _PAUSE * np.median(steps)].mean())
+    return round(rate, 3) if FRAME_RATES.holds(rate) else None
 
 
 def _segments(
