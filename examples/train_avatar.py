@@ -60,17 +60,18 @@ def main() -> None:
     with Progress() as progress:
         fit(step, batch_at, range(options.steps), Shown(progress, options.steps))
 
+    options.out.mkdir(parents=True, exist_ok=True)
+    avatar.save(options.out / "trained.avatar")
+    print(f"the avatar is in {options.out}")
     scores = []
     for frame in data.test:
         camera = data.cameras.select([frame]).to(device)
         drawn = avatar.render(data.theta[[frame]].to(device), camera).image
         scores.append(evaluate_images(drawn, images.get([frame]).to(device))["psnr"])
     images.close()
-    print(f"held-out PSNR {sum(scores) / len(scores):.2f} dB over {len(scores)} frames")
-    options.out.mkdir(parents=True, exist_ok=True)
-    avatar.save(options.out / "trained.avatar")
-    write_comparison(avatar, data, options.out / "held_out.mp4", options.out / "held_out.png")
-    print(f"avatar, film and picture are in {options.out}")
+    if scores:
+        print(f"held-out PSNR {sum(scores) / len(scores):.2f} dB over {len(scores)} frames")
+        write_comparison(avatar, data, options.out / "held_out.mp4", options.out / "held_out.png")
 
 
 if __name__ == "__main__":

@@ -36,9 +36,12 @@ def dataset_folder(path: Path) -> Path:
             # The base loader knows no tags and no merging: plain lists, mappings and texts.
             described = yaml.load(content, yaml.BaseLoader)
             manager = described["pipeline"]["datamanager"]
-            # Each may name it; the first that does is the one that was read.
-            for parts in (manager["dataparser"]["data"], manager["data"], described["data"]):
-                if isinstance(parts, list) and parts and all(isinstance(p, str) for p in parts):
+            # Each may name it; the first that does is the one that was read. A path without parts
+            # is the folder that the run was started in, and earlier runs' word for none.
+            named = (manager["dataparser"]["data"], manager["data"], described["data"])
+            paths = [parts for parts in named if isinstance(parts, list)]
+            for parts in sorted(paths, key=lambda parts: not parts):
+                if all(isinstance(part, str) for part in parts):
                     return Path(*parts)
             raise KeyError("data")
     except DamagedFileError as error:

@@ -26,7 +26,12 @@ from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.options import Counted, Seed
 from rgbavatar_ns.plugin.cameras import filled_depth, from_nerfstudio
-from rgbavatar_ns.plugin.checkpoint_state import misfits_told, model_state, require_same_layout
+from rgbavatar_ns.plugin.checkpoint_state import (
+    misfits_told,
+    model_state,
+    require_same_layout,
+    tell_another_person,
+)
 from rgbavatar_ns.plugin.dataparser import Subject
 from rgbavatar_ns.plugin.refinement import frame_refinement, require_same_refinement
 
@@ -52,7 +57,7 @@ class AvatarModelConfig(ModelConfig):
     refinement: RefinementConfig = field(default_factory=RefinementConfig)
     """How far and how quickly tracking is corrected."""
     rasterizer: str = "auto"
-    """Backend of the rasterizer, one of `rgbavatar_ns.kernels.available_backends()` or auto."""
+    """Backend of the rasterizer: auto, or one of `rgbavatar_ns.kernels.available_backends()`."""
     seed: Seed | None = None
     """Seed of what is random in a fresh avatar; by default that of the run, `--machine.seed`."""
     enable_collider: bool = False
@@ -208,7 +213,7 @@ class AvatarModel(Model):
         return model_state(self.avatar, subject)
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Nothing to restore: `load_state_dict` has compared it with this dataset's subject."""
+        """Nothing to restore: `load_state_dict` has compared its layout with this dataset's."""
 
     def load_state_dict(
         self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False
@@ -216,6 +221,7 @@ class AvatarModel(Model):
         """Load parameters; raises UserError where they are not all those of this model's make."""
         require_same_layout(state_dict, self.avatar)
         require_same_refinement(state_dict, self.refinement)
+        tell_another_person(state_dict, self.subject)
         self.avatar.fit_to(state_dict, "avatar.")
         state_dict = self.of_this_version(state_dict)
         with misfits_told():

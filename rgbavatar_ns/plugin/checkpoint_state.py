@@ -5,6 +5,7 @@ from contextlib import contextmanager
 from typing import Any
 
 import torch
+from nerfstudio.utils.rich_utils import CONSOLE
 
 from rgbavatar_ns.avatar.method import AvatarMethod, describe_layout
 from rgbavatar_ns.avatar.prior import SurfacePrior
@@ -16,6 +17,8 @@ from rgbavatar_ns.plugin.dataparser import Subject
 
 _EXTRA_STATE = "_extra_state"
 _PRIOR = "prior."
+_SAME_IDENTITY = 1e-4
+"""Coefficients are of size one."""
 
 
 def model_state(avatar: AvatarMethod, subject: Subject) -> dict[str, Any]:
@@ -69,6 +72,22 @@ def require_same_layout(state_dict: Mapping[str, Any], avatar: AvatarMethod) -> 
             "tracked with the same head model.",
         )
     _require_same_make(config, avatar)
+
+
+def tell_another_person(state_dict: Mapping[str, Any], subject: Subject) -> None:
+    """Say where the checkpoint's head is not that of the dataset, as after tracking anew."""
+    saved = state_dict.get("avatar.identity")
+    mine = subject.identity
+    if not isinstance(saved, torch.Tensor) or saved.shape != mine.shape:
+        return
+    if not torch.allclose(saved.cpu(), mine.cpu(), atol=_SAME_IDENTITY):
+        CONSOLE.print(
+            "note: the checkpoint's person was measured otherwise than this data's, which is of "
+            "another one or was tracked anew since. The avatar may lie beside the pictures: train "
+            "it anew, or name the dataset that it was trained on.",
+            highlight=False,
+            soft_wrap=True,
+        )
 
 
 def with_prior(state_dict: dict[str, Any], prior: SurfacePrior | None) -> dict[str, Any]:

@@ -56,7 +56,7 @@ class RGBAvatarDataParserConfig(DataParserConfig):
     """Reads a dataset folder of `rgbavatar track`, `rgbavatar demo-data` or another system."""
 
     _target: type = field(default_factory=lambda: RGBAvatarDataParser)
-    data: Path = Path()
+    data: Path | None = None  # pyright: ignore[reportIncompatibleVariableOverride]
     """Folder that holds dataset.json, or another system's data."""
     importing: ImportOptions = field(default_factory=ImportOptions)
     """How another system's data is read."""
@@ -88,7 +88,7 @@ class RGBAvatarDataParser(DataParser):
     def tracked(self) -> TrackedDataset:
         """The dataset, validated and read on first use; raises UserError on any problem."""
         if self._tracked is None:
-            if self.config.data == Path():
+            if self.config.data is None:
                 raise UserError(
                     "No dataset was named.",
                     "Pass --data FOLDER; `rgbavatar demo-data FOLDER` makes one to try.",

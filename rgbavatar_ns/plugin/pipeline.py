@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,7 @@ from rgbavatar_ns.avatar.training.step import StepKind, TrainingStep
 from rgbavatar_ns.avatar.training.theta_fit import fit_theta
 from rgbavatar_ns.data import TrackedDataset
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.kernels import available_backends
 from rgbavatar_ns.plugin.avatar_model import AvatarModel, AvatarModelConfig
 from rgbavatar_ns.plugin.cameras import as_perspective, from_nerfstudio, is_perspective
 from rgbavatar_ns.plugin.datamanager import RGBAvatarDataManager, RGBAvatarDataManagerConfig
@@ -58,6 +59,8 @@ class RGBAvatarPipeline(VanillaPipeline):
     def __init__(
         self, config: RGBAvatarPipelineConfig, device: str | torch.device, **more: Any
     ) -> None:
+        if more.get("test_mode", "val") != "val":
+            config, device = to_look_at(config, str(device))
         super().__init__(config, str(device), **more)
         self.viewer_panel = ViewerPanel(self.model, self.film)
         self.model.view = self._view
@@ -192,6 +195,19 @@ class RGBAvatarPipeline(VanillaPipeline):
                 numbers = {n: value for n, value in found.items() if isinstance(value, float)}
                 scores.append({f"{name}_refined": value for name, value in numbers.items()})
         return with_sharpness(mean_scores(scores), "_refined")
+
+
+def to_look_at(config: RGBAvatarPipelineConfig, device: str) -> tuple[RGBAvatarPipelineConfig, str]:
+    """The run's config and a device as they can draw on this machine, wherever it was trained.
+
+    nerfstudio takes a GPU wherever there is one; without kernels for it the processor is quicker.
+    """
+    available = available_backends()
+    if torch.device(device).type == "cuda" and "cuda" not in available and "cpu" in available:
+        device = "cpu"
+    if config.model.rasterizer not in ("auto", "reference", torch.device(device).type):
+        config = replace(config, model=replace(config.model, rasterizer="auto"))
+    return config, device
 
 
 def _as_batch(cameras: Cameras, batch: dict[str, Any]) -> TrainingBatch:

@@ -12,6 +12,7 @@ from rgbavatar_ns.data.streams import StreamedFrame, StreamSubject
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.tracking.config import TrackConfig
 from rgbavatar_ns.tracking.input.capture import FileCapture, FrameCapture, LatestFrameCapture
+from rgbavatar_ns.tracking.input.image_files import source_digest
 
 
 class VideoStream:
@@ -41,7 +42,7 @@ class VideoStream:
         self._tracker = tracker
         self.keeps_frames = self._capture.keeps_frames
         # A file's frames have the same numbers in the next run, a camera's begin anew.
-        self._session = "" if self.keeps_frames else secrets.token_hex(8)
+        self._session = _session_of(source) if self.keeps_frames else secrets.token_hex(8)
         self._counts: Counter[str] = Counter()
         self._subject: StreamSubject | None = None
         self._ready: deque[StreamedFrame] = deque()
@@ -131,6 +132,11 @@ class VideoStream:
                     image_rgba=frame.image_rgba,
                 )
             )
+
+
+def _session_of(source: str) -> str:
+    """The same whenever this file or folder is read, and another for another."""
+    return source_digest(Path(source))[:16] if Path(source).exists() else ""
 
 
 def _open(source: str) -> FrameCapture:

@@ -72,6 +72,30 @@ def test_what_cannot_be_used_is_left_out_and_counted_by_name(encode: bool):
     assert [line for line in told if "24 x 16" in line and "12 x 8" in line] == told[2:3]
 
 
+class _Film(GivenStream):
+    """One that can begin in its middle."""
+
+    went_on_after: int | None = None
+
+    def go_on_after(self, index: int) -> None:
+        self.went_on_after = index
+
+
+@pytest.mark.parametrize(
+    ("before", "now", "goes_on"), [("a", "a", True), ("", "a", True), ("a", "b", False)]
+)
+def test_another_film_is_not_gone_on_with_in_its_middle(before: str, now: str, goes_on: bool):
+    first, _ = ingest_of()
+    first.take_in(streamed(7, session=before))
+    film, who = _Film([streamed(0, session=now)]), replace(subject(), session=now)
+    second = Ingest(film, who, ReplayBuffer(who, LocalGlobalPools(150, 1000)))
+    second.load_state_dict(first.state_dict())
+    assert second.goes_on == goes_on
+    assert film.went_on_after == (7 if goes_on else None)
+    second.take_in(streamed(7, session=now))
+    assert second.counts()["duplicate"] == (before == now), "its numbers are its own"
+
+
 def test_a_png_is_not_longer_than_its_pixels():
     ingest, frames = ingest_of()
     png = streamed(0).png or b""

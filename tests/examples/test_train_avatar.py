@@ -1,5 +1,6 @@
 """The example that needs no nerfstudio: a dataset in, an avatar, its score and its picture out."""
 
+import json
 import re
 import runpy
 import sys
@@ -33,6 +34,18 @@ def test_it_trains_scores_and_draws(
     picture = cv2.imread(str(tmp_path / "out" / "held_out.png"))
     assert picture.shape[0] == 3 * SIZE
     assert len(SCRIPT.read_text().splitlines()) <= 80
+
+
+def test_without_held_out_frames_the_avatar_is_kept_all_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    tiny_dataset(tmp_path / "data")
+    index = tmp_path / "data" / "dataset.json"
+    index.write_text(json.dumps(json.loads(index.read_text()) | {"test_frames": 0}))
+    arguments = [str(tmp_path / "data"), str(tmp_path / "out"), "--steps", "1"]
+    monkeypatch.setattr(sys, "argv", [str(SCRIPT), *arguments, "--uv-resolution", "16"])
+    runpy.run_path(str(SCRIPT), run_name="__main__")
+    assert Avatar.load(tmp_path / "out" / "trained.avatar").num_gaussians > 50
 
 
 def test_it_needs_no_nerfstudio():

@@ -37,6 +37,13 @@ def test_the_dataparsers_own_folder_goes_first(tmp_path):
     assert dataset_folder(tmp_path) == Path("relative/folder")
 
 
+def test_the_folder_that_a_run_was_started_in_is_one(tmp_path):
+    here = _CONFIG.replace("PosixPath\n- /\n- some\n- data", "PosixPath []")
+    assert "some" not in here
+    (tmp_path / "config.yml").write_text(here)
+    assert dataset_folder(tmp_path) == Path()
+
+
 def test_what_is_no_run_is_taken_for_a_dataset(tmp_path):
     assert dataset_folder(tmp_path) == tmp_path
 

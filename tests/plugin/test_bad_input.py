@@ -1,6 +1,7 @@
 """What a user can get wrong is told with cause and remedy, before or during training."""
 
 import copy
+import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -12,9 +13,11 @@ import torch
 import yaml
 
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.plugin import pipeline as pipeline_module
+from rgbavatar_ns.plugin.pipeline import to_look_at
 from rgbavatar_ns.plugin.training.refused import REFUSED
 from rgbavatar_ns.plugin.training.trainer import RGBAvatarTrainerConfig
-from tests.plugin.run import make_trainer, small_config
+from tests.plugin.run import make_trainer, small_config, trained
 from tests.plugin.tiny import tiny_dataset
 
 
@@ -146,6 +149,55 @@ def test_the_page_names_every_option_that_is_refused():
         assert refused.option.rpartition(".")[2].replace("_", "-") in page
 
 
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [
+        ("gpu", "cannot be used here .available: .*cpu"),
+        ("cuda", "rasterizer is cuda, which"),
+        ("reference", None),
+    ],
+)
+def test_a_rasterizer_that_cannot_draw_here_is_told(
+    tiny_data: Path, tmp_path: Path, name: str, told: str | None
+):
+    config = copy.deepcopy(small_config(tiny_data, tmp_path / "runs", rasterizer=name))
+    if told is None:
+        config.save_config()
+        return
+    with pytest.raises(UserError, match=told):
+        config.save_config()
+    assert not (tmp_path / "runs").exists()
+
+
+def test_a_run_of_another_machine_is_looked_at_with_what_there_is(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    config = copy.deepcopy(small_config(Path("data"), Path("runs"), rasterizer="cuda")).pipeline
+    looked, device = to_look_at(config, "cpu")
+    assert (looked.model.rasterizer, device) == ("auto", "cpu")
+    assert config.model.rasterizer == "cuda", "the run's own config stays"
+    config.model.rasterizer = "cpu"
+    monkeypatch.setattr(pipeline_module, "available_backends", lambda: ("cuda", "cpu"))
+    looked, device = to_look_at(config, "cuda:0")
+    assert (looked.model.rasterizer, device) == ("auto", "cuda:0")
+    monkeypatch.setattr(pipeline_module, "available_backends", lambda: ("cpu", "reference"))
+    looked, device = to_look_at(config, "cuda:0")
+    assert (looked.model.rasterizer, device) == ("cpu", "cpu"), "no kernels, no crawling picture"
+
+
+def test_a_dataset_that_was_tracked_anew_is_told(
+    tiny_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    trainer = trained(small_config(tiny_data, tmp_path / "runs", max_num_iterations=1))
+    assert "measured otherwise" not in capsys.readouterr().out
+    anew = Path(shutil.copytree(tiny_data, tmp_path / "anew"))
+    index = json.loads((anew / "dataset.json").read_text())
+    index["identity"][0] += 0.5
+    (anew / "dataset.json").write_text(json.dumps(index))
+    make_trainer(small_config(anew, tmp_path / "more", load_dir=trainer.checkpoint_dir))
+    assert "was measured otherwise than this data's" in capsys.readouterr().out
+
+
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
 def test_a_gpu_that_is_not_there_is_told(tiny_data: Path, tmp_path: Path):
     config = small_config(tiny_data, tmp_path / "runs")
@@ -161,17 +213,8 @@ def test_a_place_that_cannot_be_written_is_told_at_the_start(tiny_data: Path, tm
         config.save_config()
 
 
-def test_latest_leads_to_the_run_begun_last(tiny_data: Path, tmp_path: Path):
-    for name in ("first", "second"):
-        config = small_config(tiny_data, tmp_path, timestamp=name)
-        config.save_config()
-    link = config.get_base_dir().with_name("latest")
-    assert link.resolve() == config.get_base_dir().resolve()
-    config.load_step = 7
+def test_the_step_that_a_run_goes_on_from_is_not_written(tiny_data: Path, tmp_path: Path):
+    config = small_config(tiny_data, tmp_path, load_step=7)
     config.save_config()
-    written = yaml.load((link / "config.yml").read_text(), yaml.Loader)
+    written = yaml.load((config.get_base_dir() / "config.yml").read_text(), yaml.Loader)
     assert (written.load_step, config.load_step) == (None, 7)
-    link.unlink()
-    link.mkdir()
-    config.save_config()
-    assert not link.is_symlink()

@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 import torch
 
+from rgbavatar_ns.data import load_dataset
 from rgbavatar_ns.data.streams import ReplayStream, SocketStream, StreamSubject
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.plugin.online.datamanager import is_recorded
 from rgbavatar_ns.plugin.online.sources import SourceConfig, await_subject, open_source
 from tests.data.streaming import Clock, GivenStream, streamed, subject
 from tests.plugin.online_run import online_config, online_trainer
@@ -24,6 +26,32 @@ def test_flags_name_the_source(tiny_data: Path):
         open_source(SourceConfig("socket", listen="0.0.0.0:0"), None)
     with pytest.raises(UserError, match="kind socket"):
         open_source(SourceConfig("folder"), tiny_data)
+
+
+def test_a_run_that_goes_on_keeps_its_recording(
+    tiny_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    who = ReplayStream(load_dataset(tiny_data)).subject(0.0)
+    config = online_config(tmp_path, recorded=tiny_data).pipeline.datamanager
+    assert is_recorded(config, who)
+    assert not capsys.readouterr().out
+    otherwise = dataclasses.replace(who, identity=who.identity + 0.1)
+    assert is_recorded(config, otherwise)
+    assert "measured anew" in capsys.readouterr().out
+    assert not is_recorded(config, dataclasses.replace(who, width=who.width + 1))
+    config.recorded = tmp_path / "nothing"
+    assert not is_recorded(config, who)
+
+
+def test_a_recording_of_an_earlier_run_in_the_folder_is_not_gone_on_with(
+    tiny_data: Path, tmp_path: Path
+):
+    first = online_trainer(online_config(tmp_path, tiny_data))
+    old = first.base_dir / "stream" / "dataset.json"
+    old.parent.mkdir()
+    old.touch()
+    online_trainer(online_config(tmp_path, tiny_data))
+    assert not old.exists()
 
 
 def test_the_first_usable_frame_is_waited_for():

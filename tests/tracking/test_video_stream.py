@@ -94,6 +94,17 @@ def test_a_file_goes_on_in_its_middle_with_the_same_subject(clip: Path):
     assert [frame.index for frame in take(late, 100)] == [2, 3, 4, 5, 6, 7]
 
 
+def test_a_file_is_one_session_whenever_it_is_read_and_another_file_is_another(
+    clip: Path, tmp_path: Path
+):
+    other = write_clip(tmp_path / "other.mp4", gradient_images(9))
+
+    def session(path: Path) -> str:
+        return take(VideoStream(str(path), tracker=CountingTracker()), 1)[0].session
+
+    assert session(clip) == session(clip) != session(other)
+
+
 class FakeCamera:
     """Gives some images, one for each of `steps`, then nothing."""
 

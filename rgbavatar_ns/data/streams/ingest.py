@@ -85,6 +85,8 @@ class Ingest:
         self._finished = threading.Event()
         self.failure: Exception | None = None
         """What ended the stream against its will; to be raised by who looks after the threads."""
+        self.goes_on = False
+        """Whether a resumed stream is the one that was left, and goes on where it was."""
 
     @property
     def finished(self) -> bool:
@@ -197,5 +199,8 @@ class Ingest:
         self._queue.dropped = self._counts.pop("dropped", 0)
         self._session = state["session"]
         self._seen.load_state_dict(state["numbers"])
-        if isinstance(self._stream, Rewindable):
+        # Earlier checkpoints of films know no session.
+        known = self._session in ("", self._subject.session)
+        if known and isinstance(self._stream, Rewindable):
+            self.goes_on = True
             self._stream.go_on_after(self._seen.newest)

@@ -12,7 +12,7 @@ from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from rgbavatar_ns.avatar.training.losses import random_backgrounds
-from rgbavatar_ns.data import DatasetWriter, LocalGlobalPools
+from rgbavatar_ns.data import DatasetWriter, LocalGlobalPools, load_dataset
 from rgbavatar_ns.data.sampling import PoolStrategy
 from rgbavatar_ns.data.streams import (
     FrameStream,
@@ -21,6 +21,7 @@ from rgbavatar_ns.data.streams import (
     ReplayBuffer,
     ReplayStream,
     Rewindable,
+    StreamSubject,
 )
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.files import atomic_folder
@@ -121,7 +122,8 @@ class OnlineDataManager(RGBAvatarDataManager):
         subject, self._first = stream.subject(0.0), None
         if not isinstance(stream, ReplayStream):
             subject, self._first = await_subject(stream, _tell)
-            _record(config, subject, [(0, self._first)])
+            if not is_recorded(config, subject):
+                _record(config, subject, [(0, self._first)])
         assert subject is not None
         self.pools = ReplayBuffer(subject, pools, save_images=not isinstance(stream, ReplayStream))
         self._ingest = Ingest(stream, subject, self.pools, config.queue_frames, _tell)
@@ -151,7 +153,7 @@ class OnlineDataManager(RGBAvatarDataManager):
 
     def start(self) -> None:
         """Begin to fill the pools."""
-        if not (self._resumed and isinstance(self._stream, Rewindable)):
+        if not (self._resumed and self.ingest.goes_on):
             self._hand_over_first()
         self.ingest.start()
 
@@ -218,7 +220,7 @@ class OnlineDataManager(RGBAvatarDataManager):
             return
         self._ingest.load_state_dict(state["stream"])
         self.images_drawn, self.ended_step = state["images"], state["ended_step"]
-        if self.ended_step is not None and not isinstance(self._stream, Rewindable):
+        if self.ended_step is not None and not self._ingest.goes_on:
             # What is sent or filmed now is no part of the stream that had ended.
             self.ended_step, self.begins_anew = None, True
         self.least = LeastLosses(state.get("least"))
@@ -243,10 +245,28 @@ def _of_dataset(config: OnlineDataManagerConfig, replayed: bool) -> OnlineDataMa
     if config.recorded is None or not config.recorded.exists():
         raise UserError(
             f"The run has recorded no frames ({config.recorded}).",
-            "Train it until its first checkpoint.",
+            "Train it: it records its first frame at once, and what its pools hold when it ends.",
         )
     dataparser = dataclasses.replace(config.dataparser)
     return dataclasses.replace(config, data=config.recorded, dataparser=dataparser)
+
+
+def is_recorded(config: OnlineDataManagerConfig, subject: StreamSubject) -> bool:
+    """Whether the run goes on from a recording of this subject; another measure of it is told."""
+    assert config.recorded is not None
+    try:
+        before = load_dataset(config.recorded)
+    except UserError:
+        return False
+    size = (before.width, before.height)
+    if before.layout != subject.layout or size != (subject.width, subject.height):
+        return False
+    if not torch.allclose(before.identity, subject.identity.cpu(), atol=1e-4):
+        _tell(
+            "note: the person was measured anew, a little otherwise than when the run began; the "
+            "avatar keeps the first measure, and may lie a little beside what is filmed now."
+        )
+    return True
 
 
 def _record(config: OnlineDataManagerConfig, subject: Any, frames: Any) -> None:

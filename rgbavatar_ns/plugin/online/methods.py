@@ -28,7 +28,7 @@ rgbavatar_paper_online = MethodSpecification(
         pipeline=OnlinePipelineConfig(
             # A stream may go on to show what was not seen yet.
             model=replace(paper_model(), hide_unseen=False),
-            datamanager=OnlineDataManagerConfig(local_share=0.7, new_first=False),
+            datamanager=OnlineDataManagerConfig(new_first=False),
         ),
         steps_after_stream=0,
         final_learning_rate_factor=1.0,

@@ -70,7 +70,7 @@ def open_source(
         from rgbavatar_ns.tracking.video_stream import VideoStream
 
         return VideoStream(config.video)
-    if data is None or data == Path():
+    if data is None:
         raise UserError(
             "No dataset was named.",
             "Pass --data FOLDER; `rgbavatar demo-data FOLDER` makes a dataset to try.",

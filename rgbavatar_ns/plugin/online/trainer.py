@@ -4,6 +4,7 @@ RGBAvatar, sec. 3.3. The stream runs in its own threads; a step takes what the p
 """
 
 import dataclasses
+import shutil
 import signal
 import time
 from collections.abc import Iterator
@@ -92,7 +93,11 @@ class OnlineTrainer(RGBAvatarTrainer):
             )
         super().__init__(config, local_rank, world_size)
         self.stop = OnlineStop()
-        config.pipeline.datamanager.recorded = config.get_base_dir() / "stream"
+        recorded = config.get_base_dir() / "stream"
+        if config.load_dir is None and config.load_checkpoint is None:
+            # Of an earlier run in this folder, perhaps of somebody else.
+            shutil.rmtree(recorded, ignore_errors=True)
+        config.pipeline.datamanager.recorded = recorded
         self._next_look_s = 0.0
         self._next_watch_s, self._last_watched = 0.0, -1
         self._psnr: float | None = None

@@ -27,8 +27,10 @@ _STILL_S = 60.0
 def save_checkpoint(state: dict[str, Any], folder: Path, step: int, keep: int) -> Path:
     """Write `folder/step-XXXXXXXXX.ckpt` atomically, then remove all but the newest `keep`.
 
-    The file grows under another name beside the folder (nerfstudio takes every file inside it
-    for a checkpoint), is synced and renamed: at any moment the folder holds only whole files.
+    So are those of later steps, which an earlier run has left here, or the way that a run has gone
+    back from: everybody would take them for the newest. The file grows under another name beside
+    the folder (nerfstudio takes every file inside it for a checkpoint), is synced and renamed: at
+    any moment the folder holds only whole files.
 
     Raises:
         UserError: there is too little space; older checkpoints are untouched.
@@ -45,8 +47,11 @@ def save_checkpoint(state: dict[str, Any], folder: Path, step: int, keep: int) -
         partial.open("wb") as file,
     ):
         torch.save(state, file)
-    for _, old in list_checkpoints(folder)[: -max(1, keep)]:
-        old.unlink()
+    there = list_checkpoints(folder)
+    kept = [one for number, one in there if number <= step][-max(1, keep) :]
+    for _, old in there:
+        if old not in kept:
+            old.unlink()
     return path
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import yaml
 from nerfstudio.engine.trainer import TrainerConfig
 
-from rgbavatar_ns.avatar.storage.checkpoint_file import list_checkpoints
+from rgbavatar_ns.avatar.storage.checkpoint_file import MODELS_FOLDER, list_checkpoints
 from rgbavatar_ns.errors import UserError, first_few
 from rgbavatar_ns.reading import DamagedFileError, damage_told, load_json, read_file
 
@@ -22,6 +22,15 @@ _LOAD_CONFIG = re.compile(r"--load[-_]config(=|$)")
 def loads_config(command_line: Sequence[str]) -> bool:
     """Whether a run's config is named, which then takes the place of all of the command's own."""
     return any(map(_LOAD_CONFIG.match, command_line))
+
+
+def _named(command_line: Sequence[str]) -> Path:
+    """The file that --load-config names."""
+    words = iter(command_line)
+    for word in words:
+        if _LOAD_CONFIG.match(word):
+            return Path(word.partition("=")[2] or next(words, ""))
+    return Path()
 
 
 def require_loadable(path: Path, command_line: Sequence[str]) -> None:
@@ -49,12 +58,21 @@ def require_loadable(path: Path, command_line: Sequence[str]) -> None:
         raise UserError(f"{path} holds no config of a run.", "Name the config.yml of a run.")
 
 
-def go_on_or_repeat(config: TrainerConfig, tell: Callable[[str], object]) -> None:
+def go_on_or_repeat(
+    config: TrainerConfig, command_line: Sequence[str], tell: Callable[[str], object]
+) -> None:
     """Let a config that was loaded go on with its run, if that has stopped before its end.
 
-    A complete run is repeated under a time of its own: it stays what it is.
+    A complete run is repeated under a time of its own: it stays what it is. Raises UserError where
+    the run lies elsewhere than its config says: it would begin from the start.
     """
     run, checkpoints = config.get_base_dir(), TrainerConfig.get_checkpoint_dir(config)
+    beside = _named(command_line).resolve().parent
+    if beside != run.resolve() and list_checkpoints(beside / MODELS_FOLDER):
+        raise UserError(
+            f"The run lies in {beside}, but its config says {run}.",
+            "Start where it was trained from; or move config.yml out of the run to repeat it.",
+        )
     if config.load_dir == checkpoints:
         config.load_dir = None
     if not list_checkpoints(checkpoints):

@@ -10,6 +10,7 @@ from nerfstudio.configs.base_config import (
 from nerfstudio.engine.trainer import TrainerConfig
 
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.kernels import available_backends
 from rgbavatar_ns.options import Between, Ranges, check_options
 from rgbavatar_ns.plugin.training.refused import require_used
 
@@ -47,4 +48,20 @@ def require_trainable(config: TrainerConfig) -> None:
         raise UserError(
             f"PyTorch finds no device of the type '{device}' that this method runs on.",
             "Leave out --machine.device-type, or install the driver and a PyTorch with CUDA.",
+        )
+    _require_rasterizer(config.pipeline.model.rasterizer, device)  # type: ignore[attr-defined]
+
+
+def _require_rasterizer(name: str, device: str) -> None:
+    available = available_backends()
+    if name != "auto" and name not in available:
+        raise UserError(
+            f"--pipeline.model.rasterizer is {name}, which cannot be used here (available: "
+            f"{', '.join(available)}).",
+            "Leave it out: auto takes the quickest that there is.",
+        )
+    if name in ("cpu", "cuda") and name != device:
+        raise UserError(
+            f"--pipeline.model.rasterizer is {name}, which does not draw on the device {device}.",
+            f"Leave it out, or pass --machine.device-type {name}.",
         )

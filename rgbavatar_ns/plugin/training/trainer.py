@@ -125,13 +125,12 @@ class RGBAvatarTrainerConfig(TrainerConfig):
         written.load_step = None
         with disk_errors(self.get_base_dir(), "Free some space, or name another --output-dir."):
             TrainerConfig.save_config(written)
-        _link_latest(self.get_base_dir())
 
     def set_timestamp(self) -> None:
         """Called by `ns-train` alone, on its own config or on the one that it has loaded."""
         super().set_timestamp()
         if loads_config(sys.argv[1:]):
-            go_on_or_repeat(self, say)
+            go_on_or_repeat(self, sys.argv[1:], say)
 
     def __setattr__(self, name: str, value: Any) -> None:
         """Where `ns-viewer` puts its own settings in place of the run's, keep these.
@@ -373,7 +372,8 @@ class RGBAvatarTrainer(EndingTrainer, FitHooks):
         remove_leftover(path.parent)
         with damage_of(path):
             self._start_step = state["step"] + 1
-            self._saved_step = state["step"]
+            if path.parent.resolve() == self.checkpoint_dir.resolve():
+                self._saved_step = state["step"]
             self.clock.resume(float(state.get("train_seconds", 0.0)))
             self.curve.points = [dict(point) for point in state.get("curve", ())]
         self.pipeline.load_pipeline(state["pipeline"], state["step"])
@@ -401,6 +401,8 @@ class RGBAvatarTrainer(EndingTrainer, FitHooks):
             keep = self.config.max_num_iterations
         save_checkpoint(self._state(step), self.checkpoint_dir, step, keep)
         self._saved_step = step
+        # Not before: a run that could not begin is of no use to who asks for the latest.
+        _link_latest(self.base_dir)
 
     def _state(self, step: int) -> dict[str, Any]:
         """What a checkpoint holds."""

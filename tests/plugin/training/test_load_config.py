@@ -94,6 +94,18 @@ def test_a_run_that_never_saved_begins_again(
     assert summary(config.get_base_dir())["steps"] == STEPS
 
 
+def test_a_run_that_lies_elsewhere_than_it_says_is_not_begun_anew(
+    tiny_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    config = finished_run(tiny_data, tmp_path / "before", max_num_iterations=STEPS)
+    (tmp_path / "before").rename(tmp_path / "moved")
+    moved = tmp_path / "moved" / config.relative_to(tmp_path / "before")
+    with pytest.raises(UserError, match="but its config says") as told:
+        load(monkeypatch, moved)
+    assert str(moved.parent) in told.value.cause
+    assert not (tmp_path / "before").exists()
+
+
 @pytest.mark.parametrize("option", ["--max-num-iterations", "--data", "--vis"])
 def test_options_that_the_file_would_replace_are_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, option: str

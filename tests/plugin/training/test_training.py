@@ -133,6 +133,37 @@ def test_finished_run_trains_no_further_on_resume(train: Train):
     assert summary["images_per_second"] == pytest.approx(12 / summary["train_seconds"])
 
 
+def test_a_finished_run_resumed_under_another_name_is_whole_there_too(config_of: ConfigOf):
+    first = trained(config_of(max_num_iterations=3, timestamp="first"))
+    again = trained(
+        config_of(max_num_iterations=3, timestamp="again", load_dir=first.checkpoint_dir)
+    )
+    assert again.checkpoint_dir != first.checkpoint_dir
+    assert [step for step, _ in list_checkpoints(again.checkpoint_dir)] == [2]
+
+
+def test_latest_leads_to_the_newest_run_that_has_a_checkpoint(config_of: ConfigOf):
+    first = trained(config_of(max_num_iterations=2, timestamp="first"))
+    link = first.base_dir.with_name("latest")
+    assert link.resolve() == first.base_dir.resolve()
+    second = make_trainer(config_of(max_num_iterations=2, timestamp="second"))
+    second.config.save_config()
+    assert link.resolve() == first.base_dir.resolve(), "nothing can be seen of the second one yet"
+    second.train()
+    assert link.resolve() == second.base_dir.resolve()
+    link.unlink()
+    link.mkdir()
+    second.save_checkpoint(1)
+    assert not link.is_symlink()
+
+
+def test_a_shorter_run_in_an_earlier_ones_folder_keeps_its_own_checkpoint(train: Train):
+    first = train(max_num_iterations=6)
+    shorter = train(max_num_iterations=3)
+    assert shorter.checkpoint_dir == first.checkpoint_dir
+    assert [step for step, _ in list_checkpoints(shorter.checkpoint_dir)] == [2]
+
+
 def test_learning_rates_fall_as_asked(uninterrupted: dict[str, Any]):
     def rate(group: str) -> float:
         return uninterrupted["optimizers"][group]["param_groups"][0]["lr"]
