@@ -58,7 +58,8 @@ class RGBAvatarDataManagerConfig(FullImageDatamanagerConfig):
     prefetch_steps: Annotated[int, Between(0, 1000)] = 2
     """Steps whose images are decoded ahead."""
     device_mib: Counted = 16384
-    """Budget for training images on a GPU in MiB; where all fit, it takes whole steps by itself."""
+    """Budget for training images on a GPU in MiB, and at most half of what is free there; where all
+    fit, it takes whole steps by itself."""
     check_data: bool = True
     """Refuse data whose head is not where its images show it (`rgbavatar check`), before the first
     step."""
@@ -175,7 +176,7 @@ class RGBAvatarDataManager(DataManager):
             return None
         tracked = self.dataparser.tracked
         each = tracked.width * tracked.height * 4
-        if len(positions) * each > self.config.device_mib * _MIB:
+        if len(positions) * each > device_budget(self.config.device_mib * _MIB, self.device):
             return None
         shape = (len(positions), tracked.height, tracked.width, 4)
         images = torch.empty(shape, dtype=torch.uint8, device=self.device)
@@ -242,3 +243,14 @@ class RGBAvatarDataManager(DataManager):
     def get_param_groups(self) -> dict[str, list[Parameter]]:
         """Nothing here is learnt."""
         return {}
+
+
+def device_budget(most: int, device: torch.device | str) -> int:
+    """Bytes of a device's memory that images may take, `most` at most.
+
+    Half of what is free there: the rest is for the avatar, its gradients and the kernels' lists.
+    """
+    if torch.device(device).type != "cuda":
+        return most
+    free, _ = torch.cuda.mem_get_info(device)
+    return min(most, free // 2)

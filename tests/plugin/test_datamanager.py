@@ -9,7 +9,11 @@ import torch
 
 from rgbavatar_ns.data import load_dataset
 from rgbavatar_ns.plugin.cameras import from_nerfstudio
-from rgbavatar_ns.plugin.datamanager import RGBAvatarDataManager, RGBAvatarDataManagerConfig
+from rgbavatar_ns.plugin.datamanager import (
+    RGBAvatarDataManager,
+    RGBAvatarDataManagerConfig,
+    device_budget,
+)
 from tests.plugin.tiny import NUM_FRAMES, NUM_TEST, SIZE, tiny_dataset
 
 
@@ -118,3 +122,10 @@ def test_held_out_frames_among_the_others_keep_their_own_cameras(tmp_path: Path)
             assert np.array_equal(image.numpy(), tracked.read_image(position))
     camera, _ = datamanager.next_eval_image(1)
     assert int(camera.metadata["position"][0]) in tracked.test
+
+
+def test_images_leave_half_of_a_gpus_free_memory(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (10 << 30, 12 << 30))
+    assert device_budget(16 << 30, "cuda:0") == 5 << 30
+    assert device_budget(1 << 30, torch.device("cuda")) == 1 << 30
+    assert device_budget(16 << 30, "cpu") == 16 << 30
