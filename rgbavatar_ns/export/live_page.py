@@ -16,7 +16,7 @@ from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import ThetaLayout
 
 DEFAULT_ADDRESS = "127.0.0.1:7072"
-_WAIT_S = 0.5
+_WAIT_S, _FAREWELL_S = 0.5, 2.0
 _REMEMBERED = 500
 """Frames whose capture is remembered until a page has shown them."""
 
@@ -70,7 +70,7 @@ class PageOutput:
         with self._changed:
             self._closed = True
             self._changed.notify_all()
-            self._changed.wait_for(lambda: self.pages == 0, _WAIT_S)
+            self._changed.wait_for(lambda: self.pages == 0, _FAREWELL_S)
         self._server.close()
 
     def _talk(self, connection: ServerConnection) -> None:
@@ -103,6 +103,7 @@ class PageOutput:
                 frame, message, status = self._frame, self._message, self._status
             if self._closed:
                 connection.send(status_message("The performance has ended."))
+                connection.close()  # In order: a page that is only cut off thinks of a loss.
                 return
             if frame is not last:
                 connection.send(message)

@@ -56,6 +56,7 @@ def test_a_canvas_without_a_style_keeps_its_place_at_any_pixel_density(page):
         """async () => {
           window.devicePixelRatio = 1.5;
           const canvas = document.createElement("canvas");
+          canvas.style.all = "initial"; // of the rule for the others
           [canvas.width, canvas.height] = [120, 80];
           document.body.append(canvas);
           window.bare = await module.RGBAvatar.load({ data: avatar.data }, canvas);
