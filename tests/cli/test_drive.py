@@ -141,9 +141,9 @@ def test_the_page_is_served_and_driven(avatar, performer, capsys):
             time.sleep(0.05)
     with page:
         assert json.loads(page.recv(timeout=5))["type"] == "hello"
-        said = [json.loads(page.recv(timeout=5)) for _ in range(12)]
         with urllib.request.urlopen(f"http://127.0.0.1:{port}/") as answer:
             assert b"<canvas" in answer.read()
+        said = [json.loads(page.recv(timeout=5)) for _ in range(12)]
     frames = [message for message in said if message["type"] == "theta"]
     assert len(frames) > 5
     assert any("frames" in message.get("text", "") for message in said), "how it goes"

@@ -69,7 +69,7 @@ def test_a_served_page_follows_and_comes_back_after_a_loss(browser, tmp_path):
         assert np.allclose(shown, theta[last % len(theta)].numpy(), atol=1e-5)
         assert 0 < output.latencies.quantile_s(0.5) < 2.0
         output.close()
-        page.wait_for_function("() => /connection lost/i.test(document.body.innerText)")
+        page.wait_for_function("() => /performance has ended/i.test(document.body.innerText)")
         output = PageOutput(avatar.layout, address, page=lambda: content)
         last = _show_until_answered(output, theta, 1000)
         assert last > 1000
