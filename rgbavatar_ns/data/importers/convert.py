@@ -23,7 +23,7 @@ from rgbavatar_ns.head.flame import FLAME_VARIABLE
 CACHE_FOLDER = ".rgbavatar"
 """In the source; nothing in it belongs to the source."""
 _STATE_FILE = ".import.json"
-_IMPORTER_VERSION = 2
+_IMPORTER_VERSION = 3
 """To be raised where the same files give another dataset."""
 
 

@@ -26,18 +26,21 @@ _JPEG_START = b"\xff\xd8"
 _GREY_TOLERANCE = 24
 """JPEG files of grey pictures come out a little coloured."""
 _PNG_HEADER_BYTES, _JPEG_HEADER_BYTES = 33, 1 << 16
+_NEARLY_WHITE = 250
 
 
 @dataclass(frozen=True)
 class FrameImage:
     """Files of one image, all of one size: colour, a grey matte (else colour's own alpha).
 
-    The matte is kept only where one of the grey `regions` is white.
+    The matte is kept only where one of the grey `regions` is white. `over_white`: whether the
+    format lays its pictures over white by the matte, which is undone.
     """
 
     color: Path
     alpha: Path | None = None
     regions: tuple[Path, ...] = ()
+    over_white: bool = False
 
 
 @dataclass(frozen=True)
@@ -98,11 +101,28 @@ def _compose(
     _require_size(image.shape[1::-1], size)
     if frame_image.alpha is not None:
         image[..., 3] = _grey(frame_image.alpha, size)
+    if frame_image.over_white:
+        _take_off_white(image)
     if frame_image.regions:
         kept = np.maximum.reduce([_grey(path, size) for path in frame_image.regions])
         product = image[..., 3].astype(np.uint16) * kept
         image[..., 3] = ((product + 127) // 255).astype(np.uint8)
     return image
+
+
+def _take_off_white(image: UInt8[np.ndarray, "height width 4"]) -> None:
+    """Make straight colour, in place, of colour that its alpha has laid over white.
+
+    A picture that is not white where its matte shows nothing was not laid over it, and stays.
+    """
+    alpha = image[..., 3]
+    unseen, soft = alpha == 0, (alpha > 0) & (alpha < 255)
+    if unseen.any() and np.median(image[unseen, :3]) < _NEARLY_WHITE:
+        return
+    share = image[soft, 3:].astype(np.float32) / 255
+    straight = 255 - (255 - image[soft, :3].astype(np.float32)) / share
+    image[soft, :3] = straight.round().clip(0, 255).astype(np.uint8)
+    image[unseen, :3] = 0
 
 
 def _read(path: Path) -> bytes:

@@ -39,7 +39,8 @@ def is_vhap(folder: Folder) -> bool:
 def read_vhap(reading: Reading) -> Source:
     """VHAP's export of one camera or many; held out is what transforms_val and _test hold.
 
-    With several cameras a frame's number is timestep x cameras + place of the camera.
+    Its images lie over white, by the masks beside them. With several cameras a frame's number is
+    timestep x cameras + place of the camera.
     """
     entries, has_split = read_transforms(reading)
     frames: list[tuple[Entry, tuple[int, int]]] = []
@@ -88,7 +89,7 @@ def _frame_image(folder: Folder, entry: Entry) -> FrameImage:
         return FrameImage(folder.path(entry.name))
     if not isinstance(mask, str) or not os.path.isfile(folder.path(mask)):
         raise UnusableFrameError("frames whose mask is missing")
-    return FrameImage(folder.path(entry.name), alpha=folder.path(mask))
+    return FrameImage(folder.path(entry.name), alpha=folder.path(mask), over_white=True)
 
 
 @dataclass

@@ -141,7 +141,7 @@ class InstaWriter(TakeWriter):
 
 
 class VhapWriter(TakeWriter):
-    """VHAP's export of one camera: OpenGL, masks beside images, parameters as npz."""
+    """VHAP's export of one camera: OpenGL, images over white beside masks, parameters as npz."""
 
     def __init__(self, dst: Path, take: Take) -> None:
         super().__init__(dst, take)
@@ -152,7 +152,7 @@ class VhapWriter(TakeWriter):
         number, theta = f"{frame.index:05d}", frame.theta
         image = f"images/{number}_00.png"
         mask, parameters = f"fg_masks/{number}_00.png", f"flame_param/{number}.npz"
-        _write_color(self._dst / image, frame)
+        _write_image(self._dst / image, _over_white(frame.image_rgba))
         _write_image(self._dst / mask, frame.image_rgba[..., 3])
         np.savez(self._dst / parameters, **self._parameters(theta))
         camera_to_world = np.linalg.inv(_OPENGL_ROWS @ frame.world_to_camera)
@@ -314,6 +314,13 @@ def _rigid_camera(take: Take, frame: TakeFrame) -> Float[np.ndarray, "4 4"]:
 def _write_color(path: Path, frame: TakeFrame) -> None:
     """Colour without alpha; PNG or JPEG after the name."""
     _write_image(path, cv2.cvtColor(frame.image_rgba, cv2.COLOR_RGBA2BGR))
+
+
+def _over_white(rgba: UInt8[np.ndarray, "height width 4"]) -> UInt8[np.ndarray, "height width 3"]:
+    """BGR over white, fractions cut off, as VHAP makes it."""
+    share = rgba[..., 3:] / 255
+    bgr = cv2.cvtColor(rgba, cv2.COLOR_RGBA2BGR)
+    return (share * bgr + (1 - share) * 255).astype(np.uint8)
 
 
 def _write_image(path: Path, image: UInt8[np.ndarray, "height width *channels"]) -> None:

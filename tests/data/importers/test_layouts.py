@@ -129,8 +129,10 @@ def test_vhaps_raw_output(tmp_path, options, takes):
     columns: dict[str, list[np.ndarray]] = {}
     for frame in frames:
         name = f"{frame.index:05d}"
-        for kind in ("images", "fg_masks"):
-            shutil.copy(tmp_path / f"export/{kind}/{name}_00.png", raw / f"{kind}/{name}.png")
+        # The tracker reads the film itself; only the export lays it over white.
+        film = cv2.cvtColor(frame.image_rgba, cv2.COLOR_RGBA2BGR)
+        cv2.imwrite(str(raw / f"images/{name}.png"), film)
+        shutil.copy(tmp_path / f"export/fg_masks/{name}_00.png", raw / f"fg_masks/{name}.png")
         with np.load(tmp_path / f"export/flame_param/{name}.npz") as values:
             for key in values.files:
                 columns.setdefault(key, []).append(values[key])
@@ -145,7 +147,7 @@ def test_vhaps_raw_output(tmp_path, options, takes):
     source = read_source(raw, options)
     exported = read_source(tmp_path / "export", options)
     assert torch.equal(source.theta, exported.theta)
-    assert np.array_equal(image(source, 3), image(exported, 3))
+    assert np.array_equal(image(source, 3), frames[3].image_rgba)
     assert torch.equal(source.cameras.focal_px, torch.full((NUM_FRAMES, 2), 1.5 * WIDTH))
     # A point .1 m to the right of and .2 m above the head's origin, which is 1 m ahead.
     seen = source.cameras.world_to_camera[0] @ torch.tensor([0.1, 0.2, 0.0, 1.0])
@@ -154,6 +156,30 @@ def test_vhaps_raw_output(tmp_path, options, takes):
     np.savez(raw / "tracked_flame_params_30.npz", **stacked)
     with pytest.raises(UserError, match="calibrated"):
         read_source(raw, options)
+
+
+def test_vhaps_white_is_taken_off_and_a_film_that_lies_over_none_stays(tmp_path, options, takes):
+    _, frames = write(tmp_path / "export", "vhap", takes)
+    picture, frame = tmp_path / f"export/images/{FIRST:05d}_00.png", frames[0]
+    alpha = frame.image_rgba[..., 3]
+    assert (cv2.imread(str(picture))[alpha == 0] == 255).all()
+    straight = image(read_source(tmp_path / "export", options), 0)
+    # By hand: red 100 at alpha 51 (a fifth) over white is 20 + 204.
+    half_seen = np.zeros((HEIGHT, WIDTH), np.uint8)
+    half_seen[:, WIDTH // 2 :] = 51
+    cv2.imwrite(str(tmp_path / f"export/fg_masks/{FIRST:05d}_00.png"), half_seen)
+    over = np.full((HEIGHT, WIDTH, 3), 255, np.uint8)
+    over[:, WIDTH // 2 :] = (255, 255, 224)
+    cv2.imwrite(str(picture), over)
+    seen = image(read_source(tmp_path / "export", options), 0)
+    assert (seen[:, : WIDTH // 2] == 0).all()
+    assert (seen[:, WIDTH // 2 :] == (100, 255, 255, 51)).all()
+    off = np.abs(straight.astype(int) - frame.image_rgba)
+    assert off[alpha > 100].max() <= 3
+    film = cv2.cvtColor(frame.image_rgba, cv2.COLOR_RGBA2BGR)
+    cv2.imwrite(str(picture), film)
+    cv2.imwrite(str(tmp_path / f"export/fg_masks/{FIRST:05d}_00.png"), alpha)
+    assert np.array_equal(image(read_source(tmp_path / "export", options), 0), frame.image_rgba)
 
 
 def test_vhaps_static_offset_is_the_subjects_head_at_rest(tmp_path, options, takes):
