@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from rgbavatar_ns.data import load_dataset
+from rgbavatar_ns.data.importers import ImportOptions
 from rgbavatar_ns.data.streams import ReplayStream, SocketStream, StreamSubject
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.plugin.online.datamanager import is_recorded
@@ -52,6 +53,24 @@ def test_a_recording_of_an_earlier_run_in_the_folder_is_not_gone_on_with(
     old.touch()
     online_trainer(online_config(tmp_path, tiny_data))
     assert not old.exists()
+
+
+def test_a_replay_opens_other_systems_data_as_the_dataparser_does(
+    tiny_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    asked: list[ImportOptions | None] = []
+
+    def opened(data: Path, options: ImportOptions | None = None):
+        asked.append(options)
+        return load_dataset(data)
+
+    for module in ("online.sources", "dataparser"):
+        monkeypatch.setattr(f"rgbavatar_ns.plugin.{module}.load_dataset", opened)
+    config = online_config(tmp_path / "out", tiny_data)
+    options = ImportOptions(head_pose="camera", allow_partial=True)
+    config.pipeline.datamanager.dataparser.importing = options
+    online_trainer(config).stream.close()
+    assert asked == [options] * 2
 
 
 def test_the_first_usable_frame_is_waited_for():

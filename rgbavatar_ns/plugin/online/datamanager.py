@@ -109,7 +109,8 @@ class OnlineDataManager(RGBAvatarDataManager):
         return self._ingest
 
     def _open(self, config: OnlineDataManagerConfig) -> None:
-        stream = open_source(config.source, config.data or config.dataparser.data, _tell)
+        parsed = config.dataparser
+        stream = open_source(config.source, config.data or parsed.data, _tell, parsed.importing)
         try:
             self._prepare(config, stream)
         except BaseException:

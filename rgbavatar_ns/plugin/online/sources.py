@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Literal
 
 from rgbavatar_ns.data import load_dataset
+from rgbavatar_ns.data.importers import ImportOptions
 from rgbavatar_ns.data.streams import (
     FrameStream,
     ReplayStream,
@@ -44,11 +45,15 @@ class SourceConfig:
 
 
 def open_source(
-    config: SourceConfig, data: Path | None, tell: Callable[[str], None] = lambda line: None
+    config: SourceConfig,
+    data: Path | None,
+    tell: Callable[[str], None] = lambda line: None,
+    importing: ImportOptions | None = None,
 ) -> FrameStream:
     """The stream that the flags name; raises UserError where they do not suffice.
 
-    `tell` is called, also from threads, with what a user should read at once.
+    `tell` is called, also from threads, with what a user should read at once. `importing` says
+    how `data` of another system is read.
     """
     if config.kind == "folder":
         raise UserError(
@@ -75,7 +80,7 @@ def open_source(
             "No dataset was named.",
             "Pass --data FOLDER; `rgbavatar demo-data FOLDER` makes a dataset to try.",
         )
-    return ReplayStream(load_dataset(data), config.frames_per_second)
+    return ReplayStream(load_dataset(data, importing), config.frames_per_second)
 
 
 def await_subject(
