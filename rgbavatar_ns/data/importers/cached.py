@@ -28,7 +28,8 @@ def open_foreign(
     """Open a folder of another system through its import, made now if need be.
 
     The import lies in the folder itself (`.rgbavatar/`) where that may be written to, else in the
-    user's cache directory; its name is a hash of the files and options that it depends on.
+    user's cache directory; its name is a hash of the files and options that it depends on. A
+    damaged one is made anew.
     """
     name = fingerprint(src, options)
     places = _places(src, name)
@@ -42,8 +43,9 @@ def open_foreign(
     else:
         made = places
     for place in made:
-        if (place / INDEX_FILE).exists():
-            return load_native(place)
+        opened = _opened(place)
+        if opened is not None:
+            return opened
     place = next((place for place in places if _can_be_made(place)), None)
     if place is None:
         raise UserError(
@@ -53,10 +55,24 @@ def open_foreign(
     found = find_format(src, options)
     # Two programs that open the same data import it one after the other.
     with hold_lock(place.with_name(f"{place.name}.lock")):
-        if not (place / INDEX_FILE).exists():
-            recognised = "" if found is None else f"{found.name} data in "
-            print(f"{recognised}{src}: imported once into {place}", file=sys.stderr)
-        return import_dataset(src, place, options, link=True, progress=progress)
+        opened = _opened(place)
+        if opened is not None:
+            return opened
+        damaged = (place / INDEX_FILE).exists()
+        recognised = "" if found is None else f"{found.name} data in "
+        how = "its import is damaged, made anew" if damaged else "imported once"
+        print(f"{recognised}{src}: {how} into {place}", file=sys.stderr)
+        return import_dataset(src, place, options, overwrite=damaged, link=True, progress=progress)
+
+
+def _opened(place: Path) -> TrackedDataset | None:
+    """The import that lies there; None where there is none, or a damaged one."""
+    if not (place / INDEX_FILE).exists():
+        return None
+    try:
+        return load_native(place)
+    except UserError:
+        return None
 
 
 def _places(src: Path, name: str) -> list[Path]:

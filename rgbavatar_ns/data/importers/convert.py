@@ -15,7 +15,7 @@ from rgbavatar_ns.data.importers.options import ImportOptions, Progress
 from rgbavatar_ns.data.importers.source import Source
 from rgbavatar_ns.data.native.dataset import TrackedDataset, load_native
 from rgbavatar_ns.data.native.format import INDEX_FILE
-from rgbavatar_ns.data.native.writer import DatasetWriter
+from rgbavatar_ns.data.native.writer import DatasetWriter, give_up
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.files import digest, read_json, write_json
 from rgbavatar_ns.head.flame import FLAME_VARIABLE
@@ -38,20 +38,22 @@ def import_dataset(
 ) -> TrackedDataset:
     """Write a folder of another system to `dst` in the project's own format.
 
-    An interrupted import goes on where it was; a finished one is opened. `link` shares the bytes
-    of images that need no change. Raises UserError where something cannot be used, or `dst` holds
-    something else and `overwrite` is not given.
+    An interrupted import goes on where it was; a finished one is opened, or with `overwrite` made
+    anew, damaged or not. `link` shares the bytes of images that need no change. Raises UserError
+    where something cannot be used, or `dst` holds something else and `overwrite` is not given.
     """
     src, dst, options = Path(src), Path(dst), options or ImportOptions()
     key = fingerprint(src, options)
-    state = read_json(dst / _STATE_FILE)
-    resumed = isinstance(state, dict) and state.get("key") == key
-    if resumed and (dst / INDEX_FILE).exists():
-        return load_native(dst)
+    state, finished = read_json(dst / _STATE_FILE), (dst / INDEX_FILE).exists()
+    same = isinstance(state, dict) and state.get("key") == key
+    if same and finished and not overwrite:
+        return _opened(dst)
     if src.resolve() == dst.resolve():
         raise UserError(f"{dst} is the data itself.", "Name another folder to write to.")
     source = read_source(src, options, progress)
-    unfinished = isinstance(state, dict) and not (dst / INDEX_FILE).exists()
+    if finished and overwrite and (dst / _STATE_FILE).exists():
+        # An import of ours; its index may be damaged, and then tells nobody what it is.
+        give_up(dst)
     writer = DatasetWriter(
         dst,
         source.arrays,
@@ -59,8 +61,8 @@ def import_dataset(
         source.layout,
         source.cameras.width,
         source.cameras.height,
-        overwrite=overwrite or unfinished,
-        keep_images=resumed,
+        overwrite=overwrite or (isinstance(state, dict) and not finished),
+        keep_images=same and not finished,
         source={
             "format": source.format,
             "path": str(src.resolve()),
@@ -87,6 +89,14 @@ def import_dataset(
                 source.timesteps[position],
             )
     return writer.finish(source.test - {source.index[position] for position in unusable})
+
+
+def _opened(dst: Path) -> TrackedDataset:
+    """A finished import; raises UserError where it is damaged."""
+    try:
+        return load_native(dst)
+    except UserError as error:
+        raise UserError(error.cause, "Import the data anew with --overwrite.") from None
 
 
 def _write_images(

@@ -97,7 +97,14 @@ class TrackedDataset:
         Raises UserError if it is missing, damaged or odd.
         """
         path = self.image_paths[position]
-        image = read_png_rgba(path)
+        try:
+            image = read_png_rgba(path)
+        except UserError as error:
+            origin = self.source.get("path")
+            if origin is None:
+                raise
+            remedy = f"Delete the folder {self.root}, so that it is imported anew from {origin}."
+            raise UserError(error.cause, remedy) from None
         height, width = image.shape[:2]
         _check_size(path, (width, height), (self.width, self.height))
         return image if self.marks_unfilmed else all_filmed(image)

@@ -61,6 +61,13 @@ def make_room(root: Path, overwrite: bool) -> None:
         )
 
 
+def give_up(root: Path) -> None:
+    """Take a dataset for what an interrupted writer has left, so that the next one replaces it."""
+    with disk_errors(root, "Name a folder that you may write to."):
+        (root / _UNFINISHED).touch()
+        (root / INDEX_FILE).unlink(missing_ok=True)
+
+
 class DatasetWriter:
     """Writes the project's own format; `dataset.json` comes last and whole.
 

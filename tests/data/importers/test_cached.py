@@ -1,0 +1,72 @@
+"""Imports on the way: what they depend on, and that damage to them heals."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from rgbavatar_ns.data import TrackedDataset, load_dataset
+from rgbavatar_ns.data.importers import ImportOptions, import_dataset
+from rgbavatar_ns.errors import UserError
+from tests.data.importers.test_round_trips import write
+
+
+@pytest.fixture
+def options(flame_folder) -> ImportOptions:
+    return ImportOptions(flame=flame_folder, teeth=False)
+
+
+@pytest.fixture
+def data(tmp_path, takes) -> Path:
+    write(tmp_path / "data", "imavatar", takes)
+    return tmp_path / "data"
+
+
+def same(one: TrackedDataset, other: TrackedDataset) -> bool:
+    images = all(np.array_equal(one.read_image(k), other.read_image(k)) for k in range(len(other)))
+    return images and torch.equal(one.theta, other.theta)
+
+
+def damage(root: Path, what: str) -> None:
+    path = root / what
+    path.write_bytes(path.read_bytes()[:-20])
+
+
+@pytest.mark.parametrize("what", ["dataset.json", "theta.npy", "head.npz", "images/00004.png"])
+def test_a_damaged_import_is_made_anew(what, data, options, tmp_path, capsys):
+    whole = import_dataset(data, tmp_path / "whole", options)
+    opened = load_dataset(data, options)
+    capsys.readouterr()
+    damage(opened.root, what)
+    again = load_dataset(data, options)
+    assert again.root == opened.root
+    assert same(again, whole)
+    assert "damaged, made anew" in capsys.readouterr().err
+    load_dataset(data, options)
+    assert not capsys.readouterr().err.strip()
+
+
+@pytest.mark.parametrize("what", ["dataset.json", "theta.npy", "images/00004.png"])
+def test_overwriting_makes_a_damaged_import_anew_and_else_this_is_told(
+    what, data, options, tmp_path
+):
+    whole = import_dataset(data, tmp_path / "whole", options)
+    import_dataset(data, tmp_path / "set", options)
+    damage(tmp_path / "set", what)
+    with pytest.raises(UserError) as caught:
+        import_dataset(data, tmp_path / "set", options)
+    assert "--overwrite" in caught.value.remedy
+    assert same(import_dataset(data, tmp_path / "set", options, overwrite=True), whole)
+
+
+def test_pixels_that_were_damaged_later_name_the_folder_to_delete(data, options):
+    opened = load_dataset(data, options)
+    path = opened.image_paths[2]
+    content = bytearray(path.read_bytes())
+    content[60] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(UserError, match="checksum") as caught:
+        load_dataset(data, options).read_image(2)
+    assert str(opened.root) in caught.value.remedy
+    assert str(data) in caught.value.remedy
