@@ -11,7 +11,7 @@ import scipy.sparse
 
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head.arrays import HeadArrays
-from rgbavatar_ns.head.flame_uv import find_uv_file, make_uv_map, read_uv_map
+from rgbavatar_ns.head.flame_uv import FILE_NAMES, find_uv_file, make_uv_map, read_uv_map
 from rgbavatar_ns.head.safe_pickle import read_pickle
 from rgbavatar_ns.head.teeth import TeethForm, with_teeth
 from rgbavatar_ns.reading import DamagedFileError, load_array
@@ -21,6 +21,8 @@ FLAME_VERTICES, FLAME_TRIANGLES = 5023, 9976
 IDENTITIES, EXPRESSIONS = 300, 100
 VERSIONS = ("2017", "2019", "2020", "2023", "2023 Open")
 _EYELIDS = ("l_eyelid.npy", "r_eyelid.npy")
+COMPANIONS = (*FILE_NAMES, *_EYELIDS)
+"""Files that add to a pickle what it lacks, where one of `places_beside` has them."""
 _USUAL_NAMES = re.compile(r"(generic|male|female)_model|flame_(neutral|male|female)")
 _SHAPES = {
     "v_template": (FLAME_VERTICES, 3),
@@ -72,7 +74,7 @@ def load_flame(
     pickle_path = _find_pickle(_given_path(path), version)
     parts = _read_parts(pickle_path)
     name = f"FLAME {version or _version_of(pickle_path)}{_gender_of(pickle_path)}"
-    places = [pickle_path.parent, pickle_path.parent.parent]
+    places = places_beside(pickle_path)
     faces = parts["f"].astype(np.int64)
     kept = np.r_[:num_identity, IDENTITIES : IDENTITIES + num_expressions]
     weights = parts["weights"].astype(np.float32)
@@ -98,6 +100,11 @@ def load_flame(
         },
     )
     return with_teeth(arrays, teeth_form) if teeth else arrays
+
+
+def places_beside(pickle_path: Path) -> list[Path]:
+    """Where a pickle's `COMPANIONS` are looked for, in this order."""
+    return [pickle_path.parent, pickle_path.parent.parent]
 
 
 def _given_path(path: Path | None) -> Path:

@@ -18,7 +18,7 @@ from rgbavatar_ns.data.native.format import INDEX_FILE
 from rgbavatar_ns.data.native.writer import DatasetWriter, give_up
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.files import digest, read_json, write_json
-from rgbavatar_ns.head.flame import FLAME_VARIABLE
+from rgbavatar_ns.head.flame import COMPANIONS, FLAME_VARIABLE, places_beside
 
 CACHE_FOLDER = ".rgbavatar"
 """In the source; nothing in it belongs to the source."""
@@ -154,11 +154,17 @@ def source_fingerprint(src: Path, options: ImportOptions) -> str:
 
 
 def flame_fingerprint(options: ImportOptions) -> str | None:
-    """Names, sizes and times of FLAME's files; None where no FLAME is named."""
+    """Names, sizes and times of FLAME's files; None where no FLAME is named.
+
+    Those count too that lie beside the pickle, or would be taken if they did.
+    """
     flame = options.flame or os.environ.get(FLAME_VARIABLE)
     if not flame:
         return None
-    return digest(_listing([flame, options.flame_uv, options.flame_eyelids]))[:8]
+    # A folder is listed with all that is in it, but its pickle takes from the one above too.
+    places = places_beside(Path(flame).expanduser())
+    beside = [place / name for place in places for name in COMPANIONS]
+    return digest(_listing([flame, options.flame_uv, options.flame_eyelids, *beside]))[:8]
 
 
 def _listing(places: Sequence[str | Path | None]) -> Iterator[str]:

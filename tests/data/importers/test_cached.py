@@ -8,6 +8,7 @@ import torch
 
 from rgbavatar_ns.data import TrackedDataset, load_dataset
 from rgbavatar_ns.data.importers import ImportOptions, import_dataset
+from rgbavatar_ns.data.importers.convert import flame_fingerprint
 from rgbavatar_ns.errors import UserError
 from tests.data.importers.test_round_trips import write
 
@@ -70,3 +71,19 @@ def test_pixels_that_were_damaged_later_name_the_folder_to_delete(data, options)
         load_dataset(data, options).read_image(2)
     assert str(opened.root) in caught.value.remedy
     assert str(data) in caught.value.remedy
+
+
+@pytest.mark.parametrize("name", ["r_eyelid.npy", "FLAME_texture.npz", "head_template.obj"])
+@pytest.mark.parametrize("above", [False, True])
+def test_what_is_put_beside_flame_later_counts(name, above, tmp_path):
+    folder = tmp_path / "models/FLAME2020"
+    folder.mkdir(parents=True)
+    pickle = folder / "generic_model.pkl"
+    pickle.write_bytes(b"FLAME")
+    (tmp_path / "models/notes.txt").write_text("a")
+    options = [ImportOptions(flame=path) for path in (pickle, folder)]
+    before = [flame_fingerprint(one) for one in options]
+    (tmp_path / "models/notes.txt").write_text("another file")
+    assert [flame_fingerprint(one) for one in options] == before
+    (tmp_path / "models" / ("" if above else "FLAME2020") / name).write_bytes(b"new")
+    assert not set(before) & {flame_fingerprint(one) for one in options}
