@@ -27,7 +27,8 @@ def run(
     Args:
         data: the dataset's folder.
         sheet: where the contact sheet goes (PNG); by default check.png in a dataset of the
-            project's own format, and FOLDER-check.png here for others.
+            project's own format, and FOLDER-check.png here for others (from within FOLDER,
+            check.png in its import).
         max_frames: how many frames are decoded and compared, evenly spread.
         as_json: print the report as JSON (format, frames, usable, problems and more).
         options: how a folder of another system is read.
@@ -54,8 +55,11 @@ def run(
 def _sheet_path(data: Path, root: Path, sheet: Path | None) -> Path:
     """In a dataset of our own, or here: other systems' folders are left as they are."""
     if sheet is None:
-        own = root.resolve() == data.resolve()
-        return data / "check.png" if own else Path(f"{data.resolve().name}-check.png")
+        whole = data.resolve()
+        # A new file in another system's folder would have it imported anew.
+        if Path.cwd().is_relative_to(whole) or root.resolve() == whole:
+            return root / "check.png"
+        return Path(f"{whole.name}-check.png")
     if sheet.suffix.lower() != ".png":
         raise UserError(f"The sheet {sheet} is no PNG.", "Let its name end in .png.")
     return sheet

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 from pathlib import Path
 
 import pytest
@@ -63,6 +64,20 @@ def test_import_tells_what_it_found_and_goes_on_after_an_interruption(
         assert (tmp_path / "set/images" / name).stat().st_mtime_ns == time
     assert json.loads((tmp_path / "set/dataset.json").read_text())["version"] == 2
     assert len(load_dataset(tmp_path / "set").arrays.v_template) == 5023 + 120
+
+
+def test_a_check_from_within_leaves_the_data_as_it_is(vhap, tmp_path, capsys, monkeypatch):
+    data, flame = shutil.copytree(vhap[0], tmp_path / "data"), vhap[1]
+    before = {path.name for path in data.iterdir()}
+    monkeypatch.chdir(data / "images")
+    for place, told in (("..", "imported once"), (str(data), "")):
+        with pytest.raises(SystemExit):  # noise is no head
+            cli.main(["check", place, "--flame", str(flame), "--max-frames", "2", "--json"])
+        printed = capsys.readouterr()
+        assert told in printed.err
+        assert bool(told) == bool(printed.err.strip())
+        assert json.loads(printed.out)["sheet"].endswith("check.png")
+        assert {path.name for path in data.iterdir()} == before | {".rgbavatar"}
 
 
 def test_another_source_does_not_go_into_a_full_folder(vhap, tmp_path, refused):
