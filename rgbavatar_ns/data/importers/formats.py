@@ -21,20 +21,36 @@ from rgbavatar_ns.errors import UserError
 
 @dataclass(frozen=True)
 class Format:
-    """One system's layout of a folder; commands call it by `key`, people by `name`."""
+    """One system's layout of a folder; commands call it by `key`, people by `name`.
+
+    `takes`: those of the options for some formats alone that count here.
+    """
 
     key: str
     name: str
     recognises: Callable[[Folder], bool]
     read: Callable[[Reading], Source]
+    takes: tuple[str, ...] = ()
+
+
+_OF_SOME = ("images", "masks", "region")
+"""Options that only some formats take."""
 
 
 FORMATS = (
     Format("vhap", "VHAP", vhap.is_vhap, vhap.read_vhap),
-    Format("vhap-raw", "raw VHAP", vhap_raw.is_vhap_raw, vhap_raw.read_vhap_raw),
+    Format(
+        "vhap-raw", "raw VHAP", vhap_raw.is_vhap_raw, vhap_raw.read_vhap_raw, ("images", "masks")
+    ),
     Format("imavatar", "IMAvatar", imavatar.is_imavatar, imavatar.read_imavatar),
     Format("insta", "INSTA", insta.is_insta, insta.read_insta),
-    Format("flashavatar", "FlashAvatar", flashavatar.is_flashavatar, flashavatar.read_flashavatar),
+    Format(
+        "flashavatar",
+        "FlashAvatar",
+        flashavatar.is_flashavatar,
+        flashavatar.read_flashavatar,
+        ("region",),
+    ),
     Format(
         "nerfblendshape",
         "NeRFBlendShape",
@@ -48,7 +64,13 @@ FORMATS = (
         frame_folders.read_gaussian_blendshapes,
     ),
     Format("rgbavatar", "RGBAvatar", frame_folders.is_rgbavatar, frame_folders.read_rgbavatar),
-    Format("metrical", "metrical-tracker", frame_folders.is_metrical, frame_folders.read_metrical),
+    Format(
+        "metrical",
+        "metrical-tracker",
+        frame_folders.is_metrical,
+        frame_folders.read_metrical,
+        ("images", "masks"),
+    ),
 )
 """In the order in which they are tried: the more particular first."""
 
@@ -82,4 +104,17 @@ def read_source(root: Path, options: ImportOptions, progress: Progress | None = 
             f"{root} is in none of the formats {', '.join(known.name for known in FORMATS)}.{hint}",
             "docs/dataset_format.md tells what each is known by; --format chooses one.",
         )
+    _refuse_idle(found, options)
     return found.read(Reading(found.name, Folder(root, options.allow_outside), options, progress))
+
+
+def _refuse_idle(found: Format, options: ImportOptions) -> None:
+    """Raise UserError about an option that changes nothing of this format's data."""
+    usual = ImportOptions()
+    for name in _OF_SOME:
+        if name not in found.takes and getattr(options, name) != getattr(usual, name):
+            takers = " and ".join(known.name for known in FORMATS if name in known.takes)
+            raise UserError(
+                f"--{name} changes nothing of {found.name} data; it is for that of {takers}.",
+                "Leave it out, or name another --format.",
+            )

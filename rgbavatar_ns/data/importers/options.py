@@ -41,7 +41,7 @@ class ImportOptions(CheckedOptions):
     """person: the format's own mattes; head: of FlashAvatar data only what its parsing masks call
     head, neck and mouth."""
     images: Path | None = None
-    """Folder of the images, where the data does not name it (VHAP's raw output)."""
+    """Folder of the images, for metrical-tracker's data and VHAP's raw output."""
     masks: Path | None = None
     """Folder of their mattes, likewise."""
     test_frames: Counted | None = None

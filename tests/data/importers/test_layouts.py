@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from rgbavatar_ns.data.importers import ImportOptions, find_format, read_source
+from rgbavatar_ns.data.importers import FORMATS, ImportOptions, find_format, read_source
 from rgbavatar_ns.data.importers.frame_images import make_png
 from rgbavatar_ns.data.png import decode_png_rgba
 from rgbavatar_ns.errors import UserError
@@ -198,6 +198,17 @@ def test_vhaps_static_offset_is_the_subjects_head_at_rest(tmp_path, options, tak
     np.savez(path, **{**changed, "static_offset": offset * 2})
     with pytest.raises(UserError, match=r"another head shape than the first: 1"):
         read_source(tmp_path / "export", options)
+
+
+@pytest.mark.parametrize("option", ["images", "masks", "region"])
+@pytest.mark.parametrize("known", FORMATS, ids=lambda known: known.key)
+def test_an_option_that_changes_nothing_is_refused(known, option, tmp_path):
+    value = "head" if option == "region" else tmp_path
+    takers = {"images": ("metrical", "vhap-raw"), "region": ("flashavatar",)}
+    with pytest.raises(UserError) as caught:
+        read_source(tmp_path, ImportOptions(format=known.key, **{option: value}))
+    refused = f"--{option} changes nothing of {known.name} data" in caught.value.cause
+    assert refused != (known.key in takers.get(option, takers["images"]))
 
 
 def test_images_without_a_matte_need_consent(frame_folder, options):
