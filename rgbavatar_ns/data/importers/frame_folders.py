@@ -9,6 +9,7 @@ from rgbavatar_ns.data.importers.frame_files import TrackedHeads, read_frame_fil
 from rgbavatar_ns.data.importers.frame_images import FrameImage
 from rgbavatar_ns.data.importers.frame_record import FrameRecord
 from rgbavatar_ns.data.importers.source import Reading, Source, assemble
+from rgbavatar_ns.errors import UserError
 
 CHECKPOINTS = "checkpoint"
 _MATTES = ("alpha", "matted", "mask", "masks", "matte", "seg_mask", "image_mask")
@@ -42,11 +43,16 @@ def _has_background(folder: Folder) -> bool:
 def read_metrical(reading: Reading) -> Source:
     """metrical-tracker's output; it has no mattes of its own, so they are looked for."""
     options, folder = reading.options, reading.folder
-    images = next(name for name in ("input", *_IMAGES) if folder.has(name))
+    images = next((name for name in ("input", *_IMAGES) if folder.has(name)), None)
     masks = next((name for name in _MATTES if folder.has(name)), None)
     if options.images is not None or options.masks is not None:
-        images = str(options.images or images)
+        images = images if options.images is None else str(options.images)
         masks = None if options.masks is None else str(options.masks)
+    if images is None:
+        raise UserError(
+            f"{reading} has no folder of images ({', '.join(_IMAGES)}).",
+            "Name it with --images, or the folder that holds the data.",
+        )
     return _read(reading, images, masks)
 
 

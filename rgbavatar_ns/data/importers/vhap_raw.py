@@ -35,6 +35,11 @@ def read_vhap_raw(reading: Reading) -> Source:
     """
     found = {path: _FILE.fullmatch(path.name) for path in reading.folder.root.glob("*.npz")}
     epochs = {int(match[1] or 0): path for path, match in found.items() if match}
+    if not epochs:
+        raise UserError(
+            f"{reading.folder.root} holds no tracked_flame_params_EPOCH.npz of VHAP's tracker.",
+            "Name the folder that holds it, or leave --format out.",
+        )
     path = reading.folder.path(epochs[max(epochs)].name)
     values = _values(reading, path)
     names = [str(name) for name in np.atleast_1d(values["timestep_id"]).tolist()]

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -198,6 +199,14 @@ def test_vhaps_static_offset_is_the_subjects_head_at_rest(tmp_path, options, tak
     np.savez(path, **{**changed, "static_offset": offset * 2})
     with pytest.raises(UserError, match=r"another head shape than the first: 1"):
         read_source(tmp_path / "export", options)
+
+
+@pytest.mark.parametrize("known", FORMATS, ids=lambda known: known.key)
+def test_a_folder_without_the_files_of_its_format_is_told(known, options, tmp_path):
+    (tmp_path / "checkpoint").mkdir()
+    for folder in (tmp_path, tmp_path / "checkpoint"):
+        with pytest.raises(UserError):
+            read_source(folder, replace(options, format=known.key))
 
 
 @pytest.mark.parametrize("option", ["images", "masks", "region"])
