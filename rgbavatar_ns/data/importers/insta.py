@@ -85,10 +85,11 @@ def _from_frames(
     report.leave_out("images without a .frame file", missing)
     wanted = {number: path for number, path in files.items() if number in entries}
     tracked = read_frame_files(reading, wanted)
+    theta = {}
     for number, head in tracked.frames.items():
         with report.frame(entries[number].name):
             _require_same(entries[number], head.camera.world_to_camera)
-    theta = {number: head.theta for number, head in tracked.frames.items()}
+            theta[number] = head.theta
     return tracked.arrays, tracked.identity, theta
 
 

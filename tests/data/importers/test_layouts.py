@@ -248,5 +248,18 @@ def test_insta_cameras_that_contradict_the_trackers_are_told(tmp_path, options, 
         read_source(tmp_path, options)
 
 
+def test_insta_frames_that_are_told_as_left_out_are(tmp_path, options, takes):
+    write(tmp_path, "insta", takes)
+    for path in tmp_path.glob("transforms*.json"):
+        content = json.loads(path.read_text())
+        for frame in content["frames"]:
+            if frame["file_path"] == f"images/{FIRST + 1:05d}.png":
+                frame["transform_matrix"][0][3] += 0.01
+        path.write_text(json.dumps(content))
+    source = read_source(tmp_path, replace(options, allow_partial=True))
+    assert any("left out: cameras" in note for note in source.notes)
+    assert source.index == tuple(FIRST + k for k in range(NUM_FRAMES) if k != 1)
+
+
 def test_an_unknown_folder_is_none(tmp_path):
     assert find_format(tmp_path) is None
