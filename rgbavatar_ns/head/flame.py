@@ -147,14 +147,21 @@ def _find_pickle(path: Path, version: str | None) -> Path:
     return found[0]
 
 
-def _version_of(path: Path, otherwise: str | None = None) -> str:
-    """What the file's name says, then its folders', nearest first."""
+def stated_version(path: Path) -> str | None:
+    """What the file's name says, then its folders', nearest first; None where none says it."""
     for name in (path.name, path.parent.name, path.parent.parent.name):
         year = re.search(r"20(16|17|19|20|23)(?!\d)", name)
         if "flame" in name.lower() and year:
             found = {"2016": "2017"}.get(year[0], year[0])
             is_open = found == "2023" and "open" in name.lower()
             return f"{found} Open" if is_open else found
+    return None
+
+
+def _version_of(path: Path, otherwise: str | None = None) -> str:
+    stated = stated_version(path)
+    if stated is not None:
+        return stated
     if _USUAL_NAMES.search(path.name.lower()):
         # FLAME 2017 and 2020 name their files alike; 2020 is what today's trackers use.
         return "2020"

@@ -14,7 +14,7 @@ from rgbavatar_ns.data.importers.import_report import UnusableFrameError
 from rgbavatar_ns.data.importers.source import Reading
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadArrays
-from rgbavatar_ns.head.flame import FLAME_VARIABLE, FLAME_VERTICES, load_flame
+from rgbavatar_ns.head.flame import FLAME_VARIABLE, FLAME_VERTICES, load_flame, stated_version
 from rgbavatar_ns.head.rotations import matrix_to_axis_angle, rows_6d_to_matrix
 from rgbavatar_ns.head.teeth import with_teeth
 
@@ -37,8 +37,9 @@ def flame_for(
     """
     options = reading.options
     wanted = options.flame_version or usual_version
-    named = options.flame or os.environ.get(FLAME_VARIABLE)
-    is_folder = bool(named) and Path(named).expanduser().is_dir()
+    given = options.flame or os.environ.get(FLAME_VARIABLE)
+    named = Path(given or "").expanduser()
+    is_folder = bool(given) and named.is_dir()
     arrays = load_flame(
         options.flame,
         uv=options.flame_uv,
@@ -47,13 +48,17 @@ def flame_for(
         version=wanted if is_folder or options.flame_version else None,
     )
     version = arrays.name.removeprefix("FLAME ").removesuffix(" female").removesuffix(" male")
+    if not is_folder:
+        # --flame-version says how the data was tracked, not what a pickle is that has a name.
+        version = stated_version(named) or version
     if version != wanted:
         raise FlameVersionError(
-            f"{reading} is tracked with FLAME {wanted}, but {named} is {arrays.name}. Each "
-            "version has expressions and identities of its own, so that coefficients of one, "
-            "padded or not, give another face in the other.",
+            f"{reading} is tracked with FLAME {wanted}, but {named} is FLAME {version} by its "
+            "name. Each version has expressions and identities of its own, so that coefficients "
+            "of one, padded or not, give another face in the other.",
             f"Name the pickle of FLAME {wanted} with --flame; if the data was tracked with "
-            f"FLAME {version} after all, say --flame-version '{version}'.",
+            f"FLAME {version} after all, say --flame-version '{version}'; if the name is wrong, "
+            "mend it.",
         )
     return _with_offset_and_teeth(arrays, static_offset, options.teeth)
 

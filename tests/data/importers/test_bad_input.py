@@ -209,6 +209,22 @@ def test_another_version_of_flame_is_refused_with_the_reason(folders, flame_fold
         assert [problem.kind for problem in report.problems] == ["FLAME version"]
 
 
+def test_the_flag_does_not_make_another_version_of_a_pickle_whose_name_says_it(
+    folders, references, flame_folder, tmp_path
+):
+    pickles = {year: next((flame_folder / f"FLAME{year}").glob("*.pkl")) for year in (2020, 2023)}
+    with pytest.raises(UserError, match="is FLAME 2020 by its name") as caught:
+        read(folders["vhap"], pickles[2020], flame_version="2023")
+    assert "--flame-version '2020'" in caught.value.remedy
+    assert_same(read(folders["vhap"], pickles[2023], flame_version="2023"), references["vhap"])
+    nameless = tmp_path / "model.pkl"
+    nameless.symlink_to(pickles[2023])
+    beside = {"flame_uv": pickles[2023].parent / "head_template.obj"}
+    beside["flame_eyelids"] = pickles[2023].parent
+    source = read(folders["vhap"], nameless, flame_version="2023", **beside)
+    assert_same(source, references["vhap"])
+
+
 def test_fifty_expressions_are_padded_within_a_version(folders, references, flame_folder, tmp_path):
     folder = shutil.copytree(folders["imavatar"], tmp_path / "data")
     path = folder / "flame_params.json"
