@@ -82,6 +82,24 @@ def test_a_replayed_dataset_means_what_its_version_says(tmp_path, version):
         assert np.array_equal(some.batch(1).images_rgba[0].numpy(), image)
 
 
+@pytest.mark.parametrize("encode", [True, False], ids=["PNG", "pixels"])
+def test_a_held_frame_marks_what_nobody_filmed_only_where_its_source_does(encode):
+    image = tracked(0).image_rgba
+    image[5:] = UNFILMED_RGBA
+    frames = pools()
+    frames.add(streamed(0, encode=encode))
+    frames.add(streamed(1, image=image, encode=encode))
+    if encode:
+        by_chance = dataclasses.replace(streamed(2, image=image), marks_unfilmed=False)
+        frames.add(by_chance)
+    held = [frame for _, frame in frames.held()]
+    assert [frame.marks_unfilmed for frame in held] == [False, True, False][: len(held)]
+    assert np.array_equal(decode_png_rgba(held[1].encoded(), ""), image)
+    if encode:
+        image[5:] = 0
+        assert np.array_equal(decode_png_rgba(held[2].encoded(), ""), image)
+
+
 def test_newest_and_recent_frames():
     clock = Clock()
     frames = pools(clock=clock)

@@ -14,7 +14,14 @@ from rgbavatar_ns.data.png import encode_png_rgba
 from rgbavatar_ns.data.streams import ReplayStream, SocketStream, StreamClient, message_format
 from rgbavatar_ns.data.streams.address import StreamAddress
 from rgbavatar_ns.errors import UserError
-from tests.data.small_dataset import HEIGHT, NUM_FRAMES, NUM_TEST, WIDTH, small_dataset
+from tests.data.small_dataset import (
+    HEIGHT,
+    NUM_FRAMES,
+    NUM_TEST,
+    WIDTH,
+    small_dataset,
+    small_writer,
+)
 from tests.data.streaming import (
     DEADLINE_S,
     HEAD,
@@ -62,6 +69,20 @@ def test_replay_goes_on_in_the_middle_and_shows_frames_again(dataset: TrackedDat
         stream.again(99)
     with pytest.raises(UserError, match="frames a second cannot"):
         ReplayStream(dataset, 0.0)
+
+
+def test_a_replay_follows_the_numbers_in_whatever_order_they_are_listed(tmp_path: Path):
+    writer = small_writer(tmp_path, HEAD)
+    for index in (5, 2, 9, 0, 7):
+        writer.add(tracked(index))
+    listed = writer.finish({2})
+    clock = Clock()
+    stream = ReplayStream(listed, 50.0, clock, clock.sleep)
+    assert [frame.index for frame in take(stream, 9)] == [0, 5, 7, 9]
+    stream = ReplayStream(listed, 50.0, clock, clock.sleep)
+    stream.go_on_after(5)
+    assert [frame.index for frame in take(stream, 9)] == [7, 9]
+    assert all(same(tracked(index), stream.again(index)) for index in (0, 2, 5, 7, 9))
 
 
 def test_a_client_is_heard_and_made_to_wait(stream: SocketStream):

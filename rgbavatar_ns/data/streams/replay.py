@@ -11,7 +11,7 @@ from rgbavatar_ns.errors import UserError
 
 
 class ReplayStream:
-    """The training frames of a dataset in order, `frames_per_second` from the first `next` on.
+    """A dataset's training frames by their numbers, `frames_per_second` from the first `next` on.
 
     A frame counts as arrived at its time; frames that are overdue come at once.
     """
@@ -32,6 +32,9 @@ class ReplayStream:
             )
         self.counts: Counter[str] = Counter()
         self._dataset, self._clock, self._sleep = dataset, clock, sleep
+        # A dataset may list its frames in any order; a film has one.
+        self._train = sorted(dataset.train, key=dataset.frame_index.__getitem__)
+        self._position = {number: place for place, number in enumerate(dataset.frame_index)}
         self._interval_s = 1.0 / frames_per_second
         self._first = self._next = 0
         self._began_s: float | None = None
@@ -45,7 +48,7 @@ class ReplayStream:
     @property
     def ended(self) -> bool:
         """Whether all training frames have been given."""
-        return self._closed or self._next >= len(self._dataset.train)
+        return self._closed or self._next >= len(self._train)
 
     def next(self, timeout_s: float) -> StreamedFrame | None:
         """The next frame when its time has come."""
@@ -59,23 +62,22 @@ class ReplayStream:
             self._sleep(min(due - now, timeout_s))
             if due > now + timeout_s:
                 return None
-        position = self._dataset.train[self._next]
+        position = self._train[self._next]
         self._next += 1
         return self._frame(position, due)
 
     def again(self, index: int) -> StreamedFrame:
         """The frame with this number, arrived now; raises UserError where there is none."""
-        position = bisect.bisect_left(self._dataset.frame_index, index)
-        if position == len(self._dataset) or self._dataset.frame_index[position] != index:
+        if index not in self._position:
             raise UserError(
                 f"The dataset {self._dataset.root} has no frame {index}.",
                 "Resume with the dataset that the run was started with.",
             )
-        return self._frame(position, self._clock())
+        return self._frame(self._position[index], self._clock())
 
     def go_on_after(self, index: int) -> None:
         """Begin behind the frame with this number."""
-        numbers = [self._dataset.frame_index[position] for position in self._dataset.train]
+        numbers = [self._dataset.frame_index[position] for position in self._train]
         self._first = self._next = bisect.bisect_right(numbers, index)
 
     def close(self) -> None:

@@ -17,6 +17,7 @@ from rgbavatar_ns.data.png import encode_png_rgba
 from rgbavatar_ns.data.sampling import LocalGlobalPools
 from rgbavatar_ns.data.streams.protocol import StreamedFrame, StreamSubject
 from rgbavatar_ns.data.streams.replay import ReplayStream
+from rgbavatar_ns.drawing.compositing import unfilmed_pixels
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.kernels.types import PinholeCameras
 
@@ -50,6 +51,18 @@ class _Held:
         if self.png is None:
             self.png = encode_png_rgba(self.frame.image_rgba)
         return self.png
+
+    def streamed(self) -> StreamedFrame:
+        """As a stream would give it; it marks what nobody filmed where there is any such."""
+        frame, marks = self.frame, bool(unfilmed_pixels(self.frame.image_rgba).any())
+        return StreamedFrame(
+            frame.index,
+            frame.theta,
+            frame.camera,
+            self.arrived_s,
+            png=self.as_png(),
+            marks_unfilmed=marks,
+        )
 
 
 class ReplayBuffer:
@@ -105,7 +118,9 @@ class ReplayBuffer:
         # Who brings pixels may use their memory again.
         image = decoded.image_rgba if frame.image_rgba is None else frame.image_rgba.copy()
         own = TrackedFrame(frame.index, frame.theta.clone(), frame.camera, image)
-        return _Held(own, frame.arrived_s, frame.png if self._save_images else None)
+        # What goes on without the frame's word on them must have no marks but real ones.
+        keeps_png = self._save_images and frame.marks_unfilmed
+        return _Held(own, frame.arrived_s, frame.png if keeps_png else None)
 
     def wait(self, timeout_s: float) -> bool:
         """Wait for the first frame; say whether it has come."""
@@ -171,13 +186,13 @@ class ReplayBuffer:
             return theta, columns["world_to_camera"].reshape(-1, 4, 4), tuple(serials)
 
     def held(self) -> list[tuple[int, StreamedFrame]]:
-        """Serial and frame of all that the pools hold, in the order of their arrival."""
+        """Serial and frame of all that the pools hold, in the order of their arrival.
+
+        `marks_unfilmed` of a frame is whether there are marks in it.
+        """
         with self._lock:
-            held = [(serial, one, one.frame) for serial, one in sorted(self._held.items())]
-        return [
-            (n, StreamedFrame(f.index, f.theta, f.camera, one.arrived_s, png=one.as_png()))
-            for n, one, f in held
-        ]
+            held = sorted(self._held.items())
+        return [(serial, one.streamed()) for serial, one in held]
 
     def median_latency_s(self) -> float | None:
         """From arrival to first use in a batch, of the last 500 frames used first; None before."""

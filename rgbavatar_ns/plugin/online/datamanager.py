@@ -283,7 +283,13 @@ def _record(config: OnlineDataManagerConfig, subject: Any, frames: Any) -> None:
             subject.height,
         )
         for serial, frame in frames:
-            writer.add_encoded(serial, frame.theta, frame.camera, frame.encoded())
+            writer.add_encoded(
+                serial,
+                frame.theta,
+                frame.camera,
+                frame.encoded(),
+                has_unfilmed=frame.marks_unfilmed,
+            )
         writer.finish(0)
 
 

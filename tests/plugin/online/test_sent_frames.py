@@ -18,6 +18,7 @@ from rgbavatar_ns import Avatar
 from rgbavatar_ns.avatar.storage.bundle import load_statistics
 from rgbavatar_ns.data import TrackedFrame, load_dataset
 from rgbavatar_ns.data.streams import StreamClient, StreamSubject
+from rgbavatar_ns.kernels.constants import UNFILMED_RGBA
 from rgbavatar_ns.plugin.online.methods import rgbavatar_online_tiny
 from rgbavatar_ns.plugin.online.sources import SourceConfig
 from rgbavatar_ns.plugin.online.trainer import OnlineTrainer
@@ -54,6 +55,7 @@ def test_frames_sent_over_a_socket_are_trained_on_and_kept(
     tiny_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     subject, frames = subject_and_frames(tiny_data)
+    frames[4].image_rgba[:2] = UNFILMED_RGBA
     subject = dataclasses.replace(subject, session="mine")
     with socket.create_server(("127.0.0.1", 0)) as free:
         address = f"127.0.0.1:{free.getsockname()[1]}"
@@ -95,7 +97,7 @@ def test_frames_sent_over_a_socket_are_trained_on_and_kept(
     recorded = load_dataset(trainer.base_dir / "stream")
     assert len(recorded) == STREAMED
     assert torch.equal(recorded.theta, load_dataset(tiny_data).theta[:STREAMED])
-    assert np.array_equal(recorded.read_image(4), frames[4].image_rgba)
+    assert np.array_equal(recorded.read_image(4), frames[4].image_rgba)  # marks and all
     monkeypatch.setitem(all_methods, "rgbavatar-online-tiny", rgbavatar_online_tiny.config)
     _, pipeline, _, step = eval_setup(trainer.base_dir / "config.yml")
     assert step == trainer.step
