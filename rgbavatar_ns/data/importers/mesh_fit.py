@@ -39,20 +39,26 @@ def fit_meshes(
     where no head of this model gives the meshes.
     """
     fit = _Fit(arrays)
-    first = list(expressions)
-    chosen = first[:: max(1, len(first) // _SHAPE_FRAMES)][:_SHAPE_FRAMES]
-    theta = torch.stack([fit.start(expressions[number]) for number in chosen])
-    targets = []
-    for number in chosen:
+    numbers = list(expressions)
+    spread = numbers[:: max(1, len(numbers) // _SHAPE_FRAMES)]
+    targets: dict[int, Float[Tensor, "V 3"]] = {}
+    damaged: set[int] = set()
+    # Others take the place of those that cannot be read.
+    for number in dict.fromkeys([*spread, *numbers]):
+        if len(targets) == _SHAPE_FRAMES:
+            break
+        damaged.add(number)
         with reading.report.frame(meshes[number].name):
-            targets.append(read_mesh(meshes[number])[fit.kept])
+            targets[number] = read_mesh(meshes[number])[fit.kept]
+            damaged.remove(number)
     reading.report.settle(str(reading), reading.options.allow_partial)
-    if len(targets) < len(chosen):
-        raise UserError(f"{reading} has damaged meshes.", "Export them again.")
-    identity = fit.shape(theta, torch.stack(targets))
+    if not targets:
+        raise reading.no_frames()
+    theta = torch.stack([fit.start(expressions[number]) for number in targets])
+    identity = fit.shape(theta, torch.stack(list(targets.values())))
     found = {}
     worst = 0.0
-    for number in reading.each(expressions, "fitting meshes"):
+    for number in reading.each([n for n in numbers if n not in damaged], "fitting meshes"):
         with reading.report.frame(meshes[number].name):
             target = read_mesh(meshes[number])[fit.kept]
             fitted, error = fit.pose(fit.start(expressions[number]), identity, target)

@@ -168,13 +168,15 @@ def test_vhaps_white_is_taken_off_and_a_film_that_lies_over_none_stays(tmp_path,
     # By hand: red 100 at alpha 51 (a fifth) over white is 20 + 204.
     half_seen = np.zeros((HEIGHT, WIDTH), np.uint8)
     half_seen[:, WIDTH // 2 :] = 51
+    half_seen[0, -1] = 255
     cv2.imwrite(str(tmp_path / f"export/fg_masks/{FIRST:05d}_00.png"), half_seen)
     over = np.full((HEIGHT, WIDTH, 3), 255, np.uint8)
     over[:, WIDTH // 2 :] = (255, 255, 224)
     cv2.imwrite(str(picture), over)
     seen = image(read_source(tmp_path / "export", options), 0)
     assert (seen[:, : WIDTH // 2] == 0).all()
-    assert (seen[:, WIDTH // 2 :] == (100, 255, 255, 51)).all()
+    assert tuple(seen[0, -1]) == (224, 255, 255, 255)
+    assert (seen[1:, WIDTH // 2 :] == (100, 255, 255, 51)).all()
     off = np.abs(straight.astype(int) - frame.image_rgba)
     assert off[alpha > 100].max() <= 3
     film = cv2.cvtColor(frame.image_rgba, cv2.COLOR_RGBA2BGR)
@@ -259,6 +261,25 @@ def test_insta_frames_that_are_told_as_left_out_are(tmp_path, options, takes):
     source = read_source(tmp_path, replace(options, allow_partial=True))
     assert any("left out: cameras" in note for note in source.notes)
     assert source.index == tuple(FIRST + k for k in range(NUM_FRAMES) if k != 1)
+
+
+def test_a_damaged_mesh_is_left_out_whichever_it_is(tmp_path, options, takes):
+    write(tmp_path, "insta-meshes", takes)
+    meshes = sorted((tmp_path / "meshes").iterdir())
+    meshes[2].write_text("v 0 0 0\n")  # one of those that the shape is taken from
+    meshes[3].write_text("v 0 0\n")
+    meshes[5].write_text("v 0 0\n")  # the next to take its place
+    told = f"not FLAME's: 2 .{meshes[2].name}, {meshes[5].name}"
+    with pytest.raises(UserError, match=told):
+        read_source(tmp_path, options)
+    source = read_source(tmp_path, replace(options, allow_partial=True))
+    assert source.index == tuple(FIRST + k for k in range(NUM_FRAMES) if k not in (2, 3, 5))
+    notes = " ".join(note for note in source.notes if "left out" in note)
+    assert [notes.count(meshes[k].name) for k in range(NUM_FRAMES)] == [0, 0, 1, 1, 0, 1]
+    for mesh in meshes:
+        mesh.write_text("v 0 0 0\n")
+    with pytest.raises(UserError, match="has no frames"):
+        read_source(tmp_path, replace(options, allow_partial=True))
 
 
 def test_an_unknown_folder_is_none(tmp_path):
