@@ -13,6 +13,7 @@ from rgbavatar_ns.data.importers.frame_images import make_png
 from rgbavatar_ns.data.importers.import_report import ImportReport, UnusableFrameError
 from rgbavatar_ns.data.importers.options import ImportOptions, Progress
 from rgbavatar_ns.data.importers.source import Source
+from rgbavatar_ns.data.importers.transforms import folders_outside
 from rgbavatar_ns.data.native.dataset import TrackedDataset, load_native
 from rgbavatar_ns.data.native.format import INDEX_FILE
 from rgbavatar_ns.data.native.writer import DatasetWriter, give_up
@@ -148,8 +149,12 @@ def source_fingerprint(src: Path, options: ImportOptions) -> str:
     """Names, sizes and times of all files of the data, and all options but FLAME's place."""
     others = replace(options, flame=None, flame_uv=None, flame_eyelids=None)
     found = find_format(src, options) if src.is_dir() else None
-    extra = tracker_folder(Folder(src)) if found and found.key == "flashavatar" else None
-    places = [src, extra, options.images, options.masks]
+    outside = []
+    if found and found.key == "flashavatar":
+        outside = [tracker_folder(Folder(src))]
+    elif found and options.allow_outside:
+        outside = folders_outside(Folder(src))
+    places = [src, *outside, options.images, options.masks]
     return digest([f"{_IMPORTER_VERSION} {others}", *_listing(places)])[:16]
 
 

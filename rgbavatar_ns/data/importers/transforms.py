@@ -4,6 +4,7 @@ import math
 import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,7 @@ from rgbavatar_ns.data.importers.source import Reading
 from rgbavatar_ns.errors import UserError
 
 INDEX_FILE = "transforms.json"
+_SPLITS = ("train", "val", "test")
 _MOST_SHARED = 100
 """Each frame gets them; nerfstudio writes some twenty."""
 _OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -58,6 +60,20 @@ def first_frame(folder: Folder) -> Mapping[str, Any] | None:
     return None
 
 
+def folders_outside(folder: Folder) -> list[Path]:
+    """Where files lie that the frames name, but not in the folder: VHAP's united sequences do."""
+    found = set()
+    for name in (INDEX_FILE, *map(_file_of, _SPLITS)):
+        content = read_json(folder.root / name) if folder.has(name) else {}
+        frames = content.get("frames")
+        for frame in frames if isinstance(frames, list) else ():
+            values = frame.values() if isinstance(frame, dict) else ()
+            paths = [value for value in values if isinstance(value, str) and "/" in value]
+            found |= {os.path.dirname(path) for path in paths}
+    outside = {name for name in found if os.path.normpath(name).startswith(("..", "/"))}
+    return [folder.root / name for name in sorted(outside)]
+
+
 def read_transforms(reading: Reading) -> tuple[list[Entry], bool]:
     """Every frame that the files name, once, and whether they tell which are held out.
 
@@ -66,7 +82,7 @@ def read_transforms(reading: Reading) -> tuple[list[Entry], bool]:
     """
     splits = {
         split: _frames(reading, _file_of(split))
-        for split in ("train", "val", "test")
+        for split in _SPLITS
         if reading.folder.has(_file_of(split))
     }
     every = dict(_frames(reading, INDEX_FILE)) if reading.folder.has(INDEX_FILE) else {}
