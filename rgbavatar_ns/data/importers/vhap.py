@@ -48,6 +48,8 @@ def read_vhap(reading: Reading) -> Source:
         with reading.report.frame(entry.name):
             place = (_index(entry.values, "timestep_index"), _index(entry.values, "camera_index"))
             frames.append((entry, place))
+    # The first moment tells the subject's shape, whichever file names it.
+    frames.sort(key=lambda frame: frame[1])
     cameras = sorted({camera for _, (_, camera) in frames})
     subject = VhapSubject(reading)
     records: list[FrameRecord] = []
@@ -92,15 +94,37 @@ def _frame_image(folder: Folder, entry: Entry) -> FrameImage:
     return FrameImage(folder.path(entry.name), alpha=folder.path(mask), over_white=True)
 
 
+@dataclass(frozen=True)
+class _Shape:
+    """A subject's identity, and offsets of vertices if there are any."""
+
+    identity: Float[np.ndarray, "_"]
+    offset: Float[np.ndarray, "_ 3"] | None
+
+    def is_like(self, other: "_Shape") -> bool:
+        """Whether both are one but for rounding."""
+        if np.abs(self.identity - other.identity).max() > _SHAPE_TOLERANCE:
+            return False
+        if self.offset is None or other.offset is None:
+            return self.offset is other.offset
+        same_size = self.offset.shape == other.offset.shape
+        return same_size and bool(np.abs(self.offset - other.offset).max() < _OFFSET_TOLERANCE_M)
+
+
 @dataclass
 class VhapSubject:
-    """The head model with the subject's own offsets, made of the first parameters that are read."""
+    """The head model with the subject's own offsets, made of the first parameters that are read.
+
+    United sequences may each have a shape of their own: all get the first one's, as in
+    GaussianAvatars.
+    """
 
     reading: Reading
     identity: Float[np.ndarray, "_"] = field(default_factory=lambda: np.zeros(0))
     """The subject's shape."""
     _arrays: HeadArrays | None = None
-    _offset: Float[np.ndarray, "_ 3"] | None = None
+    _shapes: dict[Path, "_Shape"] = field(default_factory=dict)
+    """Of each folder of parameters."""
     _known: dict[Path, dict[str, Float[np.ndarray, "_"]]] = field(default_factory=dict)
 
     @property
@@ -113,11 +137,16 @@ class VhapSubject:
     def theta(self, path: Path) -> dict[str, Float[np.ndarray, "_"]]:
         """Head parameters of a file, which several cameras may share."""
         if path not in self._known:
-            self._known[path] = self.parse(read_npz(path))
+            self._known[path] = self.parse(read_npz(path), path.parent)
         return self._known[path]
 
-    def parse(self, values: dict[str, np.ndarray]) -> dict[str, Float[np.ndarray, "_"]]:
-        """Head parameters of one moment; raises UnusableFrameError where some are missing."""
+    def parse(
+        self, values: dict[str, np.ndarray], sequence: Path
+    ) -> dict[str, Float[np.ndarray, "_"]]:
+        """Head parameters of one moment; raises UnusableFrameError where some are missing.
+
+        sequence: the folder that they lie in; within it the shape is one.
+        """
         offset = static_offset(values.get("static_offset"))
         if "shape" not in values or "expr" not in values:
             raise UnusableFrameError("parameters without 'shape' or 'expr'")
@@ -135,19 +164,18 @@ class VhapSubject:
             self.identity = padded(
                 values["shape"], self._arrays.num_identity, "shape", self._arrays.name
             )
-            self._offset = offset
         arrays = self._arrays
-        shape = padded(values["shape"], arrays.num_identity, "shape", arrays.name)
-        if np.abs(shape - self.identity).max() > _SHAPE_TOLERANCE or not self._same_offset(offset):
+        identity = padded(values["shape"], arrays.num_identity, "shape", arrays.name)
+        shape = _Shape(identity, offset)
+        if not shape.is_like(self._shapes.setdefault(sequence, shape)):
             raise UnusableFrameError("records of another head shape than the first")
+        if not shape.is_like(next(iter(self._shapes.values()))):
+            self.reading.report.note(
+                "the sequences have head shapes of their own: all get the first one's, as "
+                "GaussianAvatars reads them"
+            )
         expression = padded(values["expr"], arrays.num_expressions, "expr", arrays.name)
         return {"expression": expression, **theta}
-
-    def _same_offset(self, offset: Float[np.ndarray, "_ 3"] | None) -> bool:
-        if offset is None or self._offset is None:
-            return offset is self._offset
-        same_size = offset.shape == self._offset.shape
-        return same_size and bool(np.abs(offset - self._offset).max() < _OFFSET_TOLERANCE_M)
 
 
 def static_offset(value: np.ndarray | None) -> Float[np.ndarray, "_ 3"] | None:

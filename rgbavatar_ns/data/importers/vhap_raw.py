@@ -60,7 +60,7 @@ def read_vhap_raw(reading: Reading) -> Source:
                 raise UnusableFrameError("images without a matte")
             own = {key: values[key][moment] for key in _PER_FRAME if key in values}
             own |= {key: values[key] for key in _SHARED if key in values}
-            theta = subject.parse(own)
+            theta = subject.parse(own, path.parent)
             header = image_header(images[name])
             camera = _camera(values, header.width, header.height)
             frame_image = FrameImage(images[name], masks.get(name))

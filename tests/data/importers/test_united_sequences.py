@@ -5,12 +5,15 @@ import os
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
+import torch
 
-from rgbavatar_ns.data.importers import ImportOptions
+from rgbavatar_ns.data.importers import ImportOptions, read_source
 from rgbavatar_ns.data.importers.convert import source_fingerprint
+from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.synthetic.exporters.folders import VhapWriter
-from tests.data.importers.takes import NUM_FRAMES
+from tests.data.importers.takes import FIRST, NUM_FRAMES
 
 PATHS = ("file_path", "fg_mask_path", "flame_param_path")
 
@@ -37,6 +40,24 @@ def united(tmp_path, takes) -> Path:
         (tmp_path / "all").mkdir(exist_ok=True)
         (tmp_path / f"all/transforms_{split}.json").write_text(json.dumps(content))
     return tmp_path / "all"
+
+
+def test_sequences_of_shapes_of_their_own_get_the_first_ones(united, options, takes):
+    take, _ = takes("2023", False)
+    with pytest.raises(UserError, match="leads out"):
+        read_source(united, replace(options, allow_outside=False))
+    source = read_source(united, options)
+    assert source.index == tuple(range(FIRST, FIRST + 2 * NUM_FRAMES))
+    assert source.test == frozenset(range(FIRST + NUM_FRAMES, FIRST + 2 * NUM_FRAMES))
+    assert torch.allclose(source.identity, torch.from_numpy(take.identity).float())
+    assert torch.equal(source.theta[:NUM_FRAMES], source.theta[NUM_FRAMES:])
+    assert any("head shapes of their own" in note for note in source.notes)
+    # Within a sequence another shape is a mistake.
+    path = united.parent / f"two/flame_param/{FIRST + 2:05d}.npz"
+    with np.load(path) as values:
+        np.savez(path, **{**values, "shape": values["shape"] + 0.1})
+    with pytest.raises(UserError, match=r"another head shape than the first: 1"):
+        read_source(united, options)
 
 
 @pytest.mark.parametrize("what", ["images", "fg_masks", "flame_param"])
