@@ -15,7 +15,7 @@ from rgbavatar_ns.avatar import AvatarConfig
 from rgbavatar_ns.avatar.metrics import evaluate_images
 from rgbavatar_ns.avatar.training import FitHooks, TrainingBatch, TrainingStep, fit
 from rgbavatar_ns.data import ImageCache, OfflineOrder, load_dataset
-from rgbavatar_ns.export import write_comparison
+from rgbavatar_ns.export import statistics_of, write_comparison
 from rgbavatar_ns.head import HeadModel
 
 
@@ -61,7 +61,7 @@ def main() -> None:
         fit(step, batch_at, range(options.steps), Shown(progress, options.steps))
 
     options.out.mkdir(parents=True, exist_ok=True)
-    avatar.save(options.out / "trained.avatar")
+    avatar.save(options.out / "trained.avatar", statistics=statistics_of(avatar, data))
     print(f"the avatar is in {options.out}")
     scores = []
     for frame in data.test:

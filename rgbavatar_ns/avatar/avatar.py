@@ -385,4 +385,5 @@ class Avatar(AvatarMethod):
                 axis = 1 if ".basis_" in name else 0
                 own[name] = value.index_select(axis, places)
         chosen.load_state_dict(own, strict=False)
+        chosen.training_statistics = self.training_statistics
         return chosen

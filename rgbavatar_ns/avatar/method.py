@@ -82,10 +82,14 @@ class AvatarMethod(nn.Module, ABC):
     """The options that a checkpoint and the run that goes on with it must agree in."""
     config: MethodConfig
     identity: Tensor
+    training_statistics: TrainingStatistics | None
+    """What the file that it was loaded from knows about its training; None where it knows nothing,
+    and of an avatar that was made here."""
 
     def __init__(self, head: HeadModel, identity: Float[Tensor, "I"], config: MethodConfig) -> None:
         super().__init__()
         self.head, self.config = head, config
+        self.training_statistics = None
         self.register_buffer("identity", identity.detach().clone())
 
     @property
@@ -273,13 +277,16 @@ class AvatarMethod(nn.Module, ABC):
     ) -> None:
         """Write a bundle (a directory of avatar.safetensors and avatar.json), atomically.
 
-        Without `with_head` it only names its head model, as the licence of FLAME asks where the
-        bundle is passed on; `load` then wants the file (RGBAVATAR_HEAD).
+        statistics: of the frames that it was trained on, which driving asks for
+        (`export.statistics_of`); without any, those that it was loaded with. Without `with_head` it
+        only names its head model, as the licence of FLAME asks where the bundle is passed on;
+        `load` then wants the file (RGBAVATAR_HEAD).
         """
         state = self.to_state()
         if not with_head:
             state["head"] = reference_to(self.head.arrays)
-        save_bundle(state, self.own_state_dict(), Path(path), self.layout, statistics)
+        seen = self.training_statistics if statistics is None else statistics
+        save_bundle(state, self.own_state_dict(), Path(path), self.layout, seen)
 
     @classmethod
     def load(cls: type[Kind], path: str | Path) -> Kind:
@@ -307,6 +314,7 @@ class AvatarMethod(nn.Module, ABC):
             own = avatar.own_state_dict()
             replace(stored, parameters=parameters).check_fits(own, avatar.layout.to_json())
             avatar.load_state_dict({name: parameters[name] for name in own}, strict=False)
+            avatar.training_statistics = stored.statistics_of(avatar.layout)
         return avatar
 
     def defaults_of_before(self) -> dict[str, Tensor]:

@@ -31,6 +31,7 @@ def test_it_trains_scores_and_draws(
     assert int(frames) == NUM_TEST
     avatar = Avatar.load(tmp_path / "out" / "trained.avatar")
     assert avatar.num_gaussians > 50
+    assert avatar.training_statistics is not None, "driving asks for them"
     picture = cv2.imread(str(tmp_path / "out" / "held_out.png"))
     assert picture.shape[0] == 3 * SIZE
     assert len(SCRIPT.read_text().splitlines()) <= 80

@@ -128,7 +128,7 @@ def load_statistics(path: Path) -> TrainingStatistics | None:
     stored = load_any(path)
     if stored.statistics is None:
         return None
-    return TrainingStatistics.from_state(stored.statistics, ThetaLayout.from_json(stored.layout))
+    return stored.statistics_of(ThetaLayout.from_json(stored.layout))
 
 
 def _load_bundle(path: Path) -> StoredAvatar:

@@ -10,7 +10,9 @@ import torch
 from torch import Tensor
 
 from rgbavatar_ns.avatar.config import AvatarConfig
+from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.head import ThetaLayout
 from rgbavatar_ns.reading import DamagedFileError, damage_told
 
 RGBAVATAR = "rgbavatar"
@@ -67,6 +69,11 @@ class StoredAvatar:
             with self.damage_told():
                 raise DamagedFileError("its method has no name")
         return method
+
+    def statistics_of(self, layout: ThetaLayout) -> TrainingStatistics | None:
+        """What it saw in training, if the file kept it; raises UserError where that is damaged."""
+        known = self.statistics is not None
+        return TrainingStatistics.from_state(self.statistics, layout) if known else None
 
     @contextmanager
     def damage_told(self) -> Iterator[None]:

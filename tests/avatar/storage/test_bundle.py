@@ -250,6 +250,33 @@ def test_statistics_and_layout_are_inside_the_bundle(make_avatar, tmp_path):
     assert Avatar.load(tmp_path / "me").layout == avatar.layout
 
 
+def _same_statistics(first: TrainingStatistics | None, second: TrainingStatistics) -> bool:
+    assert first is not None
+    return all(
+        torch.equal(value, other) if isinstance(value, torch.Tensor) else value == other
+        for value, other in zip(vars(first).values(), vars(second).values())
+    )
+
+
+def test_what_was_seen_goes_from_file_to_file(make_avatar, tmp_path):
+    avatar = make_avatar(random=True)
+    assert avatar.training_statistics is None
+    written, others = _statistics(avatar), _statistics(avatar, 5)
+    avatar.save(tmp_path / "first", statistics=written)
+    loaded = Avatar.load(tmp_path / "first")
+    loaded.save(tmp_path / "second")
+    assert _same_statistics(load_statistics(tmp_path / "second"), written)
+    loaded.without_undrawn().save(tmp_path / "third")
+    assert _same_statistics(load_statistics(tmp_path / "third"), written)
+    loaded.save(tmp_path / "fourth", statistics=others)
+    assert _same_statistics(load_statistics(tmp_path / "fourth"), others)
+    checkpoint = checkpoint_of(avatar)
+    checkpoint["pipeline"]["_model._extra_state"]["statistics"] = written.to_state()
+    torch.save(checkpoint, tmp_path / "step-000000012.ckpt")
+    Avatar.load(tmp_path / "step-000000012.ckpt").save(tmp_path / "fifth")
+    assert _same_statistics(load_statistics(tmp_path / "fifth"), written)
+
+
 def test_a_bundle_and_an_earlier_run_may_have_none(make_avatar, tmp_path):
     make_avatar().save(tmp_path / "me")
     assert load_statistics(tmp_path / "me") is None
