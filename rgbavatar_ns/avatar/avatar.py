@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from rgbavatar_ns.avatar.config import AvatarConfig
-from rgbavatar_ns.avatar.method import AvatarMethod
+from rgbavatar_ns.avatar.method import AvatarMethod, require_pictures
 from rgbavatar_ns.avatar.model.anchors import GaussianAnchors
 from rgbavatar_ns.avatar.model.blendshapes import GaussianBlendshapes
 from rgbavatar_ns.avatar.model.kept_copy import KeptCopy, PictureCopy, own_tensors
@@ -224,6 +224,7 @@ class Avatar(AvatarMethod):
         (`kernels.PackedGaussians`), its mesh and weights from compiled loops (`kernels.Posing`);
         both are made once the avatar is drawn again unchanged.
         """
+        require_pictures(theta)
         options: dict[str, Any] = {"with_depth": with_depth, "with_visibility": with_visibility}
         with nullcontext() if differentiable else torch.no_grad():
             if to_be_seen and len(theta) == 1 and not (differentiable or with_visibility):

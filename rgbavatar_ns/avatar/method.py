@@ -209,6 +209,7 @@ class AvatarMethod(nn.Module, ABC):
         """
         if psi is not None and psi.shape[-1] > 0:
             raise ValueError(f"{self.method} has no blendshape weights. Leave out psi.")
+        require_pictures(theta)
         with nullcontext() if differentiable else torch.no_grad():
             return rasterize(
                 self.gaussians(theta, cameras=cameras),
@@ -320,6 +321,12 @@ class AvatarMethod(nn.Module, ABC):
     def defaults_of_before(self) -> dict[str, Tensor]:
         """What files of earlier versions lack, by its name in the state dict."""
         return {}
+
+
+def require_pictures(theta: Tensor) -> None:
+    """Raise ValueError for a batch of no theta, of which no backend makes pictures."""
+    if theta.ndim == 2 and len(theta) == 0:
+        raise ValueError("theta: leading dimension 0. Pass at least 1: there is no empty batch.")
 
 
 def describe_layout(layout: ThetaLayout) -> str:

@@ -122,6 +122,8 @@ def _check_offset(means: Tensor, screen_offset: Tensor, batch: int) -> None:
 
 def _join(batch: int, name: str, leading: int) -> int:
     """The batch size when something with this leading dimension joins it."""
+    if leading == 0:
+        raise ValueError(f"{name}: leading dimension 0. Pass at least 1: there is no empty batch.")
     if leading != batch and 1 not in (leading, batch):
         raise ValueError(
             f"{name}: leading dimension {leading} in a batch of {batch}. Pass {batch} or 1."

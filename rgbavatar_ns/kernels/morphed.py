@@ -83,4 +83,6 @@ def _num_cameras(
             f"weights are {list(weights.shape)} and vertices {list(vertices.shape)}. Pass "
             f"[B, {num_bases}] and [B, V, 3]."
         )
+    if len(weights) == 0:
+        raise ValueError("weights: leading dimension 0. Pass at least 1: there is no empty batch.")
     return check_cameras(gaussians.position, cameras)

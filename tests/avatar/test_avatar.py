@@ -3,6 +3,7 @@ import roma
 import torch
 
 from rgbavatar_ns.avatar import Avatar, AvatarConfig
+from rgbavatar_ns.avatar.methods.gaussianavatars import GaussianAvatars
 from rgbavatar_ns.avatar.training.fused_step import FusedStep
 from rgbavatar_ns.avatar.training.optimizer_states import unsupported_reason
 from rgbavatar_ns.errors import UserError
@@ -171,6 +172,16 @@ def test_theta_of_another_size_is_refused_with_the_layout(make_avatar):
         avatar.gaussians(torch.zeros(1, 5))
     with pytest.raises(UserError, match="expression 4"):
         avatar.weights(torch.zeros(1, 5))
+
+
+@pytest.mark.parametrize("differentiable", [False, True])
+def test_an_empty_batch_is_told(make_avatar, differentiable):
+    rival = GaussianAvatars(small_head(), small_identity())
+    for avatar in (make_avatar(), rival):
+        theta, camera = torch.zeros(2, avatar.layout.size), front_camera(8)
+        for given, cameras in ((theta[:0], camera), (theta, camera.select([]))):
+            with pytest.raises(ValueError, match=r"leading dimension 0\. Pass at least 1"):
+                avatar.render(given, cameras, differentiable=differentiable)
 
 
 def test_theta_that_is_not_finite_is_refused(make_avatar):

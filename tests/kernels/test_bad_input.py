@@ -6,7 +6,13 @@ import warnings
 import pytest
 import torch
 
-from rgbavatar_ns.kernels import available_backends, rasterize, registry, weighted_color_average
+from rgbavatar_ns.kernels import (
+    GaussianSet,
+    available_backends,
+    rasterize,
+    registry,
+    weighted_color_average,
+)
 from tests.kernels.scenes import (
     ATTRIBUTES,
     changed,
@@ -88,6 +94,28 @@ def test_other_arguments_that_do_not_fit_are_refused():
         weighted_color_average(gaussians, cameras, nine_channels)
     with pytest.raises(ValueError, match=r"Pass \[B, H, W, C\]"):
         weighted_color_average(gaussians, cameras, torch.zeros(3, 4, 4, 3))
+
+
+@pytest.mark.parametrize("backend", available_backends())
+def test_an_empty_batch_is_refused(backend):
+    """Compiled loops would read the first set, which is not there."""
+    gaussians, cameras = _small()
+    none = GaussianSet(**{name: tensor[:0] for name, tensor in vars(gaussians).items()})
+    images = torch.zeros(0, cameras.height, cameras.width, 3)
+    for given, name in (
+        ((none, cameras), "means"),
+        ((gaussians, cameras.select([])), "cameras"),
+        ((none, cameras.select([])), "means"),
+        ((_replaced(gaussians, opacities=gaussians.opacities[:0]), cameras), "opacities"),
+    ):
+        with pytest.raises(ValueError, match=f"{name}: leading dimension 0. Pass at least 1"):
+            rasterize(*given, backend=backend)
+        with pytest.raises(ValueError, match=f"{name}: leading dimension 0. Pass at least 1"):
+            weighted_color_average(*given, images, backend=backend)
+    with pytest.raises(ValueError, match="background: leading dimension 0"):
+        rasterize(gaussians, cameras, torch.zeros(0, 3), backend=backend)
+    with pytest.raises(ValueError, match="images: leading dimension 0"):
+        weighted_color_average(gaussians, cameras, images, backend=backend)
 
 
 @pytest.mark.skipif("cpu" not in available_backends(), reason="the extension is not compiled")
