@@ -27,6 +27,14 @@ def emulated(monkeypatch: pytest.MonkeyPatch):
     return emulator.install(monkeypatch)
 
 
+@pytest.fixture
+def unchecked_types(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As users run it: without the tests' own checks of shapes and types, which speak first."""
+    import jaxtyping
+
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
+
+
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
         "--fail-on-missing",

@@ -221,10 +221,16 @@ class AvatarMethod(nn.Module, ABC):
             )
 
     def checked(self, theta: Float[Tensor, "B H"]) -> Float[Tensor, "B H"]:
-        """Return theta in the avatar's dtype, or raise UserError with the reason."""
-        if theta.shape[-1] != self.layout.size:
+        """Return theta in the avatar's dtype, on its device, or raise UserError with the reason."""
+        if theta.ndim != 2:
             raise UserError(
-                f"theta has {theta.shape[-1]} values, but this avatar's head "
+                f"theta is {list(theta.shape)}, but a batch is wanted: [B, {self.layout.size}], a "
+                "row for each picture.",
+                "Give one frame's as theta[None].",
+            )
+        if theta.shape[1] != self.layout.size:
+            raise UserError(
+                f"theta has {theta.shape[1]} values, but this avatar's head "
                 f"'{self.head.arrays.name}' takes {describe_layout(self.layout)}.",
                 "Give theta of the head model that the avatar was trained with.",
             )
@@ -233,7 +239,7 @@ class AvatarMethod(nn.Module, ABC):
             raise UserError(
                 "theta holds NaN or infinite values.", "Repair or leave out these frames."
             )
-        return theta.to(self.identity.dtype)
+        return theta.to(self.identity)
 
     def require_layout(self, layout: ThetaLayout, source: str) -> None:
         """Raise UserError, naming both layouts, where `source` has another than this avatar."""

@@ -174,6 +174,21 @@ def test_theta_of_another_size_is_refused_with_the_layout(make_avatar):
         avatar.weights(torch.zeros(1, 5))
 
 
+@pytest.mark.usefixtures("unchecked_types")
+def test_theta_without_its_batch_is_told_with_the_shape_that_is_wanted(make_avatar):
+    avatar, camera = make_avatar(), front_camera(8)
+    size = avatar.layout.size
+    for shape in ((size,), (1, 1, size), ()):
+        theta = torch.zeros(shape)
+        for differentiable in (False, True):
+            with pytest.raises(UserError, match=rf"but a batch is wanted: \[B, {size}\]"):
+                avatar.render(theta, camera, differentiable=differentiable)
+        with pytest.raises(UserError, match=r"theta\[None\]"):
+            avatar.weights(theta)
+        with pytest.raises(UserError, match=r"theta\[None\]"):
+            avatar.render(theta, camera, to_be_seen=True)
+
+
 @pytest.mark.parametrize("differentiable", [False, True])
 def test_an_empty_batch_is_told(make_avatar, differentiable):
     rival = GaussianAvatars(small_head(), small_identity())
@@ -182,6 +197,11 @@ def test_an_empty_batch_is_told(make_avatar, differentiable):
         for given, cameras in ((theta[:0], camera), (theta, camera.select([]))):
             with pytest.raises(ValueError, match=r"leading dimension 0\. Pass at least 1"):
                 avatar.render(given, cameras, differentiable=differentiable)
+
+
+def test_theta_goes_to_the_avatars_device(make_avatar):
+    avatar = make_avatar().to("meta")
+    assert avatar.checked(torch.zeros(2, avatar.layout.size)).device.type == "meta"
 
 
 def test_theta_that_is_not_finite_is_refused(make_avatar):
