@@ -21,7 +21,7 @@ from rgbavatar_ns.avatar.storage.stored_avatar import StoredAvatar
 from rgbavatar_ns.drawing.compositing import ImagesRGBA
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadArrays, HeadModel, ThetaLayout
-from rgbavatar_ns.head.arkit import ArkitMap, arkit_coefficients, arkit_map
+from rgbavatar_ns.head.arkit import ArkitMap, arkit_map, arkit_rows
 from rgbavatar_ns.kernels import GaussianSet, PinholeCameras, RenderedBatch, rasterize
 from rgbavatar_ns.kernels.checks import holds_nonfinite
 
@@ -179,14 +179,13 @@ class AvatarMethod(nn.Module, ABC):
 
         coefficients: by name, or in the order of `ARKIT_NAMES`. head_rotation: axis-angle, radians,
         x the subject's left, y up, z out of the face. The head stays where it is at rest. Raises
-        UserError for an unknown name or a value that is no number.
+        UserError for an unknown name, a value that is no number or another number of columns.
         """
-        if isinstance(coefficients, Mapping):
-            coefficients = arkit_coefficients(coefficients)
-        given = [coefficients] if head_rotation is None else [coefficients, head_rotation]
+        rows = arkit_rows(coefficients)
+        given = [rows] if head_rotation is None else [rows, head_rotation]
         if not all(bool(torch.isfinite(part).all()) for part in given):
             raise UserError("The ARKit values hold NaN.", "Give numbers from 0 to 1, and radians.")
-        return self.arkit.theta(coefficients.to(self.identity), head_rotation)
+        return self.arkit.theta(rows.to(self.identity), head_rotation)
 
     def render(
         self,

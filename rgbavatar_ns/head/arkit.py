@@ -1,9 +1,10 @@
 """The 52 ARKit blend shapes as a head model's theta: one table a head, and its way back."""
 
 import difflib
+import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -132,14 +133,44 @@ def arkit_coefficients(named: Mapping[str, int | float]) -> Float[Tensor, "52"]:
     """
     row = torch.zeros(len(ARKIT_NAMES))
     for name, value in named.items():
-        known = name[:1].lower() + name[1:]
+        known = name[:1].lower() + name[1:] if isinstance(name, str) else str(name)
         if known not in ARKIT_NAMES:
             near = difflib.get_close_matches(known, ARKIT_NAMES, 1)
             raise UserError(
-                f"ARKit has no blend shape '{name[:40]}'.",
+                f"ARKit has no blend shape '{str(name)[:40]}'.",
                 f"Did you mean {near[0]}?" if near else "Use names such as jawOpen.",
             )
-        if not np.isfinite(value):
-            raise UserError(f"{known} is {value}.", "Give a number from 0 to 1.")
-        row[ARKIT_NAMES.index(known)] = float(value)
+        number = _number(value)
+        if not math.isfinite(number):
+            raise UserError(f"{known} is {value!r:.40}.", "Give a number from 0 to 1.")
+        row[ARKIT_NAMES.index(known)] = number
     return row
+
+
+def _number(value: Any) -> float:
+    """The value as a number; NaN where it is none, as text is."""
+    try:
+        return math.nan if isinstance(value, str | bytes) else float(value)
+    except (TypeError, ValueError, OverflowError, RuntimeError):
+        return math.nan
+
+
+def arkit_rows(values: Any) -> Float[Tensor, "*batch 52"]:
+    """Coefficients by name, or rows of them in the order of `ARKIT_NAMES`, as rows.
+
+    Raises UserError for what is neither, with the number of columns where that is what is wrong.
+    """
+    if isinstance(values, Mapping):
+        return arkit_coefficients(values)
+    wanted = (
+        f"Give a mapping such as {{'jawOpen': 0.5}}, or a tensor whose last axis has the "
+        f"{len(ARKIT_NAMES)} blend shapes in the order of ARKIT_NAMES"
+    )
+    if not isinstance(values, Tensor):
+        raise UserError(f"The ARKit values are {type(values).__name__}.", f"{wanted}.")
+    if values.ndim == 0 or values.shape[-1] != len(ARKIT_NAMES):
+        raise UserError(
+            f"The ARKit values are {list(values.shape)}.",
+            f"{wanted}; without timecode, their count, and the turns of head and eyes.",
+        )
+    return values

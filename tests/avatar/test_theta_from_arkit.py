@@ -43,6 +43,23 @@ def test_what_is_none_of_arkits_is_told():
         avatar.theta_from_arkit({}, torch.tensor([0.0, torch.inf, 0.0]))
 
 
+@pytest.mark.usefixtures("unchecked_types")
+def test_what_is_no_row_of_numbers_is_told():
+    avatar = avatar_of()
+    for value in ("0.5", None, [0.5], 10**400):
+        with pytest.raises(UserError, match=r"jawOpen is .*Give a number from 0 to 1"):
+            avatar.theta_from_arkit({"jawOpen": value})
+    for value in ("jawOpen", None, [0.0] * 52):
+        with pytest.raises(UserError, match=r"ARKit values are (str|NoneType|list)\..*a mapping"):
+            avatar.theta_from_arkit(value)
+    with pytest.raises(UserError, match="no blend shape '3'"):
+        avatar.theta_from_arkit({3: 0.5})
+    # A row of Live Link Face's table, with the turns of head and eyes.
+    for shape in ((61,), (4, 61), (4, 51), ()):
+        with pytest.raises(UserError, match=r"ARKit values are \[.*the 52 blend shapes.*timecode"):
+            avatar.theta_from_arkit(torch.zeros(shape))
+
+
 def test_a_head_without_a_face_is_told():
     with pytest.raises(UserError, match="No face was found"):
         avatar_of(arrays=small_head_arrays()).theta_from_arkit({"jawOpen": 0.5})
