@@ -226,19 +226,23 @@ class Avatar(AvatarMethod):
         """
         require_pictures(theta)
         options: dict[str, Any] = {"with_depth": with_depth, "with_visibility": with_visibility}
+        background = None if background is None else background.to(self.identity)
+        # More cameras or colours than theta make more pictures, which `rasterize` alone draws.
+        count = len(theta) if theta.ndim else 0
+        alike = background is None or background.numel() in (3, 3 * count)
+        alone = alike and count == 1 == len(cameras.focal_px)
         with nullcontext() if differentiable else torch.no_grad():
-            if to_be_seen and len(theta) == 1 and not (differentiable or with_visibility):
+            if to_be_seen and alone and not (differentiable or with_visibility):
                 picture = self.picture_renderer(theta, cameras, psi, backend=backend)
                 if picture is not None:
                     return picture.draw(background, with_depth=with_depth)
             renderer = None
-            if not differentiable:
+            if alike and not differentiable:
                 renderer = self.renderer(theta, cameras, psi, backend=backend)
             if renderer is None:
                 gaussians = self.gaussians(theta, psi)
                 return rasterize(gaussians, cameras, background, backend=backend, **options)
-            color = theta.new_zeros(3) if background is None else background
-            return renderer.draw(color.expand(len(theta), 3).to(self.identity), **options)
+            return renderer.draw(background, **options)
 
     def renderer(
         self,

@@ -213,7 +213,7 @@ class AvatarMethod(nn.Module, ABC):
             return rasterize(
                 self.gaussians(theta, cameras=cameras),
                 cameras,
-                background,
+                None if background is None else background.to(self.identity),
                 backend=backend,
                 with_depth=with_depth,
                 with_visibility=with_visibility,

@@ -39,6 +39,10 @@ class RecordedRendering:
     ) -> None:
         if not supports(avatar, theta[:1], cameras.select([0]), backend):
             raise ValueError("This backend's pictures need the host. Use Avatar.render.")
+        if len(cameras.focal_px) not in (1, len(theta)):
+            raise ValueError(
+                f"{len(cameras.focal_px)} cameras for {len(theta)} theta. Pass one, or one each."
+            )
         self._avatar, self._backend = avatar, backend
         self._recording = Recording(avatar, self._draw, recorder)
         self._lane = lane(theta.device)

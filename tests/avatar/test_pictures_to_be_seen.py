@@ -10,7 +10,7 @@ import torch
 from rgbavatar_ns.avatar.training import TrainingOptions, TrainingStep, make_optimizer
 from rgbavatar_ns.drawing.compositing import to_uint8
 from rgbavatar_ns.errors import UserError
-from rgbavatar_ns.kernels import available_backends, packed_gaussians
+from rgbavatar_ns.kernels import available_backends, packed_gaussians, rasterize
 from rgbavatar_ns.kernels.constants import MIN_ALPHA
 from rgbavatar_ns.kernels.threads import using_threads
 from tests.avatar.fused_scene import VARIANTS, far_batch, fused_step, stir
@@ -79,6 +79,27 @@ def test_pictures_to_measure_stay_exact_beside_those_to_see(stirred):
     assert torch.equal(several.image, avatar.render(pair, camera).image)
     visible = avatar.render(theta, camera, to_be_seen=True, with_visibility=True).visibility
     assert torch.equal(visible, avatar.render(theta, camera, with_visibility=True).visibility)
+
+
+@pytest.mark.usefixtures("unchecked_types")
+def test_later_pictures_take_what_the_first_one_takes(stirred):
+    """Colours of another type, and more cameras or colours than theta."""
+    avatar = stirred()
+    theta, camera = random_theta(avatar.layout, 1), front_camera()
+    gray, two = torch.full((3,), 0.25), torch.tensor([[0.2, 0.5, 0.9], [0.7, 0.1, 0.0]])
+    cases = [(camera, gray.double(), gray), (camera, torch.ones(3, dtype=torch.uint8), None)]
+    cases += [(camera.select([0, 0]), gray, gray), (camera, two, two)]
+    for cameras, background, exact_background in cases:
+        exact_background = torch.ones(3) if exact_background is None else exact_background
+        with torch.no_grad():
+            exact = rasterize(avatar.gaussians(theta), cameras, exact_background)
+        for _ in range(3):
+            drawn = avatar.render(theta, cameras, background, to_be_seen=True)
+            assert drawn.image.shape == exact.image.shape
+            assert_same_to_the_eye(drawn, exact)
+        for differentiable in (True, False):
+            drawn = avatar.render(theta, cameras, background, differentiable=differentiable)
+            torch.testing.assert_close(drawn.image, exact.image, atol=1e-5, rtol=0)
 
 
 @pytest.mark.parametrize(

@@ -289,6 +289,14 @@ def test_pictures_are_the_ordinary_ones(emulated, make_avatar, cameras):
     assert rendering(batch.theta).alpha.max() > 0.5
 
 
+def test_more_cameras_than_theta_are_refused_before_the_first_picture(emulated, make_avatar):
+    """The first pictures would be drawn, and the recorded ones not."""
+    avatar = stir(make_avatar())
+    batch, _ = far_batch(avatar, 2, 30, 20, cameras=2)
+    with pytest.raises(ValueError, match="2 cameras for 1 theta"):
+        RecordedRendering(avatar, batch.theta[:1], batch.cameras, recorder=Recorder())
+
+
 def test_a_picture_without_room_is_drawn_again(emulated, make_avatar):
     avatar = stir(make_avatar())
     rendering, recorder, batch, _ = _rendering(avatar)
