@@ -1,15 +1,17 @@
 """Overrides of a preset, checked against its typed config before anything runs."""
 
+import copy
 import dataclasses
 import types
 import typing
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from typeguard import TypeCheckError, check_type
 
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.experiments.spec import Overrides, nearest
+from rgbavatar_ns.options import CheckedOptions
 
 
 def check_overrides(config: Any, overrides: Overrides, where: str) -> None:
@@ -20,6 +22,35 @@ def check_overrides(config: Any, overrides: Overrides, where: str) -> None:
     """
     for key, value in overrides.items():
         _check(config, key, value, where)
+
+
+def with_overrides(config: Any, overrides: Overrides) -> Any:
+    """A copy of a preset's config with the overrides in it, which `check_overrides` has passed."""
+    for key, value in overrides.items():
+        config = _replaced(config, key.split("."), value)
+    return config
+
+
+def _replaced(part: Any, path: Sequence[str], value: Any) -> Any:
+    name, *rest = path
+    if isinstance(part, Mapping):
+        return {**part, name: _replaced(part[name], rest, value)}
+    if rest:
+        value = _replaced(getattr(part, name), rest, value)
+    else:
+        value = _as_config(value, typing.get_type_hints(type(part))[name])
+    changed = copy.copy(part)
+    object.__setattr__(changed, name, value)  # frozen ones too
+    return changed
+
+
+def check_together(config: Any) -> None:
+    """Raise UserError where options refuse one another, as they do on a command line."""
+    if isinstance(config, CheckedOptions):
+        config.__post_init__()
+    if dataclasses.is_dataclass(config):
+        for part in vars(config).values():
+            check_together(part)
 
 
 def _check(config: Any, key: str, value: Any, where: str) -> None:

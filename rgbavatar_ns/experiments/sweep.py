@@ -12,7 +12,7 @@ from rgbavatar_ns.experiments.cells import Cell, cells_of, demo_config
 from rgbavatar_ns.experiments.commands import killed_by
 from rgbavatar_ns.experiments.engines import Engine
 from rgbavatar_ns.experiments.kept import kept_results, portable_keys
-from rgbavatar_ns.experiments.overrides import check_overrides
+from rgbavatar_ns.experiments.overrides import check_overrides, check_together, with_overrides
 from rgbavatar_ns.experiments.reenactment import load_tracker
 from rgbavatar_ns.experiments.runner import (
     LOG_FILE,
@@ -49,9 +49,10 @@ class CellStatus:
 
 
 def check_experiment(experiment: Experiment) -> None:
-    """Raise UserError where the preset or an override does not exist or does not fit."""
+    """Raise UserError where the preset or an override does not exist, fit or lie in its range."""
     # Loads nerfstudio, which takes seconds.
     from rgbavatar_ns.plugin.presets import presets
+    from rgbavatar_ns.plugin.training.ranges import require_in_range
 
     known = presets()
     tracker = (experiment.cross_identity or {}).get("tracker")
@@ -66,6 +67,12 @@ def check_experiment(experiment: Experiment) -> None:
         base = f"The experiment {experiment.name}, base,"
         check_overrides(known[preset], experiment.base, base)
         check_overrides(known[preset], variant.overrides, where)
+        config = with_overrides(known[preset], {**experiment.base, **variant.overrides})
+        try:
+            require_in_range(config)
+            check_together(config)
+        except UserError as error:
+            raise UserError(f"{where} cannot be trained: {error.cause}", error.remedy) from None
 
 
 def sweep(

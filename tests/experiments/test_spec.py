@@ -173,6 +173,10 @@ grid: {pipeline.model.avatar.num_bases: [5, 10], machine.seed: [1]}
         ("pipeline.model", "pipeline.modle", "Did you mean 'pipeline.model'"),
         ("width: 16", "width: broad", "does not fit its type int"),
         ("width: 16", "width: 1.5", "does not fit its type int"),
+        ("width: 16", "width: 0", "hidden-width is 0. Give a number from 1 to 8,192"),
+        ("iterations: 10", "iterations: -3", "cannot be trained: --max-num-iterations is -3"),
+        ("set: {", "set: {machine.seed: -1, ", "--machine.seed is -1"),
+        ("set: {", "set: {optimizers.color.optimizer.lr: 0.01, mixed_precision: true, ", "scaling"),
         ("rgbavatar-tiny", "rgbavatar-tine", "Did you mean 'rgbavatar-tiny'"),
         ("seeds:", "seads:", "Did you mean 'seeds'"),
         ("seeds: [0, 1]", "seeds: []", "no seeds"),
@@ -200,6 +204,21 @@ def test_each_mistake_is_named_with_its_remedy(tmp_path, old, new, told):
     with pytest.raises(UserError) as refused:
         read_and_check()
     assert told in str(refused.value)
+
+
+def test_options_that_refuse_one_another_are_told_before_any_variant_trains(tmp_path):
+    text = """
+title: Last
+preset: gaussianavatars-style
+variants:
+  - name: good
+    set: {pipeline.model.avatar.density.min_opacity: 0.02, DENSITY.reset_opacity: 0.05}
+  - name: bad
+    set: {pipeline.model.avatar.density.min_opacity: 0.2}
+""".replace("DENSITY", "pipeline.model.avatar.density")
+    with pytest.raises(UserError, match=r"variant 'bad', cannot be trained: .*all be removed"):
+        check_experiment(_read(tmp_path, text))
+    check_experiment(_read(tmp_path, text.split("  - name: bad")[0]))
 
 
 def test_an_empty_grid_is_refused(tmp_path):

@@ -39,10 +39,15 @@ _HOST_RANGES: Ranges = {
 """Of what nerfstudio declares."""
 
 
-def require_trainable(config: TrainerConfig) -> None:
-    """Raise UserError for an option out of its range or without effect, or an absent device."""
+def require_in_range(config: TrainerConfig) -> None:
+    """Raise UserError for an option out of its range or without effect, on whichever machine."""
     check_options(type(config), vars(config), more=_HOST_RANGES)
     require_used(config)
+
+
+def require_trainable(config: TrainerConfig) -> None:
+    """Raise UserError as `require_in_range`, and for a device that this machine lacks."""
+    require_in_range(config)
     device = config.machine.device_type
     if device == "mps" or (device == "cuda" and not torch.cuda.is_available()):
         raise UserError(
