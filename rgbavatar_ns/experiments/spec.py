@@ -2,6 +2,7 @@
 
 import difflib
 import itertools
+import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -14,6 +15,18 @@ from rgbavatar_ns.experiments.columns import COLUMNS
 from rgbavatar_ns.files import digest
 
 _CROSS_IDENTITY = ("driver", "tracker", "face_recognition")
+
+
+class _Loader(yaml.SafeLoader):
+    """As the safe one, which follows YAML 1.1; 8e-4 and 1.5e3 are numbers too, as in 1.2."""
+
+
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float",
+    re.compile(r"[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)[eE][-+]?[0-9]+$"),
+    list("-+.0123456789"),
+)
+
 
 Overrides = dict[str, Any]
 """Dotted fields of a preset's config, as on ns-train's command line, with their values."""
@@ -112,7 +125,7 @@ def parse_experiment(
 ) -> Experiment:
     """`read_experiment` of a file's text; `path` names it, and subjects are relative to it."""
     try:
-        content = yaml.safe_load(text)
+        content = yaml.load(text, _Loader)
     except yaml.YAMLError as error:
         raise _unreadable(path, error) from None
     if not isinstance(content, dict):

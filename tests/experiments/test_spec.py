@@ -221,6 +221,29 @@ variants:
     check_experiment(_read(tmp_path, text.split("  - name: bad")[0]))
 
 
+def test_numbers_need_no_dot(tmp_path):
+    """YAML 1.1, which the reader follows, takes 8e-4 for text."""
+    rate = "optimizers.position.optimizer.lr"
+    plain, short = (
+        _read(
+            tmp_path,
+            GOOD.replace("{max_num_iterations: 10}", f"{{{rate}: {number}}}").replace(
+                "psnr: 30.5", f"e_orth: {number}"
+            ),
+        )
+        for number in ("0.0008", "8e-4")
+    )
+    assert _read(tmp_path, GOOD.replace("30.5", "+.5e2")).variants[0].paper == {"psnr": 50.0}
+    check_experiment(short)
+    assert short.variants[0].paper == {"e_orth": 0.0008}
+    assert cells_of(short) == cells_of(plain)
+    assert [cell.key for cell in cells_of(short)] == [cell.key for cell in cells_of(plain)]
+    for text in ("8e", "e-4", "1e4x", "'8e-4'"):
+        wrong = GOOD.replace("{max_num_iterations: 10}", f"{{{rate}: {text}}}")
+        with pytest.raises(UserError, match="does not fit its type float"):
+            check_experiment(_read(tmp_path, wrong))
+
+
 def test_an_empty_grid_is_refused(tmp_path):
     with pytest.raises(UserError, match="Give a list of values"):
         _read(tmp_path, "title: t\npreset: rgbavatar\ngrid: {max_num_iterations: []}\n")
