@@ -1,4 +1,4 @@
-"""That a cell is run by one process at a time, and by none that has been forgotten."""
+"""That one process at a time runs a cell, or sweeps into a folder, and none that is forgotten."""
 
 import os
 import signal
@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.files import hold_lock
 from rgbavatar_ns.plugin.training.interruption import when_parent_ends
 
@@ -24,6 +25,24 @@ def alone_in(
     The lock goes with the process.
     """
     with hold_lock(folder / _LOCK_FILE, lambda: tell(_WAITING)):
+        yield
+
+
+@contextmanager
+def alone_in_sweep(folder: Path) -> Iterator[None]:
+    """Hold a sweep's folder; raises UserError while another process sweeps into it.
+
+    Both would draw the same datasets and write the same logs.
+    """
+
+    def refuse() -> None:
+        raise UserError(
+            f"Another process sweeps into {folder}.",
+            "Wait for it or stop it; the same command then goes on. Or name another --output.",
+        )
+
+    folder.mkdir(parents=True, exist_ok=True)
+    with hold_lock(folder / _LOCK_FILE, refuse):
         yield
 
 

@@ -13,6 +13,7 @@ from rgbavatar_ns.experiments.commands import killed_by
 from rgbavatar_ns.experiments.engines import Engine
 from rgbavatar_ns.experiments.kept import kept_results, portable_keys
 from rgbavatar_ns.experiments.overrides import check_overrides, check_together, with_overrides
+from rgbavatar_ns.experiments.process_lock import alone_in_sweep
 from rgbavatar_ns.experiments.reenactment import load_tracker
 from rgbavatar_ns.experiments.runner import (
     LOG_FILE,
@@ -91,16 +92,16 @@ def sweep(
     A cell lives in `folder/cells/HASH`; a second call does only what is missing and resumes what
     was interrupted. Cells whose results `known` holds, files of `report --into`, are done too: such
     a file tells a dataset by its name alone. A failed cell is tried once more, then left with the
-    last lines of its log; the others go on. Raises UserError, before anything runs, for what
-    `check_experiment` finds, for a dataset that has changed since its cells were trained and for a
-    file of `known` that holds no results; and where `folder` cannot be written, such as on a full
-    disk.
+    last lines of its log (failed.json); the others go on. Raises UserError, before anything runs,
+    for what `check_experiment` finds, for a dataset that has changed since its cells were trained,
+    for a file of `known` that holds no results and while another process sweeps into `folder`; and
+    where that cannot be written, such as on a full disk.
     """
     check_experiment(experiment)
     kept = {key: result for path in known for key, result in kept_results(path).items()}
     remedy = "Make room or mend the permissions, then call it again: finished cells are kept."
     try:
-        with disk_errors(folder, remedy):
+        with disk_errors(folder, remedy), alone_in_sweep(folder):
             cells = cells_of(experiment)
             for key, portable in portable_keys(cells).items() if kept else ():
                 place = folder / "cells" / key

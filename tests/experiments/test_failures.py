@@ -12,7 +12,7 @@ from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.experiments import runner
 from rgbavatar_ns.experiments import sweep as sweep_module
 from rgbavatar_ns.experiments.engines import LocalEngine
-from rgbavatar_ns.experiments.process_lock import alone_in, end_with_parent
+from rgbavatar_ns.experiments.process_lock import alone_in, alone_in_sweep, end_with_parent
 from rgbavatar_ns.experiments.runner import run_cell, write_cell
 from rgbavatar_ns.experiments.sweep import cells_of, sweep
 
@@ -72,6 +72,28 @@ def test_a_full_disk_leaves_no_half_written_result(tmp_path, monkeypatch, experi
     assert ended.value.code == 1
     assert "No space left on device" in capsys.readouterr().err
     assert not (tmp_path / "result.json").exists()
+
+
+def test_a_second_sweep_into_a_folder_is_refused(experiment_of, tmp_path):
+    experiment = experiment_of("first", seeds="0")
+    here, there = _fork.Pipe()
+    other = _fork.Process(target=_sweep_into, args=(tmp_path / "out", there))
+    other.start()
+    assert here.poll(_SECONDS)
+    with pytest.raises(UserError, match=r"Another process sweeps into .*out") as refused:
+        sweep(experiment, tmp_path / "out", LocalEngine())
+    assert "--output" in refused.value.remedy
+    assert not (tmp_path / "out" / "bases.json").exists()
+    here.send("end")
+    other.join()
+    (status,) = sweep(experiment, tmp_path / "out", LocalEngine())
+    assert status.state == "done"
+
+
+def _sweep_into(folder, pipe):
+    with alone_in_sweep(folder):
+        pipe.send("held")
+        pipe.recv()
 
 
 def test_a_lost_data_set_is_named_by_the_cell(tmp_path, monkeypatch, experiment_of):
