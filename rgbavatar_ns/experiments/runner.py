@@ -7,6 +7,7 @@ interrupted resumes its training.
 
 import json
 import sys
+import traceback
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from rgbavatar_ns.avatar.loading import load_avatar
 from rgbavatar_ns.avatar.method import AvatarMethod
 from rgbavatar_ns.bench.machine import machine_facts
 from rgbavatar_ns.data import TrackedDataset, load_dataset
-from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.errors import UserError, told_as_user_error
 from rgbavatar_ns.experiments import commands
 from rgbavatar_ns.experiments.avatar_size import avatar_size
 from rgbavatar_ns.experiments.cell_pictures import write_pictures
@@ -136,7 +137,10 @@ def main() -> None:
         print(error, file=sys.stderr)
         sys.exit(1)
     except OSError as error:
-        print(f"The cell cannot be read or written: {error}.", file=sys.stderr)
+        # Where it came from, which need not be the cell's folder, and what led to it.
+        traceback.print_exc()
+        told = told_as_user_error(error) or f"The cell ended with {type(error).__name__}: {error}."
+        print(told, file=sys.stderr)
         sys.exit(1)
     except KeyboardInterrupt:
         sys.exit(130)

@@ -74,6 +74,30 @@ def test_a_full_disk_leaves_no_half_written_result(tmp_path, monkeypatch, experi
     assert not (tmp_path / "result.json").exists()
 
 
+def test_what_the_system_refused_is_told_with_where_it_came_from(
+    tmp_path, monkeypatch, experiment_of, capsys
+):
+    """It need not be the cell's folder, and what led to it says more."""
+    cell = cells_of(experiment_of("first"))[0]
+    write_cell(tmp_path, cell, tmp_path / "data")
+
+    def load_the_trackers_library(folder):
+        try:
+            raise ValueError("the tracker's file is for another machine")
+        except ValueError as error:
+            raise OSError("libtracker.so cannot be loaded") from error
+
+    monkeypatch.setattr(runner, "run_cell", load_the_trackers_library)
+    monkeypatch.setattr(sys, "argv", ["runner", str(tmp_path), str(os.getppid())])
+    with pytest.raises(SystemExit) as ended:
+        runner.main()
+    assert ended.value.code == 1
+    told = capsys.readouterr().err
+    assert "the tracker's file is for another machine" in told
+    assert "in load_the_trackers_library" in told
+    assert told.splitlines()[-1] == "The cell ended with OSError: libtracker.so cannot be loaded."
+
+
 def test_a_second_sweep_into_a_folder_is_refused(experiment_of, tmp_path):
     experiment = experiment_of("first", seeds="0")
     here, there = _fork.Pipe()
