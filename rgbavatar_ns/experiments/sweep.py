@@ -132,8 +132,9 @@ def _sweep(
         statuses, key=lambda s: (seeds.index(s.cell.seed), subjects.index(s.cell.subject))
     )
     missing = {status.folder: status for status in by_subject if status.state != "done"}
-    shown = {*subjects, *map(_driver, cells)} - {""}
-    data = {name: _dataset(name, folder, making) for name in sorted(shown) if missing}
+    needed = [status.cell for status in missing.values()]
+    shown = {name for cell in needed for name in (cell.subject, _driver(cell)) if name}
+    data = {name: _dataset(name, folder, making) for name in sorted(shown)}
     for status in missing.values():
         status.folder.mkdir(parents=True, exist_ok=True)
         (status.folder / LOG_FILE).unlink(missing_ok=True)

@@ -11,6 +11,7 @@ import pytest
 from rgbavatar_ns.cli import main as cli
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.experiments import read_experiment
+from rgbavatar_ns.experiments import sweep as sweep_module
 from rgbavatar_ns.experiments.cells import cells_of
 from rgbavatar_ns.experiments.engines import LocalEngine
 from rgbavatar_ns.experiments.kept import kept_results
@@ -18,6 +19,7 @@ from rgbavatar_ns.experiments.runner import run_folder_of
 from rgbavatar_ns.experiments.source import keep_source
 from rgbavatar_ns.experiments.sweep import sweep
 from rgbavatar_ns.files import write_json
+from rgbavatar_ns.synthetic import DemoConfig
 
 TEXT = """
 title: Two of them
@@ -220,6 +222,26 @@ def test_a_kept_figure_that_is_not_finite_stays_a_gap(in_parts, file, tmp_path):
     page = (parts / "results.md").read_text()
     assert "| hannah | two | - |" in page
     assert "| otto | two | 36.50 ± 0.71 |" in page
+
+
+def test_only_subjects_of_missing_cells_are_drawn(file, tmp_path, monkeypatch):
+    """The others' cells are known from another machine."""
+    chosen = ("demo:0:8:16", "demo:1:8:16")
+    folder = _sweep(tmp_path / "out", file, lambda cell: cell.subject == chosen[0], subjects=chosen)
+    cli.main(["report", str(folder), "--into", str(tmp_path / "docs")])
+    (known,) = (tmp_path / "docs" / "results").glob("*.json")
+    drawn: list[str] = []
+
+    def draw(folder: Path, config: DemoConfig, **options: object) -> None:
+        drawn.append(f"demo:{config.seed}")
+
+    class Ready(LocalEngine):
+        def run(self, folders, finished):
+            assert len(folders) == 4
+
+    monkeypatch.setattr(sweep_module, "make_demo_dataset", draw)
+    sweep(read_experiment(file, subjects=chosen), tmp_path / "third", Ready(), known=[known])
+    assert drawn == ["demo:1"]
 
 
 @pytest.mark.parametrize("damage", [{}, {"metrics": {"psnr": "good"}, "curve": {}}])
