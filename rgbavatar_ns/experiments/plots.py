@@ -43,7 +43,7 @@ def write_plots(experiment: Experiment, table: ResultTable, folder: Path, stem: 
         spreads = [_spread(row.entries[metric]) for row in rows]
         # Points, not bars: these would have to begin at 0, where differences do not show.
         axes.errorbar(means, places, xerr=spreads, fmt="o", color=_COLOR, capsize=2)
-        axes.set_yticks(range(len(table.rows)), [row.name for row in table.rows])
+        axes.set_yticks(range(len(table.rows)), [row.shown_name for row in table.rows])
         axes.set_ylim(len(table.rows) - 0.5, -0.5)
         axes.set_xlim(*_fair_range(metric, axes.get_xlim()))
         axes.locator_params(axis="x", nbins=5)

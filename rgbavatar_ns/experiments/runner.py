@@ -34,6 +34,7 @@ from rgbavatar_ns.files import digest, digest_of_file, read_json, write_json
 from rgbavatar_ns.plugin.online.least_losses import read_least
 
 CELL_FILE, RESULT_FILE, LOG_FILE = "cell.json", "result.json", "log.txt"
+FAILED_FILE = "failed.json"
 _EVALUATION = "eval.json"
 _STATES, _DESCRIBING = "dataset_states", {".json", ".npy", ".npz"}
 _RUN = "run"

@@ -3,6 +3,7 @@
 import json
 import shlex
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -16,6 +17,7 @@ from rgbavatar_ns.experiments.overrides import check_overrides, check_together, 
 from rgbavatar_ns.experiments.process_lock import alone_in_sweep
 from rgbavatar_ns.experiments.reenactment import load_tracker
 from rgbavatar_ns.experiments.runner import (
+    FAILED_FILE,
     LOG_FILE,
     RESULT_FILE,
     is_of_other_data,
@@ -24,7 +26,7 @@ from rgbavatar_ns.experiments.runner import (
 )
 from rgbavatar_ns.experiments.source import keep_source
 from rgbavatar_ns.experiments.spec import Experiment, nearest
-from rgbavatar_ns.files import DiskError, atomic_folder, disk_errors, write_json
+from rgbavatar_ns.files import DiskError, atomic_folder, disk_errors, read_json, write_json
 from rgbavatar_ns.synthetic import make_demo_dataset
 
 State = Literal["waiting", "running", "done", "failed"]
@@ -137,9 +139,10 @@ def _sweep(
     data = {name: _dataset(name, folder, making) for name in sorted(shown)}
     for status in missing.values():
         status.folder.mkdir(parents=True, exist_ok=True)
-        (status.folder / LOG_FILE).unlink(missing_ok=True)
-        cell = status.cell
-        write_cell(status.folder, cell, data[cell.subject], data.get(_driver(cell)))
+        for left in (LOG_FILE, FAILED_FILE):
+            (status.folder / left).unlink(missing_ok=True)
+        cell, driver = status.cell, data.get(_driver(status.cell))
+        write_cell(status.folder, cell, data[cell.subject], driver)
 
     def finished(cell_folder: Path, code: int) -> None:
         for status in statuses:  # variants may share a cell
@@ -148,6 +151,7 @@ def _sweep(
                 done = code == 0 and status.result is not None
                 status.state = "done" if done else "failed"
                 status.why = [] if done else _why(code, cell_folder)
+        _keep_failure(cell_folder, statuses)
         progress(statuses)
 
     for _ in range(_ATTEMPTS):
@@ -160,10 +164,23 @@ def _sweep(
     return statuses
 
 
+def _keep_failure(cell_folder: Path, statuses: Sequence[CellStatus]) -> None:
+    """Leave in a failed cell's folder why, for reports; nothing in one that has a result."""
+    (why, *_) = (status.why for status in statuses if status.folder == cell_folder)
+    # Of a full disk: what else runs goes on all the same.
+    with suppress(OSError, DiskError):
+        if why:
+            write_json(cell_folder / FAILED_FILE, {"why": why})
+        else:
+            (cell_folder / FAILED_FILE).unlink(missing_ok=True)
+
+
 def _why(code: int, cell_folder: Path) -> list[str]:
     """The end of a failed cell's log, and what killed it, if anything did."""
     lines = last_lines(cell_folder / LOG_FILE, _LAST_LINES)
-    return lines if code >= 0 else [*lines, f"The cell was {killed_by(code)}."]
+    if code < 0:
+        return [*lines, f"The cell was {killed_by(code)}."]
+    return lines or [f"The cell ended with exit code {code} and said nothing."]
 
 
 def last_lines(path: Path, count: int) -> list[str]:
@@ -186,7 +203,12 @@ def read_statuses(folder: Path, name: str) -> list[CellStatus]:
             f"The sweep of {name} was not begun in {folder} ({error}).",
             "Run `rgbavatar sweep FILE` with this folder first.",
         ) from None
-    return [_status(Cell.from_json(values), folder) for values in listed]
+    statuses = [_status(Cell.from_json(values), folder) for values in listed]
+    for status in statuses:
+        failure = read_json(status.folder / FAILED_FILE) if status.result is None else None
+        if isinstance(failure, dict):
+            status.state, status.why = "failed", list(map(str, failure.get("why", ())))
+    return statuses
 
 
 def _status(cell: Cell, folder: Path) -> CellStatus:

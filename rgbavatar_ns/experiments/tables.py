@@ -14,6 +14,9 @@ from rgbavatar_ns.experiments.spec import Experiment, Variant, subject_name
 from rgbavatar_ns.experiments.sweep import CellStatus
 
 _MISSING = "-"
+_SAID_ABOVE, _ERROR = "its last lines above say why", "Error: "
+"""How `commands.run_nerfstudio` ends where its command failed, and how that began to say why."""
+_LONGEST_REASON = 300
 
 
 @dataclass(frozen=True)
@@ -34,7 +37,8 @@ class Entry:
 class Row:
     """A variant: its figures by metric, and the keys of the cells that are done.
 
-    Over all subjects and seeds, or over the seeds of one `subject`.
+    Over all subjects and seeds, or over the seeds of one `subject`. Where not all cells are done,
+    its means are over fewer of them than other rows' may be, and its name says so.
     """
 
     name: str
@@ -42,6 +46,15 @@ class Row:
     paper: dict[str, float]
     cells: tuple[str, ...]
     subject: str = ""
+    planned: int | None = None
+    """How many cells there are to be; None in tables of before."""
+
+    @property
+    def shown_name(self) -> str:
+        """With how many of its cells are done, where that is not all."""
+        if self.planned is None or len(self.cells) == self.planned:
+            return self.name
+        return f"{self.name} ({len(self.cells)} of {self.planned} cells)"
 
 
 @dataclass(frozen=True)
@@ -96,19 +109,21 @@ class ResultTable:
     def to_csv(self) -> str:
         """Every figure in full precision: mean, spread and count in columns of their own.
 
-        The column `subject` is empty where a row is over all of them.
+        The column `subject` is empty where a row is over all of them; `planned` cells are all that
+        there are to be.
         """
         text = io.StringIO()
         writer = csv.writer(text, lineterminator="\n")
         paper = self.metrics if self.paper_heading else ()
         named = [f"{m}_{part}" for m in self.metrics for part in ("mean", "std", "count")]
         published = [f"paper_{metric}" for metric in paper]
-        writer.writerow(["variant", "subject", *named, *published, "cells"])
+        writer.writerow(["variant", "subject", *named, *published, "planned", "cells"])
         for row in (*self.rows, *self.subject_rows):
             entries = [row.entries.get(metric) for metric in self.metrics]
             parts = [part for e in entries for part in (astuple(e) if e else ("", "", ""))]
             theirs = [row.paper.get(metric, "") for metric in paper]
-            writer.writerow([row.name, row.subject, *parts, *theirs, " ".join(row.cells)])
+            cells = [row.planned, " ".join(row.cells)]
+            writer.writerow([row.name, row.subject, *parts, *theirs, *cells])
         return text.getvalue()
 
     def to_latex(self) -> str:
@@ -134,7 +149,8 @@ class ResultTable:
             cells = [_told(metric, row.entries.get(metric)) for metric in self.metrics]
             if self.paper_heading is not None:
                 cells += [_number(metric, row.paper.get(metric)) for metric in self.published]
-            lines.append([row.subject, row.name, *cells] if by_subject else [row.name, *cells])
+            first = [row.subject] if by_subject else []
+            lines.append([*first, row.shown_name, *cells])
         return lines
 
 
@@ -180,7 +196,7 @@ def result_table(experiment: Experiment, statuses: Sequence[CellStatus]) -> Resu
     heading = None
     if any(row.paper for row in (*rows, *subject_rows)):
         heading = "paper" + (f" ({experiment.paper_data})" if experiment.paper_data else "")
-    notes = _notes(experiment, statuses, list(named.values()))
+    notes = _notes(experiment, statuses, named)
     return ResultTable(experiment.title, experiment.metrics, rows, heading, notes, subject_rows)
 
 
@@ -199,7 +215,7 @@ def _row(
         if done and all(metric in result["metrics"] for _, result in done)
     }
     keys = tuple(status.cell.key for status in mine if status.result is not None)
-    return Row(variant.name, entries, paper, keys, subject)
+    return Row(variant.name, entries, paper, keys, subject, len(mine))
 
 
 def _subject_names(statuses: Sequence[CellStatus]) -> dict[str, str]:
@@ -224,13 +240,13 @@ def _published(variant: Variant, subjects: Sequence[str]) -> dict[str, float]:
 
 
 def _notes(
-    experiment: Experiment, statuses: Sequence[CellStatus], subjects: Sequence[str]
+    experiment: Experiment, statuses: Sequence[CellStatus], named: Mapping[str, str]
 ) -> tuple[str, ...]:
     done = [status for status in statuses if status.result is not None]
     seeds = ", ".join(str(seed) for seed in experiment.seeds)
     notes = [
         f"{len(done)} of {len(statuses)} cells done; preset {experiment.preset}; "
-        f"subjects {', '.join(subjects)}; seeds {seeds}"
+        f"subjects {', '.join(named.values())}; seeds {seeds}"
         + ("; ± is the standard deviation over seeds." if len(experiment.seeds) > 1 else ".")
     ]
     notes += _told_columns(experiment.metrics)
@@ -247,8 +263,33 @@ def _notes(
         for metric, reason in sorted(unavailable.items())
         if metric in experiment.metrics
     ]
-    failed = sorted({status.cell.variant for status in statuses if status.state == "failed"})
-    return (*notes, *(f"{name}: a cell failed, see its log." for name in failed))
+    return (*notes, *_told_failures(experiment, statuses, named))
+
+
+def _told_failures(
+    experiment: Experiment, statuses: Sequence[CellStatus], named: Mapping[str, str]
+) -> list[str]:
+    """For each variant with failed cells which these are, and why."""
+    notes = []
+    for variant in experiment.variants:
+        mine = [status for status in statuses if status.cell.variant == variant.name]
+        failed = [s for s in mine if s.state == "failed" and s.result is None]
+        done = sum(status.result is not None for status in mine)
+        causes = "; ".join(
+            f"{named[s.cell.subject]}, seed {s.cell.seed}: {_reason(s.why)}" for s in failed
+        )
+        if failed:
+            notes.append(f"{variant.name}: {done} of {len(mine)} cells; failed: {causes}")
+    return notes
+
+
+def _reason(why: Sequence[str]) -> str:
+    """The last line of a failed cell's log, or nerfstudio's own error where it refers to that."""
+    *above, last = why or ["see its log"]
+    if _SAID_ABOVE in last and above:
+        errors = [line.removeprefix(_ERROR) for line in above if line.startswith(_ERROR)]
+        last = (errors or above)[-1]
+    return last[:_LONGEST_REASON]
 
 
 def _told_columns(metrics: Sequence[str]) -> list[str]:

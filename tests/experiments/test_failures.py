@@ -1,5 +1,6 @@
 """What can go wrong while cells run: each is named, ends in an exit code, and loses nothing."""
 
+import csv
 import errno
 import multiprocessing
 import os
@@ -13,8 +14,10 @@ from rgbavatar_ns.experiments import runner
 from rgbavatar_ns.experiments import sweep as sweep_module
 from rgbavatar_ns.experiments.engines import LocalEngine
 from rgbavatar_ns.experiments.process_lock import alone_in, alone_in_sweep, end_with_parent
+from rgbavatar_ns.experiments.report import write_report
 from rgbavatar_ns.experiments.runner import run_cell, write_cell
-from rgbavatar_ns.experiments.sweep import cells_of, sweep
+from rgbavatar_ns.experiments.sweep import cells_of, read_statuses, sweep
+from rgbavatar_ns.experiments.tables import result_table
 
 
 def _no_space(*arguments, **options):
@@ -96,6 +99,44 @@ def test_what_the_system_refused_is_told_with_where_it_came_from(
     assert "the tracker's file is for another machine" in told
     assert "in load_the_trackers_library" in told
     assert told.splitlines()[-1] == "The cell ended with OSError: libtracker.so cannot be loaded."
+
+
+def test_a_failure_is_kept_for_reports_until_the_cell_is_done(experiment_of, tmp_path):
+    out, subjects = tmp_path / "out", "data, more"
+    (tmp_path / "more").mkdir()
+    fine = experiment_of("fine", "broken", subjects=subjects, seeds="0", break_="pass")
+    done = sweep(fine, out, LocalEngine(2))
+    assert [row.shown_name for row in result_table(fine, done).rows] == ["fine", "broken"]
+    (done[3].folder / "result.json").unlink()
+    lines = [
+        "Error: The loss of step 3 is nan.",
+        "Take smaller rates.",
+        "ns-train ended with exit code 1; its last lines above say why. Then call it again.",
+    ]
+    break_ = f"print(*{lines!r}, sep=chr(10)); sys.exit(1)"
+    experiment = experiment_of("fine", "broken", subjects=subjects, seeds="0", break_=break_)
+    sweep(experiment, out, LocalEngine(2))
+    statuses = read_statuses(out, "bases")
+    assert [status.state for status in statuses] == ["done"] * 3 + ["failed"]
+    assert "Take smaller rates." in statuses[3].why
+    table = result_table(experiment, statuses)
+    markdown = table.to_markdown()
+    assert "| fine | 31.00 |" in markdown
+    # Its mean is over one subject, which the row says.
+    assert "| broken (1 of 2 cells) | 32.00 |" in markdown
+    assert "| more | broken (0 of 1 cells) | - |" in markdown
+    reason = "broken: 1 of 2 cells; failed: more, seed 0: The loss of step 3 is nan."
+    assert f"- {reason}\n" in markdown
+    assert "broken (1 of 2 cells) &" in table.to_latex()
+    planned = [row["planned"] for row in csv.DictReader(table.to_csv().splitlines())]
+    assert planned == ["2", "2", "1", "1", "1", "1"]
+    page = write_report(experiment, out).paths[-1].read_text()
+    assert reason in page
+    assert "Take smaller rates." in page
+    again = experiment_of("fine", "broken", subjects=subjects, seeds="0", break_="pass")
+    assert {status.state for status in sweep(again, out, LocalEngine(2))} == {"done"}
+    assert not list(out.glob("cells/*/failed.json"))
+    assert [s.state for s in read_statuses(out, "bases")] == ["done"] * 4
 
 
 def test_a_second_sweep_into_a_folder_is_refused(experiment_of, tmp_path):
