@@ -46,7 +46,8 @@ def run(
         known: files DOCS/results/NAME.json of `rgbavatar report --into DOCS`: their cells are done,
             wherever they ran. Datasets are told apart by their names alone.
         engine: processes of this machine, or a Ray cluster.
-        at_once: cells at a time of the local engine.
+        at_once: cells at a time of the local engine. More than one share the machine: their seconds
+            are longer, and the report says so.
         address: of the Ray cluster; without it one is started here.
         cpus: CPU cores that a cell asks Ray for.
         gpus: GPUs, or a share of one, that a cell asks Ray for.

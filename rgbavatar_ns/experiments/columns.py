@@ -13,6 +13,8 @@ class Column(NamedTuple):
     lets the axis begin at 0, for what is counted from there."""
     told: str = ""
     """What the heading leaves open, as a note below the table."""
+    timed: bool = False
+    """Whether it depends on how much of the machine there was."""
 
 
 _FITTED = (
@@ -39,9 +41,9 @@ COLUMNS = {
     "e_orth": Column("e_orth", 4),
     "steps": Column("steps", 0),
     "images": Column("images", 0),
-    "images_per_second": Column("images/s", 1),
-    "train_seconds": Column("training, s", 0),
-    "frames_per_second": Column("frames/s", 1),
+    "images_per_second": Column("images/s", 1, timed=True),
+    "train_seconds": Column("training, s", 0, timed=True),
+    "frames_per_second": Column("frames/s", 1, timed=True),
     "peak_mib": Column("memory, MiB", 0),
     "gpu_peak_mib": Column("GPU memory, MiB", 0),
     "gaussians": Column("Gaussians", 0),

@@ -24,12 +24,16 @@ Finished = Callable[[Path, int], None]
 
 
 class LocalEngine:
-    """Child processes of this machine, `at_once` at a time."""
+    """Child processes of this machine, `at_once` at a time.
+
+    `side_by_side` says whether cells may share a machine, and with it their seconds.
+    """
 
     def __init__(self, at_once: int = 1) -> None:
         if at_once < 1:
             raise UserError(f"{at_once} cells at once are impossible.", "Pass --at-once 1 or more.")
         self._at_once = at_once
+        self.side_by_side = at_once > 1
         self._running: set[subprocess.Popen[bytes]] = set()
         self._lock = threading.Lock()
         self._stopped = False
@@ -100,6 +104,7 @@ class RayEngine:
         self._ray = _load_ray()
         self._ray.init(address=address, ignore_reinit_error=True, log_to_driver=False)
         self._resources = {"num_cpus": cpus, "num_gpus": gpus}
+        self.side_by_side = True  # as many on a node as it has room for
 
     def run(self, folders: Sequence[Path], finished: Finished) -> None:
         """As `LocalEngine.run`."""

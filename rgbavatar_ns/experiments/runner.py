@@ -35,6 +35,8 @@ from rgbavatar_ns.plugin.online.least_losses import read_least
 
 CELL_FILE, RESULT_FILE, LOG_FILE = "cell.json", "result.json", "log.txt"
 FAILED_FILE = "failed.json"
+SIDE_BY_SIDE = "side_by_side"
+"""In cell.json and in what a result was made by: other cells may have run on the machine too."""
 _EVALUATION = "eval.json"
 _STATES, _DESCRIBING = "dataset_states", {".json", ".npy", ".npz"}
 _RUN = "run"
@@ -43,11 +45,22 @@ _MADE = ("processor", "gpu", "cores", "instruction_set", "torch", "commit", "dat
 """Facts of the machine that a result is kept with."""
 
 
-def write_cell(folder: Path, cell: Cell, data: Path, driver: Path | None = None) -> None:
-    """Leave in `folder` what `run_cell` needs: the cell, its dataset and its driver's."""
+def write_cell(
+    folder: Path,
+    cell: Cell,
+    data: Path,
+    driver: Path | None = None,
+    *,
+    side_by_side: bool = False,
+) -> None:
+    """Leave in `folder` what `run_cell` needs: the cell, its dataset and its driver's.
+
+    side_by_side: whether other cells may run on the machine meanwhile.
+    """
     places = {"data": str(data), "driver_data": None if driver is None else str(driver)}
     states = {_STATES: dataset_states(data, driver)}
-    write_json(folder / CELL_FILE, {**cell.to_json(), **places, **states})
+    run = {SIDE_BY_SIDE: side_by_side}
+    write_json(folder / CELL_FILE, {**cell.to_json(), **places, **states, **run})
 
 
 def dataset_states(data: Path, driver: Path | None = None) -> list[str]:
@@ -85,6 +98,7 @@ def run_cell(folder: Path) -> dict[str, Any]:
     described = json.loads((folder / CELL_FILE).read_text())
     data, driver = Path(described.pop("data")), described.pop("driver_data")
     described.pop(_STATES, None)
+    side_by_side = described.pop(SIDE_BY_SIDE, False)
     cell = Cell.from_json(described)
     run_folder = run_folder_of(folder, cell)
     training = commands.train(cell.preset, data, run_folder, cell.seed, as_flags(cell.overrides))
@@ -98,7 +112,7 @@ def run_cell(folder: Path) -> dict[str, Any]:
     if "stream" in training:
         numbers |= write_streamed(avatar, dataset, folder, read_least(run_folder))
     facts = machine_facts()
-    made = {name: facts[name] for name in _MADE}
+    made = {name: facts[name] for name in _MADE} | {SIDE_BY_SIDE: side_by_side}
     result = {"key": cell.key, "metrics": numbers, "run": str(run_folder), "made": made}
     unavailable = {}
     if "lpips_unavailable" in scores:

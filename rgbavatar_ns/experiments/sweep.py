@@ -123,6 +123,7 @@ def _sweep(
     progress: Callable[[Sequence[CellStatus]], None],
     making: Callable[[str, int, int], None],
 ) -> list[CellStatus]:
+    side_by_side = engine.side_by_side
     statuses = [_status(cell, folder) for cell in cells]
     _require_same_data(statuses, folder)
     write_json(folder / f"{experiment.name}.json", [cell.to_json() for cell in cells])
@@ -142,7 +143,7 @@ def _sweep(
         for left in (LOG_FILE, FAILED_FILE):
             (status.folder / left).unlink(missing_ok=True)
         cell, driver = status.cell, data.get(_driver(status.cell))
-        write_cell(status.folder, cell, data[cell.subject], driver)
+        write_cell(status.folder, cell, data[cell.subject], driver, side_by_side=side_by_side)
 
     def finished(cell_folder: Path, code: int) -> None:
         for status in statuses:  # variants may share a cell

@@ -10,10 +10,13 @@ from typing import Any
 
 from rgbavatar_ns.experiments.cells import Cell
 from rgbavatar_ns.experiments.columns import COLUMNS
+from rgbavatar_ns.experiments.runner import SIDE_BY_SIDE
 from rgbavatar_ns.experiments.spec import Experiment, Variant, subject_name
 from rgbavatar_ns.experiments.sweep import CellStatus
 
 _MISSING = "-"
+_ENDS_BY_SECONDS = "max_train_seconds"
+_STREAMED = "l1_streamed"
 _SAID_ABOVE, _ERROR = "its last lines above say why", "Error: "
 """How `commands.run_nerfstudio` ends where its command failed, and how that began to say why."""
 _LONGEST_REASON = 300
@@ -263,7 +266,25 @@ def _notes(
         for metric, reason in sorted(unavailable.items())
         if metric in experiment.metrics
     ]
+    notes += _told_seconds(experiment, done)
     return (*notes, *_told_failures(experiment, statuses, named))
+
+
+def _told_seconds(experiment: Experiment, done: Sequence[CellStatus]) -> list[str]:
+    """That cells had to share a machine, where the table shows how much they did in a second."""
+    beside = [s for s in done if (s.result or {}).get("made", {}).get(SIDE_BY_SIDE)]
+    timed = [COLUMNS[metric].heading for metric in experiment.metrics if COLUMNS[metric].timed]
+    clocked = any(
+        _ENDS_BY_SECONDS in status.cell.overrides or _STREAMED in (status.result or {})["metrics"]
+        for status in done
+    )
+    if not beside or not (timed or clocked):
+        return []
+    told = f"{len(beside)} of {len(done)} cells may have shared their machine with others: "
+    told += f"{', '.join(timed)} are not those of one alone" if timed else ""
+    if clocked:
+        told += ("; " if timed else "") + "runs that end by the clock took fewer steps for it"
+    return [f"{told}."]
 
 
 def _told_failures(

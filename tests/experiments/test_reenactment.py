@@ -192,7 +192,7 @@ def test_the_runner_scores_and_the_table_says_what_is_not_available(tmp_path, mo
     (cell,) = cells_of(experiment)
     assert cell.cross_identity is not None
     assert cell.cross_identity["driver"] == str(tmp_path / "driver")
-    write_cell(tmp_path, cell, tmp_path / "own", tmp_path / "driver")
+    write_cell(tmp_path, cell, tmp_path / "own", tmp_path / "driver", side_by_side=True)
     run = tmp_path / "run/cell/rgbavatar-tiny/run"
     run.mkdir(parents=True)
     (run / "training.json").write_text('{"steps": 1}')
@@ -208,6 +208,7 @@ def test_the_runner_scores_and_the_table_says_what_is_not_available(tmp_path, mo
     assert {"psnr", "aed", "apd", "frames_per_second", "megabytes"} <= set(result["metrics"])
     assert result["metrics"]["gaussians"] == avatar.num_gaussians
     assert result["made"]["cores"] >= 1
+    assert result["made"]["side_by_side"] is True
     assert len(read_pictures(tmp_path)) == 3
     assert result["unavailable"] == {"csim": "no face-recognition file was named"}
     status = CellStatus(cell, tmp_path, "done", result)

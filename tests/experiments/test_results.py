@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -17,7 +18,8 @@ from rgbavatar_ns.experiments.engines import LocalEngine
 from rgbavatar_ns.experiments.kept import kept_results
 from rgbavatar_ns.experiments.runner import run_folder_of
 from rgbavatar_ns.experiments.source import keep_source
-from rgbavatar_ns.experiments.sweep import sweep
+from rgbavatar_ns.experiments.sweep import read_statuses, sweep
+from rgbavatar_ns.experiments.tables import result_table
 from rgbavatar_ns.files import write_json
 from rgbavatar_ns.synthetic import DemoConfig
 
@@ -242,6 +244,37 @@ def test_only_subjects_of_missing_cells_are_drawn(file, tmp_path, monkeypatch):
     monkeypatch.setattr(sweep_module, "make_demo_dataset", draw)
     sweep(read_experiment(file, subjects=chosen), tmp_path / "third", Ready(), known=[known])
     assert drawn == ["demo:1"]
+
+
+def test_cells_that_shared_their_machine_are_told_where_seconds_count(file, tmp_path):
+    folder = _sweep(tmp_path / "out", file)
+    experiment = read_experiment(file)
+    timed = replace(experiment, metrics=("psnr", "train_seconds"))
+    shared = "2 of 8 cells may have shared their machine with others: training, s are not those"
+    for path in sorted(folder.glob("cells/*/result.json"))[:2]:
+        result = json.loads(path.read_text())
+        result["made"]["side_by_side"] = True
+        path.write_text(json.dumps(result))
+    statuses = read_statuses(folder, experiment.name)
+    assert shared in result_table(timed, statuses).to_markdown()
+    assert "shared their machine" not in result_table(experiment, statuses).to_markdown()
+    for status in statuses:
+        status.cell = replace(status.cell, overrides={"max_train_seconds": 60.0})
+    told = result_table(experiment, statuses).to_markdown()
+    assert "with others: runs that end by the clock took fewer steps for it." in told
+    for status in statuses:
+        (status.result or {})["made"]["side_by_side"] = False
+    assert "shared their machine" not in result_table(timed, statuses).to_markdown()
+
+
+@pytest.mark.parametrize("at_once", [1, 2])
+def test_an_engine_of_several_cells_at_once_says_so_to_each(file, tmp_path, at_once):
+    class Ready(LocalEngine):
+        def run(self, folders, finished):
+            told = {json.loads((f / "cell.json").read_text())["side_by_side"] for f in folders}
+            assert told == {at_once > 1}
+
+    sweep(read_experiment(file), tmp_path / "out", Ready(at_once))
 
 
 @pytest.mark.parametrize("damage", [{}, {"metrics": {"psnr": "good"}, "curve": {}}])
