@@ -10,7 +10,10 @@ import torch
 from nerfstudio.utils import writer
 
 from rgbavatar_ns.avatar.loading import load_avatar
+from rgbavatar_ns.avatar.methods.monogaussianavatar import MonoGaussianAvatar
+from rgbavatar_ns.data import load_dataset
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.plugin.presets import presets
 from rgbavatar_ns.plugin.training.trainer import RGBAvatarTrainerConfig
 from tests.plugin.run import make_trainer, parameters_of, run_command, set_up, small_config, trained
@@ -43,6 +46,18 @@ def rival_config(name: str, data: Path, output: Path, **fields: Any) -> RGBAvata
 
 def test_there_are_five():
     assert len(RIVALS) == 5
+
+
+def test_monogaussianavatar_ends_with_all_its_points(data: Path):
+    config = presets()["monogaussianavatar-style"]
+    chosen: Any = config.pipeline.model.avatar
+    tracked = load_dataset(data)
+    avatar = MonoGaussianAvatar(HeadModel(tracked.arrays), tracked.identity, chosen)
+    epochs = config.max_num_iterations // chosen.steps_per_epoch
+    assert epochs == 100
+    # Halving rates at epoch 80 belongs to it too.
+    assert avatar.points_of(epochs) == avatar.points_of(60) == chosen.max_points == 100_000
+    assert avatar.points_of(20) == 6_400
 
 
 @pytest.mark.parametrize("name", RIVALS)
