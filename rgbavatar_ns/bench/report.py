@@ -104,7 +104,7 @@ def _figures(report: Report) -> list[str]:
         lines.append(
             f"nerfstudio's trainer: {trainer['images_per_second']:.1f} images/s over "
             f"{trainer['steps']} steps, {100 * trainer['share_of_bare_step']:.0f} % of the bare "
-            f"step's {trainer['bare_images_per_second']:.1f}"
+            f"step's {trainer['bare_images_per_second']:.1f} ({trainer['bare_step']})"
         )
     return lines
 

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from rgbavatar_ns.avatar import Avatar
 from rgbavatar_ns.avatar.training import TrainingBatch
+from rgbavatar_ns.avatar.training.batches import DeviceFrames
 from rgbavatar_ns.kernels import GaussianSet, PinholeCameras
 
 DEFAULT_COUNT = 60_000
@@ -17,7 +18,7 @@ _HEAD_SHARE = 0.8
 """Share of the image's height that the head takes without a dataset's camera."""
 
 
-_Record = TypeVar("_Record", GaussianSet, PinholeCameras, TrainingBatch)
+_Record = TypeVar("_Record", GaussianSet, PinholeCameras, TrainingBatch, DeviceFrames)
 
 
 def on_device(record: _Record, device: torch.device) -> _Record:

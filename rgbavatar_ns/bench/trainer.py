@@ -13,6 +13,10 @@ from torch.utils import benchmark
 
 from rgbavatar_ns.avatar import Avatar
 from rgbavatar_ns.avatar.training import TrainingBatch, TrainingOptions, TrainingStep, fit
+from rgbavatar_ns.avatar.training.batches import ChosenFrames, DeviceFrames
+from rgbavatar_ns.avatar.training.cuda_graph import Recorder, record_cuda_graph
+from rgbavatar_ns.avatar.training.losses import random_backgrounds
+from rgbavatar_ns.avatar.training.step import StepKind
 from rgbavatar_ns.bench.options import StepOptions
 from rgbavatar_ns.bench.scenes import DEFAULT_SIZE_PX, on_device
 from rgbavatar_ns.bench.timing import Progress
@@ -49,10 +53,13 @@ def bench_trainer(
         batch = min(datamanager.batch_size, len(dataset.train))
         avatar = Avatar(HeadModel(dataset.arrays), dataset.identity, model.avatar, seed=_SEED)
         avatar = avatar.to(device)
-        bare = _bare_images_per_second(avatar, dataset, batch, options.trainer_steps, tell)
+        bare, kind = bare_images_per_second(
+            avatar, dataset, batch, options.trainer_steps, tell, datamanager.device_mib
+        )
     return {
         "images_per_second": summary["images_per_second"],
         "bare_images_per_second": bare,
+        "bare_step": kind,
         "share_of_bare_step": summary["images_per_second"] / bare,
         "steps": summary["steps"],
         "batch": batch,
@@ -93,20 +100,39 @@ def _train(config: Any) -> dict[str, Any]:
     return json.loads((trainer.base_dir / SUMMARY_NAME).read_text())
 
 
-def _bare_images_per_second(
-    avatar: Avatar, dataset: TrackedDataset, batch: int, steps: int, tell: Progress
-) -> float:
-    """The speed of as many bare steps over the same batches, pictures at hand."""
+def bare_images_per_second(
+    avatar: Avatar,
+    dataset: TrackedDataset,
+    batch: int,
+    steps: int,
+    tell: Progress,
+    device_mib: int,
+    recorder: Recorder = record_cuda_graph,
+) -> tuple[float, StepKind]:
+    """The speed of as many bare steps over the same batches, pictures at hand, and their kind.
+
+    As in the trainer they are recorded where the device can do that and the frames fit into
+    `device_mib`; the recording counts in both.
+    """
     order, device = OfflineOrder(dataset.train, batch, _SEED), avatar.identity.device
     images = read_images(dataset, range(len(dataset)))
+    fits = images.nbytes <= device_mib << 20
 
-    def batch_at(step: int) -> TrainingBatch:
-        tell("bare steps beside the trainer", step, steps)
-        chosen = order.batch(step)
+    def device_frames() -> DeviceFrames | None:
+        frames = DeviceFrames(dataset.theta, dataset.cameras, images)
+        return on_device(frames, device) if fits else None
+
+    options = TrainingOptions(seed=_SEED, first_colors=None)
+    step = TrainingStep(avatar, options=options, frames=device_frames, recorder=recorder)
+
+    def batch_at(number: int) -> TrainingBatch | ChosenFrames:
+        tell("bare steps beside the trainer", number, steps)
+        chosen = order.batch(number)
+        if step.kind == "recorded":
+            return ChosenFrames(chosen, random_backgrounds(number, len(chosen), _SEED))
         cameras = dataset.cameras.select(chosen)
         return on_device(TrainingBatch(dataset.theta[chosen], cameras, images[chosen]), device)
 
-    step = TrainingStep(avatar, options=TrainingOptions(seed=_SEED, first_colors=None))
     start = benchmark.timer()
     fit(step, batch_at, range(steps))
-    return steps * batch / (benchmark.timer() - start)
+    return steps * batch / (benchmark.timer() - start), step.kind

@@ -4,6 +4,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from rgbavatar_ns.avatar import Avatar, AvatarConfig
 from rgbavatar_ns.bench import machine, step
 from rgbavatar_ns.bench.options import RasterizerOptions, RenderOptions, StepOptions
 from rgbavatar_ns.bench.rasterizer import bench_rasterizer
@@ -12,10 +13,12 @@ from rgbavatar_ns.bench.roofline import measure_speed
 from rgbavatar_ns.bench.scenes import ellipsoid_scene
 from rgbavatar_ns.bench.step import bench_step
 from rgbavatar_ns.bench.timing import CPU, Stopwatch
-from rgbavatar_ns.bench.trainer import bench_trainer
+from rgbavatar_ns.bench.trainer import bare_images_per_second, bench_trainer
 from rgbavatar_ns.bench.workloads import avatar_workload, parameters_of
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.kernels import rasterize
+from tests.avatar.training.test_recorded_step import Recorder
 from tests.export.subject import avatar_of
 from tests.kernels.cuda import emulator
 from tests.plugin.tiny import SIZE, tiny_dataset
@@ -173,6 +176,19 @@ def test_the_trainer_is_compared_with_the_bare_step(dataset):
     assert found["share_of_bare_step"] == pytest.approx(
         found["images_per_second"] / found["bare_images_per_second"]
     )
+
+
+@pytest.mark.parametrize(("device_mib", "kind", "records"), [(1, "recorded", 1), (0, "fused", 0)])
+def test_bare_steps_are_of_the_trainers_kind(emulated, dataset, device_mib, kind, records):
+    """On a GPU both are recorded, or both are not."""
+    config = AvatarConfig(uv_resolution=8, num_bases=2, hidden_width=8)
+    avatar = Avatar(HeadModel(dataset.arrays), dataset.identity, config)
+    recorder = Recorder()
+    speed, found = bare_images_per_second(
+        avatar, dataset, 2, 5, lambda what, done, total: None, device_mib, recorder
+    )
+    assert (found, recorder.records) == (kind, records)
+    assert speed > 0
 
 
 def test_the_ellipsoid_fills_three_fifths_of_the_image():
