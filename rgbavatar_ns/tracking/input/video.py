@@ -17,6 +17,7 @@ from av.video.stream import VideoStream
 from jaxtyping import UInt8
 
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.tracking.input.hdr import hdr_to_srgb, hdr_transfer
 from rgbavatar_ns.tracking.input.image_files import (
     fitted_size,
     image_files,
@@ -198,9 +199,12 @@ def _upright(frame: av.VideoFrame, aspect: Fraction) -> _Undecoded:
     stored = (width, frame.height)
     turns = round(frame.rotation / 90) % 4
     has_alpha = any(part.is_alpha for part in frame.format.components)
+    transfer = hdr_transfer(frame.color_trc)
+    layout = "rgba" if has_alpha else "rgb24"
+    if transfer is not None:
+        layout = "rgba64le" if has_alpha else "rgb48le"
 
     def image(max_side: int | None) -> UInt8[np.ndarray, "h w *C"]:
-        layout = "rgba" if has_alpha else "rgb24"
         wide, high = fitted_size(*stored, max_side)
         if (wide, high) == (frame.width, frame.height):
             pixels = frame.to_ndarray(format=layout)
@@ -208,6 +212,8 @@ def _upright(frame: av.VideoFrame, aspect: Fraction) -> _Undecoded:
             pixels = frame.reformat(
                 wide, high, format=layout, interpolation=Interpolation.AREA
             ).to_ndarray()
+        if transfer is not None:
+            pixels = hdr_to_srgb(pixels, transfer, frame.color_primaries)
         return np.ascontiguousarray(np.rot90(pixels, turns))
 
     size = (frame.height, width) if turns % 2 else stored
