@@ -65,7 +65,8 @@ def test_an_image_folder_is_a_clip(tmp_path: Path) -> None:
 @pytest.mark.parametrize("degrees", [90, 180, 270])
 def test_rotation_metadata_is_honoured(tmp_path: Path, degrees: int) -> None:
     turned = write_clip(tmp_path / "turned.mp4", gradient_images(2))
-    _patch_display_matrix(turned, degrees)
+    cos, sin = {90: (0, 1), 180: (-1, 0), 270: (0, -1)}[degrees]
+    _patch_display_matrix(turned, cos, sin, -sin, cos)
     upright = next(iter(FrameSource.open(turned))).image_rgb
     with av.open(str(turned)) as container:
         frame = next(container.decode(video=0))
@@ -75,13 +76,35 @@ def test_rotation_metadata_is_honoured(tmp_path: Path, degrees: int) -> None:
     np.testing.assert_array_equal(upright, np.rot90(stored, -degrees // 90))
 
 
-def _patch_display_matrix(path: Path, clockwise_degrees: int) -> None:
-    """Write a rotation into the mp4 track header, as phones do (ISO 14496-12, tkhd matrix)."""
+@pytest.mark.parametrize(
+    ("matrix", "shown"),
+    [
+        ((-1, 0, 0, 1), np.fliplr),
+        ((1, 0, 0, -1), np.flipud),
+        ((0, 1, 1, 0), lambda image: image.transpose(1, 0, 2)),
+        ((0, -1, -1, 0), lambda image: np.rot90(image, 2).transpose(1, 0, 2)),
+    ],
+)
+def test_a_film_that_is_to_be_shown_mirrored_is(
+    tmp_path: Path, matrix: tuple[int, int, int, int], shown: Callable[[np.ndarray], np.ndarray]
+) -> None:
+    images = gradient_images(2)
+    for image in images:
+        image[:20] //= 3
+    clip = write_clip(tmp_path / "mirrored.mp4", images)
+    stored = next(iter(FrameSource.open(clip))).image_rgb
+    _patch_display_matrix(clip, *matrix)
+    frame = next(iter(FrameSource.open(clip)))
+    np.testing.assert_array_equal(frame.image_rgb, shown(stored))
+    assert (frame.height, frame.width) == frame.image_rgb.shape[:2]
+
+
+def _patch_display_matrix(path: Path, a: int, b: int, c: int, d: int) -> None:
+    """Write (x, y) -> (a x + c y, b x + d y) into the mp4 track header (ISO 14496-12, tkhd)."""
     data = bytearray(path.read_bytes())
     start = data.index(b"tkhd") + 4
     assert data[start] == 0
-    cos, sin = {90: (0, 1), 180: (-1, 0), 270: (0, -1)}[clockwise_degrees]
-    values = (cos << 16, sin << 16, 0, -sin << 16, cos << 16, 0, 0, 0, 1 << 30)
+    values = (a << 16, b << 16, 0, c << 16, d << 16, 0, 0, 0, 1 << 30)
     struct.pack_into(">9i", data, start + 40, *values)
     path.write_bytes(data)
 

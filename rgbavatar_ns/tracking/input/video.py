@@ -1,5 +1,6 @@
 """Frames of videos and image folders, upright, with square pixels, in order."""
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
@@ -11,6 +12,8 @@ import cv2
 import numpy as np
 from av.container import InputContainer
 from av.error import FFmpegError
+from av.sidedata.sidedata import SideDataContainer
+from av.sidedata.sidedata import Type as SideData
 from av.stream import Disposition
 from av.video.reformatter import Interpolation
 from av.video.stream import VideoStream
@@ -194,10 +197,10 @@ def _image_stream(container: InputContainer, path: Path) -> VideoStream:
 
 
 def _upright(frame: av.VideoFrame, aspect: Fraction) -> _Undecoded:
-    """The frame turned as its rotation metadata asks, with pixels made square in width."""
+    """The frame turned and mirrored as its metadata asks, with pixels made square in width."""
     width = max(1, round(frame.width * aspect)) if aspect > 0 else frame.width
     stored = (width, frame.height)
-    turns = round(frame.rotation / 90) % 4
+    turns, mirrored = _turns_and_mirror(frame)
     has_alpha = any(part.is_alpha for part in frame.format.components)
     transfer = hdr_transfer(frame.color_trc)
     layout = "rgba" if has_alpha else "rgb24"
@@ -214,10 +217,27 @@ def _upright(frame: av.VideoFrame, aspect: Fraction) -> _Undecoded:
             ).to_ndarray()
         if transfer is not None:
             pixels = hdr_to_srgb(pixels, transfer, frame.color_primaries)
-        return np.ascontiguousarray(np.rot90(pixels, turns))
+        return np.ascontiguousarray(np.rot90(pixels[:, ::-1] if mirrored else pixels, turns))
 
     size = (frame.height, width) if turns % 2 else stored
     return _Undecoded(size, frame.time, image)
+
+
+def _turns_and_mirror(frame: av.VideoFrame) -> tuple[int, bool]:
+    """Quarter turns counterclockwise, after the image was mirrored left to right or not.
+
+    From the display matrix (ISO 14496-12, tkhd). `frame.rotation` knows no mirror, and takes one
+    for half a turn.
+    """
+    # Kept apart: in a ring with its own `side_data`, a frame would wait in memory for gc.
+    matrix = SideDataContainer(frame).get(SideData.DISPLAYMATRIX)
+    if matrix is None:
+        return 0, False
+    a, b, _, c, d = np.frombuffer(matrix, np.int32)[:5].astype(float).tolist()
+    mirrored = a * d < b * c
+    if mirrored:
+        a, b = -a, -b
+    return round(-math.atan2(b, a) / (math.pi / 2)) % 4, mirrored
 
 
 def _unreadable(path: Path, error: Exception) -> UserError:
