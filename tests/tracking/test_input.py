@@ -15,6 +15,7 @@ import pytest
 from scipy.io import wavfile
 
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.tracking.input import video
 from rgbavatar_ns.tracking.input.image_files import image_files, read_image_rgba
 from rgbavatar_ns.tracking.input.video import FrameSource
 from rgbavatar_ns.tracking.threads import InBackground
@@ -276,6 +277,32 @@ def test_a_videos_alpha_channel_is_read(tmp_path: Path) -> None:
     for frame in FrameSource.open(clip):
         assert frame.alpha is not None
         np.testing.assert_array_equal(frame.alpha, rgba[..., 3])
+
+
+@pytest.mark.parametrize("codec", ["libvpx", "libvpx-vp9"])
+def test_a_transparent_webm_keeps_its_alpha_or_its_loss_is_noted(
+    tmp_path: Path, codec: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rgba = np.full((48, 64, 4), 120, np.uint8)
+    rgba[:, :32, 3] = 0
+    with av.open(str(tmp_path / "clear.webm"), "w") as container:
+        stream = container.add_stream(codec, rate=25, options={"auto-alt-ref": "0"})
+        stream.height, stream.width, stream.pix_fmt = 48, 64, "yuva420p"
+        frame = av.VideoFrame.from_ndarray(rgba, format="rgba")
+        for packet in (*stream.encode(frame), *stream.encode(frame), *stream.encode()):
+            container.mux(packet)
+    source = FrameSource.open(tmp_path / "clear.webm")
+    frames = list(source)
+    assert [frame.time_s for frame in frames] == [0.0, 0.04]
+    for frame in frames:
+        assert frame.alpha is not None
+        assert np.abs(frame.alpha.astype(int) - rgba[..., 3])[:, np.r_[:24, 40:64]].max() <= 4
+    assert source.notes == []
+    monkeypatch.setattr(
+        video, "_ALPHA_DECODERS", {"vp8": "no_such_decoder", "vp9": "no_such_decoder"}
+    )
+    assert [frame.alpha for frame in source] == [None, None]
+    assert ["alpha channel cannot be read" in note for note in source.notes] == [True]
 
 
 def test_floating_point_images_are_refused(tmp_path: Path) -> None:

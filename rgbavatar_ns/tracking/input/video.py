@@ -10,11 +10,13 @@ from pathlib import Path
 import av
 import cv2
 import numpy as np
+from av.codec.codec import UnknownCodecError
 from av.container import InputContainer
 from av.error import FFmpegError
 from av.sidedata.sidedata import SideDataContainer
 from av.sidedata.sidedata import Type as SideData
 from av.stream import Disposition
+from av.video.codeccontext import VideoCodecContext
 from av.video.reformatter import Interpolation
 from av.video.stream import VideoStream
 from jaxtyping import UInt8
@@ -27,6 +29,9 @@ from rgbavatar_ns.tracking.input.image_files import (
     read_image_rgba,
     require_image_files,
 )
+
+_ALPHA_DECODERS = {"vp8": "libvpx", "vp9": "libvpx-vp9"}
+"""By codec."""
 
 
 @dataclass(frozen=True)
@@ -141,9 +146,10 @@ class FrameSource:
                 stream = _image_stream(container, path)
                 stream.thread_type = "AUTO"
                 aspect = stream.sample_aspect_ratio or Fraction(1)
+                decoder = self._alpha_decoder(stream, path)
                 for packet in container.demux(stream):
                     try:
-                        frames = packet.decode()
+                        frames = decoder.decode(packet)
                     except FFmpegError as error:
                         damaged, broken = damaged + 1, error
                         continue
@@ -165,6 +171,22 @@ class FrameSource:
             self.notes.append(f"{path.name}: {damaged} frames or packets are damaged")
         if declared and decoded < declared and not damaged:
             self.notes.append(f"{path.name} holds {decoded} of the {declared} frames it announces")
+
+    def _alpha_decoder(self, stream: VideoStream, path: Path) -> VideoCodecContext:
+        """The stream's own decoder, or one that gives the alpha channel which that leaves out."""
+        own = stream.codec_context
+        name = _ALPHA_DECODERS.get(own.codec.canonical_name)
+        if name is None or stream.metadata.get("alpha_mode") != "1":
+            return own
+        try:
+            decoder = VideoCodecContext.create(name, "r")
+        except UnknownCodecError:
+            self.notes.append(
+                f"{path.name}: its alpha channel cannot be read here (no {name}), so it is not used"
+            )
+            return own
+        decoder.extradata, decoder.thread_type = own.extradata, own.thread_type
+        return decoder
 
 
 def _image_of_size(
