@@ -227,6 +227,16 @@ class Stages:
         known = self._done.get(name)
         return None if known is None else known["result"]
 
+    def forget_from(self, file_name: str) -> None:
+        """The stage whose result names this file, and those done after it, are to be done again."""
+        told = json.dumps(file_name)
+        done = list(self._done.items())
+        for place, (_, known) in enumerate(done):
+            if told in json.dumps(known["result"]):
+                self._done = dict(done[:place])
+                write_json(self._path, self._done)
+                return
+
     def _next_key(self, name: str, made_from: Any) -> str:
         text = json.dumps([self._key, name, made_from], sort_keys=True, default=str)
         return digest([text])[:_DIGEST_DIGITS]

@@ -13,6 +13,7 @@ GAP = "…"
 PLACE_OF_CAUSE = {
     "UserError": 0,
     "DiskError": 0,
+    "DamagedStageError": 0,
     "FlameVersionError": 0,
     "DeviceError": 0,
     "Problem": 2,

@@ -27,15 +27,23 @@ GO_ON = "Free some space and give the same command again: it goes on from here."
 _SETTINGS, _IMAGES = "run.json", "images.jsonl"
 
 
+class DamagedStageError(UserError):
+    """What a stage of an unfinished run has left is damaged, and was forgotten."""
+
+
 @contextmanager
 def stage_damage_told(path: Path, what: str) -> Iterator[None]:
-    """Reading a stage's file in here, damage becomes a UserError: it holds no `what`."""
+    """Reading a stage's file in here, damage becomes a DamagedStageError: it holds no `what`.
+
+    The stage, and those after it, are forgotten, so that the next run does them again.
+    """
     try:
         yield
     except (DamagedFileError, KeyError, TypeError, ValueError, IndexError) as error:
-        raise UserError(
+        Stages(path.parent).forget_from(path.name)
+        raise DamagedStageError(
             f"{path} holds no {what}: {error}.",
-            "Remove the folder's unfinished tracking, or track with --overwrite.",
+            "Give the same command again: it does that part, and what follows, anew.",
         ) from None
 
 
@@ -136,10 +144,13 @@ class ResumableRun:
 
     @contextmanager
     def in_vain_if_it_fails(self) -> Iterator[None]:
-        """A user's error in here leaves nothing worth going on with, so nothing stays behind."""
+        """A user's error in here leaves nothing worth going on with, so nothing stays behind.
+
+        But for the disk's, and damage, which has been forgotten.
+        """
         try:
             yield
-        except DiskError:
+        except (DiskError, DamagedStageError):
             raise
         except UserError:
             self.close()

@@ -228,6 +228,24 @@ def test_mattes_of_key_frames_are_found_once(
     assert _files(dst) == _files(uninterrupted)
 
 
+def test_damage_of_what_was_kept_is_told_once_and_then_mended(
+    clip: Path, uninterrupted: Path, tmp_path: Path
+) -> None:
+    dst = tmp_path / "set"
+    with pytest.raises(KeyboardInterrupt):
+        track_video(clip, dst, CONFIG, _interrupting("pictures", 1))
+    first = dst / WORK_FOLDER / "faces_00000000.npz"
+    before = first.stat().st_mtime_ns
+    for kept, told in (("body_*", "body that was seen"), ("faces_*10.npz", "faces that were")):
+        damaged = next((dst / WORK_FOLDER).glob(kept))
+        damaged.write_bytes(damaged.read_bytes()[:-40])
+        with pytest.raises(UserError, match=rf"holds no {told}.*the same command again"):
+            track_video(clip, dst, replace(CONFIG, overwrite=True))
+    assert first.stat().st_mtime_ns == before
+    track_video(clip, dst, CONFIG)
+    assert _files(dst) == _files(uninterrupted)
+
+
 def test_ctrl_c_ends_with_one_line_and_code_130(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
