@@ -116,6 +116,8 @@ class LiveTracker:
             matted = self._worker.submit(self._matted, image_rgb, square)
             landmarks = self._landmarker(image_rgb)
             if landmarks is None:
+                # Not begun, mostly: else mattes of nobody would queue up, and their pictures.
+                matted.cancel()
                 self._fit.forget()
                 self.counts["no face"] += 1
                 return None

@@ -1,5 +1,6 @@
 """The tracker for a stream, on a still that is moved in known ways, and on a real clip."""
 
+import threading
 from contextlib import closing
 
 import cv2
@@ -85,6 +86,28 @@ def test_a_lost_face_is_counted_and_found_again(portrait):
             found = found or tracker(portrait)
     assert found is not None
     assert tracker.counts["no face"] >= 2
+
+
+def test_mattes_of_pictures_without_a_face_do_not_queue_up(portrait, monkeypatch):
+    nothing = np.full((SIZE, SIZE, 3), 90, np.uint8)
+    go_on, begun = threading.Event(), []
+
+    def slow(image_rgb, square):
+        begun.append(image_rgb)
+        go_on.wait(60)
+
+    with closing(LiveTracker(CONFIG)) as tracker:
+        for _ in range(3):
+            tracker(portrait)
+        with monkeypatch.context() as slowed:
+            slowed.setattr(tracker, "_matted", slow)
+            while tracker.counts["no face"] < 12:
+                tracker(nothing)
+            go_on.set()
+        found = [tracker(portrait) for _ in range(3)]
+        assert found[-1] is not None
+    # One may have begun before it was known that nobody is there.
+    assert len(begun) <= 1
 
 
 def test_another_size_is_refused_and_identity_waits_for_the_warm_up(portrait):
