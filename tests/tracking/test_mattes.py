@@ -188,6 +188,23 @@ def test_a_mask_video_of_varying_rate_is_counted_by_its_frames_and_not_by_its_le
         _levels(UserMattes.open(short, FrameSource.open(film)), set(range(14)), 64, 48)
 
 
+@pytest.mark.parametrize("suffix", ["mkv", "mp4"])
+@pytest.mark.parametrize("surplus", [-1, 0, 1])
+def test_a_mask_video_with_a_frame_more_or_less_is_told_before_mattes_shift(
+    tmp_path: Path, suffix: str, surplus: int
+) -> None:
+    images = gradient_images(1) * 100
+    film = FrameSource.open(write_clip(tmp_path / "film.mkv", images))
+    mask = write_clip(tmp_path / f"mask.{suffix}", gradient_images(1) * (100 + surplus))
+    mattes = UserMattes.open(mask, film)
+    if surplus:
+        with pytest.raises(UserError, match=rf"holds {100 + surplus} mattes, the video has 100"):
+            mattes.require_count(100, limited=False)
+        mattes.require_count(99, limited=True)
+    else:
+        mattes.require_count(100, limited=False)
+
+
 def test_mattes_of_the_first_images_are_enough_where_no_more_are_read(tmp_path: Path) -> None:
     black = np.zeros((4, 6, 3), np.uint8)
     frames = _folder(tmp_path / "f", {f"{k}.png": black for k in range(3)})

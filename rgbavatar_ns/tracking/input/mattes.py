@@ -15,7 +15,7 @@ from rgbavatar_ns.tracking.input.image_files import (
     read_image_rgba,
     require_image_files,
 )
-from rgbavatar_ns.tracking.input.video import FrameSource, announced_frames
+from rgbavatar_ns.tracking.input.video import FrameSource, counted_frames
 
 _AS_MANY = "Give one matte a frame: white (or opaque) is the person."
 
@@ -51,14 +51,15 @@ class UserMattes:
     def require_count(self, frames: int, limited: bool) -> None:
         """UserError unless each frame has a matte; too many are right if frames are limited.
 
-        A mask video may announce its length inexactly: one in a hundred is let pass here. One that
-        does not announce it is told by `levels` where it ends too soon.
+        A mask video of another rate than the film's may hold but one in a hundred more.
         """
-        if self.files is None:
-            count, slack = announced_frames(self.path) or frames, 1 + frames // 100
+        if self.files is not None:
+            count = len(self.files)
+        elif limited:
+            count = frames  # `levels` tells where it ends too soon.
         else:
-            count, slack = len(self.files), 0
-        if count < frames - slack or (count > frames + slack and not limited):
+            count = counted_frames(self.path, frames)
+        if count < frames or (count > frames and not limited):
             raise UserError(
                 f"{self.path} holds {count} mattes, the video has {frames} frames.", _AS_MANY
             )

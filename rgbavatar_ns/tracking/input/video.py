@@ -269,22 +269,30 @@ def _unreadable(path: Path, error: Exception) -> UserError:
     )
 
 
-def announced_frames(path: Path) -> int:
-    """How many frames a video says that it holds; 0 where it does not say, or is none."""
+def counted_frames(path: Path, expected: int) -> int:
+    """How many frames a video holds, whatever it announces.
+
+    It is decoded only where its packets, which are quick to count, are not as many as expected.
+    Raises UserError for what cannot be read.
+    """
     try:
         with _opened(path) as container:
-            return _image_stream(container, path).frames
-    except (FFmpegError, OSError, UserError):
-        return 0
+            packets = container.demux(_image_stream(container, path))
+            if expected == sum(one.size > 0 and not one.is_discard for one in packets):
+                return expected
+    except (FFmpegError, OSError) as error:
+        raise _unreadable(path, error) from error
+    decoded = FrameSource.open(path)._video(path)
+    return sum(1 for _ in decoded)
 
 
 def _expected_frames(path: Path) -> int:
     """As announced, or by the mean rate, which is wrong where rates vary; 0 where unknown."""
-    if announced := announced_frames(path):
-        return announced
     try:
         with _opened(path) as container:
             stream = _image_stream(container, path)
+            if stream.frames:
+                return stream.frames
             if stream.average_rate is None or container.duration is None:
                 return 0
             return round(container.duration / av.time_base * float(stream.average_rate))
