@@ -16,6 +16,7 @@ from rgbavatar_ns.tracking.input.capture import (
     FileCapture,
     FrameCapture,
     LatestFrameCapture,
+    OneSize,
     open_capture,
 )
 
@@ -52,6 +53,7 @@ class FilmedPerformer:
         self.head = PerformerHead(tracker.head.layout, tracker.head.arrays)
         self._with_images = with_images
         self._counts = Counter[str]()
+        self._of_one_size = OneSize(self._counts)
         self._keeps_all = not real_time
         self._unmet: dict[int, CapturedFrame] = {}
         self._backlog: deque[PerformanceFrame] = deque()
@@ -89,11 +91,9 @@ class FilmedPerformer:
             return None
         self._shown = True
         met, faceless = self._tracker.ready, self._tracker.counts["no face"]
-        try:
-            theta = self._tracker.pose(captured.image_rgb, captured.index)
-        except UserError:
-            self._counts["another resolution"] += 1
+        if not self._of_one_size(captured.image_rgb):
             return None
+        theta = self._tracker.pose(captured.image_rgb, captured.index)
         if not met:
             self._meet(captured, self._tracker.counts["no face"] == faceless)
             return self._backlog.popleft() if self._backlog else None

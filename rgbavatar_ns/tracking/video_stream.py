@@ -11,7 +11,12 @@ from rgbavatar_ns.data import TrackedFrame
 from rgbavatar_ns.data.streams import StreamedFrame, StreamSubject
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.tracking.config import TrackConfig
-from rgbavatar_ns.tracking.input.capture import FileCapture, FrameCapture, LatestFrameCapture
+from rgbavatar_ns.tracking.input.capture import (
+    FileCapture,
+    FrameCapture,
+    LatestFrameCapture,
+    OneSize,
+)
 from rgbavatar_ns.tracking.input.image_files import source_digest
 
 
@@ -44,6 +49,7 @@ class VideoStream:
         # A file's frames have the same numbers in the next run, a camera's begin anew.
         self._session = _session_of(source) if self.keeps_frames else secrets.token_hex(8)
         self._counts: Counter[str] = Counter()
+        self._of_one_size = OneSize(self._counts)
         self._subject: StreamSubject | None = None
         self._ready: deque[StreamedFrame] = deque()
         self._passed_over = -1
@@ -95,11 +101,9 @@ class VideoStream:
         captured = self._capture.next(timeout_s)
         if captured is None or (self._tracker.ready and captured.index <= self._passed_over):
             return
-        try:
-            frame = self._tracker(captured.image_rgb, captured.index)
-        except UserError:
-            self._counts["another resolution"] += 1
+        if not self._of_one_size(captured.image_rgb):
             return
+        frame = self._tracker(captured.image_rgb, captured.index)
         if self._subject is None and self._tracker.ready:
             backlog = self._tracker.backlog()
             self._subject = self._met(backlog)

@@ -171,6 +171,35 @@ def test_a_lost_camera_is_opened_again_and_faceless_images_are_counted():
     assert all(camera.released for camera in cameras)
 
 
+def test_a_camera_that_comes_back_with_another_size_is_told():
+    steps = threading.Semaphore(1)
+    back = [lit(80, side=6)] * 49 + [lit(90)] + [lit(80, side=6)] * 50
+    cameras = [FakeCamera([lit(50), lit(60), lit(70)], steps), FakeCamera(back, steps)]
+    opened = iter(cameras)
+    capture = SteppedCapture(steps, lambda _: next(opened), Backoff(0.01, 0.02))
+    stream = VideoStream("0", tracker=CountingTracker(), capture=capture)
+    assert [frame.index for frame in take(stream, 4)] == [0, 1, 2, 52]
+    with pytest.raises(UserError, match="changed from 4 x 4 to 6 x 6 pixels"):
+        take(stream, 1)
+    assert stream.counts["another resolution"] == 99
+    steps.release()
+    stream.close()
+
+
+def test_what_else_the_tracker_cannot_do_is_told_as_it_is():
+    class NoModel(CountingTracker):
+        def __call__(self, image_rgb: np.ndarray, index: int | None = None) -> TrackedFrame | None:
+            raise UserError("No irises.", "Bring some.")
+
+    steps = threading.Semaphore(1)
+    capture = SteppedCapture(steps, lambda _: FakeCamera([lit(50)], steps))
+    stream = VideoStream("0", tracker=NoModel(), capture=capture)
+    with pytest.raises(UserError, match="No irises"):
+        take(stream, 1)
+    steps.release()
+    stream.close()
+
+
 def test_a_slow_tracker_gets_the_latest_frame():
     steps = threading.Semaphore(5)
     camera = FakeCamera([lit(10 + i) for i in range(20)], steps)

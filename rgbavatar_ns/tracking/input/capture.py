@@ -13,12 +13,15 @@ import numpy as np
 from jaxtyping import UInt8
 
 from rgbavatar_ns.data.streams import Backoff
+from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.tracking.input.video import FrameSource
 
 _FRAMES_PER_SECOND = 25.0
 """Of a folder of images, which has no clock."""
 _TIMEOUT_MS = 5000
 _LONGEST_SKIP_S = 0.1
+_MOST_OF_ANOTHER_SIZE = 50
+"""A source that shows so many such pictures in a row will show no others: it is told."""
 Pace = Literal["each", "newest", "at once"]
 
 
@@ -177,3 +180,32 @@ class LatestFrameCapture:
 
 
 FrameCapture = FileCapture | LatestFrameCapture
+
+
+class OneSize:
+    """Holds a stream to the size of its first picture, since all its frames share a camera.
+
+    Called with each picture, it tells whether that has this size; `counts` counts those of
+    "another resolution". Raises UserError where a camera stays with another size.
+    """
+
+    def __init__(self, counts: Counter[str]) -> None:
+        self._counts, self._others = counts, 0
+        self._first: tuple[int, int] | None = None
+
+    def __call__(self, image_rgb: UInt8[np.ndarray, "H W 3"]) -> bool:
+        """Whether the picture may be tracked."""
+        high, wide = image_rgb.shape[:2]
+        self._first = self._first or (wide, high)
+        if self._first == (wide, high):
+            self._others = 0
+            return True
+        self._counts["another resolution"] += 1
+        self._others += 1
+        if self._others == _MOST_OF_ANOTHER_SIZE:
+            raise UserError(
+                f"The camera's pictures have changed from {self._first[0]} x {self._first[1]} to "
+                f"{wide} x {high} pixels.",
+                "Set the camera to its first size again, or start anew: a run has one camera.",
+            )
+        return False
