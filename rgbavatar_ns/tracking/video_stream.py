@@ -80,8 +80,9 @@ class VideoStream:
 
     def go_on_after(self, index: int) -> None:
         """Pass over a file's frames up to this number; a camera shows what is now."""
-        if self.keeps_frames:
+        if isinstance(self._capture, FileCapture):
             self._passed_over = index
+            self._capture.pass_over(index)
             self._ready = deque(frame for frame in self._ready if frame.index > index)
 
     def close(self) -> None:

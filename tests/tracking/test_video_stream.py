@@ -15,7 +15,7 @@ from rgbavatar_ns.data.streams import Backoff
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.kernels import PinholeCameras
-from rgbavatar_ns.tracking.input.capture import CapturedFrame, LatestFrameCapture
+from rgbavatar_ns.tracking.input.capture import CapturedFrame, FileCapture, LatestFrameCapture
 from rgbavatar_ns.tracking.video_stream import VideoStream
 
 from ..data.streaming import DEADLINE_S, take
@@ -103,6 +103,23 @@ def test_a_file_is_one_session_whenever_it_is_read_and_another_file_is_another(
         return take(VideoStream(str(path), tracker=CountingTracker()), 1)[0].session
 
     assert session(clip) == session(clip) != session(other)
+
+
+def test_what_is_passed_over_is_not_waited_for(tmp_path: Path):
+    # Half a minute apart, but for the last two.
+    times = [0, 30_000, 60_000, 90_000, 120_000, 120_300]
+    clip = write_clip(tmp_path / "clip.mkv", gradient_images(6), "ffv1", times_ms=times)
+    stream = VideoStream(str(clip), tracker=CountingTracker())
+    stream.go_on_after(4)
+    began = time.monotonic()
+    assert [frame.index for frame in take(stream, 100)] == [5]
+    assert 0.3 <= time.monotonic() - began < 20
+    capture = FileCapture(clip)
+    assert capture.next(0.0) is not None
+    assert capture.next(0.0) is None
+    capture.pass_over(3)
+    assert [one.index for _ in range(3) if (one := capture.next(0.0)) is not None] == [1, 2, 3]
+    assert capture.next(0.0) is None
 
 
 class FakeCamera:

@@ -53,6 +53,7 @@ class FileCapture:
         self._waiting: CapturedFrame | None = None
         self._due_s = 0.0
         self._began: tuple[float, float] | None = None  # by our clock, by the file's
+        self._passed_over = -1
         self.ended = False
 
     def next(self, timeout_s: float) -> CapturedFrame | None:
@@ -76,6 +77,12 @@ class FileCapture:
             self.counts["skipped"] += 1
         return replace(due, captured_s=due_s)
 
+    def pass_over(self, index: int) -> None:
+        """Give the frames up to this number as they are asked for; from there the file plays."""
+        self._passed_over = index
+        if self._waiting is not None and self._waiting.index <= index:
+            self._due_s = 0.0
+
     def _read(self) -> bool:
         frame = None if self.ended else next(self._frames, None)
         if frame is None:
@@ -83,7 +90,7 @@ class FileCapture:
             return False
         now = time.monotonic()
         clock_s = frame.index / _FRAMES_PER_SECOND if frame.time_s is None else frame.time_s
-        if self._began is None:
+        if self._began is None or frame.index <= self._passed_over:
             self._began = now, clock_s
         self._due_s = self._began[0] + clock_s - self._began[1]
         self._waiting = CapturedFrame(frame.index, frame.image_rgb, now, clock_s)

@@ -43,7 +43,7 @@ def hdr_to_srgb(
     if color_primaries != _BT709:
         light = cv2.transform(light, _BT2020_TO_BT709)
     # Roots of light are nearly in sRGB's steps.
-    roots = cv2.convertScaleAbs(cv2.sqrt(cv2.max(light, 0.0)), alpha=255)
+    roots = cv2.convertScaleAbs(cv2.sqrt(np.maximum(light, 0)), alpha=255)
     return np.concatenate([cv2.LUT(roots, _srgb_of_roots()), coded[..., 3:]], axis=-1)
 
 

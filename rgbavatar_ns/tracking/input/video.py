@@ -185,6 +185,7 @@ class FrameSource:
                 f"{path.name}: its alpha channel cannot be read here (no {name}), so it is not used"
             )
             return own
+        assert isinstance(decoder, VideoCodecContext)
         decoder.extradata, decoder.thread_type = own.extradata, own.thread_type
         return decoder
 
@@ -252,7 +253,8 @@ def _turns_and_mirror(frame: av.VideoFrame) -> tuple[int, bool]:
     for half a turn.
     """
     # Kept apart: in a ring with its own `side_data`, a frame would wait in memory for gc.
-    matrix = SideDataContainer(frame).get(SideData.DISPLAYMATRIX)
+    parts = SideDataContainer(frame)  # pyright: ignore[reportCallIssue]
+    matrix = parts.get(SideData.DISPLAYMATRIX)
     if matrix is None:
         return 0, False
     a, b, _, c, d = np.frombuffer(matrix, np.int32)[:5].astype(float).tolist()
