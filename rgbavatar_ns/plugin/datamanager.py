@@ -238,7 +238,7 @@ class RGBAvatarDataManager(DataManager):
 
     def get_datapath(self) -> Path:
         """The dataset's folder, beside which the viewer keeps camera paths."""
-        return self.config.dataparser.data
+        return self.config.dataparser.data or Path()
 
     def get_param_groups(self) -> dict[str, list[Parameter]]:
         """Nothing here is learnt."""
