@@ -100,6 +100,20 @@ def test_a_film_that_is_to_be_shown_mirrored_is(
     assert (frame.height, frame.width) == frame.image_rgb.shape[:2]
 
 
+def test_a_film_with_side_data_that_pyav_cannot_name_is_turned_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def unnamed(frame: av.VideoFrame) -> None:
+        raise ValueError("32 is not a valid Type")
+
+    clip = write_clip(tmp_path / "turned.mp4", gradient_images(2))
+    _patch_display_matrix(clip, 0, 1, -1, 0)
+    turned = next(iter(FrameSource.open(clip))).image_rgb
+    monkeypatch.setattr(video, "SideDataContainer", unnamed)
+    np.testing.assert_array_equal(next(iter(FrameSource.open(clip))).image_rgb, turned)
+    assert turned.shape == (64, 48, 3)
+
+
 def _patch_display_matrix(path: Path, a: int, b: int, c: int, d: int) -> None:
     """Write (x, y) -> (a x + c y, b x + d y) into the mp4 track header (ISO 14496-12, tkhd)."""
     data = bytearray(path.read_bytes())

@@ -252,8 +252,11 @@ def _turns_and_mirror(frame: av.VideoFrame) -> tuple[int, bool]:
     From the display matrix (ISO 14496-12, tkhd). `frame.rotation` knows no mirror, and takes one
     for half a turn.
     """
-    # Kept apart: in a ring with its own `side_data`, a frame would wait in memory for gc.
-    parts = SideDataContainer(frame)  # pyright: ignore[reportCallIssue]
+    try:
+        # Kept apart: in a ring with its own `side_data`, a frame would wait in memory for gc.
+        parts = SideDataContainer(frame)  # pyright: ignore[reportCallIssue]
+    except ValueError:  # PyAV before 19 met a kind of data that it has no name for.
+        return round(frame.rotation / 90) % 4, False
     matrix = parts.get(SideData.DISPLAYMATRIX)
     if matrix is None:
         return 0, False
