@@ -165,7 +165,7 @@ def test_a_damaged_or_foreign_background_is_told(tmp_path: Path, changed: dict) 
     with pytest.raises(UserError, match="no background that was found"):
         Background.load(path)
     np.savez(path, **(arrays | changed))
-    with pytest.raises(UserError, match=r"no background.*--overwrite"):
+    with pytest.raises(UserError, match=r"no background.*same command again"):
         Background.load(path)
 
 

@@ -135,12 +135,19 @@ def test_a_camera_that_shows_nothing_is_told(monkeypatch):
 def test_a_camera_that_comes_back_with_another_size_is_told():
     shown = [np.zeros((4, 6, 3), np.uint8), *[np.zeros((8, 8, 3), np.uint8)] * 50]
     frames = (CapturedFrame(k, image, 0.0) for k, image in enumerate(shown))
-    camera = SimpleNamespace(next=lambda timeout_s: next(frames), counts=Counter(), ended=False)
+
+    class Camera(LatestFrameCapture):
+        def next(self, timeout_s):
+            return next(frames)
+
+    closed = SimpleNamespace(isOpened=lambda: False, release=lambda: None)
+    camera = Camera("0", opener=lambda source: closed)
     performer = FilmedPerformer("0", tracker=_Tracker(), capture=camera)
     assert [performer.next(0.1) for _ in range(50)] == [None] * 50
     with pytest.raises(UserError, match="changed from 6 x 4 to 8 x 8 pixels"):
         performer.next(0.1)
     assert performer.counts["another resolution"] == 50
+    performer.close()
 
 
 def test_what_is_waited_for_changes_with_what_is_known(film):

@@ -293,7 +293,7 @@ def test_what_was_seen_of_a_body_comes_back_and_damage_is_told(tmp_path: Path) -
     np.testing.assert_array_equal(back.lines[0].above_cm, lines[0].above_cm)
     assert back.shown == shown
     path.write_bytes(path.read_bytes()[:-60])
-    with pytest.raises(UserError, match=r"no body that was seen.*--overwrite"):
+    with pytest.raises(UserError, match=r"no body that was seen.*same command again"):
         BodyBlock.load(path)
 
 
