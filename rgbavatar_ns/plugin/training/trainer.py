@@ -189,6 +189,7 @@ class RGBAvatarTrainer(EndingTrainer, FitHooks):
         self.stop_training = False
         self.clock = TrainClock(waiting_for(self.device))
         self._saved_step: int | None = None
+        self._is_latest = False
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         """Build pipeline, optimisers, viewer and writers; load a checkpoint if one is named."""
@@ -401,8 +402,11 @@ class RGBAvatarTrainer(EndingTrainer, FitHooks):
             keep = self.config.max_num_iterations
         save_checkpoint(self._state(step), self.checkpoint_dir, step, keep)
         self._saved_step = step
-        # Not before: a run that could not begin is of no use to who asks for the latest.
-        _link_latest(self.base_dir)
+        # Not before: a run that could not begin is of no use to who asks for the latest. Nor again:
+        # of two that train at once the one begun last stays it.
+        if not self._is_latest:
+            _link_latest(self.base_dir)
+            self._is_latest = True
 
     def _state(self, step: int) -> dict[str, Any]:
         """What a checkpoint holds."""

@@ -151,9 +151,11 @@ def test_latest_leads_to_the_newest_run_that_has_a_checkpoint(config_of: ConfigO
     assert link.resolve() == first.base_dir.resolve(), "nothing can be seen of the second one yet"
     second.train()
     assert link.resolve() == second.base_dir.resolve()
+    first.save_checkpoint(1)
+    assert link.resolve() == second.base_dir.resolve(), "of two at once the one begun last"
     link.unlink()
     link.mkdir()
-    second.save_checkpoint(1)
+    trained(config_of(max_num_iterations=2, timestamp="third"))
     assert not link.is_symlink()
 
 
