@@ -32,7 +32,6 @@ Progress = Callable[[int, int], None]
 """Called with (frames done, frames in all)."""
 
 WIDE_OPEN_RAD = 0.33
-_THREADS = 2
 _CHUNK = 16
 _CAMERA_DISTANCE_M = 1.1
 # How high the picture's middle lies and half of what it shows: the head, or shoulders too.
@@ -162,12 +161,13 @@ class DemoPerson:
         return self.head.layout.join({**parts, **moved})
 
     def draw(self, theta: Float[Tensor, "F H"]) -> Iterator[UInt8[np.ndarray, "S S 4"]]:
-        """Images of each theta in order, a few frames at work at a time."""
+        """Images of each theta in order, as many at work at a time as torch takes threads."""
         waiting: deque[Future[np.ndarray]] = deque()
-        with ThreadPoolExecutor(_THREADS) as pool:
+        threads = torch.get_num_threads()
+        with ThreadPoolExecutor(threads) as pool:
             for moment in self.moments(theta):
                 waiting.append(pool.submit(self.renderer.render, moment))
-                if len(waiting) > 2 * _THREADS:
+                if len(waiting) > 2 * threads:
                     yield waiting.popleft().result()
             while waiting:
                 yield waiting.popleft().result()
