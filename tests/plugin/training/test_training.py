@@ -19,7 +19,7 @@ from rgbavatar_ns.avatar.storage.checkpoint_file import list_checkpoints
 from rgbavatar_ns.data import load_dataset
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.export import statistics_of
-from rgbavatar_ns.plugin.methods import rgbavatar
+from rgbavatar_ns.plugin.methods import rgbavatar_paper
 from rgbavatar_ns.plugin.training.trainer import RGBAvatarTrainer, RGBAvatarTrainerConfig
 from tests.plugin.run import (
     SMALL,
@@ -176,7 +176,7 @@ def test_learning_rates_fall_as_asked(uninterrupted: dict[str, Any]):
 
 
 def test_the_papers_method_has_its_constant_rates(config_of: ConfigOf):
-    constant = rgbavatar.config
+    constant = rgbavatar_paper.config
     assert isinstance(constant, RGBAvatarTrainerConfig)
     fields = ("position_lr_final", "learning_rate_factor", "learning_rate_steps")
     trainer = make_trainer(config_of(**{name: getattr(constant, name) for name in fields}))
