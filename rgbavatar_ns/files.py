@@ -213,6 +213,9 @@ class Stages:
             self._tell(name, known["seconds"])
         else:
             self._tell(name, None)
+            if known is not None:  # what it named may be replaced now, and is not whole meanwhile
+                del self._done[name]
+                write_json(self._path, self._done)
             started = time.monotonic()
             result = action(self._key)
             seconds = time.monotonic() - started

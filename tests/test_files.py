@@ -215,6 +215,21 @@ def test_changed_settings_redo_the_stage_and_all_after_it(tmp_path):
     assert len(set(keys)) == 3
 
 
+def test_a_stage_that_was_begun_anew_and_interrupted_is_not_done(tmp_path):
+    """Whoever asks as at first again finds data that is half replaced."""
+    calls = []
+    _run_two(tmp_path, calls)
+
+    def interrupted(key):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        Stages(tmp_path).run("first", {"s": "b"}, interrupted)
+    assert Stages(tmp_path).known("first") is None
+    _run_two(tmp_path, calls)
+    assert calls == ["first", "second", "first"]
+
+
 def test_a_record_of_before_still_counts(tmp_path):
     """The keys are part of the format."""
     result = {"key": "c081e75ff0", "seconds": 1.0, "result": {"data": "x"}}

@@ -20,6 +20,7 @@ HELD_OUT_STEPS, HELD_OUT_FRAMES = 40, 24
 """Steps of fitting a video's held-out frames, for the score that looks at their images, and how
 many at most are fitted."""
 
+_FRAMES = 240
 _TINY_PX = 256
 """Pixels of a small avatar's images."""
 
@@ -27,7 +28,7 @@ _TINY_PX = 256
 def run(
     output: Path | None = None,
     video: tuple[Path, ...] = (),
-    frames: Annotated[int, Between(2, 100_000)] = 240,
+    frames: Annotated[int, Between(2, 100_000)] | None = None,
     image_size: Annotated[int, Between(16, 4096)] | None = None,
     head_only: bool = False,
     tiny: bool = False,
@@ -42,7 +43,7 @@ def run(
         output: where everything is written; outputs/demo, or outputs/NAME for NAME.mp4.
         video: your own video (several clips of one person may be given) in place of the demo
             subject.
-        frames: frames of the demo subject; its last quarter is held out.
+        frames: frames of the demo subject, 240 by default; its last quarter is held out.
         image_size: width and height of the images in pixels; by default 256, and up to 512
             of a video that has as many.
         head_only: track the head of a video without its body.
@@ -62,8 +63,9 @@ def run(
         output = Path("outputs") / (video[0].stem if video else "demo")
     output = output.resolve()
     stages = Stages(output, fresh=fresh, tell=_tell_stage)
+    _require_counting(bool(video), head_only, frames)
+    _require_same_people(stages, video, output)
     if video:
-        _require_same_people(stages, video, output)
         if tiny and image_size is None:
             image_size = _TINY_PX
         settings: dict[str, Any] = {"video": [_fingerprint(clip) for clip in video]}
@@ -74,7 +76,7 @@ def run(
             lambda key: _track(video, output / "data", image_size, head_only),
         )
     else:
-        settings = {"frames": frames, "image_size": image_size or _TINY_PX, "seed": seed}
+        settings = {"frames": frames or _FRAMES, "image_size": image_size or _TINY_PX, "seed": seed}
         data = stages.run("demo subject", settings, lambda key: _demo(output / "data", settings))
     folder = Path(data["data"])
     method = TINY if tiny else suited_method(data.get("image_size", 0))
@@ -108,12 +110,25 @@ def run(
     _tell(summary, output)
 
 
+def _require_counting(filmed: bool, head_only: bool, frames: int | None) -> None:
+    """Raise UserError for an option that changes nothing of a video or of the demo subject."""
+    if filmed and frames is not None:
+        raise UserError("--frames changes nothing of a --video.", "Leave it out.")
+    if head_only and not filmed:
+        raise UserError("--head-only changes nothing without a --video.", "Leave it out.")
+
+
 def _require_same_people(stages: Stages, video: tuple[Path, ...], output: Path) -> None:
-    """Raise UserError where the folder has the avatar of another film, which reads its data."""
+    """Raise UserError where the folder has the avatar of somebody else, which reads its data."""
     films = (stages.known("track") or {}).get("films")
+    other = None
     if films is not None and films != [str(clip.resolve()) for clip in video]:
+        other = f"another film, {', '.join(films)}"
+    elif video and stages.known("demo subject") is not None:
+        other = "the demo subject"
+    if other is not None:
         raise UserError(
-            f"{output} has the avatar of another film, {', '.join(films)}.",
+            f"{output} has the avatar of {other}.",
             "Name another folder (--output), or replace that avatar (--fresh).",
         )
 

@@ -48,5 +48,5 @@ class Posing(Protocol):
     def __call__(
         self, theta: Float[Tensor, "1 H"]
     ) -> tuple[Float[Tensor, "1 K"], Float[Tensor, "1 V 3"]]:
-        """Weights psi, and vertices in metres."""
+        """Weights psi, and vertices in metres; raises ValueError for a theta of another size."""
         ...

@@ -32,6 +32,8 @@ Progress = Callable[[int, int], None]
 """Called with (frames done, frames in all)."""
 
 WIDE_OPEN_RAD = 0.33
+_BYTES_PER_PIXEL, _MOST_BYTES = 400, 1 << 31
+"""What a picture takes while it is drawn with three rays a pixel's side, and all of them may."""
 _CHUNK = 16
 _CAMERA_DISTANCE_M = 1.1
 # How high the picture's middle lies and half of what it shows: the head, or shoulders too.
@@ -161,16 +163,21 @@ class DemoPerson:
         return self.head.layout.join({**parts, **moved})
 
     def draw(self, theta: Float[Tensor, "F H"]) -> Iterator[UInt8[np.ndarray, "S S 4"]]:
-        """Images of each theta in order, as many at work at a time as torch takes threads."""
+        """Images of each theta in order, a few at work at a time: as many as torch takes threads,
+        or two where that would take too much memory."""
         waiting: deque[Future[np.ndarray]] = deque()
-        threads = torch.get_num_threads()
-        with ThreadPoolExecutor(threads) as pool:
+        room = _MOST_BYTES // (_BYTES_PER_PIXEL * self.camera.size**2)
+        threads = min(torch.get_num_threads(), max(2, room))
+        pool = ThreadPoolExecutor(threads)
+        try:
             for moment in self.moments(theta):
                 waiting.append(pool.submit(self.renderer.render, moment))
                 if len(waiting) > 2 * threads:
                     yield waiting.popleft().result()
             while waiting:
                 yield waiting.popleft().result()
+        finally:
+            pool.shutdown(cancel_futures=True)
 
 
 @dataclass(frozen=True)
@@ -205,7 +212,8 @@ def film_demo(config: DemoConfig, stiff_neck: bool = False) -> DemoFilm:
         config.seed,
         config.body,
     )
-    tracked = with_tracker_noise(acted, layout, config.theta_noise, config.seed)
+    names = person.head.arrays.expression_names
+    tracked = with_tracker_noise(acted, layout, names, config.theta_noise, config.seed)
     found, true = (torch.from_numpy(theta).float() for theta in (tracked, acted))
     if stiff_neck:
         found, true = person.with_stiff_neck(found), person.with_stiff_neck(true)

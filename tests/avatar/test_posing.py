@@ -117,3 +117,11 @@ def test_other_backends_and_types_have_none():
     assert posing_of(parameters, "reference") is None
     avatar = avatar.double()
     assert posing_of(posing_parameters(*parts_of(avatar), avatar.config)) is None
+
+
+@pytest.mark.parametrize("more", [-1, 1])
+def test_a_theta_of_another_size_is_refused(more):
+    avatar = avatar_on(small_head())
+    theta = torch.zeros(1, avatar.layout.size + more)
+    with pytest.raises(ValueError, match=rf"theta is \[1, {theta.shape[1]}\]"):
+        compiled(avatar)(theta)

@@ -106,3 +106,34 @@ def test_another_film_of_the_same_name_does_not_replace_an_avatars_data(
     told = refused("demo", "--video", clips[1])
     assert f"has the avatar of another film, {film}" in told
     assert "--output" in told
+
+
+@pytest.mark.parametrize(
+    ("stage", "options", "who"),
+    [
+        ("demo subject", ["--video", "me.mp4"], "the demo subject"),
+        ("track", [], "another film, you.mp4"),
+    ],
+)
+def test_a_video_and_the_demo_subject_do_not_replace_one_another(
+    tmp_path, monkeypatch, refused, stage, options, who
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "me.mp4").touch()
+    result = {"data": "data", "films": ["you.mp4"]}
+    write_json(tmp_path / "x/stages.json", {stage: {"key": "", "seconds": 1.0, "result": result}})
+    assert f"has the avatar of {who}." in refused("demo", "--output", "x", *options)
+
+
+@pytest.mark.parametrize(
+    ("options", "what"),
+    [
+        (["--video", "me.mp4", "--frames", "20"], "--frames changes nothing of a --video."),
+        (["--head-only"], "--head-only changes nothing without a --video."),
+    ],
+)
+def test_options_of_the_other_kind_are_refused(tmp_path, monkeypatch, refused, options, what):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "me.mp4").touch()
+    assert what in refused("demo", *options)
+    assert [path.name for path in tmp_path.iterdir()] == ["me.mp4"]

@@ -33,7 +33,7 @@ def _performance(seed: int, seconds: float = 12.0, noise: float = 0.0) -> torch.
     layout, names = HeadModel(_HEAD).layout, _HEAD.expression_names
     count = int(seconds * _RATE)
     theta = perform(layout, names, count, count // 4, _RATE, seed)
-    return torch.from_numpy(with_tracker_noise(theta, layout, noise, seed)).float()
+    return torch.from_numpy(with_tracker_noise(theta, layout, names, noise, seed)).float()
 
 
 def _own(avatar: Avatar, theta: torch.Tensor) -> TrainingStatistics:

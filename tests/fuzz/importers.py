@@ -66,7 +66,7 @@ def write(root: Path) -> dict[str, tuple[Path, str]]:
     for key, writer in _WRITERS.items():
         version = "2023" if key == "vhap" else "2020"
         generator = np.random.default_rng(0)
-        take = Take(_small_flame(version), np.zeros(300), NUM_FRAMES, 1, WIDTH, HEIGHT)
+        take = Take(_small_flame(version), np.zeros(300), NUM_FRAMES, 1, WIDTH, HEIGHT, "data")
         writing = writer(root / key, take)
         for index in range(NUM_FRAMES):
             writing.add(make_frame(index, generator, stiff_neck=key != "vhap"))

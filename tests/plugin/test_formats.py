@@ -22,7 +22,7 @@ def both(request, tmp_path_factory) -> tuple[Path, Path, Path]:
     """The format's folder, its native twin, and the folder of FLAME."""
     root = tmp_path_factory.mktemp(request.param)
     chosen = DEMO_FORMATS[request.param]
-    film = FlameFilm(root, CONFIG, chosen.version, chosen.stiff_neck)
+    film = FlameFilm(root, CONFIG, chosen.version, chosen.stiff_neck, root.name)
     writers = [chosen.writer(root / "data", film.take), NativeWriter(root / "native", film.take)]
     for frame in film.frames():
         for writer in writers:

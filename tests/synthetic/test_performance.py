@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
 
-from rgbavatar_ns.head import HeadModel
+from rgbavatar_ns.head import EMBEDDED_BUST, HeadModel
+from rgbavatar_ns.head.arrays import NECK_SHIFTS
 from rgbavatar_ns.synthetic.performer.performance import (
     EARLY_ONLY,
     MOUTH_MOODS,
@@ -75,14 +76,25 @@ def test_a_seed_gives_one_performance():
 
 def test_noise_has_the_strength_asked_for():
     theta = np.full((3000, LAYOUT.size), 0.5)
-    assert np.array_equal(with_tracker_noise(theta, LAYOUT, 0.0, 3), theta)
-    error = with_tracker_noise(theta, LAYOUT, 2.0, 3) - theta
+    assert np.array_equal(with_tracker_noise(theta, LAYOUT, NAMES, 0.0, 3), theta)
+    error = with_tracker_noise(theta, LAYOUT, NAMES, 2.0, 3) - theta
     assert np.std(error[:, LAYOUT.slice("expression")]) == pytest.approx(0.020, rel=0.05)
     assert np.std(error[:, LAYOUT.slice("neck")]) == pytest.approx(0.0036, rel=0.1)
     assert np.std(error[:, LAYOUT.slice("translation")]) == pytest.approx(2e-4, rel=0.1)
 
 
 def test_noise_never_makes_an_expression_negative():
-    noisy = with_tracker_noise(np.zeros((50, LAYOUT.size)), LAYOUT, 1.0, 0)
+    noisy = with_tracker_noise(np.zeros((50, LAYOUT.size)), LAYOUT, NAMES, 1.0, 0)
     assert noisy[:, LAYOUT.slice("expression")].min() >= 0
     assert noisy[:, LAYOUT.slice("neck")].min() < 0
+
+
+def test_noise_leaves_the_sign_of_a_neck_s_shifts():
+    """They are centimetres, not coefficients: cut off at zero the skull was 2 mm off."""
+    bust = HeadModel.embedded(name=EMBEDDED_BUST)
+    names, layout = bust.arrays.expression_names, bust.layout
+    true = perform(layout, names, 240, 60, 8.0, 0, "lean")
+    found = with_tracker_noise(true, layout, names, 1.0, 0)
+    columns = [layout.slice("expression").start + names.index(name) for name in NECK_SHIFTS]
+    assert (true[:, columns].min(0) < -0.1).all()
+    assert np.abs(found - true)[:, columns].max() < 0.06

@@ -91,7 +91,7 @@ class CpuMorphedRenderer:
         visibility = None
         if with_visibility:
             visibility = new(batch, self._count)
-            self._session.average(None, None, None, visibility)
+            self._average(None, None, None, visibility)
         return RenderedBatch(image, alpha, depth, visibility)
 
     def draw_one(self, place: int) -> RenderedBatch:
@@ -109,8 +109,12 @@ class CpuMorphedRenderer:
         new = self._weights.new_empty
         size = (len(self._weights), self._count)
         weighted_sum, weight_sum, max_weight = new(*size, images.shape[-1]), new(size), new(size)
-        self._session.average(images.contiguous(), weighted_sum, weight_sum, max_weight)
+        self._average(images.contiguous(), weighted_sum, weight_sum, max_weight)
         return WeightedColors(weighted_sum, weight_sum, max_weight)
+
+    def _average(self, *images_and_sums: Tensor | None) -> None:
+        self._has_gradient = False  # its sums take the place of a loss's
+        self._session.average(*images_and_sums)
 
     def forward_loss(
         self,
@@ -131,10 +135,10 @@ class CpuMorphedRenderer:
             seen["sight_images"] = min(sight.num_images, len(self._weights))
             seen["over_background"] = sight.over_background
         background = checked_background(self._weights, background, len(self._weights))
-        self._has_gradient = True
         loss, shown = self._session.forward_loss(
             images_rgba.contiguous(), background.detach().contiguous(), **seen
         )
+        self._has_gradient = True
         if sight is not None:
             sight.shown = shown
         return self._weights.new_tensor(loss)

@@ -19,6 +19,7 @@ class CpuPosing:
     def __init__(self, parameters: PosingParameters) -> None:
         p = parameters
         expression, eyelids = p.expression, p.eyelids
+        self._theta_size = len(p.low)
         self._posing = _native.Posing(
             (
                 len(p.low),
@@ -45,7 +46,9 @@ class CpuPosing:
     def __call__(
         self, theta: Float[Tensor, "1 H"]
     ) -> tuple[Float[Tensor, "1 K"], Float[Tensor, "1 V 3"]]:
-        """See `kernels.posing.Posing`."""
+        """See `kernels.posing.Posing`; raises ValueError for a theta of another size."""
+        if theta.shape != (1, self._theta_size):
+            raise ValueError(f"theta is {list(theta.shape)}. Pass [1, {self._theta_size}].")
         weights = theta.new_empty(1, self._posing.num_weights)
         vertices = theta.new_empty(1, self._posing.num_vertices, 3)
         instruction_set = os.environ.get(INSTRUCTION_SET_VARIABLE, "")

@@ -104,18 +104,19 @@ class Capacities:
         self.per_image[key] = max(self.per_image.get(key, 0), room)
 
     def collect(self) -> None:
-        """Learn from the reports that have arrived."""
-        waiting = []
-        for key, batch, read in self._reports:
+        """Learn from the reports that have arrived, from each once.
+
+        Raises ValueError as `learn`.
+        """
+        for _ in range(len(self._reports)):
+            key, batch, read = report = self._reports.pop(0)
             status = read()
             if status is None:
-                waiting.append((key, batch, read))
-                continue
+                self._reports.append(report)
             # Growth only: a smaller need leaves the room as it is.
-            if status[constants()["kOverflow"]]:
+            elif status[constants()["kOverflow"]]:
                 self.skipped_steps += 1
                 self._learn(key, batch, status[constants()["kSlotsNeeded"]])
-        self._reports = waiting
 
     @staticmethod
     def _key(images: Images) -> tuple[int, int, int]:

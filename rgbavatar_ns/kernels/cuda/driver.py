@@ -52,11 +52,11 @@ class CudaLauncher:
         # One parameter: an array of one address.
         parameters = (ctypes.c_void_p * 1)(ctypes.addressof(arguments))
         function = self._functions[kernel]
-        if shared_bytes > self._asked.get(kernel, _SHARED_WITHOUT_ASKING):
-            self._ask_for_shared_memory(kernel, shared_bytes)
         stream = torch.cuda.current_stream(self._device).cuda_stream
         with torch.cuda.device(self._device):
             self._enter_thread()
+            if shared_bytes > self._asked.get(kernel, _SHARED_WITHOUT_ASKING):
+                self._ask_for_shared_memory(kernel, shared_bytes)
             started = driver.cuLaunchKernel(
                 function,
                 *grid,
@@ -93,7 +93,8 @@ class CudaLauncher:
 
     def capturing(self) -> bool:
         """See `Launcher`."""
-        return torch.cuda.is_current_stream_capturing()
+        with torch.cuda.device(self._device):
+            return torch.cuda.is_current_stream_capturing()
 
 
 def _checked(result: tuple, doing: str) -> Any:

@@ -208,6 +208,8 @@ class CudaMorphedRenderer:
     ) -> MorphedGradient:
         if self._slots is None:
             raise ValueError("There is no gradient yet. Call forward_loss() first.")
+        if self._images.count == 0:
+            return self._of_nobody(with_vertices)
         gradients = self._differentiate(with_vertices)
         together = []
         for row, name in enumerate(UPDATED_ATTRIBUTES):
@@ -223,6 +225,12 @@ class CudaMorphedRenderer:
         self._slots = None  # the parameters are others now
         vertices = self._vertex_gradient(gradients["carried"]) if with_vertices else None
         return MorphedGradient(weights, vertices)
+
+    def _of_nobody(self, with_vertices: bool) -> MorphedGradient:
+        """Without Gaussians nothing has a gradient, and there is nothing to launch."""
+        self._slots = None
+        vertices = torch.zeros_like(self._values["vertices"]) if with_vertices else None
+        return MorphedGradient(torch.zeros_like(self._weights), vertices)
 
     def _differentiate(self, with_vertices: bool) -> dict[str, Tensor]:
         """The gradients of each image by name."""

@@ -10,6 +10,8 @@ from rgbavatar_ns.kernels.cuda.launcher import Launcher
 from rgbavatar_ns.kernels.cuda.source import constants
 from rgbavatar_ns.kernels.types import FirstSight
 
+_PIXEL_BYTES = 4
+
 
 class Tiles:
     """Draws, averages and differentiates a batch that was projected into `bins`."""
@@ -98,6 +100,8 @@ class Tiles:
     ) -> tuple[Tensor, Tensor]:
         """The mean absolute difference to the images, and the slots' moments; waits for nothing."""
         self.bins.sort(checked=False)
+        if images_rgba.data_ptr() % _PIXEL_BYTES:  # pixels are read whole
+            images_rgba = images_rgba.clone()
         size = self.bins.images
         each = 1.0 / (size.batch * size.width * size.height * 3)
         slots, loss = self._new_slots(), self._new(size.batch, size.tiles)

@@ -12,7 +12,7 @@ from jaxtyping import Float, UInt8
 from rgbavatar_ns.data.native.frame import TrackedFrame
 from rgbavatar_ns.data.native.writer import DatasetWriter
 from rgbavatar_ns.data.png import encode_png_rgba
-from rgbavatar_ns.files import write_json
+from rgbavatar_ns.files import disk_errors, write_json
 from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.head.rotations import axis_angle_to_matrix, matrix_to_6d_rows
 from rgbavatar_ns.head.teeth import with_teeth
@@ -77,7 +77,7 @@ class FlashAvatarWriter(TakeWriter):
 
     def add(self, frame: TakeFrame) -> None:
         """One frame's files; the parsing masks are the matte's lower and upper half."""
-        output = self._dst / "metrical-tracker" / "output" / self._dst.resolve().name
+        output = self._dst / "metrical-tracker" / "output" / self._take.name
         _write_checkpoint(output, self._take, frame)
         number = frame.index + 1
         alpha = frame.image_rgba[..., 3]
@@ -291,7 +291,9 @@ def _write_checkpoint(folder: Path, take: Take, frame: TakeFrame) -> None:
     }
     path = folder / f"checkpoint/{frame.index:05d}.frame"
     path.parent.mkdir(parents=True, exist_ok=True)
-    torch.save(content, path)
+    # torch tells a disk that refuses by an error of its own.
+    with disk_errors(path, also=(RuntimeError,)):
+        torch.save(content, path)
 
 
 def _rows(axis_angle: Float[np.ndarray, "3"]) -> Float[np.ndarray, "6"]:
@@ -325,4 +327,6 @@ def _over_white(rgba: UInt8[np.ndarray, "height width 4"]) -> UInt8[np.ndarray, 
 
 def _write_image(path: Path, image: UInt8[np.ndarray, "height width *channels"]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    cv2.imwrite(str(path), image, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
+    # OpenCV's own writing says nothing of a disk that refuses.
+    _, encoded = cv2.imencode(path.suffix, image, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
+    path.write_bytes(encoded)

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.files import atomic_folder
 from rgbavatar_ns.synthetic import DemoConfig
 from rgbavatar_ns.synthetic.exporters.folders import (
     FlashAvatarWriter,
@@ -42,17 +43,25 @@ def write_demo(
 ) -> Path:
     """Write the demo subject in a format of `DEMO_FORMATS`; returns the FLAME-shaped pickle.
 
-    Raises UserError where the folder holds something already.
+    The folder is there once it is whole. Raises UserError where it holds something already, is a
+    file or cannot be written, and for a body, which FLAME has not.
     """
-    dst, chosen = Path(dst), DEMO_FORMATS[format]
-    if dst.exists() and (not dst.is_dir() or any(dst.iterdir())):
+    dst, chosen = Path(dst).resolve(), DEMO_FORMATS[format]
+    if config.body != "none":
+        raise UserError(
+            f"FLAME, in which {format} data is, has no shoulders: --body {config.body} cannot be.",
+            "Leave it out, or write --format native.",
+        )
+    if dst.exists() and not dst.is_dir():
+        raise UserError(f"{dst} is a file.", "Name a new folder.")
+    if dst.exists() and any(dst.iterdir()):
         raise UserError(f"The folder {dst} is not empty.", "Name a new folder.")
-    dst.mkdir(parents=True, exist_ok=True)
-    film = FlameFilm(dst, config, chosen.version, chosen.stiff_neck)
-    writer = chosen.writer(dst, film.take)
-    for frame in film.frames():
-        writer.add(frame)
-        if progress is not None:
-            progress(frame.index + 1, config.num_frames)
-    writer.finish()
-    return film.flame_path
+    with atomic_folder(dst) as partial:
+        film = FlameFilm(partial, config, chosen.version, chosen.stiff_neck, dst.name)
+        writer = chosen.writer(partial, film.take)
+        for frame in film.frames():
+            writer.add(frame)
+            if progress is not None:
+                progress(frame.index + 1, config.num_frames)
+        writer.finish()
+    return dst / film.flame_path.relative_to(partial)

@@ -54,6 +54,8 @@ class Take:
     num_test_frames: int
     width: int
     height: int
+    name: str
+    """Of the dataset's folder."""
 
 
 class FlameFilm:
@@ -64,7 +66,9 @@ class FlameFilm:
     stiff_neck: see `film_demo`. Blinks are expressions here; a tracker's eyelids stay open.
     """
 
-    def __init__(self, dst: Path, config: DemoConfig, version: str, stiff_neck: bool) -> None:
+    def __init__(
+        self, dst: Path, config: DemoConfig, version: str, stiff_neck: bool, name: str
+    ) -> None:
         self.flame_path = write_synthetic_flame(dst / FLAME_FOLDER, version)
         self.film: DemoFilm = film_demo(config, stiff_neck)
         embedded = self.film.person.head.arrays
@@ -78,6 +82,7 @@ class FlameFilm:
             config.num_test_frames,
             config.image_size,
             config.image_size,
+            name,
         )
 
     def frames(self) -> Iterator[TakeFrame]:

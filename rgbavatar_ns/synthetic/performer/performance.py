@@ -90,15 +90,27 @@ def perform(
         head |= _torso_motion(seconds, seed, body)
     theta = _join(layout, expression, gaze, head)
     if body != "none":
-        columns = [layout.slice("expression").start + names.index(name) for name in NECK_SHIFTS]
-        theta[:, columns] = _neck_shifts_cm(seconds, seed)
+        theta[:, _neck_columns(layout, names)] = _neck_shifts_cm(seconds, seed)
     return theta
 
 
+def _neck_columns(layout: ThetaLayout, names: Sequence[str]) -> list[int]:
+    """Where theta has a bust's neck shifts; none for a head alone."""
+    first = layout.slice("expression").start
+    return [first + names.index(name) for name in NECK_SHIFTS if name in names]
+
+
 def with_tracker_noise(
-    theta: Float[np.ndarray, "F H"], layout: ThetaLayout, strength: float, seed: int
+    theta: Float[np.ndarray, "F H"],
+    layout: ThetaLayout,
+    expression_names: Sequence[str],
+    strength: float,
+    seed: int,
 ) -> Float[np.ndarray, "F H"]:
-    """Theta as a tracker finds it: half of the error flickers, half drifts over some frames."""
+    """Theta as a tracker finds it: half of the error flickers, half drifts over some frames.
+
+    A coefficient of an expression is not found below zero; a bust's neck shifts are, in both ways.
+    """
     rng = np.random.default_rng([seed, 2])
     scale = np.concatenate(
         [
@@ -113,9 +125,10 @@ def with_tracker_noise(
         drift[frame] = 0.9 * drift[frame - 1] + np.sqrt(1 - 0.9**2) * drift[frame]
     error = np.sqrt(0.5) * (rng.standard_normal(theta.shape) + drift)
     noisy = theta + strength * scale * error
-    expression = layout.slice("expression")
-    if strength > 0:  # trackers keep coefficients of expressions from going below zero
-        noisy[:, expression] = np.maximum(noisy[:, expression], 0)
+    if strength > 0:
+        shifts = _neck_columns(layout, expression_names)
+        columns = np.setdiff1d(np.arange(layout.size)[layout.slice("expression")], shifts)
+        noisy[:, columns] = np.maximum(noisy[:, columns], 0)
     return noisy
 
 

@@ -349,6 +349,11 @@ def test_a_renderer_refuses_what_its_loops_would_read_wrongly(stirred):
         renderer.forward_loss(batch.images_rgba[:1], background[:1])
     with pytest.raises(ValueError, match="no gradient"):
         renderer.backward_adam({})
+    # What is averaged takes the place of what a loss has left for its gradient.
+    renderer.forward_loss(batch.images_rgba, background)
+    renderer.draw(with_visibility=True)
+    with pytest.raises(ValueError, match="no gradient"):
+        renderer.backward_adam(None)
     with pytest.raises(ValueError, match=r"weights are \[2, 1\]"):
         avatar.renderer(batch.theta, batch.cameras, torch.zeros(2, 1))
 

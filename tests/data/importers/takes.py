@@ -20,9 +20,8 @@ def make_take(flame: Path, version: str, stiff_neck: bool) -> tuple[Take, list[T
     generator = np.random.default_rng(int(version))
     identity = np.zeros(300)
     identity[:100] = 0.5 * generator.standard_normal(100)
-    take = Take(
-        arrays, identity.astype(np.float32).astype(float), NUM_FRAMES, NUM_TEST, WIDTH, HEIGHT
-    )
+    own = identity.astype(np.float32).astype(float)
+    take = Take(arrays, own, NUM_FRAMES, NUM_TEST, WIDTH, HEIGHT, "data")
     return take, [make_frame(FIRST + k, generator, stiff_neck) for k in range(NUM_FRAMES)]
 
 

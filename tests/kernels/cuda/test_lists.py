@@ -123,6 +123,9 @@ def test_more_tiles_than_a_number_holds_are_an_overflow_and_told(taken):
     assert bins.status.tolist()[constants()["kSlotsNeeded"]] == MOST
     with pytest.raises(ValueError, match=r"1 Gaussians touch 2147483647.*fewer or smaller images"):
         capacities.collect()
+    # It is told once: what is drawn next need not be as large.
+    Bins(launcher, capacities, IMAGES, project)
+    assert capacities.skipped_steps == 1
     with pytest.raises(ValueError, match=r"fewer or smaller images"):
         Bins(launcher, capacities, IMAGES, project).sort(checked=True)
 

@@ -1,14 +1,17 @@
 """Training by the emulated CUDA backend: steps, the order of threads and overflows."""
 
 import copy
+from dataclasses import fields, replace
 
+import pytest
 import torch
 
 from rgbavatar_ns.avatar.training import make_optimizer
 from rgbavatar_ns.avatar.training.color_init import FirstColors, FirstColorsKind, is_seen_well
 from rgbavatar_ns.avatar.training.fused_step import FusedStep
 from rgbavatar_ns.kernels import DeviceRenderer
-from rgbavatar_ns.kernels.types import SIGHT_UNIT
+from rgbavatar_ns.kernels.morphed import morphed_renderer
+from rgbavatar_ns.kernels.types import SIGHT_UNIT, MorphedGaussians
 from tests.avatar.fused_scene import (
     assert_unfilmed_adds_nothing,
     eager_step,
@@ -139,3 +142,57 @@ def test_drawing_never_overflows(emulated, make_avatar):
         for backend in ("auto", "reference")
     )
     assert (found - expected).abs().max() < 1e-4
+
+
+@pytest.mark.parametrize("backend", ["cpu", "cuda"])
+def test_without_gaussians_nothing_has_a_gradient(emulated, make_avatar, backend):
+    """On a GPU there is nothing to launch: the kernel would read the first of none."""
+    avatar = stir(make_avatar())
+    names = [field.name for field in fields(MorphedGaussians)]
+    tensors = {name: getattr(avatar.blendshapes, name, None) for name in names}
+    some = MorphedGaussians(**tensors | avatar.anchors.triangles(with_rest_length=False))
+    of_each = [
+        name for name in names if not name.startswith(("triangle_v", "edges", "rest", "var"))
+    ]
+    shorter = {
+        name: getattr(some, name)[(slice(None),) * name.startswith("basis_") + (slice(0),)]
+        for name in of_each
+    }
+    none = replace(some, **shorter)
+    assert len(none.position) == 0
+    batch, background = far_batch(avatar, 2)
+    weights = avatar.weights(batch.theta).detach()
+    vertices = avatar.carrier_vertices(batch.theta)
+    renderer = morphed_renderer(none, weights, vertices, batch.cameras, backend)
+    assert renderer is not None
+    loss = renderer.forward_loss(batch.images_rgba, background)
+    assert bool(loss > 0)
+    gradient = renderer.backward_adam(None, with_vertices=True)
+    assert gradient.vertices is not None
+    assert gradient.weights.shape == weights.shape
+    assert gradient.vertices.shape == vertices.shape
+    assert not bool(gradient.weights.any())
+    assert not bool(gradient.vertices.any())
+
+
+def test_pixels_that_lie_oddly_in_memory_are_moved(emulated, make_avatar):
+    """A GPU reads a pixel's four bytes at once, from where four divides."""
+    avatar = stir(make_avatar())
+    batch, background = far_batch(avatar, 2)
+    images = torch.as_tensor(batch.images_rgba)
+    odd = torch.empty(images.numel() + 1, dtype=torch.uint8)[1:].view(images.shape).copy_(images)
+    assert odd.data_ptr() % 4 != 0
+    places, launch = [], emulated.emulated.launch
+
+    def watched(kernel, *arguments, **values):
+        if kernel == "train":
+            places.append(values["images"].data_ptr() % 4)
+        launch(kernel, *arguments, **values)
+
+    emulated.emulated.launch = watched
+    losses = [
+        avatar.renderer(batch.theta, batch.cameras).forward_loss(pixels, background)
+        for pixels in (images, odd)
+    ]
+    assert torch.equal(*losses)
+    assert places == [0, 0]

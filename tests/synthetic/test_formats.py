@@ -1,0 +1,61 @@
+"""The demo subject as other systems' data: whole or not there, and what they have no place for."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.synthetic import DemoConfig
+from rgbavatar_ns.synthetic.exporters import DEMO_FORMATS, write_demo
+
+_SMALL = DemoConfig(image_size=16, num_frames=2, num_test_frames=1, supersampling=1)
+_ON_A_SMALL_DISK = """
+import resource, signal, sys
+from rgbavatar_ns.synthetic import DemoConfig
+from rgbavatar_ns.synthetic.exporters import write_demo
+
+def fill(done, total):
+    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (64, 64))
+
+write_demo(*sys.argv[1:], DemoConfig(image_size=16, num_frames=3, num_test_frames=1), fill)
+"""
+
+
+def test_what_was_interrupted_leaves_nothing_and_is_made_again(tmp_path: Path):
+    folder = tmp_path / "me"
+
+    def interrupt(done: int, total: int) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_demo(folder, "flashavatar", _SMALL, interrupt)
+    assert list(tmp_path.iterdir()) == []
+    flame = write_demo(folder, "flashavatar", _SMALL)
+    assert flame.is_file()
+    assert flame.is_relative_to(folder)
+    assert [path.name for path in (folder / "metrical-tracker/output").iterdir()] == ["me"]
+    assert len(list((folder / "imgs").iterdir())) == _SMALL.num_frames
+
+
+@pytest.mark.parametrize("format", ["insta", "vhap"])
+def test_what_the_disk_refuses_is_told(tmp_path: Path, format: str):
+    command = [sys.executable, "-c", _ON_A_SMALL_DISK, str(tmp_path / "me"), format]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    assert "DiskError: Cannot write" in ended.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("format", DEMO_FORMATS)
+def test_flame_has_no_shoulders(tmp_path: Path, format: str):
+    with pytest.raises(UserError, match="has no shoulders: --body lean cannot be"):
+        write_demo(tmp_path / "me", format, DemoConfig(body="lean"))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_file_is_not_taken_for_a_folder(tmp_path: Path):
+    (tmp_path / "me").write_text("mine")
+    with pytest.raises(UserError, match="me is a file"):
+        write_demo(tmp_path / "me", "insta", _SMALL)
