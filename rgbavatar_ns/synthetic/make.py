@@ -198,6 +198,8 @@ class DemoFilm:
 def film_demo(config: DemoConfig, stiff_neck: bool = False) -> DemoFilm:
     """Cast, script and track the demo subject; the same config gives the same film on every run.
 
+    On the same kind of processor: others round otherwise, a pixel's level here and there.
+
     stiff_neck: the body turns in the neck's stead, so that the head moves as one piece, as
     trackers assume that put all of its motion into the camera.
     """
@@ -231,8 +233,8 @@ def make_demo_dataset(
 
     `overwrite` replaces a dataset that is there; anything else there is refused by UserError.
 
-    The same config gives the same person, performance, noise and images on every run. Calls
-    `progress(frames done, frames in all)` after each frame.
+    The same config gives the same person, performance, noise and images (see `film_demo`) on every
+    run. Calls `progress(frames done, frames in all)` after each frame.
     """
     config = config or DemoConfig()
     make_room(Path(dst), overwrite)
