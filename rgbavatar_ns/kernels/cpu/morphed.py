@@ -112,9 +112,15 @@ class CpuMorphedRenderer:
         self._average(images.contiguous(), weighted_sum, weight_sum, max_weight)
         return WeightedColors(weighted_sum, weight_sum, max_weight)
 
-    def _average(self, *images_and_sums: Tensor | None) -> None:
+    def _average(
+        self,
+        images: Tensor | None,
+        weighted_sum: Tensor | None,
+        weight_sum: Tensor | None,
+        max_weight: Tensor,
+    ) -> None:
         self._has_gradient = False  # its sums take the place of a loss's
-        self._session.average(*images_and_sums)
+        self._session.average(images, weighted_sum, weight_sum, max_weight)
 
     def forward_loss(
         self,

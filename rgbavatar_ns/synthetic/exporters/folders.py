@@ -329,4 +329,4 @@ def _write_image(path: Path, image: UInt8[np.ndarray, "height width *channels"])
     path.parent.mkdir(parents=True, exist_ok=True)
     # OpenCV's own writing says nothing of a disk that refuses.
     _, encoded = cv2.imencode(path.suffix, image, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
-    path.write_bytes(encoded)
+    path.write_bytes(encoded.tobytes())
