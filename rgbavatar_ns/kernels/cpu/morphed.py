@@ -141,6 +141,7 @@ class CpuMorphedRenderer:
             seen["sight_images"] = min(sight.num_images, len(self._weights))
             seen["over_background"] = sight.over_background
         background = checked_background(self._weights, background, len(self._weights))
+        self._has_gradient = False
         loss, shown = self._session.forward_loss(
             images_rgba.contiguous(), background.detach().contiguous(), **seen
         )
