@@ -72,7 +72,7 @@ def write_data(root: Path, formats: Iterable[str], config: DemoConfig) -> dict[s
     with Progress() as progress:
         for twin, names in twins.items():
             chosen = DEMO_FORMATS[names[0]]
-            film = FlameFilm(root, config, chosen.version, chosen.stiff_neck)
+            film = FlameFilm(root, config, chosen.version, chosen.stiff_neck, names[0])
             folders |= {name: root / "data" / name for name in (twin, *names)}
             writers = [NativeWriter(folders[twin], film.take)]
             writers += [DEMO_FORMATS[name].writer(folders[name], film.take) for name in names]

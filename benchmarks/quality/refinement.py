@@ -62,7 +62,8 @@ class Tracked:
         """Read the images; make theta noisy where `noise` is not zero."""
         theta = dataset.theta
         if noise > 0:
-            noisy = with_tracker_noise(theta.double().numpy(), dataset.layout, noise, seed)
+            names = dataset.arrays.expression_names
+            noisy = with_tracker_noise(theta.double().numpy(), dataset.layout, names, noise, seed)
             theta = torch.from_numpy(np.asarray(noisy)).float()
         return cls(Subject.of(replace(dataset, theta=theta), seed), dataset.theta)
 

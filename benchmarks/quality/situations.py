@@ -56,10 +56,11 @@ class FilmedPerson:
             image_size=image_size, seed=seed, glasses=False, light=light, supersampling=2
         )
         person = DemoPerson.of(config)
-        script = _Script(person.head.layout, person.head.arrays.expression_names, seed)
+        layout, names = person.head.layout, person.head.arrays.expression_names
+        script = _Script(layout, names, seed)
 
         def shots(theta: np.ndarray) -> Shots:
-            noisy = with_tracker_noise(theta, person.head.layout, config.theta_noise, seed)
+            noisy = with_tracker_noise(theta, layout, names, config.theta_noise, seed)
             images = list(person.draw(torch.from_numpy(theta).float()))
             return Shots(torch.from_numpy(noisy).float(), torch.from_numpy(np.stack(images)))
 
