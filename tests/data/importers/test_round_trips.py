@@ -43,6 +43,7 @@ Takes = Callable[[str, bool], tuple[Take, list[TakeFrame]]]
 def write(folder: Path, name: str, takes: Takes) -> tuple[Take, list[TakeFrame]]:
     make, version, stiff_neck, _ = FORMATS[name]
     take, frames = takes(version, stiff_neck)
+    take = replace(take, name=folder.name)
     writer = make(folder, take)
     for frame in frames:
         writer.add(frame)
