@@ -1,4 +1,4 @@
-"""The demo subject as other systems' data: whole or not there, and what they have no place for."""
+"""The demo subject as other systems' data: whole or unfinished, and what they have no place for."""
 
 import subprocess
 import sys
@@ -24,18 +24,23 @@ write_demo(*sys.argv[1:], DemoConfig(image_size=16, num_frames=3, num_test_frame
 """
 
 
-def test_what_was_interrupted_leaves_nothing_and_is_made_again(tmp_path: Path):
+def test_what_was_interrupted_is_made_again_in_the_same_folder(tmp_path: Path):
+    """The folder itself stays: a user may be in it."""
     folder = tmp_path / "me"
+    folder.mkdir()
+    place = folder.stat().st_ino
 
     def interrupt(done: int, total: int) -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
         write_demo(folder, "flashavatar", _SMALL, interrupt)
-    assert list(tmp_path.iterdir()) == []
+    assert [path.name for path in folder.iterdir()] == [".unfinished"]
     flame = write_demo(folder, "flashavatar", _SMALL)
     assert flame.is_file()
     assert flame.is_relative_to(folder)
+    assert not (folder / ".unfinished").exists()
+    assert folder.stat().st_ino == place
     assert [path.name for path in (folder / "metrical-tracker/output").iterdir()] == ["me"]
     assert len(list((folder / "imgs").iterdir())) == _SMALL.num_frames
 
@@ -45,7 +50,7 @@ def test_what_the_disk_refuses_is_told(tmp_path: Path, format: str):
     command = [sys.executable, "-c", _ON_A_SMALL_DISK, str(tmp_path / "me"), format]
     ended = subprocess.run(command, capture_output=True, text=True, timeout=300)
     assert "DiskError: Cannot write" in ended.stderr
-    assert list(tmp_path.iterdir()) == []
+    assert [path.name for path in (tmp_path / "me").iterdir()] == [".unfinished"]
 
 
 @pytest.mark.parametrize("format", DEMO_FORMATS)

@@ -29,7 +29,7 @@ from rgbavatar_ns.files import atomic_write, disk_errors, read_json, write_json
 from rgbavatar_ns.head import HeadArrays, ThetaLayout
 from rgbavatar_ns.kernels.types import PinholeCameras
 
-_UNFINISHED = ".unfinished"
+UNFINISHED = ".unfinished"
 """Marks a folder whose files a writer has put there, until the index says so."""
 _OWN_IMAGE = re.compile(r"\d{5,}\.png")
 
@@ -47,7 +47,7 @@ def make_room(root: Path, overwrite: bool) -> None:
     if all(name.startswith(".") for name in os.listdir(root)):
         return
     index = read_json(root / INDEX_FILE)
-    if index is None and (root / _UNFINISHED).exists():
+    if index is None and (root / UNFINISHED).exists():
         return
     if not isinstance(index, dict) or index.get("format") != FORMAT:
         raise UserError(
@@ -64,7 +64,7 @@ def make_room(root: Path, overwrite: bool) -> None:
 def give_up(root: Path) -> None:
     """Take a dataset for what an interrupted writer has left, so that the next one replaces it."""
     with disk_errors(root, "Name a folder that you may write to."):
-        (root / _UNFINISHED).touch()
+        (root / UNFINISHED).touch()
         (root / INDEX_FILE).unlink(missing_ok=True)
 
 
@@ -111,7 +111,7 @@ class DatasetWriter:
 
     def _clear(self, overwrite: bool, keep_images: bool) -> None:
         """Make room; the old index goes first, so that no mixture can be taken for a dataset."""
-        root, mark = self._root, self._root / _UNFINISHED
+        root, mark = self._root, self._root / UNFINISHED
         if not keep_images:
             make_room(root, overwrite)
         with disk_errors(root, "Name a folder that you may write to."):
@@ -233,7 +233,7 @@ class DatasetWriter:
         with atomic_write(self._root / THETA_FILE) as partial:
             np.save(partial, np.stack(self._theta))
         write_json(self._root / INDEX_FILE, index)
-        (self._root / _UNFINISHED).unlink(missing_ok=True)
+        (self._root / UNFINISHED).unlink(missing_ok=True)
         return load_native(self._root)
 
     def _split(self, test: int | Collection[int]) -> dict[str, Any]:

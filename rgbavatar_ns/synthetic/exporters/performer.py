@@ -1,11 +1,13 @@
 """`demo-data --format`: the demo subject, as a system of another format would have left it."""
 
+import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from rgbavatar_ns.data.native.writer import UNFINISHED
 from rgbavatar_ns.errors import UserError
-from rgbavatar_ns.files import atomic_folder
+from rgbavatar_ns.files import disk_errors
 from rgbavatar_ns.synthetic import DemoConfig
 from rgbavatar_ns.synthetic.exporters.folders import (
     FlashAvatarWriter,
@@ -43,8 +45,9 @@ def write_demo(
 ) -> Path:
     """Write the demo subject in a format of `DEMO_FORMATS`; returns the FLAME-shaped pickle.
 
-    The folder is there once it is whole. Raises UserError where it holds something already, is a
-    file or cannot be written, and for a body, which FLAME has not.
+    What was interrupted lies in a folder of its own in it, and is begun anew. Raises UserError
+    where it holds something else, is a file or cannot be written, and for a body, which FLAME has
+    not.
     """
     dst, chosen = Path(dst).resolve(), DEMO_FORMATS[format]
     if config.body != "none":
@@ -54,9 +57,13 @@ def write_demo(
         )
     if dst.exists() and not dst.is_dir():
         raise UserError(f"{dst} is a file.", "Name a new folder.")
-    if dst.exists() and any(dst.iterdir()):
+    partial = dst / UNFINISHED
+    if dst.exists() and any(path != partial for path in dst.iterdir()):
         raise UserError(f"The folder {dst} is not empty.", "Name a new folder.")
-    with atomic_folder(dst) as partial:
+    # Not beside it: the folder may be the one that the user is in, or a mounted disk.
+    with disk_errors(dst):
+        shutil.rmtree(partial, ignore_errors=True)
+        partial.mkdir(parents=True)
         film = FlameFilm(partial, config, chosen.version, chosen.stiff_neck, dst.name)
         writer = chosen.writer(partial, film.take)
         for frame in film.frames():
@@ -64,4 +71,7 @@ def write_demo(
             if progress is not None:
                 progress(frame.index + 1, config.num_frames)
         writer.finish()
+        for path in list(partial.iterdir()):
+            path.rename(dst / path.name)
+        partial.rmdir()
     return dst / film.flame_path.relative_to(partial)
