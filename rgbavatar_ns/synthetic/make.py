@@ -198,7 +198,8 @@ class DemoFilm:
 def film_demo(config: DemoConfig, stiff_neck: bool = False) -> DemoFilm:
     """Cast, script and track the demo subject; the same config gives the same film on every run.
 
-    On the same kind of processor: others round otherwise, a pixel's level here and there.
+    But for a pixel's level here and there: one of 240 frames was seen to differ between two runs,
+    and other processors round otherwise.
 
     stiff_neck: the body turns in the neck's stead, so that the head moves as one piece, as
     trackers assume that put all of its motion into the camera.

@@ -168,6 +168,7 @@ def test_without_gaussians_nothing_has_a_gradient(emulated, make_avatar, backend
     loss = renderer.forward_loss(batch.images_rgba, background)
     assert bool(loss > 0)
     gradient = renderer.backward_adam(None, with_vertices=True)
+    assert "blend_backward" not in emulated.emulated.launched
     assert gradient.vertices is not None
     assert gradient.weights.shape == weights.shape
     assert gradient.vertices.shape == vertices.shape
