@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from rgbavatar_ns.kernels.constants import MAX_AVERAGE_CHANNELS
-from rgbavatar_ns.kernels.types import SIGHT_SUMS, FirstSight, PinholeCameras
+from rgbavatar_ns.kernels.types import SIGHT_SUMS, AdamParameter, FirstSight, PinholeCameras
 
 
 def holds_nonfinite(tensor: Tensor) -> bool:
@@ -15,6 +15,31 @@ def holds_nonfinite(tensor: Tensor) -> bool:
         return False
     # Only finite numbers have a finite sum, which is one operation where the exact test is five.
     return not math.isfinite(tensor.detach().sum().item()) and not bool(tensor.isfinite().all())
+
+
+def check_vertices(triangle_vertices: Tensor, vertices: Tensor) -> None:
+    """Raise ValueError where triangles name vertices that [B, V, 3] lacks; not asked of a GPU."""
+    if triangle_vertices.device.type != "cpu" or not len(triangle_vertices):
+        return
+    needed = int(triangle_vertices.max()) + 1
+    if vertices.shape[1] < needed:
+        raise ValueError(
+            f"There are {vertices.shape[1]} vertices, and the Gaussians' triangles name {needed}. "
+            "Pass those of the mesh that the Gaussians were made for."
+        )
+
+
+def check_moments(parameter: AdamParameter) -> None:
+    """Raise ValueError unless a parameter and its moments can be updated where they lie."""
+    for name in ("value", "first_moment", "second_moment"):
+        tensor: Tensor = getattr(parameter, name)
+        fits = tensor.shape == parameter.value.shape and tensor.dtype == torch.float32
+        if not (fits and tensor.is_contiguous()):
+            raise ValueError(
+                f"{name} is {tensor.dtype} {list(tensor.shape)} of strides "
+                f"{list(tensor.stride())}. It is updated where it lies: pass contiguous "
+                f"torch.float32 {list(parameter.value.shape)}."
+            )
 
 
 def check_average_images(images: Tensor, weights: Tensor, cameras: PinholeCameras) -> None:

@@ -7,6 +7,7 @@ same numbers and is only faster.
 from jaxtyping import Float
 from torch import Tensor
 
+from rgbavatar_ns.kernels.checks import check_vertices
 from rgbavatar_ns.kernels.functional import check_cameras
 from rgbavatar_ns.kernels.posing import Posing, PosingParameters
 from rgbavatar_ns.kernels.registry import (
@@ -85,4 +86,5 @@ def _num_cameras(
         )
     if len(weights) == 0:
         raise ValueError("weights: leading dimension 0. Pass at least 1: there is no empty batch.")
+    check_vertices(gaussians.triangle_vertices, vertices)
     return check_cameras(gaussians.position, cameras)

@@ -12,6 +12,7 @@ from rgbavatar_ns.avatar.training import TrainingBatch, make_optimizer
 from rgbavatar_ns.avatar.training.fused_step import FusedStep
 from rgbavatar_ns.avatar.training.losses import image_losses
 from rgbavatar_ns.drawing.compositing import composite, rgba_to_float
+from rgbavatar_ns.kernels import PinholeCameras, RenderedBatch, rasterize
 from rgbavatar_ns.kernels.constants import UNFILMED_RGBA
 from tests.kernels.scenes import to
 
@@ -50,6 +51,19 @@ def stir(avatar: Avatar, seed: int = 0) -> Avatar:
     """Move every parameter a little; colours stay between .3 and .7."""
     randomize(avatar, seed, AMOUNTS, most=2.0)
     return avatar
+
+
+@torch.no_grad()
+def spoil(avatar: Avatar, name: str, value: float) -> None:
+    """Put a number that is none into what four Gaussians hold."""
+    rows = getattr(avatar.blendshapes, name)
+    (rows[1] if name.startswith("basis") else rows)[5:9] = value
+
+
+@torch.no_grad()
+def drawn_by_the_reference(avatar: Avatar, theta: Tensor, cameras: PinholeCameras) -> RenderedBatch:
+    """Morphed, carried and activated by torch, then drawn by the readable backend."""
+    return rasterize(avatar.gaussians(theta), cameras, backend="reference")
 
 
 def far_batch(

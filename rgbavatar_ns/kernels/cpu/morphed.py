@@ -9,7 +9,12 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 from torch.autograd.graph import increment_version
 
-from rgbavatar_ns.kernels.checks import check_average_images, check_sight, check_target_images
+from rgbavatar_ns.kernels.checks import (
+    check_average_images,
+    check_moments,
+    check_sight,
+    check_target_images,
+)
 from rgbavatar_ns.kernels.cpu import (
     INSTRUCTION_SET_VARIABLE,
     _native,  # pyright: ignore[reportMissingModuleSource]
@@ -156,9 +161,9 @@ class CpuMorphedRenderer:
         """Take one step of Adam, or none, by the gradient of the last forward_loss."""
         if not self._has_gradient:
             raise ValueError("There is no gradient yet. Call forward_loss() first.")
-        self._has_gradient = False  # the parameters are others now
         names = _BASE + (_BASES if self._weights.shape[1] else ())
         groups = [] if parameters is None else [_arrays(parameters[name]) for name in names]
+        self._has_gradient = False  # the parameters are others now
         weights = torch.empty_like(self._weights)
         vertices = torch.empty_like(self._vertices) if with_vertices else None
         self._session.backward_adam(groups, weights, vertices)
@@ -168,7 +173,8 @@ class CpuMorphedRenderer:
 
 
 def _arrays(parameter: AdamParameter) -> tuple[Tensor, Tensor, Tensor, tuple[float, ...]]:
-    """A parameter as compiled code takes it."""
+    """A parameter as compiled code takes it, which would copy what does not fit, in silence."""
+    check_moments(parameter)
     return (
         parameter.value.detach(),
         parameter.first_moment.detach(),

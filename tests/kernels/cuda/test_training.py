@@ -1,6 +1,7 @@
 """Training by the emulated CUDA backend: steps, the order of threads and overflows."""
 
 import copy
+import math
 from dataclasses import fields, replace
 
 import pytest
@@ -14,14 +15,17 @@ from rgbavatar_ns.kernels.morphed import morphed_renderer
 from rgbavatar_ns.kernels.types import SIGHT_UNIT, MorphedGaussians
 from tests.avatar.fused_scene import (
     assert_unfilmed_adds_nothing,
+    drawn_by_the_reference,
     eager_step,
     far_batch,
     first_moments,
     fused_step,
     relative_differences,
+    spoil,
     stir,
     values_by_group,
 )
+from tests.avatar.small_head import front_camera, random_theta
 
 KINDS: tuple[FirstColorsKind, ...] = ("matted", "paper")
 
@@ -43,6 +47,18 @@ def test_parameters_after_some_steps(emulated, make_avatar):
 
 def test_what_nobody_filmed_adds_nothing(emulated, make_avatar):
     assert_unfilmed_adds_nothing(fused_step, lambda: stir(make_avatar()), 2)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("name", ["position", "log_scale", "opacity_logit", "basis_rotation_wxyz"])
+def test_what_is_not_finite_shows_as_the_reference_has_it(emulated, make_avatar, name, value):
+    avatar = stir(make_avatar())
+    theta, camera = random_theta(avatar.layout, 1), front_camera()
+    spoil(avatar, name, value)
+    renderer = avatar.renderer(theta, camera)
+    assert isinstance(renderer, DeviceRenderer)
+    exact = drawn_by_the_reference(avatar, theta, camera)
+    torch.testing.assert_close(renderer.draw().image, exact.image, atol=1e-4, rtol=0)
 
 
 def test_gradient_of_theta(emulated, make_avatar):

@@ -149,7 +149,8 @@ static void blend_chunk(const MorphedScene& scene, int begin, int count, BlendSc
   }
 }
 
-// Scales and opacities, which the images share.
+// Scales and opacities, which the images share. What holds no number has the opacity 0, so that it
+// is not drawn: it has no place in `exponential`, which is bounded.
 static void activate_chunk(const MorphedScene& scene, int begin, int count,
                            BlendScratch& scratch) {
   constexpr float kLog2E = 2.0f * C::kHalfLog2E;
@@ -164,7 +165,10 @@ static void activate_chunk(const MorphedScene& scene, int begin, int count,
     store(exponential(log_scale.y), scratch.scale[1] + first);
     store(exponential(log_scale.z), scratch.scale[2] + first);
     const Wide logit = load_column(scene.opacity_logit, begin + first, lanes);
-    store(1.0f / (1.0f + exponential(0.0f - logit)), scratch.opacity + first);
+    const WideMask numbers = (logit == logit) & (log_scale.x == log_scale.x) &
+                             (log_scale.y == log_scale.y) & (log_scale.z == log_scale.z);
+    store(select(numbers, 1.0f / (1.0f + exponential(0.0f - logit)), Wide(0.0f)),
+          scratch.opacity + first);
   }
 }
 

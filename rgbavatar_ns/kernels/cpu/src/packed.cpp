@@ -33,14 +33,15 @@ uint16_t half_of(float x) {
   return uint16_t(sign | (bits + 0xfffu + (bits >> 13 & 1) - (112u << 23)) >> 13);
 }
 
-// As the loops have it: within what a float holds, and what is no number counts as the least.
+// As the loops have it: within what a float holds.
 float exponential(float x) {
   const float p = x * 1.4426950408889634f;
   return std::exp2(p > -125.0f ? std::min(p, 125.0f) : -125.0f);
 }
 
 float opacity_of(const MorphedScene& scene, int64_t i) {
-  return 1.0f / (1.0f + exponential(-scene.opacity_logit[i]));
+  const float logit = scene.opacity_logit[i];
+  return logit == logit ? 1.0f / (1.0f + exponential(-logit)) : 0.0f;
 }
 
 }  // namespace
@@ -84,7 +85,9 @@ void PackedGaussians::choose(const MorphedScene& scene) {
     for (int kind = 0; kind < kMorphedKinds; ++kind)
       for (int c = 0; c < kMorphedWidth[kind]; ++c)
         all += scene.base[kind][int64_t(i) * kMorphedWidth[kind] + c] * 0.0f;
-    drawn_[i] = opacity_of(scene, i) >= kMinAlpha * 0.9999f && is_finite(all);
+    const float* size = scene.log_scale + int64_t(i) * 3;
+    const bool is_sized = size[0] == size[0] && size[1] == size[1] && size[2] == size[2];
+    drawn_[i] = opacity_of(scene, i) >= kMinAlpha * 0.9999f && is_finite(all) && is_sized;
   }
 }
 

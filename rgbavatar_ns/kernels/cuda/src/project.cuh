@@ -182,7 +182,7 @@ struct Carried {
   Vec3<float> color;
 };
 
-// exp2(-125) to exp2(125), as the CPU's.
+// exp2(-125) to exp2(125), as the CPU's; of what is no number the least.
 RGBAVATAR_FUNCTION float bounded_exp(float x) {
   return power_of_two(fminf(fmaxf(x * (2.0f * C::kHalfLog2E), -125.0f), 125.0f));
 }
@@ -210,7 +210,10 @@ RGBAVATAR_FUNCTION Carried carry(const Morphed& b, const Frame& frame, int image
   g.scale = scaled(Vec3<float>{bounded_exp(log_scale.x), bounded_exp(log_scale.y),
                                bounded_exp(log_scale.z)},
                    out.ratio);
-  g.opacity = reciprocal_of(1.0f + bounded_exp(-b.opacity_logit[gaussian]));
+  const float logit = b.opacity_logit[gaussian];
+  const bool numbers = logit == logit && log_scale.x == log_scale.x &&
+                       log_scale.y == log_scale.y && log_scale.z == log_scale.z;
+  g.opacity = numbers ? reciprocal_of(1.0f + bounded_exp(-logit)) : 0.0f;  // 0 is not drawn
   const Vec3<float> color = vec3_at(b.tangent_color, row);
   out.color = {color.x * kColorScale + 0.5f, color.y * kColorScale + 0.5f,
                color.z * kColorScale + 0.5f};
