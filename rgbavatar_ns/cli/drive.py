@@ -99,7 +99,7 @@ def run(
     from rgbavatar_ns.cli.keys import on_keys
     from rgbavatar_ns.driving.live_drive import LiveDrive
     from rgbavatar_ns.driving.live_transfer import LiveTransfer
-    from rgbavatar_ns.export.subject import load_subject
+    from rgbavatar_ns.export.subject import load_subject, told_lost
 
     shown = show.show or ("none" if show.out else "page")
     if shown == "none" and show.out is None:
@@ -107,6 +107,8 @@ def run(
     only_film = shown == "none" and show.out is not None and show.out.endswith(".mp4")
     real_time = not only_film if source.real_time is None else source.real_time
     subject = load_subject(run_folder, data, show.width, show.height)
+    if (lost := told_lost(subject)) is not None:
+        _tell(lost)
     performer = _performer(subject, source, real_time, show.beside)
     transfer = LiveTransfer(subject.avatar, subject.seen, performer.head, subject.camera, live)
     outputs: list[DriveOutput] = []

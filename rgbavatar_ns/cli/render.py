@@ -122,9 +122,11 @@ def run(
         )
     from rgbavatar_ns.avatar.loading import require_rgbavatar
     from rgbavatar_ns.export import read_texture, with_texture
-    from rgbavatar_ns.export.subject import load_subject
+    from rgbavatar_ns.export.subject import load_subject, told_lost
 
     subject = load_subject(run_folder, data, picture.width, picture.height)
+    if (lost := told_lost(subject)) is not None:
+        print(lost)
     if texture is not None:
         own = require_rgbavatar(subject.avatar, "A painted texture (--texture)")
         subject = replace(subject, avatar=with_texture(own, read_texture(texture)))

@@ -21,8 +21,8 @@ _MOST_BYTES = 1 << 18
 def dataset_folder(path: Path) -> Path:
     """The dataset folder itself, or the one that a run's config names.
 
-    Of an experiment's folder its newest run counts. Raises UserError where the path is none of
-    these.
+    Of an experiment's folder its newest run counts; of a run that a camera or a socket fed, what it
+    recorded itself. Raises UserError where the path is none of these.
     """
     folder = newest_run(path) if os.path.isdir(path) else path.parent
     if folder.name == "nerfstudio_models":
@@ -43,7 +43,8 @@ def dataset_folder(path: Path) -> Path:
             for parts in sorted(paths, key=lambda parts: not parts):
                 if all(isinstance(part, str) for part in parts):
                     return Path(*parts)
-            raise KeyError("data")
+            # Within the run's own folder, wherever that lies now.
+            return folder / Path(*manager["recorded"]).name
     except DamagedFileError as error:
         raise UserError(
             f"{config} does not say which dataset was trained on: {error}.",

@@ -1,5 +1,6 @@
 """An avatar with what a command needs to know about it: its film, what it saw, how it is seen."""
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -27,6 +28,8 @@ class Subject:
     seen: TrainingStatistics
     camera: PinholeCameras
     """The dataset's first camera, or one before the face, for pictures of the size asked for."""
+    lost: Path | None = None
+    """Where the run's own dataset was, if nothing is there."""
 
 
 def load_subject(
@@ -34,17 +37,33 @@ def load_subject(
 ) -> Subject:
     """Load an avatar from a run, a checkpoint or a bundle, with its dataset if it names one.
 
-    data: the dataset in place of the run's own. Raises UserError where the avatar or its dataset
-    cannot be read, and for a bundle that knows nothing about its training.
+    data: the dataset in place of the run's own, which may be gone where the avatar knows what it
+    saw. Raises UserError where the avatar or its dataset cannot be read, and for a bundle that
+    knows nothing about its training.
     """
     avatar, seen = load_avatar(run_folder), load_statistics(run_folder)
     folder = dataset_folder(run_folder) if data is None else data
     if data is None and folder == run_folder:
         if seen is None:
             raise UserError(f"{run_folder} does not name its dataset.", "Name it with --data.")
-        camera = front_camera(avatar, width or _SIDE_PX, height or _SIDE_PX)
-        return Subject(avatar, None, seen, camera)
+        return Subject(avatar, None, seen, _before_the_face(avatar, width, height))
+    if data is None and seen is not None and not os.path.exists(folder):
+        return Subject(avatar, None, seen, _before_the_face(avatar, width, height), lost=folder)
     dataset = load_dataset(folder)
     avatar.require_layout(dataset.layout, f"The dataset {folder}")
     camera = resized(dataset.cameras.select([0]), width or dataset.width, height or dataset.height)
     return Subject(avatar, dataset, seen or statistics_of(avatar, dataset), camera)
+
+
+def _before_the_face(avatar: AvatarMethod, width: int | None, height: int | None) -> PinholeCameras:
+    return front_camera(avatar, width or _SIDE_PX, height or _SIDE_PX)
+
+
+def told_lost(subject: Subject) -> str | None:
+    """What to tell of a film that is gone; None where it is not."""
+    if subject.lost is None:
+        return None
+    return (
+        f"note: the run's own data, {subject.lost}, is not there. It goes without its frames and "
+        "camera; --data names where they are now."
+    )

@@ -44,6 +44,19 @@ def test_the_folder_that_a_run_was_started_in_is_one(tmp_path):
     assert dataset_folder(tmp_path) == Path()
 
 
+def test_a_run_that_a_camera_fed_names_what_it_recorded(tmp_path):
+    """Its config holds the place of then; the run's folder may have been moved since."""
+    own = _CONFIG.replace(
+        "data: &id002 !!python/object/apply:pathlib.PosixPath\n- /\n- some\n- data", "data: null"
+    )
+    own = own.replace("*id002", "null").replace(
+        "!!python/object/apply:pathlib.PosixPath []", "null"
+    )
+    place = "    recorded: !!python/object/apply:pathlib.PosixPath [outputs, me, run, stream]\n"
+    (tmp_path / "config.yml").write_text(own + place)
+    assert dataset_folder(tmp_path) == tmp_path / "stream"
+
+
 def test_what_is_no_run_is_taken_for_a_dataset(tmp_path):
     assert dataset_folder(tmp_path) == tmp_path
 

@@ -18,6 +18,7 @@ from rgbavatar_ns import Avatar
 from rgbavatar_ns.avatar.storage.bundle import load_statistics
 from rgbavatar_ns.data import TrackedFrame, load_dataset
 from rgbavatar_ns.data.streams import StreamClient, StreamSubject
+from rgbavatar_ns.export import dataset_folder
 from rgbavatar_ns.kernels.constants import UNFILMED_RGBA
 from rgbavatar_ns.plugin.online.methods import rgbavatar_online_tiny
 from rgbavatar_ns.plugin.online.sources import SourceConfig
@@ -94,7 +95,8 @@ def test_frames_sent_over_a_socket_are_trained_on_and_kept(
     assert seen is not None
     assert seen.num_frames == STREAMED
     # The run is complete in itself: it holds the frames, and other commands find them.
-    recorded = load_dataset(trainer.base_dir / "stream")
+    assert dataset_folder(trainer.base_dir) == trainer.base_dir / "stream"
+    recorded = load_dataset(dataset_folder(trainer.base_dir))
     assert len(recorded) == STREAMED
     assert torch.equal(recorded.theta, load_dataset(tiny_data).theta[:STREAMED])
     assert np.array_equal(recorded.read_image(4), frames[4].image_rgba)  # marks and all
