@@ -12,7 +12,7 @@ STARTED := $(shell date +%s)
 PYTEST := PYTHONDONTWRITEBYTECODE= PATH="$(CURDIR)/$(BIN):$$PATH" \
 	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
 
-.PHONY: help setup demo test test-fast test-nightly lint format reference docs clean
+.PHONY: help setup demo test test-fast test-nightly lint style format reference docs clean
 
 help:  ## Show this list
 	@grep -hE '^[a-z-]+:.*##' Makefile | sed -E 's/:.*## /\t/' | expand -t 14
@@ -24,8 +24,10 @@ demo: setup  ## Make a head, train its avatar, evaluate, film it (VIDEO=me.mp4 f
 	@PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/rgbavatar demo --started-at $(STARTED) \
 		$(if $(VIDEO),--video "$(VIDEO)")
 
-test: setup lint  ## Linters, type check and the tests, but those of the night
-	@$(PYTEST) -m "not nightly"
+test: setup style  ## Linters, type check and the tests, but those of the night
+	@mkdir -p build; $(BIN)/basedpyright >build/types.txt 2>&1 & types=$$!; \
+		$(PYTEST) -m "not nightly"; tests=$$?; \
+		wait $$types || { cat build/types.txt; exit 1; }; exit $$tests
 
 test-fast: setup  ## The tests that take seconds
 	@$(PYTEST) -m "not (slow or nightly)"
@@ -35,11 +37,13 @@ test-nightly: setup  ## The tests of the night: sanitizers, a Ray cluster, many 
 	@$(PYTEST) -m "nightly and not browser"
 	@$(PYTEST) -n 0 -m "nightly and browser"
 
-lint: setup  ## Format check, lint, import rules, types
+lint: style  ## Format check, lint, import rules, types
+	@$(BIN)/basedpyright
+
+style: setup  ## The part of `lint` that takes seconds
 	@$(BIN)/ruff format --check .
 	@$(BIN)/ruff check .
 	@$(BIN)/lint-imports
-	@$(BIN)/basedpyright
 
 format: setup  ## Format the code and mend what the linter can
 	@$(BIN)/ruff check --fix .

@@ -7,6 +7,9 @@ import signal
 import pytest
 import torch
 
+from tests import checked_types
+
+checked_types.install()
 os.environ.setdefault("MPLBACKEND", "Agg")
 torch.set_num_threads(min(2, os.cpu_count() or 1))
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
