@@ -14,10 +14,10 @@ from tests.browser import IN_BROWSER
 from tests.plugin.run import finished_run
 from tests.plugin.viewer_page import Picture, ViewerPage, started, viewer_page
 
-_WIDTH, _HEIGHT = 900, 950
+_WIDTH, _HEIGHT = 640, 620
 _SECONDS_UNTIL_DRAWN = 120.0
 _LOOK_MS = 250
-_STAYS_S = 2.5
+_STAYS_S = 1.0
 _SHARP_PX = 512
 _SAME = 1e-4
 
@@ -33,7 +33,7 @@ pytestmark = IN_BROWSER
 def viewer(tiny_data: Path, tmp_path: Path) -> Iterator[ViewerPage]:
     """ns-viewer's page of a run whose bases have learned something."""
     avatar = AvatarConfig(uv_resolution=48, num_bases=3, scale_from_texel_spacing=True)
-    config = finished_run(tiny_data, tmp_path, avatar=avatar, max_num_iterations=150)
+    config = finished_run(tiny_data, tmp_path, avatar=avatar, max_num_iterations=80)
     command = ["ns-viewer", "--load-config", str(config)]
     with (
         started(command, tmp_path / "viewer.log") as address,
@@ -49,7 +49,7 @@ def _colored(picture: Picture) -> float:
 
 
 def _wait_for(viewer: ViewerPage, wanted: Callable[[Picture], bool]) -> Picture:
-    """The first picture that stays and for which `wanted` holds; it has to be sharp."""
+    """The first picture that stays, is sharp, and for which `wanted` holds."""
     deadline = time.monotonic() + _SECONDS_UNTIL_DRAWN
     picture, since = viewer.view(), time.monotonic()
     while (now := time.monotonic()) < deadline:
@@ -57,13 +57,16 @@ def _wait_for(viewer: ViewerPage, wanted: Callable[[Picture], bool]) -> Picture:
         before, picture = picture, viewer.view()
         if not np.array_equal(before, picture):
             since = time.monotonic()
-        elif now - since >= _STAYS_S and wanted(picture):
-            last = viewer.pictures()[-1]
-            assert max(last.width, last.height) >= _SHARP_PX
+        elif now - since >= _STAYS_S and wanted(picture) and _is_sharp(viewer):
             assert viewer.canvas_share > 0.99
             return picture
     Image.fromarray(picture).save(seen := Path(tempfile.gettempdir()) / "rgbavatar-viewer.png")
     raise AssertionError(f"the viewer did not show what was awaited, but {seen}")
+
+
+def _is_sharp(viewer: ViewerPage) -> bool:
+    last = viewer.pictures()[-1]
+    return max(last.width, last.height) >= _SHARP_PX
 
 
 def _wait_until_back(viewer: ViewerPage, first: Picture) -> None:
