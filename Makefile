@@ -6,6 +6,8 @@ WORKERS ?= 2
 BIN := .venv/bin
 # OpenMP's threads spin while they wait, which stalls everything where other programs run too.
 export OMP_WAIT_POLICY ?= PASSIVE
+# NumPy's matrices here are small, and its threads wait for each other beside another process.
+test test-fast test-nightly: export OPENBLAS_NUM_THREADS ?= 1
 STARTED := $(shell date +%s)
 
 # Bytecode is kept, also where Python is told to write none: of each run's start it is the half.

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from threadpoolctl import threadpool_info
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from rgbavatar_ns.drawing.compositing import unfilmed_pixels
 from rgbavatar_ns.errors import UserError
@@ -79,7 +79,8 @@ def test_every_frame_is_told_of_and_matrices_keep_to_one_thread(
         threads.update(pool["num_threads"] for pool in pools if pool["user_api"] == "blas")
 
     config = TrackConfig(image_size=64, key_frames=2, focal_px=500.0)
-    dataset = track_video(portrait[0], tmp_path / "set", config, watch)
+    with threadpool_limits(2, user_api="blas"):  # as at a user's, where the suite keeps to one
+        dataset = track_video(portrait[0], tmp_path / "set", config, watch)
 
     for stage in ("fit", "body", "place", "pictures"):
         assert told[stage] == set(range(min(told[stage]), len(dataset) + 1)), stage
