@@ -51,12 +51,19 @@ def test_a_program_may_set_what_it_likes(tmp_path: Path):
 
 
 @pytest.mark.slow
-def test_ns_viewer_listens_on_this_machine_alone_unless_told(tiny_data: Path, tmp_path: Path):
+@pytest.mark.parametrize(
+    ("flags", "address"),
+    [
+        ([], "127.0.0.1"),
+        pytest.param(["--viewer.websocket-host", "0.0.0.0"], "0.0.0.0", marks=pytest.mark.nightly),
+    ],
+)
+def test_ns_viewer_listens_on_this_machine_alone_unless_told(
+    tiny_data: Path, tmp_path: Path, flags: list[str], address: str
+):
     config = finished_run(tiny_data, tmp_path, max_num_iterations=2)
-    command = ["ns-viewer", "--load-config", str(config)]
-    assert _listening(command, tmp_path / "log") == {"127.0.0.1"}
-    command += ["--viewer.websocket-host", "0.0.0.0"]
-    assert _listening(command, tmp_path / "log") == {"0.0.0.0"}
+    command = ["ns-viewer", "--load-config", str(config), *flags]
+    assert _listening(command, tmp_path / "log") == {address}
 
 
 def _listening(command: list[str], log: Path) -> set[str]:

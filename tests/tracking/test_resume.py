@@ -236,7 +236,10 @@ def test_damage_of_what_was_kept_is_told_once_and_then_mended(
         track_video(clip, dst, CONFIG, _interrupting("pictures", 1))
     first = dst / WORK_FOLDER / "faces_00000000.npz"
     before = first.stat().st_mtime_ns
-    for kept, told in (("body_*", "body that was seen"), (f"faces_{BLOCK:08d}.npz", "faces that were")):
+    for kept, told in (
+        ("body_*", "body that was seen"),
+        (f"faces_{BLOCK:08d}.npz", "faces that were"),
+    ):
         damaged = next((dst / WORK_FOLDER).glob(kept))
         damaged.write_bytes(damaged.read_bytes()[:-40])
         with pytest.raises(UserError, match=rf"holds no {told}.*the same command again"):
