@@ -96,6 +96,8 @@ def test_the_lines_of_install_md_take_the_torch_that_setup_takes() -> None:
     assert f"torch=={torch[1]}" in (ROOT / "requirements/constraints.txt").read_text().split()
     lines = re.findall(r"^pip install .* torch torchvision==(\S+) && .*$", page, flags=re.M)
     assert len(lines) == 2
+    assert len(re.findall(r"^uv pip install .* torch torchvision==", page, flags=re.M)) == 2
+    lines = re.findall(r"torchvision==(\S+)", page)
     assert all(f"torchvision=={version}" in setup for version in lines)
     for path in re.findall(r"(?:-r|-c|--override) (requirements/\S+)", page):
         assert (ROOT / path).is_file()
