@@ -104,6 +104,8 @@ def gpu_build(version_of: Installed, program: Found) -> Iterator[Missing]:
     """A driver for NVIDIA GPUs beside a torch that cannot use it, or without CUDA's bindings."""
     import torch
 
+    from rgbavatar_ns.kernels.registry import install_cuda_bindings
+
     if program("nvidia-smi") is None:
         return
     if torch.version.cuda is None:
@@ -113,7 +115,7 @@ def gpu_build(version_of: Installed, program: Found) -> Iterator[Missing]:
             "install torch and torchvision by docs/install.md's line for GPUs",
         )
     elif version_of("cuda-bindings") is None:
-        line = f'pip install "cuda-bindings=={torch.version.cuda.split(".")[0]}.*"'
+        line = install_cuda_bindings(torch.version.cuda)
         yield Missing("training on the GPU", "no cuda-bindings", line)
 
 

@@ -250,10 +250,16 @@ _LOADERS = {
 }
 
 
-_REMEDIES = {
-    "cpu": "Reinstall the package with a C++17 compiler.",
-    "cuda": "Install what is missing: pip install cuda-bindings.",
-}
+def install_cuda_bindings(cuda: str | None) -> str:
+    """The line that brings bindings of a torch's CUDA ("13.0"), not of the newest there is."""
+    version = "" if cuda is None else f"=={cuda.split('.')[0]}.*"
+    return f'pip install "cuda-bindings{version}"'
+
+
+def _remedy(name: str) -> str:
+    if name == "cuda":
+        return f"Install what is missing: {install_cuda_bindings(torch.version.cuda)}"
+    return "Reinstall the package with a C++17 compiler."
 
 
 @functools.cache
@@ -306,7 +312,7 @@ def choose(name: str, device: torch.device, dtype: torch.dtype) -> Backend:
 def _warn_of_slow_choice(name: str, reason: str) -> None:
     warnings.warn(
         f"The rasterizer's {name} backend cannot be used ({reason}); rendering falls back to the "
-        f"reference, which is many times slower. {_REMEDIES[name]}",
+        f"reference, which is many times slower. {_remedy(name)}",
         RuntimeWarning,
         stacklevel=4,
     )

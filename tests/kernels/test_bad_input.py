@@ -128,6 +128,13 @@ def test_the_compiled_backend_says_what_it_takes(monkeypatch):
         rasterize(gaussians, cameras, backend="cpu")
 
 
+def test_bindings_are_asked_for_in_the_version_of_torchs_cuda(monkeypatch):
+    registry._warn_of_slow_choice.cache_clear()
+    monkeypatch.setattr(torch.version, "cuda", "12.6")
+    with pytest.warns(RuntimeWarning, match=r'pip install "cuda-bindings==12\.\*"'):
+        registry._warn_of_slow_choice("cuda", "No module named 'cuda'")
+
+
 def test_without_the_extension_the_reference_draws_and_the_reason_is_told(monkeypatch):
     load = registry._load
 
