@@ -186,12 +186,8 @@ def _performer(
 
         rate = options.source_frames_per_second
         return dataset_source(folder, rate, real_time, with_images)
-    try:
-        from rgbavatar_ns.tracking.performer import FilmedPerformer
-    except ImportError as error:
-        raise UserError(
-            f"A camera or a video needs mediapipe ({error}).", "make setup installs it."
-        ) from None
+    from rgbavatar_ns.tracking.performer import FilmedPerformer
+
     return FilmedPerformer(_camera(name), real_time, with_images)
 
 

@@ -21,7 +21,8 @@ from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
 from rgbavatar_ns.cli.drive import SourceOptions
 from rgbavatar_ns.cli.main import main
 from rgbavatar_ns.data import DatasetWriter, TrackedFrame
-from rgbavatar_ns.export import front_camera, pictures
+from rgbavatar_ns.export import front_camera, pictures, write_video
+from rgbavatar_ns.tracking.face.detector import INSTALL_MEDIAPIPE
 from tests.driving.packets import packet
 from tests.export.subject import avatar_of, lively_theta
 
@@ -169,6 +170,16 @@ def test_the_page_is_served_and_driven(avatar, performer, capsys):
 )
 def test_mistakes_are_told(avatar, refused, words, told):
     assert told in refused("drive", avatar, *words)
+
+
+def test_a_film_without_mediapipe_is_told_with_the_line_that_installs_it(
+    avatar, refused, tmp_path, monkeypatch
+):
+    film = tmp_path / "me.mp4"
+    write_video(film, [np.zeros((_SIZE, _SIZE, 3), np.uint8)] * 2)
+    monkeypatch.setitem(sys.modules, "mediapipe", None)
+    told = refused("drive", avatar, "--source", film, "--out", tmp_path / "f.mp4")
+    assert f"Install it without its second OpenCV: {INSTALL_MEDIAPIPE}" in " ".join(told.split())
 
 
 def test_a_damaged_dataset_is_told_as_one_and_is_no_folder_of_images(
