@@ -1,6 +1,6 @@
 """`rgbavatar render`: films and pictures of a trained avatar."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -28,6 +28,7 @@ _USED_BY: dict[str, tuple[Show, ...]] = {
     "transparent": (*_OF_A_SCENE, "bases"),
     **dict.fromkeys(("width", "height"), ("performance", "views", "orbit", "turntable", "bases")),
     "frames": ("comparison", *_OF_A_SCENE),
+    "frames-per-second": ("comparison", "performance", "views", "orbit", "turntable"),
     "camera-path": ("camera-path",),
     "gain": ("bases",),
     "arc": ("turntable",),
@@ -112,9 +113,8 @@ def run(
     if driver is not None and show == "comparison":
         show = "performance"
     given = {"driver": driver, "frames": frames, "hold": hold, "camera-path": camera_path}
-    given |= {"gain": gain, "arc": arc, **vars(picture)}
-    named = [name for name, value in given.items() if value is not None and value is not False]
-    require_used("show", show, _USED_BY, named)
+    smoothed = driver is not None and driving.smooth
+    _require_counting(show, given | {"gain": gain, "arc": arc}, picture, smoothed)
     if driver is None and driving != _DRIVING:
         raise UserError(
             "There are options of driving, but nobody drives the avatar.",
@@ -139,6 +139,21 @@ def run(
         scene, beside = _scene(subject, driver, frames, picture, driving)
         scene, drawn = _drawn(subject, scene, beside, show, hold, arc, camera_path, picture)
         _write(drawn, len(scene), output, show, kind, scene.frames_per_second)
+
+
+def _require_counting(
+    show: Show, options: Mapping[str, object], picture: PictureOptions, smoothed: bool
+) -> None:
+    """Raise UserError for an option that changes nothing of what is shown."""
+    given = {**options, **vars(picture)}
+    rate = given.pop("frames_per_second")
+    # Smoothing goes by the rate, whatever is written.
+    given["frames-per-second"] = None if smoothed else rate
+    named = [name for name, value in given.items() if value is not None and value is not False]
+    require_used("show", show, _USED_BY, named)
+    require_used("kind", picture.kind or "mp4", {"frames-per-second": ("mp4", "gif")}, named)
+    if picture.transparent and picture.background != _PICTURE.background:
+        raise UserError("--background changes nothing of --transparent.", "Leave one of them out.")
 
 
 def _compare(

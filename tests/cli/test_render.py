@@ -136,6 +136,8 @@ def test_another_person_drives_the_avatar_and_is_shown_beside(bundle, data, tmp_
     assert film[0].shape == (_SIZE, 2 * _SIZE, 3)
     told = capsys.readouterr().out
     assert "left out" not in told
+    still = ("--kind", "png", "--frames", 0, 1, "--frames-per-second", 50)
+    _render(bundle, tmp_path, *words, *still)  # The rate counts for smoothing.
     _render(bundle, tmp_path, *words[:-1])
     beyond = r"beyond the film in \d of 7 pictures: .*\(\d\)"
     assert re.search(beyond, capsys.readouterr().out), "what is not held back is told"
@@ -208,6 +210,17 @@ def test_mistakes_are_told(bundle, data, tmp_path, refused):
         ("--show views --arc 20", "--arc changes nothing of --show views"),
         ("--show orbit --gain 2", "take --show bases"),
         ("--show performance --smooth", "nobody drives the avatar"),
+        ("--show bases --frames-per-second 9", "--frames-per-second changes nothing of --show ba"),
+        ("--show camera-path --frames-per-second 9", "changes nothing of --show camera-path"),
+        ("--show views --kind png --frames-per-second 9", "changes nothing of --kind png"),
+        (
+            "--show views --kind png --transparent --background 0 0 0",
+            "--background changes nothing of --transparent",
+        ),
+        (
+            "--show bases --transparent --background 0 0 0",
+            "--background changes nothing of --transparent",
+        ),
     ):
         assert told in refused("render", bundle, tmp_path, "--data", data, *words.split())
 
