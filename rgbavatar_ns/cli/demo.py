@@ -68,6 +68,7 @@ def run(
     if video:
         if tiny and image_size is None:
             image_size = _TINY_PX
+        _require_same_tracking(stages, image_size, head_only, output)
         settings: dict[str, Any] = {"video": [_fingerprint(clip) for clip in video]}
         settings |= {"image_size": image_size, "head_only": head_only}
         data = stages.run(
@@ -133,6 +134,32 @@ def _require_same_people(stages: Stages, video: tuple[Path, ...], output: Path) 
         )
 
 
+def _require_same_tracking(
+    stages: Stages, image_size: int | None, head_only: bool, output: Path
+) -> None:
+    """Raise UserError where an avatar was trained on the film as other options track it."""
+    asked = (stages.known("track") or {}).get("asked")
+    given = _asked(image_size, head_only)
+    if asked is None or asked == given or stages.known("train") is None:
+        return
+    raise UserError(
+        f"{output} has an avatar of this film, and its data, tracked with other options "
+        f"({_in_words(asked)}; now {_in_words(given)}).",
+        "Name another folder (--output), or replace that avatar (--fresh).",
+    )
+
+
+def _asked(image_size: int | None, head_only: bool) -> Result:
+    """The options of tracking, to be known again."""
+    return {"image_size": image_size, "head_only": head_only}
+
+
+def _in_words(asked: Result) -> str:
+    size = asked["image_size"]
+    pixels = "the film's own pixels" if size is None else f"{size} pixels"
+    return f"{pixels}, the head alone" if asked["head_only"] else pixels
+
+
 def _fingerprint(path: Path) -> tuple[str, int, float]:
     facts = path.stat()
     return str(path.resolve()), facts.st_size, facts.st_mtime
@@ -162,7 +189,13 @@ def _track(
     with stage_bars("frames") as update:
         dataset = track_video(video, destination, config, progress=update)
     films = [str(clip.resolve()) for clip in video]
-    return {"data": str(destination), "image_size": dataset.width, "films": films}
+    asked = _asked(image_size, head_only)
+    return {
+        "data": str(destination),
+        "image_size": dataset.width,
+        "films": films,
+        "asked": asked,
+    }
 
 
 def _train(

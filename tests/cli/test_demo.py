@@ -2,6 +2,7 @@ import json
 import shlex
 from importlib.metadata import entry_points
 from pathlib import Path
+from types import SimpleNamespace
 
 import av
 import cv2
@@ -123,6 +124,39 @@ def test_a_video_and_the_demo_subject_do_not_replace_one_another(
     result = {"data": "data", "films": ["you.mp4"]}
     write_json(tmp_path / "x/stages.json", {stage: {"key": "", "seconds": 1.0, "result": result}})
     assert f"has the avatar of {who}." in refused("demo", "--output", "x", *options)
+
+
+def test_an_avatars_data_is_not_replaced_by_the_same_film_tracked_otherwise(
+    tmp_path, monkeypatch, refused
+):
+    """`make demo VIDEO=me.mp4`, then a tiny one: the first one's frames were gone."""
+    monkeypatch.chdir(tmp_path)
+    clip = tmp_path / "me.mp4"
+    clip.touch()
+    # What the tracker itself says is another matter.
+    film = SimpleNamespace(width=512)
+    monkeypatch.setattr("rgbavatar_ns.tracking.track_video", lambda *given, **named: film)
+    facts = {"train_seconds": 1.0, "images_per_second": 1.0}
+    trained = []
+
+    def train(method, *given):
+        trained.append(method)
+        return facts
+
+    scores = {"psnr": 30.0, "psnr_head": 30.0, "ssim": 0.9}
+    monkeypatch.setattr(demo.commands, "train", train)
+    monkeypatch.setattr(demo.commands, "evaluate", lambda *given: scores)
+    shown = {"frames": 1, "video": "film", "picture": "picture"}
+    monkeypatch.setattr(demo, "_film", lambda *given: shown)
+    main(["demo", "--video", "me.mp4"])
+    told = refused("demo", "--video", "me.mp4", "--tiny")
+    assert "has an avatar of this film" in told
+    assert "--output" in told
+    assert "the head alone" in refused("demo", "--video", "me.mp4", "--head-only")
+    main(["demo", "--video", "me.mp4", "--steps", "9"])  # on the same data
+    main(["demo", "--video", "me.mp4", "--tiny", "--output", "outputs/me-tiny"])
+    main(["demo", "--video", "me.mp4", "--tiny", "--fresh"])
+    assert trained == ["rgbavatar-quick"] * 2 + ["rgbavatar-tiny"] * 2
 
 
 @pytest.mark.parametrize(
