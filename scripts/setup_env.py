@@ -10,6 +10,7 @@ import hashlib
 import json
 import os
 import platform
+import re
 import shutil
 import subprocess
 import sys
@@ -38,7 +39,13 @@ def say(message: str) -> None:
 def run(*command: str | Path, quiet: bool = False) -> bool:
     """Run a command; True if it succeeded. `quiet` hides what it prints."""
     output = subprocess.DEVNULL if quiet else None
-    return subprocess.run([str(c) for c in command], stdout=output, stderr=output).returncode == 0
+    try:
+        done = subprocess.run([str(c) for c in command], stdout=output, stderr=output)
+    except OSError as error:  # no such program, or a link to one that went
+        if not quiet:
+            say(str(error))
+        return False
+    return done.returncode == 0
 
 
 def must(why: str, *command: str | Path) -> None:
@@ -94,6 +101,22 @@ def make_venv() -> None:
 def has_nvidia_gpu() -> bool:
     """Whether a driver answers: then torch's CUDA build is the right one."""
     return shutil.which("nvidia-smi") is not None and run("nvidia-smi", "-L", quiet=True)
+
+
+def tell_what_stays() -> None:
+    """Say where the environment is not what a new one would be; it is changed by hand alone."""
+    anew = "`rm -rf .venv && make setup` makes it anew"
+    made_by = re.search(r"^version = (\d+\.\d+)", _text(VENV / "pyvenv.cfg"), flags=re.M)
+    asked = "{}.{}".format(*sys.version_info)
+    # Make hands PYTHON on where somebody named it; its own default may be any Python.
+    if made_by and made_by[1] != asked and "PYTHON" in os.environ:
+        say(f"the environment stays one of Python {made_by[1]}, not of {asked}: {anew}")
+    if any(VENV.glob("lib/python*/site-packages/torch-*+cpu.dist-info")) and has_nvidia_gpu():
+        say(f"torch stays the CPU build though an NVIDIA driver answers: {anew}, with CUDA's")
+
+
+def _text(path: Path) -> str:
+    return path.read_text() if path.is_file() else ""
 
 
 def installed_torch() -> str:
@@ -168,11 +191,11 @@ def link_ffmpeg() -> None:
 
 
 def digest(*patterns: str) -> str:
-    """A hash of the files that a step depends on."""
+    """A hash of the files that a step depends on; bytecode, which every run writes, is none."""
     total = hashlib.sha256()
     for pattern in patterns:
         for path in sorted(ROOT.glob(pattern)):
-            if path.is_file():
+            if path.is_file() and path.suffix != ".pyc":
                 total.update(path.read_bytes())
     return total.hexdigest()[:16]
 
@@ -220,13 +243,14 @@ def main() -> None:
         "project": digest("pyproject.toml", "CMakeLists.txt", "rgbavatar_ns/kernels/**/*.[ch]*")
         + module_names(),
     }
-    done = read_stamp()
-    if VENV.exists() and done == wanted:
+    if VENV.exists():
+        tell_what_stays()
+    if PYTHON.exists() and read_stamp() == wanted:
         return
     if shutil.which("c++") is None and shutil.which("g++") is None:
         sys.exit("[setup] no C++ compiler found. Install one (Debian: apt-get install g++).")
     make_venv()
-    if done.get("packages") != wanted["packages"]:
+    if read_stamp().get("packages") != wanted["packages"]:  # a new environment has no stamp
         if not run(PYTHON, "-m", "uv", "--version", quiet=True):
             must("installing uv", PYTHON, "-m", "pip", "-q", "install", "uv==0.13.8")
         install_torch()
