@@ -36,8 +36,8 @@ test-fast: setup  ## The tests that take seconds
 
 test-nightly: setup  ## The tests of the night: sanitizers, a Ray cluster, many trainings, formats
 	@$(BIN)/python -m uv pip install -q --python $(BIN)/python -c requirements/constraints.txt ray
-	@$(PYTEST) -m "nightly and not browser"
-	@$(PYTEST) -n 0 -m "nightly and browser"
+	@status=0; $(PYTEST) -m "nightly and not browser" || status=$$?; \
+		$(PYTEST) -n 0 -m "nightly and browser" || status=$$?; exit $$status
 
 lint: style  ## Format check, lint, import rules, types
 	@$(BIN)/basedpyright
