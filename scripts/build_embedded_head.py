@@ -35,6 +35,7 @@ from makehuman_source import (
     read_target,
 )
 
+from rgbavatar_ns.files import atomic_write
 from rgbavatar_ns.head.arrays import BODY_IDENTITY, NECK_SHIFTS
 
 ASSETS = Path(__file__).resolve().parent.parent / "rgbavatar_ns/head/assets"
@@ -266,13 +267,14 @@ def bust_of(
 
 def main() -> None:
     """Write the assets and their licence."""
-    ASSETS.mkdir(parents=True, exist_ok=True)
     for name, arrays in zip(("makehuman_head.npz", "makehuman_bust.npz"), build()):
         target = ASSETS / name
-        np.savez_compressed(target, **arrays)  # pyright: ignore[reportArgumentType]
+        with atomic_write(target) as partial:
+            np.savez_compressed(partial, **arrays)  # pyright: ignore[reportArgumentType]
         print(f"{name}: {len(arrays['v_template'])} vertices, {len(arrays['faces'])} triangles,")
         print(f"{target.stat().st_size / 1e6:.2f} MB")
-    (ASSETS / "LICENSE").write_text(LICENCE)
+    with atomic_write(ASSETS / "LICENSE") as partial:
+        partial.write_text(LICENCE)
 
 
 if __name__ == "__main__":

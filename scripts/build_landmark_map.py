@@ -23,6 +23,7 @@ from scipy.optimize import linear_sum_assignment
 from scipy.spatial import KDTree
 from trimesh.triangles import closest_point
 
+from rgbavatar_ns.files import atomic_write
 from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.head.landmarks import LANDMARK_FILE
 
@@ -49,7 +50,7 @@ class Look:
 
 
 def looks(num_identity: int) -> list[Look]:
-    """The average head and a few random ones from nine sides, mouth shut and open in turn."""
+    """The average head and a few random ones from seven sides, mouth shut and open in turn."""
     generator = np.random.default_rng(0)
     result = []
     for person in range(4):
@@ -324,7 +325,8 @@ def main() -> None:
     arguments = parser.parse_args()
     painter = Painter(HeadModel.embedded())
     arrays = build(painter)
-    np.savez_compressed(LANDMARK_FILE, **arrays)  # pyright: ignore[reportArgumentType]
+    with atomic_write(LANDMARK_FILE) as partial:
+        np.savez_compressed(partial, **arrays)  # pyright: ignore[reportArgumentType]
     print(f"{LANDMARK_FILE.name}: {LANDMARK_FILE.stat().st_size / 1e3:.0f} kB")
     if arguments.picture:
         overlay(painter, arrays, arguments.picture)

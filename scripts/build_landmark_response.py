@@ -22,6 +22,7 @@ import numpy as np
 import torch
 from scipy.spatial import KDTree
 
+from rgbavatar_ns.files import atomic_write
 from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.head.landmarks import RESPONSE_FILE, UNSURE_M, facemesh_landmarks
 from rgbavatar_ns.synthetic import DemoConfig
@@ -295,7 +296,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--people", type=int, default=300)
     arrays = build(parser.parse_args().people)
-    np.savez_compressed(RESPONSE_FILE, **arrays)  # pyright: ignore[reportArgumentType]
+    with atomic_write(RESPONSE_FILE) as partial:
+        np.savez_compressed(partial, **arrays)  # pyright: ignore[reportArgumentType]
     print(f"{RESPONSE_FILE.name}: {RESPONSE_FILE.stat().st_size / 1e3:.0f} kB")
 
 

@@ -38,8 +38,8 @@ JOINT_VERTICES = 80
 class HeadMesh:
     """The head in triangles; each vertex is a weighted mean of MakeHuman's vertices.
 
-    `source` [V, S] carries offsets over; `charts` names each triangle's chart of MakeHuman's own
-    texture layout, whose coordinates (`guide_uv`, `guide_faces`) orient ours.
+    `source` [V, S] carries offsets over; `face_parts` names each triangle's part; MakeHuman's own
+    texture coordinates (`guide_uv`, `guide_faces`) orient ours.
     """
 
     vertices: np.ndarray
@@ -169,7 +169,6 @@ class Hinge:
 
     angle: float
     pivot: np.ndarray
-    residual_m: float
 
     def offsets(self, points: np.ndarray) -> np.ndarray:
         """How the full opening moves points that follow the jaw wholly."""
@@ -188,9 +187,7 @@ def jaw_hinge(mesh: HeadMesh, jaw_open: np.ndarray) -> Hinge:
     c, s = np.cos(angle), np.sin(angle)
     turn = np.array([[c, -s], [s, c]])
     pivot = np.linalg.solve(np.eye(2) - turn, after.mean(0) - turn @ before.mean(0))
-    hinge = Hinge(float(angle), np.array([0, *pivot]), 0.0)
-    error = hinge.offsets(mesh.vertices[teeth]) - jaw_open[teeth]
-    return replace(hinge, residual_m=float(np.linalg.norm(error, axis=1).mean()))
+    return Hinge(float(angle), np.array([0, *pivot]))
 
 
 def skinning_weights(
