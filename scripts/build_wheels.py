@@ -9,6 +9,7 @@ wheel that asks for newer symbols; try_wheel.py draws by each instruction set th
 from __future__ import annotations
 
 import argparse
+import hashlib
 import os
 import platform
 import shutil
@@ -34,10 +35,12 @@ def run(why: str, *command: str | Path, **environment: str) -> None:
 
 
 def new_venv(python: str, folder: Path, *packages: str) -> Path:
-    """A virtual environment's interpreter, with packages; one that is there is kept."""
-    interpreter = folder / "bin" / "python"
-    if not interpreter.exists():
+    """A virtual environment's interpreter, with packages; one that was made whole is kept."""
+    interpreter, whole = folder / "bin" / "python", folder / "whole"
+    if not (whole.exists() and interpreter.exists()):
+        shutil.rmtree(folder, ignore_errors=True)
         run(f"making an environment of {python}", python, "-m", "venv", folder)
+        whole.touch()
     run(f"installing {', '.join(packages)}", interpreter, "-m", "pip", "-q", "install", *packages)
     return interpreter
 
@@ -58,8 +61,9 @@ def zig_commands(interpreter: Path) -> dict[str, Path]:
 
 def build(python: str, tools: Path, zig: dict[str, Path], output: Path) -> None:
     """One Python's wheel, built, checked against the platform's symbols, and tried."""
-    interpreter = new_venv(python, WORK / Path(python).name, "pip>=24", "numpy<2")
-    raw = WORK / f"raw-{Path(python).name}"
+    name = environment_name(python)
+    interpreter = new_venv(python, WORK / name, "pip>=24", "numpy<2")
+    raw = WORK / f"raw-{name}"
     shutil.rmtree(raw, ignore_errors=True)
     run(
         f"compiling for {python}: minutes",
@@ -96,10 +100,20 @@ def main(arguments: Sequence[str] | None = None) -> None:
     pythons = options.python or [name for name in PYTHONS if runs(name)]
     if not pythons:
         sys.exit(f"[wheels] none of {', '.join(PYTHONS)} is on the PATH: name one by --python.")
+    for python in pythons:
+        if not runs(python):
+            sys.exit(f"[wheels] --python {python} does not start: name a Python that is installed.")
     tools = new_venv(sys.executable, WORK / "tools", *TOOLS)
     zig = zig_commands(tools)
     for python in pythons:
         build(python, tools, zig, options.output.absolute())
+
+
+def environment_name(python: str) -> str:
+    """One for each interpreter and version: several have the same file name."""
+    told = "import sys; print(sys.executable, sys.version)"
+    identity = subprocess.check_output([python, "-c", told])
+    return f"{Path(python).name}-{hashlib.sha256(identity).hexdigest()[:8]}"
 
 
 def runs(program: str) -> bool:

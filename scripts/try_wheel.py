@@ -6,6 +6,7 @@ that all sets must draw alike. torch is not needed, so that a wheel is tried whe
 
 from __future__ import annotations
 
+import argparse
 import importlib.util
 import sys
 import tempfile
@@ -20,10 +21,16 @@ WIDTH, HEIGHT, FOCAL_PX = 64, 48, 60.0
 
 
 def load_native(wheel: Path, folder: Path) -> ModuleType:
-    """The compiled module out of the wheel, imported from `folder`."""
-    with zipfile.ZipFile(wheel) as archive:
-        name = next(name for name in archive.namelist() if "/_native." in name and ".so" in name)
-        path = archive.extract(name, folder)
+    """The compiled module out of the wheel, imported from `folder`; exits where it holds none."""
+    try:
+        with zipfile.ZipFile(wheel) as archive:
+            names = [n for n in archive.namelist() if "/_native." in n and ".so" in n]
+            path = archive.extract(names[0], folder)
+    except (OSError, zipfile.BadZipFile, IndexError) as error:
+        sys.exit(
+            f"{wheel} is no wheel with a compiled rasterizer ({error}): name one that "
+            "scripts/build_wheels.py made."
+        )
     spec = importlib.util.spec_from_file_location("_native", path)
     assert spec is not None
     assert spec.loader is not None
@@ -59,7 +66,9 @@ def draw(native: ModuleType, instruction_set: str, means: Any, scale_m: float, t
 
 def main() -> None:
     """Try the wheel named on the command line; ends with an assertion where it draws wrongly."""
-    wheel = Path(sys.argv[1])
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("wheel", type=Path)
+    wheel: Path = parser.parse_args().wheel
     many = np.random.default_rng(1).uniform((-1, -1, 2), (1, 1, 4), (100, 3))
     with tempfile.TemporaryDirectory() as folder:
         native = load_native(wheel, Path(folder))
