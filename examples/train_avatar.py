@@ -1,7 +1,7 @@
 """Train an avatar on a tracked dataset, without nerfstudio: `train_avatar.py DATA OUT`.
 
 DATA is a folder that `rgbavatar track`, `rgbavatar demo-data` or another system wrote. OUT gets the
-avatar (a bundle for `Avatar.load`) and a picture: held-out frames above, the avatar below.
+avatar (a bundle for `Avatar.load`) and held-out frames as film and picture: truth, avatar, error.
 """
 
 import argparse
@@ -15,6 +15,7 @@ from rgbavatar_ns.avatar import AvatarConfig
 from rgbavatar_ns.avatar.metrics import evaluate_images
 from rgbavatar_ns.avatar.training import FitHooks, TrainingBatch, TrainingStep, fit
 from rgbavatar_ns.data import ImageCache, OfflineOrder, load_dataset
+from rgbavatar_ns.errors import told_without_traceback
 from rgbavatar_ns.export import statistics_of, write_comparison
 from rgbavatar_ns.head import HeadModel
 
@@ -41,9 +42,11 @@ def main() -> None:
     parser.add_argument("--batch-size", type=int, default=10)
     parser.add_argument("--uv-resolution", type=int, default=128, help="256 is the paper's size")
     options = parser.parse_args()
-
+    if options.batch_size < 1:
+        parser.error("--batch-size is how many images a step sees: give 1 or more.")
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     data = load_dataset(options.data)
+    options.out.mkdir(parents=True, exist_ok=True)
     config = AvatarConfig(uv_resolution=options.uv_resolution, scale_from_texel_spacing=True)
     avatar = Avatar(HeadModel(data.arrays), data.identity, config).to(device)
     images = ImageCache(data, budget_bytes=1 << 30)
@@ -59,8 +62,6 @@ def main() -> None:
     print(f"Steps are {step.kind}: {step.reason}.")
     with Progress() as progress:
         fit(step, batch_at, range(options.steps), Shown(progress, options.steps))
-
-    options.out.mkdir(parents=True, exist_ok=True)
     avatar.save(options.out / "trained.avatar", statistics=statistics_of(avatar, data))
     print(f"the avatar is in {options.out}")
     scores = []
@@ -75,4 +76,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with told_without_traceback("train_avatar.py"):
+        main()

@@ -1,7 +1,9 @@
 """The error that a user can cause: it names the cause and the remedy."""
 
 import errno
-from collections.abc import Collection
+import sys
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
 from itertools import islice
 
 
@@ -28,6 +30,22 @@ def told_as_user_error(error: OSError) -> UserError | None:
         return None
     place = f" {error.filename}" if error.filename else ""
     return UserError(f"The system refuses{place}: {error.strerror}.", remedy)
+
+
+@contextmanager
+def told_without_traceback(command: str) -> Iterator[None]:
+    """Print what a user can mend as `command: cause remedy`, and exit with code 1.
+
+    So is what the system refuses (`told_as_user_error`).
+    """
+    try:
+        yield
+    except (UserError, OSError) as error:
+        told = told_as_user_error(error) if isinstance(error, OSError) else error
+        if told is None:
+            raise
+        print(f"{command}: {told}", file=sys.stderr)
+        sys.exit(1)
 
 
 _FREE_SPACE = "Free some space, or name another place."

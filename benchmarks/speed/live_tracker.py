@@ -13,19 +13,21 @@ from typing import Annotated
 import cv2
 import tyro
 
+from rgbavatar_ns.errors import told_without_traceback
+from rgbavatar_ns.options import CheckedOptions, Count, Pixels
 from rgbavatar_ns.tracking import TrackConfig
 from rgbavatar_ns.tracking.input.video import FrameSource
 from rgbavatar_ns.tracking.live import LiveTracker
 
 
 @dataclass
-class Options:
+class Options(CheckedOptions):
     """What is tracked."""
 
     video: Annotated[Path, tyro.conf.Positional]
-    height_px: int = 512
+    height_px: Pixels = 512
     """Height that frames are brought to, and side of the pictures cut out."""
-    frames: int = 75
+    frames: Count = 75
 
 
 def main(options: Options) -> None:
@@ -48,4 +50,5 @@ def main(options: Options) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Options, description=__doc__))
+    with told_without_traceback("live_tracker.py"):
+        main(tyro.cli(Options, description=__doc__))

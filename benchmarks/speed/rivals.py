@@ -39,7 +39,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--size", type=int, default=256, help="pixels of the pictures")
     parser.add_argument("--steps", type=int, default=10)
-    parser.add_argument("--methods", nargs="+", default=[n for n in METHODS if n != Avatar.method])
+    rivals = [name for name in METHODS if name != Avatar.method]
+    parser.add_argument("--methods", nargs="+", choices=rivals, default=rivals)
     parser.add_argument("--all-harmonics", action="store_true")
     given = parser.parse_args()
     torch.set_num_threads(1)

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from types import FrameType
 from typing import Any
 
-from rgbavatar_ns.errors import UserError, told_as_user_error
+from rgbavatar_ns.errors import told_without_traceback
 from rgbavatar_ns.options import check_options
 
 COMMANDS = {
@@ -79,23 +79,12 @@ def _run(arguments: Sequence[str] | None) -> None:
     try:
         import tyro
 
-        module = importlib.import_module(f"rgbavatar_ns.cli.{module_name(name)}")
-        tyro.cli(_checked(module.run), prog=f"rgbavatar {name}", args=arguments[1:])
-    except UserError as error:
-        _tell(name, error)
-    except OSError as error:
-        told = told_as_user_error(error)
-        if told is None:
-            raise
-        _tell(name, told)
+        with told_without_traceback(f"rgbavatar {name}"):
+            module = importlib.import_module(f"rgbavatar_ns.cli.{module_name(name)}")
+            tyro.cli(_checked(module.run), prog=f"rgbavatar {name}", args=arguments[1:])
     except KeyboardInterrupt:
         print(f"rgbavatar {name}: interrupted; run it again to go on.", file=sys.stderr)
         sys.exit(130)
-
-
-def _tell(name: str, error: UserError) -> None:
-    print(f"rgbavatar {name}: {error}", file=sys.stderr)
-    sys.exit(1)
 
 
 def _terminate(number: int, _frame: FrameType | None) -> None:

@@ -49,5 +49,35 @@ def test_without_held_out_frames_the_avatar_is_kept_all_the_same(
     assert Avatar.load(tmp_path / "out" / "trained.avatar").num_gaussians > 50
 
 
+@pytest.mark.parametrize(
+    ("data", "out", "more", "told"),
+    [
+        ("data", "out", ("--batch-size", "0"), "--batch-size"),
+        ("nowhere", "out", (), "nowhere"),
+        ("data", "a_file", (), "a_file"),
+        ("data", "out", ("--uv-resolution", "0"), "uv-resolution"),
+    ],
+)
+def test_mistakes_are_told_before_anything_is_trained(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    data: str,
+    out: str,
+    more: tuple[str, ...],
+    told: str,
+):
+    tiny_dataset(tmp_path / "data")
+    (tmp_path / "a_file").touch()
+    words = [str(SCRIPT), str(tmp_path / data), str(tmp_path / out), *more]
+    monkeypatch.setattr(sys, "argv", words)
+    with pytest.raises(SystemExit) as ended:
+        runpy.run_path(str(SCRIPT), run_name="__main__")
+    assert ended.value.code in (1, 2)
+    printed = capsys.readouterr()
+    assert told in printed.err
+    assert "Steps are" not in printed.out
+
+
 def test_it_needs_no_nerfstudio():
     assert "nerfstudio" not in SCRIPT.read_text().split('"""', 2)[2]

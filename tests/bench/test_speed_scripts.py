@@ -1,0 +1,92 @@
+"""The scripts of benchmarks/speed: what they refuse, and what they count."""
+
+import importlib.util
+import runpy
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+SPEED = Path(__file__).parents[2] / "benchmarks" / "speed"
+
+
+@pytest.fixture
+def ended(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> Callable[..., tuple[object, str]]:
+    """Runs a script that refuses; its exit code and what it tells."""
+
+    def run(name: str, *words: object) -> tuple[object, str]:
+        monkeypatch.setattr(sys, "argv", [name, *map(str, words)])
+        monkeypatch.syspath_prepend(str(SPEED))
+        with pytest.raises(SystemExit) as ended:
+            runpy.run_path(str(SPEED / name), run_name="__main__")
+        return ended.value.code, capsys.readouterr().err
+
+    return run
+
+
+@pytest.mark.parametrize("name", ["live_tracker.py", "tracking.py"])
+def test_a_film_that_is_not_there_is_told(ended, tmp_path, name):
+    pytest.importorskip("mediapipe")
+    code, told = ended(name, tmp_path / "none.mp4")
+    assert code == 1
+    assert told.startswith(f"{name}: ")
+    assert "none.mp4" in told
+
+
+def test_ranges_of_options_are_told(ended, tmp_path):
+    code, told = ended("live_tracker.py", tmp_path / "none.mp4", "--height-px", 0)
+    assert (code, "--height-px" in told) == (1, True)
+
+
+def test_a_method_that_is_no_rival_is_told_with_those_that_are(ended):
+    for name in ("foo", "rgbavatar"):
+        code, told = ended("rivals.py", "--methods", name)
+        assert code == 2
+        assert "gaussianavatars" in told
+
+
+@pytest.fixture
+def script(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], ModuleType]:
+    """Imports a script, beside the modules of its folder."""
+
+    def load(name: str) -> ModuleType:
+        monkeypatch.syspath_prepend(str(SPEED))
+        spec = importlib.util.spec_from_file_location(f"speed_{name}", SPEED / f"{name}.py")
+        assert spec is not None
+        assert spec.loader is not None
+        module = importlib.util.module_from_spec(spec)
+        monkeypatch.setitem(sys.modules, spec.name, module)
+        spec.loader.exec_module(module)
+        return module
+
+    return load
+
+
+def test_both_columns_of_a_tracking_begin_when_mediapipe_is_there(
+    script, tmp_path, monkeypatch, capsys
+):
+    tracking, order = script("tracking"), []
+
+    class Noted(tracking.StageTimes):
+        def __post_init__(self) -> None:
+            order.append("times")
+
+    def track_video(video: Path, dataset: Path, config: object, told: Callable[..., None]) -> None:
+        order.append("track")
+        told("faces", 2, 2)
+        dataset.mkdir()
+        (dataset / "tracking.json").write_text('{"frames_read": 2}')
+
+    monkeypatch.setattr(tracking, "load_mediapipe", lambda: order.append("load"))
+    monkeypatch.setattr(tracking, "StageTimes", dataclass(Noted))
+    monkeypatch.setattr(tracking, "track_video", track_video)
+    monkeypatch.setattr(sys, "argv", ["tracking.py", str(tmp_path / "film.mp4")])
+    tracking.main()
+    assert order == ["load", "times", "track"]
+    rows = [line.split()[0] for line in capsys.readouterr().out.splitlines()]
+    assert rows == ["stage", "faces", "after", "all"]
