@@ -5,11 +5,11 @@
 The videos are played to and fro into one film of 25 frames a second, which is then performed in
 real time: picture, face, head, transfer, drawing at 512 x 512. Printed each half minute, and at
 the end: pictures a second, median and 95 % latency from the moment a frame was due to its drawn
-picture, what was skipped, the memory after a minute and at the end. First, with the frames of the
-run itself, what transfer and drawing take alone.
+picture, all of the last two minutes; of the whole drive what was drawn and skipped, the memory
+after a minute, at the end and at most. First, with the frames of the run itself, what transfer and
+drawing take alone.
 """
 
-import resource
 import tempfile
 import time
 from collections.abc import Iterator
@@ -23,6 +23,7 @@ import tyro
 from rgbavatar_ns.driving.live_drive import DrivenFrame, LiveDrive
 from rgbavatar_ns.driving.live_transfer import LiveTransfer
 from rgbavatar_ns.driving.source import PerformanceFrame, PerformerHead
+from rgbavatar_ns.errors import told_without_traceback
 from rgbavatar_ns.export import FilmWriter
 from rgbavatar_ns.export.live_pictures import PictureOutput
 from rgbavatar_ns.export.subject import Subject, load_subject
@@ -74,9 +75,10 @@ def main(
         drive.run()
         cpu_s, wall_s = time.process_time() - cpu_s, time.monotonic() - wall_s
     settled = [mb for at_s, mb in memory_mb if at_s > min(60.0, 30.0 * minutes)] or [0.0]
-    print(f"{drive.shown} pictures: {output.latencies}")
+    most_mb = max((mb for _, mb in memory_mb), default=0.0)
+    print(f"{drive.shown} pictures; over the last two minutes {output.latencies}")
     print(f"left out: {dict(performer.counts)}, tracked but not drawn {drive.not_drawn}")
-    print(f"memory {settled[0]:.0f} -> {settled[-1]:.0f} MB, most {_most_mb():.0f} MB")
+    print(f"memory {settled[0]:.0f} -> {settled[-1]:.0f} MB, most {most_mb:.0f} MB")
     print(f"{cpu_s / wall_s:.2f} cores busy")
 
 
@@ -103,13 +105,10 @@ def _to_and_fro(videos: list[Path], count: int) -> Iterator[np.ndarray]:
     """Frames of the videos forwards and backwards, without a jump, so many."""
     images = [frame.image_rgb for video in videos for frame in FrameSource.open(video)]
     for k in range(count):
-        at = k % (2 * len(images) - 2)
+        at = k % max(1, 2 * len(images) - 2)
         yield images[min(at, 2 * len(images) - 2 - at)]
 
 
-def _most_mb() -> float:
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
-
-
 if __name__ == "__main__":
-    tyro.cli(main)
+    with told_without_traceback("drive.py"):
+        tyro.cli(main)

@@ -6,8 +6,9 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 
+import numpy as np
 import pytest
 
 SPEED = Path(__file__).parents[2] / "benchmarks" / "speed"
@@ -38,6 +39,12 @@ def test_a_film_that_is_not_there_is_told(ended, tmp_path, name):
     assert "none.mp4" in told
 
 
+def test_a_run_that_is_not_there_is_told(ended, tmp_path):
+    code, told = ended("drive.py", tmp_path / "run", tmp_path / "none.mp4")
+    assert code == 1
+    assert told.startswith("drive.py: ")
+
+
 def test_ranges_of_options_are_told(ended, tmp_path):
     code, told = ended("live_tracker.py", tmp_path / "none.mp4", "--height-px", 0)
     assert (code, "--height-px" in told) == (1, True)
@@ -65,6 +72,24 @@ def script(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], ModuleType]:
         return module
 
     return load
+
+
+def test_one_frame_is_a_film_to_and_fro(script, monkeypatch):
+    drive = script("drive")
+    images = [np.full((2, 2, 3), value, np.uint8) for value in range(3)]
+
+    class Source:
+        @staticmethod
+        def open(video: Path) -> list[SimpleNamespace]:
+            return [SimpleNamespace(image_rgb=image) for image in images[: int(video.name)]]
+
+    monkeypatch.setattr(drive, "FrameSource", Source)
+    shown = {count: drive._to_and_fro([Path(str(count))], 6) for count in (1, 2, 3)}
+    assert {count: [int(image[0, 0, 0]) for image in film] for count, film in shown.items()} == {
+        1: [0, 0, 0, 0, 0, 0],
+        2: [0, 1, 0, 1, 0, 1],
+        3: [0, 1, 2, 1, 0, 1],
+    }
 
 
 def test_both_columns_of_a_tracking_begin_when_mediapipe_is_there(
