@@ -6,7 +6,8 @@ A procedural film of the longest length is made once in the folder; then each le
 trained (tiny and full size, a few hundred steps) and evaluated, each as a process of its own whose
 resident memory is looked at twenty times a second, its children's included. CPU seconds are of all
 its threads: on a machine that others use they tell what the clock does not. What lies in the folder
-is not made again, so that an interrupted run goes on; datasets stay for another look.
+is not made again, so that an interrupted run goes on, unless other options change it; datasets stay
+for another look.
 """
 
 import argparse
@@ -14,9 +15,11 @@ import json
 import shutil
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 from procedural_film import film_config, write_film
 from rich.console import Console
@@ -24,11 +27,13 @@ from rich.table import Table
 from stage_times import StageTimes
 from watched_process import Watched, watch
 
-from rgbavatar_ns.files import read_json, write_json
+from rgbavatar_ns.files import Stages, write_json
 from rgbavatar_ns.tracking import TrackConfig, track_video
+from rgbavatar_ns.tracking.face.detector import load_mediapipe
 
+_STAGE_TIMES = "stage_times.json"
 _PRESETS = {"tiny": "rgbavatar-tiny", "full": "rgbavatar"}
-_REST = "before and after"
+_LOADING, _END = "loading", "after the last stage"
 
 
 @dataclass(frozen=True)
@@ -44,17 +49,19 @@ class Costs:
 def tracked_alone(video: Path, dataset: Path, frames: int, size_px: int, times: Path) -> None:
     """Track in this process, and write what each stage took."""
     costs = StageTimes()
+    load_mediapipe()
+    costs(_LOADING, 0, None)
     track_video(
         video, dataset, TrackConfig(image_size=size_px, max_frames=frames, overwrite=True), costs
     )
-    costs(_REST, frames, frames)
+    costs(_END, frames, frames)
     told = {name: part for name, part in asdict(costs).items() if not name.startswith("_")}
     write_json(times, told)
 
 
 def tracking(video: Path, folder: Path, frames: int, size_px: int) -> dict[str, Costs]:
     """`rgbavatar track`, by stage."""
-    times = folder / "stages.json"
+    times = folder / _STAGE_TIMES
     words = ["python", __file__, "--folder", str(folder), "--frames", str(frames)]
     words += ["--size", str(size_px), "--track-alone", str(video)]
     watched = watch(words, folder / "track.log")
@@ -108,19 +115,21 @@ def _run(folder: Path, size: str) -> Path:
 def measured(
     video: Path, folder: Path, frames: int, size_px: int, steps: Mapping[str, int]
 ) -> dict[str, Costs]:
-    """All of one length; what an earlier call has measured is read."""
+    """All of one length; what an earlier call has measured of the same is read."""
     own = folder / f"{frames}"
     own.mkdir(parents=True, exist_ok=True)
-    kept = own / "costs.json"
-    found = {name: Costs(**costs) for name, costs in (read_json(kept) or {}).items()}
-    works = {"track": lambda: tracking(video, own, frames, size_px)}
+    stages, found = Stages(own, [video.name, size_px]), {}
+
+    def measure(name: str, made_from: Any, work: Callable[[], dict[str, Costs]]) -> None:
+        told = stages.run(
+            name, made_from, lambda key: {row: asdict(costs) for row, costs in work().items()}
+        )
+        found.update({row: Costs(**costs) for row, costs in told.items()})
+
+    measure("track", None, lambda: tracking(video, own, frames, size_px))
     for size, count in steps.items():
-        works[f"train {size}"] = lambda s=size, n=count: training(own / "dataset", own, s, n)
-        works[f"eval {size}"] = lambda s=size: evaluation(own, s)
-    for name, work in works.items():
-        if name not in found:
-            found |= work()
-            write_json(kept, {stage: asdict(costs) for stage, costs in found.items()})
+        measure(f"train {size}", count, partial(training, own / "dataset", own, size, count))
+        measure(f"eval {size}", None, partial(evaluation, own, size))
     return found
 
 
@@ -130,10 +139,13 @@ def table(costs: Mapping[int, Mapping[str, Costs]]) -> Table:
     for frames in costs:
         for column in (f"{frames}: s", "CPU s", "MiB", "silent s"):
             shown.add_column(column, justify="right")
-    for stage in next(iter(costs.values())):
+    for stage in dict.fromkeys(name for found in costs.values() for name in found):
         row = [stage]
         for found in costs.values():
-            one = found[stage]
+            one = found.get(stage)
+            if one is None:
+                row += [""] * 4
+                continue
             row += [_text(one.clock_s), _text(one.cpu_s), f"{one.peak_mib:.0f}"]
             row.append(_text(one.silent_s))
         shown.add_row(*row)
@@ -160,7 +172,7 @@ def main() -> None:
     folder: Path = given.folder
     if given.track_alone is not None:
         (frames,) = given.frames
-        times = folder / "stages.json"
+        times = folder / _STAGE_TIMES
         tracked_alone(given.track_alone, folder / "dataset", frames, given.size, times)
         sys.exit(0)
     folder.mkdir(parents=True, exist_ok=True)
@@ -169,10 +181,10 @@ def main() -> None:
         write_film(film, film_config(max(given.frames), given.size))
     steps = {"tiny": given.tiny_steps, "full": given.full_steps}
     costs = {frames: measured(film, folder, frames, given.size, steps) for frames in given.frames}
-    Console(width=40 + 40 * len(costs)).print(table(costs))
     if given.json is not None:
         told = {k: {name: asdict(one) for name, one in v.items()} for k, v in costs.items()}
         write_json(given.json, {str(frames): found for frames, found in told.items()})
+    Console(width=40 + 40 * len(costs)).print(table(costs))
 
 
 if __name__ == "__main__":

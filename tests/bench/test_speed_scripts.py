@@ -74,6 +74,46 @@ def script(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], ModuleType]:
     return load
 
 
+def test_what_a_long_film_costs_is_measured_again_where_options_change_it(
+    script, tmp_path, monkeypatch
+):
+    long_film, made = script("long_film"), []
+
+    def stand_in(*words: object) -> dict[str, object]:
+        name = " ".join(str(word) for word in words if isinstance(word, str | int))
+        made.append(name)
+        return {name: long_film.Costs(1.0, None, len(made))}
+
+    for name in ("tracking", "training", "evaluation"):
+        monkeypatch.setattr(long_film, name, lambda *words, name=name: stand_in(name, *words))
+
+    def measured(size_px: int, tiny: int, full: int) -> list[str]:
+        made.clear()
+        steps = {"tiny": tiny, "full": full}
+        rows = long_film.measured(tmp_path / "film.mp4", tmp_path, 250, size_px, steps)
+        assert list(rows) == [
+            f"tracking 250 {size_px}",
+            f"training tiny {tiny}",
+            "evaluation tiny",
+            f"training full {full}",
+            "evaluation full",
+        ]
+        return list(made)
+
+    assert len(measured(512, 300, 200)) == 5
+    assert measured(512, 300, 200) == []
+    assert measured(512, 300, 100) == ["training full 100", "evaluation full"]
+    assert len(measured(256, 300, 100)) == 5
+
+
+def test_lengths_whose_rows_differ_stand_in_one_table(script):
+    long_film = script("long_film")
+    one = long_film.Costs(1.0, 2.0, 3.0, 0.5)
+    shown = long_film.table({250: {"track": one}, 1000: {"track": one, "train": one}})
+    rows = list(zip(*(column.cells for column in shown.columns)))
+    assert rows[1] == ("train", "", "", "", "", "1.0", "2.0", "3", "0.5")
+
+
 def test_one_frame_is_a_film_to_and_fro(script, monkeypatch):
     drive = script("drive")
     images = [np.full((2, 2, 3), value, np.uint8) for value in range(3)]
