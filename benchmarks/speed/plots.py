@@ -8,7 +8,6 @@ again what was measured. The workload is the ellipsoid of `rgbavatar bench raste
 with backward; what is not varied is N = 60,000, B = 10 and 512 x 512.
 """
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,8 +22,10 @@ from rgbavatar_ns.bench.options import RasterizerOptions
 from rgbavatar_ns.bench.rasterizer import WHOLE, bench_rasterizer, time_rasterizer
 from rgbavatar_ns.bench.scenes import DEFAULT_COUNT, DEFAULT_SIZE_PX, ellipsoid_scene
 from rgbavatar_ns.bench.timing import Stopwatch
-from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.errors import UserError, told_without_traceback
+from rgbavatar_ns.files import write_json
 from rgbavatar_ns.kernels.threads import using_threads
+from rgbavatar_ns.reading import DamagedFileError, load_json
 
 Points = list[tuple[float, float, float, float]]
 """(what is varied, median, lower and upper quartile in milliseconds)."""
@@ -57,7 +58,7 @@ def measure(options: Options) -> dict[str, Any]:
         sizes = _sweep(bar, "pixels", [(DEFAULT_COUNT, s, 10) for s in options.sizes], options)
         task = bar.add_task("peers", total=None)
         report = bench_rasterizer(
-            RasterizerOptions(repetitions=options.repetitions, peers=options.peers),
+            RasterizerOptions(repetitions=options.repetitions, peers=options.peers, device="cpu"),
             lambda what, done, total: bar.update(task, description=what, refresh=True),
         )
         return {
@@ -147,20 +148,31 @@ def _bars(axis: Any, report: dict[str, Any]) -> None:
     axis.invert_yaxis()
 
 
+def draw_again(measured: Path, path: Path) -> None:
+    """Draw what `--json` wrote; raises UserError where it is something else."""
+    try:
+        draw(load_json(measured), path)
+    except (DamagedFileError, LookupError, TypeError, ValueError) as error:
+        reason = f"{error} is missing" if isinstance(error, KeyError) else error
+        raise UserError(
+            f"{measured} holds no figures of this script: {reason}.",
+            "Give --from-json a file that --json wrote.",
+        ) from error
+
+
 def main() -> None:
     """Measure, or read what was measured, and draw."""
     options = tyro.cli(Options, description=__doc__)
-    try:
-        figures = (
-            json.loads(options.from_json.read_text()) if options.from_json else measure(options)
-        )
-    except (UserError, OSError, ValueError) as error:
-        raise SystemExit(f"plots.py: {error}") from None
-    if options.json:
-        options.json.write_text(json.dumps(figures, indent=2) + "\n")
-    draw(figures, options.output)
+    if options.from_json is None:
+        figures = measure(options)
+        if options.json:
+            write_json(options.json, figures)
+        draw(figures, options.output)
+    else:
+        draw_again(options.from_json, options.output)
     print(options.output)
 
 
 if __name__ == "__main__":
-    main()
+    with told_without_traceback("plots.py"):
+        main()
