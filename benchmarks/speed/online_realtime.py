@@ -87,11 +87,15 @@ def run(data: Path, arguments: argparse.Namespace, folder: Path) -> dict[str, An
     with log.open("w") as output:
         process = subprocess.Popen(command, stdout=output, stderr=subprocess.STDOUT)
         looking = contextlib.nullcontext()
-        if arguments.browser:
-            looking = browser(viewer_address(process, log))
-        with looking:
-            if process.wait() != 0:
-                raise SystemExit(log.read_text())
+        try:
+            if arguments.browser:
+                looking = browser(viewer_address(process, log))
+            with looking:
+                if process.wait() != 0:
+                    raise SystemExit(log.read_text())
+        finally:  # without the browser there is nothing to train for
+            process.terminate()
+            process.wait()
     (summary,) = folder.glob("*/*/run/training.json")
     told: dict[str, Any] = json.loads(summary.read_text())
     held_out = load_dataset(data)
@@ -112,7 +116,8 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         data = subject(arguments.seconds, arguments.image_size, arguments.subjects or Path(folder))
         told = run(data, arguments, Path(folder))
-    stream, latency_s = told["stream"], told["median_latency_s"]
+    # Without a frame that was drawn there is no latency.
+    stream, latency_s = told["stream"], told.get("median_latency_s", float("inf"))
     kept_up = stream["dropped"] == 0 and latency_s < MOST_LATENCY_S
     Console().print(
         f"{told['seconds']:.0f} s at {FRAMES_PER_SECOND:.0f} frames/s on {torch.get_num_threads()} "

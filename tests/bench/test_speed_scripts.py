@@ -1,6 +1,7 @@
 """The scripts of benchmarks/speed: what they refuse, and what they count."""
 
 import importlib.util
+import os
 import runpy
 import sys
 from collections.abc import Callable
@@ -130,6 +131,36 @@ def test_one_frame_is_a_film_to_and_fro(script, monkeypatch):
         2: [0, 1, 0, 1, 0, 1],
         3: [0, 1, 2, 1, 0, 1],
     }
+
+
+def test_a_browser_that_does_not_start_ends_the_training(script, tmp_path, monkeypatch):
+    online = script("online_realtime")
+    train = tmp_path / "ns-train"
+    train.write_text(f"#!/bin/sh\necho $$ > {tmp_path}/pid; echo http://127.0.0.1:1; sleep 600\n")
+    train.chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(tmp_path / "python"))
+
+    def no_browser(address: str):
+        raise RuntimeError("no browser")
+
+    monkeypatch.setattr(online, "browser", no_browser)
+    arguments = SimpleNamespace(method="rgbavatar-online-tiny", browser=True, more=[])
+    with pytest.raises(RuntimeError, match="no browser"):
+        online.run(tmp_path, arguments, tmp_path)
+    with pytest.raises(ProcessLookupError):
+        os.kill(int((tmp_path / "pid").read_text()), 0)
+
+
+def test_a_stream_of_which_nothing_was_drawn_is_told(script, monkeypatch, capsys):
+    online = script("online_realtime")
+    told = {"stream": {"arrived": 0, "dropped": 0}, "images_per_second": 0.0}
+    monkeypatch.setattr(online, "subject", lambda *words: None)
+    monkeypatch.setattr(online, "run", lambda *words: told | {"steps": 0, "seconds": 1.0})
+    monkeypatch.setattr(sys, "argv", ["online_realtime.py"])
+    with pytest.raises(SystemExit) as ended:
+        online.main()
+    assert ended.value.code == 1
+    assert "did not keep up" in capsys.readouterr().out
 
 
 def test_both_columns_of_a_tracking_begin_when_mediapipe_is_there(
