@@ -11,6 +11,9 @@ from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
+
+from rgbavatar_ns.bench.scenes import ellipsoid_scene, leaf_gaussians
 
 SPEED = Path(__file__).parents[2] / "benchmarks" / "speed"
 
@@ -161,6 +164,23 @@ def test_a_stream_of_which_nothing_was_drawn_is_told(script, monkeypatch, capsys
         online.main()
     assert ended.value.code == 1
     assert "did not keep up" in capsys.readouterr().out
+
+
+def test_a_backward_pass_is_timed_by_itself(script):
+    sets = script("instruction_sets")
+    gaussians, cameras = ellipsoid_scene(20, 16, 2)
+    leaves, image_grad = leaf_gaussians(gaussians), torch.ones(2, 16, 16, 3)
+    found = []
+    for _ in range(2):
+        sets.seconds(leaves, cameras, image_grad)
+        found.append(leaves.means.grad.clone())
+    assert found[0].abs().max() > 0
+    torch.testing.assert_close(found[0], found[1])
+
+
+def test_a_prior_s_cost_needs_a_turn_after_the_first(ended):
+    code, told = ended("surface_prior.py", "--steps", 79)
+    assert (code, "give 80 or more" in told) == (2, True)
 
 
 def test_both_columns_of_a_tracking_begin_when_mediapipe_is_there(
