@@ -85,6 +85,15 @@ class Runner:
         spent = left_s < _LEAST_S
         return f"the budget of {self.budget_s:g} s is spent" if spent else None
 
+    def _late(self, section: Section, limit_s: float, heard: bool) -> tuple[str, str]:
+        """The state of a section that did not end; where it had less than its time, that is why."""
+        late = "it had told all and did not end" if heard else "it did not end"
+        enough_s = self.patience.to_end_s if heard else section.limit_s
+        rows = self.report.sections[section.name]["rows"]
+        if limit_s >= enough_s or _failed(rows):
+            return "timed out", f"{late} within {limit_s:.0f} s"
+        return "cut short", f"{late} within the {limit_s:.0f} s that the budget left"
+
     def _run(self, section: Section, limit_s: float) -> None:
         """One section, to its state."""
         name, start, report, patience = section.name, self.clock(), self.report, self.patience
@@ -101,8 +110,7 @@ class Runner:
                 _end_group(process)
                 state, why = _judge(process.returncode, report.sections[name]["rows"])
             else:
-                late = "it had told all and did not end" if heard else "it did not end"
-                state, why = "timed out", f"{late} within {limit_s:.0f} s"
+                state, why = self._late(section, limit_s, heard)
             if section.guest and state in BAD:
                 state, why = "left out", f"{state}: {why}"
             if left_behind is not None:
@@ -183,7 +191,7 @@ class _Listener:
 
 def _judge(status: int, rows: dict[str, Any]) -> tuple[str, str | None]:
     """The state of a section whose process has ended, and why it is that."""
-    failed = [name for name, figures in rows.items() if "failed" in figures]
+    failed = _failed(rows)
     if status < 0:
         return "died", f"by {_signal_name(-status)}"
     if failed:
@@ -192,6 +200,10 @@ def _judge(status: int, rows: dict[str, Any]) -> tuple[str, str | None]:
         return "died", f"with exit status {status}; see its log"
     left_out = [figures["left_out"] for figures in rows.values() if "left_out" in figures]
     return ("left out", left_out[0]) if left_out else ("done", None)
+
+
+def _failed(rows: dict[str, Any]) -> list[str]:
+    return [name for name, figures in rows.items() if "failed" in figures]
 
 
 def _signal_name(number: int) -> str:

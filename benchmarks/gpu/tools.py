@@ -2,6 +2,7 @@
 
 import glob
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -16,7 +17,8 @@ from benchmarks.gpu.rows import LeftOut
 
 ROOT = Path(__file__).resolve().parents[2]
 CASES_SECONDS = 52.0
-"""What a tool is given in a section: less than its limit, so that what it said is told."""
+"""What a tool is given in a section: less than its limit, so that what it said is told; where the
+budget leaves less than this, the section is cut short."""
 REMEDIES = {
     "compute-sanitizer": "pip install nvidia-cuda-sanitizer-api, or the CUDA toolkit.",
     "ncu": "Install Nsight Compute (developer.nvidia.com/nsight-compute, or the CUDA toolkit).",
@@ -37,9 +39,14 @@ def tool(name: str) -> str | None:
     found = shutil.which(name)
     if found is not None:
         return found
-    # The newest of several versions: their names end with them.
-    paths = [path for folder in folders for path in sorted(glob.glob(f"{folder}/{name}"))[::-1]]
+    found_in = [sorted(glob.glob(f"{folder}/{name}"), key=_version)[::-1] for folder in folders]
+    paths = [path for newest_first in found_in for path in newest_first]
     return next((path for path in paths if Path(path).is_file() and os.access(path, os.X_OK)), None)
+
+
+def _version(path: str) -> list[int]:
+    """The numbers in a path, by which the newest of several versions is known."""
+    return [int(number) for number in re.findall(r"\d+", path)]
 
 
 def required_tool(name: str) -> str:

@@ -158,6 +158,23 @@ def test_a_section_gets_no_more_than_is_left_of_the_budget(report):
     assert 0 < report.sections["ends"]["limit_s"] <= 50
 
 
+def test_what_the_budget_cuts_short_has_not_failed(report):
+    asked = [Section("hangs", "hangs", "", 100.0), *sections("ends")]
+    clock = late_once(report, "hangs", "deaf")
+    Runner(report, stub, 50.0, Patience(to_terminate_s=0.1), clock).run(asked)
+    assert report.sections["hangs"]["state"] == "cut short"
+    assert report.sections["hangs"]["why"] == "it did not end within the 50 s that the budget left"
+    assert report.sections["ends"]["state"] == "not run"
+    assert report.failed() == []
+
+
+def test_what_fails_before_the_budget_cuts_it_short_stays_a_failure(report, monkeypatch):
+    monkeypatch.setitem(CODES, "wrong", CODES["fails"] + "\n" + CODES["hangs"])
+    clock = late_once(report, "wrong", "deaf")
+    Runner(report, stub, 50.0, Patience(to_terminate_s=0.1), clock).run(sections("wrong"))
+    assert report.failed() == ["wrong"]
+
+
 def test_without_what_the_preflight_misses_nothing_else_is_asked(report):
     verdict = "say(row='verdict', figures={'missing': ['torch', 'NVRTC']})"
     codes = {"preflight": verdict, "smoke": CODES["ends"]}

@@ -153,6 +153,19 @@ def test_tools_are_found_in_path_toolkits_and_packages(tmp_path, monkeypatch):
         assert tools.required_tool("compute-sanitizer") == str(made)
 
 
+def test_the_newest_of_several_versions_is_found(tmp_path, monkeypatch):
+    monkeypatch.setenv("PATH", str(tmp_path / "path"))
+    for variable in ("CUDA_PATH", "CUDA_HOME"):
+        monkeypatch.delenv(variable, raising=False)
+    packages = {"purelib": str(tmp_path), "platlib": str(tmp_path)}
+    monkeypatch.setattr(tools.sysconfig, "get_paths", lambda: packages)
+    made = [
+        executable(tmp_path / "nvidia" / f"cu{version}" / "bin" / "some-tool", "exit 0")
+        for version in ("9.2", "10.1", "13", "9.10")
+    ]
+    assert tools.tool("some-tool") == str(made[2])
+
+
 def test_a_tool_that_does_not_end_is_ended_and_what_it_said_is_kept(tmp_path):
     made = executable(tmp_path / "tool", "exec sleep 600")
     assert not tools.run_case([str(made)], "fused", {}, 0.0).ended
