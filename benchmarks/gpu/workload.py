@@ -105,7 +105,8 @@ class Workload:
 
         As in training, where the host runs ahead: after each step it would be waited for too long.
         """
-        timer = Timer("call()", globals={"call": call})
+        # By itself the timer leaves the host one thread.
+        timer = Timer("call()", globals={"call": call}, num_threads=torch.get_num_threads())
         blocks = [timer.timeit(self.calls)]  # a warm-up is torch's own
         while sum(block.times[0] for block in blocks) * self.calls < self.seconds:
             blocks.append(timer.timeit(self.calls))
