@@ -27,9 +27,9 @@ from torch import Tensor, nn
 from rgbavatar_ns.avatar.config import MethodConfig
 from rgbavatar_ns.avatar.method import AvatarMethod, DrawnBatch, FilmedBatch, Losses
 from rgbavatar_ns.avatar.methods.fields import MLP, positional_encoding
+from rgbavatar_ns.avatar.methods.head_regions import MOUTH_GROUPS, group_vertices, hull_mask
 from rgbavatar_ns.avatar.methods.loss_terms import held_where, huber_loss
 from rgbavatar_ns.avatar.methods.neighbours import neighbour_distance
-from rgbavatar_ns.avatar.methods.region_mask import MOUTH_GROUPS, group_vertices, hull_mask
 from rgbavatar_ns.avatar.methods.sh import (
     MAX_DEGREE,
     ShownDegree,

@@ -46,6 +46,7 @@ from rgbavatar_ns.avatar.methods.density import (
 )
 from rgbavatar_ns.avatar.methods.expression_bases import ExpressionBases, basis_weights
 from rgbavatar_ns.avatar.methods.gaussian_rows import GaussianRows
+from rgbavatar_ns.avatar.methods.head_regions import faces_within, group_vertices
 from rgbavatar_ns.avatar.methods.loss_terms import (
     coverage_loss,
     cylinder_term,
@@ -55,7 +56,6 @@ from rgbavatar_ns.avatar.methods.loss_terms import (
 )
 from rgbavatar_ns.avatar.methods.mesh_points import spread_points
 from rgbavatar_ns.avatar.methods.neighbours import neighbour_distance
-from rgbavatar_ns.avatar.methods.region_mask import faces_within, group_vertices
 from rgbavatar_ns.avatar.methods.sh import (
     ShownDegree,
     directions_in_frames,

@@ -1,4 +1,4 @@
-"""Where parts of the head's mesh are in pictures, for losses that weigh them."""
+"""Parts of the head's mesh, and where they are in pictures, for losses that weigh them."""
 
 from collections.abc import Iterable
 
@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from rgbavatar_ns.drawing.wireframe import fixed_point, mesh_silhouette
+from rgbavatar_ns.drawing.wireframe import fixed_point
 from rgbavatar_ns.head import HeadArrays
 from rgbavatar_ns.kernels import PinholeCameras
 
@@ -25,18 +25,6 @@ def group_vertices(arrays: HeadArrays, names: Iterable[str]) -> Int[Tensor, "G"]
 def faces_within(arrays: HeadArrays, faces: Int[Tensor, "F 3"], name: str) -> Bool[Tensor, "F"]:
     """Triangles with all corners in this group; of a head without it, none."""
     return torch.isin(faces, group_vertices(arrays, [name]).to(faces)).all(1)
-
-
-@torch.no_grad()
-def region_mask(
-    vertices: Float[Tensor, "B V 3"], faces: Int[Tensor, "G 3"], cameras: PinholeCameras
-) -> Bool[Tensor, "B H W"]:
-    """Pixels with their centre in one of these triangles that faces the camera, hidden or not."""
-    size = max(cameras.width, cameras.height)
-    corners = faces.cpu().numpy()
-    drawn = [mesh_silhouette(px, corners, size) for px in _pixels(vertices, cameras)]
-    masks = torch.from_numpy(np.stack(drawn) > 0.5)[:, : cameras.height, : cameras.width]
-    return masks.to(vertices.device)
 
 
 @torch.no_grad()
