@@ -52,11 +52,11 @@ def chosen_device(name: str | None, backend: str = "auto") -> torch.device:
     return torch.device(name)
 
 
-def require_backend(name: str = "auto", device: torch.device | None = None) -> str:
+def require_backend(name: str, device: torch.device) -> str:
     """The backend that `name` stands for on a device; raises UserError where it cannot be used."""
     available = available_backends()
     if name == "auto":
-        name = "cpu" if device is None else device.type
+        name = device.type
     if name not in available:
         raise UserError(
             f"The rasterizer's backend {name!r} cannot be used here (available: "

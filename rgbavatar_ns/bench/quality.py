@@ -252,9 +252,9 @@ def seconds_to(wanted_db: float, curve: Mapping[float, float]) -> float | None:
     return None
 
 
-def print_quality(report: QualityReport, console: Console | None = None) -> None:
+def print_quality(report: QualityReport) -> None:
     """Print the mean curves as a table."""
-    console = console or Console(highlight=False)
+    console = Console(highlight=False)
     console.rule("rgbavatar bench quality")
     for facts in (report.workload, report.machine):
         told = (f"{name} {value}" for name, value in facts.items() if value is not None)

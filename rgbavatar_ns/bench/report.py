@@ -43,9 +43,9 @@ class Report:
         return asdict(self) | {"parts": self.parts}
 
 
-def print_report(report: Report, console: Console | None = None) -> None:
+def print_report(report: Report) -> None:
     """Print the figures as tables."""
-    console = console or Console(highlight=False)
+    console = Console(highlight=False)
     images = report.workload["batch"]
     console.rule(f"rgbavatar bench {report.benchmark}")
     console.print(_facts(report.workload))

@@ -39,7 +39,6 @@ class LocalServer:
         allow_remote: whether other machines may reach it; nothing is encrypted.
         talk: a conversation, until it returns or the connection is closed.
         page: what a browser gets that asks for the address itself; None refuses it.
-        origins: of web pages that may connect beside those of this machine.
 
     Raises UserError where the address is none, is taken, or other machines can reach it unasked.
     """
@@ -50,7 +49,6 @@ class LocalServer:
         allow_remote: bool,
         talk: Callable[[ServerConnection], None],
         page: Callable[[], bytes] | None = None,
-        origins: tuple[str, ...] = (),
     ) -> None:
         address = StreamAddress.parse(listen)
         if not address.is_local and not allow_remote:
@@ -65,7 +63,7 @@ class LocalServer:
                 f"Nothing can be served at {address}: {error.strerror}.",
                 "Choose another address, or end the program that uses this one.",
             ) from None
-        self._page, self._is_local, self._origins = page, address.is_local, origins
+        self._page, self._is_local = page, address.is_local
         self._server = serve(
             talk,
             sock=self._listener,
@@ -125,7 +123,7 @@ class LocalServer:
         """Whether a page of this origin that asked for this host and path may speak."""
         if origin == "null":
             return secrets.compare_digest(path.encode(), f"/{self._key}".encode())
-        if origin in self._origins or _LOCAL_ORIGIN.fullmatch(origin):
+        if _LOCAL_ORIGIN.fullmatch(origin):
             return True
         return not self._is_local and origin == f"http://{host}"
 

@@ -36,7 +36,6 @@ class PageOutput:
         allow_remote: bool = False,
         page: Callable[[], bytes] | None = None,
         calibrate: Callable[[], None] = lambda: None,
-        origins: tuple[str, ...] = (),
     ) -> None:
         self.latencies = Latencies()
         self._hello, self._calibrate = hello(layout), calibrate
@@ -46,7 +45,7 @@ class PageOutput:
         self._captured_s: OrderedDict[int, float] = OrderedDict()
         self._closed = False
         self.pages = 0
-        self._server = LocalServer(listen, allow_remote, self._talk, page, origins)
+        self._server = LocalServer(listen, allow_remote, self._talk, page)
         self.address, self.keyed_address = self._server.address, self._server.keyed_address
 
     def show(self, frame: DrivenFrame) -> None:

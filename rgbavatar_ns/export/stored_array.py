@@ -108,7 +108,6 @@ def ranged(
     values: Float[np.ndarray, "C N"],
     stored: Literal["uint8", "uint16"] = "uint8",
     *,
-    by_item: bool = True,
     logarithmic: bool = False,
 ) -> StoredArray:
     """Round to as many steps between each column's lowest and highest number as the type has."""
@@ -118,7 +117,7 @@ def ranged(
     unit = np.zeros(len(values)) if empty else (values.max(1) - low) / np.iinfo(stored).max
     safe = np.where(unit > 0, unit, 1.0)[:, None]
     rounded = np.rint((values - low[:, None]) / safe).astype(stored)
-    return StoredArray(rounded, "float32", by_item, unit, low, logarithmic)
+    return StoredArray(rounded, "float32", True, unit, low, logarithmic)
 
 
 def exact(

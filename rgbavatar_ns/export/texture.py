@@ -203,7 +203,7 @@ def uv_wires(avatar: Avatar, side_px: int) -> UInt8[np.ndarray, "R R 4"]:
     return drawn
 
 
-def write_texture(path: Path, avatar: Avatar, side_px: int | None = None) -> Path:
+def write_texture(path: Path, avatar: Avatar) -> Path:
     """Write `color_texture` as a PNG and, beside it, its wires; return where those are.
 
     Raises UserError where they cannot be written, or would replace a picture that was painted on.
@@ -213,7 +213,7 @@ def write_texture(path: Path, avatar: Avatar, side_px: int | None = None) -> Pat
             f"{path} is there already, and may have been painted on.",
             "Name another file, or move it away.",
         )
-    texture = color_texture(avatar, side_px)
+    texture = color_texture(avatar)
     wires = path.with_name(f"{path.stem}_wires.png")
     for place, picture in ((path, texture), (wires, uv_wires(avatar, len(texture)))):
         with atomic_write(place) as partial:

@@ -302,8 +302,6 @@ def weighted_color_average_reference(
     gaussians: GaussianSet,
     cameras: PinholeCameras,
     images: Float[Tensor, "#B H W C"],
-    *,
-    rules: BlendingRules | None = None,
 ) -> WeightedColors:
     """Sums of w I and w and largest w per Gaussian and image, without gradient."""
     with torch.no_grad():
@@ -313,7 +311,7 @@ def weighted_color_average_reference(
         images = images.expand(batch, -1, -1, -1)
         weighted_sum = images.new_zeros(*projected.depth_m.shape, images.shape[-1])
         weight_sum, max_weight = (torch.zeros_like(projected.depth_m) for _ in range(2))
-        for tile in _tiles(projected, cameras, rules or BlendingRules()):
+        for tile in _tiles(projected, cameras, BlendingRules()):
             pixels = images[tile.image_index, tile.rows, tile.columns].flatten(0, 1)
             weighted_sum[tile.image_index, tile.gaussian_index] += tile.weights @ pixels
             weight_sum[tile.image_index, tile.gaussian_index] += tile.weights.sum(1)

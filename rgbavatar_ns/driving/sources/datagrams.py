@@ -5,7 +5,6 @@ import socket
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
 
 from rgbavatar_ns.data.streams.address import StreamAddress
 from rgbavatar_ns.errors import UserError
@@ -21,13 +20,7 @@ class Datagrams:
     Raises UserError where the address is none, is taken, or other machines can reach it unasked.
     """
 
-    def __init__(
-        self,
-        listen: str,
-        allow_remote: bool,
-        waiting: int,
-        clock: Callable[[], float] = time.monotonic,
-    ) -> None:
+    def __init__(self, listen: str, allow_remote: bool, waiting: int) -> None:
         address = StreamAddress.parse(listen)
         if not address.is_local and not allow_remote:
             raise UserError(
@@ -49,7 +42,6 @@ class Datagrams:
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER)
         self._socket.settimeout(_LOOK_S)
         self.address = str(StreamAddress(*self._socket.getsockname()[:2]))
-        self._clock = clock
         self._packets: deque[tuple[float, bytes]] = deque(maxlen=waiting)
         self._dropped = 0
         self._changed = threading.Condition()
@@ -91,5 +83,5 @@ class Datagrams:
                 continue
             with self._changed:
                 self._dropped += len(self._packets) == self._packets.maxlen
-                self._packets.append((self._clock(), packet))
+                self._packets.append((time.monotonic(), packet))
                 self._changed.notify()

@@ -45,7 +45,6 @@ struct BlendingConstants {
   static constexpr float kMaxAlpha = 0.999f;
   static constexpr float kMinAlpha = 1.0f / 255.0f;
   static constexpr float kLog2MinAlpha = -7.994353436858858f;
-  static constexpr float kLog2MaxAlpha = -0.0014434168696687186f;
   static constexpr float kMinTransmittance = 1e-4f;
   static constexpr float kFrustumMargin = 0.3f;
   static constexpr float kMinQuatNorm = 1e-12f;
