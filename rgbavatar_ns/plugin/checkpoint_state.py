@@ -5,7 +5,6 @@ from contextlib import contextmanager
 from typing import Any
 
 import torch
-from nerfstudio.utils.rich_utils import CONSOLE
 
 from rgbavatar_ns.avatar.method import AvatarMethod, describe_layout
 from rgbavatar_ns.avatar.prior import SurfacePrior
@@ -13,6 +12,7 @@ from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
 from rgbavatar_ns.avatar.storage.stored_avatar import RGBAVATAR
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import ThetaLayout
+from rgbavatar_ns.plugin.console import say
 from rgbavatar_ns.plugin.dataparser import Subject
 
 _EXTRA_STATE = "_extra_state"
@@ -81,12 +81,10 @@ def tell_another_person(state_dict: Mapping[str, Any], subject: Subject) -> None
     if not isinstance(saved, torch.Tensor) or saved.shape != mine.shape:
         return
     if not torch.allclose(saved.cpu(), mine.cpu(), atol=_SAME_IDENTITY):
-        CONSOLE.print(
+        say(
             "note: the checkpoint's person was measured otherwise than this data's, which is of "
             "another one or was tracked anew since. The avatar may lie beside the pictures: train "
             "it anew, or name the dataset that it was trained on.",
-            highlight=False,
-            soft_wrap=True,
         )
 
 

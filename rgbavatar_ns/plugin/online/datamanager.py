@@ -9,7 +9,6 @@ from typing import Annotated, Any, Literal
 import torch
 import tyro
 from nerfstudio.cameras.cameras import Cameras
-from nerfstudio.utils.rich_utils import CONSOLE
 
 from rgbavatar_ns.avatar.training.losses import random_backgrounds
 from rgbavatar_ns.data import DatasetWriter, LocalGlobalPools, load_dataset
@@ -27,6 +26,7 @@ from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.files import atomic_folder
 from rgbavatar_ns.options import Between, Share
 from rgbavatar_ns.plugin.cameras import to_nerfstudio
+from rgbavatar_ns.plugin.console import say
 from rgbavatar_ns.plugin.datamanager import (
     RGBAvatarDataManager,
     RGBAvatarDataManagerConfig,
@@ -110,7 +110,7 @@ class OnlineDataManager(RGBAvatarDataManager):
 
     def _open(self, config: OnlineDataManagerConfig) -> None:
         parsed = config.dataparser
-        stream = open_source(config.source, config.data or parsed.data, _tell, parsed.importing)
+        stream = open_source(config.source, config.data or parsed.data, say, parsed.importing)
         try:
             self._prepare(config, stream)
         except BaseException:
@@ -122,12 +122,12 @@ class OnlineDataManager(RGBAvatarDataManager):
         pools = _pools(config, seed)
         subject, self._first = stream.subject(0.0), None
         if not isinstance(stream, ReplayStream):
-            subject, self._first = await_subject(stream, _tell)
+            subject, self._first = await_subject(stream, say)
             if not is_recorded(config, subject):
                 _record(config, subject, [(0, self._first)])
         assert subject is not None
         self.pools = ReplayBuffer(subject, pools, save_images=not isinstance(stream, ReplayStream))
-        self._ingest = Ingest(stream, subject, self.pools, config.queue_frames, _tell)
+        self._ingest = Ingest(stream, subject, self.pools, config.queue_frames, say)
         self._subject, self._stream = subject, stream
         self._resumed = False
         if not isinstance(stream, Rewindable):
@@ -263,7 +263,7 @@ def is_recorded(config: OnlineDataManagerConfig, subject: StreamSubject) -> bool
     if before.layout != subject.layout or size != (subject.width, subject.height):
         return False
     if not torch.allclose(before.identity, subject.identity.cpu(), atol=1e-4):
-        _tell(
+        say(
             "note: the person was measured anew, a little otherwise than when the run began; the "
             "avatar keeps the first measure, and may lie a little beside what is filmed now."
         )
@@ -291,7 +291,3 @@ def _record(config: OnlineDataManagerConfig, subject: Any, frames: Any) -> None:
                 has_unfilmed=frame.marks_unfilmed,
             )
         writer.finish(0)
-
-
-def _tell(line: str) -> None:
-    CONSOLE.print(line, highlight=False, markup=False, soft_wrap=True)

@@ -5,6 +5,9 @@ from dataclasses import dataclass
 
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.status import Status
+from rich.text import Text
+
+from rgbavatar_ns.plugin.console import say
 
 _SECONDS_PER_LINE = 10.0
 _GOOD = ("arrived", "taken in")
@@ -90,9 +93,9 @@ class OnlineProgress:
         """Say where things stand, at most every ten seconds where there is no terminal."""
         text = f"step {report.step}: " + ", ".join(report.lines(images_per_second))
         if self._status is not None:
-            self._status.update(text)
+            self._status.update(Text(text))
             return
         now = time.monotonic()
         if now - self._last_line_s >= _SECONDS_PER_LINE:
-            CONSOLE.print(text, highlight=False, soft_wrap=True)
+            say(text)
             self._last_line_s = now

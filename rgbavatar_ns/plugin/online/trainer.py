@@ -14,19 +14,18 @@ from typing import Annotated, Any, Literal
 
 from nerfstudio.utils import writer
 from nerfstudio.utils.misc import step_check
-from nerfstudio.utils.rich_utils import CONSOLE
 
 from rgbavatar_ns.avatar.training.batches import TrainingBatch
 from rgbavatar_ns.avatar.training.step import Losses
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.options import Between, Count, Counted
+from rgbavatar_ns.plugin.console import say
 from rgbavatar_ns.plugin.errors import install_user_error_hook
 from rgbavatar_ns.plugin.online.datamanager import OnlineDataManager
 from rgbavatar_ns.plugin.online.pipeline import OnlinePipeline, OnlinePipelineConfig
 from rgbavatar_ns.plugin.online.progress import OnlineProgress, StreamReport
 from rgbavatar_ns.plugin.option_order import led_by
 from rgbavatar_ns.plugin.training.interruption import StopRequest
-from rgbavatar_ns.plugin.training.run_end import say
 from rgbavatar_ns.plugin.training.trainer import (
     CHANGED_FIRST,
     RGBAvatarTrainer,
@@ -114,7 +113,7 @@ class OnlineTrainer(RGBAvatarTrainer):
         try:
             super().setup(test_mode)
         except KeyboardInterrupt:
-            CONSOLE.print("Stopped before the first frame; there is nothing to save.")
+            say("Stopped before the first frame; there is nothing to save.")
             raise SystemExit(0) from None
 
     def train(self) -> None:

@@ -5,6 +5,8 @@ import time
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from rgbavatar_ns.plugin.console import say
+
 _SECONDS_PER_LINE = 10.0
 
 
@@ -41,5 +43,5 @@ class TrainingProgress(Progress):
         if not self.disable:
             self.update(self._steps, completed=done, note=note)
         elif now - self._last_line >= _SECONDS_PER_LINE or done in (self._first + 1, self._total):
-            CONSOLE.print(f"step {done}/{self._total}: {note}", highlight=False)
+            say(f"step {done}/{self._total}: {note}")
             self._last_line = now

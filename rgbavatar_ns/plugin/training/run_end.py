@@ -9,24 +9,19 @@ import numpy as np
 from nerfstudio.engine.callbacks import TrainingCallbackLocation
 from nerfstudio.engine.trainer import Trainer
 from nerfstudio.utils import writer
-from nerfstudio.utils.rich_utils import CONSOLE
 
 from rgbavatar_ns.avatar.training.batches import TrainingBatch
 from rgbavatar_ns.avatar.training.method_step import MethodStep
 from rgbavatar_ns.avatar.training.step import TrainingStep
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.files import write_json
+from rgbavatar_ns.plugin.console import say
 from rgbavatar_ns.plugin.pipeline import RGBAvatarPipeline
 from rgbavatar_ns.plugin.refinement import REFINED_NAME
 from rgbavatar_ns.plugin.training.interruption import StopRequest
 from rgbavatar_ns.plugin.training.load_config import COMPLETED, SUMMARY_NAME
 from rgbavatar_ns.plugin.training.peak_memory import peak_memory
 from rgbavatar_ns.plugin.training.train_clock import TrainClock
-
-
-def say(line: str) -> None:
-    """Print a line as it is, however long and with any brackets."""
-    CONSOLE.print(line, highlight=False, soft_wrap=True, markup=False)
 
 
 class EndingTrainer(Trainer):
@@ -99,7 +94,7 @@ class EndingTrainer(Trainer):
         if self.completed:
             seconds = summary["train_seconds"]
             why = f" in the {seconds:.0f} s that it was given" if self._out_of_time else ""
-            CONSOLE.print(f"Trained {steps} steps{why}, {rate:.1f} images/s.", highlight=False)
+            say(f"Trained {steps} steps{why}, {rate:.1f} images/s.")
         else:
             say(
                 f"Stopped after {steps} of {self.config.max_num_iterations} steps; resume with "

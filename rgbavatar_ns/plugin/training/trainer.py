@@ -17,7 +17,6 @@ from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.utils import writer
 from nerfstudio.utils.misc import step_check
-from nerfstudio.utils.rich_utils import CONSOLE
 from nerfstudio.utils.writer import EventName
 from nerfstudio.viewer.viewer import Viewer
 
@@ -28,6 +27,7 @@ from rgbavatar_ns.avatar.training.step import Losses
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.files import disk_errors
 from rgbavatar_ns.options import Between, Count, Positive
+from rgbavatar_ns.plugin.console import say
 from rgbavatar_ns.plugin.errors import device_errors_told, install_user_error_hook
 from rgbavatar_ns.plugin.option_order import led_by
 from rgbavatar_ns.plugin.pipeline import RGBAvatarPipeline, RGBAvatarPipelineConfig
@@ -56,7 +56,7 @@ from rgbavatar_ns.plugin.training.optimizers import (
 from rgbavatar_ns.plugin.training.progress import TrainingProgress
 from rgbavatar_ns.plugin.training.ranges import require_trainable
 from rgbavatar_ns.plugin.training.refused import require_rates_to_fall
-from rgbavatar_ns.plugin.training.run_end import EndingTrainer, say
+from rgbavatar_ns.plugin.training.run_end import EndingTrainer
 from rgbavatar_ns.plugin.training.train_clock import TrainClock, waiting_for
 from rgbavatar_ns.plugin.training.turns import TurnsLock
 from rgbavatar_ns.plugin.viewer.settings import is_of_ns_viewer, viewer_settings
@@ -198,7 +198,7 @@ class RGBAvatarTrainer(EndingTrainer, FitHooks):
         self.pipeline.evaluated = self._add_to_curve
         if isinstance(self.viewer_state, Viewer):
             for line in self.viewer_state.viewer_info:
-                CONSOLE.print(line, highlight=False)
+                say(line)
 
     def setup_optimizers(self) -> Optimizers:
         """One optimiser a parameter group, with the schedules that the config asks for."""
@@ -235,7 +235,7 @@ class RGBAvatarTrainer(EndingTrainer, FitHooks):
             with self._failure_written():
                 with device_errors_told(self.checkpoint_dir):
                     self._take = self.pipeline.training_step(self.optimizers)
-                CONSOLE.print(f"Steps are {self._take.kind}: {self._take.reason}.", highlight=False)
+                say(f"Steps are {self._take.kind}: {self._take.reason}.")
                 with self._shown_progress():
                     fit(self._take, self._batch, self._steps(), self)
                 self._save_end()
@@ -368,7 +368,7 @@ class RGBAvatarTrainer(EndingTrainer, FitHooks):
         elif config.load_checkpoint is not None:
             state, path = read_training_state(config.load_checkpoint), config.load_checkpoint
         else:
-            CONSOLE.print("Training from the start.")
+            say("Training from the start.")
             return
         remove_leftover(path.parent)
         with damage_of(path):

@@ -13,8 +13,9 @@ import re
 from pathlib import Path, PosixPath
 from typing import Any
 
-from nerfstudio.utils.rich_utils import CONSOLE
 from viser import infra
+
+from rgbavatar_ns.plugin.console import say
 
 _FEWER_PIXELS = re.compile(rb"window\.devicePixelRatio\*\(\.2\+\.8\*[\w$]+\)")
 # Beyond two pixels a point nothing is won; three.js's canvas begins with this, too.
@@ -46,9 +47,7 @@ class _SharpServer(infra.WebsockServer):
             if client.known:
                 http_server_root = client
             else:
-                CONSOLE.print(
-                    "Another viser than 0.2.7: in a slow browser its pictures may stay coarse."
-                )
+                say("Another viser than 0.2.7: in a slow browser its pictures may stay coarse.")
         super().__init__(*arguments, http_server_root=http_server_root, **more)
 
 
