@@ -12,6 +12,7 @@ import torch
 from torch.utils import benchmark
 
 from rgbavatar_ns.avatar import Avatar
+from rgbavatar_ns.avatar.storage.checkpoint_file import SUMMARY_NAME
 from rgbavatar_ns.avatar.training import TrainingBatch, TrainingOptions, TrainingStep, fit
 from rgbavatar_ns.avatar.training.batches import ChosenFrames, DeviceFrames
 from rgbavatar_ns.avatar.training.cuda_graph import Recorder, record_cuda_graph
@@ -92,8 +93,6 @@ def _train(config: Any) -> dict[str, Any]:
     with warnings.catch_warnings():
         # nerfstudio's and torchvision's, about parts that are not used here.
         warnings.simplefilter("ignore")
-        from rgbavatar_ns.plugin.training.load_config import SUMMARY_NAME
-
         trainer = config.setup()
         trainer.setup()
         trainer.train()

@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
+from rgbavatar_ns.avatar.storage.checkpoint_file import CONFIG_NAME
 from rgbavatar_ns.cli.console import command_line, plain_console
 from rgbavatar_ns.cli.progress import progress_bar, stage_bars
 from rgbavatar_ns.cli.track import suited_method
@@ -263,7 +264,7 @@ def _tell(summary: dict[str, Any], output: Path) -> None:
         "picture": summary["picture"],
         "film": summary["video"],
         "figures": str(output / "summary.json"),
-        "viewer": _command("ns-viewer", "--load-config", run_folder / "config.yml"),
+        "viewer": _command("ns-viewer", "--load-config", run_folder / CONFIG_NAME),
         "drive it": _command("rgbavatar", "drive", run_folder),
         "web page": _command(
             "rgbavatar", "export", run_folder, output / "me.html", "--format", "web"

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from rgbavatar_ns.avatar.storage.checkpoint_file import CONFIG_NAME, MODELS_FOLDER, SUMMARY_NAME
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.plugin.training.interruption import PARENT_VARIABLE
 
@@ -67,16 +68,16 @@ def train(
     flags: list[str | Path] = ["--data", data, "--output-dir", experiment.parent]
     flags += ["--experiment-name", experiment.name, "--timestamp", run_folder.name]
     flags += ["--vis", "tensorboard", "--machine.seed", str(seed), *options]
-    if any(run_folder.glob("nerfstudio_models/*.ckpt")):
-        flags += ["--load-dir", run_folder / "nerfstudio_models"]
+    if any(run_folder.glob(f"{MODELS_FOLDER}/*.ckpt")):
+        flags += ["--load-dir", run_folder / MODELS_FOLDER]
     run_nerfstudio("ns-train", method, *flags)
-    return json.loads((run_folder / "training.json").read_text())
+    return json.loads((run_folder / SUMMARY_NAME).read_text())
 
 
 def evaluate(run_folder: Path, destination: Path) -> dict[str, Any]:
     """Evaluate a run by `ns-eval`, which writes the JSON file; return its results."""
     run_nerfstudio(
-        "ns-eval", "--load-config", run_folder / "config.yml", "--output-path", destination
+        "ns-eval", "--load-config", run_folder / CONFIG_NAME, "--output-path", destination
     )
     return json.loads(destination.read_text())["results"]
 

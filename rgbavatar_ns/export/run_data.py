@@ -7,13 +7,12 @@ import torch
 import yaml
 
 from rgbavatar_ns.avatar.method import AvatarMethod
-from rgbavatar_ns.avatar.storage.checkpoint_file import newest_run
+from rgbavatar_ns.avatar.storage.checkpoint_file import CONFIG_NAME, MODELS_FOLDER, newest_run
 from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
 from rgbavatar_ns.data.native.dataset import TrackedDataset
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.reading import DamagedFileError, damage_told, read_file
 
-_CONFIG = "config.yml"
 _MOST_BYTES = 1 << 18
 """nerfstudio's has 10 kB, and a longer one takes seconds."""
 
@@ -25,9 +24,9 @@ def dataset_folder(path: Path) -> Path:
     recorded itself. Raises UserError where the path is none of these.
     """
     folder = newest_run(path) if os.path.isdir(path) else path.parent
-    if folder.name == "nerfstudio_models":
+    if folder.name == MODELS_FOLDER:
         folder = folder.parent
-    config = folder / _CONFIG
+    config = folder / CONFIG_NAME
     if not os.path.exists(config):
         return path
     try:

@@ -10,13 +10,11 @@ import nerfstudio.viewer.viewer
 from nerfstudio.utils import writer
 from nerfstudio.utils.eval_utils import eval_setup
 
-from rgbavatar_ns.avatar.storage.checkpoint_file import newest_run
+from rgbavatar_ns.avatar.storage.checkpoint_file import CONFIG_NAME, newest_run
 from rgbavatar_ns.driving.live_drive import DrivenFrame, Latencies
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.plugin.pipeline import RGBAvatarPipeline
 from rgbavatar_ns.plugin.viewer.viewer_state import ViewerState
-
-_CONFIG = "config.yml"
 
 
 class ViewerOutput:
@@ -27,7 +25,7 @@ class ViewerOutput:
     """
 
     def __init__(self, run: Path, calibrate: Callable[[], None]) -> None:
-        config_path = (newest_run(run) if run.is_dir() else run) / _CONFIG
+        config_path = (newest_run(run) if run.is_dir() else run) / CONFIG_NAME
         if not config_path.is_file():
             raise UserError(
                 f"{run} is no run of ns-train, which nerfstudio's viewer needs.",

@@ -22,6 +22,8 @@ from rgbavatar_ns.reading import DamagedFileError, regular_file
 
 MODELS_FOLDER = "nerfstudio_models"
 """Where a run's folder has its checkpoints."""
+CONFIG_NAME, SUMMARY_NAME = "config.yml", "training.json"
+"""Beside them: what nerfstudio makes the run of again, and how the run ended."""
 _NAME = re.compile(r"step-([0-9]{9,18})\.ckpt")
 _MAX_OPCODES = 5_000_000
 """A run lists one number for each of its frames."""

@@ -15,6 +15,7 @@ from typing import Annotated, Any, Literal
 from nerfstudio.utils import writer
 from nerfstudio.utils.misc import step_check
 
+from rgbavatar_ns.avatar.storage.checkpoint_file import CONFIG_NAME
 from rgbavatar_ns.avatar.training.batches import TrainingBatch
 from rgbavatar_ns.avatar.training.step import Losses
 from rgbavatar_ns.errors import UserError
@@ -313,4 +314,4 @@ class OnlineTrainer(RGBAvatarTrainer):
         say(f"{how} {steps} steps on {summary['frames']} frames, {rate:.1f} images/s.")
         if not self.completed:
             say(f"Go on with the same command and --load-dir {self.checkpoint_dir}")
-        say(f"Config: {self.base_dir / 'config.yml'}")
+        say(f"Config: {self.base_dir / CONFIG_NAME}")

@@ -7,11 +7,14 @@ from pathlib import Path
 import yaml
 from nerfstudio.engine.trainer import TrainerConfig
 
-from rgbavatar_ns.avatar.storage.checkpoint_file import MODELS_FOLDER, list_checkpoints
+from rgbavatar_ns.avatar.storage.checkpoint_file import (
+    MODELS_FOLDER,
+    SUMMARY_NAME,
+    list_checkpoints,
+)
 from rgbavatar_ns.errors import UserError, first_few
 from rgbavatar_ns.reading import DamagedFileError, damage_told, load_json, read_file
 
-SUMMARY_NAME = "training.json"
 COMPLETED = "completed"
 _MOST_BYTES = 1 << 22
 _TRAINER = re.compile(r"tag:yaml\.org,2002:python/object:[\w.]+TrainerConfig")

@@ -10,6 +10,7 @@ from nerfstudio.engine.callbacks import TrainingCallbackLocation
 from nerfstudio.engine.trainer import Trainer
 from nerfstudio.utils import writer
 
+from rgbavatar_ns.avatar.storage.checkpoint_file import CONFIG_NAME, SUMMARY_NAME
 from rgbavatar_ns.avatar.training.batches import TrainingBatch
 from rgbavatar_ns.avatar.training.method_step import MethodStep
 from rgbavatar_ns.avatar.training.step import TrainingStep
@@ -19,7 +20,7 @@ from rgbavatar_ns.plugin.console import say
 from rgbavatar_ns.plugin.pipeline import RGBAvatarPipeline
 from rgbavatar_ns.plugin.refinement import REFINED_NAME
 from rgbavatar_ns.plugin.training.interruption import StopRequest
-from rgbavatar_ns.plugin.training.load_config import COMPLETED, SUMMARY_NAME
+from rgbavatar_ns.plugin.training.load_config import COMPLETED
 from rgbavatar_ns.plugin.training.peak_memory import peak_memory
 from rgbavatar_ns.plugin.training.train_clock import TrainClock
 
@@ -100,7 +101,7 @@ class EndingTrainer(Trainer):
                 f"Stopped after {steps} of {self.config.max_num_iterations} steps; resume with "
                 f"the same command and --load-dir {self.checkpoint_dir}"
             )
-        say(f"Config: {self.base_dir / 'config.yml'}")
+        say(f"Config: {self.base_dir / CONFIG_NAME}")
         say(f"Checkpoints: {self.checkpoint_dir}")
 
     def _save_refined(self) -> None:
