@@ -1,7 +1,6 @@
 """nerfstudio's trainer against the bare step: the same frames in the same order, from one start."""
 
 import copy
-import json
 import tempfile
 import warnings
 from dataclasses import replace
@@ -24,6 +23,7 @@ from rgbavatar_ns.bench.timing import Progress
 from rgbavatar_ns.bench.workloads import read_images
 from rgbavatar_ns.data import OfflineOrder, TrackedDataset, load_dataset
 from rgbavatar_ns.head import HeadModel
+from rgbavatar_ns.reading import load_json
 from rgbavatar_ns.synthetic import DemoConfig, make_demo_dataset
 
 _SEED = 0
@@ -96,7 +96,7 @@ def _train(config: Any) -> dict[str, Any]:
         trainer = config.setup()
         trainer.setup()
         trainer.train()
-    return json.loads((trainer.base_dir / SUMMARY_NAME).read_text())
+    return load_json(trainer.base_dir / SUMMARY_NAME)
 
 
 def bare_images_per_second(

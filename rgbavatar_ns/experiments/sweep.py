@@ -1,6 +1,5 @@
 """Run what is missing of an experiment; what is there already is kept."""
 
-import json
 import shlex
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -27,6 +26,7 @@ from rgbavatar_ns.experiments.runner import (
 from rgbavatar_ns.experiments.source import keep_source
 from rgbavatar_ns.experiments.spec import Experiment, nearest
 from rgbavatar_ns.files import DiskError, atomic_folder, disk_errors, read_json, write_json
+from rgbavatar_ns.reading import DamagedFileError, damage_told, load_json
 from rgbavatar_ns.synthetic import make_demo_dataset
 
 State = Literal["waiting", "running", "done", "failed"]
@@ -198,13 +198,14 @@ def last_lines(path: Path, count: int) -> list[str]:
 def read_statuses(folder: Path, name: str) -> list[CellStatus]:
     """Where the cells of an experiment stand in `folder`; UserError if it never ran there."""
     try:
-        listed = json.loads((folder / f"{name}.json").read_text())
-    except (OSError, ValueError) as error:
+        with damage_told():
+            listed = load_json(folder / f"{name}.json")
+            statuses = [_status(Cell.from_json(values), folder) for values in listed]
+    except DamagedFileError as error:
         raise UserError(
             f"The sweep of {name} was not begun in {folder} ({error}).",
             "Run `rgbavatar sweep FILE` with this folder first.",
         ) from None
-    statuses = [_status(Cell.from_json(values), folder) for values in listed]
     for status in statuses:
         failure = read_json(status.folder / FAILED_FILE) if status.result is None else None
         if isinstance(failure, dict):

@@ -1,6 +1,7 @@
 """A sweep does what is missing, survives failures, and its report traces every figure."""
 
 import csv
+import json
 import sys
 import time
 from dataclasses import replace
@@ -11,7 +12,7 @@ from rgbavatar_ns.cli import main as cli
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.experiments.engines import LocalEngine, RayEngine
 from rgbavatar_ns.experiments.report import write_report
-from rgbavatar_ns.experiments.sweep import sweep
+from rgbavatar_ns.experiments.sweep import cells_of, read_statuses, sweep
 
 
 def _calls(statuses):
@@ -180,6 +181,22 @@ def test_the_command_says_what_failed_and_ends_with_1(experiment_of, tmp_path, c
 def test_a_report_before_the_sweep_is_refused(experiment_of, tmp_path):
     with pytest.raises(UserError, match="was not begun"):
         write_report(experiment_of("a"), tmp_path / "none")
+
+
+@pytest.mark.parametrize(
+    "content", ["[", "3", "[3]", '["cell"]', "[{}]", '[{"variant": 1, "unknown": 2}]', '{"a": 1}']
+)
+def test_a_list_of_cells_of_another_shape_is_refused(content, tmp_path):
+    (tmp_path / "bases.json").write_text(content)
+    with pytest.raises(UserError, match="was not begun"):
+        read_statuses(tmp_path, "bases")
+
+
+def test_cells_whose_fields_are_of_other_kinds_are_refused(experiment_of, tmp_path):
+    (cell,) = cells_of(experiment_of("a", seeds="0"))
+    (tmp_path / "bases.json").write_text(json.dumps([cell.to_json() | {"overrides": 3}]))
+    with pytest.raises(UserError, match="was not begun"):
+        read_statuses(tmp_path, "bases")
 
 
 def test_without_ray_its_engine_says_what_to_do(monkeypatch):
