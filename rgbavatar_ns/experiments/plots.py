@@ -15,6 +15,7 @@ from rgbavatar_ns.experiments.spec import Experiment
 from rgbavatar_ns.experiments.streamed import StreamedCurve, read_streamed
 from rgbavatar_ns.experiments.sweep import CellStatus
 from rgbavatar_ns.experiments.tables import Entry, ResultTable, Row
+from rgbavatar_ns.files import atomic_write
 from rgbavatar_ns.plugin.training.curve import CURVE_NAME, read_curve
 
 _COLOR = "tab:blue"
@@ -195,8 +196,9 @@ def _panels(count: int, height: float, **shared: bool) -> tuple[Any, list[Any]]:
 def _saved(figure: Any, folder: Path, stem: str) -> Path:
     """Write PNG and SVG; returns the PNG's path."""
     path = folder / f"{stem}.png"
-    figure.savefig(path, dpi=130)
-    figure.savefig(path.with_suffix(".svg"))
+    for place in (path, path.with_suffix(".svg")):
+        with atomic_write(place) as partial:
+            figure.savefig(partial, dpi=130)
     return path
 
 

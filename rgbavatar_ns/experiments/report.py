@@ -9,6 +9,7 @@ from rgbavatar_ns.experiments.plots import write_convergence, write_forgetting_c
 from rgbavatar_ns.experiments.spec import Experiment
 from rgbavatar_ns.experiments.sweep import CellStatus, read_statuses
 from rgbavatar_ns.experiments.tables import ResultTable, Row, result_table
+from rgbavatar_ns.files import atomic_write
 
 _STYLE = (
     "body{font:15px/1.5 system-ui,sans-serif;max-width:70em;margin:2em auto;padding:0 1em}"
@@ -36,18 +37,19 @@ def write_report(experiment: Experiment, folder: Path, *, plots: bool = True) ->
     statuses = read_statuses(folder, experiment.name)
     table = result_table(experiment, statuses)
     out = folder / "report"
-    out.mkdir(parents=True, exist_ok=True)
     texts = {".md": table.to_markdown(), ".csv": table.to_csv(), ".tex": table.to_latex()}
     paths = [out / f"{experiment.name}{suffix}" for suffix in texts]
     for path, text in zip(paths, texts.values()):
-        path.write_text(text, encoding="utf-8")
+        with atomic_write(path) as partial:
+            partial.write_text(text, encoding="utf-8")
     drawn = []
     if plots:
         drawn = write_plots(experiment, table, out, experiment.name)
         drawn += write_convergence(experiment, statuses, out, experiment.name)
         drawn += write_forgetting_curves(statuses, out, experiment.name)
     page = out / "index.html"
-    page.write_text(_page(experiment, table, statuses, drawn), encoding="utf-8")
+    with atomic_write(page) as partial:
+        partial.write_text(_page(experiment, table, statuses, drawn), encoding="utf-8")
     return Report(table, statuses, [*paths, *drawn, page])
 
 
