@@ -7,6 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from rgbavatar_ns.avatar.method import AvatarMethod
+from rgbavatar_ns.head.joints import ROOT
 from rgbavatar_ns.head.rotations import axis_angle_to_matrix
 from rgbavatar_ns.kernels import PinholeCameras
 
@@ -15,7 +16,7 @@ from rgbavatar_ns.kernels import PinholeCameras
 def head_centre(avatar: AvatarMethod, theta: Float[Tensor, "F H"]) -> Float[Tensor, "F 3"]:
     """The middle of the posed head's box, without what the neck does not turn; in metres."""
     vertices = avatar.head(theta.to(avatar.identity), avatar.identity).cpu()
-    head = vertices[:, torch.from_numpy(avatar.head.arrays.skinning_weights[:, 0] < 0.5)]
+    head = vertices[:, torch.from_numpy(avatar.head.arrays.skinning_weights[:, ROOT] < 0.5)]
     return (head.amin(1) + head.amax(1)) / 2
 
 

@@ -23,6 +23,7 @@ from rgbavatar_ns.driving.transfer import (
 )
 from rgbavatar_ns.head import ThetaLayout, turn_seen
 from rgbavatar_ns.head.arkit import head_carrier
+from rgbavatar_ns.head.layout import CARRIER_FIELDS
 from rgbavatar_ns.head.lips import LipGap
 from rgbavatar_ns.head.rotations import axis_angle_to_matrix, matrix_to_axis_angle
 from rgbavatar_ns.kernels import PinholeCameras
@@ -98,7 +99,7 @@ class LiveTransfer:
         self._driving = DrivingOptions(relative=relative, pose=options.pose)
         # Shoulders do what they do: only the head upon them is held back.
         upon = head_carrier(avatar.head.arrays.expression_names) == "neck"
-        names = ("neck",) if upon else ("rotation", "neck")
+        names = ("neck",) if upon else CARRIER_FIELDS
         self._carriers = [avatar.layout.slice(name) for name in names]
         matrix_to_axis_angle(torch.eye(3))  # brings a library within a second: now, not then
         self._start_turns = [axis_angle_to_matrix(own.theta_mean[one]) for one in self._carriers]

@@ -11,10 +11,8 @@ from rgbavatar_ns.avatar.method import AvatarMethod
 from rgbavatar_ns.errors import UserError, first_few
 from rgbavatar_ns.head import HeadArrays, ThetaLayout
 from rgbavatar_ns.head.arkit import arkit_map, head_carrier, speaks_arkit
+from rgbavatar_ns.head.layout import CARRIER_FIELDS
 from rgbavatar_ns.head.rotations import axis_angle_to_matrix, matrix_to_axis_angle
-
-_CARRIERS = ("rotation", "neck")
-"""The joints that turn the head: the root, and the neck upon it."""
 
 
 @dataclass(frozen=True)
@@ -114,7 +112,9 @@ class NamedMap:
         self._missing = tuple(name for name in wanted if name not in place_of)
         self._known, self._carrier = named, None
         if driver.has_shoulders != avatar.has_shoulders:
-            self._carrier, other = reversed(_CARRIERS) if avatar.has_shoulders else _CARRIERS
+            self._carrier, other = (
+                reversed(CARRIER_FIELDS) if avatar.has_shoulders else CARRIER_FIELDS
+            )
             self._stays = [avatar.layout.slice(other)]
             if avatar.has_shoulders:
                 for name in ("rotation", "translation"):
@@ -133,7 +133,7 @@ class NamedMap:
         result[:, self._to] = theta[:, self._from]
         if self._carrier is not None:
             parts = self._driver.split(theta)
-            root, neck = (axis_angle_to_matrix(parts[name]) for name in _CARRIERS)
+            root, neck = (axis_angle_to_matrix(parts[name]) for name in CARRIER_FIELDS)
             result[:, self._avatar.slice(self._carrier)] = matrix_to_axis_angle(root @ neck)
             for numbers in self._stays:
                 result[:, numbers] = 0

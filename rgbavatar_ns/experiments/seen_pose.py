@@ -18,11 +18,12 @@ from rgbavatar_ns.avatar.method import AvatarMethod
 from rgbavatar_ns.data import TrackedDataset
 from rgbavatar_ns.driving.theta_map import MappedTheta
 from rgbavatar_ns.head import HeadModel, ThetaLayout, turn_seen
+from rgbavatar_ns.head.joints import LEFT_EYE, RIGHT_EYE
+from rgbavatar_ns.head.layout import CARRIER_FIELDS, RIGID_FIELDS
 from rgbavatar_ns.head.rotations import axis_angle_to_matrix, matrix_to_axis_angle
 from rgbavatar_ns.kernels import PinholeCameras
 
-_CARRIERS = ("rotation", "neck")
-_EYEBALLS = (4, 3)
+_EYEBALLS = [RIGHT_EYE, LEFT_EYE]
 """Joints of the subject's right eye (the image's left) and of the left one."""
 _STILL = 1e-5
 
@@ -32,7 +33,7 @@ def eyeballs(
     head: HeadModel, identity: Float[Tensor, "I"], theta: Float[Tensor, "F H"]
 ) -> Float[Tensor, "F 2 3"]:
     """Centres of the posed eyeballs in metres, the subject's right one first."""
-    regressor = torch.from_numpy(head.arrays.joint_regressor[list(_EYEBALLS)]).to(theta)
+    regressor = torch.from_numpy(head.arrays.joint_regressor[_EYEBALLS]).to(theta)
     return torch.einsum("jv,fvc->fjc", regressor, head(theta, identity.to(theta)))
 
 
@@ -84,7 +85,7 @@ def as_seen(
         if bool(mapped.known[where].all()):
             theta[:, where] += (place - view[:3, 3]) @ view[:3, :3] - middle
     else:
-        for name in (*_CARRIERS, "translation"):
+        for name in RIGID_FIELDS:
             theta[:, layout.slice(name)] = rest[0, layout.slice(name)]
     own_turn = _head_turn(theta, layout)
     middle = eyeballs(avatar.head, avatar.identity, theta).mean(1)
@@ -103,13 +104,13 @@ def _before(
 
 def _head_turn(theta: Float[Tensor, "F H"], layout: ThetaLayout) -> Float[Tensor, "F 3 3"]:
     """How root and neck together have turned the head."""
-    root, neck = (axis_angle_to_matrix(theta[:, layout.slice(name)]) for name in _CARRIERS)
+    root, neck = (axis_angle_to_matrix(theta[:, layout.slice(name)]) for name in CARRIER_FIELDS)
     return root @ neck
 
 
 def _turns(theta: Float[Tensor, "F H"], layout: ThetaLayout) -> bool:
     """Whether root or neck ever move."""
-    numbers = torch.cat([theta[:, layout.slice(name)] for name in _CARRIERS], 1)
+    numbers = torch.cat([theta[:, layout.slice(name)] for name in CARRIER_FIELDS], 1)
     return bool((numbers - numbers[0]).abs().max() > _STILL)
 
 
@@ -131,8 +132,8 @@ def _count_from(
     turn: Float[Tensor, "F 3 3"],
 ) -> None:
     """Let the joint that the driver moves turn the head so that `view` sees `turn`."""
-    numbers = {name: layout.slice(name) for name in _CARRIERS}
-    root, neck = (axis_angle_to_matrix(theta[:, numbers[name]]) for name in _CARRIERS)
+    numbers = {name: layout.slice(name) for name in CARRIER_FIELDS}
+    root, neck = (axis_angle_to_matrix(theta[:, numbers[name]]) for name in CARRIER_FIELDS)
     wanted = view[:3, :3].T @ turn
     if bool(mapped.known[numbers["rotation"]].all()):
         theta[:, numbers["rotation"]] = matrix_to_axis_angle(wanted @ neck.mT)

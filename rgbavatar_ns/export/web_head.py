@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, Int
 from rgbavatar_ns.avatar.avatar import Avatar
 from rgbavatar_ns.export.stored_array import StoredArray, exact, ranged, stepped
 from rgbavatar_ns.head.frames import edges_to_frame
+from rgbavatar_ns.head.joints import ROOT
 
 _OFFSET_STEP_M = 5e-5
 """Of an expression at strength 1; off by half of it, a twentieth of a pixel of most films."""
@@ -30,7 +31,7 @@ def head_arrays(avatar: Avatar) -> dict[str, StoredArray]:
     identity = avatar.identity.cpu().numpy().astype(np.float64)
     shapes = arrays.shapedirs.astype(np.float64)
     neutral = arrays.v_template + shapes[..., : arrays.num_identity] @ identity
-    kept = _outline(neutral, arrays.skinning_weights[:, 0] < 0.5)
+    kept = _outline(neutral, arrays.skinning_weights[:, ROOT] < 0.5)
     kept[triangles] = True
     number = np.cumsum(kept) - 1
     expressions = shapes[..., arrays.num_identity :]

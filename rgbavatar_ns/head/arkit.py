@@ -13,7 +13,7 @@ from torch import Tensor
 
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head.arrays import NECK_SHIFTS, HeadArrays
-from rgbavatar_ns.head.layout import ThetaLayout
+from rgbavatar_ns.head.layout import CARRIER_FIELDS, ThetaLayout
 from rgbavatar_ns.head.model import layout_of
 from rgbavatar_ns.head.rotations import axis_angle_to_matrix, matrix_to_axis_angle
 
@@ -79,7 +79,7 @@ class ArkitMap:
     def head_rotation(self, theta: Float[Tensor, "*batch H"]) -> Float[Tensor, "*batch 3"]:
         """The head's turn in the world, root and neck together (axis-angle, radians)."""
         parts = self.layout.split(theta)
-        root, neck = (axis_angle_to_matrix(parts[name]) for name in ("rotation", "neck"))
+        root, neck = (axis_angle_to_matrix(parts[name]) for name in CARRIER_FIELDS)
         return matrix_to_axis_angle(root @ neck)
 
 

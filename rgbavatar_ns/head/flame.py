@@ -12,6 +12,7 @@ import scipy.sparse
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head.arrays import HeadArrays
 from rgbavatar_ns.head.flame_uv import FILE_NAMES, find_uv_file, make_uv_map, read_uv_map
+from rgbavatar_ns.head.joints import EYES, LEFT_EYE, RIGHT_EYE
 from rgbavatar_ns.head.safe_pickle import read_pickle
 from rgbavatar_ns.head.teeth import TeethForm, with_teeth
 from rgbavatar_ns.reading import DamagedFileError, load_array
@@ -94,9 +95,9 @@ def load_flame(
         expression_names=tuple(f"expression_{i}" for i in range(num_expressions)),
         eyelid_dirs=_eyelid_dirs(eyelids, places),
         vertex_groups={
-            "skin": np.flatnonzero(weights[:, 3:].max(1) <= 0.5),
-            "left_eye": np.flatnonzero(weights[:, 3] > 0.5),
-            "right_eye": np.flatnonzero(weights[:, 4] > 0.5),
+            "skin": np.flatnonzero(weights[:, EYES].max(1) <= 0.5),
+            "left_eye": np.flatnonzero(weights[:, LEFT_EYE] > 0.5),
+            "right_eye": np.flatnonzero(weights[:, RIGHT_EYE] > 0.5),
         },
     )
     return with_teeth(arrays, teeth_form) if teeth else arrays

@@ -25,6 +25,10 @@ _LARGEST: dict[ThetaForm, tuple[float, str]] = {
     "translation": (100.0, "metres from the origin"),
 }
 """No person does more; trackers that lose the face do, and one such frame destroys a training."""
+CARRIER_FIELDS = ("rotation", "neck")
+"""What turns the head: the root, and the neck upon it."""
+RIGID_FIELDS = (*CARRIER_FIELDS, "translation")
+"""What moves the head as a whole; the other fields make the expression."""
 
 
 @dataclass(frozen=True)

@@ -8,12 +8,12 @@ from torch import Tensor
 from rgbavatar_ns.head.arrays import HeadArrays
 from rgbavatar_ns.head.flame import FLAME_VERTICES
 from rgbavatar_ns.head.landmarks import facemesh_landmarks
+from rgbavatar_ns.head.layout import RIGID_FIELDS
 from rgbavatar_ns.head.model import HeadModel
 from rgbavatar_ns.head.teeth import LOWER_LIP, UPPER_LIP
 
 _INNER_UPPER, _INNER_LOWER = 13, 14
 """FaceMesh's points in the middle of the lips' inner rims."""
-_STILL = ("rotation", "neck", "translation")
 _JAW_STEP_RAD = 0.05
 
 
@@ -34,7 +34,7 @@ class LipGap:
         self._vertices = torch.from_numpy(vertices.astype(np.int64)).flatten()
         self._weights = torch.from_numpy(weights).to(identity)
         self._moves = torch.ones(head.layout.size)
-        for name in _STILL:
+        for name in RIGID_FIELDS:
             self._moves[head.layout.slice(name)] = 0
         self.jaw = head.layout.slice("jaw").start
         two = torch.zeros(2, head.layout.size)

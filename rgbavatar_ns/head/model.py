@@ -10,11 +10,9 @@ from torch import Tensor, nn
 
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head.arrays import EMBEDDED_HEAD, HeadArrays, flat_directions
+from rgbavatar_ns.head.joints import JOINT_FIELDS
 from rgbavatar_ns.head.layout import ThetaField, ThetaLayout
 from rgbavatar_ns.head.rotations import axis_angle_to_matrix
-
-_JOINT_FIELDS = ("rotation", "neck", "jaw", "left_eye", "right_eye")
-"""Theta's field that turns each joint, in the order of the joints."""
 
 
 class HeadModel(nn.Module):
@@ -149,7 +147,7 @@ class HeadModel(nn.Module):
             "joint_directions": self._linear_joint_dirs,
             "skinning": self._weights,
             "parents": tuple(self._parents),
-            "turns": tuple(self.layout.slice(name).start for name in _JOINT_FIELDS),
+            "turns": tuple(self.layout.slice(name).start for name in JOINT_FIELDS),
         }
 
     def _person(
@@ -195,7 +193,7 @@ class HeadModel(nn.Module):
         """
         joints = torch.addmm(person_joints, parts["expression"], self._linear_joint_dirs)
         joints = joints.unflatten(-1, (3, 5)).mT
-        turns = axis_angle_to_matrix(torch.stack([parts[name] for name in _JOINT_FIELDS], dim=1))
+        turns = axis_angle_to_matrix(torch.stack([parts[name] for name in JOINT_FIELDS], dim=1))
         turns = turns - torch.eye(3, dtype=turns.dtype, device=turns.device)
         # About its joint j alone, a bone moves x by T (x - j).
         alone = torch.cat([turns, -(turns @ joints[..., None])], -1).unbind(1)
@@ -245,7 +243,7 @@ def _some(
 def layout_of(arrays: HeadArrays) -> ThetaLayout:
     """What the numbers of this head's theta mean."""
     fields = [ThetaField("expression", arrays.num_expressions, "linear")]
-    fields += [ThetaField(name, 3, "axis_angle") for name in _JOINT_FIELDS]
+    fields += [ThetaField(name, 3, "axis_angle") for name in JOINT_FIELDS]
     if arrays.eyelid_dirs is not None:
         fields.append(ThetaField("eyelids", 2, "linear"))
     fields.append(ThetaField("translation", 3, "translation"))

@@ -11,10 +11,10 @@ from scipy.spatial.transform import Rotation
 
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head.arrays import HeadArrays
+from rgbavatar_ns.head.joints import EYES
 from rgbavatar_ns.head.landmarks import facemesh_landmarks
 from rgbavatar_ns.head.skin_surface import SkinPoints, SkinSurface, is_skin, skin_points
 
-_EYES = [3, 4]
 # What lies this near to a landmark is the face; a rim around it counts as little.
 _FACE_M, _RIM_M, _RIM_WEIGHT = 0.02, 0.04, 0.05
 # How unlike a point and its nearest place may be before they count less, step by step.
@@ -73,7 +73,7 @@ def register(head: HeadArrays) -> Registration:
     for a head without a face.
     """
     surface, face = SkinSurface(head), _Face()
-    eyes = (head.joint_regressor.astype(np.float64) @ head.v_template)[_EYES]
+    eyes = (head.joint_regressor.astype(np.float64) @ head.v_template)[EYES]
     pose, identity = _fit_person(face, surface, eyes)
     turned = Rotation.from_matrix(pose.turn).magnitude()
     if turned > _MOST_TURNED or not 1 / _MOST_GROWN < pose.scale < _MOST_GROWN:
@@ -104,7 +104,7 @@ class _Face:
         self._template = arrays.v_template.astype(np.float64)
         directions = arrays.shapedirs[..., : arrays.num_identity].astype(np.float64)
         self._all_directions = directions
-        regressor = arrays.joint_regressor.astype(np.float64)[_EYES]
+        regressor = arrays.joint_regressor.astype(np.float64)[EYES]
         self.eyes = regressor @ self._template
         self.eye_directions = np.tensordot(regressor, directions, axes=1)
         marks, skin = facemesh_landmarks(), is_skin(arrays)

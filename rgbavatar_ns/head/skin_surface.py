@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 
 from rgbavatar_ns.head.arrays import HeadArrays
+from rgbavatar_ns.head.joints import EYES, JAW
 
 # What counts as distance beside metres: a normal that points elsewhere (per unit), and another
 # share in the jaw's motion, which keeps the upper lip apart from the lower one it rests on.
@@ -17,7 +18,6 @@ _EXACT_SHARE = 0.3
 # Each triangle is sampled as often as gives about so many samples in all.
 _SAMPLES, _MOST_SPLITS = 120_000, 6
 _CANDIDATES = 12
-_JAW = 2
 
 
 @dataclass(frozen=True)
@@ -110,7 +110,7 @@ class SkinSurface:
 def is_skin(arrays: HeadArrays) -> Bool[np.ndarray, "V"]:
     """Vertices of the skin: what the head's groups say, else all but the eyeballs."""
     if "skin" not in arrays.vertex_groups:
-        return arrays.skinning_weights[:, 3:].max(1) <= 0.5
+        return arrays.skinning_weights[:, EYES].max(1) <= 0.5
     skin = np.zeros(len(arrays.v_template), dtype=bool)
     skin[arrays.vertex_groups["skin"]] = True
     return skin
@@ -120,7 +120,7 @@ def skin_points(arrays: HeadArrays, placed: Float[np.ndarray, "V 3"] | None = No
     """All vertices of a head at rest, or as `placed`, with the normals of its skin."""
     vertices = arrays.v_template.astype(np.float64) if placed is None else placed
     faces = arrays.faces[is_skin(arrays)[arrays.faces].all(1)].astype(np.int64)
-    jaw = arrays.skinning_weights[:, _JAW].astype(np.float64)
+    jaw = arrays.skinning_weights[:, JAW].astype(np.float64)
     # Of the triangles around, weighed by area; 0 where there is none.
     a, b, c = vertices[faces].transpose(1, 0, 2)
     areas = np.cross(b - a, c - a)

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from rgbavatar_ns.head.arrays import HeadArrays
+from rgbavatar_ns.head.joints import JAW, NECK
 
 UPPER_LIP = (
     *(1713, 1715, 1716, 1735, 1696, 1694, 1657, 3543),
@@ -24,7 +25,6 @@ TeethForm = Literal["strips", "blocks"]
 order of VHAP and GaussianAvatars, whose `static_offset` counts them (5,023 + 120)."""
 
 _COLUMNS = len(UPPER_LIP)
-_NECK, _JAW = 1, 2
 # Shares of the mouth's width (some 50 mm): how far the teeth lie behind the lips and the lower
 # ones behind the upper, how far those bite over them, their height, and their thickness.
 _BEHIND, _OVERJET, _OVERBITE, _HEIGHT, _THICKNESS = 0.14, 0.03, 0.04, 0.18, 0.1
@@ -62,7 +62,7 @@ def with_teeth(arrays: HeadArrays, form: TeethForm = "strips") -> HeadArrays:
     upper, lower = np.array(UPPER_LIP), np.array(LOWER_LIP)
     vertices = len(arrays.v_template)
     count = _COLUMNS * len(rows)
-    follows = np.repeat([_NECK if row.upper else _JAW for row in rows], _COLUMNS)
+    follows = np.repeat([NECK if row.upper else JAW for row in rows], _COLUMNS)
     weights = np.eye(5, dtype=arrays.skinning_weights.dtype)[follows]
     directions = np.zeros((count, *arrays.shapedirs.shape[1:]), arrays.shapedirs.dtype)
     lips = (arrays.shapedirs[upper] + arrays.shapedirs[lower]) / 2
@@ -77,8 +77,8 @@ def with_teeth(arrays: HeadArrays, form: TeethForm = "strips") -> HeadArrays:
     uv, uv_faces = _uv_strips(len(strips), triangles)
     places = vertices + np.arange(count)
     groups = dict(arrays.vertex_groups)
-    groups["upper_teeth"] = places[follows == _NECK]
-    groups["lower_teeth"] = places[follows == _JAW]
+    groups["upper_teeth"] = places[follows == NECK]
+    groups["lower_teeth"] = places[follows == JAW]
     eyelids = arrays.eyelid_dirs
     return replace(
         arrays,

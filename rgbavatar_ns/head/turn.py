@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from rgbavatar_ns.head.layout import ThetaLayout
+from rgbavatar_ns.head.layout import CARRIER_FIELDS, ThetaLayout
 from rgbavatar_ns.head.rotations import axis_angle_to_matrix, matrix_to_view_degrees
 
 
@@ -17,7 +17,7 @@ def turn_seen(
     """
     parts = layout.split(theta)
     seen = world_to_camera[:, :3, :3].to(theta)
-    turns = [parts[n] for n in ("rotation", "neck") if n in parts and parts[n].shape[1] == 3]
+    turns = [parts[n] for n in CARRIER_FIELDS if n in parts and parts[n].shape[1] == 3]
     if turns:
         for turn in axis_angle_to_matrix(torch.stack(turns)):
             seen = seen @ turn

@@ -16,6 +16,7 @@ from rgbavatar_ns.data.native.frame import TrackedFrame
 from rgbavatar_ns.data.native.writer import DatasetWriter, make_room
 from rgbavatar_ns.head import EMBEDDED_BUST, EMBEDDED_HEAD, HeadModel
 from rgbavatar_ns.head.arrays import NECK_SHIFTS
+from rgbavatar_ns.head.joints import NECK
 from rgbavatar_ns.head.rotations import axis_angle_to_matrix, matrix_to_axis_angle
 from rgbavatar_ns.kernels.types import PinholeCameras
 from rgbavatar_ns.synthetic.config import DemoConfig
@@ -145,7 +146,7 @@ class DemoPerson:
         columns = [arrays.expression_names.index(name) for name in NECK_SHIFTS]
         offsets = arrays.shapedirs[..., [arrays.num_identity + column for column in columns]]
         skull = arrays.vertex_groups["upper_teeth"][0]
-        moved = np.stack([offsets[skull], np.tensordot(arrays.joint_regressor[1], offsets, 1)])
+        moved = np.stack([offsets[skull], np.tensordot(arrays.joint_regressor[NECK], offsets, 1)])
         carried, neck = torch.from_numpy(moved).float() @ expression[columns]
         return carried, neck
 

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import EMBEDDED_BUST, HeadModel
+from rgbavatar_ns.head.joints import NECK
 from rgbavatar_ns.head.landmarks import facemesh_landmarks
 from rgbavatar_ns.head.rotations import axis_angle_to_matrix
 from rgbavatar_ns.synthetic import DemoConfig
@@ -19,7 +20,7 @@ from rgbavatar_ns.synthetic.make import DemoFilm, film_demo
 from rgbavatar_ns.tracking.fit.camera import StillCamera
 from rgbavatar_ns.tracking.fit.landmark_head import LandmarkHead
 from rgbavatar_ns.tracking.torso.body_blocks import BodyBlock
-from rgbavatar_ns.tracking.torso.body_mesh import NECK, BodyMesh
+from rgbavatar_ns.tracking.torso.body_mesh import BodyMesh
 from rgbavatar_ns.tracking.torso.compose import on_body
 from rgbavatar_ns.tracking.torso.features import FollowedPoints
 from rgbavatar_ns.tracking.torso.follow import BodyFollower, BodySighting, FollowerState

@@ -66,12 +66,12 @@ from rgbavatar_ns.avatar.methods.sh import (
 from rgbavatar_ns.avatar.model.image_loss import l1_loss
 from rgbavatar_ns.avatar.model.tangent_to_world import carried
 from rgbavatar_ns.head import HeadArrays, HeadModel
+from rgbavatar_ns.head.joints import JAW, NECK
 from rgbavatar_ns.head.rotations import quat_wxyz_to_matrix
 from rgbavatar_ns.head.surface import interpolated
 from rgbavatar_ns.kernels import GaussianSet, PinholeCameras
 from rgbavatar_ns.options import Between, Count, Counted, Share, Weight
 
-_NECK, _JAW = 1, 2
 _FEWEST_POINTS = 4
 
 Degree = Annotated[int, Between(0, 3)]
@@ -219,7 +219,7 @@ class GaussianBlendshapes(AvatarMethod):
             rest = head(identity.new_zeros(self.layout.size), identity)
             teeth = {
                 bone: faces_within(head.arrays, head.faces, name)
-                for name, bone in (("upper_teeth", _NECK), ("lower_teeth", _JAW))
+                for name, bone in (("upper_teeth", NECK), ("lower_teeth", JAW))
             }
             skin = ~torch.stack(list(teeth.values())).any(0)
             self.face = self._face(rest, head.faces[skin], generator)
@@ -342,7 +342,7 @@ class GaussianBlendshapes(AvatarMethod):
         if self.teeth is None:
             return {}
         size = (self.mouth_centre, self.mouth_radius_m, self.mouth_half_height_m)
-        upper = self.teeth.skinning[:, _NECK] > 0.5
+        upper = self.teeth.skinning[:, NECK] > 0.5
         rows = [self.teeth.position[row] for row in (upper, ~upper)]
         terms = [cylinder_term(row, *size) for row in rows if len(row)]
         return {"mouth": self.config.mouth_weight * torch.stack(terms).sum()}

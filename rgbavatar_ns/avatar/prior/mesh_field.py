@@ -10,6 +10,7 @@ from torch import Tensor
 
 from rgbavatar_ns.avatar.avatar import Avatar
 from rgbavatar_ns.head import HeadArrays
+from rgbavatar_ns.head.joints import EYES
 from rgbavatar_ns.head.surface import MeshEdges
 
 _BEHIND_EYES_M, _BELOW_EYES_M = 0.095, 0.05
@@ -17,8 +18,6 @@ _BEHIND_EYES_M, _BELOW_EYES_M = 0.095, 0.05
 _ABOVE_EARS_M, _TEMPLE_M = 0.04, 0.06
 _HAIRLINE = 0.005
 """How stiff a link over the border of hair is."""
-_EYES = [3, 4]
-"""Their joints."""
 _MIRROR_REACH_M = 5e-3
 _MIRROR_TRUST = 0.3
 """How much what is known of one side of the face tells of the other."""
@@ -148,7 +147,7 @@ def _conjugate_gradients(product, wanted: Tensor, start: Tensor, diagonal: Tenso
 
 def _scalp_of(arrays: HeadArrays) -> Bool[Tensor, "V"]:
     """Vertices where nearly everybody who has hair has it, by where they lie to the eyes."""
-    eyes = (arrays.joint_regressor[_EYES] @ arrays.v_template).mean(0)
+    eyes = (arrays.joint_regressor[EYES] @ arrays.v_template).mean(0)
     _, up, forward = torch.from_numpy((arrays.v_template - eyes).astype("float32")).unbind(1)
     behind = (forward < -_BEHIND_EYES_M) & (up > -_BELOW_EYES_M)
     return behind | ((forward < -_TEMPLE_M) & (up > _ABOVE_EARS_M))

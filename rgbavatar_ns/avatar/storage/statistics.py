@@ -9,9 +9,8 @@ from torch import Tensor
 
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import ThetaLayout, turn_range, turn_seen
+from rgbavatar_ns.head.layout import RIGID_FIELDS
 
-_RIGID = ("rotation", "neck", "translation")
-"""Fields that move the head as a whole; the others make the expression."""
 _AXES = {
     **{f"theta_{kind}": "H" for kind in ("mean", "std", "min", "max", "neutral")},
     **{f"psi_{kind}": "K" for kind in ("mean", "std", "min", "max")},
@@ -187,7 +186,7 @@ def _unknown_turn(sign: int) -> Float[Tensor, "3"]:
 def expressive_numbers(layout: ThetaLayout) -> Bool[Tensor, "H"]:
     """Which numbers of theta make the expression: all but rotation, neck and translation."""
     mask = torch.ones(layout.size, dtype=torch.bool)
-    for name in _RIGID:
+    for name in RIGID_FIELDS:
         if name in layout:
             mask[layout.slice(name)] = False
     return mask

@@ -17,6 +17,7 @@ from rgbavatar_ns.data.native.dataset import TrackedDataset
 from rgbavatar_ns.drawing.compositing import all_filmed, unfilmed_pixels
 from rgbavatar_ns.drawing.wireframe import mesh_silhouette
 from rgbavatar_ns.head import HeadModel
+from rgbavatar_ns.head.joints import ROOT
 
 SMALL_PX = 96
 """Longer side of the images that silhouettes are compared in."""
@@ -123,7 +124,7 @@ def _posed(
 ) -> tuple[Float[np.ndarray, "F V 3"], Int[np.ndarray, "T 3"], Float[np.ndarray, "V 3"]]:
     arrays = dataset.arrays
     head = HeadModel(arrays)
-    with_head = arrays.skinning_weights[:, 0] < 0.5
+    with_head = arrays.skinning_weights[:, ROOT] < 0.5
     faces = arrays.faces[with_head[arrays.faces].all(1)]
     kept = np.unique(faces)
     theta = dataset.theta[list(positions)]

@@ -11,10 +11,11 @@ from rgbavatar_ns.data.importers.frame_record import FrameRecord
 from rgbavatar_ns.data.importers.options import HeadPose
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadArrays
+from rgbavatar_ns.head.joints import NECK, ROOT
+from rgbavatar_ns.head.layout import RIGID_FIELDS
 from rgbavatar_ns.head.rotations import axis_angle_to_matrix, matrix_to_axis_angle
 
 Rigid = Float[np.ndarray, "4 4"]
-_ROOT, _NECK = 0, 1
 _STILL = 1e-5
 
 
@@ -24,7 +25,7 @@ def all_is_the_cameras(records: Sequence[FrameRecord]) -> bool:
     still = not any(
         record.theta[name].any()
         for record in records
-        for name in ("rotation", "neck", "translation")
+        for name in RIGID_FIELDS
         if name in record.theta
     )
     one = len({record.camera_name for record in records}) == 1
@@ -100,7 +101,7 @@ def _joints(
     records: Sequence[FrameRecord], arrays: HeadArrays, identity: Float[np.ndarray, "I"]
 ) -> Float[np.ndarray, "F 2 3"]:
     """Root and neck of each frame's expression at rest."""
-    regressor = arrays.joint_regressor[[_ROOT, _NECK]].astype(np.float64)
+    regressor = arrays.joint_regressor[[ROOT, NECK]].astype(np.float64)
     count = arrays.num_identity
     shapedirs = arrays.shapedirs.astype(np.float64)
     rest = regressor @ (arrays.v_template + shapedirs[..., :count] @ identity)

@@ -21,6 +21,7 @@ from rgbavatar_ns.data.importers.import_report import UnusableFrameError
 from rgbavatar_ns.data.importers.source import Reading, Source, assemble
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadArrays
+from rgbavatar_ns.head.joints import JOINT_FIELDS
 
 INDEX_FILE = "flame_params.json"
 FLAME_VERSION = "2020"
@@ -28,7 +29,6 @@ SCALE = 4.0
 """IMAvatar's world is FLAME's times this."""
 _HELD_OUT = 350
 _IMAGES = ("image", "images")
-_POSE = ("rotation", "neck", "jaw", "left_eye", "right_eye")
 
 
 def is_imavatar(folder: Folder) -> bool:
@@ -97,7 +97,7 @@ def _record(
     # Some exporters write the first focal length with the wrong sign.
     camera = CameraRecord(world_to_camera, np.abs(intrinsics[:2]) * size, intrinsics[2:] * size)
     pose = numbers(frame.get("pose"), 15, "pose").reshape(5, 3)
-    theta: dict[str, np.ndarray] = dict(zip(_POSE, pose))
+    theta: dict[str, np.ndarray] = dict(zip(JOINT_FIELDS, pose))
     expression = frame.get("expression")
     theta["expression"] = padded(expression, arrays.num_expressions, "expression", arrays.name)
     return FrameRecord(number, _frame_image(folder, image, masks), theta, camera)

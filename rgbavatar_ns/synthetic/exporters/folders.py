@@ -14,6 +14,8 @@ from rgbavatar_ns.data.native.writer import DatasetWriter
 from rgbavatar_ns.data.png import encode_png_rgba
 from rgbavatar_ns.files import disk_errors, write_json
 from rgbavatar_ns.head import HeadModel
+from rgbavatar_ns.head.joints import JOINT_FIELDS, ROOT
+from rgbavatar_ns.head.layout import RIGID_FIELDS
 from rgbavatar_ns.head.rotations import axis_angle_to_matrix, matrix_to_6d_rows
 from rgbavatar_ns.head.teeth import with_teeth
 from rgbavatar_ns.synthetic.exporters.take import Take, TakeFrame
@@ -119,8 +121,7 @@ class InstaWriter(TakeWriter):
         )
 
     def _mesh(self, frame: TakeFrame) -> str:
-        still = ("rotation", "neck", "translation")
-        parts = {name: value for name, value in frame.theta.items() if name not in still}
+        parts = {name: value for name, value in frame.theta.items() if name not in RIGID_FIELDS}
         theta = self._head.layout.join({n: torch.from_numpy(v) for n, v in parts.items()})
         with torch.no_grad():
             vertices = self._head(theta, torch.from_numpy(self._take.identity))
@@ -197,7 +198,7 @@ class VhapWriter(TakeWriter):
                 "camera_indices": [0],
             }
             write_json(self._dst / f"transforms{split}.json", index)
-        zero = {name: np.zeros(3) for name in ("translation", "rotation", "neck")}
+        zero = {name: np.zeros(3) for name in RIGID_FIELDS}
         zero |= {"left_eye": np.zeros(3), "right_eye": np.zeros(3), "expression": np.zeros(100)}
         canonical = self._parameters({**zero, "jaw": np.array([0.3, 0, 0])})
         np.savez(self._dst / "canonical_flame_param.npz", **canonical)
@@ -218,7 +219,7 @@ class IMAvatarWriter(TakeWriter):
         matrix = frame.world_to_camera.copy()
         matrix[:3, 3] += matrix[:3, :3] @ theta["translation"]
         matrix[:3, 3] *= _IMAVATAR_SCALE
-        pose = [theta[part] for part in ("rotation", "neck", "jaw", "left_eye", "right_eye")]
+        pose = [theta[part] for part in JOINT_FIELDS]
         size = np.array([self._take.width, self._take.height])
         self._intrinsics = [
             *(frame.focal_px / size * [-1, 1]).tolist(),
@@ -305,7 +306,7 @@ def _rigid_camera(take: Take, frame: TakeFrame) -> Float[np.ndarray, "4 4"]:
     arrays = take.arrays
     coefficients = np.concatenate([take.identity, frame.theta["expression"]])
     vertices = arrays.v_template + arrays.shapedirs.astype(np.float64) @ coefficients
-    root = arrays.joint_regressor[0].astype(np.float64) @ vertices
+    root = arrays.joint_regressor[ROOT].astype(np.float64) @ vertices
     turn = axis_angle_to_matrix(torch.from_numpy(frame.theta["rotation"])).numpy()
     motion = np.eye(4)
     motion[:3, :3] = turn

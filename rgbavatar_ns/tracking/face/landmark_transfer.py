@@ -9,6 +9,7 @@ from jaxtyping import Float, Int
 
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head.arrays import HeadArrays
+from rgbavatar_ns.head.joints import EYES, JAW
 from rgbavatar_ns.head.landmarks import (
     UNSURE_M,
     LandmarkMap,
@@ -21,7 +22,6 @@ from rgbavatar_ns.head.landmarks import (
 from rgbavatar_ns.head.registration import Registration, register, similarity_slopes
 from rgbavatar_ns.head.skin_surface import SkinSurface, is_skin, skin_points
 
-_JAW, _EYES = 2, (3, 4)
 # Landmark displacements are told apart to this much; coefficients are of the order of one.
 _NOISE_M = 0.0005
 # Directions to the camera for which the response to the view is carried over: within 45 degrees.
@@ -47,7 +47,7 @@ def fitted_head(head: HeadArrays) -> FittedHead:
     A head without eyelid offsets and without named expressions gets the embedded head's blinks as
     its eyelids. Raises UserError for a head without a face or without eyeballs.
     """
-    eyeballs = [_eyeball(head, joint) for joint in _EYES]
+    eyeballs = [_eyeball(head, joint) for joint in EYES]
     registration = register(head)
     blinks = any(name.startswith("eyeBlink") for name in head.expression_names)
     if head.eyelid_dirs is None and not blinks:
@@ -70,7 +70,7 @@ def carried_landmarks(
     embedded, marks = HeadArrays.embedded(), facemesh_landmarks()
     triangle, barycentric = marks.triangle.copy(), marks.barycentric.copy()
     corners = embedded.faces[marks.triangle]
-    eye_share = _at(marks, embedded, embedded.skinning_weights.astype(np.float64))[:, _EYES]
+    eye_share = _at(marks, embedded, embedded.skinning_weights.astype(np.float64))[:, EYES]
     on_skin = np.flatnonzero(eye_share.max(1) < 0.5)
     points = skin_points(embedded, registration.placed).between(corners, marks.barycentric)
     places = SkinSurface(head).nearest(points.select(on_skin))
@@ -78,7 +78,7 @@ def carried_landmarks(
     spread_m = marks.spread_m.copy()
     spread_m[on_skin] = np.hypot(spread_m[on_skin], places.unlike_m)
     at_rest = _at(marks, embedded, embedded.v_template.astype(np.float64))
-    for column, joint in enumerate(_EYES):
+    for column, joint in enumerate(EYES):
         rows = np.flatnonzero(eye_share[:, column] >= 0.5)
         center = embedded.joint_regressor[joint].astype(np.float64) @ embedded.v_template
         triangle[rows], barycentric[rows] = _on_eyeball(
@@ -204,8 +204,8 @@ def _jaw_slopes(
     head: HeadArrays, marks: LandmarkMap, points: Float[np.ndarray, "L 3"]
 ) -> Float[np.ndarray, "L 3"]:
     """How the landmarks move as the jaw begins to open, metres a radian."""
-    pivot = head.joint_regressor[_JAW].astype(np.float64) @ head.v_template
-    share = _at(marks, head, head.skinning_weights.astype(np.float64))[:, _JAW, None]
+    pivot = head.joint_regressor[JAW].astype(np.float64) @ head.v_template
+    share = _at(marks, head, head.skinning_weights.astype(np.float64))[:, JAW, None]
     return share * np.cross([1.0, 0.0, 0.0], points - pivot)
 
 

@@ -7,10 +7,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from rgbavatar_ns.head import HeadModel
+from rgbavatar_ns.head.joints import JAW, JOINT_FIELDS, NECK
 from rgbavatar_ns.head.landmarks import LandmarkResponse
 from rgbavatar_ns.tracking.fit.pose_chain import (
-    JAW,
-    SKULL,
     PoseChain,
     PoseView,
     cross_matrices,
@@ -22,8 +21,6 @@ _Theta = Float[np.ndarray, "H"]
 _Identity = Float[np.ndarray, "I"]
 _Point = Float[np.ndarray, "3"]
 _Coefficients = Float[np.ndarray, "C"]
-
-POSE_FIELDS = ("rotation", "neck", "jaw", "left_eye", "right_eye")
 
 
 @dataclass(frozen=True)
@@ -68,7 +65,7 @@ class _Moments:
 
     def joint_shares(self) -> Float[np.ndarray, "L 5"]:
         """How much of each landmark each joint carries."""
-        shares = np.zeros((len(self.joint), len(POSE_FIELDS)))
+        shares = np.zeros((len(self.joint), len(JOINT_FIELDS)))
         np.put_along_axis(shares, self.joint, self.share, axis=1)
         return shares
 
@@ -182,7 +179,7 @@ class LandmarkHead:
     def unknowns(self, theta_columns: Int[np.ndarray, "P"], identity_columns: int = 0) -> Unknowns:
         """Entries of theta, then the identity's first coefficients, as unknowns of a fit."""
         kinds: dict[int, tuple[str, int]] = {}
-        for joint, name in enumerate(POSE_FIELDS):
+        for joint, name in enumerate(JOINT_FIELDS):
             if name in self.layout:
                 first = self.layout.slice(name).start
                 kinds |= {first + axis: ("angle", 3 * joint + axis) for axis in range(3)}
@@ -264,18 +261,18 @@ class LandmarkHead:
             by_angle += turned @ slid.reshape(count, -1, len(joints))
         if moments.pose_dirs is not None:
             turning = cross_matrices(local_spins) @ chain.local[joints]
-            slopes = np.zeros((len(POSE_FIELDS), 9, len(joints)))
+            slopes = np.zeros((len(JOINT_FIELDS), 9, len(joints)))
             slopes[joints, :, np.arange(len(joints))] = turning.reshape(-1, 9)
             corrected = _times(moments.pose_dirs, slopes[1:].reshape(36, -1))
             by_angle += turned @ corrected.reshape(count, -1, len(joints))
         result[..., angles] += by_angle
-        shifts = self._joint_shifts(chain, unknowns).reshape(len(POSE_FIELDS), -1)
+        shifts = self._joint_shifts(chain, unknowns).reshape(len(JOINT_FIELDS), -1)
         result += (self._joint_shares @ shifts).reshape(result.shape)
         return result
 
     def head_rotation(self, theta: _Theta) -> Float[np.ndarray, "3 3"]:
         """World rotation of the skull: global rotation, then neck."""
-        return self._chain(theta, np.zeros(self._joint_dirs.shape[-1])).turned[SKULL]
+        return self._chain(theta, np.zeros(self._joint_dirs.shape[-1])).turned[NECK]
 
     def chain(self, theta: _Theta, identity: _Identity) -> PoseChain:
         """The joints of a pose."""
@@ -308,11 +305,11 @@ class LandmarkHead:
 
     def _view(self, theta: _Theta, coefficients: _Coefficients, eye_m: _Point | None) -> PoseView:
         chain = self._chain(theta, coefficients)
-        towards = np.array([0.0, 0.0, 1.0]) if eye_m is None else eye_m - chain.placed[SKULL]
+        towards = np.array([0.0, 0.0, 1.0]) if eye_m is None else eye_m - chain.placed[NECK]
         towards = towards / np.linalg.norm(towards)
-        x, y, _ = chain.turned[SKULL].T @ towards
+        x, y, _ = chain.turned[NECK].T @ towards
         angles = np.zeros((3, 2))
-        for row, name in enumerate(POSE_FIELDS[JAW:]):
+        for row, name in enumerate(JOINT_FIELDS[JAW:]):
             if name in self.layout:
                 angles[row] = theta[self.layout.slice(name)][:2]
         sines = np.sin(angles)
@@ -321,7 +318,7 @@ class LandmarkHead:
 
     def _chain(self, theta: _Theta, coefficients: _Coefficients) -> PoseChain:
         poses = np.zeros((5, 3))
-        for joint, name in enumerate(POSE_FIELDS):
+        for joint, name in enumerate(JOINT_FIELDS):
             if name in self.layout:
                 poses[joint] = theta[self.layout.slice(name)]
         local = rotation_matrices(poses)

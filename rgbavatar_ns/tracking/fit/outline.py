@@ -10,10 +10,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from rgbavatar_ns.head import HeadModel
+from rgbavatar_ns.head.joints import NECK
 from rgbavatar_ns.tracking.fit.camera import StillCamera
 from rgbavatar_ns.tracking.fit.landmark_head import LandmarkHead
 from rgbavatar_ns.tracking.fit.levenberg_marquardt import Evaluation, QuadraticModel
-from rgbavatar_ns.tracking.fit.pose_chain import SKULL
 
 _Theta = Float[np.ndarray, "H"]
 _Identity = Float[np.ndarray, "I"]
@@ -192,7 +192,7 @@ def spread_vertices(head: HeadModel) -> Int[np.ndarray, "N"]:
     arrays = head.arrays
     template = arrays.v_template.astype(np.float64)
     eyes_m = (arrays.joint_regressor.astype(np.float64) @ template)[-2:, 1].mean()
-    rigid = arrays.skinning_weights[:, SKULL] > _RIGID
+    rigid = arrays.skinning_weights[:, NECK] > _RIGID
     may = np.flatnonzero(rigid & (template[:, 1] > eyes_m - _BELOW_EYES_M))
     places = template[may]
     chosen = [int(np.argmax(places[:, 1]))]

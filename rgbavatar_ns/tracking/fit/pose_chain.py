@@ -5,7 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-ROOT, SKULL, JAW = 0, 1, 2
+from rgbavatar_ns.head.joints import JAW, NECK
+
 NUM_SIGNALS = 8
 """The view's five terms, the jaw, the eyes' pitch and yaw."""
 _NO_ANGLE_RAD = 1e-7
@@ -63,8 +64,8 @@ def signal_slopes(
     """
     slopes = np.zeros((NUM_SIGNALS, len(joints)))
     # The direction to the camera turns the other way, as the skull sees it.
-    seen = -(spins @ cross_matrices(view.towards)) @ view.chain.turned[SKULL]
-    dx, dy = np.where(joints <= SKULL, seen[:, :2].T, 0.0)
+    seen = -(spins @ cross_matrices(view.towards)) @ view.chain.turned[NECK]
+    dx, dy = np.where(joints <= NECK, seen[:, :2].T, 0.0)
     x, y = view.signals[:2]
     slopes[:5] = dx, dy, 2 * x * dx, 2 * y * dy, x * dy + y * dx
     for place, (joint, axis) in enumerate(zip(joints.tolist(), axes.tolist())):

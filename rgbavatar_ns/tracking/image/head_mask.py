@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from rgbavatar_ns.drawing.wireframe import mesh_silhouette
+from rgbavatar_ns.head.joints import ROOT
 
 # Shares of the face's height (forehead to chin): how far hair may stand off the skull, how far
 # skin may lie beside the fitted mesh, over what length the neck fades out, and how far below the
@@ -60,7 +61,7 @@ class HeadMask:
     def __init__(
         self, faces: Int[np.ndarray, "T 3"], skinning_weights: Float[np.ndarray, "V 5"]
     ) -> None:
-        with_head = skinning_weights[:, 0] < 0.5
+        with_head = skinning_weights[:, ROOT] < 0.5
         self._faces = faces[with_head[faces].all(1)]
         self._ring = neck_ring(self._faces)
 

@@ -8,10 +8,10 @@ import torch
 from jaxtyping import Bool, Float, Int
 
 from rgbavatar_ns.head import HeadModel
+from rgbavatar_ns.head.joints import NECK, ROOT
 from rgbavatar_ns.tracking.fit.camera import StillCamera
 from rgbavatar_ns.tracking.torso.rigid_motion import RigidMotion
 
-NECK = 1
 _AROUND_HEAD_M = 0.025
 # A body is drawn so large to find what of it is seen, and where its depth leaps by so much within
 # so many pixels it hides a part of itself: points there are an outline's, which slides.
@@ -39,7 +39,7 @@ class BodyMesh:
             theta = torch.zeros(head.layout.size, dtype=person.dtype)
             rest = head(theta, person).double().numpy()
             joints = head.joints(person).double().numpy()
-        with_body = arrays.skinning_weights[:, 0] > 0.5
+        with_body = arrays.skinning_weights[:, ROOT] > 0.5
         used, faces = np.unique(arrays.faces[with_body[arrays.faces].all(1)], return_inverse=True)
         return cls(
             rest[used],

@@ -6,9 +6,9 @@ from scipy.spatial.transform import Rotation
 
 from rgbavatar_ns.head import HeadArrays, ThetaLayout
 from rgbavatar_ns.head.arrays import BODY_IDENTITY, NECK_SHIFTS
+from rgbavatar_ns.head.joints import NECK
 from rgbavatar_ns.tracking.fit.landmark_head import LandmarkHead
 from rgbavatar_ns.tracking.fit.pose_chain import PoseChain
-from rgbavatar_ns.tracking.torso.body_mesh import NECK
 from rgbavatar_ns.tracking.torso.place import BodyPlaces
 
 _FARTHEST = 3.0

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from rgbavatar_ns.files import digest
+from rgbavatar_ns.head.joints import NECK
 from rgbavatar_ns.tracking.face.clip import ClipLandmarks
 from rgbavatar_ns.tracking.fit.fit import ClipFit
 from rgbavatar_ns.tracking.fit.subject import SubjectTracker
@@ -18,7 +19,7 @@ from rgbavatar_ns.tracking.resumable_run import ResumableRun
 from rgbavatar_ns.tracking.stage_clock import StageClock
 from rgbavatar_ns.tracking.threads import InBackground
 from rgbavatar_ns.tracking.torso.body_blocks import BodyBlock
-from rgbavatar_ns.tracking.torso.body_mesh import NECK, BodyMesh
+from rgbavatar_ns.tracking.torso.body_mesh import BodyMesh
 from rgbavatar_ns.tracking.torso.follow import BodyFollower, BodySighting, FollowerState, MatteOf
 from rgbavatar_ns.tracking.torso.place import ROUNDS, BodyPlaces, SeenShoulders, place_body
 from rgbavatar_ns.tracking.torso.shape import ShoulderLine, shoulder_line, shoulders_up_cm
