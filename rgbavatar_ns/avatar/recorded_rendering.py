@@ -14,11 +14,10 @@ from rgbavatar_ns.avatar.training.cuda_graph import (
     record_cuda_graph,
     supports,
 )
-from rgbavatar_ns.kernels import DeviceRenderer, PinholeCameras, RenderedBatch
+from rgbavatar_ns.kernels import CAMERA_TENSORS, DeviceRenderer, PinholeCameras, RenderedBatch
 
 _EAGER_PICTURES = 2
 """Pictures before the recording: libraries make their handles, and the lists' room is measured."""
-_CAMERA_PARTS = ("world_to_camera", "focal_px", "principal_point_px")
 
 
 class RecordedRendering:
@@ -47,7 +46,7 @@ class RecordedRendering:
         self._recording = Recording(avatar, self._draw, recorder)
         self._lane = lane(theta.device)
         self._theta = theta.detach().clone()
-        own = {name: getattr(cameras, name).clone() for name in _CAMERA_PARTS}
+        own = {name: getattr(cameras, name).clone() for name in CAMERA_TENSORS}
         self._cameras = replace(cameras, **own)
         self._background = torch.zeros(len(theta), 3, device=theta.device)
         self._pictures = 0
@@ -84,7 +83,7 @@ class RecordedRendering:
             raise ValueError("Another batch or image size than at the start. Make a new one.")
         self._theta.copy_(theta, non_blocking=True)
         if cameras is not None:
-            for name in _CAMERA_PARTS:
+            for name in CAMERA_TENSORS:
                 getattr(own, name).copy_(getattr(cameras, name), non_blocking=True)
         if background is None:
             self._background.zero_()

@@ -22,6 +22,8 @@ from rgbavatar_ns.kernels.registry import (
 )
 from rgbavatar_ns.kernels.similarity import mean_similarity
 from rgbavatar_ns.kernels.types import (
+    BASIS_ATTRIBUTES,
+    CAMERA_TENSORS,
     UPDATED_ATTRIBUTES,
     AdamParameter,
     DeviceError,
@@ -35,6 +37,8 @@ from rgbavatar_ns.kernels.types import (
 )
 
 __all__ = [
+    "BASIS_ATTRIBUTES",
+    "CAMERA_TENSORS",
     "UPDATED_ATTRIBUTES",
     "AdamParameter",
     "DeviceError",

@@ -79,6 +79,10 @@ class PinholeCameras:
         )
 
 
+CAMERA_TENSORS = ("world_to_camera", "focal_px", "principal_point_px")
+"""What cameras hold beside the image size."""
+
+
 @dataclass(frozen=True)
 class RenderedBatch:
     """B images; `depth` and `visibility` are there only when they were asked for.
@@ -170,7 +174,8 @@ UPDATED_ATTRIBUTES = (
     "log_scale",
     "opacity_logit",
 )
-"""What of morphed Gaussians is trained; the first three have bases, named `basis_` and so."""
+"""What of morphed Gaussians is trained; the first three have bases."""
+BASIS_ATTRIBUTES = ("basis_position", "basis_rotation_wxyz", "basis_color_feature")
 
 
 @dataclass(frozen=True)

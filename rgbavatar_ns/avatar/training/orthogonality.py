@@ -11,10 +11,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from rgbavatar_ns.avatar.model.blendshapes import GaussianBlendshapes
+from rgbavatar_ns.kernels import BASIS_ATTRIBUTES
 
 ORTHOGONALITY_WEIGHT, ORTHOGONALIZE_EVERY = 10.0, 1000
 """Of the loss, and how many steps lie between two orthogonalizations."""
-_BASES = ("basis_position", "basis_rotation_wxyz", "basis_color_feature")
 
 
 def orthogonality_error(shapes: GaussianBlendshapes) -> Float[Tensor, ""]:
@@ -46,7 +46,7 @@ def orthogonalize(shapes: GaussianBlendshapes, method: Literal["qr", "gram_schmi
             rows[k] = F.normalize(rows[k], dim=0)
     bases[used] = rows * length[used]
     start = 0
-    for name in _BASES:
+    for name in BASIS_ATTRIBUTES:
         parameter = getattr(shapes, name)
         size = parameter[0].numel()
         parameter.copy_(bases[:, start : start + size].view_as(parameter))
@@ -59,4 +59,4 @@ def _gram_error(shapes: GaussianBlendshapes) -> Float[Tensor, "K K"]:
 
 
 def _rows(shapes: GaussianBlendshapes) -> Float[Tensor, "K d"]:
-    return torch.cat([getattr(shapes, name).flatten(1) for name in _BASES], dim=1)
+    return torch.cat([getattr(shapes, name).flatten(1) for name in BASIS_ATTRIBUTES], dim=1)

@@ -25,7 +25,7 @@ from rgbavatar_ns.avatar.training.cuda_graph import (
 )
 from rgbavatar_ns.avatar.training.frame_heads import FrameHeads
 from rgbavatar_ns.avatar.training.optimizer_states import AdamStates
-from rgbavatar_ns.kernels import UPDATED_ATTRIBUTES, DeviceRenderer
+from rgbavatar_ns.kernels import CAMERA_TENSORS, UPDATED_ATTRIBUTES, DeviceRenderer
 
 _NUMBERS = 5
 _EAGER_STEPS = 3
@@ -163,8 +163,9 @@ class RecordedStep:
         frames = self.frames
         theta, cameras = frames.theta.index_select(0, index), frames.cameras
         if len(cameras.focal_px) > 1:
-            parts = ("world_to_camera", "focal_px", "principal_point_px")
-            chosen = {name: getattr(cameras, name).index_select(0, index) for name in parts}
+            chosen = {
+                name: getattr(cameras, name).index_select(0, index) for name in CAMERA_TENSORS
+            }
             cameras = replace(cameras, **chosen)
         with torch.enable_grad():
             psi = self._avatar.weights_of(self._heads.features.index_select(0, index))

@@ -19,10 +19,9 @@ from rgbavatar_ns.data.streams.protocol import StreamedFrame, StreamSubject
 from rgbavatar_ns.data.streams.replay import ReplayStream
 from rgbavatar_ns.drawing.compositing import unfilmed_pixels
 from rgbavatar_ns.errors import UserError
-from rgbavatar_ns.kernels.types import PinholeCameras
+from rgbavatar_ns.kernels.types import CAMERA_TENSORS, PinholeCameras
 
 _RECENT = 500
-_CAMERA_PARTS = ("world_to_camera", "focal_px", "principal_point_px")
 
 
 @dataclass(frozen=True)
@@ -203,7 +202,7 @@ class ReplayBuffer:
         """Theta and the cameras' parts of frames, one row a frame."""
         frames = [self._held[serial].frame for serial in serials]
         parts = {"theta": [frame.theta[None] for frame in frames]}
-        for name in _CAMERA_PARTS:
+        for name in CAMERA_TENSORS:
             parts[name] = [getattr(frame.camera, name) for frame in frames]
         return {name: torch.cat(rows or [torch.empty(0)]) for name, rows in parts.items()}
 
@@ -247,7 +246,7 @@ class ReplayBuffer:
             for row, (serial, index) in enumerate(
                 zip(state["serial"].tolist(), state["index"].tolist())
             ):
-                parts = {name: state[name][row : row + 1].cpu() for name in _CAMERA_PARTS}
+                parts = {name: state[name][row : row + 1].cpu() for name in CAMERA_TENSORS}
                 camera = PinholeCameras(**parts, width=size[0], height=size[1])
                 theta = state["theta"][row].cpu()
                 png, marks = images[row]

@@ -21,7 +21,9 @@ from rgbavatar_ns.kernels.cpu import (
 )
 from rgbavatar_ns.kernels.functional import checked_background
 from rgbavatar_ns.kernels.types import (
+    BASIS_ATTRIBUTES,
     TANGENT_VARIANTS,
+    UPDATED_ATTRIBUTES,
     AdamParameter,
     FirstSight,
     MorphedGaussians,
@@ -30,9 +32,6 @@ from rgbavatar_ns.kernels.types import (
     RenderedBatch,
     WeightedColors,
 )
-
-_BASE = ("position", "rotation_wxyz", "color_feature", "log_scale", "opacity_logit")
-_BASES = ("basis_position", "basis_rotation_wxyz", "basis_color_feature")
 
 
 def native_gaussians(gaussians: MorphedGaussians) -> Any:
@@ -161,7 +160,7 @@ class CpuMorphedRenderer:
         """Take one step of Adam, or none, by the gradient of the last forward_loss."""
         if not self._has_gradient:
             raise ValueError("There is no gradient yet. Call forward_loss() first.")
-        names = _BASE + (_BASES if self._weights.shape[1] else ())
+        names = UPDATED_ATTRIBUTES + (BASIS_ATTRIBUTES if self._weights.shape[1] else ())
         groups = [] if parameters is None else [_arrays(parameters[name]) for name in names]
         self._has_gradient = False  # the parameters are others now
         weights = torch.empty_like(self._weights)
