@@ -24,8 +24,8 @@ from rgbavatar_ns.bench.scenes import DEFAULT_COUNT, DEFAULT_SIZE_PX, ellipsoid_
 from rgbavatar_ns.bench.timing import Stopwatch
 from rgbavatar_ns.errors import UserError, told_without_traceback
 from rgbavatar_ns.files import write_json
-from rgbavatar_ns.kernels.threads import using_threads
 from rgbavatar_ns.reading import DamagedFileError, load_json
+from rgbavatar_ns.threads import using_threads
 
 Points = list[tuple[float, float, float, float]]
 """(what is varied, median, lower and upper quartile in milliseconds)."""

@@ -33,7 +33,7 @@ from rgbavatar_ns.kernels import (
     rasterize,
 )
 from rgbavatar_ns.kernels.constants import MIN_ALPHA
-from rgbavatar_ns.kernels.threads import using_threads
+from rgbavatar_ns.threads import using_threads
 
 LEARNING_RATES: dict[str, float] = {
     "position": 8e-4,

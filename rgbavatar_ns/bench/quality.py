@@ -31,8 +31,8 @@ from rgbavatar_ns.data import ImageCache, OfflineOrder, TrackedDataset, load_dat
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.files import read_json
 from rgbavatar_ns.head import HeadModel
-from rgbavatar_ns.kernels.threads import using_threads
 from rgbavatar_ns.synthetic import DemoConfig, make_demo_dataset
+from rgbavatar_ns.threads import using_threads
 
 _MARKS_S = (1.0, 2.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0, 32.0, 48.0, 64.0, 96.0, 128.0, 192.0)
 _FRAMES, _HELD_OUT, _SIZE_PX = 160, 16, 256

@@ -31,7 +31,7 @@ from rgbavatar_ns.bench.timing import (
 )
 from rgbavatar_ns.bench.workloads import avatar_workload
 from rgbavatar_ns.kernels import GaussianSet, PinholeCameras, rasterize
-from rgbavatar_ns.kernels.threads import using_threads
+from rgbavatar_ns.threads import using_threads
 
 FORWARD, BACKWARD = "forward, no gradients", "backward"
 WHOLE = "forward and backward"

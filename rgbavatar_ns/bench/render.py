@@ -32,7 +32,7 @@ from rgbavatar_ns.bench.timing import (
 from rgbavatar_ns.bench.workloads import AvatarWorkload, avatar_workload, parameters_of
 from rgbavatar_ns.drawing.compositing import to_uint8
 from rgbavatar_ns.kernels import rasterize
-from rgbavatar_ns.kernels.threads import using_threads
+from rgbavatar_ns.threads import using_threads
 
 WHOLE_FRAME = "whole frame"
 VIEWER_FRAME = "(the viewer's picture, as bytes)"

@@ -39,7 +39,7 @@ from rgbavatar_ns.bench.timing import (
 )
 from rgbavatar_ns.bench.trainer import bench_trainer
 from rgbavatar_ns.bench.workloads import AvatarWorkload, avatar_workload, parameters_of
-from rgbavatar_ns.kernels.threads import using_threads
+from rgbavatar_ns.threads import using_threads
 
 WHOLE_STEP = "whole step"
 EAGER_STEP = "whole step, eager"

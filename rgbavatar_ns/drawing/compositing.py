@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from rgbavatar_ns.kernels.constants import UNFILMED_RGBA
-from rgbavatar_ns.kernels.threads import using_threads
+from rgbavatar_ns.threads import using_threads
 
 ImagesRGBA = UInt8[Tensor, "*batch height width 4"] | Float[Tensor, "*batch height width 4"]
 """Straight-alpha images, of 8 bits or in [0, 1]."""

@@ -27,8 +27,8 @@ from rgbavatar_ns.head.layout import CARRIER_FIELDS
 from rgbavatar_ns.head.lips import LipGap
 from rgbavatar_ns.head.rotations import axis_angle_to_matrix, matrix_to_axis_angle
 from rgbavatar_ns.kernels import PinholeCameras
-from rgbavatar_ns.kernels.threads import using_threads
 from rgbavatar_ns.options import CheckedOptions, Weight
+from rgbavatar_ns.threads import using_threads
 
 _LOWEST = 0.1
 """Of a calibration's frames this share may lie below rest, as a tracker's noise does."""

@@ -12,7 +12,7 @@ from rgbavatar_ns.drawing.compositing import to_uint8
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.kernels import available_backends, packed_gaussians, rasterize
 from rgbavatar_ns.kernels.constants import MIN_ALPHA
-from rgbavatar_ns.kernels.threads import using_threads
+from rgbavatar_ns.threads import using_threads
 from tests.avatar.fused_scene import (
     VARIANTS,
     drawn_by_the_reference,

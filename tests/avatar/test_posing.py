@@ -10,8 +10,8 @@ from rgbavatar_ns.avatar.model.posing_parameters import posing_parameters
 from rgbavatar_ns.head import EMBEDDED_BUST, HeadModel
 from rgbavatar_ns.head.flame import load_flame
 from rgbavatar_ns.kernels import Posing, available_backends, posing_of
-from rgbavatar_ns.kernels.threads import using_threads
 from rgbavatar_ns.synthetic.flame import write_synthetic_flame
+from rgbavatar_ns.threads import using_threads
 from tests.avatar.small_head import random_theta, randomize, small_head
 from tests.kernels.conftest import instruction_set  # noqa: F401
 

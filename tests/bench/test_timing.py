@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from rgbavatar_ns.bench.timing import WHOLE, Spread, Stopwatch, peak_growth_bytes
-from rgbavatar_ns.kernels.threads import using_threads
+from rgbavatar_ns.threads import using_threads
 from tests.data.streaming import Clock
 
 

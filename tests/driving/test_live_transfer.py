@@ -18,9 +18,9 @@ from rgbavatar_ns.head.flame import load_flame
 from rgbavatar_ns.head.landmarks import facemesh_landmarks
 from rgbavatar_ns.head.lips import LipGap
 from rgbavatar_ns.head.rotations import axis_angle_to_matrix
-from rgbavatar_ns.kernels.threads import using_threads
 from rgbavatar_ns.synthetic.flame import write_synthetic_flame
 from rgbavatar_ns.synthetic.performer.performance import perform, with_tracker_noise
+from rgbavatar_ns.threads import using_threads
 from tests.export.subject import avatar_of
 
 from .packets import packet

@@ -7,7 +7,7 @@ import torch
 
 from rgbavatar_ns.avatar.methods.sh import sh_colors
 from rgbavatar_ns.kernels import harmonic_colors
-from rgbavatar_ns.kernels.threads import using_threads
+from rgbavatar_ns.threads import using_threads
 
 
 def normal(*shape: int, seed: int = 0) -> torch.Tensor:

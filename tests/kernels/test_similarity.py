@@ -7,7 +7,7 @@ import torch
 
 from rgbavatar_ns.avatar.methods.loss_terms import dssim_loss
 from rgbavatar_ns.kernels import mean_similarity
-from rgbavatar_ns.kernels.threads import using_threads
+from rgbavatar_ns.threads import using_threads
 
 WINDOW = torch.full((11,), 1 / 11)
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from rgbavatar_ns.kernels import available_backends, rasterize
-from rgbavatar_ns.kernels.threads import using_threads
+from rgbavatar_ns.threads import using_threads
 from tests.kernels.scenes import random_scene, to
 
 pytestmark = pytest.mark.skipif("cpu" not in available_backends(), reason="not compiled")

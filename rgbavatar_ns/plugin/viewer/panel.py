@@ -22,7 +22,6 @@ from rgbavatar_ns.export import dataset_folder
 from rgbavatar_ns.export.scenes import driven_by
 from rgbavatar_ns.head import ThetaLayout, turn_seen
 from rgbavatar_ns.kernels import PinholeCameras
-from rgbavatar_ns.kernels.threads import using_threads
 from rgbavatar_ns.plugin.avatar_model import AvatarModel
 from rgbavatar_ns.plugin.film_path import FilmMoment
 from rgbavatar_ns.plugin.viewer.client import serve_sharp_client
@@ -38,6 +37,7 @@ from rgbavatar_ns.plugin.viewer.sliders import number_sliders
 from rgbavatar_ns.plugin.viewer.viewer_state import DrivenBy, ViewerState
 from rgbavatar_ns.plugin.viewer.viewpoint import Viewpoint
 from rgbavatar_ns.plugin.viewer.widgets import Widgets
+from rgbavatar_ns.threads import using_threads
 
 _TICK_S = 0.01
 _PATIENCE_S = 5.0

@@ -27,10 +27,10 @@ from rgbavatar_ns.drawing.compositing import (
 from rgbavatar_ns.drawing.wireframe import with_wireframe
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.kernels import GaussianSet, PinholeCameras, RenderedBatch
-from rgbavatar_ns.kernels.threads import using_threads
 from rgbavatar_ns.plugin.cameras import filled_depth
 from rgbavatar_ns.plugin.viewer.driving import DrivingSignal
 from rgbavatar_ns.plugin.viewer.viewer_state import ViewerState
+from rgbavatar_ns.threads import using_threads
 
 _SEEN = 0.02
 _CENTRE_RGB = (60, 255, 120)

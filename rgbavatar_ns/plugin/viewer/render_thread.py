@@ -14,7 +14,7 @@ from nerfstudio.viewer.render_state_machine import RenderAction, RenderStateMach
 from nerfstudio.viewer.utils import get_camera
 from torch import Tensor
 
-from rgbavatar_ns.kernels.threads import using_threads
+from rgbavatar_ns.threads import using_threads
 
 _BUDGET_S = 1 / 25
 """A moving picture may take so long to draw and to send."""

@@ -18,7 +18,7 @@ from rgbavatar_ns.head.landmarks import (
     facemesh_noise,
     facemesh_response,
 )
-from rgbavatar_ns.kernels.threads import using_threads
+from rgbavatar_ns.threads import using_threads
 from rgbavatar_ns.tracking.config import TrackConfig
 from rgbavatar_ns.tracking.face.detector import (
     FACE_OVAL,
