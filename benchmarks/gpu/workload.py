@@ -23,7 +23,7 @@ from rgbavatar_ns.avatar.training import TrainingOptions, TrainingStep
 from rgbavatar_ns.avatar.training.batches import ChosenFrames, DeviceFrames
 from rgbavatar_ns.avatar.training.cuda_graph import Recorder, record_cuda_graph
 from rgbavatar_ns.avatar.training.losses import random_backgrounds
-from rgbavatar_ns.bench.scenes import ellipsoid_scene, front_camera, on_device
+from rgbavatar_ns.bench.scenes import close_camera, ellipsoid_scene, on_device
 from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.kernels import GaussianSet, PinholeCameras
 from rgbavatar_ns.kernels.cuda.launcher import Launcher
@@ -146,7 +146,7 @@ class Training:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(0)  # the weight network's first weights
             avatar = Avatar(head, torch.zeros(head.num_identity), config)
-        cameras = on_device(front_camera(avatar, work.size_px), work.device)
+        cameras = on_device(close_camera(avatar, work.size_px), work.device)
         theta = 0.05 * torch.randn(work.frames, avatar.layout.size, generator=generator)
         self.avatar, self.work = avatar.to(work.device), work
         theta = theta.to(work.device)

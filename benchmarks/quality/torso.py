@@ -31,7 +31,7 @@ from rgbavatar_ns.head.rotations import axis_angle_to_matrix
 from rgbavatar_ns.synthetic import DemoConfig
 from rgbavatar_ns.synthetic.make import DemoFilm, film_demo
 from rgbavatar_ns.synthetic.performer.performance import Body
-from rgbavatar_ns.synthetic.renderer.raycast import StillCamera
+from rgbavatar_ns.synthetic.renderer.raycast import RayCamera
 from rgbavatar_ns.tracking import TrackConfig, track_video
 
 FRAMES_PER_SECOND = 15.0
@@ -48,9 +48,7 @@ def write_film(film: DemoFilm, scene: Scene, folder: Path) -> Float[np.ndarray, 
     return np.array(middles)
 
 
-def turned_to(
-    middle_px: Float[np.ndarray, "F 2"], camera: StillCamera
-) -> Float[np.ndarray, "F 3 3"]:
+def turned_to(middle_px: Float[np.ndarray, "F 2"], camera: RayCamera) -> Float[np.ndarray, "F 3 3"]:
     """From the camera's axes to those of one that looks at these pixels, as trackers assume."""
     right, down = ((middle_px - camera.size / 2) / camera.focal_px).T
     return Rotation.from_rotvec(np.stack([down, right, 0 * right], 1)).as_matrix()

@@ -2,7 +2,7 @@
 
 from rgbavatar_ns.avatar.avatar import FILM_RANGE, LEARNING_RATES, Avatar
 from rgbavatar_ns.avatar.config import AvatarConfig
-from rgbavatar_ns.avatar.model.blendshapes import GaussianBlendshapes, TangentGaussians
+from rgbavatar_ns.avatar.model.blendshapes import TangentBlendshapes, TangentGaussians
 from rgbavatar_ns.avatar.model.weight_network import WeightNetwork
 
 __all__ = [
@@ -10,7 +10,7 @@ __all__ = [
     "LEARNING_RATES",
     "Avatar",
     "AvatarConfig",
-    "GaussianBlendshapes",
+    "TangentBlendshapes",
     "TangentGaussians",
     "WeightNetwork",
 ]

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from rgbavatar_ns.avatar.config import AvatarConfig
 from rgbavatar_ns.avatar.method import AvatarMethod, require_pictures
 from rgbavatar_ns.avatar.model.anchors import GaussianAnchors
-from rgbavatar_ns.avatar.model.blendshapes import GaussianBlendshapes
+from rgbavatar_ns.avatar.model.blendshapes import TangentBlendshapes
 from rgbavatar_ns.avatar.model.kept_copy import KeptCopy, PictureCopy, own_tensors
 from rgbavatar_ns.avatar.model.posing_parameters import posing_parameters
 from rgbavatar_ns.avatar.model.tangent_to_world import tangent_to_world
@@ -101,7 +101,7 @@ class Avatar(AvatarMethod):
         if anchors is None:
             anchors = uv_anchors(head.uv, head.uv_faces, config.uv_resolution)
         self.anchors = GaussianAnchors(head, anchors, rest_vertices, config.tangent_variant)
-        self.blendshapes = GaussianBlendshapes(
+        self.blendshapes = TangentBlendshapes(
             len(self.anchors),
             config.num_bases,
             scale_m=self.initial_scale_m(),

@@ -76,7 +76,7 @@ def ellipsoid_scene(
     return gaussians, cameras
 
 
-def front_camera(avatar: Avatar, size_px: int) -> PinholeCameras:
+def close_camera(avatar: Avatar, size_px: int) -> PinholeCameras:
     """A camera a metre in front of the head, which takes most of the image's height."""
     vertices: Float[Tensor, "V 3"] = torch.as_tensor(avatar.head.arrays.v_template).float()
     low, high = vertices.amin(0), vertices.amax(0)

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from rgbavatar_ns.avatar import Avatar, AvatarConfig
 from rgbavatar_ns.avatar.training import TrainingBatch
 from rgbavatar_ns.bench.options import AvatarOptions
-from rgbavatar_ns.bench.scenes import DEFAULT_SIZE_PX, front_camera, on_device
+from rgbavatar_ns.bench.scenes import DEFAULT_SIZE_PX, close_camera, on_device
 from rgbavatar_ns.bench.timing import CPU
 from rgbavatar_ns.data import TrackedDataset, load_dataset
 from rgbavatar_ns.errors import UserError
@@ -100,7 +100,7 @@ def _batch(
     generator = torch.Generator().manual_seed(0)
     if dataset is None:
         theta = _THETA_DEVIATION * torch.randn(count, avatar.layout.size, generator=generator)
-        cameras = front_camera(avatar, size_px)
+        cameras = close_camera(avatar, size_px)
         shape = (count, size_px, size_px, 4) if with_images else (count, 0, 0, 4)
         images = torch.randint(0, 256, shape, generator=generator, dtype=torch.uint8)
         return TrainingBatch(theta, cameras, images)

@@ -20,7 +20,7 @@ _STRONGEST_GAIN = 64.0
 _CHANGE_GAIN = 2
 
 
-def basis_weights(statistics: TrainingStatistics, gain: float) -> Float[Tensor, "K1 K"]:
+def single_bases(statistics: TrainingStatistics, gain: float) -> Float[Tensor, "K1 K"]:
     """psi of K + 1 pictures: none, then each basis alone at `gain` times its largest weight seen.
 
     The largest is the one of largest magnitude, with its sign: what a basis adds when it is
@@ -50,7 +50,7 @@ def basis_grid(
     count = avatar.config.num_bases
     if count == 0:
         raise UserError("This avatar has no learned bases.", "Train one with num_bases above 0.")
-    extreme, theta = basis_weights(statistics, 1.0), statistics.theta_neutral[None]
+    extreme, theta = single_bases(statistics, 1.0), statistics.theta_neutral[None]
 
     def drawn(basis: int, times: float) -> Picture:
         return next(pictures(avatar, theta, camera, background, times * extreme[basis : basis + 1]))

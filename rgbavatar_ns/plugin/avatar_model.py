@@ -32,7 +32,7 @@ from rgbavatar_ns.plugin.checkpoint_state import (
     require_same_layout,
     tell_another_person,
 )
-from rgbavatar_ns.plugin.dataparser import Subject
+from rgbavatar_ns.plugin.dataparser import FilmedSubject
 from rgbavatar_ns.plugin.refinement import frame_refinement, require_same_refinement
 
 Outputs = dict[str, Tensor]
@@ -85,7 +85,7 @@ class AvatarModel(Model):
         """Build the avatar of the dataset's subject."""
         super().populate_modules()
         subject = self.kwargs["metadata"]["subject"]
-        assert isinstance(subject, Subject)
+        assert isinstance(subject, FilmedSubject)
         self.subject = subject
         seed = 0 if self.config.seed is None else self.config.seed
         self.avatar = self.make_avatar(HeadModel(subject.arrays), subject.identity, seed)

@@ -13,7 +13,7 @@ from rgbavatar_ns.avatar.storage.stored_avatar import RGBAVATAR
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import ThetaLayout
 from rgbavatar_ns.plugin.console import say
-from rgbavatar_ns.plugin.dataparser import Subject
+from rgbavatar_ns.plugin.dataparser import FilmedSubject
 
 _EXTRA_STATE = "_extra_state"
 _PRIOR = "prior."
@@ -21,7 +21,7 @@ _SAME_IDENTITY = 1e-4
 """Coefficients are of size one."""
 
 
-def model_state(avatar: AvatarMethod, subject: Subject) -> dict[str, Any]:
+def model_state(avatar: AvatarMethod, subject: FilmedSubject) -> dict[str, Any]:
     """Tensors and plain values only, so that checkpoints load with `weights_only=True`.
 
     `avatar` is what `Avatar.from_state` needs; `frames` lets another program play the training
@@ -38,7 +38,7 @@ def model_state(avatar: AvatarMethod, subject: Subject) -> dict[str, Any]:
 
 
 @torch.no_grad()
-def film_statistics(avatar: AvatarMethod, film: Subject) -> TrainingStatistics:
+def film_statistics(avatar: AvatarMethod, film: FilmedSubject) -> TrainingStatistics:
     """Statistics of the training frames, with the weights that the avatar's network gives now."""
     train = list(film.train) or [0]
     theta = film.theta[train].cpu()
@@ -74,7 +74,7 @@ def require_same_layout(state_dict: Mapping[str, Any], avatar: AvatarMethod) -> 
     _require_same_make(config, avatar)
 
 
-def tell_another_person(state_dict: Mapping[str, Any], subject: Subject) -> None:
+def tell_another_person(state_dict: Mapping[str, Any], subject: FilmedSubject) -> None:
     """Say where the checkpoint's head is not that of the dataset, as after tracking anew."""
     saved = state_dict.get("avatar.identity")
     mine = subject.identity

@@ -34,7 +34,7 @@ _SCENE_RADIUS_M = 0.5
 
 
 @dataclass(frozen=True)
-class Subject:
+class FilmedSubject:
     """What the model needs to know of a dataset: the head and every frame's theta."""
 
     arrays: HeadArrays
@@ -46,7 +46,7 @@ class Subject:
     """Positions of the training frames."""
     world_to_camera: Float[Tensor, "F 4 4"]
 
-    def __deepcopy__(self, memo: dict[int, Any]) -> "Subject":
+    def __deepcopy__(self, memo: dict[int, Any]) -> "FilmedSubject":
         """nerfstudio copies metadata deeply; nothing here is ever changed, so share it."""
         return self
 
@@ -117,7 +117,7 @@ class RGBAvatarDataParser(DataParser):
             alpha_color=torch.zeros(3),
             scene_box=SceneBox(aabb=torch.tensor([[-radius] * 3, [radius] * 3])),
             metadata={
-                "subject": Subject(
+                "subject": FilmedSubject(
                     arrays=tracked.arrays,
                     identity=tracked.identity,
                     layout=tracked.layout,

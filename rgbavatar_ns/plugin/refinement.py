@@ -8,13 +8,13 @@ from torch import nn
 from rgbavatar_ns.avatar.refinement.corrections import RefinementConfig
 from rgbavatar_ns.avatar.refinement.frames import FrameRefinement
 from rgbavatar_ns.errors import UserError
-from rgbavatar_ns.plugin.dataparser import Subject
+from rgbavatar_ns.plugin.dataparser import FilmedSubject
 
 REFINED_NAME = "theta_refined.npy"
 _PREFIX = "refinement."
 
 
-def frame_refinement(subject: Subject, config: RefinementConfig) -> FrameRefinement:
+def frame_refinement(subject: FilmedSubject, config: RefinementConfig) -> FrameRefinement:
     """The refinement of a dataset's training frames.
 
     Raises:

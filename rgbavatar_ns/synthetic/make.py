@@ -26,7 +26,7 @@ from rgbavatar_ns.synthetic.performer.paint import paint_head
 from rgbavatar_ns.synthetic.performer.performance import perform, with_tracker_noise
 from rgbavatar_ns.synthetic.performer.surface import TrueSurface
 from rgbavatar_ns.synthetic.performer.wrinkles import WRINKLES, wrinkle_activations
-from rgbavatar_ns.synthetic.renderer.raycast import StillCamera
+from rgbavatar_ns.synthetic.renderer.raycast import RayCamera
 from rgbavatar_ns.synthetic.renderer.render import DemoRenderer, Moment
 
 Progress = Callable[[int, int], None]
@@ -41,7 +41,7 @@ _CAMERA_DISTANCE_M = 1.1
 _HEAD_VIEW_M, _BUST_VIEW_M = (0.007, 0.153), (-0.08, 0.26)
 
 
-def as_pinhole(camera: StillCamera) -> PinholeCameras:
+def as_pinhole(camera: RayCamera) -> PinholeCameras:
     """The same camera in OpenCV's axes."""
     world_to_camera = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))[None]
     world_to_camera[0, 1, 3] = camera.height_m
@@ -58,7 +58,7 @@ class DemoPerson:
     head: HeadModel
     identity: Float[Tensor, "I"]
     renderer: DemoRenderer
-    camera: StillCamera
+    camera: RayCamera
 
     @classmethod
     def of(cls, config: DemoConfig) -> "DemoPerson":
@@ -86,7 +86,7 @@ class DemoPerson:
         bare = surface.pose(at_rest, np.zeros(len(WRINKLES))).vertices
         hair = make_hair_piece(config.hair, bare, config.seed)
         focal_px = 0.5 * config.image_size * _CAMERA_DISTANCE_M / view_m[1]
-        camera = StillCamera(view_m[0], _CAMERA_DISTANCE_M, focal_px, config.image_size)
+        camera = RayCamera(view_m[0], _CAMERA_DISTANCE_M, focal_px, config.image_size)
         renderer = DemoRenderer(
             surface,
             paint,

@@ -16,7 +16,7 @@ from rgbavatar_ns.export import (
     write_png,
     write_pngs,
 )
-from rgbavatar_ns.export.bases import basis_weights
+from rgbavatar_ns.export.bases import single_bases
 from rgbavatar_ns.kernels import PinholeCameras
 
 from .subject import avatar_of, lively_theta, psnr
@@ -80,7 +80,7 @@ def test_each_basis_is_shown_alone_at_its_largest_weight():
         torch.ones(2, dtype=torch.bool), torch.zeros(0, 2), torch.zeros(0), torch.zeros(0),
     )  # fmt: skip
     expected = torch.tensor([[0.0, 0.0], [-1.0, 0.0], [0.0, 0.8]])
-    assert torch.allclose(basis_weights(seen, 2.0), expected)
+    assert torch.allclose(single_bases(seen, 2.0), expected)
 
 
 def test_the_grid_holds_the_base_and_every_basis(avatar, camera):

@@ -41,7 +41,7 @@ def feature_from_color(color: _Array) -> _Array:
     return cast(_Array, (color - 0.5) / COLOR_SCALE)
 
 
-class GaussianBlendshapes(nn.Module):
+class TangentBlendshapes(nn.Module):
     """A base model G_0 of N Gaussians and K residuals dG_k of position, rotation and colour.
 
     Initial values: position 0, identity rotation, grey, residuals 0 (paper, sec. 3.2).

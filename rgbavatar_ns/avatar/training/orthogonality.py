@@ -10,27 +10,27 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from rgbavatar_ns.avatar.model.blendshapes import GaussianBlendshapes
+from rgbavatar_ns.avatar.model.blendshapes import TangentBlendshapes
 from rgbavatar_ns.kernels import BASIS_ATTRIBUTES
 
 ORTHOGONALITY_WEIGHT, ORTHOGONALIZE_EVERY = 10.0, 1000
 """Of the loss, and how many steps lie between two orthogonalizations."""
 
 
-def orthogonality_error(shapes: GaussianBlendshapes) -> Float[Tensor, ""]:
+def orthogonality_error(shapes: TangentBlendshapes) -> Float[Tensor, ""]:
     """Return ||V V^T - I||_2 (spectral), rows of V the K bases at unit length; 0 if K = 0."""
     if shapes.num_bases == 0:
         return shapes.position.new_zeros(())
     return torch.linalg.matrix_norm(_gram_error(shapes), ord=2)
 
 
-def orthogonality_loss(shapes: GaussianBlendshapes) -> Float[Tensor, ""]:
+def orthogonality_loss(shapes: TangentBlendshapes) -> Float[Tensor, ""]:
     """Return the squared Frobenius norm of V V^T - I, smooth where e_orth is not (ours)."""
     return _gram_error(shapes).square().sum()
 
 
 @torch.no_grad()
-def orthogonalize(shapes: GaussianBlendshapes, method: Literal["qr", "gram_schmidt"]) -> None:
+def orthogonalize(shapes: TangentBlendshapes, method: Literal["qr", "gram_schmidt"]) -> None:
     """Replace the K bases by orthogonal ones of the same lengths, in place; bases of 0 stay 0."""
     bases = _rows(shapes)
     length = bases.norm(dim=1, keepdim=True)
@@ -53,10 +53,10 @@ def orthogonalize(shapes: GaussianBlendshapes, method: Literal["qr", "gram_schmi
         start += size
 
 
-def _gram_error(shapes: GaussianBlendshapes) -> Float[Tensor, "K K"]:
+def _gram_error(shapes: TangentBlendshapes) -> Float[Tensor, "K K"]:
     unit = F.normalize(_rows(shapes), dim=1)
     return unit @ unit.T - torch.eye(len(unit), dtype=unit.dtype, device=unit.device)
 
 
-def _rows(shapes: GaussianBlendshapes) -> Float[Tensor, "K d"]:
+def _rows(shapes: TangentBlendshapes) -> Float[Tensor, "K d"]:
     return torch.cat([getattr(shapes, name).flatten(1) for name in BASIS_ATTRIBUTES], dim=1)

@@ -3,7 +3,7 @@
 from dataclasses import replace
 from pathlib import Path
 
-from rgbavatar_ns.data.importers.folder import IMAGE_SUFFIXES, Folder
+from rgbavatar_ns.data.importers.folder import IMPORTED_SUFFIXES, Folder
 from rgbavatar_ns.data.importers.frame_files import read_frame_files
 from rgbavatar_ns.data.importers.frame_folders import CHECKPOINTS, pair
 from rgbavatar_ns.data.importers.source import Reading, Source, assemble
@@ -27,7 +27,7 @@ def read_flashavatar(reading: Reading) -> Source:
     subject = _subject(reading.folder)
     frames = replace(subject, root=tracker_folder(reading.folder))
     files = frames.numbered(CHECKPOINTS, (".frame",))
-    numbered = subject.numbered("imgs", IMAGE_SUFFIXES)
+    numbered = subject.numbered("imgs", IMPORTED_SUFFIXES)
     if numbered and numbered.keys() == files.keys():
         raise UserError(
             f"{reading} counts images and frames alike, from {min(files)} to {max(files)}, but "
@@ -36,11 +36,12 @@ def read_flashavatar(reading: Reading) -> Source:
             "the last frame belong to nothing: remove them.",
         )
     images = _of_frames(numbered)
-    masks = _of_frames(subject.numbered("alpha", IMAGE_SUFFIXES))
+    masks = _of_frames(subject.numbered("alpha", IMPORTED_SUFFIXES))
     regions = None
     if reading.options.region == "head":
         neckhead, mouth = (
-            _of_frames(subject.numbered("parsing", IMAGE_SUFFIXES, ending)) for ending in _REGIONS
+            _of_frames(subject.numbered("parsing", IMPORTED_SUFFIXES, ending))
+            for ending in _REGIONS
         )
         regions = {n: (neckhead[n], mouth[n]) for n in neckhead.keys() & mouth.keys()}
     tracked = read_frame_files(reading, files)

@@ -13,7 +13,7 @@ from rgbavatar_ns.data.importers.import_report import UnusableFrameError
 from rgbavatar_ns.errors import UserError, first_few
 from rgbavatar_ns.reading import DamagedFileError, MissingFileError, load_arrays, load_json
 
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
+IMPORTED_SUFFIXES = (".png", ".jpg", ".jpeg")
 _NUMBER = re.compile(r"(?:.*\D)?(\d{1,15})")
 _MAX_AXES = 4
 

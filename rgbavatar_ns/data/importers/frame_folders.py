@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
-from rgbavatar_ns.data.importers.folder import IMAGE_SUFFIXES, Folder
+from rgbavatar_ns.data.importers.folder import IMPORTED_SUFFIXES, Folder
 from rgbavatar_ns.data.importers.frame_files import TrackedHeads, read_frame_files
 from rgbavatar_ns.data.importers.frame_images import FrameImage
 from rgbavatar_ns.data.importers.frame_record import FrameRecord
@@ -83,11 +83,11 @@ def _read(
     """Images of one subfolder, mattes of another (or the images' own alpha), `.frame` files."""
     folder = reading.folder
     files = folder.numbered(CHECKPOINTS, (".frame",))
-    images = folder.numbered(image_folder, IMAGE_SUFFIXES)
+    images = folder.numbered(image_folder, IMPORTED_SUFFIXES)
     if by_order and len(files) == len(images) and list(files) != list(images):
         reading.report.note("frames and images have other numbers: paired in order")
         images = dict(zip(files, images.values()))
-    masks = None if mask_folder is None else folder.numbered(mask_folder, IMAGE_SUFFIXES)
+    masks = None if mask_folder is None else folder.numbered(mask_folder, IMPORTED_SUFFIXES)
     tracked = read_frame_files(reading, files)
     records = pair(reading, tracked, images, masks)
     return assemble(reading, records, tracked.arrays, tracked.identity, last)

@@ -8,7 +8,7 @@ import numpy as np
 
 from rgbavatar_ns.data.importers.flame_parameters import flame_for, padded
 from rgbavatar_ns.data.importers.folder import (
-    IMAGE_SUFFIXES,
+    IMPORTED_SUFFIXES,
     Folder,
     matrix,
     number_of,
@@ -65,7 +65,7 @@ def read_imavatar(reading: Reading) -> Source:
                 lengths.add(len(frame["expression"]))
             records.append(_record(reading.folder, frame, image, masks, intrinsics, arrays))
     for folder in _IMAGES:
-        files = reading.folder.names(folder, IMAGE_SUFFIXES)
+        files = reading.folder.names(folder, IMPORTED_SUFFIXES)
         left = [image for image in files if image not in named]
         reading.report.leave_out("images without a record", left)
     if len(lengths) > 1:
@@ -114,7 +114,7 @@ def _image(folder: Folder, file_path: str) -> Path:
     named = PurePosixPath(file_path)
     parents = [named.parent, *(named.parent.parent / name for name in _IMAGES)]
     for parent in parents:
-        for suffix in ("", *IMAGE_SUFFIXES):
+        for suffix in ("", *IMPORTED_SUFFIXES):
             candidate = folder.path(f"{parent / named.name}{suffix}")
             if os.path.isfile(candidate):
                 return candidate
@@ -124,7 +124,7 @@ def _image(folder: Folder, file_path: str) -> Path:
 def _frame_image(folder: Folder, image: Path, masks: str | None) -> FrameImage:
     if masks is None:
         return FrameImage(image)
-    for suffix in IMAGE_SUFFIXES:
+    for suffix in IMPORTED_SUFFIXES:
         candidate = folder.path(f"{masks}/{image.stem}{suffix}")
         if os.path.isfile(candidate):
             return FrameImage(image, alpha=candidate)

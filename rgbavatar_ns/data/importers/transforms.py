@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from rgbavatar_ns.data.importers.folder import (
-    IMAGE_SUFFIXES,
+    IMPORTED_SUFFIXES,
     Folder,
     matrix,
     number,
@@ -115,7 +115,7 @@ def _tell_unnamed(reading: Reading, named: Iterable[str]) -> None:
     """Images that lie beside named ones, but that no entry names."""
     named = {os.path.normpath(name) for name in named}
     for parent in {os.path.dirname(name) for name in named} - {""}:
-        files = reading.folder.names(parent, IMAGE_SUFFIXES)
+        files = reading.folder.names(parent, IMPORTED_SUFFIXES)
         left = [name for name in files if os.path.join(parent, name) not in named]
         reading.report.leave_out("images without a record", left)
 

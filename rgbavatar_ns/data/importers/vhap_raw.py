@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from rgbavatar_ns.data.importers.folder import IMAGE_SUFFIXES, Folder, numbers, read_npz
+from rgbavatar_ns.data.importers.folder import IMPORTED_SUFFIXES, Folder, numbers, read_npz
 from rgbavatar_ns.data.importers.frame_images import FrameImage, image_header
 from rgbavatar_ns.data.importers.frame_record import CameraRecord, FrameRecord
 from rgbavatar_ns.data.importers.import_report import UnusableFrameError
@@ -103,7 +103,7 @@ def _by_stem(reading: Reading, given: Path | None, usual: tuple[str, ...]) -> di
     return {
         path.stem: place.path(path.name)
         for path in sorted(place.root.iterdir())
-        if path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".")
+        if path.suffix.lower() in IMPORTED_SUFFIXES and not path.name.startswith(".")
     }
 
 

@@ -31,7 +31,7 @@ from rgbavatar_ns.plugin.datamanager import (
     RGBAvatarDataManager,
     RGBAvatarDataManagerConfig,
 )
-from rgbavatar_ns.plugin.dataparser import Subject
+from rgbavatar_ns.plugin.dataparser import FilmedSubject
 from rgbavatar_ns.plugin.online.least_losses import LeastLosses
 from rgbavatar_ns.plugin.online.sources import SourceConfig, await_subject, open_source
 
@@ -143,7 +143,7 @@ class OnlineDataManager(RGBAvatarDataManager):
     def _show_first_frame_only(self) -> None:
         """The model's one frame is the newest; what has not arrived must not be known."""
         first = self.train_dataset.metadata["subject"]
-        assert isinstance(first, Subject)
+        assert isinstance(first, FilmedSubject)
         self.train_dataset.metadata["subject"] = dataclasses.replace(
             first,
             theta=first.theta[:1].clone(),

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
-from rgbavatar_ns.export.bases import basis_weights
+from rgbavatar_ns.export.bases import single_bases
 from rgbavatar_ns.plugin.avatar_model import AvatarModel
 from rgbavatar_ns.plugin.checkpoint_state import film_statistics
 from rgbavatar_ns.plugin.film_path import FilmMoment, frame_at
@@ -40,7 +40,7 @@ def driving_signal(
     if alone is not None and alone < avatar.num_bases:
         statistics = training_statistics(model)
         theta, frame = statistics.theta_neutral, None
-        psi = basis_weights(statistics, state.gain)[alone + 1]
+        psi = single_bases(statistics, state.gain)[alone + 1]
     else:
         theta, frame = _theta(model, state, time)
         psi = state.psi_by_hand

@@ -8,7 +8,7 @@ import torch
 
 from rgbavatar_ns.avatar.method import AvatarMethod
 from rgbavatar_ns.plugin.cameras import head_to_nerfstudio
-from rgbavatar_ns.plugin.dataparser import Subject
+from rgbavatar_ns.plugin.dataparser import FilmedSubject
 
 # nerfstudio shows its world ten times as large in viser.
 _VISER_PER_METRE = 10.0
@@ -28,7 +28,7 @@ class Viewpoint:
 
     @classmethod
     @torch.no_grad()
-    def before(cls, avatar: AvatarMethod, subject: Subject) -> "Viewpoint":
+    def before(cls, avatar: AvatarMethod, subject: FilmedSubject) -> "Viewpoint":
         """From the first frame's camera, a little nearer than it, at the middle of the head."""
         means = avatar.gaussians(subject.theta[:1].to(avatar.identity)).means[0]
         middle = (means.amin(0) + means.amax(0)) / 2

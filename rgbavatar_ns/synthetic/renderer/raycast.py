@@ -52,7 +52,7 @@ class RayScene:
 
 
 @dataclass(frozen=True)
-class StillCamera:
+class RayCamera:
     """A pinhole that looks along -z from (0, height_m, distance_m), square images."""
 
     height_m: float
@@ -99,7 +99,7 @@ class PixelRays:
 
 def cast_pixels(
     scene: RayScene,
-    camera: StillCamera,
+    camera: RayCamera,
     points: Float[np.ndarray, "V 3"],
     material: Int[np.ndarray, "F"],
     supersampling: int,
@@ -126,7 +126,7 @@ def cast_pixels(
 
 
 def _cast_pattern(
-    scene: RayScene, camera: StillCamera, pixel: np.ndarray, across: np.ndarray, down: np.ndarray
+    scene: RayScene, camera: RayCamera, pixel: np.ndarray, across: np.ndarray, down: np.ndarray
 ) -> tuple[np.ndarray, ...]:
     """Of rays at the same places of each pixel: pixel, place in the pattern, direction, and the
     triangle, weights and distance of the hit.

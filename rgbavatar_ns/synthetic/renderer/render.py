@@ -21,7 +21,7 @@ from rgbavatar_ns.synthetic.renderer.lighting import (
     shade,
     to_srgb,
 )
-from rgbavatar_ns.synthetic.renderer.raycast import PixelRays, RayScene, StillCamera, cast_pixels
+from rgbavatar_ns.synthetic.renderer.raycast import PixelRays, RayCamera, RayScene, cast_pixels
 
 _FRAME_MATERIAL, _HAIR_MATERIAL = len(PARTS), len(PARTS) + 1
 _AMBIENT_RAYS = 48
@@ -64,7 +64,7 @@ class DemoRenderer:
         hair: HairPiece | None,
         at_rest: Float[np.ndarray, "V 3"],
         jaw_open: Float[np.ndarray, "V 3"],
-        camera: StillCamera,
+        camera: RayCamera,
         supersampling: int,
         *,
         light_follows_head: bool = False,

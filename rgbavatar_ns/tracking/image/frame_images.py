@@ -48,7 +48,7 @@ def _softness_px(background: Background | None) -> float:
 
 
 @dataclass(frozen=True)
-class FrameImage:
+class TrackedImage:
     """One tracked frame's image as a PNG file's bytes; `position` counts tracked frames."""
 
     position: int
@@ -128,7 +128,7 @@ class FrameImages:
         source: FrameSource,
         background: Background | None = None,
         without: Collection[int] = (),
-    ) -> Generator[FrameImage, None, None]:
+    ) -> Generator[TrackedImage, None, None]:
         """The image of every tracked frame, in order, but for the positions in `without`.
 
         The `background`'s plate, if it has one, tells the person from the room.
@@ -220,7 +220,9 @@ class FrameImages:
             while held and held[0].position < needed:
                 held.popleft()
 
-    def _finish(self, plate: RoomColors | None, softness_px: float, window: _Window) -> FrameImage:
+    def _finish(
+        self, plate: RoomColors | None, softness_px: float, window: _Window
+    ) -> TrackedImage:
         crop, around = window
         if crop.alpha is not None:
             matted = MattedCrop.of(crop.image_rgb, crop.alpha, self._inside, crop.color_is_clean)
@@ -242,7 +244,7 @@ class FrameImages:
         image = self._cut_out(matted, outline)
         unfilmed = float(unfilmed_pixels(image).mean())
         png = encode_png_rgba(image)
-        return FrameImage(crop.position, png, outline, matte, inside, unfilmed)
+        return TrackedImage(crop.position, png, outline, matte, inside, unfilmed)
 
     def _steadied(self, crop: _Cropped, around: tuple[_Cropped, ...]) -> Float[np.ndarray, "S S"]:
         assert crop.coarse is not None

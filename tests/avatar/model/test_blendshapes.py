@@ -4,12 +4,12 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rgbavatar_ns.avatar import GaussianBlendshapes
+from rgbavatar_ns.avatar import TangentBlendshapes
 from rgbavatar_ns.avatar.model.blendshapes import color_from_feature, feature_from_color
 
 
-def filled(num_gaussians: int, num_bases: int, seed: int = 0) -> GaussianBlendshapes:
-    shapes = GaussianBlendshapes(num_gaussians, num_bases).double()
+def filled(num_gaussians: int, num_bases: int, seed: int = 0) -> TangentBlendshapes:
+    shapes = TangentBlendshapes(num_gaussians, num_bases).double()
     generator = torch.Generator().manual_seed(seed)
     with torch.no_grad():
         for parameter in shapes.parameters():
@@ -38,7 +38,7 @@ def test_blend_is_base_plus_weighted_residuals(num_gaussians, num_bases, batch, 
 
 
 def test_opacity_and_scale_have_no_residuals():
-    shapes = GaussianBlendshapes(5, 3)
+    shapes = TangentBlendshapes(5, 3)
     assert {name for name, _ in shapes.named_parameters() if name.startswith("basis")} == {
         "basis_position",
         "basis_rotation_wxyz",
@@ -54,7 +54,7 @@ def test_without_bases_the_blend_is_the_base():
 
 
 def test_initial_values():
-    shapes = GaussianBlendshapes(4, 2, scale_m=8e-4, opacity=0.25, color=0.75)
+    shapes = TangentBlendshapes(4, 2, scale_m=8e-4, opacity=0.25, color=0.75)
     blended = shapes.morph(torch.randn(1, 2))
     torch.testing.assert_close(blended.position, torch.zeros(1, 4, 3))
     identity = torch.tensor([1.0, 0, 0, 0]).expand(1, 4, 4)
@@ -78,5 +78,5 @@ def test_color_activation_is_the_zeroth_harmonic():
 @pytest.mark.parametrize("num_bases", [0, 2])
 def test_one_scale_a_gaussian_can_be_given(num_bases):
     scale_m = torch.tensor([1e-3, 2e-3, 4e-3])
-    shapes = GaussianBlendshapes(3, num_bases, scale_m=scale_m)
+    shapes = TangentBlendshapes(3, num_bases, scale_m=scale_m)
     torch.testing.assert_close(shapes.log_scale.exp(), scale_m[:, None].expand(3, 3))

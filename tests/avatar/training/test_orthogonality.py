@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from rgbavatar_ns.avatar.model.blendshapes import GaussianBlendshapes
+from rgbavatar_ns.avatar.model.blendshapes import TangentBlendshapes
 from rgbavatar_ns.avatar.training.orthogonality import (
     orthogonality_error,
     orthogonality_loss,
@@ -9,8 +9,8 @@ from rgbavatar_ns.avatar.training.orthogonality import (
 )
 
 
-def _shapes(num_bases: int = 4, num_gaussians: int = 30) -> GaussianBlendshapes:
-    shapes = GaussianBlendshapes(num_gaussians, num_bases).double()
+def _shapes(num_bases: int = 4, num_gaussians: int = 30) -> TangentBlendshapes:
+    shapes = TangentBlendshapes(num_gaussians, num_bases).double()
     generator = torch.Generator().manual_seed(3)
     for name, parameter in shapes.named_parameters():
         if name.startswith("basis"):
@@ -18,14 +18,14 @@ def _shapes(num_bases: int = 4, num_gaussians: int = 30) -> GaussianBlendshapes:
     return shapes
 
 
-def _vectors(shapes: GaussianBlendshapes) -> torch.Tensor:
+def _vectors(shapes: TangentBlendshapes) -> torch.Tensor:
     return torch.cat(
         [p.flatten(1) for n, p in shapes.named_parameters() if n.startswith("basis")], 1
     )
 
 
 def test_the_error_by_hand():
-    shapes = GaussianBlendshapes(1, 2)
+    shapes = TangentBlendshapes(1, 2)
     with torch.no_grad():
         shapes.basis_position[0, 0] = torch.tensor([3.0, 0.0, 0.0])
         shapes.basis_position[1, 0] = torch.tensor([0.6, 0.8, 0.0])
@@ -73,8 +73,8 @@ def test_descending_the_loss_makes_bases_orthogonal():
 
 
 def test_untrained_bases_and_none_give_finite_values():
-    fresh = GaussianBlendshapes(5, 3)
+    fresh = TangentBlendshapes(5, 3)
     orthogonality_loss(fresh).backward()
     assert fresh.basis_position.grad is not None
     assert torch.isfinite(fresh.basis_position.grad).all()
-    assert orthogonality_error(GaussianBlendshapes(5, 0)).item() == 0
+    assert orthogonality_error(TangentBlendshapes(5, 0)).item() == 0
