@@ -10,6 +10,7 @@ from torch import Tensor
 
 from rgbavatar_ns.avatar.method import AvatarMethod
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.export.nerfstudio_axes import world_to_camera_of
 from rgbavatar_ns.kernels import PinholeCameras
 from rgbavatar_ns.reading import DamagedFileError, json_numbers, load_json
 
@@ -17,8 +18,6 @@ FOUR_VIEWS_DEGREES = ((-40.0, 0.0), (40.0, 0.0), (0.0, -20.0), (0.0, 20.0))
 """(yaw, pitch) of the novel views: the head seen from its right, its left, above and below. The
 paper shows four without saying which."""
 
-# nerfstudio's world has z up: (x, y, z) of the head's world is (x, -z, y) there.
-HEAD_TO_NERFSTUDIO = ((1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0))
 _DISTANCE_M = 1.1
 _SEEN_M = 0.34
 _MOST_CAMERAS, _LARGEST_SIDE, _MOST_FRAMES_PER_SECOND = 100_000, 16384, 1000.0
@@ -79,17 +78,12 @@ def read_camera_path(path: Path) -> tuple[PinholeCameras, float]:
             "Choose the type 'perspective' in the viewer's render panel and add cameras.",
         )
     width, height = map(int, size)
-    opengl = torch.from_numpy(np.stack(poses)).float().reshape(-1, 4, 4)
+    camera_to_world = torch.from_numpy(np.stack(poses)).float().reshape(-1, 4, 4)
     fov = torch.from_numpy(fov_degrees).float().deg2rad()
     # The field of view is the vertical one.
     focal_px = 0.5 * height / torch.tan(0.5 * fov)
-    to_head = torch.tensor(HEAD_TO_NERFSTUDIO).T
-    axes = to_head @ opengl[:, :3, :3] * torch.tensor([1.0, -1.0, -1.0])
-    centre = to_head @ opengl[:, :3, 3:]
-    world_to_camera = torch.eye(4).repeat(len(fov), 1, 1)
-    world_to_camera[:, :3, :3] = axes.mT
-    world_to_camera[:, :3, 3:] = -(axes.mT @ centre)
     principal = torch.tensor([width / 2, height / 2]).expand(len(fov), 2)
+    world_to_camera = world_to_camera_of(camera_to_world[:, :3])
     cameras = PinholeCameras(
         world_to_camera, focal_px[:, None].expand(-1, 2), principal, width, height
     )

@@ -1,9 +1,4 @@
-"""Between the project's cameras (OpenCV, head world) and nerfstudio's (OpenGL, z up).
-
-The head's world has y up and z out of the face. nerfstudio's viewer has z up, so its world is
-the head's turned by a quarter about x: the face looks along -y, the subject's left stays +x.
-Both worlds are in metres.
-"""
+"""Between the project's cameras (OpenCV, head world) and nerfstudio's (OpenGL, z up)."""
 
 import copy
 
@@ -13,10 +8,12 @@ from nerfstudio.cameras.cameras import Cameras, CameraType
 from torch import Tensor
 
 from rgbavatar_ns.errors import UserError
-from rgbavatar_ns.export.views import HEAD_TO_NERFSTUDIO
+from rgbavatar_ns.export.nerfstudio_axes import (
+    HEAD_TO_NERFSTUDIO,
+    OPENCV_TO_OPENGL,
+    world_to_camera_of,
+)
 from rgbavatar_ns.kernels import PinholeCameras
-
-_OPENCV_TO_OPENGL = (1.0, -1.0, -1.0)
 
 
 def head_to_nerfstudio(points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
@@ -39,7 +36,7 @@ def to_nerfstudio(
     camera_to_head = world_to_camera[:, :3, :3].transpose(1, 2)
     turn = world_to_camera.new_tensor(HEAD_TO_NERFSTUDIO)
     centre = -(camera_to_head @ world_to_camera[:, :3, 3:])
-    axes = camera_to_head * world_to_camera.new_tensor(_OPENCV_TO_OPENGL)
+    axes = camera_to_head * world_to_camera.new_tensor(OPENCV_TO_OPENGL)
     return Cameras(
         camera_to_worlds=turn @ torch.cat([axes, centre], dim=-1),
         fx=cameras.focal_px[:, :1].expand(len(theta), 1),
@@ -83,18 +80,12 @@ def from_nerfstudio(cameras: Cameras) -> PinholeCameras:
             "The cameras of one batch differ in image size.",
             "Bring all images of a dataset to one size before training.",
         )
-    turn = flat.camera_to_worlds.new_tensor(HEAD_TO_NERFSTUDIO)
-    camera_to_head = turn.T @ flat.camera_to_worlds
-    axes = camera_to_head[:, :, :3] * turn.new_tensor(_OPENCV_TO_OPENGL)
-    rotation = axes.transpose(1, 2)
-    translation = -(rotation @ camera_to_head[:, :, 3:])
-    world_to_camera = torch.cat([rotation, translation], dim=-1)
-    last_row = world_to_camera.new_tensor([[[0.0, 0.0, 0.0, 1.0]]]).expand(len(rotation), 1, 4)
+    world_to_camera = world_to_camera_of(flat.camera_to_worlds)
     return PinholeCameras(
-        world_to_camera=torch.cat([world_to_camera, last_row], dim=1),
+        world_to_camera=world_to_camera,
         # A camera path brings poses and focal lengths in different precision.
-        focal_px=torch.cat([flat.fx, flat.fy], dim=-1).to(rotation),
-        principal_point_px=torch.cat([flat.cx, flat.cy], dim=-1).to(rotation),
+        focal_px=torch.cat([flat.fx, flat.fy], dim=-1).to(world_to_camera),
+        principal_point_px=torch.cat([flat.cx, flat.cy], dim=-1).to(world_to_camera),
         width=int(flat.width.reshape(-1)[0]),
         height=int(flat.height.reshape(-1)[0]),
     )
