@@ -33,10 +33,8 @@ from rgbavatar_ns.avatar.methods.neighbours import neighbour_distance
 from rgbavatar_ns.avatar.methods.sh import (
     MAX_DEGREE,
     ShownDegree,
-    directions_in_frames,
     num_coefficients,
-    sh_colors,
-    view_directions,
+    shown_colors,
 )
 from rgbavatar_ns.avatar.model.anchors import GaussianAnchors
 from rgbavatar_ns.avatar.model.image_loss import LPIPSLoss
@@ -173,28 +171,15 @@ class FlashAvatar(AvatarMethod):
         first, rest = numbers[..., _TURN].split([1, 3], -1)
         quats_wxyz = multiply_quats_wxyz(self.rotation_wxyz, torch.cat([first.exp(), rest], -1))
         turn_wxyz = matrix_to_quat_wxyz(turn)[:, None]
+        turns = turn[:, None].expand(-1, len(self.color), -1, -1)
         log_scale = self.log_scale * numbers[..., _STRETCH].exp()
         return GaussianSet(
             means=means,
             quats_wxyz=multiply_quats_wxyz(turn_wxyz, quats_wxyz),
             scales=log_scale.exp(),
             opacities=torch.sigmoid(self.opacity_logit)[None],
-            colors=self._colors(means, turn, cameras),
+            colors=shown_colors(self.color, self.color_rest, self._shown, means, cameras, turns),
         )
-
-    def _colors(
-        self,
-        means: Float[Tensor, "B N 3"],
-        turn: Float[Tensor, "B 3 3"],
-        cameras: PinholeCameras | None,
-    ) -> Float[Tensor, "#B N 3"]:
-        degree = 0 if cameras is None else self._shown.now
-        if degree == 0:
-            return sh_colors(self.color, means[:1], 0)
-        directions = view_directions(means, cameras) if cameras is not None else means
-        turned = directions_in_frames(directions, turn[:, None].expand(-1, len(self.color), -1, -1))
-        used = self.color_rest[:, : num_coefficients(degree) - 1]
-        return sh_colors(torch.cat([self.color, used], 1), turned, degree)
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         """Return what is trained, by the names in `LEARNING_RATES`."""
@@ -229,9 +214,8 @@ class FlashAvatar(AvatarMethod):
         return losses
 
     def after_step(self, watched: Any, optimizers: Any, step: int, seed: int) -> dict[str, float]:
-        """Raise the degree of the harmonics where that is due: the release's first step is 1."""
-        reached = min((step + 2) // self.config.raise_degree_every, self.config.sh_degree)
-        self._shown.set(reached)
+        """Raise the degree of the harmonics where that is due."""
+        self._shown.raise_by(step, self.config.raise_degree_every)
         return {}
 
 

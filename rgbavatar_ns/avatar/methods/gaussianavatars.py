@@ -53,8 +53,7 @@ from rgbavatar_ns.avatar.methods.sh import (
     MAX_DEGREE,
     ShownDegree,
     num_coefficients,
-    sh_colors,
-    view_directions,
+    shown_colors,
 )
 from rgbavatar_ns.avatar.model.image_loss import l1_loss
 from rgbavatar_ns.avatar.model.tangent_to_world import carried
@@ -185,17 +184,8 @@ class GaussianAvatars(AvatarMethod):
             quats_wxyz=quats_wxyz,
             scales=scales,
             opacities=torch.sigmoid(self.opacity_logit)[None],
-            colors=self._colors(means, cameras),
+            colors=shown_colors(self.color, self.color_rest, self._shown, means, cameras),
         )
-
-    def _colors(
-        self, means: Float[Tensor, "B N 3"], cameras: PinholeCameras | None
-    ) -> Float[Tensor, "#B N 3"]:
-        degree = 0 if cameras is None else self._shown.now
-        if cameras is None or degree == 0:
-            return sh_colors(self.color, means[:1], 0)
-        used = self.color_rest[:, : num_coefficients(degree) - 1]
-        return sh_colors(torch.cat([self.color, used], 1), view_directions(means, cameras), degree)
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         """Return what is trained, by the names in `LEARNING_RATES`."""
@@ -249,9 +239,7 @@ class GaussianAvatars(AvatarMethod):
         seed: int,
     ) -> Mapping[str, float]:
         """Raise the degree of the harmonics, add and remove Gaussians, where that is due."""
-        # The release, whose first step is 1, raises it at a step's beginning.
-        reached = min((step + 2) // self.config.raise_degree_every, self.config.sh_degree)
-        self._shown.set(reached)
+        self._shown.raise_by(step, self.config.raise_degree_every)
         if watched is not None:
             self.statistics.add_step(watched)
         known = ControlledGaussians(

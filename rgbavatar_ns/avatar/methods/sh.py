@@ -50,7 +50,7 @@ class ShownDegree:
         owner.register_load_state_dict_post_hook(
             lambda module, _: _require_degree(int(getattr(module, name)), most)
         )
-        self._owner, self._name = owner, name
+        self._owner, self._name, self._most = owner, name, most
         self._read: tuple[Tensor, int, int] | None = None
 
     @property
@@ -65,6 +65,14 @@ class ShownDegree:
         """Show as many degrees from now on."""
         if self.now != degree:
             getattr(self._owner, self._name).fill_(degree)
+
+    def raise_by(self, step: int, every: int) -> None:
+        """Show what is due after step `step`, as releases do it whose first step is 1.
+
+        They raise the degree by one, up to the last, at the beginning of each step that `every`
+        divides.
+        """
+        self.set(min((step + 2) // every, self._most))
 
 
 def _require_degree(degree: int, most: int) -> None:
@@ -141,6 +149,28 @@ def sh_colors(
     equation = "bnc,ncx->bnx" if shared.ndim == 3 else "bnc,bncx->bnx"
     colors = torch.einsum(equation, sh_basis(directions, degree), shared)
     return (colors + 0.5).clamp(min=0)
+
+
+def shown_colors(
+    flat: Float[Tensor, "N 1 3"],
+    rest: Float[Tensor, "N C 3"],
+    shown: ShownDegree,
+    means: Float[Tensor, "B N 3"],
+    cameras: PinholeCameras | None,
+    rotations: Float[Tensor, "B N 3 3"] | None = None,
+) -> Float[Tensor, "#B N 3"]:
+    """Colours as the cameras see them up to the degree that is shown; without cameras, degree 0.
+
+    The coefficients are `flat` of degree 0 and `rest` of the others; `rotations` turn the colours.
+    """
+    degree = 0 if cameras is None else shown.now
+    if cameras is None or degree == 0:
+        return sh_colors(flat, means[:1], 0)
+    directions = view_directions(means, cameras)
+    if rotations is not None:
+        directions = directions_in_frames(directions, rotations)
+    used = rest[:, : num_coefficients(degree) - 1]
+    return sh_colors(torch.cat([flat, used], 1), directions, degree)
 
 
 def rotate_sh(

@@ -13,6 +13,7 @@ from rgbavatar_ns.avatar.methods.sh import (
     rotate_sh,
     sh_basis,
     sh_colors,
+    shown_colors,
     view_directions,
 )
 from rgbavatar_ns.avatar.model.blendshapes import color_from_feature
@@ -172,3 +173,30 @@ def test_a_copys_degree_is_its_own():
     copied = copy.deepcopy(owner)
     copied.shown.set(2)
     assert (owner.shown.now, copied.shown.now, int(copied.degree)) == (0, 2, 2)
+
+
+def test_the_degree_rises_with_the_releases_steps_up_to_the_last() -> None:
+    shown = Owner().shown
+    degrees = []
+    for step in range(12):
+        shown.raise_by(step, 3)
+        degrees.append(shown.now)
+    # Their first step is 1, and what is raised at the beginning of step 3 shows in it.
+    assert degrees == [0, 1, 1, 1, 2, 2, 2, 3, 3, 3, 3, 3]
+
+
+@pytest.mark.parametrize("degree", [0, 1, 3])
+def test_colours_are_shown_up_to_the_degree_and_turn_with_what_carries_them(degree: int) -> None:
+    owner, means = Owner(), normal(2, 5, 3)
+    owner.shown.set(degree)
+    flat, rest = 0.3 * normal(5, 1, 3), 0.1 * normal(5, 15, 3, seed=4)
+    cameras, turns = cameras_at(normal(2, 3, seed=8) + 4), axis_angle_to_matrix(normal(2, 5, 3))
+    directions = view_directions(means, cameras)
+    found = shown_colors(flat, rest, owner.shown, means, cameras, turns)
+    local = directions_in_frames(directions, turns)
+    coefficients = torch.cat([flat, rest], 1)
+    torch.testing.assert_close(found.expand(2, -1, -1), sh_colors(coefficients, local, degree))
+    plain = shown_colors(flat, rest, owner.shown, means, cameras).expand(2, -1, -1)
+    torch.testing.assert_close(plain, sh_colors(coefficients, directions, degree))
+    without = shown_colors(flat, rest, owner.shown, means, None)
+    torch.testing.assert_close(without, sh_colors(flat, directions[:1], 0))
