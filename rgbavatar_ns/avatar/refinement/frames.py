@@ -45,10 +45,22 @@ class FrameRefinement(nn.Module):
         corrected = self.frames.theta(rows.clamp(min=0))
         return torch.where(known[:, None], corrected, self.frames.calibrated(theta))
 
-    def step(self, step: int, position: Int[Tensor, "B"], gradient: Float[Tensor, "B H"]) -> None:
-        """Correct training frames, once it is time, by the gradient of each one's own loss."""
-        if step >= self.start_step:
-            self.frames.step(self._row_of[position], gradient)
+    def begin(
+        self, theta: Float[Tensor, "B H"], position: Int[Tensor, "B"] | None
+    ) -> Float[Tensor, "B H"]:
+        """The corrected theta of a batch, where its training step is to leave a gradient."""
+        if position is None:
+            raise ValueError("Refined tracking needs the frames' positions.")
+        return self.corrected(theta, position).requires_grad_()
+
+    def learn(
+        self, step: int, theta: Float[Tensor, "B H"], position: Int[Tensor, "P"] | None
+    ) -> None:
+        """Correct a batch's first P frames, once it is time, by the gradient that is in `theta`."""
+        if step >= self.start_step and theta.grad is not None and position is not None:
+            # The batch's loss is a mean; each frame is to have the gradient of its own.
+            own = theta.grad[: len(position)] * len(theta)
+            self.frames.step(self._row_of[position], own)
 
     def all_frames(self, tracked: Float[Tensor, "F H"]) -> Float[Tensor, "F H"]:
         """The whole dataset's theta, corrected or calibrated."""

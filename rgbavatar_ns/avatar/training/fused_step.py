@@ -80,3 +80,16 @@ class FusedStep:
             psi.backward(weight_gradient)
         # Of the Gaussians they find no gradient; hooks and schedules still see each take its step.
         take_steps(self._states.optimizers)
+
+
+def probed_renderer(avatar: Avatar, backend: str) -> MorphedRenderer | None:
+    """How the backend draws this avatar without autograd, tried on a tiny image."""
+    position = avatar.blendshapes.position
+    camera = PinholeCameras(
+        torch.eye(4).to(position)[None],
+        position.new_full((1, 2), 8.0),
+        position.new_full((1, 2), 8.0),
+        width=16,
+        height=16,
+    )
+    return avatar.renderer(position.new_zeros(1, avatar.layout.size), camera, backend=backend)

@@ -76,8 +76,7 @@ class MethodStep:
         count, theta = len(batch.theta), batch.theta
         require_images_of(batch.images_rgba, count, batch.cameras)
         if self.refinement is not None:
-            assert batch.position is not None, "Refined tracking needs the frames' positions."
-            theta = self.refinement.corrected(theta, batch.position).requires_grad_()
+            theta = self.refinement.begin(theta, batch.position)
         background = batch.background
         if background is None:
             background = random_backgrounds(step, count, self._seed)
@@ -87,10 +86,8 @@ class MethodStep:
         torch.stack(list(losses.values())).sum().backward()
         self._set_rates(step)
         take_steps(self.optimizers)
-        if self.refinement is not None and theta.grad is not None:
-            assert batch.position is not None
-            # The batch's loss is a mean; each frame is to have the gradient of its own.
-            self.refinement.step(step, batch.position, theta.grad * count)
+        if self.refinement is not None:
+            self.refinement.learn(step, theta, batch.position)
         watched = None
         if offset is not None and offset.grad is not None:
             watched = WatchedStep(drawn.gaussians, batch.cameras, offset.grad)

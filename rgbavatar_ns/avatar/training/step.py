@@ -25,7 +25,7 @@ from rgbavatar_ns.avatar.training.batches import (
 )
 from rgbavatar_ns.avatar.training.color_init import FirstColors, FirstColorsKind
 from rgbavatar_ns.avatar.training.cuda_graph import Recorder, record_cuda_graph
-from rgbavatar_ns.avatar.training.fused_step import FusedStep
+from rgbavatar_ns.avatar.training.fused_step import FusedStep, probed_renderer
 from rgbavatar_ns.avatar.training.losses import image_losses, random_backgrounds
 from rgbavatar_ns.avatar.training.optimizer_states import take_steps, unsupported_reason
 from rgbavatar_ns.avatar.training.orthogonality import (
@@ -36,7 +36,7 @@ from rgbavatar_ns.avatar.training.orthogonality import (
 )
 from rgbavatar_ns.avatar.training.recorded_step import RecordedStep
 from rgbavatar_ns.drawing.compositing import ImagesRGBA
-from rgbavatar_ns.kernels import DeviceRenderer, MorphedRenderer, PinholeCameras
+from rgbavatar_ns.kernels import DeviceRenderer, MorphedRenderer
 
 Losses = dict[str, Float[Tensor, ""]]
 StepKind = Literal["recorded", "fused", "eager"]
@@ -140,7 +140,7 @@ class TrainingStep:
         self._recorded: RecordedStep | None = None
         self._recorder = recorder
         self.kind: StepKind = "eager"
-        renderer = _probe(avatar, self.options.backend) if self.options.fast else None
+        renderer = probed_renderer(avatar, self.options.backend) if self.options.fast else None
         autograd = self._autograd_reason(renderer)
         if autograd is not None:
             self.reason = autograd
@@ -190,18 +190,14 @@ class TrainingStep:
         self._begin(step, lambda: batch)
         theta = batch.theta
         if self.refinement is not None:
-            assert batch.position is not None, "Refined tracking needs the frames' positions."
-            theta = self.refinement.corrected(theta, batch.position).requires_grad_()
+            theta = self.refinement.begin(theta, batch.position)
         self.avatar.widen_film_range(theta)
         filmed = replace(batch, theta=theta)
         shown, view = self._with_view(filmed, step)
         count = len(theta) if view is None else len(theta) - 1
         losses = self._losses(shown, step, count, partial(self._images, filmed, step, view))
-        if self.refinement is not None and theta.grad is not None:
-            assert batch.position is not None
-            # The batch's loss is a mean; each frame is to have the gradient of its own.
-            own = theta.grad[:count] * len(theta)
-            self.refinement.step(step, batch.position[:count], own)
+        if self.refinement is not None and batch.position is not None:
+            self.refinement.learn(step, theta, batch.position[:count])
         self._finish(step)
         return losses
 
@@ -417,16 +413,3 @@ class TrainingStep:
         method = self._orthogonality
         if (step + 1) % ORTHOGONALIZE_EVERY == 0 and method in ("qr", "gram_schmidt"):
             orthogonalize(self.avatar.blendshapes, method)
-
-
-def _probe(avatar: Avatar, backend: str) -> MorphedRenderer | None:
-    """How the backend draws this avatar without autograd, tried on a tiny image."""
-    position = avatar.blendshapes.position
-    camera = PinholeCameras(
-        torch.eye(4).to(position)[None],
-        position.new_full((1, 2), 8.0),
-        position.new_full((1, 2), 8.0),
-        width=16,
-        height=16,
-    )
-    return avatar.renderer(position.new_zeros(1, avatar.layout.size), camera, backend=backend)

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from rgbavatar_ns.avatar.model.image_loss import l1_loss
-from rgbavatar_ns.avatar.refinement import RefinementConfig, TrackingRefinement
+from rgbavatar_ns.avatar.refinement import FrameRefinement, RefinementConfig, TrackingRefinement
 from rgbavatar_ns.avatar.refinement.calibration import fit_ridge
 from rgbavatar_ns.avatar.training.theta_fit import fit_theta, frame_gradients
 from rgbavatar_ns.drawing.compositing import composite, rgba_to_float
@@ -181,6 +181,31 @@ def test_each_frame_has_the_gradient_of_its_own_loss(make_avatar, backend):
         # A pair of pixel and Gaussian at the cut of 1/255 may belong to one way alone.
         assert theta.grad is not None
         assert (found[i] - theta.grad[0]).norm() < 2e-3 * theta.grad.norm()
+
+
+def test_a_batchs_first_frames_learn_by_the_gradients_of_their_own_losses():
+    tracked, position = _tracked(6), torch.tensor([4, 1, 2])
+    refinement = FrameRefinement(tracked, range(6), LAYOUT, CONFIG)
+    target = torch.linspace(0, 1, LAYOUT.size)
+
+    def take(step: int) -> None:
+        theta = refinement.begin(tracked[position], position)
+        (theta - target).square().sum(1).mean().backward()
+        refinement.learn(step, theta, position[:2])
+
+    take(CONFIG.start_step - 1)
+    assert not refinement.frames.visits.any()
+    take(CONFIG.start_step)
+    assert refinement.frames.visits.tolist() == [0, 1, 0, 0, 1, 0]
+    alone = TrackingRefinement(tracked, LAYOUT, CONFIG)
+    alone.step(position[:2], 2 * (tracked[position[:2]] - target))
+    torch.testing.assert_close(refinement.frames.theta(), alone.theta())
+
+
+def test_refined_tracking_needs_to_know_which_frames_a_batch_has():
+    refinement = FrameRefinement(_tracked(6), range(6), LAYOUT, CONFIG)
+    with pytest.raises(ValueError, match="the frames' positions"):
+        refinement.begin(_tracked(2), None)
 
 
 def test_a_frozen_avatar_finds_the_theta_of_its_own_pictures(make_avatar):
