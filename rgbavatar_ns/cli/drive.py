@@ -201,9 +201,11 @@ def _dataset_of(folder: Path) -> Path | None:
 
 
 def _camera(name: str) -> str:
+    from rgbavatar_ns.tracking.input.capture import is_device
+
     if name == "camera":
         return "0"
-    known = name.isdecimal() or "://" in name or name.startswith("/dev/")
+    known = is_device(name)
     if not known and not Path(name).expanduser().exists():
         raise UserError(
             f"There is no source {name}.",

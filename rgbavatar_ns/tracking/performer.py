@@ -2,7 +2,7 @@
 
 import glob
 import time
-from collections import Counter, deque
+from collections import deque
 from pathlib import Path
 from typing import Any
 
@@ -16,15 +16,16 @@ from rgbavatar_ns.tracking.input.capture import (
     FileCapture,
     FrameCapture,
     LatestFrameCapture,
-    OneSize,
+    is_device,
     open_capture,
 )
+from rgbavatar_ns.tracking.tracked_capture import TrackedCapture
 
 _FIRST_PICTURE_S = 10.0
 """A camera that has shown nothing for so long will show nothing: it is told."""
 
 
-class FilmedPerformer:
+class FilmedPerformer(TrackedCapture):
     """Tracks the newest picture of a camera, or those of a file, and gives the head's theta.
 
     The first dozen pictures with a face give the person, which takes two seconds; what comes
@@ -42,36 +43,19 @@ class FilmedPerformer:
         tracker: Any = None,
         capture: FrameCapture | None = None,
     ) -> None:
+        super().__init__(_open(source, real_time) if capture is None else capture, tracker)
         self._source = source
-        self._capture = _open(source, real_time) if capture is None else capture
-        if tracker is None:
-            # Imports mediapipe, which who brings a tracker need not have.
-            from rgbavatar_ns.tracking.live import LiveTracker
-
-            tracker = LiveTracker()
-        self._tracker = tracker
-        self.head = PerformerHead(tracker.head.layout, tracker.head.arrays)
+        self.head = PerformerHead(self._tracker.head.layout, self._tracker.head.arrays)
         self._with_images = with_images
-        self._counts = Counter[str]()
-        self._of_one_size = OneSize(self._counts)
         self._keeps_all = not real_time
         self._unmet: dict[int, CapturedFrame] = {}
         self._backlog: deque[PerformanceFrame] = deque()
-        self._closed = False
         self._began_s, self._shown = time.monotonic(), False
 
     @property
     def ended(self) -> bool:
         """Whether the file is at its end."""
         return self._capture.ended and not self._backlog
-
-    @property
-    def counts(self) -> Counter[str]:
-        """Pictures without a face, skipped, and losses of the source, by name."""
-        whole = self._counts + self._capture.counts
-        for name in ("no face", "does not fit"):
-            whole[name] = self._tracker.counts[name]
-        return +whole
 
     @property
     def waits_for(self) -> str:
@@ -125,13 +109,6 @@ class FilmedPerformer:
                 f"{self._source} has shown no picture for {silent_s:.0f} seconds.", _REMEDY
             )
 
-    def close(self) -> None:
-        """Let go of camera and tracker."""
-        if not self._closed:
-            self._closed = True
-            self._capture.close()
-            self._tracker.close()
-
 
 _REMEDY = (
     "Close the program that uses the camera, choose another one with --source NUMBER, or give a "
@@ -140,7 +117,7 @@ _REMEDY = (
 
 
 def _open(source: str, real_time: bool) -> FrameCapture:
-    if not (source.isdecimal() or "://" in source or source.startswith("/dev/")):
+    if not is_device(source):
         return FileCapture(Path(source), "newest" if real_time else "at once")
     # The capture would try for ever, as a stream has to; who starts a camera is told at once.
     tried = open_capture(source)

@@ -2,7 +2,7 @@
 
 import secrets
 import time
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,12 +15,13 @@ from rgbavatar_ns.tracking.input.capture import (
     FileCapture,
     FrameCapture,
     LatestFrameCapture,
-    OneSize,
+    is_device,
 )
 from rgbavatar_ns.tracking.input.image_files import source_digest
+from rgbavatar_ns.tracking.tracked_capture import TrackedCapture
 
 
-class VideoStream:
+class VideoStream(TrackedCapture):
     """Tracks frames as they come; the tracker's first ones give the subject.
 
     A file or a folder of images is tracked frame by frame, no faster than it plays. Of a camera
@@ -38,30 +39,14 @@ class VideoStream:
         tracker: Any = None,
         capture: FrameCapture | None = None,
     ) -> None:
-        self._capture = _open(source) if capture is None else capture
-        if tracker is None:
-            # Imports mediapipe, which who brings a tracker need not have.
-            from rgbavatar_ns.tracking.live import LiveTracker
-
-            tracker = LiveTracker(TrackConfig(image_size=image_size))
-        self._tracker = tracker
+        config = TrackConfig(image_size=image_size)
+        super().__init__(_open(source) if capture is None else capture, tracker, config)
         self.keeps_frames = self._capture.keeps_frames
         # A file's frames have the same numbers in the next run, a camera's begin anew.
         self._session = _session_of(source) if self.keeps_frames else secrets.token_hex(8)
-        self._counts: Counter[str] = Counter()
-        self._of_one_size = OneSize(self._counts)
         self._subject: StreamSubject | None = None
         self._ready: deque[StreamedFrame] = deque()
         self._passed_over = -1
-        self._closed = False
-
-    @property
-    def counts(self) -> Counter[str]:
-        """Frames without a face, skipped, and losses of the source, by name."""
-        whole = self._counts + self._capture.counts
-        for name in ("no face", "does not fit"):
-            whole[name] = self._tracker.counts[name]
-        return whole
 
     @property
     def ended(self) -> bool:
@@ -84,13 +69,6 @@ class VideoStream:
             self._passed_over = index
             self._capture.pass_over(index)
             self._ready = deque(frame for frame in self._ready if frame.index > index)
-
-    def close(self) -> None:
-        """Let go of source and tracker."""
-        if not self._closed:
-            self._closed = True
-            self._capture.close()
-            self._tracker.close()
 
     def _track_until(self, done: Callable[[], bool], timeout_s: float) -> None:
         deadline = time.monotonic() + timeout_s
@@ -145,6 +123,6 @@ def _session_of(source: str) -> str:
 
 
 def _open(source: str) -> FrameCapture:
-    if source.isdecimal() or "://" in source or source.startswith("/dev/"):
+    if is_device(source):
         return LatestFrameCapture(source)
     return FileCapture(Path(source))

@@ -101,6 +101,11 @@ class FileCapture:
         self.ended = True
 
 
+def is_device(source: str) -> bool:
+    """Whether this names a camera by its number, a device or a network address, and no file."""
+    return source.isdecimal() or "://" in source or source.startswith("/dev/")
+
+
 def open_capture(source: str) -> cv2.VideoCapture:
     """A camera by its number, a device or a network address."""
     if source.isdecimal():
