@@ -100,6 +100,7 @@ def test_nothing_in_a_recorded_step_waits_for_the_device(emulated, make_avatar, 
     # These look at numbers on a CPU only, where looking costs nothing.
     monkeypatch.setattr(avatar, "checked", lambda theta: theta)
     monkeypatch.setattr(kernels.morphed, "check_cameras", lambda _, cameras: len(cameras.focal_px))
+    monkeypatch.setattr(kernels.morphed, "check_vertices", lambda *_: None)
     _, _, recorder, take = _recorded(avatar, 4, NothingWaits())
     reads = []
     launcher = emulated.emulated
