@@ -1,7 +1,6 @@
 """The tests' own checks of types and shapes see what they are there for."""
 
-import sys
-import types
+import importlib
 from pathlib import Path
 
 import jaxtyping
@@ -10,6 +9,7 @@ import torch
 from jaxtyping import Float, TypeCheckError
 from torch import Tensor
 
+from tests import checked_types
 from tests.checked_types import checked
 
 
@@ -62,15 +62,14 @@ def test_a_test_may_go_without():
     assert checked(_named)("a", 2) == "a2None"
 
 
-def test_the_package_is_checked_by_it(request: pytest.FixtureRequest):
-    if request.config.getoption("--jaxtyping-packages", default=None) is None:
-        pytest.skip("started without the import hook")
-    assert jaxtyping.jaxtyped.__module__ == "tests.checked_types"
-    from rgbavatar_ns.kernels import checks
-
-    function = checks.holds_nonfinite
-    assert isinstance(function, types.FunctionType)
-    assert function.__code__.co_filename.endswith("checked_types.py")
+def test_the_import_hook_checks_a_module_by_it(tmp_path, monkeypatch):
+    (tmp_path / "hooked_module.py").write_text(
+        "def twice(count: int) -> int:\n    return 2 * count\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    with jaxtyping.install_import_hook("hooked_module", "beartype.beartype"):
+        module = importlib.import_module("hooked_module")
+    assert module.twice.__code__.co_filename == checked_types.__file__
+    assert module.twice(3) == 6
     with pytest.raises(TypeCheckError):
-        checks.holds_nonfinite("no tensor")  # pyright: ignore[reportArgumentType]
-    assert sys.modules["rgbavatar_ns.kernels.checks"] is checks
+        module.twice("3")
