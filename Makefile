@@ -58,5 +58,5 @@ docs: setup  ## The documentation as a site in build/site, strictly (Python 3.11
 	@$(BIN)/sphinx-build -q -a -E -W --keep-going -c docs/site -d build/site-trees . build/site
 	@echo "build/site/index.html"
 
-clean:  ## Remove the environment, builds and outputs
-	rm -rf .venv build outputs
+clean:  ## Remove the environment and builds; avatars (outputs) and data stay
+	rm -rf .venv build
