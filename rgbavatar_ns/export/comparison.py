@@ -56,7 +56,8 @@ def write_comparison(
     chosen = tuple(held_out if positions is None else positions)
     if not chosen:
         raise UserError(
-            f"The dataset {dataset.root} holds out no frames.", "Name the frames to compare."
+            f"The dataset {dataset.root} holds out no frames.",
+            "Name the frames to compare (--frames 0 20).",
         )
     shown = {chosen[i] for i in np.linspace(0, len(chosen) - 1, columns).round().astype(int)}
     kept: list[np.ndarray] = []
