@@ -28,8 +28,9 @@ demo: setup  ## Make a head, train its avatar, evaluate, film it (VIDEO=me.mp4 f
 
 test: setup style  ## Linters, type check and the tests, but those of the night
 	@mkdir -p build; $(BIN)/basedpyright >build/types.txt 2>&1 & types=$$!; \
+		trap "kill $$types 2>/dev/null" INT TERM; \
 		$(PYTEST) -m "not nightly"; tests=$$?; \
-		wait $$types || { cat build/types.txt; exit 1; }; exit $$tests
+		wait $$types || { cat build/types.txt; echo "ERROR types: see above"; exit 1; }; exit $$tests
 
 test-fast: setup  ## The tests that take seconds
 	@$(PYTEST) -m "not (slow or nightly)"

@@ -143,6 +143,14 @@ def read_json(path: Path) -> Any:
         return None
 
 
+def written_json(path: Path) -> Any:
+    """What another step of the same work wrote; raises UserError where it cannot be read."""
+    try:
+        return load_json(path)
+    except DamagedFileError as error:
+        raise UserError(f"{path} cannot be read: {error}.", "Run the same command again.") from None
+
+
 def digest(parts: Iterable[str | bytes | np.ndarray]) -> str:
     """SHA-256 (64 hexadecimal digits) of texts, bytes and arrays, with their types and shapes."""
     whole = hashlib.sha256()

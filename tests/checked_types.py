@@ -31,6 +31,8 @@ def _jaxtyped(fn: Any = None, *, typechecker: Any = None) -> Any:
         return functools.partial(_jaxtyped, typechecker=typechecker)
     if not isinstance(fn, types.FunctionType) or _is_strange(fn):
         return _BY_JAXTYPING(fn, typechecker=typechecker)
+    if fn.__code__.co_filename == __file__:
+        return fn  # a dataclass's own __init__, which comes twice
     return checked(fn)
 
 

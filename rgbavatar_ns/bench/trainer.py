@@ -22,8 +22,8 @@ from rgbavatar_ns.bench.scenes import DEFAULT_SIZE_PX, on_device
 from rgbavatar_ns.bench.timing import Progress
 from rgbavatar_ns.bench.workloads import read_images
 from rgbavatar_ns.data import OfflineOrder, TrackedDataset, load_dataset
+from rgbavatar_ns.files import written_json
 from rgbavatar_ns.head import HeadModel
-from rgbavatar_ns.reading import load_json
 from rgbavatar_ns.synthetic import DemoConfig, make_demo_dataset
 
 _SEED = 0
@@ -96,7 +96,7 @@ def _train(config: Any) -> dict[str, Any]:
         trainer = config.setup()
         trainer.setup()
         trainer.train()
-    return load_json(trainer.base_dir / SUMMARY_NAME)
+    return written_json(trainer.base_dir / SUMMARY_NAME)
 
 
 def bare_images_per_second(

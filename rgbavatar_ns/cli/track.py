@@ -11,7 +11,7 @@ from rich.table import Table
 from rgbavatar_ns.cli.console import command_line, plain_console
 from rgbavatar_ns.cli.progress import stage_bars
 from rgbavatar_ns.errors import UserError
-from rgbavatar_ns.reading import load_json
+from rgbavatar_ns.files import written_json
 from rgbavatar_ns.tracking import TrackConfig, track_video
 
 _FOLLOWED = 0.5
@@ -49,7 +49,7 @@ def run(
             file=sys.stderr,
         )
         sys.exit(130)
-    report = load_json(dst / "tracking.json")
+    report = written_json(dst / "tracking.json")
     console = plain_console()
     console.print(summary_table(report))
     console.print(f"{report['verdict']}", style="bold")

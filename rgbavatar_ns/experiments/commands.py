@@ -10,8 +10,8 @@ from typing import Any
 
 from rgbavatar_ns.avatar.storage.checkpoint_file import CONFIG_NAME, MODELS_FOLDER, SUMMARY_NAME
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.files import written_json
 from rgbavatar_ns.plugin.training.interruption import PARENT_VARIABLE
-from rgbavatar_ns.reading import load_json
 
 _QUIET = {
     # OpenMP's threads spin while they wait, which stalls training where other programs run too.
@@ -71,7 +71,7 @@ def train(
     if any(run_folder.glob(f"{MODELS_FOLDER}/*.ckpt")):
         flags += ["--load-dir", run_folder / MODELS_FOLDER]
     run_nerfstudio("ns-train", method, *flags)
-    return load_json(run_folder / SUMMARY_NAME)
+    return written_json(run_folder / SUMMARY_NAME)
 
 
 def evaluate(run_folder: Path, destination: Path) -> dict[str, Any]:
@@ -79,7 +79,7 @@ def evaluate(run_folder: Path, destination: Path) -> dict[str, Any]:
     run_nerfstudio(
         "ns-eval", "--load-config", run_folder / CONFIG_NAME, "--output-path", destination
     )
-    return load_json(destination)["results"]
+    return written_json(destination)["results"]
 
 
 def killed_by(code: int) -> str:

@@ -29,9 +29,8 @@ from rgbavatar_ns.experiments.reenactment import (
 )
 from rgbavatar_ns.experiments.rendering_speed import frames_per_second
 from rgbavatar_ns.experiments.streamed import write_streamed
-from rgbavatar_ns.files import digest, digest_of_file, read_json, write_json
+from rgbavatar_ns.files import digest, digest_of_file, read_json, write_json, written_json
 from rgbavatar_ns.plugin.online.least_losses import read_least
-from rgbavatar_ns.reading import load_json
 
 CELL_FILE, RESULT_FILE, LOG_FILE = "cell.json", "result.json", "log.txt"
 FAILED_FILE = "failed.json"
@@ -95,7 +94,7 @@ def read_result(folder: Path) -> dict[str, Any] | None:
 
 def run_cell(folder: Path) -> dict[str, Any]:
     """Train and evaluate; returns what result.json then holds."""
-    described = load_json(folder / CELL_FILE)
+    described = written_json(folder / CELL_FILE)
     data, driver = Path(described.pop("data")), described.pop("driver_data")
     described.pop(_STATES, None)
     side_by_side = described.pop(SIDE_BY_SIDE, False)

@@ -203,7 +203,8 @@ def read_statuses(folder: Path, name: str) -> list[CellStatus]:
             statuses = [_status(Cell.from_json(values), folder) for values in listed]
     except DamagedFileError as error:
         raise UserError(
-            f"The sweep of {name} was not begun in {folder} ({error}).",
+            f"The sweep of {name} was not begun in {folder}, or its list of cells there is another "
+            f"version's or damaged ({error}).",
             "Run `rgbavatar sweep FILE` with this folder first.",
         ) from None
     for status in statuses:

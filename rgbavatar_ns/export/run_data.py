@@ -42,8 +42,11 @@ def dataset_folder(path: Path) -> Path:
             for parts in sorted(paths, key=lambda parts: not parts):
                 if all(isinstance(part, str) for part in parts):
                     return Path(*parts)
-            # Within the run's own folder, wherever that lies now.
-            return folder / Path(*manager["recorded"]).name
+            recorded = manager.get("recorded")
+            if isinstance(recorded, list) and recorded and isinstance(recorded[-1], str):
+                # Within the run's own folder, wherever that lies now.
+                return folder / recorded[-1]
+            raise KeyError("data")
     except DamagedFileError as error:
         raise UserError(
             f"{config} does not say which dataset was trained on: {error}.",

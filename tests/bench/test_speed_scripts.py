@@ -139,7 +139,9 @@ def test_one_frame_is_a_film_to_and_fro(script, monkeypatch):
 def test_a_browser_that_does_not_start_ends_the_training(script, tmp_path, monkeypatch):
     online = script("online_realtime")
     train = tmp_path / "ns-train"
-    train.write_text(f"#!/bin/sh\necho $$ > {tmp_path}/pid; echo http://127.0.0.1:1; sleep 600\n")
+    train.write_text(
+        f"#!/bin/sh\necho $$ > {tmp_path}/pid; echo http://127.0.0.1:1; exec sleep 600\n"
+    )
     train.chmod(0o755)
     monkeypatch.setattr(sys, "executable", str(tmp_path / "python"))
 

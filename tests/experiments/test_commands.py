@@ -21,3 +21,13 @@ def test_each_end_is_told(tmp_path, monkeypatch, ending, error, told):
     monkeypatch.setattr(commands.sys, "executable", str(tmp_path / "python"))
     with pytest.raises(error, match=told):
         commands.run_nerfstudio("ns-train")
+
+
+def test_what_a_command_did_not_write_is_told_with_its_place(tmp_path, monkeypatch):
+    monkeypatch.setattr(commands, "run_nerfstudio", lambda *command: None)
+    run_folder = tmp_path / "experiment" / "method" / "run"
+    with pytest.raises(UserError, match=r"method/run/training\.json cannot be read: it does not"):
+        commands.train("method", tmp_path, run_folder, 0)
+    (tmp_path / "eval.json").write_text("{")
+    with pytest.raises(UserError, match=r"eval\.json cannot be read: .*the same command again"):
+        commands.evaluate(run_folder, tmp_path / "eval.json")

@@ -55,6 +55,9 @@ def test_a_run_that_a_camera_fed_names_what_it_recorded(tmp_path):
     place = "    recorded: !!python/object/apply:pathlib.PosixPath [outputs, me, run, stream]\n"
     (tmp_path / "config.yml").write_text(own + place)
     assert dataset_folder(tmp_path) == tmp_path / "stream"
+    (tmp_path / "config.yml").write_text(own + "    recorded: null\n")  # before it was set
+    with pytest.raises(UserError, match="does not say which dataset"):
+        dataset_folder(tmp_path)
 
 
 def test_what_is_no_run_is_taken_for_a_dataset(tmp_path):
