@@ -26,6 +26,22 @@ window.frames_drawn = 0;
 (function count() { window.frames_drawn++; requestAnimationFrame(count); })();
 """
 
+_DECODE_ONE_LATE = """
+const plain = Object.getOwnPropertyDescriptor(HTMLImageElement.prototype, "src");
+let begun = 0;
+window.late_ones = 0;
+Object.defineProperty(HTMLImageElement.prototype, "src", {
+  get: plain.get,
+  set(url) {
+    if (!url.startsWith("blob:") || begun++) return plain.set.call(this, url);
+    setTimeout(() => {
+      this.addEventListener("load", () => window.late_ones++);
+      plain.set.call(this, url);
+    }, 8000);
+  },
+});
+"""
+
 pytestmark = IN_BROWSER
 
 
@@ -81,7 +97,8 @@ def test_controls_change_the_picture_of_the_head_and_back(viewer: ViewerPage):
     assert _colored(middle) > 0.5
     assert _colored(first[:40, :40]) == 0
     assert viewer.page.get_by_text("Pause Training").count() == 0
-    # Where nothing happens the page hardly draws.
+    # Where nothing happens the page hardly draws, once its first ten seconds are over.
+    viewer.page.wait_for_function("performance.now() > 13000")
     viewer.page.evaluate(_COUNT_FRAMES)
     viewer.page.wait_for_timeout(2000)
     assert 2 <= viewer.page.evaluate("window.frames_drawn") <= 12
@@ -90,6 +107,15 @@ def test_controls_change_the_picture_of_the_head_and_back(viewer: ViewerPage):
     second = _wait_for(viewer, lambda picture: _difference(picture, first) > 0.02)
     assert _colored(second) > 0.05
     viewer.set_number("Frame", "0")
+    _wait_until_back(viewer, first)
+
+    # A picture that is decoded late does not take the place of a newer one.
+    viewer.page.evaluate(_DECODE_ONE_LATE)
+    viewer.set_number("Frame", "4")
+    _wait_for(viewer, lambda picture: _difference(picture, first) > 0.02)
+    viewer.set_number("Frame", "0")
+    viewer.page.wait_for_function("window.late_ones === 1")
+    viewer.page.wait_for_timeout(1000)
     _wait_until_back(viewer, first)
 
     viewer.tab("Face")
