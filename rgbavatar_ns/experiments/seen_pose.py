@@ -48,9 +48,7 @@ def eyes_px(
 
     In pixel indices, as OpenCV counts: the first pixel's centre is 0.
     """
-    seen = _before(cameras.world_to_camera, eyeballs(head, identity, theta))
-    pixels = seen[..., :2] / seen[..., 2:] * cameras.focal_px[:, None]
-    return (pixels + cameras.principal_point_px[:, None] - 0.5).double().numpy()
+    return (cameras.project(eyeballs(head, identity, theta)) - 0.5).double().numpy()
 
 
 @torch.no_grad()
@@ -73,7 +71,7 @@ def as_seen(
     world_to_camera, performed = cameras.world_to_camera, driver.theta[chosen]
     turn = world_to_camera[:, :3, :3] @ _head_turn(performed, driver.layout)
     between = eyeballs(HeadModel(driver.arrays), driver.identity, performed).mean(1, keepdim=True)
-    place = _before(world_to_camera, between)[:, 0]
+    place = cameras.placed(between)[:, 0]
     theta = mapped.theta.clone()
     rest = own.theta[list(own.train)]
     layout = avatar.layout
@@ -93,13 +91,6 @@ def as_seen(
     seen_by[:, :3, :3] = turn @ own_turn.mT
     seen_by[:, :3, 3] = place - (seen_by[:, :3, :3] @ middle[..., None])[..., 0]
     return theta, replace(cameras, world_to_camera=seen_by)
-
-
-def _before(
-    world_to_camera: Float[Tensor, "#F 4 4"], points: Float[Tensor, "F P 3"]
-) -> Float[Tensor, "F P 3"]:
-    """Points of the head's world as the camera has them."""
-    return points @ world_to_camera[:, :3, :3].mT + world_to_camera[:, None, :3, 3]
 
 
 def _head_turn(theta: Float[Tensor, "F H"], layout: ThetaLayout) -> Float[Tensor, "F 3 3"]:

@@ -25,16 +25,10 @@ def within_film(avatar: AvatarMethod, dataset: TrackedDataset) -> Bool[Tensor, "
     last = len(dataset) - 1
     frames = np.unique(np.linspace(0, last, min(len(dataset), _MOST_FRAMES)).round().astype(int))
     kept = torch.zeros(avatar.num_gaussians, dtype=torch.bool)
-    size = torch.tensor([dataset.width, dataset.height], dtype=torch.float32)
     for places in np.array_split(frames, -(-len(frames) // _AT_ONCE)):
         theta = dataset.theta[places.tolist()].to(avatar.identity)
         cameras = dataset.cameras.select(places.tolist())
-        camera = cameras.world_to_camera
-        seen = avatar.gaussians(theta).means.cpu() @ camera[:, :3, :3].mT + camera[:, None, :3, 3]
-        pixel = seen[..., :2] / seen[..., 2:].clamp(min=1e-6) * cameras.focal_px[:, None]
-        pixel = pixel + cameras.principal_point_px[:, None]
-        inside = ((pixel >= 0) & (pixel <= size)).all(-1) & (seen[..., 2] > 0)
-        kept |= inside.any(0)
+        kept |= cameras.shows(avatar.gaussians(theta).means.cpu()).any(0)
     return kept
 
 

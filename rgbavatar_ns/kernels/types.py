@@ -12,6 +12,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from rgbavatar_ns.kernels.constants import NEAR_PLANE_M
+
 
 class DeviceError(RuntimeError):
     """A GPU, its driver or its compiler cannot do what was asked; says why and what to do."""
@@ -67,6 +69,28 @@ class PinholeCameras:
             self.width,
             self.height,
         )
+
+    def placed(self, points: Float[Tensor, "#B P 3"]) -> Float[Tensor, "B P 3"]:
+        """Points of the world in the cameras' axes, metres."""
+        pose = self.world_to_camera
+        return points @ pose[:, :3, :3].mT + pose[:, None, :3, 3]
+
+    def project(self, points: Float[Tensor, "#B P 3"]) -> Float[Tensor, "B P 2"]:
+        """Where points of the world are in the pictures, pixels.
+
+        What is behind the near plane is taken to be on it, beside the axis as far as it is: a
+        number, but no place (`shows`).
+        """
+        placed = self.placed(points)
+        per_metre = self.focal_px[:, None] / placed[..., 2:].clamp(min=NEAR_PLANE_M)
+        return placed[..., :2] * per_metre + self.principal_point_px[:, None]
+
+    def shows(self, points: Float[Tensor, "#B P 3"]) -> Bool[Tensor, "B P"]:
+        """Which points are before the near plane and in the picture, seen or behind others."""
+        place_px = self.project(points)
+        size_px = place_px.new_tensor([self.width, self.height])
+        inside = ((place_px >= 0) & (place_px <= size_px)).all(-1)
+        return inside & (self.placed(points)[..., 2] >= NEAR_PLANE_M)
 
     def joined(self, others: "PinholeCameras") -> "PinholeCameras":
         """These cameras, then others of the same image size."""

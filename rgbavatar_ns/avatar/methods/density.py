@@ -17,8 +17,6 @@ from rgbavatar_ns.avatar.method import WatchedStep
 from rgbavatar_ns.avatar.methods.gaussian_rows import GaussianRows, Optimizers, forget_moments
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head.rotations import quat_wxyz_to_matrix
-from rgbavatar_ns.kernels import PinholeCameras
-from rgbavatar_ns.kernels.constants import NEAR_PLANE_M
 from rgbavatar_ns.options import Between, CheckedOptions, Count, Counted, Positive, Share, Weight
 
 _CHILDREN = 2
@@ -126,7 +124,7 @@ class ScreenStatistics(nn.Module):
         """Add the gradient of a step's loss, the mean over B images, by the projected means.
 
         `drawn`: which images count as showing a Gaussian; by default those with a gradient. 3DGS
-        counts all in whose picture it lies (`in_view`), also behind others.
+        counts all in whose picture it lies (`PinholeCameras.shows`), also behind others.
         """
         # By B, because 3DGS's threshold is that of the loss of one image.
         half_width, half_height = (0.5 * side * len(gradient_px) for side in (width, height))
@@ -137,9 +135,9 @@ class ScreenStatistics(nn.Module):
         self.times_seen += drawn.sum(0)
 
     def add_step(self, watched: WatchedStep) -> None:
-        """Add a step's gradient; as in 3DGS all count whose centre is in a picture (`in_view`)."""
+        """Add a step's gradient; as in 3DGS all count whose centre is in a picture."""
         cameras = watched.cameras
-        seen = in_view(watched.gaussians.means.detach(), cameras)
+        seen = cameras.shows(watched.gaussians.means.detach())
         self.add(watched.screen_gradient_px, cameras.width, cameras.height, seen)
 
     def mean_gradient(self) -> Float[Tensor, "N"]:
@@ -150,15 +148,6 @@ class ScreenStatistics(nn.Module):
         """Forget everything, for as many Gaussians."""
         self.gradient_sum = self.gradient_sum.new_zeros(num_gaussians)
         self.times_seen = self.times_seen.new_zeros(num_gaussians)
-
-
-def in_view(means: Float[Tensor, "#B N 3"], cameras: PinholeCameras) -> Bool[Tensor, "B N"]:
-    """Which Gaussians have their centre, in metres, in front of the camera and in its picture."""
-    pose = cameras.world_to_camera
-    x_y, z = (means @ pose[:, :3, :3].mT + pose[:, None, :3, 3]).split([2, 1], -1)
-    place_px = cameras.focal_px[:, None] * x_y / z + cameras.principal_point_px[:, None]
-    size_px = place_px.new_tensor([cameras.width, cameras.height])
-    return (z[..., 0] >= NEAR_PLANE_M) & ((place_px >= 0) & (place_px <= size_px)).all(-1)
 
 
 SplitRule = Callable[[Int[Tensor, "M"], Float[Tensor, "M S 3"]], Mapping[str, Tensor]]

@@ -25,30 +25,23 @@ weight is 0 there (offsets of vertices, Laplacian).
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Annotated, Any
+from typing import Annotated
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from rgbavatar_ns.avatar.config import MethodConfig
-from rgbavatar_ns.avatar.method import AvatarMethod, DrawnBatch, FilmedBatch, Losses, WatchedStep
-from rgbavatar_ns.avatar.methods.carriers import edge_frames, require_places
-from rgbavatar_ns.avatar.methods.density import (
-    ControlledGaussians,
-    DensityControl,
-    ScreenStatistics,
-    control,
-    in_view,
-    sampled_positions,
-)
-from rgbavatar_ns.avatar.methods.gaussian_rows import GaussianRows
+from rgbavatar_ns.avatar.method import DrawnBatch, FilmedBatch, Losses, WatchedStep
+from rgbavatar_ns.avatar.methods.carriers import edge_frames
+from rgbavatar_ns.avatar.methods.density import DensityControl, sampled_positions
 from rgbavatar_ns.avatar.methods.loss_terms import (
     dssim_loss,
     held_where,
     position_hinge,
     scale_hinge,
 )
+from rgbavatar_ns.avatar.methods.mesh_splats import MeshSplats
 from rgbavatar_ns.avatar.methods.sh import (
     MAX_DEGREE,
     ShownDegree,
@@ -70,10 +63,6 @@ LEARNING_RATES: dict[str, float] = {
     "color_rest": 0.0025 / 20,
 }
 """Adam's learning rate of each parameter group, that of places a metre of extent."""
-_ROWS = (
-    *("position", "rotation_wxyz", "log_scale", "opacity_logit", "color", "color_rest"),
-    *("face_index", "statistics"),
-)
 
 
 @dataclass(frozen=True)
@@ -114,7 +103,7 @@ class GaussianAvatarsConfig(MethodConfig):
     too."""
 
 
-class GaussianAvatars(AvatarMethod):
+class GaussianAvatars(MeshSplats):
     """Gaussians that keep their place, turn and size within their triangle's frame.
 
     x = k R x_l + c, q = R q_l, s = k s_l, with `edge_frames`; theta moves nothing beside the mesh.
@@ -129,7 +118,6 @@ class GaussianAvatars(AvatarMethod):
     method = "gaussianavatars-style"
     config_type = GaussianAvatarsConfig
     config: GaussianAvatarsConfig  # pyright: ignore[reportIncompatibleVariableOverride]
-    face_index: Int[Tensor, "N"]
     degree_now: Int[Tensor, ""]
     _face_size_m: Float[Tensor, "F"]
 
@@ -142,9 +130,10 @@ class GaussianAvatars(AvatarMethod):
         seed: int = 0,
     ) -> None:
         config = GaussianAvatarsConfig() if config is None else config
-        super().__init__(head, identity, config)
+        super().__init__(head, identity, config, config.density)
         count = len(head.faces)
-        self.register_buffer("face_index", torch.arange(count, device=identity.device))
+        faces = torch.arange(count, device=identity.device)
+        self._make_gaussians(faces, identity.new_zeros(count), config.initial_opacity)
         self._shown = ShownDegree(self, "degree_now", config.sh_degree)
         with torch.no_grad():
             rest = head(identity.new_zeros(1, self.layout.size), identity)
@@ -152,23 +141,9 @@ class GaussianAvatars(AvatarMethod):
         assert size_m is not None
         self.register_buffer("_face_size_m", size_m[0], persistent=False)
         self.position = nn.Parameter(identity.new_zeros(count, 3))
-        self.rotation_wxyz = nn.Parameter(identity.new_tensor([1.0, 0, 0, 0]).repeat(count, 1))
-        self.log_scale = nn.Parameter(identity.new_zeros(count, 3))
-        opacity = identity.new_full((count,), config.initial_opacity)
-        self.opacity_logit = nn.Parameter(opacity.logit())
-        self.color = nn.Parameter(identity.new_zeros(count, 1, 3))
         others = num_coefficients(config.sh_degree) - 1
         self.color_rest = nn.Parameter(identity.new_zeros(count, others, 3))
-        self.statistics = ScreenStatistics(count).to(identity)
-        self.rows = GaussianRows(self, _ROWS)
-        self.register_load_state_dict_post_hook(
-            lambda module, _: require_places(module.face_index, module.head.faces)
-        )
-
-    @property
-    def num_gaussians(self) -> int:
-        """The number N of Gaussians."""
-        return self.rows.count
+        self._keep_rows("position", "color_rest")
 
     def gaussians(
         self, theta: Float[Tensor, "B H"], *, cameras: PinholeCameras | None = None
@@ -222,14 +197,10 @@ class GaussianAvatars(AvatarMethod):
     def penalty(self, drawn: DrawnBatch, step: int) -> Losses:
         """The hinges of places and scales, in their triangles' sizes, of Gaussians in view."""
         config = self.config
-        seen = in_view(drawn.gaussians.means.detach(), drawn.cameras).any(0)
+        seen = drawn.cameras.shows(drawn.gaussians.means.detach()).any(0)
         far = position_hinge(self.position, config.farthest, seen)
         large = scale_hinge(self.log_scale.exp(), config.largest, seen)
         return {"position": config.position_weight * far, "scale": config.scale_weight * large}
-
-    def watches(self, step: int) -> bool:
-        """Whether density control still uses the gradient by the projected means."""
-        return self.config.density.watches(step)
 
     def after_step(
         self,
@@ -240,16 +211,9 @@ class GaussianAvatars(AvatarMethod):
     ) -> Mapping[str, float]:
         """Raise the degree of the harmonics, add and remove Gaussians, where that is due."""
         self._shown.raise_by(step, self.config.raise_degree_every)
-        if watched is not None:
-            self.statistics.add_step(watched)
-        known = ControlledGaussians(
-            self.rows, self.statistics, self._scale_m, self._children, face_of="face_index"
-        )
-        changes = control(known, self.config.density, optimizers, step=step, seed=seed)
-        return {} if changes is None else changes.figures()
+        return super().after_step(watched, optimizers, step, seed)
 
     def _scale_m(self) -> Float[Tensor, "N 3"]:
-        """Standard deviations at rest."""
         return self.log_scale.detach().exp() * self._face_size_m[self.face_index][:, None]
 
     def _children(
@@ -258,7 +222,3 @@ class GaussianAvatars(AvatarMethod):
         scale = self.log_scale[chosen].exp()
         place = sampled_positions(self.position[chosen], self.rotation_wxyz[chosen], scale, samples)
         return {"position": place}
-
-    def fit_to(self, parameters: Mapping[str, Any], prefix: str = "") -> None:
-        """Make room for the Gaussians of a stored state dict."""
-        self.rows.fit_to(parameters, prefix)

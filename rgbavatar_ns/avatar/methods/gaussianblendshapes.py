@@ -41,7 +41,6 @@ from rgbavatar_ns.avatar.methods.density import (
     DensityControl,
     ScreenStatistics,
     control,
-    in_view,
     sampled_positions,
 )
 from rgbavatar_ns.avatar.methods.expression_bases import ExpressionBases, basis_weights
@@ -377,7 +376,7 @@ class GaussianBlendshapes(AvatarMethod):
         teeth = replace(face, gradient_threshold=self.config.teeth_gradient_threshold)
         counts = [part.rows.count for part in self._parts]
         gradients = watched.screen_gradient_px.split(counts, 1)
-        shown = in_view(watched.gaussians.means.detach(), cameras).split(counts, 1)
+        shown = cameras.shows(watched.gaussians.means.detach()).split(counts, 1)
         figures: dict[str, float] = {}
         for part, gradient, drawn, options, name in zip(
             self._parts, gradients, shown, (face, teeth), ("face", "teeth")

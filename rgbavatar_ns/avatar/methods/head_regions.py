@@ -35,17 +35,9 @@ def hull_mask(points: Float[Tensor, "B G 3"], cameras: PinholeCameras) -> Bool[T
     in place of FlashAvatar's face parsing.
     """
     masks = np.zeros((len(points), cameras.height, cameras.width), np.uint8)
-    for mask, px in zip(masks, _pixels(points, cameras)):
+    for mask, px in zip(masks, cameras.project(points).float().cpu().numpy()):
         if len(px):
             # Within 16 bits, so that OpenCV's fixed point does not overflow.
             hull = cv2.convexHull(px.clip(-(2**14), 2**14))
             cv2.fillConvexPoly(mask, fixed_point(hull), (1,), shift=4)
     return torch.from_numpy(masks > 0).to(points.device)
-
-
-def _pixels(points: Float[Tensor, "B G 3"], cameras: PinholeCameras) -> Float[np.ndarray, "B G 2"]:
-    """Where points are in pictures of one camera, or one each."""
-    pose = cameras.world_to_camera
-    seen = points @ pose[:, :3, :3].mT + pose[:, None, :3, 3]
-    px = seen[..., :2] / seen[..., 2:].clamp(min=1e-3) * cameras.focal_px[:, None]
-    return (px + cameras.principal_point_px[:, None]).cpu().numpy().astype(np.float32)

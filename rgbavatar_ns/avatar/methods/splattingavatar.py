@@ -29,24 +29,19 @@ compares are those at rest; at the most Gaussians, those of the largest gradient
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Annotated, Any
+from typing import Annotated
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from rgbavatar_ns.avatar.config import MethodConfig
-from rgbavatar_ns.avatar.method import AvatarMethod, DrawnBatch, FilmedBatch, Losses, WatchedStep
-from rgbavatar_ns.avatar.methods.carriers import SmoothSurface, require_places
-from rgbavatar_ns.avatar.methods.density import (
-    ControlledGaussians,
-    DensityControl,
-    ScreenStatistics,
-    control,
-    sampled_positions,
-)
-from rgbavatar_ns.avatar.methods.gaussian_rows import GaussianRows, forget_moments
+from rgbavatar_ns.avatar.method import DrawnBatch, FilmedBatch, Losses, WatchedStep
+from rgbavatar_ns.avatar.methods.carriers import SmoothSurface
+from rgbavatar_ns.avatar.methods.density import DensityControl, sampled_positions
+from rgbavatar_ns.avatar.methods.gaussian_rows import forget_moments
 from rgbavatar_ns.avatar.methods.loss_terms import dssim_loss, held_where, mse_loss, spike_term
+from rgbavatar_ns.avatar.methods.mesh_splats import MeshSplats
 from rgbavatar_ns.avatar.methods.neighbours import neighbour_distance
 from rgbavatar_ns.avatar.methods.sh import sh_colors
 from rgbavatar_ns.avatar.methods.triangle_walk import TriangleWalk
@@ -68,10 +63,6 @@ LEARNING_RATES: dict[str, float] = {
 }
 """Adam's learning rate of each parameter group; that of offsets is in metres."""
 _LEAST_SCALE_M = math.sqrt(1e-7) / _UNITS_PER_M
-_ROWS = (
-    *("place", "offset_m", "rotation_wxyz", "log_scale", "opacity_logit", "color"),
-    *("face_index", "barycentric", "statistics"),
-)
 
 
 @dataclass(frozen=True)
@@ -112,7 +103,7 @@ class SplattingAvatarConfig(MethodConfig):
     """When and where Gaussians are added and removed."""
 
 
-class SplattingAvatar(AvatarMethod):
+class SplattingAvatar(MeshSplats):
     """Gaussians at places of a smooth surface, off it along its normal, turned as it turns.
 
     x = p(u, v) + d n(u, v), q = q(u, v) q_0, log s = r log s_0 in the release's units, where r is
@@ -129,7 +120,6 @@ class SplattingAvatar(AvatarMethod):
     method = "splattingavatar-style"
     config_type = SplattingAvatarConfig
     config: SplattingAvatarConfig  # pyright: ignore[reportIncompatibleVariableOverride]
-    face_index: Int[Tensor, "N"]
     barycentric: Float[Tensor, "N 3"]
     _rest_vertices: Float[Tensor, "V 3"]
 
@@ -142,35 +132,22 @@ class SplattingAvatar(AvatarMethod):
         seed: int = 0,
     ) -> None:
         config = SplattingAvatarConfig() if config is None else config
-        super().__init__(head, identity, config)
+        super().__init__(head, identity, config, config.density)
         with torch.no_grad():
             rest = head(identity.new_zeros(self.layout.size), identity)
         self.register_buffer("_rest_vertices", rest, persistent=False)
         self.surface = SmoothSurface(rest, head.faces)
         corners = rest[head.faces].detach().cpu()
         places = random_places(corners, config.initial_count, seed, by_area=config.by_area)
-        for name, values in zip(("face_index", "barycentric"), places):
-            self.register_buffer(name, values.to(identity.device))
-        at = interpolated(rest[None], head.faces[self.face_index], self.barycentric)[0]
-        log_scale, count = neighbour_distance(at, _LEAST_SCALE_M).log(), config.initial_count
-        self.place = nn.Parameter(identity.new_zeros(count, 2))
-        self.offset_m = nn.Parameter(identity.new_zeros(count))
-        self.rotation_wxyz = nn.Parameter(identity.new_tensor([1.0, 0, 0, 0]).repeat(count, 1))
-        self.log_scale = nn.Parameter(log_scale[:, None].repeat(1, 3))
-        opacity = identity.new_full((count,), config.initial_opacity)
-        self.opacity_logit = nn.Parameter(opacity.logit())
-        self.color = nn.Parameter(identity.new_zeros(count, 1, 3))
-        self.statistics = ScreenStatistics(count).to(identity)
-        self.rows = GaussianRows(self, _ROWS)
+        face_index, barycentric = (part.to(identity.device) for part in places)
+        at = interpolated(rest[None], head.faces[face_index], barycentric)[0]
+        log_scale = neighbour_distance(at, _LEAST_SCALE_M).log()
+        self._make_gaussians(face_index, log_scale, config.initial_opacity)
+        self.register_buffer("barycentric", barycentric)
+        self.place = nn.Parameter(identity.new_zeros(config.initial_count, 2))
+        self.offset_m = nn.Parameter(identity.new_zeros(config.initial_count))
+        self._keep_rows("place", "offset_m", "barycentric")
         self._lpips = LPIPSLoss()
-        self.register_load_state_dict_post_hook(
-            lambda module, _: require_places(module.face_index, module.head.faces)
-        )
-
-    @property
-    def num_gaussians(self) -> int:
-        """The number N of Gaussians."""
-        return self.rows.count
 
     def gaussians(
         self, theta: Float[Tensor, "B H"], *, cameras: PinholeCameras | None = None
@@ -237,10 +214,6 @@ class SplattingAvatar(AvatarMethod):
         spikes = spike_term(drawn.gaussians.scales, config.spike_from_m, config.spike_ratio)
         return {"spikes": config.spike_weight * _UNITS_PER_M * spikes}
 
-    def watches(self, step: int) -> bool:
-        """Whether density control still uses the gradient by the projected means."""
-        return self.config.density.watches(step)
-
     def after_step(
         self,
         watched: WatchedStep | None,
@@ -251,13 +224,10 @@ class SplattingAvatar(AvatarMethod):
         """Walk over the triangles, add and remove Gaussians, where that is due."""
         if (step + 1) % self.config.walk_every == 0:
             self._walk(optimizers)
-        if watched is not None:
-            self.statistics.add_step(watched)
-        known = ControlledGaussians(
-            self.rows, self.statistics, lambda: self.log_scale.detach().exp(), self._children
-        )
-        changes = control(known, self.config.density, optimizers, step=step, seed=seed)
-        return {} if changes is None else changes.figures()
+        return super().after_step(watched, optimizers, step, seed)
+
+    def _scale_m(self) -> Float[Tensor, "N 3"]:
+        return self.log_scale.detach().exp()
 
     @torch.no_grad()
     def _walk(self, optimizers: Sequence[torch.optim.Optimizer]) -> None:
@@ -290,10 +260,6 @@ class SplattingAvatar(AvatarMethod):
             "barycentric": barycentric.unflatten(0, (-1, count)),
             "place": samples.new_zeros(*samples.shape[:2], 2),
         }
-
-    def fit_to(self, parameters: Mapping[str, Any], prefix: str = "") -> None:
-        """Make room for the Gaussians of a stored state dict."""
-        self.rows.fit_to(parameters, prefix)
 
 
 def random_places(

@@ -15,7 +15,6 @@ from rgbavatar_ns.avatar import Avatar
 from rgbavatar_ns.avatar.method import AvatarMethod
 from rgbavatar_ns.avatar.metrics import psnr
 from rgbavatar_ns.data import TrackedDataset
-from rgbavatar_ns.data.check.sample import project
 from rgbavatar_ns.drawing.compositing import (
     composite,
     film_over,
@@ -218,8 +217,8 @@ def _gaussians(avatar: AvatarMethod, signal: DrivingSignal) -> GaussianSet:
 
 
 def _pixels(points: Float[Tensor, "P 3"], camera: PinholeCameras) -> Float[np.ndarray, "P 2"]:
-    parts = (points[None], camera.world_to_camera, camera.focal_px, camera.principal_point_px)
-    return project(*(part.cpu().numpy() for part in parts)).points_px[0]
+    # Far outside is outside; what draws has no room for more.
+    return camera.project(points[None])[0].clamp(-1e5, 1e5).cpu().numpy()
 
 
 def _with_points(picture: _Bytes, points_px: Float[np.ndarray, "P 2"]) -> _Bytes:

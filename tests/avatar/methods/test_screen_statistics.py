@@ -1,12 +1,11 @@
-"""What density control sums up between two changes, and which Gaussians are in view."""
+"""What density control sums up between two changes."""
 
 import math
 
 import torch
 
 from rgbavatar_ns.avatar.method import WatchedStep
-from rgbavatar_ns.avatar.methods.density import ScreenStatistics, in_view
-from rgbavatar_ns.kernels.reference import project
+from rgbavatar_ns.avatar.methods.density import ScreenStatistics
 from tests.kernels.scenes import random_scene
 
 
@@ -61,21 +60,6 @@ def test_what_counts_as_seen_may_be_told():
     assert statistics.mean_gradient().tolist() == [0, 0, 0, 0]
 
 
-def test_in_view_is_where_the_rasterizer_projects():
-    scene = random_scene(3, batch=2, count=300, num_cameras=2)
-    projected = project(scene.gaussians, scene.cameras)
-    x, y = projected.mean_px.unbind(-1)
-    inside = (x >= 0) & (x <= scene.cameras.width) & (y >= 0) & (y <= scene.cameras.height)
-    # The rasterizer draws no transparent ones, of which the place says nothing.
-    judged = scene.gaussians.opacities > 0.01
-    found = in_view(scene.gaussians.means, scene.cameras)
-    assert torch.equal(found[judged], (inside & projected.visible)[judged])
-    assert 0.1 < found.double().mean() < 0.95
-    behind = (scene.gaussians.means @ scene.cameras.world_to_camera[:, :3, :3].mT)[..., 2] < -2.4
-    assert behind.any()
-    assert not found[behind].any()
-
-
 def test_a_watched_step_counts_what_is_in_its_pictures_drawn_or_hidden():
     scene = random_scene(3, batch=2, count=50, num_cameras=2)
     cameras, generator = scene.cameras, torch.Generator().manual_seed(0)
@@ -83,7 +67,7 @@ def test_a_watched_step_counts_what_is_in_its_pictures_drawn_or_hidden():
     gradient[:, :5] = 0  # hidden by others
     found, wanted = ScreenStatistics(50), ScreenStatistics(50)
     found.add_step(WatchedStep(scene.gaussians, cameras, gradient))
-    seen = in_view(scene.gaussians.means, cameras)
+    seen = cameras.shows(scene.gaussians.means)
     wanted.add(gradient, cameras.width, cameras.height, seen)
     assert torch.equal(found.times_seen, seen.sum(0))
     assert found.times_seen[:5].any()
