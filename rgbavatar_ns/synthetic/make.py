@@ -53,9 +53,14 @@ def as_pinhole(camera: RayCamera) -> PinholeCameras:
 
 @dataclass(frozen=True)
 class DemoPerson:
-    """Head model, looks and renderer of the person of one config."""
+    """Head model, looks and renderer of the person of one config.
+
+    What is drawn is posed by `exact_head`, the same in float64, and rounded: float32's last digits
+    follow from how many frames are posed at once and from where they lie in memory.
+    """
 
     head: HeadModel
+    exact_head: HeadModel
     identity: Float[Tensor, "I"]
     renderer: DemoRenderer
     camera: RayCamera
@@ -76,10 +81,11 @@ class DemoPerson:
         paint = paint_head(head.arrays, resolution, config.seed, config.wrinkles, scalp_hair > 0)
         rest = torch.zeros(2, head.layout.size)
         rest[1, head.layout.slice("jaw").start] = WIDE_OPEN_RAD
-        at_rest, jaw_open = head(rest, identity).numpy()
+        exact_head, exact_identity = HeadModel(head.arrays, torch.float64), identity.double()
+        at_rest, jaw_open = exact_head(rest.double(), exact_identity).float().numpy()
         glasses = None
         if config.glasses:
-            eyes = head.joints(identity)[3:].numpy()
+            eyes = exact_head.joints(exact_identity)[3:].float().numpy()
             bridge = np.abs(at_rest[:, 0]) < 0.012
             bridge &= np.abs(at_rest[:, 1] - eyes[:, 1].mean()) < 0.008
             glasses = make_glasses(eyes[0], eyes[1], float(at_rest[bridge, 2].max()))
@@ -98,7 +104,7 @@ class DemoPerson:
             config.supersampling,
             light_follows_head=config.light == "head",
         )
-        return cls(head, identity, renderer, camera)
+        return cls(head, exact_head, identity, renderer, camera)
 
     def moments(self, theta: Float[Tensor, "F H"]) -> Iterator[Moment]:
         """What to draw for each theta."""
@@ -109,10 +115,11 @@ class DemoPerson:
         activations = wrinkle_activations(expression, names)
         jaw = theta[:, layout.slice("jaw").start].double().numpy() / WIDE_OPEN_RAD
         left, right = (expression[:, names.index(f"mouthSmile{s}")] for s in ("Left", "Right"))
-        smile = 0.5 * (left + right)
+        smile, identity = 0.5 * (left + right), self.identity.double()
         for k in range(len(theta)):
             if k % _CHUNK == 0:
-                vertices = self.head(theta[k : k + _CHUNK], self.identity).numpy()
+                posed = self.exact_head(theta[k : k + _CHUNK].double(), identity)
+                vertices = posed.float().numpy()
             rotation, shift = self._skull(theta[k])
             yield Moment(
                 tracked=vertices[k % _CHUNK],
@@ -128,7 +135,7 @@ class DemoPerson:
     ) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:
         """The rigid motion of what follows neck and body wholly."""
         parts = self.head.layout.split(theta)
-        root, neck = self.head.joints(self.identity)[:2]
+        root, neck = self._joints()[:2]
         body = axis_angle_to_matrix(parts["rotation"])
         turn = axis_angle_to_matrix(parts["neck"])
         carried, neck_carried = self._carried(parts["expression"])
@@ -146,14 +153,19 @@ class DemoPerson:
         columns = [arrays.expression_names.index(name) for name in NECK_SHIFTS]
         offsets = arrays.shapedirs[..., [arrays.num_identity + column for column in columns]]
         skull = arrays.vertex_groups["upper_teeth"][0]
+        offsets = offsets.astype(np.float64)
         moved = np.stack([offsets[skull], np.tensordot(arrays.joint_regressor[NECK], offsets, 1)])
-        carried, neck = torch.from_numpy(moved).float() @ expression[columns]
+        carried, neck = (torch.from_numpy(moved) @ expression[columns].double()).float()
         return carried, neck
+
+    def _joints(self) -> Float[Tensor, "J 3"]:
+        """At rest, metres."""
+        return self.exact_head.joints(self.identity.double()).float()
 
     def with_stiff_neck(self, theta: Float[Tensor, "F H"]) -> Float[Tensor, "F H"]:
         """Theta that moves the skull likewise, and everything else with it."""
         parts = self.head.layout.split(theta)
-        root = self.head.joints(self.identity)[0]
+        root = self._joints()[0]
         turns, shifts = zip(*(self._skull(row) for row in theta))
         turn, shift = (torch.from_numpy(np.stack(values)) for values in (turns, shifts))
         moved = {
@@ -199,8 +211,7 @@ class DemoFilm:
 def film_demo(config: DemoConfig, stiff_neck: bool = False) -> DemoFilm:
     """Cast, script and track the demo subject; the same config gives the same film on every run.
 
-    But for a pixel's level here and there: one of 240 frames was seen to differ between two runs,
-    and other processors round otherwise.
+    On another processor a pixel's level may differ here and there.
 
     stiff_neck: the body turns in the neck's stead, so that the head moves as one piece, as
     trackers assume that put all of its motion into the camera.

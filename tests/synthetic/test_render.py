@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 import torch
 
-from rgbavatar_ns.synthetic import DemoConfig, DemoPerson
+from rgbavatar_ns.synthetic import DemoConfig, DemoPerson, film_demo
 from rgbavatar_ns.synthetic.make import as_pinhole
 
 BROWS_UP = {"browInnerUp": 0.9, "browOuterUpLeft": 0.9, "browOuterUpRight": 0.9}
@@ -51,6 +51,15 @@ def theta_of(person):
 
 def draw(person, *thetas) -> list[np.ndarray]:
     return list(person.draw(torch.stack(thetas)))
+
+
+def test_a_moment_is_the_same_to_the_bit_alone_and_among_others(person):
+    film = film_demo(DemoConfig(num_frames=20, num_test_frames=4))
+    together = list(person.moments(film.true))
+    for number in (0, 7, 19):
+        alone = next(person.moments(film.true[number : number + 1]))
+        np.testing.assert_array_equal(alone.tracked, together[number].tracked)
+        np.testing.assert_array_equal(alone.head_shift_m, together[number].head_shift_m)
 
 
 def project(person, points: np.ndarray) -> np.ndarray:
