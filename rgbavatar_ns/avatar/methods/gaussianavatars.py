@@ -133,6 +133,7 @@ class GaussianAvatars(MeshSplats):
         super().__init__(head, identity, config, config.density)
         count = len(head.faces)
         faces = torch.arange(count, device=identity.device)
+        self.position = nn.Parameter(identity.new_zeros(count, 3))
         self._make_gaussians(faces, identity.new_zeros(count), config.initial_opacity)
         self._shown = ShownDegree(self, "degree_now", config.sh_degree)
         with torch.no_grad():
@@ -140,7 +141,6 @@ class GaussianAvatars(MeshSplats):
             size_m = edge_frames(rest, head.faces, self.face_index).length_ratio
         assert size_m is not None
         self.register_buffer("_face_size_m", size_m[0], persistent=False)
-        self.position = nn.Parameter(identity.new_zeros(count, 3))
         others = num_coefficients(config.sh_degree) - 1
         self.color_rest = nn.Parameter(identity.new_zeros(count, others, 3))
         self._keep_rows("position", "color_rest")

@@ -142,10 +142,10 @@ class SplattingAvatar(MeshSplats):
         face_index, barycentric = (part.to(identity.device) for part in places)
         at = interpolated(rest[None], head.faces[face_index], barycentric)[0]
         log_scale = neighbour_distance(at, _LEAST_SCALE_M).log()
-        self._make_gaussians(face_index, log_scale, config.initial_opacity)
         self.register_buffer("barycentric", barycentric)
         self.place = nn.Parameter(identity.new_zeros(config.initial_count, 2))
         self.offset_m = nn.Parameter(identity.new_zeros(config.initial_count))
+        self._make_gaussians(face_index, log_scale, config.initial_opacity)
         self._keep_rows("place", "offset_m", "barycentric")
         self._lpips = LPIPSLoss()
 
