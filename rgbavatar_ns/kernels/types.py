@@ -78,8 +78,8 @@ class PinholeCameras:
     def project(self, points: Float[Tensor, "#B P 3"]) -> Float[Tensor, "B P 2"]:
         """Where points of the world are in the pictures, pixels.
 
-        What is behind the near plane is taken to be on it, beside the axis as far as it is: a
-        number, but no place (`shows`).
+        A point behind the near plane is projected as if it were on it: to a finite number, which is
+        no place in the picture (`shows`).
         """
         placed = self.placed(points)
         per_metre = self.focal_px[:, None] / placed[..., 2:].clamp(min=NEAR_PLANE_M)

@@ -49,7 +49,7 @@ class MeshSplats(AvatarMethod):
     def _make_gaussians(
         self, face_index: Int[Tensor, "N"], log_scale: Float[Tensor, "N"], opacity: float
     ) -> None:
-        """Round, unturned Gaussians of no colour; those of a run's end may be more or fewer."""
+        """Begin with round, unturned, grey Gaussians on these triangles."""
         count, like = len(face_index), log_scale
         self.register_buffer("face_index", face_index)
         self.rotation_wxyz = nn.Parameter(like.new_tensor([1.0, 0, 0, 0]).repeat(count, 1))
@@ -59,7 +59,7 @@ class MeshSplats(AvatarMethod):
         self.statistics = ScreenStatistics(count).to(like)
 
     def _keep_rows(self, *places: str) -> None:
-        """Name the method's own tensors with a row a Gaussian, once all of them are there."""
+        """Let density control change these tensors too; called when all of them are there."""
         shared = ("rotation_wxyz", "log_scale", "opacity_logit", "color")
         self.rows = GaussianRows(self, (*places, *shared, "face_index", "statistics"))
 
