@@ -3,6 +3,7 @@
 import os
 import re
 import signal
+from pathlib import Path
 
 import pytest
 import torch
@@ -28,6 +29,22 @@ def emulated(monkeypatch: pytest.MonkeyPatch):
     if emulator.compiler() is None:
         pytest.skip("no g++ to emulate CUDA with")
     return emulator.install(monkeypatch)
+
+
+@pytest.fixture(scope="session")
+def flame_2020_pickle(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A synthetic FLAME 2020 in a folder of its own, with what lies beside it; to be read only."""
+    from rgbavatar_ns.synthetic.flame import write_synthetic_flame
+
+    return write_synthetic_flame(tmp_path_factory.mktemp("flame_2020"))
+
+
+@pytest.fixture(scope="session")
+def flame_2020(flame_2020_pickle: Path):
+    """Its arrays: reading them takes as long as writing them, seconds."""
+    from rgbavatar_ns.head.flame import load_flame
+
+    return load_flame(flame_2020_pickle)
 
 
 @pytest.fixture

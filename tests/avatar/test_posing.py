@@ -8,9 +8,7 @@ import torch
 from rgbavatar_ns.avatar import Avatar, AvatarConfig
 from rgbavatar_ns.avatar.model.posing_parameters import posing_parameters
 from rgbavatar_ns.head import EMBEDDED_BUST, HeadModel
-from rgbavatar_ns.head.flame import load_flame
 from rgbavatar_ns.kernels import Posing, available_backends, posing_of
-from rgbavatar_ns.synthetic.flame import write_synthetic_flame
 from rgbavatar_ns.threads import using_threads
 from tests.avatar.small_head import random_theta, randomize, small_head
 from tests.kernels.conftest import instruction_set  # noqa: F401
@@ -30,10 +28,12 @@ VARIANTS = {
 }
 
 
-def heads(name: str, folder) -> HeadModel:
-    if name == "flame":  # with eyelids and pose correctives
-        return HeadModel(load_flame(write_synthetic_flame(folder)))
-    return small_head() if name == "small" else HeadModel.embedded(name=EMBEDDED_BUST)
+HEADS = {
+    "small": lambda request: small_head(),
+    "bust": lambda request: HeadModel.embedded(name=EMBEDDED_BUST),
+    # With eyelids and pose correctives.
+    "flame": lambda request: HeadModel(request.getfixturevalue("flame_2020")),
+}
 
 
 def avatar_on(head: HeadModel, **changes) -> Avatar:
@@ -70,9 +70,9 @@ def assert_agrees(avatar: Avatar, seed: int = 0) -> None:
 
 
 @pytest.mark.usefixtures("instruction_set")
-@pytest.mark.parametrize("head", ["small", "bust", "flame"])
-def test_every_head_is_posed_as_in_float64(head, tmp_path):
-    assert_agrees(avatar_on(heads(head, tmp_path)))
+@pytest.mark.parametrize("head", HEADS)
+def test_every_head_is_posed_as_in_float64(head, request):
+    assert_agrees(avatar_on(HEADS[head](request)))
 
 
 @pytest.mark.parametrize("seed", [0, 1])

@@ -15,7 +15,6 @@ from rgbavatar_ns.cli import main as cli
 from rgbavatar_ns.data import DatasetWriter, TrackedFrame
 from rgbavatar_ns.data.png import encode_png_rgba, read_png_rgba
 from rgbavatar_ns.export import front_camera, pictures
-from rgbavatar_ns.synthetic.flame import write_synthetic_flame
 from tests.export.subject import avatar_of, camera_path, lively_theta
 
 _SIZE, _FRAMES, _HELD_OUT = 32, 7, 3
@@ -226,13 +225,12 @@ def test_mistakes_are_told(bundle, data, tmp_path, refused):
 
 
 def test_a_driver_of_another_head_without_a_common_expression_is_refused(
-    bundle, data, tmp_path, refused
+    bundle, data, tmp_path, refused, flame_2020_pickle
 ):
     from rgbavatar_ns.head import HeadModel
     from rgbavatar_ns.head.flame import load_flame
 
-    pickle = write_synthetic_flame(tmp_path / "models")
-    head = HeadModel(load_flame(pickle, num_identity=2, num_expressions=4, teeth=False))
+    head = HeadModel(load_flame(flame_2020_pickle, num_identity=2, num_expressions=4, teeth=False))
     camera = front_camera(avatar_of(), _SIZE, _SIZE)
     driver = tmp_path / "driver"
     writer = DatasetWriter(driver, head.arrays, torch.zeros(2), head.layout, _SIZE, _SIZE)

@@ -14,11 +14,9 @@ from rgbavatar_ns.driving.sources.live_link_face import parse_packet
 from rgbavatar_ns.export import front_camera
 from rgbavatar_ns.head import EMBEDDED_BUST, HeadArrays, HeadModel, turn_seen
 from rgbavatar_ns.head.arkit import ARKIT_NAMES, arkit_map
-from rgbavatar_ns.head.flame import load_flame
 from rgbavatar_ns.head.landmarks import facemesh_landmarks
 from rgbavatar_ns.head.lips import LipGap
 from rgbavatar_ns.head.rotations import axis_angle_to_matrix
-from rgbavatar_ns.synthetic.flame import write_synthetic_flame
 from rgbavatar_ns.synthetic.performer.performance import perform, with_tracker_noise
 from rgbavatar_ns.threads import using_threads
 from tests.export.subject import avatar_of
@@ -312,9 +310,9 @@ def _lids(head: HeadModel, theta: torch.Tensor) -> torch.Tensor:
     return upper - lower
 
 
-def test_a_person_drives_flame(tmp_path):
+def test_a_person_drives_flame(flame_2020):
     """A performance of the embedded head moves an avatar of FLAME's: mouth, blinks and turns."""
-    avatar = avatar_of(arrays=load_flame(write_synthetic_flame(tmp_path)))
+    avatar = avatar_of(arrays=flame_2020)
     performed = _performance(2, noise=0.5)
     known = arkit_map(_HEAD)
     film = avatar.arkit.theta(known.coefficients(_performance(7)), known.head_rotation(performed))

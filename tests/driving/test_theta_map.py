@@ -14,9 +14,7 @@ from rgbavatar_ns.driving.transfer import (
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import EMBEDDED_BUST, HeadArrays, HeadModel
 from rgbavatar_ns.head.arkit import ARKIT_NAMES
-from rgbavatar_ns.head.flame import load_flame
 from rgbavatar_ns.head.rotations import axis_angle_to_matrix
-from rgbavatar_ns.synthetic.flame import write_synthetic_flame
 from tests.avatar.small_head import small_head_arrays
 from tests.export.subject import avatar_of, lively_theta
 
@@ -76,10 +74,9 @@ def test_a_person_with_shoulders_turns_a_head_alone_as_the_head_turned():
     assert not mapped.theta[:, head.layout.slice("neck")].any()
 
 
-def test_arkits_names_lead_to_flame(tmp_path):
+def test_arkits_names_lead_to_flame(flame_2020):
     """A smile of the embedded head widens FLAME's mouth as much, and turns its head alike."""
-    flame = load_flame(write_synthetic_flame(tmp_path))
-    avatar = avatar_of(arrays=flame)
+    avatar = avatar_of(arrays=flame_2020)
     way = theta_map(HeadModel(_HEAD).layout, _HEAD, avatar)
     theta = torch.zeros(2, HeadModel(_HEAD).layout.size)
     for name in ("mouthSmileLeft", "mouthSmileRight"):

@@ -9,9 +9,7 @@ import torch
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import EMBEDDED_BUST, HeadArrays, HeadModel
 from rgbavatar_ns.head.arkit import ARKIT_NAMES, arkit_coefficients, arkit_map
-from rgbavatar_ns.head.flame import load_flame
 from rgbavatar_ns.head.landmarks import facemesh_landmarks
-from rgbavatar_ns.synthetic.flame import write_synthetic_flame
 
 
 def _theta(arrays: HeadArrays, **named: float) -> torch.Tensor:
@@ -99,19 +97,18 @@ def test_the_head_turns_on_its_shoulders_where_there_are_any():
         torch.testing.assert_close(known.head_rotation(theta), turn)
 
 
-def test_flame_makes_the_same_faces(tmp_path):
+def test_flame_makes_the_same_faces(flame_2020):
     """What FLAME's nameless directions make of ARKit's is compared on points of the face."""
-    flame = load_flame(write_synthetic_flame(tmp_path))
-    known = arkit_map(flame)
+    known = arkit_map(flame_2020)
     gaze = [name.startswith("eyeLook") for name in ARKIT_NAMES]
     shown = ~np.array([name == "tongueOut" for name in ARKIT_NAMES]) & ~np.array(gaze)
     assert known.unexplained[shown].max() < 0.1
     assert np.median(known.unexplained[shown]) < 0.03
     assert known.unexplained[ARKIT_NAMES.index("tongueOut")] == 1.0
-    head = HeadModel(flame, torch.float64)
+    head = HeadModel(flame_2020, torch.float64)
     embedded = HeadModel(HeadArrays.embedded(), torch.float64)
     # The made-up FLAME is the embedded head cut and renumbered: its vertices have namesakes.
-    wide, near = embedded.arrays.v_template, flame.v_template
+    wide, near = embedded.arrays.v_template, flame_2020.v_template
     same = np.linalg.norm(wide[:, None, ::1] - near[None, :400], axis=2).argmin(0)
     assert np.linalg.norm(wide[same] - near[:400], axis=1).max() < 1e-4
     for name in ("mouthSmileLeft", "jawOpen", "eyeBlinkLeft", "browDownRight"):

@@ -20,8 +20,8 @@ from rgbavatar_ns.synthetic.flame import write_synthetic_flame
 
 
 @pytest.fixture(scope="module")
-def written(tmp_path_factory) -> Path:
-    return write_synthetic_flame(tmp_path_factory.mktemp("flame"), "2020")
+def written(flame_2020_pickle) -> Path:
+    return flame_2020_pickle
 
 
 @pytest.fixture(scope="module")
@@ -34,8 +34,8 @@ def python_read(tmp_path_factory) -> tuple[Path, dict]:
 
 
 @pytest.fixture(scope="module")
-def flame(written) -> HeadArrays:
-    return load_flame(written)
+def flame(flame_2020) -> HeadArrays:
+    return flame_2020
 
 
 def test_synthetic_file_has_flames_keys_shapes_and_types(python_read):

@@ -2,9 +2,7 @@ import pytest
 import torch
 
 from rgbavatar_ns.head import EMBEDDED_BUST, HeadArrays, HeadModel
-from rgbavatar_ns.head.flame import load_flame
 from rgbavatar_ns.head.lips import LipGap
-from rgbavatar_ns.synthetic.flame import write_synthetic_flame
 from tests.avatar.small_head import small_head_arrays
 
 
@@ -30,8 +28,8 @@ def test_the_jaw_parts_the_lips_and_the_heads_turn_does_not(name):
     assert turned == pytest.approx([opened, opened], abs=1e-6)
 
 
-def test_flames_lips_part_alike(tmp_path):
-    flame, own = _gap(load_flame(write_synthetic_flame(tmp_path))), _gap(HeadArrays.embedded())
+def test_flames_lips_part_alike(flame_2020):
+    flame, own = _gap(flame_2020), _gap(HeadArrays.embedded())
     assert flame.slope_m_per_rad == pytest.approx(own.slope_m_per_rad, rel=0.35)
 
 

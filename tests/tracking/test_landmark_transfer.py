@@ -2,17 +2,14 @@
 
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadArrays, facemesh_landmarks
-from rgbavatar_ns.head.flame import load_flame
 from rgbavatar_ns.head.landmarks import LandmarkMap, facemesh_noise, facemesh_response
 from rgbavatar_ns.head.registration import register
-from rgbavatar_ns.synthetic.flame import write_synthetic_flame
 from rgbavatar_ns.tracking.face.landmark_transfer import FittedHead, carried_noise, fitted_head
 from tests.head.synthetic_head import flame_shaped_arrays
 
@@ -35,15 +32,10 @@ def another() -> tuple[FittedHead, np.ndarray, np.ndarray]:
     return fitted_head(as_another_model(remeshed(), person, mix)), person, mix
 
 
-@cache
-def flame(folder: Path) -> FittedHead:
-    """A FLAME without eyelid files."""
-    return fitted_head(replace(load_flame(write_synthetic_flame(folder)), eyelid_dirs=None))
-
-
 @pytest.fixture(scope="module")
-def flame_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("flame")
+def flame(flame_2020: HeadArrays) -> FittedHead:
+    """A FLAME without eyelid files."""
+    return fitted_head(replace(flame_2020, eyelid_dirs=None))
 
 
 def test_a_point_whose_place_is_less_sure_than_before_counts_less() -> None:
@@ -73,9 +65,9 @@ def test_landmarks_keep_their_place_on_a_head_of_other_triangles_person_size_and
 
 
 def test_landmarks_keep_their_place_to_a_tenth_of_a_millimetre_on_flames_triangles(
-    flame_folder: Path,
+    flame: FittedHead,
 ) -> None:
-    found, marks = flame(flame_folder), facemesh_landmarks()
+    found, marks = flame, facemesh_landmarks()
     away_m = places(found.arrays, found.landmarks) - places(HeadArrays.embedded(), marks)
     assert np.linalg.norm(away_m, axis=1).max() < 1e-4
 
@@ -124,8 +116,8 @@ def test_response_to_mixed_expressions_is_the_mixture_of_responses() -> None:
     assert agreement > 0.9
 
 
-def test_flame_without_eyelid_files_gets_eyelids_that_close(flame_folder: Path) -> None:
-    found = flame(flame_folder)
+def test_flame_without_eyelid_files_gets_eyelids_that_close(flame: FittedHead) -> None:
+    found = flame
     lids = found.arrays.eyelid_dirs
     assert lids is not None
     assert found.response.expression.shape[-1] == found.arrays.num_expressions + 2
@@ -138,8 +130,8 @@ def test_flame_without_eyelid_files_gets_eyelids_that_close(flame_folder: Path) 
         assert share < 0.5 if left else share > 0.8, "the subject's left eye follows its own lid"
 
 
-def test_what_is_no_face_is_refused(flame_folder: Path) -> None:
-    head = flame(flame_folder).arrays
+def test_what_is_no_face_is_refused(flame: FittedHead) -> None:
+    head = flame.arrays
     with pytest.raises(UserError, match=r"1e\+02 times as large"):
         fitted_head(replace(head, v_template=100 * head.v_template))
     with pytest.raises(UserError, match="No face was found"):

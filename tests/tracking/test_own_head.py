@@ -11,7 +11,6 @@ from scipy.spatial import KDTree
 from rgbavatar_ns.data import load_dataset
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadArrays, HeadModel
-from rgbavatar_ns.synthetic.flame import write_synthetic_flame
 from rgbavatar_ns.tracking import TrackConfig, track_video
 from rgbavatar_ns.tracking.fit.fit import ClipFit
 from rgbavatar_ns.tracking.fit.own_head import read_own_head, subject_tracker
@@ -25,11 +24,6 @@ from .remeshed_head import TURN, as_another_model, remeshed
 
 CONFIG = TrackConfig(focal_px=CAMERA.focal_px, key_frames=6, identity_components=10, head_only=True)
 FRAMES = 10
-
-
-@pytest.fixture(scope="module")
-def flame_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_synthetic_flame(tmp_path_factory.mktemp("flame"))
 
 
 @pytest.fixture(scope="module")
@@ -126,11 +120,13 @@ def test_a_head_that_is_none_is_refused_with_cause_and_remedy(tmp_path: Path) ->
 
 
 @pytest.mark.slow
-def test_a_video_tracked_with_flame_holds_that_head(flame_path: Path, tmp_path: Path) -> None:
+def test_a_video_tracked_with_flame_holds_that_head(
+    flame_2020_pickle: Path, tmp_path: Path
+) -> None:
     pytest.importorskip("mediapipe", reason="the tracker's optional extra is not installed")
     image = astronaut()
     clip = write_clip(tmp_path / "portrait.mp4", [np.roll(image, 2 * k, axis=1) for k in range(3)])
-    config = TrackConfig(image_size=64, key_frames=2, focal_px=500.0, flame=flame_path)
+    config = TrackConfig(image_size=64, key_frames=2, focal_px=500.0, flame=flame_2020_pickle)
     done = track_video(clip, tmp_path / "set", config)
     report = json.loads((tmp_path / "set" / "tracking.json").read_text())
     assert report["head_model"] == "FLAME 2020"

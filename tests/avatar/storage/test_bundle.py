@@ -15,7 +15,6 @@ from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics, neutral_f
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadArrays, HeadModel, ThetaLayout
 from rgbavatar_ns.head.flame import load_flame
-from rgbavatar_ns.synthetic.flame import write_synthetic_flame
 from tests.avatar.small_head import front_camera, random_theta
 from tests.fuzz.avatars import checkpoint_of
 
@@ -200,14 +199,13 @@ def test_the_embedded_head_is_always_there(tmp_path):
     assert torch.equal(_picture(Avatar.load(tmp_path / "me")), _picture(avatar))
 
 
-def test_flame_is_found_by_its_version_and_form(tmp_path, monkeypatch):
-    pickle = write_synthetic_flame(tmp_path / "models")
+def test_flame_is_found_by_its_version_and_form(tmp_path, monkeypatch, flame_2020_pickle):
     sizes = {"num_identity": 3, "num_expressions": 5}
-    avatar = _avatar(HeadModel(load_flame(pickle, teeth_form="blocks", **sizes)))
+    avatar = _avatar(HeadModel(load_flame(flame_2020_pickle, teeth_form="blocks", **sizes)))
     avatar.save(tmp_path / "me", with_head=False)
     with pytest.raises(UserError, match=r"FLAME 2020.*RGBAVATAR_FLAME"):
         Avatar.load(tmp_path / "me")
-    monkeypatch.setenv("RGBAVATAR_FLAME", str(tmp_path / "models"))
+    monkeypatch.setenv("RGBAVATAR_FLAME", str(flame_2020_pickle.parent.parent))
     avatar.save(tmp_path / "whole")
     found, held = Avatar.load(tmp_path / "me"), Avatar.load(tmp_path / "whole")
     assert torch.equal(_picture(found), _picture(held))
