@@ -1,9 +1,8 @@
 """Adam and learning-rate schedules whose checkpoints hold nothing but tensors and numbers."""
 
-import math
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import torch
 from nerfstudio.engine.optimizers import OptimizerConfig, Optimizers
@@ -13,6 +12,7 @@ from torch.optim.lr_scheduler import LambdaLR
 from rgbavatar_ns.avatar import LEARNING_RATES
 from rgbavatar_ns.options import Between, Counted, Positive, Weight
 
+DecayShape = Literal["exponential", "linear"]
 _MOMENTS = ("exp_avg", "exp_avg_sq")
 _MAX_STEP = 1 << 40
 _ASKED, _RATES = "asked_lr", ("lr", "initial_lr", "first_lr")
@@ -34,35 +34,39 @@ class AdamConfig(OptimizerConfig):
 
 
 @dataclass
-class ExponentialConfig(SchedulerConfig):
+class DecayConfig(SchedulerConfig):
     """Nothing before `start_step`; from the optimizer's rate at step 0 to `factor` times it at
-    step `steps`, exponentially, then constant.
+    step `steps`, then constant.
 
-    nerfstudio's own schedule computes with numpy, whose scalars end up in the checkpoint and
+    nerfstudio's own schedules compute with numpy, whose scalars end up in the checkpoint and
     make it unreadable for torch's safe loading.
     """
 
-    _target: type = field(default_factory=lambda: Exponential)
+    _target: type = field(default_factory=lambda: Decay)
     factor: Annotated[float, Between(1e-9, 1e3)] = 1.0
     """Final learning rate divided by the first one."""
     steps: Counted = 5000
     """Steps until the final rate is reached."""
     start_step: Counted = 0
     """First step with a rate that is not zero."""
+    shape: DecayShape = "exponential"
+    """Whether each step takes the same share of the rate, or the same amount."""
 
 
-class Exponential(Scheduler):
-    """The schedule of `ExponentialConfig`."""
+class Decay(Scheduler):
+    """The schedule of `DecayConfig`."""
 
-    config: ExponentialConfig
+    config: DecayConfig
 
     def get_scheduler(self, optimizer: torch.optim.Optimizer, lr_init: float) -> LambdaLR:
         """Torch's scheduler for `optimizer`; `lr_init` is taken from the optimizer itself."""
-        log_factor, steps = math.log(self.config.factor), max(1, self.config.steps)
-        start = self.config.start_step
+        factor, steps, start = self.config.factor, max(1, self.config.steps), self.config.start_step
+        linear = self.config.shape == "linear"
 
         def share(step: int) -> float:
-            return math.exp(log_factor * min(step / steps, 1.0)) if step >= start else 0.0
+            passed = min(step / steps, 1.0)
+            falling = 1 + (factor - 1) * passed if linear else factor**passed
+            return falling if step >= start else 0.0
 
         return LambdaLR(optimizer, share)
 

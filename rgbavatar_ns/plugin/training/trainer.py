@@ -48,7 +48,8 @@ from rgbavatar_ns.plugin.training.load_config import (
 )
 from rgbavatar_ns.plugin.training.optimizers import (
     AdamConfig,
-    ExponentialConfig,
+    DecayConfig,
+    DecayShape,
     go_on_as_asked,
     note_asked_rates,
     require_fitting_states,
@@ -87,10 +88,11 @@ class RGBAvatarTrainerConfig(TrainerConfig):
     saving. How many steps that makes depends on the machine; rates fall over learning_rate_steps
     all the same."""
     position_lr_final: Positive | None = None
-    """Let the learning rate of positions fall exponentially to this (paper: not; release: 8e-6)."""
+    """Let the learning rate of positions fall to this (paper: not; release: 8e-6)."""
     learning_rate_factor: Annotated[float, Between(1e-9, 1e3)] = 1.0
-    """Let all other learning rates fall exponentially to this multiple of the first one (paper,
-    release: 1)."""
+    """Let all other learning rates fall to this multiple of the first one (paper, release: 1)."""
+    learning_rate_decay: DecayShape = "exponential"
+    """How they fall: each step by the same share (release), or by the same amount."""
     learning_rate_steps: Count | None = None
     """Steps over which learning rates fall (release: 3,000); by default max_num_iterations. Name it
     where a run is to be continued beyond its first end."""
@@ -218,8 +220,11 @@ class RGBAvatarTrainer(EndingTrainer, FitHooks):
                 factor = self.config.position_lr_final / rate
             start = model.refinement.first_step_of(name, steps) if model.refine_tracking else 0
             if (factor != 1.0 or start > 0) and settings[name].get("scheduler") is None:
-                settings[name]["scheduler"] = ExponentialConfig(
-                    factor=factor, steps=steps, start_step=start
+                settings[name]["scheduler"] = DecayConfig(
+                    factor=factor,
+                    steps=steps,
+                    start_step=start,
+                    shape=self.config.learning_rate_decay,
                 )
         optimizers = Optimizers(settings, groups)
         note_asked_rates(optimizers)

@@ -10,7 +10,12 @@ import pytest
 from rgbavatar_ns.plugin.training.trainer import RGBAvatarTrainer
 from tests.plugin.run import before_each_step, make_trainer, small_config
 
-_FALLS: dict[str, Any] = {"learning_rate_factor": 0.01, "learning_rate_steps": 10}
+_FALLS: dict[str, Any] = {
+    "learning_rate_factor": 0.01,
+    "learning_rate_steps": 10,
+    "learning_rate_decay": "exponential",
+}
+_FALLS_LINEARLY = {**_FALLS, "learning_rate_decay": "linear"}
 _STAYS: dict[str, Any] = {"learning_rate_factor": 1.0, "position_lr_final": None}
 
 
@@ -42,7 +47,7 @@ def begun(tiny_data: Path, tmp_path: Path) -> Callable[..., tuple[Path, list[flo
     return begin
 
 
-@pytest.mark.parametrize("falls", [_STAYS, _FALLS])
+@pytest.mark.parametrize("falls", [_STAYS, _FALLS, _FALLS_LINEARLY])
 def test_another_rate_is_taken_as_far_as_it_has_fallen(
     falls: dict[str, Any], begun: Callable[..., Any], tiny_data: Path, tmp_path: Path
 ):
@@ -51,6 +56,15 @@ def test_another_rate_is_taken_as_far_as_it_has_fallen(
     second = run(tiny_data, tmp_path / "s", 0.005, max_num_iterations=7, load_dir=folder, **falls)
     assert second == pytest.approx(whole[4:], rel=1e-6)
     assert len(second) == 3
+
+
+def test_rates_fall_by_the_same_amount_each_step_where_that_is_asked(
+    tiny_data: Path, tmp_path: Path
+):
+    fields = {**_FALLS_LINEARLY, "learning_rate_steps": 4, "max_num_iterations": 6}
+    seen = run(tiny_data, tmp_path, 0.02, **fields)
+    # .02 less a quarter of .0198 each step, and a hundredth from the fourth on.
+    assert seen == pytest.approx([0.02, 0.01505, 0.0101, 0.00515, 0.0002, 0.0002], rel=1e-6)
 
 
 def test_a_schedule_that_is_new_stands_where_it_would(
