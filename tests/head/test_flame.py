@@ -13,15 +13,9 @@ import torch
 
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadModel, uv_anchors
-from rgbavatar_ns.head.arrays import HeadArrays
 from rgbavatar_ns.head.flame import FLAME_VARIABLE, load_flame
 from rgbavatar_ns.head.flame_uv import make_uv_map, read_uv_map
 from rgbavatar_ns.synthetic.flame import write_synthetic_flame
-
-
-@pytest.fixture(scope="module")
-def written(flame_2020_pickle) -> Path:
-    return flame_2020_pickle
 
 
 @pytest.fixture(scope="module")
@@ -31,11 +25,6 @@ def python_read(tmp_path_factory) -> tuple[Path, dict]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         return path, pickle.loads(path.read_bytes(), encoding="latin1")
-
-
-@pytest.fixture(scope="module")
-def flame(flame_2020) -> HeadArrays:
-    return flame_2020
 
 
 def test_synthetic_file_has_flames_keys_shapes_and_types(python_read):
@@ -72,42 +61,42 @@ def test_numbers_are_those_that_pythons_pickle_reads(python_read):
     assert flame.parents.tolist() == [-1, 0, 1, 1, 1]
 
 
-def test_chumpy_makes_no_difference(written, flame, tmp_path):
+def test_chumpy_makes_no_difference(flame_2020_pickle, flame_2020, tmp_path):
     plain = load_flame(write_synthetic_flame(tmp_path, "2020", chumpy=False))
-    assert b"chumpy" in written.read_bytes()[:100_000]
-    assert np.array_equal(plain.v_template, flame.v_template)
-    assert np.array_equal(plain.shapedirs, flame.shapedirs)
+    assert b"chumpy" in flame_2020_pickle.read_bytes()[:100_000]
+    assert np.array_equal(plain.v_template, flame_2020.v_template)
+    assert np.array_equal(plain.shapedirs, flame_2020.shapedirs)
 
 
-def test_head_model_runs_on_it(flame):
-    head = HeadModel(flame)
+def test_head_model_runs_on_it(flame_2020):
+    head = HeadModel(flame_2020)
     assert (head.num_identity, head.layout.slice("expression")) == (300, slice(0, 100))
     assert "eyelids" in head.layout
     # 100 expressions, 6 numbers for each of 5 rotations, 2 eyelids (method notes: 129 with
     # translation and without the neck, which FLAME trackers leave alone).
     assert head.layout.feature_size() == 132
     at_rest = head(torch.zeros(head.layout.size))
-    assert torch.equal(at_rest, torch.from_numpy(flame.v_template))
+    assert torch.equal(at_rest, torch.from_numpy(flame_2020.v_template))
     theta = torch.zeros(head.layout.size)
     theta[head.layout.slice("jaw")] = torch.tensor([0.3, 0.0, 0.0])
     moved = (head(theta) - at_rest).norm(dim=-1)
-    lower, upper = flame.vertex_groups["lower_teeth"], flame.vertex_groups["upper_teeth"]
+    lower, upper = flame_2020.vertex_groups["lower_teeth"], flame_2020.vertex_groups["upper_teeth"]
     assert moved[lower].min() > 5e-3
     assert moved[upper].max() < 1e-7
 
 
-def test_eyelids_move_only_their_own_eye(flame):
-    head = HeadModel(flame)
+def test_eyelids_move_only_their_own_eye(flame_2020):
+    head = HeadModel(flame_2020)
     theta = torch.zeros(2, head.layout.size)
     theta[:, head.layout.slice("eyelids")] = torch.eye(2)
-    moved = (head(theta) - torch.from_numpy(flame.v_template)).norm(dim=-1) > 1e-3
-    assert (flame.v_template[moved[0].numpy(), 0] > 0).all()
-    assert (flame.v_template[moved[1].numpy(), 0] < 0).all()
+    moved = (head(theta) - torch.from_numpy(flame_2020.v_template)).norm(dim=-1) > 1e-3
+    assert (flame_2020.v_template[moved[0].numpy(), 0] > 0).all()
+    assert (flame_2020.v_template[moved[1].numpy(), 0] < 0).all()
     assert moved.any(1).all()
 
 
-def test_anchors_cover_the_teeth_and_never_lie_on_unmapped_triangles(flame):
-    head = HeadModel(flame)
+def test_anchors_cover_the_teeth_and_never_lie_on_unmapped_triangles(flame_2020):
+    head = HeadModel(flame_2020)
     carrying = uv_anchors(head.uv, head.uv_faces, 256).triangle_index.unique()
     corners = head.uv[head.uv_faces]
     unmapped = (corners == corners[:, :1]).all(-1).all(-1)
@@ -116,22 +105,25 @@ def test_anchors_cover_the_teeth_and_never_lie_on_unmapped_triangles(flame):
     assert set(range(9976, 9976 + 56)) <= set(carrying.tolist())
 
 
-def test_fewer_directions_are_the_first_ones(written, flame):
-    few = load_flame(written, num_identity=10, num_expressions=50, teeth=False)
+def test_fewer_directions_are_the_first_ones(flame_2020_pickle, flame_2020):
+    few = load_flame(flame_2020_pickle, num_identity=10, num_expressions=50, teeth=False)
     assert few.shapedirs.shape == (5023, 3, 60)
-    assert np.array_equal(few.shapedirs[..., :10], flame.shapedirs[:5023, :, :10])
-    assert np.array_equal(few.shapedirs[..., 10:], flame.shapedirs[:5023, :, 300:350])
+    assert np.array_equal(few.shapedirs[..., :10], flame_2020.shapedirs[:5023, :, :10])
+    assert np.array_equal(few.shapedirs[..., 10:], flame_2020.shapedirs[:5023, :, 300:350])
     with pytest.raises(UserError, match="num_expressions is 101"):
-        load_flame(written, num_expressions=101)
+        load_flame(flame_2020_pickle, num_expressions=101)
 
 
 # Finding the files
 
 
 @pytest.fixture
-def models(written, python_read, tmp_path) -> Path:
+def models(flame_2020_pickle, python_read, tmp_path) -> Path:
     """Links to two versions in a folder."""
-    for name, source in (("FLAME2020/generic_model", written), ("flame2023", python_read[0])):
+    for name, source in (
+        ("FLAME2020/generic_model", flame_2020_pickle),
+        ("flame2023", python_read[0]),
+    ):
         path = tmp_path / f"{name}.pkl"
         path.parent.mkdir(exist_ok=True)
         path.symlink_to(source)
@@ -139,13 +131,13 @@ def models(written, python_read, tmp_path) -> Path:
     return tmp_path
 
 
-def test_environment_variable_names_file_or_folder(written, monkeypatch):
+def test_environment_variable_names_file_or_folder(flame_2020_pickle, monkeypatch):
     monkeypatch.delenv(FLAME_VARIABLE, raising=False)
     with pytest.raises(UserError, match="none is named") as missing:
         load_flame()
     assert "https://flame.is.tue.mpg.de" in missing.value.remedy
     assert FLAME_VARIABLE in missing.value.remedy
-    monkeypatch.setenv(FLAME_VARIABLE, str(written.parent.parent))
+    monkeypatch.setenv(FLAME_VARIABLE, str(flame_2020_pickle.parent.parent))
     assert load_flame().name == "FLAME 2020"
     monkeypatch.setenv(FLAME_VARIABLE, "/nowhere")
     with pytest.raises(UserError, match="no FLAME model at /nowhere"):
@@ -173,17 +165,17 @@ def test_the_version_chooses_among_several_models(models):
         ("x/generic_model.pkl", "FLAME 2020"),
     ],
 )
-def test_the_version_is_read_off_the_name(written, tmp_path, name, told):
+def test_the_version_is_read_off_the_name(flame_2020_pickle, tmp_path, name, told):
     path = tmp_path / name
     path.parent.mkdir(exist_ok=True)
-    path.symlink_to(written)
-    assert load_flame(path, uv=written.parent / "head_template.obj").name == told
+    path.symlink_to(flame_2020_pickle)
+    assert load_flame(path, uv=flame_2020_pickle.parent / "head_template.obj").name == told
 
 
-def test_a_name_without_a_version_is_refused_unless_it_is_given(written, tmp_path):
+def test_a_name_without_a_version_is_refused_unless_it_is_given(flame_2020_pickle, tmp_path):
     path = tmp_path / "model.pkl"
-    path.symlink_to(written)
-    template = written.parent / "head_template.obj"
+    path.symlink_to(flame_2020_pickle)
+    template = flame_2020_pickle.parent / "head_template.obj"
     with pytest.raises(UserError, match=r"model\.pkl does not say which version"):
         load_flame(path, uv=template)
     assert load_flame(path, uv=template, version="2017").name == "FLAME 2017"
@@ -208,11 +200,11 @@ def test_other_pickles_wrong_shapes_and_nan_are_refused(python_read, tmp_path):
 # UV maps and eyelids
 
 
-def test_npz_and_shuffled_obj_give_the_same_map(written, flame, tmp_path):
-    faces, triangles = flame.faces[:9976], flame.uv_faces[:9976]
-    uv = flame.uv[: triangles.max() + 1]
+def test_npz_and_shuffled_obj_give_the_same_map(flame_2020_pickle, flame_2020, tmp_path):
+    faces, triangles = flame_2020.faces[:9976], flame_2020.uv_faces[:9976]
+    uv = flame_2020.uv[: triangles.max() + 1]
     np.savez(tmp_path / "uv.npz", vt=uv, ft=triangles)
-    lines = (written.parent / "head_template.obj").read_text().splitlines()
+    lines = (flame_2020_pickle.parent / "head_template.obj").read_text().splitlines()
     generator = np.random.default_rng(0)
     corners = [line.split()[1:] for line in lines if line.startswith("f ")]
     for i in generator.integers(0, len(corners), 500):
@@ -226,8 +218,8 @@ def test_npz_and_shuffled_obj_give_the_same_map(written, flame, tmp_path):
         assert np.allclose(read_uv[read_faces], uv[triangles], atol=1e-6)
 
 
-def test_damaged_or_foreign_uv_maps_are_refused(flame, tmp_path):
-    faces = flame.faces[:9976]
+def test_damaged_or_foreign_uv_maps_are_refused(flame_2020, tmp_path):
+    faces = flame_2020.faces[:9976]
     for name, text, told in (
         ("none.obj", "v 0 0 0\nf 1 2 3\n", "no triangles with UV"),
         ("few.obj", "vt 0 0\nf 1/1 2/1 3/1\n", "maps 1 triangles"),
@@ -251,10 +243,12 @@ def test_damaged_or_foreign_uv_maps_are_refused(flame, tmp_path):
         read_uv_map(tmp_path / "nowhere.obj", faces)
 
 
-def test_without_a_uv_map_one_is_made_with_a_warning(monkeypatch, written, flame, tmp_path):
+def test_without_a_uv_map_one_is_made_with_a_warning(
+    monkeypatch, flame_2020_pickle, flame_2020, tmp_path
+):
     path = tmp_path / "flame" / "flame2020.pkl"
     path.parent.mkdir()
-    path.symlink_to(written)
+    path.symlink_to(flame_2020_pickle)
     monkeypatch.setattr(
         "rgbavatar_ns.head.flame.make_uv_map",
         lambda vertices, faces: (np.zeros((3, 2)), np.zeros_like(faces)),
@@ -278,10 +272,10 @@ def test_a_made_uv_map_has_no_overlap_and_leaves_room_for_teeth():
     assert covered / 512**2 == pytest.approx(area, rel=0.02)
 
 
-def test_eyelids_are_checked(written, tmp_path):
+def test_eyelids_are_checked(flame_2020_pickle, tmp_path):
     with pytest.raises(UserError, match="lacks l_eyelid"):
-        load_flame(written, eyelids=tmp_path)
+        load_flame(flame_2020_pickle, eyelids=tmp_path)
     np.save(tmp_path / "l_eyelid.npy", np.zeros((5, 3)))
     np.save(tmp_path / "r_eyelid.npy", np.zeros((5023, 3)))
     with pytest.raises(UserError, match="no eyelid offsets"):
-        load_flame(written, eyelids=tmp_path)
+        load_flame(flame_2020_pickle, eyelids=tmp_path)

@@ -25,6 +25,15 @@ def test_a_config_of_an_earlier_run_is_read_by_its_present_class(name: str):
     assert type(config).__name__ == name.partition(".")[2]
 
 
+def test_rates_of_an_earlier_run_fall_on_as_they_did():
+    """Its config was written before there were two ways to fall."""
+    from rgbavatar_ns.plugin import methods as _methods  # noqa: F401
+
+    kind = "rgbavatar_ns.plugin.training.trainer.RGBAvatarTrainerConfig"
+    config = yaml.load(f"!!python/object:{kind} {{learning_rate_factor: 0.1}}", Loader=yaml.Loader)
+    assert config.learning_rate_decay == "exponential"
+
+
 def test_nerfstudio_knows_them_once_it_knows_its_methods():
     """As in ns-viewer and ns-eval, which read a config by itself."""
     code = (

@@ -67,8 +67,8 @@ def test_landmarks_keep_their_place_on_a_head_of_other_triangles_person_size_and
 def test_landmarks_keep_their_place_to_a_tenth_of_a_millimetre_on_flames_triangles(
     flame: FittedHead,
 ) -> None:
-    found, marks = flame, facemesh_landmarks()
-    away_m = places(found.arrays, found.landmarks) - places(HeadArrays.embedded(), marks)
+    marks = facemesh_landmarks()
+    away_m = places(flame.arrays, flame.landmarks) - places(HeadArrays.embedded(), marks)
     assert np.linalg.norm(away_m, axis=1).max() < 1e-4
 
 
@@ -117,15 +117,14 @@ def test_response_to_mixed_expressions_is_the_mixture_of_responses() -> None:
 
 
 def test_flame_without_eyelid_files_gets_eyelids_that_close(flame: FittedHead) -> None:
-    found = flame
-    lids = found.arrays.eyelid_dirs
+    lids = flame.arrays.eyelid_dirs
     assert lids is not None
-    assert found.response.expression.shape[-1] == found.arrays.num_expressions + 2
-    marks = found.landmarks
+    assert flame.response.expression.shape[-1] == flame.arrays.num_expressions + 2
+    marks = flame.landmarks
     upper, lower = (marks.select(np.flatnonzero(marks.facemesh_index == i)) for i in (386, 374))
     for left, right in ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0)):
-        vertices = found.arrays.v_template + lids @ np.array([left, right], np.float32)
-        gap_m = places(found.arrays, upper, vertices) - places(found.arrays, lower, vertices)
+        vertices = flame.arrays.v_template + lids @ np.array([left, right], np.float32)
+        gap_m = places(flame.arrays, upper, vertices) - places(flame.arrays, lower, vertices)
         share = np.linalg.norm(gap_m) / 0.008
         assert share < 0.5 if left else share > 0.8, "the subject's left eye follows its own lid"
 
