@@ -23,6 +23,14 @@ from tests.browser import IN_BROWSER, chromium, picture_of
 from .subject import avatar_of, lively_theta, psnr
 
 _SIZE = 128
+_VALUES = """(name) => {
+  const bytes = new Uint8Array(Float32Array.from(avatar.data.arrays[name]).buffer);
+  let text = "";
+  for (let start = 0; start < bytes.length; start += 1 << 14) {
+    text += String.fromCharCode(...bytes.subarray(start, start + (1 << 14)));
+  }
+  return btoa(text);
+}"""
 
 pytestmark = IN_BROWSER
 
@@ -33,22 +41,31 @@ def browser() -> Iterator[Any]:
         yield browser
 
 
+@pytest.fixture
+def window(browser: Any) -> Iterator[Any]:
+    """What is opened in it ends with the test."""
+    window = browser.new_context(viewport={"width": 500, "height": 400})
+    yield window
+    window.close()
+
+
 @pytest.fixture(scope="module")
 def subject() -> Avatar:
     """Enough Gaussians for several parts."""
     return avatar_of(uv_resolution=128)
 
 
-@pytest.fixture
-def page_file(subject: Avatar, tmp_path: Path) -> Path:
-    file = tmp_path / "avatar.html"
+@pytest.fixture(scope="module")
+def page_file(subject: Avatar, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """To be read only."""
+    file = tmp_path_factory.mktemp("page") / "avatar.html"
     theta = torch.zeros(1, subject.layout.size)
     write_web_page(subject, file, front_camera(subject, _SIZE, _SIZE), theta)
     return file
 
 
-def _opened(browser: Any, address: str) -> Any:
-    page = browser.new_page(viewport={"width": 500, "height": 400})
+def _opened(window: Any, address: str) -> Any:
+    page = window.new_page()
     page.goto(address, wait_until="commit")
     page.wait_for_function("() => window.rgbavatar")  # the page may not have been read so far
     page.evaluate(
@@ -105,12 +122,12 @@ def _slow_server(content: bytes, stop: int) -> Iterator[tuple[str, threading.Eve
         server.server_close()
 
 
-def test_a_coarse_head_is_there_before_the_rest_has_arrived(browser, subject, page_file):
+def test_a_coarse_head_is_there_before_the_rest_has_arrived(window, subject, page_file):
     content = page_file.read_bytes()
     second = content.index(b'class="part"', content.index(b'class="part"') + 1)
     assert second < 300_000
     with _slow_server(content, second + 100) as (address, go_on):
-        page = _opened(browser, address)
+        page = _opened(window, address)
         available = page.evaluate("() => avatar.data.available")
         assert 1000 < available < 0.7 * subject.num_gaussians
         coarse, ours = _shown(page), _ours(subject)
@@ -123,8 +140,8 @@ def test_a_coarse_head_is_there_before_the_rest_has_arrived(browser, subject, pa
         assert psnr(_shown(page), ours) > 45
 
 
-def test_fewer_gaussians_are_larger_and_leave_no_holes(browser, subject, page_file):
-    page = _opened(browser, page_file.as_uri())
+def test_fewer_gaussians_are_larger_and_leave_no_holes(window, subject, page_file):
+    page = _opened(window, page_file.as_uri())
     page.evaluate("() => avatar.complete")
     whole = _shown(page)
     solid = whole.min(-1) < 0.9
@@ -145,23 +162,23 @@ def test_fewer_gaussians_are_larger_and_leave_no_holes(browser, subject, page_fi
     assert 25 < psnr(half, whole) < 45
 
 
-def test_what_has_arrived_in_the_browser_is_what_python_reads(browser, tmp_path):
+def test_what_has_arrived_in_the_browser_is_what_python_reads(window, tmp_path):
     avatar = avatar_of()
     theta = lively_theta(avatar, 2)
     file = tmp_path / "avatar.html"
     write_web_page(avatar, file, front_camera(avatar, 32, 32), theta)
-    page = _opened(browser, file.as_uri())
+    page = _opened(window, file.as_uri())
     page.evaluate("() => avatar.complete")
     (tmp_path / "me.rgbavatar").write_bytes(b"".join(avatar_parts(avatar, {}, theta, {})))
     manifest, arrays = read_avatar_file(tmp_path / "me.rgbavatar")
     for name, values in arrays.items():
-        found = np.array(page.evaluate("name => [...avatar.data.arrays[name]]", name))
+        found = np.frombuffer(base64.b64decode(page.evaluate(_VALUES, name)), "<f4")
         ours = values if manifest["arrays"][name]["by_item"] else values.T
         np.testing.assert_allclose(found, ours.reshape(-1), rtol=1e-6, err_msg=name)
 
 
 @pytest.mark.parametrize("damage", ["cut off", "damaged", "manifest", "version", "no avatar"])
-def test_a_file_that_is_not_whole_is_told(browser, page_file, damage):
+def test_a_file_that_is_not_whole_is_told(window, page_file, tmp_path, damage):
     text = page_file.read_text()
     head, *parts = text.split('class="part">')
     if damage == "cut off":
@@ -184,9 +201,10 @@ def test_a_file_that_is_not_whole_is_told(browser, page_file, damage):
         first = bytearray(base64.b64decode(parts[0][:64]))
         first[8 if damage == "version" else 0] = 9
         changed = [base64.b64encode(first).decode() + parts[0][64:], *parts[1:]]
-    page_file.write_text('class="part">'.join([head, *changed]))
-    page = browser.new_page()
-    page.goto(page_file.as_uri())
+    file = tmp_path / "avatar.html"
+    file.write_text('class="part">'.join([head, *changed]))
+    page = window.new_page()
+    page.goto(file.as_uri())
     said = page.locator("#message.error")
     said.wait_for()
     expected = {"version": "version 9; this program reads 2", "manifest": "damaged"}
@@ -196,9 +214,9 @@ def test_a_file_that_is_not_whole_is_told(browser, page_file, damage):
     assert (drawn > 0) == (damage in ("cut off", "damaged"))
 
 
-def test_too_little_memory_is_not_called_damage(browser, page_file):
+def test_too_little_memory_is_not_called_damage(window, page_file):
     """A manifest that asks for what no machine has is; see above."""
-    page = _opened(browser, page_file.as_uri())
+    page = _opened(window, page_file.as_uri())
     told = page.evaluate(
         """() => {
           class Full {
@@ -214,8 +232,8 @@ def test_too_little_memory_is_not_called_damage(browser, page_file):
     assert told[1] == "Array buffer allocation failed"
 
 
-def test_slow_moving_pictures_show_less_and_still_ones_all(browser, page_file):
-    page = _opened(browser, page_file.as_uri())
+def test_slow_moving_pictures_show_less_and_still_ones_all(window, page_file):
+    page = _opened(window, page_file.as_uri())
     places = page.evaluate(
         """() => {
           const pace = new Pace(), found = [];
