@@ -1,5 +1,6 @@
 """Imports on the way: what they depend on, and that damage to them heals."""
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -13,15 +14,22 @@ from rgbavatar_ns.errors import UserError
 from tests.data.importers.test_round_trips import write
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def options(flame_folder) -> ImportOptions:
     return ImportOptions(flame=flame_folder, teeth=False)
 
 
-@pytest.fixture
-def data(tmp_path, takes) -> Path:
-    write(tmp_path / "data", "imavatar", takes)
-    return tmp_path / "data"
+@pytest.fixture(scope="module")
+def data(tmp_path_factory, takes) -> Path:
+    """To be read only; its import on the way, beside it, is whole before and after each test."""
+    folder = tmp_path_factory.mktemp("cached") / "data"
+    write(folder, "imavatar", takes)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def whole(data, options, tmp_path_factory) -> TrackedDataset:
+    return import_dataset(data, tmp_path_factory.mktemp("whole") / "set", options)
 
 
 def same(one: TrackedDataset, other: TrackedDataset) -> bool:
@@ -35,8 +43,7 @@ def damage(root: Path, what: str) -> None:
 
 
 @pytest.mark.parametrize("what", ["dataset.json", "theta.npy", "head.npz", "images/00004.png"])
-def test_a_damaged_import_is_made_anew(what, data, options, tmp_path, capsys):
-    whole = import_dataset(data, tmp_path / "whole", options)
+def test_a_damaged_import_is_made_anew(what, data, options, whole, capsys):
     opened = load_dataset(data, options)
     capsys.readouterr()
     damage(opened.root, what)
@@ -50,10 +57,9 @@ def test_a_damaged_import_is_made_anew(what, data, options, tmp_path, capsys):
 
 @pytest.mark.parametrize("what", ["dataset.json", "theta.npy", "images/00004.png"])
 def test_overwriting_makes_a_damaged_import_anew_and_else_this_is_told(
-    what, data, options, tmp_path
+    what, data, options, whole, tmp_path
 ):
-    whole = import_dataset(data, tmp_path / "whole", options)
-    import_dataset(data, tmp_path / "set", options)
+    shutil.copytree(whole.root, tmp_path / "set")
     damage(tmp_path / "set", what)
     with pytest.raises(UserError) as caught:
         import_dataset(data, tmp_path / "set", options)
@@ -64,11 +70,11 @@ def test_overwriting_makes_a_damaged_import_anew_and_else_this_is_told(
 def test_pixels_that_were_damaged_later_name_the_folder_to_delete(data, options):
     opened = load_dataset(data, options)
     path = opened.image_paths[2]
-    content = bytearray(path.read_bytes())
-    content[60] ^= 1
-    path.write_bytes(content)
+    content = path.read_bytes()
+    path.write_bytes(content[:60] + bytes([content[60] ^ 1]) + content[61:])
     with pytest.raises(UserError, match="checksum") as caught:
         load_dataset(data, options).read_image(2)
+    path.write_bytes(content)
     assert str(opened.root) in caught.value.remedy
     assert str(data) in caught.value.remedy
 
