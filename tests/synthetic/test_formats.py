@@ -1,27 +1,17 @@
 """The demo subject as other systems' data: whole or unfinished, and what they have no place for."""
 
-import subprocess
-import sys
+import resource
+import signal
 from pathlib import Path
 
 import pytest
 
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.files import DiskError
 from rgbavatar_ns.synthetic import DemoConfig
 from rgbavatar_ns.synthetic.exporters import DEMO_FORMATS, write_demo
 
 _SMALL = DemoConfig(image_size=16, num_frames=2, num_test_frames=1, supersampling=1)
-_ON_A_SMALL_DISK = """
-import resource, signal, sys
-from rgbavatar_ns.synthetic import DemoConfig
-from rgbavatar_ns.synthetic.exporters import write_demo
-
-def fill(done, total):
-    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (64, 64))
-
-write_demo(*sys.argv[1:], DemoConfig(image_size=16, num_frames=3, num_test_frames=1), fill)
-"""
 
 
 def test_what_was_interrupted_is_made_again_in_the_same_folder(tmp_path: Path):
@@ -47,9 +37,19 @@ def test_what_was_interrupted_is_made_again_in_the_same_folder(tmp_path: Path):
 
 @pytest.mark.parametrize("format", ["insta", "vhap"])
 def test_what_the_disk_refuses_is_told(tmp_path: Path, format: str):
-    command = [sys.executable, "-c", _ON_A_SMALL_DISK, str(tmp_path / "me"), format]
-    ended = subprocess.run(command, capture_output=True, text=True, timeout=300)
-    assert "DiskError: Cannot write" in ended.stderr
+    """A limit of files' sizes refuses what a full disk does."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+
+    def fill(done: int, total: int) -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (64, hard))
+
+    try:
+        with pytest.raises(DiskError, match="Cannot write"):
+            write_demo(tmp_path / "me", format, _SMALL, fill)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        signal.signal(signal.SIGXFSZ, handler)
     assert [path.name for path in (tmp_path / "me").iterdir()] == [".unfinished"]
 
 

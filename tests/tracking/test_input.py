@@ -402,6 +402,8 @@ def test_closing_from_another_thread_ends_it_while_it_waits_for_a_slow_reader() 
     outer = InBackground((item for item in inner), 1)
     assert next(outer) == 0
     assert asked.wait(10)
-    inner.close()  # Its consumer is another thread, which is waiting in it.
+    closing = threading.Thread(target=inner.close)
+    closing.start()  # Its consumer is another thread, which is waiting in it.
     assert list(outer) == []
     answered.set()
+    closing.join()

@@ -151,7 +151,7 @@ def test_a_damaged_folder_is_refused_or_read_the_same(
 
 @pytest.mark.parametrize("key", ["fl_x", "fl_y", "cx", "cy"])
 def test_a_list_in_place_of_a_cameras_number_is_refused(key, folders, flame_folder, tmp_path):
-    folder = shutil.copytree(folders["insta-meshes"], tmp_path / "insta")
+    folder = shutil.copytree(folders["insta"], tmp_path / "insta")
     for path in folder.glob("*.json"):
         content = json.loads(path.read_text())
         for values in (content, *content["frames"]):
