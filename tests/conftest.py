@@ -1,9 +1,12 @@
 """Shared by all tests: few threads, so that the suite's time is steady on small machines."""
 
+import copy
 import os
 import re
 import signal
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -45,6 +48,31 @@ def flame_2020(flame_2020_pickle: Path):
     from rgbavatar_ns.head.flame import load_flame
 
     return load_flame(flame_2020_pickle)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def outlines_are_measured_once() -> Iterator[None]:
+    """Each training begins with it, an eighth of a second, and most tests' with the same frames."""
+    from rgbavatar_ns.avatar.prior import outline
+    from rgbavatar_ns.files import digest
+
+    known: dict[str, outline.Outline] = {}
+    measure = outline.measure_outline
+
+    def measured(
+        avatar: Any, field: Any, theta: torch.Tensor, cameras: Any, images_rgba: torch.Tensor
+    ) -> outline.Outline:
+        seen_by = cameras.world_to_camera, cameras.focal_px, cameras.principal_point_px
+        given = avatar.identity, theta, *seen_by, images_rgba
+        parts = [str(theta.device), avatar.head.arrays.digest()]
+        key = digest([*parts, *(tensor.detach().cpu().numpy() for tensor in given)])
+        if key not in known:
+            known[key] = measure(avatar, field, theta, cameras, images_rgba)
+        return copy.deepcopy(known[key])
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(outline, "measure_outline", measured)
+        yield
 
 
 @pytest.fixture
