@@ -40,8 +40,8 @@ def test_listing_the_methods_prints_no_warning_and_loads_nothing_that_only_other
     assert listed == "True []"
     assert started.stderr == ""
     # nerfstudio looks at the stack 26 times; for two frames, of code that no file has, `inspect`
-    # goes through all modules, three times each.
-    assert float(searches) < 7 * 26, "it does so for the frames of `import` too"
+    # goes through all modules, three times each. With the frames of `import` it were 36 times.
+    assert float(searches) < 12 * 26
 
 
 def test_the_commands_own_help_needs_neither_torch_nor_nerfstudio() -> None:
