@@ -63,7 +63,7 @@ def outlines_are_measured_once() -> Iterator[None]:
         avatar: Any, field: Any, theta: torch.Tensor, cameras: Any, images_rgba: torch.Tensor
     ) -> outline.Outline:
         seen_by = cameras.world_to_camera, cameras.focal_px, cameras.principal_point_px
-        given = avatar.identity, theta, *seen_by, images_rgba
+        given = avatar.carrier_vertices(theta), *seen_by, images_rgba
         parts = [str(theta.device), avatar.head.arrays.digest()]
         key = digest([*parts, *(tensor.detach().cpu().numpy() for tensor in given)])
         if key not in known:
