@@ -37,7 +37,7 @@ Object.defineProperty(HTMLImageElement.prototype, "src", {
     setTimeout(() => {
       this.addEventListener("load", () => window.late_ones++);
       plain.set.call(this, url);
-    }, 8000);
+    }, 5000);
   },
 });
 """
