@@ -1,8 +1,9 @@
-"""What nerfstudio sees of the project; whatever imports it leaves out two warnings of libraries.
+"""What nerfstudio sees of the project; importing it leaves out two warnings, and a slow search.
 
-Both are told on every start, and nobody who trains can act on them: nerfstudio 1.1.5 calls torch's
-autocasting by its earlier names, and torchvision's decoder of pictures, which is not used here,
-may be of another build than torch. They come last, so that `python -W` decides where it is given.
+Both warnings are told on every start, and nobody who trains can act on them: nerfstudio 1.1.5
+calls torch's autocasting by its earlier names, and torchvision's decoder of pictures, which is not
+used here, may be of another build than torch. They come last, so that `python -W` decides where it
+is given.
 """
 
 import inspect

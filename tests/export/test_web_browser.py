@@ -16,19 +16,13 @@ from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
 from rgbavatar_ns.export import PageOptions, front_camera, pictures, write_web_page
 from rgbavatar_ns.head import HeadArrays, turn_seen
 from tests.avatar.small_head import small_head_arrays
-from tests.browser import IN_BROWSER, chromium, picture_of
+from tests.browser import IN_BROWSER, picture_of
 
 from .subject import avatar_of, lively_theta, psnr
 
 _SIZE = 96
 
 pytestmark = IN_BROWSER
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    with chromium() as browser:
-        yield browser
 
 
 @pytest.fixture

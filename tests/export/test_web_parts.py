@@ -18,7 +18,7 @@ import torch
 from rgbavatar_ns.avatar import Avatar
 from rgbavatar_ns.export import front_camera, pictures, write_web_page
 from rgbavatar_ns.export.avatar_file import avatar_parts, read_avatar_file
-from tests.browser import IN_BROWSER, chromium, picture_of
+from tests.browser import IN_BROWSER, picture_of
 
 from .subject import avatar_of, lively_theta, psnr
 
@@ -33,12 +33,6 @@ _VALUES = """(name) => {
 }"""
 
 pytestmark = IN_BROWSER
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    with chromium() as browser:
-        yield browser
 
 
 @pytest.fixture
