@@ -26,13 +26,16 @@ from typing import Any
 
 import cv2
 import numpy as np
+import torch
 from jaxtyping import Bool, Float, UInt8
 from rooms import ROOMS, FilmedRoom, Performance
 
+from rgbavatar_ns.data import TrackedDataset
 from rgbavatar_ns.drawing.compositing import composite_bytes
+from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.tracking import TrackConfig, track_video
+from rgbavatar_ns.tracking.image.body_end import BodyEnd
 from rgbavatar_ns.tracking.image.crop import SquareCrop
-from rgbavatar_ns.tracking.image.cut_out import fade_at_bottom
 from rgbavatar_ns.tracking.image.matting import (
     PersonMatte,
     foreground_color,
@@ -105,6 +108,17 @@ def from_true_colors(
     return straight_rgba(truth[..., :3], np.clip(share, 0, 1).astype(np.float32))
 
 
+def above_the_end(
+    dataset: TrackedDataset, inside: Bool[np.ndarray, "S S"]
+) -> Bool[np.ndarray, "S S"]:
+    """Where no frame shows less of the body than was filmed."""
+    with torch.no_grad():
+        vertices = HeadModel(dataset.arrays)(dataset.theta, dataset.identity)
+    frames_px = dataset.cameras.project(vertices).double().numpy()
+    end = BodyEnd.of(dataset.arrays, list(frames_px), inside)
+    return np.min([end.shown(px, len(inside)) for px in frames_px], axis=0) >= 1
+
+
 def measure(film: FilmedRoom, folder: Path, tremble_px: float) -> dict[str, Any]:
     """Film, track and compare one clip."""
     clip, dst = folder / "clip.mp4", folder / "set"
@@ -122,11 +136,11 @@ def measure(film: FilmedRoom, folder: Path, tremble_px: float) -> dict[str, Any]
     with closing(PersonMatte()) as matte:
         for frame in FrameSource.open(clip).read(set(frames).__contains__):
             image, inside = crop.apply(frame.image_rgb), crop.inside(frame.width, frame.height)
-            # A body fades out where the picture ends: that is no error of the matte.
-            inside = inside & (fade_at_bottom(inside) >= 1)
             level = matte(image)
             plain.append(straight_rgba(foreground_color(image, level), level))
             told.append(from_true_colors(image, truth[len(told)], room))
+    # A body is made to end: that is no error of the matte.
+    inside = inside & above_the_end(dataset, inside)
     bands = unsure(truth, plain)
     return {
         "background": report["background"],

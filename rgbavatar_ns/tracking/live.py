@@ -236,8 +236,9 @@ class LiveTracker:
             self.counts["does not fit"] += 1
             return None
         one = ClipFit(fit.subject, values[None])
-        outline = self._cut_out.outline(crop, self._tracker.vertices_px(one, 0), landmarks_px)
-        rgba = self._cut_out(matted(), outline)
+        vertices_px = crop.points(self._tracker.vertices_px(one, 0))
+        outline = self._cut_out.outline(crop.size, vertices_px, crop.points(landmarks_px))
+        rgba = self._cut_out(matted(), outline, vertices_px)
         theta = self._theta(fit, values)
         return TrackedFrame(index, theta, crop.pinhole(fit.subject.camera), rgba)
 

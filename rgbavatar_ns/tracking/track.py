@@ -31,6 +31,7 @@ from rgbavatar_ns.tracking.fit.fit import ClipFit
 from rgbavatar_ns.tracking.fit.own_head import read_own_head, subject_tracker
 from rgbavatar_ns.tracking.fit.subject import SubjectTracker
 from rgbavatar_ns.tracking.image.background import Background
+from rgbavatar_ns.tracking.image.body_end import BodyEnd
 from rgbavatar_ns.tracking.image.crop import SquareCrop, steady_crop
 from rgbavatar_ns.tracking.image.frame_images import FrameImages
 from rgbavatar_ns.tracking.image.matting import PersonMatte
@@ -175,8 +176,6 @@ class _Tracking:
         arrays, layout = clip.tracker.head.arrays, clip.tracker.head.layout
         thetas = torch.from_numpy(clip.tracker.thetas(clip.fit)).float()
         identity = torch.from_numpy(clip.fit.subject.identity).float()
-        made_from = _digest_of_fit(clip, thetas, identity)
-        noted = self.run.noted_images(made_from)
         images = FrameImages(
             clip.tracker,
             clip.fit,
@@ -185,6 +184,8 @@ class _Tracking:
             self.mattes,
             clip.source_alpha,
         )
+        made_from = _digest_of_fit(clip, thetas, identity, images.body_end)
+        noted = self.run.noted_images(made_from)
         background = self._background(images, made_from) if images.finds_mattes else None
         with disk_errors(dst, GO_ON):
             size, keep = clip.crop.size, bool(noted)
@@ -313,11 +314,15 @@ def _film_shown(dataset: TrackedDataset, report: dict[str, Any]) -> FilmFacts:
 
 
 def _digest_of_fit(
-    clip: _FittedClip, thetas: Float[Tensor, "F H"], identity: Float[Tensor, "I"]
+    clip: _FittedClip,
+    thetas: Float[Tensor, "F H"],
+    identity: Float[Tensor, "I"],
+    body_end: BodyEnd | None,
 ) -> str:
     """What an image depends on beside the settings, in short."""
     camera = clip.fit.subject.camera
-    fixed = repr((clip.crop, camera, clip.found.frame_index, UNFILMED_RGBA))
+    end = None if body_end is None else (body_end.height_m, body_end.fade_m)
+    fixed = repr((clip.crop, camera, clip.found.frame_index, UNFILMED_RGBA, end))
     return digest([fixed, thetas.numpy(), identity.numpy()])
 
 

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from rgbavatar_ns.avatar.avatar import Avatar
 from rgbavatar_ns.head import HeadArrays
-from rgbavatar_ns.head.joints import EYES
-from rgbavatar_ns.head.surface import MeshEdges
+from rgbavatar_ns.head.joints import EYES, ROOT
+from rgbavatar_ns.head.surface import MeshEdges, vertex_normals
 
 _BEHIND_EYES_M, _BELOW_EYES_M = 0.095, 0.05
 """Hair grows behind the ears, down to about their lobes; and from there up to the crown."""
@@ -31,12 +31,17 @@ class Outline:
     """How far the person stands off the mesh along its normal."""
     empty: Float[Tensor, "V"]
     """Share of the frames in which the moved vertex lies on background."""
+    empty_gaussians: Float[Tensor, "N"]
+    """The same of each of N Gaussians; of a body by its own place."""
     goes_on_below: bool
     """Whether mattes show the person below the mesh: a neck, shoulders."""
 
 
 class MeshField:
     """The vertices of an avatar's mesh as a graph, and the Gaussians' places in it.
+
+    `outwards` is where a surface off the mesh lies from each Gaussian, in its tangent frame at
+    rest: between the vertices' normals, so that it does not gape over the mesh's edges.
 
     Values are continued harmonically, as heat would spread, to both sides of the face alike. Ours:
     because what nobody filmed is best guessed by what surrounds it.
@@ -53,6 +58,7 @@ class MeshField:
         self.edges = torch.stack([numbers // self.num_vertices, numbers % self.num_vertices], 1)
         self._mirror, self._mirrored = _mirror_of(template)
         self.scalp = _scalp_of(avatar.head.arrays).to(template.device)
+        self.height_m = template[:, 1]
         self.body = _body_of(avatar.head.arrays).to(template.device)
         first, second = self.edges.unbind(1)
         ends_of_rows = torch.bincount(first, minlength=self.num_vertices).cumsum(0)
@@ -61,6 +67,14 @@ class MeshField:
         self._columns = second.contiguous()
         across = self.scalp[first] != self.scalp[second]
         self.links = torch.where(across, _HAIRLINE, 1.0).to(template)
+        self.outwards = self._outwards(avatar)
+
+    @torch.no_grad()
+    def _outwards(self, avatar: Avatar) -> Float[Tensor, "N 3"]:
+        rest = avatar.head(avatar.identity.new_zeros(1, avatar.layout.size), avatar.identity)
+        smooth = self.at_gaussians(vertex_normals(rest, avatar.head.faces.long())[0])
+        frames = avatar.anchors.frames(rest).matrix[0]
+        return torch.linalg.solve(frames, smooth[..., None])[..., 0]
 
     def of_gaussians(
         self, values: Float[Tensor, "N C"], confidence: Float[Tensor, "N"]
@@ -154,10 +168,10 @@ def _scalp_of(arrays: HeadArrays) -> Bool[Tensor, "V"]:
 
 
 def _body_of(arrays: HeadArrays) -> Bool[Tensor, "V"]:
-    """Vertices below the neck, of heads that have such."""
-    body = torch.zeros(len(arrays.v_template), dtype=torch.bool)
-    body[torch.as_tensor(arrays.vertex_groups.get("torso", []), dtype=torch.int64)] = True
-    return body
+    """Vertices below the joint that a neck stands on, of heads that have a torso."""
+    template = torch.as_tensor(arrays.v_template)
+    root = torch.as_tensor(arrays.joint_regressor[ROOT]).to(template) @ template
+    return (template[:, 1] < root[1]) & arrays.has_torso
 
 
 def _mirror_of(

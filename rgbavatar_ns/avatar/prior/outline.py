@@ -32,6 +32,9 @@ _REST, _SCALP_REST = 0.05, 0.0005
 _MOST_FRAMES = 4.0
 """Confidence of a vertex never exceeds that of so many frames."""
 _ITERATIONS = 200
+_MAP_COLUMNS = 1024
+_LOWEST = 0.005
+"""Share of a body's front that may lie below its end: specks of a matte."""
 
 
 @dataclass
@@ -85,11 +88,41 @@ def measure_outline(
     empty = field.continued(
         empty, 100 * known, empty, stiffness=1.0, rest=1e-6, iterations=_ITERATIONS
     )[:, 0]
+    empty_gaussians = field.at_gaussians(empty[:, None])[:, 0]
     # But a body ends where the picture does: nobody knows what is worn farther down.
     empty[field.body & (known == 0)] = 1.0
+    if bool(field.body.any()):
+        front = field.at_gaussians((facing > 0).to(empty)[:, None])[:, 0] > 0.5
+        told = _told_of_body(field, images, moved, front)
+        body = field.at_gaussians(field.body.to(empty)[:, None])[:, 0] > 0.5
+        empty_gaussians = torch.where(body, told, empty_gaussians)
     rim = lower_rim(avatar)
     below = [_shown_below(image, seen, rim) for image, seen in zip(images, placed)]
-    return Outline(offset, empty.clamp(0, 1), bool(np.mean(below) > 0.1))
+    return Outline(
+        offset, empty.clamp(0, 1), empty_gaussians.clamp(0, 1), bool(np.mean(below) > 0.1)
+    )
+
+
+def _told_of_body(
+    field: MeshField,
+    images: UInt8[np.ndarray, "B height width 4"],
+    moved_px: list[Float[np.ndarray, "V 2"]],
+    front: Bool[Tensor, "N"],
+) -> Float[Tensor, "N"]:
+    """Share of the frames in which each Gaussian of a body would lie on background.
+
+    By its own place, since vertices of a body lie centimetres apart. What no frame has in the
+    picture is empty, and so is the back farther down than where the front ends, which hides it.
+    """
+    height = field.at_gaussians(field.height_m[:, None])[:, 0]
+    px = [field.at_gaussians(torch.from_numpy(each).to(height)) for each in moved_px]
+    shares = [_on_background(image, at.cpu().numpy()) for image, at in zip(images, px)]
+    empty, known = (torch.from_numpy(np.mean(part, 0)).to(height) for part in zip(*shares))
+    empty = torch.where(known > 0, empty / known.clamp(min=1e-6), 1.0)
+    shown = height[front & (empty < 0.5)]
+    if len(shown):
+        empty = torch.where(height < shown.quantile(_LOWEST), 1.0, empty)
+    return empty
 
 
 @dataclass(frozen=True)
@@ -204,10 +237,14 @@ def _on_background(
     return found[:, 0].astype(np.float32), found[:, 1].astype(np.float32)
 
 
-def _at(values: np.ndarray, px: Float[np.ndarray, "V 2"]) -> np.ndarray:
+def _at(values: np.ndarray, px: Float[np.ndarray, "P 2"]) -> np.ndarray:
     """Bilinear values of an image at places; -1 beyond its border."""
-    column, row = np.ascontiguousarray(px.T - 0.5, np.float32)[:, :, None]
+    # OpenCV takes a map of 32,767 rows at most.
+    wide = -(-len(px) // _MAP_COLUMNS) * _MAP_COLUMNS
+    places = np.zeros((wide, 2), np.float32)
+    places[: len(px)] = px - 0.5
+    column, row = np.ascontiguousarray(places.T).reshape(2, -1, _MAP_COLUMNS)
     found = cv2.remap(
         values.astype(np.float32), column, row, cv2.INTER_LINEAR, borderValue=(-1, -1, -1, -1)
     )
-    return found.reshape(len(px), *values.shape[2:])
+    return found.reshape(wide, *values.shape[2:])[: len(px)]

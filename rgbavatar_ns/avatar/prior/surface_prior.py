@@ -97,16 +97,15 @@ class SurfacePrior(nn.Module):
 
         field = self._mesh_field(avatar)
         outline = measure_outline(avatar, field, theta, cameras, _as_bytes(images_rgba))
-        known = torch.stack([outline.offset_m, outline.empty], 1)
-        offset_m, empty = field.at_gaussians(known).unbind(1)
+        offset_m = field.at_gaussians(outline.offset_m[:, None])[:, 0]
         self.offset_m.copy_(offset_m - _SUNK * avatar.initial_scale_m())
-        self.opacity_logit.copy_(torch.where(empty > 0.5, _EMPTY, _CLOSED))
+        self.opacity_logit.copy_(torch.where(outline.empty_gaussians > 0.5, _EMPTY, _CLOSED))
         self.views.begin(avatar, outline, theta, cameras)
         self.views.see(avatar, theta, cameras)
         self.begun.fill_(True)
         with torch.no_grad():
-            avatar.blendshapes.position[:, 2] = self.offset_m
-            avatar.blendshapes.log_scale.copy_(_disc(avatar))
+            avatar.blendshapes.position.copy_(self.offset_m[:, None] * field.outwards)
+            avatar.blendshapes.log_scale.copy_(_disc(avatar, avatar.initial_scale_m()))
             avatar.blendshapes.opacity_logit.copy_(self.opacity_logit.clamp(min=_FAINT))
 
     def due(self, step: int) -> bool:
@@ -156,15 +155,16 @@ class SurfacePrior(nn.Module):
             told, confidence, start, stiffness=_STIFFNESS, rest=_REST, iterations=_ITERATIONS
         )
         pull, close = (_RATE * _SEEN_PX / (px + _SEEN_PX) for px in (self.seen_px, self.through_px))
-        disc = _disc(avatar)
+        # What is to be empty is not kept by being seen from behind, through what ends before it.
+        closes = torch.where(self.opacity_logit < 0, pull, close)
+        # Discs of texels that lie farther apart than fresh ones reach are as wide as these need.
+        disc = _disc(avatar, avatar.initial_scale_m().maximum(0.5 * avatar.anchors.texel_spacing()))
         # As far as nothing shows it, nothing else closes the surface around it.
         disc[:, :2] += (_OVERLAP * (close / _RATE).square())[:, None]
-        place = torch.zeros_like(shapes.position)
-        place[:, 2] = self.offset_m
         upright = torch.zeros_like(shapes.rotation_wxyz)
         upright[:, 0] = 1
         rest = {
-            "position": place,
+            "position": self.offset_m[:, None] * field.outwards,
             "rotation_wxyz": upright,
             "log_scale": disc,
             "opacity_logit": self.opacity_logit,
@@ -172,7 +172,7 @@ class SurfacePrior(nn.Module):
         }
         for name, target in rest.items():
             value = getattr(shapes, name)
-            share = close if name == "opacity_logit" else pull
+            share = closes if name == "opacity_logit" else pull
             value.lerp_(target, share.view(-1, *[1] * (value.ndim - 1)))
         for name in ("basis_position", "basis_rotation_wxyz", "basis_color_feature"):
             if shapes.num_bases:
@@ -185,9 +185,9 @@ class SurfacePrior(nn.Module):
         return self._field[1]
 
 
-def _disc(avatar: Avatar) -> Float[Tensor, "N 3"]:
-    """The logarithms of the scales that a fresh Gaussian of the surface has."""
-    log_scale = avatar.initial_scale_m().log()[:, None].repeat(1, 3)
+def _disc(avatar: Avatar, width_m: Float[Tensor, "N"]) -> Float[Tensor, "N 3"]:
+    """The logarithms of the scales that a Gaussian of the surface has."""
+    log_scale = width_m.log()[:, None].repeat(1, 3)
     log_scale[:, :2] += avatar.anchors.texel_stretch().log()
     log_scale[:, 2] += _FLATNESS
     return log_scale

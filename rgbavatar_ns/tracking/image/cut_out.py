@@ -8,12 +8,9 @@ from jaxtyping import Bool, Float, UInt8
 from rgbavatar_ns.head import HeadArrays
 from rgbavatar_ns.kernels.constants import UNFILMED_RGBA
 from rgbavatar_ns.tracking.face.detector import CHIN, FOREHEAD
-from rgbavatar_ns.tracking.image.crop import SquareCrop
+from rgbavatar_ns.tracking.image.body_end import BodyEnd
 from rgbavatar_ns.tracking.image.head_mask import HeadMask, HeadOutline
 from rgbavatar_ns.tracking.image.matting import foreground_color, straight_rgba
-
-# Over which share of the picture's height a body fades out at its bottom.
-_FADE = 0.04
 
 
 @dataclass(frozen=True)
@@ -42,34 +39,35 @@ class MattedCrop:
 
 
 class CutOut:
-    """Cuts what the head model has out of a matted crop: a head down to its neck, or the body too.
-
-    A body ends where the picture does: there it fades out, over a few rows.
+    """Cuts what the head model has out of a matted crop: a head down to its neck, or, with where
+    its `body_end` is, the body too.
     """
 
-    def __init__(self, arrays: HeadArrays) -> None:
-        self._has_body = arrays.has_torso
+    def __init__(self, arrays: HeadArrays, body_end: BodyEnd | None = None) -> None:
+        self._body_end = body_end
         self._mask = HeadMask(arrays.faces, arrays.skinning_weights)
 
     def outline(
         self,
-        crop: SquareCrop,
+        size: int,
         vertices_px: Float[np.ndarray, "V 2"],
         landmarks_px: Float[np.ndarray, "478 2"],
     ) -> HeadOutline:
-        """Where the head lies in the crop; mesh vertices and landmarks in the frame's pixels."""
-        forehead, chin = crop.points(landmarks_px[[FOREHEAD, CHIN]])
-        return self._mask.outline(crop.points(vertices_px), forehead, chin, crop.size)
+        """Where the head lies in a crop of this size; mesh vertices and landmarks in its pixels."""
+        forehead, chin = landmarks_px[[FOREHEAD, CHIN]]
+        return self._mask.outline(vertices_px, forehead, chin, size)
 
-    def __call__(self, matted: MattedCrop, outline: HeadOutline) -> UInt8[np.ndarray, "S S 4"]:
-        """Straight-alpha image of what the matte holds of the head.
+    def __call__(
+        self, matted: MattedCrop, outline: HeadOutline, vertices_px: Float[np.ndarray, "V 2"]
+    ) -> UInt8[np.ndarray, "S S 4"]:
+        """Straight-alpha image of what the matte holds of the head; mesh in the crop's pixels.
 
         Beyond the frame it is `UNFILMED_RGBA` where the head may be; what is cut off anyway is
         background there too.
         """
         alpha, may_be_head = matted.alpha, np.ones_like(matted.alpha)
-        if self._has_body:
-            alpha = alpha * fade_at_bottom(matted.inside)
+        if self._body_end is not None:
+            alpha = alpha * self._body_end.shown(vertices_px, len(alpha))
         else:
             may_be_head = self._mask(outline, len(alpha))
             alpha = alpha * may_be_head
@@ -77,12 +75,3 @@ class CutOut:
         image[~matted.inside] = 0
         image[~matted.inside & (may_be_head >= 0.5 / 255)] = UNFILMED_RGBA
         return image
-
-
-def fade_at_bottom(inside: Bool[np.ndarray, "S S"]) -> Float[np.ndarray, "S 1"]:
-    """1, and towards 0 over the last rows of what the frame shows."""
-    size = len(inside)
-    rows = np.flatnonzero(inside.any(1))
-    last = rows[-1] + 1 if len(rows) else size
-    share = np.clip((last - np.arange(size, dtype=np.float32) - 0.5) / (_FADE * size), 0, 1)
-    return (share * share * (3 - 2 * share))[:, None]

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from rgbavatar_ns.data.check.sample import spread
 from rgbavatar_ns.data.png import encode_png_rgba
 from rgbavatar_ns.drawing.compositing import unfilmed_pixels
 from rgbavatar_ns.tracking.face.clip import ClipLandmarks
@@ -20,6 +21,7 @@ from rgbavatar_ns.tracking.image.background import (
     find_background,
     sampled_positions,
 )
+from rgbavatar_ns.tracking.image.body_end import BodyEnd
 from rgbavatar_ns.tracking.image.crop import SquareCrop
 from rgbavatar_ns.tracking.image.cut_out import CutOut, MattedCrop
 from rgbavatar_ns.tracking.image.head_mask import HeadOutline
@@ -38,6 +40,8 @@ _AHEAD, _WORKERS = 2, 2
 _MATTE_EDGE_PX, _MORE, _SOFTEST_PX = 0.65, 1.25, 1.0
 # Where no edge tells, as wide as a webcam's.
 _UNKNOWN_EDGE_PX = 1.0
+# So many frames tell where the body ends.
+_BODY_END_FRAMES = 64
 
 
 def _softness_px(background: Background | None) -> float:
@@ -78,12 +82,13 @@ _Window = tuple[_Cropped, tuple[_Cropped, ...]]
 
 
 class FrameImages:
-    """Makes tracked frames' images: crop, matte, colour at soft edges, fade-out at the neck.
+    """Makes tracked frames' images: crop, matte, colour at soft edges, an end at the neck or
+    the chest.
 
     Mattes are the user's own (`mattes`), or the alpha channel of the source where
     `source_alpha`, or found. Reading, segmentation and the rest run in threads of their own; a
     few frames are in memory at a time. Each image depends on the clip, the fit and the background
-    alone.
+    alone. `body_end` is where the body ends, by frames spread over the clip; None without a body.
     """
 
     def __init__(
@@ -97,9 +102,20 @@ class FrameImages:
     ) -> None:
         self._tracker, self._fit, self._found, self._crop = tracker, fit, found, crop
         self._mattes, self._source_alpha = mattes, source_alpha
-        self._cut_out = CutOut(tracker.head.arrays)
         self._inside = crop.inside(found.width, found.height)
+        self.body_end = self._found_body_end()
+        self._cut_out = CutOut(tracker.head.arrays, self.body_end)
         self._follows = found.follows()
+
+    def _found_body_end(self) -> BodyEnd | None:
+        arrays = self._tracker.head.arrays
+        if not arrays.has_torso:
+            return None
+        some = [self._vertices_px(k) for k in spread(len(self._found), _BODY_END_FRAMES).tolist()]
+        return BodyEnd.of(arrays, some, self._inside)
+
+    def _vertices_px(self, position: int) -> Float[np.ndarray, "V 2"]:
+        return self._crop.points(self._tracker.vertices_px(self._fit, position))
 
     @property
     def finds_mattes(self) -> bool:
@@ -232,16 +248,14 @@ class FrameImages:
             if softness_px > 0:
                 alpha = cv2.GaussianBlur(alpha, (0, 0), softness_px)
             matted = MattedCrop.of(crop.image_rgb, alpha, self._inside, background=found.background)
-        outline = self._cut_out.outline(
-            self._crop,
-            self._tracker.vertices_px(self._fit, crop.position),
-            self._found.points_px[crop.position],
-        )
+        vertices_px = self._vertices_px(crop.position)
+        landmarks_px = self._crop.points(self._found.points_px[crop.position])
+        outline = self._cut_out.outline(self._crop.size, vertices_px, landmarks_px)
         matte, inside = (
             cv2.resize(part, outline.silhouette.shape, interpolation=cv2.INTER_AREA)
             for part in (matted.alpha, self._inside.astype(np.float32))
         )
-        image = self._cut_out(matted, outline)
+        image = self._cut_out(matted, outline, vertices_px)
         unfilmed = float(unfilmed_pixels(image).mean())
         png = encode_png_rgba(image)
         return TrackedImage(crop.position, png, outline, matte, inside, unfilmed)

@@ -5,10 +5,14 @@ import torch
 from rgbavatar_ns.avatar import Avatar, AvatarConfig
 from rgbavatar_ns.avatar.prior.mesh_field import MeshField
 from rgbavatar_ns.head import HeadModel
+from rgbavatar_ns.head.arrays import EMBEDDED_HEAD
+from rgbavatar_ns.head.surface import vertex_normals
 
 
-def embedded_avatar(uv_resolution: int = 48, num_bases: int = 2) -> Avatar:
-    head = HeadModel.embedded()
+def embedded_avatar(
+    uv_resolution: int = 48, num_bases: int = 2, name: str = EMBEDDED_HEAD
+) -> Avatar:
+    head = HeadModel.embedded(name=name)
     config = AvatarConfig(
         num_bases=num_bases, uv_resolution=uv_resolution, scale_from_texel_spacing=True
     )
@@ -37,6 +41,15 @@ def test_the_continuation_solves_its_equations(make_avatar):
     system = torch.diag(confidence + there + 0.01 + weights.sum(1)) - weights
     wanted = confidence[:, None] * values + there[:, None] * values[field._mirror]
     assert torch.allclose(found, torch.linalg.solve(system, wanted), atol=1e-4)
+
+
+def test_a_surface_off_the_mesh_does_not_gape_over_its_edges():
+    avatar = embedded_avatar()
+    rest = avatar.carrier_vertices(torch.zeros(1, avatar.layout.size))
+    thick = rest + 0.03 * vertex_normals(rest, avatar.head.faces.long())
+    frames = avatar.anchors.frames(rest)
+    off = torch.einsum("nij,nj->ni", frames.matrix[0], 0.03 * MeshField(avatar).outwards)
+    assert torch.allclose(frames.origin + off, avatar.anchors.origins(thick), atol=1e-6)
 
 
 def test_a_constant_stays_one_wherever_it_is_known():

@@ -1,16 +1,21 @@
 """What no frame shows goes to the surface; what frames show stays where training put it."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
+from rgbavatar_ns import Avatar
 from rgbavatar_ns.avatar.prior import SurfacePrior
+from rgbavatar_ns.avatar.prior.mesh_field import MeshField
 from rgbavatar_ns.avatar.training import TrainingBatch, TrainingOptions, TrainingStep, fit
+from rgbavatar_ns.head.arrays import EMBEDDED_BUST
 from rgbavatar_ns.kernels import weighted_color_average
 from rgbavatar_ns.kernels.constants import UNFILMED_RGBA
 from rgbavatar_ns.kernels.cpu import INSTRUCTION_SET_VARIABLE
 
 from .test_mesh_field import embedded_avatar
-from .test_outline import drawn_thicker, front_camera, turned
+from .test_outline import SIZE, drawn_thicker, front_camera, turned
 
 STEPS = range(199, 1440, 40)
 
@@ -37,9 +42,7 @@ def shaken(avatar) -> None:
 
 
 def _on_the_surface(avatar, prior) -> torch.Tensor:
-    place = torch.zeros_like(avatar.blendshapes.position)
-    place[:, 2] = prior.offset_m
-    return place
+    return prior.offset_m[:, None] * MeshField(avatar).outwards
 
 
 def test_what_no_frame_shows_comes_to_the_surface(filmed):
@@ -57,6 +60,48 @@ def test_what_no_frame_shows_comes_to_the_surface(filmed):
     assert float(shapes.basis_position.abs().max()) < 1e-6
     assert float(shapes.basis_color_feature.abs().max()) < 1e-4
     assert torch.allclose(shapes.opacity_logit, prior.opacity_logit)
+
+
+def test_discs_that_nothing_shows_reach_each_other(filmed):
+    avatar, theta, images = filmed
+    small = replace(avatar.config, scale_from_texel_spacing=False, initial_scale_m=1e-4)
+    avatar = Avatar(avatar.head, avatar.identity, small)
+    prior = SurfacePrior(avatar)
+    prior.begin(avatar, theta, front_camera(), images)
+    nobody_filmed = torch.tensor(UNFILMED_RGBA, dtype=torch.uint8).expand_as(images).contiguous()
+    for step in STEPS:
+        prior.look(avatar, theta, front_camera(), nobody_filmed)
+        prior.pull(avatar, step)
+    apart = avatar.anchors.texel_spacing()[:, None] * avatar.anchors.texel_stretch()
+    assert torch.allclose(avatar.blendshapes.log_scale[:, :2].exp(), 0.7 * apart, rtol=1e-3)
+
+
+def test_a_body_ends_where_its_picture_does_from_every_side():
+    avatar = embedded_avatar(name=EMBEDDED_BUST)
+    theta = turned(avatar, [-6.0, 0.0, 6.0])
+    theta[:, avatar.layout.slice("translation").start + 1] = 0.13
+    images = drawn_thicker(avatar, theta, 0.0)
+    images[:, SIZE - 8 :] = 0
+    prior = SurfacePrior(avatar)
+    prior.begin(avatar, theta, front_camera(), images)
+    rest = avatar.anchors.origins(avatar.carrier_vertices(torch.zeros_like(theta[:1])))[0]
+    closed = prior.opacity_logit > 0
+    # The end, by hand: the chest is 1.1 m less .05 m away, and 120 pixels below the middle.
+    end_m = -120 / 900 * 1.05 - 0.13
+    front, back = rest[:, 2] > 0.02, rest[:, 2] < -0.08
+    for side in (front, back):
+        lower, upper = side & (rest[:, 1] < end_m - 0.015), side & (rest[:, 1] > end_m + 0.03)
+        assert int(lower.sum()) > 20
+        assert not closed[lower].any()
+        assert closed[upper].float().mean() > 0.97
+    # What shines through where the front fades does not keep the back.
+    shapes = avatar.blendshapes
+    shapes.opacity_logit.data.fill_(3.0)
+    prior.seen_px.zero_()
+    prior.through_px.fill_(5.0)
+    prior.pull(avatar, STEPS[0])
+    assert float(shapes.opacity_logit[~closed].max()) < 0
+    assert float(shapes.opacity_logit[closed].min()) > 2.9
 
 
 def test_what_a_frame_shows_well_stays(filmed):

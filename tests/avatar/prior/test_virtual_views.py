@@ -23,7 +23,7 @@ def views_of(avatar, theta, offset_m=0.0, goes_on_below=False, empty=None) -> Vi
     views = VirtualViews(count, avatar.layout.size)
     offset = torch.full((count,), offset_m)
     empty = torch.zeros(count) if empty is None else empty
-    views.begin(avatar, Outline(offset, empty, goes_on_below), theta, front_camera())
+    views.begin(avatar, Outline(offset, empty, empty[:0], goes_on_below), theta, front_camera())
     views.see(avatar, theta, front_camera())
     return views
 
