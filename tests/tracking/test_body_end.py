@@ -84,7 +84,17 @@ def test_a_quarter_of_the_frames_shows_the_end(bust: HeadArrays):
 
 
 def test_the_end_leans_with_the_body(bust: HeadArrays):
-    px = seen_px(bust, 0.03, (0, 0, 8))
-    shown = BodyEnd.of(bust, [px], everywhere()).shown(px, SIZE)
+    px, inside = seen_px(bust, 0.05, (0, 0, 8)), everywhere()
+    inside[220:] = False
+    shown = BodyEnd.of(bust, [px], inside).shown(px, SIZE)
     half = [int(np.argmin(np.abs(shown[:, column] - 0.5))) for column in (88, 168)]
     assert np.degrees(np.arctan2(half[0] - half[1], 80)) == pytest.approx(8, abs=2)
+
+
+def test_of_a_body_seen_from_its_side_the_rows_tell(bust: HeadArrays):
+    px = seen_px(bust)
+    px[:, 0] = SIZE / 2
+    shown = BodyEnd.of(bust, [px], everywhere()).shown(px, SIZE)
+    assert (shown == shown[:, :1]).all()
+    assert shown[-1, 0] < 0.02
+    assert (shown[: -FADE_ROWS - 1] == 1).all()

@@ -74,7 +74,10 @@ class MeshField:
         rest = avatar.head(avatar.identity.new_zeros(1, avatar.layout.size), avatar.identity)
         smooth = self.at_gaussians(vertex_normals(rest, avatar.head.faces.long())[0])
         frames = avatar.anchors.frames(rest).matrix[0]
-        return torch.linalg.solve(frames, smooth[..., None])[..., 0]
+        found, failed = torch.linalg.solve_ex(frames, smooth[..., None])
+        flat = (failed != 0) | ~found.isfinite().all((1, 2))
+        # A triangle without area has no frame to turn it into.
+        return torch.where(flat[:, None], torch.eye(3).to(smooth)[2], found[..., 0])
 
     def of_gaussians(
         self, values: Float[Tensor, "N C"], confidence: Float[Tensor, "N"]

@@ -20,14 +20,16 @@ _FADE = 0.04
 _SHOWN_SHARE = 0.25
 # What faces the camera of somebody upright before it.
 _FRONT = 0.3
+# Whose picture is so much narrower than high is seen from its side.
+_SIDEWAYS = 0.1
 
 
 @dataclass(frozen=True)
 class BodyEnd:
     """A height of the body at rest, in metres: below it is nothing, above it all, `fade_m` later.
 
-    Heights are told from the front of the chest, whose `places_m` (across, up) belong to these
-    `vertices` of the mesh.
+    Heights are told from the front of the chest: `vertices` of the mesh, whose places at rest are
+    `places_m` (across, up).
     """
 
     vertices: Int[np.ndarray, "P"]
@@ -51,32 +53,33 @@ class BodyEnd:
         normals = vertex_normals(torch.from_numpy(rest)[None], faces)[0].numpy()
         torso = arrays.vertex_groups["torso"]
         vertices = torso[normals[torso, 2] > _FRONT]
-        places = rest[vertices, :2]
-        rows = np.flatnonzero(inside.any(1))
-        size, last = len(inside), rows[-1] + 1 if len(rows) else len(inside)
-        lowest, px_per_m = [], []
+        places_m = rest[vertices, :2]
+        rows, size = np.flatnonzero(inside.any(1)), len(inside)
+        last = rows[-1] + 1 if len(rows) else size
+        lowest_m, m_per_px = [], []
         for vertices_px in frames_px:
-            turned, shift = _affine(places, vertices_px[vertices])
-            # The body's middle, at the picture's lower edge.
-            lowest.append((last - shift[1]) / turned[1, 1])
-            px_per_m.append(np.linalg.norm(turned[:, 1]))
-        fade_m = _FADE * size / float(np.median(px_per_m))
-        return cls(vertices, places, float(np.quantile(lowest, _SHOWN_SHARE)), fade_m)
+            seen_px = vertices_px[vertices]
+            x, y, start = _height_by_px(places_m, seen_px)
+            lowest_m.append(x * seen_px[:, 0].mean() + y * last + start)
+            m_per_px.append(abs(y))
+        fade_m = _FADE * size * float(np.median(m_per_px))
+        return cls(vertices, places_m, float(np.quantile(lowest_m, _SHOWN_SHARE)), fade_m)
 
     def shown(self, vertices_px: Float[np.ndarray, "V 2"], size: int) -> Float[np.ndarray, "S S"]:
         """How much is left of each pixel of a frame: 1 well above the end, 0 from there on."""
-        turned, shift = _affine(self.places_m, vertices_px[self.vertices])
-        up = np.linalg.inv(turned)[1]
+        x, y, start = _height_by_px(self.places_m, vertices_px[self.vertices])
         centre = np.arange(size) + 0.5
-        height_m = up[0] * (centre - shift[0])[None] + up[1] * (centre - shift[1])[:, None]
+        height_m = x * centre[None] + y * centre[:, None] + start
         share = ((height_m - self.height_m) / self.fade_m).clip(0, 1).astype(np.float32)
         return share * share * (3 - 2 * share)
 
 
-def _affine(
+def _height_by_px(
     places_m: Float[np.ndarray, "P 2"], places_px: Float[np.ndarray, "P 2"]
-) -> tuple[Float[np.ndarray, "2 2"], Float[np.ndarray, "2"]]:
-    """The affine map nearest to carrying places to pixels: a matrix, then a shift."""
-    ones = np.concatenate([places_m, np.ones((len(places_m), 1))], axis=1)
-    found = np.linalg.lstsq(ones, places_px, rcond=None)[0]
-    return found[:2].T, found[2]
+) -> tuple[float, float, float]:
+    """Metres of the body's height for a pixel to the right and one down, and at the corner."""
+    ones = np.ones((len(places_m), 1))
+    by_place = np.linalg.lstsq(np.concatenate([places_m, ones], axis=1), places_px, rcond=None)[0]
+    # Of a chest seen from its side, only the way up is known.
+    x, y = np.linalg.pinv(by_place[:2].T, rcond=_SIDEWAYS)[1].tolist()
+    return x, y, -float(by_place[2] @ (x, y))
