@@ -65,7 +65,8 @@ def outlines_are_measured_once() -> Iterator[None]:
         if theta.device.type != "cpu":  # there it is looked at where everything lies
             return measure(avatar, field, theta, cameras, images_rgba)
         seen_by = cameras.world_to_camera, cameras.focal_px, cameras.principal_point_px
-        given = avatar.carrier_vertices(theta), *seen_by, images_rgba
+        places = avatar.anchors.triangle_index, avatar.anchors.barycentric
+        given = avatar.carrier_vertices(theta), *places, *seen_by, images_rgba
         arrays = [tensor.detach().numpy() for tensor in given]
         key = digest([avatar.head.arrays.digest(), *arrays])
         if key not in known:
