@@ -321,8 +321,9 @@ def _digest_of_fit(
 ) -> str:
     """What an image depends on beside the settings, in short."""
     camera = clip.fit.subject.camera
-    end = None if body_end is None else (body_end.height_m, body_end.fade_m)
-    fixed = repr((clip.crop, camera, clip.found.frame_index, UNFILMED_RGBA, end))
+    fixed = repr((clip.crop, camera, clip.found.frame_index, UNFILMED_RGBA))
+    if body_end is not None:
+        fixed += f"{body_end.height_m:.6f} {body_end.fade_m:.6f}"
     return digest([fixed, thetas.numpy(), identity.numpy()])
 
 

@@ -91,6 +91,24 @@ def test_the_end_leans_with_the_body(bust: HeadArrays):
     assert np.degrees(np.arctan2(half[0] - half[1], 80)) == pytest.approx(8, abs=2)
 
 
+@pytest.mark.parametrize("yaw_degrees", [20, 40, 60, 70, 80, 90])
+def test_a_body_that_turns_keeps_most_of_itself(bust: HeadArrays, yaw_degrees: float):
+    end = BodyEnd.of(bust, [seen_px(bust, 0.04)], everywhere())
+    px = seen_px(bust, 0.04, (0, yaw_degrees, 0))
+    shown = end.shown(px, SIZE)
+    middle = px[chest(bust)][:, 0].mean().clip(0, SIZE - 1).astype(int)
+    halfway = SIZE - int((shown[:, middle] < 0.5).sum())
+    assert halfway == pytest.approx(SIZE - FADE_ROWS / 2, abs=2 * FADE_ROWS)
+    assert shown[: SIZE // 2].min() == 1
+
+
+def test_a_picture_that_ends_at_the_chin_ends_no_body(bust: HeadArrays):
+    frames = [seen_px(bust, -0.19), seen_px(bust, -0.22)]
+    end = BodyEnd.of(bust, frames, everywhere())
+    assert end.height_m <= np.asarray(bust.v_template)[bust.vertex_groups["torso"], 1].max()
+    assert min(end.shown(px, SIZE).min() for px in frames) == 1
+
+
 def test_of_a_body_seen_from_its_side_the_rows_tell(bust: HeadArrays):
     px = seen_px(bust)
     px[:, 0] = SIZE / 2

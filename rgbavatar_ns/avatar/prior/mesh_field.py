@@ -25,10 +25,10 @@ _MIRROR_TRUST = 0.3
 
 @dataclass(frozen=True)
 class Outline:
-    """What mattes say about each of V vertices."""
+    """What mattes say about each of V vertices and N Gaussians."""
 
     offset_m: Float[Tensor, "V"]
-    """How far the person stands off the mesh along its normal."""
+    """How far the person stands off the mesh along its smooth normal."""
     empty: Float[Tensor, "V"]
     """Share of the frames in which the moved vertex lies on background."""
     empty_gaussians: Float[Tensor, "N"]
@@ -67,6 +67,7 @@ class MeshField:
         self._columns = second.contiguous()
         across = self.scalp[first] != self.scalp[second]
         self.links = torch.where(across, _HAIRLINE, 1.0).to(template)
+        self.body_gaussians = self.at_gaussians(self.body.to(template)[:, None])[:, 0] > 0.5
         self.outwards = self._outwards(avatar)
 
     @torch.no_grad()

@@ -33,7 +33,7 @@ _MOST_FRAMES = 4.0
 """Confidence of a vertex never exceeds that of so many frames."""
 _ITERATIONS = 200
 _MAP_COLUMNS = 1024
-_LOWEST = 0.005
+_LOWEST = 0.02
 """Share of a body's front that may lie below its end: specks of a matte."""
 
 
@@ -93,9 +93,9 @@ def measure_outline(
     empty[field.body & (known == 0)] = 1.0
     if bool(field.body.any()):
         front = field.at_gaussians((facing > 0).to(empty)[:, None])[:, 0] > 0.5
-        told = _told_of_body(field, images, moved, front)
-        body = field.at_gaussians(field.body.to(empty)[:, None])[:, 0] > 0.5
-        empty_gaussians = torch.where(body, told, empty_gaussians)
+        told, end_m = _told_of_body(field, images, moved, front & field.body_gaussians)
+        empty_gaussians = torch.where(field.body_gaussians, told, empty_gaussians)
+        empty[field.body & (field.height_m < end_m)] = 1.0
     rim = lower_rim(avatar)
     below = [_shown_below(image, seen, rim) for image, seen in zip(images, placed)]
     return Outline(
@@ -108,8 +108,9 @@ def _told_of_body(
     images: UInt8[np.ndarray, "B height width 4"],
     moved_px: list[Float[np.ndarray, "V 2"]],
     front: Bool[Tensor, "N"],
-) -> Float[Tensor, "N"]:
-    """Share of the frames in which each Gaussian of a body would lie on background.
+) -> tuple[Float[Tensor, "N"], Float[Tensor, ""]]:
+    """Share of the frames in which each Gaussian of a body would lie on background, and the height
+    at rest, in metres, at which the body ends.
 
     By its own place, since vertices of a body lie centimetres apart. What no frame has in the
     picture is empty, and so is the back farther down than where the front ends, which hides it.
@@ -120,9 +121,8 @@ def _told_of_body(
     empty, known = (torch.from_numpy(np.mean(part, 0)).to(height) for part in zip(*shares))
     empty = torch.where(known > 0, empty / known.clamp(min=1e-6), 1.0)
     shown = height[front & (empty < 0.5)]
-    if len(shown):
-        empty = torch.where(height < shown.quantile(_LOWEST), 1.0, empty)
-    return empty
+    end_m = shown.quantile(_LOWEST) if len(shown) else height.new_tensor(-torch.inf)
+    return torch.where(height < end_m, 1.0, empty), end_m
 
 
 @dataclass(frozen=True)

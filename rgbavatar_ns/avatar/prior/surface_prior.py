@@ -155,8 +155,8 @@ class SurfacePrior(nn.Module):
             told, confidence, start, stiffness=_STIFFNESS, rest=_REST, iterations=_ITERATIONS
         )
         pull, close = (_RATE * _SEEN_PX / (px + _SEEN_PX) for px in (self.seen_px, self.through_px))
-        # What is to be empty is not kept by being seen from behind, through what ends before it.
-        closes = torch.where(self.opacity_logit < 0, pull, close)
+        # Below its end a body is not kept by being seen from behind, through what ends before it.
+        closes = torch.where((self.opacity_logit < 0) & field.body_gaussians, pull, close)
         # Discs of texels that lie farther apart than fresh ones reach are as wide as these need.
         disc = _disc(avatar, avatar.initial_scale_m().maximum(0.5 * avatar.anchors.texel_spacing()))
         # As far as nothing shows it, nothing else closes the surface around it.

@@ -20,8 +20,9 @@ _FADE = 0.04
 _SHOWN_SHARE = 0.25
 # What faces the camera of somebody upright before it.
 _FRONT = 0.3
+_LEAST_FADE_M = 1e-6
 # Whose picture is so much narrower than high is seen from its side.
-_SIDEWAYS = 0.1
+_SIDEWAYS = 0.3
 
 
 @dataclass(frozen=True)
@@ -62,8 +63,10 @@ class BodyEnd:
             x, y, start = _height_by_px(places_m, seen_px)
             lowest_m.append(x * seen_px[:, 0].mean() + y * last + start)
             m_per_px.append(abs(y))
-        fade_m = _FADE * size * float(np.median(m_per_px))
-        return cls(vertices, places_m, float(np.quantile(lowest_m, _SHOWN_SHARE)), fade_m)
+        fade_m = max(_FADE * size * float(np.median(m_per_px)), _LEAST_FADE_M)
+        # Where pictures end at the neck or the chin, heads move beside what a body's height tells.
+        height_m = min(float(np.quantile(lowest_m, _SHOWN_SHARE)), float(rest[torso, 1].max()))
+        return cls(vertices, places_m, height_m, fade_m)
 
     def shown(self, vertices_px: Float[np.ndarray, "V 2"], size: int) -> Float[np.ndarray, "S S"]:
         """How much is left of each pixel of a frame: 1 well above the end, 0 from there on."""
