@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 
 from rgbavatar_ns.head import HeadArrays
+from rgbavatar_ns.head.joints import ROOT
 from rgbavatar_ns.head.surface import vertex_normals
 
 # Over which share of the picture's height a body fades out.
@@ -64,8 +65,9 @@ class BodyEnd:
             lowest_m.append(x * seen_px[:, 0].mean() + y * last + start)
             m_per_px.append(abs(y))
         fade_m = max(_FADE * size * float(np.median(m_per_px)), _LEAST_FADE_M)
-        # Where pictures end at the neck or the chin, heads move beside what a body's height tells.
-        height_m = min(float(np.quantile(lowest_m, _SHOWN_SHARE)), float(rest[torso, 1].max()))
+        # Above the joint that the neck stands on heads move beside what a body's height tells.
+        neck_foot_m = float(arrays.joint_regressor[ROOT] @ rest[:, 1])
+        height_m = min(float(np.quantile(lowest_m, _SHOWN_SHARE)), neck_foot_m)
         return cls(vertices, places_m, height_m, fade_m)
 
     def shown(self, vertices_px: Float[np.ndarray, "V 2"], size: int) -> Float[np.ndarray, "S S"]:
