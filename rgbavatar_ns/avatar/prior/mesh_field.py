@@ -41,7 +41,8 @@ class MeshField:
     """The vertices of an avatar's mesh as a graph, and the Gaussians' places in it.
 
     `outwards` is where a surface off the mesh lies from each Gaussian, in its tangent frame at
-    rest: between the vertices' normals, so that it does not gape over the mesh's edges.
+    rest: between the vertices' normals, so that it does not gape over the mesh's edges. `height_m`
+    is each vertex's on the template, `body` and `body_gaussians` what lies below the neck's foot.
 
     Values are continued harmonically, as heat would spread, to both sides of the face alike. Ours:
     because what nobody filmed is best guessed by what surrounds it.
