@@ -1,6 +1,7 @@
 """How near the mattes of a clip, and those of a stream, come to the truth.
 
     python benchmarks/quality/mattes.py --seeds 5 6 --json mattes.json
+    python benchmarks/quality/mattes.py --seeds 5 6 --hair long
 
 For each procedural person (dark hair, loose strands, shoulders) and each room (a light wall, a
 busy shelf, dark on dark) it films a clip with a webcam's noise and compression, tracks it, and
@@ -22,7 +23,7 @@ import tempfile
 from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import cv2
 import numpy as np
@@ -33,6 +34,7 @@ from rooms import ROOMS, FilmedRoom, Performance
 from rgbavatar_ns.data import TrackedDataset
 from rgbavatar_ns.drawing.compositing import composite_bytes
 from rgbavatar_ns.head import HeadModel
+from rgbavatar_ns.synthetic.performer.hair import HairStyle
 from rgbavatar_ns.tracking import TrackConfig, track_video
 from rgbavatar_ns.tracking.image.body_end import BodyEnd
 from rgbavatar_ns.tracking.image.crop import SquareCrop
@@ -158,17 +160,19 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=[5, 6])
     parser.add_argument("--frames", type=int, default=60)
     parser.add_argument("--rooms", nargs="+", default=list(ROOMS), choices=list(ROOMS))
+    parser.add_argument("--hair", default="short", choices=get_args(HairStyle))
     parser.add_argument("--json", type=Path, help="also write the figures here")
     chosen = parser.parse_args(arguments)
     rows = []
     for seed in chosen.seeds:
-        performance = Performance(seed, chosen.frames, supersampling=2)
+        performance = Performance(seed, chosen.frames, supersampling=2, hair=chosen.hair)
         for name in chosen.rooms:
             for tremble_px in (0.0, _TREMBLE_PX):
                 with tempfile.TemporaryDirectory() as folder:
                     film = FilmedRoom(performance, ROOMS[name], seed)
                     row = measure(film, Path(folder), tremble_px)
-                rows.append({"seed": seed, "room": name, "tremble_px": tremble_px, **row})
+                filmed = {"seed": seed, "hair": chosen.hair, "room": name, "tremble_px": tremble_px}
+                rows.append({**filmed, **row})
                 for way in ("frame", "clip"):
                     errors = "  ".join(f"{key} {value:.2f}" for key, value in row[way].items())
                     print(f"{seed} {name} {tremble_px:g} px ({row['background']}) {way}: {errors}")

@@ -12,6 +12,7 @@ from jaxtyping import Float, UInt8
 
 from rgbavatar_ns.synthetic import DemoConfig
 from rgbavatar_ns.synthetic.make import DemoPerson
+from rgbavatar_ns.synthetic.performer.hair import HairStyle
 from rgbavatar_ns.synthetic.performer.performance import perform
 from rgbavatar_ns.synthetic.performer.regions import above_hairline_m
 
@@ -90,7 +91,9 @@ ROOMS = {
 class Performance:
     """One person's true frames, with loose hair and shoulders: straight alpha, lit evenly."""
 
-    def __init__(self, seed: int, frames: int, supersampling: int = 3) -> None:
+    def __init__(
+        self, seed: int, frames: int, supersampling: int = 3, hair: HairStyle = "short"
+    ) -> None:
         config = DemoConfig(
             image_size=HEIGHT_PX,
             num_frames=frames,
@@ -99,6 +102,7 @@ class Performance:
             frames_per_second=FRAMES_PER_SECOND,
             glasses=False,
             supersampling=supersampling,
+            hair=hair,
         )
         person = DemoPerson.of(config)
         names = person.head.arrays.expression_names

@@ -224,7 +224,7 @@ class _Tracking:
             found.save(self.run.folder / name, GO_ON)
             return name
 
-        name = self.run.stages.run("background and its edges", made_from, look)
+        name = self.run.stages.run("background, its edges and the hair before it", made_from, look)
         return Background.load(self.run.folder / name)
 
     def _write_images(

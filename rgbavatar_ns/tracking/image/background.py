@@ -1,7 +1,7 @@
 """What is behind the person: a clean plate of it where the camera stands still."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, Float16, UInt8
 
 from rgbavatar_ns.files import atomic_write
 from rgbavatar_ns.reading import DamagedFileError, load_arrays
+from rgbavatar_ns.tracking.image.hair import HairColors
 from rgbavatar_ns.tracking.image.sharpness import edge_width_px
 from rgbavatar_ns.tracking.resumable_run import stage_damage_told
 
@@ -72,6 +73,8 @@ class Background:
     plate: CleanPlate | None
     edge_px: float | None = None
     """How wide the film's sharp edges are (`sharpness.py`, the median frame); None without any."""
+    hair: HairColors | None = None
+    """How to tell the person's hair from the room; None without a plate."""
 
     @property
     def camera_is_still(self) -> bool | None:
@@ -101,8 +104,9 @@ class Background:
             np.nan if value is None else value for value in (self.motion_px, self.edge_px)
         )
         with atomic_write(path, remedy=remedy) as partial, partial.open("wb") as file:
+            held = {**plate, **({} if self.hair is None else asdict(self.hair))}
             np.savez(
-                file, kind=self.kind, motion=motion, edge=edge, light=self.light_levels, **plate
+                file, kind=self.kind, motion=motion, edge=edge, light=self.light_levels, **held
             )
 
     @classmethod
@@ -122,7 +126,8 @@ class Background:
                 if not color.shape[:2] == seen.shape == spread.shape:
                     raise DamagedFileError("its arrays do not fit together")
                 plate = CleanPlate(color, seen, spread)
-            return cls(kind, motion, float(held["light"]), plate, edge)
+            hair = HairColors(held["hair"], held["room"]) if "hair" in held else None
+            return cls(kind, motion, float(held["light"]), plate, edge, hair)
 
 
 def sampled_positions(count: int, size: int) -> list[int]:

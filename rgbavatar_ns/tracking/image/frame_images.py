@@ -8,7 +8,7 @@ from functools import partial
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 
 from rgbavatar_ns.data.check.sample import spread
 from rgbavatar_ns.data.png import encode_png_rgba
@@ -24,6 +24,7 @@ from rgbavatar_ns.tracking.image.background import (
 from rgbavatar_ns.tracking.image.body_end import BodyEnd
 from rgbavatar_ns.tracking.image.crop import SquareCrop
 from rgbavatar_ns.tracking.image.cut_out import CutOut, MattedCrop
+from rgbavatar_ns.tracking.image.hair import HairColors, HairSearch, hair_pixels
 from rgbavatar_ns.tracking.image.head_mask import HeadOutline
 from rgbavatar_ns.tracking.image.matting import PersonMatte, refined_matte
 from rgbavatar_ns.tracking.image.steady_matte import NEIGHBOURS, CoarseMatte, head_motion, steadied
@@ -78,6 +79,25 @@ class _Cropped:
     small: CoarseMatte | None = None
 
 
+@dataclass(frozen=True)
+class _Known:
+    """What the look at the background has told, as every frame's matte needs it."""
+
+    room: RoomColors | None
+    hair: HairSearch | None
+    softness_px: float
+
+    @classmethod
+    def of(cls, background: Background | None, inside: Bool[np.ndarray, "S S"]) -> "_Known":
+        softness_px, room, hair = _softness_px(background), None, None
+        if background is not None and background.plate is not None:
+            room = RoomColors.of_plate(background.plate)
+            if background.hair is not None:
+                colors = background.hair
+                hair = HairSearch.of(colors, room.color, room.variance, room.known, inside)
+        return cls(room, hair, softness_px)
+
+
 _Window = tuple[_Cropped, tuple[_Cropped, ...]]
 
 
@@ -117,6 +137,9 @@ class FrameImages:
     def _vertices_px(self, position: int) -> Float[np.ndarray, "V 2"]:
         return self._crop.points(self._tracker.vertices_px(self._fit, position))
 
+    def _landmarks_px(self, position: int) -> Float[np.ndarray, "L 2"]:
+        return self._crop.points(self._found.points_px[position])
+
     @property
     def finds_mattes(self) -> bool:
         """Whether mattes are found here, and not given."""
@@ -125,11 +148,14 @@ class FrameImages:
     def background(self, source: FrameSource, done: Callable[[int], None]) -> Background:
         """What is behind the person, from frames spread over the clip; `done` counts them."""
         positions = sampled_positions(len(self._found), self._crop.size)
+        hair: list[UInt8[np.ndarray, "N 3"]] = []
 
         def looked_at() -> Iterator[tuple[np.ndarray, np.ndarray]]:
             for count, crop in enumerate(segmented, 1):
                 assert crop.coarse is not None
-                yield crop.image_rgb, refined_matte(crop.image_rgb, crop.coarse)
+                matte = refined_matte(crop.image_rgb, crop.coarse)
+                hair.append(hair_pixels(crop.image_rgb, matte, self._landmarks_px(crop.position)))
+                yield crop.image_rgb, matte
                 done(count)
 
         with ExitStack() as closed:
@@ -137,7 +163,11 @@ class FrameImages:
             closed.enter_context(closing(crops))
             segmented = InBackground(self._segmented(crops), _AHEAD)
             closed.enter_context(closing(segmented))
-            return find_background(looked_at(), self._inside)
+            found = find_background(looked_at(), self._inside)
+        if found.plate is None:
+            return found
+        colors = HairColors.of(np.concatenate(hair), found.plate.color, found.plate.known)
+        return replace(found, hair=colors)
 
     def __call__(
         self,
@@ -160,12 +190,7 @@ class FrameImages:
             segmented = InBackground(self._segmented(crops), _AHEAD)
             closed.enter_context(closing(segmented))
             windows = self._windows(segmented, frozenset(wanted))
-            plate = None if background is None else background.plate
-            finish = partial(
-                self._finish,
-                None if plate is None else RoomColors.of_plate(plate),
-                _softness_px(background),
-            )
+            finish = partial(self._finish, _Known.of(background, self._inside))
             yield from closed.enter_context(closing(map_in_order(finish, windows, _WORKERS)))
 
     def _window(self, position: int) -> range:
@@ -211,7 +236,7 @@ class FrameImages:
                     yield crop
                     continue
                 matte = matte or PersonMatte()
-                face_px = self._crop.points(self._found.points_px[crop.position])
+                face_px = self._landmarks_px(crop.position)
                 coarse = matte.coarse_with_face(crop.image_rgb, face_px)
                 small = CoarseMatte.of(crop.image_rgb, coarse)
                 yield replace(crop, coarse=coarse, small=small)
@@ -236,20 +261,21 @@ class FrameImages:
             while held and held[0].position < needed:
                 held.popleft()
 
-    def _finish(
-        self, plate: RoomColors | None, softness_px: float, window: _Window
-    ) -> TrackedImage:
+    def _finish(self, known: _Known, window: _Window) -> TrackedImage:
         crop, around = window
         if crop.alpha is not None:
             matted = MattedCrop.of(crop.image_rgb, crop.alpha, self._inside, crop.color_is_clean)
         else:
-            found = band_matte(crop.image_rgb, self._steadied(crop, around), plate)
+            coarse = self._steadied(crop, around)
+            if known.hair is not None:
+                coarse = known.hair.with_overlooked(coarse, crop.image_rgb)
+            found = band_matte(crop.image_rgb, coarse, known.room)
             alpha = found.alpha
-            if softness_px > 0:
-                alpha = cv2.GaussianBlur(alpha, (0, 0), softness_px)
+            if known.softness_px > 0:
+                alpha = cv2.GaussianBlur(alpha, (0, 0), known.softness_px)
             matted = MattedCrop.of(crop.image_rgb, alpha, self._inside, background=found.background)
         vertices_px = self._vertices_px(crop.position)
-        landmarks_px = self._crop.points(self._found.points_px[crop.position])
+        landmarks_px = self._landmarks_px(crop.position)
         outline = self._cut_out.outline(self._crop.size, vertices_px, landmarks_px)
         matte, inside = (
             cv2.resize(part, outline.silhouette.shape, interpolation=cv2.INTER_AREA)
@@ -263,10 +289,9 @@ class FrameImages:
     def _steadied(self, crop: _Cropped, around: tuple[_Cropped, ...]) -> Float[np.ndarray, "S S"]:
         assert crop.coarse is not None
         assert crop.small is not None
-        points = self._found.points_px
-        now = self._crop.points(points[crop.position])
+        now = self._landmarks_px(crop.position)
         near = [
-            (other.small, head_motion(self._crop.points(points[other.position]), now))
+            (other.small, head_motion(self._landmarks_px(other.position), now))
             for other in around
             if other.small is not None and other.position != crop.position
         ]

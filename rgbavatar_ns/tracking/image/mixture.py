@@ -20,8 +20,8 @@ PERSON_PX, _DARKER_PX = (2, 5, 12, 40), (12, 40)
 _WIDER = 1e-3
 # Of every so many pixels and rows one is asked for them.
 _EVERY = 2
-# A pixel's channels err together: three say little more than one.
-_CHANNELS_TELL = 0.5
+CHANNELS_TELL = 0.5
+"""A pixel's channels err together: three say little more than one."""
 # The darker part has to explain a colour better by so much (minus twice a log likelihood).
 _DARKER_IS_RARE = 1.0
 # Of 0, 1 and what lies between, the first two are the likelier the less a mixture tells: off .5 by
@@ -91,7 +91,7 @@ def mixed_alpha(
     pixels = _OpenPixels(
         image.reshape(-1, 3)[open_px],
         room.reshape(-1, 3)[open_px],
-        room_variance.reshape(-1)[open_px] / np.float32(_CHANNELS_TELL),
+        room_variance.reshape(-1)[open_px] / np.float32(CHANNELS_TELL),
         guess,
         np.divmod(open_px, len(person)),
     )
