@@ -26,6 +26,7 @@ def run(
     file: Annotated[Path, tyro.conf.Positional],
     output: Path | None = None,
     subjects: tuple[str, ...] | None = None,
+    variants: tuple[str, ...] | None = None,
     tiny: bool = False,
     known: tuple[Path, ...] = (),
     engine: Literal["local", "ray"] = "local",
@@ -42,6 +43,7 @@ def run(
         file: the experiment, one of configs/*.yaml or your own.
         output: where everything is written; outputs/sweeps/NAME by default (NAME-tiny with --tiny).
         subjects: in place of the file's: dataset folders, or demo:SEED:FRAMES:SIZE.
+        variants: only the rows with these names, as the file has them; another call does the rest.
         tiny: take the file's `tiny` section: minutes on two cores.
         known: files DOCS/results/NAME.json of `rgbavatar report --into DOCS`: their cells are done,
             wherever they ran. Datasets are told apart by their names alone.
@@ -59,7 +61,15 @@ def run(
     chosen: Engine = LocalEngine(at_once) if engine == "local" else RayEngine(address, cpus, gpus)
     shown = _Progress(console)
     with Live(shown, console=plain_console(soft_wrap=False), refresh_per_second=1):
-        statuses = sweep(experiment, folder, chosen, shown.cells, known=known, making=shown.subject)
+        statuses = sweep(
+            experiment,
+            folder,
+            chosen,
+            shown.cells,
+            known=known,
+            variants=variants,
+            making=shown.subject,
+        )
     console.print()
     failed = {status.folder: status for status in statuses if status.state != "done"}
     for status in failed.values():

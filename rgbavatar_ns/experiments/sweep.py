@@ -85,9 +85,13 @@ def sweep(
     progress: Callable[[Sequence[CellStatus]], None] = lambda statuses: None,
     *,
     known: Sequence[Path] = (),
+    variants: Sequence[str] | None = None,
     making: Callable[[str, int, int], None] = lambda subject, done, total: None,
 ) -> list[CellStatus]:
     """Train and evaluate every cell that has no result yet, and return where all stand.
+
+    With `variants` only the cells of rows with these names, in the file's order; the others are
+    left for another call.
 
     `progress` is called whenever that changes, `making` with a procedural subject and how many of
     its frames are drawn.
@@ -95,9 +99,9 @@ def sweep(
     was interrupted. Cells whose results `known` holds, files of `report --into`, are done too: such
     a file tells a dataset by its name alone. A failed cell is tried once more, then left with the
     last lines of its log (failed.json); the others go on. Raises UserError, before anything runs,
-    for what `check_experiment` finds, for a dataset that has changed since its cells were trained,
-    for a file of `known` that holds no results and while another process sweeps into `folder`; and
-    where that cannot be written, such as on a full disk.
+    for what `check_experiment` finds, for a variant that is none, for a dataset that has changed
+    since its cells were trained, for a file of `known` that holds no results and while another
+    process sweeps into `folder`; and where that cannot be written, such as on a full disk.
     """
     check_experiment(experiment)
     kept = {key: result for path in known for key, result in kept_results(path).items()}
@@ -105,19 +109,33 @@ def sweep(
     try:
         with disk_errors(folder, remedy), alone_in_sweep(folder):
             cells = cells_of(experiment)
+            chosen = _chosen(experiment, cells, variants)
             for key, portable in portable_keys(cells).items() if kept else ():
                 place = folder / "cells" / key
                 if portable in kept and read_result(place) is None:
                     write_json(place / RESULT_FILE, kept[portable])
-            return _sweep(experiment, cells, folder, engine, progress, making)
+            return _sweep(experiment, cells, chosen, folder, engine, progress, making)
     except DiskError as error:
         cause = f"The sweep of {experiment.name} cannot go on: {error.cause}"
         raise DiskError(cause, remedy) from error
 
 
+def _chosen(
+    experiment: Experiment, cells: Sequence[Cell], variants: Sequence[str] | None
+) -> list[Cell]:
+    """The cells of the rows with these names; all of them where none are given."""
+    names = {cell.variant for cell in cells}
+    for name in variants or ():
+        if name not in names:
+            cause = f"The experiment {experiment.name} has no variant {name!r}."
+            raise UserError(cause, nearest(name, names))
+    return [cell for cell in cells if variants is None or cell.variant in variants]
+
+
 def _sweep(
     experiment: Experiment,
     cells: Sequence[Cell],
+    chosen: Sequence[Cell],
     folder: Path,
     engine: Engine,
     progress: Callable[[Sequence[CellStatus]], None],
@@ -126,6 +144,7 @@ def _sweep(
     side_by_side = engine.side_by_side
     statuses = [_status(cell, folder) for cell in cells]
     _require_same_data(statuses, folder)
+    statuses = [status for status in statuses if status.cell in chosen]
     write_json(folder / f"{experiment.name}.json", [cell.to_json() for cell in cells])
     keep_source(folder, experiment)
     progress(statuses)

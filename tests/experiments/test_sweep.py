@@ -32,6 +32,20 @@ def test_a_second_call_does_only_what_is_missing(experiment_of, tmp_path):
     assert _calls(wider) == ["x", "xx", "x", "x", "x", "x"]
 
 
+def test_single_rows_can_be_swept_and_the_rest_later(experiment_of, tmp_path):
+    experiment, folder = experiment_of("a", "b", "c"), tmp_path / "out"
+    some = sweep(experiment, folder, LocalEngine(2), variants=["c", "a"])
+    assert [status.cell.variant for status in some] == ["a", "a", "c", "c"]
+    assert [status.state for status in some] == ["done"] * 4
+    table = write_report(experiment, folder, plots=False).table.to_markdown()
+    assert "4 of 6 cells done" in table
+    everything = sweep(experiment, folder, LocalEngine(2))
+    assert _calls(everything) == ["x"] * 6
+    with pytest.raises(UserError, match="has no variant 'd'") as refused:
+        sweep(experiment, folder, LocalEngine(2), variants=["a", "d"])
+    assert "Known are a, b, c." in refused.value.remedy
+
+
 def test_figures_of_a_dataset_as_it_was_are_not_given_for_what_it_is_now(experiment_of, tmp_path):
     """A film that is tracked anew has the same path."""
     theta, out = tmp_path / "data" / "theta.npy", tmp_path / "out"
