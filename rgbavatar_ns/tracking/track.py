@@ -54,6 +54,8 @@ from rgbavatar_ns.tracking.verify.report import (
 
 _LIGHT_FRAMES = 60
 """Frames that tell how bright the film is and whether that changes."""
+_MATTES = "with the hair that the segmentation overlooks"
+"""How mattes are found: of something else an unfinished run makes its pictures anew."""
 
 
 def track_video(
@@ -224,7 +226,7 @@ class _Tracking:
             found.save(self.run.folder / name, GO_ON)
             return name
 
-        name = self.run.stages.run("background, its edges and the hair before it", made_from, look)
+        name = self.run.stages.run("background and its edges", made_from, look)
         return Background.load(self.run.folder / name)
 
     def _write_images(
@@ -321,7 +323,7 @@ def _digest_of_fit(
 ) -> str:
     """What an image depends on beside the settings, in short."""
     camera = clip.fit.subject.camera
-    fixed = repr((clip.crop, camera, clip.found.frame_index, UNFILMED_RGBA))
+    fixed = repr((clip.crop, camera, clip.found.frame_index, UNFILMED_RGBA, _MATTES))
     if body_end is not None:
         fixed += f"{body_end.height_m:.6f} {body_end.fade_m:.6f}"
     return digest([fixed, thetas.numpy(), identity.numpy()])

@@ -1,5 +1,6 @@
 """A clean plate is found where the camera stands, and none where camera or light move."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -12,6 +13,7 @@ from rgbavatar_ns.tracking.image.background import (
     find_background,
     sampled_positions,
 )
+from rgbavatar_ns.tracking.image.hair import HairColors
 
 SIZE, FRAMES = 96, 24
 INSIDE = np.ones((SIZE, SIZE), bool)
@@ -150,22 +152,43 @@ def test_what_is_kept_comes_back(tmp_path: Path) -> None:
         if again.plate is not None and found.plate is not None:
             np.testing.assert_array_equal(again.plate.color, found.plate.color)
             np.testing.assert_array_equal(again.plate.known, found.plate.known)
+        assert again.hair is None
+    found = replace(find_background(_film(_room()), INSIDE), hair=_hair())
+    found.save(tmp_path / "background.npz", "")
+    again = Background.load(tmp_path / "background.npz").hair
+    assert again is not None
+    np.testing.assert_array_equal(again.hair, _hair().hair)
+    np.testing.assert_array_equal(again.room, _hair().room)
+
+
+def _hair() -> HairColors:
+    pixels = np.random.default_rng(0).integers(0, 60, (400, 3)).astype(np.uint8)
+    found = HairColors.of(pixels, _room().astype(np.uint8), INSIDE, INSIDE)
+    assert found is not None
+    return found
 
 
 @pytest.mark.parametrize(
     "changed",
-    [{"kind": "new"}, {"seen": np.zeros((3, 3), np.uint8)}, {"motion": np.zeros(4)}],
+    [
+        {"kind": "new"},
+        {"seen": np.zeros((3, 3), np.uint8)},
+        {"motion": np.zeros(4)},
+        {"hair": np.zeros((4, 4, 4), np.float32)},
+        {"room": np.full((32, 32, 32), np.nan, np.float32)},
+        {"room": np.zeros((32, 32, 32))},
+    ],
 )
 def test_a_damaged_or_foreign_background_is_told(tmp_path: Path, changed: dict) -> None:
     path = tmp_path / "background.npz"
-    find_background(_film(_room()), INSIDE).save(path, "")
+    replace(find_background(_film(_room()), INSIDE), hair=_hair()).save(path, "")
     with np.load(path) as held:
         arrays = dict(held)
     path.write_bytes(path.read_bytes()[:-40])
     with pytest.raises(UserError, match="no background that was found"):
         Background.load(path)
     np.savez(path, **(arrays | changed))
-    with pytest.raises(UserError, match=r"no background.*same command again"):
+    with pytest.raises(UserError, match=r"(?s)no background.*same command again"):
         Background.load(path)
 
 

@@ -60,6 +60,11 @@ class CleanPlate:
         """Where enough frames agree."""
         return self.seen >= _SEEN
 
+    @property
+    def moves(self) -> Bool[np.ndarray, "S S"]:
+        """Where something is seen that no segmentation takes for the person, and frames differ."""
+        return ~self.known & (self.spread >= _AGREE_LEVELS)
+
 
 @dataclass(frozen=True)
 class Background:
@@ -74,7 +79,8 @@ class Background:
     edge_px: float | None = None
     """How wide the film's sharp edges are (`sharpness.py`, the median frame); None without any."""
     hair: HairColors | None = None
-    """How to tell the person's hair from the room; None without a plate."""
+    """How to tell the person's hair from the room; None without a plate, or with too little of
+    either to tell."""
 
     @property
     def camera_is_still(self) -> bool | None:
@@ -126,7 +132,8 @@ class Background:
                 if not color.shape[:2] == seen.shape == spread.shape:
                     raise DamagedFileError("its arrays do not fit together")
                 plate = CleanPlate(color, seen, spread)
-            hair = HairColors(held["hair"], held["room"]) if "hair" in held else None
+            told = "hair" in held or "room" in held
+            hair = HairColors(held["hair"], held["room"]).checked() if told else None
             return cls(kind, motion, float(held["light"]), plate, edge, hair)
 
 

@@ -91,10 +91,10 @@ class _Known:
     def of(cls, background: Background | None, inside: Bool[np.ndarray, "S S"]) -> "_Known":
         softness_px, room, hair = _softness_px(background), None, None
         if background is not None and background.plate is not None:
-            room = RoomColors.of_plate(background.plate)
-            if background.hair is not None:
-                colors = background.hair
-                hair = HairSearch.of(colors, room.color, room.variance, room.known, inside)
+            plate, colors = background.plate, background.hair
+            room = RoomColors.of_plate(plate)
+            if colors is not None:
+                hair = HairSearch.of(colors, room.variance, room.known, inside, plate.moves)
         return cls(room, hair, softness_px)
 
 
@@ -154,7 +154,8 @@ class FrameImages:
             for count, crop in enumerate(segmented, 1):
                 assert crop.coarse is not None
                 matte = refined_matte(crop.image_rgb, crop.coarse)
-                hair.append(hair_pixels(crop.image_rgb, matte, self._landmarks_px(crop.position)))
+                face_px = self._landmarks_px(crop.position)
+                hair.append(hair_pixels(crop.image_rgb, matte, face_px, self._inside))
                 yield crop.image_rgb, matte
                 done(count)
 
@@ -166,8 +167,8 @@ class FrameImages:
             found = find_background(looked_at(), self._inside)
         if found.plate is None:
             return found
-        colors = HairColors.of(np.concatenate(hair), found.plate.color, found.plate.known)
-        return replace(found, hair=colors)
+        room, known = found.plate.color, found.plate.known
+        return replace(found, hair=HairColors.of(np.concatenate(hair), room, known, self._inside))
 
     def __call__(
         self,
@@ -267,9 +268,7 @@ class FrameImages:
             matted = MattedCrop.of(crop.image_rgb, crop.alpha, self._inside, crop.color_is_clean)
         else:
             coarse = self._steadied(crop, around)
-            if known.hair is not None:
-                coarse = known.hair.with_overlooked(coarse, crop.image_rgb)
-            found = band_matte(crop.image_rgb, coarse, known.room)
+            found = band_matte(crop.image_rgb, coarse, known.room, known.hair)
             alpha = found.alpha
             if known.softness_px > 0:
                 alpha = cv2.GaussianBlur(alpha, (0, 0), known.softness_px)

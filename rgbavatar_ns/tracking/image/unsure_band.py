@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from rgbavatar_ns.tracking.image.background import CleanPlate
+from rgbavatar_ns.tracking.image.hair import HairSearch
 from rgbavatar_ns.tracking.image.matting import refined_matte
 from rgbavatar_ns.tracking.image.mixture import (
     OF_SIDE_PX,
@@ -107,12 +108,18 @@ class BandMatte:
     background: _Colors
 
 
-def band_matte(image_rgb: _Image, coarse: _Values, plate: RoomColors | None = None) -> BandMatte:
+def band_matte(
+    image_rgb: _Image,
+    coarse: _Values,
+    plate: RoomColors | None = None,
+    hair: HairSearch | None = None,
+) -> BandMatte:
     """Alpha of the person in one piece, in [0, 1], from a segmentation that knows it coarsely.
 
     `plate` is the room as other frames know it; without it the frame's own surroundings stand for
-    it. Ours: difference matting (Smith and Blinn 1996) weighed as Bayesian matting does (Chuang
-    2001), with the segmentation as prior, on those pixels alone that it leaves open.
+    it. With it, `hair` finds what the segmentation has overlooked. Ours: difference matting (Smith
+    and Blinn 1996) weighed as Bayesian matting does (Chuang 2001), with the segmentation as prior,
+    on those pixels alone that it leaves open.
     """
     coarse = _without_holes(image_rgb, coarse, plate)
     image, inward = image_rgb.astype(np.float32), _inward(coarse)
@@ -122,6 +129,10 @@ def band_matte(image_rgb: _Image, coarse: _Values, plate: RoomColors | None = No
         if plate is None
         else _lit_as(image, plate, outside)
     )
+    if plate is not None and hair is not None:
+        coarse = hair.with_overlooked(coarse, image_rgb, room.color)
+        inward = _inward(coarse)
+        outside = inward < -_NEAR_PX
     apart = image - room.color
     differs = _squares(apart) / (3 * room.variance)
     deep = (inward > _DEEP_PX).astype(np.float32)
