@@ -3,12 +3,13 @@
     python benchmarks/quality/mattes.py --seeds 5 6 --json mattes.json
     python benchmarks/quality/mattes.py --seeds 5 6 --hair long
 
-For each procedural person (dark hair, loose strands, shoulders) and each room (a light wall, a
-busy shelf, dark on dark) it films a clip with a webcam's noise and compression, tracks it, and
-prints for each way to find mattes: the mean absolute error of alpha in percent, in the unsure band
-(where the truth or a stream's matte is between .02 and .98, and 3 pixels of 480 around) and over
-the whole image; its flicker (mean absolute change of the error from frame to frame in the band,
-percent); and the error of the colour on a white and on a green background in the band, in levels.
+For each procedural person (dark hair, short or as `--hair` says, with loose strands; shoulders) and
+each room (a light wall, a busy shelf, dark on dark) it films a clip with a webcam's noise and
+compression, tracks it, and prints for each way to find mattes: the mean absolute error of alpha in
+percent, in the unsure band (where the truth or a stream's matte is between .02 and .98, and 3
+pixels of 480 around) and over the whole image; its flicker (mean absolute change of the error from
+frame to frame in the band, percent); and the error of the colour on a white and on a green
+background in the band, in levels.
 
 "frame" is a stream's way: plain segmentation and guided filter, each frame by itself. "clip" is
 what `rgbavatar track` writes. "colours" is the band's error of each pixel by itself where the true
@@ -175,7 +176,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
                 rows.append({**filmed, **row})
                 for way in ("frame", "clip"):
                     errors = "  ".join(f"{key} {value:.2f}" for key, value in row[way].items())
-                    print(f"{seed} {name} {tremble_px:g} px ({row['background']}) {way}: {errors}")
+                    of = f"{seed} {chosen.hair} {name} {tremble_px:g} px ({row['background']})"
+                    print(f"{of} {way}: {errors}")
                 if row["colours"] is not None:
                     print(f"    true colours: band {row['colours']:.2f}")
                 print(

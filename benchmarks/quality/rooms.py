@@ -116,8 +116,8 @@ class Performance:
             head = np.zeros((HEIGHT_PX, WIDTH_PX, 4), np.float32)
             left = (WIDTH_PX - HEIGHT_PX) // 2
             head[:, left : left + HEIGHT_PX] = image / np.float32(255)
-            hair = strands.drawn(turn, shift)
-            self.frames.append(np.round(255 * _over(head, _over(hair, torso))).astype(np.uint8))
+            loose = strands.drawn(turn, shift)
+            self.frames.append(np.round(255 * _over(head, _over(loose, torso))).astype(np.uint8))
 
 
 def _over(front: RGBA, behind: RGBA) -> RGBA:
