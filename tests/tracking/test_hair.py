@@ -1,16 +1,25 @@
 """Hair that every segmentation leaves out is found by its colours, where the camera stands."""
 
+import json
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
 
+from rgbavatar_ns.synthetic import DemoConfig, film_demo
+from rgbavatar_ns.tracking import TrackConfig, track_video
 from rgbavatar_ns.tracking.image.background import CleanPlate, find_background
+from rgbavatar_ns.tracking.image.crop import SquareCrop
 from rgbavatar_ns.tracking.image.hair import HairColors, HairSearch, hair_pixels
 from rgbavatar_ns.tracking.image.unsure_band import RoomColors, band_matte
+
+from .clips import write_clip
 
 FRAMES = 24
 HAIR, SKIN = np.array([58.0, 42.0, 34.0]), np.array([205.0, 160.0, 135.0])
 SHIRT = np.array([60.0, 90.0, 150.0])
+
 Film = list[tuple[np.ndarray, np.ndarray, np.ndarray]]
 
 
@@ -249,3 +258,40 @@ def test_a_dark_wall_in_brighter_light_is_no_hair() -> None:
         alpha = band_matte(image, cv2.GaussianBlur(person, (0, 0), 2), room, search).alpha
         away = cv2.dilate(person, np.ones((15, 15))) == 0
         assert (alpha[away] > 0.5).mean() < 0.002
+
+
+@pytest.mark.nightly
+@pytest.mark.slow
+def test_long_hair_of_a_tracked_clip_is_kept_before_a_shelf(tmp_path: Path) -> None:
+    """A procedural person; without the search more than 3 % of the upper half is lost."""
+    size, frames = 256, 40
+    config = DemoConfig(
+        image_size=size,
+        num_frames=frames,
+        num_test_frames=1,
+        seed=102,
+        frames_per_second=12.0,
+        theta_noise=0.0,
+        supersampling=1,
+        glasses=False,
+        body="sway",
+        hair="long",
+    )
+    film = film_demo(config)
+    drawn = list(film.person.draw(film.true))
+    random, images = np.random.default_rng(0), []
+    for image in drawn:
+        share = image[..., 3:] / 255
+        seen = image[..., :3] * share + (1 - share) * _shelf(size)
+        images.append(_bytes(seen + random.normal(0, 2, seen.shape)))
+    clip = write_clip(tmp_path / "clip.mkv", images, "ffv1", "yuv444p")
+    dataset = track_video(clip, tmp_path / "set", TrackConfig(image_size=size))
+    crop = SquareCrop(
+        **json.loads((tmp_path / "set" / "tracking.json").read_text())["crop"], size=size
+    )
+    lost, held = 0.0, 0.0
+    for k in range(len(dataset)):
+        truth = crop.apply(drawn[k])[: size // 2, :, 3] / 255
+        lost += np.clip(truth - dataset.read_image(k)[: size // 2, :, 3] / 255, 0, 1).sum()
+        held += truth.sum()
+    assert lost < 0.01 * held
