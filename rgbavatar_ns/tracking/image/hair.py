@@ -133,7 +133,7 @@ class HairSearch:
         """
         few, scale = _half(coarse), len(self.known) / OF_SIDE_PX
         asked = (_away_px(few > 0.5) < _REACH_PX * scale) & self.inside & (few < _SURE)
-        if not asked.any() or asked.all():
+        if not asked.any():
             return coarse
         places = np.flatnonzero(asked)
         color = _half(image_rgb).reshape(-1, 3)[places]
