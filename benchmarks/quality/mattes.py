@@ -176,8 +176,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
                 rows.append({**filmed, **row})
                 for way in ("frame", "clip"):
                     errors = "  ".join(f"{key} {value:.2f}" for key, value in row[way].items())
-                    of = f"{seed} {chosen.hair} {name} {tremble_px:g} px ({row['background']})"
-                    print(f"{of} {way}: {errors}")
+                    case = f"{seed} {chosen.hair} {name} {tremble_px:g} px ({row['background']})"
+                    print(f"{case} {way}: {errors}")
                 if row["colours"] is not None:
                     print(f"    true colours: band {row['colours']:.2f}")
                 print(

@@ -26,7 +26,7 @@ def run(
     file: Annotated[Path, tyro.conf.Positional],
     output: Path | None = None,
     subjects: tuple[str, ...] | None = None,
-    variants: tuple[str, ...] | None = None,
+    variants: tuple[str, ...] = (),
     tiny: bool = False,
     known: tuple[Path, ...] = (),
     engine: Literal["local", "ray"] = "local",

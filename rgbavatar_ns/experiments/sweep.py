@@ -85,7 +85,7 @@ def sweep(
     progress: Callable[[Sequence[CellStatus]], None] = lambda statuses: None,
     *,
     known: Sequence[Path] = (),
-    variants: Sequence[str] | None = None,
+    variants: Sequence[str] = (),
     making: Callable[[str, int, int], None] = lambda subject, done, total: None,
 ) -> list[CellStatus]:
     """Train and evaluate every cell that has no result yet, and return where all stand.
@@ -120,16 +120,14 @@ def sweep(
         raise DiskError(cause, remedy) from error
 
 
-def _chosen(
-    experiment: Experiment, cells: Sequence[Cell], variants: Sequence[str] | None
-) -> list[Cell]:
+def _chosen(experiment: Experiment, cells: Sequence[Cell], variants: Sequence[str]) -> list[Cell]:
     """The cells of the rows with these names; all of them where none are given."""
     names = {cell.variant for cell in cells}
-    for name in variants or ():
+    for name in variants:
         if name not in names:
             cause = f"The experiment {experiment.name} has no variant {name!r}."
             raise UserError(cause, nearest(name, names))
-    return [cell for cell in cells if variants is None or cell.variant in variants]
+    return [cell for cell in cells if not variants or cell.variant in variants]
 
 
 def _sweep(

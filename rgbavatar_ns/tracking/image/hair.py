@@ -23,9 +23,10 @@ _Mask = Bool[np.ndarray, "S S"]
 _Pixels = UInt8[np.ndarray, "N 3"]
 _Small = Float[np.ndarray, "s s"]
 
-# The numbers below were chosen on two procedural people with long hair (seeds 101 and 102), in all
-# rooms of `benchmarks/quality/rooms.py`. Lengths are pixels of an image of `OF_SIDE_PX`, and grow
-# with it. Colours are counted in bins of 8 levels a channel; so many pixels tell them at least.
+# The numbers below were chosen on procedural people with long hair or a hat (seeds 5 and 101 to
+# 104), in all rooms of `benchmarks/quality/rooms.py` and with shadows on the wall. Lengths are
+# pixels of an image of `OF_SIDE_PX`, and grow with it. Colours are counted in bins of 8 levels a
+# channel; so many pixels tell them at least.
 _BINS, _BLUR_BINS, _FEWEST = 32, 1.0, 200
 # The room has colours that were never seen there, shadows among them; hair hardly has.
 _OTHER_HAIR, _OTHER_ROOM = 0.003, 0.2
