@@ -15,7 +15,7 @@ background in the band, in levels.
 what `rgbavatar track` writes. "colours" is the band's error of each pixel by itself where the true
 colours of person and room are told, before a camera that stands: what noise and compression leave,
 and what only a guess about neighbours can undercut. Each room is filmed twice: by a camera that
-stands, and by one that trembles by some pixels, where no plate can be of use.
+stands, and by one in a hand.
 """
 
 import argparse
@@ -48,7 +48,7 @@ from rgbavatar_ns.tracking.input.video import FrameSource
 
 _SIZE, _UNSURE, _AROUND = 480, 0.02, 7
 _NEW_ROOMS = {"white": (1.0, 1.0, 1.0), "green": (0.24, 0.78, 0.24)}
-_TREMBLE_PX = 3.0
+_HAND_PX = 4.0
 
 Pictures = list[UInt8[np.ndarray, "S S 4"]]
 
@@ -122,17 +122,17 @@ def above_the_end(
     return np.min([end.shown(px, len(inside)) for px in frames_px], axis=0) >= 1
 
 
-def measure(film: FilmedRoom, folder: Path, tremble_px: float) -> dict[str, Any]:
+def measure(film: FilmedRoom, folder: Path, hand_px: float) -> dict[str, Any]:
     """Film, track and compare one clip."""
     clip, dst = folder / "clip.mp4", folder / "set"
-    film.write(clip, tremble_px)
+    film.write(clip, hand_px)
     config = TrackConfig(image_size=_SIZE)
     dataset = track_video(clip, dst, config)
     report = json.loads((dst / "tracking.json").read_text())
     crop = SquareCrop(**report["crop"], size=_SIZE)
     left_out = {frame for frames in report["rejected"].values() for frame in frames}
     frames = [k for k in range(report["frames_read"]) if k not in left_out]
-    truth = [cropped(crop, one) for k, one in enumerate(film.truth(tremble_px)) if k in set(frames)]
+    truth = [cropped(crop, one) for k, one in enumerate(film.truth(hand_px)) if k in set(frames)]
     found = [dataset.read_image(place) for place in range(len(frames))]
     plain, told, inside = [], [], np.ones((_SIZE, _SIZE), bool)
     room = crop.apply(film.behind().astype(np.float32))
@@ -149,7 +149,7 @@ def measure(film: FilmedRoom, folder: Path, tremble_px: float) -> dict[str, Any]
         "background": report["background"],
         "known": report["background_known_share"],
         "pictures_per_second": report["stages"]["pictures"]["frames_per_second"],
-        "colours": figures(told, truth, bands, inside)["band"] if tremble_px == 0 else None,
+        "colours": figures(told, truth, bands, inside)["band"] if hand_px == 0 else None,
         "frame": figures(plain, truth, bands, inside),
         "clip": figures(found, truth, bands, inside),
     }
@@ -168,15 +168,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for seed in chosen.seeds:
         performance = Performance(seed, chosen.frames, supersampling=2, hair=chosen.hair)
         for name in chosen.rooms:
-            for tremble_px in (0.0, _TREMBLE_PX):
+            for hand_px in (0.0, _HAND_PX):
                 with tempfile.TemporaryDirectory() as folder:
                     film = FilmedRoom(performance, ROOMS[name], seed)
-                    row = measure(film, Path(folder), tremble_px)
-                filmed = {"seed": seed, "hair": chosen.hair, "room": name, "tremble_px": tremble_px}
+                    row = measure(film, Path(folder), hand_px)
+                filmed = {"seed": seed, "hair": chosen.hair, "room": name, "hand_px": hand_px}
                 rows.append({**filmed, **row})
                 for way in ("frame", "clip"):
                     errors = "  ".join(f"{key} {value:.2f}" for key, value in row[way].items())
-                    case = f"{seed} {chosen.hair} {name} {tremble_px:g} px ({row['background']})"
+                    case = f"{seed} {chosen.hair} {name} {hand_px:g} px ({row['background']})"
                     print(f"{case} {way}: {errors}")
                 if row["colours"] is not None:
                     print(f"    true colours: band {row['colours']:.2f}")

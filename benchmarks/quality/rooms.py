@@ -26,7 +26,14 @@ _SHIRT_SRGB = (58.0, 84.0, 112.0)
 # What a dim room's exposure leaves of linear light, and the power that stands for sRGB's curve.
 _DIM, _GAMMA = 0.22, 2.2
 
+# How a hand moves a camera: turns about the axes to the right, down and ahead, ways along these,
+# in shares of each other; and how much of such a way shows in the room, which is farther away.
+_FOCAL_PX = 800.0
+_HAND = (1.0, 1.0, 3.0, 1.0, 1.0, 3.0)
+_ROOM_MOVES = 0.4
+
 RGBA = Float[np.ndarray, "H W 4"]
+_Homography = Float[np.ndarray, "3 3"]
 
 
 @dataclass(frozen=True)
@@ -187,22 +194,22 @@ class FilmedRoom:
     room: Room
     seed: int
 
-    def truth(self, tremble_px: float = 0.0) -> Iterator[UInt8[np.ndarray, "H W 4"]]:
+    def truth(self, hand_px: float = 0.0) -> Iterator[UInt8[np.ndarray, "H W 4"]]:
         """Straight-alpha frames as the room lights them, and as the camera's place shows them."""
-        for frame, shift in zip(self.performance.frames, self._shifts(tremble_px)):
+        for frame, (moved, _) in zip(self.performance.frames, self._moves(hand_px)):
             if self.room.dim:
                 level = np.round(np.arange(256) * _DIM ** (1 / _GAMMA)).astype(np.uint8)
                 frame = np.concatenate([level[frame[..., :3]], frame[..., 3:]], -1)
-            yield _moved(frame, shift)
+            yield _seen(frame, moved)
 
     def behind(self) -> Float[np.ndarray, "H W 3"]:
         """The room alone, as a camera that stands sees it without noise."""
         return self.room.background(self._film_rng())
 
-    def write(self, path: Path, tremble_px: float = 0.0) -> None:
+    def write(self, path: Path, hand_px: float = 0.0) -> None:
         """The clip: noise, a flickering lamp, JPEG as in the camera's cable, H.264 as recorded.
 
-        `tremble_px`: how far the camera wanders.
+        `hand_px`: how far a hand moves the camera.
         """
         rng = self._film_rng()
         behind = self.room.background(rng)
@@ -210,9 +217,9 @@ class FilmedRoom:
             stream = container.add_stream("libx264", rate=FRAMES_PER_SECOND)
             stream.width, stream.height, stream.pix_fmt = WIDTH_PX, HEIGHT_PX, "yuv420p"
             stream.options = {"crf": "20"}
-            for frame, shift in zip(self.truth(tremble_px), self._shifts(tremble_px)):
+            for frame, (_, moved) in zip(self.truth(hand_px), self._moves(hand_px)):
                 share = frame[..., 3:] / 255
-                seen = frame[..., :3] * share + _moved(behind, shift) * (1 - share)
+                seen = frame[..., :3] * share + _seen(behind, moved) * (1 - share)
                 seen = seen * (1 + 0.004 * rng.standard_normal())
                 # A camera smooths its noise a little.
                 noise = cv2.GaussianBlur(rng.standard_normal(seen.shape), (0, 0), 0.6) * 2.1
@@ -226,17 +233,42 @@ class FilmedRoom:
     def _film_rng(self) -> np.random.Generator:
         return np.random.default_rng([self.seed, 13])
 
-    def _shifts(self, tremble_px: float) -> list[tuple[int, int]]:
-        """By how many rows and columns each frame is moved: a slow sway, in whole pixels."""
+    def _moves(self, hand_px: float) -> list[tuple[_Homography, _Homography]]:
+        """How a hand's camera moves what it shows of the person in each frame, and of the room.
+
+        It turns about all axes and sways, which moves what is near by more: what comes of each is
+        `hand_px` (one standard deviation) along each side of the picture, and about as much at its
+        corners.
+        """
         rng = np.random.default_rng([self.seed, 14])
-        steps = rng.standard_normal((len(self.performance.frames), 2)).cumsum(0)
-        steps = (steps - steps.mean(0)) / steps.std(0)
-        return [(round(row), round(column)) for row, column in (tremble_px * steps).tolist()]
+        steps = rng.standard_normal((len(self.performance.frames), len(_HAND))).cumsum(0)
+        steps = hand_px * np.array(_HAND) * (steps - steps.mean(0)) / steps.std(0)
+        focal_px, to_right, to_bottom = _FOCAL_PX, WIDTH_PX / 2, HEIGHT_PX / 2
+        lens = np.array([[focal_px, 0, to_right], [0, focal_px, to_bottom], [0, 0, 1]])
+        moves = []
+        for turn_px, (right_px, down_px, nearer_px) in zip(steps[:, :3], steps[:, 3:].tolist()):
+            turned = lens @ cv2.Rodrigues(turn_px / focal_px)[0] @ np.linalg.inv(lens)
+            swayed = np.array([right_px, down_px, nearer_px / focal_px])
+            person, room = (turned @ _swayed(*(share * swayed)) for share in (1.0, _ROOM_MOVES))
+            moves.append((person, room))
+        return moves
 
 
-def _moved(picture: np.ndarray, rows_columns: tuple[int, int]) -> np.ndarray:
-    """The picture shifted; its border goes on."""
-    rows, columns = rows_columns
-    room = (max(rows, 0), max(-rows, 0), max(columns, 0), max(-columns, 0))
-    wide = cv2.copyMakeBorder(picture, *room, cv2.BORDER_REPLICATE)
-    return wide[room[1] : room[1] + HEIGHT_PX, room[3] : room[3] + WIDTH_PX]
+def _swayed(right_px: float, down_px: float, larger: float) -> _Homography:
+    """By pixels, and larger by such a share, about the picture's middle."""
+    right_px, down_px = right_px - larger * WIDTH_PX / 2, down_px - larger * HEIGHT_PX / 2
+    return np.array([[1 + larger, 0, right_px], [0, 1 + larger, down_px], [0, 0, 1]])
+
+
+def _seen(picture: np.ndarray, moved: _Homography) -> np.ndarray:
+    """The picture, with straight alpha if any, from where the camera is; its border goes on."""
+    if (moved == np.eye(3)).all():
+        return picture
+    light, size = picture.astype(np.float32), (WIDTH_PX, HEIGHT_PX)
+    light[..., :3] *= light[..., 3:] / 255 if light.shape[-1] == 4 else 1
+    light = cv2.warpPerspective(light, moved, size, borderMode=cv2.BORDER_REPLICATE)
+    if light.shape[-1] == 4:
+        light[..., :3] /= np.maximum(light[..., 3:] / 255, 1e-6)
+    if picture.dtype == np.uint8:
+        light = np.clip(light, 0, 255).round()
+    return light.astype(picture.dtype)

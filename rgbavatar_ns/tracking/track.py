@@ -54,7 +54,7 @@ from rgbavatar_ns.tracking.verify.report import (
 
 _LIGHT_FRAMES = 60
 """Frames that tell how bright the film is and whether that changes."""
-_MATTES = "with the hair that the segmentation overlooks"
+_MATTES = "with overlooked hair, and the room of a moving camera"
 """How mattes are found: of something else an unfinished run makes its pictures anew."""
 
 

@@ -1,4 +1,4 @@
-"""What is behind the person: a clean plate of it where the camera stands still."""
+"""What is behind the person: a clean plate of it, where the camera stands or a hand moves it."""
 
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, Float16, UInt8
 from rgbavatar_ns.files import atomic_write
 from rgbavatar_ns.reading import DamagedFileError, load_arrays
 from rgbavatar_ns.tracking.image.hair import HairColors
+from rgbavatar_ns.tracking.image.room_view import RoomView, laid_on
 from rgbavatar_ns.tracking.image.sharpness import edge_width_px
 from rgbavatar_ns.tracking.resumable_run import stage_damage_told
 
@@ -40,6 +41,11 @@ _TEXTURE_LEVELS, _TEXTURE_SHARE = 8.0, 0.005
 _STILL_PX = 0.5
 # The light changes where one frame in ten is off by more levels; less is followed frame by frame.
 _LIGHT_LEVELS, _LIGHT_PERCENTILE = 10.0, 90
+# A moving camera's frames are laid on one another by what lies farther from the person than this
+# share of the image, where so many of them can be.
+_CLEAR, _LAID_SHARE = 0.03, 0.75
+# Their edges are off by so many pixels.
+_LAID_OFF_PX = 0.4
 
 BackgroundKind = Literal["still", "moves", "light changes", "covered", "too short"]
 
@@ -68,7 +74,10 @@ class CleanPlate:
 
 @dataclass(frozen=True)
 class Background:
-    """What a clip's background does, and the plate if it is of use."""
+    """What a clip's background does, and the plate if it is of use.
+
+    The plate of a camera that moves is what one picture would show: `RoomView` finds it in others.
+    """
 
     kind: BackgroundKind
     motion_px: float | None
@@ -162,23 +171,87 @@ def find_background(
     edge_px = float(np.median(told)) if told else None
     if len(images) < _FEWEST:
         return Background("too short", None, 0.0, None, edge_px)
-    free, away = _farthest(_of_whole_mattes(clear_px))
-    color, spread, count = _medians(images, free)
-    often = count >= _SEEN
-    light = _light_changes(images, free, color, often)
-    motion = _motion_px(color, spread, away if away.mean() >= _AWAY_SHARE else often)
-    kind: BackgroundKind = "still"
-    if often.mean() < _TEXTURE_SHARE:
-        kind = "covered"
-    elif light > _LIGHT_LEVELS:
-        kind = "light changes"
-    elif motion is not None and motion > _STILL_PX:
-        kind = "moves"
-    if kind != "still":
-        return Background(kind, motion, light, None, edge_px)
-    known = _hanging_together(often & (spread < _AGREE_LEVELS), away)
-    seen = np.where(known, count, 0).astype(np.uint8)
-    return Background(kind, motion, light, CleanPlate(color, seen, spread), edge_px)
+    clear_px = _of_whole_mattes(clear_px)
+    look = _Look.at(images, clear_px)
+    kind, motion_px = look.kind, look.motion_px
+    if kind == "moves" and _lay_on_one(images, clear_px):
+        laid = _Look.at(images, clear_px)
+        if laid.kind == "still":
+            plate = laid.plate(_LAID_OFF_PX)
+            return Background("moves", motion_px, laid.light_levels, plate, edge_px)
+    plate = look.plate(0.0) if kind == "still" else None
+    return Background(kind, motion_px, look.light_levels, plate, edge_px)
+
+
+@dataclass(frozen=True)
+class _Look:
+    """What the samples tell of the room, pixel by pixel."""
+
+    color: UInt8[np.ndarray, "S S 3"]
+    spread: Float[np.ndarray, "S S"]
+    count: UInt8[np.ndarray, "S S"]
+    """How many frames counted."""
+    away: Bool[np.ndarray, "S S"]
+    """Where enough frames have the person well away."""
+    light_levels: float
+    motion_px: float | None
+
+    @classmethod
+    def at(cls, images: list[np.ndarray], clear_px: list[Float16[np.ndarray, "S S"]]) -> "_Look":
+        """Of images and how far each pixel lies from the person there."""
+        free, away = _farthest(clear_px)
+        color, spread, count = _medians(images, free)
+        often = count >= _SEEN
+        light = _light_changes(images, free, color, often)
+        motion = _motion_px(color, spread, away if away.mean() >= _AWAY_SHARE else often)
+        return cls(color, spread, count, away, light, motion)
+
+    @property
+    def kind(self) -> BackgroundKind:
+        """What the background does."""
+        if (self.count >= _SEEN).mean() < _TEXTURE_SHARE:
+            return "covered"
+        if self.light_levels > _LIGHT_LEVELS:
+            return "light changes"
+        moves = self.motion_px is not None and self.motion_px > _STILL_PX
+        return "moves" if moves else "still"
+
+    def plate(self, off_px: float) -> CleanPlate:
+        """The room as far as these frames agree on it, whose edges may be off by some pixels."""
+        agree = self.spread < _AGREE_LEVELS + off_px * _steep(self.color)
+        agree &= self.count >= _SEEN
+        known = _hanging_together(agree, self.away)
+        return CleanPlate(self.color, np.where(known, self.count, 0).astype(np.uint8), self.spread)
+
+
+def room_shown(matte: Float[np.ndarray, "S S"], inside: Bool[np.ndarray, "S S"]) -> np.ndarray:
+    """Where an image surely shows the room: `inside` what was filmed, and clear of the person."""
+    return inside & (_clear_of_person(matte) > _CLEAR * len(matte))
+
+
+def _lay_on_one(images: list[np.ndarray], clear_px: list[Float16[np.ndarray, "S S"]]) -> bool:
+    """Lay all images, in their place, on one from the clip's middle as far as the room tells how.
+
+    Those that cannot be laid count nowhere. False, and all as before, where these are too many.
+    """
+    shown = [clear > _CLEAR * len(clear) for clear in clear_px]
+    from_middle = sorted(range(len(images)), key=lambda place: abs(place - len(images) // 2))
+    views = (RoomView.of(images[place], shown[place]) for place in from_middle)
+    view = next((view for view in views if view is not None), None)
+    if view is None:
+        return False
+    found = [view.found_in(image, room) for image, room in zip(images, shown)]
+    if sum(one is not None for one in found) < max(_FEWEST, _LAID_SHARE * len(images)):
+        return False
+    for place, sight in enumerate(found):
+        if sight is None:
+            clear_px[place] = np.zeros_like(clear_px[place])
+        else:
+            clear, to_it = clear_px[place].astype(np.float32), sight.homography
+            images[place] = laid_on(images[place], to_it, cv2.INTER_CUBIC)
+            clear = laid_on(clear, to_it, cv2.INTER_LINEAR) * ~sight.elsewhere
+            clear_px[place] = clear.astype(np.float16)
+    return True
 
 
 def _clear_of_person(matte: Float[np.ndarray, "S S"]) -> Float16[np.ndarray, "S S"]:
@@ -268,8 +341,7 @@ def _light_changes(
 
 def _motion_px(color: np.ndarray, spread: np.ndarray, often: np.ndarray) -> float | None:
     """How far the background wanders: what edges change over time by how steep they are."""
-    grey = cv2.GaussianBlur(cv2.cvtColor(color, cv2.COLOR_RGB2GRAY).astype(np.float32), (0, 0), 1)
-    steep = np.hypot(cv2.Scharr(grey, -1, 1, 0), cv2.Scharr(grey, -1, 0, 1)) / 32
+    steep = _steep(color)
     # The border of what is known is no edge of the room.
     known = cv2.erode(often.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
     telling = known & (steep > _TEXTURE_LEVELS)
@@ -278,3 +350,9 @@ def _motion_px(color: np.ndarray, spread: np.ndarray, often: np.ndarray) -> floa
     noise = float(np.percentile(spread[known], 25))
     moved = np.sqrt(np.maximum(spread[telling] ** 2 - noise**2, 0)) / steep[telling]
     return float(np.median(moved))
+
+
+def _steep(color: np.ndarray) -> Float[np.ndarray, "S S"]:
+    """By how many levels a colour's light changes from one pixel to the next."""
+    grey = cv2.GaussianBlur(cv2.cvtColor(color, cv2.COLOR_RGB2GRAY).astype(np.float32), (0, 0), 1)
+    return np.hypot(cv2.Scharr(grey, -1, 1, 0), cv2.Scharr(grey, -1, 0, 1)) / 32

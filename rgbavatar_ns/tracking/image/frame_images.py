@@ -24,11 +24,12 @@ from rgbavatar_ns.tracking.image.background import (
 from rgbavatar_ns.tracking.image.body_end import BodyEnd
 from rgbavatar_ns.tracking.image.crop import SquareCrop
 from rgbavatar_ns.tracking.image.cut_out import CutOut, MattedCrop
-from rgbavatar_ns.tracking.image.hair import HairColors, HairSearch, hair_pixels
+from rgbavatar_ns.tracking.image.hair import HairColors, hair_pixels
 from rgbavatar_ns.tracking.image.head_mask import HeadOutline
+from rgbavatar_ns.tracking.image.known_room import KnownRoom
 from rgbavatar_ns.tracking.image.matting import PersonMatte, refined_matte
 from rgbavatar_ns.tracking.image.steady_matte import NEIGHBOURS, CoarseMatte, head_motion, steadied
-from rgbavatar_ns.tracking.image.unsure_band import RoomColors, band_matte
+from rgbavatar_ns.tracking.image.unsure_band import band_matte
 from rgbavatar_ns.tracking.input.mattes import UserMattes
 from rgbavatar_ns.tracking.input.video import FrameSource
 from rgbavatar_ns.tracking.threads import InBackground, map_in_order
@@ -83,19 +84,13 @@ class _Cropped:
 class _Known:
     """What the look at the background has told, as every frame's matte needs it."""
 
-    room: RoomColors | None
-    hair: HairSearch | None
+    room: KnownRoom | None
     softness_px: float
 
     @classmethod
     def of(cls, background: Background | None, inside: Bool[np.ndarray, "S S"]) -> "_Known":
-        softness_px, room, hair = _softness_px(background), None, None
-        if background is not None and background.plate is not None:
-            plate, colors = background.plate, background.hair
-            room = RoomColors.of_plate(plate)
-            if colors is not None:
-                hair = HairSearch.of(colors, room.variance, room.known, inside, plate.moves)
-        return cls(room, hair, softness_px)
+        room = None if background is None else KnownRoom.of(background, inside)
+        return cls(room, _softness_px(background))
 
 
 _Window = tuple[_Cropped, tuple[_Cropped, ...]]
@@ -268,7 +263,9 @@ class FrameImages:
             matted = MattedCrop.of(crop.image_rgb, crop.alpha, self._inside, crop.color_is_clean)
         else:
             coarse = self._steadied(crop, around)
-            found = band_matte(crop.image_rgb, coarse, known.room, known.hair)
+            room = None if known.room is None else known.room.behind(crop.image_rgb, coarse)
+            colors, hair = (None, None) if room is None else (room.colors, room.hair)
+            found = band_matte(crop.image_rgb, coarse, colors, hair)
             alpha = found.alpha
             if known.softness_px > 0:
                 alpha = cv2.GaussianBlur(alpha, (0, 0), known.softness_px)

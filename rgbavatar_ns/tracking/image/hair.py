@@ -1,9 +1,9 @@
 """Hair that the segmentation overlooks, told from the room by its colours.
 
-Long hair beside a neck is left out in frame after frame where the room is busy or dark. But a room
-that stands still is known wherever it shows. What is not known near the person is the person, what
-the person has covered, or something that moves: of that, and of what differs from a known room,
-what has the colours of the person's hair is taken for hair.
+Long hair beside a neck is left out in frame after frame where the room is busy or dark. But the
+room is known wherever it shows, in a clip of a camera that stands or that a hand moves. What is not
+known near the person is the person, what the person has covered, or something that moves: of that,
+and of what differs from a known room, what has the colours of the person's hair is taken for hair.
 """
 
 from dataclasses import dataclass
@@ -102,7 +102,7 @@ class HairColors:
 
 @dataclass(frozen=True)
 class HairSearch:
-    """Finds what a segmentation has left out of the hair in a room that stands still.
+    """Finds what a segmentation has left out of the hair before a known room.
 
     At half the images' size: it is told from the room by regions, and edges are found afterwards.
     """

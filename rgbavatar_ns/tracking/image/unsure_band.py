@@ -23,6 +23,7 @@ from rgbavatar_ns.tracking.image.mixture import (
     row_products,
     spread_colors,
 )
+from rgbavatar_ns.tracking.image.room_view import Homography, laid_on
 
 _Image = UInt8[np.ndarray, "S S 3"]
 _Colors = Float[np.ndarray, "S S 3"]
@@ -44,6 +45,8 @@ _LIGHT_PX, _LIGHT_LEVELS, _LIGHT_EVERY = (10, 40), 12.0, 4
 # the border of what is known, and at most, some pixels away from it.
 _NOISE_LEVELS, _GUESS_LEVELS, _TEXTURE = 2.0, 2.0, 0.1
 _GUESS_FROM, _GUESS_TO, _GUESS_PX, _TEXTURE_PX = 0.3, 4.0, 4.0, 9
+# Where nothing is known or guessed; and a pixel is known where all that it is made of is.
+_ANY_LEVELS, _WHOLLY = 60.0, 0.999
 # From so many times the noise on, a pixel may be hair that stands off; a pixel is no background, if
 # all around it are as far off.
 _MAYBE, _NOT_ROOM, _AROUND = 2.0, 4.0, np.ones((3, 3), np.uint8)
@@ -98,6 +101,18 @@ class RoomColors:
     def of_plate(cls, plate: CleanPlate) -> "RoomColors":
         """The room as a clip's plate knows it."""
         return cls.of(plate.color, plate.known, plate.spread, 1)
+
+    def seen_from(self, to_here: Homography, elsewhere: _Mask) -> "RoomColors":
+        """The same from where another picture was taken, whose pixels `to_here` leads here.
+
+        What is `elsewhere` here is not known there.
+        """
+        here = (~elsewhere).astype(np.float32)
+        known = laid_on(self.known * here, to_here, cv2.INTER_LINEAR) > _WHOLLY
+        color = laid_on(self.color, to_here, cv2.INTER_CUBIC, goes_on=True)
+        # What no pixel of this room shows may have any colour.
+        certainty = laid_on(here / self.variance, to_here, cv2.INTER_LINEAR)
+        return RoomColors(color, 1 / np.maximum(certainty, np.float32(_ANY_LEVELS**-2)), known)
 
 
 @dataclass(frozen=True)
