@@ -115,6 +115,7 @@ def test_a_moving_camera_is_noticed(sway_px: float) -> None:
     found = find_background(_film(_room(), sway_px=sway_px), INSIDE)
     assert found.kind == "moves"
     assert found.camera_is_still is False
+    assert found.plate is None
 
 
 def test_changing_light_is_noticed_and_no_motion() -> None:

@@ -106,16 +106,13 @@ class RoomView:
 
 
 def laid_on(
-    picture: np.ndarray, homography: Homography, interpolation: int, goes_on: bool = False
+    picture: np.ndarray,
+    homography: Homography,
+    interpolation: int,
+    border: int = cv2.BORDER_CONSTANT,
 ) -> np.ndarray:
-    """A picture as the view sees it that a homography leads from.
-
-    Where it shows nothing it is 0, or its border `goes_on`.
-    """
-    flags, border = interpolation | cv2.WARP_INVERSE_MAP, cv2.BORDER_CONSTANT
-    if goes_on:
-        border = cv2.BORDER_REPLICATE
-    size = picture.shape[1::-1]
+    """A picture as the view sees it that a homography leads from; 0, or `border`, beyond it."""
+    flags, size = interpolation | cv2.WARP_INVERSE_MAP, picture.shape[1::-1]
     return cv2.warpPerspective(picture, homography, size, flags=flags, borderMode=border)
 
 

@@ -109,7 +109,7 @@ class RoomColors:
         """
         here = (~elsewhere).astype(np.float32)
         known = laid_on(self.known * here, to_here, cv2.INTER_LINEAR) > _WHOLLY
-        color = laid_on(self.color, to_here, cv2.INTER_CUBIC, goes_on=True)
+        color = laid_on(self.color, to_here, cv2.INTER_CUBIC, cv2.BORDER_REPLICATE)
         # What no pixel of this room shows may have any colour.
         certainty = laid_on(here / self.variance, to_here, cv2.INTER_LINEAR)
         return RoomColors(color, 1 / np.maximum(certainty, np.float32(_ANY_LEVELS**-2)), known)
