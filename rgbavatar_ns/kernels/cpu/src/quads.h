@@ -8,6 +8,17 @@ namespace rgbavatar::RGBAVATAR_ISA {
 typedef float Quad __attribute__((vector_size(16)));
 typedef float UnalignedQuad __attribute__((vector_size(16), aligned(4)));
 
+// Four lanes of two quads, those of the second counted from 4.
+template <int i, int j, int k, int l>
+RGBAVATAR_FUNCTION Quad lanes_of(Quad a, Quad b) {
+#if defined(__clang__)
+  return __builtin_shufflevector(a, b, i, j, k, l);
+#else  // GCC, which has the other name from version 12 on
+  typedef int32_t Lanes __attribute__((vector_size(16)));
+  return __builtin_shuffle(a, b, Lanes{i, j, k, l});
+#endif
+}
+
 // The four sums of every fourth lane.
 template <int L>
 RGBAVATAR_FUNCTION Quad sum_to_quad(Floats<L> a) {
@@ -24,11 +35,9 @@ RGBAVATAR_FUNCTION Quad sum_to_quad(Floats<L> a) {
 
 // The sum of the lanes of each of four quads.
 RGBAVATAR_FUNCTION Quad sums_of_quads(Quad a, Quad b, Quad c, Quad d) {
-  const Quad ab = __builtin_shufflevector(a, b, 0, 4, 1, 5) +
-                  __builtin_shufflevector(a, b, 2, 6, 3, 7);
-  const Quad cd = __builtin_shufflevector(c, d, 0, 4, 1, 5) +
-                  __builtin_shufflevector(c, d, 2, 6, 3, 7);
-  return __builtin_shufflevector(ab, cd, 0, 1, 4, 5) + __builtin_shufflevector(ab, cd, 2, 3, 6, 7);
+  const Quad ab = lanes_of<0, 4, 1, 5>(a, b) + lanes_of<2, 6, 3, 7>(a, b);
+  const Quad cd = lanes_of<0, 4, 1, 5>(c, d) + lanes_of<2, 6, 3, 7>(c, d);
+  return lanes_of<0, 1, 4, 5>(ab, cd) + lanes_of<2, 3, 6, 7>(ab, cd);
 }
 
 // Four sums of lanes at a time.
@@ -92,14 +101,14 @@ RGBAVATAR_FUNCTION Wide wide_of(Quad a, Quad b, Quad c, Quad d) {
 
 // Rows become columns.
 RGBAVATAR_FUNCTION void transpose(Quad& a, Quad& b, Quad& c, Quad& d) {
-  const Quad ab = __builtin_shufflevector(a, b, 0, 4, 1, 5);
-  const Quad ab2 = __builtin_shufflevector(a, b, 2, 6, 3, 7);
-  const Quad cd = __builtin_shufflevector(c, d, 0, 4, 1, 5);
-  const Quad cd2 = __builtin_shufflevector(c, d, 2, 6, 3, 7);
-  a = __builtin_shufflevector(ab, cd, 0, 1, 4, 5);
-  b = __builtin_shufflevector(ab, cd, 2, 3, 6, 7);
-  c = __builtin_shufflevector(ab2, cd2, 0, 1, 4, 5);
-  d = __builtin_shufflevector(ab2, cd2, 2, 3, 6, 7);
+  const Quad ab = lanes_of<0, 4, 1, 5>(a, b);
+  const Quad ab2 = lanes_of<2, 6, 3, 7>(a, b);
+  const Quad cd = lanes_of<0, 4, 1, 5>(c, d);
+  const Quad cd2 = lanes_of<2, 6, 3, 7>(c, d);
+  a = lanes_of<0, 1, 4, 5>(ab, cd);
+  b = lanes_of<2, 3, 6, 7>(ab, cd);
+  c = lanes_of<0, 1, 4, 5>(ab2, cd2);
+  d = lanes_of<2, 3, 6, 7>(ab2, cd2);
 }
 
 RGBAVATAR_FUNCTION Quad load_quad(const float* from) {
@@ -111,26 +120,26 @@ RGBAVATAR_FUNCTION void store_quad(Quad a, float* to) {
 
 // Four pixels' r, g, b as r0 g0 b0 r1 ..., and back.
 RGBAVATAR_FUNCTION void store_interleaved(Quad r, Quad g, Quad b, float* to) {
-  const Quad rg = __builtin_shufflevector(r, g, 0, 4, 1, 5);   // r0 g0 r1 g1
-  const Quad rg2 = __builtin_shufflevector(r, g, 2, 6, 3, 7);  // r2 g2 r3 g3
-  const Quad br = __builtin_shufflevector(b, r, 0, 5, 1, 0);   // b0 r1 b1 .
-  const Quad gb = __builtin_shufflevector(g, b, 1, 5, 3, 7);   // g1 b1 g3 b3
-  const Quad b2 = __builtin_shufflevector(b, r, 2, 7, 2, 7);   // b2 r3 . .
-  store_quad(__builtin_shufflevector(rg, br, 0, 1, 4, 5), to);
-  store_quad(__builtin_shufflevector(gb, rg2, 0, 1, 4, 5), to + 4);
-  store_quad(__builtin_shufflevector(b2, gb, 0, 1, 6, 7), to + 8);
+  const Quad rg = lanes_of<0, 4, 1, 5>(r, g);   // r0 g0 r1 g1
+  const Quad rg2 = lanes_of<2, 6, 3, 7>(r, g);  // r2 g2 r3 g3
+  const Quad br = lanes_of<0, 5, 1, 0>(b, r);   // b0 r1 b1 .
+  const Quad gb = lanes_of<1, 5, 3, 7>(g, b);   // g1 b1 g3 b3
+  const Quad b2 = lanes_of<2, 7, 2, 7>(b, r);   // b2 r3 . .
+  store_quad(lanes_of<0, 1, 4, 5>(rg, br), to);
+  store_quad(lanes_of<0, 1, 4, 5>(gb, rg2), to + 4);
+  store_quad(lanes_of<0, 1, 6, 7>(b2, gb), to + 8);
 }
 RGBAVATAR_FUNCTION void load_interleaved(const float* from, Quad& r, Quad& g, Quad& b) {
   const Quad x = load_quad(from);      // r0 g0 b0 r1
   const Quad y = load_quad(from + 4);  // g1 b1 r2 g2
   const Quad z = load_quad(from + 8);  // b2 r3 g3 b3
-  const Quad r23 = __builtin_shufflevector(y, z, 2, 2, 5, 5);
-  const Quad g01 = __builtin_shufflevector(x, y, 1, 1, 4, 4);
-  const Quad g23 = __builtin_shufflevector(y, z, 3, 3, 6, 6);
-  const Quad b01 = __builtin_shufflevector(x, y, 2, 2, 5, 5);
-  r = __builtin_shufflevector(x, r23, 0, 3, 4, 6);
-  g = __builtin_shufflevector(g01, g23, 0, 2, 4, 6);
-  b = __builtin_shufflevector(b01, z, 0, 2, 4, 7);
+  const Quad r23 = lanes_of<2, 2, 5, 5>(y, z);
+  const Quad g01 = lanes_of<1, 1, 4, 4>(x, y);
+  const Quad g23 = lanes_of<3, 3, 6, 6>(y, z);
+  const Quad b01 = lanes_of<2, 2, 5, 5>(x, y);
+  r = lanes_of<0, 3, 4, 6>(x, r23);
+  g = lanes_of<0, 2, 4, 6>(g01, g23);
+  b = lanes_of<0, 2, 4, 7>(b01, z);
 }
 
 // The largest lane; all are at least 0.
