@@ -1,9 +1,27 @@
 """How many threads torch uses, and with it the compiled loops."""
 
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 
 import torch
+
+
+@dataclass
+class _Within:
+    """How many blocks are open in all threads, and the numbers that count for a new thread: outside
+    of any block, and as torch gives it, the latest that was set.
+    """
+
+    lock: threading.Lock = field(default_factory=threading.Lock)
+    blocks: int = 0
+    usual: int = 1
+    latest: int = 1
+    thread: threading.local = field(default_factory=threading.local)
+
+
+_within = _Within()
 
 
 @contextmanager
@@ -14,12 +32,21 @@ def using_threads(count: int | None) -> Iterator[int]:
     torch brings on Linux, lets the threads of an operation look for more work for ten milliseconds
     and longer (OMP_WAIT_POLICY, GOMP_SPINCOUNT), and on two cores the loops' own threads would
     share a core with them. A thread that begins to use torch while another one is within gets that
-    one's number.
+    one's number from torch; if it comes here, only until it has left.
     """
-    before = torch.get_num_threads()
-    if count is not None:
-        torch.set_num_threads(count)
+    with _within.lock:
+        before = torch.get_num_threads()
+        if _within.blocks == 0:
+            _within.usual = before
+        elif before == _within.latest and not hasattr(_within.thread, "known"):
+            before = _within.usual
+        _within.thread.known = True
+        _within.blocks += 1
+        _within.latest = before if count is None else count
+        torch.set_num_threads(_within.latest)
     try:
         yield torch.get_num_threads()
     finally:
-        torch.set_num_threads(before)
+        with _within.lock:
+            _within.blocks -= 1
+            torch.set_num_threads(before)

@@ -42,6 +42,29 @@ def test_a_forked_process_draws_with_threads_of_its_own():
     assert (done.returncode, done.stdout.strip()) == (0, "drawn"), done.stderr
 
 
+def test_a_thread_that_begins_while_another_draws_with_one_gets_the_usual_number():
+    def after_one_block(_: int) -> int:
+        with using_threads(1):
+            assert torch.get_num_threads() == 1
+        return torch.get_num_threads()
+
+    def of_its_own(_: int) -> int:
+        torch.set_num_threads(2)
+        return after_one_block(0)
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(3)
+    try:
+        with using_threads(1), ThreadPoolExecutor(1) as newcomer:
+            first, second = newcomer.map(after_one_block, range(2))
+        with using_threads(1), ThreadPoolExecutor(1) as newcomer:
+            (own,) = newcomer.map(of_its_own, range(1))
+        after = torch.get_num_threads()
+    finally:
+        torch.set_num_threads(before)
+    assert (first, second, own, after) == (3, 3, 2, 3)
+
+
 def _scene(seed: int):
     return to(random_scene(seed, batch=2, count=200, width=70, height=50), torch.float32)
 
