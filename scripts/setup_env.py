@@ -143,6 +143,11 @@ def install_torch() -> None:
         f"installing torch {TORCH}",
         PYTHON, "-m", "pip", "-q", "install", "--no-compile", f"torch=={TORCH}",
     )  # fmt: skip
+    sees_gpu = "import sys, torch; sys.exit(not torch.cuda.is_available())"
+    if has_nvidia_gpu() and not run(PYTHON, "-c", sees_gpu, quiet=True):
+        say(
+            "torch sees no GPU, though a driver answers: is it older than torch's CUDA? docs/gpu.md"
+        )
 
 
 def torchvision_works() -> bool:

@@ -134,7 +134,7 @@ def bench_quality(
                 for way in missing:
                     curves[way.name].append(_curve(subject, way, options, threads, tell))
                     found(QualityReport(facts, curves))
-    return QualityReport(facts, curves)
+        return QualityReport(facts, curves)  # here, where the threads are those of the curves
 
 
 @contextmanager

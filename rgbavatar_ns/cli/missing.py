@@ -117,6 +117,13 @@ def gpu_build(version_of: Installed, program: Found) -> Iterator[Missing]:
     elif version_of("cuda-bindings") is None:
         line = install_cuda_bindings(torch.version.cuda)
         yield Missing("training on the GPU", "no cuda-bindings", line)
+    elif not torch.cuda.is_available():
+        yield Missing(
+            "training on the GPU",
+            f"torch {torch.__version__} for CUDA {torch.version.cuda} sees no GPU",
+            "update the driver, where `nvidia-smi` shows an older CUDA, or install torch's build "
+            "for that one; an empty CUDA_VISIBLE_DEVICES hides GPUs",
+        )
 
 
 def tracker(version_of: Installed) -> Iterator[Missing]:

@@ -52,7 +52,11 @@ def test_a_driver_beside_a_torch_for_cpus_is_told(monkeypatch: pytest.MonkeyPatc
     assert "CPUs" in next(missing.gpu_build(having(), driver)).cause
     monkeypatch.setattr(torch.version, "cuda", "13.0")
     assert '"cuda-bindings==13.*"' in next(missing.gpu_build(having(), driver)).remedy
-    assert list(missing.gpu_build(having(cuda_bindings="13.0.1"), driver)) == []
+    complete = having(cuda_bindings="13.0.1")
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)  # a driver that is older
+    assert "13.0 sees no GPU" in next(missing.gpu_build(complete, driver)).cause
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    assert list(missing.gpu_build(complete, driver)) == []
     assert list(missing.gpu_build(having(), lambda _: None)) == []
 
 

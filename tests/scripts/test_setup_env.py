@@ -97,6 +97,18 @@ def test_an_environment_that_is_not_what_a_new_one_would_be_is_told(steps, monke
     assert "torch stays the CPU build" in capsys.readouterr().out
 
 
+def test_a_driver_that_torch_cannot_use_is_told(monkeypatch, capsys):
+    ran = []
+    monkeypatch.setattr(setup_env, "installed_torch", lambda: "")
+    monkeypatch.setattr(setup_env, "must", lambda *command: ran.append(command))
+    monkeypatch.setattr(setup_env, "has_nvidia_gpu", lambda: True)
+    for sees in (True, False):
+        monkeypatch.setattr(setup_env, "run", lambda *command, quiet, sees=sees: sees)
+        setup_env.install_torch()
+        assert ("older than torch's CUDA" in capsys.readouterr().out) is not sees
+    assert len(ran) == 2
+
+
 def test_bytecode_is_no_source(tmp_path, monkeypatch):
     monkeypatch.setattr(setup_env, "ROOT", tmp_path)
     source = tmp_path / "kernels" / "draw.cpp"

@@ -205,7 +205,8 @@ def load() -> CudaBackend:
     if not torch.cuda.is_available():
         built = torch.version.cuda is not None
         raise ImportError(
-            "torch sees no NVIDIA GPU"
+            f"torch, built for CUDA {torch.version.cuda}, sees no NVIDIA GPU; if there is one, its "
+            "driver may be older (`nvidia-smi` shows its CUDA)"
             if built
             else "this build of torch is for CPUs; install a CUDA build for a GPU"
         )

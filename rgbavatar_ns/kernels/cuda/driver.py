@@ -80,6 +80,12 @@ class CudaLauncher:
     def _ask_for_shared_memory(self, kernel: str, shared_bytes: int) -> None:
         attribute = driver.CUfunction_attribute.CU_FUNC_ATTRIBUTE_MAX_DYNAMIC_SHARED_SIZE_BYTES
         result = driver.cuFuncSetAttribute(self._functions[kernel], attribute, shared_bytes)
+        if result[0] == driver.CUresult.CUDA_ERROR_INVALID_VALUE:
+            raise DeviceError(
+                f"The weights of a step's images, {shared_bytes / 1024:.0f} KiB, are more than "
+                "this GPU holds for a block of threads.",
+                "Take fewer images a step (--pipeline.datamanager.batch-size) or fewer bases.",
+            )
         _checked(result, "enlarge shared memory")
         self._asked[kernel] = shared_bytes
 
