@@ -238,6 +238,29 @@ def test_the_camera_gives_way_beyond_the_film_comes_back_and_says_so(open_page):
     assert "right" in said.text_content()
 
 
+def test_a_head_beside_the_principal_point_stays_in_its_place_when_it_comes_nearer(open_page):
+    avatar = avatar_of()
+    page = open_page(avatar, torch.zeros(1, avatar.layout.size))
+    places = page.evaluate(
+        """() => {
+          const home = { ...avatar.camera.home, principal: [10, 80] }, centre = [0.05, -0.1, 0.02];
+          home.translation = home.translation.map((value, i) => value + [0.08, -0.06, 0][i]);
+          const camera = new OrbitCamera(home, avatar.camera.reach);
+          return [1, 0.5, 3].map((nearness) => {
+            camera.nearness = nearness;
+            const { rotation, translation, focal, principal } = camera.at(96, 96, centre);
+            const [x, y, z] = apply3(rotation, centre).map((value, i) => value + translation[i]);
+            return [focal[0] * x / z + principal[0], focal[1] * y / z + principal[1], z];
+          });
+        }"""
+    )
+    home, far, near = np.array(places)
+    assert np.abs(home[:2] - [10, 80]).min() > 5, "it is beside the principal point"
+    for nearness, place in ((0.5, far), (3, near)):
+        np.testing.assert_allclose(place[:2], home[:2], atol=1e-3)
+        assert place[2] == pytest.approx(home[2] / nearness)
+
+
 def test_sliders_show_the_film_and_jaws_only_open(open_page):
     avatar = avatar_of()
     theta = lively_theta(avatar, 30)

@@ -141,7 +141,8 @@ class OrbitCamera {
     return {
       rotation: turned,
       translation: [
-        ahead[0] - moved[0] + this.shift[0], ahead[1] - moved[1] + this.shift[1],
+        ahead[0] / this.nearness - moved[0] + this.shift[0],
+        ahead[1] / this.nearness - moved[1] + this.shift[1],
         ahead[2] / this.nearness - moved[2],
       ],
       focal: focal.map((value) => value * zoom),
