@@ -155,7 +155,8 @@ def source_fingerprint(src: Path, options: ImportOptions) -> str:
     elif found and options.allow_outside:
         outside = folders_outside(Folder(src))
     places = [src, *outside, options.images, options.masks]
-    return digest([f"{_IMPORTER_VERSION} {others}", *_listing(places)])[:16]
+    lines = _listing(places, follow_out=options.allow_outside)
+    return digest([f"{_IMPORTER_VERSION} {others}", *lines])[:16]
 
 
 def flame_fingerprint(options: ImportOptions) -> str | None:
@@ -169,16 +170,22 @@ def flame_fingerprint(options: ImportOptions) -> str | None:
     # A folder is listed with all that is in it, but its pickle takes from the one above too.
     places = places_beside(Path(flame).expanduser())
     beside = [place / name for place in places for name in COMPANIONS]
-    return digest(_listing([flame, options.flame_uv, options.flame_eyelids, *beside]))[:8]
+    named = [flame, options.flame_uv, options.flame_eyelids, *beside]
+    return digest(_listing(named, follow_out=True))[:8]
 
 
-def _listing(places: Sequence[str | Path | None]) -> Iterator[str]:
+def _listing(places: Sequence[str | Path | None], *, follow_out: bool) -> Iterator[str]:
+    """A line for each file below the places.
+
+    Links to folders that lead out of a place count by what they hold only with `follow_out`: what
+    is not read must not be walked either, which may be the whole disk.
+    """
     for place in places:
         if place is not None:
-            yield from _lines(place)
+            yield from _lines(place, follow_out)
 
 
-def _lines(place: str | Path) -> Iterator[str]:
+def _lines(place: str | Path, follow_out: bool) -> Iterator[str]:
     top = os.path.realpath(os.path.expanduser(place))
     if os.path.isfile(top):
         yield _line(os.path.dirname(top), os.path.basename(top))
@@ -191,8 +198,16 @@ def _lines(place: str | Path) -> Iterator[str]:
             continue
         seen.add(real)
         yield f"{os.path.relpath(folder, top)}\n"
+        if not follow_out:
+            out = [name for name in names if not _is_within(top, os.path.join(folder, name))]
+            names[:] = [name for name in names if name not in out]
+            yield from (f"{name} -> {os.readlink(os.path.join(folder, name))}\n" for name in out)
         for name in sorted(filter(_is_data, files)):
             yield _line(folder, name)
+
+
+def _is_within(top: str, place: str) -> bool:
+    return Path(os.path.realpath(place)).is_relative_to(top)
 
 
 def _is_data(name: str) -> bool:

@@ -1,6 +1,7 @@
 """Imports on the way: what they depend on, and that damage to them heals."""
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ import torch
 
 from rgbavatar_ns.data import TrackedDataset, load_dataset
 from rgbavatar_ns.data.importers import ImportOptions, import_dataset
-from rgbavatar_ns.data.importers.convert import flame_fingerprint
+from rgbavatar_ns.data.importers.convert import flame_fingerprint, source_fingerprint
 from rgbavatar_ns.errors import UserError
 from tests.data.importers.test_round_trips import write
 
@@ -93,3 +94,21 @@ def test_what_is_put_beside_flame_later_counts(name, above, tmp_path):
     assert [flame_fingerprint(one) for one in options] == before
     (tmp_path / "models" / ("" if above else "FLAME2020") / name).write_bytes(b"new")
     assert not set(before) & {flame_fingerprint(one) for one in options}
+
+
+def test_what_links_lead_to_outside_counts_only_where_it_may_be_read(data, options, tmp_path):
+    copy, beside = shutil.copytree(data, tmp_path / "data"), tmp_path / "beside"
+    (beside / "deep").mkdir(parents=True)
+    (copy / "own").symlink_to("image")
+    (copy / "loop").symlink_to(copy)
+    without = source_fingerprint(copy, options)
+    (copy / "x").symlink_to(beside)
+    consenting = replace(options, allow_outside=True)
+    before = [source_fingerprint(copy, one) for one in (options, consenting)]
+    assert before[0] != without, "the link itself counts"
+    (beside / "deep/more.png").write_bytes(b"new")
+    after = [source_fingerprint(copy, one) for one in (options, consenting)]
+    assert before[0] == after[0]
+    assert before[1] != after[1]
+    (copy / "image/more.png").write_bytes(b"new")
+    assert source_fingerprint(copy, options) != after[0]
