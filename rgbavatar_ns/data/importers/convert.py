@@ -24,7 +24,7 @@ from rgbavatar_ns.head.flame import COMPANIONS, FLAME_VARIABLE, places_beside
 CACHE_FOLDER = ".rgbavatar"
 """In the source; nothing in it belongs to the source."""
 _STATE_FILE = ".import.json"
-_IMPORTER_VERSION = 3
+_IMPORTER_VERSION = 4
 """To be raised where the same files give another dataset."""
 
 

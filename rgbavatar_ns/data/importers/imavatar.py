@@ -5,6 +5,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from rgbavatar_ns.data.importers.flame_parameters import flame_for, padded
 from rgbavatar_ns.data.importers.folder import (
@@ -27,7 +28,11 @@ INDEX_FILE = "flame_params.json"
 FLAME_VERSION = "2020"
 SCALE = 4.0
 """IMAvatar's world is FLAME's times this."""
+OLDER_SIDE_PX = 512
+"""Of the images whose pixels the older `intrinsics` count."""
 _HELD_OUT = 350
+_PRINCIPAL_POINTS = (-0.5, 1.5)
+"""In sides of the image: one of a cut-out picture may lie outside of it, but not far."""
 _IMAGES = ("image", "images")
 
 
@@ -49,9 +54,17 @@ def read_imavatar(reading: Reading) -> Source:
     arrays = flame_for(reading, FLAME_VERSION)
     try:
         identity = padded(content.get("shape_params"), arrays.num_identity, "shape", arrays.name)
-        intrinsics = numbers(content.get("intrinsics"), 4, "intrinsics")
+        intrinsics = _fractions(numbers(content.get("intrinsics"), 4, "intrinsics"))
     except UnusableFrameError as error:
         raise UserError(f"{path} has {error}.", "Export the data again.") from None
+    low, high = _PRINCIPAL_POINTS
+    if not ((low <= intrinsics[2:]) & (intrinsics[2:] <= high)).all():
+        x, y = intrinsics[2:]
+        raise UserError(
+            f"{path} has a principal point at {x:g}, {y:g} of the image's width and height.",
+            "Give the intrinsics as fractions of the image's size, or all as pixels of a picture "
+            f"of {OLDER_SIDE_PX}.",
+        )
     masks = "mask" if reading.folder.has("mask") else None
     records, named, lengths = [], set(), set()
     for place, frame in enumerate(reading.each(frames)):
@@ -76,12 +89,20 @@ def read_imavatar(reading: Reading) -> Source:
     return assemble(reading, records, arrays, identity, _HELD_OUT)
 
 
+def _fractions(intrinsics: Float[np.ndarray, "4"]) -> Float[np.ndarray, "4"]:
+    """fx, fy, cx, cy in sides of the image, told from the older form in pixels.
+
+    As IMAvatar's own loader tells them: in pixels the fourth number is above 1.
+    """
+    return intrinsics / OLDER_SIDE_PX if intrinsics[3] > 1 else intrinsics
+
+
 def _record(
     folder: Folder,
     frame: dict[str, Any],
     image: Path,
     masks: str | None,
-    intrinsics: np.ndarray,
+    intrinsics: Float[np.ndarray, "4"],
     arrays: HeadArrays,
 ) -> FrameRecord:
     number = number_of(image.name)

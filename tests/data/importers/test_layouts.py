@@ -203,6 +203,31 @@ def test_vhaps_static_offset_is_the_subjects_head_at_rest(tmp_path, options, tak
         read_source(tmp_path / "export", options)
 
 
+def test_imavatars_older_intrinsics_are_pixels_of_a_picture_of_512(tmp_path, options, takes):
+    take, frames = write(tmp_path, "imavatar", takes)
+    path = tmp_path / "flame_params.json"
+    content = json.loads(path.read_text())
+    content["intrinsics"] = [512 * value for value in content["intrinsics"]]
+    path.write_text(json.dumps(content))
+    assert_same_views(take, frames, read_source(tmp_path, options))
+    # By hand: three widths and heights of focal length, the principal point in the middle.
+    content["intrinsics"] = [-1536, 1536, 256, 256]
+    path.write_text(json.dumps(content))
+    cameras = read_source(tmp_path, options).cameras
+    assert cameras.focal_px[0].tolist() == [3 * WIDTH, 3 * HEIGHT]
+    assert cameras.principal_point_px[0].tolist() == [WIDTH / 2, HEIGHT / 2]
+
+
+@pytest.mark.parametrize("intrinsics", [[-3, 3, 256, 0.5], [-1500, 1500, 256, 2000], [3, 3, 0, -9]])
+def test_imavatars_principal_point_far_outside_is_refused(tmp_path, options, takes, intrinsics):
+    write(tmp_path, "imavatar", takes)
+    path = tmp_path / "flame_params.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"intrinsics": intrinsics}))
+    with pytest.raises(UserError, match="has a principal point at") as caught:
+        read_source(tmp_path, options)
+    assert "picture of 512" in caught.value.remedy
+
+
 @pytest.mark.parametrize("known", FORMATS, ids=lambda known: known.key)
 def test_a_folder_without_the_files_of_its_format_is_told(known, options, tmp_path):
     (tmp_path / "checkpoint").mkdir()
