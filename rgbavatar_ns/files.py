@@ -54,8 +54,9 @@ def atomic_write(
     That path, of the same suffix, lies beside `path`, or is `partial` on the same disk. A reader
     sees the old file or the whole new one, and nothing is left where writing fails. Without `sync`
     a power cut may still leave a short file: for many files that are checked when read. Folders
-    are made. Raises DiskError as `disk_errors` does.
+    are made. Raises DiskError as `disk_errors` does, UserError where `path` has no name.
     """
+    _require_name(path)
     partial = partial or path.with_name(f".{path.stem}.partial{path.suffix}")
     try:
         with disk_errors(path, remedy, also):
@@ -79,6 +80,7 @@ def atomic_folder(
 
     Killed in between, the old folder or the new one is whole, beside `path` if not there.
     """
+    _require_name(path)
     partial, old = (path.with_name(f".{path.name}.{kind}") for kind in ("partial", "old"))
     try:
         with disk_errors(path, remedy, also):
@@ -111,6 +113,15 @@ def hold_lock(path: Path, waiting: Callable[[], object] = lambda: None) -> Itera
         yield
     finally:
         lock.release()
+
+
+def _require_name(path: Path) -> None:
+    """Raise UserError where a path has no last name that could be written, as `.` and `/`."""
+    if path.name in ("", ".."):
+        raise UserError(
+            f"{path} is a place, but no name of something to write.",
+            f"Name what is to be written, such as {path / 'avatar'}.",
+        )
 
 
 def _sync(path: Path) -> None:

@@ -78,6 +78,15 @@ def test_errors_of_a_library_that_writes_are_the_disks(tmp_path):
         _write_half(tmp_path / "a", RuntimeError("short write"), also=(RuntimeError,))
 
 
+@pytest.mark.parametrize("write", [atomic_write, atomic_folder])
+@pytest.mark.parametrize("place", [".", "/", ".."])
+def test_a_place_without_a_name_is_told(write, place, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(UserError, match="no name of something to write"), write(Path(place)):
+        pass
+    assert _names(tmp_path) == []
+
+
 def test_a_folder_takes_the_place_of_an_older_one(tmp_path):
     for text in ("old", "new"):
         with atomic_folder(tmp_path / "set") as partial:

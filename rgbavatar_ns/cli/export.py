@@ -40,6 +40,7 @@ _ENDINGS: dict[str, Format] = {
     ".png": "texture",
 }
 """What a destination's ending asks for, the longer ones first."""
+_SUCH_AS: dict[Format, str] = {format: f"avatar{ending}" for ending, format in _ENDINGS.items()}
 _LONGEST_SECONDS = 30.0
 """Of a performance that nobody chose: a minute of film would double the size of a page."""
 
@@ -105,6 +106,7 @@ def run(
         "servers": bool(servers),
     }
     require_used("format", format, _USED_BY, [name for name, is_given in given.items() if is_given])
+    _require_place(destination, format, in_a_folder=frames is not None)
     whole = load_avatar(run_folder)
     if texture is not None:
         own = require_rgbavatar(whole, "A painted texture (--texture)")
@@ -138,6 +140,16 @@ def _format_of(destination: Path) -> Format:
         if destination.name.lower().endswith(ending):
             return asked
     return "bundle"
+
+
+def _require_place(destination: Path, format: Format, *, in_a_folder: bool) -> None:
+    """Raise UserError where a file is to be written in the place of a folder, before any work."""
+    is_folder = format in ("bundle", "web-module") or (in_a_folder and format in _GAUSSIANS)
+    if not is_folder and destination.is_dir():
+        raise UserError(
+            f"{destination} is a folder, but --format {format} writes a file.",
+            f"Name a file, such as {destination / _SUCH_AS[format]}.",
+        )
 
 
 def _rate_of(dataset: "TrackedDataset | None") -> float:

@@ -187,6 +187,23 @@ def test_the_runs_own_data_is_the_default(bundle, data, tmp_path, capsys):
     assert "without the frames of the run's own data" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize(
+    ("format", "told"),
+    [
+        ("web", "such as avatar.html."),
+        ("ply", "such as avatar.ply."),
+        ("texture", "such as avatar.png."),
+    ],
+)
+def test_the_folder_one_stands_in_is_no_destination_of_a_file(
+    format, told, bundle, tmp_path, refused, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("rgbavatar_ns.avatar.loading.load_avatar", None)  # no work before
+    assert told in refused("export", bundle, ".", "--format", format)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_mistakes_are_told(bundle, data, tmp_path, refused):
     framed = [bundle, tmp_path / "a.ply", "--format", "ply", "--data", data]
     for words, told in (
