@@ -41,6 +41,13 @@ _ENDINGS: dict[str, Format] = {
 }
 """What a destination's ending asks for, the longer ones first."""
 _SUCH_AS: dict[Format, str] = {format: f"avatar{ending}" for ending, format in _ENDINGS.items()}
+_NOT_WRITTEN = (
+    *(".gltf", ".splat", ".ksplat", ".spx", ".lcc"),
+    *(".obj", ".fbx", ".stl", ".usd", ".usda", ".usdc", ".usdz", ".blend", ".vrm"),
+    *(".zip", ".tar", ".gz", ".7z", ".ckpt", ".pt", ".pth", ".npz", ".safetensors", ".json"),
+    *(".jpg", ".jpeg", ".webp", ".gif", ".mp4", ".mov", ".webm", ".htm", ".js", ".rgba"),
+)
+"""Endings of other files: who asks for one does not want a bundle's folder of that name."""
 _LONGEST_SECONDS = 30.0
 """Of a performance that nobody chose: a minute of film would double the size of a page."""
 
@@ -75,7 +82,7 @@ def run(
         destination: the file to write; for bundle and web-module, and with --frames of Gaussians,
             the folder.
         format: what to write; by default what the destination's ending says (.ply, .glb, .spz,
-            .sog, .compressed.ply, .html, .png), or a bundle where it has none of these.
+            .sog, .compressed.ply, .html, .png), or a bundle where it has no file's ending.
         data: the dataset whose frames are meant; by default the one that the run names.
         frame: of Gaussians, the frame's place in the dataset; without it the head is at rest.
         frames: of Gaussians and for browsers, first frame and the frame after the last one; by
@@ -136,9 +143,15 @@ def run(
 
 def _format_of(destination: Path) -> Format:
     """What the destination's ending asks for; a bundle where it asks for nothing."""
+    name = destination.name.lower()
     for ending, asked in _ENDINGS.items():
-        if destination.name.lower().endswith(ending):
+        if name.endswith(ending):
             return asked
+    if name.endswith(_NOT_WRITTEN):
+        raise UserError(
+            f"{destination} asks for a {destination.suffix.lower()} file, which is not written.",
+            f"Take {', '.join(_ENDINGS)} or no ending, or say by --format what is to be written.",
+        )
     return "bundle"
 
 

@@ -152,6 +152,23 @@ def test_the_destinations_ending_says_what_is_written(bundle, tmp_path):
     Avatar.load(tmp_path / "a")
 
 
+@pytest.mark.parametrize(
+    "name", ["me.gltf", "me.SPLAT", "me.ksplat", "me.zip", "me.obj", "me.usdz"]
+)
+def test_the_ending_of_what_is_not_written_is_told(name, bundle, tmp_path, refused):
+    told = refused("export", bundle, tmp_path / name)
+    assert f"asks for a {Path(name).suffix.lower()} file, which is not written" in told
+    assert ".compressed.ply, .ply, .glb" in " ".join(told.split())
+    assert list(tmp_path.iterdir()) == []
+    _export(bundle, tmp_path / name, "--format", "bundle")
+    Avatar.load(tmp_path / name)
+
+
+def test_a_name_with_a_point_is_a_bundles_too(bundle, tmp_path):
+    _export(bundle, tmp_path / "me.v2")
+    Avatar.load(tmp_path / "me.v2")
+
+
 def test_a_film_is_played_at_its_own_rate(bundle, tmp_path):
     film = small_dataset(tmp_path / "film", avatar_of().head)
     index = tmp_path / "film" / "dataset.json"
