@@ -134,6 +134,34 @@ def test_a_coarse_head_is_there_before_the_rest_has_arrived(window, subject, pag
         assert psnr(_shown(page), ours) > 45
 
 
+@pytest.mark.parametrize(
+    ("meanwhile", "shown"),
+    [
+        ("avatar.performance.pause()", "sought"),
+        ("avatar.setTheta(avatar.neutralTheta.fill(0))", "set"),
+        ("avatar.performance.play(); avatar.performance.pause()", "neutral"),
+    ],
+)
+def test_a_place_that_is_sought_before_the_film_has_arrived_is_shown_then(
+    window, subject, tmp_path, meanwhile, shown
+):
+    film = lively_theta(subject, 4)
+    neutral = 0.3 * lively_theta(subject, 1, seed=5)[0]
+    camera = front_camera(subject, _SIZE, _SIZE)
+    write_web_page(subject, tmp_path / "avatar.html", camera, film, neutral=neutral)
+    content = (tmp_path / "avatar.html").read_bytes()
+    second = content.index(b'class="part"', content.index(b'class="part"') + 1)
+    with _slow_server(content, second + 100) as (address, go_on):
+        page = _opened(window, address)
+        page.evaluate(f"() => {{ avatar.performance.seek(2); {meanwhile}; }}")
+        assert page.evaluate("() => avatar.performance.place") == 2
+        go_on.set()
+        page.evaluate("() => avatar.complete")
+        theta = page.evaluate("() => avatar.theta")
+    expected = {"sought": film[2], "set": torch.zeros_like(neutral), "neutral": neutral}[shown]
+    assert theta == pytest.approx(expected.tolist(), abs=1e-5)
+
+
 def test_fewer_gaussians_are_larger_and_leave_no_holes(window, subject, page_file):
     page = _opened(window, page_file.as_uri())
     page.evaluate("() => avatar.complete")

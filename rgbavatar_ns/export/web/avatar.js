@@ -61,7 +61,7 @@ class RGBAvatar extends EventTarget {
     this._ended = new AbortController();
     this._last = null;
     this._pixelRatio = window.devicePixelRatio;
-    const { signal } = this._ended, arrived = () => this.changed();
+    const { signal } = this._ended, arrived = () => this._arrived();
     data.arrivals.add(arrived);
     signal.addEventListener("abort", () => data.arrivals.delete(arrived));
     if (controls) {
@@ -144,7 +144,7 @@ class RGBAvatar extends EventTarget {
   /** Show a theta and pause the performance; throws TypeError or RangeError where it is none. */
   setTheta(theta) {
     const read = this._fields.read(theta);
-    this.performance.pause();
+    this.performance.leave();
     this._show(read);
   }
 
@@ -253,6 +253,12 @@ class RGBAvatar extends EventTarget {
 
   _show(theta) {
     this._theta = theta;
+    this.changed();
+  }
+
+  /** There is more to draw. */
+  _arrived() {
+    this.performance.arrived();
     this.changed();
   }
 

@@ -15,6 +15,7 @@ class RecordedPerformance {
     this._show = show;
     this._place = 0;
     this._playing = false;
+    this._awaited = false; // whether the place is to be shown as soon as the film has arrived
   }
 
   get playing() {
@@ -30,18 +31,31 @@ class RecordedPerformance {
   play() {
     if (this.length === 0) return;
     this._playing = true;
-    this._follow();
+    this._awaited = false;
+    if (this._isThere()) this._follow();
   }
 
   pause() {
     this._playing = false;
   }
 
+  /** Pause, and show no place that is still awaited: something else is shown. */
+  leave() {
+    this.pause();
+    this._awaited = false;
+  }
+
   /** Show the performance at a place in frames; beyond its ends, the nearest. */
   seek(place) {
     if (this.length === 0) return;
     this._place = Math.min(Math.max(place, 0), this.length - 1);
-    this._follow();
+    this._awaited = !this._isThere();
+    if (!this._awaited) this._follow();
+  }
+
+  /** A part of the file has arrived. */
+  arrived() {
+    if (this._awaited && this._isThere()) this.seek(this._place);
   }
 
   /** Go on by so many seconds where it plays; after the last frame comes the first. */
@@ -57,7 +71,7 @@ class RecordedPerformance {
   }
 
   _follow() {
-    if (this._isThere()) this._show(this._current());
+    this._show(this._current());
   }
 
   /** theta at the current place, linear between frames. */
