@@ -25,6 +25,12 @@ class Folder:
     root: Path
     allow_outside: bool = False
 
+    def given(self, place: Path) -> "Folder":
+        """A folder that the user names, from where they stand; raises UserError if it is none."""
+        if not place.is_dir():
+            raise UserError(f"There is no folder {place}.", "Name the folder of the pictures.")
+        return Folder(place, self.allow_outside)
+
     def path(self, relative: str | Path) -> Path:
         """A path in the folder; raises UserError where it leads out, through a link or `..`."""
         text = os.fspath(relative)

@@ -14,6 +14,8 @@ from rgbavatar_ns.errors import UserError
 CHECKPOINTS = "checkpoint"
 _MATTES = ("alpha", "matted", "mask", "masks", "matte", "seg_mask", "image_mask")
 _IMAGES = ("images", "input", "imgs", "image")
+_Pictures = Mapping[int, Path]
+"""By number."""
 
 
 def is_metrical(folder: Folder) -> bool:
@@ -43,11 +45,8 @@ def _has_background(folder: Folder) -> bool:
 def read_metrical(reading: Reading) -> Source:
     """metrical-tracker's output; it has no mattes of its own, so they are looked for."""
     options, folder = reading.options, reading.folder
-    images = next((name for name in ("input", *_IMAGES) if folder.has(name)), None)
-    masks = next((name for name in _MATTES if folder.has(name)), None)
-    if options.images is not None or options.masks is not None:
-        images = images if options.images is None else str(options.images)
-        masks = None if options.masks is None else str(options.masks)
+    images = _pictures(folder, options.images, ("input", *_IMAGES))
+    masks = _pictures(folder, options.masks, _MATTES)
     if images is None:
         raise UserError(
             f"{reading} has no folder of images ({', '.join(_IMAGES)}).",
@@ -56,38 +55,47 @@ def read_metrical(reading: Reading) -> Source:
     return _read(reading, images, masks)
 
 
+def _pictures(folder: Folder, given: Path | None, usual: tuple[str, ...]) -> _Pictures | None:
+    """The pictures of the folder given, or of the first usual one there is."""
+    if given is not None:
+        return folder.given(given).numbered(".", IMPORTED_SUFFIXES)
+    there = next((name for name in usual if folder.has(name)), None)
+    return None if there is None else folder.numbered(there, IMPORTED_SUFFIXES)
+
+
 def read_gaussian_blendshapes(reading: Reading) -> Source:
     """GaussianBlendshapes: the last 350 frames are held out."""
-    return _read(reading, "images")
+    return _read(reading, _images(reading))
 
 
 def read_nerf_blend_shape(reading: Reading) -> Source:
     """NeRFBlendShape: mattes in image_mask, the last 500 frames are held out."""
-    masks = "image_mask" if reading.folder.has("image_mask") else None
-    return _read(reading, "images", masks, last=500)
+    masks = _pictures(reading.folder, None, ("image_mask",))
+    return _read(reading, _images(reading), masks, last=500)
 
 
 def read_rgbavatar(reading: Reading) -> Source:
     """RGBAvatar's own: frames and images belong together in the order of their names."""
-    return _read(reading, "images", by_order=True)
+    return _read(reading, _images(reading), by_order=True)
+
+
+def _images(reading: Reading) -> _Pictures:
+    return reading.folder.numbered("images", IMPORTED_SUFFIXES)
 
 
 def _read(
     reading: Reading,
-    image_folder: str,
-    mask_folder: str | None = None,
+    images: _Pictures,
+    masks: _Pictures | None = None,
     *,
     last: int = 350,
     by_order: bool = False,
 ) -> Source:
-    """Images of one subfolder, mattes of another (or the images' own alpha), `.frame` files."""
-    folder = reading.folder
-    files = folder.numbered(CHECKPOINTS, (".frame",))
-    images = folder.numbered(image_folder, IMPORTED_SUFFIXES)
+    """Images, mattes (or the images' own alpha), `.frame` files; all by number."""
+    files = reading.folder.numbered(CHECKPOINTS, (".frame",))
     if by_order and len(files) == len(images) and list(files) != list(images):
         reading.report.note("frames and images have other numbers: paired in order")
         images = dict(zip(files, images.values()))
-    masks = None if mask_folder is None else folder.numbered(mask_folder, IMPORTED_SUFFIXES)
     tracked = read_frame_files(reading, files)
     records = pair(reading, tracked, images, masks)
     return assemble(reading, records, tracked.arrays, tracked.identity, last)

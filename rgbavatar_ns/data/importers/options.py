@@ -41,9 +41,10 @@ class ImportOptions(CheckedOptions):
     """person: the format's own mattes; head: of FlashAvatar data only what its parsing masks call
     head, neck and mouth."""
     images: Path | None = None
-    """Folder of the images, for metrical-tracker's data and VHAP's raw output."""
+    """Folder of the images, for metrical-tracker's data and VHAP's raw output; from where you
+    stand, not from the data."""
     masks: Path | None = None
-    """Folder of their mattes, likewise."""
+    """Folder of their mattes, likewise; by default what lies in the data."""
     test_frames: Counted | None = None
     """Hold out this many frames at the end instead of those that the format holds out."""
     test_cameras: tuple[str, ...] = ()

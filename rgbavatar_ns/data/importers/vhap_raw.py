@@ -92,9 +92,7 @@ def _values(reading: Reading, path: Path) -> dict[str, np.ndarray]:
 def _by_stem(reading: Reading, given: Path | None, usual: tuple[str, ...]) -> dict[str, Path]:
     """Pictures by name without suffix, from the folder given or the first usual one there is."""
     if given is not None:
-        place = Folder(given, reading.folder.allow_outside)
-        if not given.is_dir():
-            raise UserError(f"There is no folder {given}.", "Name the folder of the pictures.")
+        place = reading.folder.given(given)
     else:
         there = [name for name in usual if (reading.folder.root / name).is_dir()]
         if not there:

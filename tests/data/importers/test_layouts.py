@@ -122,6 +122,24 @@ def test_flashavatars_parsing_masks_cut_the_matte(tmp_path, options, takes):
     assert alpha[:, WIDTH // 2 :].any()
 
 
+def test_metrical_pictures_may_lie_elsewhere_and_found_mattes_stay(
+    tmp_path, options, takes, monkeypatch
+):
+    _, frames = write(tmp_path / "data", "metrical", takes)
+    shutil.move(tmp_path / "data/input", tmp_path / "film")
+    monkeypatch.chdir(tmp_path)
+    source = read_source(Path("data"), replace(options, format="metrical", images=Path("film")))
+    assert np.array_equal(image(source, 3), frames[3].image_rgba)
+    shutil.copytree("data/alpha", "mattes")
+    for path in Path("mattes").iterdir():
+        cv2.imwrite(str(path), np.full((HEIGHT, WIDTH), 77, np.uint8))
+    named = replace(options, format="metrical", images=Path("film"), masks=Path("mattes"))
+    assert (image(read_source(Path("data"), named), 3)[..., 3] == 77).all()
+    for name in ("images", "masks"):
+        with pytest.raises(UserError, match="There is no folder alpha"):  # it lies in the data
+            read_source(Path("data"), replace(named, **{name: Path("alpha")}))
+
+
 def test_vhaps_raw_output(tmp_path, options, takes):
     _, frames = write(tmp_path / "export", "vhap", takes)
     raw = tmp_path / "raw"
