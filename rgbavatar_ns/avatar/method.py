@@ -154,7 +154,20 @@ class AvatarMethod(nn.Module, ABC):
         step: int,
         seed: int,
     ) -> Mapping[str, float]:
-        """What the method does once the optimisers have taken `step`; returns figures for logs."""
+        """What the method notes once the optimisers have taken `step`; returns figures for logs.
+
+        What a later step would have to train belongs into `before_next_step`.
+        """
+        return {}
+
+    def before_next_step(
+        self, optimizers: Sequence[torch.optim.Optimizer], step: int, seed: int
+    ) -> Mapping[str, float]:
+        """What the method changes between `step` and the one that follows; figures for logs.
+
+        Not called after a run's last step, so that a run ends with what it has trained; one that
+        goes on from there begins with it. `step`, which has been taken, is counted from 0.
+        """
         return {}
 
     def weights(self, theta: Float[Tensor, "B H"]) -> Float[Tensor, "B K"]:

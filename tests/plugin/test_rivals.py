@@ -113,7 +113,7 @@ def test_harmonics_of_another_degree_are_told(data: Path, tmp_path: Path):
 def test_what_density_control_did_is_logged(
     data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    config = rival_config("gaussianavatars-style", data, tmp_path)
+    config = rival_config("gaussianavatars-style", data, tmp_path, max_num_iterations=7)
     avatar = config.pipeline.model.avatar
     density = replace(avatar.density, from_step=0, every=2)
     config.pipeline.model.avatar = replace(avatar, density=density)

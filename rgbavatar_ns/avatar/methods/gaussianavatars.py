@@ -209,7 +209,7 @@ class GaussianAvatars(MeshSplats):
         step: int,
         seed: int,
     ) -> Mapping[str, float]:
-        """Raise the degree of the harmonics, add and remove Gaussians, where that is due."""
+        """Note where Gaussians are too few; raise the degree of the harmonics where that is due."""
         self._shown.raise_by(step, self.config.raise_degree_every)
         return super().after_step(watched, optimizers, step, seed)
 

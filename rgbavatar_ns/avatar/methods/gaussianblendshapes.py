@@ -357,31 +357,28 @@ class GaussianBlendshapes(AvatarMethod):
         step: int,
         seed: int,
     ) -> Mapping[str, float]:
-        """Density control of face and teeth, each by its threshold; the degree of colours grows."""
-        figures: dict[str, float] = {}
+        """Note where face and teeth have too few Gaussians; the degree of colours grows."""
         if watched is not None:
-            figures = self._control(watched, optimizers, step, seed)
+            self._note(watched)
         if (step + 1) % self.config.sh_degree_every == 0:
             self._shown.set(min(self._shown.now + 1, self.config.sh_degree))
-        return figures
+        return {}
 
-    def _control(
-        self,
-        watched: WatchedStep,
-        optimizers: Sequence[torch.optim.Optimizer],
-        step: int,
-        seed: int,
-    ) -> dict[str, float]:
-        cameras, face = watched.cameras, self.config.density
-        teeth = replace(face, gradient_threshold=self.config.teeth_gradient_threshold)
-        counts = [part.rows.count for part in self._parts]
+    def _note(self, watched: WatchedStep) -> None:
+        cameras, counts = watched.cameras, [part.rows.count for part in self._parts]
         gradients = watched.screen_gradient_px.split(counts, 1)
         shown = cameras.shows(watched.gaussians.means.detach()).split(counts, 1)
-        figures: dict[str, float] = {}
-        for part, gradient, drawn, options, name in zip(
-            self._parts, gradients, shown, (face, teeth), ("face", "teeth")
-        ):
+        for part, gradient, drawn in zip(self._parts, gradients, shown):
             part.statistics.add(gradient, cameras.width, cameras.height, drawn)
+
+    def before_next_step(
+        self, optimizers: Sequence[torch.optim.Optimizer], step: int, seed: int
+    ) -> Mapping[str, float]:
+        """Density control of face and teeth, each by its threshold."""
+        face = self.config.density
+        teeth = replace(face, gradient_threshold=self.config.teeth_gradient_threshold)
+        figures: dict[str, float] = {}
+        for part, options, name in zip(self._parts, (face, teeth), ("face", "teeth")):
             changes = control(part.controlled(), options, optimizers, step=step, seed=seed)
             if changes is not None:
                 figures[f"{name}_gaussians"] = float(changes.count)

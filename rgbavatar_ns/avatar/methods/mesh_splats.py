@@ -79,9 +79,15 @@ class MeshSplats(AvatarMethod):
         step: int,
         seed: int,
     ) -> Mapping[str, float]:
-        """Add and remove Gaussians, where that is due."""
+        """Note where Gaussians are too few."""
         if watched is not None:
             self.statistics.add_step(watched)
+        return {}
+
+    def before_next_step(
+        self, optimizers: Sequence[torch.optim.Optimizer], step: int, seed: int
+    ) -> Mapping[str, float]:
+        """Add and remove Gaussians, where that is due."""
         known = ControlledGaussians(
             self.rows, self.statistics, self._scale_m, self._children, face_of="face_index"
         )

@@ -333,12 +333,20 @@ class MonoGaussianAvatar(AvatarMethod):
         step: int,
         seed: int,
     ) -> Mapping[str, float]:
-        """Note what is opaque; before the next epoch remove what never was, and refill."""
+        """Note what is opaque."""
         if watched is not None:
             self.seen |= (watched.gaussians.opacities >= self.config.prune_opacity).any(0)
-        if (step + 1) % self.config.steps_per_epoch:
+        return {}
+
+    @torch.no_grad()
+    def before_next_step(
+        self, optimizers: Sequence[torch.optim.Optimizer], step: int, seed: int
+    ) -> Mapping[str, float]:
+        """Before the next epoch remove what was opaque in no step of this one, and refill."""
+        epoch, of_epoch = divmod(step + 1, self.config.steps_per_epoch)
+        # In a checkpoint of 0.2 it was done before the last step of an epoch was saved.
+        if of_epoch or epoch <= int(self.epoch):
             return {}
-        epoch = (step + 1) // self.config.steps_per_epoch
         jitter_m = _LATE_JITTER_M if epoch > _LATE_EPOCH else radius_m(epoch - 1)
         changes = prune_and_refill(
             *(self._rows, self.seen, self.points_of(epoch), optimizers),

@@ -36,7 +36,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from rgbavatar_ns.avatar.config import MethodConfig
-from rgbavatar_ns.avatar.method import DrawnBatch, FilmedBatch, Losses, WatchedStep
+from rgbavatar_ns.avatar.method import DrawnBatch, FilmedBatch, Losses
 from rgbavatar_ns.avatar.methods.carriers import SmoothSurface
 from rgbavatar_ns.avatar.methods.density import DensityControl, sampled_positions
 from rgbavatar_ns.avatar.methods.gaussian_rows import forget_moments
@@ -214,17 +214,13 @@ class SplattingAvatar(MeshSplats):
         spikes = spike_term(drawn.gaussians.scales, config.spike_from_m, config.spike_ratio)
         return {"spikes": config.spike_weight * _UNITS_PER_M * spikes}
 
-    def after_step(
-        self,
-        watched: WatchedStep | None,
-        optimizers: Sequence[torch.optim.Optimizer],
-        step: int,
-        seed: int,
+    def before_next_step(
+        self, optimizers: Sequence[torch.optim.Optimizer], step: int, seed: int
     ) -> Mapping[str, float]:
         """Walk over the triangles, add and remove Gaussians, where that is due."""
         if (step + 1) % self.config.walk_every == 0:
             self._walk(optimizers)
-        return super().after_step(watched, optimizers, step, seed)
+        return super().before_next_step(optimizers, step, seed)
 
     def _scale_m(self) -> Float[Tensor, "N 3"]:
         return self.log_scale.detach().exp()

@@ -41,10 +41,10 @@ class MethodStep:
     Args:
         method: what is trained.
         optimizers: those that hold its parameters; by default `method_optimizers`.
-        seed: of random backgrounds, and of what the method draws after a step.
+        seed: of random backgrounds, and of what the method draws between steps.
         refinement: corrects the frames' theta by the gradient that each step leaves there.
         backend: of the rasterizer.
-        logged: told of the figures that `after_step` returns.
+        logged: told of the figures that `before_next_step` and `after_step` return.
     """
 
     kind: StepKind = "eager"
@@ -67,7 +67,7 @@ class MethodStep:
         self._name_of = {p: name for name, group in groups.items() for p in group}
 
     def __call__(self, batch: TrainingBatch | ChosenFrames, step: int) -> Losses:
-        """Take step `step` and what is due after it; returns the parts of the loss, detached.
+        """Do what is due after the step before and take `step`; the parts of the loss, detached.
 
         Raises ValueError for `ChosenFrames`, which only recorded steps take.
         """
@@ -75,6 +75,9 @@ class MethodStep:
             raise ValueError(f"Steps are {self.kind}: {self.reason}. Pass a TrainingBatch.")
         count, theta = len(batch.theta), batch.theta
         require_images_of(batch.images_rgba, count, batch.cameras)
+        if step > 0:
+            before = step - 1
+            self._log(before, self.method.before_next_step(self.optimizers, before, self._seed))
         if self.refinement is not None:
             theta = self.refinement.begin(theta, batch.position)
         background = batch.background
@@ -91,10 +94,12 @@ class MethodStep:
         watched = None
         if offset is not None and offset.grad is not None:
             watched = WatchedStep(drawn.gaussians, batch.cameras, offset.grad)
-        figures = self.method.after_step(watched, self.optimizers, step, self._seed)
+        self._log(step, self.method.after_step(watched, self.optimizers, step, self._seed))
+        return {name: loss.detach() for name, loss in losses.items()}
+
+    def _log(self, step: int, figures: Mapping[str, float]) -> None:
         if figures:
             self._logged(step, figures)
-        return {name: loss.detach() for name, loss in losses.items()}
 
     def _set_rates(self, step: int) -> None:
         factors = self.method.rate_factors(step)

@@ -237,7 +237,7 @@ def test_rates_are_the_releases_and_that_of_places_falls():
 def test_density_control_fires_and_training_goes_on():
     method, batches, told = make(density=BUSY), film(), []
     step = MethodStep(method, logged=lambda number, figures: told.append((number, dict(figures))))
-    for number in range(6):
+    for number in range(7):
         losses = step(batches[number % 4], number)
         assert all(bool(torch.isfinite(loss)) for loss in losses.values())
     assert [number for number, _ in told] == [1, 3, 5]
@@ -254,14 +254,14 @@ def test_each_triangle_keeps_a_gaussian():
     method = make(density=dataclasses.replace(BUSY, gradient_threshold=1e3, keep_one_per_face=True))
     with torch.no_grad():
         method.opacity_logit.fill_(-20.0)
-    figures = method.after_step(None, method_optimizers(method), 1, 0)
+    figures = method.before_next_step(method_optimizers(method), 1, 0)
     assert figures["kept_for_faces"] == FACES == method.num_gaussians
     free = dataclasses.replace(method.config.density, keep_one_per_face=False)
     other = make(density=free)
     with torch.no_grad():
         other.opacity_logit.fill_(-20.0)
         other.opacity_logit[:10] = 1.0
-    other.after_step(None, method_optimizers(other), 1, 0)
+    other.before_next_step(method_optimizers(other), 1, 0)
     assert other.face_index.tolist() == list(range(10))
 
 

@@ -255,7 +255,9 @@ def test_each_epoch_unseen_points_are_replaced_by_moved_copies_and_training_goes
     keep = avatar.position.detach()[2:].clone()
     avatar.config = dataclasses.replace(avatar.config, prune_opacity=1.0)
     step(batch, 2)
-    assert told == [(2, {"points": 400, "pruned": 2, "copied": 2})]
+    assert not told
+    figures = avatar.before_next_step(optimizers, 2, 0)
+    assert figures == {"points": 400, "pruned": 2, "copied": 2}
     assert int(avatar.epoch) == 1
     assert not avatar.seen.any()
     torch.testing.assert_close(avatar.position[:398], keep, rtol=0, atol=1e-3)
@@ -266,16 +268,17 @@ def test_each_epoch_unseen_points_are_replaced_by_moved_copies_and_training_goes
     assert moments["exp_avg"][:398].any()
     assert not moments["exp_avg"][398:].any()
     avatar.config = dataclasses.replace(avatar.config, prune_opacity=0.1)
-    for number in range(3, 15):
+    for number in range(3, 16):
         step(batch, number)
     assert avatar.num_gaussians == 450
+    assert [number for number, _ in told] == [5, 8, 11, 14]
     assert told[-1][1]["copied"] == 50
 
 
 def test_where_every_point_is_faint_the_user_is_told():
     avatar = build(prune_opacity=1.0)
     with pytest.raises(UserError, match="transparent"):
-        avatar.after_step(None, [], 4, 0)
+        avatar.before_next_step([], 4, 0)
 
 
 def test_rates_are_halved_at_epochs_80_and_100():
@@ -302,7 +305,7 @@ def test_training_lowers_the_loss_and_is_determined_by_seed_and_steps():
 def test_a_bundle_gives_the_same_picture_though_points_were_added(tmp_path):
     avatar = build(max_points=500, steps_per_epoch=1, random=True)
     step, batch = MethodStep(avatar), batch_of(avatar)
-    for number in range(6):
+    for number in range(7):
         step(batch, number)
     assert avatar.num_gaussians == 500
     avatar.save(tmp_path / "mono")

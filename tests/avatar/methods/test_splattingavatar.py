@@ -290,6 +290,8 @@ def test_a_walk_leaves_places_where_they_were_but_in_the_triangles_that_they_rea
     (optimizer,) = (o for o in step.optimizers if method.place in o.state)
     assert not optimizer.state[method.place]["exp_avg"].any()
     step(batches[3], 3)
+    assert method.place.any()
+    method.before_next_step(step.optimizers, 3, 0)
     assert not method.place.any()
 
 
@@ -312,7 +314,7 @@ def test_children_of_a_split_lie_around_their_parent_upon_the_surface():
 def test_density_control_fires_and_training_goes_on():
     method, batches, told = make(density=BUSY, walk_every=3), film(), []
     step = MethodStep(method, logged=lambda number, figures: told.append((number, dict(figures))))
-    for number in range(6):
+    for number in range(7):
         losses = step(batches[number % 4], number)
         assert all(bool(torch.isfinite(loss)) for loss in losses.values())
     assert [number for number, _ in told] == [1, 3, 5]
