@@ -2,7 +2,6 @@
 
 import sys
 import time
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -227,20 +226,14 @@ def _train(
 
 
 def _film(run_folder: Path, data: Path, output: Path) -> Result:
-    import numpy as np
-    import torch
-
     from rgbavatar_ns.avatar.loading import load_avatar
     from rgbavatar_ns.data import load_dataset
-    from rgbavatar_ns.export import write_comparison
-    from rgbavatar_ns.plugin.refinement import REFINED_NAME
+    from rgbavatar_ns.export import as_trained_on, write_comparison
 
     video, picture = output / "comparison.mp4", output / "comparison.png"
-    dataset, refined = load_dataset(data), run_folder / REFINED_NAME
-    if refined.exists():
-        theta = torch.from_numpy(np.load(refined, allow_pickle=False))
-        dataset = replace(dataset, theta=theta)
-    count = write_comparison(load_avatar(run_folder), dataset, video, picture)
+    avatar = load_avatar(run_folder)
+    dataset = as_trained_on(avatar, run_folder, load_dataset(data), data)
+    count = write_comparison(avatar, dataset, video, picture)
     return {"video": str(video), "picture": str(picture), "frames": count}
 
 

@@ -121,7 +121,7 @@ def run(
     avatar = _without_undrawn(whole)
     dataset = _dataset(avatar, run_folder, data, needed=frame is not None or frames is not None)
     if format == "bundle":
-        seen = _seen(avatar, run_folder, dataset)
+        seen = _seen(avatar, dataset)
         avatar.save(destination, statistics=seen, with_head=head_inside)
         print(f"{type(avatar).__name__}.load({str(destination)!r}) opens it.")
     elif format in GAUSSIAN_FILES:
@@ -134,7 +134,7 @@ def run(
         own = require_rgbavatar(avatar, f"--format {format}")
         rate = frames_per_second or _rate_of(dataset)
         options = PageOptions(title or "Avatar", rate, origins=origins, servers=servers)
-        seen = _seen(avatar, run_folder, dataset)
+        seen = _seen(avatar, dataset)
         if dataset is not None:
             own = _as_filmed(own, dataset)
         places = page_frames(dataset, frames, rate)
@@ -184,22 +184,22 @@ def _without_undrawn(whole: "AvatarMethod") -> "AvatarMethod":
     return avatar
 
 
-def _seen(
-    avatar: "AvatarMethod", run_folder: Path, dataset: "TrackedDataset | None"
-) -> "TrainingStatistics | None":
+def _seen(avatar: "AvatarMethod", dataset: "TrackedDataset | None") -> "TrainingStatistics | None":
     """What the avatar saw in training, if that is known."""
-    from rgbavatar_ns.avatar.storage.bundle import load_statistics
     from rgbavatar_ns.export import statistics_of
 
-    return load_statistics(run_folder) if dataset is None else statistics_of(avatar, dataset)
+    return avatar.training_statistics if dataset is None else statistics_of(avatar, dataset)
 
 
 def _dataset(
     avatar: "AvatarMethod", run_folder: Path, data: Path | None, *, needed: bool
 ) -> "TrackedDataset | None":
-    """The named dataset, or the run's own; None where there is none and none is needed."""
+    """The named dataset, or the run's own, which has the theta that the avatar was trained on.
+
+    None where there is none and none is needed.
+    """
     from rgbavatar_ns.data import load_dataset
-    from rgbavatar_ns.export import dataset_folder
+    from rgbavatar_ns.export import as_trained_on, dataset_folder
 
     folder = dataset_folder(run_folder) if data is None else data
     if data is None and folder == run_folder:
@@ -214,7 +214,7 @@ def _dataset(
         print(f"note: {error.cause} It goes without the frames of the run's own data.")
         return None
     avatar.require_layout(dataset.layout, f"The dataset {folder}")
-    return dataset
+    return as_trained_on(avatar, run_folder, dataset, folder)
 
 
 def _write_gaussians(

@@ -10,6 +10,7 @@ from rgbavatar_ns.export.gaussian_files import (
     write_gaussians,
 )
 from rgbavatar_ns.export.gltf import write_gltf
+from rgbavatar_ns.export.own_film import as_trained_on
 from rgbavatar_ns.export.ply import write_ply
 from rgbavatar_ns.export.run_data import dataset_folder, statistics_of
 from rgbavatar_ns.export.texture import color_texture, read_texture, with_texture, write_texture
@@ -29,6 +30,7 @@ __all__ = [
     "FilmWriter",
     "PageOptions",
     "as_filmed",
+    "as_trained_on",
     "basis_grid",
     "calm_theta",
     "color_texture",

@@ -6,11 +6,11 @@ from pathlib import Path
 
 from rgbavatar_ns.avatar.loading import load_avatar
 from rgbavatar_ns.avatar.method import AvatarMethod
-from rgbavatar_ns.avatar.storage.bundle import load_statistics
 from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
 from rgbavatar_ns.data.native.dataset import TrackedDataset
 from rgbavatar_ns.data.opening import load_dataset
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.export.own_film import as_trained_on
 from rgbavatar_ns.export.run_data import dataset_folder, statistics_of
 from rgbavatar_ns.export.views import front_camera, resized
 from rgbavatar_ns.kernels import PinholeCameras
@@ -25,6 +25,7 @@ class Subject:
 
     avatar: AvatarMethod
     dataset: TrackedDataset | None
+    """Its theta as the avatar was trained on it (`as_trained_on`)."""
     seen: TrainingStatistics
     camera: PinholeCameras
     """The dataset's first camera, or one before the face, for pictures of the size asked for."""
@@ -38,10 +39,11 @@ def load_subject(
     """Load an avatar from a run, a checkpoint or a bundle, with its dataset if it names one.
 
     data: the dataset in place of the run's own, which may be gone where the avatar knows what it
-    saw. Raises UserError where the avatar or its dataset cannot be read, and for a bundle that
-    knows nothing about its training.
+    saw. Raises UserError where the avatar or its dataset cannot be read or do not fit, and for a
+    bundle that knows nothing about its training.
     """
-    avatar, seen = load_avatar(run_folder), load_statistics(run_folder)
+    avatar = load_avatar(run_folder)
+    seen = avatar.training_statistics
     folder = dataset_folder(run_folder) if data is None else data
     if data is None and folder == run_folder:
         if seen is None:
@@ -51,6 +53,7 @@ def load_subject(
         return Subject(avatar, None, seen, _before_the_face(avatar, width, height), lost=folder)
     dataset = load_dataset(folder)
     avatar.require_layout(dataset.layout, f"The dataset {folder}")
+    dataset = as_trained_on(avatar, run_folder, dataset, folder)
     camera = resized(dataset.cameras.select([0]), width or dataset.width, height or dataset.height)
     return Subject(avatar, dataset, seen or statistics_of(avatar, dataset), camera)
 

@@ -36,6 +36,8 @@ CHECKPOINT_PREFIX = "_model.avatar."
 """Where a nerfstudio checkpoint of the plugin keeps the avatar's state dict."""
 CHECKPOINT_EXTRA_STATE = "_model._extra_state"
 """Where it keeps the model's extra state, whose `avatar` is `Avatar.to_state()`."""
+_CHECKPOINT_REFINEMENT = "_model.refinement."
+"""Where it keeps the corrections of refined tracking, if there are any."""
 
 _TENSOR_MARK = "$tensor"
 _STATE_PARTS = ("config", "head", "identity")
@@ -208,8 +210,10 @@ def _load_checkpoint(path: Path) -> StoredAvatar:
         )
     with damage_of(path):
         parameters = _below(CHECKPOINT_PREFIX, pipeline or {})
+        refined = any(name.startswith(_CHECKPOINT_REFINEMENT) for name in pipeline or {})
+        frames = extra.get("frames", {}) if refined else None
     seen = extra.get("statistics")
-    return StoredAvatar(path, extra["avatar"], parameters, extra.get("layout"), seen)
+    return StoredAvatar(path, extra["avatar"], parameters, extra.get("layout"), seen, frames)
 
 
 def _split_off_tensors(value: Any, name: str, tensors: dict[str, Tensor]) -> Any:

@@ -60,6 +60,8 @@ class StoredAvatar:
     layout: Any = None
     statistics: Any = None
     """What `TrainingStatistics.from_state` takes, if there is any."""
+    refined_frames: Any = None
+    """What `RefinedFrames.of_stored` takes: of a run that refined its tracking, its frames."""
 
     @property
     def method(self) -> str:
