@@ -1,19 +1,24 @@
 """What happens before the first step: sources by their flags, and waiting for a subject."""
 
+import contextlib
 import dataclasses
+import shutil
+import socket
+import threading
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from rgbavatar_ns.data import load_dataset
+from rgbavatar_ns.data import TrackedFrame, load_dataset
 from rgbavatar_ns.data.importers import ImportOptions
-from rgbavatar_ns.data.streams import ReplayStream, SocketStream, StreamSubject
+from rgbavatar_ns.data.streams import ReplayStream, SocketStream, StreamClient, StreamSubject
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.head import EMBEDDED_BUST, HeadArrays, HeadModel
 from rgbavatar_ns.plugin.online.datamanager import is_recorded
 from rgbavatar_ns.plugin.online.sources import SourceConfig, await_subject, open_source
-from tests.data.streaming import Clock, GivenStream, streamed, subject
+from tests.data.streaming import HEAD, Clock, GivenStream, streamed, subject
 from tests.plugin.online_run import online_config, online_trainer
 
 
@@ -39,7 +44,8 @@ def test_a_run_that_goes_on_keeps_its_recording(
     otherwise = dataclasses.replace(who, identity=who.identity + 0.1)
     assert is_recorded(config, otherwise)
     assert "measured anew" in capsys.readouterr().out
-    assert not is_recorded(config, dataclasses.replace(who, width=who.width + 1))
+    with pytest.raises(UserError, match="begin a new run"):
+        is_recorded(config, dataclasses.replace(who, width=who.width + 1))
     config.recorded = tmp_path / "nothing"
     assert not is_recorded(config, who)
 
@@ -53,6 +59,39 @@ def test_a_recording_of_an_earlier_run_in_the_folder_is_not_gone_on_with(
     old.touch()
     online_trainer(online_config(tmp_path, tiny_data))
     assert not old.exists()
+
+
+@pytest.mark.parametrize("other", ["size", "head"])
+def test_a_resumed_run_with_another_camera_or_head_keeps_its_recording(
+    tiny_data: Path, tmp_path: Path, other: str
+):
+    before = load_dataset(tiny_data)
+    head = HeadModel(HeadArrays.embedded(EMBEDDED_BUST)) if other == "head" else HEAD
+    width, height = before.width + (other == "size"), before.height
+    identity = torch.zeros(head.num_identity)
+    who = StreamSubject(head.arrays, identity, head.layout, width, height)
+    camera = dataclasses.replace(before.cameras.select([0]), width=width, height=height)
+    image = np.full((height, width, 4), 255, np.uint8)
+    frame = TrackedFrame(0, torch.zeros(head.layout.size), camera, image)
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        address = f"127.0.0.1:{free.getsockname()[1]}"
+    config = online_config(
+        tmp_path / "out",
+        source=SourceConfig("socket", listen=address),
+        load_dir=tmp_path / "checkpoints",
+    )
+    recorded = config.get_base_dir() / "stream"
+    shutil.copytree(tiny_data, recorded)
+
+    def send() -> None:
+        with contextlib.suppress(UserError), StreamClient(who, address) as client:
+            client.send(frame)
+
+    sender = threading.Thread(target=send, daemon=True)
+    sender.start()
+    with pytest.raises(UserError, match="run has recorded"):
+        online_trainer(config)
+    assert torch.equal(load_dataset(recorded).theta, before.theta)
 
 
 def test_a_replay_opens_other_systems_data_as_the_dataparser_does(

@@ -253,15 +253,24 @@ def _of_dataset(config: OnlineDataManagerConfig, replayed: bool) -> OnlineDataMa
 
 
 def is_recorded(config: OnlineDataManagerConfig, subject: StreamSubject) -> bool:
-    """Whether the run goes on from a recording of this subject; another measure of it is told."""
+    """Whether the run goes on from a recording of this subject; another measure of it is told.
+
+    Where the trainer has left a recording a checkpoint is to be loaded, which fits no frames of
+    another size or head: UserError, before anything takes the recording's place.
+    """
     assert config.recorded is not None
     try:
         before = load_dataset(config.recorded)
     except UserError:
         return False
-    size = (before.width, before.height)
-    if before.layout != subject.layout or size != (subject.width, subject.height):
-        return False
+    same_head = before.layout == subject.layout and before.identity.shape == subject.identity.shape
+    if not same_head or (before.width, before.height) != (subject.width, subject.height):
+        raise UserError(
+            f"The stream has {subject.width} x {subject.height} pixels and the head "
+            f"'{subject.arrays.name}', but the run has recorded {before.width} x {before.height} "
+            f"pixels and the head '{before.arrays.name}' ({config.recorded}).",
+            "Go on with the source that the run was started with, or begin a new run.",
+        )
     if not torch.allclose(before.identity, subject.identity.cpu(), atol=1e-4):
         say(
             "note: the person was measured anew, a little otherwise than when the run began; the "
