@@ -294,6 +294,8 @@ class OnlineTrainer(RGBAvatarTrainer):
         self.stream.record()
         self.stream.least.write(self.base_dir)
         super()._save_end()
+        # The viewer may stay open for hours, in which nobody takes what is filmed or sent.
+        self.stream.close()
 
     def _frames_at_the_end(self) -> Iterator[TrainingBatch]:
         """What the pools hold, however the run ends: a stream's frames are drawn a few times."""

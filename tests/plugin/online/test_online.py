@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections import Counter
 from collections.abc import Callable
@@ -14,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 
 from rgbavatar_ns import Avatar
 from rgbavatar_ns.avatar.storage.checkpoint_file import list_checkpoints
@@ -148,6 +150,24 @@ def test_training_begins_with_the_first_frame(
     assert summary(trainer)["images"] == 2
     first = load_dataset(tiny_data).theta[0]
     assert torch.equal(trainer.pipeline.model.frame_theta[0], first)
+
+
+def test_a_completed_run_lets_go_of_its_stream_before_the_viewer_stays_open(
+    online: Online, monkeypatch: pytest.MonkeyPatch
+):
+    hold_back_after(1, monkeypatch)
+    trainer = online(max_num_iterations=2)
+    threads: list[list[str]] = []
+
+    def look(step: int) -> None:
+        running = [one.name for one in threading.enumerate()]
+        threads.append([n for n in running if n in ("rgbavatar stream", "rgbavatar ingest")])
+        assert list_checkpoints(trainer.checkpoint_dir)[-1][0] == step
+
+    where = [TrainingCallbackLocation.AFTER_TRAIN]
+    trainer.callbacks.append(TrainingCallback(where, look))
+    trainer.train()
+    assert threads == [[]]
 
 
 def test_the_viewer_knows_the_newest_frame_only(online: Online, tiny_data: Path):
