@@ -13,6 +13,7 @@ from jaxtyping import UInt8
 from rgbavatar_ns.data.importers.import_report import UnusableFrameError
 from rgbavatar_ns.data.png import (
     MAX_IMAGE_BYTES,
+    MAX_PIXELS,
     decode_bounded,
     decode_png_rgba,
     encode_png_rgba,
@@ -97,8 +98,7 @@ def make_png(frame_image: FrameImage, size: tuple[int, int]) -> EncodedImage:
 def _compose(
     frame_image: FrameImage, encoded: bytes, size: tuple[int, int]
 ) -> UInt8[np.ndarray, "height width 4"]:
-    image = _decode(encoded)
-    _require_size(image.shape[1::-1], size)
+    image = _decode(encoded, size)
     if frame_image.alpha is not None:
         image[..., 3] = _grey(frame_image.alpha, size)
     if frame_image.over_white:
@@ -142,14 +142,38 @@ def _require_size(found: tuple[int, ...] | None, size: tuple[int, int]) -> None:
         raise UnusableFrameError("images whose parts differ in size")
 
 
-def _decode(encoded: bytes) -> UInt8[np.ndarray, "height width 4"]:
-    """RGBA of a PNG of any kind or an RGB or grey JPEG; raises UnusableFrameError."""
-    if encoded[:2] != _JPEG_START:
-        try:
-            return decode_png_rgba(encoded, "")
-        except UserError:
-            raise UnusableFrameError("images that are damaged or cut short") from None
-    header = _jpeg_header(encoded)
+def _decode(encoded: bytes, size: tuple[int, int]) -> UInt8[np.ndarray, "height width 4"]:
+    """RGBA of a PNG of any kind or an RGB or grey JPEG of this (width, height).
+
+    Raises UnusableFrameError, before any pixel is decoded where the header promises others.
+    """
+    is_jpeg = encoded[:2] == _JPEG_START
+    header = _jpeg_header(encoded) if is_jpeg else png_header_size(encoded)
+    if header is not None:
+        _require_as_many_pixels(header[0] * header[1], size)
+    image = _decode_jpeg(encoded, header) if is_jpeg else _decode_png(encoded)
+    _require_size(image.shape[1::-1], size)
+    return image
+
+
+def _require_as_many_pixels(promised: int, size: tuple[int, int]) -> None:
+    """Of a header; its sides may be those of a picture that EXIF turns."""
+    if promised > MAX_PIXELS:
+        raise UnusableFrameError("images of more than 8192 x 8192 pixels")
+    if promised != size[0] * size[1]:
+        raise UnusableFrameError("images whose parts differ in size")
+
+
+def _decode_png(encoded: bytes) -> UInt8[np.ndarray, "height width 4"]:
+    try:
+        return decode_png_rgba(encoded, "")
+    except UserError:
+        raise UnusableFrameError("images that are damaged or cut short") from None
+
+
+def _decode_jpeg(
+    encoded: bytes, header: tuple[int, ...] | None
+) -> UInt8[np.ndarray, "height width 4"]:
     if header is None or is_damaged_jpeg(encoded):
         raise UnusableFrameError("images that are damaged or cut short")
     if header[2] == 4:
@@ -163,8 +187,7 @@ def _decode(encoded: bytes) -> UInt8[np.ndarray, "height width 4"]:
 
 def _grey(path: Path, size: tuple[int, int]) -> UInt8[np.ndarray, "height width"]:
     """A mask from 0 to 255; one that holds nothing but 0 and 1 is meant as 0 and 255."""
-    image = _decode(_read(path))
-    _require_size(image.shape[1::-1], size)
+    image = _decode(_read(path), size)
     color = image[..., :3]
     if int((color.max(-1) - color.min(-1)).max()) > _GREY_TOLERANCE:
         raise UnusableFrameError("masks that are coloured")

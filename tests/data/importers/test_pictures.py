@@ -1,0 +1,143 @@
+"""Pictures of formats: every kind is read, and what is damaged or too large is told."""
+
+import io
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from rgbavatar_ns.data.importers import frame_images
+from rgbavatar_ns.data.importers.frame_images import (
+    FrameImage,
+    image_header,
+    is_damaged_jpeg,
+    make_png,
+)
+from rgbavatar_ns.data.importers.import_report import UnusableFrameError
+from rgbavatar_ns.data.png import decode_png_rgba
+from tests.fuzz.attacks import turned
+
+
+def save(path: Path, image: np.ndarray) -> Path:
+    cv2.imwrite(str(path), image)
+    return path
+
+
+def decoded(frame_image: FrameImage) -> np.ndarray:
+    header = image_header(frame_image.color)
+    return decode_png_rgba(make_png(frame_image, (header.width, header.height)).encoded, "")
+
+
+def test_all_kinds_of_pictures(tmp_path):
+    grey = np.arange(48, dtype=np.uint8).reshape(6, 8) * 5
+    color = np.stack([grey, grey[::-1], grey[:, ::-1]], -1)
+    sixteen = save(tmp_path / "16.png", color.astype(np.uint16) * 257)
+    assert np.array_equal(decoded(FrameImage(sixteen))[..., :3], color[..., ::-1])
+    one = save(tmp_path / "grey.png", grey)
+    assert np.array_equal(decoded(FrameImage(one))[..., :3], np.repeat(grey[..., None], 3, -1))
+    binary = save(tmp_path / "binary.png", (grey > 100).astype(np.uint8))
+    with_mask = decoded(FrameImage(sixteen, alpha=binary, regions=(one,)))
+    assert np.array_equal(with_mask[..., 3], np.where(grey > 100, grey, 0))
+    with pytest.raises(UnusableFrameError, match="coloured"):
+        decoded(FrameImage(one, alpha=sixteen))
+    cmyk = tmp_path / "cmyk.jpg"
+    Image.new("CMYK", (8, 6), (10, 20, 30, 40)).save(cmyk)
+    with pytest.raises(UnusableFrameError, match="CMYK"):
+        decoded(FrameImage(cmyk))
+    with pytest.raises(UnusableFrameError, match="differ in size"):
+        decoded(FrameImage(one, alpha=save(tmp_path / "other.png", grey[:4])))
+
+
+def test_a_picture_cut_anywhere_is_told(tmp_path):
+    color = np.random.default_rng(0).integers(0, 256, (40, 50, 4), dtype=np.uint8)
+    for name in ("whole.png", "whole.jpg"):
+        path = save(tmp_path / name, color if name.endswith("png") else color[..., :3])
+        whole = path.read_bytes()
+        decoded(FrameImage(path))
+        for kept in range(0, len(whole) - 1, 61):
+            path.write_bytes(whole[:kept])
+            with pytest.raises(UnusableFrameError):
+                decoded(FrameImage(path))
+
+
+@pytest.mark.parametrize("suffix", ["png", "jpg"])
+@pytest.mark.parametrize("part", ["color", "alpha", "region"])
+def test_pictures_whose_header_promises_too_much_are_not_decoded(
+    part, suffix, tmp_path, monkeypatch
+):
+    small = save(tmp_path / "small.png", np.zeros((6, 8, 3), np.uint8))
+    other = save(tmp_path / f"other.{suffix}", np.zeros((60, 80, 3), np.uint8))
+    huge = save(tmp_path / f"huge.{suffix}", np.zeros((60, 80, 3), np.uint8))
+    content = bytearray(huge.read_bytes())
+    place, side = (16, 4) if suffix == "png" else (content.index(b"\xff\xc0") + 5, 2)
+    content[place : place + 2 * side] = 2 * (9000).to_bytes(side, "big")
+    huge.write_bytes(content)
+    frames = {
+        "color": lambda path: FrameImage(path, alpha=small),
+        "alpha": lambda path: FrameImage(small, alpha=path),
+        "region": lambda path: FrameImage(small, regions=(small, path)),
+    }
+    decoder = frame_images.is_damaged_jpeg if suffix == "jpg" else frame_images.decode_png_rgba
+
+    def refuse(encoded: bytes, *rest: str) -> object:
+        assert len(encoded) not in (len(content), other.stat().st_size), "it is decoded"
+        return decoder(encoded, *rest)
+
+    monkeypatch.setattr(frame_images, decoder.__name__, refuse)
+    with pytest.raises(UnusableFrameError, match="differ in size"):
+        make_png(frames[part](other), (8, 6))
+    with pytest.raises(UnusableFrameError, match="more than 8192 x 8192"):
+        make_png(frames[part](huge), (9000, 9000) if part == "color" else (8, 6))
+
+
+def test_a_matte_that_exif_turns_is_turned_as_ever(tmp_path):
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    mask = np.zeros((16, 8), np.uint8)
+    mask[:8] = 255
+    Image.fromarray(mask).save(tmp_path / "mask.jpg", exif=exif)
+    color = save(tmp_path / "color.png", np.zeros((8, 16, 3), np.uint8))
+    alpha = decoded(FrameImage(color, alpha=tmp_path / "mask.jpg"))[..., 3]
+    assert (alpha[:, 8:] > 250).all()
+    assert (alpha[:, :8] < 5).all()
+
+
+def _jpegs() -> dict[str, bytes]:
+    """A portrait's colours in the kinds of JPEG that there are."""
+    x, y = np.meshgrid(np.linspace(-1, 1, 96), np.linspace(-1, 1, 80))
+    noise = np.random.default_rng(0).normal(0, 6, (80, 96, 3))
+    color = np.stack([200 - 90 * x, 150 + 80 * y, 120 + 60 * np.hypot(x, y)], -1) + noise
+    image = Image.fromarray(color.clip(0, 255).astype(np.uint8))
+    exif = Image.Exif()
+    exif[0x0112] = 3
+    made = {
+        "usual": (image, {}),
+        "4:4:4": (image, {"subsampling": 0, "quality": 98}),
+        "4:2:2": (image, {"subsampling": 1}),
+        "progressive": (image, {"progressive": True}),
+        "optimised": (image, {"optimize": True}),
+        "restarts": (image, {"restart_marker_blocks": 4}),
+        "with EXIF and a profile": (image, {"exif": exif, "icc_profile": bytes(70_000)}),
+        "grey": (image.convert("L"), {}),
+        "tiny": (image.resize((1, 1)), {}),
+    }
+    encoded = {}
+    for name, (picture, options) in made.items():
+        file = io.BytesIO()
+        picture.save(file, "JPEG", **options)
+        encoded[name] = file.getvalue()
+    return encoded
+
+
+def test_whole_jpegs_of_all_kinds_pass_and_some_turned_bits_are_told():
+    told = 0
+    for name, whole in _jpegs().items():
+        assert not is_damaged_jpeg(whole), name
+        if name in ("usual", "progressive"):
+            generator = np.random.default_rng(1)
+            for _ in range(100):
+                told += is_damaged_jpeg(turned(whole, generator, bits=1))
+    # Without checksums most turned bits are another picture.
+    assert told > 40
