@@ -44,7 +44,7 @@ def import_dataset(
     where something cannot be used, or `dst` holds something else and `overwrite` is not given.
     """
     src, dst, options = Path(src), Path(dst), options or ImportOptions()
-    key = fingerprint(src, options)
+    key = fingerprint(src, options, dst)
     state, finished = read_json(dst / _STATE_FILE), (dst / INDEX_FILE).exists()
     same = isinstance(state, dict) and state.get("key") == key
     if same and finished and not overwrite:
@@ -140,13 +140,16 @@ def _write_image(source: Source, writer: DatasetWriter, position: int, link: boo
     writer.write_image(index, png.encoded)
 
 
-def fingerprint(src: Path, options: ImportOptions) -> str:
+def fingerprint(src: Path, options: ImportOptions, dst: Path | None = None) -> str:
     """What an import depends on, hashed: see `source_fingerprint` and `flame_fingerprint`."""
-    return f"{source_fingerprint(src, options)}-{flame_fingerprint(options) or 'none'}"
+    return f"{source_fingerprint(src, options, dst)}-{flame_fingerprint(options) or 'none'}"
 
 
-def source_fingerprint(src: Path, options: ImportOptions) -> str:
-    """Names, sizes and times of all files of the data, and all options but FLAME's place."""
+def source_fingerprint(src: Path, options: ImportOptions, dst: Path | None = None) -> str:
+    """Names, sizes and times of all files of the data, and all options but FLAME's place.
+
+    dst: where the import goes, which counts for nothing, be it in the data.
+    """
     others = replace(options, flame=None, flame_uv=None, flame_eyelids=None)
     found = find_format(src, options) if src.is_dir() else None
     outside = []
@@ -155,7 +158,7 @@ def source_fingerprint(src: Path, options: ImportOptions) -> str:
     elif found and options.allow_outside:
         outside = folders_outside(Folder(src))
     places = [src, *outside, options.images, options.masks]
-    lines = _listing(places, follow_out=options.allow_outside)
+    lines = _listing(places, follow_out=options.allow_outside, without=dst)
     return digest([f"{_IMPORTER_VERSION} {others}", *lines])[:16]
 
 
@@ -174,7 +177,9 @@ def flame_fingerprint(options: ImportOptions) -> str | None:
     return digest(_listing(named, follow_out=True))[:8]
 
 
-def _listing(places: Sequence[str | Path | None], *, follow_out: bool) -> Iterator[str]:
+def _listing(
+    places: Sequence[str | Path | None], *, follow_out: bool, without: Path | None = None
+) -> Iterator[str]:
     """A line for each file below the places.
 
     Links to folders that lead out of a place count by what they hold only with `follow_out`: what
@@ -182,10 +187,10 @@ def _listing(places: Sequence[str | Path | None], *, follow_out: bool) -> Iterat
     """
     for place in places:
         if place is not None:
-            yield from _lines(place, follow_out)
+            yield from _lines(place, follow_out, without and Path(os.path.realpath(without)))
 
 
-def _lines(place: str | Path, follow_out: bool) -> Iterator[str]:
+def _lines(place: str | Path, follow_out: bool, without: Path | None) -> Iterator[str]:
     top = os.path.realpath(os.path.expanduser(place))
     if os.path.isfile(top):
         yield _line(os.path.dirname(top), os.path.basename(top))
@@ -197,12 +202,21 @@ def _lines(place: str | Path, follow_out: bool) -> Iterator[str]:
             names.clear()
             continue
         seen.add(real)
-        yield f"{os.path.relpath(folder, top)}\n"
+        files = sorted(filter(_is_data, files))
+        if without is not None:
+            names[:] = [
+                name
+                for name in names
+                if os.path.realpath(os.path.join(folder, name)) != str(without)
+            ]
+        # A folder that only leads there was made by the import.
+        if files or without is None or not without.is_relative_to(real):
+            yield f"{os.path.relpath(folder, top)}\n"
         if not follow_out:
             out = [name for name in names if not _is_within(top, os.path.join(folder, name))]
             names[:] = [name for name in names if name not in out]
             yield from (f"{name} -> {os.readlink(os.path.join(folder, name))}\n" for name in out)
-        for name in sorted(filter(_is_data, files)):
+        for name in files:
             yield _line(folder, name)
 
 

@@ -1,5 +1,6 @@
 """Imports on the way: what they depend on, and that damage to them heals."""
 
+import os
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -9,8 +10,9 @@ import pytest
 import torch
 
 from rgbavatar_ns.data import TrackedDataset, load_dataset
-from rgbavatar_ns.data.importers import ImportOptions, import_dataset
+from rgbavatar_ns.data.importers import ImportOptions, convert, import_dataset
 from rgbavatar_ns.data.importers.convert import flame_fingerprint, source_fingerprint
+from rgbavatar_ns.data.importers.frame_images import make_png
 from rgbavatar_ns.errors import UserError
 from tests.data.importers.test_round_trips import write
 
@@ -94,6 +96,33 @@ def test_what_is_put_beside_flame_later_counts(name, above, tmp_path):
     assert [flame_fingerprint(one) for one in options] == before
     (tmp_path / "models" / ("" if above else "FLAME2020") / name).write_bytes(b"new")
     assert not set(before) & {flame_fingerprint(one) for one in options}
+
+
+@pytest.mark.parametrize("place", ["set", "mine/deep/set"])
+def test_an_import_into_the_data_itself_goes_on(place, data, options, tmp_path, monkeypatch):
+    copy = shutil.copytree(data, tmp_path / "data")
+    calls: list[object] = []
+
+    def interrupted(picture, size):
+        calls.append(picture)
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        return make_png(picture, size)
+
+    monkeypatch.setattr(convert, "make_png", interrupted)
+    monkeypatch.setattr(os, "cpu_count", lambda: 1)
+    with pytest.raises(KeyboardInterrupt):
+        import_dataset(copy, copy / place, options)
+    done = {path: path.stat().st_mtime_ns for path in (copy / place / "images").iterdir()}
+    assert len(done) >= 2
+    dataset = import_dataset(copy, copy / place, options)
+    assert {path: path.stat().st_mtime_ns for path in done} == done
+    calls.clear()
+    assert same(import_dataset(copy, copy / place, options), dataset)
+    assert not calls, "a finished one is opened"
+    (copy / "image/more.png").write_bytes(b"new")
+    with pytest.raises(UserError):
+        import_dataset(copy, copy / place, options)
 
 
 def test_what_links_lead_to_outside_counts_only_where_it_may_be_read(data, options, tmp_path):
