@@ -49,8 +49,8 @@ def run(
         head_only: track the head of a video without its body.
         tiny: for a slow machine, an avatar of a quarter of the Gaussians from images of 256 pixels
             of your video, in three quarters of the time; the demo subject's is always so.
-        steps: training steps; by default those of the method: rgbavatar-quick where images of a
-            video have 400 pixels or more, else rgbavatar-tiny.
+        steps: training steps, over which the learning rates fall; by default those of the method:
+            rgbavatar-quick where images of a video have 400 pixels or more, else rgbavatar-tiny.
         seed: of the demo subject and of the training.
         fresh: do every stage again, also those that are done.
         started_at: Unix time from which total_seconds counts; now by default.
@@ -216,7 +216,7 @@ def _train(
         options += ["--pipeline.model.refine-held-out", str(HELD_OUT_STEPS)]
         options += ["--pipeline.model.refine-held-out-frames", str(HELD_OUT_FRAMES)]
     if steps is not None:
-        options += ["--max-num-iterations", str(steps)]
+        options += ["--max-num-iterations", str(steps), "--learning-rate-steps", str(steps)]
     facts = commands.train(method, data, run_folder, seed, options)
     return {
         "run": str(run_folder),

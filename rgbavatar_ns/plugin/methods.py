@@ -140,7 +140,8 @@ rgbavatar_tiny = MethodSpecification(
         pipeline=RGBAvatarPipelineConfig(model=tiny_model()),
         max_num_iterations=1500,
         **FALLING,
-        # Named, so that a run resumed with more steps equals one that had them from the start.
+        # Named, so that a run resumed with more steps equals one that had them from the start (but
+        # with refined tracking, whose bases begin to learn sooner in the shorter one).
         learning_rate_steps=1500,
         steps_per_save=250,
     ),

@@ -88,6 +88,13 @@ def test_a_video_is_made_sharp_where_it_shows_enough_and_small_when_asked_for(
     main(["demo", "--video", str(clip), "--output", str(tmp_path / "out"), *options])
     assert (asked["method"], asked["size"]) == (method, size)
     assert "--pipeline.model.refine-tracking" in asked["options"]
+    assert "--learning-rate-steps" not in asked["options"]
+    main(
+        ["demo", "--video", str(clip), "--output", str(tmp_path / "out"), *options, "--steps", "9"]
+    )
+    named = shlex.join(asked["options"])
+    assert "--max-num-iterations 9" in named
+    assert "--learning-rate-steps 9" in named, "the rates fall over them"
 
 
 def test_another_film_of_the_same_name_does_not_replace_an_avatars_data(

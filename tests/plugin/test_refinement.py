@@ -14,7 +14,13 @@ from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.kernels import available_backends
 from rgbavatar_ns.plugin.refinement import frame_refinement
 from rgbavatar_ns.plugin.training.trainer import RGBAvatarTrainer, RGBAvatarTrainerConfig
-from tests.plugin.run import make_trainer, small_config, trained
+from tests.plugin.run import (
+    before_each_step,
+    before_step,
+    make_trainer,
+    small_config,
+    trained,
+)
 from tests.plugin.tiny import NUM_FRAMES, NUM_TEST
 
 START = 2
@@ -29,7 +35,15 @@ def _config(
         "refinement": RefinementConfig(start_step=START, bases_start=bases_start),
     }
     steps_to = {"max_num_iterations": steps, "learning_rate_steps": 8}
-    return small_config(data, output, **steps_to, **refined, **fields)
+    return small_config(data, output, **steps_to | refined | fields)
+
+
+def _interrupted(config: RGBAvatarTrainerConfig, taken: int) -> RGBAvatarTrainer:
+    """Train until Ctrl-C in the last of so many steps."""
+    trainer = make_trainer(config)
+    before_step(taken - 1, trainer, trainer.stop.request)
+    trainer.train()
+    return trainer
 
 
 def _corrections(trainer: RGBAvatarTrainer) -> torch.Tensor:
@@ -87,11 +101,49 @@ def test_nothing_is_corrected_before_the_start(tiny_data, tmp_path):
 def test_bases_wait_for_corrections_and_then_learn(tiny_data, tmp_path, fast):
     bases = {}
     for steps in (4, 5):
-        config = _config(tiny_data, tmp_path / str(steps), steps, fast=fast, bases_start=0.5)
-        shapes = trained(config).pipeline.model.avatar.blendshapes
+        config = _config(tiny_data, tmp_path / str(steps), fast=fast, bases_start=0.5)
+        shapes = _interrupted(config, steps).pipeline.model.avatar.blendshapes
         bases[steps] = [shapes.basis_position, shapes.basis_color_feature]
     assert not any(bool(basis.any()) for basis in bases[4])
     assert all(bool(basis.any()) for basis in bases[5])
+
+
+def _rates_of_bases(config: RGBAvatarTrainerConfig) -> list[float]:
+    """In each step of a run."""
+    trainer, rates = make_trainer(config), []
+    (group,) = trainer.optimizers.optimizers["basis_position"].param_groups
+    before_each_step(trainer, lambda step: rates.append(group["lr"]))
+    trainer.train()
+    return rates
+
+
+def test_bases_learn_in_a_run_that_is_shorter_than_its_schedule(tiny_data, tmp_path):
+    short = _config(tiny_data, tmp_path, 4, bases_start=0.5, learning_rate_steps=100)
+    assert [rate > 0 for rate in _rates_of_bases(short)] == [False, False, True, True]
+
+
+def test_bases_of_a_complete_run_that_goes_on_do_not_wait_again(tiny_data, tmp_path):
+    """Nor when it goes on once more."""
+    folder = trained(_config(tiny_data, tmp_path / "4", 4, bases_start=0.5)).checkpoint_dir
+    for steps, before in ((14, 4), (40, 14)):
+        fields: dict[str, Any] = {"learning_rate_steps": None, "load_dir": folder}
+        longer = _config(tiny_data, tmp_path / str(steps), steps, bases_start=0.5, **fields)
+        rates = _rates_of_bases(longer)
+        assert len(rates) == steps - before
+        assert all(rate > 0 for rate in rates)
+        longer.load_dir = None
+        folder = longer.get_checkpoint_dir()
+
+
+def test_bases_that_have_waited_wait_for_as_long_as_a_longer_run_asks(tiny_data, tmp_path):
+    first = _interrupted(_config(tiny_data, tmp_path / "first", bases_start=0.5), 2)
+    longer = _config(
+        *(tiny_data, tmp_path / "second", 12),
+        bases_start=0.5,
+        learning_rate_steps=None,
+        load_dir=first.checkpoint_dir,
+    )
+    assert [rate > 0 for rate in _rates_of_bases(longer)] == [False] * 4 + [True] * 6
 
 
 @pytest.mark.parametrize("share", [-0.1, 1.0])
@@ -102,12 +154,12 @@ def test_bases_that_would_never_learn_are_refused(tiny_data, tmp_path, share):
 
 @pytest.mark.parametrize("first_end", [3, 5], ids=["bases wait", "bases learn"])
 def test_resume_equals_uninterrupted_run(tiny_data, tmp_path, first_end):
-    def train(name: str, steps: int, load_dir: Path | None = None) -> RGBAvatarTrainer:
-        output = tmp_path / name
-        return trained(_config(tiny_data, output, steps, bases_start=0.5, load_dir=load_dir))
+    def config(name: str, load_dir: Path | None = None) -> RGBAvatarTrainerConfig:
+        return _config(tiny_data, tmp_path / name, bases_start=0.5, load_dir=load_dir)
 
-    whole = train("whole", 8)
-    rest = train("rest", 8, train("half", first_end).checkpoint_dir)
+    whole = trained(config("whole"))
+    half = _interrupted(config("half"), first_end)
+    rest = trained(config("rest", half.checkpoint_dir))
     first, second = (t.pipeline.model.state_dict() for t in (whole, rest))
     tensors = [name for name, value in first.items() if isinstance(value, torch.Tensor)]
     assert any("correction" in name for name in tensors)

@@ -25,9 +25,9 @@ class RefinementConfig(CheckedOptions):
     start_step: Counted = 50
     """First training step that corrects; before, the avatar explains too little."""
     bases_start: Share = 0.45
-    """Share of training (of the steps over which learning rates fall) after which the bases of
-    the blendshapes begin to learn. Sooner, they would learn the tracker's errors by heart, frame by
-    frame, and leave nothing to correct."""
+    """Share of training (of its steps, or of those over which learning rates fall where they are
+    fewer) after which the bases of the blendshapes begin to learn. Sooner, they would learn the
+    tracker's errors by heart, frame by frame, and leave nothing to correct."""
     rotation_sigma_rad: Positive = 0.01
     """Expected error of the head's rotation, in radians about each axis."""
     joint_sigma_rad: Positive = 0.01

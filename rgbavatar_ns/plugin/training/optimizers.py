@@ -1,7 +1,7 @@
 """Adam and learning-rate schedules whose checkpoints hold nothing but tensors and numbers."""
 
-from collections.abc import Collection, Iterable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Collection, Iterable
+from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, Literal
 
 import torch
@@ -60,15 +60,23 @@ class Decay(Scheduler):
 
     def get_scheduler(self, optimizer: torch.optim.Optimizer, lr_init: float) -> LambdaLR:
         """Torch's scheduler for `optimizer`; `lr_init` is taken from the optimizer itself."""
-        factor, steps, start = self.config.factor, max(1, self.config.steps), self.config.start_step
-        linear = self.config.shape == "linear"
+        return LambdaLR(optimizer, _share_of(self.config))
 
-        def share(step: int) -> float:
-            passed = min(step / steps, 1.0)
-            falling = 1 + (factor - 1) * passed if linear else factor**passed
-            return falling if step >= start else 0.0
 
-        return LambdaLR(optimizer, share)
+def _share_of(config: DecayConfig) -> Callable[[int], float]:
+    """From a step to what the first rate is multiplied by.
+
+    A function, because torch would store another callable's fields, and a run that goes on load
+    them in place of what is asked for now.
+    """
+    factor, steps, linear = config.factor, max(1, config.steps), config.shape == "linear"
+
+    def share(step: int) -> float:
+        passed = min(step / steps, 1.0)
+        falling = 1 + (factor - 1) * passed if linear else factor**passed
+        return falling if step >= config.start_step else 0.0
+
+    return share
 
 
 def paper_optimizers() -> dict[str, Any]:
@@ -90,12 +98,17 @@ def go_on_as_asked(optimizers: Optimizers, resumed: Collection[str], step: int) 
     """Let loaded optimisers go on from `step` at the rates that the config asks for now.
 
     What a loaded state has done to its rate (schedules, a stream's end) stays done, times the new
-    rate by the old one. `resumed` names the schedules that were loaded; others begin as if they had
+    rate by the old one, and what has begun to learn goes on, though a longer run's schedule would
+    begin later. `resumed` names the schedules that were loaded; others begin as if they had
     been there from the first step on.
     """
     for name, optimizer in optimizers.optimizers.items():
         adam, schedule = optimizers.config[name]["optimizer"], optimizers.schedulers.get(name)
+        decay = optimizers.config[name]["scheduler"]
         for number, group in enumerate(optimizer.param_groups):
+            if isinstance(decay, DecayConfig) and schedule is not None and name in resumed:
+                begun = replace(decay, start_step=0)
+                schedule.lr_lambdas[number] = _share_of(begun if group["lr"] > 0 else decay)
             before = group.get(_ASKED, group.get("initial_lr", group.get("first_lr", group["lr"])))
             if adam.lr != before:
                 change = adam.lr / before if before > 0 else 0.0

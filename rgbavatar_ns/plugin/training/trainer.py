@@ -206,6 +206,8 @@ class RGBAvatarTrainer(EndingTrainer, FitHooks):
         """One optimiser a parameter group, with the schedules that the config asks for."""
         groups = self.pipeline.get_param_groups()
         steps = self.config.learning_rate_steps or self.config.max_num_iterations
+        # Of a run that is shorter than its schedule, the bases are to learn too.
+        refined = min(steps, self.config.max_num_iterations)
         model = self.config.pipeline.model
         settings: dict[str, Any] = {}
         rates = self.pipeline.model.avatar.learning_rates()
@@ -218,7 +220,7 @@ class RGBAvatarTrainer(EndingTrainer, FitHooks):
             factor = 1.0 if name in scheduled else self.config.learning_rate_factor
             if name == "position" and self.config.position_lr_final is not None:
                 factor = self.config.position_lr_final / rate
-            start = model.refinement.first_step_of(name, steps) if model.refine_tracking else 0
+            start = model.refinement.first_step_of(name, refined) if model.refine_tracking else 0
             if (factor != 1.0 or start > 0) and settings[name].get("scheduler") is None:
                 settings[name]["scheduler"] = DecayConfig(
                     factor=factor,
