@@ -7,7 +7,7 @@ interrupted resumes its training.
 
 import sys
 import traceback
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from rgbavatar_ns.experiments import commands
 from rgbavatar_ns.experiments.avatar_size import avatar_size
 from rgbavatar_ns.experiments.cell_pictures import write_pictures
 from rgbavatar_ns.experiments.cells import Cell
+from rgbavatar_ns.experiments.dataset_state import dataset_state, old_dataset_state
 from rgbavatar_ns.experiments.overrides import as_flags
 from rgbavatar_ns.experiments.process_lock import alone_in, end_with_parent
 from rgbavatar_ns.experiments.reenactment import (
@@ -29,7 +30,7 @@ from rgbavatar_ns.experiments.reenactment import (
 )
 from rgbavatar_ns.experiments.rendering_speed import frames_per_second
 from rgbavatar_ns.experiments.streamed import write_streamed
-from rgbavatar_ns.files import digest, digest_of_file, read_json, write_json, written_json
+from rgbavatar_ns.files import read_json, write_json, written_json
 from rgbavatar_ns.plugin.online.least_losses import read_least
 
 CELL_FILE, RESULT_FILE, LOG_FILE = "cell.json", "result.json", "log.txt"
@@ -37,11 +38,12 @@ FAILED_FILE = "failed.json"
 SIDE_BY_SIDE = "side_by_side"
 """In cell.json and in what a result was made by: other cells may have run on the machine too."""
 _EVALUATION = "eval.json"
-_STATES, _DESCRIBING = "dataset_states", {".json", ".npy", ".npz"}
+_STATES, _OLD_STATES = "datasets", "dataset_states"
 _RUN = "run"
 _LPIPS = ("lpips_vgg", "lpips_vgg_refined")
 _MADE = ("processor", "gpu", "cores", "instruction_set", "torch", "commit", "date")
 """Facts of the machine that a result is kept with."""
+State = Callable[[Path], str]
 
 
 def write_cell(
@@ -51,35 +53,32 @@ def write_cell(
     driver: Path | None = None,
     *,
     side_by_side: bool = False,
+    state: State = dataset_state,
 ) -> None:
     """Leave in `folder` what `run_cell` needs: the cell, its dataset and its driver's.
 
-    side_by_side: whether other cells may run on the machine meanwhile.
+    side_by_side: whether other cells may run on the machine meanwhile. state: what a dataset is
+    now, which may remember it.
     """
     places = {"data": str(data), "driver_data": None if driver is None else str(driver)}
-    states = {_STATES: dataset_states(data, driver)}
+    states = {_STATES: [state(place) for place in (data, driver) if place is not None]}
     run = {SIDE_BY_SIDE: side_by_side}
     write_json(folder / CELL_FILE, {**cell.to_json(), **places, **states, **run})
 
 
-def dataset_states(data: Path, driver: Path | None = None) -> list[str]:
-    """What a cell's datasets are now: digests of the tables and arrays at each folder's top."""
-    return [
-        digest(
-            part
-            for path in sorted(folder.glob("*"))
-            if path.suffix in _DESCRIBING
-            for part in (path.name, digest_of_file(path))
-        )
-        for folder in (data, driver)
-        if folder is not None
-    ]
+def is_of_other_data(
+    folder: Path, data: Path, driver: Path | None = None, *, state: State = dataset_state
+) -> bool:
+    """Whether a cell was begun on another state of its datasets; False where it is not known.
 
-
-def is_of_other_data(folder: Path, data: Path, driver: Path | None = None) -> bool:
-    """Whether a cell was begun on another state of its datasets; False where it is not known."""
-    known = (read_json(folder / CELL_FILE) or {}).get(_STATES)
-    return known is not None and known != dataset_states(data, driver)
+    A cell of before, when less of a dataset counted, is asked for that alone.
+    """
+    described = read_json(folder / CELL_FILE) or {}
+    places = [place for place in (data, driver) if place is not None]
+    for name, state_of in ((_STATES, state), (_OLD_STATES, old_dataset_state)):
+        if name in described:
+            return described[name] != [state_of(place) for place in places]
+    return False
 
 
 def run_folder_of(folder: Path, cell: Cell) -> Path:
@@ -96,7 +95,8 @@ def run_cell(folder: Path) -> dict[str, Any]:
     """Train and evaluate; returns what result.json then holds."""
     described = written_json(folder / CELL_FILE)
     data, driver = Path(described.pop("data")), described.pop("driver_data")
-    described.pop(_STATES, None)
+    for name in (_STATES, _OLD_STATES):
+        described.pop(name, None)
     side_by_side = described.pop(SIDE_BY_SIDE, False)
     cell = Cell.from_json(described)
     run_folder = run_folder_of(folder, cell)

@@ -4,12 +4,14 @@ import shlex
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.experiments.cells import Cell, cells_of, demo_config
 from rgbavatar_ns.experiments.commands import killed_by
+from rgbavatar_ns.experiments.dataset_state import dataset_state
 from rgbavatar_ns.experiments.engines import Engine
 from rgbavatar_ns.experiments.kept import kept_results, portable_keys
 from rgbavatar_ns.experiments.overrides import check_overrides, check_together, with_overrides
@@ -139,9 +141,9 @@ def _sweep(
     progress: Callable[[Sequence[CellStatus]], None],
     making: Callable[[str, int, int], None],
 ) -> list[CellStatus]:
-    side_by_side = engine.side_by_side
+    side_by_side, state = engine.side_by_side, cache(dataset_state)
     statuses = [_status(cell, folder) for cell in cells]
-    _require_same_data(statuses, folder)
+    _require_same_data(statuses, folder, state)
     statuses = [status for status in statuses if status.cell in chosen]
     write_json(folder / f"{experiment.name}.json", [cell.to_json() for cell in cells])
     keep_source(folder, experiment)
@@ -160,7 +162,8 @@ def _sweep(
         for left in (LOG_FILE, FAILED_FILE):
             (status.folder / left).unlink(missing_ok=True)
         cell, driver = status.cell, data.get(_driver(status.cell))
-        write_cell(status.folder, cell, data[cell.subject], driver, side_by_side=side_by_side)
+        place = data[cell.subject]
+        write_cell(status.folder, cell, place, driver, side_by_side=side_by_side, state=state)
 
     def finished(cell_folder: Path, code: int) -> None:
         for status in statuses:  # variants may share a cell
@@ -241,7 +244,9 @@ def _driver(cell: Cell) -> str:
     return "" if cell.cross_identity is None else cell.cross_identity["driver"]
 
 
-def _require_same_data(statuses: Sequence[CellStatus], folder: Path) -> None:
+def _require_same_data(
+    statuses: Sequence[CellStatus], folder: Path, state: Callable[[Path], str]
+) -> None:
     """Raise UserError where a dataset is another than its cells were trained on."""
     outdated: dict[Path, str] = {}
     for status in statuses:
@@ -249,7 +254,7 @@ def _require_same_data(statuses: Sequence[CellStatus], folder: Path) -> None:
         data, driver = _place(cell.subject, folder), _driver(cell)
         driver_data = _place(driver, folder) if driver else None
         there = data.exists() and (driver_data is None or driver_data.exists())
-        if there and is_of_other_data(status.folder, data, driver_data):
+        if there and is_of_other_data(status.folder, data, driver_data, state=state):
             outdated[status.folder] = f"{data} or {driver_data}" if driver_data else str(data)
     if outdated:
         changed = ", ".join(dict.fromkeys(outdated.values()))

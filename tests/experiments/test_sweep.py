@@ -2,6 +2,7 @@
 
 import csv
 import json
+import os
 import sys
 import time
 from dataclasses import replace
@@ -10,6 +11,7 @@ import pytest
 
 from rgbavatar_ns.cli import main as cli
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.experiments.dataset_state import old_dataset_state
 from rgbavatar_ns.experiments.engines import LocalEngine, RayEngine
 from rgbavatar_ns.experiments.report import write_report
 from rgbavatar_ns.experiments.sweep import cells_of, read_statuses, sweep
@@ -44,6 +46,42 @@ def test_single_rows_can_be_swept_and_the_rest_later(experiment_of, tmp_path):
     with pytest.raises(UserError, match="has no variant 'd'") as refused:
         sweep(experiment, folder, LocalEngine(2), variants=["a", "d"])
     assert "Known are a, b, c." in refused.value.remedy
+
+
+@pytest.mark.parametrize("name", ["imgs/1.jpg", "alpha/1.jpg", "checkpoint/00001.frame"])
+def test_pictures_mattes_and_frames_remade_in_place_are_noticed(experiment_of, tmp_path, name):
+    path, out = tmp_path / "data" / name, tmp_path / "out"
+    path.parent.mkdir()
+    path.write_bytes(b"x" * 200_000)
+    sweep(experiment_of("a"), out, LocalEngine(2))
+    os.utime(path, (0, 0))
+    (tmp_path / "data" / "outputs").mkdir()
+    (tmp_path / "data" / "outputs" / "run.json").touch()
+    (tmp_path / "data" / ".rgbavatar").mkdir()
+    (tmp_path / "data" / ".rgbavatar" / "import.json").touch()
+    sweep(experiment_of("a"), out, LocalEngine(2))
+    for content in (b"x" * 200_001, b"x" * 199_999 + b"y", b"small"):
+        path.write_bytes(content)
+        with pytest.raises(UserError, match="data has changed since cells were trained"):
+            sweep(experiment_of("a"), out, LocalEngine(2))
+
+
+def test_a_cell_of_before_is_asked_for_what_was_kept_then(experiment_of, tmp_path):
+    """Its state is of the tables at the top alone."""
+    theta, out = tmp_path / "data" / "theta.npy", tmp_path / "out"
+    theta.write_bytes(b"first")
+    statuses = sweep(experiment_of("a"), out, LocalEngine(2))
+    (state,) = {old_dataset_state(tmp_path / "data")}
+    for status in statuses:
+        cell = json.loads((status.folder / "cell.json").read_text())
+        del cell["datasets"]
+        (status.folder / "cell.json").write_text(json.dumps(cell | {"dataset_states": [state]}))
+    (tmp_path / "data" / "images").mkdir()
+    (tmp_path / "data" / "images" / "0.png").write_bytes(b"other")
+    assert _calls(sweep(experiment_of("a"), out, LocalEngine(2))) == ["x", "x"]
+    theta.write_bytes(b"again")
+    with pytest.raises(UserError, match="data has changed since cells were trained"):
+        sweep(experiment_of("a"), out, LocalEngine(2))
 
 
 def test_figures_of_a_dataset_as_it_was_are_not_given_for_what_it_is_now(experiment_of, tmp_path):

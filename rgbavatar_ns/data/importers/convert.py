@@ -151,15 +151,21 @@ def source_fingerprint(src: Path, options: ImportOptions, dst: Path | None = Non
     dst: where the import goes, which counts for nothing, be it in the data.
     """
     others = replace(options, flame=None, flame_uv=None, flame_eyelids=None)
+    places = source_places(src, options)
+    lines = _listing(places, follow_out=options.allow_outside, without=dst)
+    return digest([f"{_IMPORTER_VERSION} {others}", *lines])[:16]
+
+
+def source_places(src: Path, options: ImportOptions) -> list[str | Path]:
+    """Where the data lies: its folder, and what its format or the options take from outside."""
     found = find_format(src, options) if src.is_dir() else None
-    outside = []
+    outside: list[Path] = []
     if found and found.key == "flashavatar":
         outside = [tracker_folder(Folder(src))]
     elif found and options.allow_outside:
         outside = folders_outside(Folder(src))
     places = [src, *outside, options.images, options.masks]
-    lines = _listing(places, follow_out=options.allow_outside, without=dst)
-    return digest([f"{_IMPORTER_VERSION} {others}", *lines])[:16]
+    return [place for place in places if place is not None]
 
 
 def flame_fingerprint(options: ImportOptions) -> str | None:
@@ -194,6 +200,23 @@ def _lines(place: str | Path, follow_out: bool, without: Path | None) -> Iterato
     top = os.path.realpath(os.path.expanduser(place))
     if os.path.isfile(top):
         yield _line(os.path.dirname(top), os.path.basename(top))
+    for folder, names, out in data_folders(top, follow_out=follow_out, without=without):
+        # A folder that only leads to an import was made by it.
+        if names or without is None or not without.is_relative_to(os.path.realpath(folder)):
+            yield f"{os.path.relpath(folder, top)}\n"
+        yield from (f"{name} -> {os.readlink(os.path.join(folder, name))}\n" for name in out)
+        for name in names:
+            yield _line(folder, name)
+
+
+def data_folders(
+    top: str, *, follow_out: bool = False, without: Path | None = None
+) -> Iterator[tuple[str, list[str], list[str]]]:
+    """A folder and all below it that hold data, links followed once: each with its files' names.
+
+    The last are the names of links that lead out of the top and are not followed. `without` is a
+    real path that is left out.
+    """
     seen: set[str] = set()
     for folder, names, files in os.walk(top, followlinks=True):
         real = os.path.realpath(folder)
@@ -202,26 +225,12 @@ def _lines(place: str | Path, follow_out: bool, without: Path | None) -> Iterato
             names.clear()
             continue
         seen.add(real)
-        files = sorted(filter(_is_data, files))
-        if without is not None:
-            names[:] = [
-                name
-                for name in names
-                if os.path.realpath(os.path.join(folder, name)) != str(without)
-            ]
-        # A folder that only leads there was made by the import.
-        if files or without is None or not without.is_relative_to(real):
-            yield f"{os.path.relpath(folder, top)}\n"
-        if not follow_out:
-            out = [name for name in names if not _is_within(top, os.path.join(folder, name))]
-            names[:] = [name for name in names if name not in out]
-            yield from (f"{name} -> {os.readlink(os.path.join(folder, name))}\n" for name in out)
-        for name in files:
-            yield _line(folder, name)
-
-
-def _is_within(top: str, place: str) -> bool:
-    return Path(os.path.realpath(place)).is_relative_to(top)
+        places = {name: os.path.realpath(os.path.join(folder, name)) for name in names}
+        names[:] = [name for name in names if places[name] != str(without)]
+        out = [name for name in names if not Path(places[name]).is_relative_to(top)]
+        out = [] if follow_out else out
+        names[:] = [name for name in names if name not in out]
+        yield folder, sorted(filter(_is_data, files)), out
 
 
 def _is_data(name: str) -> bool:
