@@ -20,16 +20,14 @@ def dataset_state(folder: Path) -> str:
     data. Pictures at the folder's top are for people to look at. Raises UserError where one cannot
     be read.
     """
+    places = [os.path.realpath(place) for place in source_places(folder, ImportOptions())]
     return digest(
         part
-        for place in source_places(folder, ImportOptions())
-        for below, names, _ in data_folders(os.path.realpath(place))
-        for name in names
-        if not _is_to_look_at(Path(below, name), Path(place).resolve())
-        for part in (
-            os.path.relpath(Path(below, name), os.path.realpath(place)),
-            _content(Path(below, name)),
-        )
+        for place in places
+        for below, names, _ in data_folders(place)
+        for path in (Path(below, name) for name in names)
+        if not _is_to_look_at(path, Path(place))
+        for part in (os.path.relpath(path, place), _content(path))
     )
 
 
@@ -59,5 +57,7 @@ def _content(path: Path) -> str:
             first = file.read(_END_BYTES)
             file.seek(size - _END_BYTES)
             return digest([str(size), first, file.read(_END_BYTES)])
+    except FileNotFoundError:
+        return "missing"  # a link to nothing, which is nobody's data either
     except OSError as error:
         raise UserError(f"{path} cannot be read: {error.strerror}.", "Check the file.") from None
