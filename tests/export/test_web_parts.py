@@ -254,6 +254,36 @@ def test_too_little_memory_is_not_called_damage(window, page_file):
     assert told[1] == "Array buffer allocation failed"
 
 
+def test_on_a_slow_display_all_is_shown_again_and_slow_pictures_are_no_slow_display(
+    window, page_file
+):
+    page = _opened(window, page_file.as_uri())
+    found = page.evaluate(
+        """() => {
+          const places = (...runs) => {
+            const pace = new Pace(), found = [];
+            let now = 0;
+            for (const [count, milliseconds] of runs) {
+              for (let i = 0; i < count; i++) {
+                now += milliseconds + (i % 2 ? 0.3 : -0.3); // no clock is even
+                pace.moves(now);
+              }
+              found.push(pace.place);
+            }
+            return found;
+          };
+          return [
+            ...[50, 30].map((hertz) => places([20, 1000 / hertz], [4, 100], [80, 1000 / hertz])),
+            places([20, 1000 / 60], [4, 100], [200, 1000 / 30]), // every other one is missed
+            places([8, 100], [80, 45]), // as even as a display's, but slow
+          ];
+        }"""
+    )
+    assert found[:3] == [[0, 1, 0], [0, 1, 0], [0, 1, 1]]
+    assert found[3][0] == 1
+    assert found[3][1] > 1
+
+
 def test_slow_moving_pictures_show_less_and_still_ones_all(window, page_file):
     page = _opened(window, page_file.as_uri())
     places = page.evaluate(

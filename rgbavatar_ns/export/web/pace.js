@@ -15,6 +15,8 @@ const SLOW_PICTURES = 7; // whose middle one is slow, until less is drawn
 const CRAWLING = 160; // milliseconds; then fewer pictures are waited for, and two steps taken
 const CRAWLING_PICTURES = 3;
 const FAST_PICTURES = 60; // in a row, until more is tried
+const LATELY = 300; // pictures, whose shortest interval is as fast as the display goes
+const ON_TIME = 1.25; // times that: no picture of the display's was missed
 const MOST_PATIENCE = 16; // times as many, where more was too much before
 const REST = 250; // milliseconds without a moving picture, until one is drawn in full
 
@@ -23,6 +25,7 @@ class Pace {
     this.place = 0; // in PACE_STEPS
     this.resting = true;
     this._recent = [];
+    this._lately = [];
     this._fast = 0;
     this._patience = 1;
     this._last = null; // when the last moving picture was drawn
@@ -67,7 +70,7 @@ class Pace {
   }
 
   _judge(milliseconds) {
-    this._fast = milliseconds < FAST ? this._fast + 1 : 0;
+    this._fast = this._isFast(milliseconds) ? this._fast + 1 : 0;
     this._recent.push(milliseconds);
     if (this._fast >= FAST_PICTURES * this._patience && this.place > 0) {
       this._go(-1);
@@ -78,6 +81,13 @@ class Pace {
     if (steps === 0) return;
     if (this._tried) this._patience = Math.min(2 * this._patience, MOST_PATIENCE);
     this._go(steps);
+  }
+
+  /** Fast enough to try more: a display of 50 Hz or slower never gives less than FAST. */
+  _isFast(milliseconds) {
+    this._lately.push(milliseconds);
+    if (this._lately.length > LATELY) this._lately.shift();
+    return milliseconds < Math.max(FAST, Math.min(ON_TIME * Math.min(...this._lately), SLOW));
   }
 
   /** How many steps too much the last pictures were. */
