@@ -219,7 +219,8 @@ class RGBAvatarTrainer(EndingTrainer, FitHooks):
             rate = settings[name]["optimizer"].lr
             factor = 1.0 if name in scheduled else self.config.learning_rate_factor
             if name == "position" and self.config.position_lr_final is not None:
-                factor = self.config.position_lr_final / rate
+                # Positions that are kept still (a rate of 0) stay so.
+                factor = self.config.position_lr_final / rate if rate > 0 else 1.0
             start = model.refinement.first_step_of(name, refined) if model.refine_tracking else 0
             if (factor != 1.0 or start > 0) and settings[name].get("scheduler") is None:
                 settings[name]["scheduler"] = DecayConfig(

@@ -1,5 +1,6 @@
 """Training through nerfstudio's trainer: repeatable, resumable bit for bit, interruptible."""
 
+import copy
 import dataclasses
 import json
 import math
@@ -202,6 +203,24 @@ def test_the_papers_method_has_its_constant_rates(config_of: ConfigOf):
     assert constant.pipeline.datamanager.batch_size == 10
     assert constant.pipeline.model.avatar.num_bases == 20
     assert constant.pipeline.model.avatar.uv_resolution == 256
+
+
+def test_positions_whose_rate_is_0_stay_where_they_are(config_of: ConfigOf):
+    # The surface prior lays Gaussians upon the surface, whatever their rate.
+    config = config_of(max_num_iterations=3, surface_prior=False)
+    assert config.position_lr_final is not None
+    config.optimizers = copy.deepcopy(config.optimizers)
+    config.optimizers["position"]["optimizer"].lr = 0.0
+    trainer = make_trainer(config)
+    avatar = trainer.pipeline.model.avatar
+    before = {name: value.detach().clone() for name, value in avatar.named_parameters()}
+    trainer.train()
+    moved = {n for n, value in avatar.named_parameters() if not torch.equal(value, before[n])}
+    positions = {id(p) for p in avatar.parameter_groups()["position"]}
+    still = {name for name, value in avatar.named_parameters() if id(value) in positions}
+    assert len(still) == 1
+    assert not moved & still
+    assert moved
 
 
 def test_training_lowers_the_loss_and_colors_gaussians(config_of: ConfigOf):
