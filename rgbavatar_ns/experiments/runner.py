@@ -13,6 +13,7 @@ from typing import Any
 
 from rgbavatar_ns.avatar.loading import load_avatar
 from rgbavatar_ns.avatar.method import AvatarMethod
+from rgbavatar_ns.avatar.storage.checkpoint_file import checkpoints_of
 from rgbavatar_ns.bench.machine import machine_facts
 from rgbavatar_ns.data import TrackedDataset, load_dataset
 from rgbavatar_ns.errors import UserError, told_as_user_error
@@ -57,12 +58,15 @@ def write_cell(
 ) -> None:
     """Leave in `folder` what `run_cell` needs: the cell, its dataset and its driver's.
 
-    side_by_side: whether other cells may run on the machine meanwhile. state: what a dataset is
+    side_by_side: whether other cells may run on the machine meanwhile; of training that goes on
+    from a checkpoint it stays so, since part of its seconds was shared. state: what a dataset is
     now, which may remember it.
     """
     places = {"data": str(data), "driver_data": None if driver is None else str(driver)}
     states = {_STATES: [state(place) for place in (data, driver) if place is not None]}
-    run = {SIDE_BY_SIDE: side_by_side}
+    goes_on = bool(checkpoints_of(run_folder_of(folder, cell)))
+    before = (read_json(folder / CELL_FILE) or {}).get(SIDE_BY_SIDE) is True
+    run = {SIDE_BY_SIDE: side_by_side or (goes_on and before)}
     write_json(folder / CELL_FILE, {**cell.to_json(), **places, **states, **run})
 
 

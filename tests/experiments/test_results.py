@@ -277,6 +277,26 @@ def test_an_engine_of_several_cells_at_once_says_so_to_each(file, tmp_path, at_o
     sweep(read_experiment(file), tmp_path / "out", Ready(at_once))
 
 
+def test_a_cell_that_began_beside_others_and_goes_on_alone_has_shared_its_seconds(file, tmp_path):
+    """One that had not begun has not."""
+
+    class Ready(LocalEngine):
+        def run(self, folders, finished):
+            for folder in folders:
+                described = json.loads((folder / "cell.json").read_text())
+                told[folder] = described["side_by_side"]
+
+    told: dict[Path, bool] = {}
+    experiment = read_experiment(file)
+    begun, *others = (s.folder for s in sweep(experiment, tmp_path / "out", Ready(4)))
+    models = run_folder_of(begun, cells_of(experiment)[0]) / "nerfstudio_models"
+    models.mkdir(parents=True)
+    (models / "step-000000010.ckpt").touch()
+    for _ in range(2):
+        sweep(experiment, tmp_path / "out", Ready(1))
+        assert told == {begun: True, **dict.fromkeys(others, False)}
+
+
 @pytest.mark.parametrize("damage", [{}, {"metrics": {"psnr": "good"}, "curve": {}}])
 def test_kept_cells_without_figures_are_told(damage, tmp_path):
     path = tmp_path / "x.json"
