@@ -4,8 +4,10 @@ import html
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from urllib.parse import quote
 
 from rgbavatar_ns.experiments.plots import write_convergence, write_forgetting_curves, write_plots
+from rgbavatar_ns.experiments.source import swept_names
 from rgbavatar_ns.experiments.spec import Experiment
 from rgbavatar_ns.experiments.sweep import CellStatus, read_statuses
 from rgbavatar_ns.experiments.tables import ResultTable, Row, result_table
@@ -31,6 +33,9 @@ class Report:
 def write_report(experiment: Experiment, folder: Path, *, plots: bool = True) -> Report:
     """Write NAME.md, .csv, .tex, .png, .svg and index.html into `folder/report`.
 
+    Where other experiments were swept into the folder too, the page is NAME.html, and index.html
+    leads to theirs and to this one.
+
     Every row of the CSV and of the page names its cells; `folder/cells/HASH` holds the run, its
     config and its log. Raises UserError where the sweep was never begun.
     """
@@ -47,10 +52,31 @@ def write_report(experiment: Experiment, folder: Path, *, plots: bool = True) ->
         drawn = write_plots(experiment, table, out, experiment.name)
         drawn += write_convergence(experiment, statuses, out, experiment.name)
         drawn += write_forgetting_curves(statuses, out, experiment.name)
-    page = out / "index.html"
-    with atomic_write(page) as partial:
-        partial.write_text(_page(experiment, table, statuses, drawn), encoding="utf-8")
-    return Report(table, statuses, [*paths, *drawn, page])
+    names = sorted({*swept_names(folder), experiment.name})
+    text = _page(experiment, table, statuses, drawn)
+    pages = {"index.html": text}
+    if len(names) > 1:
+        pages = {f"{experiment.name}.html": text, "index.html": _contents(names)}
+    for name, content in pages.items():
+        with atomic_write(out / name) as partial:
+            partial.write_text(content, encoding="utf-8")
+    return Report(table, statuses, [*paths, *drawn, *(out / name for name in pages)])
+
+
+def _contents(names: Sequence[str]) -> str:
+    """A page that leads to each experiment's."""
+    links = "".join(
+        f'<p><a href="{quote(name)}.html">{html.escape(name)}</a></p>' for name in names
+    )
+    return _whole_page("Experiments", links)
+
+
+def _whole_page(title: str, content: str) -> str:
+    told = html.escape(title)
+    return (
+        f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{told}</title>'
+        f"<style>{_STYLE}</style><h1>{told}</h1>{content}</html>\n"
+    )
 
 
 def _page(
@@ -67,12 +93,7 @@ def _page(
         for status in statuses
         if status.state == "failed"
     )
-    return (
-        f'<!doctype html><html lang="en"><meta charset="utf-8"><title>'
-        f"{html.escape(experiment.title)}</title><style>{_STYLE}</style>"
-        f"<h1>{html.escape(experiment.title)}</h1>{tables}"
-        f"{notes}{pictures}{failed}</html>\n"
-    )
+    return _whole_page(experiment.title, f"{tables}{notes}{pictures}{failed}")
 
 
 def _html_table(table: ResultTable, rows: Sequence[Row]) -> str:

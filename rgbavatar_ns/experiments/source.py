@@ -35,6 +35,11 @@ def keep_source(folder: Path, experiment: Experiment) -> None:
         write_json(folder / f"{experiment.name}{_SUFFIX}", asdict(experiment.spec_text))
 
 
+def swept_names(folder: Path) -> set[str]:
+    """The names of the experiments that were swept into `folder` from files."""
+    return {path.name.removesuffix(_SUFFIX) for path in folder.glob(f"*{_SUFFIX}")}
+
+
 def read_sources(folder: Path) -> list[Source]:
     """All experiments that were swept into `folder`, by name.
 

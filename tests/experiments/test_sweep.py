@@ -11,6 +11,7 @@ import pytest
 
 from rgbavatar_ns.cli import main as cli
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.experiments import read_experiment
 from rgbavatar_ns.experiments.dataset_state import old_dataset_state
 from rgbavatar_ns.experiments.engines import LocalEngine, RayEngine
 from rgbavatar_ns.experiments.report import write_report
@@ -228,6 +229,25 @@ def test_the_command_says_what_failed_and_ends_with_1(experiment_of, tmp_path, c
     assert "rgbavatar report" in told
     cli.main(["report", str(tmp_path / "out"), "--file", str(tmp_path / "bases.yaml")])
     assert "index.html" in capsys.readouterr().out
+
+
+def test_two_experiments_of_one_folder_keep_a_page_each(experiment_of, tmp_path, capsys):
+    out = tmp_path / "out"
+    sweep(experiment_of("a"), out, LocalEngine(2))
+    cli.main(["report", str(out), "--no-plots"])
+    assert [path.name for path in out.glob("report/*.html")] == ["index.html"]
+    text = (tmp_path / "bases.yaml").read_text()
+    (tmp_path / "other.yaml").write_text(text.replace("Bases & more", "Quite others"))
+    sweep(read_experiment(tmp_path / "other.yaml"), out, LocalEngine(2))
+    cli.main(["report", str(out), "--no-plots"])
+    told = capsys.readouterr().out.replace("\n", "")
+    pages = {path.name: path.read_text() for path in out.glob("report/*.html")}
+    assert pages.keys() == {"bases.html", "other.html", "index.html"}
+    assert "<h1>Bases &amp; more</h1>" in pages["bases.html"]
+    assert "<h1>Quite others</h1>" in pages["other.html"]
+    for name in ("bases.html", "other.html"):
+        assert f'<a href="{name}">' in pages["index.html"]
+        assert name in told
 
 
 def test_a_report_before_the_sweep_is_refused(experiment_of, tmp_path):
