@@ -6,7 +6,9 @@ import pytest
 
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.experiments import cells_of, read_experiment
+from rgbavatar_ns.experiments.overrides import with_overrides
 from rgbavatar_ns.experiments.sweep import check_experiment
+from rgbavatar_ns.plugin.presets import presets
 
 CONFIGS = sorted((Path(__file__).parents[2] / "configs").glob("*.yaml"))
 
@@ -31,6 +33,19 @@ def _read(tmp_path, text, **options):
     path = tmp_path / "widths.yaml"
     path.write_text(text)
     return read_experiment(path, **options)
+
+
+@pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
+@pytest.mark.parametrize("tiny", [False, True])
+def test_rates_that_fall_do_so_within_a_run_that_ends_by_the_clock(path, tiny):
+    """Its max_num_iterations is no length: rates would stay where they begin."""
+    experiment, known = read_experiment(path, tiny=tiny), presets()
+    for variant in experiment.variants:
+        preset = known[variant.preset or experiment.preset]
+        config = with_overrides(preset, {**experiment.base, **variant.overrides})
+        falls = config.position_lr_final is not None or config.learning_rate_factor != 1
+        if config.max_train_seconds is not None and falls:
+            assert config.learning_rate_steps is not None, variant.name
 
 
 def test_cells_are_variants_by_subjects_by_seeds(tmp_path):
