@@ -11,6 +11,7 @@ from torch import Tensor
 
 from rgbavatar_ns.avatar.method import AvatarMethod
 from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics, expressive_numbers
+from rgbavatar_ns.driving.closed_lips import ClosedLips
 from rgbavatar_ns.driving.one_euro import OneEuroFilter, OneEuroOptions
 from rgbavatar_ns.driving.source import PerformanceFrame, PerformerHead
 from rgbavatar_ns.driving.theta_map import MappedTheta, arkit_theta, theta_map
@@ -110,7 +111,7 @@ class LiveTransfer:
         self._unit = (self._high - self._low).clamp(min=_LEAST_UNIT)
         self._lips = LipGap.of(avatar.head, avatar.identity)
         if self._lips is not None:
-            self._closed_m = self._lips.at_rest_m
+            self._closed = ClosedLips(self._lips.at_rest_m)
             self._own_closed_m = float(self._lips(own.theta_neutral[None])[0])
         self._rises = _rises(avatar.layout, own)
         self._filter = OneEuroFilter(options.filter)
@@ -188,6 +189,8 @@ class LiveTransfer:
         if over or not self._calibrated:
             self._reference = self._reference_of(torch.stack(self._seen))
         if over:
+            if self._lips is not None:
+                self._closed.calibrate(self._lips(torch.stack(self._seen)))
             self._learning, self._calibrated, self._seen = False, True, []
 
     def _settle(self, theta: Float[Tensor, "H"], seconds: float) -> None:
@@ -233,9 +236,7 @@ class LiveTransfer:
         where everybody looks: closed lips would stand open, and words be said through closed ones.
         """
         gap_m, own_m = lips(torch.stack([performed, theta])).tolist()
-        share = 1 - math.exp(-seconds / _SETTLES_IN_S)
-        self._closed_m += share * min(gap_m - self._closed_m, 0.0)
-        wanted_m = self._own_closed_m + gap_m - self._closed_m
+        wanted_m = self._own_closed_m + gap_m - self._closed.follow(gap_m, seconds)
         jaw = float(theta[lips.jaw]) + (wanted_m - own_m) / lips.slope_m_per_rad
         if self.options.keep_range:
             low, high = float(self._low[lips.jaw]), float(self._high[lips.jaw])

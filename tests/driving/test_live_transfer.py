@@ -182,6 +182,58 @@ def test_calibrating_again_takes_the_new_rest(avatar, own):
     torch.testing.assert_close(again[where], rest[where], atol=5e-3, rtol=0)
 
 
+class _Mouth:
+    """A performer who keeps each face for a while; how far the avatar's lips are then apart."""
+
+    def __init__(self, avatar: Avatar, own: TrainingStatistics) -> None:
+        head = PerformerHead(HeadModel(_HEAD).layout, _HEAD)
+        self.transfer = LiveTransfer(avatar, own, head, front_camera(avatar, 64, 64))
+        self._jaw, self._size = avatar.layout.slice("jaw").start, avatar.layout.size
+        self._count = 0
+
+    def show(self, seconds: float, jaw: float = 0.0, **expressions: float) -> float:
+        theta = torch.zeros(self._size)
+        theta[self._jaw] = jaw
+        for name, weight in expressions.items():
+            theta[_HEAD.expression_names.index(name)] = weight
+        driven = theta
+        for _ in range(int(seconds * _RATE)):
+            time_s = self._count / _RATE
+            driven = self.transfer(PerformanceFrame(self._count, time_s, time_s, theta=theta))
+            self._count += 1
+        return float(_gap(driven[None])[0])
+
+
+def test_lips_that_were_pressed_once_close_again_by_themselves(avatar, own):
+    mouth = _Mouth(avatar, own)
+    before = mouth.show(10.0)
+    mouth.show(1.0, mouthClose=0.4)
+    assert mouth.show(0.5) > before + 0.002, "else there was nothing to forget"
+    assert mouth.show(30.0) == pytest.approx(before, abs=5e-4)
+
+
+def test_calibrating_again_forgets_that_lips_were_pressed(avatar, own):
+    mouth = _Mouth(avatar, own)
+    before = mouth.show(2.0)
+    mouth.show(1.0, mouthClose=0.4)
+    mouth.transfer.calibrate()
+    assert mouth.show(2.0) == pytest.approx(before, abs=5e-4)
+
+
+def test_lips_that_are_measured_apart_while_closed_are_closed(avatar, own):
+    """A tracker that sees the jaw a little open at rest: that is the performer's rest."""
+    closed = _Mouth(avatar, own).show(3.0)
+    mouth = _Mouth(avatar, own)
+    assert mouth.show(3.0, jaw=0.04) == pytest.approx(closed, abs=5e-4)
+
+
+def test_a_mouth_that_is_kept_open_stays_open(avatar, own):
+    mouth = _Mouth(avatar, own)
+    mouth.show(3.0)
+    opened = mouth.show(1.0, jaw=0.15)
+    assert mouth.show(60.0, jaw=0.15) == pytest.approx(opened, abs=5e-4)
+
+
 def test_an_arkit_stream_of_the_demo_performance_comes_back(avatar):
     """Sent as Live Link Face sends, driving the subject itself: each expression's correlation."""
     performed = _performance(7)
