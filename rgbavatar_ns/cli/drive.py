@@ -158,6 +158,7 @@ def _performer(
     subject: "Subject", options: SourceOptions, real_time: bool, with_images: bool
 ) -> "PerformanceSource":
     """The source that the flags name; raises UserError where there is none."""
+    from rgbavatar_ns.data.streams.address import told_address
     from rgbavatar_ns.driving.source import PerformerHead
     from rgbavatar_ns.driving.sources import live_link_face, vmc, web_socket
 
@@ -170,10 +171,14 @@ def _performer(
         return vmc.VmcSource(listen or vmc.DEFAULT_ADDRESS, remote)
     if name == "websocket":
         own = PerformerHead(subject.avatar.layout, subject.avatar.head.arrays)
-        return web_socket.WebSocketSource(own, listen or web_socket.DEFAULT_ADDRESS, remote)
+        opened = web_socket.WebSocketSource(own, listen or web_socket.DEFAULT_ADDRESS, remote)
+        keyed = f"from a page of the disk: ws://{opened.keyed_address}"
+        _tell(f"Messages are taken at ws://{opened.address} ({keyed})")
+        return opened
     if listen is not None:
         raise UserError(
-            f"The source {name} listens to nobody.", "--listen is for arkit, vmc and websocket."
+            f"The source {told_address(name)} listens to nobody.",
+            "--listen is for arkit, vmc and websocket.",
         )
     path = Path(name).expanduser()
     if path.suffix.lower() == ".csv":

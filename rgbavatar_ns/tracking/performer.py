@@ -9,6 +9,7 @@ from typing import Any
 from jaxtyping import Float
 from torch import Tensor
 
+from rgbavatar_ns.data.streams.address import told_address
 from rgbavatar_ns.driving.source import PerformanceFrame, PerformerHead
 from rgbavatar_ns.errors import UserError, first_few
 from rgbavatar_ns.tracking.input.capture import (
@@ -44,7 +45,7 @@ class FilmedPerformer(TrackedCapture):
         capture: FrameCapture | None = None,
     ) -> None:
         super().__init__(_open(source, real_time) if capture is None else capture, tracker)
-        self._source = source
+        self._told = told_address(source)
         self.head = PerformerHead(self._tracker.head.layout, self._tracker.head.arrays)
         self._with_images = with_images
         self._keeps_all = not real_time
@@ -61,9 +62,9 @@ class FilmedPerformer(TrackedCapture):
     def waits_for(self) -> str:
         """A picture, or a face in it."""
         if not self._shown:
-            return f"the first picture of {self._source}"
+            return f"the first picture of {self._told}"
         told = "to be met" if not self._tracker.ready else "to be found again"
-        return f"a face in {self._source} {told}: look at the camera, well lit and near"
+        return f"a face in {self._told} {told}: look at the camera, well lit and near"
 
     def next(self, timeout_s: float) -> PerformanceFrame | None:
         """The head in the newest picture; tracking one may take longer than `timeout_s`."""
@@ -106,7 +107,7 @@ class FilmedPerformer(TrackedCapture):
         silent_s = time.monotonic() - self._began_s
         if not self._shown and not self.ended and silent_s > _FIRST_PICTURE_S:
             raise UserError(
-                f"{self._source} has shown no picture for {silent_s:.0f} seconds.", _REMEDY
+                f"{self._told} has shown no picture for {silent_s:.0f} seconds.", _REMEDY
             )
 
 
@@ -126,7 +127,7 @@ def _open(source: str, real_time: bool) -> FrameCapture:
     if not opened:
         there = sorted(glob.glob("/dev/video*"))
         known = f" There are {first_few(there, 4)}." if there else " No camera is there."
-        which = f"Camera {source}" if source.isdecimal() else source
+        which = f"Camera {source}" if source.isdecimal() else told_address(source)
         raise UserError(
             f"{which} cannot be opened: it is not there, or another program has it.{known}", _REMEDY
         )

@@ -156,6 +156,17 @@ def test_the_page_is_served_and_driven(avatar, performer, capsys):
     assert re.search(f"[?]ws=ws://127.0.0.1:{port}/[-_A-Za-z0-9]{{12}}\n", told), "for the disk's"
 
 
+def test_the_key_for_pages_of_the_disk_is_told_in_the_terminal_once(avatar, capsys):
+    where = ("--source", "websocket", "--listen", "127.0.0.1:0", "--serve", "127.0.0.1:0")
+    _drive(avatar, *where, "--seconds", 4)
+    lines = capsys.readouterr().err.splitlines()
+    keyed = [
+        line for line in lines if re.search("the disk: ws://127.0.0.1:[0-9]+/[-_\\w]{12}", line)
+    ]
+    assert len(keyed) == 1
+    assert any(line.startswith("Waiting for messages") for line in lines)
+
+
 @pytest.mark.parametrize(
     ("words", "told"),
     [

@@ -131,6 +131,12 @@ def test_the_key_is_another_each_time(source):
     assert source.keyed_address.split("/")[1] != other.keyed_address.split("/")[1]
 
 
+def test_pages_that_show_what_is_waited_for_learn_no_key(source):
+    key = source.keyed_address.split("/")[1]
+    assert source.address in source.waits_for
+    assert key not in source.waits_for
+
+
 def test_other_machines_reach_it_only_when_asked_for():
     own = PerformerHead(_HEAD.layout, HeadArrays.embedded())
     with pytest.raises(UserError, match="Other machines could reach"):

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from rgbavatar_ns.data.streams.address import told_address
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.export import write_video
 from rgbavatar_ns.head import HeadModel
@@ -130,6 +131,45 @@ def test_a_camera_that_shows_nothing_is_told(monkeypatch):
     with pytest.raises(UserError, match="0 has shown no picture for"):
         performer.next(0.1)
     performer.close()
+
+
+def test_a_cameras_password_is_told_to_nobody(monkeypatch):
+    source = "rtsp://admin:secret@cam:554/1?token=secret"
+    closed = SimpleNamespace(isOpened=lambda: False, release=lambda: None)
+    silent = LatestFrameCapture(source, opener=lambda source: closed)
+    performer = FilmedPerformer(source, tracker=_Tracker(), capture=silent)
+    told = [performer.waits_for]
+    performer._shown = True
+    told.append(performer.waits_for)
+    performer._shown = False
+    monkeypatch.setattr("rgbavatar_ns.tracking.performer._FIRST_PICTURE_S", 0.0)
+    with pytest.raises(UserError) as silence:
+        performer.next(0.1)
+    performer.close()
+    # A port of this machine at which nothing answers.
+    with pytest.raises(UserError) as refused:
+        FilmedPerformer(source.replace("cam:554", "127.0.0.1:9"), tracker=_Tracker())
+    told += [str(silence.value), str(refused.value)]
+    assert all("rtsp://cam:554/1" in line for line in told[:3])
+    assert "rtsp://127.0.0.1:9/1" in told[3]
+    assert not any("secret" in line or "admin" in line for line in told)
+
+
+@pytest.mark.parametrize(
+    ("address", "told"),
+    [
+        ("rtsp://cam/1", "rtsp://cam/1"),
+        ("rtsp://a:b@[::1]:554/1", "rtsp://[::1]:554/1"),
+        ("rtsp://a:p@/ss@cam/1", "rtsp://cam/1"),
+        ("rtsp://a:p?ss@cam/1", "rtsp://..."),
+        ("http://cam/v.mjpg?user=a&pwd=b", "http://cam/v.mjpg"),
+        ("rtsp://cam/user=a&password=b.sdp", "rtsp://cam/..."),
+        ("me@home.mp4", "me@home.mp4"),
+        ("0", "0"),
+    ],
+)
+def test_an_address_is_told_without_what_opens_it(address, told):
+    assert told_address(address) == told
 
 
 def test_a_camera_that_comes_back_with_another_size_is_told():

@@ -1,4 +1,4 @@
-"""Where frames are sent to: a port of this machine."""
+"""Where frames are sent to, a port of this machine; and how an address is told."""
 
 import contextlib
 import ipaddress
@@ -42,3 +42,19 @@ class StreamAddress(NamedTuple):
     def __str__(self) -> str:
         """As `parse` reads it."""
         return f"[{self.host}]:{self.port}" if ":" in self.host else f"{self.host}:{self.port}"
+
+
+def told_address(address: str) -> str:
+    """An address as anybody may read it: neither user nor password, nor anything that may be one.
+
+    Cameras take a password before the host, in the query (left out), and in the path
+    (`/user=...&password=...`, left out too). What is no address stays as it is.
+    """
+    scheme, mark, rest = address.partition("://")
+    if not mark:
+        return address
+    place, _, asked = rest.partition("?")
+    if "@" in asked:  # of a password with a question mark in it, perhaps
+        return f"{scheme}://..."
+    host, slash, path = place.rpartition("@")[2].partition("/")
+    return f"{scheme}://{host}{slash}{'...' if '=' in path else path}"

@@ -48,10 +48,8 @@ class WebSocketSource:
         self._senders: list[ServerConnection] = []
         self._index = 0
         self._server = LocalServer(listen, allow_remote, self._talk)
-        self.waits_for = (
-            f'messages "arkit" or "theta" at ws://{self._server.address} '
-            f"(from a page of the disk: ws://{self._server.keyed_address})"
-        )
+        # Pages show it, also to others: without the key.
+        self.waits_for = f'messages "arkit" or "theta" at ws://{self._server.address}'
 
     @property
     def address(self) -> str:
