@@ -218,6 +218,7 @@ class Stages:
         self.seconds: dict[str, float] = {}
         self._path = folder / "stages.json"
         self._tell = tell
+        self._forgets = fresh
         self._key = ""
         if made_from is not None:
             self._key = self._next_key("", made_from)
@@ -232,8 +233,10 @@ class Stages:
             self._tell(name, known["seconds"])
         else:
             self._tell(name, None)
-            if known is not None:  # what it named may be replaced now, and is not whole meanwhile
-                del self._done[name]
+            if known is not None or self._forgets:
+                # What was done may be replaced now, and is not whole meanwhile.
+                self._done.pop(name, None)
+                self._forgets = False
                 write_json(self._path, self._done)
             started = time.monotonic()
             result = action(self._key)

@@ -239,6 +239,19 @@ def test_a_stage_that_was_begun_anew_and_interrupted_is_not_done(tmp_path):
     assert calls == ["first", "second", "first"]
 
 
+def test_what_fresh_work_was_interrupted_in_is_not_done_either(tmp_path):
+    calls = []
+    _run_two(tmp_path, calls)
+
+    def interrupted(key):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        Stages(tmp_path, fresh=True).run("first", {"s": "a"}, interrupted)
+    _run_two(tmp_path, calls)
+    assert calls == ["first", "second"] * 2
+
+
 def test_a_record_of_before_still_counts(tmp_path):
     """The keys are part of the format."""
     result = {"key": "c081e75ff0", "seconds": 1.0, "result": {"data": "x"}}

@@ -1,5 +1,6 @@
 """`rgbavatar demo`: from nothing (or from a video) to a trained avatar, through nerfstudio."""
 
+import shutil
 import sys
 import time
 from pathlib import Path
@@ -84,7 +85,9 @@ def run(
     trained = stages.run(
         "train",
         {"method": method, "steps": steps, "seed": seed, "refine_tracking": bool(video)},
-        lambda key: _train(folder, output, key, method, steps, seed, refine_tracking=bool(video)),
+        lambda key: _train(
+            *(folder, output, key, method, steps, seed), refine_tracking=bool(video), anew=fresh
+        ),
     )
     run_folder = Path(trained["run"])
     scores = stages.run(
@@ -207,9 +210,12 @@ def _train(
     seed: int,
     *,
     refine_tracking: bool,
+    anew: bool,
 ) -> Result:
     # Where ns-train puts an experiment of this name: what takes a run takes `output` too.
     run_folder = output / method / key
+    if anew:  # else a complete run, whose settings are the same, would be gone on with
+        shutil.rmtree(run_folder, ignore_errors=True)
     options: list[str] = []
     if refine_tracking:
         options += ["--pipeline.model.refine-tracking", "True"]

@@ -15,7 +15,8 @@ class TrackConfig(CheckedOptions):
     """Side of the square images of the dataset, pixels. None keeps the film's own, up to 512, where
     they are 400 or more, and else gives the head 256, and so more to what shows shoulders too."""
     test_frames: Counted | None = None
-    """Last frames held out for evaluation; None holds out a fifth of the tracked frames."""
+    """Last frames held out for evaluation; None holds out a fifth of the tracked frames,
+    and one of two to four."""
     max_frames: Count | None = None
     """Read at most so many frames in all; None reads everything."""
     focal_px: Annotated[float, Between(1, 1e6)] | None = None

@@ -164,7 +164,9 @@ class _Tracking:
 
     def _held_out(self, frames: int) -> int:
         """How many of the last frames are held out; UserError where none would be left."""
-        test = frames // 5 if self.config.test_frames is None else self.config.test_frames
+        test = self.config.test_frames
+        if test is None:
+            test = max(1, frames // 5) if frames > 1 else 0
         if test >= frames:
             raise UserError(
                 f"{test} of {frames} tracked frames cannot be held out.",

@@ -146,8 +146,10 @@ def test_an_avatars_data_is_not_replaced_by_the_same_film_tracked_otherwise(
     facts = {"train_seconds": 1.0, "images_per_second": 1.0}
     trained = []
 
-    def train(method, *given):
+    def train(method, data, run_folder, *given):
         trained.append(method)
+        assert not run_folder.exists()  # where there is a complete run nothing would be trained
+        run_folder.mkdir(parents=True)
         return facts
 
     scores = {"psnr": 30.0, "psnr_head": 30.0, "ssim": 0.9}
@@ -164,6 +166,8 @@ def test_an_avatars_data_is_not_replaced_by_the_same_film_tracked_otherwise(
     main(["demo", "--video", "me.mp4", "--tiny", "--output", "outputs/me-tiny"])
     main(["demo", "--video", "me.mp4", "--tiny", "--fresh"])
     assert trained == ["rgbavatar-quick"] * 2 + ["rgbavatar-tiny"] * 2
+    main(["demo", "--video", "me.mp4", "--tiny", "--fresh"])
+    assert trained[4:] == ["rgbavatar-tiny"]
 
 
 @pytest.mark.parametrize(

@@ -48,6 +48,16 @@ def _film(
     return film
 
 
+def test_lost_mattes_are_told_also_where_most_of_the_crop_was_never_filmed() -> None:
+    film, inside = _film(_room(), mistaken=5), INSIDE.copy()
+    inside[:, :8], inside[:36], inside[78:] = False, False, False
+    found = find_background(film, inside)
+    assert found.plate is not None
+    covered = np.all([mask > 0.3 for _, mask in film[5:]], axis=0) & inside
+    assert covered.any()
+    assert not found.plate.known[covered].any()
+
+
 def test_what_is_uncovered_is_known_to_the_noise_and_the_rest_is_not() -> None:
     room, film = _room(), _film(_room())
     found = find_background(film, INSIDE)

@@ -152,6 +152,23 @@ def test_gaps_jumps_pauses_and_new_clips_begin_segments() -> None:
     assert followed_face(_seen(faces, clip=clips), WIDTH, HEIGHT).follows().index(False, 1) == 5
 
 
+def test_where_others_sat_in_one_clip_the_person_may_sit_in_the_next() -> None:
+    person, other = _face(200, 240), _face(500, 240, 80)
+    both = SeenFaces(
+        count=np.array([2] * 10 + [1] * 10),
+        clip=np.repeat([0, 1], 10),
+        time_s=np.arange(20) * 0.04,
+        has_alpha=np.zeros(20, dtype=bool),
+        points=np.array([person, other] * 10 + [_face(500, 240)] * 10) / (WIDTH, HEIGHT),
+        irises=np.full((30, 2, 2), 0.5),
+        iris_sigma=np.full((30, 2, 2), 0.02),
+        sharpness=np.ones(30),
+    )
+    found = followed_face(both, WIDTH, HEIGHT)
+    assert found.frame_index == tuple(range(20))
+    assert found.points_px[:, :, 0].mean(1)[[9, 10]] == pytest.approx([200, 500], abs=30)
+
+
 def test_blurred_frames_are_noted_and_kept() -> None:
     faces: list[np.ndarray | None] = [_face(320, 240)] * 9
     sharpness = np.ones(9)

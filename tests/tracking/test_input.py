@@ -63,6 +63,22 @@ def test_an_image_folder_is_a_clip(tmp_path: Path) -> None:
     assert len(frames) == 3
 
 
+def test_nothing_is_decoded_behind_the_last_frame_asked_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source = FrameSource.open(write_clip(tmp_path / "clip.mp4", gradient_images(9)))
+    passed: list[int] = []
+    read = source.read
+
+    def counted(wanted, max_side=None):
+        return read(lambda index: passed.append(index) or wanted(index), max_side)
+
+    monkeypatch.setattr(FrameSource, "read", lambda self, *given: counted(*given))
+    assert [frame.index for frame in source.these({1, 4})] == [1, 4]
+    assert passed == [0, 1, 2, 3, 4]
+    assert list(source.these([])) == []
+
+
 @pytest.mark.parametrize("degrees", [90, 180, 270])
 def test_rotation_metadata_is_honoured(tmp_path: Path, degrees: int) -> None:
     turned = write_clip(tmp_path / "turned.mp4", gradient_images(2))

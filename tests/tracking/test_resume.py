@@ -158,6 +158,7 @@ def test_a_finished_dataset_stands_until_the_new_ones_images_begin(
     dst = tmp_path / "set"
     small = TrackConfig(image_size=48, key_frames=1, focal_px=500.0, max_frames=2)
     first = track_video(clip, dst, small)
+    assert (first.train, first.test) == ((0,), (1,)), "of two frames one is to be scored"
     again = TrackConfig(image_size=32, key_frames=1, max_frames=2, focal_px=500.0, overwrite=True)
     with pytest.raises(KeyboardInterrupt):
         track_video(clip, dst, again, _interrupting("fit", 0))

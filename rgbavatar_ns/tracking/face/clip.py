@@ -139,6 +139,8 @@ def followed_face(seen: SeenFaces, width: int, height: int) -> ClipLandmarks:
     jumps: list[int] = []
     others: list[int] = []
     for frame in range(len(seen)):
+        if frame > 0 and seen.clip[frame] != seen.clip[frame - 1]:
+            follower = FaceFollower()  # where faces were in another clip tells nothing here
         rows = slice(int(first_face[frame]), int(first_face[frame + 1]))
         faces = seen.points[rows] * (width, height)
         sighting = follower(faces, width, height)

@@ -171,7 +171,7 @@ def find_background(
     edge_px = float(np.median(told)) if told else None
     if len(images) < _FEWEST:
         return Background("too short", None, 0.0, None, edge_px)
-    clear_px = _of_whole_mattes(clear_px)
+    clear_px = _of_whole_mattes(clear_px, inside)
     look = _Look.at(images, clear_px)
     kind, motion_px = look.kind, look.motion_px
     if kind == "moves" and _lay_on_one(images, clear_px):
@@ -263,10 +263,13 @@ def _clear_of_person(matte: Float[np.ndarray, "S S"]) -> Float16[np.ndarray, "S 
 
 
 def _of_whole_mattes(
-    clear_px: list[Float16[np.ndarray, "S S"]],
+    clear_px: list[Float16[np.ndarray, "S S"]], inside: Bool[np.ndarray, "S S"]
 ) -> list[Float16[np.ndarray, "S S"]]:
-    """The same, 0 all over where a matte has lost the person: all frames here show one."""
-    areas = [float((clear == 0).mean()) for clear in clear_px]
+    """The same, 0 all over where a matte has lost the person: all frames here show one.
+
+    What nobody filmed, 0 too, is not the person.
+    """
+    areas = [float((clear[inside] == 0).sum()) for clear in clear_px]
     least = _LOST_SHARE * np.median(areas)
     return [clear * (area >= least) for clear, area in zip(clear_px, areas)]
 

@@ -206,11 +206,11 @@ class FrameImages:
 
     def _crops(self, source: FrameSource, positions: list[int]) -> Iterator[_Cropped]:
         place = {self._found.frame_index[k]: k for k in positions}
-        wanted, last = frozenset(place), max(place)
+        wanted = frozenset(place)
         mattes = None
         if self._mattes is not None:
             mattes = self._mattes.levels(wanted, self._found.width, self._found.height)
-        for frame in source.read(wanted.__contains__):
+        for frame in source.these(wanted):
             position, crop = place[frame.index], self._crop
             if self._source_alpha and frame.alpha is not None:
                 yield _Cropped(position, *crop.matted(frame.image_rgb, frame.alpha), True)
@@ -221,8 +221,6 @@ class FrameImages:
                 elif self._source_alpha:
                     alpha = np.ones((crop.size, crop.size), np.float32)
                 yield _Cropped(position, crop.apply(frame.image_rgb), alpha)
-            if frame.index == last:
-                return
 
     def _segmented(self, crops: Iterable[_Cropped]) -> Iterator[_Cropped]:
         matte = None

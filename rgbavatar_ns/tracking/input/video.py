@@ -1,7 +1,7 @@
 """Frames of videos and image folders, upright, with square pixels, in order."""
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
 from functools import partial
@@ -121,6 +121,14 @@ class FrameSource:
                     color = np.ascontiguousarray(image[..., :3])
                     yield SourceFrame(index, clip, color, alpha, *size, frame.time_s)
                 index += 1
+
+    def these(self, indices: Collection[int], max_side: int | None = None) -> Iterator[SourceFrame]:
+        """These frames alone; behind the last of them nothing is decoded."""
+        last = max(indices, default=-1)
+        for frame in self.read(frozenset(indices).__contains__, max_side) if last >= 0 else ():
+            yield frame
+            if frame.index == last:
+                return
 
     def count_hint(self) -> int | None:
         """How many frames to expect, for a progress bar; None where a file does not say."""

@@ -133,7 +133,7 @@ class _Reading:
         shown: list[BodyShown] = []
         pose = ShoulderFinder()
         try:
-            frames = InBackground(source.read(place.__contains__, _SIDE_PX), _AHEAD)
+            frames = InBackground(source.these(place, _SIDE_PX), _AHEAD)
             with closing(frames):
                 for k, frame in enumerate(frames, start):
                     cut = k == 0 or found.clip[k] != found.clip[k - 1]
