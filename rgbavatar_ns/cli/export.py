@@ -208,13 +208,13 @@ def _dataset(
         return None
     try:
         dataset = load_dataset(folder)
+        avatar.require_layout(dataset.layout, f"The dataset {folder}")
+        return as_trained_on(avatar, run_folder, dataset, folder)
     except UserError as error:
         if data is not None or needed:
             raise
         print(f"note: {error.cause} It goes without the frames of the run's own data.")
         return None
-    avatar.require_layout(dataset.layout, f"The dataset {folder}")
-    return as_trained_on(avatar, run_folder, dataset, folder)
 
 
 def _write_gaussians(
