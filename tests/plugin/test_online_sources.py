@@ -5,6 +5,7 @@ import dataclasses
 import shutil
 import socket
 import threading
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,7 @@ from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import EMBEDDED_BUST, HeadArrays, HeadModel
 from rgbavatar_ns.plugin.online.datamanager import is_recorded
 from rgbavatar_ns.plugin.online.sources import SourceConfig, await_subject, open_source
-from tests.data.streaming import HEAD, Clock, GivenStream, streamed, subject
+from tests.data.streaming import HEAD, Clock, GivenStream, streamed, subject, until
 from tests.plugin.online_run import online_config, online_trainer
 
 
@@ -127,6 +128,54 @@ def test_a_stream_without_a_usable_frame_is_an_error():
         await_subject(GivenStream([broken, streamed(2, image=large)]), print)
 
 
+def test_every_frame_before_the_first_usable_one_is_counted_and_the_first_of_a_kind_told():
+    short = dataclasses.replace(streamed(0), theta=torch.zeros(3))
+    broken = [dataclasses.replace(streamed(k), png=b"no picture") for k in (1, 2)]
+    large = streamed(3, image=np.zeros((16, 24, 4), np.uint8))
+    told: list[str] = []
+    left_out = Counter[str]()
+    frames = [short, *broken, large, large]
+    await_subject(GivenStream([*frames, streamed(4)]), told.append, left_out=left_out)
+    kinds = {"theta of another size": 1, "unreadable": 2, "another resolution": 2}
+    assert left_out == kinds
+    assert [line.split(":")[0] for line in told] == [
+        f"Frame {index} is left out" for index in (0, 1, 3)
+    ]
+    with pytest.raises(UserError) as ended:
+        await_subject(GivenStream(frames), told.append)
+    assert all(f"{name}: {count}" in ended.value.cause for name, count in kinds.items())
+
+
+def test_frames_that_were_of_no_use_while_waiting_are_in_the_runs_counts(
+    tiny_data: Path, tmp_path: Path
+):
+    """Of a sender whose first frames are broken, also where the run goes on from a checkpoint."""
+    data = load_dataset(tiny_data)
+    who = StreamSubject(data.arrays, data.identity, data.layout, data.width, data.height)
+    image = np.array(data.read_image(0))
+    frame = TrackedFrame(5, data.theta[0], data.cameras.select([0]), image)
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        address = f"127.0.0.1:{free.getsockname()[1]}"
+
+    def send() -> None:
+        with contextlib.suppress(UserError), StreamClient(who, address) as client:
+            for index in range(2):
+                absurd = torch.full_like(frame.theta, 1e6)
+                client.send(dataclasses.replace(frame, index=index, theta=absurd))
+            client.send(frame)
+
+    threading.Thread(target=send, daemon=True).start()
+    config = online_config(tmp_path / "out", source=SourceConfig("socket", listen=address))
+    trainer = online_trainer(config)
+    ingest = trainer.stream.ingest
+    until(lambda: ingest.counts()["arrived"] == 3)
+    assert ingest.counts()["theta absurd"] == 2
+    ingest.load_state_dict(ingest.state_dict() | {"counts": {"arrived": 9, "taken in": 9}})
+    assert ingest.counts()["arrived"] == 12
+    assert ingest.counts()["theta absurd"] == 2
+    trainer.stream.close()
+
+
 def test_what_is_waited_for_is_told_once_with_what_went_wrong():
     clock = Clock()
 
@@ -147,7 +196,7 @@ def test_what_is_waited_for_is_told_once_with_what_went_wrong():
 def test_ctrl_c_while_waiting_ends_with_exit_code_0(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    def interrupted(*_: object) -> None:
+    def interrupted(*_: object, **more: object) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr("rgbavatar_ns.plugin.online.datamanager.await_subject", interrupted)

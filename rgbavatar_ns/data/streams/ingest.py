@@ -110,6 +110,11 @@ class Ingest:
         self._counts["arrived"] += 1
         self._queue.put(frame, wait=self._stream.keeps_frames)
 
+    def count_left_out(self, counts: Counter[str]) -> None:
+        """Count frames, by their reasons, that were left out before the first one was given."""
+        self._counts += counts
+        self._counts["arrived"] += counts.total()
+
     def start(self) -> None:
         """Begin to fill the pools, and to listen where that has not begun."""
         if not self._threads:
@@ -162,7 +167,7 @@ class Ingest:
                 fault = self._subject.fault(frame) or self._added(frame)
                 verdict = "taken in" if fault is None else fault.name
                 if fault is not None and not self._counts[verdict]:
-                    self._tell(f"Frame {frame.index} is left out: {fault.reason}.")
+                    self._tell(fault.told(frame))
             self._counts[verdict] += 1
 
     def _number(self, frame: StreamedFrame) -> str | None:
@@ -177,7 +182,7 @@ class Ingest:
         try:
             self._pools.add(frame)
         except UserError as error:
-            return Fault("unreadable", error.cause.removesuffix("."))
+            return Fault.unreadable(error)
         return None
 
     def state_dict(self) -> dict[str, Any]:
@@ -195,7 +200,8 @@ class Ingest:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on where `state_dict` was taken; before `start`, and before `listen` if it can be."""
         self._pools.load_state_dict(state["frames"], self._stream)
-        self._counts = Counter(state["counts"])
+        # What has arrived already, for a run that goes on, came after what the state counts.
+        self._counts = self._counts + Counter(state["counts"])
         self._queue.dropped = self._counts.pop("dropped", 0)
         self._session = state["session"]
         self._seen.load_state_dict(state["numbers"])

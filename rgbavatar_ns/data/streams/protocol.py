@@ -30,6 +30,15 @@ class Fault(NamedTuple):
     name: str
     reason: str
 
+    @classmethod
+    def unreadable(cls, error: UserError) -> "Fault":
+        """Of an image that cannot be decoded."""
+        return cls("unreadable", error.cause.removesuffix("."))
+
+    def told(self, frame: "StreamedFrame") -> str:
+        """For the user, of the first frame with this fault."""
+        return f"Frame {frame.index} is left out: {self.reason}."
+
 
 @dataclass(frozen=True)
 class StreamSubject:

@@ -1,6 +1,7 @@
 """Batches from the pools of a running stream."""
 
 import dataclasses
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -120,14 +121,15 @@ class OnlineDataManager(RGBAvatarDataManager):
     def _prepare(self, config: OnlineDataManagerConfig, stream: FrameStream) -> None:
         seed = 0 if config.seed is None else config.seed
         pools = _pools(config, seed)
-        subject, self._first = stream.subject(0.0), None
+        subject, self._first, left_out = stream.subject(0.0), None, Counter[str]()
         if not isinstance(stream, ReplayStream):
-            subject, self._first = await_subject(stream, say)
+            subject, self._first = await_subject(stream, say, left_out=left_out)
             if not is_recorded(config, subject):
                 _record(config, subject, [(0, self._first)])
         assert subject is not None
         self.pools = ReplayBuffer(subject, pools, save_images=not isinstance(stream, ReplayStream))
         self._ingest = Ingest(stream, subject, self.pools, config.queue_frames, say)
+        self._ingest.count_left_out(left_out)
         self._subject, self._stream = subject, stream
         self._resumed = False
         if not isinstance(stream, Rewindable):

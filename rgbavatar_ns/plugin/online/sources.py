@@ -1,6 +1,7 @@
 """Where the frames of an online run come from, by the command's flags."""
 
 import time
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +17,7 @@ from rgbavatar_ns.data.streams import (
     StreamSubject,
 )
 from rgbavatar_ns.data.streams.address import DEFAULT_ADDRESS
+from rgbavatar_ns.data.streams.protocol import Fault
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.options import FrameRate
 
@@ -87,27 +89,34 @@ def await_subject(
     stream: FrameStream,
     tell: Callable[[str], None],
     clock: Callable[[], float] = time.monotonic,
+    left_out: Counter[str] | None = None,
 ) -> tuple[StreamSubject, StreamedFrame]:
     """The subject and its first usable frame, however long they take; tells what is waited for.
+
+    Frames before it are counted in `left_out` by their reason, and the first of each is told.
 
     Raises:
         UserError: the stream ends before.
     """
     silent_since_s: float | None = clock()
+    unused = Counter[str]() if left_out is None else left_out
+
+    def troubles() -> str:
+        found = stream.counts + unused
+        listed = ", ".join(f"{name}: {count}" for name, count in found.items())
+        return f" ({listed})" if listed else ""
 
     def go_on(what: str) -> None:
         nonlocal silent_since_s
         if stream.ended:
             raise UserError(
-                f"The stream ended before {what} came.",
+                f"The stream ended before {what} came{troubles()}.",
                 "Check the source: nothing in it could be used.",
             )
         if silent_since_s is not None and clock() - silent_since_s > _SILENT_S:
             silent_since_s = None
             place = f" at {stream.address}" if isinstance(stream, SocketStream) else ""
-            troubles = ", ".join(f"{name}: {count}" for name, count in (+stream.counts).items())
-            told = f" ({troubles})" if troubles else ""
-            tell(f"Waiting for frames{place}{told}; Ctrl-C ends.")
+            tell(f"Waiting for frames{place}{troubles()}; Ctrl-C ends.")
 
     while (subject := stream.subject(_PATIENCE_S)) is None:
         go_on("a subject")
@@ -115,15 +124,22 @@ def await_subject(
         frame = stream.next(_PATIENCE_S)
         if frame is None:
             go_on("a frame")
-        elif _usable(frame, subject):
+            continue
+        fault = _fault(frame, subject)
+        if fault is None:
             return subject, frame
+        if not unused[fault.name]:
+            tell(fault.told(frame))
+        unused[fault.name] += 1
 
 
-def _usable(frame: StreamedFrame, subject: StreamSubject) -> bool:
-    if subject.fault(frame) is not None:
-        return False
+def _fault(frame: StreamedFrame, subject: StreamSubject) -> Fault | None:
+    """Why a frame cannot be used, its image included; None where it can be."""
+    fault = subject.fault(frame)
+    if fault is not None:
+        return fault
     try:
         frame.decode()
-    except UserError:
-        return False
-    return True
+    except UserError as error:
+        return Fault.unreadable(error)
+    return None
