@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from rgbavatar_ns.export.subject import Subject
 
 Show = Literal["page", "viewer", "none"]
-_CSV_FRAMES_PER_SECOND = 60.0
-"""Of Live Link Face."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +37,8 @@ class SourceOptions(CheckedOptions):
     allow_remote: bool = False
     """Let other machines reach what listens. Nothing is encrypted."""
     source_frames_per_second: FrameRate | None = None
-    """Of a dataset (by default the film's own, or 25) or a CSV file (60)."""
+    """Of a dataset (by default the film's own, or 25) or a CSV file (by
+    default what its timecodes count to, else 60)."""
     head_angles: tuple[float, float, float] = (1.0, 1.0, 1.0)
     """Factors of the head's yaw, pitch and roll from arkit and CSV: -1 mirrors, .01745 is for
     senders of degrees."""
@@ -184,7 +183,7 @@ def _performer(
     if path.suffix.lower() == ".csv":
         from rgbavatar_ns.driving.sources.arkit_csv import csv_source
 
-        rate = options.source_frames_per_second or _CSV_FRAMES_PER_SECOND
+        rate = options.source_frames_per_second
         return csv_source(path, rate, real_time, options.head_angles)
     if path.is_dir() and (folder := _dataset_of(path)) is not None:
         from rgbavatar_ns.driving.sources.dataset import dataset_source

@@ -129,6 +129,38 @@ def test_timecodes_tell_the_time_where_they_can(tmp_path, codes, seconds):
     assert times_s == pytest.approx(seconds, abs=1e-6)
 
 
+def _codes(rate: int, count: int, first: int) -> list[str]:
+    return [f"10:00:{k // rate:02}:{k % rate:02}.000" for k in range(first, first + count)]
+
+
+@pytest.mark.parametrize("rate", [24, 25, 30, 48, 50, 60])
+@pytest.mark.parametrize("first", [0, 20])
+def test_timecodes_tell_how_many_frames_a_second_has(tmp_path, rate, first):
+    rows = [f"{code},0.5" for code in _codes(rate, 2 * rate, first)]
+    source = csv_source(_take(tmp_path, "Timecode,JawOpen", rows), None, False)
+    times_s = [source.next(0.0).time_s for _ in rows]
+    assert times_s == pytest.approx([k / rate for k in range(2 * rate)], abs=1e-6)
+
+
+def test_what_is_asked_for_or_usual_holds_where_timecodes_show_no_rate(tmp_path):
+    def last_s(codes: list[str], rate: float | None) -> float:
+        rows = [f"{code},0.5" for code in codes]
+        source = csv_source(_take(tmp_path, "Timecode,JawOpen", rows), rate, False)
+        return [source.next(0.0).time_s for _ in rows][-1]
+
+    assert last_s(_codes(30, 10, 0), None) == pytest.approx(9 / 60)  # no second ends
+    assert last_s(_codes(30, 10, 0), 30.0) == pytest.approx(9 / 30)
+    assert last_s(["10:00:00:10", "10:00:01:10"], None) == pytest.approx(1.0)
+
+
+def test_blank_rows_are_none(tmp_path):
+    rows = ["10:00:00:00,0.1", "", "10:00:00:30,0.2", " ", ""]
+    source = csv_source(_take(tmp_path, "Timecode,JawOpen", rows), 60.0, False)
+    assert [source.next(0.0).time_s for _ in range(2)] == pytest.approx([0.0, 0.5])
+    assert source.ended
+    assert source.counts["rows without numbers"] == 0
+
+
 @pytest.mark.parametrize(
     ("content", "told"),
     [

@@ -19,6 +19,9 @@ from rgbavatar_ns.errors import UserError, first_few
 from rgbavatar_ns.head.arkit import ARKIT_NAMES
 from rgbavatar_ns.reading import DamagedFileError, read_file
 
+_FRAMES_PER_SECOND = 60.0
+"""Of Live Link Face."""
+_USUAL_RATES = (24.0, 25.0, 30.0, 48.0, 50.0, 60.0)
 _MOST_BYTES = 1 << 28
 """An hour at 60 frames a second has 150 MB."""
 _TIMECODE = re.compile(r"(\d{1,3}):(\d{1,2}):(\d{1,2}):(\d{1,3})(?:\.(\d+))?")
@@ -30,15 +33,16 @@ _REMEDY = (
 
 def csv_source(
     path: Path,
-    frames_per_second: float,
+    frames_per_second: float | None,
     real_time: bool,
     angle_gain: Sequence[float] = (1.0, 1.0, 1.0),
 ) -> RecordedSource:
     """The rows of a CSV file; columns are known by their names, in any order and case.
 
-    Timecodes (hours:minutes:seconds:frames, of a take with so many `frames_per_second`) tell the
-    time; where they are missing or stand still, each row is the next frame. Rows without numbers,
-    as the app leaves where it lost the face, are passed over. angle_gain: of yaw, pitch and roll.
+    Timecodes (hours:minutes:seconds:frames, of a take with so many `frames_per_second`; by default
+    as many as they count to, else 60) tell the time; where they are missing or stand still, each
+    row is the next frame. Rows without numbers, as the app leaves where it lost the face, are
+    passed over. angle_gain: of yaw, pitch and roll.
     Raises UserError where the file cannot be read or has no such column.
     """
     names, rows = _read(path)
@@ -73,7 +77,7 @@ def csv_source(
 def _read(path: Path) -> tuple[list[str], list[list[str]]]:
     try:
         text = read_file(path, _MOST_BYTES).decode("utf-8-sig")
-        table = list(csv.reader(io.StringIO(text)))
+        table = [row for row in csv.reader(io.StringIO(text)) if any(map(str.strip, row))]
     except (DamagedFileError, UnicodeDecodeError, csv.Error, OSError) as error:
         raise UserError(f"{path} cannot be read as CSV: {error}.", _REMEDY) from None
     if len(table) < 2:
@@ -85,38 +89,60 @@ def _timed(
     names: list[str],
     rows: list[list[str]],
     places: Sequence[int | None],
-    frames_per_second: float,
+    frames_per_second: float | None,
 ) -> list[tuple[list[float], float]]:
     """Each row's numbers (NaN where there is none) and its time.
 
     Rows without a number in one of `places`, ARKit's columns, are left out.
     """
-    clock = next((k for k, name in enumerate(names) if name.strip().lower() == "timecode"), None)
+    moments = _moments_s(names, rows, frames_per_second)
     found: list[tuple[list[float], float]] = []
-    for place, row in enumerate(rows):
+    for row, moment_s in zip(rows, moments):
         values = [_number(text) for text in row] + [math.nan] * (len(names) - len(row))
-        if not any(math.isfinite(values[at]) for at in places if at is not None):
-            continue
-        found.append((values, place / frames_per_second))
+        if any(math.isfinite(values[at]) for at in places if at is not None):
+            found.append((values, moment_s))
+    return found
+
+
+def _moments_s(
+    names: list[str], rows: list[list[str]], frames_per_second: float | None
+) -> list[float]:
+    """The time of each row by its timecode; by its place where those tell nothing."""
+    even = [place / (frames_per_second or _FRAMES_PER_SECOND) for place in range(len(rows))]
+    clock = next((k for k, name in enumerate(names) if name.strip().lower() == "timecode"), None)
     if clock is None:
-        return found
-    codes = [_timecode_s(row[clock], frames_per_second) for row in rows if len(row) > clock]
-    if None in codes or len(codes) < len(rows):
-        return found
-    moments = [code - codes[0] for code in codes]  # type: ignore[operator]
+        return even
+    codes = [_timecode(row[clock]) for row in rows if len(row) > clock]
+    told = [code for code in codes if code is not None]
+    if len(told) < len(rows):
+        return even
+    rate = frames_per_second or _rate_of(told) or _FRAMES_PER_SECOND
+    moments = [seconds + frames / rate for seconds, frames in told]
     if any(later <= earlier for earlier, later in itertools.pairwise(moments)):
-        return found  # a clock that stands or goes back tells nothing
-    return [(values, moments[round(at * frames_per_second)]) for values, at in found]
+        return even  # a clock that stands or goes back tells nothing
+    return [moment - moments[0] for moment in moments]
 
 
-def _timecode_s(text: str, frames_per_second: float) -> float | None:
-    """Seconds of hours:minutes:seconds:frames, with a part of a frame; None for anything else."""
+def _timecode(text: str) -> tuple[int, float] | None:
+    """Seconds and frames of hours:minutes:seconds:frames.part; None for anything else."""
     read = _TIMECODE.fullmatch(text.strip())
     if read is None:
         return None
     hours, minutes, seconds, frames = (int(part) for part in read.groups()[:4])
     part = float(f"0.{read[5]}") if read[5] else 0.0
-    return 3600 * hours + 60 * minutes + seconds + (frames + part) / frames_per_second
+    return 3600 * hours + 60 * minutes + seconds, frames + part
+
+
+def _rate_of(codes: list[tuple[int, float]]) -> float | None:
+    """Frames a second that timecodes count to, one of the usual; None where they do not show it.
+
+    They do where a second ends: its last frame has the greatest number, which may be missing once.
+    """
+    if codes[0][0] == codes[-1][0]:
+        return None
+    count = 1 + int(max(frames for _, frames in codes))
+    rate = next((rate for rate in _USUAL_RATES if rate >= count), None)
+    return None if rate is None or rate - count > 1 else rate
 
 
 def _turns(
