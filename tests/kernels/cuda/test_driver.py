@@ -18,13 +18,14 @@ CPU = torch.device("cpu")
 class Driver:
     """Answers as the bindings do: the error first."""
 
-    CUresult = SimpleNamespace(CUDA_SUCCESS=0)
+    CUresult = SimpleNamespace(CUDA_SUCCESS=0, CUDA_ERROR_INVALID_VALUE=1)
     CUfunction_attribute = SimpleNamespace(
         CU_FUNC_ATTRIBUTE_MAX_DYNAMIC_SHARED_SIZE_BYTES="dynamic shared bytes"
     )
 
     def __init__(self) -> None:
         self.error, self.launched, self.contexts, self.attributes = 0, [], [], []
+        self.most_shared_bytes = 227 << 10
 
     def cuCtxGetCurrent(self):
         return 0, "context"
@@ -41,7 +42,7 @@ class Driver:
 
     def cuFuncSetAttribute(self, *attribute):
         self.attributes.append(attribute)
-        return (0,)
+        return (int(attribute[-1] > self.most_shared_bytes),)
 
     def cuLaunchKernel(self, function, *rest):
         *sizes, parameters, extra = rest
@@ -91,6 +92,15 @@ def test_a_launch_brings_its_structure_stream_and_sizes(launcher):
     made.launch("update", (3, 1), 20 << 10, **_update(5))
     assert fake.attributes == [(b"update_kernel", "dynamic shared bytes", 50 << 10)]
     assert fake.contexts == ["context"]
+
+
+def test_weights_that_no_block_holds_are_told_with_fewer_images(launcher):
+    made, fake = launcher
+    with pytest.raises(DeviceError, match=r"228 KiB.*fewer images a step"):
+        made.launch("update", (3, 1), 228 << 10, **_update(5))
+    assert fake.launched == []
+    made.launch("update", (3, 1), 227 << 10, **_update(5))
+    assert len(fake.launched) == 1
 
 
 def test_a_failure_names_cause_and_remedy(launcher):
