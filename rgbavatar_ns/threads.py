@@ -16,8 +16,8 @@ class _Within:
 
     lock: threading.Lock = field(default_factory=threading.Lock)
     blocks: int = 0
-    usual: int = 1
-    latest: int = 1
+    usual: int = 0
+    latest: int = 0
     thread: threading.local = field(default_factory=threading.local)
 
 
@@ -36,10 +36,10 @@ def using_threads(count: int | None) -> Iterator[int]:
     """
     with _within.lock:
         before = torch.get_num_threads()
-        if _within.blocks == 0:
+        if before == _within.latest and not hasattr(_within.thread, "known"):
+            before = _within.usual  # it may have asked torch first while another was within
+        elif _within.blocks == 0:
             _within.usual = before
-        elif before == _within.latest and not hasattr(_within.thread, "known"):
-            before = _within.usual
         _within.thread.known = True
         _within.blocks += 1
         _within.latest = before if count is None else count

@@ -214,7 +214,8 @@ def _train(
 ) -> Result:
     # Where ns-train puts an experiment of this name: what takes a run takes `output` too.
     run_folder = output / method / key
-    if anew:  # else a complete run, whose settings are the same, would be gone on with
+    # Else a run of the same settings would be gone on with, also one of other frames.
+    if anew or _is_older(run_folder / "config.yml", data / "dataset.json"):
         shutil.rmtree(run_folder, ignore_errors=True)
     options: list[str] = []
     if refine_tracking:
@@ -229,6 +230,11 @@ def _train(
         "train_seconds": facts["train_seconds"],
         "images_per_second": facts["images_per_second"],
     }
+
+
+def _is_older(path: Path, other: Path) -> bool:
+    both_there = path.exists() and other.exists()
+    return both_there and path.stat().st_mtime < other.stat().st_mtime
 
 
 def _film(run_folder: Path, data: Path, output: Path) -> Result:

@@ -105,7 +105,7 @@ def run(
         raise UserError("Nothing would be shown.", "Add --out film.mp4, or --show page.")
     only_film = shown == "none" and show.out is not None and show.out.endswith(".mp4")
     real_time = not only_film if source.real_time is None else source.real_time
-    subject = load_subject(run_folder, data, show.width, show.height)
+    subject = load_subject(run_folder, data, show.width, show.height, film=False)
     if (lost := told_lost(subject)) is not None:
         _tell(lost)
     performer = _performer(subject, source, real_time, show.beside)

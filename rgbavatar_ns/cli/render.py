@@ -124,7 +124,7 @@ def run(
     from rgbavatar_ns.export import read_texture, with_texture
     from rgbavatar_ns.export.subject import load_subject, told_lost
 
-    subject = load_subject(run_folder, data, picture.width, picture.height)
+    subject = load_subject(run_folder, data, picture.width, picture.height, film=driver is None)
     if (lost := told_lost(subject)) is not None:
         print(lost)
     if texture is not None:

@@ -5,6 +5,7 @@ from pathlib import Path
 
 from rgbavatar_ns.data.importers import ImportOptions
 from rgbavatar_ns.data.importers.convert import data_folders, source_places
+from rgbavatar_ns.data.native.format import INDEX_FILE
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.files import digest, digest_of_file
 
@@ -21,10 +22,12 @@ def dataset_state(folder: Path) -> str:
     be read.
     """
     places = [os.path.realpath(place) for place in source_places(folder, ImportOptions())]
+    # Pictures of our own datasets may lie behind a link; what is imported refuses such by default.
+    links = (folder / INDEX_FILE).is_file()
     return digest(
         part
         for place in places
-        for below, names, _ in data_folders(place)
+        for below, names, _ in data_folders(place, follow_out=links)
         for path in (Path(below, name) for name in names)
         if not _is_to_look_at(path, Path(place))
         for part in (os.path.relpath(path, place), _content(path))

@@ -56,7 +56,8 @@ def write_report(experiment: Experiment, folder: Path, *, plots: bool = True) ->
     text = _page(experiment, table, statuses, drawn)
     pages = {"index.html": text}
     if len(names) > 1:
-        pages = {f"{experiment.name}.html": text, "index.html": _contents(names)}
+        there = [n for n in names if n == experiment.name or (out / f"{n}.html").is_file()]
+        pages = {f"{experiment.name}.html": text, "index.html": _contents(there)}
     for name, content in pages.items():
         with atomic_write(out / name) as partial:
             partial.write_text(content, encoding="utf-8")

@@ -157,6 +157,7 @@ def _sweep(
     needed = [status.cell for status in missing.values()]
     shown = {name for cell in needed for name in (cell.subject, _driver(cell)) if name}
     data = {name: _dataset(name, folder, making) for name in sorted(shown)}
+    state = cache(dataset_state)  # as they are now, some of them only just made
     for status in missing.values():
         status.folder.mkdir(parents=True, exist_ok=True)
         for left in (LOG_FILE, FAILED_FILE):

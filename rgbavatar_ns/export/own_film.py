@@ -8,6 +8,7 @@ import torch
 from rgbavatar_ns.avatar.method import AvatarMethod
 from rgbavatar_ns.avatar.storage.refined_frames import RefinedFrames, load_refined_frames
 from rgbavatar_ns.data.native.dataset import TrackedDataset
+from rgbavatar_ns.data.native.format import INDEX_FILE
 from rgbavatar_ns.errors import UserError, first_few
 from rgbavatar_ns.export.run_data import dataset_folder
 
@@ -21,11 +22,12 @@ def as_trained_on(
     """The dataset that was opened from `folder`, its theta as the run refined it.
 
     So the avatar's own film looks as `ns-eval` and `ns-viewer` show it. As tracked stay a run
-    without refined tracking, a bundle, which knows no frames, and another person's dataset or one
-    of other frames, which only drives. Raises UserError where the run's own dataset is not the one
+    without refined tracking, a bundle, which knows no frames, another person's dataset or one of
+    other frames, which only drives, and another system's data, whose import may put the head's
+    motion elsewhere than the run's did. Raises UserError where the run's own dataset is not the one
     of then any more, and where the run cannot be read.
     """
-    refined = load_refined_frames(run_folder)
+    refined = load_refined_frames(run_folder) if (folder / INDEX_FILE).is_file() else None
     if refined is None:
         return dataset
     amiss = _misfit(avatar, refined, dataset)

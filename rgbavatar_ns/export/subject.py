@@ -25,7 +25,7 @@ class Subject:
 
     avatar: AvatarMethod
     dataset: TrackedDataset | None
-    """Its theta as the avatar was trained on it (`as_trained_on`)."""
+    """Where its film is shown, with the theta that the avatar was trained on (`as_trained_on`)."""
     seen: TrainingStatistics
     camera: PinholeCameras
     """The dataset's first camera, or one before the face, for pictures of the size asked for."""
@@ -34,13 +34,19 @@ class Subject:
 
 
 def load_subject(
-    run_folder: Path, data: Path | None, width: int | None = None, height: int | None = None
+    run_folder: Path,
+    data: Path | None,
+    width: int | None = None,
+    height: int | None = None,
+    *,
+    film: bool = True,
 ) -> Subject:
     """Load an avatar from a run, a checkpoint or a bundle, with its dataset if it names one.
 
     data: the dataset in place of the run's own, which may be gone where the avatar knows what it
-    saw. Raises UserError where the avatar or its dataset cannot be read or do not fit, and for a
-    bundle that knows nothing about its training.
+    saw. film: whether its own film is shown, then with the theta that the avatar was trained on,
+    and not only its camera is wanted. Raises UserError where the avatar or its dataset cannot be
+    read or do not fit, and for a bundle that knows nothing about its training.
     """
     avatar = load_avatar(run_folder)
     seen = avatar.training_statistics
@@ -53,7 +59,8 @@ def load_subject(
         return Subject(avatar, None, seen, _before_the_face(avatar, width, height), lost=folder)
     dataset = load_dataset(folder)
     avatar.require_layout(dataset.layout, f"The dataset {folder}")
-    dataset = as_trained_on(avatar, run_folder, dataset, folder)
+    if film:
+        dataset = as_trained_on(avatar, run_folder, dataset, folder)
     camera = resized(dataset.cameras.select([0]), width or dataset.width, height or dataset.height)
     return Subject(avatar, dataset, seen or statistics_of(avatar, dataset), camera)
 

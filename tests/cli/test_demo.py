@@ -1,4 +1,5 @@
 import json
+import os
 import shlex
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -168,6 +169,27 @@ def test_an_avatars_data_is_not_replaced_by_the_same_film_tracked_otherwise(
     assert trained == ["rgbavatar-quick"] * 2 + ["rgbavatar-tiny"] * 2
     main(["demo", "--video", "me.mp4", "--tiny", "--fresh"])
     assert trained[4:] == ["rgbavatar-tiny"]
+
+
+@pytest.mark.parametrize("made_anew", [True, False])
+def test_a_run_of_other_frames_is_not_gone_on_with(tmp_path, monkeypatch, made_anew):
+    """As after `--fresh` that was interrupted while it tracked: the settings are the same."""
+    data, run = tmp_path / "data", tmp_path / "rgbavatar-tiny/key"
+    for path in (data / "dataset.json", run / "config.yml"):
+        path.parent.mkdir(parents=True)
+        path.touch()
+    os.utime(data / "dataset.json", (0, 2000 if made_anew else 1000))
+    os.utime(run / "config.yml", (0, 1500))
+    kept = []
+
+    def train(method, data, run_folder, *given):
+        kept.append(run_folder.exists())
+        return {"train_seconds": 1.0, "images_per_second": 1.0}
+
+    monkeypatch.setattr(demo.commands, "train", train)
+    given = (data, tmp_path, "key", "rgbavatar-tiny", None, 0)
+    demo._train(*given, refine_tracking=True, anew=False)
+    assert kept == [not made_anew]
 
 
 @pytest.mark.parametrize(

@@ -59,10 +59,15 @@ def test_a_thread_that_begins_while_another_draws_with_one_gets_the_usual_number
             first, second = newcomer.map(after_one_block, range(2))
         with using_threads(1), ThreadPoolExecutor(1) as newcomer:
             (own,) = newcomer.map(of_its_own, range(1))
+        with ThreadPoolExecutor(1) as newcomer:
+            with using_threads(1):
+                asked_within = newcomer.submit(torch.get_num_threads).result()
+            late = newcomer.submit(after_one_block, 0).result()
         after = torch.get_num_threads()
     finally:
         torch.set_num_threads(before)
     assert (first, second, own, after) == (3, 3, 2, 3)
+    assert (asked_within, late) == (1, 3)
 
 
 def _scene(seed: int):

@@ -148,11 +148,19 @@ def _another_person(dataset: TrackedDataset) -> TrackedDataset:
 )
 def test_other_data_stays_as_tracked_and_changed_own_data_is_told(refined, tmp_path, change, told):
     avatar, other = Avatar.load(refined.folder), change(load_dataset(refined.data))
+    (tmp_path / "dataset.json").touch()
     given = as_trained_on(avatar, refined.folder, other, tmp_path)
     assert given.theta.equal(other.theta)
     with pytest.raises(UserError, match=told) as raised:
         as_trained_on(avatar, refined.folder, other, refined.data)
     assert "--data" in raised.value.remedy
+
+
+def test_another_systems_data_stays_as_imported_though_it_fits(refined, tmp_path) -> None:
+    """Its import may put the head's motion into the camera where the run's did not."""
+    avatar, same = Avatar.load(refined.folder), load_dataset(refined.data)
+    assert not as_trained_on(avatar, refined.folder, same, refined.data).theta.equal(same.theta)
+    assert as_trained_on(avatar, refined.folder, same, tmp_path).theta.equal(same.theta)
 
 
 def _without_frames(extra: dict[str, Any]) -> None:

@@ -24,8 +24,8 @@ from rgbavatar_ns.head.flame import COMPANIONS, FLAME_VARIABLE, places_beside
 CACHE_FOLDER = ".rgbavatar"
 """In the source; nothing in it belongs to the source."""
 _STATE_FILE = ".import.json"
-_IMPORTER_VERSION = 4
-"""To be raised where the same files give another dataset."""
+_IMPORTER_VERSION, _VERSIONS = 3, {"imavatar": 4}
+"""To be raised where the same files give another dataset, in one format or in all."""
 
 
 def import_dataset(
@@ -151,9 +151,11 @@ def source_fingerprint(src: Path, options: ImportOptions, dst: Path | None = Non
     dst: where the import goes, which counts for nothing, be it in the data.
     """
     others = replace(options, flame=None, flame_uv=None, flame_eyelids=None)
+    found = find_format(src, options) if src.is_dir() else None
+    version = _VERSIONS.get(found.key if found else "", _IMPORTER_VERSION)
     places = source_places(src, options)
     lines = _listing(places, follow_out=options.allow_outside, without=dst)
-    return digest([f"{_IMPORTER_VERSION} {others}", *lines])[:16]
+    return digest([f"{version} {others}", *lines])[:16]
 
 
 def source_places(src: Path, options: ImportOptions) -> list[str | Path]:

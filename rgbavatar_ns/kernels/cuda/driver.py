@@ -82,8 +82,8 @@ class CudaLauncher:
         result = driver.cuFuncSetAttribute(self._functions[kernel], attribute, shared_bytes)
         if result[0] == driver.CUresult.CUDA_ERROR_INVALID_VALUE:
             raise DeviceError(
-                f"The weights of a step's images, {shared_bytes / 1024:.0f} KiB, are more than "
-                "this GPU holds for a block of threads.",
+                f"{kernel} wants {shared_bytes / 1024:.0f} KiB for the weights of a step's images, "
+                "more than this GPU holds for a block of threads.",
                 "Take fewer images a step (--pipeline.datamanager.batch-size) or fewer bases.",
             )
         _checked(result, "enlarge shared memory")
