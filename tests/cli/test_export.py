@@ -13,7 +13,7 @@ import yaml
 from plyfile import PlyData
 
 from rgbavatar_ns import Avatar
-from rgbavatar_ns.avatar.storage.bundle import load_statistics
+from rgbavatar_ns.avatar.loading import load_avatar
 from rgbavatar_ns.cli import main as cli
 from rgbavatar_ns.cli.export import page_frames
 from rgbavatar_ns.data import load_dataset
@@ -37,7 +37,7 @@ def _export(*words: object) -> None:
 def test_a_bundle_gets_statistics_of_the_training_frames_and_passes_them_on(bundle, data, tmp_path):
     _export(bundle, tmp_path / "first", "--data", data)
     _export(tmp_path / "first", tmp_path / "second", "--no-head-inside")
-    seen = load_statistics(tmp_path / "second")
+    seen = load_avatar(tmp_path / "second").training_statistics
     assert seen is not None
     dataset = load_dataset(data)
     theta = dataset.theta[list(dataset.train)]

@@ -14,7 +14,6 @@ from rgbavatar_ns.avatar.methods.gaussianblendshapes import (
     GaussianBlendshapes,
     GaussianBlendshapesConfig,
 )
-from rgbavatar_ns.avatar.storage.bundle import load_statistics
 from rgbavatar_ns.cli.main import main
 from rgbavatar_ns.data import DatasetWriter, TrackedFrame, load_dataset
 from rgbavatar_ns.experiments.avatar_size import avatar_size
@@ -66,7 +65,7 @@ def length(film: Path) -> int:
 def test_a_bundle_goes_out_with_what_it_saw(rival, data, tmp_path, capsys):
     run("export", rival, tmp_path / "out", "--data", data)
     assert "GaussianBlendshapes.load(" in capsys.readouterr().out
-    seen = load_statistics(tmp_path / "out")
+    seen = load_avatar(tmp_path / "out").training_statistics
     assert seen is not None
     assert seen.num_frames == FRAMES - HELD_OUT
     first, second = (load_avatar(place) for place in (rival, tmp_path / "out"))

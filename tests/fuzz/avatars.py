@@ -25,7 +25,6 @@ from rgbavatar_ns.avatar.methods.gaussianavatars import GaussianAvatarsConfig
 from rgbavatar_ns.avatar.methods.gaussianblendshapes import GaussianBlendshapesConfig
 from rgbavatar_ns.avatar.methods.monogaussianavatar import MonoGaussianAvatarConfig
 from rgbavatar_ns.avatar.methods.splattingavatar import SplattingAvatarConfig
-from rgbavatar_ns.avatar.storage.bundle import load_statistics
 from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
 from tests.avatar.small_head import (
     front_camera,
@@ -143,7 +142,7 @@ def _flipped_checkpoint(folder: Path, method: str, rng: random.Random) -> None:
 def _flipped_bundle(folder: Path, method: str, rng: random.Random) -> None:
     path = _save_bundle(folder, method)
     _flip(path / rng.choice((_MANIFEST, _TENSORS)), rng)
-    seen, wanted = load_statistics(path), _statistics(method)
+    seen, wanted = load_avatar(path).training_statistics, _statistics(method)
     _require_same(load_avatar(path), method)
     assert seen is not None, "the statistics are gone"
     for name, value in wanted.to_state().items():
@@ -258,7 +257,6 @@ def _use(path: Path) -> None:
             theta, front_camera(_SIZE), with_depth=True, differentiable=differentiable
         )
         assert drawn.image.shape == (2, _SIZE, _SIZE, 3)
-    load_statistics(path)
 
 
 def _require_same(avatar: AvatarMethod, method: str) -> None:

@@ -12,8 +12,8 @@ import torch
 from plyfile import PlyData
 
 from rgbavatar_ns import Avatar
+from rgbavatar_ns.avatar.loading import load_avatar
 from rgbavatar_ns.avatar.refinement.corrections import RefinementConfig
-from rgbavatar_ns.avatar.storage.bundle import load_statistics
 from rgbavatar_ns.avatar.storage.checkpoint_file import list_checkpoints, read_checkpoint
 from rgbavatar_ns.cli import main as cli
 from rgbavatar_ns.cli.demo import _film
@@ -115,7 +115,8 @@ def test_exports_of_frames_have_it(refined, tmp_path):
 
 def test_a_bundle_knows_the_corrected_frames_ranges(refined, tmp_path):
     cli.main(["export", str(refined.folder), str(tmp_path / "me")])
-    stored, written = load_statistics(refined.folder), load_statistics(tmp_path / "me")
+    stored = load_avatar(refined.folder).training_statistics
+    written = load_avatar(tmp_path / "me").training_statistics
     assert stored is not None
     assert written is not None
     torch.testing.assert_close(written.theta_max, stored.theta_max)

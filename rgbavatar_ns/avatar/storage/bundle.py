@@ -125,14 +125,6 @@ def load_any(path: Path) -> StoredAvatar:
     return stored
 
 
-def load_statistics(path: Path) -> TrainingStatistics | None:
-    """What an avatar saw in training, if its file kept it; raises UserError as `load_any`."""
-    stored = load_any(path)
-    if stored.statistics is None:
-        return None
-    return stored.statistics_of(ThetaLayout.from_json(stored.layout))
-
-
 def _load_bundle(path: Path) -> StoredAvatar:
     manifest, tensors = _read_bundle(path)
     state = manifest["state"]

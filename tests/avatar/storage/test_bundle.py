@@ -9,8 +9,8 @@ import torch
 
 from rgbavatar_ns import Avatar
 from rgbavatar_ns.avatar import AvatarConfig
+from rgbavatar_ns.avatar.loading import load_avatar
 from rgbavatar_ns.avatar.storage import bundle
-from rgbavatar_ns.avatar.storage.bundle import load_statistics
 from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics, neutral_frame
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadArrays, HeadModel, ThetaLayout
@@ -238,7 +238,7 @@ def test_statistics_and_layout_are_inside_the_bundle(make_avatar, tmp_path):
     avatar = make_avatar(random=True)
     written = _statistics(avatar)
     avatar.save(tmp_path / "me", statistics=written)
-    read = load_statistics(tmp_path / "me")
+    read = load_avatar(tmp_path / "me").training_statistics
     assert read is not None
     for name, value in vars(written).items():
         same = getattr(read, name)
@@ -263,24 +263,25 @@ def test_what_was_seen_goes_from_file_to_file(make_avatar, tmp_path):
     avatar.save(tmp_path / "first", statistics=written)
     loaded = Avatar.load(tmp_path / "first")
     loaded.save(tmp_path / "second")
-    assert _same_statistics(load_statistics(tmp_path / "second"), written)
+    assert _same_statistics(load_avatar(tmp_path / "second").training_statistics, written)
     loaded.without_undrawn().save(tmp_path / "third")
-    assert _same_statistics(load_statistics(tmp_path / "third"), written)
+    assert _same_statistics(load_avatar(tmp_path / "third").training_statistics, written)
     loaded.save(tmp_path / "fourth", statistics=others)
-    assert _same_statistics(load_statistics(tmp_path / "fourth"), others)
+    assert _same_statistics(load_avatar(tmp_path / "fourth").training_statistics, others)
     checkpoint = checkpoint_of(avatar)
     checkpoint["pipeline"]["_model._extra_state"]["statistics"] = written.to_state()
     torch.save(checkpoint, tmp_path / "step-000000012.ckpt")
     Avatar.load(tmp_path / "step-000000012.ckpt").save(tmp_path / "fifth")
-    assert _same_statistics(load_statistics(tmp_path / "fifth"), written)
+    assert _same_statistics(load_avatar(tmp_path / "fifth").training_statistics, written)
 
 
 def test_a_bundle_and_an_earlier_run_may_have_none(make_avatar, tmp_path):
     make_avatar().save(tmp_path / "me")
-    assert load_statistics(tmp_path / "me") is None
-    assert load_statistics(Path(__file__).parents[2] / "golden" / "step-000000007.ckpt") is None
+    assert load_avatar(tmp_path / "me").training_statistics is None
+    earlier = Path(__file__).parents[2] / "golden" / "step-000000007.ckpt"
+    assert load_avatar(earlier).training_statistics is None
     with pytest.raises(UserError, match="There is no"):
-        load_statistics(tmp_path / "nobody")
+        load_avatar(tmp_path / "nobody")
 
 
 def test_statistics_of_before_have_the_views_of_most_films(make_avatar):
@@ -332,7 +333,7 @@ def test_statistics_that_lack_a_part_are_refused(make_avatar, tmp_path):
     del manifest["statistics"]["psi_max"]
     path.write_text(json.dumps(manifest))
     with pytest.raises(UserError, match="lack psi_max"):
-        load_statistics(tmp_path / "me")
+        load_avatar(tmp_path / "me")
     del manifest["state"]["anchors"]
     path.write_text(json.dumps(manifest))
     with pytest.raises(UserError, match=r"damaged.*lacks anchors"):

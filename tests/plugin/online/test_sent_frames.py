@@ -15,7 +15,7 @@ from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.utils.eval_utils import eval_setup
 
 from rgbavatar_ns import Avatar
-from rgbavatar_ns.avatar.storage.bundle import load_statistics
+from rgbavatar_ns.avatar.loading import load_avatar
 from rgbavatar_ns.data import TrackedFrame, load_dataset
 from rgbavatar_ns.data.streams import StreamClient, StreamSubject
 from rgbavatar_ns.export import dataset_folder
@@ -91,7 +91,7 @@ def test_frames_sent_over_a_socket_are_trained_on_and_kept(
     frames_saved = newest_state(trainer.checkpoint_dir)["pipeline"]["_model._extra_state"]["frames"]
     assert torch.equal(frames_saved["theta"], load_dataset(tiny_data).theta[:STREAMED])
     assert loaded.num_gaussians == trainer.pipeline.model.avatar.num_gaussians
-    seen = load_statistics(trainer.base_dir)
+    seen = load_avatar(trainer.base_dir).training_statistics
     assert seen is not None
     assert seen.num_frames == STREAMED
     # The run is complete in itself: it holds the frames, and other commands find them.

@@ -15,7 +15,7 @@ import torch
 from torch.utils._pytree import keystr, tree_flatten_with_path
 
 from rgbavatar_ns import Avatar
-from rgbavatar_ns.avatar.storage.bundle import load_statistics
+from rgbavatar_ns.avatar.loading import load_avatar
 from rgbavatar_ns.avatar.storage.checkpoint_file import list_checkpoints
 from rgbavatar_ns.data import load_dataset
 from rgbavatar_ns.errors import UserError
@@ -242,7 +242,7 @@ def test_checkpoint_says_what_was_filmed(train: Train, tiny_data: Path):
     trainer = train(max_num_iterations=3)
     dataset = load_dataset(tiny_data)
     expected = statistics_of(trainer.pipeline.model.avatar, dataset).to_state()
-    seen = load_statistics(trainer.base_dir)
+    seen = load_avatar(trainer.base_dir).training_statistics
     assert seen is not None
     for name, value in seen.to_state().items():
         assert torch.equal(torch.as_tensor(value), torch.as_tensor(expected[name])), name
