@@ -174,6 +174,29 @@ def test_a_users_matte_and_an_alpha_channel_end_up_in_the_dataset(tmp_path: Path
         track_video(frames, tmp_path / "z", replace(CONFIG, mattes=short))
 
 
+def test_who_has_no_body_in_the_given_mattes_has_none_to_follow(tmp_path: Path) -> None:
+    """The picture shows shoulders, of which segmentation knows; the mattes end at the chin."""
+    pytest.importorskip("mediapipe", reason="the tracker's optional extra is not installed")
+    image = astronaut()[::2, ::2, ::-1]
+    head = np.zeros(image.shape[:2], np.uint8)
+    head[:80] = 255
+    frames, masks, alphas = (
+        _folder(tmp_path / name, {f"{k}.png": picture for k in range(2)})
+        for name, picture in (("f", image), ("m", head), ("a", np.dstack([image, head])))
+    )
+    seen_cm2 = {}
+    for name, source, mattes in (
+        ("found", frames, None),
+        ("m", frames, masks),
+        ("a", alphas, None),
+    ):
+        track_video(source, tmp_path / "out" / name, replace(CONFIG, mattes=mattes))
+        told = json.loads((tmp_path / "out" / name / "tracking.json").read_text())
+        seen_cm2[name] = told["body"]["seen_cm2"]
+    assert seen_cm2["found"] > 100
+    assert seen_cm2["m"] == seen_cm2["a"] == 0
+
+
 def test_a_mask_video_of_varying_rate_is_counted_by_its_frames_and_not_by_its_length(
     tmp_path: Path,
 ) -> None:

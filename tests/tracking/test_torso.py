@@ -176,12 +176,11 @@ class Filmed:
         self.body = BodyMesh.of(head, person.double().numpy())
 
     def followed(self) -> list[BodySighting]:
-        mattes = {image.tobytes(): matte for image, matte in zip(self.images, self.mattes)}
-        follow = BodyFollower(self.body, self.camera, 1.0, lambda image: mattes[image.tobytes()])
-        found = zip(self.images, self.neck_m, self.vertices_px)
+        follow = BodyFollower(self.body, self.camera, 1.0)
+        found = zip(self.images, self.neck_m, self.mattes, self.vertices_px)
         return [
-            follow(image, neck, lambda px=px: px, k == 0)
-            for k, (image, neck, px) in enumerate(found)
+            follow(image, neck, lambda m=matte: m, lambda px=px: px, k == 0)
+            for k, (image, neck, matte, px) in enumerate(found)
         ]
 
 
@@ -204,9 +203,12 @@ def test_the_mesh_is_asked_for_where_points_are_chosen_alone(films) -> None:
         asked.append(True)
         return film.vertices_px[0]
 
-    follow = BodyFollower(film.body, film.camera, 1.0, lambda _: film.mattes[0])
+    follow = BodyFollower(film.body, film.camera, 1.0)
     frames = zip(film.images[:4], film.neck_m)
-    seen = [follow(image, neck, mesh_px, k == 0) for k, (image, neck) in enumerate(frames)]
+    seen = [
+        follow(image, neck, lambda: film.mattes[0], mesh_px, k == 0)
+        for k, (image, neck) in enumerate(frames)
+    ]
     assert len(asked) == sum(one.chosen_px is not None for one in seen) == 1
 
 

@@ -63,12 +63,12 @@ class Still:
     ) -> list[BodySighting]:
         follow = follow or self.follower()
         return [
-            follow(image, NECK_M, lambda: self.vertices_px, k == 0)
+            follow(image, NECK_M, lambda: self.matte, lambda: self.vertices_px, k == 0)
             for k, image in enumerate(images, first)
         ]
 
     def follower(self, state: FollowerState | None = None) -> BodyFollower:
-        return BodyFollower(self.body, CAMERA, 1.0, lambda _: self.matte, state)
+        return BodyFollower(self.body, CAMERA, 1.0, state)
 
 
 @pytest.fixture(scope="module")
@@ -110,14 +110,14 @@ def test_light_that_changes_covers_nothing(still: Still) -> None:
 def test_a_body_that_comes_back_is_found_where_it_was(still: Still) -> None:
     """It goes half out of the picture, where another key picture is taken, and comes back."""
     sway = np.round(200 * np.sin(np.linspace(0, np.pi, 57))).astype(int).tolist()
-    shown, mattes = still.images[0], {}
-    follow = BodyFollower(still.body, CAMERA, 1.0, lambda image: mattes[image.tobytes()])
+    shown = still.images[0]
+    follow = BodyFollower(still.body, CAMERA, 1.0)
     sightings = []
     for k, step in enumerate(sway):
         picture = np.roll(shown, step, axis=1)
-        mattes[picture.tobytes()] = np.roll(still.matte, step, axis=1)
+        matte = np.roll(still.matte, step, axis=1)
         mesh_px = still.vertices_px + np.array([step, 0])
-        sightings.append(follow(picture, NECK_M, lambda px=mesh_px: px, k == 0))
+        sightings.append(follow(picture, NECK_M, lambda m=matte: m, lambda px=mesh_px: px, k == 0))
     assert {one.run for one in sightings} == {0}
     assert sum(one.chosen_px is not None for one in sightings) > 1
     assert sightings[-1].of_first
@@ -179,8 +179,10 @@ def test_a_body_in_the_picture_is_told_from_none(
     assert none.seen_cm2 == 0
     assert seen_cm2([whole, none, none]) == 0
     sightings = [
-        BodyFollower(still.body, CAMERA, 1.0, lambda _: cropped)(
-            still.images[0][: len(cropped)], NECK_M, lambda: still.vertices_px, True
+        BodyFollower(still.body, CAMERA, 1.0)(
+            *(still.images[0][: len(cropped)], NECK_M),
+            *(lambda: cropped, lambda: still.vertices_px),
+            True,
         )
     ]
     places = place_body(still.body, CAMERA, sightings, NECK_M[None], [])

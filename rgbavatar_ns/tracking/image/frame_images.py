@@ -30,7 +30,7 @@ from rgbavatar_ns.tracking.image.known_room import KnownRoom
 from rgbavatar_ns.tracking.image.matting import PersonMatte, refined_matte
 from rgbavatar_ns.tracking.image.steady_matte import NEIGHBOURS, CoarseMatte, head_motion, steadied
 from rgbavatar_ns.tracking.image.unsure_band import band_matte
-from rgbavatar_ns.tracking.input.mattes import UserMattes
+from rgbavatar_ns.tracking.input.mattes import UserMattes, given_mattes
 from rgbavatar_ns.tracking.input.video import FrameSource
 from rgbavatar_ns.tracking.threads import InBackground, map_in_order
 
@@ -207,19 +207,13 @@ class FrameImages:
     def _crops(self, source: FrameSource, positions: list[int]) -> Iterator[_Cropped]:
         place = {self._found.frame_index[k]: k for k in positions}
         wanted = frozenset(place)
-        mattes = None
-        if self._mattes is not None:
-            mattes = self._mattes.levels(wanted, self._found.width, self._found.height)
-        for frame in source.these(wanted):
+        frames = source.these(wanted)
+        for frame, given in given_mattes(frames, wanted, self._mattes, self._source_alpha):
             position, crop = place[frame.index], self._crop
             if self._source_alpha and frame.alpha is not None:
                 yield _Cropped(position, *crop.matted(frame.image_rgb, frame.alpha), True)
             else:
-                alpha = None
-                if mattes is not None:
-                    alpha = crop.apply(next(mattes)[1]).astype(np.float32) / 255
-                elif self._source_alpha:
-                    alpha = np.ones((crop.size, crop.size), np.float32)
+                alpha = None if given is None else crop.apply(given).astype(np.float32) / 255
                 yield _Cropped(position, crop.apply(frame.image_rgb), alpha)
 
     def _segmented(self, crops: Iterable[_Cropped]) -> Iterator[_Cropped]:

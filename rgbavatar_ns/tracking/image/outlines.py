@@ -14,7 +14,7 @@ from rgbavatar_ns.tracking.face.clip import ClipLandmarks
 from rgbavatar_ns.tracking.fit.outline import PersonOutline
 from rgbavatar_ns.tracking.image.crop import SquareCrop, steady_crop
 from rgbavatar_ns.tracking.image.matting import PersonMatte
-from rgbavatar_ns.tracking.input.mattes import UserMattes
+from rgbavatar_ns.tracking.input.mattes import UserMattes, given_mattes
 from rgbavatar_ns.tracking.input.video import FrameSource
 from rgbavatar_ns.tracking.resumable_run import GO_ON, ResumableRun, stage_damage_told
 
@@ -119,12 +119,9 @@ def _mattes(
         return index in wanted
 
     with closing(PersonMatte()) as matte:
-        for frame in source.read(read):
-            if source_alpha:
-                alpha = frame.alpha
-                if alpha is None:
-                    alpha = np.full((frame.height, frame.width), 255, np.uint8)
-                yield frame.index, crop.apply(alpha)
+        for frame, given in given_mattes(source.read(read), wanted, None, source_alpha):
+            if given is not None:
+                yield frame.index, crop.apply(given)
             else:
                 yield frame.index, levels(matte(crop.apply(frame.image_rgb)))
             if frame.index == last:

@@ -1,6 +1,6 @@
 """A user's own mattes, which take precedence over ours."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,7 +15,7 @@ from rgbavatar_ns.tracking.input.image_files import (
     read_image_rgba,
     require_image_files,
 )
-from rgbavatar_ns.tracking.input.video import FrameSource, counted_frames
+from rgbavatar_ns.tracking.input.video import FrameSource, SourceFrame, counted_frames
 
 _AS_MANY = "Give one matte a frame: white (or opaque) is the person."
 
@@ -97,6 +97,30 @@ class UserMattes:
         for frame in FrameSource.open(self.path).read(frames.__contains__):
             grey = cv2.cvtColor(frame.image_rgb, cv2.COLOR_RGB2GRAY)
             yield frame.index, grey if frame.alpha is None else frame.alpha
+
+
+def given_mattes(
+    frames: Iterable[SourceFrame],
+    wanted: frozenset[int],
+    mattes: UserMattes | None,
+    source_alpha: bool,
+) -> Iterator[tuple[SourceFrame, UInt8[np.ndarray, "H W"] | None]]:
+    """The wanted frames, which are these, each with the matte that the user gave of it.
+
+    It is one of `mattes`, else the film's alpha where `source_alpha` (a frame without one is the
+    person all over), as large as the frame's image; None where mattes are to be found.
+    """
+    levels = None
+    for frame in frames:
+        height, width = frame.image_rgb.shape[:2]
+        if mattes is not None:
+            levels = levels or mattes.levels(wanted, frame.width, frame.height)
+            level = next(levels)[1]
+            yield frame, cv2.resize(level, (width, height), interpolation=cv2.INTER_AREA)
+        elif source_alpha and frame.alpha is None:
+            yield frame, np.full((height, width), 255, np.uint8)
+        else:
+            yield frame, frame.alpha if source_alpha else None
 
 
 def _by_name(mattes: list[Path], images: list[Path]) -> tuple[Path, ...] | None:

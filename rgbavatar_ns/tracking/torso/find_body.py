@@ -7,20 +7,22 @@ from functools import partial
 from itertools import count
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 
 from rgbavatar_ns.files import digest
 from rgbavatar_ns.head.joints import NECK
 from rgbavatar_ns.tracking.face.clip import ClipLandmarks
 from rgbavatar_ns.tracking.fit.fit import ClipFit
 from rgbavatar_ns.tracking.fit.subject import SubjectTracker
+from rgbavatar_ns.tracking.image.matting import PersonMatte
+from rgbavatar_ns.tracking.input.mattes import UserMattes, given_mattes
 from rgbavatar_ns.tracking.input.video import FrameSource
 from rgbavatar_ns.tracking.resumable_run import ResumableRun
 from rgbavatar_ns.tracking.stage_clock import StageClock
 from rgbavatar_ns.tracking.threads import InBackground
 from rgbavatar_ns.tracking.torso.body_blocks import BodyBlock
 from rgbavatar_ns.tracking.torso.body_mesh import BodyMesh
-from rgbavatar_ns.tracking.torso.follow import BodyFollower, BodySighting, FollowerState, MatteOf
+from rgbavatar_ns.tracking.torso.follow import BodyFollower, BodySighting, FollowerState
 from rgbavatar_ns.tracking.torso.place import ROUNDS, BodyPlaces, SeenShoulders, place_body
 from rgbavatar_ns.tracking.torso.shape import ShoulderLine, shoulder_line, shoulders_up_cm
 from rgbavatar_ns.tracking.torso.shoulders import ShoulderFinder
@@ -42,15 +44,16 @@ def find_body(
     tracker: SubjectTracker,
     fit: ClipFit,
     found: ClipLandmarks,
-    matte_of: MatteOf,
+    mattes: UserMattes | None,
+    source_alpha: bool,
     clock: StageClock,
     block_frames: int = BLOCK_FRAMES,
 ) -> BodyPlaces:
     """Where the body under the fitted heads is in every frame.
 
-    `matte_of` gives the person's alpha of a picture. The film is read in the clock's stage "body",
-    what was seen is put together in its stage "place". Each block of frames is a stage of `run`,
-    and one that is done is not looked at again.
+    Who the person is, `mattes` say, or the film's alpha where `source_alpha`, or segmentation. The
+    film is read in the clock's stage "body", what was seen is put together in its stage "place".
+    Each block of frames is a stage of `run`, and one that is done is not looked at again.
     """
     clock.begin("body", len(found))
     heads, identity = tracker.thetas(fit), fit.subject.identity
@@ -58,7 +61,7 @@ def find_body(
     neck_m = np.array(
         [tracker.mesh_landmarks.chain(theta, identity).placed[NECK] for theta in heads]
     )
-    reading = _Reading(tracker, fit, found, body, neck_m, matte_of, clock.done)
+    reading = _Reading(tracker, fit, found, body, neck_m, mattes, source_alpha, clock.done)
     made_from = digest([repr(found.frame_index), heads, identity])
     blocks: list[BodyBlock] = []
     reads: Generator[BodyBlock, None, None] | None = None
@@ -114,7 +117,8 @@ class _Reading:
     found: ClipLandmarks
     body: BodyMesh
     neck_m: Float[np.ndarray, "F 3"]
-    matte_of: MatteOf
+    mattes: UserMattes | None
+    source_alpha: bool
     advance: Callable[[int], None]
 
     def blocks(
@@ -126,22 +130,24 @@ class _Reading:
         scale = min(1.0, _SIDE_PX / max(found.width, found.height))
         camera = self.fit.subject.camera
         small, every = camera.scaled(scale), max(1, len(found) // _SHOULDER_FRAMES)
-        follow = BodyFollower(self.body, camera, scale, self.matte_of, state)
+        follow = BodyFollower(self.body, camera, scale, state)
         sightings: list[BodySighting] = []
         shoulders: list[SeenShoulders] = []
         lines: list[ShoulderLine] = []
         shown: list[BodyShown] = []
-        pose = ShoulderFinder()
+        read = source.these(place, _SIDE_PX)
+        given = given_mattes(read, frozenset(place), self.mattes, self.source_alpha)
+        pose, person = ShoulderFinder(), PersonMatte()
         try:
-            frames = InBackground(source.these(place, _SIDE_PX), _AHEAD)
-            with closing(frames):
-                for k, frame in enumerate(frames, start):
+            with closing(InBackground(given, _AHEAD)) as frames:
+                for k, (frame, level) in enumerate(frames, start):
                     cut = k == 0 or found.clip[k] != found.clip[k - 1]
                     pixels = partial(self.tracker.vertices_px, self.fit, k)
                     image, neck = frame.image_rgb, self.neck_m[k]
-                    sightings.append(follow(image, neck, pixels, cut))
+                    alpha = partial(_alpha, person, image, level)
+                    sightings.append(follow(image, neck, alpha, pixels, cut))
                     if k % every == 0:
-                        matte, head_px = self.matte_of(image), pixels() * scale - 0.5
+                        matte, head_px = alpha(), pixels() * scale - 0.5
                         lines.append(shoulder_line(k, matte, neck, small))
                         shown.append(body_shown(k, matte, self.body, neck, head_px, small))
                         if shown[-1].alone and (seen := pose(image)) is not None:
@@ -156,3 +162,13 @@ class _Reading:
                         return
         finally:
             pose.close()
+            person.close()
+
+
+def _alpha(
+    person: PersonMatte,
+    image_rgb: UInt8[np.ndarray, "h w 3"],
+    given: UInt8[np.ndarray, "h w"] | None,
+) -> Float[np.ndarray, "h w"]:
+    """The person's alpha of a picture, in [0, 1]: as it was given, or by segmentation."""
+    return person.coarse(image_rgb) if given is None else given.astype(np.float32) / 255

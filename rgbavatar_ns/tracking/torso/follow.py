@@ -40,8 +40,8 @@ _CLEAR = 0.02
 _AGAIN_SHARE, _MANY = 1 / 16, 0.6
 
 
-MatteOf = Callable[[UInt8[np.ndarray, "h w 3"]], Float[np.ndarray, "h w"]]
-"""The person's alpha of a picture."""
+Matte = Callable[[], Float[np.ndarray, "h w"]]
+"""The person's alpha of a frame's picture; found where it is asked for."""
 MeshPx = Callable[[], Float[np.ndarray, "V 2"]]
 """The fitted head's mesh in a frame, in pixels of the source; found where it is asked for."""
 
@@ -108,9 +108,8 @@ class FollowerState:
 class BodyFollower:
     """Follows the body of one person through a clip; call it with the frames in order.
 
-    `scale` is the size of the given pictures by the source's. `matte_of` gives the person's alpha
-    of a picture; it is asked for key pictures alone. Another follower that is given this one's
-    `state` goes on exactly alike.
+    `scale` is the size of the given pictures by the source's. Another follower that is given this
+    one's `state` goes on exactly alike.
     """
 
     def __init__(
@@ -118,10 +117,9 @@ class BodyFollower:
         body: BodyMesh,
         camera: StillCamera,
         scale: float,
-        matte_of: MatteOf,
         state: FollowerState | None = None,
     ) -> None:
-        self._body, self._scale, self._matte_of = body, scale, matte_of
+        self._body, self._scale = body, scale
         self._camera = camera.scaled(scale)
         self.state = state or FollowerState.before_the_first()
 
@@ -129,13 +127,14 @@ class BodyFollower:
         self,
         image_rgb: UInt8[np.ndarray, "h w 3"],
         neck_m: Float[np.ndarray, "3"],
+        matte: Matte,
         mesh_px: MeshPx,
         is_cut: bool,
     ) -> BodySighting:
         """The next frame; `neck_m` is where its head says that the neck's joint is.
 
-        `mesh_px` is asked for key pictures alone; `is_cut` says that the picture has nothing to do
-        with the one before.
+        `matte` and `mesh_px` are asked for key pictures alone; `is_cut` says that the picture has
+        nothing to do with the one before.
         """
         gray = cv2.cvtColor(image_rgb, cv2.COLOR_RGB2GRAY)
         key = None if is_cut else self.state.key
@@ -153,7 +152,7 @@ class BodyFollower:
             seen_px, covered, hidden_px = np.zeros((0, 2)), np.nan, np.zeros((0, 2))
         chosen_px, certainty = None, None
         if self._wants_key(seen_px, covered):
-            key = self._take_key(image_rgb, gray, mesh_px, covered, hidden_px)
+            key = self._take_key(image_rgb, gray, matte(), mesh_px(), covered, hidden_px)
             chosen_px, certainty = self._in_source(key.body.points_px), key.body.certainty
         seen_px = self._in_source(seen_px)
         return BodySighting(
@@ -261,14 +260,15 @@ class BodyFollower:
         self,
         image_rgb: UInt8[np.ndarray, "h w 3"],
         gray: UInt8[np.ndarray, "h w"],
-        mesh_px: MeshPx,
+        matte: Float[np.ndarray, "h w"],
+        mesh_px: Float[np.ndarray, "V 2"],
         covered: float,
         hidden_px: Float[np.ndarray, "C 2"],
     ) -> KeyPicture:
         """Choose points of the body anew in this picture, but not of what is before it."""
-        matte, state = self._matte_of(image_rgb), self.state
+        state = self.state
         placed = state.motion.after(state.start)
-        region = (matte > _PERSON) & ~self._of_head(mesh_px(), placed, gray.shape)
+        region = (matte > _PERSON) & ~self._of_head(mesh_px, placed, gray.shape)
         for x, y in np.round(hidden_px).astype(int).tolist():
             reach = round(_HIDES_SHARE * max(gray.shape))
             region[max(0, y - reach) : y + reach + 1, max(0, x - reach) : x + reach + 1] = False
