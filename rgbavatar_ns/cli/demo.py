@@ -163,7 +163,11 @@ def _in_words(asked: Result) -> str:
     return f"{pixels}, the head alone" if asked["head_only"] else pixels
 
 
-def _fingerprint(path: Path) -> tuple[str, int, float]:
+def _fingerprint(path: Path) -> tuple[str | int | float, ...]:
+    from rgbavatar_ns.tracking.input.image_files import source_digest
+
+    if path.is_dir():  # Its own size and time stay where an image in it is replaced.
+        return str(path.resolve()), source_digest(path)
     facts = path.stat()
     return str(path.resolve()), facts.st_size, facts.st_mtime
 

@@ -134,21 +134,21 @@ def test_a_video_and_the_demo_subject_do_not_replace_one_another(
     assert f"has the avatar of {who}." in refused("demo", "--output", "x", *options)
 
 
-def test_an_avatars_data_is_not_replaced_by_the_same_film_tracked_otherwise(
-    tmp_path, monkeypatch, refused
-):
-    """`make demo VIDEO=me.mp4`, then a tiny one: the first one's frames were gone."""
-    monkeypatch.chdir(tmp_path)
-    clip = tmp_path / "me.mp4"
-    clip.touch()
-    # What the tracker itself says is another matter.
+@pytest.fixture
+def stages(monkeypatch):
+    """Stands in for what takes long: the videos that were tracked, the methods trained."""
+    done = SimpleNamespace(tracked=[], trained=[])
     film = SimpleNamespace(width=512)
-    monkeypatch.setattr("rgbavatar_ns.tracking.track_video", lambda *given, **named: film)
+
+    def track(video, *given, **named):
+        done.tracked.append(video)
+        return film
+
+    monkeypatch.setattr("rgbavatar_ns.tracking.track_video", track)
     facts = {"train_seconds": 1.0, "images_per_second": 1.0}
-    trained = []
 
     def train(method, data, run_folder, *given):
-        trained.append(method)
+        done.trained.append(method)
         assert not run_folder.exists()  # where there is a complete run nothing would be trained
         run_folder.mkdir(parents=True)
         return facts
@@ -158,6 +158,15 @@ def test_an_avatars_data_is_not_replaced_by_the_same_film_tracked_otherwise(
     monkeypatch.setattr(demo.commands, "evaluate", lambda *given: scores)
     shown = {"frames": 1, "video": "film", "picture": "picture"}
     monkeypatch.setattr(demo, "_film", lambda *given: shown)
+    return done
+
+
+def test_an_avatars_data_is_not_replaced_by_the_same_film_tracked_otherwise(
+    tmp_path, monkeypatch, refused, stages
+):
+    """`make demo VIDEO=me.mp4`, then a tiny one: the first one's frames were gone."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "me.mp4").touch()
     main(["demo", "--video", "me.mp4"])
     told = refused("demo", "--video", "me.mp4", "--tiny")
     assert "has an avatar of this film" in told
@@ -166,9 +175,22 @@ def test_an_avatars_data_is_not_replaced_by_the_same_film_tracked_otherwise(
     main(["demo", "--video", "me.mp4", "--steps", "9"])  # on the same data
     main(["demo", "--video", "me.mp4", "--tiny", "--output", "outputs/me-tiny"])
     main(["demo", "--video", "me.mp4", "--tiny", "--fresh"])
-    assert trained == ["rgbavatar-quick"] * 2 + ["rgbavatar-tiny"] * 2
+    assert stages.trained == ["rgbavatar-quick"] * 2 + ["rgbavatar-tiny"] * 2
     main(["demo", "--video", "me.mp4", "--tiny", "--fresh"])
-    assert trained[4:] == ["rgbavatar-tiny"]
+    assert stages.trained[4:] == ["rgbavatar-tiny"]
+
+
+def test_an_image_that_is_replaced_in_a_folder_is_tracked_anew(tmp_path, monkeypatch, stages):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "me").mkdir()
+    image = tmp_path / "me" / "0.png"
+    image.write_bytes(b"one")
+    for _ in range(2):
+        main(["demo", "--video", "me"])
+    assert len(stages.tracked) == 1
+    image.write_bytes(b"another")
+    main(["demo", "--video", "me"])
+    assert len(stages.tracked) == 2
 
 
 @pytest.mark.parametrize("made_anew", [True, False])
