@@ -22,6 +22,8 @@ _LOCAL_NAME = r"(localhost|127(\.\d+){3}|\[::1\])(:\d+)?"
 _LOCAL_HOST = re.compile(_LOCAL_NAME, re.IGNORECASE)
 _LOCAL_ORIGIN = re.compile(f"https?://{_LOCAL_NAME}", re.IGNORECASE)
 _OPEN_S, _CLOSE_S, _PING_S = 3.0, 1.0, 10.0
+_MOST_WAITING, _MOST_TALKS = 32, 64
+"""Connections that fetch the page or have said nothing yet, and conversations, at a time."""
 # Port scanners and browsers are no news to the user.
 _log = logging.getLogger(f"{__name__}.websockets")
 _log.setLevel(logging.CRITICAL)
@@ -30,9 +32,10 @@ _log.setLevel(logging.CRITICAL)
 class LocalServer:
     """Listens and runs `talk` for each connection in a thread of its own.
 
-    Programs are welcome, and so are pages of this machine and this server's own. A page from the
-    disk has the origin "null", but so has any web site's sandboxed frame: it shows that it is the
-    user's by the key in the address (`keyed_address`), which is another each time.
+    At most 64 converse at a time; others are told so. Programs are welcome, and so are pages of
+    this machine and this server's own. A page from the disk has the origin "null", but so has any
+    web site's sandboxed frame: it shows that it is the user's by the key in the address
+    (`keyed_address`), which is another each time.
 
     Args:
         listen: HOST:PORT (port 0: any that is free, see `address`).
@@ -57,7 +60,7 @@ class LocalServer:
                 "Listen on this machine alone (127.0.0.1), or add --allow-remote.",
             )
         try:
-            self._listener = BoundedListener(address)
+            self._listener = BoundedListener(address, _MOST_WAITING, _MOST_TALKS)
         except OSError as error:
             raise UserError(
                 f"Nothing can be served at {address}: {error.strerror}.",
@@ -98,13 +101,13 @@ class LocalServer:
         host, origin = request.headers.get("Host", "localhost"), request.headers.get("Origin")
         is_socket = request.headers.get("Upgrade", "").lower() == "websocket"
         if is_socket and origin is None:
-            return None  # A program; browsers name one.
+            return self._admit(connection)  # A program; browsers name one.
         if not (_LOCAL_HOST.fullmatch(host) or (not self._is_local and _is_this_machine(host))):
             remedy = "Ask for this machine's number, such as 127.0.0.1.\n"
             return connection.respond(HTTPStatus.MISDIRECTED_REQUEST, remedy)
         if origin is not None and is_socket:
             if self._is_welcome(origin, host, request.path):
-                return None
+                return self._admit(connection)
             return connection.respond(HTTPStatus.FORBIDDEN, "Not from this page.\n")
         if self._page is None or request.path.split("?")[0] != "/":
             return connection.respond(HTTPStatus.NOT_FOUND, "Nothing is here.\n")
@@ -118,6 +121,13 @@ class LocalServer:
             }
         )
         return Response(HTTPStatus.OK, "OK", headers, content)
+
+    def _admit(self, connection: ServerConnection) -> Response | None:
+        """None: it converses, and makes room for no other one any more."""
+        if self._listener.keep(connection.socket):
+            return None
+        remedy = f"As many are connected as may be ({_MOST_TALKS}): close one.\n"
+        return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, remedy)
 
     def _is_welcome(self, origin: str, host: str, path: str) -> bool:
         """Whether a page of this origin that asked for this host and path may speak."""

@@ -1,5 +1,6 @@
 """What pages are told, without a browser."""
 
+import contextlib
 import json
 import socket
 import threading
@@ -9,6 +10,7 @@ import urllib.request
 
 import pytest
 import torch
+from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from rgbavatar_ns.driving.live_drive import DrivenFrame
@@ -57,6 +59,39 @@ def test_a_page_is_greeted_gets_frames_and_its_answers_make_the_latency(output):
         _until(lambda: output.latencies.shown == 1)
         assert 0.05 <= output.latencies.quantile_s(0.5) < 0.5
     _until(lambda: output.pages == 0)
+
+
+def test_many_pages_stay_connected_and_one_too_many_is_told(output):
+    with contextlib.ExitStack() as opened:
+        pages = [opened.enter_context(connect(f"ws://{output.address}")) for _ in range(64)]
+        for page in pages:
+            page.recv(timeout=2)
+        with pytest.raises(InvalidStatus) as refused:
+            connect(f"ws://{output.address}")
+        assert refused.value.response.status_code == 503
+        assert b"close one" in refused.value.response.body
+        # Fetching the page takes no conversation's place, however often.
+        for _ in range(40):
+            with urllib.request.urlopen(f"http://{output.address}/", timeout=2) as answer:
+                assert answer.read() == b"<html>it"
+        output.show(_frame(7))
+        assert {json.loads(page.recv(timeout=2))["index"] for page in pages} == {7}
+        pages[0].close()
+        _until(lambda: output.pages == 63)
+        with connect(f"ws://{output.address}") as page:
+            assert json.loads(page.recv(timeout=2))["type"] == "hello"
+
+
+def test_connections_that_say_nothing_make_room(output):
+    silent = [socket.create_connection(output.address.split(":")) for _ in range(40)]
+    try:
+        with connect(f"ws://{output.address}") as page:
+            assert json.loads(page.recv(timeout=2))["type"] == "hello"
+        silent[0].settimeout(2)
+        assert silent[0].recv(1) == b"", "the oldest was hung up on"
+    finally:
+        for one in silent:
+            one.close()
 
 
 def test_a_slow_page_gets_the_newest(output):

@@ -3,20 +3,26 @@
 import contextlib
 import os
 import socket
+import threading
 import time
 from typing import Any
 
 from rgbavatar_ns.data.streams.address import StreamAddress
 
-_MOST_CONNECTIONS = 8
-"""Each may fill memory with the largest message."""
 _RETRY_S = 0.02
 
 
 class BoundedListener(socket.socket):
-    """A listening socket that holds a bounded number of connections."""
+    """A listening socket that holds a bounded number of connections.
 
-    def __init__(self, address: StreamAddress) -> None:
+    Args:
+        address: where it listens.
+        most_waiting: connections of which nothing is known yet; each may fill memory with the
+            largest message, and the oldest makes room for a new one.
+        most_kept: connections that are kept (`keep`) at a time.
+    """
+
+    def __init__(self, address: StreamAddress, most_waiting: int, most_kept: int) -> None:
         super().__init__(socket.AF_INET6 if ":" in address.host else socket.AF_INET)
         try:
             if os.name == "posix":  # Elsewhere two programs could listen at one address.
@@ -26,11 +32,13 @@ class BoundedListener(socket.socket):
         except BaseException:
             self.close()
             raise
-        self._connections: list[socket.socket] = []
-        self._kept: socket.socket | None = None
+        self._most_waiting, self._most_kept = most_waiting, most_kept
+        self._keeping = threading.Lock()
+        self._waiting: list[socket.socket] = []
+        self._kept: list[socket.socket] = []
 
     def accept(self) -> tuple[socket.socket, Any]:
-        """The next connection; the oldest ones that are no client make room for it."""
+        """The next connection; the oldest that is not kept makes room for it."""
         while True:
             try:
                 connection, peer = super().accept()
@@ -40,27 +48,39 @@ class BoundedListener(socket.socket):
                 time.sleep(_RETRY_S)  # The process has no file left, or the other side has gone.
                 continue
             self._make_room()
-            self._connections = [*self._open(), connection]
+            with self._keeping:
+                self._waiting.append(connection)
             return connection, peer
 
     def _make_room(self) -> None:
-        for waiting in [one for one in self._open() if one is not self._kept]:
-            if len(self._open()) < _MOST_CONNECTIONS:
-                return
-            hang_up(waiting)
+        with self._keeping:
+            waiting = _open(self._waiting)
+            surplus = max(0, len(waiting) + 1 - self._most_waiting)
+            self._waiting = waiting[surplus:]
+        for oldest in waiting[:surplus]:
+            hang_up(oldest)
             time.sleep(_RETRY_S)
 
-    def keep(self, connection: socket.socket) -> None:
-        """This is the client's: it is not hung up on to make room."""
-        self._kept = connection
+    def keep(self, connection: socket.socket) -> bool:
+        """From now on this is not hung up on to make room; False where as many are kept as may."""
+        with self._keeping:
+            self._kept = _open(self._kept)
+            if len(self._kept) >= self._most_kept:
+                return False
+            self._kept.append(connection)
+            self._waiting = [one for one in self._waiting if one is not connection]
+        return True
 
     def hang_up_on_all(self) -> None:
         """End all connections at once."""
-        for connection in self._open():
+        with self._keeping:
+            connections = _open(self._waiting + self._kept)
+        for connection in connections:
             hang_up(connection)
 
-    def _open(self) -> list[socket.socket]:
-        return [one for one in self._connections if one.fileno() >= 0]
+
+def _open(connections: list[socket.socket]) -> list[socket.socket]:
+    return [one for one in connections if one.fileno() >= 0]
 
 
 def hang_up(connection: socket.socket) -> None:

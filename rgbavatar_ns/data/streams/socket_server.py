@@ -19,6 +19,8 @@ from rgbavatar_ns.errors import UserError
 
 _MOST_WAITING = 16
 """Frames that wait to be taken; a client that sends more is made to wait."""
+_MOST_CONNECTIONS = 8
+"""That are no client yet; and clients, of which all but one are about to end."""
 _OPEN_S, _CLOSE_S = 3.0, 1.0
 """For WebSocket's own greetings and farewells."""
 _LONGEST_TOLD = 400
@@ -122,7 +124,7 @@ class SocketStream:
 
     def _listen(self, address: StreamAddress) -> Server:
         try:
-            self._listener = BoundedListener(address)
+            self._listener = BoundedListener(address, _MOST_CONNECTIONS, _MOST_CONNECTIONS)
         except OSError as error:
             raise UserError(
                 f"Frames cannot be listened for at {address}: {error.strerror}.",
