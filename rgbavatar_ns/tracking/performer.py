@@ -24,6 +24,8 @@ from rgbavatar_ns.tracking.tracked_capture import TrackedCapture
 
 _FIRST_PICTURE_S = 10.0
 """A camera that has shown nothing for so long will show nothing: it is told."""
+_SILENT_S = 3.0
+"""A camera that showed pictures and shows none for so long has gone."""
 
 
 class FilmedPerformer(TrackedCapture):
@@ -51,7 +53,8 @@ class FilmedPerformer(TrackedCapture):
         self._keeps_all = not real_time
         self._unmet: dict[int, CapturedFrame] = {}
         self._backlog: deque[PerformanceFrame] = deque()
-        self._began_s, self._shown = time.monotonic(), False
+        self._began_s = time.monotonic()
+        self._shown_s: float | None = None
 
     @property
     def ended(self) -> bool:
@@ -61,8 +64,10 @@ class FilmedPerformer(TrackedCapture):
     @property
     def waits_for(self) -> str:
         """A picture, or a face in it."""
-        if not self._shown:
+        if self._shown_s is None:
             return f"the first picture of {self._told}"
+        if not self.ended and time.monotonic() - self._shown_s > _SILENT_S:
+            return f"pictures of {self._told} to come again: is it still connected?"
         told = "to be met" if not self._tracker.ready else "to be found again"
         return f"a face in {self._told} {told}: look at the camera, well lit and near"
 
@@ -74,11 +79,12 @@ class FilmedPerformer(TrackedCapture):
         if captured is None:
             self._require_pictures()
             return None
-        self._shown = True
+        self._shown_s = time.monotonic()
         met, faceless = self._tracker.ready, self._tracker.counts["no face"]
         if not self._of_one_size(captured.image_rgb):
             return None
         theta = self._tracker.pose(captured.image_rgb, captured.index)
+        self._shown_s = time.monotonic()  # Meeting a person has taken seconds of silence.
         if not met:
             self._meet(captured, self._tracker.counts["no face"] == faceless)
             return self._backlog.popleft() if self._backlog else None
@@ -105,7 +111,7 @@ class FilmedPerformer(TrackedCapture):
 
     def _require_pictures(self) -> None:
         silent_s = time.monotonic() - self._began_s
-        if not self._shown and not self.ended and silent_s > _FIRST_PICTURE_S:
+        if self._shown_s is None and not self.ended and silent_s > _FIRST_PICTURE_S:
             raise UserError(
                 f"{self._told} has shown no picture for {silent_s:.0f} seconds.", _REMEDY
             )

@@ -189,6 +189,19 @@ def test_a_client_goes_on_with_a_stream_that_was_started_again(open_stream: Open
     assert indices(again, 10) == [0, 1]
 
 
+def test_a_client_that_brings_another_person_is_told_and_goes_on(open_stream: Opener):
+    told: list[str] = []
+    stream = open_stream(tell=told.append)
+    own = subject().identity
+    for k, person in enumerate((own, own + 1e-6, own + 0.1, own + 0.1)):
+        client = StreamClient(dataclasses.replace(subject(), identity=person), stream.address)
+        client.send(tracked(k))
+        assert indices(stream, 1) == [k]
+        client.close()
+    assert len(told) == 1
+    assert "another shape of the head" in told[0]
+
+
 OTHER_ARRAYS = dataclasses.replace(HEAD.arrays, name="other")
 
 

@@ -133,15 +133,35 @@ def test_a_camera_that_shows_nothing_is_told(monkeypatch):
     performer.close()
 
 
+def test_a_camera_that_is_pulled_out_is_told_and_not_the_person(monkeypatch):
+    picture = CapturedFrame(0, np.zeros((4, 6, 3), np.uint8), 0.0)
+
+    class Camera(LatestFrameCapture):
+        def next(self, timeout_s):
+            return frames.pop() if frames else None
+
+    frames = [picture, picture]
+    closed = SimpleNamespace(isOpened=lambda: False, release=lambda: None)
+    camera = Camera("0", opener=lambda source: closed)
+    performer = FilmedPerformer("0", tracker=_Tracker(warm_up=9), capture=camera)
+    assert performer.next(0.1) is None
+    assert "look at the camera" in performer.waits_for
+    monkeypatch.setattr("rgbavatar_ns.tracking.performer._SILENT_S", 0.0)
+    assert "pictures of 0 to come again: is it still connected?" in performer.waits_for
+    monkeypatch.undo()
+    performer.next(0.1)
+    assert "look at the camera" in performer.waits_for
+    performer.close()
+
+
 def test_a_cameras_password_is_told_to_nobody(monkeypatch):
     source = "rtsp://admin:secret@cam:554/1?token=secret"
     closed = SimpleNamespace(isOpened=lambda: False, release=lambda: None)
     silent = LatestFrameCapture(source, opener=lambda source: closed)
     performer = FilmedPerformer(source, tracker=_Tracker(), capture=silent)
     told = [performer.waits_for]
-    performer._shown = True
-    told.append(performer.waits_for)
-    performer._shown = False
+    for performer._shown_s in (time.monotonic(), 0.0, None):
+        told.append(performer.waits_for)
     monkeypatch.setattr("rgbavatar_ns.tracking.performer._FIRST_PICTURE_S", 0.0)
     with pytest.raises(UserError) as silence:
         performer.next(0.1)
@@ -150,8 +170,8 @@ def test_a_cameras_password_is_told_to_nobody(monkeypatch):
     with pytest.raises(UserError) as refused:
         FilmedPerformer(source.replace("cam:554", "127.0.0.1:9"), tracker=_Tracker())
     told += [str(silence.value), str(refused.value)]
-    assert all("rtsp://cam:554/1" in line for line in told[:3])
-    assert "rtsp://127.0.0.1:9/1" in told[3]
+    assert all("rtsp://cam:554/1" in line for line in told[:5])
+    assert "rtsp://127.0.0.1:9/1" in told[5]
     assert not any("secret" in line or "admin" in line for line in told)
 
 

@@ -16,7 +16,7 @@ from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadArrays, HeadModel, ThetaLayout
 from rgbavatar_ns.kernels.types import PinholeCameras
 
-_LARGEST_IDENTITY = 100.0
+_LARGEST_IDENTITY, _SAME_IDENTITY = 100.0, 1e-4
 _FARTHEST_CAMERA_M = 1000.0
 _FOCAL_SIDES = (0.01, 10_000.0)
 _FARTHEST_CENTRE_SIDES = 100.0
@@ -72,6 +72,10 @@ class StreamSubject:
                 f"The stream's images are said to be {self.width} x {self.height} pixels.",
                 "Send the size of the images.",
             )
+
+    def is_shaped_as(self, identity: Float[Tensor, "I"]) -> bool:
+        """Whether the head's shape is this one, but for rounding: of another person it is not."""
+        return torch.allclose(identity, self.identity.cpu(), atol=_SAME_IDENTITY)
 
     def fault(self, frame: "StreamedFrame") -> Fault | None:
         """Why the frame cannot be used, found without decoding its image; None if it can be."""

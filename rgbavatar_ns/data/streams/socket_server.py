@@ -8,6 +8,7 @@ from collections import Counter, deque
 from collections.abc import Callable
 from typing import Literal
 
+import torch
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.server import Server, ServerConnection, serve
 
@@ -64,6 +65,7 @@ class SocketStream:
         self._silence_s, self._grace_s = silence_s, grace_s
         self._counts: Counter[str] = Counter()
         self._subject: StreamSubject | None = None
+        self._last_identity = torch.zeros(0)  # of whom connected last
         self._client: ServerConnection | None = None
         self._session: str | None = None
         self._received = 0  # messages of the session
@@ -171,20 +173,27 @@ class SocketStream:
         with self._changed:
             if not self._is_silent():
                 self._changed.wait_for(lambda: self._client is None or self._closed, self._grace_s)
-            before = self._client
+            before, measured_anew = self._client, False
             if self._closed or (before is not None and not self._is_silent()):
                 raise UserError("Another client is connected.", "End it first, or wait.")
             if self._subject is not None:
                 _check_same(subject, self._subject)
+                measured_anew = not subject.is_shaped_as(self._last_identity)
                 self._counts["reconnects"] += 1
             self._client, self._listening_since_s = connection, self._clock()
             self._listener.keep(connection.socket)
             if subject.session == "" or subject.session != self._session:
                 self._session, self._received = subject.session, 0
             self._subject = self._subject or subject
+            self._last_identity = subject.identity
             self._changed.notify_all()
         if before is not None:
             hang_up(before.socket)
+        if measured_anew:
+            self._tell(
+                f"The client at {self.address} brings another shape of the head than was there "
+                "before (another person, or measured anew): the first one's stays."
+            )
 
     def _is_silent(self) -> bool:
         since_s = self._listening_since_s
