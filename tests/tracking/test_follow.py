@@ -169,6 +169,32 @@ def test_where_others_sat_in_one_clip_the_person_may_sit_in_the_next() -> None:
     assert found.points_px[:, :, 0].mean(1)[[9, 10]] == pytest.approx([200, 500], abs=30)
 
 
+def test_a_cut_of_one_person_begins_a_segment_and_a_quick_turn_of_the_head_none() -> None:
+    """A shot drawn nearer by a quarter; and a head that sets off, hurries and stops."""
+    cut = [_face(300 + k, 240, 120 if k < 6 else 150) for k in range(12)]
+    found = followed_face(_seen(cut), WIDTH, HEIGHT)
+    assert [part["first_frame"] for part in found.segments()] == [0, 6]
+    way = np.cumsum([0, 0, 0, 10, 20, 30, 20, 10, 0, 0])
+    turn = followed_face(_seen([_face(200 + x, 240, 120) for x in way]), WIDTH, HEIGHT)
+    assert turn.segments() == [{"first_frame": 0, "last_frame": 9, "clip": 0}]
+
+
+def test_no_frame_is_lost_where_a_film_was_cut_and_nobody_else_is_seen() -> None:
+    """Talking heads are cut and drawn nearer every few seconds."""
+    near, far = _face(480, 300, 160), _face(300, 240)
+    shots = [far] * 12 + [near] * 7 + [far] * 9 + [None] * 2 + [near] * 8
+    film = followed_face(_seen(shots), WIDTH, HEIGHT)
+    assert film.with_others == ()
+    assert film.frame_index == (*range(28), *range(30, 38))
+    assert [part["first_frame"] for part in film.segments()] == [0, 12, 19, 30]
+    faces = np.array([face for face in shots if face is not None])
+    np.testing.assert_allclose(film.points_px, faces)
+    # A shot of three frames is nobody's yet: another one, as far as can be told.
+    flash = followed_face(_seen([far] * 12 + [near] * 3 + [far] * 9), WIDTH, HEIGHT)
+    assert flash.frame_index == (*range(12), *range(15, 24))
+    assert flash.with_others == (12, 13, 14)
+
+
 def test_blurred_frames_are_noted_and_kept() -> None:
     faces: list[np.ndarray | None] = [_face(320, 240)] * 9
     sharpness = np.ones(9)

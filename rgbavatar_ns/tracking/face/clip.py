@@ -18,6 +18,11 @@ from rgbavatar_ns.tracking.resumable_run import stage_damage_told
 
 # In one frame's time a face moves and grows by less than this; more is a cut or a jump.
 _JUMP_SHARE, _JUMP_SIZE = 0.4, 1.3
+# And by landmarks that move by this share of its height, in the root of their mean square, if they
+# move more than so many times as far as in the steps before and after. Where films of heads are
+# cut and drawn nearer by 1.3 it is .15 and 6 times; of heads that move, and cameras in a hand, up
+# to .05 and 3 times.
+_CUT_SHARE, _CUT_TIMES = 0.06, 3.0
 # A pause between two frames' times beyond this many usual ones is a gap.
 _PAUSE = 4.0
 # Sharpness below this share of the clip's sharp frames' (its 90th percentile: most frames may be
@@ -130,51 +135,57 @@ class ClipLandmarks:
 
 def followed_face(seen: SeenFaces, width: int, height: int) -> ClipLandmarks:
     """Keep to one face of those that were seen; UserError if there is none in any frame."""
-    follower = FaceFollower()
+    size = (width, height)
     first_face = np.concatenate([[0], np.cumsum(seen.count)])
-    points: list[Float[np.ndarray, "478 2"]] = []
-    irises: list[FoundIrises] = []
-    sharpness: list[float] = []
-    index: list[int] = []
-    jumps: list[int] = []
-    others: list[int] = []
-    for frame in range(len(seen)):
-        if frame > 0 and seen.clip[frame] != seen.clip[frame - 1]:
-            follower = FaceFollower()  # where faces were in another clip tells nothing here
-        rows = slice(int(first_face[frame]), int(first_face[frame + 1]))
-        faces = seen.points[rows] * (width, height)
-        sighting = follower(faces, width, height)
-        if sighting.others:
-            others.append(frame)
-        if sighting.position is not None:
-            points.append(faces[sighting.position])
-            row = rows.start + sighting.position
-            centers_px = seen.irises[row] * (width, height)
-            irises.append(FoundIrises(centers_px, seen.iris_sigma[row]))
-            sharpness.append(float(seen.sharpness[row]))
-            index.append(frame)
-            if sighting.jumped:
-                jumps.append(frame)
-    if not points:
+    positions, others, jumps = _positions(seen, first_face, size)
+    if not positions:
         raise UserError(
             f"No face was found in any of the {len(seen)} frames.",
             "Use a video in which a face is seen from the front, in good light, and at least "
             "60 pixels high.",
         )
-    landmarks = np.array(points)
+    index = list(positions)
+    rows = first_face[index] + list(positions.values())
+    landmarks = seen.points[rows] * size
     return ClipLandmarks(
         landmarks,
-        FoundIrises.stacked(irises),
+        FoundIrises(seen.irises[rows] * size, seen.iris_sigma[rows]),
         tuple(index),
         tuple(int(seen.clip[k]) for k in index),
         _segments(landmarks, np.array(index), seen, jumps),
         len(seen),
         width,
         height,
-        tuple(others),
-        _blurred(np.array(sharpness), index),
+        tuple(frame for frame, count in others.items() if count > 0),
+        _blurred(seen.sharpness[rows], index),
         _frames_per_second(seen),
     )
+
+
+def _positions(
+    seen: SeenFaces, first_face: Int[np.ndarray, "G"], size: tuple[int, int]
+) -> tuple[dict[int, int], dict[int, int], list[int]]:
+    """In which frames the followed face is seen and which of theirs it is, how many others there
+    are in each, and in which frames it has jumped, as where a film was cut."""
+    positions: dict[int, int] = {}
+    others: dict[int, int] = {}
+    jumps: list[int] = []
+    follower, first = FaceFollower(), 0
+    for frame in range(len(seen)):
+        if frame > 0 and seen.clip[frame] != seen.clip[frame - 1]:
+            follower, first = FaceFollower(), frame  # Where faces were tells nothing here.
+        faces = seen.points[int(first_face[frame]) : int(first_face[frame + 1])] * size
+        sighting = follower(faces, *size)
+        others[frame] = sighting.others
+        if sighting.position is None:
+            continue
+        for earlier, position in sighting.before:
+            positions[first + earlier] = position
+            others[first + earlier] -= 1
+        positions[frame] = sighting.position
+        if sighting.jumped:
+            jumps.append(first + sighting.before[0][0] if sighting.before else frame)
+    return positions, others, jumps
 
 
 def _frames_per_second(seen: SeenFaces) -> float | None:
@@ -202,6 +213,7 @@ def _segments(
     moved = np.linalg.norm(np.diff(center, axis=0), axis=1) / height[1:]
     grown = np.maximum(height[1:], height[:-1]) / np.minimum(height[1:], height[:-1])
     breaks = (moved > _JUMP_SHARE) | (grown > _JUMP_SIZE) | (np.diff(index) > 1)
+    breaks |= _sudden(points_px, height)
     breaks |= np.diff(seen.clip[index]) != 0
     breaks |= np.isin(index[1:], jumps)
     steps = np.diff(seen.time_s)
@@ -209,6 +221,20 @@ def _segments(
         usual = float(np.nanmedian(steps))
         breaks |= np.nan_to_num(np.diff(seen.time_s[index]), nan=usual) > _PAUSE * usual
     return tuple(int(number) for number in np.concatenate([[0], np.cumsum(breaks)]))
+
+
+def _sudden(
+    points_px: Float[np.ndarray, "F 478 2"], height_px: Float[np.ndarray, "F"]
+) -> Bool[np.ndarray, "G"]:
+    """Where a film of one person was cut: steps far longer than those before and after them.
+
+    A head that starts or stops takes some frames for it.
+    """
+    moved_px = np.linalg.norm(np.diff(points_px, axis=0), axis=2)
+    step = np.sqrt(np.square(moved_px).mean(1)) / height_px[1:]
+    around = np.pad(step, 1)
+    usual = np.maximum(around[:-2], around[2:])
+    return (step > _CUT_SHARE) & (step > _CUT_TIMES * usual)
 
 
 def _blurred(sharpness: Float[np.ndarray, "F"], index: list[int]) -> tuple[int, ...]:

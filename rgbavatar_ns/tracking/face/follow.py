@@ -1,5 +1,6 @@
 """Which of the faces in a frame is the one that is followed."""
 
+from collections import deque
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -24,12 +25,14 @@ _MOMENTUM = 0.5
 class Sighting:
     """Which face of the frame is followed (None: it is not seen), and how many others there are.
 
-    `jumped` tells that it was found again in another place.
+    `jumped` tells that it was found again in another place, `before` which face of earlier frames,
+    counted from the first one as 0, it was there while that was not known yet.
     """
 
     position: int | None
     others: int
     jumped: bool = False
+    before: tuple[tuple[int, int], ...] = ()
 
 
 @dataclass
@@ -42,6 +45,8 @@ class _Face:
     since: int
     velocity: Float[np.ndarray, "2"] = field(default_factory=lambda: np.zeros(2))
     seen: int = 1
+    last_at: deque[tuple[int, int]] = field(default_factory=lambda: deque(maxlen=_PATIENCE))
+    """The last frames in which it was seen, and its position there."""
 
     def misfit(self, center: Float[np.ndarray, "2"], height: float, frame: int) -> float:
         """How far a sighting is from what is expected; inf where it is out of reach."""
@@ -89,20 +94,26 @@ class FaceFollower:
             self._followed = self._new(centers[first], heights[first], self._frame - 1)
         owners = self._assign(distinct, centers, heights)
         position = next((k for k, owner in owners.items() if owner is self._followed), None)
-        jumped = False
+        jumped, before = False, ()
         if position is None:
             position = self._elsewhere(owners, heights)
             jumped = position is not None
         for k in distinct:
             owner = owners.get(k)
             if k == position and jumped:
+                if owner is not None and self._followed is not None:
+                    lost = self._followed.frame
+                    before = tuple((at - 1, place) for at, place in owner.last_at if at > lost)
                 self._followed = self._new(centers[k], heights[k], self._frame)
                 self._others = [face for face in self._others if face is not owner]
             elif owner is None:
-                self._others.append(self._new(centers[k], heights[k], self._frame))
+                entered = self._new(centers[k], heights[k], self._frame)
+                entered.last_at.append((self._frame, k))
+                self._others.append(entered)
             else:
                 owner.move(centers[k], float(heights[k]), self._frame)
-        return Sighting(position, len(distinct) - (position is not None), jumped)
+                owner.last_at.append((self._frame, k))
+        return Sighting(position, len(distinct) - (position is not None), jumped, before)
 
     def _new(self, center: Float[np.ndarray, "2"], height: float, frame: int) -> _Face:
         return _Face(center, float(height), frame, self._frame)
