@@ -232,7 +232,7 @@ def vertex_errors(
 def outlines(subject: Subject, tracker: SubjectTracker) -> list[PersonOutline | None]:
     """The person's outlines in the key frames, as `rgbavatar track` finds them."""
     crop = steady_crop(subject.landmarks_px, subject.size, subject.size, OUTLINE_PX)
-    keys = tracker.key_positions(subject.landmarks_px)
+    keys = tracker.key_positions(subject.landmarks_px, subject.size, subject.size)
     with closing(PersonMatte()) as matte:
         mattes = [levels(matte(crop.apply(subject.pictures[key]))) for key in keys]
     return [person_outline(m, crop, subject.landmarks_px[key]) for m, key in zip(mattes, keys)]

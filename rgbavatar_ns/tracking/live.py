@@ -188,8 +188,9 @@ class LiveTracker:
         landmarks = np.stack([points for _, _, points, _ in seen])
         irises = FoundIrises.stacked([one for *_, one in seen])
         height, width = seen[0][1].shape[:2]
-        outlines = self._outlines(landmarks, [image for _, image, _, _ in seen])
-        subject = self._tracker.fit_subject(landmarks, width, height, outlines, irises)
+        keys = self._tracker.key_positions(landmarks, width, height)
+        outlines = self._outlines(landmarks, [image for _, image, _, _ in seen], keys)
+        subject = self._tracker.fit_subject(landmarks, width, height, keys, outlines, irises)
         self._fit = _CausalFit(self._tracker, subject)
         size = self._config.image_size or _SIZE_PX
         self._crop = FollowingCrop.around(landmarks, width, height, size)
@@ -205,13 +206,16 @@ class LiveTracker:
                 self._backlog.append(frame)
 
     def _outlines(
-        self, landmarks: Float[np.ndarray, "F 478 2"], images: Sequence[_Image]
+        self,
+        landmarks: Float[np.ndarray, "F 478 2"],
+        images: Sequence[_Image],
+        keys: Sequence[int],
     ) -> list[PersonOutline | None]:
         """The person's outlines in the key frames of the warm-up."""
         height, width = images[0].shape[:2]
         crop = steady_crop(landmarks, width, height, OUTLINE_PX)
         outlines = []
-        for position in self._tracker.key_positions(landmarks):
+        for position in keys:
             matte = levels(self._matte(crop.apply(images[position])))
             outlines.append(person_outline(matte, crop, landmarks[position]))
         return outlines

@@ -129,14 +129,14 @@ class _Tracking:
 
             alpha = self.mattes is None and bool(faces.has_alpha.mean() > 0.5)
             notes = (*self.source.notes, *_alpha_notes(faces.has_alpha, alpha))
-            keys = tracker.key_positions(seen.points_px)
+            keys = tracker.key_positions(seen.points_px, width, height)
             outlines = key_outlines(
                 self.source, self.mattes, alpha, seen, keys, self.run, clock.done
             )
             clock.begin("fit", len(seen))
             follows = seen.follows()
             fit = tracker.fit(
-                seen.points_px, follows, width, height, half_done, outlines, seen.irises
+                seen.points_px, follows, width, height, half_done, keys, outlines, seen.irises
             )
             lost = tracker.rejected(fit, seen.points_px)
             found, fit = seen.without(lost), fit.without(lost)

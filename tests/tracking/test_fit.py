@@ -53,8 +53,9 @@ def test_the_same_landmarks_give_the_same_fit_and_a_gap_is_not_bridged(head: Hea
     np.testing.assert_array_equal(runs[0].values, runs[1].values)
     # What comes after the gap changes nothing before it.
     subject, targets = runs[0].subject, tracker.targets(points)
-    whole = fit_clip(tracker.cost, subject, targets, follows, 1.0).values
-    alone = fit_clip(tracker.cost, subject, targets[:3], follows[:3], 1.0).values
+    rest = (1.0, lambda *_: True)
+    whole = fit_clip(tracker.cost, subject, targets, follows, *rest).values
+    alone = fit_clip(tracker.cost, subject, targets[:3], follows[:3], *rest).values
     np.testing.assert_array_equal(whole[:3], alone)
 
 
@@ -83,6 +84,36 @@ def test_landmarks_that_no_head_explains_are_rejected(head: HeadModel) -> None:
     random = np.random.default_rng(1)
     broken[2, 30:] += random.normal(size=(448, 2)) * 15
     assert tracker.rejected(fit, broken) == [2]
+
+
+def test_frames_that_no_head_explains_neither_make_the_person_nor_move_their_neighbours(
+    head: HeadModel,
+) -> None:
+    """A hand before the chin, as FaceMesh draws it together; and a face that is none, rolled."""
+    tracker, theta, _, points = acted(head, 20, key_frames=8)
+    points += np.random.default_rng(0).normal(size=points.shape) * 0.3
+    follows, spoiled = [False] + [True] * 19, points.copy()
+    for position in (6, 7):
+        middle = points[position].mean(0)
+        low = points[position, :, 1] > middle[1]
+        spoiled[position, low, 1] = middle[1] + 0.3 * (points[position, low, 1] - middle[1])
+        spoiled[position, low, 0] += 8
+    middle = points[13].mean(0)
+    spoiled[13] = (points[13] - middle) @ [[0, 1], [-1, 0]] + middle
+    spoiled[13] += np.random.default_rng(1).normal(size=points[13].shape) * 9
+    keys = tracker.key_positions(spoiled, 320, 240)
+    assert len(keys) == 8
+    assert not {6, 7, 13} & set(keys)
+    whole = tracker.fit(points, follows, 320, 240)
+    among = SubjectTracker(head, tracker.config)
+    fit = among.fit(spoiled, follows, 320, 240)
+    assert among.rejected(fit, spoiled) == [6, 7, 13]
+    kept = [k for k in range(20) if k not in (6, 7, 13)]
+    off = [
+        degrees_apart(skulls(who, who.thetas(found)[kept]), skulls(tracker, theta[kept]))
+        for who, found in ((tracker, whole), (among, fit))
+    ]
+    assert off[1].max() < off[0].max() + 1
 
 
 def test_key_frames_differ_and_are_the_same_each_time() -> None:

@@ -90,7 +90,7 @@ def _scan_focal(
     """The focal length with the cheapest short fit of a few key frames, in pixels."""
     side = max(width, height)
     few = keys[:: max(1, len(keys) // _SCAN_KEYS)]
-    best, starts = (np.inf, side * _FOCAL_USUAL), None
+    best, starts = (np.inf, usual_focal_px(width, height)), None
     for share in FOCAL_SCAN:
         camera = initial_camera(few, side * share, (width / 2, height / 2))
         total, found = _fit_keys(cost, few, camera, identity_components, 8, starts)
@@ -98,6 +98,11 @@ def _scan_focal(
         total += 0.5 * (np.log(share / _FOCAL_USUAL) / _FOCAL_LOG_WIDTH) ** 2
         best = min(best, (total, side * share))
     return best[1]
+
+
+def usual_focal_px(width: int, height: int) -> float:
+    """The focal length of a usual camera, in pixels of such frames."""
+    return max(width, height) * _FOCAL_USUAL
 
 
 def initial_camera(
@@ -150,35 +155,49 @@ def fit_frame(
     return values
 
 
+def fit_key(cost: FrameCost, camera: StillCamera, target: Target) -> _Values:
+    """One key frame's fit by itself, for the average person."""
+    start = rigid_start(cost, camera, target)
+    return fit_frame(cost, camera, target, start, None, 0.0, _STEPS_KEY)
+
+
 def fit_clip(
     cost: FrameCost,
     subject: SubjectFit,
     targets: Sequence[Target],
     follows: Sequence[bool],
     temporal_weight: float,
+    explains: Callable[[int, _Values], bool],
     advance: Callable[[], None] = lambda: None,
 ) -> ClipFit:
     """Every frame: once forward, starting from the frame before, then once more with neighbours.
 
     `follows[i]` says that frame i comes directly after frame i - 1. The second pass draws each
     frame to the mean of both neighbours, so smoothing has no lag; a gap is never bridged.
+    `explains` tells whether such values explain a frame's landmarks: one that nothing explains, as
+    of a hand before the face, is nobody's start and no neighbour.
     """
     person = replace(cost, head=cost.head.of_person(subject.identity))
     values: list[np.ndarray] = []
+    told: list[bool] = []
     for number, target in enumerate(targets):
-        if number and follows[number]:
-            start, steps = values[-1], STEPS_ONWARD
-        else:
-            start, steps = rigid_start(person, subject.camera, target), STEPS_ANEW
-        values.append(fit_frame(person, subject.camera, target, start, None, 0.0, steps))
+        begun, steps = rigid_start(person, subject.camera, target), STEPS_ANEW
+        if number and follows[number] and told[-1]:
+            begun, steps = values[-1], STEPS_ONWARD
+        values.append(fit_frame(person, subject.camera, target, begun, None, 0.0, steps))
+        told.append(explains(number, values[-1]))
+        if not told[-1] and steps is STEPS_ONWARD:  # The one before may have led astray.
+            begun = rigid_start(person, subject.camera, target)
+            values[-1] = fit_frame(person, subject.camera, target, begun, None, 0.0, STEPS_ANEW)
+            told[-1] = explains(number, values[-1])
         advance()
     for number, target in enumerate(targets):
         near = []
-        if number and follows[number]:
+        if number and follows[number] and told[number - 1]:
             near.append(values[number - 1])
-        if number + 1 < len(targets) and follows[number + 1]:
+        if number + 1 < len(targets) and follows[number + 1] and told[number + 1]:
             near.append(values[number + 1])
-        if near and temporal_weight > 0:
+        if near and told[number] and temporal_weight > 0:
             middle = np.mean(near, axis=0)
             values[number] = fit_frame(
                 person,
@@ -265,12 +284,7 @@ def _fit_keys(
 ) -> tuple[float, SubjectFit]:
     """Fit all key frames and the person together, from `starts` and `identity` (the average)."""
     if starts is None:
-        starts = np.array(
-            [
-                fit_frame(cost, camera, key, rigid_start(cost, camera, key), None, 0.0, _STEPS_KEY)
-                for key in keys
-            ]
-        )
+        starts = np.array([fit_key(cost, camera, key) for key in keys])
     terms = [FrameTerms(key, camera) for key in keys]
     frames, size = len(keys), len(cost.parameters.columns)
     shared = min(identity_components, cost.head.num_identity)
@@ -332,14 +346,14 @@ def _fit_keys(
 def key_frame_positions(landmarks_px: Float[np.ndarray, "F L 2"], count: int) -> list[int]:
     """Frames that differ most from each other: farthest-point choice over aligned landmarks.
 
-    Starts from the frame nearest to the median shape; deterministic.
+    Starts from the frame nearest to the median shape; deterministic. Fewer where fewer differ.
     """
     centred = landmarks_px - landmarks_px.mean(1, keepdims=True)
     shapes = centred.reshape(len(centred), -1)
     median = np.median(shapes, axis=0)
     chosen = [int(np.argmin(((shapes - median) ** 2).sum(1)))]
     nearest = ((shapes - shapes[chosen[0]]) ** 2).sum(1)
-    while len(chosen) < min(count, len(shapes)):
+    while len(chosen) < min(count, len(shapes)) and nearest.max() > 0:
         chosen.append(int(np.argmax(nearest)))
         nearest = np.minimum(nearest, ((shapes - shapes[chosen[-1]]) ** 2).sum(1))
     return sorted(chosen)

@@ -35,10 +35,13 @@ from rgbavatar_ns.tracking.fit.fit import (
     ClipFit,
     SubjectFit,
     fit_clip,
+    fit_key,
     fit_outlines,
     fit_subject,
+    initial_camera,
     key_frame_positions,
     subject_offsets,
+    usual_focal_px,
 )
 from rgbavatar_ns.tracking.fit.irises import iris_places
 from rgbavatar_ns.tracking.fit.landmark_cost import FrameCost, Target
@@ -53,6 +56,8 @@ _SEEN = {*SPARSE_51, *FACE_OVAL, *IRIS_CENTERS, *range(0, IRIS_CENTERS[0], 4)}
 _SEEN |= {index for pair in LIP_PAIRS + LID_PAIRS for index in pair}
 # A frame whose landmarks the head cannot follow to this share of the face's height is left out.
 _REJECT_SHARE = 0.06
+# So many frames are judged for each key frame, at most: one costs as much as to fit a frame anew.
+_MOST_JUDGED = 10
 
 
 @dataclass
@@ -120,46 +125,93 @@ class SubjectTracker:
         width: int,
         height: int,
         advance: Callable[[], None] = lambda: None,
+        keys: Sequence[int] | None = None,
         outlines: Sequence[PersonOutline | None] = (),
         irises: FoundIrises | None = None,
     ) -> ClipFit:
         """Identity, camera and offsets from key frames, then every frame.
 
-        `outlines` are those of the person in the frames of `key_positions`, in their order;
-        `irises` those found in the pictures, in pixels.
+        `keys` are `key_positions`, where they are known; `outlines` those of the person in these
+        frames, in their order; `irises` those found in the pictures, in pixels.
         """
         # The matrices are small: more threads would only wait for each other.
         with threadpool_limits(1):
-            subject = self.fit_subject(landmarks_px, width, height, outlines, irises)
+            subject = self.fit_subject(landmarks_px, width, height, keys, outlines, irises)
             targets = self.targets(landmarks_px, irises)
-            weight = self.config.temporal_weight
-            return fit_clip(self.cost, subject, targets, follows, weight, advance)
 
-    def key_positions(self, landmarks_px: Float[np.ndarray, "F 478 2"]) -> list[int]:
-        """The frames that the subject is fitted on: those that differ most."""
-        return key_frame_positions(landmarks_px, self.config.key_frames)
+            def explains(number: int, values: Float[np.ndarray, "P"]) -> bool:
+                one = ClipFit(subject, values[None])
+                return not self.rejected(one, landmarks_px[number : number + 1])
+
+            weight = self.config.temporal_weight
+            return fit_clip(self.cost, subject, targets, follows, weight, explains, advance)
+
+    def key_positions(
+        self, landmarks_px: Float[np.ndarray, "F 478 2"], width: int, height: int
+    ) -> list[int]:
+        """The frames that the subject is fitted on: those that differ most, of those that a head
+        explains.
+
+        What is found of a hand before the face differs most of all, and would make the person.
+        Each frame is judged by itself and for the average person, so that the bound is at least
+        twice what the most usual frame has.
+        """
+        count, left = self.config.key_frames, np.arange(len(landmarks_px))
+        misfits = self._misfits_alone(
+            landmarks_px, key_frame_positions(landmarks_px, 1), width, height
+        )
+        bound = max(_REJECT_SHARE, 2 * min(misfits.values()))
+        while True:
+            chosen = left[key_frame_positions(landmarks_px[left], count)].tolist()
+            unknown = [position for position in chosen if position not in misfits]
+            misfits |= self._misfits_alone(landmarks_px, unknown, width, height)
+            poor = [position for position in chosen if misfits[position] > bound]
+            if not poor:
+                return chosen
+            left = np.setdiff1d(left, poor)
+            if len(misfits) > _MOST_JUDGED * count:
+                left = np.array(sorted(k for k, misfit in misfits.items() if misfit <= bound))
+
+    def _misfits_alone(
+        self,
+        landmarks_px: Float[np.ndarray, "F 478 2"],
+        positions: Sequence[int],
+        width: int,
+        height: int,
+    ) -> dict[int, float]:
+        """How far the average person's head stays from the landmarks of each of these frames."""
+        targets = self.targets(landmarks_px[list(positions)])
+        if not targets:
+            return {}
+        focal_px = self.config.focal_px or usual_focal_px(width, height)
+        camera = initial_camera(targets, focal_px, (width / 2, height / 2))
+        values = np.array([fit_key(self.cost, camera, target) for target in targets])
+        average = np.zeros(self.cost.head.num_identity)
+        fit = ClipFit(SubjectFit(average, camera, values), values)
+        return dict(zip(positions, self._misfits(fit, landmarks_px[list(positions)]).tolist()))
 
     def fit_subject(
         self,
         landmarks_px: Float[np.ndarray, "F 478 2"],
         width: int,
         height: int,
+        keys: Sequence[int] | None = None,
         outlines: Sequence[PersonOutline | None] = (),
         irises: FoundIrises | None = None,
     ) -> SubjectFit:
         """Identity, camera and landmark offsets from the key frames.
 
-        `outlines` and `irises` as in `fit`; without any, landmarks alone decide.
+        `keys`, `outlines` and `irises` as in `fit`; without any, landmarks alone decide.
         """
-        positions = self.key_positions(landmarks_px)
+        positions = self.key_positions(landmarks_px, width, height) if keys is None else list(keys)
         key_irises = None if irises is None else irises.of(positions)
-        keys = self.targets(landmarks_px[positions], key_irises)
+        targets = self.targets(landmarks_px[positions], key_irises)
         shared = min(self.config.identity_components, self.cost.head.num_identity)
-        subject = fit_subject(self.cost, keys, width, height, shared, self.config.focal_px)
+        subject = fit_subject(self.cost, targets, width, height, shared, self.config.focal_px)
         if outlines:
             outline_cost = OutlineCost(self.head, self.cost.parameters.columns, shared)
-            subject = fit_outlines(self.cost, outline_cost, keys, outlines, subject, shared)
-        offsets = subject_offsets(self.cost, subject, keys)
+            subject = fit_outlines(self.cost, outline_cost, targets, outlines, subject, shared)
+        offsets = subject_offsets(self.cost, subject, targets)
         # An iris that is seen is where the mesh's is to be.
         offsets[len(self.facemesh_index) :] = 0
         self.cost = replace(self.cost, head=self.cost.head.with_offsets(offsets))
@@ -200,9 +252,15 @@ class SubjectTracker:
 
     def rejected(self, fit: ClipFit, landmarks_px: Float[np.ndarray, "F 478 2"]) -> list[int]:
         """Positions whose landmarks no pose of the head explains."""
+        poor = self._misfits(fit, landmarks_px) > _REJECT_SHARE
+        return [int(position) for position in np.flatnonzero(poor)]
+
+    def _misfits(
+        self, fit: ClipFit, landmarks_px: Float[np.ndarray, "F 478 2"]
+    ) -> Float[np.ndarray, "F"]:
+        """How far the fitted head is from each frame's landmarks, in heights of the face."""
         away = self.fitted_px(fit) - landmarks_px[:, self.facemesh_index]
-        share = np.linalg.norm(away, axis=-1).mean(1) / face_height_px(landmarks_px)
-        return [int(position) for position in np.flatnonzero(share > _REJECT_SHARE)]
+        return np.linalg.norm(away, axis=-1).mean(1) / face_height_px(landmarks_px)
 
     def vertices_px(self, fit: ClipFit, position: int) -> Float[np.ndarray, "V 2"]:
         """The full mesh of one frame in source pixels."""
