@@ -30,9 +30,16 @@ class DiskError(UserError):
 def disk_errors(
     place: Path, remedy: str = ROOM_OR_PLACE, also: tuple[type[Exception], ...] = ()
 ) -> Iterator[None]:
-    """Raise what the disk refuses (OSError, and a library's own errors, `also`) as DiskError."""
+    """Raise what the disk refuses (OSError, and a library's own errors, `also`) as DiskError.
+
+    One that was told within, and of which nothing particular is to be done, gets this remedy.
+    """
     try:
         yield
+    except DiskError as error:
+        if error.remedy != ROOM_OR_PLACE:
+            raise
+        raise DiskError(error.cause, remedy) from error.__cause__
     except (OSError, *also) as error:
         if getattr(error, "errno", None) in (errno.ENOSPC, errno.EDQUOT):
             raise DiskError(f"There is no space left to write {place}.", remedy) from error

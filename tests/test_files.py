@@ -16,6 +16,7 @@ from rgbavatar_ns.files import (
     atomic_write,
     digest,
     digest_of_file,
+    disk_errors,
     hold_lock,
     read_json,
     write_json,
@@ -71,6 +72,16 @@ def test_what_the_disk_refuses_is_told_with_the_remedy(tmp_path, monkeypatch, co
     ):
         partial.write_text("a")
     assert _names(tmp_path) == []
+
+
+@pytest.mark.parametrize("own", ["Free some space or name another place.", "Mend it."])
+def test_the_remedy_is_that_of_who_knows_more_of_the_work(tmp_path, own):
+    told = "Go on." if own != "Mend it." else own
+    with (
+        pytest.raises(DiskError, match=rf"Cannot write .*short write\. {told}"),
+        disk_errors(tmp_path, "Go on."),
+    ):
+        _write_half(tmp_path / "a", RuntimeError("short write"), remedy=own, also=(RuntimeError,))
 
 
 def test_errors_of_a_library_that_writes_are_the_disks(tmp_path):

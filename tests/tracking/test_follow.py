@@ -152,6 +152,18 @@ def test_gaps_jumps_pauses_and_new_clips_begin_segments() -> None:
     assert followed_face(_seen(faces, clip=clips), WIDTH, HEIGHT).follows().index(False, 1) == 5
 
 
+def test_slow_motion_and_what_is_none_are_each_followed_at_their_own_rate() -> None:
+    faces: list[np.ndarray | None] = [_face(300 + k, 240) for k in range(60)]
+    slow, plain = np.arange(40) / 240, np.arange(20) / 30
+    clips = np.repeat([0, 1], [40, 20])
+    two = followed_face(_seen(faces, time_s=np.concatenate([slow, plain]), clip=clips), 640, 480)
+    assert [part["first_frame"] for part in two.segments()] == [0, 40]
+    assert two.frames_per_second == pytest.approx(58 / (39 / 240 + 19 / 30), abs=1e-3)
+    # A telephone's film that is slow motion at first.
+    times_s = np.concatenate([slow, slow[-1] + (1 + np.arange(20)) / 30])
+    assert len(followed_face(_seen(faces, time_s=times_s), 640, 480).segments()) == 1
+
+
 def test_where_others_sat_in_one_clip_the_person_may_sit_in_the_next() -> None:
     person, other = _face(200, 240), _face(500, 240, 80)
     both = SeenFaces(

@@ -17,6 +17,7 @@ from rgbavatar_ns.tracking.input.capture import (
     CapturedFrame,
     FileCapture,
     LatestFrameCapture,
+    is_device,
 )
 from rgbavatar_ns.tracking.performer import FilmedPerformer
 
@@ -208,6 +209,16 @@ def test_a_camera_that_comes_back_with_another_size_is_told():
         performer.next(0.1)
     assert performer.counts["another resolution"] == 50
     performer.close()
+
+
+def test_a_folder_of_images_may_be_named_by_a_number(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert [is_device(name) for name in ("0", "2024", "/dev/video0", "me.mp4")] == [
+        *[True] * 3,
+        False,
+    ]
+    (tmp_path / "2024").mkdir()
+    assert not is_device("2024")
 
 
 def test_what_is_waited_for_changes_with_what_is_known(film):

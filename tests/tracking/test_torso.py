@@ -127,6 +127,17 @@ def test_a_point_on_a_stripe_counts_only_across_it() -> None:
     assert chosen.certainty[:, 1, 1].min() > 0.8
 
 
+def test_points_in_a_line_are_found_again() -> None:
+    """As along a strap: across them nothing says how the picture turned or grew."""
+    picture = np.random.default_rng(5).integers(0, 255, (200, 200)).astype(np.uint8)
+    points = np.stack([np.arange(40.0, 160, 10)] * 2, axis=1)
+    chosen = FollowedPoints(picture, points, np.tile(np.eye(2), (len(points), 1, 1)))
+    moved, there = np.roll(picture, (3, 5), axis=(0, 1)), points + np.array([5, 3])
+    found_px, found = chosen.found_in(moved, there)
+    assert found.all()
+    np.testing.assert_allclose(found_px, there, atol=0.1)
+
+
 @pytest.fixture(scope="module")
 def films() -> Callable[[str], tuple[DemoFilm, UInt8[np.ndarray, "F S S 4"]]]:
     made: dict[str, tuple[DemoFilm, np.ndarray]] = {}

@@ -23,8 +23,9 @@ _JUMP_SHARE, _JUMP_SIZE = 0.4, 1.3
 # cut and drawn nearer by 1.3 it is .15 and 6 times; of heads that move, and cameras in a hand, up
 # to .05 and 3 times.
 _CUT_SHARE, _CUT_TIMES = 0.06, 3.0
-# A pause between two frames' times beyond this many usual ones is a gap.
-_PAUSE = 4.0
+# A pause between two frames' times beyond this many usual ones of their clip is a gap, if it is as
+# long as this: where a film is now slow motion and now not, either's steps are usual.
+_PAUSE, _LEAST_PAUSE_S = 4.0, 0.1
 # Sharpness below this share of the clip's sharp frames' (its 90th percentile: most frames may be
 # blurred) is noted as blur. Frames of a face that talks and keeps still are above .7.
 _BLURRED, _SHARP_PERCENT = 0.35, 90
@@ -194,12 +195,25 @@ def _frames_per_second(seen: SeenFaces) -> float | None:
     Their mean, since many files round times to milliseconds; None without a clock, or beyond what
     a dataset takes.
     """
-    steps = np.diff(seen.time_s)[np.diff(seen.clip) == 0]
-    steps = steps[steps > 0]
+    within = np.diff(seen.clip) == 0
+    steps, most = np.diff(seen.time_s)[within], _longest_step_s(seen)[1:][within]
+    steps = steps[(steps > 0) & (steps <= most)]
     if not len(steps):
         return None
-    rate = 1 / float(steps[steps <= _PAUSE * np.median(steps)].mean())
+    rate = 1 / float(steps.mean())
     return round(rate, 3) if FRAME_RATES.holds(rate) else None
+
+
+def _longest_step_s(seen: SeenFaces) -> Float[np.ndarray, "F"]:
+    """Up to how long after the one before it each frame still follows that; NaN without a clock."""
+    longest = np.full(len(seen), np.nan)
+    for clip in np.unique(seen.clip):
+        rows = seen.clip == clip
+        steps = np.diff(seen.time_s[rows])
+        steps = steps[steps > 0]
+        if len(steps):
+            longest[rows] = max(_PAUSE * float(np.median(steps)), _LEAST_PAUSE_S)
+    return longest
 
 
 def _segments(
@@ -216,10 +230,7 @@ def _segments(
     breaks |= _sudden(points_px, height)
     breaks |= np.diff(seen.clip[index]) != 0
     breaks |= np.isin(index[1:], jumps)
-    steps = np.diff(seen.time_s)
-    if np.isfinite(steps).any():
-        usual = float(np.nanmedian(steps))
-        breaks |= np.nan_to_num(np.diff(seen.time_s[index]), nan=usual) > _PAUSE * usual
+    breaks |= np.diff(seen.time_s[index]) > _longest_step_s(seen)[index[1:]]
     return tuple(int(number) for number in np.concatenate([[0], np.cumsum(breaks)]))
 
 

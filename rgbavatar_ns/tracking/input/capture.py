@@ -102,8 +102,13 @@ class FileCapture:
 
 
 def is_device(source: str) -> bool:
-    """Whether this names a camera by its number, a device or a network address, and no file."""
-    return source.isdecimal() or "://" in source or source.startswith("/dev/")
+    """Whether this names a camera by its number, a device or a network address, and no file.
+
+    A file or folder whose name is a number is one: cameras beyond the tenth are rare.
+    """
+    if source.isdecimal():
+        return len(source) == 1 or not Path(source).exists()
+    return "://" in source or source.startswith("/dev/")
 
 
 def open_capture(source: str) -> cv2.VideoCapture:

@@ -94,9 +94,12 @@ class FollowedPoints:
 
 
 def _affine(from_px: _Points, to_px: _Points) -> Float[np.ndarray, "2 3"]:
-    """The affine map nearest to carrying points to others, least squares."""
+    """The affine map nearest to carrying points to others, least squares.
+
+    Where points lie in a line it leaves what is across as it is.
+    """
     ones = np.concatenate([from_px, np.ones((len(from_px), 1))], axis=1)
-    return np.linalg.lstsq(ones, to_px, rcond=None)[0].T
+    return np.eye(2, 3) + np.linalg.lstsq(ones, to_px - from_px, rcond=None)[0].T
 
 
 def _certainty(gray: _Gray, points_px: _Points) -> Float[np.ndarray, "P 2 2"]:
