@@ -25,7 +25,7 @@ GOOD: dict[str, Any] = {
     "frames_read": 200,
     "frames_tracked": 200,
     "rejected": {"no face": []},
-    "segments": [{}],
+    "segments": [{"clip": 0}],
     "other_faces": [],
     "blurred": [],
     "notes": [],
@@ -74,6 +74,14 @@ def test_correlation_of_openings() -> None:
         (
             {"background": "moves", "body": {"background_moves_px": 0.2}},
             "usable: something moves behind the person",
+        ),
+        (
+            {
+                "background": "moves",
+                "body": {"background_moves_px": 0.2},
+                "segments": [{"clip": 0}, {"clip": 1}],
+            },
+            "usable: the clips show other rooms, or from another place, or something moves in them",
         ),
         (
             {"background": "moves", "body": {"background_moves_px": 2.0}},

@@ -216,6 +216,8 @@ def _background_findings(report: Mapping[str, Any]) -> list[Finding]:
     # What the body's follower finds still in either half of the whole picture, no camera moves.
     still = moved_px is not None and moved_px < _STANDS_PX
     cause = "something moves behind the person" if still else "the camera moves"
+    if still and len({part["clip"] for part in report["segments"]}) > 1:
+        cause = "the clips show other rooms, or from another place, or something moves in them"
     return [Finding("camera", "warning", cause)]
 
 
