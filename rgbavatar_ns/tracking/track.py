@@ -34,6 +34,7 @@ from rgbavatar_ns.tracking.image.background import Background
 from rgbavatar_ns.tracking.image.body_end import BodyEnd
 from rgbavatar_ns.tracking.image.crop import SquareCrop, steady_crop
 from rgbavatar_ns.tracking.image.frame_images import FrameImages
+from rgbavatar_ns.tracking.image.matting import PersonMatte
 from rgbavatar_ns.tracking.image.outlines import key_outlines
 from rgbavatar_ns.tracking.input.image_files import source_digest
 from rgbavatar_ns.tracking.input.mattes import UserMattes
@@ -149,7 +150,11 @@ class _Tracking:
         self._held_out(len(found))
         body = None
         if tracker.head.arrays.has_torso:
-            body = find_body(self.source, self.run, tracker, fit, found, self.mattes, alpha, clock)
+            given = (self.mattes, alpha)
+            with closing(PersonMatte()) as person:
+                body = find_body(
+                    self.source, self.run, tracker, fit, found, *given, person.coarse, clock
+                )
             arrays, heads = tracker.head.arrays, tracker.thetas(fit)
             alone = fit.subject.identity
             identity, upon = on_body(tracker.mesh_landmarks, arrays, alone, heads, body)

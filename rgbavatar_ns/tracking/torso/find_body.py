@@ -14,7 +14,6 @@ from rgbavatar_ns.head.joints import NECK
 from rgbavatar_ns.tracking.face.clip import ClipLandmarks
 from rgbavatar_ns.tracking.fit.fit import ClipFit
 from rgbavatar_ns.tracking.fit.subject import SubjectTracker
-from rgbavatar_ns.tracking.image.matting import PersonMatte
 from rgbavatar_ns.tracking.input.mattes import UserMattes, given_mattes
 from rgbavatar_ns.tracking.input.video import FrameSource
 from rgbavatar_ns.tracking.resumable_run import ResumableRun
@@ -28,6 +27,8 @@ from rgbavatar_ns.tracking.torso.shape import ShoulderLine, shoulder_line, shoul
 from rgbavatar_ns.tracking.torso.shoulders import ShoulderFinder
 from rgbavatar_ns.tracking.torso.shown import BodyShown, beside_share, body_shown, seen_cm2
 
+Segmentation = Callable[[UInt8[np.ndarray, "h w 3"]], Float[np.ndarray, "h w"]]
+"""The person's alpha of a picture of whom no matte was given."""
 BLOCK_FRAMES = 256
 """So many tracked frames are a stage of their own, which an interrupted run need not read again."""
 _SIDE_PX, _AHEAD = 640, 4
@@ -46,14 +47,15 @@ def find_body(
     found: ClipLandmarks,
     mattes: UserMattes | None,
     source_alpha: bool,
+    segmented: Segmentation,
     clock: StageClock,
     block_frames: int = BLOCK_FRAMES,
 ) -> BodyPlaces:
     """Where the body under the fitted heads is in every frame.
 
-    Who the person is, `mattes` say, or the film's alpha where `source_alpha`, or segmentation. The
-    film is read in the clock's stage "body", what was seen is put together in its stage "place".
-    Each block of frames is a stage of `run`, and one that is done is not looked at again.
+    Who the person is, `mattes` say, or the film's alpha where `source_alpha`, or else `segmented`.
+    The film is read in the clock's stage "body", what was seen is put together in its stage
+    "place". Each block of frames is a stage of `run`, and one that is done is not looked at again.
     """
     clock.begin("body", len(found))
     heads, identity = tracker.thetas(fit), fit.subject.identity
@@ -61,7 +63,9 @@ def find_body(
     neck_m = np.array(
         [tracker.mesh_landmarks.chain(theta, identity).placed[NECK] for theta in heads]
     )
-    reading = _Reading(tracker, fit, found, body, neck_m, mattes, source_alpha, clock.done)
+    reading = _Reading(
+        tracker, fit, found, body, neck_m, mattes, source_alpha, segmented, clock.done
+    )
     made_from = digest([repr(found.frame_index), heads, identity])
     blocks: list[BodyBlock] = []
     reads: Generator[BodyBlock, None, None] | None = None
@@ -119,6 +123,7 @@ class _Reading:
     neck_m: Float[np.ndarray, "F 3"]
     mattes: UserMattes | None
     source_alpha: bool
+    segmented: Segmentation
     advance: Callable[[int], None]
 
     def blocks(
@@ -137,14 +142,14 @@ class _Reading:
         shown: list[BodyShown] = []
         read = source.these(place, _SIDE_PX)
         given = given_mattes(read, frozenset(place), self.mattes, self.source_alpha)
-        pose, person = ShoulderFinder(), PersonMatte()
+        pose = ShoulderFinder()
         try:
             with closing(InBackground(given, _AHEAD)) as frames:
                 for k, (frame, level) in enumerate(frames, start):
                     cut = k == 0 or found.clip[k] != found.clip[k - 1]
                     pixels = partial(self.tracker.vertices_px, self.fit, k)
                     image, neck = frame.image_rgb, self.neck_m[k]
-                    alpha = partial(_alpha, person, image, level)
+                    alpha = partial(self._alpha, image, level)
                     sightings.append(follow(image, neck, alpha, pixels, cut))
                     if k % every == 0:
                         matte, head_px = alpha(), pixels() * scale - 0.5
@@ -162,13 +167,9 @@ class _Reading:
                         return
         finally:
             pose.close()
-            person.close()
 
-
-def _alpha(
-    person: PersonMatte,
-    image_rgb: UInt8[np.ndarray, "h w 3"],
-    given: UInt8[np.ndarray, "h w"] | None,
-) -> Float[np.ndarray, "h w"]:
-    """The person's alpha of a picture, in [0, 1]: as it was given, or by segmentation."""
-    return person.coarse(image_rgb) if given is None else given.astype(np.float32) / 255
+    def _alpha(
+        self, image_rgb: UInt8[np.ndarray, "h w 3"], given: UInt8[np.ndarray, "h w"] | None
+    ) -> Float[np.ndarray, "h w"]:
+        """The person's alpha of a picture, in [0, 1]: as it was given, or by segmentation."""
+        return self.segmented(image_rgb) if given is None else given.astype(np.float32) / 255
