@@ -29,6 +29,10 @@ class ImportReport:
         if names:
             self._left_out.setdefault(reason, []).extend(names)
 
+    def left_out(self, reason: str) -> int:
+        """How many frames were left out for this reason since `settle` noted them."""
+        return len(self._left_out.get(reason, ()))
+
     @contextmanager
     def frame(self, name: str) -> Iterator[None]:
         """An UnusableFrameError within goes into the report under this name."""

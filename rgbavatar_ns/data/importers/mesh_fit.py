@@ -24,6 +24,7 @@ _DAMPING = 1e-9
 _MOST_BYTES = 1 << 26
 _WORST_M = 3e-4
 """Meshes farther from the fitted head than this are not of this head model."""
+_NOT_FLAMES = "meshes that are not FLAME's"
 
 
 @torch.no_grad()
@@ -36,7 +37,7 @@ def fit_meshes(
     """Identity, and theta by frame number: Gauss-Newton on vertices, expressions known.
 
     Ours. The shape comes from a few frames together, then each frame by itself. Raises UserError
-    where no head of this model gives the meshes.
+    where no head of this model gives the meshes, or all were simplified.
     """
     fit = _Fit(arrays)
     numbers = list(expressions)
@@ -51,6 +52,13 @@ def fit_meshes(
         with reading.report.frame(meshes[number].name):
             targets[number] = read_mesh(meshes[number])[fit.kept]
             damaged.remove(number)
+    if not targets and reading.report.left_out(_NOT_FLAMES):
+        # To leave these out, as the report says, would leave nothing.
+        raise UserError(
+            f"{reading} has no frames with meshes of FLAME's {FLAME_VERTICES} vertices.",
+            "INSTA's generate.sh simplifies the meshes, and what is left does not tell FLAME's "
+            "parameters: put metrical-tracker's `checkpoint` folder of this subject into the data.",
+        )
     reading.report.settle(str(reading), reading.options.allow_partial)
     if not targets:
         raise reading.no_frames()
@@ -84,7 +92,7 @@ def read_mesh(path: Path) -> Float[Tensor, "V 3"]:
     except ValueError:
         raise UnusableFrameError("meshes that cannot be read") from None
     if vertices.shape != (FLAME_VERTICES, 3) or not np.isfinite(vertices).all():
-        raise UnusableFrameError("meshes that are not FLAME's")
+        raise UnusableFrameError(_NOT_FLAMES)
     return torch.from_numpy(vertices)
 
 

@@ -325,5 +325,18 @@ def test_a_damaged_mesh_is_left_out_whichever_it_is(tmp_path, options, takes):
         read_source(tmp_path, replace(options, allow_partial=True))
 
 
+@pytest.mark.parametrize("allow_partial", [False, True])
+def test_meshes_that_insta_simplified_are_told_as_that(tmp_path, options, takes, allow_partial):
+    write(tmp_path, "insta-meshes", takes)
+    for mesh in (tmp_path / "meshes").iterdir():
+        lines = mesh.read_text().splitlines()
+        vertices = [line for line in lines if line.startswith("v ")]
+        mesh.write_text("\n".join(vertices[:3928]) + "\n")
+    with pytest.raises(UserError, match="5023 vertices") as caught:
+        read_source(tmp_path, replace(options, allow_partial=allow_partial))
+    assert "generate.sh simplifies" in caught.value.remedy
+    assert "`checkpoint` folder" in caught.value.remedy
+
+
 def test_an_unknown_folder_is_none(tmp_path):
     assert find_format(tmp_path) is None
