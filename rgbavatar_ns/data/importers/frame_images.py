@@ -32,10 +32,11 @@ _NEARLY_WHITE = 250
 
 @dataclass(frozen=True)
 class FrameImage:
-    """Files of one image, all of one size: colour, a grey matte (else colour's own alpha).
+    """Files of one image, all of one size: colour, a matte (else colour's own alpha).
 
-    The matte is kept only where one of the grey `regions` is white. `over_white`: whether the
-    format lays its pictures over white by the matte, which is undone.
+    A matte is grey, or a cut-out with alpha. It is kept only where one of the grey `regions` is
+    white. `over_white`: whether the format lays its pictures over white by the matte, which is
+    undone.
     """
 
     color: Path
@@ -186,9 +187,14 @@ def _decode_jpeg(
 
 
 def _grey(path: Path, size: tuple[int, int]) -> UInt8[np.ndarray, "height width"]:
-    """A mask from 0 to 255; one that holds nothing but 0 and 1 is meant as 0 and 255."""
+    """A mask from 0 to 255; one that holds nothing but 0 and 1 is meant as 0 and 255.
+
+    Where the picture is transparent anywhere its alpha is the mask: a cut-out's colours are none.
+    """
     image = _decode(_read(path), size)
-    color = image[..., :3]
+    color, alpha = image[..., :3], image[..., 3]
+    if alpha.min() < 255:
+        return alpha
     if int((color.max(-1) - color.min(-1)).max()) > _GREY_TOLERANCE:
         raise UnusableFrameError("masks that are coloured")
     grey = color[..., 1]

@@ -50,6 +50,20 @@ def test_all_kinds_of_pictures(tmp_path):
         decoded(FrameImage(one, alpha=save(tmp_path / "other.png", grey[:4])))
 
 
+def test_a_cut_outs_alpha_is_its_matte_whatever_its_colours_are(tmp_path):
+    color = save(tmp_path / "color.png", np.full((6, 8, 3), 90, np.uint8))
+    alpha = np.zeros((6, 8), np.uint8)
+    alpha[:, 4:], alpha[0] = 255, 130
+    for name, shade in (("matted", (200, 30, 10)), ("white", (255, 255, 255))):
+        rgb = np.broadcast_to(np.uint8(shade), (6, 8, 3))
+        matte = save(tmp_path / f"{name}.png", np.dstack([rgb, alpha]))
+        assert np.array_equal(decoded(FrameImage(color, alpha=matte))[..., 3], alpha)
+    opaque = save(
+        tmp_path / "opaque.png", np.dstack([alpha, alpha, alpha, np.full_like(alpha, 255)])
+    )
+    assert np.array_equal(decoded(FrameImage(color, alpha=opaque))[..., 3], alpha)
+
+
 def test_a_picture_cut_anywhere_is_told(tmp_path):
     color = np.random.default_rng(0).integers(0, 256, (40, 50, 4), dtype=np.uint8)
     for name in ("whole.png", "whole.jpg"):
