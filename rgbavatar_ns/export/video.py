@@ -19,6 +19,10 @@ from rgbavatar_ns.files import atomic_write
 
 _BT709 = 1
 """Primaries and transfer, as H.264 numbers them."""
+_GIF_TICKS = 100
+"""A second."""
+_GIF_SHORTEST_CS = 2
+"""Browsers show a picture that is to last less for a tenth of a second."""
 
 
 class FilmWriter:
@@ -93,36 +97,50 @@ def write_gif(path: Path, frames: Iterable[np.ndarray], frames_per_second: float
     """Encode RGB frames as an endless GIF with a palette made for them; return their number.
 
     frames: uint8 [H, W, 3], all of one size, at least one. Kept in memory until the palette is
-    known. GIFs count time in hundredths of a second; above 50 frames a second viewers slow down.
+    known. GIFs count time in hundredths of a second, and viewers show no picture for less than two:
+    above 50 frames a second some are left out, so that the film takes as long as it should.
     """
-    kept = [np.ascontiguousarray(frame) for frame in frames]
+    kept: list[np.ndarray] = []
+    times_cs: list[int] = []
+    count = 0
+    for count, frame in enumerate(frames, start=1):
+        due_cs = _GIF_TICKS * (count - 1) / frames_per_second
+        earliest_cs = times_cs[-1] + _GIF_SHORTEST_CS if times_cs else 0
+        # What is due less than a tick before comes a little late rather than not at all.
+        if due_cs >= earliest_cs - 1:
+            kept.append(np.ascontiguousarray(frame))
+            times_cs.append(max(round(due_cs), earliest_cs))
+    end_cs = round(_GIF_TICKS * count / frames_per_second)
+    last_cs = max(end_cs - times_cs[-1], _GIF_SHORTEST_CS)
     height, width = kept[0].shape[:2]
-    rate = max(1, min(round(frames_per_second), 50))
-    graph = _palette_graph(width, height, rate)
-    for place, frame in enumerate(kept):
+    graph = _palette_graph(width, height)
+    for frame, time_cs in zip(kept, times_cs):
         picture = av.VideoFrame.from_ndarray(frame, format="rgb24")
-        picture.pts = place
+        picture.pts = time_cs
         graph.push(picture)
     graph.push(None)
+    # A picture lasts until the next one; the last one has none.
+    options = {"final_delay": str(last_cs)}
     with (
         atomic_write(path) as partial,
-        av.open(str(partial.absolute()), "w", format="gif") as container,
+        av.open(str(partial.absolute()), "w", format="gif", options=options) as container,
     ):
-        stream = container.add_stream("gif", rate=rate)
+        stream = container.add_stream("gif", rate=_GIF_TICKS)
         stream.height, stream.width, stream.pix_fmt = height, width, "pal8"
-        for place in range(len(kept)):
+        for time_cs in times_cs:
             picture = graph.pull()
-            picture.pts = place
+            picture.pts = time_cs
             container.mux(stream.encode(picture))
         container.mux(stream.encode(None))
     return len(kept)
 
 
-def _palette_graph(width: int, height: int, rate: int) -> Graph:
+def _palette_graph(width: int, height: int) -> Graph:
     """FFmpeg's filters: one branch collects a palette, the other one uses it."""
     graph = Graph()
     source = graph.add(
-        "buffer", f"video_size={width}x{height}:pix_fmt=rgb24:time_base=1/{rate}:pixel_aspect=1/1"
+        "buffer",
+        f"video_size={width}x{height}:pix_fmt=rgb24:time_base=1/{_GIF_TICKS}:pixel_aspect=1/1",
     )
     split, collect = graph.add("split"), graph.add("palettegen", "stats_mode=full")
     use, sink = graph.add("paletteuse", "dither=sierra2_4a"), graph.add("buffersink")

@@ -2,8 +2,9 @@ import av
 import numpy as np
 import pytest
 from av.video.reformatter import ColorRange, Colorspace
+from PIL import Image
 
-from rgbavatar_ns.export import write_video
+from rgbavatar_ns.export import write_gif, write_video
 
 
 def test_a_film_holds_the_frames_it_was_given(tmp_path):
@@ -31,3 +32,35 @@ def test_a_film_says_how_its_colours_are_coded_and_keeps_to_it(tmp_path):
     # BT.709's luma by hand, from 16 to 235.
     luma = 16 + 219 / 255 * (np.array([0.2126, 0.7152, 0.0722]) @ color)
     assert frame.to_ndarray()[16, 16] == pytest.approx(luma, abs=2)
+
+
+@pytest.mark.parametrize(
+    ("rate", "written", "lasts_cs"),
+    [
+        (60.0, 50, {2}),
+        (51.0, 58, {2, 3}),
+        (50.0, 60, {2}),
+        (30.0, 60, {3, 4}),
+        (12.5, 60, {8}),
+        (0.4, 60, {250}),
+    ],
+)
+def test_a_gif_takes_as_long_as_its_frames(rate, written, lasts_cs, tmp_path):
+    shades = np.arange(60) * 4
+    frames = [np.full((8, 8, 3), shade, dtype=np.uint8) for shade in shades]
+    path = tmp_path / "film.gif"
+    assert write_gif(path, frames, rate) == written
+    found_cs, seen = [], []
+    with Image.open(path) as film:
+        for place in range(film.n_frames):
+            film.seek(place)
+            found_cs.append(film.info["duration"] // 10)
+            seen.append(film.convert("L").getpixel((4, 4)))
+    assert len(found_cs) == written
+    assert set(found_cs) == lasts_cs
+    assert sum(found_cs) == pytest.approx(100 * 60 / rate, abs=1)
+    # Each is shown when it is due, but for a tick.
+    begins_cs = np.cumsum([0, *found_cs[:-1]])
+    due_cs = 100 / rate * np.array(seen) / 4
+    assert np.abs(begins_cs - due_cs).max() <= 1.01
+    assert np.all(np.diff(seen) > 0)
