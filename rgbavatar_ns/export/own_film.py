@@ -3,17 +3,13 @@
 from dataclasses import replace
 from pathlib import Path
 
-import torch
-
 from rgbavatar_ns.avatar.method import AvatarMethod
 from rgbavatar_ns.avatar.storage.refined_frames import RefinedFrames, load_refined_frames
 from rgbavatar_ns.data.native.dataset import TrackedDataset
 from rgbavatar_ns.data.native.format import INDEX_FILE
 from rgbavatar_ns.errors import UserError, first_few
 from rgbavatar_ns.export.run_data import dataset_folder
-
-_SAME_IDENTITY = 1e-4
-"""Coefficients are of size one."""
+from rgbavatar_ns.head import is_same_identity
 
 
 def as_trained_on(
@@ -45,8 +41,7 @@ def as_trained_on(
 
 def _misfit(avatar: AvatarMethod, refined: RefinedFrames, dataset: TrackedDataset) -> str | None:
     """Why the refined theta is not of this dataset; None where it is."""
-    mine, its = avatar.identity.cpu(), dataset.identity
-    if mine.shape != its.shape or not torch.allclose(mine, its.to(mine), atol=_SAME_IDENTITY):
+    if not is_same_identity(avatar.identity, dataset.identity):
         return "its person was measured otherwise"
     unknown = sorted(set(dataset.frame_index) - set(refined.frame_index))
     if unknown:

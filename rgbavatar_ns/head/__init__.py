@@ -8,6 +8,7 @@ from rgbavatar_ns.head.frames import (
     frame_quats_wxyz,
     tangent_frames,
 )
+from rgbavatar_ns.head.identity import is_same_identity
 from rgbavatar_ns.head.landmarks import SPARSE_51, LandmarkMap, facemesh_landmarks
 from rgbavatar_ns.head.layout import ThetaField, ThetaLayout
 from rgbavatar_ns.head.model import HeadModel
@@ -27,6 +28,7 @@ __all__ = [
     "edges_to_frame",
     "facemesh_landmarks",
     "frame_quats_wxyz",
+    "is_same_identity",
     "tangent_frames",
     "turn_range",
     "turn_seen",

@@ -11,14 +11,12 @@ from rgbavatar_ns.avatar.prior import SurfacePrior
 from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
 from rgbavatar_ns.avatar.storage.stored_avatar import RGBAVATAR
 from rgbavatar_ns.errors import UserError
-from rgbavatar_ns.head import ThetaLayout
+from rgbavatar_ns.head import ThetaLayout, is_same_identity
 from rgbavatar_ns.plugin.console import say
 from rgbavatar_ns.plugin.dataparser import FilmedSubject
 
 _EXTRA_STATE = "_extra_state"
 _PRIOR = "prior."
-_SAME_IDENTITY = 1e-4
-"""Coefficients are of size one."""
 
 
 def model_state(avatar: AvatarMethod, subject: FilmedSubject) -> dict[str, Any]:
@@ -80,7 +78,7 @@ def tell_another_person(state_dict: Mapping[str, Any], subject: FilmedSubject) -
     mine = subject.identity
     if not isinstance(saved, torch.Tensor) or saved.shape != mine.shape:
         return
-    if not torch.allclose(saved.cpu(), mine.cpu(), atol=_SAME_IDENTITY):
+    if not is_same_identity(saved, mine):
         say(
             "note: the checkpoint's person was measured otherwise than this data's, which is of "
             "another one or was tracked anew since. The avatar may lie beside the pictures: train "

@@ -13,10 +13,10 @@ from rgbavatar_ns.data.native.frame import TrackedFrame
 from rgbavatar_ns.data.png import decode_png_rgba, encode_png_rgba, png_header_size
 from rgbavatar_ns.drawing.compositing import all_filmed
 from rgbavatar_ns.errors import UserError
-from rgbavatar_ns.head import HeadArrays, HeadModel, ThetaLayout
+from rgbavatar_ns.head import HeadArrays, HeadModel, ThetaLayout, is_same_identity
 from rgbavatar_ns.kernels.types import PinholeCameras
 
-_LARGEST_IDENTITY, _SAME_IDENTITY = 100.0, 1e-4
+_LARGEST_IDENTITY = 100.0
 _FARTHEST_CAMERA_M = 1000.0
 _FOCAL_SIDES = (0.01, 10_000.0)
 _FARTHEST_CENTRE_SIDES = 100.0
@@ -75,7 +75,7 @@ class StreamSubject:
 
     def is_shaped_as(self, identity: Float[Tensor, "I"]) -> bool:
         """Whether the head's shape is this one, but for rounding: of another person it is not."""
-        return torch.allclose(identity, self.identity.cpu(), atol=_SAME_IDENTITY)
+        return is_same_identity(identity, self.identity)
 
     def fault(self, frame: "StreamedFrame") -> Fault | None:
         """Why the frame cannot be used, found without decoding its image; None if it can be."""
