@@ -135,7 +135,7 @@ def run(
         rate = frames_per_second or _rate_of(dataset)
         options = PageOptions(title or "Avatar", rate, origins=origins, servers=servers)
         seen = _seen(avatar, dataset)
-        if dataset is not None:
+        if dataset is not None and (data is None or _is_of(avatar, dataset)):
             own = _as_filmed(own, dataset)
         places = page_frames(dataset, frames, rate)
         _write_web(format, own, seen, dataset, places, performance, destination, options)
@@ -185,10 +185,11 @@ def _without_undrawn(whole: "AvatarMethod") -> "AvatarMethod":
 
 
 def _seen(avatar: "AvatarMethod", dataset: "TrackedDataset | None") -> "TrainingStatistics | None":
-    """What the avatar saw in training, if that is known."""
+    """What the avatar saw in training, by itself or by the dataset, if that is known."""
     from rgbavatar_ns.export import statistics_of
 
-    return avatar.training_statistics if dataset is None else statistics_of(avatar, dataset)
+    known = avatar.training_statistics
+    return known if known is not None or dataset is None else statistics_of(avatar, dataset)
 
 
 def _dataset(
@@ -252,6 +253,13 @@ def _write_texture(avatar: "Avatar", destination: Path) -> None:
     wires = write_texture(destination, avatar)
     print(f"{destination}: paint on it, the face is upright and its left side on the right.")
     print(f"{wires}: the head's mesh, to lay over it. --texture takes the painted picture.")
+
+
+def _is_of(avatar: "AvatarMethod", dataset: "TrackedDataset") -> bool:
+    """Whether a dataset is of the avatar's person; another's drives, but shows nothing of it."""
+    from rgbavatar_ns.head import is_same_identity
+
+    return is_same_identity(avatar.identity, dataset.identity)
 
 
 def _as_filmed(avatar: "Avatar", dataset: "TrackedDataset") -> "Avatar":

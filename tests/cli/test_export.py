@@ -16,11 +16,12 @@ from rgbavatar_ns import Avatar
 from rgbavatar_ns.avatar.loading import load_avatar
 from rgbavatar_ns.cli import main as cli
 from rgbavatar_ns.cli.export import page_frames
-from rgbavatar_ns.data import load_dataset
+from rgbavatar_ns.data import DatasetWriter, TrackedFrame, load_dataset
 from rgbavatar_ns.data.png import encode_png_rgba, read_png_rgba
+from rgbavatar_ns.export import calm_theta, front_camera
 from tests.data.small_dataset import NUM_FRAMES, NUM_TEST, small_dataset
 from tests.export.avatar_of_page import avatar_of_page
-from tests.export.subject import avatar_of
+from tests.export.subject import avatar_of, lively_theta
 
 
 @pytest.fixture(scope="module")
@@ -101,6 +102,42 @@ def test_a_page_with_and_without_a_performance(bundle, data, tmp_path):
     assert "<title>Me</title>" in (tmp_path / "film.html").read_text()
     counts = [_frames(tmp_path / f"{name}.html") for name in ("still", "film", "calm")]
     assert counts == [0, NUM_FRAMES, 0]
+
+
+def test_another_persons_film_drives_and_says_nothing_of_the_avatars(
+    bundle, data, tmp_path, capsys
+):
+    _export(bundle, tmp_path / "me", "--data", data)  # It knows its film from now on.
+    own, mine = load_avatar(tmp_path / "me").training_statistics, Avatar.load(bundle)
+    theta = lively_theta(mine, 3, seed=5)
+
+    def film(name: str, identity: torch.Tensor) -> Path:
+        head, camera = mine.head, front_camera(mine, 16, 12)
+        # Nearer, so that what is beside the face is beyond the picture.
+        camera = replace(camera, focal_px=3 * camera.focal_px)
+        writer = DatasetWriter(tmp_path / name, head.arrays, identity, head.layout, 16, 12)
+        for index, row in enumerate(theta):
+            writer.add(TrackedFrame(index, row, camera, np.zeros((12, 16, 4), np.uint8)))
+        writer.finish(1)
+        return tmp_path / name
+
+    identities = {"mine": mine.identity + 3e-6, "other": mine.identity + 0.3}
+    for name, identity in identities.items():
+        films = film(name, identity.detach())
+        _export(tmp_path / "me", tmp_path / f"{name}_bundle", "--data", films)
+        seen = load_avatar(tmp_path / f"{name}_bundle").training_statistics
+        assert own is not None
+        assert seen is not None
+        assert torch.equal(seen.theta_max, own.theta_max)
+        assert seen.num_frames == own.num_frames
+        capsys.readouterr()
+        _export(tmp_path / "me", tmp_path / f"{name}.html", "--data", films)
+        is_cut = "beyond every picture's edge" in capsys.readouterr().out
+        assert is_cut == (name == "mine")
+        arrays = avatar_of_page(tmp_path / f"{name}.html")[1]
+        np.testing.assert_allclose(arrays["theta"], theta, atol=2e-3)
+        calm = calm_theta(own, theta[0]).numpy()
+        np.testing.assert_allclose(arrays["neutral_theta"][:, 0], calm, atol=1e-6)
 
 
 def test_a_performance_that_nobody_chose_is_of_thirty_seconds(bundle, data, tmp_path):
