@@ -1,12 +1,13 @@
 """Files and folders that are whole at every moment, what tells contents apart, and resuming."""
 
 import errno
+import glob
 import hashlib
 import json
 import os
 import shutil
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Container, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -120,6 +121,14 @@ def hold_lock(path: Path, waiting: Callable[[], object] = lambda: None) -> Itera
         yield
     finally:
         lock.release()
+
+
+def keep_numbered(folder: Path, suffix: str, numbers: Container[int]) -> None:
+    """Remove files named 00000SUFFIX and so on of other numbers: an earlier sequence's."""
+    digits = 5
+    for path in folder.glob("[0-9]" * digits + glob.escape(suffix)):
+        if int(path.name[:digits]) not in numbers:
+            path.unlink()
 
 
 def _require_name(path: Path) -> None:

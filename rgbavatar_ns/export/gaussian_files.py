@@ -13,6 +13,7 @@ from rgbavatar_ns.avatar.method import AvatarMethod
 from rgbavatar_ns.export.compressed import write_compressed
 from rgbavatar_ns.export.gltf import write_gltf
 from rgbavatar_ns.export.ply import write_ply
+from rgbavatar_ns.files import keep_numbered
 from rgbavatar_ns.kernels import GaussianSet
 
 
@@ -52,8 +53,13 @@ def write_gaussian_sequence(
     format: str,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> None:
-    """Write a file for each frame, named after the frame's place in its film; raises UserError."""
+    """Write a file for each frame, named after the frame's place in its film; raises UserError.
+
+    Files of other places, of a sequence that was here before, are removed.
+    """
+    suffix = GAUSSIAN_FILES[format].suffix
     for done, place in enumerate(places, start=1):
-        path = folder / f"{place:05d}{GAUSSIAN_FILES[format].suffix}"
+        path = folder / f"{place:05d}{suffix}"
         write_gaussians(avatar, theta[place : place + 1], path, format)
         progress(done, len(places))
+    keep_numbered(folder, suffix, places)

@@ -15,7 +15,7 @@ from av.video.stream import VideoStream
 from jaxtyping import UInt8
 
 from rgbavatar_ns.data.png import encode_png_rgba
-from rgbavatar_ns.files import atomic_write
+from rgbavatar_ns.files import atomic_write, keep_numbered
 
 _BT709 = 1
 """Primaries and transfer, as H.264 numbers them."""
@@ -161,9 +161,7 @@ def write_pngs(folder: Path, frames: Iterable[np.ndarray]) -> int:
     count = 0
     for count, frame in enumerate(frames, start=1):
         write_png(folder / f"{count - 1:05d}.png", frame)
-    for path in folder.glob("[0-9][0-9][0-9][0-9][0-9].png"):
-        if int(path.stem) >= count:
-            path.unlink()
+    keep_numbered(folder, ".png", range(count))
     return count
 
 

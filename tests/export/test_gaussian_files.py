@@ -170,3 +170,15 @@ def test_a_sequence_is_a_file_a_frame_as_if_written_alone(format, tmp_path):
     assert names == [f"00001{suffix}", f"00003{suffix}"]
     write_gaussians(avatar, theta[3:4], tmp_path / "alone", format)
     assert (tmp_path / "alone").read_bytes() == (Path(tmp_path) / "film" / names[1]).read_bytes()
+
+
+def test_a_shorter_sequence_leaves_nothing_of_a_longer_one_before_it(tmp_path):
+    avatar = avatar_of()
+    theta = lively_theta(avatar, 5)
+    write_gaussian_sequence(avatar, theta, (0, 1, 2, 4), tmp_path, "ply")
+    others = ["00004.glb", "00004.compressed.ply", "000004.ply", "notes.ply"]
+    for name in others:
+        (tmp_path / name).write_text("")
+    write_gaussian_sequence(avatar, theta, (1, 2), tmp_path, "ply")
+    names = sorted(path.name for path in tmp_path.iterdir())
+    assert names == sorted(["00001.ply", "00002.ply", *others])
