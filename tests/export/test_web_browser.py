@@ -54,6 +54,20 @@ def open_page(browser: Any, tmp_path: Path) -> Iterator[Any]:
     assert [url for url in asked if not url.startswith(("file:", "blob:"))] == []
 
 
+def test_what_runs_no_programs_says_so_and_unpacks_nothing(browser, tmp_path):
+    context = browser.new_context(offline=True, java_script_enabled=False)
+    avatar = avatar_of()
+    nothing = torch.zeros(0, avatar.layout.size)
+    write_web_page(avatar, tmp_path / "a.html", front_camera(avatar, 8, 8), nothing)
+    page = context.new_page()
+    page.goto((tmp_path / "a.html").as_uri())
+    told = page.inner_text("#told")
+    context.close()
+    assert told.strip() == (
+        "This preview runs no programs: open the page in a browser, from a web address."
+    )
+
+
 def _shown(page: Any) -> np.ndarray:
     """The canvas [H, W, 3] in [0, 1], drawn now."""
     text = page.evaluate("() => { avatar.draw(); return avatar.canvas.toDataURL('image/png'); }")

@@ -39,6 +39,7 @@ def test_the_page_is_one_file_that_names_no_other_place(tmp_path):
         f"{kind}://{host}:*" for kind in ("ws", "wss") for host in ("127.0.0.1", "localhost")
     ]
     assert f'connect-src {" ".join(loopback)}"' in rest
+    assert "This preview runs no programs" in rest.split("<noscript>")[1].split("</noscript>")[0]
     manifest, arrays = avatar_of_page(path)
     assert page.count('class="part"') == len(manifest["parts"])
     assert arrays["theta"].shape == theta.shape
