@@ -16,6 +16,7 @@ from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader
 from rich.progress import track
 from torch.nn import Parameter
 
+from rgbavatar_ns.avatar.prior import NUM_VIEWS
 from rgbavatar_ns.avatar.training.batches import ChosenFrames, DeviceFrames
 from rgbavatar_ns.avatar.training.losses import random_backgrounds
 from rgbavatar_ns.data import ImageCache, OfflineOrder
@@ -170,22 +171,27 @@ class RGBAvatarDataManager(DataManager):
             yield self._batch(rows, self._train_cameras, positions, number)
 
     def device_frames(self) -> DeviceFrames | None:
-        """All training frames on the device; None without any, or beyond the budget."""
+        """All training frames on the device; None without any, or beyond the budget.
+
+        Behind them there is room for the surface prior's views: a second copy of all images would
+        go beyond the budget.
+        """
         positions = self.dataparser.positions("train")
         if not positions:
             return None
         tracked = self.dataparser.tracked
-        each = tracked.width * tracked.height * 4
-        if len(positions) * each > device_budget(self.config.device_mib * _MIB, self.device):
+        each, rows = tracked.width * tracked.height * 4, len(positions) + NUM_VIEWS
+        if rows * each > device_budget(self.config.device_mib * _MIB, self.device):
             return None
-        shape = (len(positions), tracked.height, tracked.width, 4)
-        images = torch.empty(shape, dtype=torch.uint8, device=self.device)
+        shape = (rows, tracked.height, tracked.width, 4)
+        room = torch.empty(shape, dtype=torch.uint8, device=self.device)
         chunks = range(0, len(positions), _DECODED_TOGETHER)
         for first in track(chunks, "Images to the device...", transient=True):
             chosen = positions[first : first + _DECODED_TOGETHER]
-            images[first : first + len(chosen)] = self.image_cache.get(chosen).to(self.device)
+            room[first : first + len(chosen)] = self.image_cache.get(chosen).to(self.device)
         theta = (self._train_cameras.metadata or {})["theta"].to(self.device)
-        return DeviceFrames(theta, from_nerfstudio(self._train_cameras), images)
+        cameras = from_nerfstudio(self._train_cameras)
+        return DeviceFrames(theta, cameras, room[: len(positions)], room)
 
     def next_choice(self, step: int) -> ChosenFrames:
         """The frames of `step` among the training frames, the same as `next_train` shows."""

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from rgbavatar_ns.avatar.prior import NUM_VIEWS
 from rgbavatar_ns.data import load_dataset
 from rgbavatar_ns.plugin.cameras import from_nerfstudio
 from rgbavatar_ns.plugin.datamanager import (
@@ -129,3 +130,23 @@ def test_images_leave_half_of_a_gpus_free_memory(monkeypatch: pytest.MonkeyPatch
     assert device_budget(16 << 30, "cuda:0") == 5 << 30
     assert device_budget(1 << 30, torch.device("cuda")) == 1 << 30
     assert device_budget(16 << 30, "cpu") == 16 << 30
+
+
+def test_images_on_a_device_have_room_for_views_behind_them_within_the_budget(
+    tiny_data: Path, monkeypatch: pytest.MonkeyPatch
+):
+    config = RGBAvatarDataManagerConfig(data=tiny_data, batch_size=4)
+    datamanager, rows = config.setup(device="cpu"), NUM_FRAMES - NUM_TEST + NUM_VIEWS
+    needed = rows * SIZE * SIZE * 4
+    place = "rgbavatar_ns.plugin.datamanager.device_budget"
+    monkeypatch.setattr(place, lambda most, device: needed - 1)
+    assert datamanager.device_frames() is None
+    monkeypatch.setattr(place, lambda most, device: needed)
+    frames = datamanager.device_frames()
+    assert frames is not None
+    assert frames.room is not None
+    assert len(frames.room) == rows
+    assert frames.images_rgba.data_ptr() == frames.room.data_ptr()
+    tracked = load_dataset(tiny_data)
+    for image, position in zip(frames.images_rgba, tracked.train, strict=True):
+        assert np.array_equal(image.numpy(), tracked.read_image(position))

@@ -31,6 +31,7 @@ TURNS_DEGREES = (
     *((0, pitch) for pitch in (20, -20, 32, -32)),
 )
 """(yaw, pitch) away from each frame's own view."""
+NUM_VIEWS = len(TURNS_DEGREES)
 _JAWS_RAD = (0.0, 0.3, 0.0, 0.15)
 """How far the mouth is opened, at least, in one view after the other: its inside is the part of a
 face that films show least."""
@@ -77,7 +78,7 @@ class VirtualViews(nn.Module):
 
     def __init__(self, num_vertices: int, theta_size: int) -> None:
         super().__init__()
-        count = len(TURNS_DEGREES)
+        count = NUM_VIEWS
         self.register_buffer("surface_m", torch.zeros(num_vertices))
         self.register_buffer("empty", torch.zeros(num_vertices))
         self.register_buffer("goes_on_below", torch.zeros((), dtype=torch.bool))
@@ -107,7 +108,7 @@ class VirtualViews(nn.Module):
         cameras: PinholeCameras,
     ) -> None:
         """Turn around these frames; `outline` says where the person's surface is."""
-        count, shared = len(TURNS_DEGREES), len(cameras.focal_px) == 1
+        count, shared = NUM_VIEWS, len(cameras.focal_px) == 1
         frames = [k % len(theta) for k in range(count)]
         theta = theta[frames].cpu().float()
         before = cameras.to("cpu").select([0] * count if shared else frames)

@@ -39,6 +39,8 @@ class DeviceFrames:
     theta: Float[Tensor, "F H"]
     cameras: PinholeCameras
     images_rgba: UInt8[Tensor, "F height width 4"]
+    room: UInt8[Tensor, "R height width 4"] | None = None
+    """The memory that the images are the beginning of, where it goes on behind them."""
 
     def batch(self, rows: Sequence[int]) -> TrainingBatch:
         """These frames by themselves."""
@@ -47,11 +49,20 @@ class DeviceFrames:
         return TrainingBatch(self.theta[chosen], cameras, self.images_rgba[chosen])
 
     def joined(self, others: "DeviceFrames") -> "DeviceFrames":
-        """These frames, then others of the same size, each with a camera."""
+        """These frames, then others of the same size, each with a camera.
+
+        The images lie in `room` where that holds them all: a film's are not copied.
+        """
+        count, room = len(self.theta) + len(others.theta), self.room
+        if room is not None and len(room) >= count:
+            images = room[:count]
+            images[len(self.theta) :] = others.images_rgba
+        else:
+            images = torch.cat([self.images_rgba, others.images_rgba])
         return DeviceFrames(
             torch.cat([self.theta, others.theta]),
             each_its_own(self.cameras, len(self.theta)).joined(others.cameras),
-            torch.cat([self.images_rgba, others.images_rgba]),
+            images,
         )
 
 

@@ -6,7 +6,13 @@ from functools import partial
 import pytest
 import torch
 
-from rgbavatar_ns.avatar.prior import SurfacePrior, VirtualViews, surface_prior, virtual_views
+from rgbavatar_ns.avatar.prior import (
+    NUM_VIEWS,
+    SurfacePrior,
+    VirtualViews,
+    surface_prior,
+    virtual_views,
+)
 from rgbavatar_ns.avatar.refinement import FrameRefinement, RefinementConfig
 from rgbavatar_ns.avatar.training import (
     TrainingBatch,
@@ -28,11 +34,17 @@ def _the_prior_is_busy(monkeypatch):
         monkeypatch.setattr(surface_prior, name, value)
 
 
-def trained(make_avatar, kind: str, steps: int = 7):
-    """An avatar after steps on two of four frames each, with a camera of their own."""
+def trained(make_avatar, kind: str, steps: int = 7, room: int = 0):
+    """An avatar after steps on two of four frames each, with a camera of their own.
+
+    Recorded steps put views into the room for so many images behind the frames, not elsewhere.
+    """
     avatar = stir(make_avatar())
     batch, background = far_batch(avatar, 4, SIZE, SIZE, cameras=4)
     frames = DeviceFrames(batch.theta, batch.cameras, batch.images_rgba)
+    if room:
+        memory = torch.cat([batch.images_rgba, batch.images_rgba.new_zeros(room, SIZE, SIZE, 4)])
+        frames = replace(frames, images_rgba=memory[:4], room=memory)
     optimizer = make_optimizer(avatar)
     for group in optimizer.param_groups:
         group["lr"] *= 0.1
@@ -46,6 +58,11 @@ def trained(make_avatar, kind: str, steps: int = 7):
         chosen = frames.batch(rows)
         images = TrainingBatch(chosen.theta, chosen.cameras, chosen.images_rgba, colors)
         take(ChosenFrames(rows, colors) if kind == "recorded" else images, step)
+    if room:
+        assert take._shown is not None
+        assert len(take._shown.images_rgba) == 4 + NUM_VIEWS
+        assert take._shown.images_rgba.data_ptr() == frames.images_rgba.data_ptr()
+        assert torch.equal(frames.images_rgba, batch.images_rgba)
     return avatar
 
 
@@ -58,6 +75,11 @@ def test_recorded_fused_and_eager_steps_show_the_same_views(emulated, make_avata
         assert parting(trained(make_avatar, "fused"), fused) > 1e-2
     monkeypatch.setattr(SurfacePrior, "pull", lambda self, avatar, step: None)
     assert parting(trained(make_avatar, "fused"), fused) > 1e-3
+
+
+def test_views_lie_behind_the_films_images_without_a_copy_of_these(emulated, make_avatar):
+    behind, apart = (trained(make_avatar, "recorded", room=n) for n in (NUM_VIEWS, 0))
+    assert parting(behind, apart) == 0
 
 
 @pytest.mark.parametrize("kind", ["recorded", "fused", "eager"])
