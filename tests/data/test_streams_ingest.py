@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from rgbavatar_ns.data import LocalGlobalPools
+from rgbavatar_ns.data.png import encode_png_rgba
 from rgbavatar_ns.data.streams import FrameStream, Ingest, ReplayBuffer, StreamedFrame
 from rgbavatar_ns.data.streams.ingest import FrameQueue
 from rgbavatar_ns.data.streams.sequence_numbers import SeenNumbers
@@ -187,6 +188,33 @@ def test_ingest_goes_on_from_its_state():
     assert resumed.num_added == 3
     # The frame that had been there before is known again.
     assert second.counts() == {"arrived": 0, "taken in": 3, "duplicate": 2, "dropped": 0}
+
+
+def test_frames_come_in_while_a_checkpoint_encodes_images(monkeypatch: pytest.MonkeyPatch):
+    ingest, frames = ingest_of()
+    for index in range(2):
+        ingest.take_in(streamed(index, encode=False))
+    finished: list[bool] = []
+
+    def encode(image: np.ndarray) -> bytes:
+        thread = threading.Thread(
+            target=ingest.take_in, args=(streamed(7 + len(finished), encode=False),), daemon=True
+        )
+        thread.start()
+        thread.join(DEADLINE_S / 10)
+        finished.append(not thread.is_alive())
+        return encode_png_rgba(image)
+
+    monkeypatch.setattr("rgbavatar_ns.data.streams.replay_buffer.encode_png_rgba", encode)
+    state = ingest.state_dict()
+    assert finished == [True, True]
+    assert frames.num_added == 4
+    # The checkpoint is of the moment at which it was asked for, in all of its parts.
+    assert state["counts"]["taken in"] == state["frames"]["added"] == 2
+    assert len(state["frames"]["png_bytes"]) == len(state["frames"]["theta"]) == 2
+    again, resumed = ingest_of()
+    again.load_state_dict(state)
+    assert [serial for serial, _ in resumed.held()] == [0, 1]
 
 
 def test_queue_lets_nothing_in_once_closed():

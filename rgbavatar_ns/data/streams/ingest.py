@@ -190,12 +190,14 @@ class Ingest:
         with self._between_frames:
             counts = self.counts()
             counts["arrived"] -= len(self._queue)
-            return {
-                "frames": self._pools.state_dict(),
+            state = {
                 "counts": dict(counts),
                 "numbers": self._seen.state_dict(),
                 "session": self._session,
             }
+            frames = self._pools.snapshot()
+        # Images are encoded here; meanwhile more may come in.
+        return state | {"frames": frames()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on where `state_dict` was taken; before `start`, and before `listen` if it can be."""

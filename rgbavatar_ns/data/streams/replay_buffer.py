@@ -217,6 +217,13 @@ class ReplayBuffer:
 
     def state_dict(self) -> dict[str, Any]:
         """Pools and frames, safe for `torch.load(weights_only=True)`."""
+        return self.snapshot()()
+
+    def snapshot(self) -> Callable[[], dict[str, Any]]:
+        """What gives the present `state_dict` whenever it is called.
+
+        That takes a while where images came as pixels, and so need not be done where others wait.
+        """
         with self._lock:
             serials = sorted(self._held)
             held = [self._held[serial] for serial in serials]
@@ -227,11 +234,7 @@ class ReplayBuffer:
                 "index": torch.tensor([one.frame.index for one in held], dtype=torch.long),
                 **self._columns(serials),
             }
-        if self._save_images:
-            images = [one.as_png() for one in held]
-            state["png_bytes"] = torch.tensor([len(png) for png in images], dtype=torch.long)
-            state["png"] = torch.from_numpy(np.frombuffer(b"".join(images), np.uint8).copy())
-        return state
+        return lambda: state | (_saved_as_png(held) if self._save_images else {})
 
     def load_state_dict(self, state: dict[str, Any], stream: object = None) -> None:
         """Go on where `state_dict` was taken, before the first `add`; images may be `stream`'s.
@@ -259,6 +262,14 @@ class ReplayBuffer:
                     )
                 self._held[serial] = self._decoded(streamed)
             self._added = state["added"]
+
+
+def _saved_as_png(held: Sequence[_Held]) -> dict[str, Tensor]:
+    images = [one.as_png() for one in held]
+    return {
+        "png_bytes": torch.tensor([len(png) for png in images], dtype=torch.long),
+        "png": torch.from_numpy(np.frombuffer(b"".join(images), np.uint8).copy()),
+    }
 
 
 def _saved_images(state: dict[str, Any], stream: object) -> list[tuple[bytes, bool]]:
