@@ -80,6 +80,8 @@ class AvatarModel(Model):
     view: Callable[[Cameras, bool], Outputs] | None = None
     """Draws a camera that brings no theta, and whether a crop box is asked for; set by the
     pipeline."""
+    filmed: Callable[[], FilmedSubject] | None = None
+    """The film so far, where it grows while the avatar is trained; set by the pipeline."""
 
     def populate_modules(self) -> None:
         """Build the avatar of the dataset's subject."""
@@ -206,7 +208,7 @@ class AvatarModel(Model):
 
     def get_extra_state(self) -> dict[str, Any]:
         """What rebuilds the avatar without this dataset: its make, and every frame's theta."""
-        subject = self.subject
+        subject = self.subject if self.filmed is None else self.filmed()
         if self.refinement is not None:
             theta = self.refinement.all_frames(subject.theta.to(self.device))
             subject = replace(subject, theta=theta.cpu())

@@ -170,6 +170,17 @@ class OnlineDataManager(RGBAvatarDataManager):
         if self.config.source.kind != "replay" and self.pools.num_added:
             _record(self.config, self._subject, self.pools.held())
 
+    def filmed(self, subject: FilmedSubject) -> FilmedSubject:
+        """The subject with all frames that the pools hold now, which may be none."""
+        theta, views, index = self.pools.parameters()
+        return dataclasses.replace(
+            subject,
+            theta=theta,
+            frame_index=index,
+            train=tuple(range(len(theta))),
+            world_to_camera=views,
+        )
+
     def next_train(self, step: int) -> tuple[Cameras, dict[str, Any]]:
         """A batch drawn from the pools now; UserError while they are empty."""
         drawn = self.pools.batch(self.config.batch_size, evenly=self.ended_step is not None)

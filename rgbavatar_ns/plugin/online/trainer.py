@@ -3,7 +3,6 @@
 RGBAvatar, sec. 3.3. The stream runs in its own threads; a step takes what the pools hold.
 """
 
-import dataclasses
 import shutil
 import signal
 import time
@@ -261,24 +260,6 @@ class OnlineTrainer(RGBAvatarTrainer):
                 self.stream.least.see(frames.index, self.pipeline.losses_of(frames))
             self._last_watched = frames.serial[-1]
         self._next_watch_s = began + (time.monotonic() - began) / _WATCH_SHARE
-
-    def _state(self, step: int) -> dict[str, Any]:
-        """With all frames that the pools hold; the viewer goes on knowing the newest alone."""
-        model = self.pipeline.model
-        theta, views, index = self.stream.pools.parameters()
-        with self.train_lock:
-            newest = model.subject
-            model.subject = dataclasses.replace(
-                newest,
-                theta=theta,
-                frame_index=index,
-                train=tuple(range(len(theta))),
-                world_to_camera=views,
-            )
-            try:
-                return super()._state(step)
-            finally:
-                model.subject = newest
 
     def _load_checkpoint(self) -> None:
         """As offline; for a new stream after an ended one the rates are the first ones again."""
