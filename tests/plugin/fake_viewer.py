@@ -44,6 +44,17 @@ class FakeHandle:
     def remove(self) -> None:
         self.label = ""
 
+    @property
+    def _impl(self) -> SimpleNamespace:
+        """Where viser takes what it has no setter for."""
+        messages = SimpleNamespace(queue_message=lambda message: self._becomes(**message.updates))
+        return SimpleNamespace(id="", gui_api=SimpleNamespace(_websock_interface=messages))
+
+    def _becomes(self, *, marks: tuple, hint: str, precision: int, **limits: float) -> None:
+        self.limits = limits["min"], limits["max"], limits["step"], self.value
+        ends = tuple(mark["value"] for mark in marks)
+        self.options = self.options | {"marks": ends, "hint": hint, "precision": precision}
+
     def __enter__(self) -> "FakeHandle":
         return self
 

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
+from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics, neutral_frame
 from rgbavatar_ns.export.bases import single_bases
 from rgbavatar_ns.plugin.avatar_model import AvatarModel
 from rgbavatar_ns.plugin.checkpoint_state import film_statistics
@@ -25,20 +25,35 @@ class DrivingSignal:
 
 
 def training_statistics(model: AvatarModel) -> TrainingStatistics:
-    """What the avatar has seen, with the weights that its network gives now."""
-    theta = model.driving_theta(list(range(len(model.frame_theta))))
-    return film_statistics(model.avatar, replace(model.subject, theta=theta.cpu()))
+    """What the avatar has seen so far, with the weights that its network gives now."""
+    film = None if model.filmed is None else model.filmed()
+    if film is None or len(film.theta) == 0:
+        theta = model.driving_theta(list(range(len(model.frame_theta))))
+        film = replace(model.subject, theta=theta.cpu())
+    return film_statistics(model.avatar, film)
+
+
+def neutral_of_shown(model: AvatarModel) -> Float[Tensor, "H"]:
+    """The frame with the most neutral expression of those that the viewer can show."""
+    theta = model.driving_theta(list(model.subject.train) or [0])
+    return neutral_frame(theta.cpu(), model.avatar.layout)
 
 
 @torch.no_grad()
 def driving_signal(
-    model: AvatarModel, state: ViewerState, time: float | FilmMoment | None = None
+    model: AvatarModel,
+    state: ViewerState,
+    time: float | FilmMoment | None = None,
+    seen: TrainingStatistics | None = None,
 ) -> DrivingSignal:
-    """What drives the picture; `time` (in [0, 1], or a moment) counts where the state asks it."""
+    """What drives the picture; `time` (in [0, 1], or a moment) counts where the state asks it.
+
+    seen: what is known of the film, where it is known.
+    """
     avatar = model.avatar
     alone, used = state.basis_alone, state.bases_used
     if alone is not None and alone < avatar.num_bases:
-        statistics = training_statistics(model)
+        statistics = training_statistics(model) if seen is None else seen
         theta, frame = statistics.theta_neutral, None
         psi = single_bases(statistics, state.gain)[alone + 1]
     else:

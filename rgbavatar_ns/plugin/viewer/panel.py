@@ -4,7 +4,6 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +14,7 @@ from torch import Tensor
 
 from rgbavatar_ns.data import TrackedDataset, load_dataset
 from rgbavatar_ns.driving.live_drive import DrivenFrame
-from rgbavatar_ns.driving.theta_map import ThetaNames
-from rgbavatar_ns.driving.transfer import DrivingOptions, told_beyond
+from rgbavatar_ns.driving.transfer import DrivingOptions
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.export import dataset_folder
 from rgbavatar_ns.export.scenes import driven_by
@@ -28,12 +26,13 @@ from rgbavatar_ns.plugin.viewer.client import serve_sharp_client
 from rgbavatar_ns.plugin.viewer.driving import (
     DrivingSignal,
     driving_signal,
+    neutral_of_shown,
     random_expression,
     training_statistics,
 )
+from rgbavatar_ns.plugin.viewer.film_seen import FilmSeen
 from rgbavatar_ns.plugin.viewer.render import ViewerRender, viewer_render
 from rgbavatar_ns.plugin.viewer.render_thread import ask_for_pictures, draw_by_render_threads
-from rgbavatar_ns.plugin.viewer.sliders import number_sliders
 from rgbavatar_ns.plugin.viewer.viewer_state import DrivenBy, ViewerState
 from rgbavatar_ns.plugin.viewer.viewpoint import Viewpoint
 from rgbavatar_ns.plugin.viewer.widgets import Widgets
@@ -88,6 +87,7 @@ class ViewerPanel(ViewerControl):
         self._model, self._film, self._clock = model, film, clock
         self._viewer: Any = None
         self._widgets: Widgets | None = None
+        self._seen: FilmSeen | None = None
         self._beyond: Callable[..., str] = lambda theta, turns: ""
         self._changing = threading.RLock()
         self._report: _Report | None = None
@@ -111,14 +111,11 @@ class ViewerPanel(ViewerControl):
         self.state = ViewerState(background=(1.0, 1.0, 1.0))
         if self._film is not None:
             self.state = replace(self.state, frames_per_second=self._film.playback_rate)
-        arrays, statistics = self._model.avatar.head.arrays, training_statistics(self._model)
-        sliders = number_sliders(ThetaNames.of(self._model.avatar.layout, arrays), statistics)
-        labels = {slider.place: slider.label for slider in sliders}
-        names = [labels[place] for place in range(len(labels))]
-        self._beyond = partial(told_beyond, statistics, names)
+        self._seen = seen = FilmSeen(self._model)
+        self._beyond = seen.beyond
         gui = viewer.viser_server.gui
         rate = self.state.frames_per_second
-        self._widgets = Widgets(gui, self, sliders, statistics, self._num_frames, rate)
+        self._widgets = Widgets(gui, self, seen.sliders, seen.statistics, self._num_frames, rate)
         viewpoint = Viewpoint.before(self._model.avatar, self._model.subject)
         viewer.viser_server.scene.set_up_direction("+z")
         viewer.viser_server.on_client_connect(viewpoint.place)
@@ -168,9 +165,12 @@ class ViewerPanel(ViewerControl):
             self._next_frame_s = frame_s + (now_s if late else self._next_frame_s)
             self._played, self._played_s = report, now_s
             self.advance()
-        if self._widgets is None:
+        if self._widgets is None or self._seen is None:
             return
         self._hide_training()
+        trainer = self._viewer.trainer
+        if self._seen.look_again(now_s, trainer and trainer.training_state):
+            self._widgets.renew(self._seen.sliders, self._seen.statistics)
         if report is not None and report is not self._told and now_s >= self._next_told_s:
             self._told, self._next_told_s = report, now_s + _TOLD_EVERY_S
             self._widgets.report(report.text(self._model.avatar.layout, self._beyond))
@@ -212,8 +212,8 @@ class ViewerPanel(ViewerControl):
         self.set_theta(theta)
 
     def show_neutral(self) -> None:
-        """Drive by hand: the frame with the most neutral expression."""
-        self.set_theta(training_statistics(self._model).theta_neutral)
+        """Drive by hand: the frame with the most neutral expression, of a stream the newest."""
+        self.set_theta(neutral_of_shown(self._model))
 
     def show_random_expression(self) -> None:
         """Drive by hand: a random expression within what was seen, on the pose shown."""
@@ -313,7 +313,8 @@ class ViewerPanel(ViewerControl):
     def _drawn(
         self, state: ViewerState, camera: PinholeCameras, time_share: float | FilmMoment | None
     ) -> tuple[DrivingSignal, ViewerRender]:
-        model, signal = self._model, driving_signal(self._model, state, time_share)
+        model, seen = self._model, self._seen and self._seen.statistics
+        signal = driving_signal(model, state, time_share, seen)
         options: dict[str, Any] = {"film": self._film, "backend": model.config.rasterizer}
         options["with_depth"] = self._depth_is_wanted()
         # Films of `ns-render` are exact.

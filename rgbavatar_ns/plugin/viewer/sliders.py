@@ -17,6 +17,7 @@ _BEYOND = 0.25
 _ONE_WAY = ("jaw", 0)
 """The field and number that go to one side only: a mouth is open or closed."""
 _STEPS = 200
+_LEAST_WEIGHT = 1.0
 
 TITLES = {
     "jaw": "Jaw",
@@ -67,6 +68,34 @@ class NumberSlider:
         return on_step(min(max(number * self.shown_per_unit, self.low), self.high), self.step)
 
 
+@dataclass(frozen=True)
+class WeightSlider:
+    """The weight of one basis, psi; goes half beyond what was seen, and at least to +-1."""
+
+    low: float
+    high: float
+    step: float
+    marks: tuple[float, float]
+    """Where the film ends."""
+    hint: str
+
+    def shown(self, weight: float) -> float:
+        """The slider's place for a weight."""
+        return on_step(min(max(weight, self.low), self.high), self.step)
+
+
+def weight_sliders(statistics: TrainingStatistics) -> list[WeightSlider]:
+    """A slider for each basis."""
+    sliders = []
+    for low, high in zip(statistics.psi_min.tolist(), statistics.psi_max.tolist()):
+        reach = max(_LEAST_WEIGHT, 1.5 * max(high, -low))
+        ends = slider_ends(-reach, reach)
+        marks = on_step(low, ends[2]), on_step(high, ends[2])
+        hint = f"How much of this change is added (psi); in training {marks[0]:g} to {marks[1]:g}"
+        sliders.append(WeightSlider(*ends, marks, hint))
+    return sliders
+
+
 def number_sliders(names: ThetaNames, statistics: TrainingStatistics) -> list[NumberSlider]:
     """A slider for each number of theta, expressions that moved most in training first.
 
@@ -109,7 +138,12 @@ def slider_ends(low: float, high: float) -> tuple[float, float, float]:
 
 def on_step(value: float, step: float) -> float:
     """The nearest whole number of steps, without the digits that floats leave behind."""
-    return round(round(value / step) * step, max(0, -math.floor(math.log10(step)))) + 0.0
+    return round(round(value / step) * step, digits_of(step)) + 0.0
+
+
+def digits_of(step: float) -> int:
+    """Digits behind the point of whole numbers of steps."""
+    return max(0, -math.floor(math.log10(step)))
 
 
 def _meaning(names: ThetaNames, place: int, field: str, number: int) -> tuple[str, str]:

@@ -6,14 +6,20 @@ from typing import Any, Protocol, get_args, runtime_checkable
 
 from jaxtyping import Float
 from torch import Tensor
+from viser._messages import GuiUpdateMessage
 
 from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
-from rgbavatar_ns.plugin.viewer.sliders import TITLES, NumberSlider, on_step, slider_ends
+from rgbavatar_ns.plugin.viewer.sliders import (
+    TITLES,
+    NumberSlider,
+    WeightSlider,
+    digits_of,
+    weight_sliders,
+)
 from rgbavatar_ns.plugin.viewer.viewer_state import DrivenBy, PictureKind, ViewerState
 
 _TOPMOST = -1.0
 _STRONGEST = 12
-_LEAST_WEIGHT = 1.0
 _NO_BASIS = "none"
 _Number = int | float
 
@@ -47,8 +53,7 @@ class Widgets:
     ) -> None:
         self._gui, self._do = gui, actions
         self._numbers: list[tuple[NumberSlider, Any]] = []
-        self._weights: list[Any] = []
-        self._reach: list[tuple[float, float, float]] = []
+        self._weights: list[tuple[WeightSlider, Any]] = []
         with gui.add_folder("Avatar", order=_TOPMOST):
             self._report = gui.add_markdown("")
             self._said = gui.add_markdown("", visible=False)
@@ -76,8 +81,19 @@ class Widgets:
         """Bring the sliders of face and bases to the numbers that a picture was drawn with."""
         for slider, handle in self._numbers:
             _put(handle, slider.shown(float(theta[slider.place])), slider.step)
-        for (low, high, step), handle, weight in zip(self._reach, self._weights, psi.tolist()):
-            _put(handle, on_step(min(max(weight, low), high), step), step)
+        for (slider, handle), weight in zip(self._weights, psi.tolist()):
+            _put(handle, slider.shown(weight), slider.step)
+
+    def renew(self, sliders: list[NumberSlider], statistics: TrainingStatistics) -> None:
+        """Bring ends, marks and hints of the sliders to what the avatar has seen by now."""
+        of_place = {slider.place: slider for slider in sliders}
+        numbers = [(of_place[old.place], handle) for old, handle in self._numbers]
+        weights = zip(weight_sliders(statistics), (handle for _, handle in self._weights))
+        before = [*self._numbers, *self._weights]
+        self._numbers, self._weights = numbers, list(weights)
+        for (old, handle), (slider, _) in zip(before, [*self._numbers, *self._weights]):
+            if slider != old:
+                _renew(handle, slider)
 
     def offer_sequence(self, num_frames: int) -> None:
         """Make a slider for a driver's frames, in place of the last driver's."""
@@ -186,17 +202,11 @@ class Widgets:
         )
         hint = "Times its largest weight in training, where a basis is shown alone"
         self._slider("Exaggerate", (0, 5, 0.1), 1.5, lambda v: do.change(gain=float(v)), hint)
-        for basis in range(count):
-            low, high = float(seen.psi_min[basis]), float(seen.psi_max[basis])
-            reach = max(_LEAST_WEIGHT, 1.5 * max(high, -low))
-            ends = slider_ends(-reach, reach)
-            marks = on_step(low, ends[2]), on_step(high, ends[2])
-            seen_ends = " to ".join(f"{end:g}" for end in marks)
-            hint = f"How much of this change is added (psi); in training {seen_ends}"
+        for basis, slider in enumerate(weight_sliders(seen)):
+            label, ends = f"Basis {basis + 1}", (slider.low, slider.high, slider.step)
             set_this = partial(do.set_weight, basis)
-            self._reach.append(ends)
-            label = f"Basis {basis + 1}"
-            self._weights.append(self._slider(label, ends, 0.0, set_this, hint, marks))
+            handle = self._slider(label, ends, 0.0, set_this, slider.hint, slider.marks)
+            self._weights.append((slider, handle))
 
     def _add_looks(self) -> None:
         gui, do = self._gui, self._do
@@ -220,7 +230,7 @@ class Widgets:
         marks: tuple[float, float] | None = None,
     ) -> Any:
         value = min(max(value, limits[0]), limits[1])
-        ends = None if marks is None else tuple(sorted(set(marks)))
+        ends = None if marks is None else _without_doubles(marks)
         return _on(self._gui.add_slider(label, *limits, value, marks=ends, hint=hint), done)
 
     def _button(self, label: str, done: Callable[[], None], hint: str) -> None:
@@ -231,6 +241,24 @@ def _on(handle: Any, done: Callable[[Any], None]) -> Any:
     """Pass on what a user does with a control; what `_put` does brings no client."""
     handle.on_update(lambda event: None if event.client is None else done(handle.value))
     return handle
+
+
+def _renew(handle: Any, slider: NumberSlider | WeightSlider) -> None:
+    """Let a control be another slider; its value stays. viser's page can do that, its API not."""
+    updates = {
+        "min": slider.low,
+        "max": slider.high,
+        "step": slider.step,
+        "precision": digits_of(slider.step),
+        "marks": tuple({"value": mark} for mark in _without_doubles(slider.marks)),
+        "hint": slider.hint,
+    }
+    inside = handle._impl
+    inside.gui_api._websock_interface.queue_message(GuiUpdateMessage(inside.id, updates))
+
+
+def _without_doubles(marks: tuple[float, float]) -> tuple[float, ...]:
+    return tuple(sorted(set(marks)))
 
 
 def _put(handle: Any, value: Any, step: float = 0.0) -> None:
