@@ -91,8 +91,8 @@ class LocalGlobalPools:
     Args:
         local_size, global_size: frames in the pools (paper: 150 and 1000).
         local_share: the paper's eta, the part of a batch from the local pool.
-        new_first: let local frames that no batch has held yet fill up to half of the local part,
-            the newest first. Ours: by chance alone a frame may wait for seconds.
+        new_first: let local frames that no batch has held yet fill up to half of the local part
+            (rounded up), the newest first. Ours: by chance alone a frame may wait for seconds.
     """
 
     def __init__(

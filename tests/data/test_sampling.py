@@ -161,6 +161,18 @@ def test_new_frames_come_first_newest_first_and_take_half_of_the_local_part():
         assert len(set(drawn)) == 10
 
 
+@pytest.mark.parametrize(("share", "local", "new"), [(0.1, 1, 1), (0.3, 3, 2), (0.7, 7, 4)])
+def test_new_frames_fill_half_of_the_local_part_rounded_up(share: float, local: int, new: int):
+    """As the option's help says it; .3 is the tiny preset's share."""
+    by_chance = set[int]()
+    for seed in range(20):
+        drawn = filled(LocalGlobalPools(100, 50, share, seed, new_first=True), 120).batch(10)
+        assert drawn[:new] == list(range(119, 119 - new, -1))
+        assert sum(frame >= 20 for frame in drawn) == local
+        by_chance |= set(drawn[new:local])
+    assert len(by_chance) > 15 or local == new
+
+
 def test_without_new_first_a_frame_waits_for_chance():
     pools = LocalGlobalPools(100, 50)
     for frame in range(120):

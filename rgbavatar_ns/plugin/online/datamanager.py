@@ -55,8 +55,9 @@ class OnlineDataManagerConfig(RGBAvatarDataManagerConfig):
     """The paper's eta, the part of a batch from the local pool: by default .7, and .3 for the
     release's strategy, which begins with 1."""
     new_first: bool = True
-    """Let frames that no batch has held yet fill up to half of the local part, so that none waits
-    for chance. False draws from the local pool by chance alone, as in the paper."""
+    """Let frames that no batch has held yet fill up to half of the local part, rounded up (2 of 3,
+    4 of 7), so that none waits for chance. False draws from the local pool by chance alone, as in
+    the paper."""
     queue_frames: Annotated[int, Between(1, 10**5)] = 256
     """Frames that may wait to be decoded; beyond, the oldest is dropped, or the source waits
     where it keeps them (a video file)."""
