@@ -31,9 +31,9 @@ _Sums = TypeVar("_Sums", Tensor, np.ndarray)
 
 FirstColorsKind = Literal["matted", "paper"]
 """paper: I is the training picture over its background. matted: each pixel counts by its matte
-alpha a too, c = sum w a I / sum w a, and a colour that was learned from fainter sights stays. Ours,
-because what lies behind the person tints the silhouette else, and late means undo what was learned
-(docs/paper.md)."""
+alpha a too, c = sum w a I / sum w a, and a colour stays that was learned from fainter sights or
+painted by the surface prior. Ours, because what lies behind the person tints the silhouette else,
+and late means undo what was learned (docs/paper.md)."""
 
 WEIGHT_THRESHOLD = 0.1
 """The blending weight that a Gaussian must exceed in some pixel (paper: .1; its release: .01)."""
