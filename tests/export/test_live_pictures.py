@@ -85,6 +85,16 @@ def test_a_clock_that_jumps_makes_no_endless_film(tmp_path):
     assert len(_levels(tmp_path / "film.mp4")) == 5
 
 
+def test_a_long_pause_stands_still_for_ten_seconds_and_the_film_goes_on(tmp_path):
+    for pause_s, repeats in ((9.0, 225), (10.0, 250), (11.0, 251), (600.0, 251)):
+        sink = FilmSink(tmp_path / "film.mp4", 25.0)
+        for time_s, level in [(3.0, 50), (3.0 + pause_s, 150), (3.04 + pause_s, 200)]:
+            sink.add(_grey(level), time_s)
+        sink.close()
+        wanted = [50] * repeats + [150, 200]
+        assert np.allclose(_levels(tmp_path / "film.mp4"), wanted, atol=4)
+
+
 def test_without_a_picture_there_is_no_film(tmp_path):
     sink = FilmSink(tmp_path / "film.mp4", 25.0)
     with pytest.raises(UserError, match="has no picture"):
