@@ -89,6 +89,12 @@ def suitable_python() -> str:
     )
 
 
+def has_compiler() -> bool:
+    """Whether there is a C++ compiler that CMake finds: the one named by CXX, or a usual one."""
+    named = os.environ.get("CXX", "").split()[:1]
+    return any(shutil.which(name) for name in (*named, "c++", "g++", "clang++"))
+
+
 def make_venv() -> None:
     """Create the environment; one that an interruption left broken is made anew."""
     if VENV.exists() and not run(PYTHON, "-m", "pip", "--version", quiet=True):
@@ -252,8 +258,11 @@ def main() -> None:
         tell_what_stays()
     if PYTHON.exists() and read_stamp() == wanted:
         return
-    if shutil.which("c++") is None and shutil.which("g++") is None:
-        sys.exit("[setup] no C++ compiler found. Install one (Debian: apt-get install g++).")
+    if not has_compiler():
+        sys.exit(
+            "[setup] no C++ compiler found. Install one (Debian: apt-get install g++), or name "
+            "one: make setup CXX=/path/to/clang++"
+        )
     make_venv()
     if read_stamp().get("packages") != wanted["packages"]:  # a new environment has no stamp
         if not run(PYTHON, "-m", "uv", "--version", quiet=True):

@@ -109,6 +109,33 @@ def test_a_driver_that_torch_cannot_use_is_told(monkeypatch, capsys):
     assert len(ran) == 2
 
 
+@pytest.mark.parametrize(
+    ("named", "installed", "found"),
+    [
+        (None, ["g++"], True),
+        (None, ["clang++"], True),
+        (None, [], False),
+        ("", [], False),
+        (" ", ["/opt/gcc/bin/g++-12"], False),
+        ("/opt/gcc/bin/g++-12 -m64", ["/opt/gcc/bin/g++-12"], True),
+        ("/opt/gcc/bin/g++-12", [], False),
+    ],
+)
+def test_a_compiler_is_the_one_that_is_named_or_a_usual_one(
+    steps, monkeypatch, named, installed, found
+):
+    monkeypatch.delenv("CXX", raising=False)
+    if named is not None:
+        monkeypatch.setenv("CXX", named)
+    monkeypatch.setattr(setup_env.shutil, "which", lambda name: name in installed or None)
+    if found:
+        setup_env.main()
+        assert json.loads(setup_env.STAMP.read_text()) == WANTED
+    else:
+        with pytest.raises(SystemExit, match=r"no C\+\+ compiler found.*CXX="):
+            setup_env.main()
+
+
 def test_bytecode_is_no_source(tmp_path, monkeypatch):
     monkeypatch.setattr(setup_env, "ROOT", tmp_path)
     source = tmp_path / "kernels" / "draw.cpp"
