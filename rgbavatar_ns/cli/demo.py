@@ -1,7 +1,6 @@
 """`rgbavatar demo`: from nothing (or from a video) to a trained avatar, through nerfstudio."""
 
 import shutil
-import sys
 import time
 from pathlib import Path
 from typing import Annotated, Any
@@ -66,6 +65,7 @@ def run(
     stages = Stages(output, fresh=fresh, tell=_tell_stage)
     _require_counting(bool(video), head_only, frames)
     _require_same_people(stages, video, output)
+    commands.require_program("ns-train")  # now, not after minutes of tracking
     if video:
         if tiny and image_size is None:
             image_size = _TINY_PX
@@ -294,4 +294,4 @@ def _tell(summary: dict[str, Any], output: Path) -> None:
 
 def _command(program: str, *words: str | Path) -> str:
     """Of this environment."""
-    return command_line(Path(sys.executable).with_name(program), *words)
+    return command_line(commands.find_program(program) or program, *words)

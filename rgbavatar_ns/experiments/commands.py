@@ -1,9 +1,12 @@
 """nerfstudio's commands as child processes of this environment."""
 
 import os
+import shutil
 import signal
+import site
 import subprocess
 import sys
+import sysconfig
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -21,14 +24,40 @@ _QUIET = {
 }
 
 
+def find_program(name: str) -> Path | None:
+    """Where this environment has a program such as `ns-train`; else the PATH's; None without one.
+
+    A system's Python has its programs in another folder than itself, `pip install --user` in the
+    user's, and an environment with --system-site-packages uses the system's.
+    """
+    places = [sysconfig.get_path("scripts")]
+    if site.ENABLE_USER_SITE:
+        places.append(sysconfig.get_path("scripts", sysconfig.get_preferred_scheme("user")))
+    places.append(os.path.dirname(sys.executable))
+    found = shutil.which(name, path=os.pathsep.join(places)) or shutil.which(name)
+    return None if found is None else Path(found)
+
+
+def require_program(name: str) -> Path:
+    """As `find_program`; raises UserError where there is none."""
+    found = find_program(name)
+    if found is None:
+        raise UserError(
+            f"There is no {name} in the environment {sys.prefix}, nor on the PATH.",
+            f"Install the project there as docs/install.md says, or put {name}'s folder on the "
+            "PATH.",
+        )
+    return found
+
+
 def run_nerfstudio(*command: str | Path) -> None:
     """Run `ns-train`, `ns-eval` and the like; their output is shown as it comes.
 
     On Ctrl-C and SIGTERM the command is given the time to save what it has; it ends with this
-    process. Raises UserError where it ends with another exit code than 0, KeyboardInterrupt where
-    it was interrupted.
+    process. Raises UserError where it is not there or ends with another exit code than 0,
+    KeyboardInterrupt where it was interrupted.
     """
-    program = Path(sys.executable).with_name(str(command[0]))
+    program = require_program(str(command[0]))
     environment = _QUIET | os.environ | {PARENT_VARIABLE: str(os.getpid())}
     with subprocess.Popen([program, *map(str, command[1:])], env=environment) as process:
         try:

@@ -134,6 +134,15 @@ def test_a_video_and_the_demo_subject_do_not_replace_one_another(
     assert f"has the avatar of {who}." in refused("demo", "--output", "x", *options)
 
 
+def test_without_nerfstudios_commands_nothing_is_tracked(tmp_path, monkeypatch, refused):
+    (tmp_path / "me.mp4").touch()
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(demo.commands, "find_program", lambda name: None)
+    monkeypatch.setattr(demo, "_track", lambda *given: pytest.fail("it was tracked"))
+    assert "There is no ns-train in the environment" in refused("demo", "--video", "me.mp4")
+    assert shlex.split(demo._command("ns-viewer", "--help")) == ["ns-viewer", "--help"]
+
+
 @pytest.fixture
 def stages(monkeypatch):
     """Stands in for what takes long: the videos that were tracked, the methods trained."""

@@ -18,8 +18,31 @@ def test_each_end_is_told(tmp_path, monkeypatch, ending, error, told):
     program = tmp_path / "ns-train"
     program.write_text(f"#!/bin/sh\n{ending}\n")
     program.chmod(0o755)
-    monkeypatch.setattr(commands.sys, "executable", str(tmp_path / "python"))
+    monkeypatch.setattr(commands.sysconfig, "get_path", lambda *_: str(tmp_path))
     with pytest.raises(error, match=told):
+        commands.run_nerfstudio("ns-train")
+
+
+def test_a_program_is_found_where_this_environment_has_it(tmp_path, monkeypatch):
+    """From the first place to the last: its scripts, the user's, beside the interpreter, PATH."""
+    folders = [tmp_path / name for name in ("scripts", "user", "interpreter", "path")]
+    for folder in folders:
+        folder.mkdir()
+        (folder / "ns-train").touch()
+        (folder / "ns-train").chmod(0o755)
+    scripts, user, interpreter, path = folders
+    monkeypatch.setattr(
+        commands.sysconfig, "get_path", lambda name, scheme="": str(user if scheme else scripts)
+    )
+    monkeypatch.setattr(commands.site, "ENABLE_USER_SITE", True)
+    monkeypatch.setattr(commands.sys, "executable", str(interpreter / "python"))
+    monkeypatch.setenv("PATH", str(path))
+    for folder in folders:
+        assert commands.require_program("ns-train") == folder / "ns-train"
+        (folder / "ns-train").unlink()
+    assert commands.find_program("ns-train") is None
+    monkeypatch.setattr(commands.sys, "prefix", "/opt/env")
+    with pytest.raises(UserError, match="There is no ns-train in the environment /opt/env"):
         commands.run_nerfstudio("ns-train")
 
 
