@@ -1,5 +1,6 @@
 """CSV takes and datasets as performances."""
 
+import json
 import math
 
 import pytest
@@ -13,6 +14,7 @@ from rgbavatar_ns.driving.sources.paced import RecordedSource
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head.arkit import ARKIT_NAMES
 from rgbavatar_ns.synthetic import DemoConfig, make_demo_dataset
+from tests.plugin.tiny import tiny_dataset
 
 
 class _Clock:
@@ -201,3 +203,30 @@ def test_a_dataset_performs_with_its_own_theta_and_pictures(tmp_path):
     )
     faster = dataset_source(made.root, 50.0, False, False)
     assert [faster.next(0.0).time_s for _ in range(6)] == pytest.approx([k / 50 for k in range(6)])
+
+
+def test_frames_that_are_not_in_a_dataset_leave_a_gap_in_its_performance(tmp_path):
+    made = tiny_dataset(tmp_path / "data", frames=5, test=1)
+    path = tmp_path / "data" / "dataset.json"
+    written = json.loads(path.read_text())
+
+    def times_s(**columns: list[object]) -> list[tuple[int, float]]:
+        frames = [dict(frame) for frame in written["frames"]]
+        for name, values in columns.items():
+            for frame, value in zip(frames, values):
+                frame[name] = value
+        held_out = {"test": [frames[-1]["index"]]}
+        path.write_text(json.dumps({**written, "frames": frames} | held_out))
+        source, found = dataset_source(made.root, 10.0, False, False), []
+        while not source.ended:
+            frame = source.next(0.0)
+            place = int((made.theta - frame.theta).abs().sum(1).argmin())
+            found.append((place, round(frame.time_s, 6)))
+        return found
+
+    # Two faces were not found, and the list need not follow the film.
+    assert times_s(index=[12, 10, 15, 16, 11]) == [(1, 0), (4, 0.1), (0, 0.2), (2, 0.5), (3, 0.6)]
+    cameras = {"index": [0, 1, 2, 4, 5], "camera_name": list("abaab")}
+    steps = {"timestep": [7, 7, 8, 10, 11]}
+    assert times_s(**cameras, **steps) == [(0, 0), (2, 0.1), (3, 0.3)]
+    assert times_s(**cameras) == [(0, 0), (2, 0.1), (3, 0.2)]

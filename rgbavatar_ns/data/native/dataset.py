@@ -91,6 +91,31 @@ class TrackedDataset:
         listed, names = tuple(positions), self.camera_names
         return tuple(p for p in listed if not names or names[p] == names[listed[0]])
 
+    @property
+    def moments(self) -> tuple[int, ...]:
+        """When each frame was filmed, in frames of the film: what is not tracked leaves a gap.
+
+        Without timesteps one camera's numbers say it; of several, where numbers count all, the
+        place among the camera's own frames.
+        """
+        if self.timesteps or len(set(self.camera_names)) < 2:
+            return self.timesteps or self.frame_index
+        moments, counts = [0] * len(self), Counter[str]()
+        for position in sorted(range(len(self)), key=self.frame_index.__getitem__):
+            name = self.camera_names[position]
+            moments[position] = counts[name]
+            counts[name] += 1
+        return tuple(moments)
+
+    @property
+    def films(self) -> tuple[tuple[int, ...], ...]:
+        """Each camera's positions as they follow one another in time; the first frame's first."""
+        names, moments = self.camera_names or ("",) * len(self), self.moments
+        films: dict[str, list[int]] = {name: [] for name in names}
+        for position in sorted(range(len(self)), key=moments.__getitem__):
+            films[names[position]].append(position)
+        return tuple(map(tuple, films.values()))
+
     def read_image(self, position: int) -> UInt8[np.ndarray, "height width 4"]:
         """Decode one frame to RGBA, straight alpha, `UNFILMED_RGBA` where nobody filmed.
 

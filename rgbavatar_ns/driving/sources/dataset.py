@@ -15,11 +15,13 @@ def dataset_source(
 ) -> RecordedSource:
     """A dataset's frames of its first camera, at this rate or, by default, at the film's own.
 
-    Raises UserError where it cannot be read.
+    Each comes when it was filmed: those that are not in the dataset leave a gap. Raises UserError
+    where it cannot be read.
     """
     dataset = load_dataset(folder)
-    places, rate = dataset.of_one_camera(range(len(dataset))), frames_per_second
-    times_s = [number / (rate or dataset.playback_rate) for number in range(len(places))]
+    places, moments = dataset.films[0], dataset.moments
+    rate = frames_per_second or dataset.playback_rate
+    times_s = [(moments[place] - moments[places[0]]) / rate for place in places]
 
     def frame(number: int, captured_s: float) -> PerformanceFrame:
         place = places[number]
