@@ -66,15 +66,20 @@ def drive(
     own: TrainingStatistics,
     frames_per_second: float,
     options: DrivingOptions | None = None,
+    films: Sequence[Sequence[int]] | None = None,
 ) -> MappedTheta:
     """A whole performance as the avatar's theta: smoothed, relative, held.
 
-    `layout` and `own` are the avatar's: what its theta holds, and what it saw in training.
+    `layout` and `own` are the avatar's: what its theta holds, and what it saw in training. films:
+    rows that follow one another, a list for each camera; by default all as they come.
     """
     options = DrivingOptions() if options is None else options
     result = mapped.theta
     if options.smooth:
-        result = one_euro(result, frames_per_second, options.filter)
+        result = result.clone()
+        for rows in [range(len(result))] if films is None else films:
+            film = mapped.theta[list(rows)]
+            result[list(rows)] = one_euro(film, frames_per_second, options.filter)
     references = reference_of(result, layout), own_reference(own)
     result = relative_theta(result, *references, mapped.known, own, layout, options)
     return replace(mapped, theta=result)

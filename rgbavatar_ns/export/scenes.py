@@ -89,7 +89,8 @@ def driven_by(
     Raises UserError where no expression of the driver is known to the avatar.
     """
     mapped = theta_map(driver.layout, driver.arrays, avatar)(driver.theta)
-    mapped = drive(mapped, avatar.layout, own, frames_per_second, options)
+    # What each camera saw is smoothed by itself: of several, a moment's rows lie side by side.
+    mapped = drive(mapped, avatar.layout, own, frames_per_second, options, driver.films)
     return replace(mapped, theta=mapped.theta[list(chosen)])
 
 

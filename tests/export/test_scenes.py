@@ -6,10 +6,12 @@ import pytest
 import torch
 
 from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
+from rgbavatar_ns.driving.transfer import DrivingOptions
 from rgbavatar_ns.export import front_camera
 from rgbavatar_ns.export.scenes import (
     TURNTABLE_FRAMES,
     Scene,
+    driven_by,
     orbiting,
     told_beyond_film,
     turned,
@@ -17,6 +19,7 @@ from rgbavatar_ns.export.scenes import (
 )
 from rgbavatar_ns.head import turn_seen
 from rgbavatar_ns.kernels import PinholeCameras
+from tests.plugin.tiny import tiny_dataset
 
 from .subject import avatar_of, lively_theta
 
@@ -111,6 +114,30 @@ def test_a_held_frame_keeps_its_own_camera(avatar):
     held = scene.held(2, 10)
     assert torch.equal(held.cameras.world_to_camera, views[2:])
     assert len(held.theta) == 10
+
+
+def test_a_driver_that_several_cameras_filmed_is_smoothed_as_one_of_one_camera(tmp_path, seen):
+    driver = tiny_dataset(tmp_path / "driver", frames=12, test=1)
+    avatar = avatar_of(num_bases=0, arrays=driver.arrays)
+    theta = driver.theta + 0.03 * torch.randn(
+        driver.theta.shape, generator=torch.Generator().manual_seed(2)
+    )
+    alone = replace(driver, theta=theta[:4], frame_index=(0, 1, 2, 3), image_paths=[tmp_path] * 4)
+    order = torch.tensor([0, 0, 0, 2, 2, 2, 1, 1, 1, 3, 3, 3])
+    several = replace(
+        driver,
+        theta=theta[order],
+        timesteps=tuple(order.tolist()),
+        camera_names=tuple("abcabcabcabc"),
+    )
+    options = DrivingOptions(relative="off", pose="absolute", smooth=True)
+    chosen = several.of_one_camera(range(len(several)))
+    one, many = (
+        driven_by(avatar, film, places, seen, 25.0, options).theta
+        for film, places in ((alone, range(4)), (several, chosen))
+    )
+    assert torch.equal(many, one[[0, 2, 1, 3]])
+    assert not torch.allclose(one, theta[:4], atol=0.01), "else nothing was smoothed"
 
 
 def test_what_goes_beyond_the_film_is_told_and_counted(avatar, seen):
