@@ -1,7 +1,6 @@
 """The panel: what its controls do to the picture, without a browser."""
 
 from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 import torch
@@ -17,7 +16,7 @@ from rgbavatar_ns.plugin.viewer.sliders import on_step
 from rgbavatar_ns.plugin.viewer.viewpoint import Viewpoint
 from tests.plugin.desk import Desk, rendered, rendered_depth
 from tests.plugin.fake_viewer import FakeViewer
-from tests.plugin.tiny import NUM_FRAMES, tiny_dataset
+from tests.plugin.tiny import NUM_FRAMES
 
 
 def test_without_a_viewer_the_cameras_time_chooses_and_the_ground_is_black(
@@ -265,37 +264,6 @@ def test_one_basis_alone_is_base_and_basis_on_the_neutral_frame(desk: Desk):
     assert torch.allclose(desk.picture(), desk.white(seen.theta_neutral[None], psi), atol=1e-5)
     desk.set("Show one alone", "none")
     assert torch.equal(desk.picture(), desk.white(desk.model.frame_theta[0:1]))
-
-
-def test_a_driver_plays_on_this_avatar(desk: Desk, tmp_path: Path):
-    other = tiny_dataset(tmp_path / "other", frames=6, test=1)
-    desk.panel.load_driver(str(tmp_path / "other"), "off")
-    state = desk.panel.state
-    assert (state.driven_by, len(state.sequence)) == ("driving sequence", 6)
-    jaw = desk.model.avatar.layout.slice("jaw")
-    assert torch.allclose(state.sequence[:, jaw], other.theta[:, jaw])
-    first = desk.picture()
-    desk.set("Driver's frame", 3)
-    assert (desk.picture() - first).abs().max() > 0.01
-    desk.panel.advance()
-    assert desk.panel.state.sequence_frame == 4
-    # Its pictures are another person's: there is nothing to compare with.
-    desk.panel.change(picture="error")
-    assert desk.picture().shape == first.shape
-    assert "no film to compare" in desk.told()
-
-
-@pytest.mark.parametrize("folder", ["", "/nowhere/at/all"])
-def test_a_driver_that_is_none_is_told_in_the_panel(desk: Desk, folder: str):
-    desk.panel.load_driver(folder, "neutral")
-    assert desk.panel.state.driven_by == "dataset frame"
-    assert "Cannot be shown" in desk.told()
-
-
-def test_the_sequence_cannot_be_chosen_before_it_is_there(desk: Desk):
-    desk.set("Driven by", "driving sequence")
-    assert "Load a driver" in desk.told()
-    assert desk.viewer.gui["Driven by"].value == "dataset frame"
 
 
 def test_trouble_is_told_and_the_plain_avatar_drawn(desk: Desk):

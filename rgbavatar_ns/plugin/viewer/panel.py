@@ -94,6 +94,8 @@ class ViewerPanel(ViewerControl):
         self._told = self._played = self._report
         self._next_told_s = self._next_frame_s = self._played_s = 0.0
         self._may_refine = True
+        self._rates: dict[DrivenBy, float] = {}
+        self._plays: DrivenBy = "dataset frame"
         self._calibrate: Callable[[], None] = lambda: None
         self._drawn_live: Callable[[ViewerState], None] = lambda state: None
         serve_sharp_client()
@@ -114,7 +116,7 @@ class ViewerPanel(ViewerControl):
         self._seen = seen = FilmSeen(self._model)
         self._beyond = seen.beyond
         gui = viewer.viser_server.gui
-        rate = self.state.frames_per_second
+        self._rates["dataset frame"] = rate = self.state.frames_per_second
         self._widgets = Widgets(gui, self, seen.sliders, seen.statistics, self._num_frames, rate)
         viewpoint = Viewpoint.before(self._model.avatar, self._model.subject)
         viewer.viser_server.scene.set_up_direction("+z")
@@ -181,8 +183,15 @@ class ViewerPanel(ViewerControl):
                 self._widgets.tell(report.trouble)
 
     def change(self, **values: Any) -> None:
-        """Replace parts of the state by name and draw anew, if any is another than before."""
+        """Replace parts of the state by name and draw anew, if any is another than before.
+
+        Film and driver play at their own rates: whichever comes in the other's place brings its.
+        """
         with self._changing:
+            plays = values.get("driven_by", self._plays)
+            if plays in self._rates and plays != self._plays:
+                self._plays = plays
+                values = {"frames_per_second": self._rates[plays]} | values
             if all(_same(getattr(self.state, name), value) for name, value in values.items()):
                 return
             self.state = replace(self.state, **values)
@@ -247,7 +256,7 @@ class ViewerPanel(ViewerControl):
             mapped = driven_by(
                 self._model.avatar,
                 driver,
-                range(len(driver)),
+                driver.of_one_camera(range(len(driver))),
                 training_statistics(self._model),
                 driver.playback_rate,
                 DrivingOptions(relative=relative),  # type: ignore[arg-type]
@@ -265,7 +274,9 @@ class ViewerPanel(ViewerControl):
         self.tell(
             f"{len(mapped.theta)} frames of {driver.root}{left_out}{beyond and f', {beyond}'}"
         )
-        self.change(driven_by="driving sequence", sequence=mapped.theta, sequence_frame=0)
+        self._rates["driving sequence"] = rate = driver.playback_rate
+        playing: dict[str, Any] = {"driven_by": "driving sequence", "frames_per_second": rate}
+        self.change(sequence=mapped.theta, sequence_frame=0, **playing)
 
     def listen_live(
         self, calibrate: Callable[[], None], drawn: Callable[[ViewerState], None]

@@ -21,6 +21,7 @@ from rgbavatar_ns.plugin.viewer.viewer_state import DrivenBy, PictureKind, Viewe
 _TOPMOST = -1.0
 _STRONGEST = 12
 _NO_BASIS = "none"
+_HIGHEST_RATE = 60
 _Number = int | float
 
 
@@ -71,6 +72,7 @@ class Widgets:
         """Bring the controls to the panel's state."""
         _put(self._driven_by, state.driven_by)
         _put(self._frame, state.frame)
+        _put(self._rate, _shown_rate(state.frames_per_second))
         if self._sequence_frame is not None:
             _put(self._sequence_frame, state.sequence_frame)
         _put(self._by_hand, state.psi_by_hand is not None)
@@ -132,8 +134,10 @@ class Widgets:
         hint = "Frames one after the other, round and round"
         play = gui.add_checkbox("Play", False, hint=hint)
         _on(play, do.play)
-        rate = min(max(round(frames_per_second), 1), 60)
-        self._slider("Frames/s", (1, 60, 1), rate, lambda v: do.change(frames_per_second=float(v)))
+        rate = _shown_rate(frames_per_second)
+        self._rate = self._slider(
+            "Frames/s", (1, _HIGHEST_RATE, 1), rate, lambda v: do.change(frames_per_second=float(v))
+        )
         self._button("Neutral", do.show_neutral, "Drive by hand from the most neutral frame")
         hint = "Within what was seen in training"
         self._button("Random expression", do.show_random_expression, hint)
@@ -235,6 +239,10 @@ class Widgets:
 
     def _button(self, label: str, done: Callable[[], None], hint: str) -> None:
         self._gui.add_button(label, hint=hint).on_click(lambda _: done())
+
+
+def _shown_rate(frames_per_second: float) -> int:
+    return min(max(round(frames_per_second), 1), _HIGHEST_RATE)
 
 
 def _on(handle: Any, done: Callable[[Any], None]) -> Any:
