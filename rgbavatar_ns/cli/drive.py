@@ -38,7 +38,7 @@ class SourceOptions(CheckedOptions):
     """Let other machines reach what listens. Nothing is encrypted."""
     source_frames_per_second: FrameRate | None = None
     """Of a dataset (by default the film's own, or 25) or a CSV file (by
-    default what its timecodes count to, else 60)."""
+    default what its timecodes tell, else 60)."""
     head_angles: tuple[float, float, float] = (1.0, 1.0, 1.0)
     """Factors of the head's yaw, pitch and roll from arkit and CSV: -1 mirrors, .01745 is for
     senders of degrees."""

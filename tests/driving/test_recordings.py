@@ -144,6 +144,60 @@ def test_timecodes_tell_how_many_frames_a_second_has(tmp_path, rate, first):
     assert times_s == pytest.approx([k / rate for k in range(2 * rate)], abs=1e-6)
 
 
+def _spoilt(codes: list[str], how: str) -> list[str]:
+    codes = list(codes)
+    if how == "one comes twice":
+        codes[40] = codes[39]
+    elif how == "one is missing":
+        codes[40] = ""
+    elif how == "one a second is missing":
+        codes[::30] = [""] * len(codes[::30])
+    elif how == "it goes back":
+        codes[70] = codes[10]
+    elif how == "the take was paused":
+        codes[60:] = [code.replace("10:00", "14:00") for code in codes[60:]]
+        codes[40] = codes[39]
+    return codes
+
+
+@pytest.mark.parametrize("rate", [24, 25, 30, 60])
+@pytest.mark.parametrize(
+    "how",
+    ["one comes twice", "one is missing", "one a second is missing", "it goes back",
+     "the take was paused"],
+)  # fmt: skip
+def test_spoilt_timecodes_still_tell_how_many_frames_a_second_has(tmp_path, rate, how):
+    codes = _spoilt(_codes(rate, 4 * rate, 7), how)
+    source = csv_source(
+        _take(tmp_path, "Timecode,JawOpen", [f"{code},0.5" for code in codes]), None, False
+    )
+    times_s = [source.next(0.0).time_s for _ in codes]
+    assert times_s == pytest.approx([k / rate for k in range(4 * rate)], abs=1e-6)
+
+
+def test_sixty_rows_a_second_whose_timecodes_count_to_thirty_stay_sixty(tmp_path):
+    rows = [f"{code},0.5" for code in _codes(30, 90, 5) for _ in range(2)]
+    source = csv_source(_take(tmp_path, "Timecode,JawOpen", rows), None, False)
+    times_s = [source.next(0.0).time_s for _ in rows]
+    assert times_s == pytest.approx([k / 60 for k in range(180)], abs=1e-6)
+
+
+@pytest.mark.parametrize("rate", [25, 60])
+def test_a_take_that_passes_midnight_goes_on(tmp_path, rate):
+    codes = [
+        f"{k // 3600 % 24:02}:{k // 60 % 60:02}:{k % 60:02}:{frame:02}"
+        for k in range(24 * 3600 - 2, 24 * 3600 + 2)
+        for frame in range(rate)
+        if frame != 3  # a gap, which only timecodes tell
+    ]
+    source = csv_source(
+        _take(tmp_path, "Timecode,JawOpen", [f"{code},0.5" for code in codes]), None, False
+    )
+    times_s = [source.next(0.0).time_s for _ in codes]
+    wanted = [k / rate for k in range(4 * rate) if k % rate != 3]
+    assert times_s == pytest.approx(wanted, abs=1e-6)
+
+
 def test_what_is_asked_for_or_usual_holds_where_timecodes_show_no_rate(tmp_path):
     def last_s(codes: list[str], rate: float | None) -> float:
         rows = [f"{code},0.5" for code in codes]

@@ -5,6 +5,7 @@ import io
 import itertools
 import math
 import re
+import statistics
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -22,9 +23,14 @@ from rgbavatar_ns.reading import DamagedFileError, read_file
 _FRAMES_PER_SECOND = 60.0
 """Of Live Link Face."""
 _USUAL_RATES = (24.0, 25.0, 30.0, 48.0, 50.0, 60.0)
+_NEAR_A_RATE = 0.1
+"""How far from a usual rate counted rows may be, as a share of it: some are lost or come twice."""
+_DAY_S = 24 * 3600
 _MOST_BYTES = 1 << 28
 """An hour at 60 frames a second has 150 MB."""
 _TIMECODE = re.compile(r"(\d{1,3}):(\d{1,2}):(\d{1,2}):(\d{1,3})(?:\.(\d+))?")
+_Code = tuple[int, float]
+"""A timecode's seconds and frames."""
 _REMEDY = (
     "Give the CSV file of a take of Live Link Face: a row of names (EyeBlinkLeft, JawOpen, ...), "
     "then a row of numbers for each frame."
@@ -40,9 +46,9 @@ def csv_source(
     """The rows of a CSV file; columns are known by their names, in any order and case.
 
     Timecodes (hours:minutes:seconds:frames, of a take with so many `frames_per_second`; by default
-    as many as they count to, else 60) tell the time; where they are missing or stand still, each
-    row is the next frame. Rows without numbers, as the app leaves where it lost the face, are
-    passed over. angle_gain: of yaw, pitch and roll.
+    as many as they count to) tell the time; where they are missing or stand still, each row is the
+    next frame, of so many a second as the timecodes have rows, else of 60. Rows without numbers,
+    as the app leaves where it lost the face, are passed over. angle_gain: of yaw, pitch and roll.
     Raises UserError where the file cannot be read or has no such column.
     """
     names, rows = _read(path)
@@ -107,23 +113,21 @@ def _timed(
 def _moments_s(
     names: list[str], rows: list[list[str]], frames_per_second: float | None
 ) -> list[float]:
-    """The time of each row by its timecode; by its place where those tell nothing."""
-    even = [place / (frames_per_second or _FRAMES_PER_SECOND) for place in range(len(rows))]
+    """The time of each row by its timecode; by its place where one is missing or does not rise."""
     clock = next((k for k, name in enumerate(names) if name.strip().lower() == "timecode"), None)
-    if clock is None:
-        return even
-    codes = [_timecode(row[clock]) for row in rows if len(row) > clock]
+    texts = ["" if clock is None or len(row) <= clock else row[clock] for row in rows]
+    codes = _over_midnight([_timecode(text) for text in texts])
     told = [code for code in codes if code is not None]
-    if len(told) < len(rows):
-        return even
-    rate = frames_per_second or _rate_of(told) or _FRAMES_PER_SECOND
-    moments = [seconds + frames / rate for seconds, frames in told]
-    if any(later <= earlier for earlier, later in itertools.pairwise(moments)):
-        return even  # a clock that stands or goes back tells nothing
-    return [moment - moments[0] for moment in moments]
+    if len(told) == len(rows):
+        rate = frames_per_second or _rate_of(told) or _FRAMES_PER_SECOND
+        moments = [seconds + frames / rate for seconds, frames in told]
+        if all(earlier < later for earlier, later in itertools.pairwise(moments)):
+            return [moment - moments[0] for moment in moments]
+    rate = frames_per_second or _rows_a_second(codes) or _FRAMES_PER_SECOND
+    return [place / rate for place in range(len(rows))]
 
 
-def _timecode(text: str) -> tuple[int, float] | None:
+def _timecode(text: str) -> _Code | None:
     """Seconds and frames of hours:minutes:seconds:frames.part; None for anything else."""
     read = _TIMECODE.fullmatch(text.strip())
     if read is None:
@@ -133,7 +137,38 @@ def _timecode(text: str) -> tuple[int, float] | None:
     return 3600 * hours + 60 * minutes + seconds, frames + part
 
 
-def _rate_of(codes: list[tuple[int, float]]) -> float | None:
+def _over_midnight(codes: list[_Code | None]) -> list[_Code | None]:
+    """The codes with seconds that go on where the day's begin again."""
+    days, last_s, result = 0, 0, list[_Code | None]()
+    for code in codes:
+        if code is not None:
+            days += last_s - code[0] > _DAY_S / 2
+            last_s, code = code[0], (code[0] + days * _DAY_S, code[1])
+        result.append(code)
+    return result
+
+
+def _rows_a_second(codes: list[_Code | None]) -> float | None:
+    """The usual rate nearest to the rows of most seconds told; None without one near.
+
+    Codes may count to another number: a take of 60 rows a second has each of 30 twice.
+    """
+    begins: list[tuple[int, int]] = []
+    before = None
+    for place, code in enumerate(codes):
+        if code is not None:
+            if before is not None and code[0] != before:
+                begins.append((place, code[0]))
+            before = code[0]
+    whole = [b[0] - a[0] for a, b in itertools.pairwise(begins) if b[1] - a[1] == 1]
+    if not whole:
+        return None
+    counted = statistics.median_high(whole)  # a clock that jumps cuts some seconds short
+    nearest = min(_USUAL_RATES, key=lambda rate: abs(rate - counted))
+    return nearest if abs(nearest - counted) <= _NEAR_A_RATE * nearest else None
+
+
+def _rate_of(codes: list[_Code]) -> float | None:
     """Frames a second that timecodes count to, one of the usual; None where they do not show it.
 
     They do where a second ends: its last frame has the greatest number, which may be missing once.
