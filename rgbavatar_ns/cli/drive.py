@@ -170,7 +170,10 @@ def _performer(
         return vmc.VmcSource(listen or vmc.DEFAULT_ADDRESS, remote)
     if name == "websocket":
         own = PerformerHead(subject.avatar.layout, subject.avatar.head.arrays)
-        opened = web_socket.WebSocketSource(own, listen or web_socket.DEFAULT_ADDRESS, remote)
+        if (trouble := web_socket.arkit_trouble(subject.avatar)) is not None:
+            _tell(f'Only "theta" moves this avatar, not "arkit": {trouble}')
+        address = listen or web_socket.DEFAULT_ADDRESS
+        opened = web_socket.WebSocketSource(own, address, remote, trouble)
         keyed = f"from a page of the disk: ws://{opened.keyed_address}"
         _tell(f"Messages are taken at ws://{opened.address} ({keyed})")
         return opened

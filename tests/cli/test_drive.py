@@ -10,6 +10,7 @@ import threading
 import time
 import urllib.request
 from pathlib import Path
+from types import SimpleNamespace
 
 import av
 import numpy as np
@@ -18,11 +19,15 @@ import torch
 from websockets.sync.client import connect
 
 from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
+from rgbavatar_ns.cli import drive
 from rgbavatar_ns.cli.drive import SourceOptions
 from rgbavatar_ns.cli.main import main
 from rgbavatar_ns.data import DatasetWriter, TrackedFrame
+from rgbavatar_ns.driving.live_transfer import LiveTransfer
+from rgbavatar_ns.driving.source import PerformanceFrame
 from rgbavatar_ns.export import front_camera, pictures, write_video
 from rgbavatar_ns.tracking.face.detector import INSTALL_MEDIAPIPE
+from tests.avatar.small_head import small_head_arrays
 from tests.driving.packets import packet
 from tests.export.subject import avatar_of, lively_theta
 
@@ -165,6 +170,22 @@ def test_the_key_for_pages_of_the_disk_is_told_in_the_terminal_once(avatar, caps
     ]
     assert len(keyed) == 1
     assert any(line.startswith("Waiting for messages") for line in lines)
+
+
+@pytest.mark.parametrize("with_a_face", [True, False])
+def test_what_arkit_takes_is_made_before_the_first_message(with_a_face, capsys):
+    avatar = avatar_of(arrays=None if with_a_face else small_head_arrays())
+    options = SourceOptions(source="websocket", listen="127.0.0.1:0")
+    source = drive._performer(SimpleNamespace(avatar=avatar), options, True, False)
+    source.close()
+    assert ("arkit" in vars(avatar)) == with_a_face
+    told = capsys.readouterr().err
+    assert ('Only "theta" moves this avatar' in told) != with_a_face
+    camera, theta = front_camera(avatar, _SIZE, _SIZE), torch.zeros(1, avatar.layout.size)
+    views = camera.world_to_camera
+    own = TrainingStatistics.of(theta, torch.zeros(1, 1), avatar.layout, views)
+    transfer = LiveTransfer(avatar, own, source.head, camera)
+    assert transfer(PerformanceFrame(0, 0.0, 0.0, theta=theta[0])).isfinite().all()
 
 
 @pytest.mark.parametrize(

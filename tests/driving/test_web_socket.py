@@ -8,10 +8,12 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from rgbavatar_ns.driving.source import PerformerHead
-from rgbavatar_ns.driving.sources.web_socket import WebSocketSource
+from rgbavatar_ns.driving.sources.web_socket import WebSocketSource, arkit_trouble
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadArrays, HeadModel
 from rgbavatar_ns.head.arkit import ARKIT_NAMES
+from tests.avatar.small_head import small_head_arrays
+from tests.export.subject import avatar_of
 
 _HEAD = HeadModel.embedded()
 
@@ -80,6 +82,29 @@ def test_what_cannot_be_used_is_answered_with_the_reason(source, text, told):
     assert frame.coefficients.max() == 1.0
     assert source.counts["unreadable"] == 1
     assert source.counts["values beyond 0..1"] == 1
+
+
+def test_an_avatar_that_arkit_cannot_move_follows_theta_and_the_sender_is_told():
+    avatar = avatar_of(arrays=small_head_arrays())
+    trouble = arkit_trouble(avatar)
+    assert trouble is not None
+    assert arkit_trouble(avatar_of()) is None
+    own = PerformerHead(avatar.layout, avatar.head.arrays)
+    source = WebSocketSource(own, "127.0.0.1:0", without_arkit=trouble)
+    assert '"arkit"' not in source.waits_for
+    try:
+        with connect(f"ws://{source.address}") as client:
+            _say(client, type="arkit", coefficients={"jawOpen": 0.4})
+            answer = json.loads(client.recv(timeout=2.0))
+            assert f'"arkit" cannot move this avatar: {trouble.cause}' in answer["text"]
+            theta = torch.linspace(-0.1, 0.1, avatar.layout.size)
+            _say(client, type="theta", theta=theta.tolist())
+            frame = source.next(2.0)
+    finally:
+        source.close()
+    assert frame.coefficients is None
+    torch.testing.assert_close(frame.theta, theta)
+    assert source.counts["unreadable"] == 1
 
 
 def test_the_newest_message_counts_and_the_last_who_came(source):

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.server import ServerConnection
 
+from rgbavatar_ns.avatar.method import AvatarMethod
 from rgbavatar_ns.driving.local_server import LocalServer
 from rgbavatar_ns.driving.messages import (
     SentPerformance,
@@ -25,12 +26,25 @@ _MOST_TOLD = 20
 """Different faults of one sender that it is told."""
 
 
+def arkit_trouble(avatar: AvatarMethod) -> UserError | None:
+    """Why an avatar cannot follow ARKit's coefficients; None where it can.
+
+    Takes seconds with FLAME, once: the first message would wait for it.
+    """
+    try:
+        _ = avatar.arkit
+    except UserError as error:
+        return error
+    return None
+
+
 class WebSocketSource:
     """Listens for JSON messages "arkit" and "theta" (`driving.messages`); the newest wins.
 
-    avatar_head: in whose layout "theta" comes. Whoever connected last is followed. What cannot be
-    used is counted, and the sender is told why ({"type": "error"}), once for each reason. Raises
-    UserError as `LocalServer`.
+    avatar_head: in whose layout "theta" comes. without_arkit: why the avatar cannot follow "arkit",
+    if it cannot (`arkit_trouble`). Whoever connected last is followed. What cannot be used is
+    counted, and the sender is told why ({"type": "error"}), once for each reason. Raises UserError
+    as `LocalServer`.
     """
 
     ended = False
@@ -40,8 +54,9 @@ class WebSocketSource:
         avatar_head: PerformerHead,
         listen: str = DEFAULT_ADDRESS,
         allow_remote: bool = False,
+        without_arkit: UserError | None = None,
     ) -> None:
-        self.head = avatar_head
+        self.head, self._without_arkit = avatar_head, without_arkit
         self.counts = Counter[str]()
         self._changed = threading.Condition()
         self._newest: tuple[float, SentPerformance] | None = None
@@ -49,7 +64,8 @@ class WebSocketSource:
         self._index = 0
         self._server = LocalServer(listen, allow_remote, self._talk)
         # Pages show it, also to others: without the key.
-        self.waits_for = f'messages "arkit" or "theta" at ws://{self._server.address}'
+        kinds = '"arkit" or "theta"' if without_arkit is None else '"theta"'
+        self.waits_for = f"messages {kinds} at ws://{self._server.address}"
 
     @property
     def address(self) -> str:
@@ -89,6 +105,8 @@ class WebSocketSource:
                         check_hello(message)
                         continue
                     sent = parse_performance(message, self.head.layout)
+                    if sent.coefficients is not None and (why := self._without_arkit) is not None:
+                        raise UserError(f'"arkit" cannot move this avatar: {why.cause}', why.remedy)
                 except UserError as error:
                     self._count("unreadable")
                     if error.cause not in told and len(told) < _MOST_TOLD:
