@@ -213,6 +213,8 @@ def _scene(
     rate = picture.frames_per_second or other.playback_rate
     chosen = chosen_frames(len(other), frames, other.of_one_camera(range(len(other))))
     mapped = driven_by(subject.avatar, other, chosen, subject.seen, rate, driving)
+    if mapped.told:
+        print(mapped.told)
     if mapped.unmapped:
         print(f"not known to the avatar, left out: {', '.join(mapped.unmapped)}")
     if mapped.missing:

@@ -1,4 +1,4 @@
-"""Another head's theta in the avatar's layout: by name, or by what ARKit calls the expressions."""
+"""Another head's theta in the avatar's layout: by name, by ARKit's names, or by what it moves."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -11,6 +11,7 @@ from rgbavatar_ns.avatar.method import AvatarMethod
 from rgbavatar_ns.errors import UserError, first_few
 from rgbavatar_ns.head import HeadArrays, ThetaLayout
 from rgbavatar_ns.head.arkit import arkit_map, head_carrier, speaks_arkit
+from rgbavatar_ns.head.expression_bases import ExpressionFit, expression_fit
 from rgbavatar_ns.head.layout import CARRIER_FIELDS
 from rgbavatar_ns.head.rotations import axis_angle_to_matrix, matrix_to_axis_angle
 
@@ -55,6 +56,8 @@ class MappedTheta:
     """The driver's numbers that the avatar does not know."""
     missing: tuple[str, ...] = ()
     """The avatar's numbers that the driver does not know."""
+    told: str = ""
+    """What else the user should know of the way; empty where numbers go by their names."""
 
 
 ThetaMap = Callable[[Float[Tensor, "F G"]], MappedTheta]
@@ -64,13 +67,16 @@ ThetaMap = Callable[[Float[Tensor, "F G"]], MappedTheta]
 def theta_map(layout: ThetaLayout, arrays: HeadArrays, avatar: AvatarMethod) -> ThetaMap:
     """The way from the theta of a driver's head (`layout`, `arrays`) to the avatar's.
 
-    By name where a name is shared; from a head with ARKit's names to any other head through
-    ARKit's coefficients (`AvatarMethod.arkit`). Raises UserError where neither is possible.
+    By name where a name is shared, nameless expressions of another FLAME by what they move
+    (`expression_fit`); from a head with ARKit's names to any other head through ARKit's
+    coefficients (`AvatarMethod.arkit`). Raises UserError where neither is possible.
     """
     driver = ThetaNames.of(layout, arrays)
     own = ThetaNames.of(avatar.layout, avatar.head.arrays)
     if set(driver.expression_names) & set(own.expression_names) or not speaks_arkit(arrays):
-        return NamedMap(driver, own)
+        fit = expression_fit(arrays, avatar.head.arrays)
+        told = "" if fit is None else _told(fit, arrays.name, avatar.head.arrays.name)
+        return NamedMap(driver, own, fit, told)
     theirs, ours = arkit_map(arrays), avatar.arkit
 
     def by_arkit(theta: Float[Tensor, "F G"]) -> MappedTheta:
@@ -96,20 +102,33 @@ class NamedMap:
     """Theta of one head model in the layout of another, number by number by its name.
 
     Between a head and one upon shoulders the head's whole turn goes to the joint that carries it;
-    what a head alone says of place and turn is nothing that shoulders have to follow. Raises
-    UserError where not a single expression has a name that the avatar knows.
+    what a head alone says of place and turn is nothing that shoulders have to follow. Where names
+    mean something else in each, `fit` makes all expressions of all. Raises UserError where not a
+    single expression has a name that the avatar knows.
     """
 
-    def __init__(self, driver: ThetaNames, avatar: ThetaNames) -> None:
+    def __init__(
+        self,
+        driver: ThetaNames,
+        avatar: ThetaNames,
+        fit: ExpressionFit | None = None,
+        told: str = "",
+    ) -> None:
         _require_a_shared_name(driver, avatar)
-        self._driver, self._avatar = driver.layout, avatar.layout
+        self._driver, self._avatar, self._told = driver.layout, avatar.layout, told
+        self._table = None if fit is None else torch.from_numpy(fit.table)
         place_of = {name: place for place, name in enumerate(driver.numbers)}
         wanted = avatar.numbers
         named = torch.tensor([name in place_of for name in wanted])
         self._to = torch.nonzero(named)[:, 0]
         self._from = torch.tensor([place_of[name] for name in wanted if name in place_of])
-        self._unmapped = tuple(name for name in driver.numbers if name not in wanted)
-        self._missing = tuple(name for name in wanted if name not in place_of)
+        known, by_driver = set(wanted), set(place_of)
+        if fit is not None:
+            named[avatar.layout.slice("expression")] = True
+            known |= set(driver.expression_names)
+            by_driver |= set(avatar.expression_names)
+        self._unmapped = tuple(name for name in driver.numbers if name not in known)
+        self._missing = tuple(name for name in wanted if name not in by_driver)
         self._known, self._carrier = named, None
         if driver.has_shoulders != avatar.has_shoulders:
             self._carrier, other = (
@@ -131,13 +150,23 @@ class NamedMap:
             )
         result = theta.new_zeros(len(theta), self._avatar.size)
         result[:, self._to] = theta[:, self._from]
+        if self._table is not None:
+            expression = theta[:, self._driver.slice("expression")]
+            result[:, self._avatar.slice("expression")] = expression @ self._table.to(theta)
         if self._carrier is not None:
             parts = self._driver.split(theta)
             root, neck = (axis_angle_to_matrix(parts[name]) for name in CARRIER_FIELDS)
             result[:, self._avatar.slice(self._carrier)] = matrix_to_axis_angle(root @ neck)
             for numbers in self._stays:
                 result[:, numbers] = 0
-        return MappedTheta(result, self._known, self._unmapped, self._missing)
+        return MappedTheta(result, self._known, self._unmapped, self._missing, self._told)
+
+
+def _told(fit: ExpressionFit, driver: str, avatar: str) -> str:
+    return (
+        f"the driver's expressions are those of {driver}, the avatar's of {avatar}: they are "
+        f"fitted, {100 * fit.left_over:.0f} % of their motion is left out"
+    )
 
 
 def _require_a_shared_name(driver: ThetaNames, avatar: ThetaNames) -> None:

@@ -6,6 +6,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from rgbavatar_ns.head.arrays import HeadArrays
+from rgbavatar_ns.head.expression_bases import DIRECTION_PRIOR_M
 from rgbavatar_ns.head.layout import ThetaLayout
 from rgbavatar_ns.head.model import HeadModel
 from rgbavatar_ns.head.registration import register
@@ -17,11 +18,8 @@ leaves less than half of what it has misjudged."""
 _SLOPE_STEP = 1e-5
 _STILL_M = 1e-3
 """What moves all points together by less has nothing to follow: the eyes' turns, the tongue."""
-_PRIOR_M = 0.006
-"""A unit of a direction costs as much as this much motion left over on a single one of the face's
-points: FLAME's later directions are weak, and tens of units of them would wrinkle a person."""
 _JAW_PRIOR_M = 0.002
-"""The same for a radian of the jaw, which costs no more than it explains."""
+"""`DIRECTION_PRIOR_M` for a radian of the jaw, which costs no more than it explains."""
 
 
 def fitted_table(
@@ -47,7 +45,7 @@ def fitted_table(
     corners = torch.from_numpy(arrays.faces[places.triangle].astype(np.int64))
     barycentric = torch.from_numpy(places.barycentric)
     free = _free_columns(layout)
-    prior_m = np.full(len(free), _PRIOR_M)
+    prior_m = np.full(len(free), DIRECTION_PRIOR_M)
     jaw = layout.slice("jaw")
     prior_m[(free >= jaw.start) & (free < jaw.stop)] = _JAW_PRIOR_M
 

@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import av
@@ -14,7 +15,7 @@ import torch
 from rgbavatar_ns.cli import main as cli
 from rgbavatar_ns.data import DatasetWriter, TrackedFrame
 from rgbavatar_ns.data.png import encode_png_rgba, read_png_rgba
-from rgbavatar_ns.export import front_camera, pictures
+from rgbavatar_ns.export import front_camera, pictures, scenes
 from tests.export.subject import avatar_of, camera_path, lively_theta
 
 _SIZE, _FRAMES, _HELD_OUT = 32, 7, 3
@@ -192,6 +193,18 @@ def test_of_several_cameras_one_is_shown(bundle, data, tmp_path):
     assert len(_film(tmp_path / "performance.mp4")) == 2, "frames 4 and 6 of 4 to 6"
     _render(bundle, tmp_path, *words, "--driver", folder)
     assert len(_film(tmp_path / "performance.mp4")) == 4
+
+
+def test_what_a_driver_has_of_its_own_is_told(bundle, data, tmp_path, monkeypatch, capsys):
+    driven_by = scenes.driven_by
+
+    def mapped(*given):
+        return replace(driven_by(*given), unmapped=("pout",), told="its expressions are fitted")
+
+    monkeypatch.setattr(scenes, "driven_by", mapped)
+    _render(bundle, tmp_path, "--data", data, "--driver", data, "--frames", 0, 2)
+    told = capsys.readouterr().out
+    assert "its expressions are fitted\nnot known to the avatar, left out: pout\n" in told
 
 
 def test_mistakes_are_told(bundle, data, tmp_path, refused):

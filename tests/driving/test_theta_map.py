@@ -1,5 +1,8 @@
 """From one head's theta to another's: shoulders, FLAME, and what no name joins."""
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
 import torch
 
@@ -14,6 +17,7 @@ from rgbavatar_ns.driving.transfer import (
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import EMBEDDED_BUST, HeadArrays, HeadModel
 from rgbavatar_ns.head.arkit import ARKIT_NAMES
+from rgbavatar_ns.head.flame import FLAME_VERTICES, load_flame
 from rgbavatar_ns.head.rotations import axis_angle_to_matrix
 from tests.avatar.small_head import small_head_arrays
 from tests.export.subject import avatar_of, lively_theta
@@ -94,6 +98,79 @@ def test_arkits_names_lead_to_flame(flame_2020):
     wanted = (own(theta)[1] - own(theta)[0]).norm(dim=1).max().item()
     assert moved == pytest.approx(wanted, rel=0.1)
     assert not mapped.known[avatar.layout.slice("translation")].any()
+
+
+def _other_version(flame: HeadArrays, expressions: int = 100) -> HeadArrays:
+    """Its expressions mixed, as another version has other directions of the same faces."""
+    generator = np.random.default_rng(3)
+    mixed, _ = np.linalg.qr(generator.normal(size=(100, 100)))
+    own = flame.shapedirs[..., flame.num_identity :]
+    directions = [flame.shapedirs[..., : flame.num_identity], (own @ mixed)[..., :expressions]]
+    return replace(
+        flame,
+        name="FLAME 2023",
+        shapedirs=np.concatenate(directions, 2).astype(np.float32),
+        expression_names=flame.expression_names[:expressions],
+    )
+
+
+@pytest.mark.parametrize(
+    ("expressions", "teeth"), [(100, "strips"), (50, "strips"), (100, "blocks")]
+)
+def test_another_version_of_flame_moves_the_same_points(
+    flame_2020, flame_2020_pickle, expressions, teeth
+):
+    same = teeth == "strips"
+    as_read = flame_2020 if same else load_flame(flame_2020_pickle, teeth_form=teeth)
+    driver, avatar = _other_version(as_read, expressions), avatar_of(arrays=flame_2020)
+    head = HeadModel(driver)
+    theta = torch.zeros(6, head.layout.size)
+    generator = torch.Generator().manual_seed(1)
+    expression, jaw = (head.layout.slice(name) for name in ("expression", "jaw"))
+    theta[1:, expression] = torch.randn(5, expressions, generator=generator)
+    theta[1:, jaw.start] = 0.1
+    mapped = theta_map(head.layout, driver, avatar)(theta)
+    wanted, shown = (
+        model(rows, torch.zeros(model.num_identity))[:, :FLAME_VERTICES]
+        for model, rows in ((head, theta), (avatar.head, mapped.theta))
+    )
+    moved, apart = (
+        (one - other).norm(dim=-1).mean() for one, other in ((wanted, wanted[:1]), (shown, wanted))
+    )
+    assert apart < 0.05 * moved
+    assert torch.equal(mapped.theta[:, avatar.layout.slice("jaw")], theta[:, jaw])
+    assert mapped.known[avatar.layout.slice("expression")].all()
+    assert (mapped.unmapped, mapped.missing) == ((), ())
+    told = "the driver's expressions are those of FLAME 2023, the avatar's of FLAME 2020: they are"
+    assert mapped.told.startswith(told)
+    share = int(mapped.told.split()[-8])
+    assert share <= 5
+
+
+def test_of_one_version_coefficients_are_copied(flame_2020):
+    """Also from files of 16 bits, and of fewer expressions."""
+    avatar = avatar_of(arrays=flame_2020)
+    rough = _other_version(flame_2020).shapedirs.copy()
+    rough[..., flame_2020.num_identity :] = flame_2020.shapedirs[..., flame_2020.num_identity :]
+    rough = rough.astype(np.float16).astype(np.float32)
+    names = flame_2020.expression_names
+    fewer = replace(flame_2020, shapedirs=rough[..., :-50], expression_names=names[:50])
+    for driver, missing in ((replace(flame_2020, shapedirs=rough), ()), (fewer, names[50:])):
+        layout = HeadModel(driver).layout
+        theta = torch.randn(3, layout.size, generator=torch.Generator().manual_seed(1))
+        mapped = theta_map(layout, driver, avatar)(theta)
+        where = slice(0, len(driver.expression_names))
+        assert torch.equal(mapped.theta[:, where], theta[:, where])
+        assert (mapped.told, mapped.missing) == ("", missing)
+
+
+def test_names_say_what_they_say_whatever_they_move():
+    """A head whose smile is another one still smiles by its name."""
+    driver = replace(_HEAD, shapedirs=0.5 * _HEAD.shapedirs)
+    theta = lively_theta(avatar_of(), 3)
+    mapped = theta_map(HeadModel(driver).layout, driver, avatar_of())(theta)
+    assert torch.equal(mapped.theta, theta)
+    assert mapped.told == ""
 
 
 def test_coefficients_alone_tell_nothing_of_the_head():

@@ -1,11 +1,14 @@
 """Another's performance in the viewer's panel: loaded, shown and played as it was filmed."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 
+from rgbavatar_ns.driving.theta_map import MappedTheta
+from rgbavatar_ns.plugin.viewer import panel
 from tests.plugin.desk import Desk
 from tests.plugin.tiny import tiny_dataset
 
@@ -61,6 +64,18 @@ def test_of_a_driver_that_several_cameras_filmed_one_film_is_played(desk: Desk, 
     assert torch.allclose(desk.panel.state.sequence[:, jaw], other.theta[::2, jaw])
     assert desk.viewer.gui["Driver's frame"].limits[1] == 2
     assert desk.told().count("3 frames of") == 1
+
+
+def test_what_a_driver_has_of_its_own_is_told(desk: Desk, tmp_path: Path, monkeypatch):
+    tiny_dataset(tmp_path / "other", frames=3, test=1)
+
+    def mapped(*given: object) -> MappedTheta:
+        return replace(driven_by(*given), unmapped=("pout",), told="its expressions are fitted")
+
+    driven_by = panel.driven_by
+    monkeypatch.setattr(panel, "driven_by", mapped)
+    desk.panel.load_driver(str(tmp_path / "other"), "off")
+    assert "not known to the avatar: pout, its expressions are fitted" in desk.told()
 
 
 def _written(folder: Path, frames_per_second: float = 25.0, **columns: list[object]) -> None:

@@ -268,6 +268,7 @@ class ViewerPanel(ViewerControl):
             self._widgets.offer_sequence(len(mapped.theta))
         unknown = ", ".join(mapped.unmapped)
         left_out = f", not known to the avatar: {unknown}" if unknown else ""
+        left_out += mapped.told and f", {mapped.told}"
         camera = self._model.subject.world_to_camera[:1]
         turns = turn_seen(mapped.theta, camera, self._model.avatar.layout)
         beyond = self._beyond(mapped.theta, turns)
