@@ -157,6 +157,8 @@ def test_an_incomplete_frame_is_refused(missing: str):
         ({"head": None}, "not known here"),
         ({"session": 5}, "session"),
         ({"session": "x" * 1000}, "session"),
+        ({"client": 5}, "client"),
+        ({"client": "x" * 1000}, "client"),
     ],
 )
 def test_an_unfit_subject_is_refused_with_the_reason(fields: dict[str, Any], told: str):

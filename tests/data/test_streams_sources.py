@@ -125,10 +125,13 @@ def test_a_silent_client_is_replaced(open_stream: Opener):
 
 
 class Relay:
-    """Passes bytes on to a stream, and breaks a connection after so many of them."""
+    """Passes bytes on to a stream, and breaks a connection after so many of them.
 
-    def __init__(self, address: str, *limits: int) -> None:
-        self._to = StreamAddress.parse(address)
+    `unnoticed`: the stream hears no more of it, as where a cable was pulled out.
+    """
+
+    def __init__(self, address: str, *limits: int, unnoticed: bool = False) -> None:
+        self._to, self._unnoticed = StreamAddress.parse(address), unnoticed
         self._listener = socket.create_server(("127.0.0.1", 0))
         self.address = f"127.0.0.1:{self._listener.getsockname()[1]}"
         threading.Thread(target=self._serve, args=(limits,), daemon=True).start()
@@ -138,15 +141,15 @@ class Relay:
             client, _ = self._listener.accept()
             server = socket.create_connection(self._to)
             threading.Thread(target=_pump, args=(server, client, 1 << 30), daemon=True).start()
-            _pump(client, server, limit)
+            _pump(client, server, limit, *([client] if self._unnoticed else []))
 
 
-def _pump(source: socket.socket, sink: socket.socket, limit: int) -> None:
+def _pump(source: socket.socket, sink: socket.socket, limit: int, *ends: socket.socket) -> None:
     with contextlib.suppress(OSError):
         while limit > 0 and (data := source.recv(min(limit, 4096))):
             limit -= len(data)
             sink.sendall(data)
-    for end in (source, sink):
+    for end in ends or (source, sink):
         with contextlib.suppress(OSError):
             end.shutdown(socket.SHUT_RDWR)
 
@@ -160,6 +163,18 @@ def test_what_a_lost_connection_had_on_its_way_is_sent_again(stream: SocketStrea
     with sending("mine", relay.address, range(2, 30)):
         assert indices(stream, 100) == list(range(30))
     assert stream.counts == {"source lost": 3, "reconnects": 3}
+
+
+def test_a_client_whose_lost_connection_was_not_noticed_takes_its_own_place(open_stream: Opener):
+    stream = open_stream(grace_s=0.05)
+    greeting = 400 + len(message_format.subject_message(subject()))
+    relay = Relay(stream.address, greeting + 3 * FRAME_BYTES, unnoticed=True)
+    with StreamClient(subject(), relay.address) as client:
+        for index in range(12):
+            client.send(tracked(index))
+    assert indices(stream, 100) == list(range(12))
+    assert stream.counts["reconnects"] == 1
+    assert stream.counts["refused clients"] == 0
 
 
 def test_another_program_may_go_on(stream: SocketStream):

@@ -46,7 +46,7 @@ class StreamClient:
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
         session = subject.session or secrets.token_hex(8)
-        named = dataclasses.replace(subject, session=session)
+        named = dataclasses.replace(subject, session=session, client=secrets.token_hex(8))
         self._greeting = message_format.subject_message(named)
         self._address = StreamAddress.parse(address)
         self._patience_s, self._clock, self._sleep = patience_s, clock, sleep

@@ -28,7 +28,7 @@ LARGEST_MESSAGE = 64 << 20
 LARGEST_HEADER = 1 << 18
 LARGEST_SIDE = 8192
 """Of an image, in pixels."""
-_LONGEST_SESSION = _LONGEST_NAME = 200
+_LONGEST_NAME = 200
 _SIZE = struct.Struct("<I")
 _CLIENT = "Send what `rgbavatar_ns.data.streams.StreamClient` sends; docs/online.md describes it."
 
@@ -66,7 +66,7 @@ def subject_message(subject: StreamSubject) -> bytes:
         "head": subject.arrays.name,
         "identity": subject.identity.tolist(),
         "layout": subject.layout.to_json(),
-        **{name: getattr(subject, name) for name in ("width", "height", "session")},
+        **{name: getattr(subject, name) for name in ("width", "height", "session", "client")},
     }
     if subject.arrays is HeadArrays.embedded_as(subject.arrays.name):
         return encode(header)
@@ -96,14 +96,17 @@ def parse_subject(message: bytes | str) -> StreamSubject:
             width, height = _whole(header["width"]), _whole(header["height"])
             if max(width, height) > LARGEST_SIDE:
                 raise DamagedFileError(f"images of {width} x {height} pixels are too large")
-            session = header.get("session", "")
-            if not isinstance(session, str) or len(session) > _LONGEST_SESSION:
+            session, client = (header.get(key, "") for key in ("session", "client"))
+            if not _is_short_text(session):
                 raise DamagedFileError("its session is no short text")
+            if not _is_short_text(client):
+                raise DamagedFileError("its client is no short text")
             identity, layout = _numbers(header["identity"]), header["layout"]
             arrays = _head(header, payload, identity)
     except DamagedFileError as error:
         raise UserError(f"A stream's subject cannot be used: {error}.", _CLIENT) from None
-    return StreamSubject(arrays, identity, ThetaLayout.from_json(layout), width, height, session)
+    theta = ThetaLayout.from_json(layout)
+    return StreamSubject(arrays, identity, theta, width, height, session, client)
 
 
 def parse_message(
@@ -136,6 +139,10 @@ def parse_answer(answer: bytes | str) -> int:
         "Something else than a stream of frames listens at this address.",
         "Give the address at which `ns-train rgbavatar-online` waits for frames.",
     )
+
+
+def _is_short_text(value: Any) -> bool:
+    return isinstance(value, str) and len(value) <= _LONGEST_NAME
 
 
 def _whole(value: Any) -> int:

@@ -51,6 +51,8 @@ class StreamSubject:
     height: int
     session: str = ""
     """Numbering of frames begins anew where a source comes back with another session."""
+    client: str = ""
+    """Known to one client alone: who brings it again comes back over a new connection."""
 
     def __post_init__(self) -> None:
         expected = HeadModel(self.arrays).layout

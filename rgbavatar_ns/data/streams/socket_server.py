@@ -34,10 +34,11 @@ class SocketStream:
     """Listens for one client at a time, which sends messages as `message_format` describes them.
 
     While a client is connected a second one is refused, unless the first has sent no whole frame
-    for `silence_s`. One that hangs up may come back, another may take its place, with the same
-    head and image size. What is no message of a stream is counted as "unreadable", and told once a
-    client. Web pages are refused. Of connections that are no client yet, the oldest makes room
-    where there are too many.
+    for `silence_s`, or it is the first one again, whose connection was lost unnoticed here: nobody
+    else knows its `StreamSubject.client`. One that hangs up may come back, another may take its
+    place, with the same head and image size. What is no message of a stream is counted as
+    "unreadable", and told once a client. Web pages are refused. Of connections that are no client
+    yet, the oldest makes room where there are too many.
 
     Args:
         listen: HOST:PORT (port 0: any that is free, see `address`).
@@ -67,6 +68,7 @@ class SocketStream:
         self._subject: StreamSubject | None = None
         self._last_identity = torch.zeros(0)  # of whom connected last
         self._client: ServerConnection | None = None
+        self._named = ""  # by `StreamSubject.client`, who connected last
         self._session: str | None = None
         self._received = 0  # messages of the session
         self._listening_since_s: float | None = None
@@ -171,10 +173,12 @@ class SocketStream:
     def _admit(self, connection: ServerConnection, subject: StreamSubject) -> None:
         """Make this the client; raises UserError if there is another, or its subject is."""
         with self._changed:
-            if not self._is_silent():
+            # The session does not tell: two programs may be given one name, and both live.
+            returned = subject.client != "" and subject.client == self._named
+            if not (returned or self._is_silent()):
                 self._changed.wait_for(lambda: self._client is None or self._closed, self._grace_s)
             before, measured_anew = self._client, False
-            if self._closed or (before is not None and not self._is_silent()):
+            if self._closed or (before is not None and not (returned or self._is_silent())):
                 raise UserError("Another client is connected.", "End it first, or wait.")
             if self._subject is not None:
                 _check_same(subject, self._subject)
@@ -185,7 +189,7 @@ class SocketStream:
             if subject.session == "" or subject.session != self._session:
                 self._session, self._received = subject.session, 0
             self._subject = self._subject or subject
-            self._last_identity = subject.identity
+            self._last_identity, self._named = subject.identity, subject.client
             self._changed.notify_all()
         if before is not None:
             hang_up(before.socket)
