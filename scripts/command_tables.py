@@ -94,7 +94,11 @@ def _rows(parser: Any) -> dict[str, Row]:
         takes = f" {action.metavar}" if action.option_strings and action.metavar else ""
         default = _OF_THE_MACHINE.get(name, found[1] if found else "")
         code = f"`{name}{takes}`".replace("|", "\\|")
-        rows[name] = (code, _cell(default), _cell(_DEFAULT.sub("", told)))
+        rows[name if action.option_strings else action.dest] = (
+            code,
+            _cell(default),
+            _cell(_DEFAULT.sub("", told)),
+        )
     return rows
 
 

@@ -16,7 +16,7 @@ from rgbavatar_ns.options import Count
 
 
 def run(
-    data: Annotated[Path, tyro.conf.Positional],
+    data: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FOLDER")],
     sheet: Path | None = None,
     max_frames: Count = 200,
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False,

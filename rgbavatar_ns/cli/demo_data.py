@@ -15,7 +15,7 @@ DataFormat = Literal["native", "insta", "metrical", "vhap", "flashavatar", "imav
 
 
 def run(
-    dst: Annotated[Path, tyro.conf.Positional],
+    dst: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DST")],
     config: Annotated[DemoConfig, tyro.conf.arg(name="")] = DemoConfig(),
     format: DataFormat = "native",
     overwrite: bool = False,

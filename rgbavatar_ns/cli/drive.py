@@ -77,7 +77,7 @@ _SOURCE, _SHOW, _LIVE = SourceOptions(), ShowOptions(), LiveOptions()
 
 
 def run(
-    run_folder: Annotated[Path, tyro.conf.Positional],
+    run_folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")],
     data: Path | None = None,
     source: Annotated[SourceOptions, tyro.conf.arg(name="")] = _SOURCE,
     show: Annotated[ShowOptions, tyro.conf.arg(name="")] = _SHOW,

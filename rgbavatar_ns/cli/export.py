@@ -53,8 +53,8 @@ _LONGEST_SECONDS = 30.0
 
 
 def run(
-    run_folder: Annotated[Path, tyro.conf.Positional],
-    destination: Annotated[Path, tyro.conf.Positional],
+    run_folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")],
+    destination: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DST")],
     format: Format | None = None,
     data: Path | None = None,
     frame: int | None = None,

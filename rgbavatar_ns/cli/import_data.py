@@ -11,8 +11,8 @@ from rgbavatar_ns.data.importers import ImportOptions, import_dataset
 
 
 def run(
-    src: Annotated[Path, tyro.conf.Positional],
-    dst: Annotated[Path, tyro.conf.Positional],
+    src: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SRC")],
+    dst: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DST")],
     options: Annotated[ImportOptions, tyro.conf.arg(name="")] = ImportOptions(),
     overwrite: bool = False,
 ) -> None:

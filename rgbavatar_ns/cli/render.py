@@ -66,8 +66,8 @@ _PICTURE, _DRIVING = PictureOptions(), DrivingOptions()
 
 
 def run(
-    run_folder: Annotated[Path, tyro.conf.Positional],
-    output: Annotated[Path, tyro.conf.Positional],
+    run_folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")],
+    output: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUTPUT")],
     data: Path | None = None,
     show: Show = "comparison",
     driver: Path | None = None,

@@ -69,6 +69,16 @@ def test_the_page_of_commands_is_what_the_parsers_say() -> None:
     assert "| `--pipeline.model.avatar.num-bases INT` | 20 |" in page
 
 
+def test_each_argument_of_a_command_has_a_row() -> None:
+    page = write_reference.COMMANDS_PAGE.read_text()
+    taken = {"import": ("SRC", "DST"), "render": ("RUN", "OUTPUT"), "export": ("RUN", "DST")}
+    for command, arguments in taken.items():
+        told = page.split(f"### rgbavatar {command}\n")[1].split("\n### ")[0]
+        assert f"`rgbavatar {command} {' '.join(arguments)}`" in told
+        for argument in arguments:
+            assert f"| `{argument}` |" in told, command
+
+
 def test_what_troubleshooting_quotes_is_said_somewhere(texts: list[error_texts.ErrorText]) -> None:
     quotes = _QUOTED.findall((ROOT / "docs" / "troubleshooting.md").read_text())
     assert len(quotes) > 40
