@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+from rgbavatar_ns.cli.used_options import require_used
 from rgbavatar_ns.driving.live_transfer import LiveOptions
 from rgbavatar_ns.errors import UserError
-from rgbavatar_ns.options import CheckedOptions, FrameRate, Pixels, Share
+from rgbavatar_ns.options import Between, CheckedOptions, FrameRate, Pixels, Share
 
 if TYPE_CHECKING:
     from rgbavatar_ns.avatar import Avatar
@@ -21,6 +22,14 @@ if TYPE_CHECKING:
     from rgbavatar_ns.export.subject import Subject
 
 Show = Literal["page", "viewer", "none"]
+Kind = Literal["arkit", "vmc", "websocket", "CSV file", "dataset", "camera or film"]
+"""What a source is."""
+_LISTENING: tuple[Kind, ...] = ("arkit", "vmc", "websocket")
+_OF_SOURCES: dict[str, tuple[tuple[Kind, ...], str]] = {
+    "head-angles": (("arkit", "CSV file"), "arkit and CSV files"),
+    "source-frames-per-second": (("CSV file", "dataset"), "CSV files and datasets"),
+}
+"""What each option counts for, and how that is told."""
 
 
 @dataclass(frozen=True)
@@ -65,11 +74,13 @@ class ShowOptions(CheckedOptions):
     """Height of pictures, likewise."""
     background: tuple[Share, Share, Share] = (1.0, 1.0, 1.0)
     """Colour behind the head, red, green and blue in [0, 1]."""
-    frames_per_second: FrameRate = 25.0
-    """Of a film and of a virtual camera."""
+    frames_per_second: FrameRate | None = None
+    """Of a film and of a virtual camera; 25 by default."""
     serve: str | None = None
     """HOST:PORT of the page and of pages opened with ?ws= (127.0.0.1:7072)."""
-    seconds: Annotated[float, tyro.conf.arg(metavar="SECONDS")] | None = None
+    seconds: (
+        Annotated[float, Between(0, 1e6, open=True), tyro.conf.arg(metavar="SECONDS")] | None
+    ) = None
     """End after so many seconds."""
 
 
@@ -103,6 +114,8 @@ def run(
     shown = show.show or ("none" if show.out else "page")
     if shown == "none" and show.out is None:
         raise UserError("Nothing would be shown.", "Add --out film.mp4, or --show page.")
+    _require_shown(shown, show)
+    _require_heeded(shown, source)
     only_film = shown == "none" and show.out is not None and show.out.endswith(".mp4")
     real_time = not only_film if source.real_time is None else source.real_time
     subject = load_subject(run_folder, data, show.width, show.height, film=False)
@@ -133,6 +146,50 @@ def run(
         _tell(f"The film is {show.out}.")
 
 
+def _require_shown(shown: Show, show: ShowOptions) -> None:
+    """Raise UserError for an option that changes nothing of what is shown."""
+    has_rate = show.frames_per_second is not None
+    behind = show.out is None and show.background != _SHOW.background
+    given = [name for name, it in (("serve", show.serve), ("background", behind)) if it]
+    require_used("show", shown, {"serve": ("page",), "background": ("page",)}, given)
+    for name, is_given in (("beside", show.beside), ("frames-per-second", has_rate)):
+        if is_given and show.out is None:
+            raise UserError(
+                f"--{name} changes nothing without --out.", "Leave it out, or add --out film.mp4."
+            )
+    if has_rate and show.out == "-":
+        raise UserError(
+            "--frames-per-second changes nothing of raw pictures.",
+            "Leave it out, or name a film or a device: --out film.mp4.",
+        )
+
+
+def _require_heeded(shown: Show, source: SourceOptions) -> None:
+    """Raise UserError for an option of which this source and what is shown know nothing."""
+    from rgbavatar_ns.data.streams.address import told_address
+
+    kind, told = _kind(source.source), told_address(source.source)
+    if source.listen is not None and kind not in _LISTENING:
+        raise UserError(
+            f"The source {told} listens to nobody.", "--listen is for arkit, vmc and websocket."
+        )
+    if source.allow_remote and kind not in _LISTENING and shown != "page":
+        raise UserError(
+            "--allow-remote changes nothing where neither a source nor a page listens.",
+            "Leave it out, or take --show page.",
+        )
+    given = {
+        "head-angles": source.head_angles != _SOURCE.head_angles,
+        "source-frames-per-second": source.source_frames_per_second is not None,
+    }
+    for name, (kinds, used_by) in _OF_SOURCES.items():
+        if given[name] and kind not in kinds:
+            raise UserError(
+                f"--{name} changes nothing of the source {told}.",
+                f"Leave it out: it is for {used_by}.",
+            )
+
+
 def _tell(line: str) -> None:
     """To standard error: standard output may carry pictures."""
     print(line, file=sys.stderr, flush=True)
@@ -157,7 +214,6 @@ def _performer(
     subject: "Subject", options: SourceOptions, real_time: bool, with_images: bool
 ) -> "PerformanceSource":
     """The source that the flags name; raises UserError where there is none."""
-    from rgbavatar_ns.data.streams.address import told_address
     from rgbavatar_ns.driving.source import PerformerHead
     from rgbavatar_ns.driving.sources import live_link_face, vmc, web_socket
 
@@ -177,34 +233,41 @@ def _performer(
         keyed = f"from a page of the disk: ws://{opened.keyed_address}"
         _tell(f"Messages are taken at ws://{opened.address} ({keyed})")
         return opened
-    if listen is not None:
-        raise UserError(
-            f"The source {told_address(name)} listens to nobody.",
-            "--listen is for arkit, vmc and websocket.",
-        )
-    path = Path(name).expanduser()
-    if path.suffix.lower() == ".csv":
+    path, kind = Path(name).expanduser(), _kind(name)
+    if kind == "CSV file":
         from rgbavatar_ns.driving.sources.arkit_csv import csv_source
 
         rate = options.source_frames_per_second
         return csv_source(path, rate, real_time, options.head_angles)
-    if path.is_dir() and (folder := _dataset_of(path)) is not None:
+    if kind == "dataset":
         from rgbavatar_ns.driving.sources.dataset import dataset_source
+        from rgbavatar_ns.export import dataset_folder
 
         rate = options.source_frames_per_second
-        return dataset_source(folder, rate, real_time, with_images)
+        return dataset_source(dataset_folder(path), rate, real_time, with_images)
     from rgbavatar_ns.tracking.performer import FilmedPerformer
 
     return FilmedPerformer(_camera(name), real_time, with_images)
 
 
-def _dataset_of(folder: Path) -> Path | None:
-    """The dataset that the folder is, or as a run names; None for a folder of images."""
+def _kind(name: str) -> Kind:
+    """What a source of this name is; nothing is opened."""
+    for listening in _LISTENING:
+        if name == listening:
+            return listening
+    path = Path(name).expanduser()
+    if path.suffix.lower() == ".csv":
+        return "CSV file"
+    return "dataset" if path.is_dir() and _is_dataset(path) else "camera or film"
+
+
+def _is_dataset(folder: Path) -> bool:
+    """Whether the folder is a dataset, or a run that names one; else it is one of images."""
     from rgbavatar_ns.data import is_dataset
     from rgbavatar_ns.export import dataset_folder
 
     named = dataset_folder(folder)
-    return named if named != folder or is_dataset(named) else None
+    return named != folder or is_dataset(named)
 
 
 def _camera(name: str) -> str:
@@ -223,9 +286,11 @@ def _camera(name: str) -> str:
 
 def _pictures(subject: "Subject", show: ShowOptions) -> "DriveOutput":
     """A film, raw frames or a virtual camera."""
+    from rgbavatar_ns.data.native.dataset import USUAL_FRAMES_PER_SECOND
     from rgbavatar_ns.export import live_pictures
 
     assert show.out is not None
+    rate = show.frames_per_second or USUAL_FRAMES_PER_SECOND
     sink: live_pictures.PictureSink
     if show.out == "-":
         if sys.stdout.isatty():
@@ -236,9 +301,9 @@ def _pictures(subject: "Subject", show: ShowOptions) -> "DriveOutput":
             )
         sink = live_pictures.RawSink()
     elif show.out.startswith("/dev/"):
-        sink = live_pictures.VirtualCameraSink(show.out, show.frames_per_second)
+        sink = live_pictures.VirtualCameraSink(show.out, rate)
     elif show.out.endswith(".mp4"):
-        sink = live_pictures.FilmSink(Path(show.out), show.frames_per_second)
+        sink = live_pictures.FilmSink(Path(show.out), rate)
     else:
         raise UserError(
             f"Pictures cannot go to {show.out}.",

@@ -198,10 +198,31 @@ def test_what_arkit_takes_is_made_before_the_first_message(with_a_face, capsys):
         (["--source", "arkit", "--listen", "here", "--out", "f.mp4"], "'here' is no address"),
         (["--source", "websocket", "--listen", "0.0.0.0:0", "--out", "f.mp4"], "Other machines"),
         (["--source", "camera", "--listen", "127.0.0.1:1", "--out", "f.mp4"], "listens to nobody"),
+        (["--beside"], "--beside changes nothing without --out"),
+        (["--frames-per-second", 30], "--frames-per-second changes nothing without --out"),
+        (["--out", "-", "--frames-per-second", 30], "changes nothing of raw pictures"),
+        (["--serve", "127.0.0.1:0", "--out", "f.mp4"], "--serve changes nothing of --show none"),
+        (["--serve", "127.0.0.1:0", "--show", "viewer"], "--serve changes nothing of --show view"),
+        (["--background", 0, 0, 0, "--show", "viewer"], "--background changes nothing of --show"),
+        (["--allow-remote", "--out", "f.mp4"], "--allow-remote changes nothing"),
+        (["--head-angles", -1, 1, 1], "--head-angles changes nothing of the source camera"),
+        (
+            ["--source", "rtsp://me:secret@there/", "--source-frames-per-second", 50],
+            "--source-frames-per-second changes nothing of the source rtsp://there/",
+        ),
+        (
+            ["--source", "no.mp4", "--source-frames-per-second", 50],
+            "it is for CSV files and datasets",
+        ),
     ],
 )
 def test_mistakes_are_told(avatar, refused, words, told):
     assert told in refused("drive", avatar, *words)
+
+
+def test_what_a_dataset_knows_nothing_of_is_told(avatar, performer, refused):
+    told = refused("drive", avatar, "--source", performer, "--head-angles", 1, -1, 1)
+    assert "--head-angles changes nothing of the source" in told
 
 
 def test_a_film_without_mediapipe_is_told_with_the_line_that_installs_it(
@@ -242,3 +263,6 @@ def test_options_out_of_range_are_told(avatar, refused):
     assert SourceOptions().source == "camera"
     for flag in ("--calibrate", "--calibrate-s"):
         assert "--calibrate-s is -1" in refused("drive", avatar, flag, "-1", "--out", "f.mp4")
+    for seconds in ("-5", "0", "nan", "1e11"):
+        told = refused("drive", avatar, "--out", "f.mp4", "--seconds", seconds)
+        assert "Give a number from 0 to 1,000,000" in told
