@@ -130,6 +130,8 @@ def test_every_number_fits_its_field_and_every_label_wraps(desk: Desk):
     hints = [h.options.get("hint") for h in desk.viewer.gui.handles if h.label.startswith("Basis ")]
     assert len(hints) == desk.model.avatar.config.num_bases
     assert all("in training" in hint for hint in hints)
+    (alone,) = (h for h in desk.viewer.gui.handles if h.label == "Show one alone")
+    assert "Exaggerate" in alone.options["hint"], "the factor is not 1 at first"
 
 
 def test_training_is_steered_only_while_it_runs(desk: Desk, pipeline: RGBAvatarPipeline):

@@ -198,7 +198,7 @@ class Widgets:
         alone = gui.add_dropdown(
             "Show one alone",
             (_NO_BASIS, *(str(1 + basis) for basis in range(count))),
-            hint="Base and this basis at its largest weight in training, on the neutral frame",
+            hint="On the neutral frame, at its largest weight in training times Exaggerate",
         )
         self._alone = _on(
             alone,
