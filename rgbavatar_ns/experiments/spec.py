@@ -108,10 +108,10 @@ def read_experiment(
     `subjects` replace the file's: folders relative to the working directory, or the procedural
     ones; the experiment's name then tells them. Keys: name, title, preset, variants (name, preset,
     set, paper, paper_by_subject), grid (override -> values; each combination is a variant),
-    subjects, seeds, base, metrics, plot, paper_data, tiny (any of these anew). Options may be
-    written with - for _, as on command lines. Raises UserError naming the key for anything unknown,
-    missing or of a wrong type. Whether overrides fit the preset is checked by
-    `overrides.check_overrides`.
+    subjects, seeds, base, metrics, plot, paper_data, tiny (any of these anew, but its base is added
+    to the file's). Options may be written with - for _, as on command lines. Raises UserError
+    naming the key for anything unknown, missing or of a wrong type. Whether overrides fit the
+    preset is checked by `overrides.check_overrides`.
     """
     try:
         text = path.read_text(encoding="utf-8")
