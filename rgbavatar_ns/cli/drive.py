@@ -26,6 +26,7 @@ Kind = Literal["arkit", "vmc", "websocket", "CSV file", "dataset", "camera or fi
 """What a source is."""
 _LISTENING: tuple[Kind, ...] = ("arkit", "vmc", "websocket")
 _OF_SOURCES: dict[str, tuple[tuple[Kind, ...], str]] = {
+    "beside": (("dataset", "camera or film"), "sources with pictures"),
     "head-angles": (("arkit", "CSV file"), "arkit and CSV files"),
     "source-frames-per-second": (("CSV file", "dataset"), "CSV files and datasets"),
 }
@@ -115,7 +116,7 @@ def run(
     if shown == "none" and show.out is None:
         raise UserError("Nothing would be shown.", "Add --out film.mp4, or --show page.")
     _require_shown(shown, show)
-    _require_heeded(shown, source)
+    _require_heeded(shown, show, source)
     only_film = shown == "none" and show.out is not None and show.out.endswith(".mp4")
     real_time = not only_film if source.real_time is None else source.real_time
     subject = load_subject(run_folder, data, show.width, show.height, film=False)
@@ -123,6 +124,8 @@ def run(
         _tell(lost)
     performer = _performer(subject, source, real_time, show.beside)
     transfer = LiveTransfer(subject.avatar, subject.seen, performer.head, subject.camera, live)
+    if transfer.told:
+        _tell(f"note: {transfer.told}")
     outputs: list[DriveOutput] = []
     drive = LiveDrive(performer, transfer, outputs, real_time, _tell)
     try:
@@ -164,11 +167,13 @@ def _require_shown(shown: Show, show: ShowOptions) -> None:
         )
 
 
-def _require_heeded(shown: Show, source: SourceOptions) -> None:
+def _require_heeded(shown: Show, show: ShowOptions, source: SourceOptions) -> None:
     """Raise UserError for an option of which this source and what is shown know nothing."""
     from rgbavatar_ns.data.streams.address import told_address
 
     kind, told = _kind(source.source), told_address(source.source)
+    if kind == "camera or film":
+        _camera(source.source)  # That there is none is worse than an option too many.
     if source.listen is not None and kind not in _LISTENING:
         raise UserError(
             f"The source {told} listens to nobody.", "--listen is for arkit, vmc and websocket."
@@ -179,6 +184,7 @@ def _require_heeded(shown: Show, source: SourceOptions) -> None:
             "Leave it out, or take --show page.",
         )
     given = {
+        "beside": show.beside,
         "head-angles": source.head_angles != _SOURCE.head_angles,
         "source-frames-per-second": source.source_frames_per_second is not None,
     }

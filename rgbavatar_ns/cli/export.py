@@ -86,7 +86,8 @@ def run(
         data: the dataset whose frames are meant; by default the one that the run names.
         frame: of Gaussians, the frame's place in the dataset; without it the head is at rest.
         frames: of Gaussians and for browsers, first frame and the frame after the last one; by
-            default, for browsers, the first 30 seconds of the run's own film.
+            default, for browsers, the first 30 seconds of the run's own film. A folder of Gaussians
+            then holds these frames alone.
         head_inside: for bundle, put the head model inside. Without it the bundle only names its
             head model, as the licence of FLAME asks where it is passed on.
         texture: a PNG painted over what --format texture wrote of this avatar: its colours change

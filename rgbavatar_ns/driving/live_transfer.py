@@ -92,9 +92,13 @@ class LiveTransfer:
     ) -> None:
         self.options = options = LiveOptions() if options is None else options
         self._avatar, self._own, self._layout = avatar, own, avatar.layout
-        self._map = None if head is None else theta_map(head.layout, head.arrays, avatar)
-        if self._map is None:
+        self._map, self.told = None, ""
+        if head is None:
             _ = avatar.arkit  # takes seconds for FLAME: now, not with the first frame
+        else:
+            self._map = theta_map(head.layout, head.arrays, avatar)
+            self.told = self._map(torch.zeros(1, head.layout.size)).told
+            """What the user should know of the way from the source's head."""
         self._world_to_camera = camera.world_to_camera[:1]
         relative = "neutral" if options.calibrate_s > 0 else "off"
         self._driving = DrivingOptions(relative=relative, pose=options.pose)

@@ -32,7 +32,7 @@ _log.setLevel(logging.CRITICAL)
 class LocalServer:
     """Listens and runs `talk` for each connection in a thread of its own.
 
-    At most 64 converse at a time; others are told so. Programs are welcome, and so are pages of
+    At most 64 converse at a time; others are refused. Programs are welcome, and so are pages of
     this machine and this server's own. A page from the disk has the origin "null", but so has any
     web site's sandboxed frame: it shows that it is the user's by the key in the address
     (`keyed_address`), which is another each time.

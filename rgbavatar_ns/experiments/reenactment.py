@@ -150,9 +150,9 @@ def reenactment_scores(
 ) -> tuple[dict[str, float], dict[str, str]]:
     """AED, APD and CSIM of an avatar driven by another's held-out frames; why some are missing.
 
-    The driver's numbers are taken as they are (mapped by name), as in the paper, and the avatar is
-    seen as the driver was (`seen_pose.as_seen`), in pictures of the driver's size. Raises UserError
-    where the driver has no expression that the avatar knows.
+    The driver's numbers are taken as they are, as in the paper (by name, or of another FLAME by
+    what they move), and the avatar is seen as the driver was (`seen_pose.as_seen`), in pictures of
+    the driver's size. Raises UserError where the driver has no expression that the avatar knows.
     """
     avatar = avatar.cpu()
     chosen = list(driver.test or driver.train)

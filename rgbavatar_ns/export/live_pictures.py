@@ -20,8 +20,8 @@ from rgbavatar_ns.export.video import FilmWriter
 from rgbavatar_ns.kernels import PinholeCameras
 
 _Picture = UInt8[np.ndarray, "height width 3"]
-_MOST_REPEATS = 250
-"""A pause of the performer stands still in the film for at most so many pictures."""
+_LONGEST_STILL_S = 10.0
+"""A pause of the performer stands still in the film for at most so long."""
 _LONGEST_PAUSE_S = 3600.0
 """After a longer one the source counts by another clock: nobody waited."""
 
@@ -99,10 +99,10 @@ class FilmSink:
         if self._began_s is None:
             self._began_s = time_s - self._film.count / self._rate
         due = round((time_s - self._began_s) * self._rate)
-        ahead = due - self._film.count
-        if not -1 <= ahead <= _MOST_REPEATS:
+        ahead, most = due - self._film.count, round(_LONGEST_STILL_S * self._rate)
+        if not -1 <= ahead <= most:
             paused = 0 < ahead <= _LONGEST_PAUSE_S * self._rate
-            due = self._film.count + (_MOST_REPEATS if paused else 0)
+            due = self._film.count + (most if paused else 0)
             self._began_s = time_s - due / self._rate
         while self._last is not None and self._film.count < due:
             self._film.add(self._last)

@@ -66,7 +66,9 @@ class FilmedPerformer(TrackedCapture):
         """A picture, or a face in it."""
         if self._shown_s is None:
             return f"the first picture of {self._told}"
-        if not self.ended and time.monotonic() - self._shown_s > _SILENT_S:
+        silent_s = time.monotonic() - self._shown_s
+        # A film waits for its next frame as long as that asks for.
+        if not self._capture.keeps_frames and silent_s > _SILENT_S:
             return f"pictures of {self._told} to come again: is it still connected?"
         told = "to be met" if not self._tracker.ready else "to be found again"
         return f"a face in {self._told} {told}: look at the camera, well lit and near"

@@ -211,8 +211,13 @@ def test_what_arkit_takes_is_made_before_the_first_message(with_a_face, capsys):
             "--source-frames-per-second changes nothing of the source rtsp://there/",
         ),
         (
-            ["--source", "no.mp4", "--source-frames-per-second", 50],
+            ["--source", "rtsp://there/", "--source-frames-per-second", 50],
             "it is for CSV files and datasets",
+        ),
+        (["--source", "no.mp4", "--source-frames-per-second", 50], "There is no source no.mp4"),
+        (
+            ["--source", "arkit", "--beside", "--out", "f.mp4"],
+            "--beside changes nothing of the source arkit",
         ),
     ],
 )

@@ -7,6 +7,8 @@ import pytest
 import torch
 
 from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
+from rgbavatar_ns.driving.live_transfer import LiveTransfer
+from rgbavatar_ns.driving.source import PerformerHead
 from rgbavatar_ns.driving.theta_map import NamedMap, ThetaNames, arkit_theta, theta_map
 from rgbavatar_ns.driving.transfer import (
     DrivingOptions,
@@ -15,6 +17,7 @@ from rgbavatar_ns.driving.transfer import (
     relative_theta,
 )
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.export import front_camera
 from rgbavatar_ns.head import EMBEDDED_BUST, HeadArrays, HeadModel
 from rgbavatar_ns.head.arkit import ARKIT_NAMES
 from rgbavatar_ns.head.flame import FLAME_VERTICES, load_flame
@@ -145,6 +148,12 @@ def test_another_version_of_flame_moves_the_same_points(
     assert mapped.told.startswith(told)
     share = int(mapped.told.split()[-8])
     assert share <= 5
+    # Who drives live is told the same.
+    film, camera = lively_theta(avatar, 4), front_camera(avatar, 64, 64)
+    views = camera.world_to_camera.expand(4, 4, 4)
+    own = TrainingStatistics.of(film, torch.zeros(4, 1), avatar.layout, views)
+    live = LiveTransfer(avatar, own, PerformerHead(head.layout, driver), camera)
+    assert live.told == mapped.told
 
 
 def test_of_one_version_coefficients_are_copied(flame_2020):

@@ -95,6 +95,15 @@ def test_a_long_pause_stands_still_for_ten_seconds_and_the_film_goes_on(tmp_path
         assert np.allclose(_levels(tmp_path / "film.mp4"), wanted, atol=4)
 
 
+def test_at_any_rate_a_pause_stands_still_for_as_long(tmp_path):
+    for rate in (10.0, 60.0):
+        sink = FilmSink(tmp_path / "film.mp4", rate)
+        for time_s, level in [(3.0, 50), (33.0, 150), (33.0 + 1 / rate, 200)]:
+            sink.add(_grey(level), time_s)
+        sink.close()
+        assert len(_levels(tmp_path / "film.mp4")) == 10 * rate + 3
+
+
 def test_without_a_picture_there_is_no_film(tmp_path):
     sink = FilmSink(tmp_path / "film.mp4", 25.0)
     with pytest.raises(UserError, match="has no picture"):

@@ -189,6 +189,10 @@ def test_a_cut_of_one_person_begins_a_segment_and_a_quick_turn_of_the_head_none(
     way = np.cumsum([0, 0, 0, 10, 20, 30, 20, 10, 0, 0])
     turn = followed_face(_seen([_face(200 + x, 240, 120) for x in way]), WIDTH, HEIGHT)
     assert turn.segments() == [{"first_frame": 0, "last_frame": 9, "clip": 0}]
+    # A webcam's 10 frames a second in a recording of 30.
+    thrice = np.repeat(np.arange(0, 120, 12), 3)
+    turn = followed_face(_seen([_face(200 + x, 240, 120) for x in thrice]), WIDTH, HEIGHT)
+    assert len(turn.segments()) == 1
 
 
 def test_no_frame_is_lost_where_a_film_was_cut_and_nobody_else_is_seen() -> None:

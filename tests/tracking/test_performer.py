@@ -147,7 +147,7 @@ def test_a_camera_that_is_pulled_out_is_told_and_not_the_person(monkeypatch):
     performer = FilmedPerformer("0", tracker=_Tracker(warm_up=9), capture=camera)
     assert performer.next(0.1) is None
     assert "look at the camera" in performer.waits_for
-    monkeypatch.setattr("rgbavatar_ns.tracking.performer._SILENT_S", 0.0)
+    monkeypatch.setattr("rgbavatar_ns.tracking.performer._SILENT_S", -1.0)
     assert "pictures of 0 to come again: is it still connected?" in performer.waits_for
     monkeypatch.undo()
     performer.next(0.1)

@@ -21,7 +21,7 @@ def longest_run(dataset: TrackedDataset) -> tuple[int, ...]:
     """Positions of frames that follow one another, of one camera; at most `MAX_FRAMES`."""
     names = dataset.camera_names or ("",) * len(dataset)
     camera = Counter(names).most_common(1)[0][0]
-    moments = dataset.timesteps or dataset.frame_index
+    moments = dataset.moments
     ordered = sorted(
         (moments[position], position) for position, name in enumerate(names) if name == camera
     )

@@ -1,7 +1,9 @@
 """What the avatar has seen, as the viewer tells it: looked up now and then while it is trained."""
 
 import time
+from contextlib import suppress
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -48,9 +50,11 @@ class FilmSeen:
         if training_state is None or self._is_final or (now_s < self._next_look_s and not is_over):
             return False
         began_s = time.perf_counter()
-        found = self._found()
-        if bool(found.psi_mean.isfinite().all()):  # Training that goes astray is about to end.
-            self._take(found)
+        # Training that goes astray is about to end.
+        with suppress(torch.linalg.LinAlgError):  # pyright: ignore[reportPrivateImportUsage]
+            found = self._found()
+            if bool(found.psi_mean.isfinite().all()):
+                self._take(found)
         took_s = time.perf_counter() - began_s
         self._next_look_s = now_s + max(_LOOK_INTERVAL_S, took_s / _LOOK_SHARE)
         self._is_final = is_over

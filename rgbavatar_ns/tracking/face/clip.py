@@ -19,10 +19,10 @@ from rgbavatar_ns.tracking.resumable_run import stage_damage_told
 # In one frame's time a face moves and grows by less than this; more is a cut or a jump.
 _JUMP_SHARE, _JUMP_SIZE = 0.4, 1.3
 # And by landmarks that move by this share of its height, in the root of their mean square, if they
-# move more than so many times as far as in the steps before and after. Where films of heads are
-# cut and drawn nearer by 1.3 it is .15 and 6 times; of heads that move, and cameras in a hand, up
-# to .05 and 3 times.
-_CUT_SHARE, _CUT_TIMES = 0.06, 3.0
+# move more than so many times as far as in any of so many steps before and after. Where films of
+# heads are cut and drawn nearer by 1.3 it is .15 and 6 times; of heads that move, and cameras in a
+# hand, up to .05 and 3 times.
+_CUT_SHARE, _CUT_TIMES, _CUT_AROUND = 0.06, 3.0, 3
 # A pause between two frames' times beyond this many usual ones of their clip is a gap, if it is as
 # long as this: where a film is now slow motion and now not, either's steps are usual.
 _PAUSE, _LEAST_PAUSE_S = 4.0, 0.1
@@ -239,12 +239,14 @@ def _sudden(
 ) -> Bool[np.ndarray, "G"]:
     """Where a film of one person was cut: steps far longer than those before and after them.
 
-    A head that starts or stops takes some frames for it.
+    A head that starts or stops takes some frames for it. Of a film that shows each frame twice or
+    three times every other step is none.
     """
     moved_px = np.linalg.norm(np.diff(points_px, axis=0), axis=2)
     step = np.sqrt(np.square(moved_px).mean(1)) / height_px[1:]
-    around = np.pad(step, 1)
-    usual = np.maximum(around[:-2], around[2:])
+    around = np.pad(step, _CUT_AROUND)
+    beside = [k for k in range(2 * _CUT_AROUND + 1) if k != _CUT_AROUND]
+    usual = np.max([around[k : k + len(step)] for k in beside], axis=0)
     return (step > _CUT_SHARE) & (step > _CUT_TIMES * usual)
 
 
