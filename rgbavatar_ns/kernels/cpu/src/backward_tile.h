@@ -66,31 +66,35 @@ static void clear_slot(const Tile& tile, const Splat& s, float* slots, int width
   for (int k = 0; k < width; ++k) slot[k] = 0.0f;
 }
 
-// Where pixel (0, 0) of a block is, from that of the tile's first block.
-struct BlockOffsets {
-  float x[kBlocksPerTile], y[kBlocksPerTile];
-  constexpr BlockOffsets() : x(), y() {
-    for (int block = 0; block < kBlocksPerTile; ++block) {
-      x[block] = float(block % kTileBlocks * kBlockSide);
-      y[block] = float(block / kTileBlocks * kBlockSide);
-    }
+// A block is that many registers, each of some of its rows.
+constexpr int kParts = kLanes / kNativeLanes, kPartRows = kBlockSide / kParts;
+
+// Where a part of a block lies from the first part of another one of its tile, in pixels, and what
+// sums of squares need of that.
+struct alignas(32) PartOffset {
+  float x = 0.0f, y = 0.0f, xx = 0.0f, xy = 0.0f, yy = 0.0f;
+};
+struct alignas(64) PartOffsets {
+  static constexpr int kStride = 2 * kTileBlocks, kLeft = kTileBlocks - 1;
+  PartOffset of[kTileBlocks * kParts * kStride];
+
+  constexpr PartOffsets() : of() {
+    for (int down = 0; down < kTileBlocks * kParts; ++down)
+      for (int across = -kLeft; across < kTileBlocks; ++across) {
+        const float x = float(across * kBlockSide), y = float(down * kPartRows);
+        of[down * kStride + across + kLeft] = {x, y, x * x, x * y, y * y};
+      }
+  }
+  // Numbers of blocks whose differences say where one lies from another.
+  static RGBAVATAR_MEMBER int place_of(int block) {
+    return block + (block & -kTileBlocks) * (kParts * kStride / kTileBlocks - 1);
+  }
+  // Of the parts of a block from one that no other lies above.
+  RGBAVATAR_MEMBER const PartOffset* between(int first_place, int place) const {
+    return of + (place - first_place + kLeft);
   }
 };
-static constexpr BlockOffsets kBlockOffsets = {};
-
-// Sums over a Gaussian's jobs, lane by lane: of w dL/dcolour, of alpha dL/dalpha, and of this times
-// dx, dy and their products.
-struct LaneSums {
-  Native red = 0.0f, green = 0.0f, blue = 0.0f, one = 0.0f, x = 0.0f, y = 0.0f, xx = 0.0f,
-         xy = 0.0f, yy = 0.0f, largest = 0.0f;
-
-  void add(const LaneSums& other) {
-    red = red + other.red, green = green + other.green, blue = blue + other.blue;
-    one = one + other.one, x = x + other.x, y = y + other.y;
-    xx = xx + other.xx, xy = xy + other.xy, yy = yy + other.yy;
-    largest = max_of(largest, other.largest);
-  }
-};
+static constexpr PartOffsets kPartOffsets = {};
 
 static RGBAVATAR_MEMBER Native load_native(const float* from) {
   Native a;
@@ -98,64 +102,64 @@ static RGBAVATAR_MEMBER Native load_native(const float* from) {
   return a;
 }
 
-// The sums of a register's lanes from `first` on. Afterwards the Gaussian stands, for these pixels,
-// behind those in front of it.
-template <bool kLargest>
-static RGBAVATAR_MEMBER LaneSums sum_lanes(const BlockGrid& grid, const Group& group, int place,
-                                           int first, const Kept& kept, TileScratch& scratch) {
-  const Splat& s = group.splats[place];
-  const Native color_red(s.red), color_green(s.green), color_blue(s.blue), zero(0.0f);
-  const Native x = load_native(grid.x[0] + first) - s.mean_x;
-  const Native y = load_native(grid.y[0] + first) - s.mean_y;
-  LaneSums sums;
-  const float* alpha_row = kept.alpha[group.first_job[place]] + first;
-  const float* weight_row = kept.weight[group.first_job[place]] + first;
-  for (uint64_t left = group.blocks[place]; left; left &= left - 1) {
-    const int block = __builtin_ctzll(left);
-    float* row = block_rows<kBlendRows>(scratch, block)[0] + first;
-    const Native red = load_native(row + kColor * kBlockPixels);
-    const Native green = load_native(row + (kColor + 1) * kBlockPixels);
-    const Native blue = load_native(row + (kColor + 2) * kBlockPixels);
-    const Native behind = load_native(row + kBehind * kBlockPixels);
-    const Native alpha = load_native(alpha_row), w = load_native(weight_row);
-    if (kLargest) sums.largest = max_of(sums.largest, w);
-    const Native more = red * color_red + green * color_green + blue * color_blue - behind;
-    store(behind + alpha * more, row + kBehind * kBlockPixels);
-    // alpha dL/dalpha, whose ln 2 follows below; the cap has no gradient.
-    const Native d_p = select(Native(C::kMaxAlpha) > alpha, w * more, zero);
-    const Native dx = x + kBlockOffsets.x[block], dy = y + kBlockOffsets.y[block];
-    const Native d_x = d_p * dx, d_y = d_p * dy;
-    sums.red = sums.red + w * red;
-    sums.green = sums.green + w * green;
-    sums.blue = sums.blue + w * blue;
-    sums.one = sums.one + d_p;
-    sums.x = sums.x + d_x;
-    sums.y = sums.y + d_y;
-    sums.xx = sums.xx + d_x * dx;
-    sums.xy = sums.xy + d_x * dy;
-    sums.yy = sums.yy + d_y * dy;
-    alpha_row += kBlockPixels;
-    weight_row += kBlockPixels;
-  }
-  return sums;
-}
-
-// The sums over the jobs of one Gaussian of the group, which are written to its slot. Returns the
-// largest weight, if that is asked for. The sums of a register's lanes are taken over all jobs before
-// the next lanes are: those of a whole block would not stay in AVX2's registers, or SSE's.
+// The sums over the jobs of one Gaussian of the group, which are written to its slot: of w
+// dL/dcolour, of alpha dL/dalpha, and of this times dx, dy and their products. Afterwards the Gaussian
+// stands behind those in front of it. Returns the largest weight, if that is asked for.
+// All parts of a block are added to the same lanes. These lie where they do in the first block's first
+// part, and the others' offsets are numbers: of the sums with them follow those with the distances.
 template <bool kLargest>
 static RGBAVATAR_MEMBER float sum_moments(const Tile& tile, const BlockGrid& grid,
                                           const Group& group, int place, const Kept& kept,
                                           TileScratch& scratch, float* slots) {
-  LaneSums sums = sum_lanes<kLargest>(grid, group, place, 0, kept, scratch);
-  for (int first = kNativeLanes; first < kLanes; first += kNativeLanes)
-    sums.add(sum_lanes<kLargest>(grid, group, place, first, kept, scratch));
-  float* slot = slot_of(tile, group.splats[place], slots, kMoments);
+  const Splat& s = group.splats[place];
+  const Native color_red(s.red), color_green(s.green), color_blue(s.blue), zero(0.0f);
+  Native red = zero, green = zero, blue = zero, one = zero, x_sum = zero, y_sum = zero, xx = zero,
+         xy = zero, yy = zero, largest = zero;
+  const float* alpha_row = kept.alpha[group.first_job[place]];
+  const float* weight_row = kept.weight[group.first_job[place]];
+  const int first_block = __builtin_ctzll(group.blocks[place]);
+  const int first_place = PartOffsets::place_of(first_block);
+  for (uint64_t left = group.blocks[place]; left; left &= left - 1) {
+    const int block = __builtin_ctzll(left);
+    const PartOffset* offset = kPartOffsets.between(first_place, PartOffsets::place_of(block));
+    float* row = block_rows<kBlendRows>(scratch, block)[0];
+    for (int part = 0; part < kParts; ++part) {
+      const Native g_red = load_native(row + kColor * kBlockPixels);
+      const Native g_green = load_native(row + (kColor + 1) * kBlockPixels);
+      const Native g_blue = load_native(row + (kColor + 2) * kBlockPixels);
+      const Native behind = load_native(row + kBehind * kBlockPixels);
+      const Native alpha = load_native(alpha_row), w = load_native(weight_row);
+      if (kLargest) largest = max_of(largest, w);
+      const Native more =
+          g_red * color_red + g_green * color_green + g_blue * color_blue - behind;
+      store(behind + alpha * more, row + kBehind * kBlockPixels);
+      // alpha dL/dalpha, whose ln 2 follows below; the cap has no gradient.
+      const Native d_p = select(Native(C::kMaxAlpha) > alpha, w * more, zero);
+      red = red + w * g_red;
+      green = green + w * g_green;
+      blue = blue + w * g_blue;
+      one = one + d_p;
+      x_sum = x_sum + d_p * offset->x;
+      y_sum = y_sum + d_p * offset->y;
+      xx = xx + d_p * offset->xx;
+      xy = xy + d_p * offset->xy;
+      yy = yy + d_p * offset->yy;
+      offset += PartOffsets::kStride;
+      row += kNativeLanes;
+      alpha_row += kNativeLanes;
+      weight_row += kNativeLanes;
+    }
+  }
+  const Native x = load_native(grid.x[first_block % kTileBlocks]) - s.mean_x;
+  const Native y = load_native(grid.y[first_block / kTileBlocks]) - s.mean_y;
+  const Native d_x = x * one + x_sum, d_y = y * one + y_sum;
+  float* slot = slot_of(tile, s, slots, kMoments);
   const Quad units = {1.0f, 1.0f, 1.0f, C::kLn2};
-  store_quad(sums_of(sums.red, sums.green, sums.blue, sums.one) * units, slot);
-  store_quad(sums_of(sums.x, sums.y, sums.xx, sums.xy) * C::kLn2, slot + 4);
-  slot[8] = sum_of(sums.yy) * C::kLn2;
-  return kLargest ? max_lane(sums.largest) : 0.0f;
+  store_quad(sums_of(red, green, blue, one) * units, slot);
+  store_quad(sums_of(d_x, d_y, x * (d_x + x_sum) + xx, x * d_y + (y * x_sum + xy)) * C::kLn2,
+             slot + 4);
+  slot[8] = sum_of(y * (d_y + y_sum) + yy) * C::kLn2;
+  return kLargest ? max_lane(largest) : 0.0f;
 }
 
 static void sum_group(const Tile& tile, const BlockGrid& grid, const Group& group, const Kept& kept,
