@@ -49,14 +49,29 @@ def _help() -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run one sub-command; whoever reads its output may leave (`| head`)."""
+    """Run one sub-command; whoever reads its output may leave (`| head`), which ends it."""
     try:
         _run(arguments)
+    except BrokenPipeError:
+        if _is_read("\n"):  # Some other pipe broke.
+            raise
+        sys.exit(_ENDED_BY_A_PIPE)
     finally:
-        try:
-            sys.stdout.flush()
-        except BrokenPipeError:  # Python would complain when it ends.
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _is_read()
+
+
+_ENDED_BY_A_PIPE = 141
+"""What shells give for SIGPIPE, 128 + 13."""
+
+
+def _is_read(more: str = "") -> bool:
+    """Whether somebody takes what was printed, and `more`; else nothing is left to be written."""
+    try:
+        print(more, end="", flush=True)
+    except BrokenPipeError:  # Python would complain when it ends.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return False
+    return True
 
 
 def _run(arguments: Sequence[str] | None) -> None:

@@ -27,15 +27,16 @@ def test_a_users_mistake_is_told_in_one_line_without_a_traceback(refused, tmp_pa
 
 
 @pytest.mark.parametrize("buffered", [True, False])
-def test_who_reads_the_output_may_leave(buffered):
-    program = "from rgbavatar_ns.cli.main import main; main(['--help'])"
+@pytest.mark.parametrize(("words", "code"), [(["--help"], 0), (["render", "--help"], 141)])
+def test_who_reads_the_output_may_leave(words, code, buffered):
+    program = f"from rgbavatar_ns.cli.main import main; main({words})"
     env = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
     reader, writer = os.pipe()
     os.close(reader)
-    words = [sys.executable, *["-u"] * (not buffered), "-c", program]
-    ended = subprocess.run(words, stdout=writer, stderr=subprocess.PIPE, env=env, check=False)
+    started = [sys.executable, *["-u"] * (not buffered), "-c", program]
+    ended = subprocess.run(started, stdout=writer, stderr=subprocess.PIPE, env=env, check=False)
     os.close(writer)
-    assert (ended.returncode, ended.stderr) == (0, b"")
+    assert (ended.returncode, ended.stderr) == (code, b"")
 
 
 @pytest.mark.parametrize("name", list(cli.COMMANDS))
