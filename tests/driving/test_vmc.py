@@ -12,6 +12,7 @@ from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head.arkit import ARKIT_NAMES
 
 osc = pytest.importorskip("pythonosc.osc_message_builder", reason="python-osc is not installed")
+osc_bundle = pytest.importorskip("pythonosc.osc_bundle_builder")
 
 
 def _message(address, *values):
@@ -65,6 +66,37 @@ def test_nothing_is_shown_before_it_is_applied(source):
     assert source.next(0.05) is None
     _send(source, _message("/VMC/Ext/Blend/Apply"))
     assert _value(source.next(1.0), "jawOpen") == 0.5
+
+
+def test_what_is_told_after_a_frame_belongs_to_the_next(source):
+    """However many packets wait: a frame is what was told when it was applied."""
+    half = math.sin(math.radians(15))
+    begun = [
+        _message("/VMC/Ext/Blend/Val", "jawOpen", 0.75),
+        _message("/VMC/Ext/Bone/Pos", "Head", 0.0, 1.5, 0.0, half, 0.0, 0.0, half),
+    ]
+    applied = _message("/VMC/Ext/Blend/Apply")
+    _send(source, _message("/VMC/Ext/Blend/Val", "jawOpen", 0.25), applied)
+    before = source.next(1.0)
+    _send(source, applied, *begun)
+    frame = source.next(1.0)
+    assert _value(frame, "jawOpen") == 0.25
+    assert frame.head_rotation is before.head_rotation
+    _send(source, applied)
+    frame = source.next(1.0)
+    assert _value(frame, "jawOpen") == 0.75
+    assert frame.head_rotation.tolist() == pytest.approx([math.radians(90), 0, 0], abs=1e-5)
+
+
+def test_one_packet_may_end_a_frame_and_begin_the_next(source):
+    bundle = osc_bundle.OscBundleBuilder(osc_bundle.IMMEDIATELY)
+    for told in (("Val", "jawOpen", 0.25), ("Apply",), ("Val", "jawOpen", 0.75)):
+        message = osc.OscMessageBuilder(f"/VMC/Ext/Blend/{told[0]}")
+        for value in told[1:]:
+            message.add_arg(value)
+        bundle.add_content(message.build())
+    _send(source, bundle.build().dgram)
+    assert _value(source.next(1.0), "jawOpen") == 0.25
 
 
 def test_the_head_turns_to_the_same_side_as_in_unity(source):

@@ -82,36 +82,37 @@ class VmcSource:
         """The newest frame that was applied."""
         until_s = time.monotonic() + timeout_s
         while (left_s := until_s - time.monotonic()) > 0:
-            applied_s, frames = None, 0
-            for came_s, packet in self._datagrams.take(left_s):
-                if self._read(packet):
-                    applied_s, frames = came_s, frames + 1
-            self.counts["skipped"] += max(frames - 1, 0)
-            if applied_s is not None:
+            applied = [
+                (came_s, coefficients, turn)
+                for came_s, packet in self._datagrams.take(left_s)
+                for coefficients, turn in self._read(packet)
+            ]
+            self.counts["skipped"] += max(len(applied) - 1, 0)
+            if applied:
                 self._index += 1
+                came_s, coefficients, turn = applied[-1]
                 return PerformanceFrame(
-                    self._index,
-                    applied_s,
-                    applied_s,
-                    coefficients=self._coefficients(),
-                    head_rotation=self._turn,
+                    self._index, came_s, came_s, coefficients=coefficients, head_rotation=turn
                 )
         return None
 
-    def _read(self, packet: bytes) -> bool:
-        """Take over what a packet tells; whether it ends a frame."""
-        applied = False
+    def _read(self, packet: bytes) -> list[tuple[Float[Tensor, "52"], Float[Tensor, "3"] | None]]:
+        """Take over what a packet tells; coefficients and turn of each frame that it ends.
+
+        They are taken where the frame ends: what follows it belongs to the next one.
+        """
+        applied = []
         try:
             messages = [timed.message for timed in self._packet(packet).messages]
         except (self._parse_error, ValueError, IndexError, RecursionError):
             self.counts["unreadable"] += 1
-            return False
+            return []
         for message in messages:
             values = list(message)
             if message.address == "/VMC/Ext/Blend/Val":
                 self._take_value(values)
             elif message.address == "/VMC/Ext/Blend/Apply":
-                applied = True
+                applied.append((self._coefficients(), self._turn))
             elif message.address == "/VMC/Ext/Bone/Pos" and values[:1] == [_HEAD]:
                 self._take_turn(values[4:])
         return applied
