@@ -28,6 +28,9 @@ _GREY_TOLERANCE = 24
 """JPEG files of grey pictures come out a little coloured."""
 _PNG_HEADER_BYTES, _JPEG_HEADER_BYTES = 33, 1 << 16
 _NEARLY_WHITE = 250
+_ORIENTATION = 0x0112
+_ON_ITS_SIDE = range(5, 9)
+"""EXIF's orientations of pictures whose stored width is their height."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +50,7 @@ class FrameImage:
 
 @dataclass(frozen=True)
 class ImageHeader:
-    """What a file's first bytes say."""
+    """What a file's first bytes say; width and height are those of the picture set upright."""
 
     width: int
     height: int
@@ -151,18 +154,12 @@ def _decode(encoded: bytes, size: tuple[int, int]) -> UInt8[np.ndarray, "height 
     is_jpeg = encoded[:2] == _JPEG_START
     header = _jpeg_header(encoded) if is_jpeg else png_header_size(encoded)
     if header is not None:
-        _require_as_many_pixels(header[0] * header[1], size)
+        if header[0] * header[1] > MAX_PIXELS:
+            raise UnusableFrameError("images of more than 8192 x 8192 pixels")
+        _require_size(header[:2], size)
     image = _decode_jpeg(encoded, header) if is_jpeg else _decode_png(encoded)
     _require_size(image.shape[1::-1], size)
     return image
-
-
-def _require_as_many_pixels(promised: int, size: tuple[int, int]) -> None:
-    """Of a header; its sides may be those of a picture that EXIF turns."""
-    if promised > MAX_PIXELS:
-        raise UnusableFrameError("images of more than 8192 x 8192 pixels")
-    if promised != size[0] * size[1]:
-        raise UnusableFrameError("images whose parts differ in size")
 
 
 def _decode_png(encoded: bytes) -> UInt8[np.ndarray, "height width 4"]:
@@ -220,8 +217,11 @@ def is_damaged_jpeg(encoded: bytes) -> bool:
 
 
 def _jpeg_header(encoded: bytes) -> tuple[int, int, int] | None:
-    """(width, height, components) from a JPEG's frame header; None where there is none."""
-    place = 2
+    """(width, height, components) from a JPEG's frame header; None where there is none.
+
+    The sides are those of the picture as OpenCV sets it upright by its EXIF data.
+    """
+    place, lies_on_its_side = 2, False
     while place + 9 < len(encoded) and encoded[place] == 0xFF:
         marker = encoded[place + 1]
         if marker == 0xFF:  # fill bytes
@@ -229,6 +229,30 @@ def _jpeg_header(encoded: bytes) -> tuple[int, int, int] | None:
             continue
         if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
             height, width, components = struct.unpack(">HHB", encoded[place + 5 : place + 10])
-            return width, height, components
-        place += 2 + struct.unpack(">H", encoded[place + 2 : place + 4])[0]
+            sides = (height, width) if lies_on_its_side else (width, height)
+            return *sides, components
+        end = place + 2 + struct.unpack(">H", encoded[place + 2 : place + 4])[0]
+        if marker == 0xE1 and encoded[place + 4 : place + 10] == b"Exif\0\0":
+            lies_on_its_side = _exif_orientation(encoded[place + 10 : end]) in _ON_ITS_SIDE
+        place = end
     return None
+
+
+def _exif_orientation(block: bytes) -> int:
+    """How EXIF data, which has TIFF's form, says that the picture lies; 1 (upright) if it does not.
+
+    Source: TIFF 6.0, sections 2 and 8 (Orientation).
+    """
+    order = {b"II*\0": "<", b"MM\0*": ">"}.get(block[:4])
+    if order is None:
+        return 1
+    try:
+        (place,) = struct.unpack_from(f"{order}I", block, 4)
+        (count,) = struct.unpack_from(f"{order}H", block, place)
+        for entry in range(count):
+            tag, _, _, value = struct.unpack_from(f"{order}HHIH", block, place + 2 + 12 * entry)
+            if tag == _ORIENTATION:
+                return value
+    except struct.error:  # It ends before what it promises.
+        pass
+    return 1

@@ -118,6 +118,37 @@ def test_a_matte_that_exif_turns_is_turned_as_ever(tmp_path):
     assert (alpha[:, :8] < 5).all()
 
 
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize("orientation", range(10))
+def test_the_header_tells_a_turned_jpegs_size_as_opencv_decodes_it(orientation, order, tmp_path):
+    exif = Image.Exif()
+    exif.endian = order
+    exif[0x010F], exif[0x0112], exif[0x0131] = "before", orientation, "behind"
+    path = tmp_path / "turned.jpg"
+    corner = np.zeros((48, 64, 3), np.uint8)
+    corner[:24, :32] = 255
+    Image.fromarray(corner).save(path, exif=exif, xmp=b"<x/>", comment="turned")
+    upright = cv2.imread(str(path))
+    header = image_header(path)
+    assert (header.height, header.width) == upright.shape[:2]
+    assert np.array_equal(decoded(FrameImage(path))[..., 2::-1], upright)
+
+
+def test_exif_data_cut_anywhere_is_no_error():
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    file = io.BytesIO()
+    Image.new("RGB", (64, 48)).save(file, "JPEG", exif=exif)
+    whole = file.getvalue()
+    start = whole.index(b"\xff\xe1")
+    length = int.from_bytes(whole[start + 2 : start + 4], "big")
+    for kept in range(2, length):
+        cut = whole[: start + 2] + kept.to_bytes(2, "big") + whole[start + 4 : start + 2 + kept]
+        header = frame_images._jpeg_header(cut + whole[start + 2 + length :])
+        assert header is not None
+        assert sorted(header[:2]) == [48, 64], kept
+
+
 def _jpegs() -> dict[str, bytes]:
     """A portrait's colours in the kinds of JPEG that there are."""
     x, y = np.meshgrid(np.linspace(-1, 1, 96), np.linspace(-1, 1, 80))
