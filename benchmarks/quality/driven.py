@@ -43,7 +43,7 @@ def main(
     subject = load_subject(run, None)
     print("performer, frames: correlation (standard deviation of performer -> avatar; mm, degrees)")
     for source in sources:
-        head, frames = _performed(source)
+        head, frames = _performed(source, subject.camera.height)
         transfer = LiveTransfer(subject.avatar, subject.seen, head, subject.camera)
         driven = torch.stack([transfer(frame) for frame in frames])
         theta = torch.stack([frame.theta for frame in frames if frame.theta is not None])
@@ -66,12 +66,12 @@ def main(
             output.close()
 
 
-def _performed(source: Path) -> tuple[PerformerHead, list[PerformanceFrame]]:
-    """All frames of a video or a dataset."""
+def _performed(source: Path, image_height_px: int) -> tuple[PerformerHead, list[PerformanceFrame]]:
+    """All frames of a video or a dataset, with pictures of this height."""
     if source.is_dir():
-        performer = dataset_source(dataset_folder(source), _RATE, False, True)
+        performer = dataset_source(dataset_folder(source), _RATE, False, image_height_px)
     else:
-        performer = FilmedPerformer(str(source), False, with_images=True)
+        performer = FilmedPerformer(str(source), False, image_height_px)
     frames = []
     while not performer.ended:
         frame = performer.next(1.0)

@@ -122,7 +122,8 @@ def run(
     subject = load_subject(run_folder, data, show.width, show.height, film=False)
     if (lost := told_lost(subject)) is not None:
         _tell(lost)
-    performer = _performer(subject, source, real_time, show.beside)
+    beside_px = subject.camera.height if show.beside else None
+    performer = _performer(subject, source, real_time, beside_px)
     transfer = LiveTransfer(subject.avatar, subject.seen, performer.head, subject.camera, live)
     if transfer.told:
         _tell(f"note: {transfer.told}")
@@ -217,7 +218,7 @@ def _run(drive: "LiveDrive", seconds: float | None) -> None:
 
 
 def _performer(
-    subject: "Subject", options: SourceOptions, real_time: bool, with_images: bool
+    subject: "Subject", options: SourceOptions, real_time: bool, image_height_px: int | None
 ) -> "PerformanceSource":
     """The source that the flags name; raises UserError where there is none."""
     from rgbavatar_ns.driving.source import PerformerHead
@@ -250,10 +251,10 @@ def _performer(
         from rgbavatar_ns.export import dataset_folder
 
         rate = options.source_frames_per_second
-        return dataset_source(dataset_folder(path), rate, real_time, with_images)
+        return dataset_source(dataset_folder(path), rate, real_time, image_height_px)
     from rgbavatar_ns.tracking.performer import FilmedPerformer
 
-    return FilmedPerformer(_camera(name), real_time, with_images)
+    return FilmedPerformer(_camera(name), real_time, image_height_px)
 
 
 def _kind(name: str) -> Kind:

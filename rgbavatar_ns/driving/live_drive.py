@@ -35,7 +35,7 @@ class DrivenFrame:
     time_s: float
     """By the source's own clock."""
     image_rgb: UInt8[np.ndarray, "height width 3"] | None = None
-    """The performer's picture, where there is one."""
+    """The performer's picture, where there is one, as high as the pictures beside which it is."""
 
 
 class Latencies:

@@ -28,7 +28,7 @@ class PerformanceFrame:
     head_rotation: Float[Tensor, "3"] | None = None
     """With `coefficients`: axis-angle in radians, x the subject's left, y up, z out of the face."""
     image_rgb: UInt8[np.ndarray, "height width 3"] | None = None
-    """The source's own picture, where it has one."""
+    """The source's own picture, where it has one, at the height that was asked of the source."""
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,6 @@ from jaxtyping import UInt8
 
 from rgbavatar_ns.avatar.method import AvatarMethod
 from rgbavatar_ns.drawing.compositing import to_uint8
-from rgbavatar_ns.drawing.contact_sheet import scaled
 from rgbavatar_ns.driving.live_drive import DrivenFrame, Latencies
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.export.drawing import Color, draw
@@ -62,7 +61,7 @@ class PictureOutput:
         drawn = draw(self._avatar, theta, self._camera, self._background, to_be_seen=True)
         picture = to_uint8(drawn.image[0])
         if self._beside and frame.image_rgb is not None:
-            picture = np.concatenate([self._performer(frame.image_rgb, picture), picture], axis=1)
+            picture = np.concatenate([self._performer(frame.image_rgb), picture], axis=1)
         self._sink.add(picture, frame.time_s)
         self.latencies.add(frame.captured_s, time.monotonic())
 
@@ -70,14 +69,13 @@ class PictureOutput:
         """Pictures are of the avatar alone."""
 
     def _performer(
-        self, image_rgb: UInt8[np.ndarray, "H W 3"], picture: _Picture
+        self, image_rgb: UInt8[np.ndarray, "height W 3"]
     ) -> UInt8[np.ndarray, "height beside 3"]:
-        """The performer's picture as high as the avatar's, and as wide as the first one was."""
-        performer = scaled(image_rgb, len(picture) / len(image_rgb))
-        self._beside_px = self._beside_px or performer.shape[1]
-        tile = np.full((len(picture), self._beside_px, 3), 255, np.uint8)
-        height, width = (min(a, b) for a, b in zip(tile.shape, performer.shape[:2]))
-        tile[:height, :width] = performer[:height, :width]
+        """The performer's picture as wide as the first one was."""
+        height, width = image_rgb.shape[:2]
+        self._beside_px = self._beside_px or width
+        tile = np.full((height, self._beside_px, 3), 255, np.uint8)
+        tile[:, :width] = image_rgb[:, : self._beside_px]
         return tile
 
     def close(self) -> None:

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from rgbavatar_ns.data.streams.address import told_address
+from rgbavatar_ns.drawing.contact_sheet import scaled
 from rgbavatar_ns.driving.source import PerformanceFrame, PerformerHead
 from rgbavatar_ns.errors import UserError, first_few
 from rgbavatar_ns.tracking.input.capture import (
@@ -36,20 +37,21 @@ class FilmedPerformer(TrackedCapture):
     `source` names: a camera's number, a device, a network address, a video file or a folder of
     images. Of a file in real time only what is due is tracked, else every frame. Raises UserError
     where the camera cannot be opened or shows nothing, and where the file cannot be read.
+    image_height_px: of the pictures that frames bring along; without it they bring none.
     """
 
     def __init__(
         self,
         source: str,
         real_time: bool = True,
-        with_images: bool = False,
+        image_height_px: int | None = None,
         tracker: Any = None,
         capture: FrameCapture | None = None,
     ) -> None:
         super().__init__(_open(source, real_time) if capture is None else capture, tracker)
         self._told = told_address(source)
         self.head = PerformerHead(self._tracker.head.layout, self._tracker.head.arrays)
-        self._with_images = with_images
+        self._image_height_px = image_height_px
         self._keeps_all = not real_time
         self._unmet: dict[int, CapturedFrame] = {}
         self._backlog: deque[PerformanceFrame] = deque()
@@ -106,7 +108,11 @@ class FilmedPerformer(TrackedCapture):
 
     def _performed(self, captured: CapturedFrame, theta: Float[Tensor, "H"]) -> PerformanceFrame:
         clock_s = captured.captured_s if captured.time_s is None else captured.time_s
-        image_rgb = captured.image_rgb if self._with_images else None
+        image_rgb = None
+        if self._image_height_px is not None:
+            # Now: a film's beginning is kept for seconds, whose whole pictures may be gigabytes.
+            zoom = self._image_height_px / len(captured.image_rgb)
+            image_rgb = scaled(captured.image_rgb, zoom)
         return PerformanceFrame(
             captured.index, captured.captured_s, clock_s, theta=theta, image_rgb=image_rgb
         )

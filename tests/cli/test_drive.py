@@ -176,7 +176,7 @@ def test_the_key_for_pages_of_the_disk_is_told_in_the_terminal_once(avatar, caps
 def test_what_arkit_takes_is_made_before_the_first_message(with_a_face, capsys):
     avatar = avatar_of(arrays=None if with_a_face else small_head_arrays())
     options = SourceOptions(source="websocket", listen="127.0.0.1:0")
-    source = drive._performer(SimpleNamespace(avatar=avatar), options, True, False)
+    source = drive._performer(SimpleNamespace(avatar=avatar), options, True, None)
     source.close()
     assert ("arkit" in vars(avatar)) == with_a_face
     told = capsys.readouterr().err

@@ -245,17 +245,17 @@ def test_a_dataset_performs_with_its_own_theta_and_pictures(tmp_path):
     config = DemoConfig(num_frames=6, num_test_frames=2, image_size=32)
     make_demo_dataset(tmp_path / "data", config)
     made = load_dataset(tmp_path / "data")
-    source = dataset_source(made.root, None, False, True)
+    source = dataset_source(made.root, None, False, 16)
     frames = []
     while not source.ended:
         frames.append(source.next(0.0))
     assert torch.equal(torch.stack([f.theta for f in frames]), made.theta)
-    assert frames[0].image_rgb.shape == (32, 32, 3)
+    assert frames[0].image_rgb.shape == (16, 16, 3)
     assert source.head.layout == made.layout
     assert [f.time_s for f in frames] == pytest.approx(
         [k / config.frames_per_second for k in range(6)]
     )
-    faster = dataset_source(made.root, 50.0, False, False)
+    faster = dataset_source(made.root, 50.0, False, None)
     assert [faster.next(0.0).time_s for _ in range(6)] == pytest.approx([k / 50 for k in range(6)])
 
 
@@ -271,7 +271,7 @@ def test_frames_that_are_not_in_a_dataset_leave_a_gap_in_its_performance(tmp_pat
                 frame[name] = value
         held_out = {"test": [frames[-1]["index"]]}
         path.write_text(json.dumps({**written, "frames": frames} | held_out))
-        source, found = dataset_source(made.root, 10.0, False, False), []
+        source, found = dataset_source(made.root, 10.0, False, None), []
         while not source.ended:
             frame = source.next(0.0)
             place = int((made.theta - frame.theta).abs().sum(1).argmin())

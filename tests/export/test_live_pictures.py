@@ -47,15 +47,17 @@ def test_what_is_shown_is_the_avatars_picture():
     assert output.latencies.shown == 3
 
 
-def test_the_performer_stands_beside_it_at_one_size_whatever_comes():
+def test_the_performer_stands_beside_it_at_one_width_whatever_comes():
     avatar = avatar_of()
     kept = _Kept()
     output = PictureOutput(avatar, front_camera(avatar, 40, 40), _WHITE, kept, beside=True)
     theta = torch.zeros(avatar.layout.size)
-    for k, size in enumerate([(60, 80), (60, 80), (120, 90)]):
+    for k, size in enumerate([(40, 53), (40, 53), (40, 30), (40, 90)]):
         output.show(_frame(k, theta, np.full((*size, 3), 200, np.uint8)))
     assert {picture.shape for picture in kept.pictures} == {(40, 93, 3)}
-    assert (kept.pictures[0][:, :50] == 200).all()
+    for picture, width in zip(kept.pictures, (53, 53, 30, 53)):
+        assert (picture[:, :width] == 200).all()
+        assert (picture[:, width:53] == 255).all()
 
 
 def _levels(path):

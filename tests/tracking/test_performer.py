@@ -70,12 +70,14 @@ def _all(performer):
 
 
 def test_offline_no_frame_is_lost_not_even_those_that_give_the_person(film):
-    performer = FilmedPerformer(str(film), False, with_images=True, tracker=_Tracker(warm_up=12))
+    performer = FilmedPerformer(str(film), False, image_height_px=8, tracker=_Tracker(warm_up=12))
     frames = _all(performer)
     assert [frame.index for frame in frames] == list(range(40))
     levels = [float(frame.theta[0]) for frame in frames]
     assert np.allclose(levels, [40 + 5 * k for k in range(40)], atol=3)
-    assert [frame.image_rgb.shape for frame in frames] == [(32, 32, 3)] * 40
+    assert [frame.image_rgb.shape for frame in frames] == [(8, 8, 3)] * 40
+    shown = [frame.image_rgb.mean() for frame in frames]
+    assert np.allclose(shown, levels, atol=1), "of that frame, and tracked at its own size"
     assert frames[25].time_s - frames[0].time_s == pytest.approx(1.0)
 
 
