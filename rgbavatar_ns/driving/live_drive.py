@@ -107,6 +107,10 @@ class FrameTransfer(Protocol):
         """Learn from a frame ahead of its turn."""
         ...
 
+    def conclude(self) -> None:
+        """Learn no more: what is known so far counts."""
+        ...
+
     def __call__(self, frame: PerformanceFrame) -> Float[Tensor, "H"]:
         """The avatar's theta."""
         ...
@@ -231,7 +235,9 @@ class LiveDrive:
                     continue
                 self._show_all([*ahead, performed])
                 ahead.clear()
-            self._show_all(ahead)
+            if ahead:
+                self._transfer.conclude()
+                self._show_all(ahead)
         except BaseException as error:
             self._trouble = error
         finally:

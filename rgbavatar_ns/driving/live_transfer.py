@@ -46,7 +46,10 @@ _LEAST_UNIT = 0.3
 """Of smoothing: what hardly moved in the film trembles all the more in another's performance."""
 _MOST_TURNS_BACK, _SAME_DEGREES = 4, 0.5
 _GAP_S = 0.5
-"""After a longer gap the performer may be anywhere: nothing is smoothed across it."""
+"""After a longer gap the performer may be anywhere: nothing is smoothed across it, and of a
+calibration no more of it counts."""
+_LEAST_FRAMES = 10
+"""Fewer say too little of who performs, however long they took."""
 _MOST_FRAMES = 600
 """A calibration keeps no more: ten seconds of the quickest senders."""
 
@@ -122,6 +125,7 @@ class LiveTransfer:
         self._reference: Reference | None = None
         self._seen: list[Tensor] = []
         self._began_s: float | None = None
+        self._learnt_s = 0.0
         self._last_s: float | None = None
         self._learning, self._calibrated = options.calibrate_s > 0, False
 
@@ -139,6 +143,16 @@ class LiveTransfer:
     def learn(self, frame: PerformanceFrame) -> None:
         """Take a frame into the calibration before its turn, as of a recording one can."""
         self._learn(self._mapped(frame).theta[0], frame.time_s)
+
+    def conclude(self) -> None:
+        """Take what was learnt so far for the performer's rest, as at a recording's end."""
+        if not self._seen:
+            return
+        seen = torch.stack(self._seen)
+        self._reference = self._reference_of(seen)
+        if self._lips is not None:
+            self._closed.calibrate(self._lips(seen))
+        self._learning, self._calibrated, self._seen = False, True, []
 
     @torch.no_grad()
     def __call__(self, frame: PerformanceFrame) -> Float[Tensor, "H"]:
@@ -186,16 +200,17 @@ class LiveTransfer:
         The first time the reference is what the frames so far say, so that the avatar follows at
         once; later the old one stays until a new one is known.
         """
-        if self._began_s is None or time_s < self._began_s:
-            self._began_s = time_s
+        if self._began_s is None:
+            self._began_s = self._learnt_s = time_s
+        step_s, self._learnt_s = time_s - self._learnt_s, time_s
+        # As if it had begun so much later: while nobody is seen, nothing is learnt.
+        self._began_s += step_s - min(max(step_s, 0.0), _GAP_S)
         self._seen.append(theta)
-        over = time_s - self._began_s >= self.options.calibrate_s or len(self._seen) >= _MOST_FRAMES
-        if over or not self._calibrated:
+        long = time_s - self._began_s >= self.options.calibrate_s
+        if (long and len(self._seen) >= _LEAST_FRAMES) or len(self._seen) >= _MOST_FRAMES:
+            self.conclude()
+        elif not self._calibrated:
             self._reference = self._reference_of(torch.stack(self._seen))
-        if over:
-            if self._lips is not None:
-                self._closed.calibrate(self._lips(torch.stack(self._seen)))
-            self._learning, self._calibrated, self._seen = False, True, []
 
     def _settle(self, theta: Float[Tensor, "H"], seconds: float) -> None:
         """Let rest follow down what only rises from it: who talked while being met rests later."""

@@ -29,6 +29,9 @@ class _Transfer:
     def learn(self, frame):
         raise AssertionError("nothing is to be learnt")
 
+    def conclude(self):
+        raise AssertionError("nothing was learnt")
+
 
 class _Source:
     head, waits_for = None, "a face"
@@ -93,14 +96,17 @@ class _Learning(_Transfer):
 
     def __init__(self):
         super().__init__()
-        self.learnt, self.knew = [], []
+        self.learnt, self.knew, self.concluded = [], [], False
 
     @property
     def calibrating(self):
-        return len(self.learnt) < 5
+        return len(self.learnt) < 5 and not self.concluded
 
     def learn(self, frame):
         self.learnt.append(frame.index)
+
+    def conclude(self):
+        self.concluded = True
 
     def __call__(self, frame):
         self.knew.append(len(self.learnt))
@@ -115,6 +121,7 @@ def test_a_film_begins_once_the_performers_rest_is_known(count):
     LiveDrive(_Source(count), transfer, [output], real_time=False).run()
     assert output.seen == list(range(1, count + 1))
     assert transfer.knew[0] == min(count, 5), "all that was to be learnt, or all there was"
+    assert transfer.learnt == list(range(1, min(count, 5) + 1)), "each once"
 
 
 def test_live_nobody_waits_for_the_calibration():
