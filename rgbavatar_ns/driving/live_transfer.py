@@ -12,7 +12,7 @@ from torch import Tensor
 from rgbavatar_ns.avatar.method import AvatarMethod
 from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics, expressive_numbers
 from rgbavatar_ns.driving.closed_lips import ClosedLips
-from rgbavatar_ns.driving.one_euro import OneEuroFilter, OneEuroOptions
+from rgbavatar_ns.driving.one_euro import GAP_S, OneEuroFilter, OneEuroOptions
 from rgbavatar_ns.driving.source import PerformanceFrame, PerformerHead
 from rgbavatar_ns.driving.theta_map import MappedTheta, arkit_theta, theta_map
 from rgbavatar_ns.driving.transfer import (
@@ -45,9 +45,6 @@ _SETTLES_IN_S = 0.3
 _LEAST_UNIT = 0.3
 """Of smoothing: what hardly moved in the film trembles all the more in another's performance."""
 _MOST_TURNS_BACK, _SAME_DEGREES = 4, 0.5
-_GAP_S = 0.5
-"""After a longer gap the performer may be anywhere: nothing is smoothed across it, and of a
-calibration no more of it counts."""
 _LEAST_FRAMES = 10
 """Fewer say too little of who performs, however long they took."""
 _MOST_FRAMES = 600
@@ -165,8 +162,8 @@ class LiveTransfer:
         performed = mapped.theta[0]
         seconds = 0.0 if self._last_s is None else frame.time_s - self._last_s
         self._last_s = frame.time_s
-        if not 0 < seconds < _GAP_S:
-            self._filter, seconds = OneEuroFilter(self.options.filter), 0.0
+        if not 0 < seconds < GAP_S:
+            seconds = 0.0  # As if it were the first one.
         if self._learning:
             self._learn(performed, frame.time_s)
         self._settle(performed, seconds)
@@ -203,8 +200,8 @@ class LiveTransfer:
         if self._began_s is None:
             self._began_s = self._learnt_s = time_s
         step_s, self._learnt_s = time_s - self._learnt_s, time_s
-        # As if it had begun so much later: while nobody is seen, nothing is learnt.
-        self._began_s += step_s - min(max(step_s, 0.0), _GAP_S)
+        # As if it had begun so much later but for `GAP_S`: while nobody is seen, nothing is learnt.
+        self._began_s += step_s - min(max(step_s, 0.0), GAP_S)
         self._seen.append(theta)
         long = time_s - self._began_s >= self.options.calibrate_s
         if (long and len(self._seen) >= _LEAST_FRAMES) or len(self._seen) >= _MOST_FRAMES:

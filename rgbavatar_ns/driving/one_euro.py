@@ -1,13 +1,18 @@
 """The one-euro filter against jitter (Casiez, Roussel and Vogel, CHI 2012)."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from rgbavatar_ns.options import CheckedOptions, Positive, Weight
+
+GAP_S = 0.5
+"""After a longer gap a face may be anywhere: nothing is smoothed across it."""
 
 
 @dataclass(frozen=True)
@@ -27,6 +32,7 @@ class OneEuroFilter:
 
     Looks back only. Rotations may come as axis-angle vectors, as long as they stay below half a
     turn. At a steady speed v the result lags by v / (2 pi cutoff), less one frame at most.
+    After a gap of `GAP_S` it begins anew.
     """
 
     def __init__(self, options: OneEuroOptions | None = None) -> None:
@@ -36,7 +42,7 @@ class OneEuroFilter:
 
     def __call__(self, values: Float[Tensor, "D"], seconds: float) -> Float[Tensor, "D"]:
         """The next vector, so many seconds after the one before it; the first is as it comes."""
-        if self._last is None or self._speed is None or seconds <= 0:
+        if self._last is None or self._speed is None or not 0 < seconds < GAP_S:
             self._last, self._speed = values.clone(), torch.zeros_like(values)
             return self._last
         options, rate = self._options, 1 / seconds
@@ -49,11 +55,19 @@ class OneEuroFilter:
 
 
 def one_euro(
-    values: Float[Tensor, "F D"], frames_per_second: float, options: OneEuroOptions | None = None
+    values: Float[Tensor, "F D"],
+    frames_per_second: float,
+    options: OneEuroOptions | None = None,
+    moments: Sequence[int] | None = None,
 ) -> Float[Tensor, "F D"]:
-    """Smooth each column of a whole performance (`OneEuroFilter`)."""
+    """Smooth each column of a whole performance (`OneEuroFilter`).
+
+    moments: when each row was filmed, in frames, rising; by default one after another.
+    """
     smoothed = OneEuroFilter(options)
-    rows = [smoothed(row, 1 / frames_per_second) for row in values]
+    filmed = range(len(values)) if moments is None else moments
+    steps = [0, *(later - earlier for earlier, later in pairwise(filmed))]
+    rows = [smoothed(row, step / frames_per_second) for row, step in zip(values, steps)]
     return torch.stack(rows) if rows else values.clone()
 
 

@@ -67,19 +67,23 @@ def drive(
     frames_per_second: float,
     options: DrivingOptions | None = None,
     films: Sequence[Sequence[int]] | None = None,
+    moments: Sequence[int] | None = None,
 ) -> MappedTheta:
     """A whole performance as the avatar's theta: smoothed, relative, held.
 
     `layout` and `own` are the avatar's: what its theta holds, and what it saw in training. films:
-    rows that follow one another, a list for each camera; by default all as they come.
+    rows that follow one another, a list for each camera; by default all as they come. moments:
+    when each row was filmed, in frames, so that nothing is smoothed across a gap; by default one
+    after another.
     """
     options = DrivingOptions() if options is None else options
     result = mapped.theta
     if options.smooth:
         result = result.clone()
+        filmed = range(len(result)) if moments is None else moments
         for rows in [range(len(result))] if films is None else films:
-            film = mapped.theta[list(rows)]
-            result[list(rows)] = one_euro(film, frames_per_second, options.filter)
+            film, when = mapped.theta[list(rows)], [filmed[row] for row in rows]
+            result[list(rows)] = one_euro(film, frames_per_second, options.filter, when)
     references = reference_of(result, layout), own_reference(own)
     result = relative_theta(result, *references, mapped.known, own, layout, options)
     return replace(mapped, theta=result)

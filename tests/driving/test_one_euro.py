@@ -57,6 +57,19 @@ def test_a_shift_passes_through(seed, shift):
     assert torch.allclose(one_euro(values + shift, _RATE), one_euro(values, _RATE) + shift)
 
 
+def test_what_lies_beyond_a_gap_is_smoothed_by_itself():
+    values = torch.randn(30, 2, generator=torch.Generator().manual_seed(3)).double()
+    moments = [*range(12), *range(30, 48)]
+    apart = [one_euro(values[part], _RATE) for part in (slice(0, 12), slice(12, 30))]
+    assert torch.equal(one_euro(values, _RATE, moments=moments), torch.cat(apart))
+
+
+def test_every_other_frame_is_smoothed_as_a_film_of_half_the_rate():
+    values = torch.randn(30, 2, generator=torch.Generator().manual_seed(4)).double()
+    there = one_euro(values, _RATE, moments=range(7, 67, 2))
+    assert torch.allclose(there, one_euro(values, _RATE / 2), rtol=0, atol=1e-12)
+
+
 def test_no_filter_is_refused():
     for wrong in ({"min_cutoff_hz": 0.0}, {"beta": -1.0}, {"derivative_cutoff_hz": 0.0}):
         with pytest.raises(UserError, match="Give a number from"):

@@ -140,6 +140,23 @@ def test_a_driver_that_several_cameras_filmed_is_smoothed_as_one_of_one_camera(t
     assert not torch.allclose(one, theta[:4], atol=0.01), "else nothing was smoothed"
 
 
+def test_a_driver_is_not_smoothed_across_frames_in_which_nobody_was_found(tmp_path, seen):
+    driver = tiny_dataset(tmp_path / "driver", frames=6, test=1)
+    avatar = avatar_of(num_bases=0, arrays=driver.arrays)
+    theta = torch.zeros_like(driver.theta)
+    jaw = driver.layout.slice("jaw").start
+    theta[3:, jaw] = 0.3
+    options = DrivingOptions(relative="off", pose="absolute", smooth=True)
+
+    def driven(*frame_index: int) -> torch.Tensor:
+        film = replace(driver, theta=theta, frame_index=frame_index)
+        return driven_by(avatar, film, range(6), seen, 25.0, options).theta[:, jaw]
+
+    apart = driven(0, 1, 2, 100, 101, 102)
+    torch.testing.assert_close(apart, theta[:, jaw], rtol=0, atol=1e-6)
+    assert driven(0, 1, 2, 3, 4, 5)[3] < 0.25, "else nothing was smoothed"
+
+
 def test_what_goes_beyond_the_film_is_told_and_counted(avatar, seen):
     scene = _moved(avatar, 4)
     scene.theta[:, :] = seen.theta_neutral
