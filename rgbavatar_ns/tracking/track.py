@@ -36,6 +36,7 @@ from rgbavatar_ns.tracking.image.crop import SquareCrop, steady_crop
 from rgbavatar_ns.tracking.image.frame_images import FrameImages
 from rgbavatar_ns.tracking.image.matting import PersonMatte
 from rgbavatar_ns.tracking.image.outlines import key_outlines
+from rgbavatar_ns.tracking.input.bars import Bars
 from rgbavatar_ns.tracking.input.image_files import source_digest
 from rgbavatar_ns.tracking.input.mattes import UserMattes
 from rgbavatar_ns.tracking.input.video import FrameSource
@@ -76,7 +77,7 @@ def track_video(
     """
     config = config or TrackConfig()
     own_head = read_own_head(config.flame)
-    source = FrameSource.open(videos, config.max_frames)
+    source = FrameSource.open(videos, config.max_frames).without_bars()
     mattes = None if config.mattes is None else UserMattes.open(config.mattes, source)
     load_mediapipe()
     settings = _settings(source, config, own_head)
@@ -129,7 +130,8 @@ class _Tracking:
                 clock.done(next(calls) // 2)
 
             alpha = self.mattes is None and bool(faces.has_alpha.mean() > 0.5)
-            notes = (*self.source.notes, *_alpha_notes(faces.has_alpha, alpha))
+            about_alpha = _alpha_notes(faces.has_alpha, alpha)
+            notes = (*_bars_notes(self.source.bars), *self.source.notes, *about_alpha)
             keys = tracker.key_positions(seen.points_px, width, height)
             outlines = key_outlines(
                 self.source, self.mattes, alpha, seen, keys, self.run, clock.done
@@ -313,6 +315,14 @@ def _alpha_notes(has_alpha: Bool[np.ndarray, "F"], used: bool) -> list[str]:
     return [f"{count} of {frames} frames have an alpha channel; {rest}"]
 
 
+def _bars_notes(bars: Bars) -> list[str]:
+    """What was cut off the film before anything was looked for."""
+    sides = [
+        f"{px} pixels {where}" for where, px in zip(("left", "above", "right", "below"), bars) if px
+    ]
+    return [f"bars around the film are cut off: {', '.join(sides)}"] if sides else []
+
+
 def _film_shown(dataset: TrackedDataset, report: dict[str, Any]) -> FilmFacts:
     """What the film shows and lacks, from its dataset and from what only tracking knows."""
     some = take_sample(dataset, spread(len(dataset), _LIGHT_FRAMES).tolist())
@@ -345,6 +355,7 @@ def _settings(
     return {
         "the video": [source_digest(path) for path in source.paths],
         "the mattes": None if mattes is None else source_digest(Path(mattes)),
+        **({"the bars around the film": list(source.bars)} if any(source.bars) else {}),
         "the head model": None if own_head is None else own_head.digest(),
         **options,
         "the version of this program": version("rgbavatar-ns"),

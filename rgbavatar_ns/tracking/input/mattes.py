@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.tracking.input.bars import NO_BARS, Bars
 from rgbavatar_ns.tracking.input.image_files import (
     image_files,
     last_number,
@@ -30,6 +31,8 @@ class UserMattes:
 
     path: Path
     files: tuple[Path, ...] | None
+    bars: Bars = NO_BARS
+    """Of the film: they are cut off its mattes too."""
 
     @classmethod
     def open(cls, path: Path, source: FrameSource) -> "UserMattes":
@@ -37,16 +40,16 @@ class UserMattes:
         if not path.exists():
             raise UserError(f"There are no mattes at {path}.", "Check the path.")
         if not path.is_dir():
-            return cls(path, None)
+            return cls(path, None, source.bars)
         files = require_image_files(path)
         if len(source.paths) == 1 and source.paths[0].is_dir():
             named = _by_name(files, image_files(source.paths[0])[: source.max_frames])
             if named is not None:
-                return cls(path, named)
+                return cls(path, named, source.bars)
         numbers = [last_number(file) for file in files]
         if None not in numbers and len(set(numbers)) == len(numbers):
             files = [file for _, file in sorted(zip(numbers, files), key=lambda pair: pair[0] or 0)]
-        return cls(path, tuple(files))
+        return cls(path, tuple(files), source.bars)
 
     def require_count(self, frames: int, limited: bool) -> None:
         """UserError unless each frame has a matte; too many are right if frames are limited.
@@ -67,20 +70,22 @@ class UserMattes:
     def levels(
         self, frames: frozenset[int], width: int, height: int
     ) -> Iterator[tuple[int, UInt8[np.ndarray, "H W"]]]:
-        """The mattes of these frames, in order, with the frame's number.
+        """The mattes of these frames within the bars, in order, with the frame's number.
 
         UserError where one is missing or has another size than the video.
         """
         last = -1
         for index, matte in self._mattes(frames):
-            if matte.shape != (height, width):
+            if self.bars.within((matte.shape[1], matte.shape[0])) != (width, height):
+                film = width + self.bars.left + self.bars.right
                 raise UserError(
                     f"The matte of frame {index} in {self.path} has {matte.shape[1]} x "
-                    f"{matte.shape[0]} pixels, the video {width} x {height}.",
+                    f"{matte.shape[0]} pixels, the video {film} x "
+                    f"{height + self.bars.top + self.bars.bottom}.",
                     "Bring mattes and video to one size.",
                 )
             last = index
-            yield index, matte
+            yield index, np.ascontiguousarray(self.bars.cut(matte))
         if frames and last != max(frames):
             raise UserError(
                 f"{self.path} ends before frame {max(frames)} of the video has a matte.", _AS_MANY

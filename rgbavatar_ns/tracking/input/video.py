@@ -2,7 +2,8 @@
 
 import math
 from collections.abc import Callable, Collection, Iterator, Sequence
-from dataclasses import dataclass, field
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from functools import partial
 from pathlib import Path
@@ -22,6 +23,7 @@ from av.video.stream import VideoStream
 from jaxtyping import UInt8
 
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.tracking.input.bars import NO_BARS, Bars, find_bars
 from rgbavatar_ns.tracking.input.hdr import hdr_to_srgb, hdr_transfer
 from rgbavatar_ns.tracking.input.image_files import (
     fitted_size,
@@ -30,6 +32,8 @@ from rgbavatar_ns.tracking.input.image_files import (
     require_image_files,
 )
 
+_GLANCES = 8
+"""Pictures of a clip by which its bars are known."""
 _ALPHA_DECODERS = {"vp8": "libvpx", "vp9": "libvpx-vp9"}
 """By codec."""
 
@@ -66,11 +70,12 @@ class FrameSource:
 
     Each path is a file that PyAV reads or a folder of images (sorted by name). All frames must
     have one size, since they share a camera. `notes` collects what a reader should know about
-    damaged clips. Raises UserError for what cannot be read.
+    damaged clips. `bars` are cut off each frame. Raises UserError for what cannot be read.
     """
 
     paths: tuple[Path, ...]
     max_frames: int | None = None
+    bars: Bars = NO_BARS
     notes: list[str] = field(default_factory=list)
 
     @classmethod
@@ -89,6 +94,11 @@ class FrameSource:
             elif path.stat().st_size == 0:
                 raise UserError(f"{path} is empty (0 bytes).", "Copy or record it again.")
         return cls(tuple(map(Path, listed)), max_frames)
+
+    def without_bars(self) -> "FrameSource":
+        """The same without the bars of one colour that all clips have, by a few glances at each."""
+        glances = (picture for path in self.paths for picture in _glances(path))
+        return replace(self, bars=find_bars(glances))
 
     def __iter__(self) -> Iterator[SourceFrame]:
         """Every frame of every clip; the order and the indices are the same each time."""
@@ -114,13 +124,21 @@ class FrameSource:
                     )
                 size = frame.size
                 if wanted(index):
-                    image = frame.image(max_side)
+                    image = self._within_bars(frame, max_side)
                     alpha = np.ascontiguousarray(image[..., 3]) if image.shape[2] == 4 else None
                     if alpha is not None and alpha.min() == 255:
                         alpha = None
                     color = np.ascontiguousarray(image[..., :3])
-                    yield SourceFrame(index, clip, color, alpha, *size, frame.time_s)
+                    within = self.bars.within(size)
+                    yield SourceFrame(index, clip, color, alpha, *within, frame.time_s)
                 index += 1
+
+    def _within_bars(self, frame: _Undecoded, max_side: int | None) -> UInt8[np.ndarray, "h w C"]:
+        if not any(self.bars):
+            return frame.image(max_side)
+        whole = self.bars.cut(frame.image(None))
+        smaller = fitted_size(*self.bars.within(frame.size), max_side)
+        return cv2.resize(whole, smaller, interpolation=cv2.INTER_AREA)
 
     def these(self, indices: Collection[int], max_side: int | None = None) -> Iterator[SourceFrame]:
         """These frames alone; behind the last of them nothing is decoded."""
@@ -273,6 +291,24 @@ def _turns_and_mirror(frame: av.VideoFrame) -> tuple[int, bool]:
     if mirrored:
         a, b = -a, -b
     return round(-math.atan2(b, a) / (math.pi / 2)) % 4, mirrored
+
+
+def _glances(path: Path) -> Iterator[UInt8[np.ndarray, "h w C"]]:
+    """A few pictures spread over a clip; fewer, or none, of what cannot be read."""
+    if path.is_dir():
+        files = image_files(path)
+        for position in sorted({round(k) for k in np.linspace(0, len(files) - 1, _GLANCES)}):
+            yield read_image_rgba(files[position])
+        return
+    # Reading the clip tells, or notes, what is damaged.
+    with suppress(FFmpegError, OSError, StopIteration), _opened(path) as container:
+        stream = _image_stream(container, path)
+        aspect = stream.sample_aspect_ratio or Fraction(1)
+        for part in range(_GLANCES):
+            if part and container.duration:
+                begun, away = container.start_time or 0, part * container.duration // _GLANCES
+                container.seek(begun + away)
+            yield _upright(next(container.decode(stream)), aspect).image(None)
 
 
 def _unreadable(path: Path, error: Exception) -> UserError:
