@@ -102,6 +102,12 @@ def test_a_source_reads_the_same_frames(tmp_path: Path, bars: Bars, max_side: in
     assert next(iter(framed)).height == 96 + bars.top + bars.bottom, "not asked to"
 
 
+def test_images_that_nobody_reads_are_not_looked_at(tmp_path: Path) -> None:
+    film = _folder(tmp_path / "film", [_framed(one, _BARS[0]) for one in _pictures()])
+    (film / "00003.png").write_bytes(b"no image")
+    assert FrameSource.open(film, max_frames=3).without_bars().bars == _BARS[0]
+
+
 def test_bars_of_a_video(tmp_path: Path) -> None:
     picture = astronaut()[::2, ::2]
     bars = Bars(0, 40, 0, 40)

@@ -97,7 +97,7 @@ class FrameSource:
 
     def without_bars(self) -> "FrameSource":
         """The same without the bars of one colour that all clips have, by a few glances at each."""
-        glances = (picture for path in self.paths for picture in _glances(path))
+        glances = (picture for path in self.paths for picture in _glances(path, self.max_frames))
         return replace(self, bars=find_bars(glances))
 
     def __iter__(self) -> Iterator[SourceFrame]:
@@ -293,10 +293,13 @@ def _turns_and_mirror(frame: av.VideoFrame) -> tuple[int, bool]:
     return round(-math.atan2(b, a) / (math.pi / 2)) % 4, mirrored
 
 
-def _glances(path: Path) -> Iterator[UInt8[np.ndarray, "h w C"]]:
-    """A few pictures spread over a clip; fewer, or none, of what cannot be read."""
+def _glances(path: Path, max_frames: int | None) -> Iterator[UInt8[np.ndarray, "h w C"]]:
+    """A few pictures spread over a clip; fewer, or none, of a video that cannot be read.
+
+    None of an image beyond the first `max_frames`, which nobody reads.
+    """
     if path.is_dir():
-        files = image_files(path)
+        files = image_files(path)[:max_frames]
         for position in sorted({round(k) for k in np.linspace(0, len(files) - 1, _GLANCES)}):
             yield read_image_rgba(files[position])
         return
