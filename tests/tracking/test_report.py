@@ -72,13 +72,16 @@ def test_correlation_of_openings() -> None:
         ({"body": {"background_moves_px": 20.0}}, "usable: the camera moves"),
         ({"body": {"background_moves_px": 2.0}}, "good"),
         (
-            {"background": "moves", "body": {"background_moves_px": 0.2}},
+            {
+                "background": "moves",
+                "body": {"background_moves_px": 0.2, "background_stands": True},
+            },
             "usable: something moves behind the person",
         ),
         (
             {
                 "background": "moves",
-                "body": {"background_moves_px": 0.2},
+                "body": {"background_moves_px": 0.2, "background_stands": True},
                 "segments": [{"clip": 0}, {"clip": 1}],
             },
             "usable: the clips show other rooms, or from another place, or something moves in them",

@@ -98,7 +98,7 @@ def test_a_known_motion_is_found_among_points_that_lie() -> None:
     certain = np.tile(np.eye(2), (80, 1, 1))
     motion, pivot = RigidMotion.none(), np.array([0.0, -0.05, 0.0])
     for _ in range(3):  # frame after frame it comes nearer
-        fitted = fit_rigid_motion(points, seen, certain, CAMERA, motion, pivot)
+        fitted = fit_rigid_motion(points, seen, certain, CAMERA, 1.0, motion, pivot)
         assert fitted is not None
         motion, error_px = fitted
     assert degrees(motion.rotation, true.rotation) < 0.2
@@ -112,9 +112,12 @@ def test_points_that_agree_on_nothing_are_no_motion() -> None:
     certain = np.tile(np.eye(2), (40, 1, 1))
     seen = drawn.uniform(0, 320, (40, 2))
     none = RigidMotion.none()
-    assert fit_rigid_motion(points, seen, certain, CAMERA, none, np.zeros(3)) is None
+    assert fit_rigid_motion(points, seen, certain, CAMERA, 1.0, none, np.zeros(3)) is None
     few = slice(0, 5)
-    assert fit_rigid_motion(points[few], seen[few], certain[few], CAMERA, none, np.zeros(3)) is None
+    assert (
+        fit_rigid_motion(points[few], seen[few], certain[few], CAMERA, 1.0, none, np.zeros(3))
+        is None
+    )
 
 
 def test_a_point_on_a_stripe_counts_only_across_it() -> None:
@@ -199,7 +202,7 @@ def test_a_body_that_keeps_still_is_not_turned_by_its_head(films) -> None:
     film = Filmed(*films("still"))
     turns = np.ptp(film.vertices_px[:, 0], axis=0)
     assert turns.max() > 10, "the head does turn"
-    places = place_body(film.body, film.camera, film.followed(), film.neck_m, [])
+    places = place_body(film.body, film.camera, 1.0, film.followed(), film.neck_m, [])
     assert places.still
     assert places.followed == 1
     assert np.array_equal(places.rotation, np.tile(places.rotation[:1], (FRAMES, 1, 1)))
@@ -226,7 +229,7 @@ def test_the_mesh_is_asked_for_where_points_are_chosen_alone(films) -> None:
 def test_a_body_that_leans_is_followed(films) -> None:
     film = Filmed(*films("lean"))
     assert degrees(film.rotation, film.rotation[:1]).max() > 6
-    places = place_body(film.body, film.camera, film.followed(), film.neck_m, [])
+    places = place_body(film.body, film.camera, 1.0, film.followed(), film.neck_m, [])
     assert not places.still
     # How it stands on the whole one camera hardly tells: relative to its mean.
     mean = [
@@ -249,7 +252,7 @@ def test_a_plain_shirt_leaves_the_body_where_it_was() -> None:
     none = np.zeros((0, 2))
     unseen = [BodySighting(k, none, none, np.zeros((0, 2, 2)), np.nan) for k in range(4)]
     necks = np.tile(np.array([[0.01], [0.02], [0.03], [0.04]]), (1, 3))
-    places = place_body(body, CAMERA, unseen, necks, [])
+    places = place_body(body, CAMERA, 1.0, unseen, necks, [])
     assert places.followed == 0
     assert places.still
     np.testing.assert_allclose(places.rotation, np.tile(np.eye(3), (4, 1, 1)), atol=1e-12)
@@ -265,7 +268,7 @@ def test_shoulders_tilt_a_body_only_where_they_are_plainly_aslant(
     shoulders = [SeenShoulders(0, CAMERA.project(marks), 0.0)]
     none = np.zeros((0, 2))
     unseen = [BodySighting(0, none, none, np.zeros((0, 2, 2)), np.nan)]
-    places = place_body(body, CAMERA, unseen, neck[None], shoulders)
+    places = place_body(body, CAMERA, 1.0, unseen, neck[None], shoulders)
     assert degrees(places.rotation[0], turned(0, 0, told)) < 0.3
 
 

@@ -1,5 +1,6 @@
 """Bodies in hard films: arms before them, somebody beside, a chair behind, none in the picture."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -7,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from jaxtyping import Float, UInt8
+from scipy.spatial.transform import Rotation
 
 from rgbavatar_ns.head import EMBEDDED_BUST, HeadModel
 from rgbavatar_ns.tracking.fit.camera import StillCamera
@@ -92,11 +94,11 @@ def test_an_arm_before_the_chest_is_said_and_does_not_move_the_body(still: Still
     assert (covered[2:4] < 0.02).all()
     assert covered[FRAMES - 5] > 0.1
     assert (covered[FRAMES - 3 :] < 0.02).all(), "the arm is gone, and was not learned"
-    places = place_body(still.body, CAMERA, sightings, np.tile(NECK_M, (FRAMES, 1)), [])
+    places = place_body(still.body, CAMERA, 1.0, sightings, np.tile(NECK_M, (FRAMES, 1)), [])
     assert places.still
     assert 0.3 < places.covered_share < 0.6
     moves = place_body(
-        still.body, CAMERA, still.followed(still.images), np.tile(NECK_M, (FRAMES, 1)), []
+        still.body, CAMERA, 1.0, still.followed(still.images), np.tile(NECK_M, (FRAMES, 1)), []
     )
     assert moves.covered_share == 0
 
@@ -163,7 +165,7 @@ def test_a_motion_that_no_body_under_the_head_makes_is_not_believed(still: Still
         for k in range(1, FRAMES)
     ]
     first = BodySighting(0, none, chosen.chosen_px, chosen.certainty, np.nan)
-    places = place_body(still.body, CAMERA, [first, *gone], np.tile(NECK_M, (FRAMES, 1)), [])
+    places = place_body(still.body, CAMERA, 1.0, [first, *gone], np.tile(NECK_M, (FRAMES, 1)), [])
     assert places.followed < 1
     assert np.linalg.norm(places.neck_m - NECK_M, axis=1).max() < 0.09
 
@@ -185,7 +187,7 @@ def test_a_body_in_the_picture_is_told_from_none(
             True,
         )
     ]
-    places = place_body(still.body, CAMERA, sightings, NECK_M[None], [])
+    places = place_body(still.body, CAMERA, 1.0, sightings, NECK_M[None], [])
     assert places.still
     np.testing.assert_allclose(places.neck_m, NECK_M[None], atol=1e-12)
 
@@ -227,7 +229,7 @@ def test_frames_without_a_motion_lie_between_those_with_one(still: Still) -> Non
     run = [BodySighting(0, none, chosen.chosen_px - 0.5, chosen.certainty, np.nan)]
     run += [BodySighting(0, px, None, None, np.nan) for px in seen[1:]]
     necks = NECK_M + steps
-    places = place_body(still.body, CAMERA, run, necks, [])
+    places = place_body(still.body, CAMERA, 1.0, run, necks, [])
     assert places.followed == pytest.approx(4 / 7)
     np.testing.assert_allclose(places.neck_m[3], necks[3], atol=2e-3)
 
@@ -238,5 +240,51 @@ def test_a_collar_with_too_few_points_to_follow_keeps_still(still: Still) -> Non
     none = np.zeros((0, 2))
     run = [BodySighting(0, none, few, np.tile(np.eye(2), (4, 1, 1)), np.nan)]
     run += [BodySighting(0, none, None, None, np.nan) for _ in range(4)]
-    places = place_body(still.body, CAMERA, run, np.tile(NECK_M, (5, 1)), [])
+    places = place_body(still.body, CAMERA, 1.0, run, np.tile(NECK_M, (5, 1)), [])
     np.testing.assert_allclose(places.neck_m, np.tile(NECK_M, (5, 1)), atol=1e-9)
+
+
+def leaning(still: Still, seed: int) -> tuple[list[BodySighting], Float[np.ndarray, "F 3"]]:
+    """Points on the shirt as a body that leans to its side shows them, each off by .4 pixels, and
+    where its neck is."""
+    chosen = still.followed(still.images[:1])[0]
+    assert chosen.chosen_px is not None
+    placed = RigidMotion(np.eye(3), NECK_M - still.body.neck_m)
+    points, near = still.body.lifted(chosen.chosen_px, placed, CAMERA)
+    drawn, none = np.random.default_rng(seed), np.zeros((0, 2))
+    run = [BodySighting(0, none, chosen.chosen_px, chosen.certainty, 0.0)]
+    hip = NECK_M - [0.0, 0.4, 0.0]
+    necks = [NECK_M]
+    for angle in 0.15 * np.sin(np.arange(1, 2 * FRAMES) / 4):
+        lean = Rotation.from_rotvec([0.0, 0.0, angle])
+        px = CAMERA.project(lean.apply(points - hip) + hip)
+        px = px + 0.4 * drawn.standard_normal(px.shape)
+        px[~near] = np.nan
+        run.append(BodySighting(0, px, None, None, 0.1))
+        necks.append(lean.apply(NECK_M - hip) + hip)
+    return run, np.array(necks)
+
+
+def test_a_larger_film_of_the_same_body_shows_the_same_motions(still: Still) -> None:
+    """The body is followed in a small picture, whatever the film's size: so are its errors."""
+    run, necks = leaning(still, 3)
+    by = 6.0
+    camera = replace(CAMERA, focal_px=by * CAMERA.focal_px, center_px=(by * SIZE / 2,) * 2)
+    larger = [
+        replace(
+            one,
+            seen_px=by * one.seen_px,
+            chosen_px=None if one.chosen_px is None else by * one.chosen_px,
+            background_px=by * one.background_px,
+        )
+        for one in run
+    ]
+    small = place_body(still.body, CAMERA, 1.0, run, necks, [])
+    large = place_body(still.body, camera, 1 / by, larger, necks, [])
+    assert small.followed == large.followed == 1
+    assert small.report()["turned_degrees"] > 4, "it does lean"
+    np.testing.assert_allclose(large.rotation, small.rotation, atol=1e-6)
+    np.testing.assert_allclose(large.neck_m, small.neck_m, atol=1e-6)
+    assert large.background_px == pytest.approx(by * small.background_px)
+    assert small.background_stands
+    assert large.background_stands, "six pixels of the film are one of what was looked at"

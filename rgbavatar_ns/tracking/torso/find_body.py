@@ -101,7 +101,8 @@ def find_body(
     def visited() -> None:
         clock.done(next(visits) // ROUNDS)
 
-    places = place_body(body, camera, seen.sightings, neck_m, shoulders, visited)
+    scale = _followed_scale(found)
+    places = place_body(body, camera, scale, seen.sightings, neck_m, shoulders, visited)
     up_cm = shoulders_up_cm(body, camera, seen.lines, places.rotation)
     clock.done(len(found))
     return replace(
@@ -110,6 +111,11 @@ def find_body(
         seen_cm2=seen_cm2(seen.shown),
         beside_share=beside,
     )
+
+
+def _followed_scale(found: ClipLandmarks) -> float:
+    """The size of the pictures in which the body is followed by the source's."""
+    return min(1.0, _SIDE_PX / max(found.width, found.height))
 
 
 @dataclass(frozen=True)
@@ -132,7 +138,7 @@ class _Reading:
         """What is seen of the body from a position on, where following was in that `state`."""
         found = self.found
         place = {index: k for k, index in enumerate(found.frame_index) if k >= start}
-        scale = min(1.0, _SIDE_PX / max(found.width, found.height))
+        scale = _followed_scale(found)
         camera = self.fit.subject.camera
         small, every = camera.scaled(scale), max(1, len(found) // _SHOULDER_FRAMES)
         follow = BodyFollower(self.body, camera, scale, state)

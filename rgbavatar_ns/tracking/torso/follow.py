@@ -231,6 +231,7 @@ class BodyFollower:
             px[seen],
             key.body.certainty[seen],
             self._camera,
+            1.0,
             self.state.motion,
             pivot,
         )

@@ -28,6 +28,8 @@ _DOUBTED_YAW_RAD, _DOUBTED_ROLL_RAD = 0.2, 0.035
 # Where so much of the clothes looks otherwise, something is before them: folds are less.
 _COVERED = 0.05
 _LEAST_FRAMES = 10
+# A camera that stands leaves the background within so many pixels of the followed picture.
+_STANDS_PX = 0.5
 ROUNDS = 5
 """How often each frame is visited."""
 
@@ -61,6 +63,8 @@ class BodyPlaces:
     """Area of body that half of the frames show; NaN where nobody looked."""
     beside_share: float = 0.0
     """Share of the frames in which the matte holds something beside the person."""
+    background_stands: bool = False
+    """Whether the background moves by no more than it seems to before a camera that stands."""
 
     def report(self) -> dict[str, Any]:
         """What `tracking.json` tells of the body."""
@@ -73,6 +77,7 @@ class BodyPlaces:
             "turned_degrees": float(np.percentile(away, 98)),
             "moved_mm": float(1e3 * np.percentile(_away(self.neck_m), 98)),
             "background_moves_px": None if np.isnan(self.background_px) else self.background_px,
+            "background_stands": self.background_stands,
             "covered_share": self.covered_share,
             "seen_cm2": None if np.isnan(self.seen_cm2) else self.seen_cm2,
             "beside_share": self.beside_share,
@@ -82,6 +87,7 @@ class BodyPlaces:
 def place_body(
     body: BodyMesh,
     camera: StillCamera,
+    scale: float,
     sightings: Sequence[BodySighting],
     head_neck_m: Float[np.ndarray, "F 3"],
     shoulders: Sequence[SeenShoulders],
@@ -89,7 +95,8 @@ def place_body(
 ) -> BodyPlaces:
     """The body's place in every frame; `head_neck_m` is where the heads say the neck's joint is.
 
-    `visited` is called at each of the `ROUNDS` visits of a frame.
+    `camera` is the source's, `scale` the size of the pictures in which the body was followed by the
+    source's. `visited` is called at each of the `ROUNDS` visits of a frame.
 
     The clothes' pattern says how the body moves, never the head's turn. What they do not say is
     where it stood: upright and turned to the camera on the whole, unless the shoulders say plainly
@@ -104,7 +111,7 @@ def place_body(
         near = [one for one in shoulders if own[0] <= one.position <= own[-1]]
         seen = [sightings[k] for k in own]
         motions, start, count = _Run(
-            body, camera, seen, head_neck_m[own], near, int(own[0])
+            body, camera, scale, seen, head_neck_m[own], near, int(own[0])
         ).solved(visited)
         still &= all(motion is motions[0] for motion in motions)
         followed += count
@@ -121,6 +128,7 @@ def place_body(
         followed / max(frames, 1),
         background_px,
         covered_share=float(covered),
+        background_stands=background_px * scale < _STANDS_PX,
     )
 
 
@@ -130,6 +138,7 @@ class _Run:
 
     body: BodyMesh
     camera: StillCamera
+    scale: float
     sightings: Sequence[BodySighting]
     neck_m: Float[np.ndarray, "F 3"]
     shoulders: Sequence[SeenShoulders]
@@ -144,7 +153,7 @@ class _Run:
         start = RigidMotion(np.eye(3), self.neck_m[0] - self.body.neck_m)
         motions, count = [RigidMotion.none()] * len(self.sightings), 0
         for _ in range(ROUNDS):
-            found = run_motions(self.body, self.camera, self.sightings, start, visited)
+            found = run_motions(self.body, self.camera, self.scale, self.sightings, start, visited)
             pivot = start(self.body.neck_m)
             found = self._near_the_head(found, pivot)
             count = sum(motion is not None for motion in found)

@@ -13,7 +13,8 @@ _Points = Float[np.ndarray, "P 3"]
 _ITERATIONS = 8
 # A step this small, radians and metres, is a fraction of what the points' own noise moves.
 _SETTLED = 1e-4
-# Points this far off (a sleeve that folds, a hand) hardly count: Geman and McClure's loss.
+# Points this far off (a sleeve that folds, a hand) hardly count: Geman and McClure's loss. Pixels
+# of the picture in which they are followed: a larger film is not followed more exactly.
 _ROBUST_PX = 0.7
 # A frame's motion is drawn to the one before it by so much, so that few or flat points do not let
 # it wander: standard deviations from frame to frame.
@@ -51,18 +52,20 @@ def fit_rigid_motion(
     seen_px: Float[np.ndarray, "P 2"],
     certainty: Float[np.ndarray, "P 2 2"],
     camera: StillCamera,
+    scale: float,
     before: RigidMotion,
     pivot_m: Float[np.ndarray, "3"],
 ) -> tuple[RigidMotion, float] | None:
     """The motion that carries points to where they are seen, near `before`, and its error.
 
-    `certainty` says along which directions of the picture a place counts. Turns are drawn to those
-    of `before` about `pivot_m`. The error is the median distance in pixels. None where too few
-    points agree.
+    `seen_px` and the error, the median distance, are in pixels of `camera`'s picture; `scale` is
+    the size of the picture in which the points were followed by that one's. `certainty` says along
+    which directions of the picture a place counts. Turns are drawn to those of `before` about
+    `pivot_m`. None where too few points agree.
     """
     if len(points_m) < LEAST_POINTS:
         return None
-    sigma_px = _ROBUST_PX
+    sigma_px = _ROBUST_PX / scale
     motion = before
     turned, shifted = np.zeros(3), np.zeros(3)
     pivot = before(pivot_m)

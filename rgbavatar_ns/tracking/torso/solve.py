@@ -13,14 +13,16 @@ from rgbavatar_ns.tracking.torso.rigid_motion import LEAST_POINTS, RigidMotion, 
 def run_motions(
     body: BodyMesh,
     camera: StillCamera,
+    scale: float,
     run: Sequence[BodySighting],
     start: RigidMotion,
     visited: Callable[[], None],
 ) -> list[RigidMotion | None]:
     """How the body moves from the first frame of a run to each; None where it was not found.
 
-    `start` places the body at rest in the first frame: how deep points lie follows from it, and so
-    how far a turn carries them. `visited` is called at each frame.
+    `camera` is the source's, `scale` the size of the pictures in which points were followed by the
+    source's. `start` places the body at rest in the first frame: how deep points lie follows from
+    it, and so how far a turn carries them. `visited` is called at each frame.
     """
     motions: list[RigidMotion | None] = []
     last, pivot = RigidMotion.none(), start(body.neck_m)
@@ -36,7 +38,13 @@ def run_motions(
         if len(places_m) >= LEAST_POINTS:
             seen = near & np.isfinite(sighting.seen_px[:, 0])
             fitted = fit_rigid_motion(
-                places_m[seen], sighting.seen_px[seen], certainty[seen], camera, last, pivot
+                places_m[seen],
+                sighting.seen_px[seen],
+                certainty[seen],
+                camera,
+                scale,
+                last,
+                pivot,
             )
             found = fitted is not None
             last = last if fitted is None else fitted[0]

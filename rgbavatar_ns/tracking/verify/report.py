@@ -27,8 +27,7 @@ _IRIS_ERROR, _AT_BOUND = (0.1, 0.2), (0.02, 0.2)
 _REJECTED, _BLURRED = (0.05, 0.25), (0.1, 0.3)
 _FACE_PX, _FRAMES = (100.0, 50.0), (100, 25)
 # How far the background wanders, in shares of the face's height, until the camera is said to move.
-# A camera that stands leaves it within so many pixels.
-_MOVES, _STANDS_PX = 0.03, 0.5
+_MOVES = 0.03
 # A body that is not there or hardly, square centimetres (shoulders and chest have 800, the two real
 # clips, which end at the collar, 40), and shares of frames with something before or beside it.
 _NO_BODY_CM2, _LITTLE_BODY_CM2 = 15.0, 80.0
@@ -208,13 +207,14 @@ def tracking_findings(report: Mapping[str, Any]) -> list[Finding]:
 
 def _background_findings(report: Mapping[str, Any]) -> list[Finding]:
     """What moves behind the person: all of it with the camera, or somebody, something."""
-    moved_px = (report["body"] or {}).get("background_moves_px")
+    body = report["body"] or {}
+    moved_px = body.get("background_moves_px")
     if moved_px is not None and moved_px > _MOVES * report["face_height_px"]:
         return [Finding("camera", "warning", "the camera moves")]
     if report.get("background") != "moves":
         return []
     # What the body's follower finds still in either half of the whole picture, no camera moves.
-    still = moved_px is not None and moved_px < _STANDS_PX
+    still = body.get("background_stands", False)
     cause = "something moves behind the person" if still else "the camera moves"
     if still and len({part["clip"] for part in report["segments"]}) > 1:
         cause = "the clips show other rooms, or from another place, or something moves in them"
