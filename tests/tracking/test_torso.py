@@ -30,6 +30,7 @@ from rgbavatar_ns.tracking.torso.shape import ShoulderLine, shoulder_line, shoul
 from rgbavatar_ns.tracking.torso.shown import BodyShown
 
 SIZE, FRAMES = 320, 24
+ONE_STRETCH = [False] + [True] * (FRAMES - 1)
 CAMERA = StillCamera(700.0, (160.0, 160.0), 1.1)
 
 
@@ -202,7 +203,7 @@ def test_a_body_that_keeps_still_is_not_turned_by_its_head(films) -> None:
     film = Filmed(*films("still"))
     turns = np.ptp(film.vertices_px[:, 0], axis=0)
     assert turns.max() > 10, "the head does turn"
-    places = place_body(film.body, film.camera, 1.0, film.followed(), film.neck_m, [])
+    places = place_body(film.body, film.camera, 1.0, film.followed(), film.neck_m, ONE_STRETCH, [])
     assert places.still
     assert places.followed == 1
     assert np.array_equal(places.rotation, np.tile(places.rotation[:1], (FRAMES, 1, 1)))
@@ -229,7 +230,7 @@ def test_the_mesh_is_asked_for_where_points_are_chosen_alone(films) -> None:
 def test_a_body_that_leans_is_followed(films) -> None:
     film = Filmed(*films("lean"))
     assert degrees(film.rotation, film.rotation[:1]).max() > 6
-    places = place_body(film.body, film.camera, 1.0, film.followed(), film.neck_m, [])
+    places = place_body(film.body, film.camera, 1.0, film.followed(), film.neck_m, ONE_STRETCH, [])
     assert not places.still
     # How it stands on the whole one camera hardly tells: relative to its mean.
     mean = [
@@ -252,7 +253,7 @@ def test_a_plain_shirt_leaves_the_body_where_it_was() -> None:
     none = np.zeros((0, 2))
     unseen = [BodySighting(k, none, none, np.zeros((0, 2, 2)), np.nan) for k in range(4)]
     necks = np.tile(np.array([[0.01], [0.02], [0.03], [0.04]]), (1, 3))
-    places = place_body(body, CAMERA, 1.0, unseen, necks, [])
+    places = place_body(body, CAMERA, 1.0, unseen, necks, ONE_STRETCH[:4], [])
     assert places.followed == 0
     assert places.still
     np.testing.assert_allclose(places.rotation, np.tile(np.eye(3), (4, 1, 1)), atol=1e-12)
@@ -268,7 +269,7 @@ def test_shoulders_tilt_a_body_only_where_they_are_plainly_aslant(
     shoulders = [SeenShoulders(0, CAMERA.project(marks), 0.0)]
     none = np.zeros((0, 2))
     unseen = [BodySighting(0, none, none, np.zeros((0, 2, 2)), np.nan)]
-    places = place_body(body, CAMERA, 1.0, unseen, neck[None], shoulders)
+    places = place_body(body, CAMERA, 1.0, unseen, neck[None], ONE_STRETCH[:1], shoulders)
     assert degrees(places.rotation[0], turned(0, 0, told)) < 0.3
 
 

@@ -1,5 +1,6 @@
 """Bodies in hard films: arms before them, somebody beside, a chair behind, none in the picture."""
 
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,6 +25,11 @@ SIZE, FRAMES = 320, 16
 CAMERA = StillCamera(560.0, (160.0, 160.0), 1.1)
 NECK_M = np.array([0.0, 0.0, 0.0])
 _Pictures = UInt8[np.ndarray, "F S S 3"]
+
+
+def one_stretch(frames: int) -> list[bool]:
+    """That each frame comes directly after the one before it."""
+    return [k > 0 for k in range(frames)]
 
 
 def speckled(seed: int, low: int, high: int) -> Float[np.ndarray, "S S 3"]:
@@ -94,11 +100,19 @@ def test_an_arm_before_the_chest_is_said_and_does_not_move_the_body(still: Still
     assert (covered[2:4] < 0.02).all()
     assert covered[FRAMES - 5] > 0.1
     assert (covered[FRAMES - 3 :] < 0.02).all(), "the arm is gone, and was not learned"
-    places = place_body(still.body, CAMERA, 1.0, sightings, np.tile(NECK_M, (FRAMES, 1)), [])
+    places = place_body(
+        still.body, CAMERA, 1.0, sightings, np.tile(NECK_M, (FRAMES, 1)), one_stretch(FRAMES), []
+    )
     assert places.still
     assert 0.3 < places.covered_share < 0.6
     moves = place_body(
-        still.body, CAMERA, 1.0, still.followed(still.images), np.tile(NECK_M, (FRAMES, 1)), []
+        still.body,
+        CAMERA,
+        1.0,
+        still.followed(still.images),
+        np.tile(NECK_M, (FRAMES, 1)),
+        one_stretch(FRAMES),
+        [],
     )
     assert moves.covered_share == 0
 
@@ -165,7 +179,15 @@ def test_a_motion_that_no_body_under_the_head_makes_is_not_believed(still: Still
         for k in range(1, FRAMES)
     ]
     first = BodySighting(0, none, chosen.chosen_px, chosen.certainty, np.nan)
-    places = place_body(still.body, CAMERA, 1.0, [first, *gone], np.tile(NECK_M, (FRAMES, 1)), [])
+    places = place_body(
+        still.body,
+        CAMERA,
+        1.0,
+        [first, *gone],
+        np.tile(NECK_M, (FRAMES, 1)),
+        one_stretch(FRAMES),
+        [],
+    )
     assert places.followed < 1
     assert np.linalg.norm(places.neck_m - NECK_M, axis=1).max() < 0.09
 
@@ -187,7 +209,7 @@ def test_a_body_in_the_picture_is_told_from_none(
             True,
         )
     ]
-    places = place_body(still.body, CAMERA, 1.0, sightings, NECK_M[None], [])
+    places = place_body(still.body, CAMERA, 1.0, sightings, NECK_M[None], one_stretch(1), [])
     assert places.still
     np.testing.assert_allclose(places.neck_m, NECK_M[None], atol=1e-12)
 
@@ -212,26 +234,50 @@ def test_a_chair_behind_the_shoulders_does_not_raise_them(still: Still) -> None:
     assert shoulders_up_cm(still.body, CAMERA, lines, np.tile(np.eye(3), (6, 1, 1))) == 0.0
 
 
-def test_frames_without_a_motion_lie_between_those_with_one(still: Still) -> None:
-    """Worked by hand: 30 mm in 6 frames, of which the middle ones see nothing."""
+def sightings_of(
+    still: Still,
+    motions: Sequence[RigidMotion],
+    unseen: Collection[int] = (),
+    noise_px: float = 0.0,
+) -> list[BodySighting]:
+    """One run: points on the shirt where these motions carry them, but for frames without any."""
     chosen = still.followed(still.images[:1])[0]
     assert chosen.chosen_px is not None
-    assert chosen.certainty is not None
     placed = RigidMotion(np.eye(3), NECK_M - still.body.neck_m)
-    points, near = still.body.lifted(chosen.chosen_px - 0.5, placed, CAMERA)
+    points, near = still.body.lifted(chosen.chosen_px, placed, CAMERA)
+    drawn, none = np.random.default_rng(3), np.zeros((0, 2))
+    run = [BodySighting(0, none, chosen.chosen_px, chosen.certainty, 0.0)]
+    for k, motion in enumerate(motions[1:], 1):
+        px = CAMERA.project(motion(points))
+        px += noise_px * drawn.standard_normal(px.shape)
+        seen = near & (k not in unseen)
+        run.append(BodySighting(0, np.where(seen[:, None], px, np.nan), None, None, 0.1))
+    return run
+
+
+def test_frames_without_a_motion_lie_between_those_with_one(still: Still) -> None:
+    """Worked by hand: 30 mm in 6 frames, of which the middle ones see nothing."""
     steps = 0.03 * np.linspace(0, 1, 7)[:, None] * [1.0, 0, 0]
-    seen = [CAMERA.project(points + step) for step in steps]
-    for px in seen:
-        px[~near] = np.nan
-    for k in (2, 3, 4):
-        seen[k][:] = np.nan
-    none = np.zeros((0, 2))
-    run = [BodySighting(0, none, chosen.chosen_px - 0.5, chosen.certainty, np.nan)]
-    run += [BodySighting(0, px, None, None, np.nan) for px in seen[1:]]
+    run = sightings_of(still, [RigidMotion(np.eye(3), step) for step in steps], (2, 3, 4))
     necks = NECK_M + steps
-    places = place_body(still.body, CAMERA, 1.0, run, necks, [])
+    places = place_body(still.body, CAMERA, 1.0, run, necks, one_stretch(7), [])
     assert places.followed == pytest.approx(4 / 7)
     np.testing.assert_allclose(places.neck_m[3], necks[3], atol=2e-3)
+
+
+def test_nothing_is_smoothed_or_bridged_where_a_film_leaves_something_out(still: Still) -> None:
+    """Worked by hand: a body is 30 mm elsewhere from the 8th frame on, and still before and after.
+
+    The frames about that one see nothing; of the third stretch none does.
+    """
+    frames, borders = 16, (8, 14)
+    follows = [k > 0 and k not in borders for k in range(frames)]
+    steps = 0.03 * (np.arange(frames) >= borders[0])[:, None] * [1.0, 0, 0]
+    motions = [RigidMotion(np.eye(3), step) for step in steps]
+    run = sightings_of(still, motions, (6, 7, 8, 9, 14, 15))
+    places = place_body(still.body, CAMERA, 1.0, run, NECK_M + steps, follows, [])
+    assert places.followed == pytest.approx(10 / 16)
+    np.testing.assert_allclose(places.neck_m, NECK_M + steps, atol=2e-3)
 
 
 def test_a_collar_with_too_few_points_to_follow_keeps_still(still: Still) -> None:
@@ -240,34 +286,17 @@ def test_a_collar_with_too_few_points_to_follow_keeps_still(still: Still) -> Non
     none = np.zeros((0, 2))
     run = [BodySighting(0, none, few, np.tile(np.eye(2), (4, 1, 1)), np.nan)]
     run += [BodySighting(0, none, None, None, np.nan) for _ in range(4)]
-    places = place_body(still.body, CAMERA, 1.0, run, np.tile(NECK_M, (5, 1)), [])
+    places = place_body(still.body, CAMERA, 1.0, run, np.tile(NECK_M, (5, 1)), one_stretch(5), [])
     np.testing.assert_allclose(places.neck_m, np.tile(NECK_M, (5, 1)), atol=1e-9)
-
-
-def leaning(still: Still, seed: int) -> tuple[list[BodySighting], Float[np.ndarray, "F 3"]]:
-    """Points on the shirt as a body that leans to its side shows them, each off by .4 pixels, and
-    where its neck is."""
-    chosen = still.followed(still.images[:1])[0]
-    assert chosen.chosen_px is not None
-    placed = RigidMotion(np.eye(3), NECK_M - still.body.neck_m)
-    points, near = still.body.lifted(chosen.chosen_px, placed, CAMERA)
-    drawn, none = np.random.default_rng(seed), np.zeros((0, 2))
-    run = [BodySighting(0, none, chosen.chosen_px, chosen.certainty, 0.0)]
-    hip = NECK_M - [0.0, 0.4, 0.0]
-    necks = [NECK_M]
-    for angle in 0.15 * np.sin(np.arange(1, 2 * FRAMES) / 4):
-        lean = Rotation.from_rotvec([0.0, 0.0, angle])
-        px = CAMERA.project(lean.apply(points - hip) + hip)
-        px = px + 0.4 * drawn.standard_normal(px.shape)
-        px[~near] = np.nan
-        run.append(BodySighting(0, px, None, None, 0.1))
-        necks.append(lean.apply(NECK_M - hip) + hip)
-    return run, np.array(necks)
 
 
 def test_a_larger_film_of_the_same_body_shows_the_same_motions(still: Still) -> None:
     """The body is followed in a small picture, whatever the film's size: so are its errors."""
-    run, necks = leaning(still, 3)
+    hip = NECK_M - [0.0, 0.4, 0.0]
+    turns = Rotation.from_rotvec(0.15 * np.sin(np.arange(32) / 4)[:, None] * [0.0, 0.0, 1.0])
+    motions = [RigidMotion(turn, hip - turn @ hip) for turn in turns.as_matrix()]
+    run = sightings_of(still, motions, noise_px=0.4)
+    necks = np.array([motion(NECK_M) for motion in motions])
     by = 6.0
     camera = replace(CAMERA, focal_px=by * CAMERA.focal_px, center_px=(by * SIZE / 2,) * 2)
     larger = [
@@ -279,8 +308,8 @@ def test_a_larger_film_of_the_same_body_shows_the_same_motions(still: Still) -> 
         )
         for one in run
     ]
-    small = place_body(still.body, CAMERA, 1.0, run, necks, [])
-    large = place_body(still.body, camera, 1 / by, larger, necks, [])
+    small = place_body(still.body, CAMERA, 1.0, run, necks, one_stretch(len(run)), [])
+    large = place_body(still.body, camera, 1 / by, larger, necks, one_stretch(len(run)), [])
     assert small.followed == large.followed == 1
     assert small.report()["turned_degrees"] > 4, "it does lean"
     np.testing.assert_allclose(large.rotation, small.rotation, atol=1e-6)

@@ -102,7 +102,9 @@ def find_body(
         clock.done(next(visits) // ROUNDS)
 
     scale = _followed_scale(found)
-    places = place_body(body, camera, scale, seen.sightings, neck_m, shoulders, visited)
+    places = place_body(
+        body, camera, scale, seen.sightings, neck_m, found.follows(), shoulders, visited
+    )
     up_cm = shoulders_up_cm(body, camera, seen.lines, places.rotation)
     clock.done(len(found))
     return replace(

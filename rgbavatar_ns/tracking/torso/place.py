@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation, Slerp
 
@@ -90,20 +90,22 @@ def place_body(
     scale: float,
     sightings: Sequence[BodySighting],
     head_neck_m: Float[np.ndarray, "F 3"],
+    follows: Sequence[bool],
     shoulders: Sequence[SeenShoulders],
     visited: Callable[[], None] = lambda: None,
 ) -> BodyPlaces:
     """The body's place in every frame; `head_neck_m` is where the heads say the neck's joint is.
 
     `camera` is the source's, `scale` the size of the pictures in which the body was followed by the
-    source's. `visited` is called at each of the `ROUNDS` visits of a frame.
+    source's. `follows[i]` says that frame i comes directly after frame i - 1: nothing is smoothed
+    across other borders. `visited` is called at each of the `ROUNDS` visits of a frame.
 
     The clothes' pattern says how the body moves, never the head's turn. What they do not say is
     where it stood: upright and turned to the camera on the whole, unless the shoulders say plainly
     otherwise, and under the head on the whole.
     """
     frames = len(sightings)
-    runs = np.array([one.run for one in sightings])
+    runs, stretch = np.array([one.run for one in sightings]), np.cumsum(~np.array(follows, bool))
     rotation, neck_m = np.tile(np.eye(3), (frames, 1, 1)), head_neck_m.copy()
     still, followed = True, 0
     for run in np.unique(runs):
@@ -111,7 +113,7 @@ def place_body(
         near = [one for one in shoulders if own[0] <= one.position <= own[-1]]
         seen = [sightings[k] for k in own]
         motions, start, count = _Run(
-            body, camera, scale, seen, head_neck_m[own], near, int(own[0])
+            body, camera, scale, seen, head_neck_m[own], stretch[own], near, int(own[0])
         ).solved(visited)
         still &= all(motion is motions[0] for motion in motions)
         followed += count
@@ -134,13 +136,17 @@ def place_body(
 
 @dataclass(frozen=True)
 class _Run:
-    """Frames through which the body is followed; `first` is the position of the first one."""
+    """Frames through which the body is followed; `first` is the position of the first one.
+
+    `stretch` counts up where the film leaves something out between two of them.
+    """
 
     body: BodyMesh
     camera: StillCamera
     scale: float
     sightings: Sequence[BodySighting]
     neck_m: Float[np.ndarray, "F 3"]
+    stretch: Int[np.ndarray, "F"]
     shoulders: Sequence[SeenShoulders]
     first: int
 
@@ -157,11 +163,11 @@ class _Run:
             pivot = start(self.body.neck_m)
             found = self._near_the_head(found, pivot)
             count = sum(motion is not None for motion in found)
-            motions = _filled(found, pivot)
+            motions = _filled(found, pivot, self.stretch)
             if _extent_m(self.body, motions, pivot) < _STILL_M:
                 motions = [RigidMotion.none()] * len(motions)
             else:
-                motions = _smoothed(motions, pivot)
+                motions = _smoothed(motions, pivot, self.stretch)
             turn = self._upright(motions)
             back = [motion.undone()(place) for motion, place in zip(motions, self.neck_m)]
             start = RigidMotion(turn, np.median(back, axis=0) - turn @ self.body.neck_m)
@@ -203,20 +209,35 @@ def _away(points_m: Float[np.ndarray, "F 3"]) -> Float[np.ndarray, "F"]:
 
 
 def _filled(
-    motions: Sequence[RigidMotion | None], pivot_m: Float[np.ndarray, "3"]
+    motions: Sequence[RigidMotion | None],
+    pivot_m: Float[np.ndarray, "3"],
+    stretch: Int[np.ndarray, "F"],
 ) -> list[RigidMotion]:
-    """Frames without a motion go evenly from the last one that has one to the next."""
-    known = [k for k, motion in enumerate(motions) if motion is not None]
+    """Frames without a motion go evenly from the last one that has one to the next, in a stretch.
+
+    Where a stretch has none, they are as the nearest frame of another that has one.
+    """
+    known = np.array([k for k, motion in enumerate(motions) if motion is not None])
     found = [motion for motion in motions if motion is not None]
     if not found:
         return [RigidMotion.none()] * len(motions)
-    at = np.arange(len(motions)).clip(known[0], known[-1])
+    at = np.arange(len(motions))
+    for own in _stretches(stretch):
+        inside = known[(known >= own[0]) & (known <= own[-1])]
+        if not len(inside):
+            inside = known[[np.abs(known - own.mean()).argmin()]]
+        at[own] = own.clip(inside[0], inside[-1])
     turns = Rotation.from_matrix([motion.rotation for motion in found])
     between = turns if len(known) == 1 else Slerp(known, turns)(at)
     pivots = np.array([motion(pivot_m) for motion in found])
     places = np.stack([np.interp(at, known, along) for along in pivots.T], axis=1)
     matrices = np.broadcast_to(between.as_matrix(), (len(at), 3, 3))
     return [RigidMotion(turn, place - turn @ pivot_m) for turn, place in zip(matrices, places)]
+
+
+def _stretches(stretch: Int[np.ndarray, "F"]) -> list[Int[np.ndarray, "_"]]:
+    """The frames of each stretch."""
+    return np.split(np.arange(len(stretch)), np.flatnonzero(np.diff(stretch)) + 1)
 
 
 def _extent_m(
@@ -229,13 +250,17 @@ def _extent_m(
     return float(np.percentile(away, 98))
 
 
-def _smoothed(motions: Sequence[RigidMotion], pivot: Float[np.ndarray, "3"]) -> list[RigidMotion]:
-    """Motions without what points tremble: bodies are heavy."""
+def _smoothed(
+    motions: Sequence[RigidMotion],
+    pivot: Float[np.ndarray, "3"],
+    stretch: Int[np.ndarray, "F"],
+) -> list[RigidMotion]:
+    """Motions without what points tremble: bodies are heavy. Each stretch is smoothed by itself."""
     turns = Rotation.from_matrix([m.rotation for m in motions]).as_rotvec()
     pivots = np.array([m(pivot) for m in motions])
-    turns, pivots = (
-        gaussian_filter1d(part, _SMOOTH_FRAMES, axis=0, mode="nearest") for part in (turns, pivots)
-    )
+    for own in _stretches(stretch):
+        for part in (turns, pivots):
+            part[own] = gaussian_filter1d(part[own], _SMOOTH_FRAMES, axis=0, mode="nearest")
     matrices = Rotation.from_rotvec(turns).as_matrix()
     return [RigidMotion(r, p - r @ pivot) for r, p in zip(matrices, pivots)]
 
