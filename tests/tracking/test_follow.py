@@ -8,6 +8,7 @@ import pytest
 
 from rgbavatar_ns.tracking.face.clip import SeenFaces, followed_face
 from rgbavatar_ns.tracking.face.detector import IRIS_CENTERS
+from rgbavatar_ns.tracking.face.find_faces import sharpness
 from rgbavatar_ns.tracking.face.follow import FaceFollower
 
 from .clips import astronaut
@@ -218,6 +219,14 @@ def test_blurred_frames_are_noted_and_kept() -> None:
     found = followed_face(_seen(faces, sharpness=sharpness), WIDTH, HEIGHT)
     assert found.blurred == (4,)
     assert len(found) == 9
+
+
+def test_a_face_beside_the_picture_has_no_sharpness() -> None:
+    picture = np.random.default_rng(5).integers(0, 255, (90, 120, 3)).astype(np.uint8)
+    face = np.clip(SHAPE, -0.5, 0.5) * 0.25
+    assert sharpness(picture, face + 0.5) > 0
+    for beside in ((-0.2, 0.5), (0.5, -0.2), (-0.2, -0.2), (1.2, 0.5), (0.5, 1.2)):
+        assert sharpness(picture, face + beside) == 0, beside
 
 
 def test_real_faces_that_cross_in_a_picture() -> None:

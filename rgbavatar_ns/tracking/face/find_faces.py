@@ -136,7 +136,8 @@ def sharpness(image_rgb: UInt8[np.ndarray, "H W 3"], face: Float[np.ndarray, "47
     """
     height, width = image_rgb.shape[:2]
     low = np.clip(np.floor(face.min(0) * (width, height)), 0, None).astype(int)
-    high = np.ceil(face.max(0) * (width, height)).astype(int)
+    # Below 0 an end would be counted from the image's other side.
+    high = np.clip(np.ceil(face.max(0) * (width, height)), 0, None).astype(int)
     part = image_rgb[low[1] : high[1], low[0] : high[0]]
     if min(part.shape[:2]) < 2:
         return 0.0
