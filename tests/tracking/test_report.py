@@ -10,12 +10,14 @@ from rich.console import Console
 from rgbavatar_ns.cli.track import summary_table
 from rgbavatar_ns.data.check.problems import verdict
 from rgbavatar_ns.drawing.wireframe import mesh_silhouette
+from rgbavatar_ns.tracking.face.detector import LIP_PAIRS, face_height_px
 from rgbavatar_ns.tracking.image.head_mask import HeadOutline, height_above_chin
 from rgbavatar_ns.tracking.verify.contact_sheet import draw_tile, sheet_frames
 from rgbavatar_ns.tracking.verify.report import (
     closed_eyes,
     count_blinks,
     gap_correlation,
+    gap_shares,
     silhouette_shares,
     silhouette_summary,
     tracking_findings,
@@ -62,6 +64,24 @@ def test_correlation_of_openings() -> None:
     assert gap_correlation(2 * opening + 1, opening) == pytest.approx(1)
     assert gap_correlation(-opening, opening) == pytest.approx(-1)
     assert gap_correlation(np.ones(4), opening) is None
+
+
+def test_a_face_that_comes_nearer_opens_no_mouth() -> None:
+    """A fit whose mouth keeps still follows none that speaks, however large the face becomes."""
+    drawn, height = np.random.default_rng(7), np.linspace(120, 300, 80)
+    still, speaks = 0.05 + 0.004 * drawn.standard_normal((2, 80))
+    faces = []
+    for opening in (still, speaks):
+        points = np.zeros((80, 478, 2))
+        points[:, 152, 1] = height
+        points[:, [below for _, below in LIP_PAIRS], 1] = (opening * height)[:, None]
+        faces.append(points)
+    every = np.arange(478)
+    shares = [gap_shares(points, every, LIP_PAIRS, face_height_px(points)) for points in faces]
+    np.testing.assert_allclose(shares, [still, speaks])
+    correlation = gap_correlation(*shares)
+    assert correlation == pytest.approx(np.corrcoef(still, speaks)[0, 1])
+    assert abs(correlation) < 0.3 < 0.85 < np.corrcoef(still * height, speaks * height)[0, 1]
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ from rgbavatar_ns.tracking.face.detector import LID_PAIRS, LIP_PAIRS, face_heigh
 from rgbavatar_ns.tracking.fit.fit import ClipFit
 from rgbavatar_ns.tracking.fit.subject import SubjectTracker
 from rgbavatar_ns.tracking.image.crop import SquareCrop
-from rgbavatar_ns.tracking.verify.report import mean_gap
+from rgbavatar_ns.tracking.verify.report import gap_shares
 
 _TILES, _TILE_PX = 12, 384
 _FOUND_BGR, _FITTED_BGR = (80, 255, 80), (60, 60, 255)
@@ -87,8 +87,8 @@ def sheet_frames(
     turn = (nose - left) / (right - left + 1e-9)
     notable = {
         "worst fit": int(np.argmax(error_px / height)),
-        "widest mouth": int(np.argmax(mean_gap(points_px, every, LIP_PAIRS) / height)),
-        "eyes most closed": int(np.argmin(mean_gap(points_px, every, LID_PAIRS) / height)),
+        "widest mouth": int(np.argmax(gap_shares(points_px, every, LIP_PAIRS, height))),
+        "eyes most closed": int(np.argmin(gap_shares(points_px, every, LID_PAIRS, height))),
         "turned left": int(np.argmax(turn)),
         "turned right": int(np.argmin(turn)),
     }

@@ -60,7 +60,9 @@ def fit_quality(
     error = np.linalg.norm(fitted - found, axis=-1).mean(1)
     mesh_error = np.linalg.norm(bare_px - found, axis=-1).mean(1)
     gaps = {
-        name: [mean_gap(points, tracker.facemesh_index, pairs) for points in (fitted, found)]
+        name: [
+            gap_shares(points, tracker.facemesh_index, pairs, height) for points in (fitted, found)
+        ]
         for name, pairs in (("mouth", LIP_PAIRS), ("eyelid", LID_PAIRS))
     }
     return {
@@ -72,23 +74,26 @@ def fit_quality(
         "face_height_px": float(height.mean()),
         "mouth_opening_correlation": gap_correlation(*gaps["mouth"]),
         "eyelid_opening_correlation": gap_correlation(*gaps["eyelid"]),
-        "blinks_measured": count_blinks(gaps["eyelid"][1] / height),
-        "blinks_fitted": count_blinks(gaps["eyelid"][0] / height),
+        "blinks_measured": count_blinks(gaps["eyelid"][1]),
+        "blinks_fitted": count_blinks(gaps["eyelid"][0]),
         **gaze_quality(tracker, fit, landmarks_px, irises),
         "focal_px": fit.subject.camera.focal_px,
         "camera_distance_m": fit.subject.camera.distance_m,
     }
 
 
-def mean_gap(
+def gap_shares(
     points_px: Float[np.ndarray, "F L 2"],
     facemesh_index: Int[np.ndarray, "L"],
     pairs: Sequence[tuple[int, int]],
+    height_px: Float[np.ndarray, "F"],
 ) -> Float[np.ndarray, "F"]:
-    """How far lips or lids are open in each frame: the mean distance of these pairs, pixels."""
+    """How far lips or lids are open in each frame: the mean distance of these pairs, as a share of
+    the face's height, so that a face that comes nearer opens nothing."""
     place = {int(index): row for row, index in enumerate(facemesh_index)}
     rows = np.array([(place[a], place[b]) for a, b in pairs])
-    return np.linalg.norm(points_px[:, rows[:, 0]] - points_px[:, rows[:, 1]], axis=-1).mean(1)
+    gaps_px = np.linalg.norm(points_px[:, rows[:, 0]] - points_px[:, rows[:, 1]], axis=-1)
+    return gaps_px.mean(1) / height_px
 
 
 def gap_correlation(fitted: Float[np.ndarray, "F"], found: Float[np.ndarray, "F"]) -> float | None:
