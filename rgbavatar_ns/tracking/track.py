@@ -24,7 +24,7 @@ from rgbavatar_ns.files import digest, disk_errors, write_json
 from rgbavatar_ns.head import HeadArrays
 from rgbavatar_ns.kernels.constants import UNFILMED_RGBA
 from rgbavatar_ns.tracking.config import TrackConfig
-from rgbavatar_ns.tracking.face.clip import ClipLandmarks, followed_face
+from rgbavatar_ns.tracking.face.clip import ClipLandmarks, followed_face, rate_notes
 from rgbavatar_ns.tracking.face.detector import load_mediapipe
 from rgbavatar_ns.tracking.face.find_faces import find_faces
 from rgbavatar_ns.tracking.fit.fit import ClipFit
@@ -132,6 +132,7 @@ class _Tracking:
             alpha = self.mattes is None and bool(faces.has_alpha.mean() > 0.5)
             about_alpha = _alpha_notes(faces.has_alpha, alpha)
             notes = (*_bars_notes(self.source.bars), *self.source.notes, *about_alpha)
+            notes = (*notes, *rate_notes(faces))
             keys = tracker.key_positions(seen.points_px, width, height)
             outlines = key_outlines(
                 self.source, self.mattes, alpha, seen, keys, self.run, clock.done

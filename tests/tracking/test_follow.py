@@ -1,12 +1,13 @@
 """Which face is followed: laws over drawn boxes, and real faces that cross in one picture."""
 
+import re
 from contextlib import closing
 
 import cv2
 import numpy as np
 import pytest
 
-from rgbavatar_ns.tracking.face.clip import SeenFaces, followed_face
+from rgbavatar_ns.tracking.face.clip import SeenFaces, followed_face, rate_notes
 from rgbavatar_ns.tracking.face.detector import IRIS_CENTERS
 from rgbavatar_ns.tracking.face.find_faces import sharpness
 from rgbavatar_ns.tracking.face.follow import FaceFollower
@@ -131,6 +132,18 @@ def test_the_films_rate_comes_from_its_clock() -> None:
     assert rate(np.zeros(10), one) is None
 
 
+def test_clips_of_several_rates_have_the_longest_ones_and_that_is_told() -> None:
+    face: list[np.ndarray | None] = [_face(300, 240)] * 70
+    clips = np.repeat([0, 1], [10, 60])
+    for longer, told in ((60.0, ["30", "60", "60"]), (30.3, [])):
+        times_s = np.concatenate([np.arange(10) / 30, np.arange(60) / longer])
+        seen = _seen(face, time_s=times_s, clip=clips)
+        found = followed_face(seen, WIDTH, HEIGHT)
+        assert found.frames_per_second == pytest.approx(longer)
+        assert [number for note in rate_notes(seen) for number in re.findall(r"\d+", note)] == told
+    assert rate_notes(_seen(face, time_s=np.full(70, np.nan), clip=clips)) == []
+
+
 def test_gaps_jumps_pauses_and_new_clips_begin_segments() -> None:
     faces: list[np.ndarray | None] = [_face(300 + 3 * k, 240) for k in range(10)]
     plain = followed_face(_seen(faces), WIDTH, HEIGHT)
@@ -159,7 +172,7 @@ def test_slow_motion_and_what_is_none_are_each_followed_at_their_own_rate() -> N
     clips = np.repeat([0, 1], [40, 20])
     two = followed_face(_seen(faces, time_s=np.concatenate([slow, plain]), clip=clips), 640, 480)
     assert [part["first_frame"] for part in two.segments()] == [0, 40]
-    assert two.frames_per_second == pytest.approx(58 / (39 / 240 + 19 / 30), abs=1e-3)
+    assert two.frames_per_second == pytest.approx(240), "the longer one's"
     # A telephone's film that is slow motion at first.
     times_s = np.concatenate([slow, slow[-1] + (1 + np.arange(20)) / 30])
     assert len(followed_face(_seen(faces, time_s=times_s), 640, 480).segments()) == 1

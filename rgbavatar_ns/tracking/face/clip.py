@@ -29,6 +29,8 @@ _PAUSE, _LEAST_PAUSE_S = 4.0, 0.1
 # Sharpness below this share of the clip's sharp frames' (its 90th percentile: most frames may be
 # blurred) is noted as blur. Frames of a face that talks and keeps still are above .7.
 _BLURRED, _SHARP_PERCENT = 0.35, 90
+# Rates that differ by less are one: times of single frames are rounded.
+_SAME_RATE = 0.03
 _MOST_BYTES = 1 << 32
 _PER_FRAME, _POINTS, _IRISES = ("count", "clip", "time_s", "has_alpha"), (478, 2), (2, 2)
 
@@ -189,19 +191,39 @@ def _positions(
     return positions, others, jumps
 
 
-def _frames_per_second(seen: SeenFaces) -> float | None:
-    """The film's rate, over the steps between frames of a clip that are no pauses.
+def rate_notes(seen: SeenFaces) -> list[str]:
+    """What is to be known where clips of several rates are one film: some will play otherwise."""
+    kept, rates = _frames_per_second(seen), _clip_rates(seen)
+    if kept is None or all(abs(rate / kept - 1) <= _SAME_RATE for rate in rates.values()):
+        return []
+    told = ", ".join(f"{rate:.4g}" for rate in rates.values())
+    return [f"the clips have {told} frames a second; all play at {kept:.4g}, the longest one's"]
 
-    Their mean, since many files round times to milliseconds; None without a clock, or beyond what
-    a dataset takes.
+
+def _frames_per_second(seen: SeenFaces) -> float | None:
+    """The film's rate: that of the clip of most frames, since a mean would be none's.
+
+    None without a clock, or beyond what a dataset takes.
+    """
+    rates = _clip_rates(seen)
+    if not rates:
+        return None
+    rate = rates[max(rates, key=lambda clip: np.count_nonzero(seen.clip == clip))]
+    return round(rate, 3) if FRAME_RATES.holds(rate) else None
+
+
+def _clip_rates(seen: SeenFaces) -> dict[int, float]:
+    """Each clip's frames a second, over the steps between its frames that are no pauses.
+
+    By their mean, since many files round times to milliseconds; clips without a clock have none.
     """
     within = np.diff(seen.clip) == 0
-    steps, most = np.diff(seen.time_s)[within], _longest_step_s(seen)[1:][within]
-    steps = steps[(steps > 0) & (steps <= most)]
-    if not len(steps):
-        return None
-    rate = 1 / float(steps.mean())
-    return round(rate, 3) if FRAME_RATES.holds(rate) else None
+    steps, most = np.diff(seen.time_s), _longest_step_s(seen)[1:]
+    usual = within & (steps > 0) & (steps <= most)
+    return {
+        int(clip): 1 / float(steps[usual & (seen.clip[1:] == clip)].mean())
+        for clip in np.unique(seen.clip[1:][usual])
+    }
 
 
 def _longest_step_s(seen: SeenFaces) -> Float[np.ndarray, "F"]:
