@@ -1,3 +1,4 @@
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -124,6 +125,23 @@ def test_key_frames_differ_and_are_the_same_each_time() -> None:
     assert len(chosen) == 2
     assert 2 in chosen, "a translation alone is no new shape"
     assert key_frame_positions(clip, 99) == key_frame_positions(clip, 5)
+
+
+def test_key_frames_of_a_long_film_are_those_worked_out_at_once_in_little_memory() -> None:
+    random = np.random.default_rng(3)
+    clip = random.normal(size=(1500, 478, 2)) + 40 * random.normal(size=(1500, 1, 2))
+    among = np.flatnonzero(random.random(1500) < 0.8)
+    shapes = (clip - clip.mean(1, keepdims=True)).reshape(1500, -1)[among]
+    expected = [int(((shapes - np.median(shapes, axis=0)) ** 2).sum(1).argmin())]
+    while len(expected) < 12:
+        apart = ((shapes[:, None] - shapes[expected]) ** 2).sum(-1)
+        expected.append(int(apart.min(1).argmax()))
+    tracemalloc.start()
+    chosen = key_frame_positions(clip, 12, among)
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert chosen == sorted(among[expected].tolist())
+    assert most < clip.nbytes
 
 
 def test_the_mesh_is_of_the_person_that_is_asked_for(head: HeadModel) -> None:

@@ -1,6 +1,7 @@
 """Which face is followed: laws over drawn boxes, and real faces that cross in one picture."""
 
 import re
+import tracemalloc
 from contextlib import closing
 
 import cv2
@@ -142,6 +143,17 @@ def test_clips_of_several_rates_have_the_longest_ones_and_that_is_told() -> None
         assert found.frames_per_second == pytest.approx(longer)
         assert [number for note in rate_notes(seen) for number in re.findall(r"\d+", note)] == told
     assert rate_notes(_seen(face, time_s=np.full(70, np.nan), clip=clips)) == []
+
+
+def test_a_long_film_is_looked_through_in_little_more_than_its_landmarks() -> None:
+    seen = _seen([_face(300 + k % 7, 240) for k in range(1000)])
+    followed_face(seen, WIDTH, HEIGHT)  # the first call prepares the checks of types
+    tracemalloc.start()
+    found = followed_face(seen, WIDTH, HEIGHT)
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert len(found.segments()) == 1
+    assert most < 2 * found.points_px.nbytes
 
 
 def test_gaps_jumps_pauses_and_new_clips_begin_segments() -> None:

@@ -2,6 +2,7 @@
 
 from collections.abc import Collection
 from dataclasses import dataclass, fields, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -149,7 +150,8 @@ def followed_face(seen: SeenFaces, width: int, height: int) -> ClipLandmarks:
         )
     index = list(positions)
     rows = first_face[index] + list(positions.values())
-    landmarks = seen.points[rows] * size
+    landmarks = seen.points[rows]
+    landmarks *= size
     return ClipLandmarks(
         landmarks,
         FoundIrises(seen.irises[rows] * size, seen.iris_sigma[rows]),
@@ -264,8 +266,9 @@ def _sudden(
     A head that starts or stops takes some frames for it. Of a film that shows each frame twice or
     three times every other step is none.
     """
-    moved_px = np.linalg.norm(np.diff(points_px, axis=0), axis=2)
-    step = np.sqrt(np.square(moved_px).mean(1)) / height_px[1:]
+    # Frame by frame: of a long film one more array of all landmarks is much memory.
+    moved_px = (np.linalg.norm(then - now, axis=1) for now, then in pairwise(points_px))
+    step = np.sqrt([np.square(one).mean() for one in moved_px]) / height_px[1:]
     around = np.pad(step, _CUT_AROUND)
     beside = [k for k in range(2 * _CUT_AROUND + 1) if k != _CUT_AROUND]
     usual = np.max([around[k : k + len(step)] for k in beside], axis=0)

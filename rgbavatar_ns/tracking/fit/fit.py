@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from rgbavatar_ns.tracking.fit.camera import StillCamera
 from rgbavatar_ns.tracking.fit.landmark_cost import FrameCost, FrameTerms, Target
@@ -26,6 +26,7 @@ _FOCAL_USUAL, _FOCAL_LOG_WIDTH = 1.4, 0.5
 _IDENTITY_WIDTH = 1.0  # principal components, of variance 1
 _SCAN_KEYS = 4
 _HEAD_HEIGHT_M = 0.19
+_BLOCK_FRAMES = 256
 _OFFSET_SHRINK = 0.8
 # Steps towards a frame from the one before it, and from a pose that fits already; from nowhere,
 # where a clip or a stream begins or a face comes back; and for key frames, whose person is unknown.
@@ -343,17 +344,38 @@ def _fit_keys(
     return total, SubjectFit(found, camera, values)
 
 
-def key_frame_positions(landmarks_px: Float[np.ndarray, "F L 2"], count: int) -> list[int]:
+def key_frame_positions(
+    landmarks_px: Float[np.ndarray, "F L 2"],
+    count: int,
+    among: Int[np.ndarray, "A"] | None = None,
+) -> list[int]:
     """Frames that differ most from each other: farthest-point choice over aligned landmarks.
 
     Starts from the frame nearest to the median shape; deterministic. Fewer where fewer differ.
+    `among` are the positions to choose from, all by default.
     """
-    centred = landmarks_px - landmarks_px.mean(1, keepdims=True)
-    shapes = centred.reshape(len(centred), -1)
-    median = np.median(shapes, axis=0)
-    chosen = [int(np.argmin(((shapes - median) ** 2).sum(1)))]
-    nearest = ((shapes - shapes[chosen[0]]) ** 2).sum(1)
-    while len(chosen) < min(count, len(shapes)) and nearest.max() > 0:
+    frames = np.arange(len(landmarks_px)) if among is None else among
+    # Of a long film one more array of all landmarks is much memory.
+    blocks = np.split(frames, range(_BLOCK_FRAMES, len(frames), _BLOCK_FRAMES))
+    means = np.concatenate([landmarks_px[block].mean(1) for block in blocks])
+
+    def away(other: Float[np.ndarray, "L 2"]) -> Float[np.ndarray, "F"]:
+        """Squared distances of all shapes from one."""
+        found, start = [], 0
+        for block in blocks:
+            shapes = landmarks_px[block] - means[start : start + len(block), None]
+            found.append(np.square(shapes - other).reshape(len(block), -1).sum(1))
+            start += len(block)
+        return np.concatenate(found)
+
+    def shape(row: int) -> Float[np.ndarray, "L 2"]:
+        return landmarks_px[frames[row]] - means[row]
+
+    marks = range(landmarks_px.shape[1])
+    median = np.array([np.median(landmarks_px[frames, mark] - means, axis=0) for mark in marks])
+    chosen = [int(away(median).argmin())]
+    nearest = away(shape(chosen[0]))
+    while len(chosen) < min(count, len(frames)) and nearest.max() > 0:
         chosen.append(int(np.argmax(nearest)))
-        nearest = np.minimum(nearest, ((shapes - shapes[chosen[-1]]) ** 2).sum(1))
-    return sorted(chosen)
+        nearest = np.minimum(nearest, away(shape(chosen[-1])))
+    return sorted(frames[chosen].tolist())

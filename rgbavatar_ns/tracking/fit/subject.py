@@ -162,7 +162,7 @@ class SubjectTracker:
         )
         bound = max(_REJECT_SHARE, 2 * min(misfits.values()))
         while True:
-            chosen = left[key_frame_positions(landmarks_px[left], count)].tolist()
+            chosen = key_frame_positions(landmarks_px, count, left)
             unknown = [position for position in chosen if position not in misfits]
             misfits |= self._misfits_alone(landmarks_px, unknown, width, height)
             poor = [position for position in chosen if misfits[position] > bound]
