@@ -68,13 +68,14 @@ def drive(
     options: DrivingOptions | None = None,
     films: Sequence[Sequence[int]] | None = None,
     moments: Sequence[int] | None = None,
+    expression_names: Sequence[str] = (),
 ) -> MappedTheta:
     """A whole performance as the avatar's theta: smoothed, relative, held.
 
     `layout` and `own` are the avatar's: what its theta holds, and what it saw in training. films:
     rows that follow one another, a list for each camera; by default all as they come. moments:
     when each row was filmed, in frames, so that nothing is smoothed across a gap; by default one
-    after another.
+    after another. `expression_names` are the avatar's, as `neutral_frame` takes them.
     """
     options = DrivingOptions() if options is None else options
     result = mapped.theta
@@ -84,7 +85,7 @@ def drive(
         for rows in [range(len(result))] if films is None else films:
             film, when = mapped.theta[list(rows)], [filmed[row] for row in rows]
             result[list(rows)] = one_euro(film, frames_per_second, options.filter, when)
-    references = reference_of(result, layout), own_reference(own)
+    references = reference_of(result, layout, expression_names), own_reference(own)
     result = relative_theta(result, *references, mapped.known, own, layout, options)
     return replace(mapped, theta=result)
 
@@ -98,10 +99,12 @@ class Reference:
     mean: Float[Tensor, "H"]
 
 
-def reference_of(theta: Float[Tensor, "F H"], layout: ThetaLayout) -> Reference:
-    """A driver's reference over all its frames."""
+def reference_of(
+    theta: Float[Tensor, "F H"], layout: ThetaLayout, expression_names: Sequence[str] = ()
+) -> Reference:
+    """A driver's reference over all its frames; `expression_names` as in `neutral_frame`."""
     # Angles of a head are small: their mean is that of their axis-angle vectors.
-    return Reference(neutral_frame(theta, layout), theta.mean(0))
+    return Reference(neutral_frame(theta, layout, expression_names), theta.mean(0))
 
 
 def own_reference(own: TrainingStatistics) -> Reference:

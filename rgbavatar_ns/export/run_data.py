@@ -64,4 +64,5 @@ def statistics_of(avatar: AvatarMethod, dataset: TrackedDataset) -> TrainingStat
     theta = dataset.theta[list(dataset.train)]
     psi = avatar.weights(theta.to(avatar.identity.device)).cpu()
     views = dataset.cameras.world_to_camera[list(dataset.train)]
-    return TrainingStatistics.of(theta, psi, avatar.layout, views)
+    names = avatar.head.arrays.expression_names
+    return TrainingStatistics.of(theta, psi, avatar.layout, views, names)

@@ -91,7 +91,8 @@ def driven_by(
     mapped = theta_map(driver.layout, driver.arrays, avatar)(driver.theta)
     # What each camera saw is smoothed by itself: of several, a moment's rows lie side by side.
     when = driver.films, driver.moments
-    mapped = drive(mapped, avatar.layout, own, frames_per_second, options, *when)
+    names = avatar.head.arrays.expression_names
+    mapped = drive(mapped, avatar.layout, own, frames_per_second, options, *when, names)
     return replace(mapped, theta=mapped.theta[list(chosen)])
 
 

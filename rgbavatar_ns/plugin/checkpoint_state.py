@@ -41,7 +41,8 @@ def film_statistics(avatar: AvatarMethod, film: FilmedSubject) -> TrainingStatis
     train = list(film.train) or [0]
     theta = film.theta[train].cpu()
     psi = avatar.weights(theta.to(avatar.identity)).cpu()
-    return TrainingStatistics.of(theta, psi, avatar.layout, film.world_to_camera[train].cpu())
+    views, names = film.world_to_camera[train].cpu(), avatar.head.arrays.expression_names
+    return TrainingStatistics.of(theta, psi, avatar.layout, views, names)
 
 
 def require_same_layout(state_dict: Mapping[str, Any], avatar: AvatarMethod) -> None:

@@ -1,5 +1,6 @@
 """What an avatar has seen in training: ranges of theta, psi and views, its space of expressions."""
 
+from collections.abc import Sequence
 from dataclasses import MISSING, dataclass, field, fields
 from typing import Any
 
@@ -9,6 +10,7 @@ from torch import Tensor
 
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import ThetaLayout, turn_range, turn_seen
+from rgbavatar_ns.head.arrays import NECK_SHIFTS
 from rgbavatar_ns.head.layout import RIGID_FIELDS
 
 _AXES = {
@@ -66,10 +68,12 @@ class TrainingStatistics:
         psi: Float[Tensor, "F K"],
         layout: ThetaLayout,
         world_to_camera: Float[Tensor, "#F 4 4"] | None = None,
+        expression_names: Sequence[str] = (),
     ) -> "TrainingStatistics":
         """Statistics of training frames; raises UserError where there are none.
 
-        Without cameras the views are taken to be those of most films.
+        Without cameras the views are taken to be those of most films. `expression_names` as in
+        `neutral_frame`.
         """
         if len(theta) == 0:
             raise UserError("There are no training frames.", "Give a dataset with frames.")
@@ -91,7 +95,7 @@ class TrainingStatistics:
             theta_std=theta.std(0, unbiased=False),
             theta_min=theta.amin(0),
             theta_max=theta.amax(0),
-            theta_neutral=neutral_frame(theta, layout),
+            theta_neutral=neutral_frame(theta, layout, expression_names),
             psi_mean=psi.mean(0),
             # Of no weights torch would warn.
             psi_std=psi.std(0, unbiased=False) if psi.shape[1] else psi[0],
@@ -192,13 +196,20 @@ def expressive_numbers(layout: ThetaLayout) -> Bool[Tensor, "H"]:
     return mask
 
 
-def neutral_frame(theta: Float[Tensor, "F H"], layout: ThetaLayout) -> Float[Tensor, "H"]:
+def neutral_frame(
+    theta: Float[Tensor, "F H"], layout: ThetaLayout, expression_names: Sequence[str] = ()
+) -> Float[Tensor, "H"]:
     """The frame whose expression is nearest to rest.
 
     Of the calm ones, whose sum of absolute values is near the smallest, that with the most closed
     jaw: of people who speak the calmest alone is often one between two words, the mouth ajar.
+    `expression_names` are the head's, where they are known: those that carry the head upon a body,
+    in centimetres, are no expression.
     """
-    size = theta[:, expressive_numbers(layout)].abs().sum(1)
+    told = expressive_numbers(layout)
+    for column, name in enumerate(expression_names, layout.slice("expression").start):
+        told[column] &= name not in NECK_SHIFTS
+    size = theta[:, told].abs().sum(1)
     calm = torch.nonzero(size <= _CALM * size.min())[:, 0]
     jaw = layout.slice("jaw").start
     return theta[calm[theta[calm, jaw].argmin()]]

@@ -36,7 +36,8 @@ def training_statistics(model: AvatarModel) -> TrainingStatistics:
 def neutral_of_shown(model: AvatarModel) -> Float[Tensor, "H"]:
     """The frame with the most neutral expression of those that the viewer can show."""
     theta = model.driving_theta(list(model.subject.train) or [0])
-    return neutral_frame(theta.cpu(), model.avatar.layout)
+    avatar = model.avatar
+    return neutral_frame(theta.cpu(), avatar.layout, avatar.head.arrays.expression_names)
 
 
 @torch.no_grad()

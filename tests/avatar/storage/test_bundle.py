@@ -12,8 +12,9 @@ from rgbavatar_ns.avatar import AvatarConfig
 from rgbavatar_ns.avatar.loading import load_avatar
 from rgbavatar_ns.avatar.storage import bundle
 from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics, neutral_frame
+from rgbavatar_ns.driving.transfer import reference_of
 from rgbavatar_ns.errors import UserError
-from rgbavatar_ns.head import HeadArrays, HeadModel, ThetaLayout
+from rgbavatar_ns.head import EMBEDDED_BUST, HeadArrays, HeadModel, ThetaLayout
 from rgbavatar_ns.head.flame import load_flame
 from tests.avatar.small_head import front_camera, random_theta
 from tests.fuzz.avatars import checkpoint_of
@@ -347,6 +348,20 @@ def test_of_the_calm_frames_the_one_with_the_mouth_closed_is_neutral(make_avatar
     theta[:, layout.slice("jaw").start] = torch.tensor([0.1, 0.01, 0.0])
     # Sums 1.1, 1.16 and 3.0: the last one's jaw is closed, but its face is not calm.
     assert torch.equal(neutral_frame(theta, layout), theta[1])
+
+
+def test_where_a_head_lies_upon_its_body_does_not_decide_which_frame_is_calm():
+    bust = HeadModel.embedded(name=EMBEDDED_BUST)
+    layout, names = bust.layout, bust.arrays.expression_names
+    theta = torch.zeros(2, layout.size)
+    first = layout.slice("expression").start
+    smile, neck_up = (first + names.index(name) for name in ("mouthSmileLeft", "neckUp"))
+    theta[0, neck_up], theta[1, smile] = 2.0, 0.9  # two centimetres; nearly all of a smile
+    theta[:, layout.slice("jaw").start] = torch.tensor([0.01, 0.0])
+    assert torch.equal(neutral_frame(theta, layout, names), theta[0])
+    seen = TrainingStatistics.of(theta, torch.zeros(2, 1), layout, expression_names=names)
+    assert torch.equal(seen.theta_neutral, theta[0])
+    assert torch.equal(reference_of(theta, layout, names).neutral, theta[0])
 
 
 def test_values_worked_by_hand(make_avatar):
