@@ -190,9 +190,8 @@ class OnlineTrainer(RGBAvatarTrainer):
         """See whether the stream has ended; raises what ended it against its will, after saving."""
         ingest = self.stream.ingest
         if ingest.failure is not None:
+            self._save_if_unsaved()
             self.stream.record()
-            if self.step >= 0:
-                self.save_checkpoint(self.step)
             raise ingest.failure
         if ingest.finished and self.stream.ended_step is None:
             self.stream.ended_step = step
@@ -272,6 +271,8 @@ class OnlineTrainer(RGBAvatarTrainer):
                     group["lr"] = self.optimizers.config[name]["optimizer"].lr
 
     def _save_end(self) -> None:
+        # First of all, since many frames are long in recording, and a full disk may refuse them.
+        self._save_if_unsaved()
         self.stream.record()
         self.stream.least.write(self.base_dir)
         super()._save_end()

@@ -406,16 +406,3 @@ def test_rates_that_are_to_fall_need_to_know_over_how_many_steps(online: Online)
     trainer.train()
     last = trainer.optimizers.optimizers["color"].param_groups[0]["lr"]
     assert last < 0.2 * first, "what has no schedule falls after the stream"
-
-
-def test_what_interrupts_looking_back_costs_no_step(online: Online):
-    trainer = online()
-    before_step(2, trainer, trainer.stop.request)
-
-    def interrupted() -> Any:
-        raise KeyboardInterrupt
-
-    trainer.pipeline.training_frames = interrupted  # type: ignore[method-assign]
-    with pytest.raises(KeyboardInterrupt):
-        trainer.train()
-    assert list_checkpoints(trainer.checkpoint_dir)[-1][0] == trainer.step
