@@ -177,6 +177,10 @@ class AvatarModel(Model):
         """Do what is due when all steps are done; whether that changed the avatar."""
         return False
 
+    def changed_at_end(self) -> dict[str, Tensor]:
+        """Copies of what `finish`, or looking back, may change, by its name in the avatar."""
+        return {}
+
     @property
     def looks_back(self) -> bool:
         """Whether a run that is complete looks at all its training frames once more."""

@@ -11,7 +11,7 @@ from rgbavatar_ns.avatar import Avatar, AvatarConfig
 from rgbavatar_ns.avatar.model.image_loss import LPIPSLoss
 from rgbavatar_ns.avatar.prior import SurfacePrior
 from rgbavatar_ns.avatar.training.batches import DeviceFrames
-from rgbavatar_ns.avatar.training.color_init import FirstColorsKind, hide_unseen
+from rgbavatar_ns.avatar.training.color_init import CHANGED_AT_END, FirstColorsKind, hide_unseen
 from rgbavatar_ns.avatar.training.cuda_graph import Recorder
 from rgbavatar_ns.avatar.training.losses import image_losses
 from rgbavatar_ns.avatar.training.step import Orthogonality, TrainingOptions, TrainingStep
@@ -136,6 +136,11 @@ class RGBAvatarModel(AvatarModel):
         if self.config.hide_unseen:
             hide_unseen(self.avatar)
         return self.config.hide_unseen
+
+    def changed_at_end(self) -> dict[str, Tensor]:
+        """See `AvatarModel`: a run that goes on trains what was hidden, as if it had not ended."""
+        state = self.avatar.state_dict()
+        return {name: state[name].clone() for name in CHANGED_AT_END}
 
     @property
     def looks_back(self) -> bool:

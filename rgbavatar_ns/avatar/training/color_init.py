@@ -41,6 +41,12 @@ _LEARNED = 0.06
 """A colour feature that is so far from its initial grey was learned: five of Adam's steps."""
 _HIDDEN_LOGIT = -12.0
 """An opacity of 6e-6, far below what is drawn."""
+CHANGED_AT_END = (
+    "color_initialized",
+    "blendshapes.color_feature",
+    "blendshapes.opacity_logit",
+)
+"""What first colours that are given after the last step, and `hide_unseen`, change of an avatar."""
 _SMALLEST_WEIGHT_SUM = 1e-3
 """Below this sum of counted weights a Gaussian saw background only."""
 

@@ -1,5 +1,6 @@
 """A trainer's checkpoints: written whole or not at all, and what it needs in order to go on."""
 
+import os
 import shutil
 import time
 from collections.abc import Callable, Iterator
@@ -9,6 +10,7 @@ from typing import Any
 
 import torch
 
+from rgbavatar_ns.avatar.storage.bundle import CHECKPOINT_PREFIX
 from rgbavatar_ns.avatar.storage.checkpoint_file import (
     checkpoints_of,
     list_checkpoints,
@@ -19,6 +21,9 @@ from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.files import atomic_write
 
 _REQUIRED = frozenset({"step", "pipeline", "optimizers", "schedulers", "scalers"})
+BEFORE_END = "before_end"
+"""Where a checkpoint keeps what the end of its run has changed of the avatar, as it was before."""
+LATEST = "latest"
 # What a zip file's directory and small values may add to the tensors' bytes.
 _OVERHEAD_BYTES = 4 << 20
 _STILL_S = 60.0
@@ -108,13 +113,29 @@ def read_training_state(path: Path) -> dict[str, Any]:
             f"The checkpoint {path} lacks {', '.join(sorted(missing))}.",
             "Resume from another one of the run.",
         )
-    for name in _REQUIRED:
-        if not isinstance(state[name], int if name == "step" else dict):
+    for name in _REQUIRED | {BEFORE_END}:
+        if not isinstance(state.get(name, {}), int if name == "step" else dict):
             raise UserError(
                 f"The checkpoint {path} has something else as its {name}.",
                 "Resume from another one of the run.",
             )
     return state
+
+
+def state_before_end(state: dict[str, Any]) -> dict[str, Any]:
+    """Return the pipeline's state that training goes on from: what a run's end did is undone."""
+    before = state.get(BEFORE_END, {})
+    return state["pipeline"] | {f"{CHECKPOINT_PREFIX}{k}": value for k, value in before.items()}
+
+
+def link_latest(run: Path) -> None:
+    """Let METHOD/latest lead to the newest run, for commands that take one run's config.yml."""
+    link, fresh = run.with_name(LATEST), run.with_name(f".{LATEST}.{os.getpid()}")
+    if run.name == LATEST or (link.exists() and not link.is_symlink()):
+        return
+    with suppress(OSError):  # a file system without links
+        fresh.symlink_to(run.name, target_is_directory=True)
+        fresh.replace(link)
 
 
 def _require_space(folder: Path, needed: int, remedy: str) -> None:

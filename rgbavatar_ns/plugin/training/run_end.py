@@ -9,6 +9,7 @@ import numpy as np
 from nerfstudio.engine.callbacks import TrainingCallbackLocation
 from nerfstudio.engine.trainer import Trainer
 from nerfstudio.utils import writer
+from torch import Tensor
 
 from rgbavatar_ns.avatar.storage.checkpoint_file import CONFIG_NAME, SUMMARY_NAME
 from rgbavatar_ns.avatar.training.batches import TrainingBatch
@@ -35,6 +36,8 @@ class EndingTrainer(Trainer):
     """Of the steps alone, over all sessions of the run."""
     _saved_step: int | None
     """Step whose state lies on the disk as it is."""
+    _before_end: dict[str, Tensor]
+    """What the end of the run has changed of the avatar, as it was; empty before."""
 
     @property
     @abstractmethod
@@ -65,9 +68,10 @@ class EndingTrainer(Trainer):
         self.training_state = "completed" if self.completed else "paused"
         # First of all, since looking back at many frames takes a while.
         self._save_if_unsaved()
+        before = self.pipeline.model.changed_at_end()
         looked = self._take.look_back(self._frames_at_the_end())
         if (self.completed and self.pipeline.model.finish()) or looked:
-            self._saved_step = None
+            self._before_end, self._saved_step = before, None
             self._save_if_unsaved()
         writer.write_out_storage()
         self._save_refined()

@@ -2,10 +2,9 @@
 
 import copy
 import math
-import os
 import sys
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,6 +18,7 @@ from nerfstudio.utils import writer
 from nerfstudio.utils.misc import step_check
 from nerfstudio.utils.writer import EventName
 from nerfstudio.viewer.viewer import Viewer
+from torch import Tensor
 
 from rgbavatar_ns.avatar.storage.stored_avatar import damage_of
 from rgbavatar_ns.avatar.training.batches import ChosenFrames, TrainingBatch
@@ -32,12 +32,15 @@ from rgbavatar_ns.plugin.errors import device_errors_told, install_user_error_ho
 from rgbavatar_ns.plugin.option_order import led_by
 from rgbavatar_ns.plugin.pipeline import RGBAvatarPipeline, RGBAvatarPipelineConfig
 from rgbavatar_ns.plugin.training.checkpoints import (
+    BEFORE_END,
     checkpoint_of_step,
+    link_latest,
     load_newest,
     read_training_state,
     readable_step,
     remove_leftover,
     save_checkpoint,
+    state_before_end,
 )
 from rgbavatar_ns.plugin.training.curve import EvaluationCurve
 from rgbavatar_ns.plugin.training.interruption import StopRequest, stop_with_starter
@@ -62,7 +65,6 @@ from rgbavatar_ns.plugin.training.train_clock import TrainClock, waiting_for
 from rgbavatar_ns.plugin.training.turns import TurnsLock
 from rgbavatar_ns.plugin.viewer.settings import is_of_ns_viewer, viewer_settings
 
-LATEST = "latest"
 CHANGED_FIRST = (
     "data", "experiment_name", "output_dir", "max_num_iterations", "max_train_seconds", "vis",
     "load_dir", "load_config", "steps_per_save", "keep_checkpoints",
@@ -147,16 +149,6 @@ class RGBAvatarTrainerConfig(TrainerConfig):
             require_loadable(self.load_config, sys.argv[1:])
 
 
-def _link_latest(run: Path) -> None:
-    """Let METHOD/latest lead to the newest run, for commands that take one run's config.yml."""
-    link, fresh = run.with_name(LATEST), run.with_name(f".{LATEST}.{os.getpid()}")
-    if run.name == LATEST or (link.exists() and not link.is_symlink()):
-        return
-    with suppress(OSError):  # a file system without links
-        fresh.symlink_to(run.name, target_is_directory=True)
-        fresh.replace(link)
-
-
 _IN_TRAINER = ContextVar("a trainer asks where to save", default=False)
 
 
@@ -191,6 +183,7 @@ class RGBAvatarTrainer(EndingTrainer, FitHooks):
         self.stop_training = False
         self.clock = TrainClock(waiting_for(self.device))
         self._saved_step: int | None = None
+        self._before_end: dict[str, Tensor] = {}
         self._is_latest = False
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
@@ -385,7 +378,7 @@ class RGBAvatarTrainer(EndingTrainer, FitHooks):
                 self._saved_step = state["step"]
             self.clock.resume(float(state.get("train_seconds", 0.0)))
             self.curve.points = [dict(point) for point in state.get("curve", ())]
-        self.pipeline.load_pipeline(state["pipeline"], state["step"])
+        self.pipeline.load_pipeline(state_before_end(state), state["step"])
         with damage_of(path):
             self.optimizers.load_optimizers(state["optimizers"])
             require_fitting_states(self.optimizers.optimizers.values())
@@ -413,7 +406,7 @@ class RGBAvatarTrainer(EndingTrainer, FitHooks):
         # Not before: a run that could not begin is of no use to who asks for the latest. Nor again:
         # of two that train at once the one begun last stays it.
         if not self._is_latest:
-            _link_latest(self.base_dir)
+            link_latest(self.base_dir)
             self._is_latest = True
 
     def _state(self, step: int) -> dict[str, Any]:
@@ -423,6 +416,7 @@ class RGBAvatarTrainer(EndingTrainer, FitHooks):
             "train_seconds": self.clock.seconds,
             "curve": self.curve.points,
             "pipeline": self.pipeline.state_dict(),
+            BEFORE_END: self._before_end,
             "optimizers": {k: v.state_dict() for k, v in self.optimizers.optimizers.items()},
             "schedulers": {k: v.state_dict() for k, v in self.optimizers.schedulers.items()},
             "scalers": self.grad_scaler.state_dict(),

@@ -43,6 +43,34 @@ def test_what_was_never_seen_is_hidden_at_the_end_and_nothing_else(tiny_data: Pa
     assert torch.equal(logit[seen], plain[seen])
 
 
+def test_a_run_that_was_finished_and_goes_on_equals_one_that_was_not(
+    tiny_data: Path, tmp_path: Path
+):
+    """What was hidden, or had its colour after the last step, is trained on as it was before."""
+    whole = trained(paper_config(tiny_data, tmp_path / "whole", max_num_iterations=20))
+    first = trained(paper_config(tiny_data, tmp_path / "first", max_num_iterations=5))
+    state = newest_state(first.checkpoint_dir)
+    now, before = state["pipeline"], state["before_end"]
+    logit, seen = (f"_model.avatar.{n}" for n in ("blendshapes.opacity_logit", "color_initialized"))
+    assert 0 < int(before["color_initialized"].sum()) < int(now[seen].sum()) < len(now[seen])
+    assert not now[logit].equal(before["blendshapes.opacity_logit"])
+    resume = {"max_num_iterations": 20, "load_dir": first.checkpoint_dir}
+    again = trained(paper_config(tiny_data, tmp_path / "again", **resume))
+    ends = [newest_state(one.checkpoint_dir) for one in (whole, again)]
+    for part in ("pipeline", "before_end"):
+        tensors = {k: v for k, v in ends[0][part].items() if isinstance(v, torch.Tensor)}
+        assert all(value.equal(ends[1][part][name]) for name, value in tensors.items()), part
+
+
+def test_a_finished_run_that_has_no_steps_left_is_finished_still(tiny_data: Path, tmp_path: Path):
+    first = trained(paper_config(tiny_data, tmp_path / "first", max_num_iterations=5))
+    resume = {"max_num_iterations": 5, "load_dir": first.checkpoint_dir}
+    for folder in ("first", "other"):
+        again = trained(paper_config(tiny_data, tmp_path / folder, **resume))
+        ends = [newest_state(one.checkpoint_dir)["pipeline"] for one in (first, again)]
+        assert all(v.equal(ends[1][k]) for k, v in ends[0].items() if isinstance(v, torch.Tensor))
+
+
 def test_nothing_of_ours_is_in_it(tiny_data: Path, tmp_path: Path):
     trainer = trained(paper_config(tiny_data, tmp_path, max_num_iterations=3))
     model = trainer.pipeline.model
