@@ -1,6 +1,7 @@
 """Refined tracking through nerfstudio's trainer: what is corrected, resumed, written, scored."""
 
 import dataclasses
+import json
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import torch
 from rgbavatar_ns.avatar import AvatarConfig
 from rgbavatar_ns.avatar.refinement.corrections import RefinementConfig
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.files import DiskError
 from rgbavatar_ns.kernels import available_backends
 from rgbavatar_ns.plugin.refinement import frame_refinement
 from rgbavatar_ns.plugin.training.trainer import RGBAvatarTrainer, RGBAvatarTrainerConfig
@@ -72,6 +74,26 @@ def test_training_frames_are_corrected_and_held_out_ones_calibrated(tiny_data, t
         layout.slice("rotation").start + 1,
         layout.slice("jaw").start,
     }
+
+
+def test_corrections_that_the_disk_refuses_are_told_and_leave_the_earlier_ones(
+    tiny_data, tmp_path, monkeypatch
+):
+    """What a full disk cuts off is no file of corrections."""
+    trainer = trained(_config(tiny_data, tmp_path))
+    path = trainer.base_dir / "theta_refined.npy"
+    whole = path.read_bytes()
+
+    def full(place, array):
+        Path(place).write_bytes(whole[:40])
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(np, "save", full)
+    with pytest.raises(DiskError, match=r"no space left to write .*theta_refined\.npy"):
+        trained(_config(tiny_data, tmp_path, load_dir=trainer.checkpoint_dir))
+    assert path.read_bytes() == whole
+    assert not list(trainer.base_dir.glob(".theta_refined*"))
+    assert json.loads((trainer.base_dir / "training.json").read_text())["steps"] == 8
 
 
 def test_both_ways_correct_alike(tiny_data, tmp_path):

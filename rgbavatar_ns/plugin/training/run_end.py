@@ -16,7 +16,7 @@ from rgbavatar_ns.avatar.training.batches import TrainingBatch
 from rgbavatar_ns.avatar.training.method_step import MethodStep
 from rgbavatar_ns.avatar.training.step import TrainingStep
 from rgbavatar_ns.errors import UserError
-from rgbavatar_ns.files import write_json
+from rgbavatar_ns.files import atomic_write, write_json
 from rgbavatar_ns.plugin.console import say
 from rgbavatar_ns.plugin.pipeline import RGBAvatarPipeline
 from rgbavatar_ns.plugin.refinement import REFINED_NAME
@@ -74,8 +74,9 @@ class EndingTrainer(Trainer):
             self._before_end, self._saved_step = before, None
             self._save_if_unsaved()
         writer.write_out_storage()
+        summary = self._write_summary(COMPLETED if self.completed else "stopped")
         self._save_refined()
-        self._tell_end(self._write_summary(COMPLETED if self.completed else "stopped"))
+        self._tell_end(summary)
 
     def _save_if_unsaved(self) -> None:
         if self.step >= 0 and self.step != self._saved_step:
@@ -113,7 +114,8 @@ class EndingTrainer(Trainer):
         model = self.pipeline.model
         if model.refinement is not None:
             theta = model.refinement.all_frames(model.frame_theta).cpu().numpy()
-            np.save(self.base_dir / REFINED_NAME, theta.astype(np.float32))
+            with atomic_write(self.base_dir / REFINED_NAME) as partial:
+                np.save(partial, theta.astype(np.float32))
 
     def _totals(self) -> dict[str, Any]:
         """What the run has seen over all its sessions: "images", and more by other names."""
