@@ -40,6 +40,13 @@ class TrainClock:
             self._per_step = (self.seconds - self._seconds_before) / self._steps
             self._steps, self._seconds_before = 0, self.seconds
 
+    def reaches(self, seconds: float) -> bool:
+        """Whether so many have passed; settles only where, by its steps so far, they may have."""
+        expected = self.seconds + (self._steps + 1) * self._per_step
+        if self._steps > 0 and (self._per_step == 0 or expected >= seconds):
+            self.settle()
+        return self.seconds >= seconds
+
     @property
     def seconds_per_step(self) -> float:
         """Mean of the steps between the last two times it settled."""

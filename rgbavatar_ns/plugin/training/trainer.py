@@ -359,7 +359,7 @@ class RGBAvatarTrainer(EndingTrainer, FitHooks):
     @property
     def _out_of_time(self) -> bool:
         most = self.config.max_train_seconds
-        return most is not None and self.clock.seconds >= most
+        return most is not None and self.clock.reaches(most)
 
     def _load_checkpoint(self) -> None:
         """Load what --load-dir (newest readable) or --load-checkpoint names, if anything."""

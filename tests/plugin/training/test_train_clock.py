@@ -15,8 +15,10 @@ class Device:
 
     def __init__(self) -> None:
         self.time_s = self.left_s = 0.0
+        self.waits = 0
 
     def wait(self) -> None:
+        self.waits += 1
         self.time_s += self.left_s
         self.left_s = 0.0
 
@@ -47,6 +49,37 @@ def test_it_goes_on_from_the_sessions_before() -> None:
     clock.settle()
     assert clock.seconds == 101.0
     assert clock.seconds_per_step == 1.0
+
+
+def test_seconds_are_reached_with_the_step_that_uses_them_up_and_few_waits() -> None:
+    device, steps = Device(), 0
+    clock = device.clock()
+    while not clock.reaches(1000.0):
+        device.left_s += 2.0
+        clock.add(0.001)
+        steps += 1
+    assert steps == 500
+    assert device.waits < 20
+
+
+def test_a_run_of_so_many_seconds_takes_no_step_beyond_them(
+    config_of: Callable[..., RGBAvatarTrainerConfig],
+) -> None:
+    config = config_of(max_num_iterations=30, max_train_seconds=20.0)
+    config.logging.steps_per_log = 50
+    trainer = make_trainer(config)
+    device = Device()
+    trainer.clock = device.clock()
+
+    def work(step: int) -> None:
+        device.left_s += 3.0
+
+    before_each_step(trainer, work)
+    after_step = trainer.after_step
+    trainer.after_step = lambda step, losses, seconds: after_step(step, losses, 0.0)
+    trainer.train()
+    summary = json.loads((trainer.base_dir / "training.json").read_text())
+    assert (summary["steps"], summary["train_seconds"]) == (7, 21.0)
 
 
 def test_a_cpu_has_done_what_it_was_told() -> None:
