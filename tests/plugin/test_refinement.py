@@ -174,6 +174,30 @@ def test_bases_that_would_never_learn_are_refused(tiny_data, tmp_path, share):
         make_trainer(_config(tiny_data, tmp_path, bases_start=share))
 
 
+def test_a_run_of_so_many_seconds_says_over_how_many_steps_its_bases_wait(
+    tiny_data, tmp_path, capsys
+):
+    def begun(name: str, **fields: Any) -> RGBAvatarTrainer:
+        seconds = {"max_train_seconds": 6.0, "max_num_iterations": 5000}
+        config = _config(tiny_data, tmp_path / name, bases_start=0.5, **seconds | fields)
+        trainer = make_trainer(config)
+        after_step = trainer.after_step
+        trainer.after_step = lambda step, losses, seconds: after_step(step, losses, 2.0)
+        return trainer
+
+    with pytest.raises(UserError, match=r"--max-train-seconds is 6\.0, but") as refused:
+        begun("unknown", learning_rate_steps=None)
+    assert "--learning-rate-steps" in refused.value.remedy
+    for steps, learned in ((4, True), (8, False)):
+        trainer = begun(str(steps), learning_rate_steps=steps)
+        capsys.readouterr()
+        trainer.train()
+        assert trainer.step == 2
+        assert bool(trainer.pipeline.model.avatar.blendshapes.basis_position.any()) == learned
+        told = " ".join(capsys.readouterr().out.split())
+        assert ("bases have learned nothing, since they begin with step 4" in told) != learned
+
+
 @pytest.mark.parametrize("first_end", [3, 5], ids=["bases wait", "bases learn"])
 def test_resume_equals_uninterrupted_run(tiny_data, tmp_path, first_end):
     def config(name: str, load_dir: Path | None = None) -> RGBAvatarTrainerConfig:

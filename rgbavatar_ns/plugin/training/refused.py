@@ -79,6 +79,22 @@ def require_rates_to_fall(config: Any, groups: Collection[str], scheduled: Colle
         raise UserError(f"--learning-rate-factor is {factor}, but {because}.", _LEAVE_OUT)
 
 
+def require_bases_to_begin(config: Any, groups: Collection[str]) -> None:
+    """Raise UserError where bases would wait for a share of steps that nobody knows the number of.
+
+    A run that ends by the clock takes as many as the machine makes of its seconds.
+    """
+    model, seconds = config.pipeline.model, config.max_train_seconds
+    if seconds is None or config.learning_rate_steps is not None or not model.refine_tracking:
+        return
+    if any(model.refinement.first_step_of(name, config.max_num_iterations) for name in groups):
+        raise UserError(
+            f"--max-train-seconds is {seconds}, but with refined tracking bases begin to learn "
+            "after a share of the steps, which may be more than the seconds allow for.",
+            "Say by --learning-rate-steps about how many steps they make.",
+        )
+
+
 def require_used(config: TrainerConfig) -> None:
     """Raise UserError for an option of nerfstudio's that would change nothing, or wait for ever."""
     for refused in REFUSED:

@@ -22,6 +22,7 @@ from rgbavatar_ns.plugin.pipeline import RGBAvatarPipeline
 from rgbavatar_ns.plugin.refinement import REFINED_NAME
 from rgbavatar_ns.plugin.training.interruption import StopRequest
 from rgbavatar_ns.plugin.training.load_config import COMPLETED
+from rgbavatar_ns.plugin.training.optimizers import DecayConfig
 from rgbavatar_ns.plugin.training.peak_memory import peak_memory
 from rgbavatar_ns.plugin.training.train_clock import TrainClock
 
@@ -101,6 +102,7 @@ class EndingTrainer(Trainer):
             seconds = summary["train_seconds"]
             why = f" in the {seconds:.0f} s that it was given" if self._out_of_time else ""
             say(f"Trained {steps} steps{why}, {rate:.1f} images/s.")
+            self._tell_bases_that_waited()
         else:
             say(
                 f"Stopped after {steps} of {self.config.max_num_iterations} steps; resume with "
@@ -108,6 +110,18 @@ class EndingTrainer(Trainer):
             )
         say(f"Config: {self.base_dir / CONFIG_NAME}")
         say(f"Checkpoints: {self.checkpoint_dir}")
+
+    def _tell_bases_that_waited(self) -> None:
+        """Say where refined tracking let the bases wait for longer than the run took."""
+        for name, group in self.pipeline.get_param_groups().items():
+            schedule = self.optimizers.config[name]["scheduler"]
+            start = schedule.start_step if isinstance(schedule, DecayConfig) else 0
+            if start > self.step and not any(bool(parameter.any()) for parameter in group):
+                say(
+                    f"note: the bases have learned nothing, since they begin with step {start}. "
+                    "Give the run more time, or name fewer --learning-rate-steps."
+                )
+                return
 
     def _save_refined(self) -> None:
         """Write theta of all frames, corrected or calibrated, as float32 [F, H]."""

@@ -59,7 +59,7 @@ from rgbavatar_ns.plugin.training.optimizers import (
 )
 from rgbavatar_ns.plugin.training.progress import TrainingProgress
 from rgbavatar_ns.plugin.training.ranges import require_trainable
-from rgbavatar_ns.plugin.training.refused import require_rates_to_fall
+from rgbavatar_ns.plugin.training.refused import require_bases_to_begin, require_rates_to_fall
 from rgbavatar_ns.plugin.training.run_end import EndingTrainer
 from rgbavatar_ns.plugin.training.train_clock import TrainClock, waiting_for
 from rgbavatar_ns.plugin.training.turns import TurnsLock
@@ -88,7 +88,7 @@ class RGBAvatarTrainerConfig(TrainerConfig):
     a resume included, even if steps are left: to compare methods at equal time. Counted as
     training.json's train_seconds: the steps and their waiting for images, neither evaluation nor
     saving. How many steps that makes depends on the machine; rates fall over learning_rate_steps
-    all the same."""
+    all the same, and with refined tracking bases wait for a share of these."""
     position_lr_final: Positive | None = None
     """Let the learning rate of positions fall to this (paper: not; release: 8e-6)."""
     learning_rate_factor: Annotated[float, Between(1e-9, 1e3)] = 1.0
@@ -206,6 +206,7 @@ class RGBAvatarTrainer(EndingTrainer, FitHooks):
         rates = self.pipeline.model.avatar.learning_rates()
         scheduled = self.pipeline.model.avatar.rate_factors(0).keys()
         require_rates_to_fall(self.config, groups.keys(), scheduled)
+        require_bases_to_begin(self.config, groups.keys())
         for name in groups:
             own = {"optimizer": AdamConfig(lr=rates[name]), "scheduler": None}
             settings[name] = dict(self.config.optimizers.get(name, own))
