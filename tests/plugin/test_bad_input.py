@@ -15,9 +15,10 @@ import yaml
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.plugin import pipeline as pipeline_module
 from rgbavatar_ns.plugin.pipeline import to_look_at
+from rgbavatar_ns.plugin.presets import presets
 from rgbavatar_ns.plugin.training.refused import REFUSED
 from rgbavatar_ns.plugin.training.trainer import RGBAvatarTrainerConfig
-from tests.plugin.run import make_trainer, small_config, trained
+from tests.plugin.run import make_trainer, set_up, small_config, trained
 from tests.plugin.tiny import tiny_dataset
 
 
@@ -141,6 +142,45 @@ def test_options_that_would_change_nothing_are_refused_before_a_file_is_written(
     assert told.value.cause.startswith(f"--{option.replace('_', '-')} ")
     assert told.value.remedy
     assert not (tmp_path / "runs").exists()
+
+
+STAY: dict[str, Any] = {"position_lr_final": None, "learning_rate_factor": 1.0}
+
+
+@pytest.mark.parametrize(
+    ("method", "option", "value", "without", "beside"),
+    [
+        ("rgbavatar-paper", "learning_rate_steps", 3000, {}, {"learning_rate_factor": 0.1}),
+        ("rgbavatar-paper", "learning_rate_steps", 3000, {}, {"position_lr_final": 1e-5}),
+        ("rgbavatar-paper", "learning_rate_steps", 3000, {}, {"refine_tracking": True}),
+        ("rgbavatar-paper", "learning_rate_decay", "linear", {}, {"learning_rate_factor": 0.1}),
+        ("rgbavatar-quick", "learning_rate_steps", 3000, STAY, {}),
+        ("gaussianavatars-style", "learning_rate_steps", 99, {}, {"learning_rate_factor": 0.1}),
+        ("monogaussianavatar-style", "learning_rate_steps", 99, {}, None),
+        ("rgbavatar", "first_colors", "paper", {"initialize_colors": False}, {}),
+        ("rgbavatar", "lpips_start_step", 9, {}, {"lpips_weight": 0.05}),
+        ("rgbavatar", "refine_held_out_frames", 9, {}, {"refine_held_out": 5}),
+    ],
+)
+def test_options_that_count_beside_another_one_are_refused_without_it(
+    tmp_path: Path,
+    method: str,
+    option: str,
+    value: Any,
+    without: dict[str, Any],
+    beside: dict[str, Any] | None,
+):
+    def saved(**fields: Any) -> None:
+        config = copy.deepcopy(presets()[method])
+        set_up(config, tmp_path, **fields)
+        config.save_config()
+
+    with pytest.raises(UserError, match=f"--.*{option.replace('_', '-')} is {value}, but"):
+        saved(**{option: value}, **without)
+    assert not any(tmp_path.iterdir())
+    if beside is not None:
+        saved(**{option: value}, **beside)
+    saved(**without)  # as the preset has it
 
 
 def test_the_page_names_every_option_that_is_refused():

@@ -1,6 +1,6 @@
-"""Options of nerfstudio that this method has no use for: refused by name instead of ignored."""
+"""Options that would change nothing: refused by name instead of ignored."""
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from functools import reduce
 from pathlib import Path
@@ -67,6 +67,51 @@ REFUSED = (
 )
 
 
+@dataclass(frozen=True)
+class Dependent:
+    """An option that only counts beside another one; the preset's own value is passed over."""
+
+    option: str
+    counts: Callable[[Any], bool]
+    because: str
+    remedy: str
+
+
+def _rates_fall(config: Any) -> bool:
+    return config.position_lr_final is not None or config.learning_rate_factor != 1.0
+
+
+def _rates_fall_or_bases_wait(config: Any) -> bool:
+    model = config.pipeline.model
+    return _rates_fall(config) or (model.refine_tracking and model.refinement.bases_start > 0)
+
+
+_NO_RATE_FALLS = "no learning rate is to fall"
+_LET_FALL = "Leave it out, or name --learning-rate-factor or --position-lr-final."
+DEPENDENT = (
+    Dependent("learning_rate_steps", _rates_fall_or_bases_wait, _NO_RATE_FALLS, _LET_FALL),
+    Dependent("learning_rate_decay", _rates_fall, _NO_RATE_FALLS, _LET_FALL),
+    Dependent(
+        "pipeline.model.first_colors",
+        lambda config: config.pipeline.model.initialize_colors,
+        "first colours are off",
+        "Leave it out, or --pipeline.model.initialize-colors False.",
+    ),
+    Dependent(
+        "pipeline.model.lpips_start_step",
+        lambda config: config.pipeline.model.lpips_weight > 0,
+        "the LPIPS loss has no weight",
+        "Leave it out, or name --pipeline.model.lpips-weight.",
+    ),
+    Dependent(
+        "pipeline.model.refine_held_out_frames",
+        lambda config: config.pipeline.model.refine_held_out > 0,
+        "held-out frames are not fitted",
+        "Leave it out, or name --pipeline.model.refine-held-out.",
+    ),
+)
+
+
 def require_rates_to_fall(config: Any, groups: Collection[str], scheduled: Collection[str]) -> None:
     """Raise UserError where rates are to fall that the method has not, or lets fall by itself."""
     final, factor = config.position_lr_final, config.learning_rate_factor
@@ -96,12 +141,19 @@ def require_bases_to_begin(config: Any, groups: Collection[str]) -> None:
 
 
 def require_used(config: TrainerConfig) -> None:
-    """Raise UserError for an option of nerfstudio's that would change nothing, or wait for ever."""
+    """Raise UserError for an option that would change nothing, or wait for ever."""
     for refused in REFUSED:
-        value = reduce(getattr, refused.option.split("."), config)
+        value = _value(config, refused.option)
         if value not in refused.taken:
-            option = "--" + refused.option.replace("_", "-")
+            option = _flag(refused.option)
             raise UserError(f"{option} is {value}, but {refused.because}.", refused.remedy)
+    for dependent in DEPENDENT:
+        value = _value(config, dependent.option)
+        if value is None or dependent.counts(config):
+            continue
+        if value != _value(_preset_of(config), dependent.option):
+            option = _flag(dependent.option)
+            raise UserError(f"{option} is {value}, but {dependent.because}.", dependent.remedy)
     if config.vis == "viewer_legacy":
         raise UserError(
             "--vis is viewer_legacy, but this method has its panel in nerfstudio's newer viewer.",
@@ -112,3 +164,21 @@ def require_used(config: TrainerConfig) -> None:
             "--start-paused waits for the viewer's button, and --vis is without a viewer.",
             "Leave it out, or take --vis viewer+tensorboard.",
         )
+
+
+def _value(config: Any, option: str) -> Any:
+    """An option's value; None where the method has no such option."""
+    return reduce(lambda part, name: getattr(part, name, None), option.split("."), config)
+
+
+def _flag(option: str) -> str:
+    return "--" + option.replace("_", "-")
+
+
+def _preset_of(config: TrainerConfig) -> TrainerConfig:
+    """The method's config as nerfstudio lists it; the defaults of one that it does not list."""
+    # Its list imports this plugin, whose trainer imports this file.
+    from nerfstudio.configs.method_configs import all_methods
+
+    name = config.method_name
+    return all_methods[name] if name in all_methods else type(config)()
