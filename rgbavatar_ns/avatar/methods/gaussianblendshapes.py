@@ -64,6 +64,7 @@ from rgbavatar_ns.avatar.methods.sh import (
 )
 from rgbavatar_ns.avatar.model.image_loss import l1_loss
 from rgbavatar_ns.avatar.model.tangent_to_world import carried
+from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import HeadArrays, HeadModel
 from rgbavatar_ns.head.joints import JAW, NECK
 from rgbavatar_ns.head.rotations import quat_wxyz_to_matrix
@@ -107,6 +108,16 @@ class GaussianBlendshapesConfig(MethodConfig):
     """Density control of the face."""
     teeth_gradient_threshold: Weight = 2e-4
     """From which teeth are cloned or split; all else as the face."""
+
+    def __post_init__(self) -> None:
+        """Refuse what density control could only do with Gaussians of triangles."""
+        super().__post_init__()
+        if self.density.keep_one_per_face:
+            raise UserError(
+                "density.keep_one_per_face is True, and this method's Gaussians lie on no "
+                "triangle.",
+                "Leave it out.",
+            )
 
 
 class _AtRest(NamedTuple):

@@ -373,6 +373,11 @@ def test_density_control_of_face_and_teeth_has_its_own_threshold(grows):
     assert avatar.gaussians(theta).means.shape == (1, sum(after), 3)
 
 
+def test_keeping_gaussians_of_triangles_is_refused_before_training():
+    with pytest.raises(UserError, match=r"lie on no triangle\. Leave it out"):
+        replace(SMALL, density=replace(DENSE, keep_one_per_face=True))
+
+
 def test_a_bundle_gives_the_same_picture_after_the_number_changed(tmp_path):
     config = replace(SMALL, density=DENSE, sh_degree_every=2)
     avatar, frames = make(config), batch()
