@@ -70,7 +70,7 @@ from rgbavatar_ns.head.joints import JAW, NECK
 from rgbavatar_ns.head.rotations import quat_wxyz_to_matrix
 from rgbavatar_ns.head.surface import interpolated
 from rgbavatar_ns.kernels import GaussianSet, PinholeCameras
-from rgbavatar_ns.options import Between, Count, Counted, Share, Weight
+from rgbavatar_ns.options import Between, Count, Counted, Positive, Share, Weight
 
 _FEWEST_POINTS = 4
 
@@ -106,7 +106,7 @@ class GaussianBlendshapesConfig(MethodConfig):
         default_factory=lambda: DensityControl(gradient_threshold=1e-3, reset_every=0)
     )
     """Density control of the face."""
-    teeth_gradient_threshold: Weight = 2e-4
+    teeth_gradient_threshold: Positive = 2e-4
     """From which teeth are cloned or split; all else as the face."""
 
     def __post_init__(self) -> None:

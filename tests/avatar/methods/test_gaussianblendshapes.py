@@ -378,6 +378,12 @@ def test_keeping_gaussians_of_triangles_is_refused_before_training():
         replace(SMALL, density=replace(DENSE, keep_one_per_face=True))
 
 
+def test_the_teeths_threshold_has_the_faces_range():
+    with pytest.raises(UserError, match="--teeth-gradient-threshold is 0"):
+        replace(SMALL, teeth_gradient_threshold=0.0)
+    assert replace(SMALL, teeth_gradient_threshold=1e-9).teeth_gradient_threshold == 1e-9
+
+
 def test_a_bundle_gives_the_same_picture_after_the_number_changed(tmp_path):
     config = replace(SMALL, density=DENSE, sh_degree_every=2)
     avatar, frames = make(config), batch()
