@@ -24,6 +24,8 @@ from rgbavatar_ns.errors import UserError
 
 _BLUR_SIGMA_PX = 1.5
 _BLUR_RADIUS_PX = 5
+_BEST_DB = 100.0
+"""PSNR of equal pictures, so that one of them leaves a mean of many finite."""
 
 
 def psnr(
@@ -33,13 +35,16 @@ def psnr(
 ) -> Float[Tensor, "B"]:
     """Return each image's peak signal-to-noise ratio in dB, for a range of 1.
 
-    Over the pixels `inside`, if given: NaN where there are none. Infinite where images are equal.
+    Over the pixels `inside`, if given: NaN where there are none. At most 100, also where images are
+    equal.
     """
     # By hand: torchmetrics takes seconds to import, in the middle of a stream.
     error = (image - target).square().mean(-1)
     if inside is None:
-        return -10 * error.mean((1, 2)).log10()
-    return -10 * ((error * inside).sum((1, 2)) / inside.sum((1, 2))).log10()
+        mean = error.mean((1, 2))
+    else:
+        mean = (error * inside).sum((1, 2)) / inside.sum((1, 2))
+    return (-10 * mean.log10()).clamp(max=_BEST_DB)
 
 
 def l1_over_black(

@@ -123,14 +123,18 @@ def write_convergence(
 
 
 def convergence(status: CellStatus) -> dict[int, tuple[float, float]]:
-    """Seconds and PSNR by step of a finished cell; empty without any evaluation in training."""
+    """Seconds and PSNR by step of a finished cell, where it has one; empty without evaluations."""
     if status.result is None:
         return {}
     kept = kept_curve(status.result)
     if kept is not None:
         return kept
     points = read_curve(run_folder_of(status.folder, status.cell) / CURVE_NAME)
-    seen = {int(point["step"]): (point["train_seconds"], point["psnr"]) for point in points}
+    seen = {
+        int(point["step"]): (point["train_seconds"], point["psnr"])
+        for point in points
+        if "psnr" in point
+    }
     ended = status.result["metrics"]
     if seen and {"steps", "train_seconds", "psnr"} <= ended.keys():
         seen[int(ended["steps"]) - 1] = (ended["train_seconds"], ended["psnr"])

@@ -9,7 +9,7 @@ from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 from torchmetrics.functional.image import structural_similarity_index_measure
 
 from rgbavatar_ns.avatar import metrics
-from rgbavatar_ns.avatar.metrics import LPIPSMetric, evaluate_images, psnr, ssim
+from rgbavatar_ns.avatar.metrics import LPIPSMetric, evaluate_images, mean_scores, psnr, ssim
 from rgbavatar_ns.avatar.model.image_loss import LPIPSLoss
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.kernels.constants import UNFILMED_RGBA
@@ -31,6 +31,20 @@ def test_psnr_by_hand():
     target = torch.full_like(image, 0.1)
     target[1] = 0.01
     torch.testing.assert_close(psnr(image, target), torch.tensor([20.0, 40.0]).double())
+
+
+def test_equal_pictures_have_100_db_and_leave_means_finite():
+    image = torch.zeros(3, 4, 4, 3, dtype=torch.float64)
+    target = torch.zeros_like(image)
+    target[0] = 0.01
+    inside = torch.ones(3, 4, 4, dtype=torch.bool)
+    inside[2] = False
+    assert psnr(image, target)[1:].tolist() == [100.0, 100.0]
+    found = psnr(image, target, inside)
+    assert found[:2].tolist() == pytest.approx([40.0, 100.0])
+    assert math.isnan(found[2])
+    frames = [{"psnr": score} for score in found.tolist()]
+    assert mean_scores(frames)["psnr"] == pytest.approx(70.0)
 
 
 def test_psnr_and_ssim_equal_scikit_images(pair):
@@ -64,7 +78,7 @@ def test_targets_are_laid_over_black_and_images_clamped():
     image = torch.full((1, 16, 16, 3), 0.3)
     assert evaluate_images(image, target)["psnr"] == pytest.approx(20.0, abs=1e-3)
     white = torch.full((1, 16, 16, 4), 255, dtype=torch.uint8)
-    assert evaluate_images(torch.full((1, 16, 16, 3), 7.0), white)["psnr"] == math.inf
+    assert evaluate_images(torch.full((1, 16, 16, 3), 7.0), white)["psnr"] == 100
     names = {"psnr", "psnr_head", "ssim", "detail", "detail_film"}
     assert evaluate_images(image, target).keys() == names
 

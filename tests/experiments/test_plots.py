@@ -56,6 +56,17 @@ def test_convergence_has_a_line_a_variant_and_a_thin_one_a_seed(experiment_of, t
     assert axes.get_xlim()[0] == 0
 
 
+def test_convergence_passes_over_points_without_psnr(experiment_of, tmp_path):
+    """As they were written where no score was a finite number."""
+    status = _done(cells_of(experiment_of("a"))[0], tmp_path, 9.0)
+    points = [
+        {"step": 10, "train_seconds": 1.0, "psnr": 21.0},
+        {"step": 20, "train_seconds": 2.0, "ssim": 1.0},
+    ]
+    write_json(run_folder_of(status.folder, status.cell) / "curve.json", {"points": points})
+    assert plots.convergence(status) == {10: (1.0, 21.0), 40: (9.0, 30.0)}
+
+
 def test_no_convergence_without_evaluations_in_training(experiment_of, tmp_path, drawn):
     experiment = experiment_of("a")
     statuses = [_done(cell, tmp_path, 1.0) for cell in cells_of(experiment)]

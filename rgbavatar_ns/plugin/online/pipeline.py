@@ -21,8 +21,6 @@ from rgbavatar_ns.plugin.option_order import led_by
 from rgbavatar_ns.plugin.pipeline import RGBAvatarPipeline, RGBAvatarPipelineConfig
 from rgbavatar_ns.plugin.viewer.status_panel import StatusPanel
 
-_BEST_DB = 100.0
-
 
 @led_by("datamanager", "model")
 @dataclass
@@ -71,7 +69,7 @@ class OnlinePipeline(RGBAvatarPipeline):
         rgba = newest_first.images_rgba.to(self.device)
         filmed = ~is_unfilmed(rgba)
         truth = film_over(rgba, black, drawn)
-        score = float(psnr(drawn, truth, filmed).clamp(max=_BEST_DB).mean())
+        score = float(psnr(drawn, truth, filmed).mean())
         pair = torch.cat([composite(rgba_to_float(rgba[0]), black[0]), drawn[0]], dim=1)
         return score, (pair * 255).round().to(torch.uint8).cpu()
 

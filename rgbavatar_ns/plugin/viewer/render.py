@@ -136,7 +136,7 @@ def _beside_film(
     image = drawn.image[0].clamp(0, 1)
     truth = film_over(rgba, background, image)
     filmed = ~is_unfilmed(rgba)
-    quality_db = float(psnr(image[None], truth[None], filmed[None]).clamp(max=100))
+    quality_db = float(psnr(image[None], truth[None], filmed[None]))
     tiles = [_colored(shown_error(image, truth).mean(-1, keepdim=True), cv2.COLORMAP_INFERNO)]
     if state.picture == "beside the film":
         overlaid = _with_overlays(image, avatar, signal, state, own, drawn.visibility)
