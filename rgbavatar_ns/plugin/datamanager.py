@@ -16,11 +16,13 @@ from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader
 from rich.progress import track
 from torch.nn import Parameter
 
+from rgbavatar_ns.avatar.methods.loss_terms import SSIM_WINDOW_PX
 from rgbavatar_ns.avatar.prior import NUM_VIEWS
 from rgbavatar_ns.avatar.training.batches import ChosenFrames, DeviceFrames
 from rgbavatar_ns.avatar.training.losses import random_backgrounds
-from rgbavatar_ns.data import ImageCache, OfflineOrder
+from rgbavatar_ns.data import ImageCache, OfflineOrder, TrackedDataset
 from rgbavatar_ns.data.check import quick_check
+from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.options import Between, Counted, Seed
 from rgbavatar_ns.plugin.cameras import from_nerfstudio
 from rgbavatar_ns.plugin.dataparser import (
@@ -113,10 +115,12 @@ class RGBAvatarDataManager(DataManager):
             config.dataparser.data = Path(config.data)
         self.dataparser: RGBAvatarDataParser = config.dataparser.setup()
         self.includes_time = self.dataparser.includes_time
-        if config.check_data and test_mode == "val":
-            for problem in quick_check(self.dataparser.tracked):
-                raise problem.as_error()
         tracked = self.dataparser.tracked
+        if test_mode == "val":
+            _require_room_for_ssim(tracked)
+            if config.check_data:
+                for problem in quick_check(tracked):
+                    raise problem.as_error()
         self.film_path = FilmPath(len(tracked), tracked.train)
         self.train_dataparser_outputs = self.dataparser.get_dataparser_outputs("train")
         self.train_dataset = self._dataset("train", self.train_dataparser_outputs)
@@ -249,6 +253,16 @@ class RGBAvatarDataManager(DataManager):
     def get_param_groups(self) -> dict[str, list[Parameter]]:
         """Nothing here is learnt."""
         return {}
+
+
+def _require_room_for_ssim(tracked: TrackedDataset) -> None:
+    """Refuse pictures that neither losses nor scores could compare, before they are trained on."""
+    if min(tracked.width, tracked.height) < SSIM_WINDOW_PX:
+        raise UserError(
+            f"The images of {tracked.root} have {tracked.width} x {tracked.height} pixels, fewer "
+            f"than the {SSIM_WINDOW_PX} a side that SSIM compares.",
+            "Make the dataset again with larger images.",
+        )
 
 
 def device_budget(most: int, device: torch.device | str) -> int:

@@ -49,6 +49,16 @@ def test_broken_dataset_is_a_user_error(data: Path, tmp_path: Path, damage: Call
     assert named in told.value.cause
 
 
+def test_pictures_that_no_window_of_ssim_fits_into_are_refused_before_training(tmp_path: Path):
+    for size in (10, 11):
+        tiny_dataset(tmp_path / f"{size}", size=size, frames=4, test=1)
+    with pytest.raises(UserError, match=r"10 x 10 pixels, fewer than the 11 a side that SSIM"):
+        make_trainer(small_config(tmp_path / "10", tmp_path / "runs"))
+    smallest = trained(small_config(tmp_path / "11", tmp_path / "runs", max_num_iterations=2))
+    scores = smallest.pipeline.get_average_eval_image_metrics(step=2)
+    assert 0 < scores["ssim"] <= 1
+
+
 def test_no_data_at_all_is_a_user_error(tmp_path: Path):
     config = small_config(Path(), tmp_path)
     config.pipeline.datamanager.data = None

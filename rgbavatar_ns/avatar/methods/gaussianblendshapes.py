@@ -339,13 +339,12 @@ class GaussianBlendshapes(AvatarMethod):
     def image_losses(self, drawn: DrawnBatch, filmed: FilmedBatch, step: int) -> Losses:
         """.8 L1 + .2 DSSIM + 10 times the squared difference of opacity and matte."""
         config, unfilmed = self.config, filmed.unfilmed
-        held = held_where(drawn.image, unfilmed)
         covered = coverage_loss(drawn.alpha, filmed.matte[..., 0], ~unfilmed)
-        return {
-            "l1": (1 - config.dssim_weight) * l1_loss(drawn.image, filmed.target),
-            "dssim": config.dssim_weight * dssim_loss(held, filmed.target),
-            "coverage": config.coverage_weight * covered,
-        }
+        losses = {"l1": (1 - config.dssim_weight) * l1_loss(drawn.image, filmed.target)}
+        if config.dssim_weight > 0:
+            held = held_where(drawn.image, unfilmed)
+            losses["dssim"] = config.dssim_weight * dssim_loss(held, filmed.target)
+        return losses | {"coverage": config.coverage_weight * covered}
 
     def penalty(self, drawn: DrawnBatch, step: int) -> Losses:
         """100 times how far each row of teeth, at rest, is outside of the mouth's cylinder."""

@@ -16,7 +16,9 @@ from torch import Tensor
 
 from rgbavatar_ns.kernels import mean_similarity
 
-_WINDOW, _SIGMA = 11, 1.5
+SSIM_WINDOW_PX = 11
+"""Side of the windows that SSIM compares; a picture holds one at least."""
+_SIGMA = 1.5
 _C1, _C2 = 0.01**2, 0.03**2
 
 
@@ -62,8 +64,10 @@ def dssim_loss(
     Only windows that lie within the picture count; `avatar.metrics.ssim` continues pictures by
     reflection, 3D Gaussian splatting's loss by zeros. Raises ValueError for pictures below 11 x 11.
     """
-    if min(image.shape[1:3]) < _WINDOW:
-        raise ValueError(f"Pictures are {tuple(image.shape[1:3])}. Pass {_WINDOW} pixels or more.")
+    if min(image.shape[1:3]) < SSIM_WINDOW_PX:
+        raise ValueError(
+            f"Pictures are {tuple(image.shape[1:3])}. Pass {SSIM_WINDOW_PX} pixels or more."
+        )
     return 1 - _MeanSimilarity.apply(image, target)
 
 
@@ -125,7 +129,7 @@ def _similarity(
     return similarity.mean(), from_mean + 2 * x * from_squares + y * from_product
 
 
-_AROUND = (0, 0, *((_WINDOW - 1,) * 4))
+_AROUND = (0, 0, *((SSIM_WINDOW_PX - 1,) * 4))
 """Zeros around rows and columns, with which the window gives back what it took."""
 
 
@@ -141,7 +145,7 @@ def _blurred(maps: Float[Tensor, "M H W 3"]) -> Float[Tensor, "M h w 3"]:
 @functools.cache
 def _window(dtype: torch.dtype, device: torch.device) -> Float[Tensor, "K"]:
     with torch.inference_mode(False):
-        place = torch.arange(_WINDOW, dtype=torch.float64) - _WINDOW // 2
+        place = torch.arange(SSIM_WINDOW_PX, dtype=torch.float64) - SSIM_WINDOW_PX // 2
         weights = torch.exp(-place.square() / (2 * _SIGMA**2))
         return (weights / weights.sum()).to(device, dtype)
 

@@ -266,6 +266,11 @@ def test_the_loss_is_that_of_the_table_by_hand():
     assert {name: loss.item() for name, loss in losses.items()} == pytest.approx(wanted, rel=1e-3)
 
 
+def test_pictures_below_a_window_of_dssim_are_trained_on_without_it():
+    step = MethodStep(make(replace(SMALL, dssim_weight=0.0)))
+    assert step(batch(size=8), 0).keys() == {"l1", "coverage", "mouth"}
+
+
 def test_what_nobody_filmed_has_no_gradient():
     avatar, drawn, filmed = filmed_and_drawn(0.5, 0.25, 0.7, 1.0)
     filmed.unfilmed[:, :, 8:] = True
