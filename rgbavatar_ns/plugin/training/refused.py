@@ -145,14 +145,14 @@ def require_used(config: TrainerConfig) -> None:
     for refused in REFUSED:
         value = _value(config, refused.option)
         if value not in refused.taken:
-            option = _flag(refused.option)
+            option = "--" + refused.option.replace("_", "-")
             raise UserError(f"{option} is {value}, but {refused.because}.", refused.remedy)
     for dependent in DEPENDENT:
         value = _value(config, dependent.option)
         if value is None or dependent.counts(config):
             continue
         if value != _value(_preset_of(config), dependent.option):
-            option = _flag(dependent.option)
+            option = "--" + dependent.option.replace("_", "-")
             raise UserError(f"{option} is {value}, but {dependent.because}.", dependent.remedy)
     if config.vis == "viewer_legacy":
         raise UserError(
@@ -169,10 +169,6 @@ def require_used(config: TrainerConfig) -> None:
 def _value(config: Any, option: str) -> Any:
     """An option's value; None where the method has no such option."""
     return reduce(lambda part, name: getattr(part, name, None), option.split("."), config)
-
-
-def _flag(option: str) -> str:
-    return "--" + option.replace("_", "-")
 
 
 def _preset_of(config: TrainerConfig) -> TrainerConfig:
