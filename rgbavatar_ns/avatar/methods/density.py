@@ -283,7 +283,12 @@ def _prune(
             raise ValueError("No face_of names the triangles that shall keep their Gaussians.")
         spared = doomed & ~_face_goes_on(rows[gaussians.face_of], ~doomed)
         doomed, kept = doomed & ~spared, int(spared.sum())
-    _require_some(~doomed, f"less opaque than {options.min_opacity:g} or too large")
+    if bool(doomed.all()):
+        raise UserError(
+            f"Density control would leave nothing: each of {rows.count} Gaussians is less opaque "
+            f"than {options.min_opacity:g} or too large.",
+            "Lower the bound of opacity, raise that of size, or reset opacities less often.",
+        )
     if bool(doomed.any()):
         rows.take((~doomed).nonzero()[:, 0], optimizers)
     return int(doomed.sum()), kept
@@ -314,15 +319,22 @@ def prune_and_refill(
     jitter_m: float,
     step: int,
     seed: int,
+    remedy: str,
 ) -> DensityChanges:
     """Remove what is not kept, then copy what remains, moved at random, up to `count` Gaussians.
 
     Copies lie in a cube with sides of `jitter_m` (in the unit of `position`) around what they
-    copy, which is drawn with replacement; their moments are 0. UserError where nothing is kept.
+    copy, which is drawn with replacement; their moments are 0. UserError where nothing is kept,
+    with the caller's `remedy`.
     Source: MonoGaussianAvatar, code/scripts/train.py, model/point_cloud.py (there the whole
     optimiser begins anew).
     """
-    _require_some(keep, "so transparent that it is removed")
+    if not bool(keep.any()):
+        raise UserError(
+            f"Density control would leave nothing: each of {len(keep)} Gaussians is so "
+            "transparent that it is removed.",
+            remedy,
+        )
     staying = keep.nonzero()[:, 0]
     missing, random = max(0, count - len(staying)), _random(seed, step)
     drawn = torch.from_numpy(random.integers(len(staying), size=missing)).to(staying)
@@ -334,14 +346,6 @@ def prune_and_refill(
         rows.take(source, optimizers, fresh)
         rows[position][len(staying) :] += moved.to(rows[position])
     return DensityChanges(cloned=missing, pruned=pruned, count=rows.count)
-
-
-def _require_some(stays: Bool[Tensor, "N"], others: str) -> None:
-    if not bool(stays.any()):
-        raise UserError(
-            f"Density control would leave nothing: each of {len(stays)} Gaussians is {others}.",
-            "Lower the bound of opacity, raise that of size, or reset opacities less often.",
-        )
 
 
 def _random(seed: int, step: int) -> np.random.Generator:

@@ -353,6 +353,8 @@ class MonoGaussianAvatar(AvatarMethod):
             jitter_m=jitter_m,
             step=step,
             seed=seed,
+            remedy="Lower prune_opacity, give longer epochs (steps_per_epoch), and look at the "
+            "mattes (`rgbavatar check`).",
         )
         self.seen.zero_()
         self.epoch.fill_(epoch)

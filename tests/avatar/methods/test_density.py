@@ -199,7 +199,7 @@ def test_each_parents_children_lie_around_it():
 def test_samples_are_not_of_the_stream_that_backgrounds_are_of():
     splats, optimizer = ready(3)
     keep = torch.tensor([True, False, False])
-    prune_and_refill(splats.rows, keep, 3, [optimizer], jitter_m=1.0, step=5, seed=2)
+    prune_and_refill(splats.rows, keep, 3, [optimizer], jitter_m=1.0, step=5, seed=2, remedy="")
     moved = (splats.position[1:] - splats.position[0] + 0.5).detach()
 
     stream = np.random.Generator(np.random.Philox(key=np.array([2, 5], dtype=np.uint64)))
@@ -339,7 +339,7 @@ def test_refilled_points_lie_around_what_remains():
     remembered = [m[keep].clone() for m in moments(optimizer, splats.position)]
 
     def refill(**changes):
-        arguments = {"jitter_m": 0.02, "step": 3, "seed": 1} | changes
+        arguments = {"jitter_m": 0.02, "step": 3, "seed": 1, "remedy": "Keep more."} | changes
         return prune_and_refill(splats.rows, keep, 400, [optimizer], **arguments)
 
     assert refill() == DensityChanges(cloned=396, pruned=8, count=400)
@@ -362,7 +362,7 @@ def test_refilled_points_lie_around_what_remains():
     assert refill() == DensityChanges(count=400)
     assert all_equal(before, everything(splats, optimizer))
     keep = torch.zeros(400, dtype=torch.bool)
-    with pytest.raises(UserError, match="leave nothing"):
+    with pytest.raises(UserError, match=r"leave nothing.* removed\. Keep more\."):
         refill()
 
 

@@ -1,4 +1,5 @@
 import dataclasses
+import re
 
 import numpy as np
 import pytest
@@ -277,8 +278,11 @@ def test_each_epoch_unseen_points_are_replaced_by_moved_copies_and_training_goes
 
 def test_where_every_point_is_faint_the_user_is_told():
     avatar = build(prune_opacity=1.0)
-    with pytest.raises(UserError, match="transparent"):
+    with pytest.raises(UserError, match="transparent") as told:
         avatar.before_next_step([], 4, 0)
+    remedy, options = told.value.remedy, {field.name for field in dataclasses.fields(avatar.config)}
+    assert {"prune_opacity", "steps_per_epoch"} <= options & set(re.findall(r"\w+", remedy))
+    assert "rgbavatar check" in remedy
 
 
 def test_rates_are_halved_at_epochs_80_and_100():
