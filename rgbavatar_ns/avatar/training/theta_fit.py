@@ -69,11 +69,15 @@ def fit_theta(
     reference: Float[Tensor, "R H"] | None = None,
     backend: str = "auto",
 ) -> Float[Tensor, "B H"]:
-    """Correct theta of unseen frames, the avatar frozen; `reference`: see `TrackingRefinement`."""
+    """Correct theta of unseen frames, the avatar frozen; `reference`: see `TrackingRefinement`.
+
+    With such a `reference` a frame's theta is the same, whichever others are fitted beside it.
+    """
     frames = TrackingRefinement(theta, avatar.layout, config, centered=False, reference=reference)
     rows = torch.arange(len(theta), device=theta.device)
     for step in range(steps):
-        background = random_backgrounds(step, len(theta)).to(theta)
+        # One for all, so that a frame's place among them changes nothing.
+        background = random_backgrounds(step, 1).to(theta).repeat(len(theta), 1)
         present = frames.theta()
         frames.step(
             rows, frame_gradients(avatar, present, cameras, images_rgba, background, backend)

@@ -74,3 +74,23 @@ def test_a_frozen_avatar_finds_the_theta_of_its_own_pictures():
     assert all(torch.equal(avatar.state_dict()[name], value) for name, value in before.items())
     with pytest.raises(ValueError, match="images"):
         fit_theta(avatar, tracked, front_camera(41), images, 1)
+
+
+def test_chunks_of_any_size_fit_the_same_theta():
+    avatar, camera = rival(torch.float64), front_camera(24, torch.float64)
+    truth = random_theta(avatar.layout, 3, dtype=torch.float64)
+    images = film_of(avatar, truth, 24)
+    tracked = truth + 0.05 * random_theta(avatar.layout, 3, seed=7, dtype=torch.float64)
+    rows = torch.arange(3)
+    whole, *parts = (
+        torch.cat(
+            [
+                fit_theta(avatar, tracked[chunk], camera, images[chunk], 4, reference=tracked)
+                for chunk in rows.split(size)
+            ]
+        )
+        for size in (3, 2, 1)
+    )
+    assert (whole - tracked).abs().max() > 1e-4
+    for part in parts:
+        torch.testing.assert_close(part, whole, atol=1e-9, rtol=0)
