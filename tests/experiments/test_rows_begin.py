@@ -48,6 +48,7 @@ def test_every_row_trains(path, tiny, tmp_path):
             config = _with(config, f"pipeline.model.avatar.{name}", SMALL[name])
         if hasattr(model, "lpips_weight"):
             config.pipeline.model.lpips_weight = 0.0
+            config.pipeline.model.lpips_start_step = type(model).lpips_start_step
         small = {
             "max_num_iterations": 2,
             "batch_size": min(4, config.pipeline.datamanager.batch_size),
