@@ -102,7 +102,7 @@ def run(
     from rgbavatar_ns.avatar.loading import load_avatar, require_rgbavatar
     from rgbavatar_ns.export import GAUSSIAN_FILES, read_texture, with_texture
 
-    format = format or _format_of(destination)
+    format = _format_of(destination, format)
     given = {
         "frame": frame is not None,
         "frames": frames is not None,
@@ -142,12 +142,24 @@ def run(
         _write_web(format, own, seen, dataset, places, performance, destination, options)
 
 
-def _format_of(destination: Path) -> Format:
-    """What the destination's ending asks for; a bundle where it asks for nothing."""
+def _format_of(destination: Path, format: Format | None) -> Format:
+    """The format, or what the destination's ending asks for; a bundle where it asks for nothing.
+
+    Raises UserError where the ending asks for another file than the format's: other programs go by
+    the ending.
+    """
     name = destination.name.lower()
     for ending, asked in _ENDINGS.items():
         if name.endswith(ending):
-            return asked
+            if format is None:
+                return asked
+            if Path(_SUCH_AS.get(format, "")).suffix != destination.suffix.lower():
+                raise UserError(
+                    f"{destination} asks for --format {asked}, and --format {format} is given.",
+                    "Leave out --format, or name a file or folder with another ending.",
+                )
+    if format is not None:
+        return format
     if name.endswith(_NOT_WRITTEN):
         raise UserError(
             f"{destination} asks for a {destination.suffix.lower()} file, which is not written.",

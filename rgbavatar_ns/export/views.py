@@ -68,8 +68,9 @@ def read_camera_path(path: Path) -> tuple[PinholeCameras, float]:
         if not ((fov_degrees > 0) & (fov_degrees < 180)).all():
             raise DamagedFileError("it has angles of view outside of 0 to 180 degrees")
     except (DamagedFileError, KeyError, TypeError, AttributeError) as error:
+        told = f"it has no {error}" if isinstance(error, KeyError) else str(error)
         raise UserError(
-            f"{path} is no camera path of nerfstudio's viewer: {error!r}.",
+            f"{path} is no camera path of nerfstudio's viewer: {told}.",
             "Save one with 'Generate Command' in the viewer's render panel.",
         ) from None
     if kind != "perspective" or not listed:

@@ -201,6 +201,22 @@ def test_the_ending_of_what_is_not_written_is_told(name, bundle, tmp_path, refus
     Avatar.load(tmp_path / name)
 
 
+@pytest.mark.parametrize(
+    ("name", "format"),
+    [("me.glb", "ply"), ("me.HTML", "ply"), ("me.png", "sog"), ("me.ply", "bundle")],
+)
+def test_an_ending_that_contradicts_the_format_is_told(name, format, bundle, tmp_path, refused):
+    told = refused("export", bundle, tmp_path / name, "--format", format)
+    assert f"{name} asks for --format " in told
+    assert f"--format {format} is given" in told
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_both_kinds_of_ply_have_its_ending(bundle, tmp_path):
+    _export(bundle, tmp_path / "me.ply", "--format", "compressed-ply")
+    assert (tmp_path / "me.ply").read_bytes()[:3] == b"ply"
+
+
 def test_a_name_with_a_point_is_a_bundles_too(bundle, tmp_path):
     _export(bundle, tmp_path / "me.v2")
     Avatar.load(tmp_path / "me.v2")

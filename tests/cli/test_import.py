@@ -87,6 +87,13 @@ def test_another_source_does_not_go_into_a_full_folder(vhap, tmp_path, refused):
     assert "in none of the formats" in refused("import", tmp_path, tmp_path / "set")
 
 
+def test_a_dataset_needs_no_import(tmp_path, refused):
+    small = ["--num-frames", "4", "--num-test-frames", "1", "--image-size", "32"]
+    cli.main(["demo-data", str(tmp_path / "own"), *small])
+    told = " ".join(refused("import", tmp_path / "own", tmp_path / "set").split())
+    assert "own is a dataset already. Train on it: ns-train rgbavatar --data" in told
+
+
 def test_without_flame_it_says_where_to_get_it(vhap, tmp_path, refused, monkeypatch):
     monkeypatch.delenv("RGBAVATAR_FLAME", raising=False)
     told = refused("import", vhap[0], tmp_path / "set")

@@ -109,7 +109,7 @@ def test_what_is_no_camera_path_is_refused(tmp_path):
         read_camera_path(path)
     one = torch.eye(4)[None]
     for described, told in (
-        ({}, "no camera path"),
+        ({}, "no camera path of nerfstudio's viewer: it has no 'camera_path'\\."),
         (camera_path(one, camera_type="fisheye"), "fisheye"),
         (camera_path(one, camera_path=[]), "0 cameras"),
         (camera_path(one, render_width=10**9), "1e\\+09"),

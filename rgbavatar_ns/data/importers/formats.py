@@ -16,6 +16,7 @@ from rgbavatar_ns.data.importers import (
 from rgbavatar_ns.data.importers.folder import Folder
 from rgbavatar_ns.data.importers.options import ImportOptions, Progress
 from rgbavatar_ns.data.importers.source import Reading, Source
+from rgbavatar_ns.data.native.format import INDEX_FILE
 from rgbavatar_ns.errors import UserError
 
 
@@ -95,6 +96,10 @@ def read_source(root: Path, options: ImportOptions, progress: Progress | None = 
     if not os.path.isdir(root):
         raise UserError(f"There is no folder {root}.", "Name the folder that holds the data.")
     found = find_format(root, options)
+    if found is None and (root / INDEX_FILE).is_file():
+        raise UserError(
+            f"{root} is a dataset already.", f"Train on it: ns-train rgbavatar --data {root}."
+        )
     if found is None:
         below = sorted(
             path.name for path in root.iterdir() if path.is_dir() and find_format(path) is not None
