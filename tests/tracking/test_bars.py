@@ -102,6 +102,14 @@ def test_a_source_reads_the_same_frames(tmp_path: Path, bars: Bars, max_side: in
     assert next(iter(framed)).height == 96 + bars.top + bars.bottom, "not asked to"
 
 
+@pytest.mark.filterwarnings("error")
+def test_two_even_fields_are_no_bars() -> None:
+    picture = np.full((90, 120, 3), 40, np.uint8)
+    picture[:, 60:] = 200
+    assert find_bars([picture, picture.swapaxes(0, 1)]) == NO_BARS
+    assert find_bars([picture] * 2) == NO_BARS
+
+
 def test_images_that_nobody_reads_are_not_looked_at(tmp_path: Path) -> None:
     film = _folder(tmp_path / "film", [_framed(one, _BARS[0]) for one in _pictures()])
     (film / "00003.png").write_bytes(b"no image")

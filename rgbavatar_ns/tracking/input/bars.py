@@ -78,7 +78,7 @@ class _Seen(NamedTuple):
 
 
 def _depths_and_edges(image: UInt8[np.ndarray, "h w C"]) -> _Seen | None:
-    """None for a picture that is even all over, or transparent somewhere."""
+    """None for a picture of even fields alone, or one that is transparent somewhere."""
     if image[..., 3:].size and image[..., 3].min() < 255:
         return None
     height, width = image.shape[:2]
@@ -90,6 +90,8 @@ def _depths_and_edges(image: UInt8[np.ndarray, "h w C"]) -> _Seen | None:
         return None
     left, top, right, bottom = depths = [int((~lines).argmax()) for lines in even]
     within = (down >= top) & (down < height - bottom), (across >= left) & (across < width - right)
+    if not all(lines.any() for lines in within):  # Even fields side by side, and nothing between.
+        return None
     other = [(away[:, within[k % 2]] > _OTHER_LEVELS).mean(1) for k, away in enumerate(sides)]
     return _Seen((width, height), depths, other)
 

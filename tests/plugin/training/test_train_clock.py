@@ -6,7 +6,7 @@ from collections.abc import Callable
 import pytest
 
 from rgbavatar_ns.plugin.training.train_clock import TrainClock, waiting_for
-from rgbavatar_ns.plugin.training.trainer import RGBAvatarTrainerConfig
+from rgbavatar_ns.plugin.training.trainer import RGBAvatarTrainer, RGBAvatarTrainerConfig
 from tests.plugin.run import before_each_step, make_trainer
 
 
@@ -41,6 +41,19 @@ def test_what_the_device_has_left_to_do_counts() -> None:
     assert clock.seconds_per_step == pytest.approx(2.001)
 
 
+def trainer_on_a_device(config: RGBAvatarTrainerConfig) -> tuple[RGBAvatarTrainer, Device]:
+    """A trainer whose steps leave the device three seconds of work."""
+    trainer = make_trainer(config)
+    device = Device()
+    trainer.clock = device.clock()
+
+    def work(step: int) -> None:
+        device.left_s += 3.0
+
+    before_each_step(trainer, work)
+    return trainer, device
+
+
 def test_it_goes_on_from_the_sessions_before() -> None:
     device = Device()
     clock = device.clock()
@@ -67,14 +80,7 @@ def test_a_run_of_so_many_seconds_takes_no_step_beyond_them(
 ) -> None:
     config = config_of(max_num_iterations=30, max_train_seconds=20.0)
     config.logging.steps_per_log = 50
-    trainer = make_trainer(config)
-    device = Device()
-    trainer.clock = device.clock()
-
-    def work(step: int) -> None:
-        device.left_s += 3.0
-
-    before_each_step(trainer, work)
+    trainer, _ = trainer_on_a_device(config)
     after_step = trainer.after_step
     trainer.after_step = lambda step, losses, seconds: after_step(step, losses, 0.0)
     trainer.train()
@@ -94,14 +100,7 @@ def test_a_runs_seconds_are_the_devices_and_evaluation_is_none_of_them(
 ) -> None:
     config = config_of(max_num_iterations=6, steps_per_eval_all_images=2)
     config.logging.steps_per_log = 4
-    trainer = make_trainer(config)
-    device = Device()
-    trainer.clock = device.clock()
-
-    def work(step: int) -> None:
-        device.left_s += 3.0
-
-    before_each_step(trainer, work)
+    trainer, device = trainer_on_a_device(config)
     evaluate = trainer.pipeline.get_average_eval_image_metrics
 
     def evaluated(*given, **named):
