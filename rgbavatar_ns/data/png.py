@@ -13,7 +13,7 @@ from jaxtyping import UInt8, UInt16
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.reading import DamagedFileError, MissingFileError, read_file, regular_file
 
-_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+PNG_START = b"\x89PNG\r\n\x1a\n"
 _HEADER_BYTES = 33
 MAX_IMAGE_BYTES, MAX_PIXELS = 1 << 28, 1 << 26
 """What is read of one image: 8192 x 8192 pixels take 256 MB."""
@@ -33,7 +33,7 @@ def png_size(path: Path) -> tuple[int, int]:
         tail = file.read()
     if not head:
         raise UserError(f"The image {path} is empty.", _REPAIR)
-    if head[:8] != _SIGNATURE[: len(head)] or head[12:16] != b"IHDR"[: max(0, len(head) - 12)]:
+    if head[:8] != PNG_START[: len(head)] or head[12:16] != b"IHDR"[: max(0, len(head) - 12)]:
         raise UserError(f"{path} is not a PNG image.", "Store images as PNG files.")
     size = png_header_size(head)
     if size is None or tail != _END_CHUNK:
@@ -43,7 +43,7 @@ def png_size(path: Path) -> tuple[int, int]:
 
 def png_header_size(encoded: bytes) -> tuple[int, int] | None:
     """(width, height) that a PNG's first bytes promise; None where they are none of a PNG."""
-    if len(encoded) < _HEADER_BYTES or encoded[:8] != _SIGNATURE or encoded[12:16] != b"IHDR":
+    if len(encoded) < _HEADER_BYTES or encoded[:8] != PNG_START or encoded[12:16] != b"IHDR":
         return None
     width, height = struct.unpack(">II", encoded[16:24])
     return width, height
@@ -111,7 +111,7 @@ def png_damage(encoded: bytes) -> str | None:
     """Say what is wrong with a PNG's chunks, or None where they are whole."""
     if not encoded:
         return "is empty"
-    if encoded[:8] != _SIGNATURE[: len(encoded)]:
+    if encoded[:8] != PNG_START[: len(encoded)]:
         return "is not a PNG"
     place, size = 8, len(encoded)
     while place + 12 <= size:

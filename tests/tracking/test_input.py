@@ -160,6 +160,19 @@ def test_what_cannot_be_read_is_the_users_error_with_a_remedy(tmp_path: Path) ->
             list(FrameSource.open(tmp_path / name))
 
 
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".webp", ".bmp", ".tiff", "png.jpg"])
+def test_a_picture_that_was_cut_in_half_is_refused_by_name(tmp_path: Path, suffix: str) -> None:
+    rng = np.random.default_rng(0)
+    image = cv2.GaussianBlur(rng.integers(0, 255, (96, 128, 3)).astype(np.uint8), (0, 0), 3)
+    encoded = cv2.imencode(".png" if suffix == "png.jpg" else suffix, image)[1].tobytes()
+    for number in range(3):
+        (tmp_path / f"{number}{suffix}").write_bytes(encoded)
+    assert len(list(FrameSource.open(tmp_path))) == 3
+    (tmp_path / f"1{suffix}").write_bytes(encoded[: len(encoded) // 2])
+    with pytest.raises(UserError, match=rf"1{suffix} .*(truncated|cannot be decoded)"):
+        list(FrameSource.open(tmp_path))
+
+
 def test_clips_of_two_sizes_are_refused(tmp_path: Path) -> None:
     a = write_clip(tmp_path / "a.mp4", gradient_images(2))
     b = write_clip(tmp_path / "b.mp4", gradient_images(2, 64, 80))

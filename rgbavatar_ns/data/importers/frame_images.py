@@ -4,13 +4,12 @@ import struct
 from dataclasses import dataclass
 from pathlib import Path
 
-import av
-import av.error
 import cv2
 import numpy as np
 from jaxtyping import UInt8
 
 from rgbavatar_ns.data.importers.import_report import UnusableFrameError
+from rgbavatar_ns.data.jpeg import JPEG_START, is_damaged_jpeg
 from rgbavatar_ns.data.png import (
     MAX_IMAGE_BYTES,
     MAX_PIXELS,
@@ -23,7 +22,6 @@ from rgbavatar_ns.data.png import (
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.reading import DamagedFileError, MissingFileError, read_file, regular_file
 
-_JPEG_START = b"\xff\xd8"
 _GREY_TOLERANCE = 24
 """JPEG files of grey pictures come out a little coloured."""
 _PNG_HEADER_BYTES, _JPEG_HEADER_BYTES = 33, 1 << 16
@@ -62,7 +60,7 @@ def image_header(path: Path) -> ImageHeader:
     try:
         with regular_file(path) as file:
             head = file.read(_PNG_HEADER_BYTES)
-            if head[:2] == _JPEG_START:
+            if head[:2] == JPEG_START:
                 head += file.read(_JPEG_HEADER_BYTES)
                 # A long colour profile or thumbnail may come first.
                 found = _jpeg_header(head) or _jpeg_header(head + file.read(MAX_IMAGE_BYTES))
@@ -151,7 +149,7 @@ def _decode(encoded: bytes, size: tuple[int, int]) -> UInt8[np.ndarray, "height 
 
     Raises UnusableFrameError, before any pixel is decoded where the header promises others.
     """
-    is_jpeg = encoded[:2] == _JPEG_START
+    is_jpeg = encoded[:2] == JPEG_START
     header = _jpeg_header(encoded) if is_jpeg else png_header_size(encoded)
     if header is not None:
         if header[0] * header[1] > MAX_PIXELS:
@@ -196,24 +194,6 @@ def _grey(path: Path, size: tuple[int, int]) -> UInt8[np.ndarray, "height width"
         raise UnusableFrameError("masks that are coloured")
     grey = color[..., 1]
     return grey * np.uint8(255) if grey.max() == 1 else grey
-
-
-def is_damaged_jpeg(encoded: bytes) -> bool:
-    """Whether a JPEG is cut short, or its bits are no code of it; the others' change is not seen.
-
-    OpenCV decodes those too, and tells on stderr at most; ffmpeg's decoder can be told to refuse.
-    JPEG has no checksums: most turned bits still are a picture, and nothing tells them.
-    """
-    if encoded.rfind(b"\xff\xd9") < encoded.find(b"\xff\xda"):
-        return True
-    decoder = av.CodecContext.create("mjpeg", "r")
-    decoder.options = {"err_detect": "explode"}
-    try:
-        return not decoder.decode(av.Packet(encoded))
-    except av.error.InvalidDataError:
-        return True
-    except av.error.FFmpegError:  # a rarer kind of JPEG, which OpenCV may know
-        return False
 
 
 def _jpeg_header(encoded: bytes) -> tuple[int, int, int] | None:

@@ -8,7 +8,13 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from rgbavatar_ns.data.png import MAX_IMAGE_BYTES, read_png_rgba
+from rgbavatar_ns.data.jpeg import JPEG_START, is_truncated_jpeg
+from rgbavatar_ns.data.png import (
+    MAX_IMAGE_BYTES,
+    PNG_START,
+    decode_png_rgba,
+    read_png_rgba,
+)
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.files import digest, digest_of_file
 from rgbavatar_ns.reading import DamagedFileError, read_file
@@ -51,15 +57,23 @@ def source_digest(path: Path) -> str:
 def read_image_rgba(path: Path) -> UInt8[np.ndarray, "H W 4"]:
     """Decode an image, turned as its EXIF data asks; opaque where it has no alpha.
 
-    Grey becomes RGB, 16 bit become 8. Raises UserError for what is damaged or floating point.
+    Grey becomes RGB, 16 bit become 8. Raises UserError for what is damaged, cut short or floating
+    point.
     """
     if path.suffix.lower() == ".png":
         return read_png_rgba(path)
     try:
-        encoded = np.frombuffer(read_file(path, MAX_IMAGE_BYTES), np.uint8)
+        content = read_file(path, MAX_IMAGE_BYTES)
     except DamagedFileError as error:
         raise UserError(f"{path} cannot be read: {error}.", "Check the file.") from None
-    decoded = None
+    if content.startswith(PNG_START):  # Under another name.
+        return decode_png_rgba(content, str(path))
+    if content.startswith(JPEG_START) and is_truncated_jpeg(content):
+        raise UserError(
+            f"{path} is truncated: the end of the picture is missing.",
+            "Copy or export it again, or remove it.",
+        )
+    decoded, encoded = None, np.frombuffer(content, np.uint8)
     # OpenCV raises its own error for a few kinds of damage, and for sizes beyond its limit.
     with suppress(cv2.error):
         if path.suffix.lower() not in _NEVER_ALPHA:

@@ -12,10 +12,10 @@ from rgbavatar_ns.data.importers import frame_images
 from rgbavatar_ns.data.importers.frame_images import (
     FrameImage,
     image_header,
-    is_damaged_jpeg,
     make_png,
 )
 from rgbavatar_ns.data.importers.import_report import UnusableFrameError
+from rgbavatar_ns.data.jpeg import is_damaged_jpeg, is_truncated_jpeg
 from rgbavatar_ns.data.png import decode_png_rgba
 from tests.fuzz.attacks import turned
 
@@ -186,3 +186,24 @@ def test_whole_jpegs_of_all_kinds_pass_and_some_turned_bits_are_told():
                 told += is_damaged_jpeg(turned(whole, generator, bits=1))
     # Without checksums most turned bits are another picture.
     assert told > 40
+
+
+def test_a_jpeg_cut_anywhere_is_told_and_none_that_shows_all_of_the_picture():
+    jpegs = _jpegs()
+    thumbnail = jpegs["tiny"]
+    block = b"Exif\0\0" + thumbnail + b"\xff\xd9"
+    segment = b"\xff\xe1" + (len(block) + 2).to_bytes(2, "big") + block
+    usual = jpegs["usual"]
+    jpegs["with a thumbnail"] = usual[:2] + segment + usual[2:]
+    for name, whole in jpegs.items():
+        for more in (b"", bytes(5000), b"\xff\xff", b"the camera's notes", usual):
+            assert not is_truncated_jpeg(whole + more), (name, more)
+        assert not is_truncated_jpeg(whole[:-2]), f"{name}: nothing but the end's marker is missing"
+        if name == "tiny":
+            continue
+        for share in (0.1, 0.3, 0.5, 0.8, 0.95):
+            cut = whole[: int(share * len(whole))]
+            rest = bytes(len(whole) - len(cut))
+            for broken in (cut, cut + rest, cut + b"\xff"):
+                assert is_truncated_jpeg(broken), (name, share, len(broken))
+                assert is_damaged_jpeg(broken), (name, share, len(broken))
