@@ -61,6 +61,10 @@ def run(
         f"{len(dataset.train)} frames to train on, {len(dataset.test)} held out, in {dst}"
     )
     console.print(f"Look at {dst / 'overlay.png'}: the mesh should lie on the face.")
+    for problem in report["refused"]:
+        console.print(f"It cannot be trained on. {problem['cause']} {problem['remedy']}")
+    if report["refused"]:
+        return
     train = command_line("ns-train", suited_method(dataset.width), "--data", dst)
     console.print(f"Then: {train}")
 

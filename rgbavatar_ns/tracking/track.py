@@ -17,7 +17,8 @@ from torch import Tensor
 
 from rgbavatar_ns.data import DatasetWriter, TrackedDataset
 from rgbavatar_ns.data.check.film import FilmFacts, film_facts
-from rgbavatar_ns.data.check.problems import verdict
+from rgbavatar_ns.data.check.problems import Problem, verdict
+from rgbavatar_ns.data.check.report import quick_check
 from rgbavatar_ns.data.check.sample import spread, take_sample
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.files import digest, disk_errors, write_json
@@ -79,6 +80,8 @@ def track_video(
     own_head = read_own_head(config.flame)
     source = FrameSource.open(videos, config.max_frames).without_bars()
     mattes = None if config.mattes is None else UserMattes.open(config.mattes, source)
+    if mattes is not None:
+        mattes.require_somebody(config.max_frames)
     load_mediapipe()
     settings = _settings(source, config, own_head)
     with alone_in(Path(dst)), _one_thread_a_call():
@@ -215,7 +218,8 @@ class _Tracking:
             clock.done(frames // 2)
             quality = fit_quality(clip.tracker, clip.fit, bare_px, found.points_px, found.irises)
             shares = [noted[index] for index in found.frame_index]
-            report = self._report(clip, background, quality, shares)
+            refused = quick_check(dataset)
+            report = self._report(clip, background, quality, shares, refused)
             clock.done(3 * frames // 4)
             report["film"] = _film_shown(dataset, report).to_json()
             write_json(dst / "tracking.json", report)
@@ -274,8 +278,9 @@ class _Tracking:
         background: Background | None,
         quality: dict[str, Any],
         shares: Sequence[dict[str, Any]],
+        refused: Sequence[Problem],
     ) -> dict[str, Any]:
-        """What `tracking.json` holds."""
+        """What `tracking.json` holds; `refused` is why the dataset cannot be trained on."""
         seen, found, crop = clip.seen, clip.found, clip.crop
         with_others, tracked = set(seen.with_others), set(found.frame_index)
         faceless = sorted(set(range(seen.frames_read)) - set(seen.frame_index))
@@ -303,8 +308,9 @@ class _Tracking:
             "frames_per_second": self.clock.frames_per_second(seen.frames_read),
             "body": None if clip.body is None else clip.body.report(),
             "crop": {"left": crop.left, "top": crop.top, "side": crop.side},
+            "refused": [problem.to_json() for problem in refused],
         }
-        return {"verdict": verdict(tracking_findings(report)), **report}
+        return {"verdict": verdict([*refused, *tracking_findings(report)]), **report}
 
 
 def _alpha_notes(has_alpha: Bool[np.ndarray, "F"], used: bool) -> list[str]:

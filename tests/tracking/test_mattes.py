@@ -1,6 +1,7 @@
 """The user's own mattes are taken as they are; ours do not flicker and drag nothing along."""
 
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,6 +9,9 @@ import cv2
 import numpy as np
 import pytest
 
+from rgbavatar_ns.cli.track import run
+from rgbavatar_ns.data.check.report import quick_check
+from rgbavatar_ns.data.native.dataset import load_native
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.tracking import TrackConfig, track_video
 from rgbavatar_ns.tracking.image.crop import SquareCrop
@@ -172,6 +176,74 @@ def test_a_users_matte_and_an_alpha_channel_end_up_in_the_dataset(tmp_path: Path
     short = _folder(tmp_path / "s", {"0.png": own})
     with pytest.raises(UserError, match="no matte named 1"):
         track_video(frames, tmp_path / "z", replace(CONFIG, mattes=short))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "told"),
+    [
+        (lambda own: 0 * own, r"mattes in .* dark all over: the lightest place has 0 of 255"),
+        (lambda own: own // 255, r"mattes in .* dark all over: the lightest place has 1 of 255"),
+        (lambda own: 255 - own, r"mattes in .*m leave the face out: they hold \d% of it"),
+        (
+            lambda own: np.roll(own, 130, 1),
+            r"mattes in .*m leave the face out: they hold \d% of it",
+        ),
+    ],
+)
+def test_mattes_of_something_else_are_told_before_anything_is_fitted(
+    tmp_path: Path, wrong: Callable[[np.ndarray], np.ndarray], told: str
+) -> None:
+    pytest.importorskip("mediapipe", reason="the tracker's optional extra is not installed")
+    image = astronaut()[::2, ::2, ::-1]
+    own = np.zeros(image.shape[:2], np.uint8)
+    own[:, 40:150] = 255
+    given = wrong(own)
+    frames, masks = (
+        _folder(tmp_path / name, {f"{k}.png": picture for k in range(2)})
+        for name, picture in (("f", image), ("m", given))
+    )
+    stages: list[str] = []
+    with pytest.raises(UserError, match=told) as error:
+        track_video(
+            frames,
+            tmp_path / "x",
+            replace(CONFIG, mattes=masks),
+            lambda stage, *rest: stages.append(stage),
+        )
+    assert "255" in str(error.value) or "inverted" in str(error.value)
+    assert set(stages) <= {"faces", "outlines"}
+    assert not list((tmp_path / "x").glob("*")), "nothing is left behind"
+    if given[0, 0] == 255:
+        # Of an alpha channel too.
+        alphas = _folder(tmp_path / "a", {f"{k}.png": np.dstack([image, given]) for k in range(2)})
+        with pytest.raises(UserError, match="alpha channel leave the face out"):
+            track_video(alphas, tmp_path / "y", CONFIG)
+
+
+def test_a_dataset_that_training_refuses_is_not_recommended_for_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Twenty columns of the face are this person, but too little to train on; thirty are enough."""
+    pytest.importorskip("mediapipe", reason="the tracker's optional extra is not installed")
+    image = astronaut()[::2, ::2, ::-1]
+    narrow, wide = np.zeros((2, *image.shape[:2]), np.uint8)
+    narrow[:, 88:108] = 255
+    wide[:, 85:115] = 255
+    frames = _folder(tmp_path / "f", {f"{k}.png": image for k in range(2)})
+    for name, matte in (("narrow", narrow), ("wide", wide)):
+        masks = _folder(tmp_path / name, {f"{k}.png": matte for k in range(2)})
+        run((frames, tmp_path / f"of_{name}"), replace(CONFIG, mattes=masks))
+        printed = " ".join(capsys.readouterr().out.split())
+        refused = quick_check(load_native(tmp_path / f"of_{name}"))
+        told = json.loads((tmp_path / f"of_{name}" / "tracking.json").read_text())
+        assert told["refused"] == [problem.to_json() for problem in refused]
+        assert bool(refused) == (name == "narrow")
+        assert ("ns-train" in printed) == (not refused)
+        for problem in refused:
+            assert told["verdict"].startswith("look at it")
+            assert problem.cause.rstrip(".") in told["verdict"]
+            assert problem.cause in printed
+            assert problem.remedy in printed
 
 
 def test_who_has_no_body_in_the_given_mattes_has_none_to_follow(tmp_path: Path) -> None:

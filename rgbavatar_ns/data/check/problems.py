@@ -57,5 +57,5 @@ def verdict(findings: Iterable[Finding]) -> str:
     ordered = sorted(findings, key=lambda finding: finding.severity)
     if not ordered:
         return "good"
-    causes = "; ".join(finding.cause for finding in ordered)
+    causes = "; ".join(finding.cause.removesuffix(".") for finding in ordered)
     return f"{'usable' if usable(ordered) else 'look at it'}: {causes}"

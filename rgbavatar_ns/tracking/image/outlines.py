@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.files import atomic_write
 from rgbavatar_ns.reading import DamagedFileError, load_arrays
 from rgbavatar_ns.tracking.face.clip import ClipLandmarks
@@ -20,8 +21,9 @@ from rgbavatar_ns.tracking.resumable_run import GO_ON, ResumableRun, stage_damag
 
 OUTLINE_PX = 256
 """Side of the crops that outlines are found in: segmentation knows no more."""
-# A matte that holds less of the face than this is of something else, or of nothing.
-_OF_FACE = 0.8
+# A matte that holds less of the face than this is of something else, or of nothing; given mattes of
+# which most hold even less are no film's of this person.
+_OF_FACE, _LEAST_OF_FACE = 0.8, 0.25
 _MOST_BYTES = 1 << 28
 
 
@@ -33,8 +35,7 @@ def person_outline(
     Holes are filled and what stands apart is left out: only where the person ends is asked.
     """
     solid = (matte > 127).astype(np.uint8)
-    hull = cv2.convexHull(crop.points(landmarks_px).astype(np.float32))
-    face = cv2.fillConvexPoly(np.zeros_like(solid), np.round(hull - 0.5).astype(np.int32), (1,))
+    face = _face(crop, landmarks_px)
     contours, _ = cv2.findContours(solid, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     person, most = np.zeros_like(solid), 0
     for contour in contours:
@@ -50,6 +51,26 @@ def person_outline(
     away = np.where(person > 0, 0.5 - inwards, outwards - 0.5)
     first_px = np.array([crop.left, crop.top]) + 0.5 * step_px
     return PersonOutline(away * step_px, first_px, step_px)
+
+
+def _face(crop: SquareCrop, landmarks_px: Float[np.ndarray, "478 2"]) -> UInt8[np.ndarray, "s s"]:
+    """1 where the face is, within the hull of its landmarks."""
+    hull = cv2.convexHull(crop.points(landmarks_px).astype(np.float32))
+    none = np.zeros((crop.size, crop.size), np.uint8)
+    return cv2.fillConvexPoly(none, np.round(hull - 0.5).astype(np.int32), (1,))
+
+
+def _require_faces(
+    kept: UInt8[np.ndarray, "K s s"], faces: Sequence[UInt8[np.ndarray, "s s"]], given: str
+) -> None:
+    """UserError where most of the mattes that were given leave the face out."""
+    held = [(matte > 127)[face > 0].mean() for matte, face in zip(kept, faces) if face.any()]
+    if held and np.median(held) < _LEAST_OF_FACE:
+        raise UserError(
+            f"{given} leave the face out: they hold {np.median(held):.0%} of it.",
+            "White (or opaque) is the person: turn inverted mattes round. Others are perhaps of "
+            "another film, or in another order.",
+        )
 
 
 def _distances(part: UInt8[np.ndarray, "s s"]) -> Float[np.ndarray, "s s"]:
@@ -73,6 +94,7 @@ def key_outlines(
     """The outlines in these frames, from the user's own mattes, the source's alpha, or found.
 
     The frames are read once more, and `advance` is told how many; what was found is kept in `run`.
+    Raises UserError where most of the mattes that were given leave the face out.
     """
     crop = steady_crop(found.points_px, found.width, found.height, OUTLINE_PX)
     place = {found.frame_index[position]: position for position in positions}
@@ -92,10 +114,13 @@ def key_outlines(
         kept = load_arrays(path, _MOST_BYTES)["matte"]
         if kept.shape != (len(place), OUTLINE_PX, OUTLINE_PX) or kept.dtype != np.uint8:
             raise DamagedFileError("its arrays do not fit together")
-    return [
-        person_outline(matte, crop, found.points_px[place[index]])
-        for index, matte in zip(sorted(place), kept)
-    ]
+    landmarks_px = [found.points_px[place[index]] for index in sorted(place)]
+    if mattes is not None or source_alpha:
+        given = "The mattes of the film's alpha channel"
+        if mattes is not None:
+            given = f"The mattes in {mattes.path}"
+        _require_faces(kept, [_face(crop, points) for points in landmarks_px], given)
+    return [person_outline(matte, crop, points) for matte, points in zip(kept, landmarks_px)]
 
 
 def _mattes(

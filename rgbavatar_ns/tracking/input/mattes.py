@@ -16,8 +16,10 @@ from rgbavatar_ns.tracking.input.image_files import (
     read_image_rgba,
     require_image_files,
 )
-from rgbavatar_ns.tracking.input.video import FrameSource, SourceFrame, counted_frames
+from rgbavatar_ns.tracking.input.video import FrameSource, SourceFrame, counted_frames, glances
 
+_PERSON = 128
+"""From here on a matte counts as the person."""
 _AS_MANY = "Give one matte a frame: white (or opaque) is the person."
 
 
@@ -50,6 +52,17 @@ class UserMattes:
         if None not in numbers and len(set(numbers)) == len(numbers):
             files = [file for _, file in sorted(zip(numbers, files), key=lambda pair: pair[0] or 0)]
         return cls(path, tuple(files), source.bars)
+
+    def require_somebody(self, max_frames: int | None) -> None:
+        """UserError where a few mattes, spread over the first so many, have nothing light."""
+        looked_at = [int(_level(image).max()) for image in glances(self.path, max_frames)]
+        most = max(looked_at, default=255)
+        if most < _PERSON:
+            raise UserError(
+                f"The mattes in {self.path} are dark all over: the lightest place has {most} of "
+                "255.",
+                "Make the person 255 (of masks with 0 and 1, 255 times as much) and the rest 0.",
+            )
 
     def require_count(self, frames: int, limited: bool) -> None:
         """UserError unless each frame has a matte; too many are right if frames are limited.
@@ -94,10 +107,7 @@ class UserMattes:
     def _mattes(self, frames: frozenset[int]) -> Iterator[tuple[int, UInt8[np.ndarray, "H W"]]]:
         if self.files is not None:
             for index in sorted(frames.intersection(range(len(self.files)))):
-                rgba = read_image_rgba(self.files[index])
-                opaque = rgba[..., 3].min() == 255
-                level = cv2.cvtColor(rgba, cv2.COLOR_RGBA2GRAY) if opaque else rgba[..., 3]
-                yield index, np.ascontiguousarray(level)
+                yield index, _level(read_image_rgba(self.files[index]))
             return
         for frame in FrameSource.open(self.path).read(frames.__contains__):
             grey = cv2.cvtColor(frame.image_rgb, cv2.COLOR_RGB2GRAY)
@@ -126,6 +136,13 @@ def given_mattes(
             yield frame, np.full((height, width), 255, np.uint8)
         else:
             yield frame, frame.alpha if source_alpha else None
+
+
+def _level(image: UInt8[np.ndarray, "H W C"]) -> UInt8[np.ndarray, "H W"]:
+    """A matte's alpha where that is not opaque all over, else its grey."""
+    if image.shape[2] == 4 and image[..., 3].min() < 255:
+        return np.ascontiguousarray(image[..., 3])
+    return cv2.cvtColor(np.ascontiguousarray(image[..., :3]), cv2.COLOR_RGB2GRAY)
 
 
 def _by_name(mattes: list[Path], images: list[Path]) -> tuple[Path, ...] | None:

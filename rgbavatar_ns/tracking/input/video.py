@@ -33,7 +33,7 @@ from rgbavatar_ns.tracking.input.image_files import (
 )
 
 _GLANCES = 8
-"""Pictures of a clip by which its bars are known."""
+"""Pictures of a clip by which its bars are known, and whether mattes hold anybody."""
 _ALPHA_DECODERS = {"vp8": "libvpx", "vp9": "libvpx-vp9"}
 """By codec."""
 
@@ -97,8 +97,8 @@ class FrameSource:
 
     def without_bars(self) -> "FrameSource":
         """The same without the bars of one colour that all clips have, by a few glances at each."""
-        glances = (picture for path in self.paths for picture in _glances(path, self.max_frames))
-        return replace(self, bars=find_bars(glances))
+        pictures = (picture for path in self.paths for picture in glances(path, self.max_frames))
+        return replace(self, bars=find_bars(pictures))
 
     def __iter__(self) -> Iterator[SourceFrame]:
         """Every frame of every clip; the order and the indices are the same each time."""
@@ -293,7 +293,7 @@ def _turns_and_mirror(frame: av.VideoFrame) -> tuple[int, bool]:
     return round(-math.atan2(b, a) / (math.pi / 2)) % 4, mirrored
 
 
-def _glances(path: Path, max_frames: int | None) -> Iterator[UInt8[np.ndarray, "h w C"]]:
+def glances(path: Path, max_frames: int | None) -> Iterator[UInt8[np.ndarray, "h w C"]]:
     """A few pictures spread over a clip; fewer, or none, of a video that cannot be read.
 
     None of an image beyond the first `max_frames`, which nobody reads.
