@@ -145,6 +145,50 @@ def test_clips_of_several_rates_have_the_longest_ones_and_that_is_told() -> None
     assert rate_notes(_seen(face, time_s=np.full(70, np.nan), clip=clips)) == []
 
 
+def _played_apart_s(times_s: np.ndarray, frames_per_second: float) -> float:
+    """How far apart a frame's own moment and that of a film of one rate are at most."""
+    return float(np.abs(times_s - times_s[0] - np.arange(len(times_s)) / frames_per_second).max())
+
+
+def test_a_film_whose_rate_varies_is_told_with_how_far_its_frames_shift() -> None:
+    def notes(times_s: np.ndarray) -> tuple[list[str], float | None]:
+        count = len(times_s)
+        seen = _seen(
+            [_face(300, 240)] * count, time_s=times_s, clip=np.zeros(count, dtype=np.int64)
+        )
+        return rate_notes(seen), followed_face(seen, WIDTH, HEIGHT).frames_per_second
+
+    dark = np.cumsum([0, *[1 / 30] * 48, *[1 / 15] * 48])  # 1.6 s at 30, then 3.2 s at 15
+    (note,), rate = notes(dark)
+    assert rate == pytest.approx(20)
+    # At 1.6 s comes frame 48, which is shown at 48 / 20 s.
+    assert _played_apart_s(dark, 20) == pytest.approx(0.8)
+    for told in ("the film's frames", "15 to 30 a second", "up to 0.8 s too", "-vf fps="):
+        assert told in note
+    drawn = np.random.default_rng(4)
+    even = np.arange(900) / 30
+    for times_s in (
+        np.round(even, 3),
+        np.round(np.arange(900) * 1.001 / 24, 3),
+        even + drawn.normal(0, 0.003, 900),  # a telephone's
+        even + (even > 10) / 30,  # one frame is left out
+        even + 7.0 * (even > 10),  # a pause
+    ):
+        assert notes(times_s)[0] == []
+    # Light that a telephone's rate follows: 24 to 30, slowly.
+    followed = np.cumsum(1 / (27 + 3 * np.cos(np.arange(900) / 140)))
+    (note,), rate = notes(followed)
+    assert rate is not None
+    assert f"up to {_played_apart_s(followed, rate):.1f} s too" in note
+    several = np.concatenate([np.arange(30) / 30, dark])
+    clips = np.repeat([0, 1], [30, len(dark)])
+    told_of = rate_notes(_seen([_face(300, 240)] * len(clips), time_s=several, clip=clips))
+    assert [note.startswith("clip 2's frames come at a varying rate") for note in told_of] == [
+        True,
+        False,
+    ]
+
+
 def test_a_long_film_is_looked_through_in_little_more_than_its_landmarks() -> None:
     seen = _seen([_face(300 + k % 7, 240) for k in range(1000)])
     followed_face(seen, WIDTH, HEIGHT)  # the first call prepares the checks of types

@@ -30,6 +30,9 @@ _PAUSE, _LEAST_PAUSE_S = 4.0, 0.1
 # Sharpness below this share of the clip's sharp frames' (its 90th percentile: most frames may be
 # blurred) is noted as blur. Frames of a face that talks and keeps still are above .7.
 _BLURRED, _SHARP_PERCENT = 0.35, 90
+# A film whose frames come unevenly is told from here on: so far off sound and lips are felt apart.
+# A telephone's jitter shifts frames by some milliseconds, a single frame that it leaves out by 33.
+_SHIFTED_S = 0.1
 # Rates that differ by less are one: times of single frames are rounded.
 _SAME_RATE = 0.03
 _MOST_BYTES = 1 << 32
@@ -194,12 +197,32 @@ def _positions(
 
 
 def rate_notes(seen: SeenFaces) -> list[str]:
-    """What is to be known where clips of several rates are one film: some will play otherwise."""
+    """What is to be known where a film will play otherwise than it was filmed: its frames come
+    unevenly, or it is of clips of several rates."""
     kept, rates = _frames_per_second(seen), _clip_rates(seen)
-    if kept is None or all(abs(rate / kept - 1) <= _SAME_RATE for rate in rates.values()):
+    if kept is None:
         return []
-    told = ", ".join(f"{rate:.4g}" for rate in rates.values())
-    return [f"the clips have {told} frames a second; all play at {kept:.4g}, the longest one's"]
+    notes = [note for clip in rates for note in _uneven_notes(seen, clip, len(rates) > 1)]
+    if any(abs(rate / kept - 1) > _SAME_RATE for rate in rates.values()):
+        told = ", ".join(f"{rate:.4g}" for rate in rates.values())
+        all_play = f"all play at {kept:.4g}, the longest one's"
+        notes.append(f"the clips have {told} frames a second; {all_play}")
+    return notes
+
+
+def _uneven_notes(seen: SeenFaces, clip: int, of_several: bool) -> list[str]:
+    """How far a clip's frames lie from where they are played, evenly and without its pauses."""
+    steps = _usual_steps_s(seen, clip)
+    shifted_s = float(np.abs(np.cumsum(steps - steps.mean())).max())
+    if shifted_s <= _SHIFTED_S:
+        return []
+    slow, usual, fast = 1 / np.percentile(steps, (95, 50, 5))
+    whose = f"clip {clip + 1}'s" if of_several else "the film's"
+    return [
+        f"{whose} frames come at a varying rate, {slow:.3g} to {fast:.3g} a second, and play "
+        f"evenly: up to {shifted_s:.1f} s too early or too late. A film of one rate, to be tracked "
+        f"in its place: ffmpeg -i FILM -vf fps={usual:.0f} EVEN.mp4"
+    ]
 
 
 def _frames_per_second(seen: SeenFaces) -> float | None:
@@ -219,13 +242,15 @@ def _clip_rates(seen: SeenFaces) -> dict[int, float]:
 
     By their mean, since many files round times to milliseconds; clips without a clock have none.
     """
-    within = np.diff(seen.clip) == 0
-    steps, most = np.diff(seen.time_s), _longest_step_s(seen)[1:]
-    usual = within & (steps > 0) & (steps <= most)
-    return {
-        int(clip): 1 / float(steps[usual & (seen.clip[1:] == clip)].mean())
-        for clip in np.unique(seen.clip[1:][usual])
-    }
+    steps = {int(clip): _usual_steps_s(seen, int(clip)) for clip in np.unique(seen.clip)}
+    return {clip: 1 / float(times.mean()) for clip, times in steps.items() if len(times)}
+
+
+def _usual_steps_s(seen: SeenFaces, clip: int) -> Float[np.ndarray, "G"]:
+    """Between a clip's frames, where time goes on and that is no pause."""
+    rows = seen.clip == clip
+    steps, most = np.diff(seen.time_s[rows]), _longest_step_s(seen)[rows][1:]
+    return steps[(steps > 0) & (steps <= most)]
 
 
 def _longest_step_s(seen: SeenFaces) -> Float[np.ndarray, "F"]:
