@@ -20,7 +20,8 @@ class TrackConfig(CheckedOptions):
     max_frames: Count | None = None
     """Read at most so many frames in all; None reads everything."""
     focal_px: Annotated[float, Between(1, 1e6)] | None = None
-    """Focal length in pixels of the source frame; None estimates it."""
+    """Focal length in pixels of the source frame, .25 to 50 times its longer side; None estimates
+    it."""
     identity_components: Annotated[int, Between(1, 1000)] = 30
     """How many identity components of the head model are fitted."""
     key_frames: Annotated[int, Between(1, 1000)] = 12

@@ -17,6 +17,7 @@ from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.tracking.config import TrackConfig
 from rgbavatar_ns.tracking.face.detector import FaceLandmarker
 from rgbavatar_ns.tracking.face.iris import FoundIrises, find_irises
+from rgbavatar_ns.tracking.fit.camera import require_possible_focal
 from rgbavatar_ns.tracking.fit.fit import (
     STEPS_ANEW,
     ClipFit,
@@ -170,6 +171,8 @@ class LiveTracker:
                 f"to {width} x {height} pixels.",
                 "Keep one size, or start a new tracker: all frames share a camera.",
             )
+        if self._size is None:
+            require_possible_focal(self._config.focal_px, width, height)
         self._size = (width, height)
 
     def _collected(self, index: int, image_rgb: _Image) -> bool:

@@ -28,6 +28,7 @@ from rgbavatar_ns.tracking.config import TrackConfig
 from rgbavatar_ns.tracking.face.clip import ClipLandmarks, followed_face, rate_notes
 from rgbavatar_ns.tracking.face.detector import load_mediapipe
 from rgbavatar_ns.tracking.face.find_faces import find_faces
+from rgbavatar_ns.tracking.fit.camera import require_possible_focal
 from rgbavatar_ns.tracking.fit.fit import ClipFit
 from rgbavatar_ns.tracking.fit.own_head import read_own_head, subject_tracker
 from rgbavatar_ns.tracking.fit.subject import SubjectTracker
@@ -54,6 +55,8 @@ from rgbavatar_ns.tracking.verify.report import (
     tracking_findings,
 )
 
+_GLANCE_PX = 64
+"""Longer side of a picture of which only the film's size is asked."""
 _LIGHT_FRAMES = 60
 """Frames that tell how bright the film is and whether that changes."""
 _MATTES = "with overlooked hair, and the room of a moving camera"
@@ -79,6 +82,8 @@ def track_video(
     config = config or TrackConfig()
     own_head = read_own_head(config.flame)
     source = FrameSource.open(videos, config.max_frames).without_bars()
+    for frame in source.these([] if config.focal_px is None else [0], _GLANCE_PX):
+        require_possible_focal(config.focal_px, frame.width, frame.height)
     mattes = None if config.mattes is None else UserMattes.open(config.mattes, source)
     if mattes is not None:
         mattes.require_somebody(config.max_frames)

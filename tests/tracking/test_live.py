@@ -2,6 +2,7 @@
 
 import threading
 from contextlib import closing
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -33,6 +34,14 @@ def _moved(image: np.ndarray, degrees: float = 0.0, right_px: float = 0.0) -> np
     motion = cv2.getRotationMatrix2D((SIZE / 2 - 0.5, SIZE / 2 - 0.5), degrees, 1.0)
     motion[0, 2] += right_px
     return cv2.warpAffine(image, motion, (SIZE, SIZE), borderMode=cv2.BORDER_REPLICATE)
+
+
+def test_a_focal_length_of_no_camera_is_told_with_the_first_picture() -> None:
+    with (
+        closing(LiveTracker(replace(CONFIG, focal_px=1.0))) as tracker,
+        pytest.raises(UserError, match="1 pixels is no camera's"),
+    ):
+        tracker(np.zeros((120, 160, 3), np.uint8))
 
 
 def test_roll_and_shift_of_a_still_come_back_as_rotation_and_translation(portrait):

@@ -10,6 +10,7 @@ from rgbavatar_ns.drawing.compositing import unfilmed_pixels
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.tracking import TrackConfig, track_video
 from rgbavatar_ns.tracking.face.detector import load_mediapipe
+from rgbavatar_ns.tracking.fit.camera import require_possible_focal
 
 from .clips import REAL_CLIPS, astronaut, gradient_images, write_clip
 
@@ -103,6 +104,25 @@ def test_the_body_is_left_out_only_when_asked_for(
         assert dataset.read_image(0)[-1, :, 3].max() < 20, "it fades out at the bottom"
     assert shares[0] < 0.05
     assert shares[1] > 0.3
+
+
+@pytest.mark.parametrize("focal_px", [1.0, 40.0, 3.0e4])
+def test_a_focal_length_of_no_camera_is_told_before_anything_is_looked_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, focal_px: float
+) -> None:
+    """The film is 320 x 160: what sees 152 degrees of it, or half of one, is no lens."""
+    film = write_clip(tmp_path / "film.mp4", gradient_images(3, 160, 320))
+    monkeypatch.delattr("rgbavatar_ns.tracking.track.find_faces")
+    with pytest.raises(UserError, match=r"80 to 16000 pixels.*Leave --focal-px out") as error:
+        track_video(film, tmp_path / "x", TrackConfig(focal_px=focal_px))
+    assert f"{focal_px:g} pixels" in str(error.value)
+    assert not (tmp_path / "x").exists()
+
+
+@pytest.mark.parametrize("focal_px", [None, 90.0, 110.0, 380.0, 1.5e4])
+def test_focal_lengths_of_cameras_are_taken(focal_px: float | None) -> None:
+    require_possible_focal(focal_px, 320, 160)
+    require_possible_focal(focal_px, 160, 320)
 
 
 def test_missing_mediapipe_is_told_with_the_command_that_installs_it(

@@ -5,6 +5,25 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
+from rgbavatar_ns.errors import UserError
+
+_SHORTEST, _LONGEST = 0.25, 50.0
+"""Focal lengths of cameras, in longer sides of the picture: 127 degrees wide, and 1.1."""
+_FULL_FRAME_MM = 36
+
+
+def require_possible_focal(focal_px: float | None, width: int, height: int) -> None:
+    """UserError for a focal length that no camera of such pictures has; None is to be estimated."""
+    side = max(width, height)
+    low, high = _SHORTEST * side, _LONGEST * side
+    if focal_px is not None and not low <= focal_px <= high:
+        raise UserError(
+            f"A focal length of {focal_px:g} pixels is no camera's whose pictures have "
+            f"{width} x {height}: those are from {low:.0f} to {high:.0f} pixels.",
+            f"Leave --focal-px out, so that it is estimated, or give pixels of the film: "
+            f"millimetres of a 35 mm camera times {side / _FULL_FRAME_MM:.3g}.",
+        )
+
 
 @dataclass(frozen=True)
 class StillCamera:
