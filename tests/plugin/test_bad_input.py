@@ -1,6 +1,7 @@
 """What a user can get wrong is told with cause and remedy, before or during training."""
 
 import copy
+import dataclasses
 import json
 import shutil
 from collections.abc import Callable
@@ -18,7 +19,7 @@ from rgbavatar_ns.plugin.pipeline import to_look_at
 from rgbavatar_ns.plugin.presets import presets
 from rgbavatar_ns.plugin.training.refused import REFUSED
 from rgbavatar_ns.plugin.training.trainer import RGBAvatarTrainerConfig
-from tests.plugin.run import make_trainer, set_up, small_config, trained
+from tests.plugin.run import SMALL, make_trainer, set_up, small_config, trained
 from tests.plugin.tiny import tiny_dataset
 
 
@@ -64,6 +65,40 @@ def test_no_data_at_all_is_a_user_error(tmp_path: Path):
     config.pipeline.datamanager.data = None
     with pytest.raises(UserError, match="No dataset"):
         make_trainer(config)
+
+
+def _files(folder: Path) -> dict[Path, tuple[int, bytes]]:
+    """When each was written, and what stands in it."""
+    files = [path for path in folder.rglob("*") if path.is_file()]
+    return {path: (path.stat().st_mtime_ns, path.read_bytes()) for path in files}
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"load_dir": Path("nowhere")}, "no checkpoint"),
+        ({"steps_per_save": 0}, "steps-per-save"),
+        ({"data": Path("absent")}, "absent"),
+        ({"learning_rate_factor": 0.5, "learning_rate_steps": 0}, "learning-rate-steps"),
+        ({"avatar": dataclasses.replace(SMALL, num_bases=2)}, "num-bases"),
+    ],
+)
+def test_a_refused_command_changes_nothing_of_a_run_in_its_folder(
+    tiny_data: Path, tmp_path: Path, change: dict[str, Any], told: str
+):
+    """As one does that goes on with a run by --load-dir and --timestamp, mistyped."""
+    first = trained(small_config(tiny_data, tmp_path, max_num_iterations=2))
+    before = _files(tmp_path)
+    fields: dict[str, Any] = {"load_dir": first.checkpoint_dir, "max_num_iterations": 4} | change
+    data = fields.pop("data", tiny_data)
+    with pytest.raises(UserError, match=told):
+        make_trainer(small_config(data, tmp_path, **fields))
+    assert _files(tmp_path) == before
+    fields = {"load_dir": first.checkpoint_dir, "max_num_iterations": 4}
+    make_trainer(small_config(tiny_data, tmp_path, **fields))
+    written = yaml.load((first.base_dir / "config.yml").read_text(), yaml.Loader)
+    assert written.max_num_iterations == 4, "one that is not refused is written down"
+    assert written.pipeline.datamanager.seed is None, "as it was asked for"
 
 
 def test_theta_of_another_layout_than_the_checkpoints_is_refused_by_name(

@@ -62,6 +62,17 @@ def test_a_recording_of_an_earlier_run_in_the_folder_is_not_gone_on_with(
     assert not old.exists()
 
 
+def test_a_source_that_cannot_be_opened_costs_no_recording_of_an_earlier_run(
+    tiny_data: Path, tmp_path: Path
+):
+    config = online_config(tmp_path, source=SourceConfig("video", video=str(tmp_path / "no.mp4")))
+    recorded = config.get_base_dir() / "stream"
+    shutil.copytree(tiny_data, recorded)
+    with pytest.raises(UserError, match=r"no\.mp4"):
+        online_trainer(config)
+    assert torch.equal(load_dataset(recorded).theta, load_dataset(tiny_data).theta)
+
+
 @pytest.mark.parametrize("other", ["size", "head"])
 def test_a_resumed_run_with_another_camera_or_head_keeps_its_recording(
     tiny_data: Path, tmp_path: Path, other: str

@@ -1,6 +1,7 @@
 """Batches from the pools of a running stream."""
 
 import dataclasses
+import shutil
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -67,6 +68,8 @@ class OnlineDataManagerConfig(RGBAvatarDataManagerConfig):
     Takes a tenth of the time; 0 watches none."""
     recorded: tyro.conf.Suppress[Path | None] = None
     """Dataset of the frames that the pools held, which the trainer writes for later commands."""
+    resumes: tyro.conf.Suppress[bool] = False
+    """Set by the trainer: whether what is recorded is the run's own, to be gone on with."""
 
 
 class OnlineDataManager(RGBAvatarDataManager):
@@ -123,12 +126,16 @@ class OnlineDataManager(RGBAvatarDataManager):
         seed = 0 if config.seed is None else config.seed
         pools = _pools(config, seed)
         subject, self._first, left_out = stream.subject(0.0), None, Counter[str]()
-        if not isinstance(stream, ReplayStream):
+        replayed = isinstance(stream, ReplayStream)
+        if not replayed:
             subject, self._first = await_subject(stream, say, left_out=left_out)
-            if not is_recorded(config, subject):
-                _record(config, subject, [(0, self._first)])
+        if not config.resumes and config.recorded is not None:
+            # Of an earlier run in this folder, perhaps of somebody else.
+            shutil.rmtree(config.recorded, ignore_errors=True)
         assert subject is not None
-        self.pools = ReplayBuffer(subject, pools, save_images=not isinstance(stream, ReplayStream))
+        if self._first is not None and not is_recorded(config, subject):
+            _record(config, subject, [(0, self._first)])
+        self.pools = ReplayBuffer(subject, pools, save_images=not replayed)
         self._ingest = Ingest(stream, subject, self.pools, config.queue_frames, say)
         self._ingest.count_left_out(left_out)
         self._subject, self._stream = subject, stream

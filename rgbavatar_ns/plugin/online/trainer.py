@@ -3,7 +3,6 @@
 RGBAvatar, sec. 3.3. The stream runs in its own threads; a step takes what the pools hold.
 """
 
-import shutil
 import signal
 import time
 from collections.abc import Iterator
@@ -90,13 +89,12 @@ class OnlineTrainer(RGBAvatarTrainer):
                 "Learning rates are to fall, but nobody knows how long the stream is.",
                 "Say over how many steps by --learning-rate-steps.",
             )
+        # Must be known to later commands.
+        config.pipeline.datamanager.recorded = config.get_base_dir() / "stream"
         super().__init__(config, local_rank, world_size)
         self.stop = OnlineStop()
-        recorded = config.get_base_dir() / "stream"
-        if config.load_dir is None and config.load_checkpoint is None:
-            # Of an earlier run in this folder, perhaps of somebody else.
-            shutil.rmtree(recorded, ignore_errors=True)
-        config.pipeline.datamanager.recorded = recorded
+        resumes = config.load_dir is not None or config.load_checkpoint is not None
+        config.pipeline.datamanager.resumes = resumes
         self._next_look_s = 0.0
         self._next_watch_s, self._last_watched = 0.0, -1
         self._psnr: float | None = None
@@ -108,8 +106,6 @@ class OnlineTrainer(RGBAvatarTrainer):
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         """Wait for the stream's subject, then build everything; Ctrl-C meanwhile ends the run."""
-        # What this class has set must be known to later commands.
-        self.config.save_config()
         try:
             super().setup(test_mode)
         except KeyboardInterrupt:

@@ -20,6 +20,7 @@ from nerfstudio.utils.writer import EventName
 from nerfstudio.viewer.viewer import Viewer
 from torch import Tensor
 
+from rgbavatar_ns.avatar.storage.checkpoint_file import CONFIG_NAME
 from rgbavatar_ns.avatar.storage.stored_avatar import damage_of
 from rgbavatar_ns.avatar.training.batches import ChosenFrames, TrainingBatch
 from rgbavatar_ns.avatar.training.loop import FitHooks, fit
@@ -121,10 +122,19 @@ class RGBAvatarTrainerConfig(TrainerConfig):
     def save_config(self) -> None:
         """Write config.yml, the first file of a run; raises UserError where none can begin.
 
-        The step that a run goes on from is left out: those who read the config want the newest.
+        That of a run that lies there already is left to the trainer, which writes it anew once
+        nothing can refuse the command any more.
         """
         install_user_error_hook()
         require_trainable(self)
+        if not (self.get_base_dir() / CONFIG_NAME).exists():
+            self.write_config()
+
+    def write_config(self) -> None:
+        """Write config.yml, whatever lies there; raises UserError where the disk refuses it.
+
+        The step that a run goes on from is left out: those who read the config want the newest.
+        """
         written = copy.copy(self)
         written.load_step = None
         with disk_errors(self.get_base_dir(), "Free some space, or name another --output-dir."):
@@ -172,6 +182,7 @@ class RGBAvatarTrainer(EndingTrainer, FitHooks):
         require_trainable(config)
         if world_size != 1:
             raise UserError("This method trains on one device.", "Leave out --machine.num-devices.")
+        self._asked = copy.deepcopy(config)
         _use_run_seed(config)
         asks = _IN_TRAINER.set(True)
         try:
@@ -187,9 +198,13 @@ class RGBAvatarTrainer(EndingTrainer, FitHooks):
         self._is_latest = False
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
-        """Build pipeline, optimisers, viewer and writers; load a checkpoint if one is named."""
+        """Build pipeline, optimisers, viewer and writers; load a checkpoint if one is named.
+
+        Until that is done nothing of a run that lies in the folder is changed.
+        """
         self.curve = EvaluationCurve(self.base_dir)
         super().setup(test_mode)
+        self._asked.write_config()
         self.pipeline.evaluated = self._add_to_curve
         if isinstance(self.viewer_state, Viewer):
             for line in self.viewer_state.viewer_info:
