@@ -1,7 +1,7 @@
 """Batches of whole frames for nerfstudio's pipeline, decoded in the background."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -81,6 +81,18 @@ class RGBAvatarDataManagerConfig(FullImageDatamanagerConfig):
     train_cameras_sampling_seed: tyro.conf.Suppress[int] = 0
     fps_reset_every: tyro.conf.Suppress[int] = 100
 
+    def require_trainable(self) -> None:
+        """Raise UserError where there is no dataset, or one that no run can train on."""
+        parsed = self.dataparser if self.data is None else replace(self.dataparser, data=self.data)
+        self.check(parsed.setup().tracked)
+
+    def check(self, tracked: TrackedDataset) -> None:
+        """Raise UserError for pictures that losses cannot compare, or a head beside its images."""
+        _require_room_for_ssim(tracked)
+        if self.check_data:
+            for problem in quick_check(tracked):
+                raise problem.as_error()
+
 
 class RGBAvatarDataManager(DataManager):
     """Serves frames as (nerfstudio cameras with theta, uint8 RGBA images).
@@ -117,10 +129,7 @@ class RGBAvatarDataManager(DataManager):
         self.includes_time = self.dataparser.includes_time
         tracked = self.dataparser.tracked
         if test_mode == "val":
-            _require_room_for_ssim(tracked)
-            if config.check_data:
-                for problem in quick_check(tracked):
-                    raise problem.as_error()
+            config.check(tracked)
         self.film_path = FilmPath(len(tracked), tracked.train)
         self.train_dataparser_outputs = self.dataparser.get_dataparser_outputs("train")
         self.train_dataset = self._dataset("train", self.train_dataparser_outputs)

@@ -60,6 +60,38 @@ def test_pictures_that_no_window_of_ssim_fits_into_are_refused_before_training(t
     assert 0 < scores["ssim"] <= 1
 
 
+def _shrink_focal_length(data: Path) -> None:
+    index = json.loads((data / "dataset.json").read_text())
+    index["camera"]["focal_px"] = [focal_px / 4 for focal_px in index["camera"]["focal_px"]]
+    (data / "dataset.json").write_text(json.dumps(index))
+
+
+def _keep_only_pictures(data: Path) -> None:
+    (data / "dataset.json").unlink()
+
+
+@pytest.mark.parametrize("method", ["rgbavatar-tiny", "rgbavatar-online-tiny", "flashavatar-style"])
+@pytest.mark.parametrize("damage", [shutil.rmtree, _keep_only_pictures, _shrink_focal_length])
+def test_data_that_cannot_be_trained_on_is_told_before_a_file_is_written(
+    data: Path, tmp_path: Path, method: str, damage: Callable[[Path], None]
+):
+    config = copy.deepcopy(presets()[method])
+    config.pipeline.datamanager.data = data
+    set_up(config, tmp_path / "runs")
+    damage(data)
+    with pytest.raises(UserError):
+        config.save_config()
+    assert not (tmp_path / "runs").exists()
+
+
+def test_a_folder_without_checkpoints_to_go_on_from_is_told_before_a_file_is_written(
+    tiny_data: Path, tmp_path: Path
+):
+    with pytest.raises(UserError, match=r"no checkpoint in .*nowhere"):
+        small_config(tiny_data, tmp_path / "runs", load_dir=tmp_path / "nowhere").save_config()
+    assert not (tmp_path / "runs").exists()
+
+
 def test_no_data_at_all_is_a_user_error(tmp_path: Path):
     config = small_config(Path(), tmp_path)
     config.pipeline.datamanager.data = None
@@ -208,6 +240,7 @@ STAY: dict[str, Any] = {"position_lr_final": None, "learning_rate_factor": 1.0}
     ],
 )
 def test_options_that_count_beside_another_one_are_refused_without_it(
+    tiny_data: Path,
     tmp_path: Path,
     method: str,
     option: str,
@@ -217,6 +250,7 @@ def test_options_that_count_beside_another_one_are_refused_without_it(
 ):
     def saved(**fields: Any) -> None:
         config = copy.deepcopy(presets()[method])
+        config.pipeline.datamanager.data = tiny_data
         set_up(config, tmp_path, **fields)
         config.save_config()
 

@@ -71,6 +71,11 @@ class OnlineDataManagerConfig(RGBAvatarDataManagerConfig):
     resumes: tyro.conf.Suppress[bool] = False
     """Set by the trainer: whether what is recorded is the run's own, to be gone on with."""
 
+    def require_trainable(self) -> None:
+        """As offline, where a dataset is replayed; other sources are asked when the run begins."""
+        if self.source.kind == "replay":
+            super().require_trainable()
+
 
 class OnlineDataManager(RGBAvatarDataManager):
     """Serves batches from local and global pool while the stream goes on.

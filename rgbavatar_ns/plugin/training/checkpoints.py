@@ -85,6 +85,11 @@ def load_newest(folder: Path, tell: Callable[[str], object]) -> tuple[dict[str, 
 
     `folder` may be a run's folder too. Raises UserError where there is no readable one.
     """
+    return read_newest(require_checkpoints(folder), read_training_state, tell)
+
+
+def require_checkpoints(folder: Path) -> list[Path]:
+    """Those in `folder`, or in a run's folder, oldest first; raises UserError without any."""
     checkpoints = checkpoints_of(folder)
     if not checkpoints:
         raise UserError(
@@ -92,7 +97,7 @@ def load_newest(folder: Path, tell: Callable[[str], object]) -> tuple[dict[str, 
             "Give the folder that holds step-*.ckpt (a run's nerfstudio_models), or train from the "
             "start.",
         )
-    return read_newest(checkpoints, read_training_state, tell)
+    return checkpoints
 
 
 def readable_step(folder: Path, asked: int | None, tell: Callable[[str], object]) -> int:

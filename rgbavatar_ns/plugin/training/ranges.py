@@ -1,4 +1,4 @@
-"""Which options a run can begin with, nerfstudio's included."""
+"""Which options a run can begin with, nerfstudio's included, and on which data."""
 
 import torch
 from nerfstudio.configs.base_config import (
@@ -12,6 +12,7 @@ from nerfstudio.engine.trainer import TrainerConfig
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.kernels import available_backends
 from rgbavatar_ns.options import Between, Ranges, check_options
+from rgbavatar_ns.plugin.training.checkpoints import require_checkpoints
 from rgbavatar_ns.plugin.training.refused import require_used
 
 _OFTEN = Between(1, 10**9)
@@ -55,6 +56,13 @@ def require_trainable(config: TrainerConfig) -> None:
             "Leave out --machine.device-type, or install the driver and a PyTorch with CUDA.",
         )
     _require_rasterizer(config.pipeline.model.rasterizer, device)  # type: ignore[attr-defined]
+
+
+def require_found(config: TrainerConfig) -> None:
+    """Raise UserError where there is nothing to train on, or no checkpoint to go on from."""
+    config.pipeline.datamanager.require_trainable()  # type: ignore[attr-defined]
+    if config.load_dir is not None and config.load_step is None:
+        require_checkpoints(config.load_dir)
 
 
 def _require_rasterizer(name: str, device: str) -> None:

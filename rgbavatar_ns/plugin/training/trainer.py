@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
+import yaml
 from nerfstudio.engine.callbacks import TrainingCallbackLocation
 from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.engine.trainer import TrainerConfig
@@ -26,7 +27,7 @@ from rgbavatar_ns.avatar.training.batches import ChosenFrames, TrainingBatch
 from rgbavatar_ns.avatar.training.loop import FitHooks, fit
 from rgbavatar_ns.avatar.training.step import Losses
 from rgbavatar_ns.errors import UserError
-from rgbavatar_ns.files import disk_errors
+from rgbavatar_ns.files import atomic_write
 from rgbavatar_ns.options import Between, Count, Positive
 from rgbavatar_ns.plugin.console import say
 from rgbavatar_ns.plugin.errors import device_errors_told, install_user_error_hook
@@ -59,7 +60,7 @@ from rgbavatar_ns.plugin.training.optimizers import (
     require_fitting_states,
 )
 from rgbavatar_ns.plugin.training.progress import TrainingProgress
-from rgbavatar_ns.plugin.training.ranges import require_trainable
+from rgbavatar_ns.plugin.training.ranges import require_found, require_trainable
 from rgbavatar_ns.plugin.training.refused import require_bases_to_begin, require_rates_to_fall
 from rgbavatar_ns.plugin.training.run_end import EndingTrainer
 from rgbavatar_ns.plugin.training.train_clock import TrainClock, waiting_for
@@ -127,6 +128,7 @@ class RGBAvatarTrainerConfig(TrainerConfig):
         """
         install_user_error_hook()
         require_trainable(self)
+        require_found(self)
         if not (self.get_base_dir() / CONFIG_NAME).exists():
             self.write_config()
 
@@ -135,10 +137,11 @@ class RGBAvatarTrainerConfig(TrainerConfig):
 
         The step that a run goes on from is left out: those who read the config want the newest.
         """
-        written = copy.copy(self)
+        written, path = copy.copy(self), self.get_base_dir() / CONFIG_NAME
         written.load_step = None
-        with disk_errors(self.get_base_dir(), "Free some space, or name another --output-dir."):
-            TrainerConfig.save_config(written)
+        remedy = "Free some space, or name another --output-dir."
+        with atomic_write(path, remedy=remedy) as partial:
+            partial.write_text(yaml.dump(written), "utf8")
 
     def set_timestamp(self) -> None:
         """Called by `ns-train` alone, on its own config or on the one that it has loaded."""
