@@ -8,6 +8,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from nerfstudio.utils import writer
@@ -56,6 +57,13 @@ class OnlineTrainerConfig(RGBAvatarTrainerConfig):
     final_learning_rate_factor: Annotated[float, Between(1e-9, 1e3)] = 0.1
     """What the learning rates fall to in these steps, times what they were; 1 keeps them
     (paper)."""
+
+    def lie_in(self, folder: Path) -> None:
+        """As offline, with what the stream's pools held."""
+        super().lie_in(folder)
+        manager = self.pipeline.datamanager
+        if manager.recorded is not None:
+            manager.recorded = folder / manager.recorded.name
 
 
 class OnlineStop(StopRequest):

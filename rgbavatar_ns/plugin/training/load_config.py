@@ -1,6 +1,10 @@
-"""`ns-train METHOD --load-config RUN/config.yml`: goes on with the run, or repeats it."""
+"""A run's config.yml, as nerfstudio's commands load it.
+
+`ns-train METHOD --load-config RUN/config.yml` goes on with the run, or repeats it.
+"""
 
 import re
+import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -17,6 +21,7 @@ from rgbavatar_ns.reading import DamagedFileError, damage_told, load_json, read_
 
 COMPLETED = "completed"
 _MOST_BYTES = 1 << 22
+_EVALUATION = "nerfstudio.utils.eval_utils"
 _TRAINER = re.compile(r"tag:yaml\.org,2002:python/object:[\w.]+TrainerConfig")
 """What the root of a saved config names."""
 _LOAD_CONFIG = re.compile(r"--load[-_]config(=|$)")
@@ -87,6 +92,33 @@ def go_on_or_repeat(
     else:
         config.load_dir, config.load_checkpoint = checkpoints, None
         tell(f"Going on with {run}.")
+
+
+def loaded_by_command() -> Path | None:
+    """The config.yml that ns-eval, ns-viewer or ns-render has read; None where none of them asks.
+
+    They pass the file's place on to nobody, and a run may lie elsewhere than its config says.
+    """
+    frame = sys._getframe()  # pyright: ignore[reportPrivateUsage]
+    while frame is not None:
+        named = frame.f_locals.get("config_path")
+        if frame.f_globals.get("__name__") == _EVALUATION and isinstance(named, Path):
+            return named
+        frame = frame.f_back
+    return None
+
+
+def require_checkpoints_beside(path: Path, said: Path) -> None:
+    """Raise UserError where the folder of this config.yml is not the run's own.
+
+    said: the folder of checkpoints that the config itself names.
+    """
+    if list_checkpoints(path.parent / MODELS_FOLDER):
+        return
+    remedy = "Name the config.yml in the run's own folder; or train, and save before you stop."
+    if list_checkpoints(said):
+        remedy = f"The config's run lies in {said.parent}: name the config.yml there."
+    raise UserError(f"There is no checkpoint in {path.parent / MODELS_FOLDER}.", remedy)
 
 
 def _complete(run: Path) -> bool:

@@ -48,7 +48,9 @@ from rgbavatar_ns.plugin.training.curve import EvaluationCurve
 from rgbavatar_ns.plugin.training.interruption import StopRequest, stop_with_starter
 from rgbavatar_ns.plugin.training.load_config import (
     go_on_or_repeat,
+    loaded_by_command,
     loads_config,
+    require_checkpoints_beside,
     require_loadable,
 )
 from rgbavatar_ns.plugin.training.optimizers import (
@@ -106,17 +108,34 @@ class RGBAvatarTrainerConfig(TrainerConfig):
     mixed_precision: bool = False
     """Half precision is refused: the rasterizer computes in float32."""
     method_name: tyro.conf.Suppress[str | None] = None
+    run_folder: tyro.conf.Suppress[Path | None] = None
+    """Where the run lies, once a command has loaded it from there; by default where it began."""
+
+    def get_base_dir(self) -> Path:
+        """The run's folder."""
+        return self.run_folder or super().get_base_dir()
+
+    def lie_in(self, folder: Path) -> None:
+        """Take what the run has written from here, wherever it was trained."""
+        self.run_folder = folder
 
     def get_checkpoint_dir(self) -> Path:
         """Where the run's checkpoints are; for who loads one from there, `load_step` is set.
 
         ns-eval, ns-viewer and ns-render ask for the folder and then load what is there of
         `load_step`, or the newest, readable or not; so `load_step` becomes the newest that can be
-        read. Raises UserError where there is none, or not that of a `load_step` already set.
+        read. What lies beside the config.yml that they have loaded counts, not where it says.
+        Raises UserError where there is none, or not that of a `load_step` already set.
         """
         folder = super().get_checkpoint_dir()
         if not _IN_TRAINER.get():
             install_user_error_hook()
+            loaded = loaded_by_command()
+            if loaded is not None:
+                require_checkpoints_beside(loaded, folder)
+                if loaded.parent.resolve() != self.get_base_dir().resolve():
+                    self.lie_in(loaded.parent)
+                    folder = super().get_checkpoint_dir()
             self.load_step = readable_step(folder, self.load_step, say)
         return folder
 

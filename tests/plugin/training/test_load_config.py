@@ -2,6 +2,7 @@
 
 import copy
 import json
+import shutil
 import sys
 from pathlib import Path
 from typing import Any
@@ -9,12 +10,15 @@ from typing import Any
 import pytest
 import torch
 import yaml
+from nerfstudio.pipelines.base_pipeline import Pipeline
 from nerfstudio.scripts.train import main
 from nerfstudio.utils import writer
+from nerfstudio.utils.eval_utils import eval_setup
 
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.plugin.methods import rgbavatar_tiny
 from rgbavatar_ns.plugin.training.trainer import RGBAvatarTrainerConfig
+from tests.plugin.online_run import online_config, online_trainer
 from tests.plugin.run import (
     before_step,
     finished_run,
@@ -104,6 +108,54 @@ def test_a_run_that_lies_elsewhere_than_it_says_is_not_begun_anew(
         load(monkeypatch, moved)
     assert str(moved.parent) in told.value.cause
     assert not (tmp_path / "before").exists()
+
+
+def parameters(pipeline: Pipeline) -> list[torch.Tensor]:
+    return list(pipeline.model.parameters())
+
+
+def test_a_copied_run_is_looked_at_from_its_own_folder(tiny_data: Path, tmp_path: Path):
+    """Also while the first one, which its config names, trains on."""
+    first = finished_run(tiny_data, tmp_path / "runs", max_num_iterations=2)
+    copied = Path(shutil.copytree(first.parent, tmp_path / "copy")) / "config.yml"
+    as_copied = [value.clone() for value in parameters(eval_setup(copied)[1])]
+    models = first.parent / "nerfstudio_models"
+    finished_run(tiny_data, tmp_path / "runs", max_num_iterations=STEPS, load_dir=models)
+    config, pipeline, checkpoint, step = eval_setup(copied)
+    assert checkpoint == copied.parent / "nerfstudio_models" / "step-000000001.ckpt"
+    assert step == 1
+    assert all(map(torch.equal, parameters(pipeline), as_copied))
+    assert config.get_base_dir() == copied.parent, "the viewer keeps its log there"
+    _, pipeline, checkpoint, step = eval_setup(first)
+    assert (checkpoint.parent, step) == (models, STEPS - 1)
+    assert not all(map(torch.equal, parameters(pipeline), as_copied))
+
+
+def test_a_moved_run_is_looked_at_where_it_is(tiny_data: Path, tmp_path: Path):
+    first = finished_run(tiny_data, tmp_path / "before", max_num_iterations=2)
+    moved = first.parent.rename(tmp_path / "moved")
+    _, _, checkpoint, _ = eval_setup(moved / "config.yml")
+    assert checkpoint.parent == moved / "nerfstudio_models"
+
+
+def test_a_moved_run_of_a_stream_takes_its_own_recording(tiny_data: Path, tmp_path: Path):
+    config = online_config(tmp_path / "before", tiny_data)
+    trainer = online_trainer(config)
+    trainer.train()
+    moved = trainer.base_dir.rename(tmp_path / "moved")
+    loaded = eval_setup(moved / "config.yml")[0]
+    assert loaded.pipeline.datamanager.recorded == moved / "stream"
+
+
+def test_a_config_apart_from_its_run_is_refused_with_the_runs_place(
+    tiny_data: Path, tmp_path: Path
+):
+    config = finished_run(tiny_data, tmp_path / "runs", max_num_iterations=1)
+    apart = Path(shutil.copy(config, tmp_path))
+    with pytest.raises(UserError, match="no checkpoint") as told:
+        eval_setup(apart)
+    assert str(tmp_path / "nerfstudio_models") in told.value.cause
+    assert str(config.parent) in told.value.remedy
 
 
 @pytest.mark.parametrize("option", ["--max-num-iterations", "--data", "--vis"])
