@@ -296,10 +296,18 @@ class OnlineTrainer(RGBAvatarTrainer):
             "stream": dict(self.stream.ingest.counts()),
         }
 
+    def _limit(self) -> str:
+        if self._out_of_time or self._last_step() == self.config.max_num_iterations:
+            return super()._limit()
+        return f"--steps-after-stream {self.config.steps_after_stream}"
+
     def _tell_end(self, summary: dict[str, Any]) -> None:
         steps, rate = summary["steps"], summary["images_per_second"]
-        how = "Trained" if self.completed else "Stopped after"
-        say(f"{how} {steps} steps on {summary['frames']} frames, {rate:.1f} images/s.")
+        if self.completed and self._had_all:
+            say(self._untrained(steps))
+        else:
+            how = "Trained" if self.completed else "Stopped after"
+            say(f"{how} {steps} steps on {summary['frames']} frames, {rate:.1f} images/s.")
         if not self.completed:
             say(f"Go on with the same command and --load-dir {self.checkpoint_dir}")
         say(f"Config: {self.base_dir / CONFIG_NAME}")

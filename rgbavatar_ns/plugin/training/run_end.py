@@ -98,7 +98,9 @@ class EndingTrainer(Trainer):
 
     def _tell_end(self, summary: dict[str, Any]) -> None:
         steps, rate = summary["steps"], summary["images_per_second"]
-        if self.completed:
+        if self.completed and self._had_all:
+            say(self._untrained(steps))
+        elif self.completed:
             seconds = summary["train_seconds"]
             why = f" in the {seconds:.0f} s that it was given" if self._out_of_time else ""
             say(f"Trained {steps} steps{why}, {rate:.1f} images/s.")
@@ -110,6 +112,23 @@ class EndingTrainer(Trainer):
             )
         say(f"Config: {self.base_dir / CONFIG_NAME}")
         say(f"Checkpoints: {self.checkpoint_dir}")
+
+    @property
+    def _had_all(self) -> bool:
+        """Whether a run that goes on had all its steps before."""
+        return 0 <= self.step < self._start_step
+
+    def _untrained(self, steps: int) -> str:
+        return (
+            f"Nothing was trained: the run has had {steps} steps before, which count too, and "
+            f"{self._limit()} asks for no more. Name a larger one to go on."
+        )
+
+    def _limit(self) -> str:
+        """The option that has ended the run, as it was given."""
+        if self._out_of_time:
+            return f"--max-train-seconds {self.config.max_train_seconds:g}"  # type: ignore[attr-defined]
+        return f"--max-num-iterations {self.config.max_num_iterations}"
 
     def _tell_bases_that_waited(self) -> None:
         """Say where refined tracking let the bases wait for longer than the run took."""

@@ -209,7 +209,9 @@ def test_sigterm_saves_and_is_told_by_the_exit_code(online: Online):
     assert summary(trainer)["ended"] == "stopped"
 
 
-def test_a_resumed_stream_goes_on_where_it_was(online: Online, monkeypatch: pytest.MonkeyPatch):
+def test_a_resumed_stream_goes_on_where_it_was(
+    online: Online, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
     sizes = {"local_size": 2, "global_size": 3}
     trainer = online("first", **sizes)
     pools = trainer.stream.pools
@@ -236,8 +238,12 @@ def test_a_resumed_stream_goes_on_where_it_was(online: Online, monkeypatch: pyte
     assert told["taken in"] == told["arrived"] == STREAMED
     assert again.stream.pools.num_added == STREAMED
     finished = online("third", load_dir=again.checkpoint_dir, **sizes)
+    capsys.readouterr()
     finished.train()
     assert finished.step == again.step
+    told = " ".join(capsys.readouterr().out.split())
+    assert "Nothing was trained" in told
+    assert "--steps-after-stream 3 asks for no more" in told
 
 
 def test_a_fault_of_the_source_saves_and_is_told(online: Online):

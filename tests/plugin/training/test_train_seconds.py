@@ -54,7 +54,9 @@ def test_steps_that_are_done_sooner_end_it_as_ever(
     assert "it was given" not in capsys.readouterr().out
 
 
-def test_seconds_count_over_all_sessions_and_equal_the_run_in_one(config_of: ConfigOf):
+def test_seconds_count_over_all_sessions_and_equal_the_run_in_one(
+    config_of: ConfigOf, capsys: pytest.CaptureFixture[str]
+):
     whole = _train(config_of("whole", max_train_seconds=10.0))
     first = _train(config_of("rest", max_train_seconds=10.0), stop_before=2)
     assert _summary(first)["ended"] == "stopped"
@@ -64,7 +66,9 @@ def test_seconds_count_over_all_sessions_and_equal_the_run_in_one(config_of: Con
     ends = [newest_state(run.checkpoint_dir)["pipeline"] for run in (whole, second)]
     assert all(a.equal(ends[1][name]) for name, a in ends[0].items() if hasattr(a, "equal"))
     # All used up: nothing more is trained. More seconds: it goes on.
+    capsys.readouterr()
     again = _train(config_of("rest", **resume))
+    assert "--max-train-seconds 10 asks for no more" in " ".join(capsys.readouterr().out.split())
     assert (_summary(again)["ended"], _summary(again)["steps"]) == (COMPLETED, 5)
     longer = _train(config_of("rest", **{**resume, "max_train_seconds": 14.0}))
     assert (_summary(longer)["ended"], _summary(longer)["steps"]) == (COMPLETED, 7)

@@ -134,6 +134,21 @@ def test_finished_run_trains_no_further_on_resume(train: Train):
     assert summary["images_per_second"] == pytest.approx(12 / summary["train_seconds"])
 
 
+@pytest.mark.parametrize("steps", [2, 3])
+def test_a_run_that_has_all_its_steps_says_that_nothing_was_trained_and_how_to_go_on(
+    train: Train, capsys: pytest.CaptureFixture[str], steps: int
+):
+    first = train(max_num_iterations=3)
+    assert "Trained 3 steps" in capsys.readouterr().out
+    train(max_num_iterations=steps, load_dir=first.checkpoint_dir)
+    told = " ".join(capsys.readouterr().out.split())
+    assert "Trained" not in told
+    assert "Nothing was trained: the run has had 3 steps before" in told
+    assert f"--max-num-iterations {steps} asks for no more" in told
+    train(max_num_iterations=4, load_dir=first.checkpoint_dir)
+    assert "Trained 4 steps" in capsys.readouterr().out
+
+
 def test_a_finished_run_resumed_under_another_name_is_whole_there_too(config_of: ConfigOf):
     first = trained(config_of(max_num_iterations=3, timestamp="first"))
     again = trained(
