@@ -1,9 +1,11 @@
 """What nerfstudio's own commands cannot do with this method, in the words of a user's error."""
 
+from pathlib import Path
 from types import TracebackType
 
 from rgbavatar_ns.errors import UserError
 
+_EVAL = "nerfstudio.scripts.eval"
 _EXPORTER, _RENDER = "nerfstudio.scripts.exporter", "nerfstudio.scripts.render"
 _WRITER = "nerfstudio.utils.writer"
 _SERVICES = {
@@ -30,6 +32,10 @@ def told_of_command(error: BaseException, trace: TracebackType | None) -> UserEr
                 "`rgbavatar export RUN DST --format ply` writes Gaussians of one frame or of many; "
                 "gltf, spz, sog, web and others: `rgbavatar export --help`. There is no mesh.",
             )
+        if module == _EVAL and ours and isinstance(error, AssertionError):
+            told = _of_scores(command)
+            if told is not None:
+                return told
         if module == _RENDER and ours:
             told = _of_rendering(error, command)
             if told is not None:
@@ -41,6 +47,14 @@ def told_of_command(error: BaseException, trace: TracebackType | None) -> UserEr
             return UserError(cause, f"{service}; or take --vis viewer+tensorboard.")
         trace = trace.tb_next
     return None
+
+
+def _of_scores(command: object) -> UserError | None:
+    path = getattr(command, "output_path", None)
+    if not isinstance(path, Path) or path.suffix == ".json":
+        return None
+    given = f"--output-path is {path}, but scores are written as JSON."
+    return UserError(given, "Name a file that ends in .json.")
 
 
 def _of_rendering(error: BaseException, command: object) -> UserError | None:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from nerfstudio.scripts.eval import ComputePSNR
 from nerfstudio.scripts.render import (
     DatasetRender,
     RenderCameraPath,
@@ -22,6 +23,7 @@ from PIL import Image
 from rgbavatar_ns.data import load_dataset
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.plugin.host_commands import told_of_command
+from rgbavatar_ns.plugin.pipeline import RGBAvatarPipeline
 from tests.export.subject import camera_path
 from tests.plugin.run import finished_run, run_command
 from tests.plugin.tiny import NUM_TEST
@@ -152,6 +154,19 @@ def test_what_ns_render_cannot_do_is_told(config: Path, tmp_path: Path):
     assert "--downscale-factor is 2" in smaller
     rays = told(RenderInterpolated(config, out, render_nearest_camera=True).main, UserError)
     assert "--render-nearest-camera" in rays
+
+
+@pytest.mark.parametrize("name", ["scores.txt", "scores", ".json"])
+def test_scores_in_a_file_of_another_ending_are_refused_before_they_are_counted(
+    config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+):
+    counted: list[object] = []
+    monkeypatch.setattr(RGBAvatarPipeline, "get_average_eval_image_metrics", counted.append)
+    scores = told(ComputePSNR(config, tmp_path / name).main, AssertionError)
+    assert f"--output-path is {tmp_path / name}" in scores
+    assert "ends in .json" in scores
+    assert not counted
+    assert not (tmp_path / name).exists()
 
 
 @pytest.mark.parametrize(
