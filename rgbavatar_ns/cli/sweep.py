@@ -94,7 +94,8 @@ class _Progress:
         self._next_line_s = 0.0
 
     def __rich__(self) -> Group:
-        return Group(_table(self._statuses), self._making)
+        # None before the first cells: an experiment may be refused.
+        return Group(_table(self._statuses), self._making) if self._statuses else Group()
 
     def cells(self, statuses: Sequence[CellStatus]) -> None:
         """Where the cells stand now."""

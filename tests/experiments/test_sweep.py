@@ -231,6 +231,27 @@ def test_the_command_says_what_failed_and_ends_with_1(experiment_of, tmp_path, c
     assert "index.html" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize(
+    ("old", "new", "told"),
+    [
+        ("num_bases", "num_basis", "no field of the preset"),
+        ("subjects: [", "subjects: [absent/", "does not exist"),
+    ],
+)
+def test_an_experiment_that_is_refused_shows_no_table(
+    experiment_of, tmp_path, capsys, old, new, told
+):
+    experiment_of("fine")
+    file = tmp_path / "bases.yaml"
+    file.write_text(file.read_text().replace(old, new))
+    with pytest.raises(SystemExit) as ended:
+        cli.main(["sweep", str(file), "--output", str(tmp_path / "out")])
+    assert ended.value.code == 1
+    shown = capsys.readouterr()
+    assert told in shown.err
+    assert not shown.out.strip()
+
+
 def test_two_experiments_of_one_folder_keep_a_page_each(experiment_of, tmp_path, capsys):
     out = tmp_path / "out"
     sweep(experiment_of("a"), out, LocalEngine(2))
