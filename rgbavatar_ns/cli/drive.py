@@ -22,11 +22,13 @@ if TYPE_CHECKING:
     from rgbavatar_ns.export.subject import Subject
 
 Show = Literal["page", "viewer", "none"]
-Kind = Literal["arkit", "vmc", "websocket", "CSV file", "dataset", "camera or film"]
+Kind = Literal["arkit", "vmc", "websocket", "CSV file", "dataset", "film", "camera"]
 """What a source is."""
 _LISTENING: tuple[Kind, ...] = ("arkit", "vmc", "websocket")
+_RECORDED: tuple[Kind, ...] = ("CSV file", "dataset", "film")
+"""These have a clock of their own."""
 _OF_SOURCES: dict[str, tuple[tuple[Kind, ...], str]] = {
-    "beside": (("dataset", "camera or film"), "sources with pictures"),
+    "beside": (("dataset", "film", "camera"), "sources with pictures"),
     "head-angles": (("arkit", "CSV file"), "arkit and CSV files"),
     "source-frames-per-second": (("CSV file", "dataset"), "CSV files and datasets"),
 }
@@ -82,7 +84,8 @@ class ShowOptions(CheckedOptions):
     seconds: (
         Annotated[float, Between(0, 1e6, open=True), tyro.conf.arg(metavar="SECONDS")] | None
     ) = None
-    """End after so many seconds."""
+    """End after so many seconds: of a recording its own, however long they take, else by the
+    clock."""
 
 
 _SOURCE, _SHOW, _LIVE = SourceOptions(), ShowOptions(), LiveOptions()
@@ -128,7 +131,9 @@ def run(
     if transfer.told:
         _tell(f"note: {transfer.told}")
     outputs: list[DriveOutput] = []
-    drive = LiveDrive(performer, transfer, outputs, real_time, _tell)
+    recorded = _kind(source.source) in _RECORDED
+    of_recording, by_clock = (show.seconds, None) if recorded else (None, show.seconds)
+    drive = LiveDrive(performer, transfer, outputs, real_time, _tell, of_recording)
     try:
         if shown == "page":
             outputs.append(_page(subject, show, source.allow_remote, drive.calibrate))
@@ -138,7 +143,7 @@ def run(
             outputs.append(_pictures(subject, show))
         with on_keys({"c": drive.calibrate, "q": drive.stop}) as heard:
             _tell("c: learn the neutral face again, q: end." if heard else "Ctrl-C ends.")
-            _run(drive, show.seconds)
+            _run(drive, by_clock)
     except BrokenPipeError:
         _tell("The reader of the pictures has gone.")
     finally:
@@ -173,7 +178,7 @@ def _require_heeded(shown: Show, show: ShowOptions, source: SourceOptions) -> No
     from rgbavatar_ns.data.streams.address import told_address
 
     kind, told = _kind(source.source), told_address(source.source)
-    if kind == "camera or film":
+    if kind in ("film", "camera"):
         _camera(source.source)  # That there is none is worse than an option too many.
     if source.listen is not None and kind not in _LISTENING:
         raise UserError(
@@ -262,10 +267,14 @@ def _kind(name: str) -> Kind:
     for listening in _LISTENING:
         if name == listening:
             return listening
+    from rgbavatar_ns.tracking.input.capture import is_device
+
     path = Path(name).expanduser()
     if path.suffix.lower() == ".csv":
         return "CSV file"
-    return "dataset" if path.is_dir() and _is_dataset(path) else "camera or film"
+    if path.is_dir() and _is_dataset(path):
+        return "dataset"
+    return "camera" if name == "camera" or is_device(name) else "film"
 
 
 def _is_dataset(folder: Path) -> bool:

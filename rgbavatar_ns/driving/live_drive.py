@@ -20,6 +20,8 @@ _SILENT_S = 1.5
 _TOLD_EVERY_S = 1.0
 _WAITING = 4
 """Frames of a recording that are tracked while others are drawn."""
+_SAME_MOMENT_S = 1e-6
+"""Sums of frames' times differ by less from what they should be."""
 _KEPT = 3000
 """Latencies that are kept: two minutes."""
 
@@ -134,7 +136,8 @@ class LiveDrive:
     """Follows a source in a thread of its own and shows each frame from the caller's.
 
     real_time: the newest frame is shown and older ones are skipped; otherwise each one is.
-    tell: is called with what a user should read, at most once a second.
+    tell: is called with what a user should read, at most once a second. seconds: of the
+    performance by the source's own clock, from its first frame on; without, all of it is shown.
     """
 
     def __init__(
@@ -144,9 +147,11 @@ class LiveDrive:
         outputs: Sequence[DriveOutput],
         real_time: bool = True,
         tell: Callable[[str], None] = lambda line: None,
+        seconds: float | None = None,
     ) -> None:
         self._source, self._transfer, self._outputs = source, transfer, outputs
-        self._tell = tell
+        self._tell, self._seconds = tell, seconds
+        self._began_s: float | None = None
         self._waiting: deque[DrivenFrame] = deque(maxlen=1 if real_time else None)
         self._room = 1 if real_time else _WAITING
         self._real_time = real_time
@@ -226,6 +231,8 @@ class LiveDrive:
                 performed = self._source.next(_PATIENCE_S)
                 if performed is None:
                     continue
+                if self._is_past(performed):
+                    break
                 if self._asked:
                     self._asked = False
                     self._transfer.calibrate()
@@ -244,6 +251,14 @@ class LiveDrive:
             with self._changed:
                 self._followed = True
                 self._changed.notify_all()
+
+    def _is_past(self, performed: PerformanceFrame) -> bool:
+        """Whether the frame comes after the seconds that are asked for."""
+        if self._seconds is None:
+            return False
+        if self._began_s is None:
+            self._began_s = performed.time_s
+        return performed.time_s - self._began_s > self._seconds - _SAME_MOMENT_S
 
     def _show_all(self, performed: Sequence[PerformanceFrame]) -> None:
         for one in performed:

@@ -26,6 +26,7 @@ from rgbavatar_ns.data import DatasetWriter, TrackedFrame
 from rgbavatar_ns.driving.live_transfer import LiveTransfer
 from rgbavatar_ns.driving.source import PerformanceFrame
 from rgbavatar_ns.export import front_camera, pictures, write_video
+from rgbavatar_ns.export.live_pictures import PictureOutput
 from rgbavatar_ns.tracking.face.detector import INSTALL_MEDIAPIPE
 from tests.avatar.small_head import small_head_arrays
 from tests.driving.packets import packet
@@ -78,6 +79,31 @@ def test_a_dataset_drives_a_film_frame_by_frame(avatar, performer, tmp_path, cap
     assert f"{_FRAMES} frames" in told.err
     assert str(film) in told.err
     assert told.out == "", "standard output is for pictures"
+
+
+def test_a_film_of_some_seconds_holds_as_many_of_the_recording(
+    avatar, performer, tmp_path, monkeypatch
+):
+    film, size = tmp_path / "film.mp4", ("--width", 24, "--height", 24)
+    _drive(avatar, "--source", performer, "--out", film, "--seconds", 0.4, *size)
+    assert len(_film(film)) == 10, "of 20 at 25 a second, however soon they are drawn"
+    slow = PictureOutput.show
+
+    def slowly(self, frame):
+        time.sleep(0.1)
+        slow(self, frame)
+
+    monkeypatch.setattr(PictureOutput, "show", slowly)
+    _drive(avatar, "--source", performer, "--out", film, "--seconds", 0.4, *size)
+    assert len(_film(film)) == 10, "however late"
+
+
+@pytest.mark.parametrize(
+    ("source", "kind"),
+    [("camera", "camera"), ("0", "camera"), ("rtsp://there/1", "camera"), ("me.mp4", "film")],
+)
+def test_a_file_is_known_from_a_camera_by_its_name(source, kind):
+    assert drive._kind(source) == kind
 
 
 def test_curves_of_a_phone_drive_a_film(avatar, tmp_path):

@@ -91,6 +91,14 @@ def test_offline_every_frame_is_shown_in_order():
     assert output.closed
 
 
+@pytest.mark.parametrize("slow_s", [0.0, 0.03])
+@pytest.mark.parametrize(("seconds", "count"), [(0.8, 20), (0.04, 1), (0.05, 2), (99.0, 50)])
+def test_seconds_of_a_recording_are_its_own_however_long_they_take(slow_s, seconds, count):
+    source, output = _Source(50), _Output(slow_s)
+    LiveDrive(source, _Transfer(), [output], real_time=False, seconds=seconds).run()
+    assert output.seen == list(range(1, count + 1)), "25 frames a second"
+
+
 class _Learning(_Transfer):
     """Wants five frames before it knows the performer; tells what it knew of each."""
 
@@ -122,6 +130,13 @@ def test_a_film_begins_once_the_performers_rest_is_known(count):
     assert output.seen == list(range(1, count + 1))
     assert transfer.knew[0] == min(count, 5), "all that was to be learnt, or all there was"
     assert transfer.learnt == list(range(1, min(count, 5) + 1)), "each once"
+
+
+def test_seconds_that_are_too_few_to_learn_from_are_shown_all_the_same():
+    transfer, output = _Learning(), _Output()
+    LiveDrive(_Source(20), transfer, [output], real_time=False, seconds=0.12).run()
+    assert output.seen == transfer.learnt == [1, 2, 3]
+    assert transfer.concluded
 
 
 def test_live_nobody_waits_for_the_calibration():
