@@ -267,8 +267,7 @@ def _drawn(
             rate = picture.frames_per_second or USUAL_FRAMES_PER_SECOND
             scene = replace(scene, frames_per_second=rate)
         beside = None
-    if show == "views":
-        return scene, scenes.side_by_side(avatar, scene, seen, background)
+    views = scenes.four_views(avatar, scene, seen) if show == "views" else None
     if show == "orbit":
         scene = scenes.orbiting(avatar, scene, seen)
     elif show == "turntable":
@@ -277,8 +276,10 @@ def _drawn(
         if camera_path is None:
             raise UserError("There is no camera path.", "Name its file with --camera-path.")
         scene = scenes.along_path(camera_path, scene)
-    if told := scenes.told_beyond_film(avatar, scene, seen):
+    if told := scenes.told_beyond_film(avatar, scene if views is None else views, seen):
         print(told)
+    if views is not None:
+        return scene, scenes.side_by_side(avatar, views, background)
     if show == "performance" and beside is not None and background is not None:
         return scene, scenes.beside_driver(avatar, scene, *beside, background)
     return scene, pictures(avatar, scene.theta, scene.cameras, background)

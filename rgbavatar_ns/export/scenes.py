@@ -1,5 +1,6 @@
 """What `rgbavatar render` shows: who performs, seen from where, frame by frame."""
 
+import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -167,15 +168,21 @@ def along_path(path: Path, scene: Scene) -> Scene:
     return Scene(scene.theta[places], cameras, frames_per_second)
 
 
-def side_by_side(
-    avatar: AvatarMethod, scene: Scene, seen: TrainingStatistics, background: Color | None
-) -> Iterator[Picture]:
-    """Four views of each frame in a row."""
-    yaw, pitch = torch.tensor(FOUR_VIEWS_DEGREES).unbind(1)
-    for frame in range(len(scene)):
-        same = scene.held(frame, len(yaw))
-        views = turned(avatar, same, seen, yaw, pitch)
-        yield np.concatenate(list(pictures(avatar, views.theta, views.cameras, background)), axis=1)
+def four_views(avatar: AvatarMethod, scene: Scene, seen: TrainingStatistics) -> Scene:
+    """Each frame of the scene four times, seen from as many sides."""
+    yaw, pitch = torch.tensor(FOUR_VIEWS_DEGREES).repeat(len(scene), 1).unbind(1)
+    places = [frame for frame in range(len(scene)) for _ in FOUR_VIEWS_DEGREES]
+    several = len(scene.cameras.world_to_camera) > 1
+    cameras = scene.cameras.select(places) if several else scene.cameras
+    same = replace(scene, theta=scene.theta[places], cameras=cameras)
+    return turned(avatar, same, seen, yaw, pitch)
+
+
+def side_by_side(avatar: AvatarMethod, views: Scene, background: Color | None) -> Iterator[Picture]:
+    """The pictures of `four_views`, those of a frame in a row."""
+    drawn = pictures(avatar, views.theta, views.cameras, background)
+    while row := list(itertools.islice(drawn, len(FOUR_VIEWS_DEGREES))):
+        yield np.concatenate(row, axis=1)
 
 
 def beside_driver(

@@ -143,6 +143,23 @@ def test_another_person_drives_the_avatar_and_is_shown_beside(bundle, data, tmp_
     assert re.search(beyond, capsys.readouterr().out), "what is not held back is told"
 
 
+def test_views_tell_what_of_them_is_beyond_the_film(bundle, data, tmp_path, capsys):
+    driver = _write_dataset(tmp_path / "driver", seed=1)
+    words = ["--data", data, "--driver", driver, "--relative", "off", "--pose", "absolute"]
+    told = []
+    for show in ("performance", "views"):
+        _render(bundle, tmp_path, *words, "--show", show, "--kind", "png")
+        line = re.search(r"beyond the film in \d+ of (\d+) pictures: .*", capsys.readouterr().out)
+        assert line is not None
+        assert int(line[1]) == _FRAMES * (4 if show == "views" else 1)
+        told.append(dict(re.findall(r"(\S+) \((\d+)\)", line[0])))
+    alone, views = told
+    common = alone.keys() & views.keys() - {"turn"}  # The most frequent six are named.
+    assert len(common) >= 4
+    assert all(int(views[name]) == 4 * int(alone[name]) for name in common)
+    assert len(list((tmp_path / "views").iterdir())) == _FRAMES, "with four views each"
+
+
 def test_a_bundle_with_statistics_needs_no_dataset(bundle, data, tmp_path, refused):
     cli.main(["export", str(bundle), str(tmp_path / "me"), "--data", str(data)])
     words = ["--show", "views", "--kind", "png", "--width", 20, "--height", 20]
