@@ -152,6 +152,7 @@ class LiveDrive:
         self._source, self._transfer, self._outputs = source, transfer, outputs
         self._tell, self._seconds = tell, seconds
         self._began_s: float | None = None
+        self._learning_ahead = False
         self._waiting: deque[DrivenFrame] = deque(maxlen=1 if real_time else None)
         self._room = 1 if real_time else _WAITING
         self._real_time = real_time
@@ -204,7 +205,7 @@ class LiveDrive:
                     output.tell(line)
 
     def _told(self, silent_s: float) -> str:
-        if silent_s > _SILENT_S:
+        if silent_s > _SILENT_S and not self._learning_ahead:
             return f"Waiting for {self._source.waits_for}; Ctrl-C ends."
         told = [str(one.latencies) for one in self._outputs if one.latencies.shown]
         told += ["learning the neutral face"] if self._transfer.calibrating else []
@@ -239,7 +240,9 @@ class LiveDrive:
                 if not self._real_time and self._transfer.calibrating and self.shown == 0:
                     self._transfer.learn(performed)
                     ahead.append(performed)
+                    self._learning_ahead = True
                     continue
+                self._learning_ahead = False
                 self._show_all([*ahead, performed])
                 ahead.clear()
             if ahead:

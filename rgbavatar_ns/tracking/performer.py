@@ -65,15 +65,18 @@ class FilmedPerformer(TrackedCapture):
 
     @property
     def waits_for(self) -> str:
-        """A picture, or a face in it."""
+        """A picture, or a face in it; who is recorded is asked for nothing."""
         if self._shown_s is None:
             return f"the first picture of {self._told}"
-        silent_s = time.monotonic() - self._shown_s
+        met = self._tracker.ready
+        face = f"a face in {self._told} to be {'found again' if met else 'met'}"
         # A film waits for its next frame as long as that asks for.
-        if not self._capture.keeps_frames and silent_s > _SILENT_S:
+        if self._capture.keeps_frames:
+            what = "pictures without one are passed over" if met else "a dozen give the person"
+            return f"{face}: {what}"
+        if time.monotonic() - self._shown_s > _SILENT_S:
             return f"pictures of {self._told} to come again: is it still connected?"
-        told = "to be met" if not self._tracker.ready else "to be found again"
-        return f"a face in {self._told} {told}: look at the camera, well lit and near"
+        return f"{face}: look at the camera, well lit and near"
 
     def next(self, timeout_s: float) -> PerformanceFrame | None:
         """The head in the newest picture; tracking one may take longer than `timeout_s`."""

@@ -7,6 +7,7 @@ from collections import Counter
 import pytest
 import torch
 
+from rgbavatar_ns.driving import live_drive
 from rgbavatar_ns.driving.live_drive import DrivenFrame, Latencies, LiveDrive
 from rgbavatar_ns.driving.source import PerformanceFrame
 from rgbavatar_ns.errors import UserError
@@ -210,6 +211,17 @@ def test_who_waits_is_told_for_what():
     threading.Timer(2.6, drive.stop).start()
     drive.run()
     assert told[-1] == output.told == "Waiting for a face; Ctrl-C ends."
+
+
+def test_while_a_films_beginning_is_learnt_from_nobody_is_waited_for(monkeypatch):
+    monkeypatch.setattr(live_drive, "_SILENT_S", 0.0)
+    monkeypatch.setattr(live_drive, "_TOLD_EVERY_S", 0.02)
+    told = []
+    source = _Source(5, every_s=0.2)
+    LiveDrive(source, _Learning(), [_Output()], real_time=False, tell=told.append).run()
+    assert "0 frames; learning the neutral face" in told
+    seen = told.index("0 frames; learning the neutral face")
+    assert not any(line.startswith("Waiting") for line in told[seen:])
 
 
 def test_latencies_are_kept_for_two_minutes_and_no_longer():

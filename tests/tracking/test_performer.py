@@ -227,9 +227,9 @@ def test_what_is_waited_for_changes_with_what_is_known(film):
     tracker = _Tracker(warm_up=2)
     performer = FilmedPerformer(str(film), False, tracker=tracker)
     performer.next(0.1)
-    assert "to be met" in performer.waits_for
+    assert performer.waits_for == f"a face in {film} to be met: a dozen give the person"
     _all(performer)
-    assert "to be found again" in performer.waits_for
+    assert performer.waits_for.endswith("found again: pictures without one are passed over")
 
 
 def test_a_missing_video_is_told(tmp_path):
