@@ -18,6 +18,7 @@ from rgbavatar_ns.tracking.input.capture import (
     FileCapture,
     FrameCapture,
     LatestFrameCapture,
+    is_address,
     is_device,
     open_capture,
 )
@@ -49,7 +50,7 @@ class FilmedPerformer(TrackedCapture):
         capture: FrameCapture | None = None,
     ) -> None:
         super().__init__(_open(source, real_time) if capture is None else capture, tracker)
-        self._told = told_address(source)
+        self._told, self._is_address = told_address(source), is_address(source)
         self.head = PerformerHead(self._tracker.head.layout, self._tracker.head.arrays)
         self._image_height_px = image_height_px
         self._keeps_all = not real_time
@@ -122,15 +123,23 @@ class FilmedPerformer(TrackedCapture):
 
     def _require_pictures(self) -> None:
         silent_s = time.monotonic() - self._began_s
-        if self._shown_s is None and not self.ended and silent_s > _FIRST_PICTURE_S:
+        if self._shown_s is not None or self.ended or silent_s <= _FIRST_PICTURE_S:
+            return
+        if self._is_address:
             raise UserError(
-                f"{self._told} has shown no picture for {silent_s:.0f} seconds.", _REMEDY
+                f"No picture has come from {self._told} for {silent_s:.0f} seconds.",
+                _REMEDY_OF_ADDRESS,
             )
+        raise UserError(f"{self._told} has shown no picture for {silent_s:.0f} seconds.", _REMEDY)
 
 
 _REMEDY = (
     "Close the program that uses the camera, choose another one with --source NUMBER, or give a "
     "video file."
+)
+_REMEDY_OF_ADDRESS = (
+    "Start the camera or server, and look at host, port and path, and at user and password "
+    "(rtsp://USER:PASSWORD@HOST:PORT/PATH). `ffplay ADDRESS` tells whether it can be seen at all."
 )
 
 
@@ -141,6 +150,12 @@ def _open(source: str, real_time: bool) -> FrameCapture:
     tried = open_capture(source)
     opened = tried.isOpened()
     tried.release()
+    if not opened and is_address(source):
+        raise UserError(
+            f"{told_address(source)} cannot be opened: nothing answers there, or nothing that is a "
+            "video.",
+            _REMEDY_OF_ADDRESS,
+        )
     if not opened:
         there = sorted(glob.glob("/dev/video*"))
         known = f" There are {first_few(there, 4)}." if there else " No camera is there."

@@ -174,7 +174,10 @@ def test_a_cameras_password_is_told_to_nobody(monkeypatch):
         FilmedPerformer(source.replace("cam:554", "127.0.0.1:9"), tracker=_Tracker())
     told += [str(silence.value), str(refused.value)]
     assert all("rtsp://cam:554/1" in line for line in told[:5])
-    assert "rtsp://127.0.0.1:9/1" in told[5]
+    assert "rtsp://127.0.0.1:9/1 cannot be opened: nothing answers there" in told[5]
+    for remedy in (silence.value.remedy, refused.value.remedy):
+        assert "host, port and path, and at user and password" in remedy
+        assert "--source NUMBER" not in remedy, "which is of cameras of this machine"
     assert not any("secret" in line or "admin" in line for line in told)
 
 

@@ -108,7 +108,12 @@ def is_device(source: str) -> bool:
     """
     if source.isdecimal():
         return len(source) == 1 or not Path(source).exists()
-    return "://" in source or source.startswith("/dev/")
+    return is_address(source) or source.startswith("/dev/")
+
+
+def is_address(source: str) -> bool:
+    """Whether this names what a network or a server shows: rtsp://..., http://..."""
+    return "://" in source
 
 
 def open_capture(source: str) -> cv2.VideoCapture:
