@@ -1,5 +1,6 @@
 """A take of ARKit curves in a CSV file, as Live Link Face and many senders export it."""
 
+import contextlib
 import csv
 import io
 import itertools
@@ -28,7 +29,9 @@ _NEAR_A_RATE = 0.1
 _DAY_S = 24 * 3600
 _MOST_BYTES = 1 << 28
 """An hour at 60 frames a second has 150 MB."""
-_TIMECODE = re.compile(r"(\d{1,3}):(\d{1,2}):(\d{1,2}):(\d{1,3})(?:\.(\d+))?")
+_TIMECODE = re.compile(r"(\d{1,3}):(\d{1,2}):(\d{1,2}):(\d{1,3})(?:[.,](\d+))?")
+_SEPARATORS = ",;\t"
+"""The first is usual; spreadsheets write the second where decimals have a comma."""
 _Code = tuple[int, float]
 """A timecode's seconds and frames."""
 _REMEDY = (
@@ -44,6 +47,8 @@ def csv_source(
     angle_gain: Sequence[float] = (1.0, 1.0, 1.0),
 ) -> RecordedSource:
     """The rows of a CSV file; columns are known by their names, in any order and case.
+
+    Commas, semicolons or tabs separate them; decimals have a point or a comma.
 
     Timecodes (hours:minutes:seconds:frames, of a take with so many `frames_per_second`; by default
     as many as they count to) tell the time; where they are missing or stand still, each row is the
@@ -83,12 +88,33 @@ def csv_source(
 def _read(path: Path) -> tuple[list[str], list[list[str]]]:
     try:
         text = read_file(path, _MOST_BYTES).decode("utf-8-sig")
-        table = [row for row in csv.reader(io.StringIO(text)) if any(map(str.strip, row))]
+        lines = csv.reader(io.StringIO(text), delimiter=_separator(text))
+        table = [row for row in lines if any(map(str.strip, row))]
     except (DamagedFileError, UnicodeDecodeError, csv.Error, OSError) as error:
         raise UserError(f"{path} cannot be read as CSV: {error}.", _REMEDY) from None
     if len(table) < 2:
         raise UserError(f"{path} holds no rows.", _REMEDY)
-    return table[0], table[1:]
+    names, rows = table[0], table[1:]
+    longer = sum(any(map(str.strip, row[len(names) :])) for row in rows)
+    if longer > len(rows) / 2:
+        raise UserError(
+            f"{path} has {len(names)} names and more values in {longer} of {len(rows)} rows: "
+            "commas separate its columns and its decimals alike.",
+            "Write decimals with a point, or separate the columns by semicolons.",
+        )
+    return names, rows
+
+
+def _separator(text: str) -> str:
+    """What separates the most of ARKit's names in the first line that is not blank."""
+    first = next((line for line in io.StringIO(text) if line.strip()), "")
+    known = {name.lower() for name in ARKIT_NAMES}
+
+    def found(separator: str) -> int:
+        names = next(csv.reader([first], delimiter=separator), [])
+        return sum(name.strip().lower() in known for name in names)
+
+    return max(_SEPARATORS, key=found)
 
 
 def _timed(
@@ -193,10 +219,10 @@ def _turns(
 
 
 def _number(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        return math.nan
+    for told in (text, text.replace(",", ".")):
+        with contextlib.suppress(ValueError):
+            return float(told)
+    return math.nan
 
 
 def _coefficients(values: list[float], places: Sequence[int | None]) -> Float[Tensor, "52"]:
