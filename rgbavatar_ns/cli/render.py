@@ -266,7 +266,9 @@ def _drawn(
         if moving:  # The camera is all that moves, and does not care for the film's rate.
             rate = picture.frames_per_second or USUAL_FRAMES_PER_SECOND
             scene = replace(scene, frames_per_second=rate)
-        beside = None
+        elif beside is not None:
+            other, chosen = beside
+            beside = other, (chosen[hold or 0],)
     views = scenes.four_views(avatar, scene, seen) if show == "views" else None
     if show == "orbit":
         scene = scenes.orbiting(avatar, scene, seen)

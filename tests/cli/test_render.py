@@ -143,6 +143,16 @@ def test_another_person_drives_the_avatar_and_is_shown_beside(bundle, data, tmp_
     assert re.search(beyond, capsys.readouterr().out), "what is not held back is told"
 
 
+def test_a_held_expression_stands_beside_the_drivers_picture_of_it(bundle, data, tmp_path):
+    driver = _write_dataset(tmp_path / "driver", seed=1)
+    words = ["--data", data, "--driver", driver, "--kind", "png", "--frames", 1, 6]
+    _render(bundle, tmp_path / "all", *words)
+    _render(bundle, tmp_path / "one", *words, "--hold", 2)
+    played, held = (sorted((tmp_path / name).rglob("*.png")) for name in ("all", "one"))
+    assert (len(played), len(held)) == (5, 1)
+    assert np.array_equal(read_png_rgba(held[0]), read_png_rgba(played[2]))
+
+
 def test_views_tell_what_of_them_is_beyond_the_film(bundle, data, tmp_path, capsys):
     driver = _write_dataset(tmp_path / "driver", seed=1)
     words = ["--data", data, "--driver", driver, "--relative", "off", "--pose", "absolute"]
