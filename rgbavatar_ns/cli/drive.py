@@ -136,7 +136,7 @@ def run(
     drive = LiveDrive(performer, transfer, outputs, real_time, _tell, of_recording)
     try:
         if shown == "page":
-            outputs.append(_page(subject, show, source.allow_remote, drive.calibrate))
+            outputs.append(_page(subject, data, show, source.allow_remote, drive.calibrate))
         if shown == "viewer":
             outputs.append(_viewer(run_folder, drive))
         if show.out is not None:  # The last: nothing is left half-written where another fails.
@@ -331,7 +331,11 @@ def _pictures(subject: "Subject", show: ShowOptions) -> "DriveOutput":
 
 
 def _page(
-    subject: "Subject", show: ShowOptions, allow_remote: bool, calibrate: Callable[[], None]
+    subject: "Subject",
+    data: Path | None,
+    show: ShowOptions,
+    allow_remote: bool,
+    calibrate: Callable[[], None],
 ) -> "DriveOutput":
     """The page, served, and told what moves it."""
     from rgbavatar_ns.avatar.loading import require_rgbavatar
@@ -339,7 +343,7 @@ def _page(
 
     avatar = require_rgbavatar(subject.avatar, "A page (--show page)")
     _tell("The page is being made ...")
-    content = _page_content(avatar, subject, show)  # Now: nobody who asks has to wait for it.
+    content = _page_content(avatar, subject, data, show)  # Now: nobody who asks has to wait for it.
     output = PageOutput(
         avatar.layout, show.serve or DEFAULT_ADDRESS, allow_remote, lambda: content, calibrate
     )
@@ -348,14 +352,16 @@ def _page(
     return output
 
 
-def _page_content(avatar: "Avatar", subject: "Subject", show: ShowOptions) -> bytes:
+def _page_content(
+    avatar: "Avatar", subject: "Subject", data: Path | None, show: ShowOptions
+) -> bytes:
     """The avatar's page without a performance of its own, calm until it is driven."""
     import torch
 
-    from rgbavatar_ns.export import PageOptions, as_filmed, calm_theta, write_web_page
+    from rgbavatar_ns.export import PageOptions, as_filmed, calm_theta, is_of, write_web_page
 
     avatar, dataset, seen = avatar.without_undrawn(), subject.dataset, subject.seen
-    if dataset is not None:
+    if dataset is not None and (data is None or is_of(avatar, dataset)):
         avatar = as_filmed(avatar, dataset)
     neutral = calm_theta(seen, seen.theta_mean)
     with tempfile.TemporaryDirectory() as folder:

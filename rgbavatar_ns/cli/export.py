@@ -130,13 +130,13 @@ def run(
     elif format == "texture":
         _write_texture(require_rgbavatar(avatar, "--format texture"), destination)
     else:
-        from rgbavatar_ns.export import PageOptions
+        from rgbavatar_ns.export import PageOptions, is_of
 
         own = require_rgbavatar(avatar, f"--format {format}")
         rate = frames_per_second or _rate_of(dataset)
         options = PageOptions(title or "Avatar", rate, origins=origins, servers=servers)
         seen = _seen(avatar, dataset)
-        if dataset is not None and (data is None or _is_of(avatar, dataset)):
+        if dataset is not None and (data is None or is_of(avatar, dataset)):
             own = _as_filmed(own, dataset)
         places = page_frames(dataset, frames, rate)
         _write_web(format, own, seen, dataset, places, performance, destination, options)
@@ -266,13 +266,6 @@ def _write_texture(avatar: "Avatar", destination: Path) -> None:
     wires = write_texture(destination, avatar)
     print(f"{destination}: paint on it, the face is upright and its left side on the right.")
     print(f"{wires}: the head's mesh, to lay over it. --texture takes the painted picture.")
-
-
-def _is_of(avatar: "AvatarMethod", dataset: "TrackedDataset") -> bool:
-    """Whether a dataset is of the avatar's person; another's drives, but shows nothing of it."""
-    from rgbavatar_ns.head import is_same_identity
-
-    return is_same_identity(avatar.identity, dataset.identity)
 
 
 def _as_filmed(avatar: "Avatar", dataset: "TrackedDataset") -> "Avatar":

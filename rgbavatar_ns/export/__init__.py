@@ -3,7 +3,7 @@
 from rgbavatar_ns.export.bases import basis_grid
 from rgbavatar_ns.export.comparison import comparison_frames, write_comparison
 from rgbavatar_ns.export.drawing import draw, pictures
-from rgbavatar_ns.export.filmed import as_filmed, within_film
+from rgbavatar_ns.export.filmed import as_filmed, is_of, within_film
 from rgbavatar_ns.export.gaussian_files import (
     GAUSSIAN_FILES,
     write_gaussian_sequence,
@@ -38,6 +38,7 @@ __all__ = [
     "dataset_folder",
     "draw",
     "front_camera",
+    "is_of",
     "pictures",
     "read_camera_path",
     "read_texture",

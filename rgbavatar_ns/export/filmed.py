@@ -8,6 +8,7 @@ from torch import Tensor
 from rgbavatar_ns.avatar.avatar import Avatar
 from rgbavatar_ns.avatar.method import AvatarMethod
 from rgbavatar_ns.data.native.dataset import TrackedDataset
+from rgbavatar_ns.head import is_same_identity
 
 _MOST_FRAMES = 24
 """Spread over the film: people sit as still as that."""
@@ -30,6 +31,11 @@ def within_film(avatar: AvatarMethod, dataset: TrackedDataset) -> Bool[Tensor, "
         cameras = dataset.cameras.select(places.tolist())
         kept |= cameras.shows(avatar.gaussians(theta).means.cpu()).any(0)
     return kept
+
+
+def is_of(avatar: AvatarMethod, dataset: TrackedDataset) -> bool:
+    """Whether a dataset is of the avatar's person; another's drives, but shows nothing of it."""
+    return is_same_identity(avatar.identity, dataset.identity)
 
 
 def as_filmed(avatar: Avatar, dataset: TrackedDataset) -> Avatar:

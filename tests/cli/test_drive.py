@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 import urllib.request
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -20,16 +21,18 @@ from websockets.sync.client import connect
 
 from rgbavatar_ns.avatar.storage.statistics import TrainingStatistics
 from rgbavatar_ns.cli import drive
-from rgbavatar_ns.cli.drive import SourceOptions
+from rgbavatar_ns.cli.drive import ShowOptions, SourceOptions
 from rgbavatar_ns.cli.main import main
 from rgbavatar_ns.data import DatasetWriter, TrackedFrame
 from rgbavatar_ns.driving.live_transfer import LiveTransfer
 from rgbavatar_ns.driving.source import PerformanceFrame
 from rgbavatar_ns.export import front_camera, pictures, write_video
 from rgbavatar_ns.export.live_pictures import PictureOutput
+from rgbavatar_ns.export.subject import load_subject
 from rgbavatar_ns.tracking.face.detector import INSTALL_MEDIAPIPE
 from tests.avatar.small_head import small_head_arrays
 from tests.driving.packets import packet
+from tests.export.avatar_of_page import avatar_of_page
 from tests.export.subject import avatar_of, lively_theta
 
 _SIZE, _FRAMES = 32, 20
@@ -185,6 +188,26 @@ def test_the_page_is_served_and_driven(avatar, performer, capsys):
     told = capsys.readouterr().err
     assert f"http://127.0.0.1:{port}/?ws=ws://127.0.0.1:{port}\n" in told
     assert re.search(f"[?]ws=ws://127.0.0.1:{port}/[-_A-Za-z0-9]{{12}}\n", told), "for the disk's"
+
+
+@pytest.mark.parametrize(("departs", "is_cut"), [(3e-6, True), (0.3, False)])
+def test_a_page_is_cut_where_a_film_of_its_own_person_ends(avatar, tmp_path, departs, is_cut):
+    made, film = avatar_of(), tmp_path / "film"
+    camera = front_camera(made, 16, 12)
+    # Nearer, so that what is beside the face is beyond the picture.
+    camera = replace(camera, focal_px=3 * camera.focal_px)
+    person = (made.identity + departs).detach()
+    writer = DatasetWriter(film, made.head.arrays, person, made.layout, 16, 12)
+    for index, theta in enumerate(lively_theta(made, 3, 5)):
+        writer.add(TrackedFrame(index, theta, camera, np.zeros((12, 16, 4), np.uint8)))
+    writer.finish(1)
+    subject = load_subject(avatar, film, film=False)
+    page = tmp_path / "page.html"
+    page.write_bytes(drive._page_content(subject.avatar, subject, film, ShowOptions()))
+    # Gaussians of no opacity are drawn by nobody, and stay out in any case.
+    whole = subject.avatar.without_undrawn().num_gaussians
+    shown = len(avatar_of_page(page)[1]["opacity"])
+    assert (shown < whole) == is_cut
 
 
 def test_the_key_for_pages_of_the_disk_is_told_in_the_terminal_once(avatar, capsys):
