@@ -2,6 +2,7 @@
 
 import glob
 import os
+import shutil
 import sys
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from rgbavatar_ns.data.importers.options import ImportOptions, Progress
 from rgbavatar_ns.data.native.dataset import TrackedDataset, load_native
 from rgbavatar_ns.data.native.format import INDEX_FILE
 from rgbavatar_ns.errors import UserError
-from rgbavatar_ns.files import hold_lock
+from rgbavatar_ns.files import DiskError, hold_lock
 
 _NO_BACKUP = "Signature: 8a477f597d28d172789f06886806bc55\n# Made by rgbavatar; may be deleted.\n"
 
@@ -59,10 +60,26 @@ def open_foreign(
         if opened is not None:
             return opened
         damaged = (place / INDEX_FILE).exists()
-        recognised = "" if found is None else f"{found.name} data in "
-        how = "its import is damaged, made anew" if damaged else "imported once"
-        print(f"{recognised}{src}: {how} into {place}", file=sys.stderr)
-        return import_dataset(src, place, options, overwrite=damaged, link=True, progress=progress)
+        dataset = _imported(src, place, options, damaged, progress)
+    recognised = "" if found is None else f"{found.name} data in "
+    how = "its import was damaged, made anew" if damaged else "imported once"
+    print(f"{recognised}{src}: {how} into {place}", file=sys.stderr)
+    return dataset
+
+
+def _imported(
+    src: Path, place: Path, options: ImportOptions, overwrite: bool, progress: Progress | None
+) -> TrackedDataset:
+    """The import made; of data that cannot be used nothing stays there."""
+    try:
+        return import_dataset(
+            src, place, options, overwrite=overwrite, link=True, progress=progress
+        )
+    except DiskError:
+        raise  # With some space it goes on from what is there.
+    except UserError:
+        shutil.rmtree(place, ignore_errors=True)
+        raise
 
 
 def _opened(place: Path) -> TrackedDataset | None:

@@ -11,9 +11,15 @@ import torch
 
 from rgbavatar_ns.data import TrackedDataset, load_dataset
 from rgbavatar_ns.data.importers import ImportOptions, convert, import_dataset
-from rgbavatar_ns.data.importers.convert import flame_fingerprint, source_fingerprint
+from rgbavatar_ns.data.importers.convert import (
+    CACHE_FOLDER,
+    flame_fingerprint,
+    source_fingerprint,
+)
 from rgbavatar_ns.data.importers.frame_images import make_png
+from rgbavatar_ns.data.native.writer import DatasetWriter
 from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.files import DiskError
 from tests.data.importers.test_round_trips import write
 
 
@@ -56,6 +62,40 @@ def test_a_damaged_import_is_made_anew(what, data, options, whole, capsys):
     assert "damaged, made anew" in capsys.readouterr().err
     load_dataset(data, options)
     assert not capsys.readouterr().err.strip()
+
+
+def _imports(data: Path) -> list[str]:
+    return [path.name for path in (data / CACHE_FOLDER).iterdir() if path.is_dir()]
+
+
+def test_an_import_is_told_once_it_is_there_and_a_refused_one_leaves_nothing(
+    data, options, tmp_path, capsys, monkeypatch
+):
+    copy = shutil.copytree(data, tmp_path / "data", ignore=shutil.ignore_patterns(CACHE_FOLDER))
+    monkeypatch.delenv("RGBAVATAR_FLAME", raising=False)
+    with pytest.raises(UserError, match="FLAME"):
+        load_dataset(copy, ImportOptions())
+    assert "imported" not in capsys.readouterr().err
+    assert _imports(copy) == []
+    for image in (copy / "image").iterdir():
+        image.write_bytes(b"no picture")
+    with pytest.raises(UserError, match="image"):
+        load_dataset(copy, options)
+    assert "imported" not in capsys.readouterr().err
+    assert _imports(copy) == []
+
+
+def test_an_import_that_met_a_full_disk_keeps_what_it_has(data, options, tmp_path, monkeypatch):
+    copy = shutil.copytree(data, tmp_path / "data", ignore=shutil.ignore_patterns(CACHE_FOLDER))
+
+    def full(self, *arguments):
+        raise DiskError("full", "Free some space.")
+
+    monkeypatch.setattr(DatasetWriter, "finish", full)
+    with pytest.raises(DiskError):
+        load_dataset(copy, options)
+    (name,) = _imports(copy)
+    assert list((copy / CACHE_FOLDER / name / "images").iterdir())
 
 
 @pytest.mark.parametrize("what", ["dataset.json", "theta.npy", "images/00004.png"])
