@@ -45,6 +45,8 @@ def disk_errors(
         if getattr(error, "errno", None) in (errno.ENOSPC, errno.EDQUOT):
             raise DiskError(f"There is no space left to write {place}.", remedy) from error
         reason = getattr(error, "strerror", None) or error
+        if isinstance(error, FileExistsError) and Path(error.filename or ".").is_file():
+            reason = f"{error.filename} is a file"  # In the place of a folder.
         raise DiskError(f"Cannot write {place}: {reason}.", remedy) from error
 
 

@@ -74,6 +74,12 @@ def test_what_the_disk_refuses_is_told_with_the_remedy(tmp_path, monkeypatch, co
     assert _names(tmp_path) == []
 
 
+def test_a_file_in_the_place_of_a_folder_is_told_as_one(tmp_path):
+    (tmp_path / "notes").write_text("")
+    with pytest.raises(DiskError, match=r"Cannot write .*notes/a\.json: .*notes is a file\."):
+        write_json(tmp_path / "notes" / "a.json", 1)
+
+
 @pytest.mark.parametrize("own", ["Free some space or name another place.", "Mend it."])
 def test_the_remedy_is_that_of_who_knows_more_of_the_work(tmp_path, own):
     told = "Go on." if own != "Mend it." else own

@@ -16,7 +16,7 @@ from rgbavatar_ns.bench.options import (
     RenderOptions,
     StepOptions,
 )
-from rgbavatar_ns.errors import UserError
+from rgbavatar_ns.files import disk_errors, write_json
 
 if TYPE_CHECKING:
     from rgbavatar_ns.bench.report import Report
@@ -38,7 +38,6 @@ def run(options: Annotated[Options, tyro.conf.arg(name="")]) -> None:
     Other programs that run meanwhile make every figure worse.
     """
     from rgbavatar_ns.bench.report import print_report
-    from rgbavatar_ns.files import write_json
 
     if options.json is not None:
         _require_writable(options.json)
@@ -67,7 +66,6 @@ def _measure(options: RasterizerOptions | StepOptions | RenderOptions, told: "To
 
 def _measure_quality(options: QualityOptions) -> None:
     from rgbavatar_ns.bench.quality import QualityReport, bench_quality, print_quality
-    from rgbavatar_ns.files import write_json
 
     def keep(report: QualityReport) -> None:
         if options.json is not None:
@@ -81,16 +79,12 @@ def _measure_quality(options: QualityOptions) -> None:
 
 def _require_writable(path: Path) -> None:
     """Raise UserError before minutes are spent on figures that cannot be written."""
-    try:
+    with disk_errors(path, "Give --json a path you can write to."):
         if path.is_dir():
             raise IsADirectoryError("it is a folder")
         path.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=path.parent):
             pass
-    except OSError as error:
-        raise UserError(
-            f"Cannot write {path}: {error}.", "Give --json a path you can write to."
-        ) from None
 
 
 @contextmanager

@@ -26,7 +26,7 @@ from rgbavatar_ns.experiments.plots import (
 from rgbavatar_ns.experiments.source import Source, read_sources
 from rgbavatar_ns.experiments.sweep import CellStatus, read_statuses
 from rgbavatar_ns.experiments.tables import ResultTable, result_table
-from rgbavatar_ns.files import atomic_write, read_json, write_json
+from rgbavatar_ns.files import atomic_write, disk_errors, read_json, write_json
 
 RESULTS, PAGE = "results", "results.md"
 _MOST_BYTES = 300_000
@@ -73,7 +73,8 @@ def write_page(docs: Path) -> Path:
 
 
 def _write_result(source: Source, statuses: Sequence[CellStatus], place: Path) -> list[Path]:
-    place.mkdir(parents=True, exist_ok=True)
+    with disk_errors(place):
+        place.mkdir(parents=True, exist_ok=True)
     path = place / f"{source.name}.json"
     kept = kept_results(path) if path.exists() else {}
     portable = portable_keys([status.cell for status in statuses])
@@ -129,7 +130,8 @@ def _draw_plots(source: Source, statuses: Sequence[CellStatus], place: Path) -> 
         if experiment.plot is not None:
             table = result_table(experiment, statuses)
             drawn += write_plots(experiment, table, Path(made), name)
-        return [Path(shutil.copyfile(path, place / path.name)) for path in drawn]
+        with disk_errors(place):
+            return [Path(shutil.copyfile(path, place / path.name)) for path in drawn]
 
 
 def _draw_what_cells_saw(

@@ -16,7 +16,7 @@ from av.video.stream import VideoStream
 from jaxtyping import UInt8
 
 from rgbavatar_ns.data.png import encode_png_rgba
-from rgbavatar_ns.files import atomic_write, keep_numbered
+from rgbavatar_ns.files import atomic_write, disk_errors, keep_numbered
 
 _BT709 = 1
 """Primaries and transfer, as H.264 numbers them."""
@@ -52,7 +52,7 @@ class FilmWriter:
         return self
 
     def add(self, frame: UInt8[np.ndarray, "H W 3"]) -> None:
-        """Encode one more frame."""
+        """Encode one more frame; raises DiskError where the file's place refuses it."""
         assert self._container is not None
         sides = [(0, side % 2) for side in frame.shape[:2]]
         given_height, given_width = frame.shape[:2]
@@ -73,7 +73,8 @@ class FilmWriter:
             dst_colorspace=Colorspace.ITU709,
             dst_color_range=ColorRange.MPEG,
         )
-        self._container.mux(self._stream.encode(coded))
+        with disk_errors(self._path):  # The file is opened with its first bytes.
+            self._container.mux(self._stream.encode(coded))
         self.count += 1
 
     def _begun(self, height: int, width: int) -> VideoStream:
@@ -89,10 +90,13 @@ class FilmWriter:
 
     def __exit__(self, *raised: Any) -> bool | None:
         """Complete the file, or leave none."""
-        if raised[0] is None and self._stream is not None:
-            assert self._container is not None
-            self._container.mux(self._stream.encode(None))
-        return self._open.__exit__(*raised)
+        if raised[0] is not None:
+            return self._open.__exit__(*raised)
+        with self._open:
+            if self._stream is not None:
+                assert self._container is not None
+                self._container.mux(self._stream.encode(None))
+        return None
 
 
 def write_video(path: Path, frames: Iterable[np.ndarray], frames_per_second: float = 25.0) -> int:

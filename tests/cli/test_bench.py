@@ -1,4 +1,6 @@
+import errno
 import json
+import tempfile
 
 import pytest
 
@@ -42,3 +44,14 @@ def test_a_mistake_is_told_in_one_line(arguments, cause, refused):
     told = refused("bench", *arguments)
     assert cause in told
     assert len(told.strip().splitlines()) == 1
+
+
+def test_a_place_that_refuses_is_told_by_the_name_that_was_given(refused, monkeypatch, tmp_path):
+    def refuse(dir):
+        raise OSError(errno.EROFS, "Read-only file system", f"{dir}/tmp_of_python")
+
+    monkeypatch.setattr(tempfile, "TemporaryFile", refuse)
+    path = tmp_path / "out.json"
+    told = refused("bench", "render", "--json", path)
+    assert f"Cannot write {path}: Read-only file system." in "".join(told.splitlines())
+    assert "tmp_of_python" not in told

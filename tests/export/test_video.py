@@ -1,4 +1,6 @@
+import resource
 import warnings
+from contextlib import suppress
 
 import av
 import numpy as np
@@ -7,6 +9,8 @@ from av.video.reformatter import ColorRange, Colorspace
 from PIL import Image
 
 from rgbavatar_ns.export import write_gif, write_video
+from rgbavatar_ns.export.live_pictures import FilmSink
+from rgbavatar_ns.files import DiskError
 
 
 def test_a_film_holds_the_frames_it_was_given(tmp_path):
@@ -70,3 +74,38 @@ def test_a_gif_takes_as_long_as_its_frames(rate, written, lasts_cs, tmp_path):
     due_cs = 100 / rate * np.array(seen) / 4
     assert np.abs(begins_cs - due_cs).max() <= 1.01
     assert np.all(np.diff(seen) > 0)
+
+
+@pytest.fixture
+def full_disk():
+    """No file of this process may grow any more: what the system says, it says with the write."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, before[1]))
+    yield
+    resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+@pytest.mark.parametrize("frames", [1, 200])
+def test_a_film_that_the_disk_refuses_is_told_by_its_name_and_leaves_nothing(
+    frames, tmp_path, full_disk
+):
+    noise = np.random.default_rng(0).integers(0, 256, (frames, 64, 64, 3)).astype(np.uint8)
+    with pytest.raises(DiskError, match=r"Cannot write .*/film\.mp4: File too large\."):
+        write_video(tmp_path / "film.mp4", noise)
+    sink = FilmSink(tmp_path / "film.mp4", 25.0)
+
+    def drive():
+        try:
+            for place, frame in enumerate(noise):
+                sink.add(frame, place / 25.0)
+        except DiskError:
+            with suppress(DiskError):  # Whoever drives closes it all the same.
+                sink.close()
+            raise
+        sink.close()
+
+    with pytest.raises(DiskError, match=r"Cannot write .*/film\.mp4: File too large\."):
+        drive()
+    with pytest.raises(DiskError, match=r"Cannot write .*/film\.gif: File too large\."):
+        write_gif(tmp_path / "film.gif", noise)
+    assert list(tmp_path.iterdir()) == []
