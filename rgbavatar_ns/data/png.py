@@ -69,13 +69,15 @@ def read_png_rgba(path: Path) -> UInt8[np.ndarray, "height width 4"]:
 def decode_png_rgba(encoded: bytes, name: str) -> UInt8[np.ndarray, "height width 4"]:
     """Decode a PNG to RGBA; grey becomes RGB, a missing alpha becomes opaque.
 
-    Raises UserError, calling the image `name`, where a chunk's length or checksum is wrong:
-    OpenCV alone would hand back a partial picture without a word.
+    Raises UserError, calling the image `name`, where it is too large, or a chunk's length or
+    checksum is wrong: OpenCV alone would hand back a partial picture without a word.
     """
     damage = png_damage(encoded)
     if damage is not None:
         raise UserError(f"The image {name} {damage}.", _REPAIR)
-    decoded = decode_bounded(encoded, cv2.IMREAD_UNCHANGED, png_header_size(encoded))
+    size = png_header_size(encoded)
+    require_bounded(size, name)
+    decoded = decode_bounded(encoded, cv2.IMREAD_UNCHANGED, size)
     if decoded is None:
         raise UserError(f"The image {name} cannot be decoded.", _REPAIR)
     if decoded.dtype == np.uint16:
@@ -84,6 +86,15 @@ def decode_png_rgba(encoded: bytes, name: str) -> UInt8[np.ndarray, "height widt
         return cv2.cvtColor(decoded, cv2.COLOR_GRAY2RGBA)
     opaque = decoded.shape[2] == 3
     return cv2.cvtColor(decoded, cv2.COLOR_BGR2RGBA if opaque else cv2.COLOR_BGRA2RGBA)
+
+
+def require_bounded(size: tuple[int, int] | None, name: str) -> None:
+    """Raise UserError, calling the image `name`, where its header promises more than is read."""
+    if size is not None and size[0] * size[1] > MAX_PIXELS:
+        raise UserError(
+            f"The image {name} is said to have {size[0]} x {size[1]} pixels.",
+            f"Make it smaller: images of up to {MAX_PIXELS / 1e6:.0f} million pixels are read.",
+        )
 
 
 def decode_bounded(

@@ -12,8 +12,10 @@ import av
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 from scipy.io import wavfile
 
+from rgbavatar_ns.data import png
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.tracking.input import video
 from rgbavatar_ns.tracking.input.image_files import image_files, read_image_rgba
@@ -296,6 +298,21 @@ def test_a_transparent_webm_keeps_its_alpha_or_its_loss_is_noted(
     )
     assert [frame.alpha for frame in source] == [None, None]
     assert ["alpha channel cannot be read" in note for note in source.notes] == [True]
+
+
+@pytest.mark.parametrize("suffix", ["png", "jpg", "bmp", "webp", "tif"])
+def test_an_image_of_more_pixels_than_are_read_is_refused_before_any_is_decoded(
+    suffix: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / f"a.{suffix}"
+    Image.new("RGB", (120, 90), (9, 99, 0)).save(path)
+    assert read_image_rgba(path).shape == (90, 120, 4)
+    monkeypatch.setattr(png, "MAX_PIXELS", 120 * 90 - 1)
+    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("it is decoded"))
+    with pytest.raises(
+        UserError, match=r"a\.\w+ is said to have 120 x 90 pixels\. Make it smaller"
+    ):
+        read_image_rgba(path)
 
 
 def test_floating_point_images_are_refused(tmp_path: Path) -> None:

@@ -1,6 +1,5 @@
 """How a frame's RGBA image is made of a format's files: colour, matte and parsing masks."""
 
-import struct
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -8,6 +7,7 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
+from rgbavatar_ns.data.image_headers import jpeg_header
 from rgbavatar_ns.data.importers.import_report import UnusableFrameError
 from rgbavatar_ns.data.jpeg import JPEG_START, is_damaged_jpeg
 from rgbavatar_ns.data.png import (
@@ -26,9 +26,6 @@ _GREY_TOLERANCE = 24
 """JPEG files of grey pictures come out a little coloured."""
 _PNG_HEADER_BYTES, _JPEG_HEADER_BYTES = 33, 1 << 16
 _NEARLY_WHITE = 250
-_ORIENTATION = 0x0112
-_ON_ITS_SIDE = range(5, 9)
-"""EXIF's orientations of pictures whose stored width is their height."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +60,7 @@ def image_header(path: Path) -> ImageHeader:
             if head[:2] == JPEG_START:
                 head += file.read(_JPEG_HEADER_BYTES)
                 # A long colour profile or thumbnail may come first.
-                found = _jpeg_header(head) or _jpeg_header(head + file.read(MAX_IMAGE_BYTES))
+                found = jpeg_header(head) or jpeg_header(head + file.read(MAX_IMAGE_BYTES))
                 size, has_alpha = (None if found is None else found[:2]), False
             else:
                 # Colour types 4 and 6 are grey and RGB with alpha.
@@ -150,7 +147,7 @@ def _decode(encoded: bytes, size: tuple[int, int]) -> UInt8[np.ndarray, "height 
     Raises UnusableFrameError, before any pixel is decoded where the header promises others.
     """
     is_jpeg = encoded[:2] == JPEG_START
-    header = _jpeg_header(encoded) if is_jpeg else png_header_size(encoded)
+    header = jpeg_header(encoded) if is_jpeg else png_header_size(encoded)
     if header is not None:
         if header[0] * header[1] > MAX_PIXELS:
             raise UnusableFrameError("images of more than 8192 x 8192 pixels")
@@ -194,45 +191,3 @@ def _grey(path: Path, size: tuple[int, int]) -> UInt8[np.ndarray, "height width"
         raise UnusableFrameError("masks that are coloured")
     grey = color[..., 1]
     return grey * np.uint8(255) if grey.max() == 1 else grey
-
-
-def _jpeg_header(encoded: bytes) -> tuple[int, int, int] | None:
-    """(width, height, components) from a JPEG's frame header; None where there is none.
-
-    The sides are those of the picture as OpenCV sets it upright by its EXIF data.
-    """
-    place, lies_on_its_side = 2, False
-    while place + 9 < len(encoded) and encoded[place] == 0xFF:
-        marker = encoded[place + 1]
-        if marker == 0xFF:  # fill bytes
-            place += 1
-            continue
-        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
-            height, width, components = struct.unpack(">HHB", encoded[place + 5 : place + 10])
-            sides = (height, width) if lies_on_its_side else (width, height)
-            return *sides, components
-        end = place + 2 + struct.unpack(">H", encoded[place + 2 : place + 4])[0]
-        if marker == 0xE1 and encoded[place + 4 : place + 10] == b"Exif\0\0":
-            lies_on_its_side = _exif_orientation(encoded[place + 10 : end]) in _ON_ITS_SIDE
-        place = end
-    return None
-
-
-def _exif_orientation(block: bytes) -> int:
-    """How EXIF data, which has TIFF's form, says that the picture lies; 1 (upright) if it does not.
-
-    Source: TIFF 6.0, sections 2 and 8 (Orientation).
-    """
-    order = {b"II*\0": "<", b"MM\0*": ">"}.get(block[:4])
-    if order is None:
-        return 1
-    try:
-        (place,) = struct.unpack_from(f"{order}I", block, 4)
-        (count,) = struct.unpack_from(f"{order}H", block, place)
-        for entry in range(count):
-            tag, _, _, value = struct.unpack_from(f"{order}HHIH", block, place + 2 + 12 * entry)
-            if tag == _ORIENTATION:
-                return value
-    except struct.error:  # It ends before what it promises.
-        pass
-    return 1

@@ -8,12 +8,14 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
+from rgbavatar_ns.data.image_headers import header_size
 from rgbavatar_ns.data.jpeg import JPEG_START, is_truncated_jpeg
 from rgbavatar_ns.data.png import (
     MAX_IMAGE_BYTES,
     PNG_START,
     decode_png_rgba,
     read_png_rgba,
+    require_bounded,
 )
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.files import digest, digest_of_file
@@ -57,8 +59,8 @@ def source_digest(path: Path) -> str:
 def read_image_rgba(path: Path) -> UInt8[np.ndarray, "H W 4"]:
     """Decode an image, turned as its EXIF data asks; opaque where it has no alpha.
 
-    Grey becomes RGB, 16 bit become 8. Raises UserError for what is damaged, cut short or floating
-    point.
+    Grey becomes RGB, 16 bit become 8. Raises UserError for what is damaged, cut short, floating
+    point or of more than 67 million pixels.
     """
     if path.suffix.lower() == ".png":
         return read_png_rgba(path)
@@ -68,6 +70,8 @@ def read_image_rgba(path: Path) -> UInt8[np.ndarray, "H W 4"]:
         raise UserError(f"{path} cannot be read: {error}.", "Check the file.") from None
     if content.startswith(PNG_START):  # Under another name.
         return decode_png_rgba(content, str(path))
+    # Else a few MB of one colour would be decoded to gigabytes.
+    require_bounded(header_size(content), str(path))
     if content.startswith(JPEG_START) and is_truncated_jpeg(content):
         raise UserError(
             f"{path} is truncated: the end of the picture is missing.",

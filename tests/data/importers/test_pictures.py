@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from rgbavatar_ns.data.image_headers import jpeg_header
 from rgbavatar_ns.data.importers import frame_images
 from rgbavatar_ns.data.importers.frame_images import (
     FrameImage,
@@ -144,7 +145,7 @@ def test_exif_data_cut_anywhere_is_no_error():
     length = int.from_bytes(whole[start + 2 : start + 4], "big")
     for kept in range(2, length):
         cut = whole[: start + 2] + kept.to_bytes(2, "big") + whole[start + 4 : start + 2 + kept]
-        header = frame_images._jpeg_header(cut + whole[start + 2 + length :])
+        header = jpeg_header(cut + whole[start + 2 + length :])
         assert header is not None
         assert sorted(header[:2]) == [48, 64], kept
 
