@@ -99,5 +99,5 @@ def _in_words(data: Path, report: CheckReport) -> str:
     warned = len(report.problems)
     verdict = "It can be trained." if report.usable else "It cannot be trained like this."
     if report.usable and warned:
-        verdict += f" See the {warned} warning{'s' if warned > 1 else ''} first."
+        verdict += f" See the {f'{warned} warnings' if warned > 1 else 'warning'} first."
     return "\n".join([*lines, verdict])

@@ -113,7 +113,8 @@ class FilmSink:
         if self._film.count == 0:
             nothing = UserError(
                 f"{self._path} has no picture.",
-                "The performer was not seen for long enough: a dozen pictures with a face.",
+                "What drives it has to be seen: a dozen pictures with a face, or what another "
+                "program sends.",
             )
             self._film.__exit__(UserError, nothing, None)
             raise nothing

@@ -48,5 +48,5 @@ class DemoConfig(CheckedOptions):
         if not 0 <= self.num_test_frames < self.num_frames:
             raise UserError(
                 f"{self.num_test_frames} of {self.num_frames} frames cannot be held out.",
-                "Ask for more frames, or hold out fewer.",
+                "Ask for more frames (--num-frames), or hold out fewer (--num-test-frames).",
             )

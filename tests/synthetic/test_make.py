@@ -28,6 +28,14 @@ def made(tmp_path_factory) -> tuple[Path, list[tuple[int, int]]]:
     return folder, calls
 
 
+def test_more_held_out_frames_than_there_are_name_both_options():
+    with pytest.raises(UserError, match="60 of 24 frames") as refused:
+        DemoConfig(num_frames=24)
+    assert all(
+        f"({name})" in refused.value.remedy for name in ("--num-frames", "--num-test-frames")
+    )
+
+
 @pytest.mark.slow
 def test_a_seed_gives_one_dataset_bit_for_bit(made, tmp_path):
     folder, calls = made
