@@ -84,8 +84,8 @@ class ShowOptions(CheckedOptions):
     seconds: (
         Annotated[float, Between(0, 1e6, open=True), tyro.conf.arg(metavar="SECONDS")] | None
     ) = None
-    """End after so many seconds: of a recording its own, however long they take, else by the
-    clock."""
+    """End after so many seconds: of a recording its own, from its first frame (of a film: with a
+    face) on, however long they take, else by the clock."""
 
 
 _SOURCE, _SHOW, _LIVE = SourceOptions(), ShowOptions(), LiveOptions()

@@ -278,7 +278,8 @@ def _drawn(
         if camera_path is None:
             raise UserError("There is no camera path.", "Name its file with --camera-path.")
         scene = scenes.along_path(camera_path, scene)
-    if told := scenes.told_beyond_film(avatar, scene if views is None else views, seen):
+    drawn, what = (scene, "pictures") if views is None else (views, "views")
+    if told := scenes.told_beyond_film(avatar, drawn, seen, what):
         print(told)
     if views is not None:
         return scene, scenes.side_by_side(avatar, views, background)

@@ -137,7 +137,7 @@ class LiveDrive:
 
     real_time: the newest frame is shown and older ones are skipped; otherwise each one is.
     tell: is called with what a user should read, at most once a second. seconds: of the
-    performance by the source's own clock, from its first frame on; without, all of it is shown.
+    performance by the source's own clock, from the first frame that comes; without, all is shown.
     """
 
     def __init__(

@@ -144,10 +144,12 @@ def told_beyond(
     names: Sequence[str],
     theta: Float[Tensor, "#F H"],
     turns_degrees: Float[Tensor, "#F 3"],
+    what: str = "pictures",
 ) -> str:
     """What goes beyond the film that the avatar was trained on, most frequent first; may be empty.
 
-    names: of theta's numbers. turns_degrees: `head.turn_seen` of the frames.
+    names: of theta's numbers. turns_degrees: `head.turn_seen` of the frames, which are called
+    `what`.
     """
     numbers, view = seen.beyond(theta, turns_degrees)
     frames = max(len(numbers), len(view))
@@ -159,5 +161,5 @@ def told_beyond(
     called = ("the head's turn", *names)
     several = frames > 1
     told = [called[place] + (f" ({-count})" if several else "") for count, place in found]
-    share = f" in {int(beyond.any(1).sum())} of {frames} pictures" if several else ""
+    share = f" in {int(beyond.any(1).sum())} of {frames} {what}" if several else ""
     return f"beyond the film{share}: {first_few(told, 6)}"

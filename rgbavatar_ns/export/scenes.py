@@ -153,11 +153,16 @@ def turntable(
     return turned(avatar, scene, None, yaw, level)
 
 
-def told_beyond_film(avatar: AvatarMethod, scene: Scene, seen: TrainingStatistics) -> str:
-    """What of the scene goes beyond the film, in a line; empty where nothing does."""
+def told_beyond_film(
+    avatar: AvatarMethod, scene: Scene, seen: TrainingStatistics, what: str = "pictures"
+) -> str:
+    """What of the scene goes beyond the film, in a line that calls its pictures `what`.
+
+    Empty where nothing does.
+    """
     turns = turn_seen(scene.theta, scene.cameras.world_to_camera, avatar.layout)
     names = ThetaNames.of(avatar.layout, avatar.head.arrays).numbers
-    return told_beyond(seen, names, scene.theta, turns)
+    return told_beyond(seen, names, scene.theta, turns, what)
 
 
 def along_path(path: Path, scene: Scene) -> Scene:

@@ -1,6 +1,5 @@
 """Frames to films and pictures, with PyAV (FFmpeg's libraries come inside its wheel)."""
 
-import warnings
 from collections.abc import Iterable
 from contextlib import ExitStack
 from fractions import Fraction
@@ -30,8 +29,8 @@ class FilmWriter:
     """Encodes RGB frames as H.264, as they come; within `with`.
 
     The file appears under its name only when it is complete, and not at all where an error ends
-    it. All frames have one size; of an odd one the last row or column is there twice, as the codec
-    asks, which is warned of. Colours are those of BT.709, and said to be.
+    it. All frames have one size; of an odd side the last row or column is there twice, as the codec
+    asks. Colours are those of BT.709, and said to be.
     """
 
     def __init__(self, path: Path, frames_per_second: float = 25.0) -> None:
@@ -55,18 +54,9 @@ class FilmWriter:
         """Encode one more frame; raises DiskError where the file's place refuses it."""
         assert self._container is not None
         sides = [(0, side % 2) for side in frame.shape[:2]]
-        given_height, given_width = frame.shape[:2]
         frame = np.pad(frame, (*sides, (0, 0)), mode="edge")
         if self._stream is None:
-            height, width = frame.shape[:2]
-            if (height, width) != (given_height, given_width):
-                warnings.warn(
-                    f"{self._path} is {width} x {height} pixels, of pictures of {given_width} x "
-                    f"{given_height}: H.264 takes no odd side, so that the last row or column is "
-                    "there twice.",
-                    stacklevel=2,
-                )
-            self._stream = self._begun(height, width)
+            self._stream = self._begun(*frame.shape[:2])
         picture = av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format="rgb24")
         coded = picture.reformat(
             format="yuv420p",

@@ -159,9 +159,12 @@ def test_views_tell_what_of_them_is_beyond_the_film(bundle, data, tmp_path, caps
     told = []
     for show in ("performance", "views"):
         _render(bundle, tmp_path, *words, "--show", show, "--kind", "png")
-        line = re.search(r"beyond the film in \d+ of (\d+) pictures: .*", capsys.readouterr().out)
+        line = re.search(
+            r"beyond the film in \d+ of (\d+) (pictures|views): .*", capsys.readouterr().out
+        )
         assert line is not None
-        assert int(line[1]) == _FRAMES * (4 if show == "views" else 1)
+        shown = (_FRAMES * 4, "views") if show == "views" else (_FRAMES, "pictures")
+        assert (int(line[1]), line[2]) == shown
         told.append(dict(re.findall(r"(\S+) \((\d+)\)", line[0])))
     alone, views = told
     common = alone.keys() & views.keys() - {"turn"}  # The most frequent six are named.
