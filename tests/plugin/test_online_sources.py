@@ -7,6 +7,7 @@ import socket
 import threading
 from collections import Counter
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.head import EMBEDDED_BUST, HeadArrays, HeadModel
 from rgbavatar_ns.plugin.online.datamanager import is_recorded
 from rgbavatar_ns.plugin.online.sources import SourceConfig, await_subject, open_source
+from rgbavatar_ns.plugin.online.trainer import OnlineTrainer
 from tests.data.streaming import HEAD, Clock, GivenStream, streamed, subject, until
 from tests.plugin.online_run import online_config, online_trainer
 
@@ -71,6 +73,42 @@ def test_a_source_that_cannot_be_opened_costs_no_recording_of_an_earlier_run(
     with pytest.raises(UserError, match=r"no\.mp4"):
         online_trainer(config)
     assert torch.equal(load_dataset(recorded).theta, load_dataset(tiny_data).theta)
+
+
+def test_a_run_refused_after_its_first_frame_leaves_what_an_earlier_one_recorded(
+    tiny_data: Path, tmp_path: Path
+):
+    """The model refuses it; the next one, which nothing refuses, begins its own recording."""
+    before = load_dataset(tiny_data)
+    who = ReplayStream(before).subject(0.0)
+    image = np.array(before.read_image(3))
+    frame = TrackedFrame(0, before.theta[3], before.cameras.select([3]), image)
+    recorded = online_config(tmp_path / "out").get_base_dir() / "stream"
+    shutil.copytree(tiny_data, recorded)
+    files = {path: path.read_bytes() for path in recorded.rglob("*") if path.is_file()}
+
+    def begin(**fields: Any) -> OnlineTrainer:
+        with socket.create_server(("127.0.0.1", 0)) as free:
+            address = f"127.0.0.1:{free.getsockname()[1]}"
+
+        def send() -> None:
+            with contextlib.suppress(UserError), StreamClient(who, address) as client:
+                client.send(frame)
+
+        threading.Thread(target=send, daemon=True).start()
+        source = SourceConfig("socket", listen=address)
+        return online_trainer(online_config(tmp_path / "out", source=source, **fields))
+
+    with pytest.raises(UserError, match="hide-unseen"):
+        begin(hide_unseen=True, initialize_colors=False)
+    left = {path: path.read_bytes() for path in recorded.rglob("*") if path.is_file()}
+    assert left == files
+    trainer = begin()
+    now = load_dataset(recorded)
+    assert torch.equal(now.theta, before.theta[3:4])
+    shown = trainer.stream.train_dataset.get_numpy_image(0)
+    assert np.array_equal(shown, image)
+    trainer.stream.close()
 
 
 @pytest.mark.parametrize("other", ["size", "head"])

@@ -2,6 +2,7 @@
 
 import dataclasses
 import shutil
+import tempfile
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -36,6 +37,9 @@ from rgbavatar_ns.plugin.datamanager import (
 from rgbavatar_ns.plugin.dataparser import FilmedSubject
 from rgbavatar_ns.plugin.online.least_losses import LeastLosses
 from rgbavatar_ns.plugin.online.sources import SourceConfig, await_subject, open_source
+
+STREAM_FOLDER = "stream"
+"""Where a run's folder has what its pools held."""
 
 
 @dataclass
@@ -94,6 +98,7 @@ class OnlineDataManager(RGBAvatarDataManager):
         **more: Any,
     ) -> None:
         self._ingest: Ingest | None = None
+        self._begun: tempfile.TemporaryDirectory[str] | None = None
         self.images_drawn = 0
         self.least = LeastLosses()
         self.ended_step: int | None = None
@@ -104,7 +109,8 @@ class OnlineDataManager(RGBAvatarDataManager):
         if test_mode == "val" and not replayed:
             # Then --data is no dataset; the first frame makes one.
             self._open(config)
-        super().__init__(_of_dataset(config, replayed), device, test_mode, **more)
+        served = config if replayed else _of_dataset(config, self._begun)
+        super().__init__(served, device, test_mode, **more)
         if test_mode == "val":
             if replayed:
                 self._open(config)
@@ -134,12 +140,12 @@ class OnlineDataManager(RGBAvatarDataManager):
         replayed = isinstance(stream, ReplayStream)
         if not replayed:
             subject, self._first = await_subject(stream, say, left_out=left_out)
-        if not config.resumes and config.recorded is not None:
-            # Of an earlier run in this folder, perhaps of somebody else.
-            shutil.rmtree(config.recorded, ignore_errors=True)
         assert subject is not None
-        if self._first is not None and not is_recorded(config, subject):
-            _record(config, subject, [(0, self._first)])
+        if self._first is not None and not (config.resumes and is_recorded(config, subject)):
+            # Elsewhere, for what lies in the run's folder stays until nothing can refuse this run;
+            # until the process ends, for the viewer is served from there.
+            self._begun = tempfile.TemporaryDirectory(prefix="rgbavatar-")
+            _record(Path(self._begun.name) / STREAM_FOLDER, subject, [(0, self._first)])
         self.pools = ReplayBuffer(subject, pools, save_images=not replayed)
         self._ingest = Ingest(stream, subject, self.pools, config.queue_frames, say)
         self._ingest.count_left_out(left_out)
@@ -167,6 +173,21 @@ class OnlineDataManager(RGBAvatarDataManager):
             world_to_camera=first.world_to_camera[:1].clone(),
         )
 
+    def begin_recording(self) -> None:
+        """Record the first frame in the run's folder, once nothing can refuse the run any more.
+
+        What an earlier run has recorded there goes, be it of somebody else: unless it is gone on
+        with.
+        """
+        recorded = self.config.recorded
+        assert recorded is not None
+        if self._begun is not None:
+            with atomic_folder(recorded) as folder:
+                first = Path(self._begun.name) / STREAM_FOLDER
+                shutil.copytree(first, folder, dirs_exist_ok=True)
+        elif not self.config.resumes:
+            shutil.rmtree(recorded, ignore_errors=True)
+
     def start(self) -> None:
         """Begin to fill the pools."""
         if not (self._resumed and self.ingest.goes_on):
@@ -181,7 +202,8 @@ class OnlineDataManager(RGBAvatarDataManager):
     def record(self) -> None:
         """Write the frames that the pools hold as a dataset, where there is none to replay."""
         if self.config.source.kind != "replay" and self.pools.num_added:
-            _record(self.config, self._subject, self.pools.held())
+            assert self.config.recorded is not None
+            _record(self.config.recorded, self._subject, self.pools.held())
 
     def filmed(self, subject: FilmedSubject) -> FilmedSubject:
         """The subject with all frames that the pools hold now, which may be none."""
@@ -265,17 +287,18 @@ def _pools(config: OnlineDataManagerConfig, seed: int) -> LocalGlobalPools:
     )
 
 
-def _of_dataset(config: OnlineDataManagerConfig, replayed: bool) -> OnlineDataManagerConfig:
+def _of_dataset(
+    config: OnlineDataManagerConfig, begun: "tempfile.TemporaryDirectory[str] | None"
+) -> OnlineDataManagerConfig:
     """The config as `RGBAvatarDataManager` takes it: `data` is a dataset in the own format."""
-    if replayed:
-        return config
-    if config.recorded is None or not config.recorded.exists():
+    recorded = config.recorded if begun is None else Path(begun.name) / STREAM_FOLDER
+    if recorded is None or not recorded.exists():
         raise UserError(
-            f"The run has recorded no frames ({config.recorded}).",
+            f"The run has recorded no frames ({recorded}).",
             "Train it: it records its first frame at once, and what its pools hold when it ends.",
         )
     dataparser = dataclasses.replace(config.dataparser)
-    return dataclasses.replace(config, data=config.recorded, dataparser=dataparser)
+    return dataclasses.replace(config, data=recorded, dataparser=dataparser)
 
 
 def is_recorded(config: OnlineDataManagerConfig, subject: StreamSubject) -> bool:
@@ -305,10 +328,9 @@ def is_recorded(config: OnlineDataManagerConfig, subject: StreamSubject) -> bool
     return True
 
 
-def _record(config: OnlineDataManagerConfig, subject: Any, frames: Any) -> None:
-    assert config.recorded is not None
+def _record(destination: Path, subject: Any, frames: Any) -> None:
     # As a whole, so that a killed run keeps what it recorded before.
-    with atomic_folder(config.recorded) as folder:
+    with atomic_folder(destination) as folder:
         writer = DatasetWriter(
             folder,
             subject.arrays,

@@ -21,7 +21,7 @@ from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.options import Between, Count, Counted
 from rgbavatar_ns.plugin.console import say
 from rgbavatar_ns.plugin.errors import install_user_error_hook
-from rgbavatar_ns.plugin.online.datamanager import OnlineDataManager
+from rgbavatar_ns.plugin.online.datamanager import STREAM_FOLDER, OnlineDataManager
 from rgbavatar_ns.plugin.online.pipeline import OnlinePipeline, OnlinePipelineConfig
 from rgbavatar_ns.plugin.online.progress import OnlineProgress, StreamReport
 from rgbavatar_ns.plugin.option_order import led_by
@@ -98,7 +98,7 @@ class OnlineTrainer(RGBAvatarTrainer):
                 "Say over how many steps by --learning-rate-steps.",
             )
         # Must be known to later commands.
-        config.pipeline.datamanager.recorded = config.get_base_dir() / "stream"
+        config.pipeline.datamanager.recorded = config.get_base_dir() / STREAM_FOLDER
         super().__init__(config, local_rank, world_size)
         self.stop = OnlineStop()
         resumes = config.load_dir is not None or config.load_checkpoint is not None
@@ -113,9 +113,13 @@ class OnlineTrainer(RGBAvatarTrainer):
         return self.pipeline.datamanager
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
-        """Wait for the stream's subject, then build everything; Ctrl-C meanwhile ends the run."""
+        """Wait for the stream's subject, then build everything; Ctrl-C meanwhile ends the run.
+
+        What was recorded in the folder is replaced after that, as its config is.
+        """
         try:
             super().setup(test_mode)
+            self.stream.begin_recording()
         except KeyboardInterrupt:
             say("Stopped before the first frame; there is nothing to save.")
             raise SystemExit(0) from None
