@@ -84,11 +84,19 @@ def test_data_that_cannot_be_trained_on_is_told_before_a_file_is_written(
     assert not (tmp_path / "runs").exists()
 
 
-def test_a_folder_without_checkpoints_to_go_on_from_is_told_before_a_file_is_written(
-    tiny_data: Path, tmp_path: Path
+@pytest.mark.parametrize(
+    ("named", "told"),
+    [
+        ({"load_dir": Path("nowhere")}, "no checkpoint in nowhere"),
+        ({"load_dir": Path("nowhere"), "load_step": 1}, "no checkpoint nowhere.*step-000000001"),
+        ({"load_checkpoint": Path("nowhere.ckpt")}, "no checkpoint nowhere.ckpt"),
+    ],
+)
+def test_what_is_not_there_to_go_on_from_is_told_before_a_file_is_written(
+    tiny_data: Path, tmp_path: Path, named: dict[str, Any], told: str
 ):
-    with pytest.raises(UserError, match=r"no checkpoint in .*nowhere"):
-        small_config(tiny_data, tmp_path / "runs", load_dir=tmp_path / "nowhere").save_config()
+    with pytest.raises(UserError, match=told):
+        small_config(tiny_data, tmp_path / "runs", **named).save_config()
     assert not (tmp_path / "runs").exists()
 
 

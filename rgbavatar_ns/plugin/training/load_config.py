@@ -108,17 +108,22 @@ def loaded_by_command() -> Path | None:
     return None
 
 
-def require_checkpoints_beside(path: Path, said: Path) -> None:
-    """Raise UserError where the folder of this config.yml is not the run's own.
+def run_beside(path: Path, said: Path, tell: Callable[[str], object]) -> Path:
+    """The folder of the run that this config.yml lies in, or a link leads to.
 
-    said: the folder of checkpoints that the config itself names.
+    said: the run's folder by the config itself, which counts, and is told, where no checkpoints lie
+    beside the file. Raises UserError where there are none either.
     """
-    if list_checkpoints(path.parent / MODELS_FOLDER):
-        return
-    remedy = "Name the config.yml in the run's own folder; or train, and save before you stop."
-    if list_checkpoints(said):
-        remedy = f"The config's run lies in {said.parent}: name the config.yml there."
-    raise UserError(f"There is no checkpoint in {path.parent / MODELS_FOLDER}.", remedy)
+    for folder in (path.parent, path.resolve().parent):
+        if list_checkpoints(folder / MODELS_FOLDER):
+            return folder
+    if not list_checkpoints(said / MODELS_FOLDER):
+        raise UserError(
+            f"There is no checkpoint in {path.parent / MODELS_FOLDER}.",
+            "Name the config.yml in the run's own folder; or train, and save before you stop.",
+        )
+    tell(f"note: no checkpoint lies beside {path}; its run is taken from {said}.")
+    return said
 
 
 def _complete(run: Path) -> bool:

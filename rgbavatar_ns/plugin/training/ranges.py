@@ -12,7 +12,7 @@ from nerfstudio.engine.trainer import TrainerConfig
 from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.kernels import available_backends
 from rgbavatar_ns.options import Between, Ranges, check_options
-from rgbavatar_ns.plugin.training.checkpoints import require_checkpoints
+from rgbavatar_ns.plugin.training.checkpoints import checkpoint_of_step, require_checkpoints
 from rgbavatar_ns.plugin.training.refused import require_used
 
 _OFTEN = Between(1, 10**9)
@@ -63,6 +63,11 @@ def require_found(config: TrainerConfig) -> None:
     config.pipeline.datamanager.require_trainable()  # type: ignore[attr-defined]
     if config.load_dir is not None and config.load_step is None:
         require_checkpoints(config.load_dir)
+    named = config.load_checkpoint
+    if config.load_dir is not None and config.load_step is not None:
+        named = checkpoint_of_step(config.load_dir, config.load_step)
+    if named is not None and not named.is_file():
+        raise UserError(f"There is no checkpoint {named}.", "Check its name and folder.")
 
 
 def _require_rasterizer(name: str, device: str) -> None:

@@ -50,8 +50,8 @@ from rgbavatar_ns.plugin.training.load_config import (
     go_on_or_repeat,
     loaded_by_command,
     loads_config,
-    require_checkpoints_beside,
     require_loadable,
+    run_beside,
 )
 from rgbavatar_ns.plugin.training.optimizers import (
     AdamConfig,
@@ -132,9 +132,9 @@ class RGBAvatarTrainerConfig(TrainerConfig):
             install_user_error_hook()
             loaded = loaded_by_command()
             if loaded is not None:
-                require_checkpoints_beside(loaded, folder)
-                if loaded.parent.resolve() != self.get_base_dir().resolve():
-                    self.lie_in(loaded.parent)
+                beside = run_beside(loaded, self.get_base_dir(), say)
+                if beside.resolve() != self.get_base_dir().resolve():
+                    self.lie_in(beside)
                     folder = super().get_checkpoint_dir()
             self.load_step = readable_step(folder, self.load_step, say)
         return folder

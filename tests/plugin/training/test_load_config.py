@@ -138,7 +138,9 @@ def test_a_moved_run_is_looked_at_where_it_is(tiny_data: Path, tmp_path: Path):
     assert checkpoint.parent == moved / "nerfstudio_models"
 
 
-def test_a_moved_run_of_a_stream_takes_its_own_recording(tiny_data: Path, tmp_path: Path):
+def test_a_moved_run_of_a_stream_names_the_recording_that_is_beside_it(
+    tiny_data: Path, tmp_path: Path
+):
     config = online_config(tmp_path / "before", tiny_data)
     trainer = online_trainer(config)
     trainer.train()
@@ -147,15 +149,22 @@ def test_a_moved_run_of_a_stream_takes_its_own_recording(tiny_data: Path, tmp_pa
     assert loaded.pipeline.datamanager.recorded == moved / "stream"
 
 
-def test_a_config_apart_from_its_run_is_refused_with_the_runs_place(
-    tiny_data: Path, tmp_path: Path
+def test_a_linked_config_is_its_runs_and_one_apart_leads_to_its_run_and_says_so(
+    tiny_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     config = finished_run(tiny_data, tmp_path / "runs", max_num_iterations=1)
-    apart = Path(shutil.copy(config, tmp_path))
+    moved = Path(shutil.copytree(config.parent, tmp_path / "copy"))
+    (tmp_path / "best.yml").symlink_to(moved / "config.yml")
+    apart = Path(shutil.copy(config, tmp_path / "apart.yml"))
+    capsys.readouterr()
+    assert eval_setup(tmp_path / "best.yml")[2].parent == moved / "nerfstudio_models"
+    assert "note:" not in capsys.readouterr().out
+    assert eval_setup(apart)[2].parent == config.parent / "nerfstudio_models"
+    assert "no checkpoint lies beside" in capsys.readouterr().out
+    shutil.rmtree(config.parent)
     with pytest.raises(UserError, match="no checkpoint") as told:
         eval_setup(apart)
     assert str(tmp_path / "nerfstudio_models") in told.value.cause
-    assert str(config.parent) in told.value.remedy
 
 
 @pytest.mark.parametrize("option", ["--max-num-iterations", "--data", "--vis"])
