@@ -5,6 +5,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import av
 import cv2
 import numpy as np
 import pytest
@@ -91,6 +92,49 @@ def test_missing_surplus_and_misfitting_mattes_are_told(tmp_path: Path) -> None:
     folder = FrameSource.open(_folder(tmp_path / "images", images))
     with pytest.raises(UserError, match="no matte named 2"):
         UserMattes.open(_folder(tmp_path / "two", dict(list(small.items())[:2])), folder)
+
+
+@pytest.mark.parametrize("kind", ["folder", "video"])
+def test_mattes_with_somebody_in_a_few_frames_are_not_dark_all_over(
+    tmp_path: Path, kind: str
+) -> None:
+    empty = np.zeros((16, 16, 3), np.uint8)
+    person = empty.copy()
+    person[4:12, 4:12] = 255
+    masks = [person if 24 <= k < 45 else empty for k in range(160)]
+    if kind == "folder":
+        path = _folder(tmp_path / "m", {f"{k:03}.png": mask for k, mask in enumerate(masks)})
+    else:
+        path = write_clip(tmp_path / "m.mp4", masks, "libx264")  # one group of pictures
+    clip = FrameSource.open(write_clip(tmp_path / "f.mkv", gradient_images(1, 16, 16), "ffv1"))
+    mattes = UserMattes.open(path, clip)
+    for enough in (None, 25):
+        mattes.require_somebody(enough)
+    with pytest.raises(UserError, match=r"dark all over: the lightest place has \d of 255"):
+        mattes.require_somebody(24)
+
+
+def test_whether_mattes_are_dark_is_asked_of_what_is_read_as_the_matte(tmp_path: Path) -> None:
+    clip = FrameSource.open(write_clip(tmp_path / "f.mkv", gradient_images(2), "ffv1"))
+    for colour, alpha in ((0, 255), (255, 0)):
+        image = np.full((48, 64, 4), colour, np.uint8)
+        image[..., 3] = 0
+        image[8:40, 8:56, 3] = alpha
+        path = tmp_path / f"{colour}.webm"
+        with av.open(str(path), "w") as container:
+            stream = container.add_stream("libvpx-vp9", rate=25)
+            stream.height, stream.width, stream.pix_fmt = 48, 64, "yuva420p"
+            for _ in range(2):
+                frame = av.VideoFrame.from_ndarray(image, format="rgba")
+                container.mux(stream.encode(frame.reformat(format="yuva420p")))
+            container.mux(stream.encode())
+        mattes = UserMattes.open(path, clip)
+        assert _levels(mattes, {0, 1}, 64, 48) == pytest.approx({0: alpha, 1: alpha}, abs=3)
+        if alpha:
+            mattes.require_somebody(None)
+        else:
+            with pytest.raises(UserError, match="dark all over"):
+                mattes.require_somebody(None)
 
 
 def _disc(size: int, x: float) -> np.ndarray:

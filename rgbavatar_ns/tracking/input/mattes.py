@@ -1,6 +1,6 @@
 """A user's own mattes, which take precedence over ours."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,7 +16,7 @@ from rgbavatar_ns.tracking.input.image_files import (
     read_image_rgba,
     require_image_files,
 )
-from rgbavatar_ns.tracking.input.video import FrameSource, SourceFrame, counted_frames, glances
+from rgbavatar_ns.tracking.input.video import FrameSource, SourceFrame, counted_frames
 
 _PERSON = 128
 """From here on a matte counts as the person."""
@@ -54,15 +54,16 @@ class UserMattes:
         return cls(path, tuple(files), source.bars)
 
     def require_somebody(self, max_frames: int | None) -> None:
-        """UserError where a few mattes, spread over the first so many, have nothing light."""
-        looked_at = [int(_level(image).max()) for image in glances(self.path, max_frames)]
-        most = max(looked_at, default=255)
-        if most < _PERSON:
-            raise UserError(
-                f"The mattes in {self.path} are dark all over: the lightest place has {most} of "
-                "255.",
-                "Make the person 255 (of masks with 0 and 1, 255 times as much) and the rest 0.",
-            )
+        """UserError where none of the first so many mattes has anything light."""
+        most = 0
+        for _, matte in self._mattes(lambda index: True, max_frames):
+            most = max(most, int(matte.max()))
+            if most >= _PERSON:  # Mostly the first one's is.
+                return
+        raise UserError(
+            f"The mattes in {self.path} are dark all over: the lightest place has {most} of 255.",
+            "Make the person 255 (of masks with 0 and 1, 255 times as much) and the rest 0.",
+        )
 
     def require_count(self, frames: int, limited: bool) -> None:
         """UserError unless each frame has a matte; too many are right if frames are limited.
@@ -88,7 +89,7 @@ class UserMattes:
         UserError where one is missing or has another size than the video.
         """
         last = -1
-        for index, matte in self._mattes(frames):
+        for index, matte in self._mattes(frames.__contains__):
             if self.bars.within((matte.shape[1], matte.shape[0])) != (width, height):
                 film = width + self.bars.left + self.bars.right
                 raise UserError(
@@ -104,12 +105,15 @@ class UserMattes:
                 f"{self.path} ends before frame {max(frames)} of the video has a matte.", _AS_MANY
             )
 
-    def _mattes(self, frames: frozenset[int]) -> Iterator[tuple[int, UInt8[np.ndarray, "H W"]]]:
+    def _mattes(
+        self, wanted: Callable[[int], bool], max_frames: int | None = None
+    ) -> Iterator[tuple[int, UInt8[np.ndarray, "H W"]]]:
         if self.files is not None:
-            for index in sorted(frames.intersection(range(len(self.files)))):
-                yield index, _level(read_image_rgba(self.files[index]))
+            for index, file in enumerate(self.files[:max_frames]):
+                if wanted(index):
+                    yield index, _level(read_image_rgba(file))
             return
-        for frame in FrameSource.open(self.path).read(frames.__contains__):
+        for frame in FrameSource.open(self.path, max_frames).read(wanted):
             grey = cv2.cvtColor(frame.image_rgb, cv2.COLOR_RGB2GRAY)
             yield frame.index, grey if frame.alpha is None else frame.alpha
 

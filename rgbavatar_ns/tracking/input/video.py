@@ -33,7 +33,7 @@ from rgbavatar_ns.tracking.input.image_files import (
 )
 
 _GLANCES = 8
-"""Pictures of a clip by which its bars are known, and whether mattes hold anybody."""
+"""Pictures of a clip by which its bars are known."""
 _ALPHA_DECODERS = {"vp8": "libvpx", "vp9": "libvpx-vp9"}
 """By codec."""
 
