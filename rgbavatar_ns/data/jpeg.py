@@ -25,6 +25,7 @@ def is_truncated_jpeg(encoded: bytes) -> bool:
 def is_damaged_jpeg(encoded: bytes) -> bool:
     """Whether a JPEG is cut short, or its bits are no code of it; the others' change is not seen.
 
+    Without the end's marker it is: who exports datasets writes that.
     OpenCV decodes those too, and tells on stderr at most; ffmpeg's decoder can be told to refuse.
     JPEG has no checksums: most turned bits still are a picture, and nothing tells them.
     """

@@ -209,17 +209,19 @@ def test_what_is_asked_for_or_usual_holds_where_timecodes_show_no_rate(tmp_path)
     assert last_s(["10:00:00:10", "10:00:01:10"], None) == pytest.approx(1.0)
 
 
+@pytest.mark.parametrize("first", ["", "sep={}\r\n"])
 @pytest.mark.parametrize(
     ("separator", "decimal"), [(";", ","), (";", "."), ("\t", ","), ("\t", ".")]
 )
-def test_a_spreadsheets_take_is_read_as_the_phones(tmp_path, separator, decimal):
+def test_a_spreadsheets_take_is_read_as_the_phones(tmp_path, separator, decimal, first):
     header = "Timecode,BlendShapeCount,JawOpen,EyeBlinkLeft,HeadYaw,HeadPitch,HeadRoll"
     codes = _codes(30, 90, 5)
     rows = [f"{code},61,0.{k:02},{k % 2},-0.{k:02},1e-3,0" for k, code in enumerate(codes)]
     plain = csv_source(_take(tmp_path, header, rows), None, False)
     written = [line.replace(",", separator).replace(".", decimal) for line in (header, *rows)]
     path = tmp_path / "europe.csv"
-    path.write_bytes(("\r\n".join(written) + "\r\n").encode("utf-8-sig"))
+    told = first.format(separator)
+    path.write_bytes((told + "\r\n".join(written) + "\r\n").encode("utf-8-sig"))
     europe = csv_source(path, None, False)
     for _ in rows:
         one, other = plain.next(0.0), europe.next(0.0)
@@ -237,8 +239,10 @@ def test_quoted_decimal_commas_are_read_and_bare_ones_between_commas_told(tmp_pa
     with pytest.raises(UserError, match=r"2 names and more values in 2 of 3 rows: commas") as told:
         csv_source(_take(tmp_path, "JawOpen,MouthClose", rows), None, False)
     assert "semicolons" in told.value.remedy
-    ended = csv_source(_take(tmp_path, "JawOpen,MouthClose,", ["0.25,0,,", "0.5,0,,"]), None, False)
-    assert ended.next(0.0).coefficients[ARKIT_NAMES.index("jawOpen")] == 0.25
+    for more in (",,", ",0.75", ",7"):
+        rows = ["0.25,0" + more, "0.5,0" + more]
+        longer = csv_source(_take(tmp_path, "JawOpen,MouthClose", rows), None, False)
+        assert longer.next(0.0).coefficients[ARKIT_NAMES.index("jawOpen")] == 0.25
 
 
 def test_blank_rows_are_none(tmp_path):
@@ -253,6 +257,7 @@ def test_blank_rows_are_none(tmp_path):
     ("content", "told"),
     [
         ("a,b\n1,2\n", "has no ARKit columns: a, b"),
+        ("a take\njawOpen,mouthClose\n1,2\n", "has no ARKit columns: a take"),
         ("jawOpen\n", "holds no rows"),
         ("jawOpen,mouthClose\nx,y\n", "no row of numbers"),
         ("", "holds no rows"),

@@ -165,6 +165,10 @@ def test_a_film_whose_rate_varies_is_told_with_how_far_its_frames_shift() -> Non
     assert _played_apart_s(dark, 20) == pytest.approx(0.8)
     for told in ("the film's frames", "15 to 30 a second", "up to 0.8 s too", "-vf fps="):
         assert told in note
+    for rate in (12.5, 2.0, 0.4):  # One or two frames of slow films are long.
+        assert notes(np.delete(np.arange(200) / rate, [90, 91]))[0] == []
+    (note,), _ = notes(np.cumsum([0, *[2.5] * 30, *[4.0] * 20]))
+    assert "-vf fps=0.4 " in note
     drawn = np.random.default_rng(4)
     even = np.arange(900) / 30
     for times_s in (

@@ -32,6 +32,8 @@ _MOST_BYTES = 1 << 28
 _TIMECODE = re.compile(r"(\d{1,3}):(\d{1,2}):(\d{1,2}):(\d{1,3})(?:[.,](\d+))?")
 _SEPARATORS = ",;\t"
 """The first is usual; spreadsheets write the second where decimals have a comma."""
+_TOLD_SEPARATOR = re.compile(r"\s*sep=([,;\t])\r?\n")
+_DECIMAL = re.compile(r"\s*[-+]?\d*\.\d")
 _Code = tuple[int, float]
 """A timecode's seconds and frames."""
 _REMEDY = (
@@ -61,6 +63,7 @@ def csv_source(
     places = [columns.get(name.lower()) for name in ARKIT_NAMES]
     if all(place is None for place in places):
         raise UserError(f"{path} has no ARKit columns: {first_few(names, 4)}.", _REMEDY)
+    _require_decimal_points(path, names, rows)
     angles = [columns.get(name.lower()) for name in HEAD_ANGLES]
     frames = _timed(names, rows, places, frames_per_second)
     if not frames:
@@ -88,21 +91,27 @@ def csv_source(
 def _read(path: Path) -> tuple[list[str], list[list[str]]]:
     try:
         text = read_file(path, _MOST_BYTES).decode("utf-8-sig")
-        lines = csv.reader(io.StringIO(text), delimiter=_separator(text))
+        told = _TOLD_SEPARATOR.match(text)  # as Excel writes and reads it
+        separator = told[1] if told else _separator(text)
+        lines = csv.reader(io.StringIO(text[told.end() :] if told else text), delimiter=separator)
         table = [row for row in lines if any(map(str.strip, row))]
     except (DamagedFileError, UnicodeDecodeError, csv.Error, OSError) as error:
         raise UserError(f"{path} cannot be read as CSV: {error}.", _REMEDY) from None
     if len(table) < 2:
         raise UserError(f"{path} holds no rows.", _REMEDY)
-    names, rows = table[0], table[1:]
+    return table[0], table[1:]
+
+
+def _require_decimal_points(path: Path, names: list[str], rows: list[list[str]]) -> None:
+    """UserError where commas separate columns and decimals alike: a number is two values then."""
     longer = sum(any(map(str.strip, row[len(names) :])) for row in rows)
-    if longer > len(rows) / 2:
+    pointed = any(_DECIMAL.match(value) for row in rows for value in row)
+    if longer > len(rows) / 2 and not pointed:
         raise UserError(
             f"{path} has {len(names)} names and more values in {longer} of {len(rows)} rows: "
             "commas separate its columns and its decimals alike.",
             "Write decimals with a point, or separate the columns by semicolons.",
         )
-    return names, rows
 
 
 def _separator(text: str) -> str:

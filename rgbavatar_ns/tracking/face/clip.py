@@ -197,8 +197,7 @@ def _positions(
 
 
 def rate_notes(seen: SeenFaces) -> list[str]:
-    """What is to be known where a film will play otherwise than it was filmed: its frames come
-    unevenly, or it is of clips of several rates."""
+    """What to tell of a film that will play otherwise than it was filmed."""
     kept, rates = _frames_per_second(seen), _clip_rates(seen)
     if kept is None:
         return []
@@ -214,14 +213,15 @@ def _uneven_notes(seen: SeenFaces, clip: int, of_several: bool) -> list[str]:
     """How far a clip's frames lie from where they are played, evenly and without its pauses."""
     steps = _usual_steps_s(seen, clip)
     shifted_s = float(np.abs(np.cumsum(steps - steps.mean())).max())
-    if shifted_s <= _SHIFTED_S:
-        return []
     slow, usual, fast = 1 / np.percentile(steps, (95, 50, 5))
+    # A few frames that are left out shift a slow film as far, and change no rate.
+    if shifted_s <= _SHIFTED_S or fast / slow - 1 <= _SAME_RATE:
+        return []
     whose = f"clip {clip + 1}'s" if of_several else "the film's"
     return [
         f"{whose} frames come at a varying rate, {slow:.3g} to {fast:.3g} a second, and play "
         f"evenly: up to {shifted_s:.1f} s too early or too late. A film of one rate, to be tracked "
-        f"in its place: ffmpeg -i FILM -vf fps={usual:.0f} EVEN.mp4"
+        f"in its place: ffmpeg -i FILM -vf fps={usual:.5g} EVEN.mp4"
     ]
 
 
