@@ -1,6 +1,6 @@
 """A head model as plain arrays in FLAME's convention, and their file."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields
 from functools import cache, cached_property
 from pathlib import Path
@@ -15,6 +15,8 @@ from rgbavatar_ns.errors import UserError
 from rgbavatar_ns.files import atomic_write, digest
 from rgbavatar_ns.reading import DamagedFileError, load_arrays
 
+TEETH, TONGUE = ("upper_teeth", "lower_teeth"), "tongue"
+"""Names of vertex groups."""
 NECK_SHIFTS = ("neckLeft", "neckUp", "neckForward")
 """Expressions of a bust that carry the head along the torso's x, y and z, in centimetres, as the
 neck does without a turn of its one joint."""
@@ -145,6 +147,11 @@ class HeadArrays:
     def has_torso(self) -> bool:
         """Whether the mesh goes on below the neck, where the root joint carries it."""
         return "torso" in self.vertex_groups
+
+    def group(self, names: Iterable[str]) -> Int[np.ndarray, "_"]:
+        """The vertices of those groups that this head has, in order; of one without any, none."""
+        found = [np.asarray(self.vertex_groups.get(name, []), np.int64) for name in names]
+        return np.unique(np.concatenate([*found, np.zeros(0, np.int64)]))
 
     @cached_property
     def flat_shapedirs(self) -> Float[np.ndarray, "C V3"]:

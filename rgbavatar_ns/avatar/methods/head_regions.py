@@ -10,16 +10,16 @@ from torch import Tensor
 
 from rgbavatar_ns.drawing.wireframe import fixed_point
 from rgbavatar_ns.head import HeadArrays
+from rgbavatar_ns.head.arrays import TEETH, TONGUE
 from rgbavatar_ns.kernels import PinholeCameras
 
-MOUTH_GROUPS = ("upper_teeth", "lower_teeth", "tongue")
+MOUTH_GROUPS = (*TEETH, TONGUE)
 """Vertex groups of what is behind the lips."""
 
 
 def group_vertices(arrays: HeadArrays, names: Iterable[str]) -> Int[Tensor, "G"]:
     """The vertices of those groups that this head has; of a head without any, none."""
-    found = [np.asarray(arrays.vertex_groups.get(name, []), np.int64) for name in names]
-    return torch.from_numpy(np.unique(np.concatenate([*found, np.zeros(0, np.int64)])))
+    return torch.from_numpy(arrays.group(names))
 
 
 def faces_within(arrays: HeadArrays, faces: Int[Tensor, "F 3"], name: str) -> Bool[Tensor, "F"]:

@@ -115,13 +115,16 @@ class MeshField:
         stiffness: float | Float[Tensor, "E"],
         rest: float | Float[Tensor, "V"],
         iterations: int,
+        mirrored: bool = True,
     ) -> Float[Tensor, "V C"]:
         """The smooth function near `values`, as near as `confidence` says, from a first guess.
 
         Minimises sum confidence (x - values)^2 + rest x^2 + sum over edges stiffness (x_i - x_j)^2
-        by conjugate gradients, without waiting for the device.
+        by conjugate gradients, without waiting for the device. `mirrored`: what is known of one
+        side of the face tells of the other too.
         """
-        there = _MIRROR_TRUST * self._mirrored * confidence[self._mirror]
+        trust = _MIRROR_TRUST if mirrored else 0.0
+        there = trust * self._mirrored * confidence[self._mirror]
         weight = (confidence + there)[:, None]
         known = confidence[:, None] * values + there[:, None] * values[self._mirror]
         # Sparse products promote no types.

@@ -6,13 +6,16 @@ without it a head turned beyond its film shatters (the paper names the limit, no
 """
 
 import math
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 
 from rgbavatar_ns.avatar.avatar import Avatar
+from rgbavatar_ns.avatar.prior.leash import Leash
 from rgbavatar_ns.avatar.prior.mesh_field import MeshField
+from rgbavatar_ns.avatar.prior.mouth import HiddenMouth
 from rgbavatar_ns.avatar.prior.virtual_views import VirtualViews
 from rgbavatar_ns.drawing.compositing import ImagesRGBA, is_unfilmed
 from rgbavatar_ns.kernels import MorphedRenderer, PinholeCameras, weighted_color_average
@@ -32,8 +35,9 @@ as seen, else the back of a head is stretched until it paints the rim of its fro
 to the third its colour becomes clear, which at the rim is that of the neck behind."""
 _CLEAR_PX = 0.1
 """Clear pixels at which its colour half tells that of its surroundings."""
-_SUNK = 1.25
-"""How many of its widths a Gaussian's centre lies below the surface that it reaches to."""
+_SUNK, _SUNK_IN_CAVITY = 1.25, -0.6
+"""How many of its widths a Gaussian's centre lies below the surface that it reaches to; those of
+the mouth's cavity lie above it, or they come through the lips, which are thin."""
 _FLATNESS = math.log(0.25)
 """Logarithm of thickness over width: surfaces are made of discs."""
 _OVERLAP = math.log(1.4)
@@ -54,6 +58,8 @@ class SurfacePrior(nn.Module):
         through_px: the same from whichever side: a matte that fades shows the far side's opacity.
         offset_m: how far the surface stands off the mesh at each, by the outlines of mattes.
         opacity_logit: of the surface: closed, but where mattes show background.
+        leashed_position: where each one's neighbours would have it, in its tangent frame.
+        leash_share: of the way there in a step; 0 until that is known.
         begun: whether the surface has been measured.
         views: from where nobody filmed.
     """
@@ -63,6 +69,8 @@ class SurfacePrior(nn.Module):
     through_px: Float[Tensor, "N"]
     offset_m: Float[Tensor, "N"]
     opacity_logit: Float[Tensor, "N"]
+    leashed_position: Float[Tensor, "N 3"]
+    leash_share: Float[Tensor, "N"]
     begun: Tensor
 
     def __init__(self, avatar: Avatar) -> None:
@@ -73,9 +81,11 @@ class SurfacePrior(nn.Module):
         self.register_buffer("through_px", torch.zeros(num_gaussians))
         self.register_buffer("offset_m", torch.zeros(num_gaussians))
         self.register_buffer("opacity_logit", torch.full((num_gaussians,), _CLOSED))
+        self.register_buffer("leashed_position", torch.zeros(num_gaussians, 3))
+        self.register_buffer("leash_share", torch.zeros(num_gaussians))
         self.register_buffer("begun", torch.zeros((), dtype=torch.bool))
         self.views = VirtualViews(len(avatar.head.arrays.v_template), avatar.layout.size)
-        self._field: tuple[torch.device, MeshField] | None = None
+        self._known_of: tuple[torch.device, _Known] | None = None
         self._has_begun = False
 
     @property
@@ -95,10 +105,14 @@ class SurfacePrior(nn.Module):
         # Here, so that timing steps on a bare machine needs no OpenCV.
         from rgbavatar_ns.avatar.prior.outline import measure_outline
 
-        field = self._mesh_field(avatar)
+        field, mouth = self._known(avatar).field, self._known(avatar).mouth
         outline = measure_outline(avatar, field, theta, cameras, _as_bytes(images_rgba))
         offset_m = field.at_gaussians(outline.offset_m[:, None])[:, 0]
-        self.offset_m.copy_(offset_m - _SUNK * avatar.initial_scale_m())
+        sunk = torch.full_like(offset_m, _SUNK)
+        if mouth is not None:  # which no outline tells of
+            offset_m = offset_m * (1 - mouth.behind)
+            sunk = torch.lerp(sunk, torch.full_like(sunk, _SUNK_IN_CAVITY), mouth.cavity)
+        self.offset_m.copy_(offset_m - sunk * avatar.initial_scale_m())
         self.opacity_logit.copy_(torch.where(outline.empty_gaussians > 0.5, _EMPTY, _CLOSED))
         self.views.begin(avatar, outline, theta, cameras)
         self.views.see(avatar, theta, cameras)
@@ -134,7 +148,11 @@ class SurfacePrior(nn.Module):
             sums = renderer.weighted_color_average(filmed)
         else:
             sums = weighted_color_average(avatar.gaussians(theta), cameras, filmed, backend=backend)
-        shown_px, facing = sums.weighted_sum[..., 0], _facing(avatar, theta, cameras)
+        vertices, cameras = avatar.carrier_vertices(theta), cameras.to(avatar.identity)
+        shown_px, facing = sums.weighted_sum[..., 0], _facing(avatar, vertices, cameras)
+        mouth = self._known(avatar).mouth
+        if mouth is not None:
+            shown_px = mouth.through_lips(shown_px, vertices, cameras)
         for known, share in (
             (self.through_px, torch.ones_like(facing)),
             (self.seen_px, _ramp(facing, _TURNED_AWAY, _FACING)),
@@ -147,9 +165,12 @@ class SurfacePrior(nn.Module):
         """Draw to the surface what no frame shows."""
         if step < _FIRST_PULL:
             return
-        shapes, field = avatar.blendshapes, self._mesh_field(avatar)
+        shapes, known = avatar.blendshapes, self._known(avatar)
+        field, mouth = known.field, known.mouth
         clear = self.clear_px.square() / (self.clear_px.square() + _CLEAR_PX**2)
         told, confidence = field.of_gaussians(shapes.color_feature, clear)
+        if mouth is not None:
+            told, confidence = mouth.guessed(told, confidence)
         start, _ = field.of_gaussians(shapes.color_feature, torch.ones_like(clear))
         color = field.continued(
             told, confidence, start, stiffness=_STIFFNESS, rest=_REST, iterations=_ITERATIONS
@@ -160,11 +181,15 @@ class SurfacePrior(nn.Module):
         # Discs of texels that lie farther apart than fresh ones reach are as wide as these need.
         disc = _disc(avatar, avatar.initial_scale_m().maximum(0.5 * avatar.anchors.texel_spacing()))
         # As far as nothing shows it, nothing else closes the surface around it.
-        disc[:, :2] += (_OVERLAP * (close / _RATE).square())[:, None]
+        wider = _OVERLAP * (close / _RATE).square()
+        if mouth is not None:  # where what lies behind is dark too
+            wider = wider * (1 - mouth.cavity)
+        disc[:, :2] += wider[:, None]
         upright = torch.zeros_like(shapes.rotation_wxyz)
         upright[:, 0] = 1
+        home = self.offset_m[:, None] * field.outwards
         rest = {
-            "position": self.offset_m[:, None] * field.outwards,
+            "position": home,
             "rotation_wxyz": upright,
             "log_scale": disc,
             "opacity_logit": self.opacity_logit,
@@ -177,12 +202,31 @@ class SurfacePrior(nn.Module):
         for name in ("basis_position", "basis_rotation_wxyz", "basis_color_feature"):
             if shapes.num_bases:
                 getattr(shapes, name).mul_((1 - pull)[:, None])
+        counts = shapes.opacity_logit.sigmoid() * (1 - pull / _RATE)
+        self.leashed_position.copy_(known.leash.smooth(shapes.position, home, counts))
+        self.leash_share.copy_(known.leash.share)
 
-    def _mesh_field(self, avatar: Avatar) -> MeshField:
+    @torch.no_grad()
+    def hold(self, avatar: Avatar) -> None:
+        """Draw to their neighbours, after every step, those that expressions would tear away."""
+        avatar.blendshapes.position.lerp_(self.leashed_position, self.leash_share[:, None])
+
+    def _known(self, avatar: Avatar) -> "_Known":
         device = self.seen_px.device
-        if self._field is None or self._field[0] != device:
-            self._field = device, MeshField(avatar)
-        return self._field[1]
+        if self._known_of is None or self._known_of[0] != device:
+            field = MeshField(avatar)
+            known = _Known(field, HiddenMouth.of(avatar), Leash(avatar, field))
+            self._known_of = device, known
+        return self._known_of[1]
+
+
+@dataclass(frozen=True)
+class _Known:
+    """What is the same in every look at an avatar."""
+
+    field: MeshField
+    mouth: HiddenMouth | None
+    leash: Leash
 
 
 def _disc(avatar: Avatar, width_m: Float[Tensor, "N"]) -> Float[Tensor, "N 3"]:
@@ -194,11 +238,11 @@ def _disc(avatar: Avatar, width_m: Float[Tensor, "N"]) -> Float[Tensor, "N 3"]:
 
 
 def _facing(
-    avatar: Avatar, theta: Float[Tensor, "B H"], cameras: PinholeCameras
+    avatar: Avatar, vertices: Float[Tensor, "B V 3"], cameras: PinholeCameras
 ) -> Float[Tensor, "B N"]:
     """Cosine of the angle between the surface's normal at each Gaussian and its way to the eye."""
     mesh = avatar.anchors.triangles(with_rest_length=False)
-    corners = avatar.carrier_vertices(theta)[:, mesh["triangle_vertices"]]
+    corners = vertices[:, mesh["triangle_vertices"]]
     first, second, third = corners.unbind(2)
     normal = torch.linalg.cross(second - first, third - first)
     pose = cameras.world_to_camera.to(first)

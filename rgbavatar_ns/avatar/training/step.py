@@ -407,8 +407,10 @@ class TrainingStep:
 
     def _finish(self, step: int) -> None:
         """What is due after a step: what is not seen, orthogonal bases."""
-        if self._prior is not None and self._prior.due(step):
-            self._prior.pull(self.avatar, step)
+        if self._prior is not None:
+            self._prior.hold(self.avatar)
+            if self._prior.due(step):
+                self._prior.pull(self.avatar, step)
         # Last, since what is not seen is drawn to the surface with its bases.
         method = self._orthogonality
         if (step + 1) % ORTHOGONALIZE_EVERY == 0 and method in ("qr", "gram_schmidt"):
