@@ -43,8 +43,8 @@ class Mouth:
         rows = [int(np.flatnonzero(marks.facemesh_index == point)[0]) for point in _INNER_RIMS]
         vertices, weights = arrays.faces[marks.triangle[rows]], marks.barycentric[rows]
         points_m = (arrays.v_template[vertices] * weights[..., None]).sum(1)
-        nearest = KDTree(arrays.v_template).query(points_m)[1].tolist()
-        cavity = _cut_off(_edge_lengths(arrays), nearest)
+        _, nearest = KDTree(arrays.v_template).query(points_m)
+        cavity = _cut_off(_edge_lengths(arrays), np.asarray(nearest).tolist())
         teeth, tongue = arrays.group(TEETH), arrays.group([TONGUE])
         return cls(vertices, weights, cavity, teeth, tongue)
 
@@ -54,7 +54,7 @@ def _edge_lengths(arrays: HeadArrays) -> sparse.csr_matrix:
     first, second = np.concatenate([arrays.faces[:, [k, (k + 1) % 3]] for k in range(3)]).T
     metres = np.linalg.norm(arrays.v_template[first] - arrays.v_template[second], axis=1)
     there = sparse.csr_matrix((metres, (first, second)), shape=2 * [len(arrays.v_template)])
-    return there.maximum(there.T)
+    return sparse.csr_matrix(there.maximum(there.T))
 
 
 def _cut_off(lengths: sparse.csr_matrix, stations: list[int]) -> Int[np.ndarray, "C"]:

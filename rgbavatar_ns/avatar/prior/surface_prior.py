@@ -209,7 +209,9 @@ class SurfacePrior(nn.Module):
     @torch.no_grad()
     def hold(self, avatar: Avatar) -> None:
         """Draw to their neighbours, after every step, those that expressions would tear away."""
-        avatar.blendshapes.position.lerp_(self.leashed_position, self.leash_share[:, None])
+        position = avatar.blendshapes.position
+        share = self.leash_share[:, None].to(position)
+        position.lerp_(self.leashed_position.to(position), share)
 
     def _known(self, avatar: Avatar) -> "_Known":
         device = self.seen_px.device
