@@ -17,6 +17,7 @@ from jaxtyping import Float
 
 from rgbavatar_ns import Avatar
 from rgbavatar_ns.avatar.orbit import head_centre, orbit
+from rgbavatar_ns.avatar.storage.statistics import neutral_frame
 from rgbavatar_ns.data import load_dataset
 from rgbavatar_ns.head.arkit import arkit_coefficients, arkit_map
 
@@ -46,12 +47,10 @@ def sheet(avatar: Avatar, data: Path) -> Float[np.ndarray, "height width 3"]:
     """All faces of the calmest held-out frame, then this frame turned; white background."""
     dataset, table = load_dataset(data), arkit_map(avatar.head.arrays)
     held_out = list(dataset.test) or list(dataset.train)
-    moved = dataset.theta[held_out][:, avatar.layout.slice("expression")].abs().sum(1)
-    frame = held_out[int(moved.argmin())]
-    camera, calm = (
-        dataset.cameras.select([frame % len(dataset.cameras.focal_px)]),
-        dataset.theta[frame],
-    )
+    theta, names = dataset.theta[held_out], avatar.head.arrays.expression_names
+    calm = neutral_frame(theta, avatar.layout, names)
+    frame = held_out[int((theta == calm).all(1).nonzero()[0, 0])]
+    camera = dataset.cameras.select([frame % len(dataset.cameras.focal_px)])
     faces = [arkit_coefficients(by_sides(face)) for face in FACES.values()]
     cells = [(calm + table.theta(face), camera) for face in faces]
     centre = head_centre(avatar, calm[None]).to(camera.world_to_camera)
@@ -70,7 +69,9 @@ def main() -> None:
     parser.add_argument("pairs", type=Path, nargs="+", metavar="AVATAR DATASET")
     parser.add_argument("--picture", type=Path, required=True, help="the sheet to write")
     arguments = parser.parse_args()
-    pairs = zip(arguments.pairs[::2], arguments.pairs[1::2], strict=True)
+    if len(arguments.pairs) % 2:
+        parser.error("Name a dataset after each avatar.")
+    pairs = zip(arguments.pairs[::2], arguments.pairs[1::2])
     rows = [sheet(Avatar.load(path), data) for path, data in pairs]
     arguments.picture.parent.mkdir(parents=True, exist_ok=True)
     picture = (np.concatenate(rows) * 255 + 0.5).astype(np.uint8)

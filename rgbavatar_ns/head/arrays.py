@@ -148,8 +148,8 @@ class HeadArrays:
         """Whether the mesh goes on below the neck, where the root joint carries it."""
         return "torso" in self.vertex_groups
 
-    def group(self, names: Iterable[str]) -> Int[np.ndarray, "_"]:
-        """The vertices of those groups that this head has, in order; of one without any, none."""
+    def vertices_of(self, names: Iterable[str]) -> Int[np.ndarray, "_"]:
+        """The vertices in any of those groups, by number; of a head without such groups none."""
         found = [np.asarray(self.vertex_groups.get(name, []), np.int64) for name in names]
         return np.unique(np.concatenate([*found, np.zeros(0, np.int64)]))
 

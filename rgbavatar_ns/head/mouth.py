@@ -45,7 +45,7 @@ class Mouth:
         points_m = (arrays.v_template[vertices] * weights[..., None]).sum(1)
         _, nearest = KDTree(arrays.v_template).query(points_m)
         cavity = _cut_off(_edge_lengths(arrays), np.asarray(nearest).tolist())
-        teeth, tongue = arrays.group(TEETH), arrays.group([TONGUE])
+        teeth, tongue = arrays.vertices_of(TEETH), arrays.vertices_of([TONGUE])
         return cls(vertices, weights, cavity, teeth, tongue)
 
 

@@ -91,7 +91,7 @@ def with_prior(state_dict: dict[str, Any], prior: SurfacePrior | None) -> dict[s
     """Return the state with all that a prior has, and without where the model has none.
 
     A run that began without a prior, or without its views, goes on without: a fresh one does
-    nothing.
+    nothing. What holds neighbours together is known anew when the prior looks next.
     """
     if prior is None:
         return {k: v for k, v in state_dict.items() if not k.startswith(_PRIOR)}

@@ -15,7 +15,7 @@ _BEFORE_M = np.array([0.0, -0.03, 0.6], np.float32)
 """An eye in front of the lips."""
 
 
-def _seen(head: HeadModel, jaw_rad: float, vertices: np.ndarray) -> np.ndarray:
+def seen_from_before(head: HeadModel, jaw_rad: float, vertices: np.ndarray) -> np.ndarray:
     """Which vertices an eye before the face sees, by rays that Embree casts."""
     theta = torch.zeros(head.layout.size)
     theta[head.layout.slice("jaw").start] = jaw_rad
@@ -32,7 +32,7 @@ def test_closed_lips_hide_what_an_opened_jaw_shows(name):
     mouth = Mouth.of(head.arrays)
     assert mouth is not None
     for part in (mouth.cavity, mouth.teeth, mouth.tongue):
-        hidden, shown = (_seen(head, jaw_rad, part).sum() for jaw_rad in (0.0, 0.4))
+        hidden, shown = (seen_from_before(head, jaw_rad, part).sum() for jaw_rad in (0.0, 0.4))
         assert hidden <= 0.02 * len(part)
         assert hidden + 3 < shown < len(part) / 2
 
@@ -44,7 +44,7 @@ def test_nothing_of_the_face_is_in_it():
     inside = np.concatenate([mouth.cavity, mouth.teeth, mouth.tongue])
     assert len(np.unique(inside)) == len(inside)
     assert not np.isin(arrays.faces[marks.triangle], inside).all(1).any()
-    skin = np.setdiff1d(arrays.group(["skin"]), mouth.cavity)
+    skin = np.setdiff1d(arrays.vertices_of(["skin"]), mouth.cavity)
     assert arrays.v_template[mouth.cavity, 2].max() < arrays.v_template[skin, 2].max() - 0.005
 
 

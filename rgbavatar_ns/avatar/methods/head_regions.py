@@ -19,7 +19,7 @@ MOUTH_GROUPS = (*TEETH, TONGUE)
 
 def group_vertices(arrays: HeadArrays, names: Iterable[str]) -> Int[Tensor, "G"]:
     """The vertices of those groups that this head has; of a head without any, none."""
-    return torch.from_numpy(arrays.group(names))
+    return torch.from_numpy(arrays.vertices_of(names))
 
 
 def faces_within(arrays: HeadArrays, faces: Int[Tensor, "F 3"], name: str) -> Bool[Tensor, "F"]:

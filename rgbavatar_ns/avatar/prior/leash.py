@@ -6,7 +6,7 @@ from torch import Tensor
 
 from rgbavatar_ns.avatar.avatar import Avatar
 from rgbavatar_ns.avatar.prior.mesh_field import MeshField
-from rgbavatar_ns.head.layout import RIGID_FIELDS
+from rgbavatar_ns.head.arrays import NECK_SHIFTS
 
 _RATE = 0.01
 """Share of the way to its neighbours' mean that a Gaussian goes in a step."""
@@ -30,7 +30,7 @@ class Leash:
 
     def __init__(self, avatar: Avatar, field: MeshField) -> None:
         self._field = field
-        rest = avatar.head(avatar.identity.new_zeros(1, avatar.layout.size), avatar.identity)
+        rest = avatar.carrier_vertices(avatar.identity.new_zeros(1, avatar.layout.size))
         self._to_head = avatar.anchors.frames(rest).matrix[0]
         inverse, failed = torch.linalg.inv_ex(self._to_head)
         flat = (failed != 0) | ~inverse.isfinite().flatten(1).all(1)
@@ -64,19 +64,24 @@ class Leash:
 
 @torch.no_grad()
 def _stretch(avatar: Avatar, field: MeshField) -> Float[Tensor, "V"]:
-    """How much any expression, or an opened jaw, changes the edges at each vertex, over lengths."""
-    layout = avatar.layout
+    """How much any expression, or an opened jaw, changes the edges at each vertex, over lengths.
+
+    Of what carries Gaussians; and what carries the head upon its body is no expression.
+    """
+    layout, names = avatar.layout, avatar.head.arrays.expression_names
+    carries = {layout.slice("expression").start + names.index(k) for k in NECK_SHIFTS if k in names}
     columns = [
         column
         for part in layout.fields
-        if part.form == "linear" and part.name not in RIGID_FIELDS
+        if part.form == "linear"
         for column in range(layout.size)[layout.slice(part.name)]
+        if column not in carries
     ]
     theta = avatar.identity.new_zeros(len(columns) + 2, layout.size)
     theta[torch.arange(len(columns)), columns] = 1
     theta[-2, layout.slice("jaw").start] = _JAW_RAD
     first, second = field.edges.unbind(1)
-    vertices = avatar.head(theta, avatar.identity)
+    vertices = avatar.carrier_vertices(theta)
     edges = vertices[:, second] - vertices[:, first]
     changed = (edges[:-1] - edges[-1:]).norm(dim=-1).amax(0)
     stretch = changed / edges[-1].norm(dim=-1).clamp(min=1e-9)

@@ -12,6 +12,7 @@ from torch.nn.functional import normalize
 from rgbavatar_ns.avatar.avatar import Avatar
 from rgbavatar_ns.avatar.model.blendshapes import color_from_feature, feature_from_color
 from rgbavatar_ns.head.mouth import Mouth
+from rgbavatar_ns.head.surface import vertex_normals
 from rgbavatar_ns.kernels import PinholeCameras
 
 _PARTED_M = 1e-3
@@ -24,6 +25,9 @@ _LIPS_M, _AROUND_M = 0.012, 0.05
 """Lips reach so far from their inner rims, inwards too, where they have the colour of their fronts:
 dark ones would come through where lips are pressed or pursed. And so far reaches the skin that the
 mouth's colours are guessed by."""
+_BACKWARDS, _RIM_M = -0.2, 0.004
+"""Normals (z forwards) from which a surface is never seen from in front, farther than so from the
+lips' inner rims, which turn inside out when they part."""
 
 
 @dataclass(frozen=True)
@@ -38,8 +42,11 @@ class HiddenMouth:
     """Those of cavity, teeth and tongue."""
     behind: Float[Tensor, "N"]
     """1 at these, falling to 0 at the lips."""
-    cavity: Float[Tensor, "N"]
+    in_cavity: Float[Tensor, "N"]
     """The same of the cavity alone."""
+    backs: Bool[Tensor, "N"]
+    """Those of the cavity that face the back of the head, behind lips and cheeks: nobody sees them
+    from outside, but where lips are pursed they come through."""
     corners: Int[Tensor, "G 3"]
     barycentric: Float[Tensor, "G 3"]
     rim_vertices: Int[Tensor, "R 3"]
@@ -72,6 +79,8 @@ class HiddenMouth:
         inside, cavity = np.zeros(len(template)), np.zeros(len(template))
         inside[np.concatenate([mouth.cavity, mouth.teeth, mouth.tongue])] = 1
         cavity[mouth.cavity] = 1
+        normals = vertex_normals(torch.from_numpy(template)[None], avatar.head.faces.cpu().long())
+        backs = (normals[0, :, 2].numpy() < _BACKWARDS) & (away_m > _RIM_M)
         around = (inside == 0) & (away_m > _LIPS_M) & (away_m < _AROUND_M)
 
         def here(values: np.ndarray) -> Tensor:
@@ -86,6 +95,7 @@ class HiddenMouth:
             gaussians,
             behind,
             at_gaussians(cavity),
+            at_gaussians(cavity * backs) > 0.5,
             corners[gaussians],
             barycentric[gaussians],
             torch.from_numpy(mouth.rim_vertices.astype(np.int64)).to(corners.device),

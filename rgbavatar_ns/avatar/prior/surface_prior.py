@@ -105,22 +105,19 @@ class SurfacePrior(nn.Module):
         # Here, so that timing steps on a bare machine needs no OpenCV.
         from rgbavatar_ns.avatar.prior.outline import measure_outline
 
-        field, mouth = self._known(avatar).field, self._known(avatar).mouth
+        field = self._known(avatar).field
         outline = measure_outline(avatar, field, theta, cameras, _as_bytes(images_rgba))
         offset_m = field.at_gaussians(outline.offset_m[:, None])[:, 0]
-        sunk = torch.full_like(offset_m, _SUNK)
-        if mouth is not None:  # which no outline tells of
-            offset_m = offset_m * (1 - mouth.behind)
-            sunk = torch.lerp(sunk, torch.full_like(sunk, _SUNK_IN_CAVITY), mouth.cavity)
-        self.offset_m.copy_(offset_m - sunk * avatar.initial_scale_m())
+        self.offset_m.copy_(offset_m - _SUNK * avatar.initial_scale_m())
         self.opacity_logit.copy_(torch.where(outline.empty_gaussians > 0.5, _EMPTY, _CLOSED))
         self.views.begin(avatar, outline, theta, cameras)
         self.views.see(avatar, theta, cameras)
         self.begun.fill_(True)
         with torch.no_grad():
-            avatar.blendshapes.position.copy_(self.offset_m[:, None] * field.outwards)
+            position, opacity_logit = self.surface(avatar)
+            avatar.blendshapes.position.copy_(position)
             avatar.blendshapes.log_scale.copy_(_disc(avatar, avatar.initial_scale_m()))
-            avatar.blendshapes.opacity_logit.copy_(self.opacity_logit.clamp(min=_FAINT))
+            avatar.blendshapes.opacity_logit.copy_(opacity_logit.clamp(min=_FAINT))
 
     def due(self, step: int) -> bool:
         """Whether to `look` before this step, counted from 0, and to `pull` after it."""
@@ -152,7 +149,8 @@ class SurfacePrior(nn.Module):
         shown_px, facing = sums.weighted_sum[..., 0], _facing(avatar, vertices, cameras)
         mouth = self._known(avatar).mouth
         if mouth is not None:
-            shown_px = mouth.through_lips(shown_px, vertices, cameras)
+            # Also where expressions do not carry Gaussians they part the lips.
+            shown_px = mouth.through_lips(shown_px, avatar.head(theta, avatar.identity), cameras)
         for known, share in (
             (self.through_px, torch.ones_like(facing)),
             (self.seen_px, _ramp(facing, _TURNED_AWAY, _FACING)),
@@ -177,22 +175,22 @@ class SurfacePrior(nn.Module):
         )
         pull, close = (_RATE * _SEEN_PX / (px + _SEEN_PX) for px in (self.seen_px, self.through_px))
         # Below its end a body is not kept by being seen from behind, through what ends before it.
-        closes = torch.where((self.opacity_logit < 0) & field.body_gaussians, pull, close)
+        home, opacity_logit = self.surface(avatar)
+        closes = torch.where((opacity_logit < 0) & field.body_gaussians, pull, close)
         # Discs of texels that lie farther apart than fresh ones reach are as wide as these need.
         disc = _disc(avatar, avatar.initial_scale_m().maximum(0.5 * avatar.anchors.texel_spacing()))
         # As far as nothing shows it, nothing else closes the surface around it.
         wider = _OVERLAP * (close / _RATE).square()
         if mouth is not None:  # where what lies behind is dark too
-            wider = wider * (1 - mouth.cavity)
+            wider = wider * (1 - mouth.in_cavity)
         disc[:, :2] += wider[:, None]
         upright = torch.zeros_like(shapes.rotation_wxyz)
         upright[:, 0] = 1
-        home = self.offset_m[:, None] * field.outwards
         rest = {
             "position": home,
             "rotation_wxyz": upright,
             "log_scale": disc,
-            "opacity_logit": self.opacity_logit,
+            "opacity_logit": opacity_logit,
             "color_feature": field.at_gaussians(color),
         }
         for name, target in rest.items():
@@ -212,6 +210,16 @@ class SurfacePrior(nn.Module):
         position = avatar.blendshapes.position
         share = self.leash_share[:, None].to(position)
         position.lerp_(self.leashed_position.to(position), share)
+
+    def surface(self, avatar: Avatar) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N"]]:
+        """Where each lies on the surface, in its tangent frame, and its opacity there, a logit."""
+        known, offset_m, opacity_logit = self._known(avatar), self.offset_m, self.opacity_logit
+        if known.mouth is not None:  # which no outline tells of
+            scale_m, mouth = avatar.initial_scale_m(), known.mouth
+            sunk = _SUNK + (_SUNK_IN_CAVITY - _SUNK) * mouth.in_cavity
+            offset_m = (offset_m + _SUNK * scale_m) * (1 - mouth.behind) - sunk * scale_m
+            opacity_logit = torch.where(mouth.backs, _EMPTY, opacity_logit)
+        return offset_m[:, None] * known.field.outwards, opacity_logit
 
     def _known(self, avatar: Avatar) -> "_Known":
         device = self.seen_px.device

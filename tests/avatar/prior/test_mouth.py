@@ -1,14 +1,19 @@
 """The mouth is seen through the lips alone, and what nobody saw in it is dark."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
 import torch
 
+from rgbavatar_ns.avatar import Avatar
 from rgbavatar_ns.avatar.model.blendshapes import color_from_feature, feature_from_color
 from rgbavatar_ns.avatar.prior import SurfacePrior
+from rgbavatar_ns.avatar.prior.mesh_field import MeshField
 from rgbavatar_ns.avatar.prior.mouth import HiddenMouth, within_polygon
 from rgbavatar_ns.kernels.constants import UNFILMED_RGBA
+from tests.head.test_mouth import seen_from_before
 
 from .test_mesh_field import embedded_avatar
 from .test_outline import drawn_thicker, front_camera, turned
@@ -58,6 +63,15 @@ def test_what_lies_behind_the_lips_counts_only_where_they_are_open(avatar, mouth
     assert torch.equal(opened[mouth.gaussians][through], shown_px[1, mouth.gaussians][through])
 
 
+@pytest.mark.parametrize("jaw_rad", [0.0, 0.2, 0.4])
+def test_nobody_in_front_sees_what_is_left_out_behind_the_lips(avatar, mouth, jaw_rad):
+    corners, barycentric = avatar.anchors.corners()
+    nearest = corners.gather(1, barycentric.argmax(1, keepdim=True))[:, 0]
+    backs = nearest[mouth.backs].unique()
+    assert len(backs) > 50
+    assert not seen_from_before(avatar.head, jaw_rad, backs.numpy()).any()
+
+
 def test_guesses_are_the_skins_colour_in_the_dark_and_give_way_to_what_is_seen(mouth):
     skin = torch.tensor([0.8, 0.6, 0.5])
     nothing = torch.zeros(len(mouth.weight))
@@ -89,12 +103,35 @@ def test_a_mouth_that_never_opened_is_dark_within(avatar, mouth):
     colors = color_from_feature(shapes.color_feature.detach())
     seen = prior.clear_px > 0.5
     assert int(seen.sum()) > 100
-    assert not seen[mouth.gaussians].any()
+    assert float(seen[mouth.gaussians].float().mean()) < 0.05
     assert float((colors[seen] - colors.new_tensor([0.8, 0.6, 0.5])).abs().max()) < 0.02
-    inside = mouth.cavity > 0.99
+    inside = mouth.in_cavity > 0.99
     assert float(colors[inside].mean(1).median()) < 0.3
-    # And it is not sunk into the lips.
-    assert float(prior.offset_m[inside].min()) > 0
+    # It is not sunk into the lips, and what faces them from behind is clear.
+    outwards = MeshField(avatar).outwards
+    assert float((shapes.position[inside] * outwards[inside]).sum(1).min()) > 0
+    assert float((shapes.opacity_logit[mouth.backs] < -5).float().mean()) > 0.9
+    assert float((shapes.opacity_logit[inside & ~mouth.backs] > 1).float().mean()) > 0.9
+
+
+def test_lips_are_parted_by_expressions_that_carry_no_gaussian(monkeypatch):
+    plain = embedded_avatar()
+    avatar = Avatar(plain.head, plain.identity, replace(plain.config, carrier="joints"))
+    theta = turned(avatar, [0.0, 5.0])
+    part, names = avatar.layout.slice("expression"), avatar.head.arrays.expression_names
+    theta[1, part.start + names.index("mouthUpperUpLeft")] = 1.0
+    prior, given = SurfacePrior(avatar), []
+    images = drawn_thicker(avatar, theta, 0.0)
+    prior.begin(avatar, theta, front_camera(), images)
+
+    def through(mouth, shown_px, vertices, cameras):
+        given.append(vertices)
+        return shown_px
+
+    monkeypatch.setattr(HiddenMouth, "through_lips", through)
+    prior.look(avatar, theta, front_camera(), images)
+    assert torch.equal(given[0], avatar.head(theta, avatar.identity))
+    assert not torch.equal(given[0][1], avatar.carrier_vertices(theta)[1])
 
 
 def test_with_nothing_filmed_there_is_no_colour_to_guess_by(avatar, mouth):

@@ -43,7 +43,13 @@ def shaken(avatar) -> None:
 
 
 def _on_the_surface(avatar, prior) -> torch.Tensor:
-    return prior.offset_m[:, None] * MeshField(avatar).outwards
+    position, opacity_logit = prior.surface(avatar)
+    mouth = HiddenMouth.of(avatar)
+    assert mouth is not None
+    skin = mouth.behind == 0
+    assert torch.equal(position[skin], (prior.offset_m[:, None] * MeshField(avatar).outwards)[skin])
+    assert torch.equal(opacity_logit[skin], prior.opacity_logit[skin])
+    return position
 
 
 def test_what_no_frame_shows_comes_to_the_surface(filmed):
@@ -60,7 +66,7 @@ def test_what_no_frame_shows_comes_to_the_surface(filmed):
     assert float((shapes.position - _on_the_surface(avatar, prior)).abs().max()) < 1e-6
     assert float(shapes.basis_position.abs().max()) < 1e-6
     assert float(shapes.basis_color_feature.abs().max()) < 1e-4
-    assert torch.allclose(shapes.opacity_logit, prior.opacity_logit)
+    assert torch.allclose(shapes.opacity_logit, prior.surface(avatar)[1])
 
 
 def test_discs_that_nothing_shows_reach_each_other(filmed):
@@ -77,8 +83,8 @@ def test_discs_that_nothing_shows_reach_each_other(filmed):
     mouth = HiddenMouth.of(avatar)
     assert mouth is not None
     # Half as wide as texels lie apart, and by 1.4 more but in the mouth, whose lips are thin.
-    wide = 0.5 * apart * 1.4 ** (1 - mouth.cavity)[:, None]
-    assert int((mouth.cavity == 0).sum()) > 0.9 * avatar.num_gaussians
+    wide = 0.5 * apart * 1.4 ** (1 - mouth.in_cavity)[:, None]
+    assert int((mouth.in_cavity == 0).sum()) > 0.9 * avatar.num_gaussians
     assert torch.allclose(avatar.blendshapes.log_scale[:, :2].exp(), wide, rtol=1e-3)
 
 
