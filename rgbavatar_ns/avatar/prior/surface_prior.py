@@ -202,7 +202,7 @@ class SurfacePrior(nn.Module):
                 getattr(shapes, name).mul_((1 - pull)[:, None])
         counts = shapes.opacity_logit.sigmoid() * (1 - pull / _RATE)
         self.leashed_position.copy_(known.leash.smooth(shapes.position, home, counts))
-        self.leash_share.copy_(known.leash.share)
+        self.leash_share.copy_(known.leash.share(avatar))
 
     @torch.no_grad()
     def hold(self, avatar: Avatar) -> None:

@@ -66,7 +66,8 @@ def test_what_nothing_knows_follows_what_is_known(avatar, leash):
 
 
 def test_it_holds_where_the_face_moves(avatar, leash):
-    most = float(leash.share.max())
+    share = leash.share(avatar)
+    most = float(share.max())
     assert most == pytest.approx(0.01)
     arrays, (corners, barycentric) = avatar.head.arrays, avatar.anchors.corners()
 
@@ -77,18 +78,32 @@ def test_it_holds_where_the_face_moves(avatar, leash):
     of_jaw = at(torch.as_tensor(arrays.skinning_weights[:, JAW]).float()) > 0.999
     assert int(of_jaw.sum()) > 20
     by_hand = most * min(1.0, 2 * math.sin(0.15) / 0.3)
-    assert float(leash.share[of_jaw].min()) > 0.98 * by_hand
+    assert float(share[of_jaw].min()) > 0.98 * by_hand
 
 
 @pytest.mark.parametrize("name", [EMBEDDED_HEAD, EMBEDDED_BUST])
 def test_it_lets_hair_go_and_what_carries_the_head(name):
     avatar = embedded_avatar(uv_resolution=96, name=name)
     field = MeshField(avatar)
-    share = Leash(avatar, field).share / 0.01
+    share = Leash(avatar, field).share(avatar) / 0.01
     hair = field.at_gaussians(field.scalp.float()[:, None])[:, 0] > 0.99
     assert int(hair.sum()) > 200
     assert float(share[hair].mean()) < 0.01
     assert float(share[hair].max()) < 0.2
+
+
+def test_a_film_that_moves_the_face_needs_none(avatar, leash):
+    speech, everything = torch.zeros(2, avatar.layout.size), torch.zeros(2, avatar.layout.size)
+    part, jaw = avatar.layout.slice("expression"), avatar.layout.slice("jaw").start
+    speech[1, part], speech[1, jaw] = 0.25, 0.25 * 0.3
+    everything[1, part], everything[1, jaw] = 0.6, 0.6 * 0.3
+    before = leash.share(avatar)
+    avatar.widen_film_range(speech)
+    assert torch.allclose(leash.share(avatar), before, atol=1e-6)
+    avatar.widen_film_range(0.375 / 0.25 * speech)
+    assert torch.allclose(leash.share(avatar), before / 2, atol=1e-6)
+    avatar.widen_film_range(everything)
+    assert not leash.share(avatar).any()
 
 
 def test_every_step_draws_by_the_share_once_it_is_known(avatar):
@@ -105,5 +120,5 @@ def test_every_step_draws_by_the_share_once_it_is_known(avatar):
     assert torch.equal(free.detach(), prior.leashed_position)
     prior.look(avatar, theta, front_camera(), images)
     prior.pull(avatar, 199)
-    known = prior._known(avatar).leash.share
+    known = prior._known(avatar).leash.share(avatar)
     assert torch.equal(prior.leash_share, known)
