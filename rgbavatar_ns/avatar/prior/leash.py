@@ -1,4 +1,4 @@
-"""A leash for Gaussians: where expressions move the face they stay beside their neighbours."""
+"""A leash for Gaussians: where faces move farther than filmed they stay beside their neighbours."""
 
 import torch
 from jaxtyping import Float, Int

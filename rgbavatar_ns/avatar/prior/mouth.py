@@ -11,8 +11,9 @@ from torch.nn.functional import normalize
 
 from rgbavatar_ns.avatar.avatar import Avatar
 from rgbavatar_ns.avatar.model.blendshapes import color_from_feature, feature_from_color
+from rgbavatar_ns.avatar.prior.mesh_field import MeshField
 from rgbavatar_ns.head.mouth import Mouth
-from rgbavatar_ns.head.surface import vertex_normals
+from rgbavatar_ns.head.surface import interpolated, vertex_normals
 from rgbavatar_ns.kernels import PinholeCameras
 
 _PARTED_M = 1e-3
@@ -59,7 +60,7 @@ class HiddenMouth:
     """1 on the skin around the lips."""
 
     @classmethod
-    def of(cls, avatar: Avatar) -> "HiddenMouth | None":
+    def of(cls, avatar: Avatar, field: MeshField) -> "HiddenMouth | None":
         """The mouth of an avatar's head, if it is known where it has one."""
         arrays = avatar.head.arrays
         mouth = Mouth.of(arrays)
@@ -87,7 +88,7 @@ class HiddenMouth:
             return torch.from_numpy(values).to(barycentric)
 
         def at_gaussians(values: np.ndarray) -> Float[Tensor, "N"]:
-            return (here(values)[corners] * barycentric).sum(1)
+            return field.at_gaussians(here(values)[:, None])[:, 0]
 
         behind = at_gaussians(inside)
         gaussians = torch.nonzero(behind > 0.5)[:, 0]
@@ -112,9 +113,9 @@ class HiddenMouth:
         cameras: PinholeCameras,
     ) -> Float[Tensor, "B N"]:
         """What frames show of each Gaussian, less what lies behind closed lips or cheeks."""
-        rim = (vertices[:, self.rim_vertices] * self.rim_weights[..., None]).sum(2)
+        rim = interpolated(vertices, self.rim_vertices, self.rim_weights)
         rim = rim + _PARTED_M * normalize(rim - rim.mean(1, keepdim=True), dim=-1)
-        places = (vertices[:, self.corners] * self.barycentric[..., None]).sum(2)
+        places = interpolated(vertices, self.corners, self.barycentric)
         seen = within_polygon(cameras.project(places), cameras.project(rim))
         share = torch.ones_like(shown_px).index_copy(1, self.gaussians, seen.to(shown_px))
         return shown_px * share

@@ -85,7 +85,7 @@ class SurfacePrior(nn.Module):
         self.register_buffer("leash_share", torch.zeros(num_gaussians))
         self.register_buffer("begun", torch.zeros((), dtype=torch.bool))
         self.views = VirtualViews(len(avatar.head.arrays.v_template), avatar.layout.size)
-        self._known_of: tuple[torch.device, _Known] | None = None
+        self._parts_of: tuple[torch.device, _Parts] | None = None
         self._has_begun = False
 
     @property
@@ -105,7 +105,7 @@ class SurfacePrior(nn.Module):
         # Here, so that timing steps on a bare machine needs no OpenCV.
         from rgbavatar_ns.avatar.prior.outline import measure_outline
 
-        field = self._known(avatar).field
+        field = self._parts(avatar).field
         outline = measure_outline(avatar, field, theta, cameras, _as_bytes(images_rgba))
         offset_m = field.at_gaussians(outline.offset_m[:, None])[:, 0]
         self.offset_m.copy_(offset_m - _SUNK * avatar.initial_scale_m())
@@ -147,7 +147,7 @@ class SurfacePrior(nn.Module):
             sums = weighted_color_average(avatar.gaussians(theta), cameras, filmed, backend=backend)
         vertices, cameras = avatar.carrier_vertices(theta), cameras.to(avatar.identity)
         shown_px, facing = sums.weighted_sum[..., 0], _facing(avatar, vertices, cameras)
-        mouth = self._known(avatar).mouth
+        mouth = self._parts(avatar).mouth
         if mouth is not None:
             # Also where expressions do not carry Gaussians they part the lips.
             shown_px = mouth.through_lips(shown_px, avatar.head(theta, avatar.identity), cameras)
@@ -163,8 +163,8 @@ class SurfacePrior(nn.Module):
         """Draw to the surface what no frame shows."""
         if step < _FIRST_PULL:
             return
-        shapes, known = avatar.blendshapes, self._known(avatar)
-        field, mouth = known.field, known.mouth
+        shapes, parts = avatar.blendshapes, self._parts(avatar)
+        field, mouth = parts.field, parts.mouth
         clear = self.clear_px.square() / (self.clear_px.square() + _CLEAR_PX**2)
         told, confidence = field.of_gaussians(shapes.color_feature, clear)
         if mouth is not None:
@@ -201,8 +201,8 @@ class SurfacePrior(nn.Module):
             if shapes.num_bases:
                 getattr(shapes, name).mul_((1 - pull)[:, None])
         counts = shapes.opacity_logit.sigmoid() * (1 - pull / _RATE)
-        self.leashed_position.copy_(known.leash.smooth(shapes.position, home, counts))
-        self.leash_share.copy_(known.leash.share(avatar))
+        self.leashed_position.copy_(parts.leash.smooth(shapes.position, home, counts))
+        self.leash_share.copy_(parts.leash.share(avatar))
 
     @torch.no_grad()
     def hold(self, avatar: Avatar) -> None:
@@ -213,26 +213,26 @@ class SurfacePrior(nn.Module):
 
     def surface(self, avatar: Avatar) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N"]]:
         """Where each lies on the surface, in its tangent frame, and its opacity there, a logit."""
-        known, offset_m, opacity_logit = self._known(avatar), self.offset_m, self.opacity_logit
-        if known.mouth is not None:  # which no outline tells of
-            scale_m, mouth = avatar.initial_scale_m(), known.mouth
+        parts, offset_m, opacity_logit = self._parts(avatar), self.offset_m, self.opacity_logit
+        if parts.mouth is not None:  # which no outline tells of
+            scale_m, mouth = avatar.initial_scale_m(), parts.mouth
             sunk = _SUNK + (_SUNK_IN_CAVITY - _SUNK) * mouth.in_cavity
             offset_m = (offset_m + _SUNK * scale_m) * (1 - mouth.behind) - sunk * scale_m
             opacity_logit = torch.where(mouth.backs, _EMPTY, opacity_logit)
-        return offset_m[:, None] * known.field.outwards, opacity_logit
+        return offset_m[:, None] * parts.field.outwards, opacity_logit
 
-    def _known(self, avatar: Avatar) -> "_Known":
+    def _parts(self, avatar: Avatar) -> "_Parts":
         device = self.seen_px.device
-        if self._known_of is None or self._known_of[0] != device:
+        if self._parts_of is None or self._parts_of[0] != device:
             field = MeshField(avatar)
-            known = _Known(field, HiddenMouth.of(avatar), Leash(avatar, field))
-            self._known_of = device, known
-        return self._known_of[1]
+            mouth, leash = HiddenMouth.of(avatar, field), Leash(avatar, field)
+            self._parts_of = device, _Parts(field, mouth, leash)
+        return self._parts_of[1]
 
 
 @dataclass(frozen=True)
-class _Known:
-    """What is the same in every look at an avatar."""
+class _Parts:
+    """What the prior knows of an avatar's head, the same in every look."""
 
     field: MeshField
     mouth: HiddenMouth | None

@@ -406,7 +406,7 @@ class TrainingStep:
             self._prior.begin(self.avatar, batch.theta, batch.cameras, batch.images_rgba)
 
     def _finish(self, step: int) -> None:
-        """What is due after a step: what is not seen, orthogonal bases."""
+        """What is due after a step: neighbours held, what is not seen, orthogonal bases."""
         if self._prior is not None:
             self._prior.hold(self.avatar)
             if self._prior.due(step):

@@ -120,5 +120,4 @@ def test_every_step_draws_by_the_share_once_it_is_known(avatar):
     assert torch.equal(free.detach(), prior.leashed_position)
     prior.look(avatar, theta, front_camera(), images)
     prior.pull(avatar, 199)
-    known = prior._known(avatar).leash.share(avatar)
-    assert torch.equal(prior.leash_share, known)
+    assert torch.equal(prior.leash_share, Leash(avatar, MeshField(avatar)).share(avatar))

@@ -27,7 +27,7 @@ def avatar():
 
 @pytest.fixture
 def mouth(avatar) -> HiddenMouth:
-    found = HiddenMouth.of(avatar)
+    found = HiddenMouth.of(avatar, MeshField(avatar))
     assert found is not None
     return found
 

@@ -44,7 +44,7 @@ def shaken(avatar) -> None:
 
 def _on_the_surface(avatar, prior) -> torch.Tensor:
     position, opacity_logit = prior.surface(avatar)
-    mouth = HiddenMouth.of(avatar)
+    mouth = HiddenMouth.of(avatar, MeshField(avatar))
     assert mouth is not None
     skin = mouth.behind == 0
     assert torch.equal(position[skin], (prior.offset_m[:, None] * MeshField(avatar).outwards)[skin])
@@ -80,7 +80,7 @@ def test_discs_that_nothing_shows_reach_each_other(filmed):
         prior.look(avatar, theta, front_camera(), nobody_filmed)
         prior.pull(avatar, step)
     apart = avatar.anchors.texel_spacing()[:, None] * avatar.anchors.texel_stretch()
-    mouth = HiddenMouth.of(avatar)
+    mouth = HiddenMouth.of(avatar, MeshField(avatar))
     assert mouth is not None
     # Half as wide as texels lie apart, and by 1.4 more but in the mouth, whose lips are thin.
     wide = 0.5 * apart * 1.4 ** (1 - mouth.in_cavity)[:, None]
