@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Collection, Iterator, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from functools import partial
@@ -172,17 +172,17 @@ class FrameSource:
                 stream = _image_stream(container, path)
                 stream.thread_type = "AUTO"
                 aspect = stream.sample_aspect_ratio or Fraction(1)
-                decoder = self._alpha_decoder(stream, path)
-                for packet in container.demux(stream):
-                    try:
-                        frames = decoder.decode(packet)
-                    except FFmpegError as error:
-                        damaged, broken = damaged + 1, error
-                        continue
-                    for frame in frames:
-                        decoded += 1
-                        damaged += bool(frame.is_corrupt)
-                        yield _upright(frame, aspect)
+                with _at_rest_afterwards(self._alpha_decoder(stream, path)) as decoder:
+                    for packet in container.demux(stream):
+                        try:
+                            frames = decoder.decode(packet)
+                        except FFmpegError as error:
+                            damaged, broken = damaged + 1, error
+                            continue
+                        for frame in frames:
+                            decoded += 1
+                            damaged += bool(frame.is_corrupt)
+                            yield _upright(frame, aspect)
                 declared = stream.frames
         except (FFmpegError, OSError) as error:
             if not decoded:
@@ -235,6 +235,19 @@ def _image_of_size(
 def _opened(path: Path) -> InputContainer:
     # A relative name with a colon would be taken for a protocol.
     return av.open(str(path.absolute()))
+
+
+@contextmanager
+def _at_rest_afterwards(decoder: VideoCodecContext) -> Iterator[VideoCodecContext]:
+    """The decoder, whose threads are waited for before anything can free it.
+
+    PyAV frees it while it holds Python's lock, and torchvision, once imported, has FFmpeg's errors
+    told through Python: a thread that met damage behind the last frame read would wait for ever.
+    """
+    try:
+        yield decoder
+    finally:
+        decoder.flush_buffers()
 
 
 def _image_stream(container: InputContainer, path: Path) -> VideoStream:
