@@ -26,6 +26,8 @@ _AGREES = 0.7
 _REACH_M = 0.04
 """Farther borders belong to something else."""
 _BESIDE_PX = 3.0
+_LIFT_M, _LEAST_UPWARDS = 0.1, 0.5
+"""Clothes stand farther off than hair; normals have so much of upwards where a body is lifted."""
 _SPREAD, _LEAST_ALIKE = 0.12, 0.02
 _REST, _SCALP_REST = 0.05, 0.0005
 """How soon the offset goes back to none away from a rim; hair goes around the head."""
@@ -68,7 +70,7 @@ def measure_outline(
     sums = _Sums(*(np.zeros((count, *size), np.float32) for size in ((), (), (3,), ())))
     placed = [PlacedMesh.of(vertices.cpu(), normals, cameras, k) for k in range(len(theta))]
     for image, seen in zip(images, placed):
-        _add_frame(sums, image, seen, faces.numpy())
+        _add_frame(sums, image, seen, faces.numpy(), field)
     facing = torch.from_numpy(sums.facing)
     colors = torch.from_numpy(sums.color) / facing[:, None].clamp(min=1e-6)
     offset = torch.from_numpy(sums.distance_m / np.maximum(sums.rims, 1))[:, None]
@@ -146,6 +148,11 @@ class PlacedMesh:
             camera.principal_point_px[0].cpu().to(vertices),
         )
 
+    def is_upright(self, height_m: Float[Tensor, "V"]) -> bool:
+        """Whether a mesh of these heights stands in the picture, within 45 degrees."""
+        across, down, _ = self.places_m[height_m.argmin()] - self.places_m[height_m.argmax()]
+        return bool(down > across.abs())
+
     def moved(self, offset_m: Float[Tensor, "V"] | float) -> Float[np.ndarray, "V 2"]:
         """Where the vertices, moved along their normals, are in the picture."""
         offset = torch.as_tensor(offset_m, dtype=self.places_m.dtype).reshape(-1, 1)
@@ -154,7 +161,9 @@ class PlacedMesh:
         return px.numpy().astype(np.float32)
 
 
-def _add_frame(sums: _Sums, image: np.ndarray, seen: PlacedMesh, faces: np.ndarray) -> None:
+def _add_frame(
+    sums: _Sums, image: np.ndarray, seen: PlacedMesh, faces: np.ndarray, field: MeshField
+) -> None:
     """Rims with their distance to the matte's border, and colours of what faces the camera."""
     height, width = image.shape[:2]
     px, view = seen.moved(0.0), F.normalize(seen.places_m, dim=-1)
@@ -171,6 +180,12 @@ def _add_frame(sums: _Sums, image: np.ndarray, seen: PlacedMesh, faces: np.ndarr
     metres = apart * seen.places_m[:, 2].numpy() / float(seen.focal_px[0])
     rim = (np.abs(along) < _GRAZING) & (beside >= 0) & (beside < 0.1) & filmed
     rim &= (-(inwards * outwards).sum(1) > _AGREES) & (np.abs(metres) < _REACH_M)
+    upper = (field.body.cpu() & (seen.normals[:, 1] < -_LEAST_UPWARDS)).numpy()
+    if seen.is_upright(field.height_m.cpu()):
+        lifts_px, at_rim = _lifts_px(image, mesh, px)
+        lifts_m = lifts_px * seen.places_m[:, 2].numpy() / float(seen.focal_px[1])
+        lifted = at_rim & filmed & (np.abs(lifts_m) < _LIFT_M)
+        metres, rim = np.where(upper, lifts_m, metres), np.where(upper, lifted, rim)
     sums.distance_m[rim] += metres[rim]
     sums.rims[rim] += 1
     covered = image[..., 3:].astype(np.float32) / 255
@@ -179,6 +194,37 @@ def _add_frame(sums: _Sums, image: np.ndarray, seen: PlacedMesh, faces: np.ndarr
     facing = (-along - 0.2).clip(0) * (color[:, 3] > 0.95)
     sums.color += color[:, :3] * facing[:, None]
     sums.facing += facing
+
+
+def _lifts_px(
+    image: np.ndarray,
+    mesh: UInt8[np.ndarray, "height width"],
+    px: Float[np.ndarray, "V 2"],
+) -> tuple[Int[np.ndarray, "V"], Bool[np.ndarray, "V"]]:
+    """How far the matte ends above the mesh's upper rim, and which vertices are of that rim.
+
+    Straight up, since shoulders hardly show where they turn away, and between neck and shoulder
+    the normals of a mesh that lies lower point at the neck.
+    """
+    height, width = mesh.shape
+    column, row = np.floor(px.clip(0, [width - 1, height - 1])).astype(int).T
+    above = np.maximum(row - round(_BESIDE_PX), 0)
+    rim = (mesh[row, column] > 0) & (mesh[above, column] == 0)
+    unfilmed = unfilmed_pixels(image)
+    matte = (image[..., 3] > 127) | unfilmed
+    top, mesh_top = (_first_rows(mask)[row, column] for mask in (matte, mesh > 0))
+    rim &= (top > 0) & (top < height) & ~unfilmed[top.clip(0, height - 1), column]
+    return mesh_top - top, rim & (px > 0).all(1) & (px < [width, height]).all(1)
+
+
+def _first_rows(mask: Bool[np.ndarray, "height width"]) -> Int[np.ndarray, "height width"]:
+    """The row at which each pixel's column enters the mask that holds it, or the next one below;
+    beyond the last where there is none."""
+    rows = np.arange(len(mask))[:, None]
+    begins = mask & ~np.pad(mask, ((1, 0), (0, 0)))[:-1]
+    last = np.maximum.accumulate(np.where(begins, rows, -1), 0)
+    following = np.minimum.accumulate(np.where(begins, rows, 2 * len(mask))[::-1], 0)[::-1]
+    return np.where(mask, last, following)
 
 
 def covered_pixels(
