@@ -54,7 +54,7 @@ class AvatarConfig(MethodConfig):
     """Whether Gaussians grow and shrink with their triangle (paper, release: no)."""
     initial_scale_m: Annotated[float, Between(1e-7, 1)] = 8e-4
     """Initial standard deviation of every Gaussian in metres (paper: "a default value"; release:
-    .0008)."""
+    .0008); with a surface prior wider where half of what texels lie apart is more."""
     scale_from_texel_spacing: bool = False
     """Take the initial scale from the distance of neighbouring texels on the head instead: ours,
     for fewer Gaussians than the paper's."""

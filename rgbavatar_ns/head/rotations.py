@@ -143,6 +143,15 @@ def conjugate_quats_wxyz(quats_wxyz: Float[Tensor, "*batch 4"]) -> Float[Tensor,
     return torch.cat([quats_wxyz[..., :1], -quats_wxyz[..., 1:]], -1)
 
 
+def turn_back(
+    quats_wxyz: Float[Tensor, "*batch 4"], vectors: Float[Tensor, "*batch 3"]
+) -> Float[Tensor, "*batch 3"]:
+    """Vectors as seen from axes that are turned by unit quaternions."""
+    pure = torch.nn.functional.pad(vectors, (1, 0))
+    turned = multiply_quats_wxyz(conjugate_quats_wxyz(quats_wxyz), pure)
+    return multiply_quats_wxyz(turned, quats_wxyz)[..., 1:]
+
+
 class _QuatProduct(torch.autograd.Function):
     """`multiply_quats_wxyz` of equal shapes, with its gradient written out.
 

@@ -109,3 +109,11 @@ def test_a_product_of_quaternions_turns_by_the_second_then_the_first() -> None:
     torch.testing.assert_close(back, first * second.square().sum(-1, keepdim=True))
     inputs = (first.requires_grad_(), second.requires_grad_())
     assert torch.autograd.gradcheck(rotations.multiply_quats_wxyz, inputs)
+
+
+def test_turning_back_undoes_the_matrix() -> None:
+    random = torch.Generator().manual_seed(5)
+    quats = torch.nn.functional.normalize(torch.randn(20, 4, generator=random).double(), dim=-1)
+    vectors = torch.randn(20, 3, generator=random).double()
+    turned = (rotations.quat_wxyz_to_matrix(quats) @ vectors[..., None])[..., 0]
+    torch.testing.assert_close(rotations.turn_back(quats, turned), vectors)

@@ -19,7 +19,7 @@ def test_a_run_of_before_is_held_from_its_next_look_on():
     begun.look(avatar, theta, front_camera(), images)
     begun.pull(avatar, 199)
     state = {f"prior.{name}": value for name, value in begun.state_dict().items()}
-    for name in ("leashed_position", "leash_share"):
+    for name in ("leashed_position", "leash_share", "grazing_px"):
         del state[f"prior.{name}"]
     state = with_prior(state, resumed)
     resumed.load_state_dict({name.removeprefix("prior."): value for name, value in state.items()})

@@ -4,6 +4,7 @@ import warnings
 from dataclasses import dataclass
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 from torch import Tensor
@@ -11,6 +12,7 @@ from torch import Tensor
 from rgbavatar_ns.avatar.avatar import Avatar
 from rgbavatar_ns.head import HeadArrays
 from rgbavatar_ns.head.joints import EYES, ROOT
+from rgbavatar_ns.head.rotations import turn_back
 from rgbavatar_ns.head.surface import MeshEdges, vertex_normals
 
 _BEHIND_EYES_M, _BELOW_EYES_M = 0.095, 0.05
@@ -41,8 +43,11 @@ class MeshField:
     """The vertices of an avatar's mesh as a graph, and the Gaussians' places in it.
 
     `outwards` is where a surface off the mesh lies from each Gaussian, in its tangent frame at
-    rest: between the vertices' normals, so that it does not gape over the mesh's edges. `height_m`
-    is each vertex's on the template, `body` and `body_gaussians` what lies below the neck's foot.
+    rest: between the vertices' normals, so that it does not gape over the mesh's edges;
+    `normal_of_gaussians` is that direction in the axes that their rotations are in. `rest_m` and
+    `normals` are the vertices' own at rest, `height_m` is theirs on the template; `body` and
+    `body_gaussians` lie below the neck's foot, `scalp` where nearly everybody who has hair has it,
+    `back` (1 or 0) behind the ears.
 
     Values are continued harmonically, as heat would spread, to both sides of the face alike. Ours:
     because what nobody filmed is best guessed by what surrounds it.
@@ -58,7 +63,10 @@ class MeshField:
         numbers = torch.unique(first * self.num_vertices + second)
         self.edges = torch.stack([numbers // self.num_vertices, numbers % self.num_vertices], 1)
         self._mirror, self._mirrored = _mirror_of(template)
-        self.scalp = _scalp_of(avatar.head.arrays).to(template.device)
+        behind, up = (part.to(template) for part in _behind_and_above_eyes(avatar.head.arrays))
+        back = behind > _BEHIND_EYES_M
+        self.back = back.to(template)
+        self.scalp = (back & (up > -_BELOW_EYES_M)) | ((behind > _TEMPLE_M) & (up > _ABOVE_EARS_M))
         self.height_m = template[:, 1]
         self.body = _body_of(avatar.head.arrays).to(template.device)
         first, second = self.edges.unbind(1)
@@ -66,20 +74,18 @@ class MeshField:
         self._row_starts = torch.cat([ends_of_rows.new_zeros(1), ends_of_rows])
         # A GPU's library reads them as they lie, one behind the other.
         self._columns = second.contiguous()
-        across = self.scalp[first] != self.scalp[second]
+        # Above the ears hair goes on, or a bald head does.
+        low = up < _ABOVE_EARS_M
+        across = (self.scalp[first] != self.scalp[second]) & low[first] & low[second]
         self.links = torch.where(across, _HAIRLINE, 1.0).to(template)
         self.body_gaussians = self.at_gaussians(self.body.to(template)[:, None])[:, 0] > 0.5
-        self.outwards = self._outwards(avatar)
-
-    @torch.no_grad()
-    def _outwards(self, avatar: Avatar) -> Float[Tensor, "N 3"]:
-        rest = avatar.head(avatar.identity.new_zeros(1, avatar.layout.size), avatar.identity)
-        smooth = self.at_gaussians(vertex_normals(rest, avatar.head.faces.long())[0])
-        frames = avatar.anchors.frames(rest).matrix[0]
-        found, failed = torch.linalg.solve_ex(frames, smooth[..., None])
-        flat = (failed != 0) | ~found.isfinite().all((1, 2))
-        # A triangle without area has no frame to turn it into.
-        return torch.where(flat[:, None], torch.eye(3).to(smooth)[2], found[..., 0])
+        with torch.no_grad():
+            rest = avatar.head(avatar.identity.new_zeros(1, avatar.layout.size), avatar.identity)
+            self.rest_m, self.normals = rest[0], vertex_normals(rest, faces)[0]
+            frames = avatar.anchors.frames(rest)
+            smooth = self.at_gaussians(self.normals)
+            self.outwards = _solved(frames.matrix[0], smooth)
+            self.normal_of_gaussians = F.normalize(turn_back(frames.quat_wxyz[0], smooth), dim=-1)
 
     def of_gaussians(
         self, values: Float[Tensor, "N C"], confidence: Float[Tensor, "N"]
@@ -91,6 +97,12 @@ class MeshField:
         for corner in range(3):
             sums.index_add_(0, self._corners[:, corner], ones * shares[:, corner : corner + 1])
         return sums[:, :-1] / sums[:, -1:].clamp(min=1e-12), sums[:, -1]
+
+    def mean_around(self, of_edges: Float[Tensor, "E"]) -> Float[Tensor, "V"]:
+        """Each vertex's mean of its edges."""
+        sums = of_edges.new_zeros(self.num_vertices)
+        sums.index_add_(0, self.edges[:, 0], of_edges)
+        return sums / self._row_starts.diff().clamp(min=1)
 
     def at_gaussians(self, values: Float[Tensor, "V C"]) -> Float[Tensor, "N C"]:
         """The values of vertices where the Gaussians are."""
@@ -152,6 +164,13 @@ class MeshField:
             )
 
 
+def _solved(frames: Float[Tensor, "N 3 3"], vectors: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+    """Vectors in tangent frames, and the third axis where a triangle has no area."""
+    found, failed = torch.linalg.solve_ex(frames, vectors[..., None])
+    flat = (failed != 0) | ~found.isfinite().all((1, 2))
+    return torch.where(flat[:, None], torch.eye(3).to(vectors)[2], found[..., 0])
+
+
 def _conjugate_gradients(product, wanted: Tensor, start: Tensor, diagonal: Tensor, iterations: int):
     """Solve each column by itself, preconditioned by the diagonal."""
     x, left = start, wanted - product(start)
@@ -167,12 +186,11 @@ def _conjugate_gradients(product, wanted: Tensor, start: Tensor, diagonal: Tenso
     return x
 
 
-def _scalp_of(arrays: HeadArrays) -> Bool[Tensor, "V"]:
-    """Vertices where nearly everybody who has hair has it, by where they lie to the eyes."""
+def _behind_and_above_eyes(arrays: HeadArrays) -> tuple[Float[Tensor, "V"], Float[Tensor, "V"]]:
+    """How far each vertex lies behind the eyes, and above them, in metres."""
     eyes = (arrays.joint_regressor[EYES] @ arrays.v_template).mean(0)
     _, up, forward = torch.from_numpy((arrays.v_template - eyes).astype("float32")).unbind(1)
-    behind = (forward < -_BEHIND_EYES_M) & (up > -_BELOW_EYES_M)
-    return behind | ((forward < -_TEMPLE_M) & (up > _ABOVE_EARS_M))
+    return -forward, up
 
 
 def _body_of(arrays: HeadArrays) -> Bool[Tensor, "V"]:

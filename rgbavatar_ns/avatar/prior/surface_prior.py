@@ -13,6 +13,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 
 from rgbavatar_ns.avatar.avatar import Avatar
+from rgbavatar_ns.avatar.prior.discs import disc_log_scale, flatten, log_overlap
 from rgbavatar_ns.avatar.prior.leash import Leash
 from rgbavatar_ns.avatar.prior.mesh_field import MeshField
 from rgbavatar_ns.avatar.prior.mouth import HiddenMouth
@@ -29,19 +30,19 @@ _RATE = 0.4
 _FORGETS = 0.97
 _SEEN_PX = 0.02
 """Pixels that a Gaussian covers in the frame that shows it best, at which it is half known."""
+_SHINES_PX = 1.0
+"""Pixels covered through what lies before it at which its being wider half counts: backs shine a
+little through every face, and much through the rim of hair, which wide ones would blur."""
 _TURNED_AWAY, _FACING, _FRONTAL = -0.3, 0.0, 0.4
 """Cosines between normal and view: up to the first a Gaussian counts as not seen, from the second
 as seen, else the back of a head is stretched until it paints the rim of its front; from the second
 to the third its colour becomes clear, which at the rim is that of the neck behind."""
 _CLEAR_PX = 0.1
-"""Clear pixels at which its colour half tells that of its surroundings."""
+"""Clear pixels at which its colour half tells that of its surroundings, and others that half tell
+how thick it is."""
 _SUNK, _SUNK_IN_CAVITY = 1.25, -0.6
 """How many of its widths a Gaussian's centre lies below the surface that it reaches to; those of
 the mouth's cavity lie above it, or they come through the lips, which are thin."""
-_FLATNESS = math.log(0.25)
-"""Logarithm of thickness over width: surfaces are made of discs."""
-_OVERLAP = math.log(1.4)
-"""Logarithm of how much wider discs are than fresh ones where nothing is seen."""
 _CLOSED, _EMPTY = math.log(0.9 / 0.1), math.log(0.001 / 0.999)
 _FAINT = math.log(0.01 / 0.99)
 """What is empty begins as: drawn still, so that frames to come may want it."""
@@ -55,6 +56,7 @@ class SurfacePrior(nn.Module):
         seen_px: pixels that each covered, from its own side, in the frame that showed it best,
             slowly forgotten.
         clear_px: the same from ever more in front, for what its colour tells of its surroundings.
+        grazing_px: the same from ever more aside, which tells how thick it is.
         through_px: the same from whichever side: a matte that fades shows the far side's opacity.
         offset_m: how far the surface stands off the mesh at each, by the outlines of mattes.
         opacity_logit: of the surface: closed, but where mattes show background.
@@ -66,6 +68,7 @@ class SurfacePrior(nn.Module):
 
     seen_px: Float[Tensor, "N"]
     clear_px: Float[Tensor, "N"]
+    grazing_px: Float[Tensor, "N"]
     through_px: Float[Tensor, "N"]
     offset_m: Float[Tensor, "N"]
     opacity_logit: Float[Tensor, "N"]
@@ -78,6 +81,7 @@ class SurfacePrior(nn.Module):
         num_gaussians = avatar.num_gaussians
         self.register_buffer("seen_px", torch.zeros(num_gaussians))
         self.register_buffer("clear_px", torch.zeros(num_gaussians))
+        self.register_buffer("grazing_px", torch.zeros(num_gaussians))
         self.register_buffer("through_px", torch.zeros(num_gaussians))
         self.register_buffer("offset_m", torch.zeros(num_gaussians))
         self.register_buffer("opacity_logit", torch.full((num_gaussians,), _CLOSED))
@@ -116,7 +120,7 @@ class SurfacePrior(nn.Module):
         with torch.no_grad():
             position, opacity_logit = self.surface(avatar)
             avatar.blendshapes.position.copy_(position)
-            avatar.blendshapes.log_scale.copy_(_disc(avatar, avatar.initial_scale_m()))
+            avatar.blendshapes.log_scale.copy_(disc_log_scale(avatar))
             avatar.blendshapes.opacity_logit.copy_(opacity_logit.clamp(min=_FAINT))
 
     def due(self, step: int) -> bool:
@@ -136,7 +140,7 @@ class SurfacePrior(nn.Module):
     ) -> None:
         """See what these frames show; `renderer` is theirs, where there is one already."""
         self.views.see(avatar, theta, cameras)
-        for known in (self.seen_px, self.clear_px, self.through_px):
+        for known in (self.seen_px, self.clear_px, self.grazing_px, self.through_px):
             known.mul_(_FORGETS)
         if renderer is None:
             renderer = avatar.renderer(theta, cameras, backend=backend)
@@ -151,10 +155,12 @@ class SurfacePrior(nn.Module):
         if mouth is not None:
             # Also where expressions do not carry Gaussians they part the lips.
             shown_px = mouth.through_lips(shown_px, avatar.head(theta, avatar.identity), cameras)
+        seen, clear = _ramp(facing, _TURNED_AWAY, _FACING), _ramp(facing, _FACING, _FRONTAL)
         for known, share in (
             (self.through_px, torch.ones_like(facing)),
-            (self.seen_px, _ramp(facing, _TURNED_AWAY, _FACING)),
-            (self.clear_px, _ramp(facing, _FACING, _FRONTAL)),
+            (self.seen_px, seen),
+            (self.clear_px, clear),
+            (self.grazing_px, seen - clear),
         ):
             torch.maximum(known, (shown_px * share).amax(0), out=known)
 
@@ -177,13 +183,15 @@ class SurfacePrior(nn.Module):
         # Below its end a body is not kept by being seen from behind, through what ends before it.
         home, opacity_logit = self.surface(avatar)
         closes = torch.where((opacity_logit < 0) & field.body_gaussians, pull, close)
-        # Discs of texels that lie farther apart than fresh ones reach are as wide as these need.
-        disc = _disc(avatar, avatar.initial_scale_m().maximum(0.5 * avatar.anchors.texel_spacing()))
+        disc = disc_log_scale(avatar)
+        frontal = clear * _CLEAR_PX / (self.grazing_px + _CLEAR_PX)
+        flatten(shapes, field.normal_of_gaussians, disc, frontal)
         # As far as nothing shows it, nothing else closes the surface around it.
-        wider = _OVERLAP * (close / _RATE).square()
+        through = _SHINES_PX / (self.through_px + _SHINES_PX)
+        alone = (pull / _RATE * through).square()
         if mouth is not None:  # where what lies behind is dark too
-            wider = wider * (1 - mouth.in_cavity)
-        disc[:, :2] += wider[:, None]
+            alone = alone * (1 - mouth.in_cavity)
+        disc[:, :2] += alone[:, None] * log_overlap(avatar, field, self.views.surface_m)
         upright = torch.zeros_like(shapes.rotation_wxyz)
         upright[:, 0] = 1
         rest = {
@@ -237,14 +245,6 @@ class _Parts:
     field: MeshField
     mouth: HiddenMouth | None
     leash: Leash
-
-
-def _disc(avatar: Avatar, width_m: Float[Tensor, "N"]) -> Float[Tensor, "N 3"]:
-    """The logarithms of the scales that a Gaussian of the surface has."""
-    log_scale = width_m.log()[:, None].repeat(1, 3)
-    log_scale[:, :2] += avatar.anchors.texel_stretch().log()
-    log_scale[:, 2] += _FLATNESS
-    return log_scale
 
 
 def _facing(

@@ -77,6 +77,19 @@ def test_what_one_side_of_the_face_shows_tells_of_the_other():
     assert float((found - x_m.abs())[right].abs().median()) < 2e-3
 
 
+def test_hair_goes_on_over_the_temples_and_hardly_over_the_ears():
+    field = MeshField(embedded_avatar())
+    eyes_m = 0.03  # about where the template's eyes lie
+    first, second = field.edges.unbind(1)
+    across = field.scalp[first] != field.scalp[second]
+    height_m = field.height_m[first].minimum(field.height_m[second])
+    above, beside = across & (height_m > eyes_m + 0.06), across & (height_m < eyes_m)
+    assert int(above.sum()) > 20
+    assert int(beside.sum()) > 20
+    assert bool((field.links[above] == 1).all())
+    assert float(field.links[beside].max()) < 0.01
+
+
 def test_the_matrix_of_the_edges_is_one_that_every_library_reads():
     """Not contiguous indices are read wrong on a GPU, and nobody checks them there."""
     field = MeshField(embedded_avatar())
