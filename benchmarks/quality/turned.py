@@ -1,11 +1,12 @@
 """Holes and coloured noise of an avatar that is turned: what people see first.
 
-    python benchmarks/quality/turned.py AVATAR DATASET [AVATAR DATASET ...] --json turned.json
+    python benchmarks/quality/turned.py AVATAR DATASET [AVATAR DATASET ...] --json turned.json \
+        --picture turned.png
 
 Frames of a dataset are seen from the front and 15, 30 and 60 degrees to either side. "holes" is the
 share of pixels of the head's mesh (without neck and shoulders) whose alpha is below .9; "noise" the
 energy there of the Laplacian of the two chroma channels, blurred by a pixel, over the frontal
-view's. No truth is needed.
+view's. No truth is needed. The picture has a row an avatar: its first frame as filmed, and turned.
 """
 
 import argparse
@@ -27,6 +28,8 @@ from rgbavatar_ns.head.surface import vertex_normals
 from rgbavatar_ns.kernels import PinholeCameras
 
 TURNS_DEG = (0, 15, 30, 60)
+_DRAWN_DEG = (0.0, 15.0, 30.0, -15.0, -30.0, 60.0, 180.0)
+_ROW_PX = 1792
 _FRAMES = 4
 _GREY = 0.5
 _CB = np.array([-0.168736, -0.331264, 0.5], np.float32)
@@ -70,6 +73,21 @@ def turned(
     return found
 
 
+@torch.no_grad()
+def sheet(
+    avatar: Avatar, theta: Float[Tensor, "1 H"], camera: PinholeCameras
+) -> Float[np.ndarray, "height width 3"]:
+    """One frame as filmed, to both sides, more to one, and from behind; white background."""
+    centre = head_centre(avatar, theta).to(camera.world_to_camera)
+    yaws = torch.tensor(_DRAWN_DEG)
+    cells = [
+        avatar.render(theta, orbit(camera, centre, yaw[None], torch.zeros(1)), torch.ones(3))
+        for yaw in yaws
+    ]
+    row = np.concatenate([cell.image[0].clamp(0, 1).numpy() for cell in cells], 1)
+    return cv2.resize(row, (_ROW_PX, round(_ROW_PX * row.shape[0] / row.shape[1])))
+
+
 def tell_turned(name: str, found: dict[str, dict[str, float]]) -> None:
     """Print a line for each turn."""
     for turn, figures in found.items():
@@ -81,14 +99,21 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("pairs", type=Path, nargs="+", metavar="AVATAR DATASET")
     parser.add_argument("--json", type=Path, help="also write the figures here")
+    parser.add_argument("--picture", type=Path, help="also draw them here")
     arguments = parser.parse_args()
-    figures = {}
+    figures, rows = {}, []
     for path, data in zip(arguments.pairs[::2], arguments.pairs[1::2], strict=True):
         avatar, dataset = Avatar.load(path), load_dataset(data)
         frames = list(dataset.test)[:: max(1, len(dataset.test) // _FRAMES)][:_FRAMES]
         figures[str(path)] = turned(avatar, dataset.theta[frames], dataset.cameras.select(frames))
         tell_turned(path.name, figures[str(path)])
+        one = dataset.cameras.select(frames[:1])
+        rows.append(sheet(avatar, dataset.theta[frames[:1]], one))
     write_figures(arguments.json, arguments, avatars=figures)
+    if arguments.picture:
+        picture = (np.concatenate(rows) * 255 + 0.5).astype(np.uint8)
+        if not cv2.imwrite(str(arguments.picture), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)):
+            raise SystemExit(f"{arguments.picture} cannot be written.")
 
 
 if __name__ == "__main__":
