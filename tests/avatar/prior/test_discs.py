@@ -30,13 +30,13 @@ def test_needles_along_the_normal_are_shortened_and_nothing_else_is(make_avatar)
     normals = torch.nn.functional.normalize(torch.randn(count, 3, generator=random), dim=1)
     shapes.rotation_wxyz.data.copy_(torch.randn(count, 4, generator=random))
     shapes.log_scale.data.copy_(disc + 0.8 * torch.randn(count, 3, generator=random))
-    before, scales = _thickness_m(shapes, normals), shapes.log_scale.detach().clone()
+    before, scales = _thickness_m(shapes, normals).detach(), shapes.log_scale.detach().clone()
     limit = 1.5 * disc[:, :2].mean(1).exp()
     share = (torch.arange(count) % 2).float()
     with torch.no_grad():
         for _ in range(12):  # what several axes make up takes several looks
             flatten(shapes, normals, disc, share)
-    after = _thickness_m(shapes, normals)
+    after = _thickness_m(shapes, normals).detach()
     thick = (before > limit) & (share > 0)
     assert 0.05 * count < int(thick.sum()) < 0.95 * count
     assert float((after / limit)[thick].max()) < 1.02
