@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from rich.progress import track
 from situations import FilmedPerson, Shots
-from subject import BATCH_SIZE, write_figures
+from subject import BATCH_SIZE, write_figures, write_picture
 from turned import tell_turned, turned
 
 from rgbavatar_ns import Avatar
@@ -101,9 +101,7 @@ def picture(avatar: Avatar | None, filmed: FilmedPerson, path: Path) -> None:
         if avatar is not None:
             images = avatar.render(shots.theta[chosen], filmed.camera, white).image
         rows.append(torch.cat(list(images.clamp(0, 1)), 1))
-    sheet = (torch.cat(rows).numpy() * 255 + 0.5).astype(np.uint8)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    cv2.imwrite(str(path), cv2.cvtColor(sheet, cv2.COLOR_RGB2BGR))
+    write_picture(path, torch.cat(rows).numpy())
 
 
 def beside(folder: Path, seed: int) -> None:

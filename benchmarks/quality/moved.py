@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 import torch
 from jaxtyping import Float
+from subject import avatars_and_datasets, write_picture
 
 from rgbavatar_ns import Avatar
 from rgbavatar_ns.avatar.orbit import head_centre, orbit
@@ -69,14 +70,11 @@ def main() -> None:
     parser.add_argument("pairs", type=Path, nargs="+", metavar="AVATAR DATASET")
     parser.add_argument("--picture", type=Path, required=True, help="the sheet to write")
     arguments = parser.parse_args()
-    if len(arguments.pairs) % 2:
-        parser.error("Name a dataset after each avatar.")
-    pairs = zip(arguments.pairs[::2], arguments.pairs[1::2])
-    rows = [sheet(Avatar.load(path), data) for path, data in pairs]
-    arguments.picture.parent.mkdir(parents=True, exist_ok=True)
-    picture = (np.concatenate(rows) * 255 + 0.5).astype(np.uint8)
-    if not cv2.imwrite(str(arguments.picture), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)):
-        raise SystemExit(f"{arguments.picture} cannot be written.")
+    pairs = avatars_and_datasets(parser, arguments.pairs)
+    write_picture(
+        arguments.picture,
+        np.concatenate([sheet(Avatar.load(path), data) for path, data in pairs]),
+    )
     print(f"{arguments.picture}: {', '.join(FACES)}, turned by -25 and 25 degrees")
 
 

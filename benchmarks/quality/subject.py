@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -84,3 +86,20 @@ def write_figures(path: Path | None, arguments: argparse.Namespace, **figures: A
     settings = {name: str(value) for name, value in vars(arguments).items()}
     content = {"settings": settings, "machine": machine_facts(), **figures}
     path.write_text(json.dumps(content, indent=2) + "\n")
+
+
+def write_picture(path: Path, image: Float[np.ndarray, "height width 3"]) -> None:
+    """Write RGB values from 0 to 1; ends the script where a path cannot be written."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    picture = (image * 255 + 0.5).astype(np.uint8)
+    if not cv2.imwrite(str(path), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)):
+        raise SystemExit(f"{path} cannot be written.")
+
+
+def avatars_and_datasets(
+    parser: argparse.ArgumentParser, named: Sequence[Path]
+) -> list[tuple[Path, Path]]:
+    """Paths that were named by turns."""
+    if len(named) % 2:
+        parser.error("Name a dataset after each avatar.")
+    return list(zip(named[::2], named[1::2]))

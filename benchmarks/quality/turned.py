@@ -6,7 +6,7 @@
 Frames of a dataset are seen from the front and 15, 30 and 60 degrees to either side. "holes" is the
 share of pixels of the head's mesh (without neck and shoulders) whose alpha is below .9; "noise" the
 energy there of the Laplacian of the two chroma channels, blurred by a pixel, over the frontal
-view's. No truth is needed. The picture has a row an avatar: its first frame as filmed, and turned.
+view's. No truth is needed. The picture has a row an avatar: a held-out frame as it is, and turned.
 """
 
 import argparse
@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from subject import write_figures
+from subject import avatars_and_datasets, write_figures, write_picture
 from torch import Tensor
 
 from rgbavatar_ns import Avatar
@@ -102,18 +102,17 @@ def main() -> None:
     parser.add_argument("--picture", type=Path, help="also draw them here")
     arguments = parser.parse_args()
     figures, rows = {}, []
-    for path, data in zip(arguments.pairs[::2], arguments.pairs[1::2], strict=True):
+    for path, data in avatars_and_datasets(parser, arguments.pairs):
         avatar, dataset = Avatar.load(path), load_dataset(data)
         frames = list(dataset.test)[:: max(1, len(dataset.test) // _FRAMES)][:_FRAMES]
         figures[str(path)] = turned(avatar, dataset.theta[frames], dataset.cameras.select(frames))
         tell_turned(path.name, figures[str(path)])
-        one = dataset.cameras.select(frames[:1])
-        rows.append(sheet(avatar, dataset.theta[frames[:1]], one))
+        if arguments.picture:
+            camera = dataset.cameras.select(frames[:1])
+            rows.append(sheet(avatar, dataset.theta[frames[:1]], camera))
     write_figures(arguments.json, arguments, avatars=figures)
     if arguments.picture:
-        picture = (np.concatenate(rows) * 255 + 0.5).astype(np.uint8)
-        if not cv2.imwrite(str(arguments.picture), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)):
-            raise SystemExit(f"{arguments.picture} cannot be written.")
+        write_picture(arguments.picture, np.concatenate(rows))
 
 
 if __name__ == "__main__":

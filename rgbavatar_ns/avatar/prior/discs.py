@@ -26,7 +26,7 @@ _NO_THICKNESS = 1e-30
 
 
 def disc_log_scale(avatar: Avatar) -> Float[Tensor, "N 3"]:
-    """The logarithms of the scales that a Gaussian of the surface has.
+    """The logarithms of the scales, in metres, that a Gaussian of the surface has.
 
     Where texels lie farther apart than fresh ones reach, they are as wide as it takes.
     """
@@ -42,7 +42,7 @@ def log_overlap(
 ) -> Float[Tensor, "N 2"]:
     """Logarithms of how much wider discs are, along u and v, where nothing else closes the surface.
 
-    A surface so far off the mesh is larger than it: hair is wider than a skull.
+    A surface that stands `surface_m` off the mesh is larger than it: hair is wider than a skull.
     """
     surface_m = surface_m.clamp(min=0)  # below it, only folds gape
     first, second = field.edges.unbind(1)
