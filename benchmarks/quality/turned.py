@@ -22,7 +22,7 @@ from torch import Tensor
 
 from rgbavatar_ns import Avatar
 from rgbavatar_ns.avatar.orbit import head_centre, orbit
-from rgbavatar_ns.avatar.prior.outline import PlacedMesh, covered_pixels
+from rgbavatar_ns.avatar.prior.placed_mesh import PlacedMesh, covered_pixels
 from rgbavatar_ns.data import load_dataset
 from rgbavatar_ns.head.surface import vertex_normals
 from rgbavatar_ns.kernels import PinholeCameras

@@ -18,13 +18,15 @@ def test_a_run_of_before_is_held_from_its_next_look_on():
     shaken(avatar)
     begun.look(avatar, theta, front_camera(), images)
     begun.pull(avatar, 199)
+    begun.views.hair_contrast.fill_(0.1)
     state = {f"prior.{name}": value for name, value in begun.state_dict().items()}
-    for name in ("leashed_position", "leash_share", "grazing_px"):
+    for name in ("leashed_position", "leash_share", "grazing_px", "views.hair_contrast"):
         del state[f"prior.{name}"]
     state = with_prior(state, resumed)
     resumed.load_state_dict({name.removeprefix("prior."): value for name, value in state.items()})
     assert resumed.has_begun
     assert torch.equal(resumed.seen_px, begun.seen_px)
+    assert float(resumed.views.hair_contrast) == 0  # its back stays plain
     before = avatar.blendshapes.position.detach().clone()
     resumed.hold(avatar)
     assert torch.equal(avatar.blendshapes.position.detach(), before)

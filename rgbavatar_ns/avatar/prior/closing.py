@@ -65,6 +65,20 @@ def closed_on_device(
     return torch.cat([plain, opaque]).permute(1, 2, 0).to(torch.uint8)
 
 
+def with_light_of(
+    own: Float[Tensor, "rows columns 4"],
+    plain: UInt8[Tensor, "rows columns 4"],
+    share: Float[Tensor, "rows columns"],
+) -> UInt8[Tensor, "rows columns 4"]:
+    """A smoothed picture with so much of the light of its own, which is premultiplied, where that
+    is opaque: in hair light is no noise, and its hue is."""
+    light = 255 * own[..., :3].mean(-1, keepdim=True) / own[..., 3:].clamp(min=_LEAST)
+    color = plain[..., :3].to(own)
+    share = share[..., None] * own[..., 3:]
+    lit = (color + share * (light - color.mean(-1, keepdim=True))).clamp(0, 255).round()
+    return torch.cat([lit.to(torch.uint8), plain[..., 3:]], -1)
+
+
 def _times_smaller(width: int) -> int:
     return max(1, width // _WIDTH)
 

@@ -17,7 +17,10 @@ from rgbavatar_ns.head.surface import MeshEdges, vertex_normals
 
 _BEHIND_EYES_M, _BELOW_EYES_M = 0.095, 0.05
 """Hair grows behind the ears, down to about their lobes; and from there up to the crown."""
-_ABOVE_EARS_M, _TEMPLE_M = 0.04, 0.06
+_TEMPLE_M, _EARS_TOP_M = 0.06, 0.015
+"""And so far behind the eyes also farther in front, above the ears' upper ends."""
+_ABOVE_EARS_M = 0.04
+"""From here up hair goes on to the forehead, or a bald head does."""
 _HAIRLINE = 0.005
 """How stiff a link over the border of hair is."""
 _MIRROR_REACH_M = 5e-3
@@ -37,6 +40,8 @@ class Outline:
     """The same of each of N Gaussians; of a body by its own place."""
     goes_on_below: bool
     """Whether mattes show the person below the mesh: a neck, shoulders."""
+    hair_contrast: float
+    """How far light varies over strands of hair, a share of it: 0 where none are seen."""
 
 
 class MeshField:
@@ -47,7 +52,7 @@ class MeshField:
     `normal_of_gaussians` is that direction in the axes that their rotations are in. `rest_m` and
     `normals` are the vertices' own at rest, `height_m` is theirs on the template; `body` and
     `body_gaussians` lie below the neck's foot, `scalp` where nearly everybody who has hair has it,
-    `back` (1 or 0) behind the ears.
+    `back` (1 or 0) behind the ears, `above_ears` above them.
 
     Values are continued harmonically, as heat would spread, to both sides of the face alike. Ours:
     because what nobody filmed is best guessed by what surrounds it.
@@ -63,10 +68,10 @@ class MeshField:
         numbers = torch.unique(first * self.num_vertices + second)
         self.edges = torch.stack([numbers // self.num_vertices, numbers % self.num_vertices], 1)
         self._mirror, self._mirrored = _mirror_of(template)
-        behind, up = (part.to(template) for part in _behind_and_above_eyes(avatar.head.arrays))
-        back = behind > _BEHIND_EYES_M
-        self.back = back.to(template)
-        self.scalp = (back & (up > -_BELOW_EYES_M)) | ((behind > _TEMPLE_M) & (up > _ABOVE_EARS_M))
+        behind, up = (part.to(template) for part in behind_and_above_eyes(avatar.head.arrays))
+        self.back = (behind > _BEHIND_EYES_M).to(template)
+        self.scalp = self.scalp_of(avatar.head.arrays).to(template.device)
+        self.above_ears = up > _ABOVE_EARS_M
         self.height_m = template[:, 1]
         self.body = _body_of(avatar.head.arrays).to(template.device)
         first, second = self.edges.unbind(1)
@@ -75,7 +80,7 @@ class MeshField:
         # A GPU's library reads them as they lie, one behind the other.
         self._columns = second.contiguous()
         # Above the ears hair goes on, or a bald head does.
-        low = up < _ABOVE_EARS_M
+        low = ~self.above_ears
         across = (self.scalp[first] != self.scalp[second]) & low[first] & low[second]
         self.links = torch.where(across, _HAIRLINE, 1.0).to(template)
         self.body_gaussians = self.at_gaussians(self.body.to(template)[:, None])[:, 0] > 0.5
@@ -86,6 +91,13 @@ class MeshField:
             smooth = self.at_gaussians(self.normals)
             self.outwards = _solved(frames.matrix[0], smooth)
             self.normal_of_gaussians = F.normalize(turn_back(frames.quat_wxyz[0], smooth), dim=-1)
+
+    @staticmethod
+    def scalp_of(arrays: HeadArrays) -> Bool[Tensor, "V"]:
+        """Where nearly everybody who has hair has it."""
+        behind, up = behind_and_above_eyes(arrays)
+        back = (behind > _BEHIND_EYES_M) & (up > -_BELOW_EYES_M)
+        return back | ((behind > _TEMPLE_M) & (up > _EARS_TOP_M))
 
     def of_gaussians(
         self, values: Float[Tensor, "N C"], confidence: Float[Tensor, "N"]
@@ -186,7 +198,7 @@ def _conjugate_gradients(product, wanted: Tensor, start: Tensor, diagonal: Tenso
     return x
 
 
-def _behind_and_above_eyes(arrays: HeadArrays) -> tuple[Float[Tensor, "V"], Float[Tensor, "V"]]:
+def behind_and_above_eyes(arrays: HeadArrays) -> tuple[Float[Tensor, "V"], Float[Tensor, "V"]]:
     """How far each vertex lies behind the eyes, and above them, in metres."""
     eyes = (arrays.joint_regressor[EYES] @ arrays.v_template).mean(0)
     _, up, forward = torch.from_numpy((arrays.v_template - eyes).astype("float32")).unbind(1)

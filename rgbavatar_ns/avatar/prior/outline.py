@@ -14,7 +14,9 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from rgbavatar_ns.avatar.avatar import Avatar
+from rgbavatar_ns.avatar.prior.hair_seen import hair_contrast
 from rgbavatar_ns.avatar.prior.mesh_field import MeshField, Outline
+from rgbavatar_ns.avatar.prior.placed_mesh import PlacedMesh, covered_pixels
 from rgbavatar_ns.drawing.compositing import unfilmed_pixels
 from rgbavatar_ns.head.surface import MeshEdges, vertex_normals
 from rgbavatar_ns.kernels import PinholeCameras
@@ -101,7 +103,11 @@ def measure_outline(
     rim = lower_rim(avatar)
     below = [_shown_below(image, seen, rim) for image, seen in zip(images, placed)]
     return Outline(
-        offset, empty.clamp(0, 1), empty_gaussians.clamp(0, 1), bool(np.mean(below) > 0.1)
+        offset,
+        empty.clamp(0, 1),
+        empty_gaussians.clamp(0, 1),
+        bool(np.mean(below) > 0.1),
+        hair_contrast(avatar.head.arrays, images, placed, moved, faces.numpy()),
     )
 
 
@@ -125,40 +131,6 @@ def _told_of_body(
     shown = height[front & (empty < 0.5)]
     end_m = shown.quantile(_LOWEST) if len(shown) else height.new_tensor(-torch.inf)
     return torch.where(height < end_m, 1.0, empty), end_m
-
-
-@dataclass(frozen=True)
-class PlacedMesh:
-    """The mesh as one camera sees it, in its own axes."""
-
-    places_m: Float[Tensor, "V 3"]
-    normals: Float[Tensor, "V 3"]
-    focal_px: Float[Tensor, "2"]
-    principal_point_px: Float[Tensor, "2"]
-
-    @classmethod
-    def of(cls, vertices: Tensor, normals: Tensor, cameras: PinholeCameras, k: int) -> "PlacedMesh":
-        """Frame k of a batch with one camera, or one a frame."""
-        camera = cameras.select([k % len(cameras.focal_px)])
-        pose = camera.world_to_camera[0].cpu().to(vertices)
-        return cls(
-            vertices[k] @ pose[:3, :3].T + pose[:3, 3],
-            normals[k] @ pose[:3, :3].T,
-            camera.focal_px[0].cpu().to(vertices),
-            camera.principal_point_px[0].cpu().to(vertices),
-        )
-
-    def is_upright(self, height_m: Float[Tensor, "V"]) -> bool:
-        """Whether a mesh of these heights stands in the picture, within 45 degrees."""
-        across, down, _ = self.places_m[height_m.argmin()] - self.places_m[height_m.argmax()]
-        return bool(down > across.abs())
-
-    def moved(self, offset_m: Float[Tensor, "V"] | float) -> Float[np.ndarray, "V 2"]:
-        """Where the vertices, moved along their normals, are in the picture."""
-        offset = torch.as_tensor(offset_m, dtype=self.places_m.dtype).reshape(-1, 1)
-        moved = self.places_m + offset * self.normals
-        px = moved[:, :2] / moved[:, 2:].clamp(min=1e-3) * self.focal_px + self.principal_point_px
-        return px.numpy().astype(np.float32)
 
 
 def _add_frame(
@@ -225,18 +197,6 @@ def _first_rows(mask: Bool[np.ndarray, "height width"]) -> Int[np.ndarray, "heig
     last = np.maximum.accumulate(np.where(begins, rows, -1), 0)
     following = np.minimum.accumulate(np.where(begins, rows, 2 * len(mask))[::-1], 0)[::-1]
     return np.where(mask, last, following)
-
-
-def covered_pixels(
-    px: Float[np.ndarray, "V 2"], faces: Int[np.ndarray, "F 3"], width: int, height: int
-) -> UInt8[np.ndarray, "height width"]:
-    """1 where a projected mesh covers or touches a pixel."""
-    mesh = np.zeros((height, width), np.uint8)
-    # OpenCV's first pixel has its centre at 0.
-    corners = np.round((px[faces].clip(-(2**14), 2**14) - 0.5) * 16).astype(np.int32)
-    for triangle in corners:
-        cv2.fillConvexPoly(mesh, triangle, (1,), shift=4)
-    return mesh
 
 
 def _signed_distance_px(

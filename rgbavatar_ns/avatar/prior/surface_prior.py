@@ -1,4 +1,4 @@
-"""A prior for what was never seen: it lies on the person's surface, closed and plain.
+"""A prior for what was never seen: it lies on the person's surface, closed, plain but for hair.
 
 How much each Gaussian was seen decides how far it may leave the place, shape and colour that its
 surroundings suggest. Ours: Adam moves what is hardly seen as fast as everything else, so that
@@ -17,6 +17,7 @@ from rgbavatar_ns.avatar.prior.discs import disc_log_scale, flatten, log_overlap
 from rgbavatar_ns.avatar.prior.leash import Leash
 from rgbavatar_ns.avatar.prior.mesh_field import MeshField
 from rgbavatar_ns.avatar.prior.mouth import HiddenMouth
+from rgbavatar_ns.avatar.prior.strands import Strands
 from rgbavatar_ns.avatar.prior.virtual_views import VirtualViews
 from rgbavatar_ns.drawing.compositing import ImagesRGBA, is_unfilmed
 from rgbavatar_ns.kernels import MorphedRenderer, PinholeCameras, weighted_color_average
@@ -170,16 +171,20 @@ class SurfacePrior(nn.Module):
         if step < _FIRST_PULL:
             return
         shapes, parts = avatar.blendshapes, self._parts(avatar)
-        field, mouth = parts.field, parts.mouth
+        field, mouth, strands = parts.field, parts.mouth, parts.strands
         clear = self.clear_px.square() / (self.clear_px.square() + _CLEAR_PX**2)
+        start, most = field.of_gaussians(shapes.color_feature, torch.ones_like(clear))
         told, confidence = field.of_gaussians(shapes.color_feature, clear)
+        confidence = strands.known(confidence, most)
         if mouth is not None:
             told, confidence = mouth.guessed(told, confidence)
-        start, _ = field.of_gaussians(shapes.color_feature, torch.ones_like(clear))
         color = field.continued(
             told, confidence, start, stiffness=_STIFFNESS, rest=_REST, iterations=_ITERATIONS
         )
-        pull, close = (_RATE * _SEEN_PX / (px + _SEEN_PX) for px in (self.seen_px, self.through_px))
+        colored_px = strands.colored_px(self.seen_px, self.clear_px, self.grazing_px)
+        pull, close, color_pull = (
+            _RATE * _SEEN_PX / (px + _SEEN_PX) for px in (self.seen_px, self.through_px, colored_px)
+        )
         # Below its end a body is not kept by being seen from behind, through what ends before it.
         home, opacity_logit = self.surface(avatar)
         closes = torch.where((opacity_logit < 0) & field.body_gaussians, pull, close)
@@ -199,15 +204,16 @@ class SurfacePrior(nn.Module):
             "rotation_wxyz": upright,
             "log_scale": disc,
             "opacity_logit": opacity_logit,
-            "color_feature": field.at_gaussians(color),
+            "color_feature": strands.drawn(field.at_gaussians(color), self.views.hair_contrast),
         }
+        shares = {"opacity_logit": closes, "color_feature": color_pull}
         for name, target in rest.items():
-            value = getattr(shapes, name)
-            share = closes if name == "opacity_logit" else pull
+            value, share = getattr(shapes, name), shares.get(name, pull)
             value.lerp_(target, share.view(-1, *[1] * (value.ndim - 1)))
         for name in ("basis_position", "basis_rotation_wxyz", "basis_color_feature"):
             if shapes.num_bases:
-                getattr(shapes, name).mul_((1 - pull)[:, None])
+                fades = color_pull if name == "basis_color_feature" else pull
+                getattr(shapes, name).mul_((1 - fades)[:, None])
         counts = shapes.opacity_logit.sigmoid() * (1 - pull / _RATE)
         self.leashed_position.copy_(parts.leash.smooth(shapes.position, home, counts))
         self.leash_share.copy_(parts.leash.share(avatar))
@@ -234,7 +240,7 @@ class SurfacePrior(nn.Module):
         if self._parts_of is None or self._parts_of[0] != device:
             field = MeshField(avatar)
             mouth, leash = HiddenMouth.of(avatar, field), Leash(avatar, field)
-            self._parts_of = device, _Parts(field, mouth, leash)
+            self._parts_of = device, _Parts(field, mouth, leash, Strands.of(avatar, field))
         return self._parts_of[1]
 
 
@@ -245,6 +251,7 @@ class _Parts:
     field: MeshField
     mouth: HiddenMouth | None
     leash: Leash
+    strands: Strands
 
 
 def _facing(

@@ -39,6 +39,10 @@ _FRAMES_A_VIEW = 40
 """Frames trained on for each view. Ours: one in 20 leaves less noise, one in 60 more detail."""
 _BORDER_PX = 1
 """The outline is soft: so wide a rim within it is left alone."""
+_STRANDED = 0.05
+"""Contrast of hair from which all of its light counts as strands."""
+_HAIRLINE = 1 / 128
+"""Standard deviation of the border of hair, a share of the picture's width."""
 _CLEAR_DEGREES = 5.0
 """How far a view lies beyond what was filmed, at least."""
 
@@ -59,6 +63,7 @@ class VirtualViews(nn.Module):
         surface_m: how far the person stands off each of V vertices.
         empty: share of the frames that show background at each vertex.
         goes_on_below: whether the film shows the person below the mesh.
+        hair_contrast: of strands of hair, as the film shows it; 0 for none.
         theta: of the W views, some with an open mouth, whose cameras are held by their parts.
         turns_degrees: yaw, pitch and roll of the head in each view.
         filmed_low_degrees: the lowest turns that the film has shown so far; "high": the highest.
@@ -67,6 +72,7 @@ class VirtualViews(nn.Module):
     surface_m: Float[Tensor, "V"]
     empty: Float[Tensor, "V"]
     goes_on_below: Tensor
+    hair_contrast: Float[Tensor, ""]
     theta: Float[Tensor, "W H"]
     world_to_camera: Float[Tensor, "W 4 4"]
     focal_px: Float[Tensor, "W 2"]
@@ -82,6 +88,7 @@ class VirtualViews(nn.Module):
         self.register_buffer("surface_m", torch.zeros(num_vertices))
         self.register_buffer("empty", torch.zeros(num_vertices))
         self.register_buffer("goes_on_below", torch.zeros((), dtype=torch.bool))
+        self.register_buffer("hair_contrast", torch.zeros(()))
         self.register_buffer("theta", torch.zeros(count, theta_size))
         self.register_buffer("world_to_camera", torch.eye(4).repeat(count, 1, 1))
         self.register_buffer("focal_px", torch.ones(count, 2))
@@ -120,6 +127,7 @@ class VirtualViews(nn.Module):
         self.surface_m.copy_(outline.offset_m)
         self.empty.copy_(outline.empty)
         self.goes_on_below.fill_(outline.goes_on_below)
+        self.hair_contrast.fill_(outline.hair_contrast)
         self.theta.copy_(theta)
         self.world_to_camera.copy_(views.world_to_camera)
         self.focal_px.copy_(views.focal_px)
@@ -156,9 +164,10 @@ class VirtualViews(nn.Module):
     def completed(
         self, avatar: Avatar, view: int, own: RenderedBatch
     ) -> UInt8[Tensor, "1 height width 4"]:
-        """A view's image as the avatar is to show it: its `own` picture, closed and smoothed."""
+        """A view's image as the avatar is to show it: its `own` picture, closed, and smoothed but
+        for the light of hair."""
         # Here, as below, so that timing steps on a bare machine needs no OpenCV.
-        from rgbavatar_ns.avatar.prior.closing import closed, closed_on_device
+        from rgbavatar_ns.avatar.prior.closing import closed, closed_on_device, with_light_of
 
         mask = self._mask(avatar, view)
         if mask.is_empty:
@@ -170,6 +179,8 @@ class VirtualViews(nn.Module):
             picture = torch.from_numpy(closed(part.numpy(), width))
         else:
             picture = closed_on_device(part, width)
+        stranded = (self.hair_contrast / _STRANDED).clamp(max=1)
+        picture = with_light_of(part, picture, stranded * mask.hair[rows, columns])
         image = mask.image_rgba.clone()
         there = image[0, rows, columns]
         inner = mask.inner[rows, columns, None]
@@ -220,7 +231,9 @@ class VirtualViews(nn.Module):
     def _draw(self, avatar: Avatar, view: int) -> "_Mask":
         import cv2
 
-        from rgbavatar_ns.avatar.prior.outline import PlacedMesh, covered_pixels, lower_rim
+        from rgbavatar_ns.avatar.prior.hair_seen import haired_pixels
+        from rgbavatar_ns.avatar.prior.outline import lower_rim
+        from rgbavatar_ns.avatar.prior.placed_mesh import PlacedMesh, covered_pixels
 
         faces = avatar.head.faces.cpu().long()
         vertices = avatar.carrier_vertices(self.theta[[view]].to(avatar.identity)).cpu()
@@ -241,7 +254,10 @@ class VirtualViews(nn.Module):
         device = self.theta.device
         rows, columns = (np.flatnonzero(inner.any(axis)) for axis in (1, 0))
         image, inner = torch.from_numpy(image)[None].to(device), torch.from_numpy(inner).to(device)
-        return _Mask(image, inner, (_reach(rows), _reach(columns)))
+        hair = haired_pixels(avatar.head.arrays, seen, px, faces.numpy(), *size)
+        soft = cv2.GaussianBlur(hair.astype(np.float32), (0, 0), _HAIRLINE * cameras.width)
+        soft = torch.from_numpy(soft).to(device)
+        return _Mask(image, inner, (_reach(rows), _reach(columns)), soft)
 
 
 @dataclass(frozen=True)
@@ -254,6 +270,8 @@ class _Mask:
     """Where the person is, for certain."""
     box: tuple[slice, slice]
     """The rows and columns of that."""
+    hair: Float[Tensor, "height width"]
+    """1 where strands may be, which are no noise."""
 
     @property
     def is_empty(self) -> bool:

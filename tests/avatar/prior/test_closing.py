@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from rgbavatar_ns.avatar.prior.closing import closed, closed_on_device
+from rgbavatar_ns.avatar.prior.closing import closed, closed_on_device, with_light_of
 
 WIDTH, HEIGHT = 256, 40
 
@@ -59,3 +59,12 @@ def test_a_device_closes_as_opencv_does(rows, columns, width):
     assert found.shape == expected.shape
     assert np.abs(found - expected).max() <= 1
     assert (found != expected).mean() < 0.1
+
+
+def test_light_comes_back_by_its_share_and_hue_stays_plain():
+    own = torch.tensor([[0.2, 0.5, 0.5, 1.0], [0.1, 0.25, 0.25, 0.5], [0.0, 0.0, 0.0, 0.0]])[None]
+    plain = torch.tensor([30, 60, 90, 255], dtype=torch.uint8).expand(1, 3, 4)
+    # By hand: own light .4 is 102 levels, plain light 60.
+    whole = with_light_of(own, plain, torch.ones(1, 3))
+    assert whole[0].tolist() == [[72, 102, 132, 255], [51, 81, 111, 255], [30, 60, 90, 255]]
+    assert torch.equal(with_light_of(own, plain, torch.zeros(1, 3)), plain)

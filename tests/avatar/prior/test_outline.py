@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from rgbavatar_ns.avatar.prior.mesh_field import MeshField
-from rgbavatar_ns.avatar.prior.outline import PlacedMesh, measure_outline
+from rgbavatar_ns.avatar.prior.outline import measure_outline
+from rgbavatar_ns.avatar.prior.placed_mesh import PlacedMesh
 from rgbavatar_ns.head.arrays import EMBEDDED_BUST
 from rgbavatar_ns.head.surface import vertex_normals
 from rgbavatar_ns.kernels import PinholeCameras

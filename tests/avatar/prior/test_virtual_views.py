@@ -23,7 +23,8 @@ def views_of(avatar, theta, offset_m=0.0, goes_on_below=False, empty=None) -> Vi
     views = VirtualViews(count, avatar.layout.size)
     offset = torch.full((count,), offset_m)
     empty = torch.zeros(count) if empty is None else empty
-    views.begin(avatar, Outline(offset, empty, empty[:0], goes_on_below), theta, front_camera())
+    outline = Outline(offset, empty, empty[:0], goes_on_below, hair_contrast=0.0)
+    views.begin(avatar, outline, theta, front_camera())
     views.see(avatar, theta, front_camera())
     return views
 
@@ -91,6 +92,44 @@ def test_a_view_asks_for_the_avatars_own_colours_as_they_are_now():
         known = (image[..., 3] > 0) & ~is_unfilmed(image)
         mean = image[known][:, :3].float().mean(0) / 255
         assert mean.tolist() == pytest.approx(color, abs=0.01)
+
+
+@pytest.mark.parametrize("contrast", [0.0, 0.1])
+def test_light_is_smoothed_but_in_hair_with_strands_and_hue_everywhere(contrast: float):
+    avatar = embedded_avatar(uv_resolution=128)
+    views = views_of(avatar, turned(avatar, [0.0]))
+    views.hair_contrast.fill_(contrast)
+    avatar.blendshapes.opacity_logit.data.fill_(4.0)
+    view = TURNS_DEGREES.index((60, 12))
+    frame = views.frame(avatar, view)
+    random, noise = torch.Generator().manual_seed(0), {}
+    for kind, spread in (
+        ("light", torch.randn(avatar.num_gaussians, 1, generator=random)),
+        ("hue", torch.randn(avatar.num_gaussians, 1, generator=random) * torch.tensor([1, -1, 0])),
+    ):
+        avatar.blendshapes.color_feature.data.copy_(spread)
+        own = avatar.render(frame.theta, frame.cameras).image[0] * 255
+        asked = views.frame(avatar, view).images_rgba[0, ..., :3].float()
+        noise[kind] = (own, asked)
+    rest = avatar.carrier_vertices(frame.theta)[0]
+    v_template = torch.as_tensor(avatar.head.arrays.v_template)
+    hair = (v_template[:, 2] < -0.02) & (v_template[:, 1] > 0.06) & (v_template[:, 0].abs() > 0.03)
+    cheek = (v_template[:, 2] > 0.02) & (v_template[:, 1].abs() < 0.04)
+    left = {}
+    for part, chosen in (("hair", hair), ("cheek", cheek)):
+        turned_to = places_px(frame.cameras, rest[chosen])
+        column, row = turned_to.mean(0).long().tolist()
+        place = slice(row - 8, row + 9), slice(column - 8, column + 9)
+        for kind, pictures in noise.items():
+            own, asked = (picture[place].mean(-1) for picture in pictures)
+            if kind == "hue":
+                own, asked = (
+                    picture[place][..., 0] - picture[place][..., 1] for picture in pictures
+                )
+            left[part, kind] = float(asked.std() / own.std())
+    assert left["hair", "light"] > 0.9 if contrast else left["hair", "light"] < 0.85
+    assert left["cheek", "light"] < 0.85
+    assert max(left["hair", "hue"], left["cheek", "hue"]) < 0.6
 
 
 def test_what_the_film_shows_to_be_empty_is_not_closed():
