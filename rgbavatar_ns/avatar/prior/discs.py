@@ -19,8 +19,12 @@ _OVERLAP = math.log(1.4)
 _AT_SEAMS = math.log(1.5)
 """And along a row of texels that ends, at the back: the next is up to two texels away."""
 _MOST_SPREAD = math.log(2)
-_THICKEST = 1.5
-"""Of a disc's width: what is seen from the front alone is no thicker along its normal."""
+_THICKEST, LONGEST = 1.5, 2.5
+"""Of a disc's width: what is seen from the front alone is no thicker along its normal, and no
+longer along the view."""
+_FRONT, _SIDE = 0.3, 0.7
+"""Sideways parts of normals: up to the first a surface faces front, above or below, and from the
+second it is a side."""
 _NO_THICKNESS = 1e-30
 """Square metres; and where there is no normal."""
 
@@ -71,16 +75,29 @@ def flatten(
     normals: Float[Tensor, "N 3"],
     disc: Float[Tensor, "N 3"],
     share: Float[Tensor, "N"],
+    widths: float = _THICKEST,
 ) -> None:
     """Go by a share to the most thickness along normals that is left to those with such discs.
 
-    Unit normals in the axes that rotations are in; `disc` holds logarithms of scales. Each axis is
+    Unit normals, or other directions, in the axes that rotations are in; `disc` holds logarithms
+    of scales, and so many widths of it are left. Each axis is
     shortened as far as it makes up the thickness. Ours, because from the front a needle along the
     view is a point, and a film that is all front leaves it be: from the side profiles bristled.
     """
     along = turn_back(F.normalize(shapes.rotation_wxyz, dim=-1), normals)
     parts = along.square() * (2 * shapes.log_scale).exp()
     squared = parts.sum(1).clamp(min=_NO_THICKNESS)
-    thickest = math.log(_THICKEST) + disc[:, :2].mean(1)
+    thickest = math.log(widths) + disc[:, :2].mean(1)
     excess = (0.5 * squared.log() - thickest).clamp(min=0) * share
     shapes.log_scale.sub_(excess[:, None] * parts / squared[:, None])
+
+
+def narrow_ahead(field: MeshField) -> Float[Tensor, "N"]:
+    """1 where Gaussians need not reach along the view of a film that is all front.
+
+    Lips, nose and brows bristle, also below, which faces no camera. But sides, which the film
+    hardly shows, are closed by what reaches along them, and bodies do not turn with the head.
+    """
+    sideways = field.at_gaussians(field.normals)[:, 0].abs()
+    front = ((_SIDE - sideways) / (_SIDE - _FRONT)).clamp(0, 1)
+    return front * (~field.body_gaussians).to(front)

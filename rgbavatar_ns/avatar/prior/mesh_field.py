@@ -49,7 +49,8 @@ class MeshField:
 
     `outwards` is where a surface off the mesh lies from each Gaussian, in its tangent frame at
     rest: between the vertices' normals, so that it does not gape over the mesh's edges;
-    `normal_of_gaussians` is that direction in the axes that their rotations are in. `rest_m` and
+    `normal_of_gaussians` is that direction in the axes that their rotations are in, which
+    `rest_quats_wxyz` turn to the head's. `rest_m` and
     `normals` are the vertices' own at rest, `height_m` is theirs on the template; `body` and
     `body_gaussians` lie below the neck's foot, `scalp` where nearly everybody who has hair has it,
     `back` (1 or 0) behind the ears, `above_ears` above them.
@@ -88,6 +89,7 @@ class MeshField:
             rest = avatar.head(avatar.identity.new_zeros(1, avatar.layout.size), avatar.identity)
             self.rest_m, self.normals = rest[0], vertex_normals(rest, faces)[0]
             frames = avatar.anchors.frames(rest)
+            self.rest_quats_wxyz = frames.quat_wxyz[0]
             smooth = self.at_gaussians(self.normals)
             self.outwards = _solved(frames.matrix[0], smooth)
             self.normal_of_gaussians = F.normalize(turn_back(frames.quat_wxyz[0], smooth), dim=-1)

@@ -13,13 +13,20 @@ from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 
 from rgbavatar_ns.avatar.avatar import Avatar
-from rgbavatar_ns.avatar.prior.discs import disc_log_scale, flatten, log_overlap
+from rgbavatar_ns.avatar.prior.discs import (
+    LONGEST,
+    disc_log_scale,
+    flatten,
+    log_overlap,
+    narrow_ahead,
+)
 from rgbavatar_ns.avatar.prior.leash import Leash
 from rgbavatar_ns.avatar.prior.mesh_field import MeshField
 from rgbavatar_ns.avatar.prior.mouth import HiddenMouth
 from rgbavatar_ns.avatar.prior.strands import Strands
 from rgbavatar_ns.avatar.prior.virtual_views import VirtualViews
 from rgbavatar_ns.drawing.compositing import ImagesRGBA, is_unfilmed
+from rgbavatar_ns.head.rotations import turn_back
 from rgbavatar_ns.kernels import MorphedRenderer, PinholeCameras, weighted_color_average
 
 EVERY = 40
@@ -191,6 +198,10 @@ class SurfacePrior(nn.Module):
         disc = disc_log_scale(avatar)
         frontal = clear * _CLEAR_PX / (self.grazing_px + _CLEAR_PX)
         flatten(shapes, field.normal_of_gaussians, disc, frontal)
+        ahead, alone = self.views.seen_from()
+        view = turn_back(field.rest_quats_wxyz, ahead.to(disc).expand(len(disc), 3))
+        seen = 1 - pull / _RATE
+        flatten(shapes, view, disc, alone.to(disc) * parts.narrow * seen, widths=LONGEST)
         # As far as nothing shows it, nothing else closes the surface around it.
         through = _SHINES_PX / (self.through_px + _SHINES_PX)
         alone = (pull / _RATE * through).square()
@@ -214,7 +225,7 @@ class SurfacePrior(nn.Module):
             if shapes.num_bases:
                 fades = color_pull if name == "basis_color_feature" else pull
                 getattr(shapes, name).mul_((1 - fades)[:, None])
-        counts = shapes.opacity_logit.sigmoid() * (1 - pull / _RATE)
+        counts = shapes.opacity_logit.sigmoid() * seen
         self.leashed_position.copy_(parts.leash.smooth(shapes.position, home, counts))
         self.leash_share.copy_(parts.leash.share(avatar))
 
@@ -239,8 +250,17 @@ class SurfacePrior(nn.Module):
         device = self.seen_px.device
         if self._parts_of is None or self._parts_of[0] != device:
             field = MeshField(avatar)
-            mouth, leash = HiddenMouth.of(avatar, field), Leash(avatar, field)
-            self._parts_of = device, _Parts(field, mouth, leash, Strands.of(avatar, field))
+            strands = Strands.of(avatar, field)
+            self._parts_of = (
+                device,
+                _Parts(
+                    field,
+                    HiddenMouth.of(avatar, field),
+                    Leash(avatar, field),
+                    strands,
+                    narrow_ahead(field) * (1 - strands.haired),
+                ),
+            )
         return self._parts_of[1]
 
 
@@ -252,6 +272,8 @@ class _Parts:
     mouth: HiddenMouth | None
     leash: Leash
     strands: Strands
+    narrow: Float[Tensor, "N"]
+    """1 where the film's view says nothing of how far Gaussians reach along it."""
 
 
 def _facing(

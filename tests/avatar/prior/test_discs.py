@@ -9,6 +9,7 @@ from rgbavatar_ns.avatar.orbit import orbit
 from rgbavatar_ns.avatar.prior import SurfacePrior
 from rgbavatar_ns.avatar.prior.discs import disc_log_scale, flatten, log_overlap
 from rgbavatar_ns.avatar.prior.mesh_field import MeshField
+from rgbavatar_ns.head.arrays import EMBEDDED_BUST
 from rgbavatar_ns.head.rotations import quat_wxyz_to_matrix
 from rgbavatar_ns.head.surface import vertex_normals
 
@@ -83,6 +84,40 @@ def test_what_a_frame_shows_from_the_side_keeps_its_thickness_and_nothing_else_d
     assert int(only_clear.sum()) > 100
     assert float(longer[aside].min()) > 30
     assert float(longer[only_clear].median()) < 10
+
+
+def test_needles_along_the_view_of_a_frontal_film_go_from_lips_and_stay_at_the_sides():
+    avatar = embedded_avatar(name=EMBEDDED_BUST)
+    camera = front_camera()
+    rest = avatar.anchors.origins(avatar.carrier_vertices(turned(avatar, [0.0])))[0]
+    longer = {}
+    for kind, degrees in (("still", [-1.0, 0.0, 1.0]), ("turning", [-25.0, 0.0, 25.0])):
+        theta = turned(avatar, degrees)
+        images = drawn_thicker(avatar, theta, 0.0)
+        prior, shapes = SurfacePrior(avatar), avatar.blendshapes
+        prior.begin(avatar, theta, camera, images)
+        # All reach ten discs along z, towards the camera, and one across.
+        disc = disc_log_scale(avatar)
+        frames = avatar.anchors.frames(avatar.carrier_vertices(turned(avatar, [0.0])))
+        shapes.rotation_wxyz.data.copy_(frames.quat_wxyz[0] * torch.tensor([1.0, -1, -1, -1]))
+        wide = disc[:, :2].mean(1)
+        shapes.log_scale.data.copy_(wide[:, None].expand(-1, 3))
+        shapes.log_scale.data[:, 2] += math.log(10)
+        prior.look(avatar, theta, camera, images)
+        prior.seen_px.fill_(1e3)  # nothing is drawn to the surface
+        prior.grazing_px.fill_(1e3)  # and nothing shortened along its normal
+        prior.pull(avatar, 199)
+        longer[kind] = (shapes.log_scale.detach()[:, 2] - wide).exp()
+    field = MeshField(avatar)
+    sideways = field.at_gaussians(field.normals)[:, 0].abs()
+    middle = (rest[:, 0].abs() < 0.03) & (rest[:, 2] > 0.03) & (rest[:, 1] < 0.03)
+    lips = middle & (sideways < 0.2) & ~field.body_gaussians
+    sides = (sideways > 0.75) & ~field.body_gaussians
+    assert int(lips.sum()) > 30
+    assert min(int(sides.sum()), int(field.body_gaussians.sum())) > 100
+    assert float(longer["still"][lips].max()) < 2.8  # 2.5, and what .95 of the way leaves
+    assert float(longer["still"][sides | field.body_gaussians].min()) > 9.9
+    assert float(longer["turning"].min()) > 9.9
 
 
 def test_discs_grow_with_a_surface_that_is_larger_than_its_mesh():

@@ -9,6 +9,7 @@ from rgbavatar_ns.avatar.prior.mesh_field import MeshField, Outline
 from rgbavatar_ns.avatar.prior.outline import measure_outline
 from rgbavatar_ns.avatar.prior.virtual_views import TURNS_DEGREES
 from rgbavatar_ns.drawing.compositing import is_unfilmed
+from rgbavatar_ns.head.rotations import axis_angle_to_matrix
 from rgbavatar_ns.kernels import PinholeCameras
 
 from .test_mesh_field import embedded_avatar
@@ -168,6 +169,19 @@ def test_views_turn_about_the_head_as_far_as_they_say():
         if yaw == 0 or pitch == 0:
             assert turns[:2].tolist() == pytest.approx([yaw, pitch], abs=1e-3)
         assert abs(float(turns[0])) >= abs(yaw) - 1e-3
+
+
+@pytest.mark.parametrize(("yaw", "pitch"), [(12.0, 0.0), (0.0, -9.0)])
+def test_the_film_is_known_to_look_at_the_head_from_where_its_camera_is(yaw: float, pitch: float):
+    avatar = embedded_avatar()
+    frames = looking(avatar, [yaw], []) if yaw else looking(avatar, [], [pitch])
+    ahead, alone = views_of(avatar, frames).seen_from()
+    # A turned head sees a camera on its old z axis turned the other way.
+    turn = axis_angle_to_matrix(frames[0, avatar.layout.slice("rotation")])
+    assert torch.allclose(ahead, turn.T @ torch.tensor([0.0, 0.0, 1.0]), atol=1e-4)
+    assert float(alone) == pytest.approx(1, abs=1e-3)
+    _, alone = views_of(avatar, looking(avatar, [-5.0, 15.0], [])).seen_from()
+    assert float(alone) == pytest.approx(0.5, abs=1e-3)  # 20 of 40 degrees
 
 
 def test_some_views_open_the_mouth_to_either_side_and_none_closes_it():
