@@ -35,7 +35,7 @@ _WAVES_RAD, _WAVE_M = 0.5, 0.03
 """How far strands turn aside, and over how long a way."""
 _SAMPLES = 9
 _CROWN = (0.0, 0.08, -0.06)
-"""From the middle of the scalp to where hair begins to part, in metres: up, and behind."""
+"""From the middle of what may have hair to where it begins to part, in metres: up, and behind."""
 _ROOM_M = 0.4
 """Side of a cube of noise, which goes on mirrored."""
 _GRAZING = 0.1

@@ -39,7 +39,8 @@ _FRAMES_A_VIEW = 40
 """Frames trained on for each view. Ours: one in 20 leaves less noise, one in 60 more detail."""
 _BORDER_PX = 1
 """The outline is soft: so wide a rim within it is left alone."""
-_TURNS_DEGREES = 40.0
+_TURNING_DEGREES = 40.0
+"""A head that turns or nods by so much in all is seen from enough sides for itself."""
 _STRANDED = 0.05
 """Contrast of hair from which all of its light counts as strands."""
 _HAIRLINE = 1 / 128
@@ -146,11 +147,11 @@ class VirtualViews(nn.Module):
 
     def seen_from(self) -> tuple[Float[Tensor, "3"], Float[Tensor, ""]]:
         """Where the film has looked at the head from, in the head's axes, and how far from there
-        alone: 1 where the head never turns, 0 where it turns by `_TURNS_DEGREES` in all."""
+        alone: 1 where the head never turns, 0 where it turns by `_TURNING_DEGREES` in all."""
         low, high = self.filmed_low_degrees[:2], self.filmed_high_degrees[:2]
         yaw, pitch = torch.deg2rad(0.5 * (low + high)).unbind()
         ahead = torch.stack([yaw.sin() * pitch.cos(), -pitch.sin(), yaw.cos() * pitch.cos()])
-        return ahead, (1 - (high - low).amax() / _TURNS_DEGREES).clamp(0, 1)
+        return ahead, (1 - (high - low).amax() / _TURNING_DEGREES).clamp(0, 1)
 
     def due(self, step: int, batch_size: int) -> int | None:
         """The view that takes the place of a batch's last frame at this step, if any."""
