@@ -27,13 +27,13 @@ from tracker import FACE_FRONT_M, Subject, aligned_to_face, outlines, text
 
 from rgbavatar_ns.drawing.wireframe import mesh_silhouette
 from rgbavatar_ns.head import HeadModel
+from rgbavatar_ns.head.hair import haired_vertices
 from rgbavatar_ns.head.rotations import matrix_to_axis_angle
 from rgbavatar_ns.synthetic.performer.hair import SCALP_HAIR, HairStyle, make_hair_piece
 from rgbavatar_ns.synthetic.performer.surface import TrueSurface
 from rgbavatar_ns.synthetic.performer.wrinkles import WRINKLES
 from rgbavatar_ns.tracking.config import TrackConfig
 from rgbavatar_ns.tracking.face.detector import CHIN, FOREHEAD
-from rgbavatar_ns.tracking.fit.outline import haired_vertices
 from rgbavatar_ns.tracking.fit.subject import SubjectTracker
 from rgbavatar_ns.tracking.image.head_mask import height_above_chin
 from rgbavatar_ns.tracking.image.matting import PersonMatte
@@ -103,7 +103,7 @@ def measure(subject: Subject, head: HeadModel, *, with_outlines: bool) -> dict[s
     ratio = camera.focal_px / subject.camera.focal_px
     aligned, _ = aligned_to_face(ours - [0, 0, camera.distance_m], real - eye, face, ratio)
     aligned = aligned + eye
-    out_m = outside_m(subject, real, aligned[:, haired_vertices(head)])
+    out_m = outside_m(subject, real, aligned[:, haired_vertices(head.arrays)])
     middles = [points[:, ears(head)].mean(1) for points in (aligned, real)]
     return {
         "rotation_degrees": float(np.degrees(np.linalg.norm(off, axis=1)).mean()),

@@ -38,8 +38,8 @@ class RGBAvatarModelConfig(AvatarModelConfig):
     """How: paper, the mean of the training picture over its random background, in the first step in
     which its weight exceeds .1; matted (ours), the mean of the person alone. (The release: .01.)"""
     surface_prior: bool = True
-    """Keep what the film does not show on the person's surface, closed and plain: heads can be
-    turned beyond their film. Ours; False leaves it to chance, as the paper does."""
+    """Keep what the film does not show on the person's surface, closed, and plain but for hair:
+    heads can be turned beyond their film. Ours; False leaves it to chance, as the paper does."""
     hide_unseen: bool = False
     """At the end of a run make the Gaussians transparent that no training frame showed (release;
     the paper is silent). Off in ours, where the surface prior looks after them."""

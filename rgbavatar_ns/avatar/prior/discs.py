@@ -9,7 +9,7 @@ from torch import Tensor
 
 from rgbavatar_ns.avatar.avatar import Avatar
 from rgbavatar_ns.avatar.model.blendshapes import TangentBlendshapes
-from rgbavatar_ns.avatar.prior.mesh_field import MeshField
+from rgbavatar_ns.avatar.prior.mesh_field import MeshField, ramp
 from rgbavatar_ns.head.rotations import turn_back
 
 _FLATNESS = math.log(0.25)
@@ -99,5 +99,5 @@ def narrow_ahead(field: MeshField) -> Float[Tensor, "N"]:
     hardly shows, are closed by what reaches along them, and bodies do not turn with the head.
     """
     sideways = field.at_gaussians(field.normals)[:, 0].abs()
-    front = ((_SIDE - sideways) / (_SIDE - _FRONT)).clamp(0, 1)
+    front = ramp(sideways, _SIDE, _FRONT)
     return front * (~field.body_gaussians).to(front)

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
+from rgbavatar_ns.avatar.prior.mesh_field import haired_for_certain
 from rgbavatar_ns.avatar.prior.placed_mesh import PlacedMesh, covered_pixels
-from rgbavatar_ns.avatar.prior.strands import haired_vertices
 from rgbavatar_ns.drawing.compositing import unfilmed_pixels
 from rgbavatar_ns.head import HeadArrays
 
@@ -36,7 +36,7 @@ def haired_pixels(
     side, other = second - first, third - first
     # As y goes down in pictures, what shows its outer side turns to the left.
     towards = faces[side[0] * other[1] < side[1] * other[0]]
-    haired = haired_vertices(arrays).numpy()[towards].all(1)
+    haired = haired_for_certain(arrays).numpy()[towards].all(1)
     hair = covered_pixels(px, towards[haired], width, height)
     # Only what lies there may be before it: to draw every face takes thirty milliseconds.
     column, row = px[towards].clip(0, [width - 1, height - 1]).astype(int).transpose(2, 0, 1)

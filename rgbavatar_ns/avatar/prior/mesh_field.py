@@ -11,14 +11,21 @@ from torch import Tensor
 
 from rgbavatar_ns.avatar.avatar import Avatar
 from rgbavatar_ns.head import HeadArrays
+from rgbavatar_ns.head.hair import haired_vertices
 from rgbavatar_ns.head.joints import EYES, ROOT
 from rgbavatar_ns.head.rotations import turn_back
 from rgbavatar_ns.head.surface import MeshEdges, vertex_normals
 
-_BEHIND_EYES_M, _BELOW_EYES_M = 0.095, 0.05
-"""Hair grows behind the ears, down to about their lobes; and from there up to the crown."""
-_TEMPLE_M, _EARS_TOP_M = 0.06, 0.015
-"""And so far behind the eyes also farther in front, above the ears' upper ends."""
+_BEHIND_EYES_M = 0.095
+"""So far behind the eyes lies what is behind the ears."""
+_TEMPLE_M, _SIDES_M, _TOP_M = 0.06, 0.045, 0.075
+"""So far behind the eyes whoever has hair has it; from so far on, or so far above them, hair is the
+rule, and farther in front each has a hairline of one's own."""
+_OVER_EARS_M = 0.015
+"""From here up hair hangs over the tops of ears, or their colour would go on into it."""
+_LOBES_M = 0.05
+"""How far below the eyes hair ends, at the ears' lobes: a centimetre lower lie the neck's sides,
+where hair as thick as above would stand out as soon as a head turns."""
 _ABOVE_EARS_M = 0.04
 """From here up hair goes on to the forehead, or a bald head does."""
 _HAIRLINE = 0.005
@@ -52,8 +59,8 @@ class MeshField:
     `normal_of_gaussians` is that direction in the axes that their rotations are in, which
     `rest_quats_wxyz` turn to the head's. `rest_m` and
     `normals` are the vertices' own at rest, `height_m` is theirs on the template; `body` and
-    `body_gaussians` lie below the neck's foot, `scalp` where nearly everybody who has hair has it,
-    `back` (1 or 0) behind the ears, `above_ears` above them.
+    `body_gaussians` lie below the neck's foot, `haired` where hair is the rule, `scalp` where
+    everybody who has hair has it, `back` (1 or 0) behind the ears, `above_ears` above them.
 
     Values are continued harmonically, as heat would spread, to both sides of the face alike. Ours:
     because what nobody filmed is best guessed by what surrounds it.
@@ -69,9 +76,10 @@ class MeshField:
         numbers = torch.unique(first * self.num_vertices + second)
         self.edges = torch.stack([numbers // self.num_vertices, numbers % self.num_vertices], 1)
         self._mirror, self._mirrored = _mirror_of(template)
-        behind, up = (part.to(template) for part in behind_and_above_eyes(avatar.head.arrays))
+        behind, up = (part.to(template) for part in _behind_and_above_eyes(avatar.head.arrays))
         self.back = (behind > _BEHIND_EYES_M).to(template)
-        self.scalp = self.scalp_of(avatar.head.arrays).to(template.device)
+        self.haired = haired_for_certain(avatar.head.arrays).to(template.device)
+        self.scalp = self.haired & (behind > _TEMPLE_M)
         self.above_ears = up > _ABOVE_EARS_M
         self.height_m = template[:, 1]
         self.body = _body_of(avatar.head.arrays).to(template.device)
@@ -93,13 +101,6 @@ class MeshField:
             smooth = self.at_gaussians(self.normals)
             self.outwards = _solved(frames.matrix[0], smooth)
             self.normal_of_gaussians = F.normalize(turn_back(frames.quat_wxyz[0], smooth), dim=-1)
-
-    @staticmethod
-    def scalp_of(arrays: HeadArrays) -> Bool[Tensor, "V"]:
-        """Where nearly everybody who has hair has it."""
-        behind, up = behind_and_above_eyes(arrays)
-        back = (behind > _BEHIND_EYES_M) & (up > -_BELOW_EYES_M)
-        return back | ((behind > _TEMPLE_M) & (up > _EARS_TOP_M))
 
     def of_gaussians(
         self, values: Float[Tensor, "N C"], confidence: Float[Tensor, "N"]
@@ -200,7 +201,20 @@ def _conjugate_gradients(product, wanted: Tensor, start: Tensor, diagonal: Tenso
     return x
 
 
-def behind_and_above_eyes(arrays: HeadArrays) -> tuple[Float[Tensor, "V"], Float[Tensor, "V"]]:
+def ramp(values: Float[Tensor, "*n"], start: float, end: float) -> Float[Tensor, "*n"]:
+    """0 up to `start`, 1 from `end` on, which may lie on either side, and a line between."""
+    return ((values - start) / (end - start)).clamp(0, 1)
+
+
+def haired_for_certain(arrays: HeadArrays) -> Bool[Tensor, "V"]:
+    """Where a head has hair, if it has any, wherever its hairline runs in front."""
+    behind, up = _behind_and_above_eyes(arrays)
+    certain = ((behind > _SIDES_M) & (up > -_LOBES_M)) | (up > _TOP_M)
+    over_ears = (behind > _TEMPLE_M) & (up > _OVER_EARS_M)
+    return (torch.from_numpy(haired_vertices(arrays)) & certain) | over_ears
+
+
+def _behind_and_above_eyes(arrays: HeadArrays) -> tuple[Float[Tensor, "V"], Float[Tensor, "V"]]:
     """How far each vertex lies behind the eyes, and above them, in metres."""
     eyes = (arrays.joint_regressor[EYES] @ arrays.v_template).mean(0)
     _, up, forward = torch.from_numpy((arrays.v_template - eyes).astype("float32")).unbind(1)

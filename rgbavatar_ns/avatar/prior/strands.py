@@ -1,4 +1,4 @@
-"""Hair where nobody filmed it: strands with the contrast of those that the film shows."""
+"""Hair where nobody filmed it: strands, the stronger the film's are, in the colour of hair."""
 
 import math
 from dataclasses import dataclass
@@ -10,12 +10,8 @@ from torch import Tensor
 
 from rgbavatar_ns.avatar.avatar import Avatar
 from rgbavatar_ns.avatar.model.blendshapes import color_from_feature, feature_from_color
-from rgbavatar_ns.avatar.prior.mesh_field import MeshField, behind_and_above_eyes
-from rgbavatar_ns.head import HeadArrays
+from rgbavatar_ns.avatar.prior.mesh_field import MeshField, ramp
 
-_SIDES_BEHIND_M, _SIDES_ABOVE_M, _TOP_M = 0.045, 0.02, 0.075
-"""Beside the scalp, what lies so far behind the eyes and above them, or on top, has hair, if
-anything has."""
 _EARS_ASIDE_M = 0.05
 """Ears, and what lies behind them, are farther than so from the middle."""
 _STRAND_M, _LOCK_M = 3e-3, 9e-3
@@ -46,13 +42,6 @@ _TELLS_FROM, _TELLS_AT = 0.25, 0.5
 which it does: what shines there is the ear's skin."""
 
 
-def haired_vertices(arrays: HeadArrays) -> Bool[Tensor, "V"]:
-    """Where a head has hair, if it has any: more than its scalp, whose border is that of many."""
-    behind, up = behind_and_above_eyes(arrays)
-    sides = (behind > _SIDES_BEHIND_M) & (up > _SIDES_ABOVE_M)
-    return MeshField.scalp_of(arrays) | sides | (up > _TOP_M)
-
-
 @dataclass(frozen=True)
 class Strands:
     """The strands of hair of N Gaussians. Ours, because plain backs of heads look like caps."""
@@ -70,14 +59,13 @@ class Strands:
 
         A line integral convolution (Cabral and Leedom 1993).
         """
-        vertices = haired_vertices(avatar.head.arrays).to(field.scalp.device)
         aside = field.rest_m[:, 0].abs() > _EARS_ASIDE_M
         beside_ears = field.scalp & ~field.above_ears & aside
-        haired = field.at_gaussians(vertices.to(field.rest_m)[:, None])[:, 0]
-        if not bool(vertices.any()):
+        haired = field.at_gaussians(field.haired.to(field.rest_m)[:, None])[:, 0]
+        if not bool(field.haired.any()):
             return cls(haired, torch.zeros_like(haired), beside_ears)
         normals = F.normalize(field.at_gaussians(field.normals), dim=-1)
-        places_m = field.at_gaussians(field.rest_m - field.rest_m[vertices].mean(0))
+        places_m = field.at_gaussians(field.rest_m - field.rest_m[field.haired].mean(0))
         falls = places_m - places_m.new_tensor(_CROWN)
         along = F.normalize(falls - (falls * normals).sum(-1, keepdim=True) * normals, dim=-1)
         turn_rad = _WAVES_RAD * _noise(places_m, _WAVE_M, 0)[:, None]
@@ -99,8 +87,7 @@ class Strands:
     def known(self, confidence: Float[Tensor, "V"], most: Float[Tensor, "V"]) -> Float[Tensor, "V"]:
         """How much of vertices' colours is known, without skin that shines beside ears; `most` is
         their confidence where all is seen."""
-        share = confidence / most.clamp(min=1e-12)
-        tells = ((share - _TELLS_FROM) / (_TELLS_AT - _TELLS_FROM)).clamp(0, 1)
+        tells = ramp(confidence / most.clamp(min=1e-12), _TELLS_FROM, _TELLS_AT)
         return torch.where(self.beside_ears, tells * confidence, confidence)
 
     def drawn(

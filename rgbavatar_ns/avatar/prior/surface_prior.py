@@ -21,7 +21,7 @@ from rgbavatar_ns.avatar.prior.discs import (
     narrow_ahead,
 )
 from rgbavatar_ns.avatar.prior.leash import Leash
-from rgbavatar_ns.avatar.prior.mesh_field import MeshField
+from rgbavatar_ns.avatar.prior.mesh_field import MeshField, ramp
 from rgbavatar_ns.avatar.prior.mouth import HiddenMouth
 from rgbavatar_ns.avatar.prior.strands import Strands
 from rgbavatar_ns.avatar.prior.virtual_views import VirtualViews
@@ -163,7 +163,7 @@ class SurfacePrior(nn.Module):
         if mouth is not None:
             # Also where expressions do not carry Gaussians they part the lips.
             shown_px = mouth.through_lips(shown_px, avatar.head(theta, avatar.identity), cameras)
-        seen, clear = _ramp(facing, _TURNED_AWAY, _FACING), _ramp(facing, _FACING, _FRONTAL)
+        seen, clear = ramp(facing, _TURNED_AWAY, _FACING), ramp(facing, _FACING, _FRONTAL)
         for known, share in (
             (self.through_px, torch.ones_like(facing)),
             (self.seen_px, seen),
@@ -289,11 +289,6 @@ def _facing(
     lengths = normal.square().sum(-1) * to_eye.square().sum(-1)
     cosine = (normal * to_eye).sum(-1) * lengths.clamp(min=1e-30).rsqrt()
     return cosine[:, mesh["triangle_of"]]
-
-
-def _ramp(values: Float[Tensor, "B N"], start: float, end: float) -> Float[Tensor, "B N"]:
-    """0 up to `start`, 1 from `end`, a line between."""
-    return ((values - start) / (end - start)).clamp(0, 1)
 
 
 def _as_bytes(images_rgba: ImagesRGBA) -> UInt8[Tensor, "B height width 4"]:

@@ -56,8 +56,8 @@ class TrainingOptions:
     first_colors: FirstColorsKind | None = "matted"
     """How Gaussians are given their first colours; None leaves them grey."""
     surface_prior: bool = True
-    """Keep what the film does not show on the person's surface, closed and plain (ours; the paper
-    leaves it to chance)."""
+    """Keep what the film does not show on the person's surface, closed, and plain but for hair
+    (ours; the paper leaves it to chance)."""
     orthogonality: Orthogonality = "free"
     """How bases are kept orthogonal: not at all, by a loss, or by QR or Gram-Schmidt at times."""
     max_norm: Mapping[str, float] = field(default_factory=dict)

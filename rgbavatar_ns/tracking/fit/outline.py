@@ -7,9 +7,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from rgbavatar_ns.head import HeadModel
+from rgbavatar_ns.head.hair import haired_vertices
 from rgbavatar_ns.head.joints import NECK
 from rgbavatar_ns.tracking.fit.camera import StillCamera
 from rgbavatar_ns.tracking.fit.landmark_head import LandmarkHead
@@ -35,9 +36,6 @@ _FAN_RAD, _DIRECTIONS = np.radians(120), 49
 _SPREAD_POINTS = 240  # about 9 mm apart
 _BELOW_EYES_M = 0.06  # the upper lip: below it the jaw moves
 _RIGID = 0.95
-# From between the eyes, metres: how high the ears' tops are, how high the hairline is there and how
-# it rises forwards, and what lies behind the ears.
-_EAR_TOP_M, _HAIRLINE_M, _HAIRLINE_SLOPE, _BEHIND_EARS_M = 0.02, 0.043, 0.96, -0.095
 
 
 @dataclass(frozen=True)
@@ -93,7 +91,7 @@ class OutlineCost:
         self, head: HeadModel, columns: Int[np.ndarray, "P"], identity_columns: int
     ) -> None:
         chosen = spread_vertices(head)
-        self._haired = haired_vertices(head)[chosen]
+        self._haired = haired_vertices(head.arrays)[chosen]
         corners = np.repeat(chosen[:, None], 3, axis=1)
         self._head = LandmarkHead(head, corners, np.tile([1.0, 0.0, 0.0], (len(corners), 1)))
         self._unknowns = self._head.unknowns(columns, identity_columns)
@@ -170,18 +168,6 @@ class OutlineCost:
         rim = np.unique((points_px @ outwards.T).argmax(0))
         away_px, _ = terms.outline.at(points_px[rim])
         return rim, away_px * _metres_a_pixel(points[rim], terms.camera)
-
-
-def haired_vertices(head: HeadModel) -> Bool[np.ndarray, "V"]:
-    """Where hair grows on most heads: above the forehead and the ears, and behind the ears.
-
-    In a head's own measure from between its eyes, so that it holds for any head model.
-    """
-    template = head.arrays.v_template.astype(np.float64)
-    eyes = (head.arrays.joint_regressor.astype(np.float64) @ template)[-2:].mean(0)
-    _, above, ahead = (template - eyes).T
-    line_m = np.maximum(_EAR_TOP_M, _HAIRLINE_M + _HAIRLINE_SLOPE * ahead)
-    return (above > line_m) | ((ahead < _BEHIND_EARS_M) & (above > -_BELOW_EYES_M))
 
 
 def spread_vertices(head: HeadModel) -> Int[np.ndarray, "N"]:

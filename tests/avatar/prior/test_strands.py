@@ -1,4 +1,4 @@
-"""Hair that nobody filmed: strands along the fall of hair, as strong as the film's, in its hue."""
+"""Hair that nobody filmed: strands along its fall, the stronger the film's are, in its hue."""
 
 import math
 
@@ -98,13 +98,12 @@ def test_no_contrast_turns_hair_to_less_than_black():
         assert abs(float(strands.pattern.mean())) < 1e-3
 
 
-def test_a_mesh_that_is_all_face_has_no_strands(make_avatar, monkeypatch: pytest.MonkeyPatch):
+def test_a_mesh_that_is_all_face_has_no_strands(make_avatar):
     avatar = make_avatar()
     field = MeshField(avatar)
     assert not field.scalp.any()
     assert bool(Strands.of(avatar, field).pattern.isfinite().all())
-    nowhere = torch.zeros(field.num_vertices, dtype=torch.bool)
-    monkeypatch.setattr("rgbavatar_ns.avatar.prior.strands.haired_vertices", lambda _: nowhere)
+    field.haired = torch.zeros_like(field.haired)
     strands = Strands.of(avatar, field)
     assert not strands.pattern.any()
     assert not strands.haired.any()
@@ -136,7 +135,7 @@ def test_the_films_contrast_is_that_of_a_band_of_its_light():
     fine, coarse = (math.exp(-2 * (math.pi * s / period_m) ** 2) for s in (1e-3, 6e-3))
     expected = 1.4826 * share / math.sqrt(2) * (fine - coarse)
     assert found.hair_contrast == pytest.approx(expected, rel=0.15)
-    # What shows no hair says nothing, and half the pixels as many metres the same.
+    # Frames that show no hair say nothing.
     images = _striped(avatar, theta, share, period_m)
     images[:2] = torch.tensor(UNFILMED_RGBA, dtype=torch.uint8)
     some = measure_outline(avatar, field, theta, front_camera(), images)

@@ -170,8 +170,10 @@ def test_its_memory_goes_on_from_its_state(filmed):
     prior, copy = (SurfacePrior(avatar) for _ in range(2))
     prior.begin(avatar, theta, front_camera(), images)
     prior.look(avatar, theta, front_camera(), images)
+    prior.views.hair_contrast.fill_(0.1)
     copy.load_state_dict(prior.state_dict())
     assert copy.has_begun
+    assert float(copy.views.hair_contrast) == pytest.approx(0.1)
     for name, value in prior.state_dict().items():
         assert torch.equal(value, copy.state_dict()[name])
 
