@@ -59,7 +59,8 @@ class AvatarConfig(MethodConfig):
     """Take the initial scale from the distance of neighbouring texels on the head instead: ours,
     for fewer Gaussians than the paper's."""
     initial_opacity: Annotated[float, Between(0, 1, open=True)] = 0.5
-    """Initial opacity, inside (0, 1) (paper: "a default value"; release: .5)."""
+    """Initial opacity, inside (0, 1) (paper: "a default value"; release: .5); with a surface prior
+    that of mouth and lips is .9."""
     initial_color: Share = 0.5
     """Initial grey value (paper: "a default value"; release: .5)."""
 

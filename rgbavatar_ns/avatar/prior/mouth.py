@@ -43,6 +43,8 @@ class HiddenMouth:
     """Those of cavity, teeth and tongue."""
     behind: Float[Tensor, "N"]
     """1 at these, falling to 0 at the lips."""
+    before: Float[Tensor, "N"]
+    """1 within and at the lips, and at as much skin around as its colours are guessed by."""
     in_cavity: Float[Tensor, "N"]
     """The same of the cavity alone."""
     backs: Bool[Tensor, "N"]
@@ -95,6 +97,7 @@ class HiddenMouth:
         return cls(
             gaussians,
             behind,
+            at_gaussians((away_m < _AROUND_M).astype(np.float32)),
             at_gaussians(cavity),
             at_gaussians(cavity * backs) > 0.5,
             corners[gaussians],

@@ -70,6 +70,31 @@ def test_what_no_frame_shows_comes_to_the_surface(filmed):
     assert torch.allclose(shapes.opacity_logit, prior.surface(avatar)[1])
 
 
+def test_what_the_film_may_move_begins_half_clear_and_lips_begin_closed(filmed):
+    avatar, theta, images = filmed
+    prior, mouth = SurfacePrior(avatar), HiddenMouth.of(avatar, MeshField(avatar))
+    assert mouth is not None
+    prior.begin(avatar, theta, front_camera(), images)
+    begun = avatar.blendshapes.opacity_logit.sigmoid()
+    closed = prior.surface(avatar)[1].sigmoid()
+    lips = (mouth.before > 0.5) & (mouth.behind == 0)
+    face = mouth.before == 0
+    assert int(lips.sum()) > 50
+    assert torch.equal(begun[lips], closed[lips])
+    assert float(closed[lips].median()) == pytest.approx(0.9, abs=1e-4)
+    full = face & (closed > 0.5)
+    assert int(full.sum()) > 500
+    assert torch.allclose(begun[full], torch.tensor(avatar.config.initial_opacity))
+    empty = face & (closed < 0.01)
+    assert torch.allclose(begun[empty], torch.tensor(0.01), atol=1e-4)
+    # How far from the lips, by hand: their middle, and the tip of a nose some 4 cm above it.
+    rest = avatar.anchors.origins(avatar.carrier_vertices(torch.zeros_like(theta[:1])))[0]
+    height_m = rest[:, 1] - rest[lips, 1].mean()
+    front = rest[:, 2] > rest[lips, 2].mean() - 0.02
+    assert not (mouth.before[front & (height_m > 0.08)] > 0).any()
+    assert (mouth.before[front & (height_m.abs() < 0.01) & (rest[:, 0].abs() < 0.03)] > 0.9).all()
+
+
 def test_discs_that_nothing_shows_reach_each_other(filmed):
     avatar, theta, images = filmed
     small = replace(avatar.config, scale_from_texel_spacing=False, initial_scale_m=1e-4)
