@@ -82,7 +82,7 @@ class MeshField:
         self.scalp = self.haired & (behind > _TEMPLE_M)
         self.above_ears = up > _ABOVE_EARS_M
         self.height_m = template[:, 1]
-        self.body = _body_of(avatar.head.arrays).to(template.device)
+        self.body = body_vertices(avatar.head.arrays).to(template.device)
         first, second = self.edges.unbind(1)
         ends_of_rows = torch.bincount(first, minlength=self.num_vertices).cumsum(0)
         self._row_starts = torch.cat([ends_of_rows.new_zeros(1), ends_of_rows])
@@ -221,11 +221,11 @@ def _behind_and_above_eyes(arrays: HeadArrays) -> tuple[Float[Tensor, "V"], Floa
     return -forward, up
 
 
-def _body_of(arrays: HeadArrays) -> Bool[Tensor, "V"]:
-    """Vertices below the joint that a neck stands on, of heads that have a torso."""
+def body_vertices(arrays: HeadArrays, higher_m: float = 0.0) -> Bool[Tensor, "V"]:
+    """Those below the joint that a neck stands on, or higher, of heads that have a torso."""
     template = torch.as_tensor(arrays.v_template)
     root = torch.as_tensor(arrays.joint_regressor[ROOT]).to(template) @ template
-    return (template[:, 1] < root[1]) & arrays.has_torso
+    return (template[:, 1] < root[1] + higher_m) & arrays.has_torso
 
 
 def _mirror_of(

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from rgbavatar_ns.avatar.avatar import Avatar
 from rgbavatar_ns.avatar.orbit import head_centre, orbit
-from rgbavatar_ns.avatar.prior.mesh_field import Outline
+from rgbavatar_ns.avatar.prior.mesh_field import Outline, body_vertices
 from rgbavatar_ns.head import turn_seen
 from rgbavatar_ns.head.surface import vertex_normals
 from rgbavatar_ns.kernels import DeviceRenderer, PinholeCameras, RenderedBatch
@@ -39,6 +39,9 @@ _FRAMES_A_VIEW = 40
 """Frames trained on for each view. Ours: one in 20 leaves less noise, one in 60 more detail."""
 _BORDER_PX = 1
 """The outline is soft: so wide a rim within it is left alone."""
+_COLLAR_M, _WORN_M = 0.05, 0.02
+"""So high up a neck it has a collar, and so far around clothes and collar a view knows nothing: it
+would cut a slit between them, for they stand off less evenly than hair."""
 _TURNING_DEGREES = 40.0
 """A head that turns or nods by so much in all is seen from enough sides for itself."""
 _STRANDED = 0.05
@@ -252,7 +255,11 @@ class VirtualViews(nn.Module):
         px, size = seen.moved(self.surface_m.cpu()), (cameras.width, cameras.height)
         there = ~(self.empty.cpu() > 0.5)[faces].any(1)
         body, rest = (covered_pixels(px, faces[k].numpy(), *size) > 0 for k in (there, ~there))
-        unknown = body | rest
+        clothed = body_vertices(avatar.head.arrays, _COLLAR_M)
+        worn = covered_pixels(px, faces[clothed[faces].all(1)].numpy(), *size)
+        reach_px = _WORN_M * float(seen.focal_px.mean() / seen.places_m[:, 2].median())
+        away_px = cv2.distanceTransform(1 - worn, cv2.DIST_L2, cv2.DIST_MASK_3)
+        unknown = body | rest | (away_px < reach_px)
         rim = np.ones((2 * _BORDER_PX + 1,) * 2, np.uint8)
         inner = cv2.erode(body.astype(np.uint8), rim, borderValue=(1,)) > 0
         # What the mesh ends in goes on below it: a neck, shoulders.

@@ -9,6 +9,7 @@ from rgbavatar_ns.avatar.prior.mesh_field import MeshField, Outline
 from rgbavatar_ns.avatar.prior.outline import measure_outline
 from rgbavatar_ns.avatar.prior.virtual_views import TURNS_DEGREES
 from rgbavatar_ns.drawing.compositing import is_unfilmed
+from rgbavatar_ns.head.arrays import EMBEDDED_BUST
 from rgbavatar_ns.head.rotations import axis_angle_to_matrix
 from rgbavatar_ns.kernels import PinholeCameras
 
@@ -78,6 +79,33 @@ def test_nothing_is_beside_the_outline_and_within_it_the_avatar_is_closed():
         assert not (within & ~wider)[: SIZE // 2].any()
         crown = [int(mask.any(1).nonzero()[0]) for mask in (within, wider)]
         assert crown[0] - crown[1] == pytest.approx(0.01 / 1.1 * 900, abs=2)
+
+
+def test_around_clothes_and_collar_nothing_is_known_and_beside_the_head_that_nothing_is():
+    avatar = embedded_avatar(name=EMBEDDED_BUST)
+    theta = turned(avatar, [-4.0, 4.0])
+    theta[:, avatar.layout.slice("translation").start + 1] = 0.08
+    frame = views_of(avatar, theta).frame(avatar, 0)
+    vertices = avatar.carrier_vertices(frame.theta)[0]
+    pose = frame.cameras.world_to_camera[0]
+    away_m = vertices @ pose[2, :3] + pose[2, 3]
+    rows, columns = torch.meshgrid(torch.arange(SIZE), torch.arange(SIZE), indexing="ij")
+    pixels = torch.stack([columns, rows], -1).flatten(0, 1) + 0.5
+    mesh_px = places_px(frame.cameras, vertices).float()
+    # Metres to the nearest vertex: mostly a few millimetres more than to the mesh between them.
+    nearest_px, index = torch.cdist(pixels, mesh_px).min(1)
+    off_m = nearest_px * away_m[index] / frame.cameras.focal_px[0, 0]
+    rest = torch.as_tensor(avatar.head.arrays.v_template)
+    foot = float((torch.as_tensor(avatar.head.arrays.joint_regressor[0]).to(rest) @ rest)[1])
+    height_m = rest[index, 1] - foot
+    unfilmed = is_unfilmed(frame.images_rgba)[0].flatten()
+    background = ~within_outline(frame.images_rgba)[0].flatten()
+    around = (off_m > 0.008) & (off_m < 0.016) & (unfilmed | background)
+    worn, bare = around & (height_m < 0.02), around & (height_m > 0.1)
+    assert min(int(worn.sum()), int(bare.sum())) > 200
+    assert float(unfilmed[worn].float().mean()) > 0.97
+    assert float(background[bare].float().mean()) > 0.97
+    assert float(background[off_m > 0.04].float().mean()) > 0.97
 
 
 def test_a_view_asks_for_the_avatars_own_colours_as_they_are_now():
