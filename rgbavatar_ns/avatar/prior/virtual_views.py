@@ -39,9 +39,10 @@ _FRAMES_A_VIEW = 40
 """Frames trained on for each view. Ours: one in 20 leaves less noise, one in 60 more detail."""
 _BORDER_PX = 1
 """The outline is soft: so wide a rim within it is left alone."""
-_COLLAR_M, _WORN_M = 0.05, 0.02
-"""So high up a neck it has a collar, and so far around clothes and collar a view knows nothing: it
-would cut a slit between them, for they stand off less evenly than hair."""
+_COLLAR_M, _WORN_M = (-0.06, 0.05), 0.02
+"""Heights above a neck's foot between which it has a collar, and how far around that a view knows
+nothing: clothes stand off there less evenly than hair, and it would cut a slit into them. Ours;
+around all clothes it left more fog before the chest."""
 _TURNING_DEGREES = 40.0
 """A head that turns or nods by so much in all is seen from enough sides for itself."""
 _STRANDED = 0.05
@@ -255,10 +256,10 @@ class VirtualViews(nn.Module):
         px, size = seen.moved(self.surface_m.cpu()), (cameras.width, cameras.height)
         there = ~(self.empty.cpu() > 0.5)[faces].any(1)
         body, rest = (covered_pixels(px, faces[k].numpy(), *size) > 0 for k in (there, ~there))
-        clothed = body_vertices(avatar.head.arrays, _COLLAR_M)
-        worn = covered_pixels(px, faces[clothed[faces].all(1)].numpy(), *size)
+        below, under = (body_vertices(avatar.head.arrays, height_m) for height_m in _COLLAR_M)
+        collar = covered_pixels(px, faces[(under & ~below)[faces].all(1)].numpy(), *size)
         reach_px = _WORN_M * float(seen.focal_px.mean() / seen.places_m[:, 2].median())
-        away_px = cv2.distanceTransform(1 - worn, cv2.DIST_L2, cv2.DIST_MASK_3)
+        away_px = cv2.distanceTransform(1 - collar, cv2.DIST_L2, cv2.DIST_MASK_3)
         unknown = body | rest | (away_px < reach_px)
         rim = np.ones((2 * _BORDER_PX + 1,) * 2, np.uint8)
         inner = cv2.erode(body.astype(np.uint8), rim, borderValue=(1,)) > 0
