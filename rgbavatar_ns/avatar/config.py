@@ -60,7 +60,7 @@ class AvatarConfig(MethodConfig):
     for fewer Gaussians than the paper's."""
     initial_opacity: Annotated[float, Between(0, 1, open=True)] = 0.5
     """Initial opacity, inside (0, 1) (paper: "a default value"; release: .5); with a surface prior
-    that of mouth and lips is .9."""
+    .9 at mouth and lips, and all over FLAME's head, whose lips nobody has pointed out."""
     initial_color: Share = 0.5
     """Initial grey value (paper: "a default value"; release: .5)."""
 

@@ -95,6 +95,17 @@ def test_what_the_film_may_move_begins_half_clear_and_lips_begin_closed(filmed):
     assert (mouth.before[front & (height_m.abs() < 0.01) & (rest[:, 0].abs() < 0.03)] > 0.9).all()
 
 
+def test_a_head_whose_lips_are_not_known_begins_closed(filmed, monkeypatch):
+    avatar, theta, images = filmed
+    monkeypatch.setattr(HiddenMouth, "of", lambda avatar, field: None)
+    prior = SurfacePrior(avatar)
+    prior.begin(avatar, theta, front_camera(), images)
+    begun = avatar.blendshapes.opacity_logit.sigmoid()
+    closed = prior.opacity_logit > 0
+    assert int(closed.sum()) > 500
+    assert torch.allclose(begun[closed], torch.tensor(0.9))
+
+
 def test_discs_that_nothing_shows_reach_each_other(filmed):
     avatar, theta, images = filmed
     small = replace(avatar.config, scale_from_texel_spacing=False, initial_scale_m=1e-4)
