@@ -74,7 +74,7 @@ def _contrast_in(
 ) -> float | None:
     """One frame's, or None where it shows no hair."""
     height, width = image.shape[:2]
-    px_of_metre = float(seen.focal_px[0] / seen.places_m[:, 2].mean())
+    px_of_metre = seen.px_of_metre
     person = ((image[..., 3] > 127) & ~unfilmed_pixels(image)).astype(np.uint8)
     depth_m = cv2.distanceTransform(person, cv2.DIST_L2, 5) / px_of_metre
     hair = (depth_m > _RIM_M) & (haired_pixels(arrays, seen, px, faces, width, height) > 0)

@@ -222,7 +222,7 @@ def _behind_and_above_eyes(arrays: HeadArrays) -> tuple[Float[Tensor, "V"], Floa
 
 
 def body_vertices(arrays: HeadArrays, higher_m: float = 0.0) -> Bool[Tensor, "V"]:
-    """Those below the joint that a neck stands on, or higher, of heads that have a torso."""
+    """Those below the joint that a neck stands on, or so much higher, of heads with a torso."""
     template = torch.as_tensor(arrays.v_template)
     root = torch.as_tensor(arrays.joint_regressor[ROOT]).to(template) @ template
     return (template[:, 1] < root[1] + higher_m) & arrays.has_torso

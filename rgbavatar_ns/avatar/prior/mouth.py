@@ -44,7 +44,7 @@ class HiddenMouth:
     behind: Float[Tensor, "N"]
     """1 at these, falling to 0 at the lips."""
     before: Float[Tensor, "N"]
-    """1 within and at the lips, and at as much skin around as its colours are guessed by."""
+    """1 within the mouth, at its lips and on the skin around, all of which hide it."""
     in_cavity: Float[Tensor, "N"]
     """The same of the cavity alone."""
     backs: Bool[Tensor, "N"]

@@ -32,6 +32,11 @@ class PlacedMesh:
             camera.principal_point_px[0].cpu().to(vertices),
         )
 
+    @property
+    def px_of_metre(self) -> float:
+        """How large a metre is in the picture, at the vertices' mean distance."""
+        return float(self.focal_px[0] / self.places_m[:, 2].mean())
+
     def is_upright(self, height_m: Float[Tensor, "V"]) -> bool:
         """Whether a mesh of these heights stands in the picture, within 45 degrees."""
         across, down, _ = self.places_m[height_m.argmin()] - self.places_m[height_m.argmax()]

@@ -117,9 +117,9 @@ class SurfacePrior(nn.Module):
         # Here, so that timing steps on a bare machine needs no OpenCV.
         from rgbavatar_ns.avatar.prior.outline import measure_outline
 
-        field, mouth = self._parts(avatar).field, self._parts(avatar).mouth
-        outline = measure_outline(avatar, field, theta, cameras, _as_bytes(images_rgba))
-        offset_m = field.at_gaussians(outline.offset_m[:, None])[:, 0]
+        parts = self._parts(avatar)
+        outline = measure_outline(avatar, parts.field, theta, cameras, _as_bytes(images_rgba))
+        offset_m = parts.field.at_gaussians(outline.offset_m[:, None])[:, 0]
         self.offset_m.copy_(offset_m - _SUNK * avatar.initial_scale_m())
         self.opacity_logit.copy_(torch.where(outline.empty_gaussians > 0.5, _EMPTY, _CLOSED))
         self.views.begin(avatar, outline, theta, cameras)
@@ -130,11 +130,11 @@ class SurfacePrior(nn.Module):
             avatar.blendshapes.position.copy_(position)
             avatar.blendshapes.log_scale.copy_(disc_log_scale(avatar))
             begun = opacity_logit.clamp(min=_FAINT)
-            if mouth is not None:
+            if parts.mouth is not None:
                 # As clear as fresh ones, or what stands off the mesh, as glasses do, is learnt
                 # late; but closed before the mouth, which would be painted through it.
                 clearer = begun.minimum(avatar.blendshapes.opacity_logit)
-                begun = torch.where(mouth.before > 0.5, begun, clearer)
+                begun = torch.where(parts.mouth.before > 0.5, begun, clearer)
             avatar.blendshapes.opacity_logit.copy_(begun)
 
     def due(self, step: int) -> bool:

@@ -39,7 +39,7 @@ _FRAMES_A_VIEW = 40
 """Frames trained on for each view. Ours: one in 20 leaves less noise, one in 60 more detail."""
 _BORDER_PX = 1
 """The outline is soft: so wide a rim within it is left alone."""
-_COLLAR_M, _WORN_M = (-0.06, 0.05), 0.02
+_COLLAR_M, _AROUND_COLLAR_M = (-0.06, 0.05), 0.02
 """Heights above a neck's foot between which it has a collar, and how far around that a view knows
 nothing: clothes stand off there less evenly than hair, and it would cut a slit into them. Ours;
 around all clothes it left more fog before the chest."""
@@ -258,9 +258,8 @@ class VirtualViews(nn.Module):
         body, rest = (covered_pixels(px, faces[k].numpy(), *size) > 0 for k in (there, ~there))
         below, under = (body_vertices(avatar.head.arrays, height_m) for height_m in _COLLAR_M)
         collar = covered_pixels(px, faces[(under & ~below)[faces].all(1)].numpy(), *size)
-        reach_px = _WORN_M * float(seen.focal_px.mean() / seen.places_m[:, 2].median())
         away_px = cv2.distanceTransform(1 - collar, cv2.DIST_L2, cv2.DIST_MASK_3)
-        unknown = body | rest | (away_px < reach_px)
+        unknown = body | rest | (away_px < _AROUND_COLLAR_M * seen.px_of_metre)
         rim = np.ones((2 * _BORDER_PX + 1,) * 2, np.uint8)
         inner = cv2.erode(body.astype(np.uint8), rim, borderValue=(1,)) > 0
         # What the mesh ends in goes on below it: a neck, shoulders.

@@ -87,7 +87,7 @@ def test_what_the_film_may_move_begins_half_clear_and_lips_begin_closed(filmed):
     assert torch.allclose(begun[full], torch.tensor(avatar.config.initial_opacity))
     empty = face & (closed < 0.01)
     assert torch.allclose(begun[empty], torch.tensor(0.01), atol=1e-4)
-    # How far from the lips, by hand: their middle, and the tip of a nose some 4 cm above it.
+    # By hand: a mouth's own height is near it, and eyes, 8 cm above it, are not.
     rest = avatar.anchors.origins(avatar.carrier_vertices(torch.zeros_like(theta[:1])))[0]
     height_m = rest[:, 1] - rest[lips, 1].mean()
     front = rest[:, 2] > rest[lips, 2].mean() - 0.02
