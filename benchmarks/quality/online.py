@@ -324,7 +324,8 @@ def main() -> None:
     parser.add_argument("--images-per-second", type=float, default=200.0)
     parser.add_argument("--steps-after-stream", type=int, help="500 for 3,000 frames")
     parser.add_argument("--looks-per-second", type=float, default=2.0)
-    parser.add_argument("--variants", nargs="+", help="only these, by their names")
+    names = [*variants(PAPER_STREAM_FRAMES, 0), OFFLINE, OFFLINE_CONSTANT]
+    parser.add_argument("--variants", nargs="+", choices=names, help="only these, by their names")
     parser.add_argument("--subjects", type=Path, help="keep the subjects here")
     parser.add_argument("--out", type=Path, default=Path("outputs/online"))
     arguments = parser.parse_args()
