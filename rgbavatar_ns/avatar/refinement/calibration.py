@@ -1,7 +1,7 @@
 """What a tracker gets wrong in every frame alike, as a linear map from what it says."""
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 _BLOCKS = 5
@@ -13,20 +13,32 @@ def fit_ridge(inputs: Float[Tensor, "F M"], outputs: Float[Tensor, "F H"]) -> Fl
     """The linear map from inputs to outputs, each output's ridge chosen by what it predicts.
 
     Both are thought to be centred. A ridge is judged on five blocks of successive frames, each
-    predicted from the others. An output that no ridge predicts better than zero gets zero.
+    predicted from the others. Of those that predict an output as well as the best one, to within
+    its standard error, the largest is taken, and zero where that is one of them (Breiman et al.
+    1984): on a minute of film the best one is often the best by chance.
     """
     ridges = inputs.new_tensor(_RIDGES) * len(inputs)
-    error = outputs.new_zeros(len(ridges) + 1, outputs.shape[1])
+    errors = []
     for held_out in torch.arange(len(inputs), device=inputs.device).chunk(_BLOCKS):
         others = torch.ones(len(inputs), dtype=torch.bool, device=inputs.device)
         others[held_out] = False
         maps = _ridge_maps(inputs[others], outputs[others], ridges)
         maps = torch.cat([maps, torch.zeros_like(maps[:1])])
-        error += (inputs[held_out] @ maps - outputs[held_out]).square().sum(1)
+        errors.append((inputs[held_out] @ maps - outputs[held_out]).square().sum(1))
     maps = _ridge_maps(inputs, outputs, ridges)
     maps = torch.cat([maps, torch.zeros_like(maps[:1])])
-    best = error.argmin(0)
-    return maps.gather(0, best.expand(1, inputs.shape[1], -1))[0]
+    chosen = _simplest(torch.stack(errors))
+    return maps.gather(0, chosen.expand(1, inputs.shape[1], -1))[0]
+
+
+def _simplest(errors: Float[Tensor, "K L H"]) -> Int[Tensor, "H"]:
+    """The last of L choices whose error over K blocks is within a standard error of the best."""
+    mean = errors.mean(0)
+    best = mean.argmin(0, keepdim=True)
+    spread = errors.std(0, correction=min(1, len(errors) - 1)).gather(0, best)
+    good = mean <= mean.gather(0, best) + spread / len(errors) ** 0.5
+    numbers = torch.arange(len(mean), device=mean.device)[:, None]
+    return torch.where(good, numbers, 0).amax(0)
 
 
 def _ridge_maps(

@@ -114,8 +114,9 @@ class TrackingRefinement(nn.Module):
     def calibrated(self, theta: Float[Tensor, "B H"]) -> Float[Tensor, "B H"]:
         """Theta of new frames of the same tracker, without the errors that all its frames have.
 
-        The corrections found so far, as far as a linear map predicts them from the tracked theta;
-        none larger than in the frames that it was learnt from. What a bound cut off is none.
+        The corrections found so far, as far as a linear map predicts them from the tracked theta,
+        of which it knows no more than their range; none larger than in the frames that it was
+        learnt from. What a bound cut off is none.
         """
         middle, spread = self.tracked.mean(0), self.tracked.std(0)
         steady = self._sigma == 0
@@ -126,7 +127,9 @@ class TrackingRefinement(nn.Module):
 
         mean = found.mean(0)
         learnt = fit_ridge(standardized(self.tracked), found - mean)
-        correction = standardized(theta) @ learnt + mean
+        # A number that hardly moved would else be a thousand of its widths away as soon as it does.
+        known = theta.clamp(self.tracked.amin(0), self.tracked.amax(0))
+        correction = standardized(known) @ learnt + mean
         correction = correction.clamp(found.amin(0), found.amax(0))
         return theta + correction * self._sigma
 

@@ -134,6 +134,15 @@ def test_ridge_against_numpy_and_nothing_from_noise():
     assert found[:, 2:].square().sum() < 0.02 * (4 * 3)
 
 
+def test_what_predicts_no_better_than_chance_is_left_alone():
+    """In sixty frames some of forty inputs seem to tell of an output that has nothing to do with
+    them."""
+    rng = np.random.default_rng(3)
+    inputs, outputs = (torch.from_numpy(rng.standard_normal((60, n))) for n in (40, 200))
+    left_alone = (fit_ridge(inputs, outputs) == 0).all(0)
+    assert left_alone.double().mean() > 0.9
+
+
 def test_calibration_knows_what_every_frame_has_wrong():
     """Truth is .9 of what is tracked: new frames are corrected as the known ones were."""
     refinement = TrackingRefinement(_tracked(80), LAYOUT, CONFIG)
@@ -143,6 +152,24 @@ def test_calibration_knows_what_every_frame_has_wrong():
     wrong = new - refinement.calibrated(new)
     expected = 0.1 * (new - refinement.tracked.mean(0))
     assert (wrong - expected).square().mean() < 0.01 * expected.square().mean()
+
+
+def test_what_hardly_moved_tells_nothing_once_it_moves():
+    """Else a blink that the film has not would be a thousand of its widths away."""
+    tracked, noise = _tracked(80), torch.Generator().manual_seed(3)
+    still = LAYOUT.slice("expression").start
+    tracked[:, still] = 1e-5 * torch.rand(80, generator=noise)
+    refinement = TrackingRefinement(tracked, LAYOUT, CONFIG)
+    errors = -0.1 * tracked / refinement._sigma
+    refinement.correction.copy_(errors + 0.1 * torch.randn(errors.shape, generator=noise))
+    refinement.correction.sub_(refinement.correction.mean(0))
+    new = _tracked(20, seed=9)
+    new[:, still] = 0
+    before = refinement.calibrated(new)
+    new[:, still] = 0.7
+    moved = (refinement.calibrated(new) - before) / refinement._sigma
+    moved[:, still] = 0
+    assert moved.abs().max() < 0.2
 
 
 def test_calibration_learns_nothing_from_what_bounds_cut_off():
