@@ -47,7 +47,7 @@ _Values = Float[np.ndarray, "P"]
 class LiveTracker:
     """Follows one person in a stream, with the models and the fit of `track_video`.
 
-    The first `config.key_frames` frames that show the face give identity, focal length and crop:
+    The first `config.key_frames` frames that show the face give identity and crop:
     until then `ready` is False and calls return None. `backlog` hands these frames out afterwards,
     tracked, so that none is lost. Every later call fits one frame, starting from the one before
     and drawn a little towards it. The square that is cut out stays where it is until the head

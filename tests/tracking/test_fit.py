@@ -10,7 +10,7 @@ from rgbavatar_ns.tracking.fit.fit import fit_clip, key_frame_positions
 from rgbavatar_ns.tracking.fit.subject import SubjectTracker
 from rgbavatar_ns.tracking.verify.report import fit_quality
 
-from .acting import ACTIVE, CAMERA, acted, degrees_apart, skulls
+from .acting import ACTIVE, CAMERA, acted, degrees_apart, observed, skulls
 
 
 def test_known_performance_is_recovered_from_its_own_landmarks(head: HeadModel) -> None:
@@ -44,6 +44,24 @@ def test_known_performance_is_recovered_from_its_own_landmarks(head: HeadModel) 
     assert tracker.rejected(fit, noisy) == []
     bounds = tracker.cost.parameters
     assert ((bounds.lower <= fit.values) & (fit.values <= bounds.upper)).all()
+
+
+def test_an_error_that_all_frames_share_makes_no_deeper_face(head: HeadModel) -> None:
+    """A millimetre across the picture is at most one of depth, before an average, still head."""
+    random = np.random.default_rng(4)
+    tracker, theta, identity, _ = acted(head, 12, key_frames=12)
+    average = np.zeros_like(identity)
+    points = observed(tracker, np.zeros_like(theta), average)
+    one_mm = 0.001 * CAMERA.focal_px / CAMERA.distance_m
+    points += one_mm * random.normal(size=points.shape[1:])
+    # Frames that do not differ are no key frames.
+    points += 0.05 * one_mm * random.normal(size=points.shape)
+    found = tracker.fit_subject(points, 320, 240).identity
+    rest = torch.zeros(head.layout.size, dtype=torch.float64)
+    with torch.no_grad():
+        ours, true = (head(rest, torch.from_numpy(person)).numpy() for person in (found, average))
+    deeper = (ours - true)[head.arrays.v_template[:, 2] > 0.02, 2]
+    assert deeper.std() < 0.001
 
 
 def test_the_same_landmarks_give_the_same_fit_and_a_gap_is_not_bridged(head: HeadModel) -> None:

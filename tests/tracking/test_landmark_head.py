@@ -3,6 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scipy.linalg import sqrtm
 
 from rgbavatar_ns.head import HeadModel
 from rgbavatar_ns.head.landmarks import LandmarkResponse, facemesh_landmarks, facemesh_response
@@ -64,6 +65,42 @@ def test_derivatives_equal_those_of_the_full_head_by_automatic_differentiation(
     derivative = reduced.derivative(posed, reduced.unknowns(columns, 7))
     by_torch = torch.cat([expected[0][..., columns], expected[1][..., :7]], -1)
     np.testing.assert_allclose(derivative, by_torch, atol=1e-9)
+
+
+def _with_identities(head: HeadModel, motion_m: np.ndarray) -> LandmarkHead:
+    """Landmarks of this head, whose identity moves all of it by these [C, 3] metres."""
+    arrays = head.arrays
+    still = arrays.shapedirs[..., arrays.num_identity :]
+    moved = np.broadcast_to(motion_m.T, (len(still), *motion_m.T.shape)).astype(np.float32)
+    shapedirs = np.concatenate([moved, still], axis=2)
+    other = replace(arrays, shapedirs=shapedirs, num_identity=len(motion_m))
+    return LandmarkHead(HeadModel(other, dtype=torch.float64), *_landmarks(head))
+
+
+def test_depth_has_all_of_what_moves_ahead_and_none_of_what_moves_across(head: HeadModel) -> None:
+    # 3 cm ahead, 2 cm up, and what moves nothing; then 3 mm aside with 4 ahead.
+    apart = _with_identities(head, np.array([[0, 0, 0.03], [0, 0.02, 0], [0, 0, 0]]))
+    np.testing.assert_allclose(apart.depth_share(3), np.diag([1.0, 0, 0]), atol=1e-6)
+    slanting = _with_identities(head, np.array([[0.003, 0, 0.004]]))
+    np.testing.assert_allclose(slanting.depth_share(1), [[16 / 25]], rtol=1e-5)
+    assert apart.depth_share(0).shape == (0, 0)
+
+
+def test_depths_share_is_that_of_the_full_heads_motions(head: HeadModel) -> None:
+    vertex_ids, barycentric = _landmarks(head)
+    count = head.num_identity
+    rest = torch.zeros(head.layout.size, dtype=torch.float64)
+    persons = torch.cat([torch.zeros(1, count), torch.eye(count)]).double()
+    corners = torch.stack([head(rest, person) for person in persons])[:, vertex_ids]
+    points = (corners * torch.from_numpy(barycentric)[..., None]).sum(2).numpy()
+    moved = points[1:] - points[0]
+    root = sqrtm(np.einsum("clx,dlx->cd", moved, moved)).real
+    expected = np.linalg.solve(root, np.linalg.solve(root, moved[..., 2] @ moved[..., 2].T).T)
+    share = LandmarkHead(head, vertex_ids, barycentric).depth_share(count)
+    np.testing.assert_allclose(share, expected, atol=1e-6)
+    sizes = np.linalg.eigvalsh(share)
+    assert sizes.min() > -1e-9
+    assert sizes.max() < 1 + 1e-9
 
 
 def test_offsets_ride_with_the_head(head: HeadModel) -> None:

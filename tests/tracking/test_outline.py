@@ -65,11 +65,11 @@ class Scene:
         self.theta, self.identity = performance(head, 4)
         self.landmarks = seen_faces(head, self.theta, self.identity)
         self.true = [silhouette(head, row, self.identity) for row in self.theta]
-        # Every point of the face's outline above the brows, up by a tenth of the face's height.
+        # Every point of the face's outline above the brows, up by a seventh of the face's height.
         brows = self.landmarks[:, 105, 1]
         for index in FACE_OVAL:
             high = (brows - self.landmarks[:, index, 1]).clip(0)
-            self.landmarks[:, index, 1] -= 0.35 * high
+            self.landmarks[:, index, 1] -= 0.5 * high
 
     def tracker(self) -> SubjectTracker:
         options = TrackConfig(

@@ -13,14 +13,14 @@ _FULL_FRAME_MM = 36
 
 
 def require_possible_focal(focal_px: float | None, width: int, height: int) -> None:
-    """UserError for a focal length that no camera of such pictures has; None is to be estimated."""
+    """UserError for a focal length that no camera of such pictures has; None is not known."""
     side = max(width, height)
     low, high = _SHORTEST * side, _LONGEST * side
     if focal_px is not None and not low <= focal_px <= high:
         raise UserError(
             f"A focal length of {focal_px:g} pixels is no camera's whose pictures have "
             f"{width} x {height}: those are from {low:.0f} to {high:.0f} pixels.",
-            f"Leave --focal-px out, so that it is estimated, or give pixels of the film: "
+            f"Leave --focal-px out, which suits most films, or give pixels of the film: "
             f"millimetres of a 35 mm camera times {side / _FULL_FRAME_MM:.3g}.",
         )
 

@@ -19,12 +19,14 @@ from rgbavatar_ns.tracking.fit.outline import OutlineCost, OutlineTerms, PersonO
 _Values = Float[np.ndarray, "P"]
 _Packed = Float[np.ndarray, "Q"]
 
-# Focal lengths tried, as multiples of the frame's longer side (38 to 17 degrees of view), and
-# the width of the prior around a usual camera: a face's landmarks say little about it.
-FOCAL_SCAN = (0.9, 1.2, 1.6, 2.2, 3.0)
-_FOCAL_USUAL, _FOCAL_LOG_WIDTH = 1.4, 0.5
+# FaceMesh's points look as if seen from afar wherever the camera is: of shorter focal lengths this
+# one explained them best, of people drawn from .45 m away too.
+_FOCAL = 3.0
 _IDENTITY_WIDTH = 1.0  # principal components, of variance 1
-_SCAN_KEYS = 4
+# From in front a nose's length or a mouth's depth is told by millimetres, and so by what landmarks
+# err by, which is the same in all of a person's frames: twelve tell no more of it than one. So in
+# depth a person's prior counts once a frame. Ours, from real speakers' profiles.
+_DEPTH_WIDTH = 0.5
 _HEAD_HEIGHT_M = 0.19
 _BLOCK_FRAMES = 256
 _OFFSET_SHRINK = 0.8
@@ -73,37 +75,14 @@ def fit_subject(
     identity_components: int,
     focal_px: float | None,
 ) -> SubjectFit:
-    """Identity, focal length and camera distance from key frames.
-
-    The focal length is scanned; each candidate gets a full joint fit and the best one wins,
-    weighed by a broad prior (ours: landmarks of one face hardly observe it).
-    """
-    center = (width / 2, height / 2)
-    if focal_px is None:
-        focal_px = _scan_focal(cost, keys, width, height, identity_components)
-    camera = initial_camera(keys, focal_px, center)
-    return _fit_keys(cost, keys, camera, identity_components, 15)[1]
+    """Identity and camera distance from key frames, by a known focal length or `far_focal_px`."""
+    camera = initial_camera(keys, focal_px or far_focal_px(width, height), (width / 2, height / 2))
+    return _fit_keys(cost, keys, camera, identity_components, 15)
 
 
-def _scan_focal(
-    cost: FrameCost, keys: Sequence[Target], width: int, height: int, identity_components: int
-) -> float:
-    """The focal length with the cheapest short fit of a few key frames, in pixels."""
-    side = max(width, height)
-    few = keys[:: max(1, len(keys) // _SCAN_KEYS)]
-    best, starts = (np.inf, usual_focal_px(width, height)), None
-    for share in FOCAL_SCAN:
-        camera = initial_camera(few, side * share, (width / 2, height / 2))
-        total, found = _fit_keys(cost, few, camera, identity_components, 8, starts)
-        starts = found.key_values  # the next camera is not far off
-        total += 0.5 * (np.log(share / _FOCAL_USUAL) / _FOCAL_LOG_WIDTH) ** 2
-        best = min(best, (total, side * share))
-    return best[1]
-
-
-def usual_focal_px(width: int, height: int) -> float:
-    """The focal length of a usual camera, in pixels of such frames."""
-    return max(width, height) * _FOCAL_USUAL
+def far_focal_px(width: int, height: int) -> float:
+    """The focal length, in pixels of such frames, at which a head fits FaceMesh's points."""
+    return max(width, height) * _FOCAL
 
 
 def initial_camera(
@@ -260,7 +239,7 @@ def fit_outlines(
             thetas = [cost.theta(subject.key_values[number]) for number in terms]
             hair_m = outline_cost.hair_m(thetas, subject.identity, list(terms.values()))
             terms = {number: replace(one, hair_m=hair_m) for number, one in terms.items()}
-        _, subject = _fit_keys(
+        subject = _fit_keys(
             cost,
             keys,
             camera,
@@ -282,7 +261,7 @@ def _fit_keys(
     starts: Float[np.ndarray, "K P"] | None = None,
     identity: Float[np.ndarray, "I"] | None = None,
     outlines: tuple[OutlineCost, Mapping[int, OutlineTerms]] | None = None,
-) -> tuple[float, SubjectFit]:
+) -> SubjectFit:
     """Fit all key frames and the person together, from `starts` and `identity` (the average)."""
     if starts is None:
         starts = np.array([fit_key(cost, camera, key) for key in keys])
@@ -290,7 +269,8 @@ def _fit_keys(
     frames, size = len(keys), len(cost.parameters.columns)
     shared = min(identity_components, cost.head.num_identity)
     joint = replace(cost, identity_columns=shared)
-    precision = _IDENTITY_WIDTH**-2.0
+    precision = _IDENTITY_WIDTH**-2.0 * np.eye(shared)
+    precision += frames * _DEPTH_WIDTH**-2.0 * cost.head.depth_share(shared)
     lower = np.concatenate([np.tile(cost.parameters.lower, frames), np.full(shared, -3.0)])
     upper = np.concatenate([np.tile(cost.parameters.upper, frames), np.full(shared, 3.0)])
     common = slice(frames * size, frames * size + shared)
@@ -312,13 +292,13 @@ def _fit_keys(
         return found
 
     def evaluate(packed: _Packed) -> Evaluation:
-        found, pull = evaluations(packed), precision * packed[common]
+        found, pull = evaluations(packed), precision @ packed[common]
         total = 0.5 * float(pull @ packed[common]) + sum(one.cost for _, one in found)
 
         def model() -> QuadraticModel:
             gradient, hessian = np.zeros(len(packed)), np.zeros((len(packed), len(packed)))
             gradient[common] = pull
-            hessian[common, common] = precision * np.eye(shared)
+            hessian[common, common] = precision
             for number, one in found:
                 own, part = slice(number * size, (number + 1) * size), one.model()
                 gradient[own] += part.gradient[:size]
@@ -332,7 +312,7 @@ def _fit_keys(
         return Evaluation(total, model)
 
     begun = np.zeros(shared) if identity is None else identity[:shared]
-    packed, total = levenberg_marquardt(
+    packed, _ = levenberg_marquardt(
         evaluate,
         np.concatenate([starts.reshape(-1), begun]),
         lower,
@@ -341,7 +321,7 @@ def _fit_keys(
         tolerance=1e-3,
     )
     values, found = unpacked(packed)
-    return total, SubjectFit(found, camera, values)
+    return SubjectFit(found, camera, values)
 
 
 def key_frame_positions(

@@ -17,6 +17,9 @@ from rgbavatar_ns.tracking.fit.pose_chain import (
     signal_slopes,
 )
 
+_MOVES = 1e-9
+"""Share of the largest squared motion below which a mixture of coefficients moves no landmark."""
+
 _Theta = Float[np.ndarray, "H"]
 _Identity = Float[np.ndarray, "I"]
 _Point = Float[np.ndarray, "3"]
@@ -175,6 +178,20 @@ class LandmarkHead:
         count = self.layout.slice("expression").stop - self.layout.slice("expression").start
         moved = self._moments.dirs[..., first : first + count].sum(1)
         return np.linalg.norm(moved, axis=1).max(0)
+
+    def depth_share(self, identity_columns: int) -> Float[np.ndarray, "C C"]:
+        """Which part of how the first C identity coefficients move landmarks at rest is in depth.
+
+        G^-1/2 D G^-1/2 with the inner products G of these motions and D of what they have along z:
+        of one coefficient by itself the share of its squared motion, 0 to 1. What moves no landmark
+        has none.
+        """
+        moved = self._moments.dirs[..., :identity_columns].sum(1)
+        sizes, directions = np.linalg.eigh(np.einsum("lxc,lxd->cd", moved, moved))
+        seen = sizes > _MOVES * sizes.max(initial=0.0)
+        even = directions[:, seen] * sizes[seen] ** -0.5 @ directions[:, seen].T
+        ahead = moved[:, 2] @ even
+        return ahead.T @ ahead
 
     def unknowns(self, theta_columns: Int[np.ndarray, "P"], identity_columns: int = 0) -> Unknowns:
         """Entries of theta, then the identity's first coefficients, as unknowns of a fit."""

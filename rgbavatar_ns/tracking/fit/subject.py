@@ -34,6 +34,7 @@ from rgbavatar_ns.tracking.face.iris import FoundIrises
 from rgbavatar_ns.tracking.fit.fit import (
     ClipFit,
     SubjectFit,
+    far_focal_px,
     fit_clip,
     fit_key,
     fit_outlines,
@@ -41,7 +42,6 @@ from rgbavatar_ns.tracking.fit.fit import (
     initial_camera,
     key_frame_positions,
     subject_offsets,
-    usual_focal_px,
 )
 from rgbavatar_ns.tracking.fit.irises import iris_places
 from rgbavatar_ns.tracking.fit.landmark_cost import FrameCost, Target
@@ -183,7 +183,7 @@ class SubjectTracker:
         targets = self.targets(landmarks_px[list(positions)])
         if not targets:
             return {}
-        focal_px = self.config.focal_px or usual_focal_px(width, height)
+        focal_px = self.config.focal_px or far_focal_px(width, height)
         camera = initial_camera(targets, focal_px, (width / 2, height / 2))
         values = np.array([fit_key(self.cost, camera, target) for target in targets])
         average = np.zeros(self.cost.head.num_identity)
