@@ -83,6 +83,9 @@ def test_depth_has_all_of_what_moves_ahead_and_none_of_what_moves_across(head: H
     np.testing.assert_allclose(apart.depth_share(3), np.diag([1.0, 0, 0]), atol=1e-6)
     slanting = _with_identities(head, np.array([[0.003, 0, 0.004]]))
     np.testing.assert_allclose(slanting.depth_share(1), [[16 / 25]], rtol=1e-5)
+    # Ahead, and ahead and aside as far: G = [1 1; 1 2], its root [2 1; 1 3] / sqrt(5).
+    mixed = _with_identities(head, np.array([[0, 0, 0.01], [0.01, 0, 0.01]]))
+    np.testing.assert_allclose(mixed.depth_share(2), np.array([[4, 2], [2, 1]]) / 5, atol=1e-4)
     assert apart.depth_share(0).shape == (0, 0)
 
 

@@ -15,11 +15,11 @@ def fit_ridge(inputs: Float[Tensor, "F M"], outputs: Float[Tensor, "F H"]) -> Fl
     Both are thought to be centred. A ridge is judged on five blocks of successive frames, each
     predicted from the others. Of those that predict an output as well as the best one, to within
     its standard error, the largest is taken, and zero where that is one of them (Breiman et al.
-    1984): on a minute of film the best one is often the best by chance.
+    1984): of sixty frames the best one is often the best by chance.
     """
     ridges = inputs.new_tensor(_RIDGES) * len(inputs)
-    errors = []
-    for held_out in torch.arange(len(inputs), device=inputs.device).chunk(_BLOCKS):
+    errors, frames = [], torch.arange(len(inputs), device=inputs.device)
+    for held_out in frames.tensor_split(min(_BLOCKS, len(inputs))):
         others = torch.ones(len(inputs), dtype=torch.bool, device=inputs.device)
         others[held_out] = False
         maps = _ridge_maps(inputs[others], outputs[others], ridges)

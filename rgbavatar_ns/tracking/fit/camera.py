@@ -13,7 +13,7 @@ _FULL_FRAME_MM = 36
 
 
 def require_possible_focal(focal_px: float | None, width: int, height: int) -> None:
-    """UserError for a focal length that no camera of such pictures has; None is not known."""
+    """UserError for a focal length that no camera of such pictures has; None is an unknown one."""
     side = max(width, height)
     low, high = _SHORTEST * side, _LONGEST * side
     if focal_px is not None and not low <= focal_px <= high:

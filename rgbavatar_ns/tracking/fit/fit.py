@@ -19,13 +19,13 @@ from rgbavatar_ns.tracking.fit.outline import OutlineCost, OutlineTerms, PersonO
 _Values = Float[np.ndarray, "P"]
 _Packed = Float[np.ndarray, "Q"]
 
-# FaceMesh's points look as if seen from afar wherever the camera is: of shorter focal lengths this
-# one explained them best, of people drawn from .45 m away too.
-_FOCAL = 3.0
+# Longer sides of the picture. FaceMesh's points look as if seen from afar wherever the camera is:
+# of .9 to 3 the longest explained them best, those of people drawn from .45 m away too.
+_FAR = 3.0
 _IDENTITY_WIDTH = 1.0  # principal components, of variance 1
-# From in front a nose's length or a mouth's depth is told by millimetres, and so by what landmarks
-# err by, which is the same in all of a person's frames: twelve tell no more of it than one. So in
-# depth a person's prior counts once a frame. Ours, from real speakers' profiles.
+# Of them in depth, beside that, once a frame: from in front landmarks hardly show a face's depth,
+# and what they err by is mostly the same in all of a person's frames, so that twelve tell of it
+# little more than one. Ours, from the profile of a real speaker.
 _DEPTH_WIDTH = 0.5
 _HEAD_HEIGHT_M = 0.19
 _BLOCK_FRAMES = 256
@@ -73,16 +73,16 @@ def fit_subject(
     width: int,
     height: int,
     identity_components: int,
-    focal_px: float | None,
+    focal_px: float,
 ) -> SubjectFit:
-    """Identity and camera distance from key frames, by a known focal length or `far_focal_px`."""
-    camera = initial_camera(keys, focal_px or far_focal_px(width, height), (width / 2, height / 2))
+    """Identity and camera distance from key frames."""
+    camera = initial_camera(keys, focal_px, (width / 2, height / 2))
     return _fit_keys(cost, keys, camera, identity_components, 15)
 
 
 def far_focal_px(width: int, height: int) -> float:
-    """The focal length, in pixels of such frames, at which a head fits FaceMesh's points."""
-    return max(width, height) * _FOCAL
+    """The focal length, in pixels of such frames, by which unknown cameras are told as far off."""
+    return max(width, height) * _FAR
 
 
 def initial_camera(

@@ -180,11 +180,12 @@ class LandmarkHead:
         return np.linalg.norm(moved, axis=1).max(0)
 
     def depth_share(self, identity_columns: int) -> Float[np.ndarray, "C C"]:
-        """Which part of how the first C identity coefficients move landmarks at rest is in depth.
+        """How much of what the first C identity coefficients do to landmarks at rest is in depth.
 
         G^-1/2 D G^-1/2 with the inner products G of these motions and D of what they have along z:
-        of one coefficient by itself the share of its squared motion, 0 to 1. What moves no landmark
-        has none.
+        of a coefficient by itself, or whose motion is orthogonal to the others', the share of its
+        squared motion, 0 to 1. Of mixtures only about: some that keep within the picture have a
+        part too. What moves no landmark has none.
         """
         moved = self._moments.dirs[..., :identity_columns].sum(1)
         sizes, directions = np.linalg.eigh(np.einsum("lxc,lxd->cd", moved, moved))

@@ -183,8 +183,7 @@ class SubjectTracker:
         targets = self.targets(landmarks_px[list(positions)])
         if not targets:
             return {}
-        focal_px = self.config.focal_px or far_focal_px(width, height)
-        camera = initial_camera(targets, focal_px, (width / 2, height / 2))
+        camera = initial_camera(targets, self._focal_px(width, height), (width / 2, height / 2))
         values = np.array([fit_key(self.cost, camera, target) for target in targets])
         average = np.zeros(self.cost.head.num_identity)
         fit = ClipFit(SubjectFit(average, camera, values), values)
@@ -207,7 +206,8 @@ class SubjectTracker:
         key_irises = None if irises is None else irises.of(positions)
         targets = self.targets(landmarks_px[positions], key_irises)
         shared = min(self.config.identity_components, self.cost.head.num_identity)
-        subject = fit_subject(self.cost, targets, width, height, shared, self.config.focal_px)
+        focal_px = self._focal_px(width, height)
+        subject = fit_subject(self.cost, targets, width, height, shared, focal_px)
         if outlines:
             outline_cost = OutlineCost(self.head, self.cost.parameters.columns, shared)
             subject = fit_outlines(self.cost, outline_cost, targets, outlines, subject, shared)
@@ -216,6 +216,9 @@ class SubjectTracker:
         offsets[len(self.facemesh_index) :] = 0
         self.cost = replace(self.cost, head=self.cost.head.with_offsets(offsets))
         return subject
+
+    def _focal_px(self, width: int, height: int) -> float:
+        return self.config.focal_px or far_focal_px(width, height)
 
     def thetas(self, fit: ClipFit) -> Float[np.ndarray, "F H"]:
         """theta of every frame, upon the body where that is known."""
