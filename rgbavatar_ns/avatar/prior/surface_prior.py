@@ -35,6 +35,9 @@ _FIRST_STEP, _FIRST_PULL = 60, 160
 """Until the surface has closed everything is seen; then frames are looked at before any pull."""
 _RATE = 0.4
 """Share of the way to the surface that an unseen Gaussian goes at a time."""
+_DEPTH_RATE = 0.1
+"""Share of the way to the surface, along the view of a film that is all front, of those that it
+shows of a face: it does not tell how far before or behind they lie. Ours."""
 _FORGETS = 0.97
 _SEEN_PX = 0.02
 """Pixels that a Gaussian covers in the frame that shows it best, at which it is half known."""
@@ -207,7 +210,10 @@ class SurfacePrior(nn.Module):
         ahead, alone = self.views.seen_from()
         view = turn_back(field.rest_quats_wxyz, ahead.to(disc).expand(len(disc), 3))
         seen = 1 - pull / _RATE
-        flatten(shapes, view, disc, alone.to(disc) * parts.narrow * seen, widths=LONGEST)
+        unturned = alone.to(disc) * parts.narrow * seen
+        flatten(shapes, view, disc, unturned, widths=LONGEST)
+        depth = ((home - shapes.position) * view).sum(1)
+        shapes.position.add_((_DEPTH_RATE * unturned * depth)[:, None] * view)
         # As far as nothing shows it, nothing else closes the surface around it.
         through = _SHINES_PX / (self.through_px + _SHINES_PX)
         alone = (pull / _RATE * through).square()

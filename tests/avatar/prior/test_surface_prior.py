@@ -12,6 +12,7 @@ from rgbavatar_ns.avatar.prior.mouth import HiddenMouth
 from rgbavatar_ns.avatar.prior.strands import Strands
 from rgbavatar_ns.avatar.training import TrainingBatch, TrainingOptions, TrainingStep, fit
 from rgbavatar_ns.head.arrays import EMBEDDED_BUST
+from rgbavatar_ns.head.rotations import turn_back
 from rgbavatar_ns.kernels import weighted_color_average
 from rgbavatar_ns.kernels.constants import UNFILMED_RGBA
 from rgbavatar_ns.kernels.cpu import INSTRUCTION_SET_VARIABLE
@@ -41,6 +42,12 @@ def shaken(avatar) -> None:
         (shapes.basis_color_feature, 0.3),
     ):
         tensor.data.add_(size * torch.randn(tensor.shape, generator=random))
+
+
+def _ahead(avatar) -> torch.Tensor:
+    """The way to a camera in front, in each Gaussian's axes."""
+    rest_quats = MeshField(avatar).rest_quats_wxyz
+    return turn_back(rest_quats, torch.eye(3)[2].expand(len(rest_quats), 3))
 
 
 def _on_the_surface(avatar, prior) -> torch.Tensor:
@@ -172,7 +179,12 @@ def test_what_a_frame_shows_well_stays(filmed):
     skin = Strands.of(avatar, MeshField(avatar)).haired == 0
     assert 100 < int(clear.sum()) < avatar.num_gaussians
     moved = shapes.position - before["position"]
-    assert float((moved.norm(dim=-1) / gone.norm(dim=-1))[clear].max()) < 0.01
+    # But for its depth, which a film that is nearly all front does not tell.
+    view = _ahead(avatar)
+    depth = (moved * view).sum(1, keepdim=True)
+    across = (moved - depth * view).norm(dim=-1)
+    assert float((across / gone.norm(dim=-1))[clear].max()) < 0.01
+    assert float((depth.abs()[:, 0] / gone.norm(dim=-1))[clear].max()) < 0.1
     # And what is seen less goes further.
     barely = prior.seen_px < 0.01
     assert float((moved.norm(dim=-1) / gone.norm(dim=-1))[barely].min()) > 0.1
@@ -182,6 +194,33 @@ def test_what_a_frame_shows_well_stays(filmed):
         kept = clear & ((prior.clear_px > 1) | skin) if "color" in name else clear
         change = change[:, kept] if name.startswith("basis") else change[kept]
         assert float(change.max()) < 0.05, name
+
+
+def test_a_face_comes_to_its_surface_along_the_view_of_a_film_that_never_turns():
+    avatar = embedded_avatar(name=EMBEDDED_BUST)
+    field, view = MeshField(avatar), _ahead(avatar)
+    left = {}
+    for kind, degrees in (("still", [-1.0, 0.0, 1.0]), ("turning", [-25.0, 0.0, 25.0])):
+        theta = turned(avatar, degrees)
+        images = drawn_thicker(avatar, theta, 0.0)
+        prior, position = SurfacePrior(avatar), avatar.blendshapes.position
+        prior.begin(avatar, theta, front_camera(), images)
+        home = prior.surface(avatar)[0].clone()
+        position.data.add_(0.004 * view)
+        prior.look(avatar, theta, front_camera(), images)
+        prior.seen_px.fill_(1e3)  # nothing is drawn to the surface for want of being seen
+        for step in STEPS:
+            prior.pull(avatar, step)
+        left[kind] = ((position.detach() - home) * view).sum(1) / 0.004
+        torch.testing.assert_close(position.detach() - home, (0.004 * left[kind])[:, None] * view)
+    sideways = field.at_gaussians(field.normals)[:, 0].abs()
+    front = (sideways < 0.2) & ~field.body_gaussians
+    skin = Strands.of(avatar, field).haired == 0
+    assert int((front & skin).sum()) > 100
+    # Of 32 looks each leaves nine tenths.
+    assert float(left["still"][front & skin].max()) < 0.06
+    assert float(left["still"][(sideways > 0.75) | field.body_gaussians].min()) > 0.99
+    assert float(left["turning"].min()) > 0.99
 
 
 def test_a_run_that_it_did_not_see_begin_is_left_alone(filmed):
