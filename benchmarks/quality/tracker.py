@@ -13,7 +13,7 @@ the error without each eye's constant part, of which pictures tell little), how 
 the pictures lie from the true ones and how far the fitted mesh's do (mean, eye widths, lids open),
 the share of open eyes with a found iris and of frames whose gaze is at a bound, how much the fit's
 second differences shrink against a fit without smoothing, its lag in frames, and CPU time of the
-fit.
+fit. Once with the camera's true focal length and once with the one that is taken without it.
 """
 
 import argparse

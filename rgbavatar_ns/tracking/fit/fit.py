@@ -124,7 +124,7 @@ def fit_frame(
         if not most:
             continue
         frame = FrameTerms(target, camera, redescending, neighbours, temporal_weight)
-        values, _ = levenberg_marquardt(
+        values = levenberg_marquardt(
             partial(cost.at, identity=identity, frame=frame),
             values,
             cost.parameters.lower,
@@ -312,7 +312,7 @@ def _fit_keys(
         return Evaluation(total, model)
 
     begun = np.zeros(shared) if identity is None else identity[:shared]
-    packed, _ = levenberg_marquardt(
+    packed = levenberg_marquardt(
         evaluate,
         np.concatenate([starts.reshape(-1), begun]),
         lower,

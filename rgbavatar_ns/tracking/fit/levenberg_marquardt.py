@@ -80,10 +80,10 @@ def levenberg_marquardt(
     *,
     iterations: int,
     tolerance: float = 1e-4,
-) -> tuple[Vector, float]:
+) -> Vector:
     """Minimise inside the bounds, from `start`; the damping follows whether steps succeed.
 
-    A model is asked for only where a step is taken from. Returns the best point and its cost.
+    A model is asked for only where a step is taken from. Returns the best point.
     Stops when a step lowers the cost by less than `tolerance` of it. Deterministic.
     """
     point, damping = np.clip(start, lower, upper), 1e-4
@@ -109,4 +109,4 @@ def levenberg_marquardt(
             damping = max(damping, 1e-6) * 10
             if damping > 1e6:
                 break
-    return point, here.cost
+    return point

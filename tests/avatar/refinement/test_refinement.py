@@ -119,15 +119,18 @@ def test_state_goes_on_to_the_bit():
     assert torch.equal(first.theta(), second.theta())
 
 
-def test_a_law_is_found_as_least_squares_with_a_ridge_find_it():
+def test_ridge_against_numpy_and_nothing_from_noise():
+    """A law is found, as least squares with a ridge finds it; chance gives the zero map."""
     rng = np.random.default_rng(0)
     inputs = rng.standard_normal((100, 4))
     law = rng.standard_normal((4, 2))
     outputs = inputs @ law + 1e-3 * rng.standard_normal((100, 2))
-    found = fit_ridge(torch.from_numpy(inputs), torch.from_numpy(outputs))
+    noise = rng.standard_normal((100, 3))
+    found = fit_ridge(torch.from_numpy(inputs), torch.from_numpy(np.hstack([outputs, noise])))
     ridge = 0.3  # the smallest that is tried: .003 a frame
     normal = inputs.T @ inputs + ridge * np.eye(4)
-    np.testing.assert_allclose(found, np.linalg.solve(normal, inputs.T @ outputs), rtol=1e-9)
+    np.testing.assert_allclose(found[:, :2], np.linalg.solve(normal, inputs.T @ outputs), rtol=1e-9)
+    assert (found[:, 2:] == 0).all()
 
 
 def test_what_predicts_no_better_than_chance_is_left_alone():
