@@ -59,7 +59,7 @@ _GLANCE_PX = 64
 """Longer side of a picture of which only the film's size is asked."""
 _LIGHT_FRAMES = 60
 """Frames that tell how bright the film is and whether that changes."""
-_MATTES = "with overlooked hair, and the room of a moving camera"
+_MATTES = "with overlooked hair, the room of a moving camera, and nothing that is cut off"
 """How mattes are found: of something else an unfinished run makes its pictures anew."""
 
 

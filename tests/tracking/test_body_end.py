@@ -6,9 +6,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from rgbavatar_ns.drawing.wireframe import mesh_silhouette
 from rgbavatar_ns.head import HeadArrays
 from rgbavatar_ns.head.arrays import EMBEDDED_BUST
 from rgbavatar_ns.tracking.image.body_end import BodyEnd
+from rgbavatar_ns.tracking.image.cut_out import CutOut, MattedCrop
+from rgbavatar_ns.tracking.image.head_mask import HeadMask
 
 SIZE, FOCAL_PX = 256, 500.0
 FADE_ROWS = 10
@@ -116,3 +119,27 @@ def test_of_a_body_seen_from_its_side_the_rows_tell(bust: HeadArrays):
     assert (shown == shown[:, :1]).all()
     assert shown[-1, 0] < 0.02
     assert (shown[: -FADE_ROWS - 1] == 1).all()
+
+
+def test_what_hung_on_the_part_that_is_cut_off_alone_is_cut_off_too(bust: HeadArrays):
+    """A lamp beside the sleeve, which the matte holds together with it in the last rows."""
+    px = seen_px(bust, 0.05)
+    end = BodyEnd.of(bust, [px] * 3, everywhere())
+    cut_out = CutOut(bust, end)
+    outline = HeadMask(bust.faces, bust.skinning_weights).outline(px, px[0], px[0] + [0, 60], SIZE)
+    body = mesh_silhouette(px, bust.faces, SIZE).astype(np.float32)
+    lamp = np.zeros((SIZE, SIZE), np.float32)
+    lamp[170:, :8] = 1
+    floor = np.zeros_like(lamp)
+    floor[SIZE - 4 :] = 1  # by which both hang together
+    color, alone = np.full((SIZE, SIZE, 3), 90, np.uint8), np.maximum(body, floor)
+    images = [
+        cut_out(MattedCrop(color, matte, everywhere()), outline, px)
+        for matte in (np.maximum(alone, lamp), alone)
+    ]
+    assert lamp[body > 0].sum() == 0, "beside the person"
+    assert (alone * end.shown(px, SIZE) > 0.5).sum() > 2000
+    np.testing.assert_array_equal(images[0][:, 8:], images[1][:, 8:])
+    assert not images[0][:, :8, 3].any(), "nor what of it fades out"
+    beside = cut_out(MattedCrop(color, body, everywhere()), outline, px)
+    np.testing.assert_array_equal(beside[: SIZE - FADE_ROWS], images[1][: SIZE - FADE_ROWS])

@@ -10,7 +10,10 @@ from rgbavatar_ns.kernels.constants import UNFILMED_RGBA
 from rgbavatar_ns.tracking.face.detector import CHIN, FOREHEAD
 from rgbavatar_ns.tracking.image.body_end import BodyEnd
 from rgbavatar_ns.tracking.image.head_mask import HeadMask, HeadOutline
-from rgbavatar_ns.tracking.image.matting import foreground_color, straight_rgba
+from rgbavatar_ns.tracking.image.matting import foreground_color, in_one_piece, straight_rgba
+
+_STRAY = 0.05
+"""Alpha from which something is there."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +70,8 @@ class CutOut:
         """
         alpha, may_be_head = matted.alpha, np.ones_like(matted.alpha)
         if self._body_end is not None:
-            alpha = alpha * self._body_end.shown(vertices_px, len(alpha))
+            shown = self._body_end.shown(vertices_px, len(alpha))
+            alpha = _without_what_hung_below(alpha, shown, outline.silhouette > 0.5) * shown
         else:
             may_be_head = self._mask(outline, len(alpha))
             alpha = alpha * may_be_head
@@ -75,3 +79,19 @@ class CutOut:
         image[~matted.inside] = 0
         image[~matted.inside & (may_be_head >= 0.5 / 255)] = UNFILMED_RGBA
         return image
+
+
+def _without_what_hung_below(
+    alpha: Float[np.ndarray, "S S"],
+    shown: Float[np.ndarray, "S S"],
+    head: Bool[np.ndarray, "s s"],
+) -> Float[np.ndarray, "S S"]:
+    """A matte without pieces that hang together with the head by what is not `shown` alone.
+
+    A lamp beside a sleeve is nobody's, nor is what of it still fades out below.
+    """
+    whole = shown > 0.5
+    kept = in_one_piece(np.where(whole, alpha, 0), head)
+    dropped = (whole & (alpha > _STRAY) & (kept < alpha)).any(0)
+    stays = (whole & (kept > _STRAY)).any(0)
+    return np.where(whole, kept, np.where(dropped & ~stays, 0, alpha))

@@ -2,7 +2,7 @@
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 
 from rgbavatar_ns.tracking.face.detector import load_mediapipe
 
@@ -20,6 +20,8 @@ _LIT_LEVEL, _LIT_PERCENTILE, _DARK_BELOW = 0.75, 95, 150
 # left out where it would be nearly the whole.
 _CLOSE_UP, _RAISED, _FADE_SHARE, _NEARLY_ALL = 1.4, 0.12, 12, 0.9
 _SEGMENTED_PX = 256
+# Of pieces of a matte: what alpha counts, and over what gaps they hang together.
+_STRAY_ALPHA, _BRIDGE_PX = 0.05, 5
 
 
 class PersonMatte:
@@ -103,6 +105,24 @@ def refined_matte(image_rgb: _Image, coarse: _Alpha) -> _Alpha:
     fine = cv2.ximgproc.guidedFilter(image_rgb, coarse, radius, _GUIDE_EPSILON, None, -1, scale)
     # The segmentation hovers a little off 0 and 1; an avatar would learn that as haze.
     return np.clip((fine - 0.06) / 0.88, 0, 1).astype(np.float32)
+
+
+def in_one_piece(alpha: _Alpha, person: Bool[np.ndarray, "h w"]) -> _Alpha:
+    """Only what hangs together with most of a person, strands across small gaps too.
+
+    Where the person is for certain, a picture of any size of it tells.
+    """
+    size = len(alpha)
+    few = max(1, size // 2)
+    seen = cv2.resize(alpha, (few, few), interpolation=cv2.INTER_AREA) > _STRAY_ALPHA
+    bridged = cv2.dilate(seen.astype(np.uint8), np.ones((_BRIDGE_PX, _BRIDGE_PX), np.uint8))
+    _, labels = cv2.connectedComponents(bridged)
+    there = cv2.resize(person.astype(np.uint8), (few, few), interpolation=cv2.INTER_NEAREST)
+    votes = np.bincount(labels[(there > 0) & (bridged > 0)], minlength=1)
+    if not votes.any():
+        return alpha
+    kept = (labels == votes.argmax()).astype(np.uint8)
+    return alpha * cv2.resize(kept, (size, size), interpolation=cv2.INTER_NEAREST)
 
 
 def straight_rgba(color: _Image, alpha: _Alpha) -> UInt8[np.ndarray, "H W 4"]:

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from rgbavatar_ns.tracking.image.background import CleanPlate
 from rgbavatar_ns.tracking.image.hair import HairSearch
-from rgbavatar_ns.tracking.image.matting import refined_matte
+from rgbavatar_ns.tracking.image.matting import in_one_piece, refined_matte
 from rgbavatar_ns.tracking.image.mixture import (
     OF_SIDE_PX,
     PERSON_PX,
@@ -70,7 +70,6 @@ _HAZE = 0.15
 # What is enclosed by the person and smaller is a fault of the segmentation, unless the plate shows
 # through; shares of the image.
 _HOLE_SHARE = 0.003
-_STRAY_ALPHA, _BRIDGE_PX = 0.05, 5
 
 
 @dataclass(frozen=True)
@@ -174,7 +173,7 @@ def band_matte(
     alpha.reshape(-1)[open_px] = mixed_alpha(
         image, room.color, room.variance, person, guess, open_px
     )
-    return BandMatte(_in_one_piece(alpha, inward > 0), room.color)
+    return BandMatte(in_one_piece(alpha, inward > 0), room.color)
 
 
 def _tinted(apart: _Colors, towards: _Colors, room: RoomColors, inward: _Values) -> _Mask:
@@ -265,19 +264,6 @@ def _without_holes(image_rgb: _Image, coarse: _Values, plate: RoomColors | None)
                 continue
         filled[hole] = 1
     return filled
-
-
-def _in_one_piece(alpha: _Values, segmented: _Mask) -> _Values:
-    """Only what hangs together with most of the segmented person, strands across small gaps too."""
-    size = len(alpha)
-    few = max(1, size // 2)
-    seen = cv2.resize(alpha, (few, few), interpolation=cv2.INTER_AREA) > _STRAY_ALPHA
-    bridged = cv2.dilate(seen.astype(np.uint8), np.ones((_BRIDGE_PX, _BRIDGE_PX), np.uint8))
-    _, labels = cv2.connectedComponents(bridged)
-    person = cv2.resize(segmented.astype(np.uint8), (few, few), interpolation=cv2.INTER_NEAREST)
-    votes = np.bincount(labels[(person > 0) & (bridged > 0)], minlength=1)
-    kept = (labels == votes.argmax()).astype(np.uint8)
-    return alpha * cv2.resize(kept, (size, size), interpolation=cv2.INTER_NEAREST)
 
 
 def _inward(coarse: _Values) -> _Values:
