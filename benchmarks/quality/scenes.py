@@ -10,15 +10,17 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float, UInt8
 
-Scene = Literal["plain", "arms", "neighbour", "headrest", "patterned headrest", "cropped", "camera"]
+Scene = Literal[
+    "plain", "arms", "neighbour", "headrest", "patterned headrest", "shoulders", "cropped", "camera"
+]
 """plain: a wall. arms: a forearm rises before the chest, then beside the head. neighbour: another
 person's shoulder, which moves, in the picture's edge. headrest, dark or patterned: a chair's back
-behind the shoulders, which keeps still. cropped: the picture ends at the chin. camera: it
-wanders."""
+behind the shoulders, which keeps still. shoulders: the picture ends below them. cropped: it ends
+at the chin. camera: it wanders."""
 
-# Of the picture's side: where the bust's chin is, how far the camera wanders, and how much of the
-# picture is seen then.
-_CHIN, _WANDERS, _SHOWN = 0.46, 0.03, 0.9
+# Of the picture's side: where the bust's chin is, and what ends below its shoulders, how far the
+# camera wanders, and how much of the picture is seen then.
+_CHIN, _SHOULDERS, _WANDERS, _SHOWN = 0.46, 0.66, 0.03, 0.9
 _SKIN, _SLEEVE, _CHAIR = (196.0, 158.0, 138.0), (150.0, 60.0, 50.0), (42.0, 40.0, 44.0)
 _COAT = (70.0, 105.0, 70.0)
 # Arms come and go within so much of the film, and a neighbour sways once in so much.
@@ -115,6 +117,8 @@ def _shown(scene: Scene, picture: _Picture, done: float) -> FilmedPicture:
     if scene == "cropped":
         height = 2 * round(size * _CHIN / 2)
         width, left = height, (size - height) // 2
+    elif scene == "shoulders":
+        height = 2 * round(size * _SHOULDERS / 2)
     elif scene == "camera":
         width = height = 2 * round(size * _SHOWN / 2)
         wander = _WANDERS * size * np.array([np.sin(9 * done), np.sin(13 * done + 1)])

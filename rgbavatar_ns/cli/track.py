@@ -115,11 +115,15 @@ def summary_table(report: Mapping[str, Any]) -> Table:
 def _body_told(body: Mapping[str, Any] | None) -> str:
     if body is None:
         return "the head alone, down to the neck"
+    by = ""
     if body["followed_share"] < _FOLLOWED:
-        return "taken to keep still: no pattern of clothes is seen that could be followed"
+        if body["still"] and body["outlined_share"] == 0:
+            return "taken to keep still: neither pattern nor outline of clothes tells its motion"
+        by = ", mostly by its outline: hardly any pattern of clothes is seen"
     if body["still"]:
-        return "keeps still"
-    return f"turns by {body['turned_degrees']:.0f} degrees, moves by {body['moved_mm'] / 10:.0f} cm"
+        return f"keeps still{by}"
+    turned, moved = body["turned_degrees"], body["moved_mm"] / 10
+    return f"turns by {turned:.0f} degrees, moves by {moved:.0f} cm{by}"
 
 
 def _percent(share: float | None) -> str:

@@ -64,12 +64,15 @@ def test_correlation_of_openings() -> None:
     assert gap_correlation(2 * opening + 1, opening) == pytest.approx(1)
     assert gap_correlation(-opening, opening) == pytest.approx(-1)
     assert gap_correlation(np.ones(4), opening) is None
+    # As lids that never blink: what trembles is no motion that a fit could follow.
+    assert gap_correlation(opening, 0.05 + 0.009 * opening) is None
+    assert gap_correlation(opening, 0.05 + 0.02 * opening) == pytest.approx(1)
 
 
 def test_a_face_that_comes_nearer_opens_no_mouth() -> None:
     """A fit whose mouth keeps still follows none that speaks, however large the face becomes."""
     drawn, height = np.random.default_rng(7), np.linspace(120, 300, 80)
-    still, speaks = 0.05 + 0.004 * drawn.standard_normal((2, 80))
+    still, speaks = 0.15 + 0.012 * drawn.standard_normal((2, 80))
     faces = []
     for opening in (still, speaks):
         points = np.zeros((80, 478, 2))
@@ -267,3 +270,24 @@ def test_a_sheet_of_one_frame() -> None:
     assert sheet.shape[1] == 2 * sheet.shape[0]
     assert sheet[:, : sheet.shape[0]][40:].min() == 255, "left: the image as it is"
     assert sheet[:, sheet.shape[0] :].min() < 200, "right: with the mesh"
+
+
+@pytest.mark.parametrize(
+    ("followed", "outlined", "still", "told"),
+    [
+        (0.9, 0.2, True, "keeps still"),
+        (0.0, 0.0, True, "taken to keep still: neither pattern nor outline"),
+        (0.1, 0.8, True, "keeps still, mostly by its outline"),
+        (0.1, 0.8, False, "turns by 2 degrees, moves by 3 cm, mostly by its outline"),
+        (0.9, 0.2, False, "turns by 2 degrees, moves by 3 cm"),
+    ],
+)
+def test_the_table_says_by_what_a_body_was_followed(
+    followed: float, outlined: float, still: bool, told: str
+) -> None:
+    body = {"followed_share": followed, "outlined_share": outlined, "still": still}
+    body |= {"turned_degrees": 2.2, "moved_mm": 31.0}
+    console = Console(width=200, record=True)
+    report = GOOD | {"verdict": "good", "frames_per_second": None, "body": body}
+    console.print(summary_table(report))
+    assert told in console.export_text()

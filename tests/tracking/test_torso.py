@@ -24,6 +24,7 @@ from rgbavatar_ns.tracking.torso.body_mesh import BodyMesh
 from rgbavatar_ns.tracking.torso.compose import on_body
 from rgbavatar_ns.tracking.torso.features import FollowedPoints
 from rgbavatar_ns.tracking.torso.follow import BodyFollower, BodySighting, FollowerState
+from rgbavatar_ns.tracking.torso.outline_motion import OutlinePatch
 from rgbavatar_ns.tracking.torso.place import BodyPlaces, SeenShoulders, place_body
 from rgbavatar_ns.tracking.torso.rigid_motion import RigidMotion, fit_rigid_motion
 from rgbavatar_ns.tracking.torso.shape import ShoulderLine, shoulder_line, shoulders_up_cm
@@ -299,15 +300,18 @@ def test_what_was_seen_of_a_body_comes_back_and_damage_is_told(tmp_path: Path) -
         BodySighting(1, none, none, np.zeros((0, 2, 2)), np.nan),
     ]
     shoulders = [SeenShoulders(1, drawn.uniform(0, 99, (2, 2)), 0.1)]
+    patches = [OutlinePatch(2, drawn.integers(0, 256, (4, 6)).astype(np.uint8))]
     lines = [ShoulderLine(0, np.array([1.0, np.nan, 2.0]))]
     shown = [BodyShown(0, 800.0, 0.01)]
     path = tmp_path / "body.npz"
-    BodyBlock(seen, shoulders, lines, shown, FollowerState.before_the_first()).save(path)
+    BodyBlock(seen, shoulders, patches, lines, shown, FollowerState.before_the_first()).save(path)
     back = BodyBlock.load(path)
     assert [one.run for one in back.sightings] == [0, 0, 1]
     assert [one.chosen_px is None for one in back.sightings] == [False, True, False]
     np.testing.assert_array_equal(back.sightings[1].seen_px, seen[1].seen_px)
     np.testing.assert_array_equal(back.shoulders[0].shoulders_px, shoulders[0].shoulders_px)
+    assert [one.position for one in back.patches] == [2]
+    np.testing.assert_array_equal(back.patches[0].alpha, patches[0].alpha)
     np.testing.assert_array_equal(back.lines[0].above_cm, lines[0].above_cm)
     assert back.shown == shown
     path.write_bytes(path.read_bytes()[:-60])

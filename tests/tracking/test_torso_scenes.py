@@ -148,7 +148,7 @@ def test_following_goes_on_alike_from_what_was_kept(still: Still, tmp_path: Path
     for border in (1, 9):
         begun = still.follower()
         before = still.followed(images[:border], begun)
-        BodyBlock(before, [], [], [], begun.state).save(tmp_path / "body.npz")
+        BodyBlock(before, [], [], [], [], begun.state).save(tmp_path / "body.npz")
         kept = BodyBlock.load(tmp_path / "body.npz")
         again = still.followed(images[border:], still.follower(kept.state), border)
         for one, other in zip(whole, [*kept.sightings, *again], strict=True):

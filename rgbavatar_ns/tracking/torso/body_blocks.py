@@ -13,6 +13,7 @@ from rgbavatar_ns.tracking.resumable_run import GO_ON, stage_damage_told
 from rgbavatar_ns.tracking.torso.cloth_colors import ClothColors
 from rgbavatar_ns.tracking.torso.features import FollowedPoints
 from rgbavatar_ns.tracking.torso.follow import BodySighting, FollowerState, KeyPicture
+from rgbavatar_ns.tracking.torso.outline_motion import OutlinePatch
 from rgbavatar_ns.tracking.torso.place import SeenShoulders
 from rgbavatar_ns.tracking.torso.rigid_motion import RigidMotion
 from rgbavatar_ns.tracking.torso.shape import ShoulderLine
@@ -28,6 +29,7 @@ class BodyBlock:
 
     sightings: Sequence[BodySighting]
     shoulders: Sequence[SeenShoulders]
+    patches: Sequence[OutlinePatch]
     lines: Sequence[ShoulderLine]
     shown: Sequence[BodyShown]
     state: FollowerState
@@ -42,6 +44,8 @@ class BodyBlock:
                 -1, 2, 2
             ),
             "yaw_rad": np.array([one.yaw_rad for one in self.shoulders], np.float64),
+            "patch_frame": np.array([one.position for one in self.patches], np.int64),
+            "patch_alpha": np.array([one.alpha for one in self.patches], np.uint8),
             "line_frame": np.array([one.position for one in self.lines], np.int64),
             "line_cm": np.array([one.above_cm for one in self.lines]),
             "shown_frame": np.array([one.position for one in self.shown], np.int64),
@@ -61,6 +65,7 @@ class BodyBlock:
             return cls(
                 _sightings_unpacked(held),
                 [SeenShoulders(int(k), px, float(yaw)) for k, px, yaw in rows],
+                [OutlinePatch(int(k), a) for k, a in zip(held["patch_frame"], held["patch_alpha"])],
                 [ShoulderLine(int(k), cm) for k, cm in zip(held["line_frame"], held["line_cm"])],
                 [BodyShown(int(k), float(seen), float(beside)) for k, seen, beside in shown],
                 _state_unpacked(held),

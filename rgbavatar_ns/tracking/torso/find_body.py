@@ -3,7 +3,7 @@
 from collections.abc import Callable, Generator
 from contextlib import closing
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache, partial
 from itertools import count
 
 import numpy as np
@@ -22,6 +22,12 @@ from rgbavatar_ns.tracking.threads import InBackground
 from rgbavatar_ns.tracking.torso.body_blocks import BodyBlock
 from rgbavatar_ns.tracking.torso.body_mesh import BodyMesh
 from rgbavatar_ns.tracking.torso.follow import BodyFollower, BodySighting, FollowerState
+from rgbavatar_ns.tracking.torso.outline_motion import (
+    OutlinePatch,
+    num_visits,
+    outline_patch,
+    outline_path,
+)
 from rgbavatar_ns.tracking.torso.place import ROUNDS, BodyPlaces, SeenShoulders, place_body
 from rgbavatar_ns.tracking.torso.shape import ShoulderLine, shoulder_line, shoulders_up_cm
 from rgbavatar_ns.tracking.torso.shoulders import ShoulderFinder
@@ -35,8 +41,14 @@ _SIDE_PX, _AHEAD = 640, 4
 # In how many frames the shoulders are looked for, spread over the clip: they tell only how the
 # body stands on the whole.
 _SHOULDER_FRAMES = 24
+# What is looked at: of something else an unfinished run looks anew.
+_LOOKED_FOR = "patterns and outlines"
+# Bodies are heavy: what the pattern tells is compared with the outline now and then.
+_PATCH_FRAMES = 4
 # The person is not alone where more of these frames show something else.
 _OTHERS_SHARE = 0.05
+# And where half of them do, the outline is somebody else's too.
+_MANY_OTHERS_SHARE = 0.5
 
 
 def find_body(
@@ -66,7 +78,7 @@ def find_body(
     reading = _Reading(
         tracker, fit, found, body, neck_m, mattes, source_alpha, segmented, clock.done
     )
-    made_from = digest([repr(found.frame_index), heads, identity])
+    made_from = digest([repr(found.frame_index), heads, identity, _LOOKED_FOR])
     blocks: list[BodyBlock] = []
     reads: Generator[BodyBlock, None, None] | None = None
     start = 0
@@ -96,14 +108,16 @@ def find_body(
     # Who else is in the picture pulls at the shoulders that are found, also where no matte says so.
     shoulders = seen.shoulders if beside <= _OTHERS_SHARE else ()
     clock.begin("place", len(found))
-    visits = count()
+    patches = seen.patches if beside <= _MANY_OTHERS_SHARE else ()
+    visits, most = count(), ROUNDS + num_visits(len(patches)) / len(found)
 
     def visited() -> None:
-        clock.done(next(visits) // ROUNDS)
+        clock.done(int(next(visits) / most))
 
     scale = _followed_scale(found)
+    path = outline_path(patches, neck_m, camera, found.follows(), visited)
     places = place_body(
-        body, camera, scale, seen.sightings, neck_m, found.follows(), shoulders, visited
+        body, camera, scale, seen.sightings, neck_m, found.follows(), shoulders, path, visited
     )
     up_cm = shoulders_up_cm(body, camera, seen.lines, places.rotation)
     clock.done(len(found))
@@ -146,6 +160,7 @@ class _Reading:
         follow = BodyFollower(self.body, camera, scale, state)
         sightings: list[BodySighting] = []
         shoulders: list[SeenShoulders] = []
+        patches: list[OutlinePatch] = []
         lines: list[ShoulderLine] = []
         shown: list[BodyShown] = []
         read = source.these(place, _SIDE_PX)
@@ -157,8 +172,11 @@ class _Reading:
                     cut = k == 0 or found.clip[k] != found.clip[k - 1]
                     pixels = partial(self.tracker.vertices_px, self.fit, k)
                     image, neck = frame.image_rgb, self.neck_m[k]
-                    alpha = partial(self._alpha, image, level)
+                    # Asked for by several, found once.
+                    alpha = cache(partial(self._alpha, image, level))
                     sightings.append(follow(image, neck, alpha, pixels, cut))
+                    if k % _PATCH_FRAMES == 0 or not sightings[-1].is_followed:
+                        patches.append(outline_patch(k, alpha(), neck, small))
                     if k % every == 0:
                         matte, head_px = alpha(), pixels() * scale - 0.5
                         lines.append(shoulder_line(k, matte, neck, small))
@@ -169,8 +187,8 @@ class _Reading:
                     self.advance(k + 1)
                     last = k + 1 == len(found)
                     if last or (k + 1) % block_frames == 0:
-                        yield BodyBlock(sightings, shoulders, lines, shown, follow.state)
-                        sightings, shoulders, lines, shown = [], [], [], []
+                        yield BodyBlock(sightings, shoulders, patches, lines, shown, follow.state)
+                        sightings, shoulders, patches, lines, shown = [], [], [], [], []
                     if last:
                         return
         finally:

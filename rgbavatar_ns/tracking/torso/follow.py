@@ -23,6 +23,8 @@ _LEAST_BACKGROUND, _MOST_BACKGROUND = 8, 24
 # A camera moves all that it sees, something behind the person only a part: what all but this share
 # of the points of a half do.
 _STILLEST = 0.3
+# Of fewer points none are wrong for sure.
+_RELIED_ON = 24
 # How many frames of a body without a pattern pass until one is looked for again.
 _PATIENCE = 15
 # The head's shadow and the chin's are no pattern of the clothes: so far below the neck's joint.
@@ -66,6 +68,11 @@ class BodySighting:
     of_first: bool = False
     """Whether `seen_px` are the points that the run chose first, not the last ones, and go on to
     be followed."""
+
+    @property
+    def is_followed(self) -> bool:
+        """Whether enough points are seen for a motion that can be relied on."""
+        return np.count_nonzero(np.isfinite(self.seen_px[:, 0])) >= _RELIED_ON
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from rgbavatar_ns.tracking.fit.camera import StillCamera
 from rgbavatar_ns.tracking.torso.body_mesh import BodyMesh
 from rgbavatar_ns.tracking.torso.follow import BodySighting
+from rgbavatar_ns.tracking.torso.outline_motion import OutlinePath
 from rgbavatar_ns.tracking.torso.rigid_motion import RigidMotion
 from rgbavatar_ns.tracking.torso.solve import run_motions
 
@@ -63,6 +64,8 @@ class BodyPlaces:
     """Area of body that half of the frames show; NaN where nobody looked."""
     beside_share: float = 0.0
     """Share of the frames in which the matte holds something beside the person."""
+    outlined: float = 0.0
+    """Share of the frames whose own outline said where it is."""
     background_stands: bool = False
     """Whether the background moves by no more than it seems to before a camera that stands."""
 
@@ -73,6 +76,7 @@ class BodyPlaces:
         return {
             "still": self.still,
             "followed_share": self.followed,
+            "outlined_share": self.outlined,
             "shoulders_up_cm": self.shoulders_up_cm,
             "turned_degrees": float(np.percentile(away, 98)),
             "moved_mm": float(1e3 * np.percentile(_away(self.neck_m), 98)),
@@ -92,17 +96,19 @@ def place_body(
     head_neck_m: Float[np.ndarray, "F 3"],
     follows: Sequence[bool],
     shoulders: Sequence[SeenShoulders],
+    path: OutlinePath | None = None,
     visited: Callable[[], None] = lambda: None,
 ) -> BodyPlaces:
     """The body's place in every frame; `head_neck_m` is where the heads say the neck's joint is.
 
     `camera` is the source's, `scale` the size of the pictures in which the body was followed by the
     source's. `follows[i]` says that frame i comes directly after frame i - 1: nothing is smoothed
-    across other borders. `visited` is called at each of the `ROUNDS` visits of a frame.
+    across other borders. `path` is where outlines put the body, which frames without a pattern go
+    by. `visited` is called at each of the `ROUNDS` visits of a frame.
 
-    The clothes' pattern says how the body moves, never the head's turn. What they do not say is
-    where it stood: upright and turned to the camera on the whole, unless the shoulders say plainly
-    otherwise, and under the head on the whole.
+    The clothes' pattern says how the body moves, or their outline, never the head's turn. What they
+    do not say is where it stood: upright and turned to the camera on the whole, unless the
+    shoulders say plainly otherwise, and under the head on the whole.
     """
     frames = len(sightings)
     runs, stretch = np.array([one.run for one in sightings]), np.cumsum(~np.array(follows, bool))
@@ -112,8 +118,18 @@ def place_body(
         own = np.flatnonzero(runs == run)
         near = [one for one in shoulders if own[0] <= one.position <= own[-1]]
         seen = [sightings[k] for k in own]
+        outlined = None if path is None else path.of(own)
         motions, start, count = _Run(
-            body, camera, scale, seen, head_neck_m[own], stretch[own], near, int(own[0])
+            body,
+            camera,
+            scale,
+            seen,
+            head_neck_m[own],
+            stretch[own],
+            near,
+            outlined,
+            int(own[0]),
+            len(own) < frames,
         ).solved(visited)
         still &= all(motion is motions[0] for motion in motions)
         followed += count
@@ -130,6 +146,7 @@ def place_body(
         followed / max(frames, 1),
         background_px,
         covered_share=float(covered),
+        outlined=0.0 if path is None else float(path.told.mean()),
         background_stands=background_px * scale < _STANDS_PX,
     )
 
@@ -148,7 +165,10 @@ class _Run:
     neck_m: Float[np.ndarray, "F 3"]
     stretch: Int[np.ndarray, "F"]
     shoulders: Sequence[SeenShoulders]
+    path: OutlinePath | None
     first: int
+    is_part: bool
+    """Whether there are others, which outlines alone put in the same place."""
 
     def solved(self, visited: Callable[[], None]) -> tuple[list[RigidMotion], RigidMotion, int]:
         """Motions since the first frame, where the body is in that, and in how many it was found.
@@ -158,18 +178,24 @@ class _Run:
         """
         start = RigidMotion(np.eye(3), self.neck_m[0] - self.body.neck_m)
         motions, count = [RigidMotion.none()] * len(self.sightings), 0
+        along = motions if self.path is None else self.path.motions()
         for _ in range(ROUNDS):
-            found = run_motions(self.body, self.camera, self.scale, self.sightings, start, visited)
+            found = run_motions(
+                self.body, self.camera, self.scale, self.sightings, start, along, visited
+            )
             pivot = start(self.body.neck_m)
             found = self._near_the_head(found, pivot)
             count = sum(motion is not None for motion in found)
-            motions = _filled(found, pivot, self.stretch)
+            motions = _filled(found, along, pivot, self.stretch)
             if _extent_m(self.body, motions, pivot) < _STILL_M:
                 motions = [RigidMotion.none()] * len(motions)
             else:
                 motions = _smoothed(motions, pivot, self.stretch)
             turn = self._upright(motions)
-            back = [motion.undone()(place) for motion, place in zip(motions, self.neck_m)]
+            necks_m = self.neck_m
+            if self.path is not None and (self.is_part or 2 * count < len(motions)):
+                necks_m = self.path.neck_m
+            back = [motion.undone()(place) for motion, place in zip(motions, necks_m)]
             start = RigidMotion(turn, np.median(back, axis=0) - turn @ self.body.neck_m)
         return motions, start, count
 
@@ -210,17 +236,21 @@ def _away(points_m: Float[np.ndarray, "F 3"]) -> Float[np.ndarray, "F"]:
 
 def _filled(
     motions: Sequence[RigidMotion | None],
+    along: Sequence[RigidMotion],
     pivot_m: Float[np.ndarray, "3"],
     stretch: Int[np.ndarray, "F"],
 ) -> list[RigidMotion]:
-    """Frames without a motion go evenly from the last one that has one to the next, in a stretch.
+    """Frames without a motion go as `along` says, and evenly from what the last one that has one is
+    off it to what the next is, in a stretch.
 
-    Where a stretch has none, they are as the nearest frame of another that has one.
+    Where a stretch has none, they are off as the nearest frame of another that has one.
     """
-    known = np.array([k for k, motion in enumerate(motions) if motion is not None])
-    found = [motion for motion in motions if motion is not None]
+    pairs = [(k, one) for k, one in enumerate(motions) if one is not None]
+    known = np.array([k for k, _ in pairs])
+    # What the pattern says beyond the outline, about the joint where it was in the first frame.
+    found = [one.after(along[k].undone()) for k, one in pairs]
     if not found:
-        return [RigidMotion.none()] * len(motions)
+        return list(along)
     at = np.arange(len(motions))
     for own in _stretches(stretch):
         inside = known[(known >= own[0]) & (known <= own[-1])]
@@ -229,10 +259,15 @@ def _filled(
         at[own] = own.clip(inside[0], inside[-1])
     turns = Rotation.from_matrix([motion.rotation for motion in found])
     between = turns if len(known) == 1 else Slerp(known, turns)(at)
-    pivots = np.array([motion(pivot_m) for motion in found])
-    places = np.stack([np.interp(at, known, along) for along in pivots.T], axis=1)
     matrices = np.broadcast_to(between.as_matrix(), (len(at), 3, 3))
-    return [RigidMotion(turn, place - turn @ pivot_m) for turn, place in zip(matrices, places)]
+    # Of the joint in each frame, that turns do not carry it away.
+    off_m = np.array([one(pivot_m) - along[k](pivot_m) for k, one in pairs])
+    off_m = np.stack([np.interp(at, known, part) for part in off_m.T], axis=1)
+    filled = []
+    for turn, by_m, own in zip(matrices, off_m, along):
+        place, rotation = own(pivot_m) + by_m, turn @ own.rotation
+        filled.append(RigidMotion(rotation, place - rotation @ pivot_m))
+    return filled
 
 
 def _stretches(stretch: Int[np.ndarray, "F"]) -> list[Int[np.ndarray, "_"]]:

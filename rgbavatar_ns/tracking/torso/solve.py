@@ -16,24 +16,29 @@ def run_motions(
     scale: float,
     run: Sequence[BodySighting],
     start: RigidMotion,
+    along: Sequence[RigidMotion],
     visited: Callable[[], None],
 ) -> list[RigidMotion | None]:
     """How the body moves from the first frame of a run to each; None where it was not found.
 
     `camera` is the source's, `scale` the size of the pictures in which points were followed by the
     source's. `start` places the body at rest in the first frame: how deep points lie follows from
-    it, and so how far a turn carries them. `visited` is called at each frame.
+    it, and so how far a turn carries them. Lost, it is looked for where `along`, which
+    also counts from the first, goes. `visited` is called at each frame.
     """
     motions: list[RigidMotion | None] = []
-    last, pivot = RigidMotion.none(), start(body.neck_m)
+    last, since, pivot = RigidMotion.none(), RigidMotion.none(), start(body.neck_m)
     places_m, near, certainty = np.zeros((0, 3)), np.zeros(0, bool), np.zeros((0, 2, 2))
     first = None
-    for sighting in run:
+    for sighting, way in zip(run, along):
         visited()
+        # Lost, it goes on as the outline does.
+        onward, since = way.after(since.undone()).after(last), way
+        last = onward if motions and motions[-1] is None else last
         if sighting.of_first and first is not None:
             places_m, near, certainty = first
         chosen = sighting.chosen_px
-        found = not motions and chosen is not None and len(chosen) > 0
+        found, fitted = not motions and chosen is not None and len(chosen) > 0, None
         # The follower left fewer alone: it tells none of them.
         if len(places_m) >= LEAST_POINTS:
             seen = near & np.isfinite(sighting.seen_px[:, 0])
@@ -47,7 +52,7 @@ def run_motions(
                 pivot,
             )
             found = fitted is not None
-            last = last if fitted is None else fitted[0]
+        last = onward if fitted is None else fitted[0]
         motions.append(last if found else None)
         if sighting.chosen_px is not None:
             places_m, near = np.zeros((0, 3)), np.zeros(0, bool)
