@@ -37,6 +37,9 @@ _MOST_FRAMES = 4.0
 """Confidence of a vertex never exceeds that of so many frames."""
 _ITERATIONS = 200
 _MAP_COLUMNS = 1024
+_IN_PICTURE = 0.25
+"""Share of the frames that have a part of a body in the picture, below which it is left out: mattes
+fade where so many show it (`tracking/image/body_end.py`)."""
 _LOWEST = 0.02
 """Share of a body's front that may lie below its end: specks of a matte."""
 
@@ -94,7 +97,7 @@ def measure_outline(
     )[:, 0]
     empty_gaussians = field.at_gaussians(empty[:, None])[:, 0]
     # But a body ends where the picture does: nobody knows what is worn farther down.
-    empty[field.body & (known == 0)] = 1.0
+    empty[field.body & (known < _IN_PICTURE)] = 1.0
     if bool(field.body.any()):
         front = field.at_gaussians((facing > 0).to(empty)[:, None])[:, 0] > 0.5
         told, end_m = _told_of_body(field, images, moved, front & field.body_gaussians)
@@ -120,14 +123,14 @@ def _told_of_body(
     """Share of the frames in which each Gaussian of a body would lie on background, and the height
     at rest, in metres, at which the body ends.
 
-    By its own place, since vertices of a body lie centimetres apart. What no frame has in the
+    By its own place, since vertices of a body lie centimetres apart. What few frames have in the
     picture is empty, and so is the back farther down than where the front ends, which hides it.
     """
     height = field.at_gaussians(field.height_m[:, None])[:, 0]
     px = [field.at_gaussians(torch.from_numpy(each).to(height)) for each in moved_px]
     shares = [_on_background(image, at.cpu().numpy()) for image, at in zip(images, px)]
     empty, known = (torch.from_numpy(np.mean(part, 0)).to(height) for part in zip(*shares))
-    empty = torch.where(known > 0, empty / known.clamp(min=1e-6), 1.0)
+    empty = torch.where(known >= _IN_PICTURE, empty / known.clamp(min=1e-6), 1.0)
     shown = height[front & (empty < 0.5)]
     end_m = shown.quantile(_LOWEST) if len(shown) else height.new_tensor(-torch.inf)
     return torch.where(height < end_m, 1.0, empty), end_m

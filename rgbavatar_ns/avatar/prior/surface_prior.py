@@ -20,13 +20,14 @@ from rgbavatar_ns.avatar.prior.discs import (
     log_overlap,
     narrow_ahead,
 )
+from rgbavatar_ns.avatar.prior.front import FrontSurface
 from rgbavatar_ns.avatar.prior.leash import Leash
 from rgbavatar_ns.avatar.prior.mesh_field import MeshField, ramp
 from rgbavatar_ns.avatar.prior.mouth import HiddenMouth
 from rgbavatar_ns.avatar.prior.strands import Strands
 from rgbavatar_ns.avatar.prior.virtual_views import VirtualViews
 from rgbavatar_ns.drawing.compositing import ImagesRGBA, is_unfilmed
-from rgbavatar_ns.head.rotations import turn_back
+from rgbavatar_ns.head.rotations import conjugate_quats_wxyz, turn_back
 from rgbavatar_ns.kernels import MorphedRenderer, PinholeCameras, weighted_color_average
 
 EVERY = 40
@@ -38,9 +39,14 @@ _RATE = 0.4
 _DEPTH_RATE = 0.1
 """Share of the way to the surface, along the view of a film that is all front, of those that it
 shows of a face: it does not tell how far before or behind they lie. Ours."""
+_ASIDE_M = 3e-3, 1e-2
+"""From what a face's Gaussian has gone across the view it may be seen, and is for sure."""
+_ASTRAY = 2.0
+"""Widths from its place at which what is hardly seen of a body is clear until it is back."""
 _FORGETS = 0.97
 _SEEN_PX = 0.02
-"""Pixels that a Gaussian covers in the frame that shows it best, at which it is half known."""
+"""Pixels that a Gaussian covers in the frame that shows it best, at which it is half known; of a
+body as many more as its discs are larger."""
 _SHINES_PX = 1.0
 """Pixels covered through what lies before it at which its being wider half counts: backs shine a
 little through every face, and much through the rim of hair, which wide ones would blur."""
@@ -198,21 +204,34 @@ class SurfacePrior(nn.Module):
             told, confidence, start, stiffness=_STIFFNESS, rest=_REST, iterations=_ITERATIONS
         )
         colored_px = strands.colored_px(self.seen_px, self.clear_px, self.grazing_px)
+        disc = disc_log_scale(avatar)
+        half_px = parts.half_known_px
         pull, close, color_pull = (
-            _RATE * _SEEN_PX / (px + _SEEN_PX) for px in (self.seen_px, self.through_px, colored_px)
+            _RATE * half_px / (px + half_px) for px in (self.seen_px, self.through_px, colored_px)
         )
         # Below its end a body is not kept by being seen from behind, through what ends before it.
         home, opacity_logit = self.surface(avatar)
+        astray = (shapes.position - home).norm(dim=1) > _ASTRAY * disc[:, :2].mean(1).exp()
+        opacity_logit = torch.where(astray & field.body_gaussians, _EMPTY, opacity_logit)
         closes = torch.where((opacity_logit < 0) & field.body_gaussians, pull, close)
-        disc = disc_log_scale(avatar)
         frontal = clear * _CLEAR_PX / (self.grazing_px + _CLEAR_PX)
         flatten(shapes, field.normal_of_gaussians, disc, frontal)
         ahead, alone = self.views.seen_from()
         view = turn_back(field.rest_quats_wxyz, ahead.to(disc).expand(len(disc), 3))
-        seen = 1 - pull / _RATE
+        seen = (1 - pull / _RATE).clamp(min=0)
         unturned = alone.to(disc) * parts.narrow * seen
         flatten(shapes, view, disc, unturned, widths=LONGEST)
-        depth = ((home - shapes.position) * view).sum(1)
+        # Gone aside, as chins that paint the neck, it has the surface before it that is there.
+        turned = conjugate_quats_wxyz(field.rest_quats_wxyz)
+        here, there = (parts.rest_m + turn_back(turned, at) for at in (shapes.position, home))
+        before_m, front_m = parts.front.at(here), parts.front.at(there)
+        # And what was hidden there, as below the chin, is not any more.
+        aside = ramp((here - there)[:, :2].norm(dim=1), *_ASIDE_M)
+        shown = aside if mouth is None else aside * (1 - mouth.behind)
+        sunk_m = _SUNK * avatar.initial_scale_m()
+        hidden_m = (front_m - there[:, 2] - sunk_m).clamp(min=0)
+        before_m = (before_m - front_m + shown * hidden_m).nan_to_num()
+        depth = ((home - shapes.position) * view).sum(1) + before_m * ahead[2].to(disc)
         shapes.position.add_((_DEPTH_RATE * unturned * depth)[:, None] * view)
         # As far as nothing shows it, nothing else closes the surface around it.
         through = _SHINES_PX / (self.through_px + _SHINES_PX)
@@ -271,6 +290,9 @@ class SurfacePrior(nn.Module):
                     Leash(avatar, field),
                     strands,
                     narrow_ahead(field) * (1 - strands.haired),
+                    FrontSurface.of(avatar, field),
+                    field.at_gaussians(field.rest_m),
+                    _SEEN_PX * _body_sizes(avatar, field),
                 ),
             )
         return self._parts_of[1]
@@ -286,6 +308,22 @@ class _Parts:
     strands: Strands
     narrow: Float[Tensor, "N"]
     """1 where the film's view says nothing of how far Gaussians reach along it."""
+    front: FrontSurface
+    rest_m: Float[Tensor, "N 3"]
+    """Each one's place on the mesh at rest."""
+    half_known_px: Float[Tensor, "N"]
+    """Pixels covered at which each is half known."""
+
+
+def _body_sizes(avatar: Avatar, field: MeshField) -> Float[Tensor, "N"]:
+    """How many times larger a body's discs are than a head's, 1 elsewhere: a corner shows neither.
+
+    Ours, because discs hid beyond the picture's end, where nothing is asked of them, but for a
+    quarter of a pixel, and hung there as specks below the body.
+    """
+    area = disc_log_scale(avatar)[:, :2].sum(1)
+    usual = area[~field.body_gaussians].median()
+    return torch.where(field.body_gaussians, (area - usual).exp().clamp(min=1), 1.0)
 
 
 def _facing(

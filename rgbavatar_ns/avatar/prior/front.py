@@ -1,0 +1,70 @@
+"""How far forward a head's surface lies, as it is seen from in front."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from rgbavatar_ns.avatar.avatar import Avatar
+from rgbavatar_ns.avatar.prior.mesh_field import MeshField
+
+_PIXEL_M = 1.5e-3
+_SMOOTH_PX = 2.0
+
+
+@dataclass(frozen=True)
+class FrontSurface:
+    """The foremost surface of the mesh at rest, along the head's z axis: metres.
+
+    Rows go down from `corner_m`, x and y of the first pixel's middle, columns to the right.
+    """
+
+    depth_m: Float[Tensor, "rows columns"]
+    """Smoothed; it goes on for some pixels beside the mesh."""
+    there: Bool[Tensor, "rows columns"]
+    corner_m: Float[Tensor, "2"]
+    px_per_m: Float[Tensor, "2"]
+    last_px: Float[Tensor, "2"]
+
+    @classmethod
+    def of(cls, avatar: Avatar, field: MeshField) -> "FrontSurface":
+        """Drawn from afar to near."""
+        # Here, so that timing steps on a bare machine needs no OpenCV.
+        import cv2
+
+        rest_m = field.rest_m.cpu().double().numpy()
+        faces = avatar.head.faces.cpu().long().numpy()
+        low, high = rest_m.min(0), rest_m.max(0)
+        columns, rows = (int(part / _PIXEL_M) + 2 for part in (high - low)[:2])
+        px = np.stack([rest_m[:, 0] - low[0], high[1] - rest_m[:, 1]], 1) / _PIXEL_M
+        corners = np.round(px[faces] * 16).astype(np.int32)
+        drawn = np.full((rows, columns), np.nan, np.float32)
+        forward = rest_m[faces, 2].mean(1)
+        for face in np.argsort(forward):
+            cv2.fillConvexPoly(drawn, corners[face], (float(forward[face]),), shift=4)
+        there = np.isfinite(drawn)
+        both = np.dstack([np.nan_to_num(drawn), there.astype(np.float32)])
+        value, weight = np.moveaxis(cv2.GaussianBlur(both, (0, 0), _SMOOTH_PX), -1, 0)
+        held = field.rest_m
+        return cls(
+            torch.from_numpy(value / weight.clip(1e-6)).to(held),
+            torch.from_numpy(there).to(held.device),
+            torch.tensor([low[0], high[1]]).to(held),
+            torch.tensor([1 / _PIXEL_M, -1 / _PIXEL_M]).to(held),
+            torch.tensor([columns - 1.0, rows - 1.0]).to(held),
+        )
+
+    def at(self, places_m: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
+        """z of the foremost surface where places lie; NaN beside it."""
+        rows, columns = self.depth_m.shape
+        px = (places_m[:, :2] - self.corner_m) * self.px_per_m
+        found = F.grid_sample(
+            self.depth_m[None, None], (2 * px / self.last_px - 1)[None, None], align_corners=True
+        )
+        column, row = px.round().long().unbind(1)
+        inside = (column >= 0) & (row >= 0) & (column < columns) & (row < rows)
+        inside &= self.there[row.clamp(0, rows - 1), column.clamp(0, columns - 1)]
+        return torch.where(inside, found[0, 0, 0], torch.nan)

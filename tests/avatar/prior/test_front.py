@@ -1,0 +1,115 @@
+"""The surface that a camera in front sees, and what goes to it; bodies' strays."""
+
+import numpy as np
+import torch
+
+from rgbavatar_ns import Avatar
+from rgbavatar_ns.avatar.prior import SurfacePrior
+from rgbavatar_ns.avatar.prior.front import FrontSurface
+from rgbavatar_ns.avatar.prior.mesh_field import MeshField
+from rgbavatar_ns.avatar.prior.strands import Strands
+from rgbavatar_ns.head.arrays import EMBEDDED_BUST
+from rgbavatar_ns.head.rotations import conjugate_quats_wxyz, turn_back
+
+from .test_mesh_field import embedded_avatar
+from .test_outline import drawn_thicker, front_camera, turned
+
+STEPS = range(199, 1440, 40)
+
+
+def foremost_m(avatar: Avatar, places_m: torch.Tensor) -> np.ndarray:
+    """z of the nearest triangle where a ray along z meets the mesh at rest; NaN where none does.
+
+    Every triangle is asked, in double precision.
+    """
+    rest = MeshField(avatar).rest_m.double().numpy()
+    first, second, third = rest[avatar.head.faces.numpy()].transpose(1, 0, 2)
+    side, other = second - first, third - first
+    area = side[:, 0] * other[:, 1] - side[:, 1] * other[:, 0]
+    found = np.full(len(places_m), np.nan)
+    for k, place in enumerate(places_m.double().numpy()):
+        away = place - first
+        with np.errstate(divide="ignore", invalid="ignore"):
+            u = (away[:, 0] * other[:, 1] - away[:, 1] * other[:, 0]) / area
+            v = (side[:, 0] * away[:, 1] - side[:, 1] * away[:, 0]) / area
+        hit = (u >= 0) & (v >= 0) & (u + v <= 1)
+        if hit.any():
+            found[k] = (first[:, 2] + u * side[:, 2] + v * other[:, 2])[hit].max()
+    return found
+
+
+def test_the_front_surface_is_what_rays_from_in_front_meet_first():
+    avatar = embedded_avatar(name=EMBEDDED_BUST)
+    front = FrontSurface.of(avatar, MeshField(avatar))
+    drawn = np.random.default_rng(0).uniform([-0.12, -0.2, 0], [0.12, 0.14, 0], (1500, 3))
+    places = torch.from_numpy(drawn).float()
+    ours, rays = front.at(places).numpy(), foremost_m(avatar, places)
+    there = np.isfinite(rays)
+    assert 300 < there.sum() < 1400
+    # Pixels of 1.5 mm at the border may belong to either side.
+    assert (np.isfinite(ours) == there).mean() > 0.97
+    both = there & np.isfinite(ours)
+    off = np.abs(ours - rays)[both]
+    assert np.median(off) < 1e-3
+    # Smoothed where the depth leaps: chin before neck, lobe before nape.
+    assert np.quantile(off, 0.9) < 6e-3
+    assert off.max() < 0.03, "and never that of nothing, 0, beside the mesh"
+    beside = torch.tensor([[1.0, 0.0, 0.0], [0.0, -9.0, 0.0]])
+    assert front.at(beside).isnan().all()
+
+
+def test_a_chin_that_paints_the_neck_lies_on_it():
+    """Its Gaussians go 25 mm down, before the neck, at the depth that they had."""
+    avatar = embedded_avatar(name=EMBEDDED_BUST)
+    field = MeshField(avatar)
+    theta = turned(avatar, [-1.0, 0.0, 1.0])
+    images = drawn_thicker(avatar, theta, 0.0)
+    prior, position = SurfacePrior(avatar), avatar.blendshapes.position
+    prior.begin(avatar, theta, front_camera(), images)
+    rest, home = field.at_gaussians(field.rest_m), prior.surface(avatar)[0]
+    turned_back = conjugate_quats_wxyz(field.rest_quats_wxyz)
+    before = rest + turn_back(turned_back, home)
+    down = torch.tensor([0.0, -0.025, 0.0])
+    there_m = torch.from_numpy(foremost_m(avatar, before + down)).float()
+    gap_m = before[:, 2] - there_m
+    sideways = field.at_gaussians(field.normals)[:, 0].abs()
+    skin = Strands.of(avatar, field).haired == 0
+    chin = (gap_m > 0.01) & (sideways < 0.3) & skin & ~field.body_gaussians
+    chin &= (before[:, 0].abs() < 0.03) & (before[:, 2] > 0)
+    assert int(chin.sum()) >= 10
+    position.data.copy_(home + turn_back(field.rest_quats_wxyz, down.expand_as(home)))
+    prior.look(avatar, theta, front_camera(), images)
+    prior.seen_px.fill_(1e3)  # nothing is drawn home for want of being seen
+    for step in STEPS:
+        prior.pull(avatar, step)
+    after = rest + turn_back(turned_back, position.detach())
+    assert float((after - before - down)[chin, :2].abs().max()) < 2e-3, "along the view alone"
+    left = (after[:, 2] - there_m)[chin].abs() / gap_m[chin]
+    assert float(left.median()) < 0.2
+
+
+def test_what_of_a_body_strays_where_nothing_is_filmed_is_clear_until_it_is_back():
+    avatar = embedded_avatar(name=EMBEDDED_BUST)
+    theta = turned(avatar, [-1.0, 0.0, 1.0])
+    images = drawn_thicker(avatar, theta, 0.0)
+    prior, shapes = SurfacePrior(avatar), avatar.blendshapes
+    prior.begin(avatar, theta, front_camera(), images)
+    home, logit = prior.surface(avatar)
+    body = MeshField(avatar).body_gaussians & (logit > 0)
+    assert int(body.sum()) > 100
+    shapes.opacity_logit.data.fill_(2.0)
+    strays = home + torch.tensor([0.03, 0.0, 0.0])
+    shapes.position.data.copy_(strays)
+    even = torch.arange(len(body)) % 2 == 0
+    corner, shown = body & even, body & ~even
+    prior.seen_px[corner], prior.seen_px[shown] = 0.01, 1e3
+    prior.through_px.copy_(prior.seen_px)
+    prior.pull(avatar, STEPS[0])
+    position, opacity_logit = shapes.position.detach(), shapes.opacity_logit.detach()
+    assert float(opacity_logit[corner].max()) < 0
+    assert float(opacity_logit[shown].min()) > 1.9
+    assert float((position - strays)[shown].abs().max()) < 1e-3
+    for step in STEPS:
+        prior.pull(avatar, step)
+    assert float((position - home)[corner].abs().max()) < 1e-4
+    assert float(opacity_logit[corner].min()) > 1
