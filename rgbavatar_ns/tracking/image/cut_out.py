@@ -10,10 +10,12 @@ from rgbavatar_ns.kernels.constants import UNFILMED_RGBA
 from rgbavatar_ns.tracking.face.detector import CHIN, FOREHEAD
 from rgbavatar_ns.tracking.image.body_end import BodyEnd
 from rgbavatar_ns.tracking.image.head_mask import HeadMask, HeadOutline
-from rgbavatar_ns.tracking.image.matting import foreground_color, in_one_piece, straight_rgba
-
-_STRAY = 0.05
-"""Alpha from which something is there."""
+from rgbavatar_ns.tracking.image.matting import (
+    STRAY_ALPHA,
+    foreground_color,
+    in_one_piece,
+    straight_rgba,
+)
 
 
 @dataclass(frozen=True)
@@ -92,6 +94,6 @@ def _without_what_hung_below(
     """
     whole = shown > 0.5
     kept = in_one_piece(np.where(whole, alpha, 0), head)
-    dropped = (whole & (alpha > _STRAY) & (kept < alpha)).any(0)
-    stays = (whole & (kept > _STRAY)).any(0)
+    dropped = (whole & (alpha > STRAY_ALPHA) & (kept < alpha)).any(0)
+    stays = (whole & (kept > STRAY_ALPHA)).any(0)
     return np.where(whole, kept, np.where(dropped & ~stays, 0, alpha))

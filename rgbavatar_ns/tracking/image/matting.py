@@ -20,8 +20,10 @@ _LIT_LEVEL, _LIT_PERCENTILE, _DARK_BELOW = 0.75, 95, 150
 # left out where it would be nearly the whole.
 _CLOSE_UP, _RAISED, _FADE_SHARE, _NEARLY_ALL = 1.4, 0.12, 12, 0.9
 _SEGMENTED_PX = 256
-# Of pieces of a matte: what alpha counts, and over what gaps they hang together.
-_STRAY_ALPHA, _BRIDGE_PX = 0.05, 5
+STRAY_ALPHA = 0.05
+"""Of pieces of a matte: from which alpha on something is there."""
+# Over what gaps they hang together, at half the size.
+_BRIDGE_PX = 5
 
 
 class PersonMatte:
@@ -114,7 +116,7 @@ def in_one_piece(alpha: _Alpha, person: Bool[np.ndarray, "h w"]) -> _Alpha:
     """
     size = len(alpha)
     few = max(1, size // 2)
-    seen = cv2.resize(alpha, (few, few), interpolation=cv2.INTER_AREA) > _STRAY_ALPHA
+    seen = cv2.resize(alpha, (few, few), interpolation=cv2.INTER_AREA) > STRAY_ALPHA
     bridged = cv2.dilate(seen.astype(np.uint8), np.ones((_BRIDGE_PX, _BRIDGE_PX), np.uint8))
     _, labels = cv2.connectedComponents(bridged)
     there = cv2.resize(person.astype(np.uint8), (few, few), interpolation=cv2.INTER_NEAREST)

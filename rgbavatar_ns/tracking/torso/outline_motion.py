@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from rgbavatar_ns.tracking.fit.camera import StillCamera
 from rgbavatar_ns.tracking.torso.rigid_motion import RigidMotion
 
-# What is looked at, around the neck's joint: to each side, from just below it down to the chest.
+# What is looked at, around the neck's joint: to each side, from just above it down to the chest.
 _ASIDE_M, _ABOVE_M, _BELOW_M, _CELL_M = 0.36, 0.02, 0.30, 0.01
 # Jaw and neck, which turn with the head.
 _JAW_ASIDE_M, _JAW_BELOW_M = 0.1, 0.04
@@ -48,7 +48,7 @@ class OutlinePath:
     neck_m: Float[np.ndarray, "F 3"]
     roll_rad: Float[np.ndarray, "F"]
     told: Bool[np.ndarray, "F"]
-    """Where a frame's own outline says so; elsewhere it is between those that do."""
+    """Where a frame's own outline says so; else it is between those that do, or as the head."""
 
     def of(self, frames: Int[np.ndarray, "R"]) -> "OutlinePath":
         """The same of some frames."""
