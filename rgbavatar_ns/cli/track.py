@@ -119,7 +119,7 @@ def _body_told(body: Mapping[str, Any] | None) -> str:
     if body["followed_share"] < _FOLLOWED:
         if body["still"] and body["outlined_share"] == 0:
             return "taken to keep still: neither pattern nor outline of clothes tells its motion"
-        by = ", mostly by its outline: hardly any pattern of clothes is seen"
+        by = ", mostly by its outline: hardly any pattern of clothes tells it"
     if body["still"]:
         return f"keeps still{by}"
     turned, moved = body["turned_degrees"], body["moved_mm"] / 10

@@ -14,6 +14,7 @@ def test_projection_worked_by_hand() -> None:
     np.testing.assert_allclose(camera.project(np.array([[0.1, 0.05, 1.0]])), [[140.0, 60.0]])
     in_camera = camera.world_to_camera @ [0.1, 0.05, 1.0, 1.0]
     np.testing.assert_allclose(in_camera, [0.1, -0.05, 1.0, 1.0])
+    assert (camera.px_per_m(0.0), camera.px_per_m(1.0)) == (200.0, 400.0)
 
 
 def test_projection_derivative_equals_central_differences() -> None:

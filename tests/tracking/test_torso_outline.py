@@ -1,6 +1,7 @@
 """Bodies in plain shirts, followed by their outline."""
 
 from collections.abc import Collection, Sequence
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -245,3 +246,67 @@ def test_a_body_that_is_lost_goes_on_by_its_outline(body: BodyMesh) -> None:
     last = found[-1]
     assert last is not None
     np.testing.assert_allclose(last(body_m[0]), body_m[-1], atol=1e-3)
+
+
+def followed(
+    body: BodyMesh, count: int, start_m: Float[np.ndarray, "3"], by_m: _Places
+) -> list[BodySighting]:
+    """So many points of a shirt that rests at a place, moved from the first frame on."""
+    spots_px = np.random.default_rng(6).uniform([150, 190], [250, 250], (count, 2))
+    start = RigidMotion(np.eye(3), start_m - body.neck_m)
+    points_m, near = body.lifted(spots_px, start, CAMERA)
+    assert near.all()
+    none, certain = np.zeros((0, 2)), np.tile(np.eye(2), (count, 1, 1))
+    seen = [CAMERA.project(points_m + shift) for shift in by_m[1:]]
+    run = [BodySighting(0, none, spots_px, certain, 0.0)]
+    return run + [BodySighting(0, px, None, None, 0.0) for px in seen]
+
+
+@pytest.mark.parametrize(("count", "believed"), [(12, False), (30, False), (60, True)])
+def test_few_points_that_stay_where_they_are_do_not_hold_a_body_that_moves(
+    body: BodyMesh, count: int, believed: bool
+) -> None:
+    """A film's compression holds them; so many that they are the shirt's own are believed, since
+    arms move outlines too. Worked by hand: 2 mm a frame."""
+    body_m = np.array([0.0, 0.02, 0.0]) + 0.002 * np.arange(FRAMES)[:, None] * [1, 0, 0]
+    run = followed(body, count, body_m[0], np.zeros((FRAMES, 3)))
+    path = OutlinePath(body_m, np.zeros(FRAMES), np.ones(FRAMES, bool))
+    follows = [k > 0 for k in range(FRAMES)]
+    head_m = np.tile(body_m.mean(0), (FRAMES, 1))
+    places = place_body(body, CAMERA, 1.0, run, head_m, follows, [], path)
+    went = places.neck_m[-1] - places.neck_m[0]
+    np.testing.assert_allclose(went, [0.0 if believed else 0.078, 0, 0], atol=3e-3)
+    assert places.still == believed
+
+
+@pytest.mark.parametrize("told", [True, False])
+def test_a_frame_that_shows_few_points_goes_by_its_outline_if_that_tells(
+    body: BodyMesh, told: bool
+) -> None:
+    """Worked by hand: the body keeps still; in a third of the frames a dozen points of sixty are
+    left, and go 10 mm to the side."""
+    still_m, few = np.tile([0.0, 0.02, 0.0], (FRAMES, 1)), np.arange(FRAMES) % 3 == 2
+    run = followed(body, 60, still_m[0], 0.01 * few[:, None] * [1, 0, 0])
+    left = np.arange(60)[:, None] < 12
+    run = [
+        replace(one, seen_px=np.where(left, one.seen_px, np.nan)) if little else one
+        for one, little in zip(run, few)
+    ]
+    path = OutlinePath(still_m, np.zeros(FRAMES), np.full(FRAMES, True) if told else ~few)
+    follows = [k > 0 for k in range(FRAMES)]
+    places = place_body(body, CAMERA, 1.0, run, still_m, follows, [], path)
+    assert places.still == told
+    assert places.followed == pytest.approx(1 - told * few.mean())
+
+
+def test_few_points_that_go_with_the_outline_tell_more_than_it_does(body: BodyMesh) -> None:
+    """Worked by hand: the body comes 1 mm nearer in each frame, which the outline does not see."""
+    along = np.array([0.0, 0.02, 0.0]) + 0.002 * np.arange(FRAMES)[:, None] * [1, 0, 0]
+    nearer = 0.001 * np.arange(FRAMES)[:, None] * [0, 0, 1]
+    run = followed(body, 30, along[0], along + nearer - along[0])
+    path = OutlinePath(along, np.zeros(FRAMES), np.ones(FRAMES, bool))
+    follows = [k > 0 for k in range(FRAMES)]
+    places = place_body(body, CAMERA, 1.0, run, along + nearer, follows, [], path)
+    assert places.followed == 1.0
+    went = places.neck_m[-1] - places.neck_m[0]
+    np.testing.assert_allclose(went, [0.078, 0, 0.039], atol=5e-3)

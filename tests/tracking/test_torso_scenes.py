@@ -94,6 +94,15 @@ def with_arm(images: _Pictures) -> _Pictures:
     return result
 
 
+def with_print(still: Still, side: int) -> _Pictures:
+    """The shirt is plain but for a speckled square."""
+    top, left = SIZE - 10 - side, SIZE // 2 - side // 2
+    images = np.where((still.matte > 0)[..., None], np.uint8(100), still.images)
+    spots = np.s_[:, top : top + side, left : left + side]
+    images[spots] = still.images[spots]
+    return images
+
+
 def test_an_arm_before_the_chest_is_said_and_does_not_move_the_body(still: Still) -> None:
     sightings = still.followed(with_arm(still.images))
     covered = np.array([one.covered for one in sightings])
@@ -115,6 +124,25 @@ def test_an_arm_before_the_chest_is_said_and_does_not_move_the_body(still: Still
         [],
     )
     assert moves.covered_share == 0
+
+
+def test_points_are_kept_where_too_few_can_be_chosen_anew(still: Still) -> None:
+    """An arm hides most of them, and the matte is empty meanwhile: what is left is followed on."""
+    images, sleeve = with_print(still, 130), speckled(2, 20, 230)
+    top = SIZE - 60
+    images[3:-3, top:, 70:250] = sleeve[top:, 70:250] * [1, 1, 0.3]
+    mattes = [still.matte * (k < 3 or k >= FRAMES - 3) for k in range(FRAMES)]
+    follow = still.follower()
+    sightings = [
+        follow(image, NECK_M, lambda m=matte: m, lambda: still.vertices_px, k == 0)
+        for k, (image, matte) in enumerate(zip(images, mattes))
+    ]
+    counts = [one.num_seen for one in sightings[1:]]
+    assert min(counts) < 0.4 * max(counts)
+    assert all(one.is_followed for one in sightings[1:])
+    assert {one.run for one in sightings} == {0}
+    assert [k for k, one in enumerate(sightings) if one.chosen_px is not None] == [0]
+    assert counts[-1] == counts[0]
 
 
 def test_light_that_changes_covers_nothing(still: Still) -> None:
@@ -280,14 +308,21 @@ def test_nothing_is_smoothed_or_bridged_where_a_film_leaves_something_out(still:
     np.testing.assert_allclose(places.neck_m, NECK_M + steps, atol=2e-3)
 
 
-def test_a_collar_with_too_few_points_to_follow_keeps_still(still: Still) -> None:
-    """As clips that end at the collar show it: chosen, and left alone by the follower."""
-    few = np.array([[150.0, 230], [160, 232], [155, 236], [165, 231]])
-    none = np.zeros((0, 2))
-    run = [BodySighting(0, none, few, np.tile(np.eye(2), (4, 1, 1)), np.nan)]
-    run += [BodySighting(0, none, None, None, np.nan) for _ in range(4)]
-    places = place_body(still.body, CAMERA, 1.0, run, np.tile(NECK_M, (5, 1)), one_stretch(5), [])
-    np.testing.assert_allclose(places.neck_m, np.tile(NECK_M, (5, 1)), atol=1e-9)
+@pytest.mark.parametrize(("side", "is_followed"), [(24, False), (130, True)])
+def test_a_shirt_with_too_few_points_to_follow_keeps_still(
+    still: Still, side: int, is_followed: bool
+) -> None:
+    """As a collar at the end of the picture shows it, or a logo: none of it is followed."""
+    sightings = still.followed(with_print(still, side))
+    for one in sightings:
+        assert one.is_followed == (is_followed and one is not sightings[0])
+    chosen_px = sightings[0].chosen_px
+    assert chosen_px is not None
+    assert bool(len(chosen_px)) == is_followed
+    heads = np.tile(NECK_M, (FRAMES, 1))
+    places = place_body(still.body, CAMERA, 1.0, sightings, heads, one_stretch(FRAMES), [])
+    assert places.followed == is_followed
+    np.testing.assert_allclose(places.neck_m, heads, atol=1e-9 if not is_followed else 2e-3)
 
 
 def test_a_larger_film_of_the_same_body_shows_the_same_motions(still: Still) -> None:

@@ -60,6 +60,10 @@ class StillCamera:
         across = points_m[..., :2] * (1.0, -1.0)
         return self.focal_px * across / depth[..., None] + self.center_px
 
+    def px_per_m(self, z_m: float) -> float:
+        """How many pixels a metre across the picture is, `z_m` before the world's origin."""
+        return float(self.focal_px / (self.distance_m - z_m))
+
     def image_slope(self, points_m: Float[np.ndarray, "L 3"]) -> Float[np.ndarray, "L 2 3"]:
         """Derivative of `project` to the points, pixels a metre."""
         depth = self.distance_m - points_m[:, 2]

@@ -86,14 +86,14 @@ class BodyMesh:
         return camera.eye_m + reach[:, None] * ray, (triangle >= 0) & smooth[row, column]
 
     def head_px(
-        self, vertices_px: Float[np.ndarray, "V 2"], width: int, height: int, focal_by_depth: float
+        self, vertices_px: Float[np.ndarray, "V 2"], width: int, height: int, px_per_m: float
     ) -> Bool[np.ndarray, "height width"]:
-        """Where the head may be, hair and collar with it; `focal_by_depth` in pixels a metre."""
+        """Where the head may be, hair and collar with it; `px_per_m` at its depth."""
         mask = np.zeros((height, width), np.uint8)
         corners = np.round(vertices_px[self.head_faces].clip(-(2**14), 2**14) * 8).astype(np.int32)
         for triangle in corners:
             cv2.fillConvexPoly(mask, triangle, (1,), shift=3)
-        reach = 2 * round(_AROUND_HEAD_M * focal_by_depth) + 1
+        reach = 2 * round(_AROUND_HEAD_M * px_per_m) + 1
         return cv2.dilate(mask, np.ones((reach, reach), np.uint8)) > 0
 
 

@@ -42,7 +42,7 @@ _SIDE_PX, _AHEAD = 640, 4
 # body stands on the whole.
 _SHOULDER_FRAMES = 24
 # What is looked at: of something else an unfinished run looks anew.
-_LOOKED_FOR = "patterns and outlines"
+_LOOKED_FOR = "patterns of many points and outlines"
 # Bodies are heavy: what the pattern tells is compared with the outline now and then.
 _PATCH_FRAMES = 4
 # The person is not alone where more of these frames show something else.

@@ -11,7 +11,7 @@ from rgbavatar_ns.tracking.fit.camera import StillCamera
 from rgbavatar_ns.tracking.torso.body_mesh import BodyMesh
 from rgbavatar_ns.tracking.torso.cloth_colors import ClothColors
 from rgbavatar_ns.tracking.torso.features import FollowedPoints, grid_within
-from rgbavatar_ns.tracking.torso.rigid_motion import LEAST_POINTS, RigidMotion, fit_rigid_motion
+from rgbavatar_ns.tracking.torso.rigid_motion import RigidMotion, fit_rigid_motion
 
 # A fresh key picture is taken when fewer of the points than this share are found again.
 _FEW = 0.4
@@ -23,7 +23,7 @@ _LEAST_BACKGROUND, _MOST_BACKGROUND = 8, 24
 # A camera moves all that it sees, something behind the person only a part: what all but this share
 # of the points of a half do.
 _STILLEST = 0.3
-# Of fewer points none are wrong for sure.
+# Of fewer points none are wrong for sure, and a shirt that shows fewer has no pattern.
 _RELIED_ON = 24
 # How many frames of a body without a pattern pass until one is looked for again.
 _PATIENCE = 15
@@ -54,7 +54,8 @@ class BodySighting:
 
     `run` counts up where the body cannot be followed from the frame before. `seen_px` are the
     points last chosen, NaN where they are lost; `chosen_px` are those chosen anew in this frame,
-    from here on, whose places count as far as their `certainty` says. `background_px` is how far
+    from here on, none on a shirt without a pattern, whose places count as far as their `certainty`
+    says. `background_px` is how far
     the background has moved since then, NaN where too little of it is seen. `covered` is the share
     of the clothes in the picture that something is before, NaN where that is not known.
     """
@@ -70,9 +71,14 @@ class BodySighting:
     be followed."""
 
     @property
+    def num_seen(self) -> int:
+        """How many points are seen."""
+        return np.count_nonzero(np.isfinite(self.seen_px[:, 0]))
+
+    @property
     def is_followed(self) -> bool:
         """Whether enough points are seen for a motion that can be relied on."""
-        return np.count_nonzero(np.isfinite(self.seen_px[:, 0])) >= _RELIED_ON
+        return self.num_seen >= _RELIED_ON
 
 
 @dataclass(frozen=True)
@@ -160,7 +166,8 @@ class BodyFollower:
         chosen_px, certainty = None, None
         if self._wants_key(seen_px, covered):
             key = self._take_key(image_rgb, gray, matte(), mesh_px(), covered, hidden_px)
-            chosen_px, certainty = self._in_source(key.body.points_px), key.body.certainty
+            if key is not None:
+                chosen_px, certainty = self._in_source(key.body.points_px), key.body.certainty
         seen_px = self._in_source(seen_px)
         return BodySighting(
             self.state.run, seen_px, chosen_px, certainty, background_px, covered, of_first
@@ -175,6 +182,7 @@ class BodyFollower:
             motion=RigidMotion.none(),
             plain_frames=_PATIENCE,
             first=None,
+            key=None,
             cloth=None,
         )
 
@@ -206,7 +214,7 @@ class BodyFollower:
     ) -> Float[np.ndarray, "P 2"] | None:
         """The points of the run's first key picture, if it serves again; None if it does not."""
         first, before = self.state.first, self.state
-        if first is None or first is key or len(first.places_m) < LEAST_POINTS:
+        if first is None or first is key or not len(first.places_m):
             return None
         near_px = self._camera.project(before.motion(first.places_m))
         moved_px = np.linalg.norm(near_px - first.body.points_px, axis=1).mean()
@@ -228,7 +236,7 @@ class BodyFollower:
         hidden_px: Float[np.ndarray, "C 2"],
     ) -> Float[np.ndarray, "P 2"] | None:
         """The points in this picture, NaN where lost; None where they show no motion of a body."""
-        if len(key.places_m) < LEAST_POINTS:
+        if not len(key.places_m):
             return np.zeros((0, 2))
         px, seen = key.body.found_in(gray, near_px)
         seen &= ~_near_any(px, hidden_px, _HIDES_SHARE * max(gray.shape))
@@ -272,8 +280,11 @@ class BodyFollower:
         mesh_px: Float[np.ndarray, "V 2"],
         covered: float,
         hidden_px: Float[np.ndarray, "C 2"],
-    ) -> KeyPicture:
-        """Choose points of the body anew in this picture, but not of what is before it."""
+    ) -> KeyPicture | None:
+        """Choose points of the body anew in this picture, but not of what is before it.
+
+        None where it shows too few, and those of the key picture of before still serve.
+        """
         state = self.state
         placed = state.motion.after(state.start)
         region = (matte > _PERSON) & ~self._of_head(mesh_px, placed, gray.shape)
@@ -282,13 +293,17 @@ class BodyFollower:
             region[max(0, y - reach) : y + reach + 1, max(0, x - reach) : x + reach + 1] = False
         chosen = FollowedPoints.chosen(gray, region, _MOST_POINTS)
         places, near = self._body.lifted(chosen.points_px, placed, self._camera)
+        if near.sum() < _RELIED_ON:
+            if state.key is not None and len(state.key.places_m):
+                return None
+            near = np.zeros_like(near)
         chosen, places = chosen.select(near), state.motion.undone()(places[near])
         beside = _beside(gray, matte < _BACKGROUND)
         key = KeyPicture(chosen, places, beside, 0.0 if np.isnan(covered) else covered)
-        cloth = None if len(places) < LEAST_POINTS else self._cloth(image_rgb, region, covered)
+        cloth = self._cloth(image_rgb, region, covered) if len(places) else None
         self.state = replace(
             state,
-            first=state.first or key,
+            first=state.first or (key if len(places) else None),
             key=key,
             near_px=chosen.points_px,
             beside_px=beside.points_px,
@@ -321,8 +336,8 @@ class BodyFollower:
         """Where head and neck may be, and all that is higher than the shoulders."""
         height, width = shape
         neck = placed(self._body.neck_m)
-        by_depth = self._camera.focal_px / (self._camera.distance_m - neck[2])
-        mask = self._body.head_px(vertices_px * self._scale - 0.5, width, height, by_depth)
+        px_per_m = self._camera.px_per_m(neck[2])
+        mask = self._body.head_px(vertices_px * self._scale - 0.5, width, height, px_per_m)
         below = self._camera.project(placed(self._body.neck_m - [0, _BELOW_NECK_M, 0]))
         up = self._camera.project(placed(self._body.neck_m)) - below
         rows, columns = np.mgrid[:height, :width]

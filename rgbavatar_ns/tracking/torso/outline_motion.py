@@ -72,7 +72,7 @@ def outline_patch(
 ) -> OutlinePatch:
     """What the matte shows around the neck's joint; the camera is the matte's."""
     cells_m = _cells_m()
-    px_per_m = camera.focal_px / (camera.distance_m - neck_m[2])
+    px_per_m = camera.px_per_m(neck_m[2])
     px = (camera.project(neck_m) + px_per_m * cells_m * (1, -1)).astype(np.float32)
     fine = cv2.GaussianBlur(matte, (0, 0), max(0.4 * _CELL_M * px_per_m, 0.3))
     alpha = cv2.remap(fine, px[..., 0], px[..., 1], cv2.INTER_LINEAR)
@@ -279,6 +279,6 @@ def _extent_m(known: Float[np.ndarray, "K 4"], camera: StillCamera) -> float:
     neck_m, tilt = known[:, :3], known[:, 3]
     across = np.stack([np.cos(tilt), np.sin(tilt), np.zeros(len(tilt))], 1)
     marks = [camera.project(neck_m + side * _SHOULDER_M * across) for side in (-1, 0, 1)]
-    px_per_m = camera.focal_px / (camera.distance_m - np.median(neck_m[:, 2]))
+    px_per_m = camera.px_per_m(float(np.median(neck_m[:, 2])))
     away = [np.linalg.norm(px - np.median(px, axis=0), axis=1) / px_per_m for px in marks]
     return float(np.percentile(np.max(away, axis=0), 98))

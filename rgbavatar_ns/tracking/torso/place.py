@@ -29,6 +29,9 @@ _DOUBTED_YAW_RAD, _DOUBTED_ROLL_RAD = 0.2, 0.035
 # Where so much of the clothes looks otherwise, something is before them: folds are less.
 _COVERED = 0.05
 _LEAST_FRAMES = 10
+# So many points are the shirt's own, whatever its outline does: an arm moves that, a neighbour.
+# Fewer are where they are off it by less than this, or leave less than half of its squares.
+_MANY_POINTS, _AGREES_M, _UNEXPLAINED = 48, 0.003, 0.5**0.5
 # A camera that stands leaves the background within so many pixels of the followed picture.
 _STANDS_PX = 0.5
 ROUNDS = 5
@@ -104,7 +107,8 @@ def place_body(
     `camera` is the source's, `scale` the size of the pictures in which the body was followed by the
     source's. `follows[i]` says that frame i comes directly after frame i - 1: nothing is smoothed
     across other borders. `path` is where outlines put the body, which frames without a pattern go
-    by. `visited` is called at each of the `ROUNDS` visits of a frame.
+    by, or with one of few points that is not the body's. `visited` is called at each of the
+    `ROUNDS` visits of a frame.
 
     The clothes' pattern says how the body moves, or their outline, never the head's turn. What they
     do not say is where it stood: upright and turned to the camera on the whole, unless the
@@ -184,7 +188,7 @@ class _Run:
                 self.body, self.camera, self.scale, self.sightings, start, along, visited
             )
             pivot = start(self.body.neck_m)
-            found = self._near_the_head(found, pivot)
+            found = self._relied_on(self._near_the_head(found, pivot), pivot)
             count = sum(motion is not None for motion in found)
             motions = _filled(found, along, pivot, self.stretch)
             if _extent_m(self.body, motions, pivot) < _STILL_M:
@@ -198,6 +202,48 @@ class _Run:
             back = [motion.undone()(place) for motion, place in zip(motions, necks_m)]
             start = RigidMotion(turn, np.median(back, axis=0) - turn @ self.body.neck_m)
         return motions, start, count
+
+    def _relied_on(
+        self, motions: Sequence[RigidMotion | None], pivot_m: Float[np.ndarray, "3"]
+    ) -> list[RigidMotion | None]:
+        """Motions without those of few points, where outlines say how the body moves.
+
+        What a few of them follow over a plain shirt may be what stays where it is in the picture:
+        its last rows, a film's compression. So they must tell most of what outlines do.
+        """
+        if self.path is None:
+            return list(motions)
+        told = self.path.told
+        frames = zip(self.sightings, motions, self.path.motions(), told)
+        # The first frame's points rest in it by definition: they tell nothing.
+        both = [
+            (sighting.num_seen, motion, way)
+            for sighting, motion, way, tells in [*frames][1:]
+            if tells and motion is not None
+        ]
+        if both and not self._agree(both, pivot_m):
+            return [None] * len(motions)
+        return [
+            motion if k == 0 or sighting.is_followed or not told[k] else None
+            for k, (motion, sighting) in enumerate(zip(motions, self.sightings))
+        ]
+
+    def _agree(
+        self,
+        both: Sequence[tuple[int, RigidMotion, RigidMotion]],
+        pivot_m: Float[np.ndarray, "3"],
+    ) -> bool:
+        """Whether motions of so many points are the body's, as those by its outlines beside are."""
+        if np.median([count for count, _, _ in both]) >= _MANY_POINTS:
+            return True
+        marks = _marks_m(self.body, pivot_m)
+        points_px, outline_px = (
+            np.array([self.camera.project(motion(marks)) for motion in way])
+            for way in ([one for _, one, _ in both], [way for _, _, way in both])
+        )
+        px_per_m = self.camera.px_per_m(pivot_m[2])
+        moved_m, apart_m = (_spread(px) / px_per_m for px in (outline_px, points_px - outline_px))
+        return bool(apart_m < max(_AGREES_M, _UNEXPLAINED * moved_m))
 
     def _near_the_head(
         self, motions: Sequence[RigidMotion | None], pivot_m: Float[np.ndarray, "3"]
@@ -232,6 +278,17 @@ class _Run:
 def _away(points_m: Float[np.ndarray, "F 3"]) -> Float[np.ndarray, "F"]:
     """Distances to the median point."""
     return np.linalg.norm(points_m - np.median(points_m, axis=0), axis=1)
+
+
+def _marks_m(body: BodyMesh, neck_m: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+    """The neck's joint, where it is, and the shoulders."""
+    return np.stack([body.neck_m, *body.shoulders_m]) - body.neck_m + neck_m
+
+
+def _spread(places: Float[np.ndarray, "F M d"]) -> float:
+    """How far marks are from where each mostly is, root mean square."""
+    away = places - np.median(places, axis=0)
+    return float(np.sqrt((away**2).sum(-1).mean()))
 
 
 def _filled(
@@ -279,7 +336,7 @@ def _extent_m(
     body: BodyMesh, motions: Sequence[RigidMotion], neck_m: Float[np.ndarray, "3"]
 ) -> float:
     """How far the neck's joint and the shoulders go from where they mostly are."""
-    marks = np.stack([body.neck_m, *body.shoulders_m]) - body.neck_m + neck_m
+    marks = _marks_m(body, neck_m)
     places = np.array([motion(marks) for motion in motions])
     away = np.linalg.norm(places - np.median(places, axis=0), axis=-1).max(1)
     return float(np.percentile(away, 98))

@@ -19,7 +19,7 @@ _ROBUST_PX = 0.7
 # A frame's motion is drawn to the one before it by so much, so that few or flat points do not let
 # it wander: standard deviations from frame to frame.
 _TURN_RAD, _SHIFT_M = 0.05, 0.02
-LEAST_POINTS = 8
+_LEAST_POINTS = 8
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ def fit_rigid_motion(
     which directions of the picture a place counts. Turns are drawn to those of `before` about
     `pivot_m`. None where too few points agree.
     """
-    if len(points_m) < LEAST_POINTS:
+    if len(points_m) < _LEAST_POINTS:
         return None
     sigma_px = _ROBUST_PX / scale
     motion = before
@@ -92,6 +92,6 @@ def fit_rigid_motion(
             break
     away = camera.project(motion(points_m)) - seen_px
     away = np.sqrt((away * (certainty @ away[..., None])[..., 0]).sum(1).clip(0))
-    if np.count_nonzero(away < 2 * sigma_px) < max(LEAST_POINTS, 0.3 * len(away)):
+    if np.count_nonzero(away < 2 * sigma_px) < max(_LEAST_POINTS, 0.3 * len(away)):
         return None
     return motion, float(np.median(away))

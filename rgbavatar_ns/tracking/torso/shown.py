@@ -46,7 +46,7 @@ def body_shown(
 
     The camera is the matte's, `head_px` the vertices of the whole mesh with the fitted head.
     """
-    px_per_m = camera.focal_px / (camera.distance_m - neck_m[2])
+    px_per_m = camera.px_per_m(neck_m[2])
     placed = RigidMotion(np.eye(3), neck_m - body.neck_m)
     torso = _silhouette(camera.project(placed(body.vertices_m)), body.faces, matte.shape)
     head = _silhouette(head_px, body.head_faces, matte.shape)

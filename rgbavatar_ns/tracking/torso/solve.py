@@ -7,7 +7,7 @@ import numpy as np
 from rgbavatar_ns.tracking.fit.camera import StillCamera
 from rgbavatar_ns.tracking.torso.body_mesh import BodyMesh
 from rgbavatar_ns.tracking.torso.follow import BodySighting
-from rgbavatar_ns.tracking.torso.rigid_motion import LEAST_POINTS, RigidMotion, fit_rigid_motion
+from rgbavatar_ns.tracking.torso.rigid_motion import RigidMotion, fit_rigid_motion
 
 
 def run_motions(
@@ -39,8 +39,7 @@ def run_motions(
             places_m, near, certainty = first
         chosen = sighting.chosen_px
         found, fitted = not motions and chosen is not None and len(chosen) > 0, None
-        # The follower left fewer alone: it tells none of them.
-        if len(places_m) >= LEAST_POINTS:
+        if len(places_m):
             seen = near & np.isfinite(sighting.seen_px[:, 0])
             fitted = fit_rigid_motion(
                 places_m[seen],
@@ -61,5 +60,5 @@ def run_motions(
                 places_m = last.undone()(places_m)
                 assert sighting.certainty is not None
                 certainty = sighting.certainty
-            first = first or (places_m, near, certainty)
+            first = first or ((places_m, near, certainty) if len(places_m) else None)
     return motions
