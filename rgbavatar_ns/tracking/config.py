@@ -20,9 +20,9 @@ class TrackConfig(CheckedOptions):
     max_frames: Count | None = None
     """Read at most so many frames in all; None reads everything."""
     focal_px: Annotated[float, Between(1, 1e6)] | None = None
-    """Focal length in pixels of the source frame, .25 to 50 times its longer side; None takes three
-    times that side. FaceMesh sees a head as from afar wherever the camera is: the true focal length
-    of a camera half a metre away makes a worse head."""
+    """Focal length in pixels of the source frame, .25 to 50 times its longer side; None takes
+    the camera to be 1.1 m away. FaceMesh sees a head as from there wherever the camera is: the true
+    focal length of a camera half a metre away makes a worse head."""
     identity_components: Annotated[int, Between(1, 1000)] = 30
     """How many identity components of the head model are fitted."""
     key_frames: Annotated[int, Between(1, 1000)] = 12

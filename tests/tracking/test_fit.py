@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from rgbavatar_ns.head import HeadModel
+from rgbavatar_ns.tracking.face.detector import face_height_px
 from rgbavatar_ns.tracking.face.iris import FoundIrises
 from rgbavatar_ns.tracking.fit.fit import fit_clip, key_frame_positions
 from rgbavatar_ns.tracking.fit.subject import SubjectTracker
@@ -66,11 +67,21 @@ def test_an_error_that_all_frames_share_makes_no_deeper_face(head: HeadModel, se
     assert deeper.std() < 0.001
 
 
-def test_a_camera_that_nobody_names_is_far_off(head: HeadModel) -> None:
+def test_a_camera_that_nobody_names_is_as_far_off_as_faces_look(head: HeadModel) -> None:
+    """Whatever the picture's size, and however much of it the face fills; but no lens is wider than
+    .7 longer sides."""
     tracker, _, _, points = acted(head, 2, key_frames=1)
     unknown = SubjectTracker(head, replace(tracker.config, focal_px=None))
-    for width, height in ((320, 240), (240, 320)):
-        assert unknown.fit_subject(points, width, height).camera.focal_px == 3 * 320
+    for width, height in ((320, 240), (240, 320), (800, 600)):
+        camera = unknown.fit_subject(points, width, height).camera
+        assert camera.focal_px == pytest.approx(1.1 / 0.19 * np.median(face_height_px(points)))
+        assert camera.distance_m == pytest.approx(1.1, abs=0.05)
+    assert unknown.fit_subject(0.5 * points, 320, 240).camera.focal_px == pytest.approx(
+        0.5 * unknown.fit_subject(points, 320, 240).camera.focal_px
+    )
+    far = unknown.fit_subject(0.1 * points, 320, 240).camera
+    assert far.focal_px == pytest.approx(0.7 * 320)
+    assert far.distance_m > 1.2
     assert tracker.fit_subject(points, 320, 240).camera.focal_px == CAMERA.focal_px
 
 

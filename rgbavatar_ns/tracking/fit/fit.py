@@ -19,9 +19,11 @@ from rgbavatar_ns.tracking.fit.outline import OutlineCost, OutlineTerms, PersonO
 _Values = Float[np.ndarray, "P"]
 _Packed = Float[np.ndarray, "Q"]
 
-# Longer sides of the picture. FaceMesh's points look as if seen from afar wherever the camera is:
-# of .9 to 3 the longest explained them best, those of people drawn from .45 m away too.
-_FAR = 3.0
+# FaceMesh's points look as if seen from about so far wherever the camera is; its response was
+# learned from there.
+_USUAL_DISTANCE_M = 1.1
+# Longer sides of the picture: no face of a film is seen by a wider lens.
+_WIDEST = 0.7
 _IDENTITY_WIDTH = 1.0  # principal components, of variance 1
 # Of them in depth, beside that, once a frame: from in front landmarks hardly show a face's depth,
 # and what they err by is mostly the same in all of a person's frames, so that twelve tell of it
@@ -75,14 +77,14 @@ def fit_subject(
     identity_components: int,
     focal_px: float,
 ) -> SubjectFit:
-    """Identity and camera distance from key frames."""
+    """Identity from key frames, at the distance that their faces' size says."""
     camera = initial_camera(keys, focal_px, (width / 2, height / 2))
     return _fit_keys(cost, keys, camera, identity_components, 15)
 
 
-def far_focal_px(width: int, height: int) -> float:
-    """The focal length, in pixels of such frames, by which unknown cameras are told as far off."""
-    return max(width, height) * _FAR
+def usual_focal_px(face_px: float, width: int, height: int) -> float:
+    """The focal length by which faces of such a height are as far off as FaceMesh's points look."""
+    return max(face_px * _USUAL_DISTANCE_M / _HEAD_HEIGHT_M, max(width, height) * _WIDEST)
 
 
 def initial_camera(

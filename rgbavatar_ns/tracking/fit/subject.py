@@ -34,7 +34,6 @@ from rgbavatar_ns.tracking.face.iris import FoundIrises
 from rgbavatar_ns.tracking.fit.fit import (
     ClipFit,
     SubjectFit,
-    far_focal_px,
     fit_clip,
     fit_key,
     fit_outlines,
@@ -42,6 +41,7 @@ from rgbavatar_ns.tracking.fit.fit import (
     initial_camera,
     key_frame_positions,
     subject_offsets,
+    usual_focal_px,
 )
 from rgbavatar_ns.tracking.fit.irises import iris_places
 from rgbavatar_ns.tracking.fit.landmark_cost import FrameCost, Target
@@ -183,7 +183,9 @@ class SubjectTracker:
         targets = self.targets(landmarks_px[list(positions)])
         if not targets:
             return {}
-        camera = initial_camera(targets, self._focal_px(width, height), (width / 2, height / 2))
+        camera = initial_camera(
+            targets, self._focal_px(landmarks_px, width, height), (width / 2, height / 2)
+        )
         values = np.array([fit_key(self.cost, camera, target) for target in targets])
         average = np.zeros(self.cost.head.num_identity)
         fit = ClipFit(SubjectFit(average, camera, values), values)
@@ -206,7 +208,7 @@ class SubjectTracker:
         key_irises = None if irises is None else irises.of(positions)
         targets = self.targets(landmarks_px[positions], key_irises)
         shared = min(self.config.identity_components, self.cost.head.num_identity)
-        focal_px = self._focal_px(width, height)
+        focal_px = self._focal_px(landmarks_px, width, height)
         subject = fit_subject(self.cost, targets, width, height, shared, focal_px)
         if outlines:
             outline_cost = OutlineCost(self.head, self.cost.parameters.columns, shared)
@@ -217,8 +219,12 @@ class SubjectTracker:
         self.cost = replace(self.cost, head=self.cost.head.with_offsets(offsets))
         return subject
 
-    def _focal_px(self, width: int, height: int) -> float:
-        return self.config.focal_px or far_focal_px(width, height)
+    def _focal_px(
+        self, landmarks_px: Float[np.ndarray, "F 478 2"], width: int, height: int
+    ) -> float:
+        return self.config.focal_px or usual_focal_px(
+            float(np.median(face_height_px(landmarks_px))), width, height
+        )
 
     def thetas(self, fit: ClipFit) -> Float[np.ndarray, "F H"]:
         """theta of every frame, upon the body where that is known."""
