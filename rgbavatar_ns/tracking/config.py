@@ -21,8 +21,8 @@ class TrackConfig(CheckedOptions):
     """Read at most so many frames in all; None reads everything."""
     focal_px: Annotated[float, Between(1, 1e6)] | None = None
     """Focal length in pixels of the source frame, .25 to 50 times its longer side; None takes
-    the camera to be 1.1 m away. FaceMesh sees a head as from there wherever the camera is: the true
-    focal length of a camera half a metre away makes a worse head."""
+    the head to be .9 to .95 m away. FaceMesh sees it as from about there wherever the camera is:
+    the true focal length of a camera half a metre away makes a worse head."""
     identity_components: Annotated[int, Between(1, 1000)] = 30
     """How many identity components of the head model are fitted."""
     key_frames: Annotated[int, Between(1, 1000)] = 12

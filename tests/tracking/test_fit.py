@@ -74,7 +74,7 @@ def test_a_camera_that_nobody_names_is_as_far_off_as_faces_look(head: HeadModel)
     unknown = SubjectTracker(head, replace(tracker.config, focal_px=None))
     for width, height in ((320, 240), (240, 320), (800, 600)):
         camera = unknown.fit_subject(points, width, height).camera
-        assert camera.focal_px == pytest.approx(1.1 / 0.19 * np.median(face_height_px(points)))
+        assert camera.focal_px == pytest.approx(5.8 * np.median(face_height_px(points)))
         assert camera.distance_m == pytest.approx(1.1, abs=0.05)
     assert unknown.fit_subject(0.5 * points, 320, 240).camera.focal_px == pytest.approx(
         0.5 * unknown.fit_subject(points, 320, 240).camera.focal_px

@@ -19,10 +19,10 @@ from rgbavatar_ns.tracking.fit.outline import OutlineCost, OutlineTerms, PersonO
 _Values = Float[np.ndarray, "P"]
 _Packed = Float[np.ndarray, "Q"]
 
-# FaceMesh's points look as if seen from about so far wherever the camera is; its response was
-# learned from there.
-_USUAL_DISTANCE_M = 1.1
-# Longer sides of the picture: no face of a film is seen by a wider lens.
+# Heights of the face: heads come to stand .9 to .95 m from the camera, from where FaceMesh's points
+# of real people look as if seen, wherever the camera is (benchmarks/quality/camera_distance.py).
+_FOCAL_BY_FACE = 5.8
+# Longer sides of the picture: faces that ask for a wider lens are taken to be farther away.
 _WIDEST = 0.7
 _IDENTITY_WIDTH = 1.0  # principal components, of variance 1
 # Of them in depth, beside that, once a frame: from in front landmarks hardly show a face's depth,
@@ -84,7 +84,7 @@ def fit_subject(
 
 def usual_focal_px(face_px: float, width: int, height: int) -> float:
     """The focal length by which faces of such a height are as far off as FaceMesh's points look."""
-    return max(face_px * _USUAL_DISTANCE_M / _HEAD_HEIGHT_M, max(width, height) * _WIDEST)
+    return max(face_px * _FOCAL_BY_FACE, max(width, height) * _WIDEST)
 
 
 def initial_camera(

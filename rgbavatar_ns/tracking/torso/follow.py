@@ -54,10 +54,10 @@ class BodySighting:
 
     `run` counts up where the body cannot be followed from the frame before. `seen_px` are the
     points last chosen, NaN where they are lost; `chosen_px` are those chosen anew in this frame,
-    from here on, none on a shirt without a pattern, whose places count as far as their `certainty`
-    says. `background_px` is how far
-    the background has moved since then, NaN where too little of it is seen. `covered` is the share
-    of the clothes in the picture that something is before, NaN where that is not known.
+    from here on, whose places count as far as their `certainty` says: none of a shirt without a
+    pattern. `background_px` is how far the background has moved since then, NaN where too little of
+    it is seen. `covered` is the share of the clothes in the picture that something is before, NaN
+    where that is not known.
     """
 
     run: int

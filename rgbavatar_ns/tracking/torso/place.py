@@ -30,7 +30,8 @@ _DOUBTED_YAW_RAD, _DOUBTED_ROLL_RAD = 0.2, 0.035
 _COVERED = 0.05
 _LEAST_FRAMES = 10
 # So many points are the shirt's own, whatever its outline does: an arm moves that, a neighbour.
-# Fewer are where they are off it by less than this, or leave less than half of its squares.
+# Fewer are its own where their motion is off the outline's by less than this (root mean square), or
+# by less than this share of how far that goes: half of its squares.
 _MANY_POINTS, _AGREES_M, _UNEXPLAINED = 48, 0.003, 0.5**0.5
 # A camera that stands leaves the background within so many pixels of the followed picture.
 _STANDS_PX = 0.5

@@ -60,5 +60,5 @@ def run_motions(
                 places_m = last.undone()(places_m)
                 assert sighting.certainty is not None
                 certainty = sighting.certainty
-            first = first or ((places_m, near, certainty) if len(places_m) else None)
+                first = first or (places_m, near, certainty)
     return motions
