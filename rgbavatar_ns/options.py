@@ -1,11 +1,11 @@
-"""Ranges of options, written where an option is declared and checked in one place."""
+"""Ranges and choices of options, written where an option is declared and checked in one place."""
 
 import dataclasses
 import inspect
 import math
 from collections.abc import Mapping, Sequence
 from functools import cache
-from typing import Annotated, Any, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
 from rgbavatar_ns.errors import UserError
 
@@ -53,13 +53,13 @@ Positive = Annotated[float, Between(1e-9, 1e9)]
 def check_options(
     owner: Any, values: Mapping[str, Any], prefix: str = "", more: Ranges | None = None
 ) -> None:
-    """Raise UserError for the first value that leaves the range of its annotation.
+    """Raise UserError for the first value that leaves the range or choices of its annotation.
 
     owner: the class or function whose annotations declare the options; `more` has ranges of
     classes whose declarations are not ours. Tuples are checked item by item, dataclasses and
     mappings within as well. prefix: of the options' names in an error.
     """
-    declared = _declared_bounds(owner)
+    declared, choices = _declared_bounds(owner), _declared_choices(owner)
     others: dict[str, Between] = {}
     for kind in inspect.getmro(owner) if isinstance(owner, type) else ():
         others.update((more or {}).get(kind, {}))
@@ -68,6 +68,8 @@ def check_options(
         for item in value if isinstance(value, tuple | list) else (value,):
             for bound in bounds:
                 _check(prefix + name, item, bound)
+            if isinstance(item, str) and name in choices:
+                _check_choice(prefix + name, item, choices[name])
             _check_within(item, f"{prefix}{name}.", more)
 
 
@@ -76,6 +78,18 @@ def _declared_bounds(owner: Any) -> Mapping[str, Sequence[Between]]:
     """The bounds of each name that a class or function annotates."""
     hints = get_type_hints(owner, include_extras=True)
     return {name: _bounds(hint) for name, hint in hints.items()}
+
+
+@cache
+def _declared_choices(owner: Any) -> Mapping[str, tuple[Any, ...]]:
+    """What each name that is annotated as one of some words, or None, can be."""
+    found = {}
+    for name, hint in get_type_hints(owner).items():
+        parts = [part for part in get_args(hint) or (hint,) if part is not type(None)]
+        literal = hint if get_origin(hint) is Literal else parts[0] if len(parts) == 1 else None
+        if get_origin(literal) is Literal:
+            found[name] = get_args(literal)
+    return found
 
 
 def _check_within(value: Any, prefix: str, more: Ranges | None) -> None:
@@ -87,10 +101,10 @@ def _check_within(value: Any, prefix: str, more: Ranges | None) -> None:
 
 
 class CheckedOptions:
-    """Base of the dataclasses of options: refuses values out of range as they are made."""
+    """Base of the dataclasses of options: refuses what is out of range as they are made."""
 
     def __post_init__(self) -> None:
-        """Raise UserError for a value that leaves its range."""
+        """Raise UserError for a value that leaves its range or choices."""
         check_options(type(self), vars(self))
 
 
@@ -116,3 +130,11 @@ def _check(name: str, value: Any, bounds: Between) -> None:
     if not number or math.isnan(value) or not bounds.holds(value):
         option = "--" + name.replace("_", "-")
         raise UserError(f"{option} is {value!r}.", f"Give a number {bounds}.")
+
+
+def _check_choice(name: str, value: str, choices: tuple[Any, ...]) -> None:
+    if value not in choices:
+        *others, last = map(repr, choices)
+        option = "--" + name.replace("_", "-")
+        allowed = f"{', '.join(others)} or {last}" if others else last
+        raise UserError(f"{option} is {value!r}.", f"Give {allowed}.")

@@ -1,5 +1,5 @@
 from dataclasses import dataclass, field
-from typing import Annotated
+from typing import Annotated, Literal
 
 import pytest
 from hypothesis import given
@@ -21,6 +21,8 @@ class Outer(CheckedOptions):
     opacity: Annotated[float, Between(0, 1, open=True)] = 0.5
     inner: Inner = field(default_factory=Inner)
     free: float = 0.0
+    shape: Literal["round", "flat", "none"] = "round"
+    engine: Literal["own", "host"] | None = None
 
 
 @pytest.mark.parametrize(
@@ -31,6 +33,8 @@ class Outer(CheckedOptions):
         ({"color": (0.5, 1.5)}, "--color is 1.5."),
         ({"opacity": 1.0}, r"from 0 to 1 \(both excluded\)"),
         ({"opacity": float("nan")}, "--opacity is nan"),
+        ({"shape": "square"}, "--shape is 'square'. Give 'round', 'flat' or 'none'."),
+        ({"engine": "none"}, "--engine is 'none'. Give 'own' or 'host'."),
     ],
 )
 def test_a_value_out_of_its_range_is_told_with_its_option(given_values, told):
@@ -60,3 +64,8 @@ def test_options_within_are_named_by_their_path_and_hosts_have_ranges_too():
     with pytest.raises(UserError, match=r"--groups\.a\.rate is 0\.0"):
         check_options(Outer, {"groups": {"a": inner}})
     check_options(Outer, {"free": float("inf"), "count": None})
+
+
+def test_every_choice_is_taken():
+    assert Outer(shape="none", engine="host").shape == "none"
+    assert Outer(engine=None).engine is None

@@ -64,21 +64,6 @@ class AvatarConfig(MethodConfig):
     initial_color: Share = 0.5
     """Initial grey value (paper: "a default value"; release: .5)."""
 
-    def __post_init__(self) -> None:
-        """Refuse values that cannot make an avatar."""
-        super().__post_init__()
-        for name, choices in (
-            ("weight_network", ("mlp", "linear", "none")),
-            ("carrier", ("mesh", "joints")),
-            ("tangent_variant", ("normalized", "raw", "orthonormal")),
-        ):
-            if getattr(self, name) not in choices:
-                *others, last = map(repr, choices)
-                raise UserError(
-                    f"The avatar's {name} is {getattr(self, name)!r}.",
-                    f"Give {', '.join(others)} or {last}.",
-                )
-
 
 def _from_json(kind: type[Any], values: dict[str, Any]) -> Any:
     defaults = kind()
