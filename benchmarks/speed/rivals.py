@@ -20,6 +20,7 @@ from rgbavatar_ns import Avatar
 from rgbavatar_ns.avatar import AvatarConfig
 from rgbavatar_ns.avatar.loading import METHODS
 from rgbavatar_ns.avatar.training import TrainingBatch, TrainingOptions, TrainingStep
+from rgbavatar_ns.avatar.training.freed_memory import keep_freed_memory
 from rgbavatar_ns.avatar.training.method_step import MethodStep
 from rgbavatar_ns.head import uv_anchors
 from rgbavatar_ns.synthetic import DemoConfig, film_demo
@@ -44,6 +45,7 @@ def main() -> None:
     parser.add_argument("--all-harmonics", action="store_true")
     given = parser.parse_args()
     torch.set_num_threads(1)
+    keep_freed_memory()  # as ns-train does
     film = film_demo(DemoConfig(image_size=given.size, num_frames=_FRAMES, num_test_frames=0))
     head, identity = film.person.head, film.person.identity
     batches = [

@@ -1,11 +1,13 @@
 """What a head model's expressions do to Gaussians that lie on it, and what they learn to do."""
 
 from collections.abc import Callable
+from typing import Any
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
 
 from rgbavatar_ns.avatar.methods.carriers import SmoothSurface
 from rgbavatar_ns.errors import UserError
@@ -106,7 +108,43 @@ class ExpressionBases(nn.Module):
         self, name: str, own: Float[Tensor, "N B M"], width: int | None = None
     ) -> Float[Tensor, "B N W"]:
         """What was learned of an attribute, or of its first `width` numbers, for `own_weights`."""
-        return torch.bmm(own, self.get_parameter(name)[..., :width]).transpose(0, 1)
+        bases = self.get_parameter(name)
+        width = bases.shape[2] if width is None else width
+        return _Weighted.apply(own, bases, width).transpose(0, 1)
+
+
+class _Weighted(torch.autograd.Function):
+    """own @ bases[..., :width], whose gradient for the bases is written once, as they lie.
+
+    Autograd's own goes through memory three times as often, and for these is most of a step.
+    """
+
+    @staticmethod
+    def forward(
+        ctx: Any, own: Float[Tensor, "N B M"], bases: Float[Tensor, "N M C"], width: int
+    ) -> Float[Tensor, "N B W"]:
+        ctx.save_for_backward(own, bases)
+        return torch.bmm(own, bases[..., :width])
+
+    @staticmethod
+    @once_differentiable
+    def backward(  # pyright: ignore[reportIncompatibleMethodOverride]
+        ctx: Any, *grad_outputs: Tensor
+    ) -> tuple[Tensor | None, Tensor | None, None]:
+        (own, bases), (gradient,) = ctx.saved_tensors, grad_outputs
+        width = gradient.shape[2]
+        of_own = of_bases = None
+        if ctx.needs_input_grad[0]:
+            of_own = torch.bmm(gradient, bases[..., :width].mT)
+        if ctx.needs_input_grad[1]:
+            of_bases = torch.empty_like(bases)
+            of_bases[..., width:] = 0
+            if own.shape[1] == 1:
+                # A product of two vectors for each Gaussian, which bmm is slow at.
+                torch.mul(own.mT, gradient, out=of_bases[..., :width])
+            else:
+                of_bases[..., :width] = torch.bmm(own.mT, gradient)
+        return of_own, of_bases, None
 
 
 def basis_weights(head: HeadModel, theta: Float[Tensor, "B H"]) -> Float[Tensor, "B P"]:

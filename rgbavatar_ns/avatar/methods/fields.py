@@ -1,11 +1,12 @@
 """Attributes as functions of place and theta: positional encoding and multilayer perceptrons."""
 
 from collections.abc import Iterator, Sequence
+from functools import cache
 from typing import Any, Literal
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
@@ -22,7 +23,32 @@ def positional_encoding(x: Float[Tensor, "*n D"], octaves: int) -> Float[Tensor,
     return torch.cat([x, *waves], -1)
 
 
+Precision = Literal["auto", "float32", "bfloat16"]
+"""In what a field's products are: with auto bfloat16 where a processor has instructions for it."""
+
+
+def multiplied_in(precision: Precision, values: Tensor) -> torch.dtype:
+    """The type in which `values` are multiplied; those of double precision, and on a GPU, as is.
+
+    Sums are single precision either way.
+    """
+    if precision == "float32" or values.dtype != torch.float32:
+        return values.dtype
+    if precision == "auto" and (values.device.type != "cpu" or not _has_bfloat16()):
+        return torch.float32
+    return torch.bfloat16
+
+
+@cache
+def _has_bfloat16() -> bool:
+    """Whether this processor multiplies bfloat16 itself; False where torch cannot tell."""
+    told = getattr(torch.cpu, "get_capabilities", dict)()
+    return any(told.get(name, False) for name in ("avx512_bf16", "amx_bf16"))
+
+
 _SHARPNESS, _FLAT_FROM = 100.0, 0.2
+_LINEAR_FROM = 20.0
+"""Sharpness times x from which torch's softplus is x itself."""
 
 
 def sharp_softplus(x: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
@@ -32,7 +58,24 @@ def sharp_softplus(x: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
     take a hundred times as long as with others: ten times as long for a whole step on an Intel
     Xeon. Source: MonoGaussianAvatar (`geometry_network.py`); the flat tail is ours.
     """
-    return F.softplus(x.clamp(min=-_FLAT_FROM), beta=_SHARPNESS)
+    return _SharpSoftplus.apply(x)
+
+
+class _SharpSoftplus(torch.autograd.Function):
+    """`sharp_softplus`; autograd's gradient of the clamp takes longer than all the rest."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
+        held = x.clamp(min=-_FLAT_FROM)
+        ctx.save_for_backward(held)
+        return F.softplus(held, beta=_SHARPNESS)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *grad_outputs: Tensor) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
+        (held,) = ctx.saved_tensors
+        slope = torch.ops.aten.softplus_backward(grad_outputs[0], held, _SHARPNESS, _LINEAR_FROM)
+        return torch.ops.aten.threshold_backward(slope, held, -_FLAT_FROM)
 
 
 class MLP(nn.Module):
@@ -43,7 +86,8 @@ class MLP(nn.Module):
     itself and adds, so that nothing is repeated N or B times. With `skip_at` = k the k-th hidden
     layer (from 0) takes the input again, behind what the last one gave. Initial values are those of
     `torch.nn.Linear`, drawn from `generator`, those of the output times `last_scale`: with 0 the
-    field begins at nothing.
+    field begins at nothing. `precision` is that of the layers' products: parameters, their
+    gradients and what the field gives are as the parameters are.
     """
 
     def __init__(
@@ -57,8 +101,10 @@ class MLP(nn.Module):
         skip_at: int | None = None,
         activation: Literal["relu", "softplus"] = "relu",
         last_scale: float = 1.0,
+        precision: Precision = "float32",
     ) -> None:
         super().__init__()
+        self.precision: Precision = precision
         if depth < 1 or (skip_at is not None and not 0 < skip_at < depth):
             raise ValueError(
                 f"skip_at is {skip_at} of {depth} hidden layers. Pass one of 1 to - 1."
@@ -82,11 +128,18 @@ class MLP(nn.Module):
         found = tuple(part.shape[-1] for part in parts)
         if found != self.part_widths:
             raise ValueError(f"The parts are {found} wide. Pass {self.part_widths}.")
-        if self.activation == "relu" and self.skip_at is None:
-            first, *others = (
-                p for layer in (*self.hidden, self.output) for p in layer.parameters()
-            )
-            return _ReluLayers.apply(_of_parts(parts, first, others[0]), *others[1:])
+        given, device = self.output.weight.dtype, self.output.weight.device.type
+        narrow = multiplied_in(self.precision, self.output.weight)
+        plain = self.activation == "relu" and self.skip_at is None
+        weight, bias, *others = (
+            p for layer in (*self.hidden, self.output) for p in layer.parameters()
+        )
+        with torch.autocast(device, narrow, enabled=narrow != given):
+            values = _of_parts(parts, weight, bias) if plain else self._layers(parts)
+        return (_ReluLayers.apply(values, *others) if plain else values).to(given)
+
+    def _layers(self, parts: tuple[Tensor, ...]) -> Tensor:
+        """One layer after another, through autograd."""
         values = None
         for index, layer in enumerate(self.hidden):
             assert isinstance(layer, nn.Linear)
@@ -115,6 +168,7 @@ def _of_parts(parts: tuple[Tensor, ...], weight: Tensor, bias: Tensor | None) ->
 
 _BLOCK_ROWS = 1024
 """Rows that go through all layers together: what they hold stays within a core's cache."""
+_ROUNDED_TO = 128
 
 
 class _ReluLayers(torch.autograd.Function):
@@ -122,22 +176,24 @@ class _ReluLayers(torch.autograd.Function):
 
     The gradient is written out, because most of its rows may be 0: no picture shows what is behind
     the head, or covered. Such rows add exactly nothing, and are left out. Values and gradients are
-    those of autograd; there is no second derivative.
+    those of autograd; there is no second derivative. Products are of the type of `first`, sums of
+    a gradient over blocks of rows of the layers' own.
     """
 
     @staticmethod
     def forward(ctx: Any, first: Float[Tensor, "..."], *layers: Tensor) -> Float[Tensor, "..."]:
-        rows = first.flatten(0, -2)
-        hidden = [torch.empty_like(rows)]
-        hidden += [rows.new_empty(len(rows), len(bias)) for bias in layers[1:-2:2]]
-        output = rows.new_empty(len(rows), len(layers[-1]))
+        rows, ctx.dtype = first.flatten(0, -2), layers[0].dtype
+        weights, biases = ([x.to(first.dtype) for x in layers[k::2]] for k in (0, 1))
+        values = [torch.empty_like(rows)]
+        values += [rows.new_empty(len(rows), len(bias)) for bias in biases]
         for block in _blocks(len(rows)):
-            torch.clamp(rows[block], min=0, out=hidden[0][block])
-            for weight, bias, below, above in zip(layers[::2], layers[1::2], hidden, hidden[1:]):
-                torch.addmm(bias, below[block], weight.mT, out=above[block]).clamp_(min=0)
-            torch.addmm(layers[-1], hidden[-1][block], layers[-2].mT, out=output[block])
-        ctx.save_for_backward(*hidden, *layers[::2])
-        return output.unflatten(0, first.shape[:-1])
+            torch.clamp(rows[block], min=0, out=values[0][block])
+            for k, (weight, bias) in enumerate(zip(weights, biases), 1):
+                torch.addmm(bias, values[k - 1][block], weight.mT, out=values[k][block])
+                if k < len(weights):
+                    values[k][block].clamp_(min=0)
+        ctx.save_for_backward(*values[:-1], *weights)
+        return values[-1].unflatten(0, first.shape[:-1])
 
     @staticmethod
     @once_differentiable
@@ -147,21 +203,32 @@ class _ReluLayers(torch.autograd.Function):
         saved, count = ctx.saved_tensors, len(ctx.saved_tensors) // 2
         hidden, weights = saved[:count], saved[count:]
         gradient = grad_outputs[0].flatten(0, -2)
-        alive = (gradient != 0).any(1).nonzero()[:, 0]
+        alive = _rows_of(gradient)
         of_first = torch.zeros_like(hidden[0])
-        of_weights = [torch.zeros_like(weight) for weight in weights]
-        of_biases = [weight.new_zeros(len(weight)) for weight in weights]
+        of_weights = [torch.zeros_like(weight, dtype=ctx.dtype) for weight in weights]
+        of_biases = [weight.new_zeros(len(weight), dtype=ctx.dtype) for weight in weights]
         for block in _blocks(len(alive)):
             rows = alive[block]
             above = gradient[rows]
             for k in reversed(range(count)):
                 below = hidden[k][rows]
-                of_weights[k].addmm_(above.mT, below)
-                of_biases[k] += above.sum(0)
-                above = (above @ weights[k]).mul_(below > 0)
+                of_weights[k] += above.mT @ below
+                of_biases[k] += above.sum(0, dtype=ctx.dtype)
+                above = torch.ops.aten.threshold_backward(above @ weights[k], below, 0)
             of_first[rows] = above
         of_layers = (part for pair in zip(of_weights, of_biases) for part in pair)
         return of_first.view(*grad_outputs[0].shape[:-1], -1), *of_layers
+
+
+def _rows_of(gradient: Float[Tensor, "n C"]) -> Int[Tensor, "M"]:
+    """Rows that are not all 0, and some that are, to make few different numbers of rows.
+
+    For each size of a product oneDNN makes code of its own and keeps it: half a megabyte.
+    """
+    alive = (gradient != 0).any(1)
+    rows = alive.nonzero()[:, 0]
+    missing = -len(rows) % _ROUNDED_TO
+    return torch.cat([rows, (~alive).nonzero()[:missing, 0]]) if missing else rows
 
 
 def _blocks(count: int) -> Iterator[slice]:

@@ -26,7 +26,7 @@ from torch import Tensor, nn
 
 from rgbavatar_ns.avatar.config import MethodConfig
 from rgbavatar_ns.avatar.method import AvatarMethod, DrawnBatch, FilmedBatch, Losses
-from rgbavatar_ns.avatar.methods.fields import MLP, positional_encoding
+from rgbavatar_ns.avatar.methods.fields import MLP, Precision, positional_encoding
 from rgbavatar_ns.avatar.methods.head_regions import MOUTH_GROUPS, group_vertices, hull_mask
 from rgbavatar_ns.avatar.methods.loss_terms import held_where, huber_loss
 from rgbavatar_ns.avatar.methods.neighbours import neighbour_distance
@@ -72,6 +72,9 @@ class FlashAvatarConfig(MethodConfig):
     """How many hidden layers it has."""
     octaves: Annotated[int, Between(0, 30)] = 8
     """Frequencies that encode a Gaussian's place at rest."""
+    network_precision: Precision = "auto"
+    """Of the network's products (ours): auto is bfloat16 on processors that multiply it, else
+    float32, the release's."""
     initial_opacity: Annotated[float, Between(0, 1, open=True)] = 0.1
     """Opacity of every Gaussian at first."""
     sh_degree: Annotated[int, Between(0, MAX_DEGREE)] = 3
@@ -142,6 +145,7 @@ class FlashAvatar(AvatarMethod):
             config.hidden_layers,
             _STRETCH.stop,
             generator=torch.Generator().manual_seed(seed),
+            precision=config.network_precision,
         ).to(identity)
         self._lpips = LPIPSLoss()
 

@@ -37,7 +37,7 @@ from torch import Tensor, nn
 from rgbavatar_ns.avatar.config import MethodConfig
 from rgbavatar_ns.avatar.method import AvatarMethod, DrawnBatch, FilmedBatch, Losses, WatchedStep
 from rgbavatar_ns.avatar.methods.density import prune_and_refill
-from rgbavatar_ns.avatar.methods.fields import MLP, positional_encoding, sharp_softplus
+from rgbavatar_ns.avatar.methods.fields import MLP, Precision, positional_encoding, sharp_softplus
 from rgbavatar_ns.avatar.methods.gaussian_rows import GaussianRows
 from rgbavatar_ns.avatar.methods.loss_terms import dssim_loss, held_where
 from rgbavatar_ns.avatar.model.image_loss import LPIPSLoss, l1_loss
@@ -88,6 +88,9 @@ class MonoGaussianAvatarConfig(MethodConfig):
     """Width of the three layers of the attributes' offsets."""
     octaves: Annotated[int, Between(0, 30)] = 6
     """Frequencies that encode a point's place for its attributes."""
+    network_precision: Precision = "auto"
+    """Of the products of attributes and their offsets (ours): auto is bfloat16 on processors that
+    multiply it, else float32, the release's. The deformer's are float32."""
     dssim_weight: Weight = 0.25
     """Weight of 1 - SSIM."""
     lpips_weight: Weight = 0.0
@@ -117,13 +120,10 @@ class DeformedPoints:
 class _Heads(nn.Module):
     """A hidden layer and an output for each attribute."""
 
-    def __init__(self, width: int, activation: Any, generator: torch.Generator) -> None:
+    def __init__(self, width: int, **options: Any) -> None:
         super().__init__()
         self.heads = nn.ModuleDict(
-            {
-                name: MLP([width], width, 1, size, generator=generator, activation=activation)
-                for name, size in _ATTRIBUTES.items()
-            }
+            {name: MLP([width], width, 1, size, **options) for name, size in _ATTRIBUTES.items()}
         )
 
     def forward(self, features: Float[Tensor, "*n C"]) -> dict[str, Float[Tensor, "*n _"]]:
@@ -181,6 +181,7 @@ class MonoGaussianAvatar(AvatarMethod):
         self._make_networks(generator)
         self._rows = GaussianRows(self, ("position", "seen"))
         self._lpips = LPIPSLoss()
+        self._of_means: tuple[Tensor, DeformedPoints] | None = None
 
     def _make_networks(self, generator: torch.Generator) -> None:
         config = self.config
@@ -198,12 +199,11 @@ class MonoGaussianAvatar(AvatarMethod):
             last_scale=0.0,
         )
         code = 3 * (1 + 2 * config.octaves)
-        self.attributes = MLP(
-            *([code], wide, 6, wide), generator=generator, skip_at=3, activation="softplus"
-        )
-        self.attribute_heads = _Heads(wide, "softplus", generator)
-        self.offsets = MLP([3], narrow, 2, narrow, generator=generator)
-        self.offset_heads = _Heads(narrow, "relu", generator)
+        made: dict[str, Any] = {"generator": generator, "precision": config.network_precision}
+        self.attributes = MLP([code], wide, 6, wide, skip_at=3, activation="softplus", **made)
+        self.attribute_heads = _Heads(wide, activation="softplus", **made)
+        self.offsets = MLP([3], narrow, 2, narrow, **made)
+        self.offset_heads = _Heads(narrow, **made)
         for network in (self.deformer, self.skinning.hidden, self.attributes):
             _draw_he_normal(network, generator)
         self.to(self.identity)
@@ -234,6 +234,7 @@ class MonoGaussianAvatar(AvatarMethod):
         theta = self.checked(theta)
         deformed = self.deformed()
         means = self._posed(deformed, theta)
+        self._of_means = (means, deformed) if torch.is_grad_enabled() else None
         # Of the head's motion the release's world has the turns; its translation is the camera's.
         with torch.no_grad():
             moved = means - self._translation(theta)[:, None] - deformed.place_at_rest
@@ -304,7 +305,7 @@ class MonoGaussianAvatar(AvatarMethod):
 
     def penalty(self, drawn: DrawnBatch, step: int) -> Losses:
         """How far the points' deformation is from the head model's at the nearest vertex."""
-        config, points = self.config, self.deformed()
+        config, points = self.config, self._deformed_for(drawn)
         places = points.place_at_rest.detach().cpu().numpy()
         nearest = torch.from_numpy(self._vertex_tree.query(places)[1]).to(self.position.device)
         factor = _halved(step // config.steps_per_epoch, _TERMS_HALVED)
@@ -320,6 +321,12 @@ class MonoGaussianAvatar(AvatarMethod):
             if weight > 0 and own.numel():
                 losses[name] = factor * weight * F.mse_loss(own, model[nearest])
         return losses
+
+    def _deformed_for(self, drawn: DrawnBatch) -> DeformedPoints:
+        """What a picture was drawn with, so that no step asks the deformer twice."""
+        known, self._of_means = self._of_means, None
+        same = known is not None and known[0] is drawn.gaussians.means
+        return known[1] if known is not None and same else self.deformed()
 
     def watches(self, step: int) -> bool:
         """All steps: what they draw opaque stays."""

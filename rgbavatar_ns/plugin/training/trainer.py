@@ -24,6 +24,7 @@ from torch import Tensor
 from rgbavatar_ns.avatar.storage.checkpoint_file import CONFIG_NAME
 from rgbavatar_ns.avatar.storage.stored_avatar import damage_of
 from rgbavatar_ns.avatar.training.batches import ChosenFrames, TrainingBatch
+from rgbavatar_ns.avatar.training.freed_memory import keep_freed_memory
 from rgbavatar_ns.avatar.training.loop import FitHooks, fit
 from rgbavatar_ns.avatar.training.step import Losses
 from rgbavatar_ns.errors import UserError
@@ -275,6 +276,8 @@ class RGBAvatarTrainer(EndingTrainer, FitHooks):
                 with device_errors_told(self.checkpoint_dir):
                     self._take = self.pipeline.training_step(self.optimizers)
                 say(f"Steps are {self._take.kind}: {self._take.reason}.")
+                if self._take.kind == "eager":
+                    keep_freed_memory()
                 with self._shown_progress():
                     fit(self._take, self._batch, self._steps(), self)
                 self._save_end()

@@ -3,7 +3,13 @@ import math
 import pytest
 import torch
 
-from rgbavatar_ns.avatar.methods.fields import MLP, positional_encoding, sharp_softplus
+from rgbavatar_ns.avatar.methods import fields
+from rgbavatar_ns.avatar.methods.fields import (
+    MLP,
+    multiplied_in,
+    positional_encoding,
+    sharp_softplus,
+)
 
 
 def seeded(seed: int = 0) -> torch.Generator:
@@ -104,3 +110,50 @@ def test_rows_without_a_gradient_are_left_out_of_it_exactly(alive):
     torch.testing.assert_close(field(place, theta), values)
     for own, expected in zip(found, torch.autograd.grad((values * weight).sum(), inputs)):
         torch.testing.assert_close(own, expected)
+
+
+@pytest.mark.parametrize("activation", ["relu", "softplus"])
+def test_half_as_long_numbers_give_nearly_the_same_values_and_gradients(activation):
+    made = [
+        MLP([3, 2], 32, 3, 4, generator=seeded(), activation=activation, precision=precision)
+        for precision in ("float32", "bfloat16")
+    ]
+    place, theta = normal(1, 1500, 3).float(), normal(2, 1, 2, seed=2).float()
+    weight = normal(2, 1500, 4, seed=3).float().abs()
+    found = []
+    for network in made:
+        inputs = [place.clone().requires_grad_(), theta.clone().requires_grad_()]
+        values = network(*inputs)
+        wanted = [*inputs, *network.parameters()]
+        found.append([values, *torch.autograd.grad((values * weight).sum(), wanted)])
+    # Where a unit is just on or just off, the gradient of a single place leaps.
+    allowed = [0.01, 0.1, *[0.02] * (len(found[0]) - 2)]
+    for exact, narrow, share in zip(*found, allowed):
+        assert narrow.dtype == torch.float32
+        with torch.no_grad():
+            assert 0 < float((narrow - exact).norm() / exact.norm()) < share
+
+
+def test_the_precision_follows_the_processor_unless_it_is_asked_for(monkeypatch):
+    single, double = torch.zeros(1), torch.zeros(1, dtype=torch.float64)
+    for known in (True, False):
+        monkeypatch.setattr(fields, "_has_bfloat16", lambda known=known: known)
+        assert multiplied_in("auto", single) == (torch.bfloat16 if known else torch.float32)
+        assert multiplied_in("bfloat16", single) == torch.bfloat16
+        assert multiplied_in("float32", single) == torch.float32
+        assert multiplied_in("auto", double) == multiplied_in("bfloat16", double) == torch.float64
+    on_a_gpu = torch.zeros(1, device="meta")
+    monkeypatch.setattr(fields, "_has_bfloat16", lambda: True)
+    assert multiplied_in("auto", on_a_gpu) == torch.float32
+
+
+@pytest.mark.parametrize("alive", [0, 1, 128, 129, 950, 1000])
+def test_a_gradients_rows_are_few_different_numbers_and_none_is_missing(alive):
+    gradient = torch.zeros(1000, 3)
+    chosen = torch.randperm(1000, generator=seeded())[:alive]
+    gradient[chosen, 1] = 1.0
+    rows = fields._rows_of(gradient)
+    assert len(rows.unique()) == len(rows)
+    assert set(chosen.tolist()) <= set(rows.tolist())
+    # A multiple of 128, or all there are.
+    assert len(rows) == min(-(-alive // 128) * 128, 1000)
