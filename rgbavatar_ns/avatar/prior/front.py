@@ -9,10 +9,16 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from rgbavatar_ns.avatar.avatar import Avatar
-from rgbavatar_ns.avatar.prior.mesh_field import MeshField
+from rgbavatar_ns.avatar.model.blendshapes import TangentBlendshapes
+from rgbavatar_ns.avatar.prior.mesh_field import MeshField, ramp
+from rgbavatar_ns.head.rotations import conjugate_quats_wxyz, turn_back
 
 _PIXEL_M = 1.5e-3
 _SMOOTH_PX = 2.0
+_TIP = 1.5
+"""Standard deviations from its centre at which a Gaussian ends."""
+_BEFORE_M = 4e-3, 8e-3
+"""From what a Gaussian's tip stands before the surface it counts, and from what altogether."""
 
 
 @dataclass(frozen=True)
@@ -68,3 +74,42 @@ class FrontSurface:
         inside = (column >= 0) & (row >= 0) & (column < columns) & (row < rows)
         inside &= self.there[row.clamp(0, rows - 1), column.clamp(0, columns - 1)]
         return torch.where(inside, found[0, 0, 0], torch.nan)
+
+    def overhang(
+        self, centres_m: Float[Tensor, "N 3"], axes_m: Float[Tensor, "N 3"]
+    ) -> Float[Tensor, "N"]:
+        """1 where Gaussians with these longest axes reach out before another part of the head.
+
+        Those below a chin that paint the throat from there hang before it like a beard, and from
+        in front it is all the same. What stands before the surface as a whole, as glasses, does
+        not count. Axes are as long as their standard deviations.
+        """
+        before_m = [
+            (place[:, 2] - self.at(place)).nan_to_num(nan=-1.0)
+            for place in (centres_m, centres_m + _TIP * axes_m, centres_m - _TIP * axes_m)
+        ]
+        farther_m = before_m[1].maximum(before_m[2]) - before_m[0].clamp(min=0)
+        return ramp(farther_m, *_BEFORE_M)
+
+
+def shorten_overhanging(
+    shapes: TangentBlendshapes,
+    front: FrontSurface,
+    rest_m: Float[Tensor, "N 3"],
+    frame_wxyz: Float[Tensor, "N 4"],
+    disc: Float[Tensor, "N 3"],
+    share: Float[Tensor, "N"],
+) -> None:
+    """Go by a share to the width of its disc along the longest axis of what overhangs.
+
+    rest_m: where Gaussians are on the head at rest; frame_wxyz turns its axes into those that
+    rotations are in; `disc` holds logarithms of scales. Ours, because from in front all that a
+    chin paints of a throat is the same, and turned heads had whiskers.
+    """
+    log_scale, longest = shapes.log_scale.max(1, keepdim=True)
+    axis = torch.zeros_like(shapes.log_scale).scatter_(1, longest, log_scale.exp())
+    for turn in (F.normalize(shapes.rotation_wxyz, dim=-1), frame_wxyz):
+        axis = turn_back(conjugate_quats_wxyz(turn), axis)
+    short = log_scale.minimum(disc[:, :2].mean(1, keepdim=True))
+    goes = share * front.overhang(rest_m, axis)
+    shapes.log_scale.scatter_(1, longest, log_scale.lerp(short, goes[:, None]))

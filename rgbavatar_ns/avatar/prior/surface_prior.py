@@ -20,7 +20,7 @@ from rgbavatar_ns.avatar.prior.discs import (
     log_overlap,
     narrow_ahead,
 )
-from rgbavatar_ns.avatar.prior.front import FrontSurface
+from rgbavatar_ns.avatar.prior.front import FrontSurface, shorten_overhanging
 from rgbavatar_ns.avatar.prior.leash import Leash
 from rgbavatar_ns.avatar.prior.mesh_field import MeshField, ramp
 from rgbavatar_ns.avatar.prior.mouth import HiddenMouth
@@ -233,6 +233,8 @@ class SurfacePrior(nn.Module):
         before_m = (before_m - front_m + shown * hidden_m).nan_to_num()
         depth = ((home - shapes.position) * view).sum(1) + before_m * ahead[2].to(disc)
         shapes.position.add_((_DEPTH_RATE * unturned * depth)[:, None] * view)
+        here = parts.rest_m + turn_back(turned, shapes.position)
+        shorten_overhanging(shapes, parts.front, here, field.rest_quats_wxyz, disc, parts.skin)
         # As far as nothing shows it, nothing else closes the surface around it.
         through = _SHINES_PX / (self.through_px + _SHINES_PX)
         alone = (pull / _RATE * through).square()
@@ -290,6 +292,7 @@ class SurfacePrior(nn.Module):
                     Leash(avatar, field),
                     strands,
                     narrow_ahead(field) * (1 - strands.haired),
+                    (1 - strands.haired) * ~field.body_gaussians,
                     FrontSurface.of(avatar, field),
                     field.at_gaussians(field.rest_m),
                     _SEEN_PX * _body_sizes(avatar, field),
@@ -308,6 +311,8 @@ class _Parts:
     strands: Strands
     narrow: Float[Tensor, "N"]
     """1 where the film's view says nothing of how far Gaussians reach along it."""
+    skin: Float[Tensor, "N"]
+    """1 of a head where no hair is."""
     front: FrontSurface
     rest_m: Float[Tensor, "N 3"]
     """Each one's place on the mesh at rest."""

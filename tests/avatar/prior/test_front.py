@@ -1,10 +1,13 @@
 """The surface that a camera in front sees, and what goes to it; bodies' strays."""
 
+import math
+
 import numpy as np
 import torch
 
 from rgbavatar_ns import Avatar
 from rgbavatar_ns.avatar.prior import SurfacePrior
+from rgbavatar_ns.avatar.prior.discs import disc_log_scale
 from rgbavatar_ns.avatar.prior.front import FrontSurface
 from rgbavatar_ns.avatar.prior.mesh_field import MeshField
 from rgbavatar_ns.avatar.prior.strands import Strands
@@ -86,6 +89,55 @@ def test_a_chin_that_paints_the_neck_lies_on_it():
     assert float((after - before - down)[chin, :2].abs().max()) < 2e-3, "along the view alone"
     left = (after[:, 2] - there_m)[chin].abs() / gap_m[chin]
     assert float(left.median()) < 0.2
+
+
+def test_what_hangs_before_another_part_is_as_short_as_its_disc_again():
+    """From each place of the skin a Gaussian hangs 18 mm down: chins before throats, brows not."""
+    avatar = embedded_avatar(name=EMBEDDED_BUST)
+    field, long_m = MeshField(avatar), 0.012
+    theta = turned(avatar, [-1.0, 0.0, 1.0])
+    images = drawn_thicker(avatar, theta, 0.0)
+    prior, shapes = SurfacePrior(avatar), avatar.blendshapes
+    prior.begin(avatar, theta, front_camera(), images)
+    rest, frame = field.at_gaussians(field.rest_m), field.rest_quats_wxyz
+    down = turn_back(frame, torch.tensor([0.0, -1.0, 0.0]).expand_as(rest))
+    # A half turn about the bisector takes the first axis to any direction.
+    half = torch.nn.functional.normalize(down + torch.tensor([1.0, 0.0, 0.0]), dim=1)
+    shapes.rotation_wxyz.data.copy_(torch.nn.functional.pad(half, (1, 0)))
+    shapes.log_scale.data[:, 0] = math.log(long_m)
+    centre = rest + turn_back(conjugate_quats_wxyz(frame), shapes.position.detach())
+    tips = [centre + torch.tensor([0.0, 1.5 * way * long_m, 0.0]) for way in (-1, 1)]
+    own, *others = (at[:, 2].numpy() - foremost_m(avatar, at) for at in (centre, *tips))
+    before_m = np.fmax(*others) - own.clip(0)
+    skin = Strands.of(avatar, field).haired == 0
+    plain = skin & ~field.body_gaussians & (field.at_gaussians(field.normals)[:, 1].abs() < 0.3)
+    hangs = skin & ~field.body_gaussians & torch.from_numpy(before_m > 0.015)
+    lies = plain & torch.from_numpy(np.abs(before_m) < 0.002) & (centre[:, 2] > 0.03)
+    assert int(hangs.sum()) >= 20
+    assert int(lies.sum()) >= 50
+    prior.look(avatar, theta, front_camera(), images)
+    prior.seen_px.fill_(1e3)
+    prior.pull(avatar, STEPS[0])
+    disc_m = disc_log_scale(avatar)[:, :2].mean(1).exp()
+    found_m = shapes.log_scale.detach()[:, 0].exp()
+    assert float((found_m / disc_m)[hangs].quantile(0.9)) < 1.05
+    assert float((found_m / long_m)[lies].quantile(0.1)) > 0.95
+
+
+def test_what_stands_off_as_a_whole_hangs_nowhere():
+    avatar = embedded_avatar(name=EMBEDDED_BUST)
+    field = MeshField(avatar)
+    front, rest = FrontSurface.of(avatar, field), field.at_gaussians(field.rest_m)
+    upon = rest.clone()
+    upon[:, 2] = front.at(rest)
+    brow = ~upon[:, 2].isnan() & (field.at_gaussians(field.normals)[:, 2] > 0.95)
+    brow &= rest[:, 1] > 0.04
+    assert int(brow.sum()) >= 15
+    upon, aside = upon[brow], torch.tensor([0.006, 0.0, 0.0]).expand(int(brow.sum()), 3)
+    off = torch.tensor([0.0, 0.0, 0.02])
+    assert float(front.overhang(upon + off, aside).max()) == 0, "as glasses do"
+    ahead = torch.tensor([0.0, 0.0, 0.02]).expand_as(aside)
+    assert float(front.overhang(upon, ahead).min()) == 1
 
 
 def test_what_of_a_body_strays_where_nothing_is_filmed_is_clear_until_it_is_back():
