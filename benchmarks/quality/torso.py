@@ -83,7 +83,7 @@ def measure(seed: int, body: Body, scene: Scene, size: int, frames: int) -> dict
         with torch.no_grad():
             ours = head(data.theta, data.identity).double().numpy()
             real = head(true, film.person.identity).double().numpy()
-        ours = ours - [0, 0, report["camera_distance_m"]]
+        ours = ours - [0, 0, float(data.cameras.world_to_camera[0, 2, 3])]
         seen_from = turned_to(middle_px[kept], camera)
         real = (real - [0, camera.height_m, camera.distance_m]) @ seen_from.swapaxes(1, 2)
         off = turns(head, data.theta) @ (seen_from @ turns(head, true)).swapaxes(1, 2)

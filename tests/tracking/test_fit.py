@@ -43,6 +43,8 @@ def test_known_performance_is_recovered_from_its_own_landmarks(head: HeadModel) 
     assert quality["reprojection_error_share"] < 0.01
     assert quality["mouth_opening_correlation"] > 0.95
     assert quality["eyelid_opening_correlation"] > 0.95
+    truly_m = np.linalg.norm(true.mean(1) - CAMERA.eye_m, axis=1)
+    assert quality["camera_distance_m"] == pytest.approx(np.median(truly_m), rel=0.03)
     assert tracker.rejected(fit, noisy) == []
     bounds = tracker.cost.parameters
     assert ((bounds.lower <= fit.values) & (fit.values <= bounds.upper)).all()

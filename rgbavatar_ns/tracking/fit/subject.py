@@ -248,6 +248,15 @@ class SubjectTracker:
             ]
         )[:, : len(self.facemesh_index)]
 
+    def face_distances_m(self, fit: ClipFit) -> Float[np.ndarray, "F"]:
+        """How far the middle of the landmarks is from the camera, in each frame."""
+        eye_m = fit.subject.camera.eye_m
+        middles = [
+            self._seen.points(theta, fit.subject.identity).mean(0)
+            for theta in self._head_thetas(fit)
+        ]
+        return np.linalg.norm(np.array(middles) - eye_m, axis=1)
+
     def irises_px(self, fit: ClipFit) -> Float[np.ndarray, "F 2 2"]:
         """Where the middle of the mesh's right iris and of its left one is, source pixels."""
         irises = LandmarkHead(self.head, *iris_places(self.head.arrays))

@@ -81,7 +81,7 @@ def fit_quality(
         "blinks_fitted": count_blinks(gaps["eyelid"][0]),
         **gaze_quality(tracker, fit, landmarks_px, irises),
         "focal_px": fit.subject.camera.focal_px,
-        "camera_distance_m": fit.subject.camera.distance_m,
+        "camera_distance_m": float(np.median(tracker.face_distances_m(fit))),
     }
 
 
