@@ -2,10 +2,21 @@
 
 import dataclasses
 import inspect
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from functools import cache
-from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
+from types import UnionType
+from typing import (
+    Annotated,
+    Any,
+    Literal,
+    NoReturn,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 from rgbavatar_ns.errors import UserError
 
@@ -68,8 +79,8 @@ def check_options(
         for item in value if isinstance(value, tuple | list) else (value,):
             for bound in bounds:
                 _check(prefix + name, item, bound)
-            if isinstance(item, str) and name in choices:
-                _check_choice(prefix + name, item, choices[name])
+            if name in choices and item not in choices[name]:
+                _refuse_choice(prefix + name, item, choices[name])
             _check_within(item, f"{prefix}{name}.", more)
 
 
@@ -85,10 +96,11 @@ def _declared_choices(owner: Any) -> Mapping[str, tuple[Any, ...]]:
     """What each name that is annotated as one of some words, or None, can be."""
     found = {}
     for name, hint in get_type_hints(owner).items():
-        parts = [part for part in get_args(hint) or (hint,) if part is not type(None)]
-        literal = hint if get_origin(hint) is Literal else parts[0] if len(parts) == 1 else None
-        if get_origin(literal) is Literal:
-            found[name] = get_args(literal)
+        kinds = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
+        words = [get_args(kind) for kind in kinds if get_origin(kind) is Literal]
+        rest = [kind for kind in kinds if get_origin(kind) is not Literal]
+        if words and all(kind is type(None) for kind in rest):
+            found[name] = (*itertools.chain(*words), *(None for _ in rest))
     return found
 
 
@@ -132,9 +144,8 @@ def _check(name: str, value: Any, bounds: Between) -> None:
         raise UserError(f"{option} is {value!r}.", f"Give a number {bounds}.")
 
 
-def _check_choice(name: str, value: str, choices: tuple[Any, ...]) -> None:
-    if value not in choices:
-        *others, last = map(repr, choices)
-        option = "--" + name.replace("_", "-")
-        allowed = f"{', '.join(others)} or {last}" if others else last
-        raise UserError(f"{option} is {value!r}.", f"Give {allowed}.")
+def _refuse_choice(name: str, value: object, choices: tuple[Any, ...]) -> NoReturn:
+    *others, last = map(repr, choices)
+    option = "--" + name.replace("_", "-")
+    allowed = f"{', '.join(others)} or {last}" if others else last
+    raise UserError(f"{option} is {value!r}.", f"Give {allowed}.")

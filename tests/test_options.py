@@ -23,6 +23,8 @@ class Outer(CheckedOptions):
     free: float = 0.0
     shape: Literal["round", "flat", "none"] = "round"
     engine: Literal["own", "host"] | None = None
+    pose: Literal["up", "down"] | Literal["auto"] = "auto"
+    sides: int | Literal["all"] = "all"
 
 
 @pytest.mark.parametrize(
@@ -34,7 +36,10 @@ class Outer(CheckedOptions):
         ({"opacity": 1.0}, r"from 0 to 1 \(both excluded\)"),
         ({"opacity": float("nan")}, "--opacity is nan"),
         ({"shape": "square"}, "--shape is 'square'. Give 'round', 'flat' or 'none'."),
-        ({"engine": "none"}, "--engine is 'none'. Give 'own' or 'host'."),
+        ({"engine": "none"}, "--engine is 'none'. Give 'own', 'host' or None."),
+        ({"shape": None}, "--shape is None. Give 'round', 'flat' or 'none'."),
+        ({"shape": True}, "--shape is True."),
+        ({"pose": "left"}, "--pose is 'left'. Give 'up', 'down' or 'auto'."),
     ],
 )
 def test_a_value_out_of_its_range_is_told_with_its_option(given_values, told):
@@ -68,4 +73,5 @@ def test_options_within_are_named_by_their_path_and_hosts_have_ranges_too():
 
 def test_every_choice_is_taken():
     assert Outer(shape="none", engine="host").shape == "none"
-    assert Outer(engine=None).engine is None
+    assert Outer(engine=None, pose="up").engine is None
+    assert Outer(sides=3).sides == 3

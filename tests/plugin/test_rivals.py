@@ -173,3 +173,16 @@ def test_rates_that_a_method_lets_fall_itself_are_left_to_it_or_refused(data: Pa
     ):
         with pytest.raises(UserError, match="but the method"):
             begin(name, **option)
+
+
+def test_steps_through_autograd_keep_the_memory_that_they_free(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    asked: list[str] = []
+    monkeypatch.setattr(
+        "rgbavatar_ns.plugin.training.trainer.keep_freed_memory", lambda: asked.append("asked")
+    )
+    trained(rival_config(RIVALS[0], data, tmp_path / "rival", max_num_iterations=1))
+    assert asked == ["asked"]
+    fused = trained(small_config(data, tmp_path / "own", max_num_iterations=1))
+    assert len(asked) == 1 + (fused._take.kind == "eager")

@@ -28,9 +28,8 @@ Precision = Literal["auto", "float32", "bfloat16"]
 
 
 def multiplied_in(precision: Precision, values: Tensor) -> torch.dtype:
-    """The type in which `values` are multiplied; those of double precision, and on a GPU, as is.
-
-    Sums are single precision either way.
+    """The type in which `values` are multiplied: their own in double precision, and with auto on a
+    GPU or a processor that does not multiply bfloat16 itself.
     """
     if precision == "float32" or values.dtype != torch.float32:
         return values.dtype
@@ -41,9 +40,10 @@ def multiplied_in(precision: Precision, values: Tensor) -> torch.dtype:
 
 @cache
 def _has_bfloat16() -> bool:
-    """Whether this processor multiplies bfloat16 itself; False where torch cannot tell."""
-    told = getattr(torch.cpu, "get_capabilities", dict)()
-    return any(told.get(name, False) for name in ("avx512_bf16", "amx_bf16"))
+    """Whether this processor multiplies bfloat16 itself; False where torch cannot tell, and on
+    ARM, where nobody has measured it."""
+    asked = ("_is_avx512_bf16_supported", "_is_amx_tile_supported")
+    return any(getattr(torch.cpu, name, bool)() for name in asked)
 
 
 _SHARPNESS, _FLAT_FROM = 100.0, 0.2
@@ -86,8 +86,8 @@ class MLP(nn.Module):
     itself and adds, so that nothing is repeated N or B times. With `skip_at` = k the k-th hidden
     layer (from 0) takes the input again, behind what the last one gave. Initial values are those of
     `torch.nn.Linear`, drawn from `generator`, those of the output times `last_scale`: with 0 the
-    field begins at nothing. `precision` is that of the layers' products: parameters, their
-    gradients and what the field gives are as the parameters are.
+    field begins at nothing. `precision` is that of the layers' products and what they give, but for
+    an output that is narrower than they are: that one, parameters and their gradients are single.
     """
 
     def __init__(
@@ -134,12 +134,18 @@ class MLP(nn.Module):
         weight, bias, *others = (
             p for layer in (*self.hidden, self.output) for p in layer.parameters()
         )
+        # Numbers to draw with are narrower than layers; where they are as wide, others go on.
+        exact = self.output.out_features < self.output.in_features
         with torch.autocast(device, narrow, enabled=narrow != given):
-            values = _of_parts(parts, weight, bias) if plain else self._layers(parts)
-        return (_ReluLayers.apply(values, *others) if plain else values).to(given)
+            values = _of_parts(parts, weight, bias) if plain else self._hidden(parts)
+            if not plain and not exact:
+                values = self.output(values)
+        if plain:
+            return _ReluLayers.apply(exact, values, *others).to(given)
+        return self.output(values.to(given)) if exact else values.to(given)
 
-    def _layers(self, parts: tuple[Tensor, ...]) -> Tensor:
-        """One layer after another, through autograd."""
+    def _hidden(self, parts: tuple[Tensor, ...]) -> Tensor:
+        """What the hidden layers give, through autograd."""
         values = None
         for index, layer in enumerate(self.hidden):
             assert isinstance(layer, nn.Linear)
@@ -154,7 +160,8 @@ class MLP(nn.Module):
             # In place: neither the layer nor the activation looks back at it.
             relu = self.activation == "relu"
             values = F.relu(values, inplace=True) if relu else sharp_softplus(values)
-        return self.output(values)
+        assert values is not None
+        return values
 
 
 def _of_parts(parts: tuple[Tensor, ...], weight: Tensor, bias: Tensor | None) -> Tensor:
@@ -175,21 +182,26 @@ class _ReluLayers(torch.autograd.Function):
     """ReLU, then linear layers with ReLU between them, given as weight, bias, weight, bias ...
 
     The gradient is written out, because most of its rows may be 0: no picture shows what is behind
-    the head, or covered. Such rows add exactly nothing, and are left out. Values and gradients are
-    those of autograd; there is no second derivative. Products are of the type of `first`, sums of
-    a gradient over blocks of rows of the layers' own.
+    the head, or covered. Such rows add exactly nothing, and most are left out. Values and
+    gradients are those of autograd; there is no second derivative. Products are of the type of
+    `first`, with `exact` those of the last layer, and sums over blocks of rows, of the layers' own.
     """
 
     @staticmethod
-    def forward(ctx: Any, first: Float[Tensor, "..."], *layers: Tensor) -> Float[Tensor, "..."]:
+    def forward(
+        ctx: Any, exact: bool, first: Float[Tensor, "..."], *layers: Tensor
+    ) -> Float[Tensor, "..."]:
         rows, ctx.dtype = first.flatten(0, -2), layers[0].dtype
         weights, biases = ([x.to(first.dtype) for x in layers[k::2]] for k in (0, 1))
+        if exact:
+            weights[-1], biases[-1] = layers[-2], layers[-1]
         values = [torch.empty_like(rows)]
-        values += [rows.new_empty(len(rows), len(bias)) for bias in biases]
+        values += [bias.new_empty(len(rows), len(bias)) for bias in biases]
         for block in _blocks(len(rows)):
             torch.clamp(rows[block], min=0, out=values[0][block])
             for k, (weight, bias) in enumerate(zip(weights, biases), 1):
-                torch.addmm(bias, values[k - 1][block], weight.mT, out=values[k][block])
+                below = values[k - 1][block].to(weight.dtype)
+                torch.addmm(bias, below, weight.mT, out=values[k][block])
                 if k < len(weights):
                     values[k][block].clamp_(min=0)
         ctx.save_for_backward(*values[:-1], *weights)
@@ -199,7 +211,7 @@ class _ReluLayers(torch.autograd.Function):
     @once_differentiable
     def backward(  # pyright: ignore[reportIncompatibleMethodOverride]
         ctx: Any, *grad_outputs: Tensor
-    ) -> tuple[Tensor, ...]:
+    ) -> tuple[Tensor | None, ...]:
         saved, count = ctx.saved_tensors, len(ctx.saved_tensors) // 2
         hidden, weights = saved[:count], saved[count:]
         gradient = grad_outputs[0].flatten(0, -2)
@@ -212,12 +224,13 @@ class _ReluLayers(torch.autograd.Function):
             above = gradient[rows]
             for k in reversed(range(count)):
                 below = hidden[k][rows]
-                of_weights[k] += above.mT @ below
+                of_weights[k] += above.mT @ below.to(above.dtype)
                 of_biases[k] += above.sum(0, dtype=ctx.dtype)
-                above = torch.ops.aten.threshold_backward(above @ weights[k], below, 0)
+                above = (above @ weights[k]).to(below.dtype)
+                above = torch.ops.aten.threshold_backward(above, below, 0)
             of_first[rows] = above
         of_layers = (part for pair in zip(of_weights, of_biases) for part in pair)
-        return of_first.view(*grad_outputs[0].shape[:-1], -1), *of_layers
+        return None, of_first.view(*grad_outputs[0].shape[:-1], -1), *of_layers
 
 
 def _rows_of(gradient: Float[Tensor, "n C"]) -> Int[Tensor, "M"]:

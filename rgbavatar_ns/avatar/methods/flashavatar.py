@@ -13,8 +13,9 @@ asked for; the learning rates; no density control; one image a step.
 Different here, because the harness is: backgrounds are random colours (there green); Adam's epsilon
 is that of 3DGS for the network too; LPIPS sees the whole picture (there the parsed head), the mouth
 is that of the mesh (`hull_mask`; there face parsing); the rim of FLAME's neck is drawn; scales are
-found at rest, not in the first frame. Its world is the head: here the head moves, so that offsets,
-rotations and harmonics turn with the neck's joint, and the network sees the neck's turn too.
+found at rest, not in the first frame; the network multiplies bfloat16 where a processor does
+(`network_precision`). Its world is the head: here the head moves, so that offsets, rotations and
+harmonics turn with the neck's joint, and the network sees the neck's turn too.
 """
 
 from dataclasses import dataclass

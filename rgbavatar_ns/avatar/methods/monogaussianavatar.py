@@ -20,7 +20,8 @@ the variance of the film's expressions, which a method does not know, in the exp
 stands for it); canonical jaw and expression, which are those at rest here; weight normalisation;
 initial values of a signed distance (He's here); batches that shrink as points grow, which is the
 preset's; white backgrounds (random colours here). Rotations are the networks' alone, as there:
-bones move points, but do not turn what is drawn there.
+bones move points, but do not turn what is drawn there. Networks of attributes multiply bfloat16
+where a processor does (`network_precision`).
 """
 
 from collections.abc import Mapping, Sequence
@@ -181,7 +182,6 @@ class MonoGaussianAvatar(AvatarMethod):
         self._make_networks(generator)
         self._rows = GaussianRows(self, ("position", "seen"))
         self._lpips = LPIPSLoss()
-        self._of_means: tuple[Tensor, DeformedPoints] | None = None
 
     def _make_networks(self, generator: torch.Generator) -> None:
         config = self.config
@@ -234,7 +234,6 @@ class MonoGaussianAvatar(AvatarMethod):
         theta = self.checked(theta)
         deformed = self.deformed()
         means = self._posed(deformed, theta)
-        self._of_means = (means, deformed) if torch.is_grad_enabled() else None
         # Of the head's motion the release's world has the turns; its translation is the camera's.
         with torch.no_grad():
             moved = means - self._translation(theta)[:, None] - deformed.place_at_rest
@@ -305,7 +304,7 @@ class MonoGaussianAvatar(AvatarMethod):
 
     def penalty(self, drawn: DrawnBatch, step: int) -> Losses:
         """How far the points' deformation is from the head model's at the nearest vertex."""
-        config, points = self.config, self._deformed_for(drawn)
+        config, points = self.config, self.deformed()
         places = points.place_at_rest.detach().cpu().numpy()
         nearest = torch.from_numpy(self._vertex_tree.query(places)[1]).to(self.position.device)
         factor = _halved(step // config.steps_per_epoch, _TERMS_HALVED)
@@ -321,12 +320,6 @@ class MonoGaussianAvatar(AvatarMethod):
             if weight > 0 and own.numel():
                 losses[name] = factor * weight * F.mse_loss(own, model[nearest])
         return losses
-
-    def _deformed_for(self, drawn: DrawnBatch) -> DeformedPoints:
-        """What a picture was drawn with, so that no step asks the deformer twice."""
-        known, self._of_means = self._of_means, None
-        same = known is not None and known[0] is drawn.gaussians.means
-        return known[1] if known is not None and same else self.deformed()
 
     def watches(self, step: int) -> bool:
         """All steps: what they draw opaque stays."""

@@ -83,10 +83,9 @@ class MethodStep:
         background = batch.background
         if background is None:
             background = random_backgrounds(step, count, self._seed)
-        losses, drawn, offset = self._losses(batch, theta, background.to(theta), step)
-        # Only now, so that the new gradients find the memory of the old ones whole.
         for optimizer in self.optimizers:
             optimizer.zero_grad(set_to_none=True)
+        losses, drawn, offset = self._losses(batch, theta, background.to(theta), step)
         torch.stack(list(losses.values())).sum().backward()
         self._set_rates(step)
         take_steps(self.optimizers)

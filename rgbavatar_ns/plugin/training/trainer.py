@@ -276,7 +276,7 @@ class RGBAvatarTrainer(EndingTrainer, FitHooks):
                 with device_errors_told(self.checkpoint_dir):
                     self._take = self.pipeline.training_step(self.optimizers)
                 say(f"Steps are {self._take.kind}: {self._take.reason}.")
-                if self._take.kind == "eager":
+                if self._take.kind == "eager" and self.device == "cpu":
                     keep_freed_memory()
                 with self._shown_progress():
                     fit(self._take, self._batch, self._steps(), self)

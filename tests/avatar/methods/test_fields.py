@@ -128,10 +128,18 @@ def test_half_as_long_numbers_give_nearly_the_same_values_and_gradients(activati
         found.append([values, *torch.autograd.grad((values * weight).sum(), wanted)])
     # Where a unit is just on or just off, the gradient of a single place leaps.
     allowed = [0.01, 0.1, *[0.02] * (len(found[0]) - 2)]
-    for exact, narrow, share in zip(*found, allowed):
-        assert narrow.dtype == torch.float32
-        with torch.no_grad():
-            assert 0 < float((narrow - exact).norm() / exact.norm()) < share
+    off = [float((b - a).detach().norm() / a.detach().norm()) for a, b in zip(*found)]
+    assert all(share < most for share, most in zip(off, allowed))
+    assert off[0] > 1e-5, "and are not the same"
+    assert all(narrow.dtype == torch.float32 for narrow in found[1])
+
+
+def test_an_output_that_is_narrower_than_its_layers_is_not_rounded():
+    for outputs in (4, 32):
+        network = MLP([3], 32, 2, outputs, generator=seeded(), precision="bfloat16")
+        values = network(normal(500, 3).float()).detach()
+        rounded = (values == values.bfloat16().float()).float().mean()
+        assert (float(rounded) > 0.99) == (outputs == 32)
 
 
 def test_the_precision_follows_the_processor_unless_it_is_asked_for(monkeypatch):

@@ -27,7 +27,9 @@ from tests.avatar.small_head import (
     small_identity,
 )
 
-SMALL = FlashAvatarConfig(uv_resolution=10, hidden_width=8, hidden_layers=2, octaves=2)
+SMALL = FlashAvatarConfig(
+    uv_resolution=10, hidden_width=8, hidden_layers=2, octaves=2, network_precision="float32"
+)
 
 
 def build(dtype=torch.float32, seed: int = 0, head: HeadModel | None = None, **changes):
@@ -246,6 +248,17 @@ def test_training_lowers_the_loss_and_is_determined_by_seed_and_steps():
     assert int(avatars[0].degree_now) == 3
     for name, value in avatars[0].state_dict().items():
         torch.testing.assert_close(value, avatars[1].state_dict()[name], rtol=0, atol=0)
+
+
+def test_half_as_long_numbers_train_alike():
+    losses = []
+    for precision in ("float32", "bfloat16"):
+        avatar = build(hidden_width=32, network_precision=precision)
+        assert avatar.offset_network.precision == precision
+        step, batch = MethodStep(avatar, seed=1), batch_of(avatar)
+        losses.append([float(sum(step(batch, s).values())) for s in range(30)])
+    assert losses[0] != losses[1]
+    np.testing.assert_allclose(losses[1], losses[0], rtol=0.02)
 
 
 def test_a_bundle_gives_the_same_picture(tmp_path):

@@ -20,7 +20,13 @@ from rgbavatar_ns.head.rotations import axis_angle_to_matrix
 from tests.avatar.small_head import front_camera, random_theta, small_head, small_identity
 
 SMALL = MonoGaussianAvatarConfig(
-    steps_per_epoch=5, max_points=60, deformer_width=8, attribute_width=8, offset_width=6, octaves=2
+    steps_per_epoch=5,
+    max_points=60,
+    deformer_width=8,
+    attribute_width=8,
+    offset_width=6,
+    octaves=2,
+    network_precision="float32",
 )
 
 
@@ -304,6 +310,16 @@ def test_training_lowers_the_loss_and_is_determined_by_seed_and_steps():
     assert np.mean(runs[0][-5:]) < np.mean(runs[0][:5])
     for name, value in avatars[0].state_dict().items():
         torch.testing.assert_close(value, avatars[1].state_dict()[name], rtol=0, atol=0)
+
+
+def test_only_networks_of_attributes_multiply_half_as_long_numbers():
+    avatars = [build(attribute_width=32, network_precision=p) for p in ("float32", "bfloat16")]
+    exact, narrow = (avatar.gaussians(random_theta(avatar.layout, 2)) for avatar in avatars)
+    assert torch.equal(exact.means, narrow.means), "whom the deformer carries"
+    for name in ("scales", "opacities", "colors"):
+        one, other = (getattr(gaussians, name) for gaussians in (exact, narrow))
+        assert not torch.equal(one, other)
+        torch.testing.assert_close(other, one, rtol=0.05, atol=0.01)
 
 
 def test_a_bundle_gives_the_same_picture_though_points_were_added(tmp_path):
