@@ -43,11 +43,16 @@ _ASIDE_M = 3e-3, 1e-2
 """From what a face's Gaussian has gone across the view it may be seen, and is for sure."""
 _ASTRAY = 2.0
 """Widths from its place at which what is hardly seen of a body is clear until it is back."""
+_HARDLY_TURNED = 0.25
+"""Of a film that is all front, from which on it does not tell what hangs before a throat."""
+_STRAYS_M, _FLEETING = (2e-2, 3e-2), (0.2, 0.1)
+"""From what a face's Gaussian has left its place it may stray, and does for sure, where so little
+of what is seen of it is seen in front: from behind jaws and ears it paints collars and curtains."""
 _FORGETS = 0.97
 _SEEN_PX = 0.02
 """Pixels that a Gaussian covers in the frame that shows it best, at which it is half known; of a
 body as many more as its discs are larger."""
-_SHINES_PX = 1.0
+_SHINES_PX = 2.0
 """Pixels covered through what lies before it at which its being wider half counts: backs shine a
 little through every face, and much through the rim of hair, which wide ones would blur."""
 _TURNED_AWAY, _FACING, _FRONTAL = -0.3, 0.0, 0.4
@@ -209,8 +214,11 @@ class SurfacePrior(nn.Module):
         pull, close, color_pull = (
             _RATE * half_px / (px + half_px) for px in (self.seen_px, self.through_px, colored_px)
         )
-        # Below its end a body is not kept by being seen from behind, through what ends before it.
         home, opacity_logit = self.surface(avatar)
+        fleeting = ramp(self.clear_px / self.seen_px.clamp(min=_SEEN_PX), *_FLEETING)
+        strays = parts.skin * fleeting * ramp((shapes.position - home).norm(dim=1), *_STRAYS_M)
+        pull = pull + (_RATE - pull) * strays
+        # Below its end a body is not kept by being seen from behind, through what ends before it.
         astray = (shapes.position - home).norm(dim=1) > _ASTRAY * disc[:, :2].mean(1).exp()
         opacity_logit = torch.where(astray & field.body_gaussians, _EMPTY, opacity_logit)
         closes = torch.where((opacity_logit < 0) & field.body_gaussians, pull, close)
@@ -234,7 +242,8 @@ class SurfacePrior(nn.Module):
         depth = ((home - shapes.position) * view).sum(1) + before_m * ahead[2].to(disc)
         shapes.position.add_((_DEPTH_RATE * unturned * depth)[:, None] * view)
         here = parts.rest_m + turn_back(turned, shapes.position)
-        shorten_overhanging(shapes, parts.front, here, field.rest_quats_wxyz, disc, parts.skin)
+        hangs = parts.skin * ramp(alone.to(disc), 0.0, _HARDLY_TURNED)
+        shorten_overhanging(shapes, parts.front, here, field.rest_quats_wxyz, disc, hangs)
         # As far as nothing shows it, nothing else closes the surface around it.
         through = _SHINES_PX / (self.through_px + _SHINES_PX)
         alone = (pull / _RATE * through).square()

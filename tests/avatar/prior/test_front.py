@@ -82,7 +82,8 @@ def test_a_chin_that_paints_the_neck_lies_on_it():
     assert int(chin.sum()) >= 10
     position.data.copy_(home + turn_back(field.rest_quats_wxyz, down.expand_as(home)))
     prior.look(avatar, theta, front_camera(), images)
-    prior.seen_px.fill_(1e3)  # nothing is drawn home for want of being seen
+    for known in (prior.seen_px, prior.clear_px):
+        known.fill_(1e3)  # nothing is drawn home for want of being seen
     for step in STEPS:
         prior.pull(avatar, step)
     after = rest + turn_back(turned_back, position.detach())
@@ -138,6 +139,32 @@ def test_what_stands_off_as_a_whole_hangs_nowhere():
     assert float(front.overhang(upon + off, aside).max()) == 0, "as glasses do"
     ahead = torch.tensor([0.0, 0.0, 0.02]).expand_as(aside)
     assert float(front.overhang(upon, ahead).min()) == 1
+
+
+def test_skin_that_is_never_seen_in_front_does_not_paint_what_is_far_off():
+    avatar = embedded_avatar(name=EMBEDDED_BUST)
+    theta = turned(avatar, [-1.0, 0.0, 1.0])
+    images = drawn_thicker(avatar, theta, 0.0)
+    prior, shapes, field = SurfacePrior(avatar), avatar.blendshapes, MeshField(avatar)
+    prior.begin(avatar, theta, front_camera(), images)
+    home = prior.surface(avatar)[0]
+    head = ~field.body_gaussians
+    skin = head & (Strands.of(avatar, field).haired == 0)
+    third = torch.arange(len(head)) % 3
+    far, near = torch.tensor([0.03, 0.02, 0.0]), torch.tensor([0.006, 0.004, 0.0])
+    shapes.position.data.copy_(home + torch.where((third == 2)[:, None], near, far))
+    before = shapes.position.detach().clone()
+    for known in (prior.seen_px, prior.through_px, prior.grazing_px):
+        known.fill_(7.0)
+    prior.clear_px.copy_(torch.where(third == 1, 7.0, 0.3))
+    for step in STEPS[:12]:
+        prior.pull(avatar, step)
+    went = (shapes.position.detach() - home).norm(dim=1) / (before - home).norm(dim=1)
+    hair = head & (Strands.of(avatar, field).haired == 1)
+    assert float(went[skin & (third == 0)].quantile(0.9)) < 0.65, "until it is near enough"
+    for stays in (skin & (third == 1), skin & (third == 2), hair):
+        assert int(stays.sum()) > 100
+        assert float(went[stays].median()) > 0.95
 
 
 def test_what_of_a_body_strays_where_nothing_is_filmed_is_clear_until_it_is_back():
