@@ -17,6 +17,8 @@ _PIXEL_M = 1.5e-3
 _SMOOTH_PX = 2.0
 _TIP = 1.5
 """Standard deviations from its centre at which a Gaussian ends."""
+_ACROSS = 0.5, 0.7
+"""Sideways parts of its longest axis from which it reaches across the view, and does altogether."""
 _BEFORE_M = 4e-3, 8e-3
 """From what a Gaussian's tip stands before the surface it counts, and from what altogether."""
 
@@ -92,24 +94,39 @@ class FrontSurface:
         return ramp(farther_m, *_BEFORE_M)
 
 
+def longest_axes_m(
+    shapes: TangentBlendshapes, frame_wxyz: Float[Tensor, "N 4"]
+) -> Float[Tensor, "N 3"]:
+    """The longest axis of each Gaussian, as long as its standard deviation, on the head at rest.
+
+    frame_wxyz turns the head's axes into those that rotations are in.
+    """
+    log_scale, longest = shapes.log_scale.max(1, keepdim=True)
+    axis = torch.zeros_like(shapes.log_scale).scatter_(1, longest, log_scale.exp())
+    for turn_wxyz in (F.normalize(shapes.rotation_wxyz, dim=-1), frame_wxyz):
+        axis = turn_back(conjugate_quats_wxyz(turn_wxyz), axis)
+    return axis
+
+
 def shorten_overhanging(
     shapes: TangentBlendshapes,
     front: FrontSurface,
     rest_m: Float[Tensor, "N 3"],
     frame_wxyz: Float[Tensor, "N 4"],
     disc: Float[Tensor, "N 3"],
-    share: Float[Tensor, "N"],
+    shares: tuple[Float[Tensor, "N"], Float[Tensor, "N"]],
 ) -> None:
     """Go by a share to the width of its disc along the longest axis of what overhangs.
 
-    rest_m: where Gaussians are on the head at rest; frame_wxyz turns its axes into those that
-    rotations are in; `disc` holds logarithms of scales. Ours, because from in front all that a
-    chin paints of a throat is the same, and turned heads had whiskers.
+    rest_m: where Gaussians are on the head at rest; frame_wxyz: see `longest_axes_m`; `disc` holds
+    logarithms of scales; shares: of what reaches out across the view, and along it, which closes
+    sides and is theirs. Ours, because from in front all that a chin paints of a throat is the
+    same, and turned heads had whiskers.
     """
     log_scale, longest = shapes.log_scale.max(1, keepdim=True)
-    axis = torch.zeros_like(shapes.log_scale).scatter_(1, longest, log_scale.exp())
-    for turn in (F.normalize(shapes.rotation_wxyz, dim=-1), frame_wxyz):
-        axis = turn_back(conjugate_quats_wxyz(turn), axis)
     short = log_scale.minimum(disc[:, :2].mean(1, keepdim=True))
-    goes = share * front.overhang(rest_m, axis)
+    axes_m = longest_axes_m(shapes, frame_wxyz)
+    across = axes_m[:, :2].norm(dim=1) / axes_m.norm(dim=1).clamp(min=1e-9)
+    share = torch.lerp(shares[1], shares[0], ramp(across, *_ACROSS))
+    goes = share * front.overhang(rest_m, axes_m)
     shapes.log_scale.scatter_(1, longest, log_scale.lerp(short, goes[:, None]))

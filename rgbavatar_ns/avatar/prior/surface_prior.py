@@ -242,8 +242,9 @@ class SurfacePrior(nn.Module):
         depth = ((home - shapes.position) * view).sum(1) + before_m * ahead[2].to(disc)
         shapes.position.add_((_DEPTH_RATE * unturned * depth)[:, None] * view)
         here = parts.rest_m + turn_back(turned, shapes.position)
-        hangs = parts.skin * ramp(alone.to(disc), 0.0, _HARDLY_TURNED)
-        shorten_overhanging(shapes, parts.front, here, field.rest_quats_wxyz, disc, hangs)
+        hangs = seen * ramp(alone.to(disc), 0.0, _HARDLY_TURNED)
+        shares = parts.skin * hangs, parts.narrow * hangs
+        shorten_overhanging(shapes, parts.front, here, field.rest_quats_wxyz, disc, shares)
         # As far as nothing shows it, nothing else closes the surface around it.
         through = _SHINES_PX / (self.through_px + _SHINES_PX)
         alone = (pull / _RATE * through).square()
