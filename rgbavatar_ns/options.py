@@ -67,10 +67,12 @@ def check_options(
     """Raise UserError for the first value that leaves the range or choices of its annotation.
 
     owner: the class or function whose annotations declare the options; `more` has ranges of
-    classes whose declarations are not ours. Tuples are checked item by item, dataclasses and
+    classes whose declarations are not ours, whose words are not checked. Tuples are checked item by item, dataclasses and
     mappings within as well. prefix: of the options' names in an error.
     """
-    declared, choices = _declared_bounds(owner), _declared_choices(owner)
+    declared, choices = _declared_bounds(owner), {}
+    if isinstance(owner, type) and issubclass(owner, CheckedOptions):
+        choices = _declared_choices(owner)
     others: dict[str, Between] = {}
     for kind in inspect.getmro(owner) if isinstance(owner, type) else ():
         others.update((more or {}).get(kind, {}))

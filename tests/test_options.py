@@ -59,11 +59,14 @@ def test_a_rate_is_taken_exactly_where_it_lies_within(rate):
 
 class Host:
     workers: int = 2
+    device: Literal["cpu", "cuda"] = "cpu"
 
 
 def test_options_within_are_named_by_their_path_and_hosts_have_ranges_too():
     with pytest.raises(UserError, match=r"--machine\.workers is -1"):
         check_options(Host, {"workers": -1}, "machine.", {Host: {"workers": Between(0, 4)}})
+    # A host's words are its own affair: there are devices that it does not name.
+    check_options(Host, {"device": "elsewhere"})
     inner = Inner()
     object.__setattr__(inner, "rate", 0.0)
     with pytest.raises(UserError, match=r"--groups\.a\.rate is 0\.0"):
