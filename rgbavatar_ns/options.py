@@ -67,8 +67,9 @@ def check_options(
     """Raise UserError for the first value that leaves the range or choices of its annotation.
 
     owner: the class or function whose annotations declare the options; `more` has ranges of
-    classes whose declarations are not ours, whose words are not checked. Tuples are checked item by item, dataclasses and
-    mappings within as well. prefix: of the options' names in an error.
+    classes whose declarations are not ours, and whose choices are not checked. Tuples are checked
+    item by item, dataclasses and mappings within as well. prefix: of the options' names in an
+    error.
     """
     declared, choices = _declared_bounds(owner), {}
     if isinstance(owner, type) and issubclass(owner, CheckedOptions):

@@ -1,6 +1,7 @@
 """Attributes as functions of place and theta: positional encoding and multilayer perceptrons."""
 
 from collections.abc import Iterator, Sequence
+from contextlib import nullcontext
 from functools import cache
 from typing import Any, Literal
 
@@ -136,7 +137,7 @@ class MLP(nn.Module):
         )
         # Numbers to draw with are narrower than layers; where they are as wide, others go on.
         exact = self.output.out_features < self.output.in_features
-        with torch.autocast(device, narrow, enabled=narrow != given):
+        with torch.autocast(device, narrow) if narrow != given else nullcontext():
             values = _of_parts(parts, weight, bias) if plain else self._hidden(parts)
             if not plain and not exact:
                 values = self.output(values)
