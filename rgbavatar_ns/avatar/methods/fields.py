@@ -177,6 +177,7 @@ def _of_parts(parts: tuple[Tensor, ...], weight: Tensor, bias: Tensor | None) ->
 _BLOCK_ROWS = 1024
 """Rows that go through all layers together: what they hold stays within a core's cache."""
 _ROUNDED_TO = 128
+"""Rows of a gradient come in multiples of this many (`_rows_of`)."""
 
 
 class _ReluLayers(torch.autograd.Function):

@@ -11,7 +11,8 @@ def keep_freed_memory() -> bool:
 
     A step through autograd makes and frees hundreds of megabytes, and what comes from the system
     anew comes page by page, each cleared: a third of the step's time. The process keeps its peak
-    from then on. False where the C library is not glibc, whose habits stay what they are.
+    from then on, and holes between what it keeps can make that larger. False where the C library
+    is not glibc, whose habits stay what they are.
     """
     try:
         mallopt = ctypes.CDLL(None).mallopt
