@@ -21,6 +21,8 @@ _ACROSS = 0.5, 0.7
 """Sideways parts of its longest axis from which it reaches across the view, and does altogether."""
 _BEFORE_M = 4e-3, 8e-3
 """From what a Gaussian's tip stands before the surface it counts, and from what altogether."""
+_NEEDLE = 1.5
+"""Widths of its disc that a Gaussian is longer than, if it is cut."""
 
 
 @dataclass(frozen=True)
@@ -86,12 +88,19 @@ class FrontSurface:
         in front it is all the same. What stands before the surface as a whole, as glasses, does
         not count. Axes are as long as their standard deviations.
         """
-        before_m = [
+        return ramp(self.overhang_m(centres_m, axes_m)[0], *_BEFORE_M)
+
+    def overhang_m(
+        self, centres_m: Float[Tensor, "N 3"], axes_m: Float[Tensor, "N 3"]
+    ) -> tuple[Float[Tensor, "N"], Float[Tensor, "N"]]:
+        """How far a Gaussian's foremost tip stands before the surface, or how much farther than
+        its centre does, and which way along its axis that tip is: 1 or -1."""
+        centre, first, second = (
             (place[:, 2] - self.at(place)).nan_to_num(nan=-1.0)
             for place in (centres_m, centres_m + _TIP * axes_m, centres_m - _TIP * axes_m)
-        ]
-        farther_m = before_m[1].maximum(before_m[2]) - before_m[0].clamp(min=0)
-        return ramp(farther_m, *_BEFORE_M)
+        )
+        way = torch.where(first >= second, 1.0, -1.0)
+        return first.maximum(second) - centre.clamp(min=0), way
 
 
 def longest_axes_m(
@@ -130,3 +139,29 @@ def shorten_overhanging(
     share = torch.lerp(shares[1], shares[0], ramp(across, *_ACROSS))
     goes = share * front.overhang(rest_m, axes_m)
     shapes.log_scale.scatter_(1, longest, log_scale.lerp(short, goes[:, None]))
+
+
+def trim_ahead(
+    shapes: TangentBlendshapes,
+    front: FrontSurface,
+    rest_m: Float[Tensor, "N 3"],
+    frame_wxyz: Float[Tensor, "N 4"],
+    disc: Float[Tensor, "N 3"],
+    share: Float[Tensor, "N"],
+) -> None:
+    """Cut off by a share what of a Gaussian along the view stands before the head; the rest stays.
+
+    Arguments as of `shorten_overhanging`. Ours, because sides are closed by what reaches along the
+    view, and beside a cheek such a needle came out of it.
+    """
+    axes_m = longest_axes_m(shapes, frame_wxyz)
+    length_m = axes_m.norm(dim=1).clamp(min=1e-9)
+    along = ramp(axes_m[:, :2].norm(dim=1) / length_m, *_ACROSS[::-1])
+    excess_m, way = front.overhang_m(rest_m, axes_m)
+    before = (excess_m - _BEFORE_M[0]).clamp(min=0) / (2 * _TIP * length_m)
+    spare = 1 - _NEEDLE * disc[:, :2].amax(1).exp() / length_m
+    cut = share * along * before.minimum(spare.clamp(min=0))
+    back_m = turn_back(frame_wxyz, -(_TIP * way * cut)[:, None] * axes_m)
+    shapes.position.add_(back_m)
+    longest = shapes.log_scale.argmax(1, keepdim=True)
+    shapes.log_scale.scatter_add_(1, longest, (1 - cut).log()[:, None])

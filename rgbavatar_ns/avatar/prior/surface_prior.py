@@ -20,7 +20,7 @@ from rgbavatar_ns.avatar.prior.discs import (
     log_overlap,
     narrow_ahead,
 )
-from rgbavatar_ns.avatar.prior.front import FrontSurface, shorten_overhanging
+from rgbavatar_ns.avatar.prior.front import FrontSurface, shorten_overhanging, trim_ahead
 from rgbavatar_ns.avatar.prior.leash import Leash
 from rgbavatar_ns.avatar.prior.mesh_field import MeshField, ramp
 from rgbavatar_ns.avatar.prior.mouth import HiddenMouth
@@ -244,6 +244,8 @@ class SurfacePrior(nn.Module):
         here = parts.rest_m + turn_back(turned, shapes.position)
         hangs = seen * ramp(alone.to(disc), 0.0, _HARDLY_TURNED)
         shares = parts.skin * hangs, parts.narrow * hangs
+        trim_ahead(shapes, parts.front, here, field.rest_quats_wxyz, disc, shares[0])
+        here = parts.rest_m + turn_back(turned, shapes.position)
         shorten_overhanging(shapes, parts.front, here, field.rest_quats_wxyz, disc, shares)
         # As far as nothing shows it, nothing else closes the surface around it.
         through = _SHINES_PX / (self.through_px + _SHINES_PX)

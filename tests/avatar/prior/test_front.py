@@ -125,6 +125,42 @@ def test_what_hangs_before_another_part_is_as_short_as_its_disc_again():
     assert float((found_m / long_m)[lies].quantile(0.1)) > 0.95
 
 
+def test_needles_along_the_view_end_at_the_face_and_still_close_its_sides():
+    """Beside cheeks needles reach 25 mm out of the head: those are cut off, nothing behind is."""
+    avatar = embedded_avatar(name=EMBEDDED_BUST)
+    field, long_m = MeshField(avatar), 0.025
+    theta = turned(avatar, [-1.0, 0.0, 1.0])
+    images = drawn_thicker(avatar, theta, 0.0)
+    prior, shapes = SurfacePrior(avatar), avatar.blendshapes
+    prior.begin(avatar, theta, front_camera(), images)
+    rest, frame = field.at_gaussians(field.rest_m), field.rest_quats_wxyz
+    ahead = turn_back(frame, torch.tensor([0.0, 0.0, 1.0]).expand_as(rest))
+    half = torch.nn.functional.normalize(ahead + torch.tensor([1.0, 0.0, 0.0]), dim=1)
+    shapes.rotation_wxyz.data.copy_(torch.nn.functional.pad(half, (1, 0)))
+    shapes.log_scale.data[:, 0] = math.log(long_m)
+    foremost = torch.from_numpy(foremost_m(avatar, rest)).float()
+    centre = torch.cat([rest[:, :2], (foremost - 0.0125)[:, None]], 1)
+    shapes.position.data.copy_(turn_back(frame, centre - rest).nan_to_num())
+    sideways = field.at_gaussians(field.normals)[:, 0].abs()
+    sides = (Strands.of(avatar, field).haired == 0) & ~field.body_gaussians & (sideways > 0.75)
+    # Where the drawn surface, which is smoothed, is that of the rays.
+    sides &= (FrontSurface.of(avatar, field).at(rest) - foremost).abs() < 1e-3
+    # And where what is left is longer than its disc.
+    sides &= disc_log_scale(avatar)[:, :2].amax(1).exp() < 0.01
+    assert int(sides.sum()) >= 20
+    prior.look(avatar, theta, front_camera(), images)
+    for known in (prior.seen_px, prior.clear_px, prior.grazing_px):
+        known.fill_(1e3)  # nothing is drawn home, nor flat for being seen from in front alone
+    prior.pull(avatar, STEPS[0])
+    after = rest + turn_back(conjugate_quats_wxyz(frame), shapes.position.detach())
+    reach = 1.5 * shapes.log_scale.detach()[:, 0].exp()
+    before_m, back_m = after[:, 2] + reach - foremost, after[:, 2] - reach
+    assert float(before_m[sides].max()) < 6e-3
+    assert float(before_m[sides].min()) > 2e-3, "no more than that"
+    assert float((back_m - (centre[:, 2] - 1.5 * long_m))[sides].abs().max()) < 1e-3
+    assert float((after - centre)[sides, :2].abs().max()) < 1e-3
+
+
 def test_what_stands_off_as_a_whole_hangs_nowhere():
     avatar = embedded_avatar(name=EMBEDDED_BUST)
     field = MeshField(avatar)
