@@ -23,7 +23,7 @@ _TEMPLE_M, _SIDES_M, _TOP_M = 0.06, 0.045, 0.075
 rule, and farther in front each has a hairline of one's own."""
 _OVER_EARS_M = 0.015
 """From here up hair hangs over the tops of ears, or their colour would go on into it."""
-_LOBES_M = 0.05
+NECK_HAIR_M = 0.05
 """How far below the eyes hair ends, at the ears' lobes: a centimetre lower lie the neck's sides,
 where hair as thick as above would stand out as soon as a head turns."""
 _ABOVE_EARS_M = 0.04
@@ -58,9 +58,10 @@ class MeshField:
     rest: between the vertices' normals, so that it does not gape over the mesh's edges;
     `normal_of_gaussians` is that direction in the axes that their rotations are in, which
     `rest_quats_wxyz` turn to the head's. `rest_m` and
-    `normals` are the vertices' own at rest, `height_m` is theirs on the template; `body` and
-    `body_gaussians` lie below the neck's foot, `haired` where hair is the rule, `scalp` where
-    everybody who has hair has it, `back` (1 or 0) behind the ears, `above_ears` above them.
+    `normals` are the vertices' own at rest, `height_m`, `behind_eyes_m` and `above_eyes_m` are
+    theirs on the template; `body` and `body_gaussians` lie below the neck's foot, `haired` where
+    hair is the rule, `scalp` where everybody who has hair has it, `back` (1 or 0) behind the ears,
+    `above_ears` above them.
 
     Values are continued harmonically, as heat would spread, to both sides of the face alike. Ours:
     because what nobody filmed is best guessed by what surrounds it.
@@ -77,6 +78,7 @@ class MeshField:
         self.edges = torch.stack([numbers // self.num_vertices, numbers % self.num_vertices], 1)
         self._mirror, self._mirrored = _mirror_of(template)
         behind, up = (part.to(template) for part in _behind_and_above_eyes(avatar.head.arrays))
+        self.behind_eyes_m, self.above_eyes_m = behind, up
         self.back = (behind > _BEHIND_EYES_M).to(template)
         self.haired = haired_for_certain(avatar.head.arrays).to(template.device)
         self.scalp = self.haired & (behind > _TEMPLE_M)
@@ -209,7 +211,7 @@ def ramp(values: Float[Tensor, "*n"], start: float, end: float) -> Float[Tensor,
 def haired_for_certain(arrays: HeadArrays) -> Bool[Tensor, "V"]:
     """Where a head has hair, if it has any, wherever its hairline runs in front."""
     behind, up = _behind_and_above_eyes(arrays)
-    certain = ((behind > _SIDES_M) & (up > -_LOBES_M)) | (up > _TOP_M)
+    certain = ((behind > _SIDES_M) & (up > -NECK_HAIR_M)) | (up > _TOP_M)
     over_ears = (behind > _TEMPLE_M) & (up > _OVER_EARS_M)
     return (torch.from_numpy(haired_vertices(arrays)) & certain) | over_ears
 

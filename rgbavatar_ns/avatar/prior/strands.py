@@ -11,6 +11,7 @@ from torch import Tensor
 from rgbavatar_ns.avatar.avatar import Avatar
 from rgbavatar_ns.avatar.model.blendshapes import color_from_feature, feature_from_color
 from rgbavatar_ns.avatar.prior.mesh_field import MeshField, ramp
+from rgbavatar_ns.avatar.prior.nape import Nape
 
 _EARS_ASIDE_M = 0.05
 """Ears, and what lies behind them, are farther than so from the middle."""
@@ -52,6 +53,7 @@ class Strands:
     """How much lighter or darker each is than hair on average, for a contrast of 1: at most 3."""
     beside_ears: Bool[Tensor, "V"]
     """Vertices of the scalp where ears are before it, seen from in front."""
+    nape: Nape
 
     @classmethod
     def of(cls, avatar: Avatar, field: MeshField) -> "Strands":
@@ -63,7 +65,8 @@ class Strands:
         beside_ears = field.scalp & ~field.above_ears & aside
         haired = field.at_gaussians(field.haired.to(field.rest_m)[:, None])[:, 0]
         if not bool(field.haired.any()):
-            return cls(haired, torch.zeros_like(haired), beside_ears)
+            plain = torch.zeros_like(haired)
+            return cls(haired, plain, beside_ears, Nape.of(field, plain))
         normals = F.normalize(field.at_gaussians(field.normals), dim=-1)
         places_m = field.at_gaussians(field.rest_m - field.rest_m[field.haired].mean(0))
         falls = places_m - places_m.new_tensor(_CROWN)
@@ -82,7 +85,9 @@ class Strands:
                 drawn += _noise(places_m + step_m * along, apart_m, seed)
             pattern += contrast * _standardized(drawn, haired)
         pattern = _MOST * (_standardized(pattern, haired) / _MOST).tanh()
-        return cls(haired, haired * _standardized(pattern, haired) / _DRAWN, beside_ears)
+        nape = Nape.of(field, _standardized(pattern, haired))
+        haired = torch.lerp(haired, nape.hair, nape.near)
+        return cls(haired, haired * _standardized(pattern, haired) / _DRAWN, beside_ears, nape)
 
     def known(self, confidence: Float[Tensor, "V"], most: Float[Tensor, "V"]) -> Float[Tensor, "V"]:
         """How much of vertices' colours is known, without skin that shines beside ears; `most` is

@@ -253,6 +253,7 @@ class SurfacePrior(nn.Module):
         if mouth is not None:  # where what lies behind is dark too
             alone = alone * (1 - mouth.in_cavity)
         disc[:, :2] += alone[:, None] * log_overlap(avatar, field, self.views.surface_m)
+        plain = strands.nape.colored(field.at_gaussians(color), color)
         upright = torch.zeros_like(shapes.rotation_wxyz)
         upright[:, 0] = 1
         rest = {
@@ -260,7 +261,7 @@ class SurfacePrior(nn.Module):
             "rotation_wxyz": upright,
             "log_scale": disc,
             "opacity_logit": opacity_logit,
-            "color_feature": strands.drawn(field.at_gaussians(color), self.views.hair_contrast),
+            "color_feature": strands.drawn(plain, self.views.hair_contrast),
         }
         shares = {"opacity_logit": closes, "color_feature": color_pull}
         for name, target in rest.items():
