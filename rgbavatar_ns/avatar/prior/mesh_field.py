@@ -28,8 +28,8 @@ NECK_HAIR_M = 0.05
 where hair as thick as above would stand out as soon as a head turns."""
 _ABOVE_EARS_M = 0.04
 """From here up hair goes on to the forehead, or a bald head does."""
-_HAIRLINE = 0.005
-"""How stiff a link over the border of hair is."""
+_BORDER = 0.005
+"""How stiff a link over the border of hair is, and over that of a body, which wears clothes."""
 _MIRROR_REACH_M = 5e-3
 _MIRROR_TRUST = 0.3
 """How much what is known of one side of the face tells of the other."""
@@ -93,7 +93,8 @@ class MeshField:
         # Above the ears hair goes on, or a bald head does.
         low = ~self.above_ears
         across = (self.scalp[first] != self.scalp[second]) & low[first] & low[second]
-        self.links = torch.where(across, _HAIRLINE, 1.0).to(template)
+        across |= self.body[first] != self.body[second]
+        self.links = torch.where(across, _BORDER, 1.0).to(template)
         self.body_gaussians = self.at_gaussians(self.body.to(template)[:, None])[:, 0] > 0.5
         with torch.no_grad():
             rest = avatar.head(avatar.identity.new_zeros(1, avatar.layout.size), avatar.identity)

@@ -5,7 +5,7 @@ import torch
 from rgbavatar_ns.avatar import Avatar, AvatarConfig
 from rgbavatar_ns.avatar.prior.mesh_field import MeshField
 from rgbavatar_ns.head import HeadModel
-from rgbavatar_ns.head.arrays import EMBEDDED_HEAD
+from rgbavatar_ns.head.arrays import EMBEDDED_BUST, EMBEDDED_HEAD
 from rgbavatar_ns.head.surface import vertex_normals
 
 
@@ -101,3 +101,25 @@ def test_the_matrix_of_the_edges_is_one_that_every_library_reads():
     first, second = field.edges.unbind(1)
     expected = torch.zeros(matrix.shape).index_put((first, second), entries)
     assert torch.equal(matrix.to_dense(), expected)
+
+
+def test_a_neck_s_back_is_as_its_front_is_whatever_lies_below():
+    """Light skin in front, a dark shirt and dark hair: the back of the neck is no mixture."""
+    field = MeshField(embedded_avatar(name=EMBEDDED_BUST))
+    middle = (field.rest_m[:, 1] > -0.09) & (field.rest_m[:, 1] < -0.06) & ~field.body
+    skin = ~field.body & ~field.haired
+    front = skin & (field.behind_eyes_m < 0.05)
+    neck = skin & middle & (field.behind_eyes_m > 0.09)
+    assert int(neck.sum()) > 15
+    confidence = (front | field.body | field.haired).float()
+    values = skin.float()[:, None]
+    found = field.continued(values, confidence, values, stiffness=0.02, rest=1e-6, iterations=300)[
+        :, 0
+    ]
+    assert float(found[neck].min()) > 0.75
+    # Where all links are alike most of it is shirt and hair.
+    field.links = torch.ones_like(field.links)
+    alike = field.continued(values, confidence, values, stiffness=0.02, rest=1e-6, iterations=300)[
+        :, 0
+    ]
+    assert float(alike[neck].mean()) < 0.5
