@@ -88,19 +88,14 @@ class FrontSurface:
         in front it is all the same. What stands before the surface as a whole, as glasses, does
         not count. Axes are as long as their standard deviations.
         """
-        return ramp(self.overhang_m(centres_m, axes_m)[0], *_BEFORE_M)
+        tips_m = centres_m + _TIP * axes_m, centres_m - _TIP * axes_m
+        before_m = self.before_m(tips_m[0]).maximum(self.before_m(tips_m[1]))
+        return ramp(before_m - self.before_m(centres_m).clamp(min=0), *_BEFORE_M)
 
-    def overhang_m(
-        self, centres_m: Float[Tensor, "N 3"], axes_m: Float[Tensor, "N 3"]
-    ) -> tuple[Float[Tensor, "N"], Float[Tensor, "N"]]:
-        """How far a Gaussian's foremost tip stands before the surface, or how much farther than
-        its centre does, and which way along its axis that tip is: 1 or -1."""
-        centre, first, second = (
-            (place[:, 2] - self.at(place)).nan_to_num(nan=-1.0)
-            for place in (centres_m, centres_m + _TIP * axes_m, centres_m - _TIP * axes_m)
-        )
-        way = torch.where(first >= second, 1.0, -1.0)
-        return first.maximum(second) - centre.clamp(min=0), way
+    def before_m(self, places_m: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
+        """How far before the foremost surface places lie, along the head's z axis at rest; -1 m
+        beside it."""
+        return (places_m[:, 2] - self.at(places_m)).nan_to_num(nan=-1.0)
 
 
 def longest_axes_m(
@@ -123,45 +118,28 @@ def shorten_overhanging(
     rest_m: Float[Tensor, "N 3"],
     frame_wxyz: Float[Tensor, "N 4"],
     disc: Float[Tensor, "N 3"],
-    shares: tuple[Float[Tensor, "N"], Float[Tensor, "N"]],
+    shares: tuple[Float[Tensor, "N"], Float[Tensor, "N"], Float[Tensor, "N"]],
 ) -> None:
     """Go by a share to the width of its disc along the longest axis of what overhangs.
 
     rest_m: where Gaussians are on the head at rest; frame_wxyz: see `longest_axes_m`; `disc` holds
-    logarithms of scales; shares: of what reaches out across the view, and along it, which closes
-    sides and is theirs. Ours, because from in front all that a chin paints of a throat is the
-    same, and turned heads had whiskers.
+    logarithms of scales; shares: of what reaches out across the view, and along it; and of what
+    closes sides by reaching along it, of which only the end that stands before the head is cut off.
+    Ours, because from in front all that a chin paints of a throat, and how long a needle beside a
+    cheek is, is the same, and turned heads had whiskers.
     """
     log_scale, longest = shapes.log_scale.max(1, keepdim=True)
     short = log_scale.minimum(disc[:, :2].mean(1, keepdim=True))
     axes_m = longest_axes_m(shapes, frame_wxyz)
-    across = axes_m[:, :2].norm(dim=1) / axes_m.norm(dim=1).clamp(min=1e-9)
-    share = torch.lerp(shares[1], shares[0], ramp(across, *_ACROSS))
-    goes = share * front.overhang(rest_m, axes_m)
-    shapes.log_scale.scatter_(1, longest, log_scale.lerp(short, goes[:, None]))
-
-
-def trim_ahead(
-    shapes: TangentBlendshapes,
-    front: FrontSurface,
-    rest_m: Float[Tensor, "N 3"],
-    frame_wxyz: Float[Tensor, "N 4"],
-    disc: Float[Tensor, "N 3"],
-    share: Float[Tensor, "N"],
-) -> None:
-    """Cut off by a share what of a Gaussian along the view stands before the head; the rest stays.
-
-    Arguments as of `shorten_overhanging`. Ours, because sides are closed by what reaches along the
-    view, and beside a cheek such a needle came out of it.
-    """
-    axes_m = longest_axes_m(shapes, frame_wxyz)
     length_m = axes_m.norm(dim=1).clamp(min=1e-9)
-    along = ramp(axes_m[:, :2].norm(dim=1) / length_m, *_ACROSS[::-1])
-    excess_m, way = front.overhang_m(rest_m, axes_m)
-    before = (excess_m - _BEFORE_M[0]).clamp(min=0) / (2 * _TIP * length_m)
-    spare = 1 - _NEEDLE * disc[:, :2].amax(1).exp() / length_m
-    cut = share * along * before.minimum(spare.clamp(min=0))
-    back_m = turn_back(frame_wxyz, -(_TIP * way * cut)[:, None] * axes_m)
-    shapes.position.add_(back_m)
-    longest = shapes.log_scale.argmax(1, keepdim=True)
-    shapes.log_scale.scatter_add_(1, longest, (1 - cut).log()[:, None])
+    across = ramp(axes_m[:, :2].norm(dim=1) / length_m, *_ACROSS)
+    goes = torch.lerp(shares[1], shares[0], across) * front.overhang(rest_m, axes_m)
+    ahead_m = _TIP * axes_m * torch.where(axes_m[:, 2:] < 0, -1.0, 1.0)
+    # What stands off as a whole, as the side of glasses, is no end of anything.
+    own = ramp(front.before_m(rest_m), _BEFORE_M[0], 0.0)
+    before = (front.before_m(rest_m + ahead_m) - _BEFORE_M[0]).clamp(min=0)
+    spare = (1 - _NEEDLE * disc[:, :2].amax(1).exp() / length_m).clamp(min=0)
+    cut = shares[2] * (1 - across) * own * (before / (2 * _TIP * length_m)).minimum(spare)
+    shapes.position.sub_(turn_back(frame_wxyz, cut[:, None] * ahead_m))
+    log_scale = log_scale.lerp(short, goes[:, None]) + (1 - cut).log()[:, None]
+    shapes.log_scale.scatter_(1, longest, log_scale)

@@ -28,8 +28,9 @@ NECK_HAIR_M = 0.05
 where hair as thick as above would stand out as soon as a head turns."""
 _ABOVE_EARS_M = 0.04
 """From here up hair goes on to the forehead, or a bald head does."""
-_BORDER = 0.005
-"""How stiff a link over the border of hair is, and over that of a body, which wears clothes."""
+_HAIRLINE, _COLLAR = 0.005, 0.005
+"""How stiff a link over the border of hair is; and over that of a body, which wears clothes, but
+only for colours."""
 _MIRROR_REACH_M = 5e-3
 _MIRROR_TRUST = 0.3
 """How much what is known of one side of the face tells of the other."""
@@ -61,7 +62,7 @@ class MeshField:
     `normals` are the vertices' own at rest, `height_m`, `behind_eyes_m` and `above_eyes_m` are
     theirs on the template; `body` and `body_gaussians` lie below the neck's foot, `haired` where
     hair is the rule, `scalp` where everybody who has hair has it, `back` (1 or 0) behind the ears,
-    `above_ears` above them.
+    `above_ears` above them. All that is continued is by `links`; by `color_links` colours are, too.
 
     Values are continued harmonically, as heat would spread, to both sides of the face alike. Ours:
     because what nobody filmed is best guessed by what surrounds it.
@@ -93,8 +94,9 @@ class MeshField:
         # Above the ears hair goes on, or a bald head does.
         low = ~self.above_ears
         across = (self.scalp[first] != self.scalp[second]) & low[first] & low[second]
-        across |= self.body[first] != self.body[second]
-        self.links = torch.where(across, _BORDER, 1.0).to(template)
+        self.links = torch.where(across, _HAIRLINE, 1.0).to(template)
+        dressed = self.body[first] != self.body[second]
+        self.color_links = torch.where(dressed, _COLLAR, 1.0).to(template)
         self.body_gaussians = self.at_gaussians(self.body.to(template)[:, None])[:, 0] > 0.5
         with torch.no_grad():
             rest = avatar.head(avatar.identity.new_zeros(1, avatar.layout.size), avatar.identity)

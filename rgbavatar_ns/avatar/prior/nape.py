@@ -18,6 +18,10 @@ _BEHIND_M = 0.095, 0.11
 """From what lies so far behind the eyes it begins, and is altogether."""
 _HAIR_M, _SKIN_M = (0.0, 0.015), (-0.045, -0.025)
 """Heights over the end of the mesh's hair whose colours are hair's and skin's."""
+_LOWEST_M = -0.036
+"""Below it no strand reaches."""
+_STRANDS = 0.01, 0.03
+"""Contrasts of hair from which it ends so, and from which it does altogether: caps do not."""
 _NEAREST = 4
 """Vertices whose mean colour is a Gaussian's."""
 
@@ -44,13 +48,14 @@ class Nape:
         sides = field.behind_eyes_m > _BEHIND_M[0]
         known = [sides & _between(height_m, *bounds) for bounds in (_HAIR_M, _SKIN_M)]
         known = [known[0] & field.haired, known[1] & ~field.haired]
+        # Aside at rest, as wide as this person's neck is.
         behind_m, up_m, aside_m = field.at_gaussians(
             torch.stack([field.behind_eyes_m, height_m, field.rest_m[:, 0]], 1)
         ).unbind(1)
         middle = (1 - (aside_m / _HALF_WIDTH_M).square()).clamp(min=0)
         line_m = _HIGHEST_M - _DEEPEST_M * middle
         hair = ramp(up_m - line_m + _RAGGED_M * strands, -_SOFT_M, _SOFT_M)
-        near = ramp(behind_m, *_BEHIND_M) * _between(up_m, _SKIN_M[1], _HAIR_M[1]).to(up_m)
+        near = ramp(behind_m, *_BEHIND_M) * _between(up_m, _LOWEST_M, _HAIR_M[1]).to(up_m)
         if not all(bool(some.any()) for some in known):
             near = torch.zeros_like(near)
         places = torch.nonzero(near)[:, 0]
@@ -59,11 +64,16 @@ class Nape:
         return cls(near, hair, places, of_hair, of_skin)
 
     def colored(
-        self, color: Float[Tensor, "N C"], of_vertices: Float[Tensor, "V C"]
+        self,
+        color: Float[Tensor, "N C"],
+        of_vertices: Float[Tensor, "V C"],
+        contrast: Float[Tensor, ""],
     ) -> Float[Tensor, "N C"]:
-        """Colours of Gaussians with this line between hair and skin."""
+        """Colours of Gaussians with this line between hair and skin, where hair has strands of
+        some contrast."""
         hair, skin = (of_vertices[some].mean(1) for some in (self.of_hair, self.of_skin))
         share, near = self.hair[self.places, None], self.near[self.places, None]
+        near = near * ramp(contrast, *_STRANDS)
         there = torch.lerp(color[self.places], torch.lerp(skin, hair, share), near)
         return color.index_copy(0, self.places, there)
 

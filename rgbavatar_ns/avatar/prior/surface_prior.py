@@ -20,7 +20,7 @@ from rgbavatar_ns.avatar.prior.discs import (
     log_overlap,
     narrow_ahead,
 )
-from rgbavatar_ns.avatar.prior.front import FrontSurface, shorten_overhanging, trim_ahead
+from rgbavatar_ns.avatar.prior.front import FrontSurface, shorten_overhanging
 from rgbavatar_ns.avatar.prior.leash import Leash
 from rgbavatar_ns.avatar.prior.mesh_field import MeshField, ramp
 from rgbavatar_ns.avatar.prior.mouth import HiddenMouth
@@ -45,6 +45,8 @@ _ASTRAY = 2.0
 """Widths from its place at which what is hardly seen of a body is clear until it is back."""
 _HARDLY_TURNED = 0.25
 """Of a film that is all front, from which on it does not tell what hangs before a throat."""
+_FROM_FRONT = 0.8, 0.95
+"""Forward parts of a film's view from which on it hardly tells how long a head's sides are."""
 _STRAYS_M, _FLEETING = (2e-2, 3e-2), (0.2, 0.1)
 """From what a face's Gaussian has left its place it may stray, and does for sure, where so little
 of what is seen of it is seen in front: from behind jaws and ears it paints collars and curtains."""
@@ -206,7 +208,12 @@ class SurfacePrior(nn.Module):
         if mouth is not None:
             told, confidence = mouth.guessed(told, confidence)
         color = field.continued(
-            told, confidence, start, stiffness=_STIFFNESS, rest=_REST, iterations=_ITERATIONS
+            told,
+            confidence,
+            start,
+            stiffness=_STIFFNESS * field.color_links,
+            rest=_REST,
+            iterations=_ITERATIONS,
         )
         colored_px = strands.colored_px(self.seen_px, self.clear_px, self.grazing_px)
         disc = disc_log_scale(avatar)
@@ -244,8 +251,9 @@ class SurfacePrior(nn.Module):
         here = parts.rest_m + turn_back(turned, shapes.position)
         hangs = seen * ramp(alone.to(disc), 0.0, _HARDLY_TURNED)
         shares = parts.skin * hangs, parts.narrow * hangs
-        trim_ahead(shapes, parts.front, here, field.rest_quats_wxyz, disc, shares[0])
-        here = parts.rest_m + turn_back(turned, shapes.position)
+        # A film from aside shows how long sides are.
+        cut = (shares[0] - shares[1]).clamp(min=0) * ramp(ahead[2].to(disc), *_FROM_FRONT)
+        shares = (*shares, cut)
         shorten_overhanging(shapes, parts.front, here, field.rest_quats_wxyz, disc, shares)
         # As far as nothing shows it, nothing else closes the surface around it.
         through = _SHINES_PX / (self.through_px + _SHINES_PX)
@@ -253,7 +261,8 @@ class SurfacePrior(nn.Module):
         if mouth is not None:  # where what lies behind is dark too
             alone = alone * (1 - mouth.in_cavity)
         disc[:, :2] += alone[:, None] * log_overlap(avatar, field, self.views.surface_m)
-        plain = strands.nape.colored(field.at_gaussians(color), color)
+        contrast = self.views.hair_contrast
+        plain = strands.nape.colored(field.at_gaussians(color), color, contrast)
         upright = torch.zeros_like(shapes.rotation_wxyz)
         upright[:, 0] = 1
         rest = {
@@ -261,7 +270,7 @@ class SurfacePrior(nn.Module):
             "rotation_wxyz": upright,
             "log_scale": disc,
             "opacity_logit": opacity_logit,
-            "color_feature": strands.drawn(plain, self.views.hair_contrast),
+            "color_feature": strands.drawn(plain, contrast),
         }
         shares = {"opacity_logit": closes, "color_feature": color_pull}
         for name, target in rest.items():

@@ -3,6 +3,7 @@
 import math
 
 import numpy as np
+import pytest
 import torch
 
 from rgbavatar_ns import Avatar
@@ -125,11 +126,16 @@ def test_what_hangs_before_another_part_is_as_short_as_its_disc_again():
     assert float((found_m / long_m)[lies].quantile(0.1)) > 0.95
 
 
-def test_needles_along_the_view_end_at_the_face_and_still_close_its_sides():
-    """Beside cheeks needles reach 25 mm out of the head: those are cut off, nothing behind is."""
+@pytest.mark.parametrize(
+    ("degrees", "off_m", "cut"), [(0.0, -0.0125, True), (0.0, 0.008, False), (60.0, -0.0125, False)]
+)
+def test_needles_along_the_view_end_at_the_face_and_still_close_its_sides(degrees, off_m, cut):
+    """Beside cheeks needles reach 25 mm out of the head: those are cut off, nothing behind is.
+
+    But what stands off as a whole stays, and so does what a film from aside shows."""
     avatar = embedded_avatar(name=EMBEDDED_BUST)
     field, long_m = MeshField(avatar), 0.025
-    theta = turned(avatar, [-1.0, 0.0, 1.0])
+    theta = turned(avatar, [degrees - 1, degrees, degrees + 1])
     images = drawn_thicker(avatar, theta, 0.0)
     prior, shapes = SurfacePrior(avatar), avatar.blendshapes
     prior.begin(avatar, theta, front_camera(), images)
@@ -139,7 +145,7 @@ def test_needles_along_the_view_end_at_the_face_and_still_close_its_sides():
     shapes.rotation_wxyz.data.copy_(torch.nn.functional.pad(half, (1, 0)))
     shapes.log_scale.data[:, 0] = math.log(long_m)
     foremost = torch.from_numpy(foremost_m(avatar, rest)).float()
-    centre = torch.cat([rest[:, :2], (foremost - 0.0125)[:, None]], 1)
+    centre = torch.cat([rest[:, :2], (foremost + off_m)[:, None]], 1)
     shapes.position.data.copy_(turn_back(frame, centre - rest).nan_to_num())
     sideways = field.at_gaussians(field.normals)[:, 0].abs()
     sides = (Strands.of(avatar, field).haired == 0) & ~field.body_gaussians & (sideways > 0.75)
@@ -155,6 +161,9 @@ def test_needles_along_the_view_end_at_the_face_and_still_close_its_sides():
     after = rest + turn_back(conjugate_quats_wxyz(frame), shapes.position.detach())
     reach = 1.5 * shapes.log_scale.detach()[:, 0].exp()
     before_m, back_m = after[:, 2] + reach - foremost, after[:, 2] - reach
+    if not cut:
+        np.testing.assert_allclose(before_m[sides], off_m + 1.5 * long_m, atol=1e-3)
+        return
     assert float(before_m[sides].max()) < 6e-3
     assert float(before_m[sides].min()) > 2e-3, "no more than that"
     assert float((back_m - (centre[:, 2] - 1.5 * long_m))[sides].abs().max()) < 1e-3
