@@ -7,10 +7,13 @@ from typing import Annotated, Any, Literal
 import torch
 from nerfstudio.engine.optimizers import OptimizerConfig, Optimizers
 from nerfstudio.engine.schedulers import Scheduler, SchedulerConfig
+from torch.nn import Parameter
 from torch.optim.lr_scheduler import LambdaLR
 
 from rgbavatar_ns.avatar import LEARNING_RATES
+from rgbavatar_ns.avatar.method import AvatarMethod
 from rgbavatar_ns.options import Between, Counted, Positive, Weight
+from rgbavatar_ns.plugin.training.refused import require_bases_to_begin, require_rates_to_fall
 
 DecayShape = Literal["exponential", "linear"]
 _MOMENTS = ("exp_avg", "exp_avg_sq")
@@ -87,7 +90,40 @@ def paper_optimizers() -> dict[str, Any]:
     }
 
 
-def note_asked_rates(optimizers: Optimizers) -> None:
+def scheduled_optimizers(
+    config: Any, groups: dict[str, list[Parameter]], avatar: AvatarMethod
+) -> Optimizers:
+    """Return an optimiser a parameter group, with the schedules that a trainer's config asks for.
+
+    Raises UserError where the config asks for what would change nothing.
+    """
+    steps = config.learning_rate_steps or config.max_num_iterations
+    # Of a run that is shorter than its schedule, the bases are to learn too.
+    refined = min(steps, config.max_num_iterations)
+    model = config.pipeline.model
+    settings: dict[str, Any] = {}
+    rates, scheduled = avatar.learning_rates(), avatar.rate_factors(0).keys()
+    require_rates_to_fall(config, groups.keys(), scheduled)
+    require_bases_to_begin(config, groups.keys())
+    for name in groups:
+        own = {"optimizer": AdamConfig(lr=rates[name]), "scheduler": None}
+        settings[name] = dict(config.optimizers.get(name, own))
+        rate = settings[name]["optimizer"].lr
+        factor = 1.0 if name in scheduled else config.learning_rate_factor
+        if name == "position" and config.position_lr_final is not None:
+            # Positions that are kept still (a rate of 0) stay so.
+            factor = config.position_lr_final / rate if rate > 0 else 1.0
+        start = model.refinement.first_step_of(name, refined) if model.refine_tracking else 0
+        if (factor != 1.0 or start > 0) and settings[name].get("scheduler") is None:
+            settings[name]["scheduler"] = DecayConfig(
+                factor=factor, steps=steps, start_step=start, shape=config.learning_rate_decay
+            )
+    optimizers = Optimizers(settings, groups)
+    _note_asked_rates(optimizers)
+    return optimizers
+
+
+def _note_asked_rates(optimizers: Optimizers) -> None:
     """Keep in each optimiser's state the rate that was asked for, before any schedule."""
     for name, optimizer in optimizers.optimizers.items():
         for group in optimizer.param_groups:

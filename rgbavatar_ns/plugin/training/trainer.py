@@ -1,7 +1,6 @@
 """nerfstudio's trainer with checkpoints, resuming and interruption that can be relied on."""
 
 import copy
-import math
 import sys
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -17,7 +16,6 @@ from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.utils import writer
 from nerfstudio.utils.misc import step_check
-from nerfstudio.utils.writer import EventName
 from nerfstudio.viewer.viewer import Viewer
 from torch import Tensor
 
@@ -55,17 +53,15 @@ from rgbavatar_ns.plugin.training.load_config import (
     run_beside,
 )
 from rgbavatar_ns.plugin.training.optimizers import (
-    AdamConfig,
-    DecayConfig,
     DecayShape,
     go_on_as_asked,
-    note_asked_rates,
     require_fitting_states,
+    scheduled_optimizers,
 )
 from rgbavatar_ns.plugin.training.progress import TrainingProgress
 from rgbavatar_ns.plugin.training.ranges import require_found, require_trainable
-from rgbavatar_ns.plugin.training.refused import require_bases_to_begin, require_rates_to_fall
 from rgbavatar_ns.plugin.training.run_end import EndingTrainer
+from rgbavatar_ns.plugin.training.scalars import finite_loss, write_rates, write_step
 from rgbavatar_ns.plugin.training.train_clock import TrainClock, waiting_for
 from rgbavatar_ns.plugin.training.turns import TurnsLock
 from rgbavatar_ns.plugin.viewer.settings import is_of_ns_viewer, viewer_settings
@@ -235,35 +231,9 @@ class RGBAvatarTrainer(EndingTrainer, FitHooks):
 
     def setup_optimizers(self) -> Optimizers:
         """One optimiser a parameter group, with the schedules that the config asks for."""
-        groups = self.pipeline.get_param_groups()
-        steps = self.config.learning_rate_steps or self.config.max_num_iterations
-        # Of a run that is shorter than its schedule, the bases are to learn too.
-        refined = min(steps, self.config.max_num_iterations)
-        model = self.config.pipeline.model
-        settings: dict[str, Any] = {}
-        rates = self.pipeline.model.avatar.learning_rates()
-        scheduled = self.pipeline.model.avatar.rate_factors(0).keys()
-        require_rates_to_fall(self.config, groups.keys(), scheduled)
-        require_bases_to_begin(self.config, groups.keys())
-        for name in groups:
-            own = {"optimizer": AdamConfig(lr=rates[name]), "scheduler": None}
-            settings[name] = dict(self.config.optimizers.get(name, own))
-            rate = settings[name]["optimizer"].lr
-            factor = 1.0 if name in scheduled else self.config.learning_rate_factor
-            if name == "position" and self.config.position_lr_final is not None:
-                # Positions that are kept still (a rate of 0) stay so.
-                factor = self.config.position_lr_final / rate if rate > 0 else 1.0
-            start = model.refinement.first_step_of(name, refined) if model.refine_tracking else 0
-            if (factor != 1.0 or start > 0) and settings[name].get("scheduler") is None:
-                settings[name]["scheduler"] = DecayConfig(
-                    factor=factor,
-                    steps=steps,
-                    start_step=start,
-                    shape=self.config.learning_rate_decay,
-                )
-        optimizers = Optimizers(settings, groups)
-        note_asked_rates(optimizers)
-        return optimizers
+        return scheduled_optimizers(
+            self.config, self.pipeline.get_param_groups(), self.pipeline.model.avatar
+        )
 
     def train(self) -> None:
         """Train until steps or seconds are used up or a stop is asked for; then save."""
@@ -363,33 +333,21 @@ class RGBAvatarTrainer(EndingTrainer, FitHooks):
             callback.run_callback_at_location(step, location)
 
     def _finite_loss(self, losses: Losses, step: int) -> float:
-        """The whole loss; raises UserError where it is not finite."""
-        loss = sum(map(float, losses.values()))
-        if not math.isfinite(loss):
-            changed = "smaller learning rates, for example --optimizers.color.optimizer.lr 0.005"
-            if not self.config.optimizers:  # the method's own rates
-                changed = "other options of the method, --pipeline.model.avatar.*"
-            raise UserError(
-                f"The loss of step {step} is {loss}.",
-                f"Resume from the last checkpoint in {self.checkpoint_dir} with {changed}.",
-            )
-        return loss
+        return finite_loss(losses, step, self.config.optimizers, self.checkpoint_dir)
 
     def _write_scalars(self, step: int, losses: Losses) -> float:
         """TensorBoard's curves, and the speeds the viewer shares the device by; the loss."""
         self.clock.settle()
-        seconds = self.clock.seconds_per_step
         loss = self._finite_loss(losses, step)
-        pixels = self.pipeline.datamanager.get_train_rays_per_batch()
-        rate = self._images_per_step / seconds
-        writer.put_scalar(name="Train Loss", scalar=loss, step=step)
-        writer.put_dict(name="Train Loss Dict", scalar_dict={**losses}, step=step)
-        writer.put_scalar(name="Train Images / Sec", scalar=rate, step=step)
-        writer.put_time(EventName.ITER_TRAIN_TIME, seconds, step, update_eta=True)
-        writer.put_time(EventName.TRAIN_RAYS_PER_SEC, pixels / seconds, step)
-        for name, scheduler in self.optimizers.schedulers.items():
-            rate = scheduler.get_last_lr()[0]
-            writer.put_scalar(name=f"learning_rate/{name}", scalar=rate, step=step)
+        write_step(
+            step,
+            loss,
+            losses,
+            images=self._images_per_step,
+            pixels=self.pipeline.datamanager.get_train_rays_per_batch(),
+            seconds=self.clock.seconds_per_step,
+        )
+        write_rates(step, self.optimizers.schedulers)
         return loss
 
     @property
