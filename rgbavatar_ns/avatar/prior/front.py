@@ -40,19 +40,20 @@ class FrontSurface:
     last_px: Float[Tensor, "2"]
 
     @classmethod
-    def of(cls, avatar: Avatar, field: MeshField) -> "FrontSurface":
-        """Drawn from afar to near."""
+    def of(cls, avatar: Avatar, field: MeshField, *, from_behind: bool = False) -> "FrontSurface":
+        """Drawn from afar to near; `from_behind`, the hindmost surface, whose depth is minus z."""
         # Here, so that timing steps on a bare machine needs no OpenCV.
         import cv2
 
         rest_m = field.rest_m.cpu().double().numpy()
         faces = avatar.head.faces.cpu().long().numpy()
         low, high = rest_m.min(0), rest_m.max(0)
+        nearness_m = rest_m[:, 2] * (-1 if from_behind else 1)
         columns, rows = (int(part / _PIXEL_M) + 2 for part in (high - low)[:2])
         px = np.stack([rest_m[:, 0] - low[0], high[1] - rest_m[:, 1]], 1) / _PIXEL_M
         corners = np.round(px[faces] * 16).astype(np.int32)
         drawn = np.full((rows, columns), np.nan, np.float32)
-        forward = rest_m[faces, 2].mean(1)
+        forward = nearness_m[faces].mean(1)
         for face in np.argsort(forward):
             cv2.fillConvexPoly(drawn, corners[face], (float(forward[face]),), shift=4)
         there = np.isfinite(drawn)

@@ -13,6 +13,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 
 from rgbavatar_ns.avatar.avatar import Avatar
+from rgbavatar_ns.avatar.prior.covered import HeadSolid
 from rgbavatar_ns.avatar.prior.discs import (
     LONGEST,
     disc_log_scale,
@@ -77,8 +78,8 @@ class SurfacePrior(nn.Module):
     """Remembers how much each of N Gaussians was seen, and draws the unseen to the surface.
 
     Attributes:
-        seen_px: pixels that each covered, from its own side, in the frame that showed it best,
-            slowly forgotten.
+        seen_px: pixels that each covered, from its own side and with none of the head before it, in
+            the frame that showed it best, slowly forgotten.
         clear_px: the same from ever more in front, for what its colour tells of its surroundings.
         grazing_px: the same from ever more aside, which tells how thick it is.
         through_px: the same from whichever side: a matte that fades shows the far side's opacity.
@@ -169,7 +170,7 @@ class SurfacePrior(nn.Module):
         backend: str = "auto",
     ) -> None:
         """See what these frames show; `renderer` is theirs, where there is one already."""
-        self.views.see(avatar, theta, cameras)
+        to_eye = self.views.see(avatar, theta, cameras)
         for known in (self.seen_px, self.clear_px, self.grazing_px, self.through_px):
             known.mul_(_FORGETS)
         if renderer is None:
@@ -181,11 +182,18 @@ class SurfacePrior(nn.Module):
             sums = weighted_color_average(avatar.gaussians(theta), cameras, filmed, backend=backend)
         vertices, cameras = avatar.carrier_vertices(theta), cameras.to(avatar.identity)
         shown_px, facing = sums.weighted_sum[..., 0], _facing(avatar, vertices, cameras)
-        mouth = self._parts(avatar).mouth
+        parts = self._parts(avatar)
+        mouth = parts.mouth
         if mouth is not None:
             # Also where expressions do not carry Gaussians they part the lips.
             shown_px = mouth.through_lips(shown_px, avatar.head(theta, avatar.identity), cameras)
-        seen, clear = ramp(facing, _TURNED_AWAY, _FACING), ramp(facing, _FACING, _FRONTAL)
+        # Bodies do not turn with the head, and of the mouth its lips decide.
+        here_m = parts.at_rest_m(avatar.blendshapes.position)
+        covered = parts.solid.covered(here_m, to_eye.to(facing)) * parts.outer
+        seen, clear = (
+            (1 - covered) * ramp(facing, *cosines)
+            for cosines in ((_TURNED_AWAY, _FACING), (_FACING, _FRONTAL))
+        )
         for known, share in (
             (self.through_px, torch.ones_like(facing)),
             (self.seen_px, seen),
@@ -237,8 +245,7 @@ class SurfacePrior(nn.Module):
         unturned = alone.to(disc) * parts.narrow * seen
         flatten(shapes, view, disc, unturned, widths=LONGEST)
         # Gone aside, as chins that paint the neck, it has the surface before it that is there.
-        turned = conjugate_quats_wxyz(field.rest_quats_wxyz)
-        here, there = (parts.rest_m + turn_back(turned, at) for at in (shapes.position, home))
+        here, there = parts.at_rest_m(shapes.position), parts.at_rest_m(home)
         before_m, front_m = parts.front.at(here), parts.front.at(there)
         # And what was hidden there, as below the chin, is not any more.
         aside = ramp((here - there)[:, :2].norm(dim=1), *_ASIDE_M)
@@ -248,7 +255,7 @@ class SurfacePrior(nn.Module):
         before_m = (before_m - front_m + shown * hidden_m).nan_to_num()
         depth = ((home - shapes.position) * view).sum(1) + before_m * ahead[2].to(disc)
         shapes.position.add_((_DEPTH_RATE * unturned * depth)[:, None] * view)
-        here = parts.rest_m + turn_back(turned, shapes.position)
+        here = parts.at_rest_m(shapes.position)
         hangs = seen * ramp(alone.to(disc), 0.0, _HARDLY_TURNED)
         shares = parts.skin * hangs, parts.narrow * hangs
         # A film from aside shows how long sides are.
@@ -305,17 +312,20 @@ class SurfacePrior(nn.Module):
         device = self.seen_px.device
         if self._parts_of is None or self._parts_of[0] != device:
             field = MeshField(avatar)
-            strands = Strands.of(avatar, field)
+            strands, mouth = Strands.of(avatar, field), HiddenMouth.of(avatar, field)
+            front, outer = FrontSurface.of(avatar, field), (~field.body_gaussians).to(field.rest_m)
             self._parts_of = (
                 device,
                 _Parts(
                     field,
-                    HiddenMouth.of(avatar, field),
+                    mouth,
                     Leash(avatar, field),
                     strands,
                     narrow_ahead(field) * (1 - strands.haired),
                     (1 - strands.haired) * ~field.body_gaussians,
-                    FrontSurface.of(avatar, field),
+                    front,
+                    HeadSolid.of(avatar, field, front),
+                    outer if mouth is None else outer * (1 - mouth.behind),
                     field.at_gaussians(field.rest_m),
                     _SEEN_PX * _body_sizes(avatar, field),
                 ),
@@ -336,10 +346,18 @@ class _Parts:
     skin: Float[Tensor, "N"]
     """1 of a head where no hair is."""
     front: FrontSurface
+    solid: HeadSolid
+    outer: Float[Tensor, "N"]
+    """1 of a head, 0 of the body and within the mouth."""
     rest_m: Float[Tensor, "N 3"]
     """Each one's place on the mesh at rest."""
     half_known_px: Float[Tensor, "N"]
     """Pixels covered at which each is half known."""
+
+    def at_rest_m(self, position: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+        """Where positions in tangent frames are on the head at rest, in its axes."""
+        back = conjugate_quats_wxyz(self.field.rest_quats_wxyz)
+        return self.rest_m + turn_back(back, position)
 
 
 def _body_sizes(avatar: Avatar, field: MeshField) -> Float[Tensor, "N"]:

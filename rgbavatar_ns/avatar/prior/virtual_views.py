@@ -142,20 +142,23 @@ class VirtualViews(nn.Module):
         self.size_px.copy_(torch.tensor([views.width, views.height]))
         self._forget()
 
-    def see(self, avatar: Avatar, theta: Float[Tensor, "B H"], cameras: PinholeCameras) -> None:
-        """Take into account how far these frames of the film go."""
+    def see(
+        self, avatar: Avatar, theta: Float[Tensor, "B H"], cameras: PinholeCameras
+    ) -> Float[Tensor, "B 3"]:
+        """Take into account how far these frames of the film go; returns from where each looks."""
         turns = turn_seen(theta, cameras.world_to_camera, avatar.layout).to(self.turns_degrees)
         torch.minimum(self.filmed_low_degrees, turns.amin(0), out=self.filmed_low_degrees)
         torch.maximum(self.filmed_high_degrees, turns.amax(0), out=self.filmed_high_degrees)
         self._beyond = None
+        return looked_from(turns[:, :2])
 
     def seen_from(self) -> tuple[Float[Tensor, "3"], Float[Tensor, ""]]:
         """Where the film has looked at the head from, in the head's axes, and how far from there
         alone: 1 where the head never turns, 0 where it turns by `_TURNING_DEGREES` in all."""
         low, high = self.filmed_low_degrees[:2], self.filmed_high_degrees[:2]
-        yaw, pitch = torch.deg2rad(0.5 * (low + high)).unbind()
-        ahead = torch.stack([yaw.sin() * pitch.cos(), -pitch.sin(), yaw.cos() * pitch.cos()])
-        return ahead, (1 - (high - low).amax() / _TURNING_DEGREES).clamp(0, 1)
+        return looked_from(0.5 * (low + high)), (1 - (high - low).amax() / _TURNING_DEGREES).clamp(
+            0, 1
+        )
 
     def due(self, step: int, batch_size: int) -> int | None:
         """The view that takes the place of a batch's last frame at this step, if any."""
@@ -294,6 +297,12 @@ class _Mask:
     def is_empty(self) -> bool:
         """Whether nobody is there for certain."""
         return any(part.start == part.stop for part in self.box)
+
+
+def looked_from(turns_degrees: Float[Tensor, "*n 2"]) -> Float[Tensor, "*n 3"]:
+    """The way to the eye, in the head's axes, of who sees it turned by this yaw and pitch."""
+    yaw, pitch = torch.deg2rad(turns_degrees).unbind(-1)
+    return torch.stack([yaw.sin() * pitch.cos(), -pitch.sin(), yaw.cos() * pitch.cos()], -1)
 
 
 def _chosen(values: Float[Tensor, "W ..."], rows: list[int]) -> Tensor:
