@@ -1,4 +1,4 @@
-"""What lies within a head, as those who look at it from somewhere see it: not at all."""
+"""What lies within a head is not seen, from wherever one looks at it."""
 
 from dataclasses import dataclass
 
@@ -12,7 +12,8 @@ from rgbavatar_ns.avatar.prior.front import FrontSurface
 from rgbavatar_ns.avatar.prior.mesh_field import MeshField, ramp
 
 _WAY_M = (0.0, 0.02, 0.045, 0.08)
-"""Distances on the way to the eye at which is asked how deep within the head that leads."""
+"""Distances on the way to the eye at which is asked how deep within the head that leads: by the
+last of them it has left the head, or was deep before."""
 _COVERED_M = 0.01, 0.02
 """Depths from which something counts as covered, and is altogether. Ours: from 8 mm on, faces that
 were filmed lost a little; from 15 on, foreheads still showed where discs behind them end."""
@@ -27,7 +28,7 @@ class HeadSolid:
     """z of the foremost surface and minus z of the hindmost one, as `front` lays them out, within a
     rim of a pixel; minus infinity beside the mesh."""
     upright: Float[Tensor, "2 rows columns"]
-    """How far both surfaces face along z: what lies a metre behind a slope is so near to it."""
+    """The cosine of either surface's slope, by which depth along z becomes distance from it."""
 
     @classmethod
     def of(cls, avatar: Avatar, field: MeshField, front: FrontSurface) -> "HeadSolid":
@@ -51,18 +52,23 @@ class HeadSolid:
         ahead, behind = (end.flatten()[pixel] for end in self.ends_m)
         before, after = (part.flatten()[pixel] for part in self.upright)
         z = places_m[..., 2]
-        return ((ahead - z) * before).minimum((behind + z) * after).clamp(min=0)
+        deep = ((ahead - z) * before).minimum((behind + z) * after)
+        return deep.nan_to_num(nan=0.0).clamp(min=0)
 
     def covered(
-        self, places_m: Float[Tensor, "N 3"], to_eye: Float[Tensor, "B 3"]
+        self,
+        places_m: Float[Tensor, "N 3"],
+        to_eye: Float[Tensor, "B 3"],
+        inset_m: Float[Tensor, "N"] | float = 0.0,
     ) -> Float[Tensor, "B N"]:
         """1 where the way from places on the head at rest to each of B eyes leads through it.
 
-        to_eye: unit vectors in the head's axes. Ours, because large discs of sides, eyes and backs
-        paint skin that training leaves half clear from behind: from in front that is all the same,
-        and on a head turned by 15 degrees a cheek or forehead shows where they end.
+        to_eye: unit vectors in the head's axes; inset_m: how far the person's own surface lies
+        within the mesh there. Ours, because large discs of sides, eye sockets and backs paint skin
+        that training leaves half clear from behind: from in front that is all the same, and on a
+        head turned by 15 degrees a cheek or forehead shows where they end.
         """
         deepest = places_m.new_zeros(len(to_eye), len(places_m))
         for away_m in _WAY_M:
             deepest = deepest.maximum(self.depth_m(places_m + away_m * to_eye[:, None]))
-        return ramp(deepest, *_COVERED_M)
+        return ramp(deepest - inset_m, *_COVERED_M)

@@ -187,9 +187,10 @@ class SurfacePrior(nn.Module):
         if mouth is not None:
             # Also where expressions do not carry Gaussians they part the lips.
             shown_px = mouth.through_lips(shown_px, avatar.head(theta, avatar.identity), cameras)
-        # Bodies do not turn with the head, and of the mouth its lips decide.
+        # Bodies do not turn with the head, and of the mouth its lips decide, where they are known.
         here_m = parts.at_rest_m(avatar.blendshapes.position)
-        covered = parts.solid.covered(here_m, to_eye.to(facing)) * parts.outer
+        inset_m = (-self.offset_m).clamp(min=0)
+        covered = parts.solid.covered(here_m, to_eye.to(facing), inset_m) * parts.outer
         seen, clear = (
             (1 - covered) * ramp(facing, *cosines)
             for cosines in ((_TURNED_AWAY, _FACING), (_FACING, _FRONTAL))
@@ -325,7 +326,7 @@ class SurfacePrior(nn.Module):
                     (1 - strands.haired) * ~field.body_gaussians,
                     front,
                     HeadSolid.of(avatar, field, front),
-                    outer if mouth is None else outer * (1 - mouth.behind),
+                    torch.zeros_like(outer) if mouth is None else outer * (1 - mouth.behind),
                     field.at_gaussians(field.rest_m),
                     _SEEN_PX * _body_sizes(avatar, field),
                 ),
@@ -348,7 +349,7 @@ class _Parts:
     front: FrontSurface
     solid: HeadSolid
     outer: Float[Tensor, "N"]
-    """1 of a head, 0 of the body and within the mouth."""
+    """1 of a head, 0 of the body and within the mouth; 0 of all where no mouth is known."""
     rest_m: Float[Tensor, "N 3"]
     """Each one's place on the mesh at rest."""
     half_known_px: Float[Tensor, "N"]

@@ -145,7 +145,10 @@ class VirtualViews(nn.Module):
     def see(
         self, avatar: Avatar, theta: Float[Tensor, "B H"], cameras: PinholeCameras
     ) -> Float[Tensor, "B 3"]:
-        """Take into account how far these frames of the film go; returns from where each looks."""
+        """Take into account how far these frames of the film go.
+
+        Returns, in the head's axes, the way back along each camera's axis.
+        """
         turns = turn_seen(theta, cameras.world_to_camera, avatar.layout).to(self.turns_degrees)
         torch.minimum(self.filmed_low_degrees, turns.amin(0), out=self.filmed_low_degrees)
         torch.maximum(self.filmed_high_degrees, turns.amax(0), out=self.filmed_high_degrees)
@@ -300,7 +303,7 @@ class _Mask:
 
 
 def looked_from(turns_degrees: Float[Tensor, "*n 2"]) -> Float[Tensor, "*n 3"]:
-    """The way to the eye, in the head's axes, of who sees it turned by this yaw and pitch."""
+    """The way to the eye, in the head's axes, of who sees it turned by so much (yaw, pitch)."""
     yaw, pitch = torch.deg2rad(turns_degrees).unbind(-1)
     return torch.stack([yaw.sin() * pitch.cos(), -pitch.sin(), yaw.cos() * pitch.cos()], -1)
 

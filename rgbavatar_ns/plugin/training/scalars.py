@@ -12,11 +12,13 @@ from rgbavatar_ns.avatar.training.step import Losses
 from rgbavatar_ns.errors import UserError
 
 
-def finite_loss(losses: Losses, step: int, optimizers: Mapping[str, Any], resumed: Path) -> float:
+def finite_loss(
+    losses: Losses, step: int, optimizers: Mapping[str, Any], checkpoint_dir: Path
+) -> float:
     """Return the whole loss; raises UserError where it is not finite.
 
-    Who reads that is told what to change, by the `optimizers` that their config has, and from
-    which folder the run is resumed.
+    It tells what to change, by the `optimizers` of the config, and to resume from
+    `checkpoint_dir`.
     """
     loss = sum(map(float, losses.values()))
     if not math.isfinite(loss):
@@ -25,7 +27,7 @@ def finite_loss(losses: Losses, step: int, optimizers: Mapping[str, Any], resume
             changed = "other options of the method, --pipeline.model.avatar.*"
         raise UserError(
             f"The loss of step {step} is {loss}.",
-            f"Resume from the last checkpoint in {resumed} with {changed}.",
+            f"Resume from the last checkpoint in {checkpoint_dir} with {changed}.",
         )
     return loss
 
