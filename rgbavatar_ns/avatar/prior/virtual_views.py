@@ -159,9 +159,8 @@ class VirtualViews(nn.Module):
         """Where the film has looked at the head from, in the head's axes, and how far from there
         alone: 1 where the head never turns, 0 where it turns by `_TURNING_DEGREES` in all."""
         low, high = self.filmed_low_degrees[:2], self.filmed_high_degrees[:2]
-        return looked_from(0.5 * (low + high)), (1 - (high - low).amax() / _TURNING_DEGREES).clamp(
-            0, 1
-        )
+        alone = (1 - (high - low).amax() / _TURNING_DEGREES).clamp(0, 1)
+        return looked_from(0.5 * (low + high)), alone
 
     def due(self, step: int, batch_size: int) -> int | None:
         """The view that takes the place of a batch's last frame at this step, if any."""
