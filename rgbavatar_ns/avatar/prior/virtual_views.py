@@ -153,14 +153,14 @@ class VirtualViews(nn.Module):
         torch.minimum(self.filmed_low_degrees, turns.amin(0), out=self.filmed_low_degrees)
         torch.maximum(self.filmed_high_degrees, turns.amax(0), out=self.filmed_high_degrees)
         self._beyond = None
-        return looked_from(turns[:, :2])
+        return _looked_from(turns[:, :2])
 
     def seen_from(self) -> tuple[Float[Tensor, "3"], Float[Tensor, ""]]:
         """Where the film has looked at the head from, in the head's axes, and how far from there
         alone: 1 where the head never turns, 0 where it turns by `_TURNING_DEGREES` in all."""
         low, high = self.filmed_low_degrees[:2], self.filmed_high_degrees[:2]
         alone = (1 - (high - low).amax() / _TURNING_DEGREES).clamp(0, 1)
-        return looked_from(0.5 * (low + high)), alone
+        return _looked_from(0.5 * (low + high)), alone
 
     def due(self, step: int, batch_size: int) -> int | None:
         """The view that takes the place of a batch's last frame at this step, if any."""
@@ -301,7 +301,7 @@ class _Mask:
         return any(part.start == part.stop for part in self.box)
 
 
-def looked_from(turns_degrees: Float[Tensor, "*n 2"]) -> Float[Tensor, "*n 3"]:
+def _looked_from(turns_degrees: Float[Tensor, "*n 2"]) -> Float[Tensor, "*n 3"]:
     """The way to the eye, in the head's axes, of who sees it turned by so much (yaw, pitch)."""
     yaw, pitch = torch.deg2rad(turns_degrees).unbind(-1)
     return torch.stack([yaw.sin() * pitch.cos(), -pitch.sin(), yaw.cos() * pitch.cos()], -1)
